@@ -1,0 +1,115 @@
+"""Calibration records: where a sensor sits, how its lens bends, what the tool weighs. Dated, versioned, with covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from hal.geometry import UncertainPose, transform_rpy
+from hal.strict import Strict, load_toml
+
+Vector3 = tuple[float, float, float]
+Vector6 = tuple[float, float, float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraIntrinsics:
+    """Pinhole with the radial-tangential model of Brown and Conrady.
+
+    `u = fx x_d + cx` with `x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)`, x = X/Z; OpenCV's order
+    of `distortion`: (k1, k2, p1, p2, k3). Camera axes: x right, y down, z along the view. Pixel (0, 0) is a pixel's centre.
+    """
+
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ToolLoad:
+    """What hangs below the force/torque sensor, in sensor axes: mass, centre of mass and the sensor's bias."""
+
+    mass_kg: float
+    centre_of_mass_m: Vector3
+    bias: Vector6  # fx, fy, fz in N, then tx, ty, tz in N m
+
+
+class MountRecord(Strict):
+    """Pose of a device on its parent: fixed-axis roll, pitch, yaw, and one sigma for each of the six axes."""
+
+    position_m: Vector3
+    rpy_rad: Vector3
+    sigma_m: Vector3 = (0.0, 0.0, 0.0)
+    sigma_rad: Vector3 = (0.0, 0.0, 0.0)
+
+    def pose(self) -> UncertainPose:
+        """`parent_from_device` with its covariance."""
+        sigma = np.array([*self.sigma_m, *self.sigma_rad])
+        return UncertainPose(
+            parent_from_child=transform_rpy(self.position_m, self.rpy_rad), covariance=np.diag(sigma**2)
+        )
+
+
+class IntrinsicsRecord(Strict):
+    """Lens and image geometry of a camera."""
+
+    width_px: Annotated[int, Field(ge=1, le=16384)]
+    height_px: Annotated[int, Field(ge=1, le=16384)]
+    fx_px: Annotated[float, Field(gt=0)]
+    fy_px: Annotated[float, Field(gt=0)]
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    rms_px: Annotated[float, Field(ge=0)] = 0.0
+
+    def intrinsics(self) -> CameraIntrinsics:
+        """The value type that perception computes with."""
+        return CameraIntrinsics(**self.model_dump(exclude={"rms_px"}))
+
+
+class LoadRecord(Strict):
+    """Tool weight and force/torque bias."""
+
+    mass_kg: Annotated[float, Field(ge=0)]
+    centre_of_mass_m: Vector3
+    bias_force_n: Vector3 = (0.0, 0.0, 0.0)
+    bias_torque_nm: Vector3 = (0.0, 0.0, 0.0)
+
+    def load(self) -> ToolLoad:
+        """The value type that motion computes with."""
+        return ToolLoad(
+            mass_kg=self.mass_kg,
+            centre_of_mass_m=self.centre_of_mass_m,
+            bias=(*self.bias_force_n, *self.bias_torque_nm),
+        )
+
+
+class CalibrationRecord(Strict):
+    """One calibration file: what was found for one device, when and how well."""
+
+    schema_: Annotated[Literal[1], Field(alias="schema")] = 1
+    device: str
+    version: Annotated[int, Field(ge=1)] = 1
+    date: str
+    method: str
+    mount: MountRecord | None = None
+    intrinsics: IntrinsicsRecord | None = None
+    load: LoadRecord | None = None
+    quality: dict[str, float] = {}
+
+
+def load_calibration(path: Path) -> CalibrationRecord:
+    """Read one record.
+
+    Raises:
+        ConfigError: missing or malformed file, with key path.
+    """
+    return load_toml(path, CalibrationRecord, "calibration record")

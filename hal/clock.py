@@ -1,0 +1,129 @@
+"""Clocks and deadlines. Nothing in the cell asks the wall for the time of day."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """Monotonic seconds. `sleep` returns when that much of *this* clock's time has passed."""
+
+    def now_s(self) -> float:
+        """Seconds since an arbitrary start; never goes back."""
+        ...
+
+    def sleep(self, duration_s: float) -> None:
+        """Let `duration_s` of this clock's time pass; a simulated clock steps its world."""
+        ...
+
+
+class WallClock:
+    """The machine's monotonic clock."""
+
+    def now_s(self) -> float:
+        """Seconds of `time.monotonic`."""
+        return time.monotonic()
+
+    def sleep(self, duration_s: float) -> None:
+        """Block the calling thread."""
+        if duration_s > 0.0:
+            time.sleep(duration_s)
+
+
+class SimClock:
+    """A clock that a simulator owns: `advance` steps the world and moves the time.
+
+    Args:
+        advance: called with the seconds to pass; returns the new time in seconds. None makes a free-running test clock.
+    """
+
+    def __init__(self, advance: Callable[[float], float] | None = None, *, start_s: float = 0.0) -> None:
+        self._advance = advance
+        self._now_s = start_s
+        self._lock = threading.Lock()
+
+    def now_s(self) -> float:
+        """Simulated seconds since the world began."""
+        return self._now_s
+
+    def attach(self, advance: Callable[[float], float]) -> None:
+        """Let a world drive this clock; called once, when the first simulated device connects."""
+        self._advance = advance
+
+    def set_now_s(self, now_s: float) -> None:
+        """Follow the world's time; it never goes back."""
+        self._now_s = max(self._now_s, now_s)
+
+    def sleep(self, duration_s: float) -> None:
+        """Step the world by `duration_s`."""
+        if duration_s <= 0.0:
+            return
+        with self._lock:
+            end_s = self._now_s + duration_s
+            self.set_now_s(self._advance(duration_s) if self._advance else end_s)
+
+
+class PacedClock:
+    """The wall's time beside a simulated world (mode `mixed`): each `sleep` steps the world and never runs ahead of the wall."""
+
+    def __init__(self, advance: Callable[[float], float] | None = None) -> None:
+        self._advance = advance
+
+    def attach(self, advance: Callable[[float], float]) -> None:
+        """Let this clock drive a world."""
+        self._advance = advance
+
+    def now_s(self) -> float:
+        """Seconds of `time.monotonic`."""
+        return time.monotonic()
+
+    def sleep(self, duration_s: float) -> None:
+        """Step the world by `duration_s`, then wait for the wall to catch up."""
+        end_s = time.monotonic() + duration_s
+        if duration_s > 0.0 and self._advance is not None:
+            self._advance(duration_s)
+        time.sleep(max(0.0, end_s - time.monotonic()))
+
+
+class ReplayClock:
+    """Follows the stamps of a recording: `now_s` is the time of the newest record given out."""
+
+    def __init__(self, *, start_s: float = 0.0) -> None:
+        self._now_s = start_s
+
+    def now_s(self) -> float:
+        """Recorded seconds."""
+        return self._now_s
+
+    def seek(self, stamp_s: float) -> None:
+        """Move on to the stamp of the record that is given out now."""
+        self._now_s = max(self._now_s, stamp_s)
+
+    def sleep(self, duration_s: float) -> None:
+        """Time passes at once: a recording has no present."""
+        self._now_s += max(0.0, duration_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Deadline:
+    """A moment on a clock after which a call must have returned. One deadline owns a call and its retries."""
+
+    at_s: float
+    clock: Clock
+
+    @classmethod
+    def after(cls, clock: Clock, duration_s: float) -> Deadline:
+        """The moment `duration_s` from now."""
+        return cls(clock.now_s() + duration_s, clock)
+
+    def remaining_s(self) -> float:
+        """Seconds left, never negative."""
+        return max(0.0, self.at_s - self.clock.now_s())
+
+    def is_past(self) -> bool:
+        """Has the moment passed?"""
+        return self.clock.now_s() >= self.at_s

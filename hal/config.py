@@ -1,0 +1,163 @@
+"""The cell file: which devices make up a cell, where they sit and what limits hold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from hal.calibration import CalibrationRecord, Vector3, load_calibration
+from hal.devices import DeviceKind
+from hal.errors import ConfigError
+from hal.panel import Panel, load_panel
+from hal.strict import Strict, load_toml
+
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}$")]
+Positive = Annotated[float, Field(gt=0)]
+
+
+class CellSection(Strict):
+    """`[cell]`"""
+
+    name: Name
+    mode: Literal["sim", "real", "mixed"]
+    panel: str
+    calibrations: str
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    control_rate_hz: Annotated[float, Field(ge=50, le=1000)] = 500.0
+
+
+class Mount(Strict):
+    """Where a device sits: on `flange`, `base` or the name of another frame, with a calibration record."""
+
+    parent: Name = "flange"
+    calibration: Name
+
+
+class DeviceSection(Strict):
+    """`[devices.NAME]`"""
+
+    kind: DeviceKind
+    driver: Annotated[str, Field(pattern=r"^[a-z0-9_.+-]+:[a-z0-9_.+-]+$")]
+    options: dict[str, Any] = {}
+    mount: Mount | None = None
+
+
+class EmulatorSection(Strict):
+    """`[emulators.NAME]`: the far side of device NAME's wire, worked by another (usually simulated) driver."""
+
+    emulator: str
+    driver: str
+    emulator_options: dict[str, Any] = {}
+    options: dict[str, Any] = {}
+
+
+class SafetySection(Strict):
+    """`[safety]`"""
+
+    force_limit_n: Annotated[float, Field(gt=0, le=500)] = 100.0
+    speed_limit_m_per_s: Annotated[float, Field(gt=0, le=2)] = 0.25
+    lease_ttl_s: Annotated[float, Field(ge=0.1, le=10)] = 2.0
+    max_reading_age_s: Positive = 0.1
+
+
+class WorkspaceSection(Strict):
+    """`[workspace]`: where the panel is expected and how far it may be off; where the arm parks; what else is in the way."""
+
+    panel_position_m: Vector3
+    panel_rpy_rad: Vector3
+    position_tolerance_m: Positive = 0.10
+    angle_tolerance_rad: Positive = 0.27
+    park_rad: tuple[float, ...]
+    floor_z_m: float = 0.0
+
+
+class CellFile(Strict):
+    """A whole cell file."""
+
+    schema_: Annotated[Literal[1], Field(alias="schema")] = 1
+    cell: CellSection
+    devices: Annotated[dict[Name, DeviceSection], Field(min_length=1)]
+    workspace: WorkspaceSection
+    safety: SafetySection = SafetySection()
+    emulators: dict[Name, EmulatorSection] = {}
+
+    @model_validator(mode="after")
+    def _emulators_have_devices(self) -> CellFile:
+        for name in self.emulators:
+            if name not in self.devices:
+                raise ValueError(f"emulators.{name} stands for no device; devices: {', '.join(self.devices)}")
+        if self.emulators and self.cell.mode == "real":
+            raise ValueError("emulators need cell.mode = 'mixed' or 'sim'")
+        return self
+
+
+class Cell(Strict):
+    """A cell file with everything it points to, read and checked."""
+
+    path: Path
+    file: CellFile
+    panel: Panel
+    calibrations: dict[str, CalibrationRecord]
+
+    @property
+    def name(self) -> str:
+        """Name of the cell."""
+        return self.file.cell.name
+
+    def names_of(self, kind: DeviceKind) -> tuple[str, ...]:
+        """Names of the devices of a kind, in the order of the file."""
+        return tuple(name for name, device in self.file.devices.items() if device.kind is kind)
+
+    def calibration_of(self, device: str) -> CalibrationRecord:
+        """The calibration record of a mounted device.
+
+        Raises:
+            ConfigError: the device has no mount.
+        """
+        mount = self.file.devices[device].mount
+        if mount is None:
+            raise ConfigError(
+                f"devices.{device} has no mount",
+                hint=f"add mount = {{ parent = ..., calibration = ... }}",
+                file=str(self.path),
+                key=f"devices.{device}.mount",
+            )
+        return self.calibrations[mount.calibration]
+
+
+def load_cell(path: Path, *, seed: int | None = None) -> Cell:
+    """Read a cell file, its panel and its calibration records.
+
+    Paths inside the file are looked up from the file's folder upwards, so `panels/bench.toml` works from anywhere.
+
+    Args:
+        seed: replaces the file's seed.
+
+    Raises:
+        ConfigError: names file, key path and remedy.
+    """
+    file = load_toml(path, CellFile, "cell file")
+    if seed is not None:
+        file = file.model_copy(update={"cell": file.cell.model_copy(update={"seed": seed})})
+    panel = load_panel(_locate(file.cell.panel, path, "cell.panel"))
+    folder = _locate(file.cell.calibrations, path, "cell.calibrations")
+    names = {device.mount.calibration for device in file.devices.values() if device.mount is not None}
+    records = {name: load_calibration(folder / f"{name}.toml") for name in sorted(names)}
+    return Cell.model_construct(path=path, file=file, panel=panel, calibrations=records)
+
+
+def _locate(text: str, cell_path: Path, key: str) -> Path:
+    wanted = Path(text)
+    if wanted.is_absolute():
+        return wanted
+    for folder in cell_path.resolve().parents:
+        if (folder / wanted).exists():
+            return folder / wanted
+    raise ConfigError(
+        f"{cell_path}: {key}: {text!r} does not exist",
+        file=str(cell_path),
+        key=key,
+        hint="give a path relative to the cell file's folder or one above it",
+    )

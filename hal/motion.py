@@ -1,0 +1,202 @@
+"""Declared motions: a skill says beforehand what shall move, how hard it may push and what ends it; the cell executes it.
+
+All poses are `base_from_tool`, where `flange_from_tool` comes with the motion. Wrenches are contact wrenches (bias and tool
+weight taken off) in tool axes about the tool's origin: what the world exerts on the tool.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+Array = NDArray[np.float64]
+
+
+class Quantity(StrEnum):
+    """What a guard watches."""
+
+    FORCE = "force"  # N, along `axis` of the tool, or the norm when the axis is None
+    TORQUE = "torque"  # N m, likewise
+    FORCE_RISE = "force-rise"  # N above the running median of the last 0.4 s, along `axis` or the norm
+    TOUCH = "touch"  # number of channels in contact
+    PROXIMITY = "proximity"  # m, nearest of all valid proximity readings
+    TRAVEL = (
+        "travel"  # m, tip displacement from the start of the motion (along `axis` of the start tool frame, or the norm)
+    )
+    ROTATION = "rotation"  # rad, turn of the tool since the start
+    TRACKING = "tracking"  # m, distance between commanded and measured tip
+
+
+class Reaction(StrEnum):
+    """What happens when a guard trips."""
+
+    STOP = "stop"  # decelerate, hold, outcome `guard`
+    FAULT = "fault"  # the same, but the motion counts as failed (protective)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Guard:
+    """Trips when the quantity is at or beyond `limit` for `ticks` control ticks (below it when `below`)."""
+
+    name: str
+    quantity: Quantity
+    limit: float
+    axis: tuple[float, float, float] | None = None
+    below: bool = False
+    ticks: int = 2
+    reaction: Reaction = Reaction.STOP
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Compliance:
+    """Admittance in tool axes (x, y, z, rx, ry, rz): the tool yields to contact wrenches about the declared path.
+
+    mass a + damping v + stiffness x = wrench - target. An axis with stiffness `inf` does not yield.
+    """
+
+    stiffness: tuple[float, float, float, float, float, float]
+    damping: tuple[float, float, float, float, float, float]
+    mass: tuple[float, float, float, float, float, float] = (20.0, 20.0, 20.0, 0.5, 0.5, 0.5)
+    target_wrench: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    max_offset_m: float = 0.03
+    max_offset_rad: float = 0.3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class JointTrajectory:
+    """Joint positions (N, n) rad at times (N,) s from 0, with velocities (N, n) rad/s: cubic Hermite between them."""
+
+    name: str
+    times_s: Array
+    positions_rad: Array
+    velocities_rad_per_s: Array
+    guards: tuple[Guard, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CartesianPath:
+    """Tool poses at times (N,) s from 0; straight and constant turn between neighbours.
+
+    The first pose must be where the tool is (within 5 mm and 0.05 rad): the executor blends from the measured pose.
+    """
+
+    name: str
+    flange_from_tool: RigidTransform
+    times_s: Array
+    base_from_tool: tuple[RigidTransform, ...]
+    guards: tuple[Guard, ...] = ()
+    compliance: Compliance | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hold:
+    """Stand still for a while: lamps settle, frames arrive."""
+
+    name: str
+    duration_s: float
+    guards: tuple[Guard, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GripperMotion:
+    """Move the pads while the arm holds; ends when they rest or `timeout_s` is over."""
+
+    name: str
+    width_m: float
+    force_n: float
+    speed_m_per_s: float = 0.08
+    timeout_s: float = 3.0
+    guards: tuple[Guard, ...] = ()
+
+
+DeclaredMotion = JointTrajectory | CartesianPath | Hold | GripperMotion
+
+
+class MotionOutcome(StrEnum):
+    """How a declared motion ended."""
+
+    COMPLETED = "completed"
+    GUARD = "guard"
+    STOPPED = "stopped"  # the stop latch
+    CANCELLED = "cancelled"
+    FAULT = "fault"  # a device failed or a protective guard tripped; `cause` says which
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MotionLog:
+    """What happened, sampled every `1/rate_hz`: times (N,), joints (N, n), contact wrench in tool axes (N, 6), tip (N, 3)."""
+
+    times_s: Array
+    positions_rad: Array
+    wrench: Array
+    tip_m: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MotionReport:
+    """What really happened. `tripped` names the guard; `cause` is a sentence for people."""
+
+    name: str
+    outcome: MotionOutcome
+    tripped: str | None
+    cause: str
+    started_s: float
+    ended_s: float
+    position_rad: Array
+    base_from_tool: RigidTransform
+    wrench: Array  # (6,) contact wrench at the end, tool axes
+    peak_force_n: float
+    gripper_width_m: float | None
+    log: MotionLog
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds on the cell's clock."""
+        return self.ended_s - self.started_s
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RobotState:
+    """Snapshot of the cell for reads that do not move: joints, flange, contact wrench, contacts, proximity."""
+
+    stamp_s: float
+    position_rad: Array
+    velocity_rad_per_s: Array
+    base_from_flange: RigidTransform
+    wrench: Array  # (6,) contact wrench in flange axes about the flange, N and N m
+    contacts: tuple[bool, ...]
+    proximity_m: tuple[float, ...]
+    gripper_width_m: float
+    is_moving: bool
+    is_stopped: bool
+    faults: tuple[str, ...] = field(default=())
+
+
+class Mover(Protocol):
+    """The cell's motion port: one motion at a time."""
+
+    def execute(self, motion: DeclaredMotion) -> MotionReport:
+        """Run the motion to its end; blocks. Never raises for what the motion met: the report says it.
+
+        Raises:
+            MotionRefused: not finite, outside limits, start pose too far away, or another motion runs.
+            Stopped: the stop latch is set.
+        """
+        ...
+
+    def cancel(self) -> None:
+        """Decelerate and end the running motion with outcome `cancelled`; returns at once."""
+        ...
+
+    def tare(self) -> Array:
+        """Take the present wrench (averaged over 0.1 s at rest) as zero contact; returns the (6,) bias that it found."""
+        ...
+
+    def state(self) -> RobotState:
+        """Newest snapshot."""
+        ...

@@ -1,0 +1,116 @@
+"""Drivers by name: entry points, loaded only when a cell file asks for them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, TypeVar
+
+from hal.clock import Clock, WallClock
+from hal.config import Cell
+from hal.devices import Device
+from hal.errors import CellError, ConfigError
+
+DEVICES = "panelwright.devices"
+EMULATORS = "panelwright.emulators"
+R = TypeVar("R")
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class Shared:
+    """What several devices of one cell share: the world, a bus. Made once, closed last."""
+
+    _things: dict[str, Any] = field(default_factory=dict)
+    _lock: threading.RLock = field(default_factory=threading.RLock)
+
+    def get(self, key: str, make: Callable[[], R]) -> R:
+        """The thing under `key`; the first caller makes it."""
+        with self._lock:
+            if key not in self._things:
+                self._things[key] = make()
+            thing: R = self._things[key]
+            return thing
+
+    def peek(self, key: str) -> Any | None:
+        """The thing under `key`, or None."""
+        return self._things.get(key)
+
+    def close(self) -> None:
+        """Close everything in reverse order; a second call does nothing."""
+        with self._lock:
+            things = list(self._things.values())[::-1]
+            self._things.clear()
+        for thing in things:
+            thing.close()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Context:
+    """What a driver's factory gets beside its options.
+
+    `cell` is None when a driver is used on its own. A simulated driver replaces the time with its world's:
+    it registers `advance` at the `SimClock` in `clock`.
+    """
+
+    name: str
+    clock: Clock = field(default_factory=WallClock)
+    cell: Cell | None = None
+    shared: Shared = field(default_factory=Shared)
+
+
+Factory = Callable[[Context, dict[str, Any]], Device]
+"""A driver's entry point: `connect(context, options) -> Device`; validates `options` with a strict model (`ConfigError`),
+raises `DeviceUnavailable` when the device cannot be reached."""
+
+
+def device_factory(driver: str) -> Factory:
+    """The factory registered under `driver`, for example `serial:tfmini`.
+
+    Raises:
+        ConfigError: unknown name (with the nearest known one), or its package does not import.
+    """
+    factory: Factory = _load(DEVICES, driver, "driver")
+    return factory
+
+
+def emulator_factory(name: str) -> Any:
+    """The emulator registered under `name`: `start(backing: Device, options) -> Emulator` (see `hal.emulation`)."""
+    return _load(EMULATORS, name, "emulator")
+
+
+def installed_drivers() -> tuple[str, ...]:
+    """Names of all registered drivers."""
+    return tuple(sorted(point.name for point in entry_points(group=DEVICES)))
+
+
+def _load(group: str, name: str, what: str) -> Any:
+    known: dict[str, EntryPoint] = {point.name: point for point in entry_points(group=group)}
+    if name not in known:
+        near = get_close_matches(name, known, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"installed: {', '.join(sorted(known)) or 'none'}"
+        raise ConfigError(f"no {what} called {name!r}", hint=hint, driver=name)
+    try:
+        return known[name].load()
+    except ImportError as error:
+        raise ConfigError(
+            f"{what} {name!r} does not import: {error}",
+            hint="run `make setup`; Python must be 3.11 (see `panelwright doctor`)",
+            driver=name,
+        ) from error
+
+
+def connect(context: Context, driver: str, options: dict[str, Any], *, key: str = "") -> Device:
+    """Connect one device; a fault names the device and the key in the cell file."""
+    try:
+        return device_factory(driver)(context, options)
+    except ConfigError as error:
+        place = key or f"devices.{context.name}"
+        if str(error).startswith(place):
+            raise
+        file = f"{context.cell.path}: " if context.cell is not None else ""
+        raise ConfigError(f"{file}{place}: {error.what}", hint=error.hint, **error.details) from error
+    except CellError:
+        raise

@@ -1,0 +1,139 @@
+"""Strict models for files and requests: unknown keys, wrong types and non-finite numbers are refused with the key's path."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from hal.errors import ConfigError
+
+M = TypeVar("M", bound="Strict")
+
+
+class Strict(BaseModel):
+    """Base of every model that comes from a file or a request."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def load_toml(path: Path, model: type[M], what: str) -> M:
+    """Read `path` and validate it as `model`.
+
+    Raises:
+        ConfigError: the file is missing, is not TOML, or breaks the model; names file, key path and remedy.
+    """
+    return parse_toml(read_text(path, what), model, source=str(path))
+
+
+def read_text(path: Path, what: str) -> str:
+    """The text of a file that a user named."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        near = get_close_matches(path.name, [p.name for p in path.parent.glob("*.toml")], n=1)
+        hint = f"did you mean {path.parent / near[0]}?" if near else f"give the path of a {what} (TOML)"
+        raise ConfigError(f"{what} {path} does not exist", hint=hint, file=str(path)) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"{what} {path} cannot be read: {error}", hint="check path, rights and encoding (UTF-8)", file=str(path)
+        ) from error
+
+
+def parse_toml(text: str, model: type[M], *, source: str) -> M:
+    """Validate TOML text as `model`; `source` names it in errors."""
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(
+            f"{source} is not valid TOML: {error}", hint="look at that line; strings need quotes", file=source
+        ) from error
+    return validate(data, model, source=source)
+
+
+def validate(data: dict[str, Any], model: type[M], *, source: str) -> M:
+    """Validate plain data as `model`, with every fault named by key path.
+
+    TOML has no tuples, so lists stand for them; nothing else is converted.
+    """
+    try:
+        # JSON mode is strict about types, but takes a list where the model has a tuple and a string where it has an enum.
+        return model.model_validate_json(json.dumps(data, default=str), strict=True)
+    except ValidationError as error:
+        faults = [_fault(item, model) for item in error.errors()]
+        first_key, first_text, first_hint = faults[0]
+        more = f" (and {len(faults) - 1} more faults)" if len(faults) > 1 else ""
+        raise ConfigError(
+            f"{source}: {first_key}: {first_text}{more}",
+            hint=first_hint,
+            file=source,
+            key=first_key,
+            faults=[f"{key}: {text}" for key, text, _ in faults],
+        ) from error
+
+
+def _fault(item: Any, model: type[BaseModel]) -> tuple[str, str, str]:
+    path = _path_in_file(item["loc"], model)
+    key = ".".join(str(part) for part in path) or "(top level)"
+    if item["type"] == "extra_forbidden":
+        known = _fields_at(model, list(item["loc"][:-1]))
+        return key, f"unknown key {path[-1]!r}", _did_you_mean(str(path[-1]), known)
+    if item["type"] == "missing":
+        return key, "is missing", f"add {key}; the reference is in docs/"
+    given = repr(item.get("input"))
+    return key, f"{item['msg']} (given: {given[:60]})", "see the file reference in docs/ for type, unit and range"
+
+
+def _path_in_file(location: tuple[Any, ...], model: type[BaseModel]) -> list[Any]:
+    # A discriminated union puts its tag into the path, where a reader of the file sees none.
+    tags = {tag for m in _reachable(model) if (tag := _tag_of(m))}
+    return [
+        part for i, part in enumerate(location) if not (part in tags and i > 0 and isinstance(location[i - 1], int))
+    ]
+
+
+def _reachable(model: type[BaseModel]) -> set[type[BaseModel]]:
+    found: set[type[BaseModel]] = set()
+    waiting = [model]
+    while waiting:
+        current = waiting.pop()
+        if current not in found:
+            found.add(current)
+            waiting += [m for field in current.model_fields.values() for m in _models_in(field.annotation)]
+    return found
+
+
+def _did_you_mean(name: str, known: list[str]) -> str:
+    near = get_close_matches(name, known, n=1, cutoff=0.5)
+    if near:
+        return f"did you mean {near[0]!r}?"
+    return f"known keys: {', '.join(sorted(known))}" if known else "remove it"
+
+
+def _fields_at(model: type[BaseModel], location: list[Any]) -> list[str]:
+    """Field names of the model that stands at `location` inside `model`."""
+    models: list[type[BaseModel]] = [model]
+    for part in location:
+        if isinstance(part, int):
+            continue
+        stepped = [
+            inner for m in models if part in m.model_fields for inner in _models_in(m.model_fields[part].annotation)
+        ]
+        tagged = [m for m in models if _tag_of(m) == part]
+        models = stepped or tagged or models
+    return sorted({name for m in models for name in m.model_fields})
+
+
+def _tag_of(model: type[BaseModel]) -> str | None:
+    field = model.model_fields.get("kind")
+    return str(field.default) if field is not None and field.default is not None else None
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [m for argument in get_args(annotation) for m in _models_in(argument)]

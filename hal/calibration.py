@@ -1,4 +1,4 @@
-"""Calibration records: where a sensor sits, how its lens bends, what the tool weighs. Dated, versioned, with covariance."""
+"""Calibration records: where a sensor sits, how its lens bends, what the tool weighs; dated."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ Vector6 = tuple[float, float, float, float, float, float]
 class CameraIntrinsics:
     """Pinhole with the radial-tangential model of Brown and Conrady.
 
-    `u = fx x_d + cx` with `x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)`, x = X/Z; OpenCV's order
-    of `distortion`: (k1, k2, p1, p2, k3). Camera axes: x right, y down, z along the view. Pixel (0, 0) is a pixel's centre.
+    `u = fx x_d + cx` with `x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)`, x = X/Z.
+    OpenCV's order of `distortion`: (k1, k2, p1, p2, k3). Camera axes: x right, y down, z along the
+    view. Pixel (0, 0) is a pixel's centre.
     """
 
     width_px: int

@@ -68,7 +68,7 @@ class SimClock:
 
 
 class PacedClock:
-    """The wall's time beside a simulated world (mode `mixed`): each `sleep` steps the world and never runs ahead of the wall."""
+    """The wall's time beside a simulated world (mode `mixed`): `sleep` steps the world, never ahead of the wall."""
 
     def __init__(self, advance: Callable[[float], float] | None = None) -> None:
         self._advance = advance

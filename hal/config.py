@@ -42,6 +42,7 @@ class DeviceSection(Strict):
     driver: Annotated[str, Field(pattern=r"^[a-z0-9_.+-]+:[a-z0-9_.+-]+$")]
     options: dict[str, Any] = {}
     mount: Mount | None = None
+    isolate: bool = False
 
 
 class EmulatorSection(Strict):
@@ -63,7 +64,7 @@ class SafetySection(Strict):
 
 
 class WorkspaceSection(Strict):
-    """`[workspace]`: where the panel is expected and how far it may be off; where the arm parks; what else is in the way."""
+    """`[workspace]`: where the panel is expected and how far it may be off; where the arm parks; the floor."""
 
     panel_position_m: Vector3
     panel_rpy_rad: Vector3
@@ -120,7 +121,7 @@ class Cell(Strict):
         if mount is None:
             raise ConfigError(
                 f"devices.{device} has no mount",
-                hint=f"add mount = {{ parent = ..., calibration = ... }}",
+                hint="add mount = { parent = ..., calibration = ... }",
                 file=str(self.path),
                 key=f"devices.{device}.mount",
             )

@@ -4,7 +4,8 @@ Common promises (checked by `hal.conformance`):
 - a read returns the newest sample with its stamps and never an old one as new; the stamp and sequence tell;
 - silence raises `DeviceTimeout` before the deadline plus 50 ms; a broken device raises `DeviceFault`; a lost one
   `DeviceUnavailable`;
-- `health` never blocks on the device; `close` is idempotent and bounded; after it every call raises `DeviceUnavailable`.
+- `health` never blocks on the device; `close` is idempotent and bounded; after it every call raises
+  `DeviceUnavailable`.
 """
 
 from __future__ import annotations
@@ -87,7 +88,8 @@ class DhLink:
 class ArmCapabilities:
     """Kinematics and limits; `flange` is the frame after the last link.
 
-    `link_radius_m` gives, per link, the radius of a capsule round the segment from joint i to joint i + 1, for collision checks.
+    `link_radius_m` gives, per link, the radius of a capsule round the segment from joint i to joint i + 1, for
+    collision checks.
     """
 
     model: str
@@ -235,7 +237,7 @@ class RangeScannerCapabilities:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RangeImage:
-    """`depth_m`: float32 (height, width), NaN where the sensor saw nothing. Axes as the camera's: x right, y down, z out."""
+    """`depth_m`: float32 (height, width), NaN where the sensor saw nothing. Axes as the camera's."""
 
     depth_m: NDArray[np.float32]
 

@@ -1,7 +1,7 @@
-"""Declared motions: a skill says beforehand what shall move, how hard it may push and what ends it; the cell executes it.
+"""Declared motions: a skill says what shall move, how hard it may push and what ends it; the cell executes it.
 
-All poses are `base_from_tool`, where `flange_from_tool` comes with the motion. Wrenches are contact wrenches (bias and tool
-weight taken off) in tool axes about the tool's origin: what the world exerts on the tool.
+All poses are `base_from_tool`, where `flange_from_tool` comes with the motion. Wrenches are contact wrenches (bias and
+tool weight taken off) in tool axes about the tool's origin: what the world exerts on the tool.
 """
 
 from __future__ import annotations
@@ -129,7 +129,8 @@ class MotionOutcome(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionLog:
-    """What happened, sampled every `1/rate_hz`: times (N,), joints (N, n), contact wrench in tool axes (N, 6), tip (N, 3)."""
+    """What happened, sampled every `1/rate_hz`: times (N,), joints (N, n), contact wrench in tool axes (N, 6),
+    tip (N, 3)."""
 
     times_s: Array
     positions_rad: Array
@@ -194,7 +195,7 @@ class Mover(Protocol):
         ...
 
     def tare(self) -> Array:
-        """Take the present wrench (averaged over 0.1 s at rest) as zero contact; returns the (6,) bias that it found."""
+        """Take the present wrench (averaged over 0.1 s at rest) as zero contact; returns the (6,) bias found."""
         ...
 
     def state(self) -> RobotState:

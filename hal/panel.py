@@ -1,4 +1,4 @@
-"""The panel file: what a panel is. Perception recognises with it, manipulation acts with it, the simulator builds from it.
+"""The panel file: what a panel is. Perception recognises with it, manipulation acts with it, simulators build it.
 
 Panel frame: origin in the middle of the plate's front face, x right and y up as the viewer sees it, z out of the plate
 towards the viewer. Angles of needles, levers and knobs are clockwise from straight up as the viewer sees them (so a
@@ -7,6 +7,7 @@ positive angle is a negative turn about z).
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -32,8 +33,8 @@ class Light(Strict):
 class Scale(Strict):
     """How an angle (or a length) shows a value.
 
-    `at_min` and `at_max` are the pointer's places at `minimum` and `maximum`; `table` holds further (place, value) pairs of
-    a scale that is not linear, in rising order of place.
+    `at_min` and `at_max` are the pointer's places at `minimum` and `maximum`; `table` holds further (place, value) pairs
+    of a scale that is not linear, in rising order of place.
     """
 
     minimum: float
@@ -55,7 +56,7 @@ class Scale(Strict):
     def value_at(self, place: float) -> float:
         """The value shown at a place (rad or m), linear between taught pairs, going on straight beyond the ends."""
         points = self._points()
-        for (p0, v0), (p1, v1) in zip(points, points[1:], strict=False):
+        for (p0, v0), (p1, v1) in pairwise(points):
             if place <= p1 or (p1, v1) == points[-1]:
                 return v0 + (place - p0) * (v1 - v0) / (p1 - p0)
         raise AssertionError("a scale has two points")
@@ -63,7 +64,7 @@ class Scale(Strict):
     def place_of(self, value: float) -> float:
         """The inverse of `value_at`."""
         points = sorted((v, p) for p, v in self._points())
-        for (v0, p0), (v1, p1) in zip(points, points[1:], strict=False):
+        for (v0, p0), (v1, p1) in pairwise(points):
             if value <= v1 or (v1, p1) == points[-1]:
                 return p0 + (value - v0) * (p1 - p0) / (v1 - v0)
         raise AssertionError("a scale has two points")

@@ -62,8 +62,8 @@ class Context:
 
 
 Factory = Callable[[Context, dict[str, Any]], Device]
-"""A driver's entry point: `connect(context, options) -> Device`; validates `options` with a strict model (`ConfigError`),
-raises `DeviceUnavailable` when the device cannot be reached."""
+"""A driver's entry point: `connect(context, options) -> Device`; validates `options` with a strict model
+(`ConfigError`), raises `DeviceUnavailable` when the device cannot be reached."""
 
 
 def device_factory(driver: str) -> Factory:

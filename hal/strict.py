@@ -1,4 +1,4 @@
-"""Strict models for files and requests: unknown keys, wrong types and non-finite numbers are refused with the key's path."""
+"""Strict models for files and requests: unknown keys, wrong types and non-finite numbers are refused by key path."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def validate(data: dict[str, Any], model: type[M], *, source: str) -> M:
     TOML has no tuples, so lists stand for them; nothing else is converted.
     """
     try:
-        # JSON mode is strict about types, but takes a list where the model has a tuple and a string where it has an enum.
+        # JSON mode is strict about types, but takes a list for a tuple and a string for an enum.
         return model.model_validate_json(json.dumps(data, default=str), strict=True)
     except ValidationError as error:
         faults = [_fault(item, model) for item in error.errors()]

@@ -1,0 +1,115 @@
+"""Messages between two processes on one machine: pickles over a Unix socket, big arrays through shared memory.
+
+Arrays travel out of band (pickle protocol 5) in a memory file that both sides map. The kernel frees it with its last
+user, so even `kill -9` leaves nothing behind. A channel carries one call at a time; it is not for several threads.
+"""
+
+from __future__ import annotations
+
+import io
+import mmap
+import os
+import pickle
+from multiprocessing import reduction
+from multiprocessing.connection import Connection
+from typing import Any
+
+from hal.clock import Clock, Deadline
+
+INLINE_BYTES = 16_384  # below this a pipe is as fast as shared memory
+
+
+class _Pickler(pickle.Pickler):
+    def persistent_id(self, obj: Any) -> Any:
+        # The two sides have different clocks, so what travels is the time that is left.
+        return obj.remaining_s() if isinstance(obj, Deadline) else None
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, data: bytes, buffers: list[Any], clock: Clock) -> None:
+        super().__init__(io.BytesIO(data), buffers=buffers)
+        self._clock = clock
+
+    def persistent_load(self, pid: Any) -> Any:
+        return Deadline.after(self._clock, float(pid))
+
+
+class Channel:
+    """One end of a connection.
+
+    Args:
+        connection: a connected Unix-socket connection of `multiprocessing`; the channel owns it.
+        clock: whose time received deadlines count in.
+    """
+
+    def __init__(self, connection: Connection, clock: Clock) -> None:
+        self._connection = connection
+        self._clock = clock
+        self._outgoing: mmap.mmap | None = None
+        self._incoming: mmap.mmap | None = None
+
+    def send(self, message: Any) -> None:
+        """Send one message; the peer must have taken the one before (calls alternate)."""
+        big: list[pickle.PickleBuffer] = []
+        stream = io.BytesIO()
+
+        def stays_inside(buffer: pickle.PickleBuffer) -> bool:
+            if buffer.raw().nbytes >= INLINE_BYTES:
+                big.append(buffer)
+                return False
+            return True
+
+        _Pickler(stream, protocol=5, buffer_callback=stays_inside).dump(message)
+        sizes = [buffer.raw().nbytes for buffer in big]
+        fresh = self._reserve(sum(sizes))
+        self._connection.send_bytes(
+            pickle.dumps((stream.getvalue(), sizes, len(self._outgoing or b""), fresh is not None))
+        )
+        if fresh is not None:
+            reduction.send_handle(self._connection, fresh, 0)
+            os.close(fresh)
+        start = 0
+        for buffer, size in zip(big, sizes, strict=True):
+            assert self._outgoing is not None  # noqa: S101 - narrowing: sizes are not empty
+            self._outgoing[start : start + size] = buffer.raw()
+            start += size
+        if big:
+            self._connection.send_bytes(b"filled")
+
+    def receive(self) -> Any:
+        """The next message; blocks.
+
+        Raises:
+            EOFError: the peer is gone.
+        """
+        data, sizes, capacity, is_fresh = pickle.loads(self._connection.recv_bytes())  # noqa: S301 - authenticated peer
+        if is_fresh:
+            handle = reduction.recv_handle(self._connection)
+            self._incoming = mmap.mmap(handle, capacity)
+            os.close(handle)
+        buffers: list[bytearray] = []
+        if sizes:
+            self._connection.recv_bytes()
+            start = 0
+            for size in sizes:
+                assert self._incoming is not None  # noqa: S101 - narrowing: the peer sent it first
+                buffers.append(bytearray(self._incoming[start : start + size]))
+                start += size
+        return _Unpickler(data, buffers, self._clock).load()
+
+    def poll(self, timeout_s: float) -> bool:
+        """Is a message there within `timeout_s`?"""
+        return self._connection.poll(timeout_s)
+
+    def close(self) -> None:
+        """Close the connection; a second call does nothing."""
+        self._connection.close()
+
+    def _reserve(self, size: int) -> int | None:
+        """Make the outgoing memory at least `size` long; the descriptor of a new one, or None."""
+        if size == 0 or (self._outgoing is not None and len(self._outgoing) >= size):
+            return None
+        handle = os.memfd_create("panelwright")
+        os.ftruncate(handle, size)
+        self._outgoing = mmap.mmap(handle, size)
+        return handle

@@ -1,0 +1,320 @@
+"""Objects of another process behind proxies with the same methods.
+
+The service reaches the cell's devices this way, and a driver whose library holds the interpreter lock gets a process
+of its own (`isolate = true` in the cell file). One mechanism for both: a server with one thread a connection, one call
+at a time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import secrets
+import tempfile
+import threading
+from collections.abc import Callable, Mapping
+from multiprocessing.connection import Client, Connection, Listener
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+
+from hal.channel import Channel
+from hal.clock import Clock, Deadline, WallClock
+from hal.errors import CellError, ConfigError, DeviceTimeout, DeviceUnavailable
+
+ANSWER_MARGIN_S = 0.5  # what an answer may take beyond the deadline that went with the call
+CONNECT_TIMEOUT_S = 20.0
+
+
+class HostServer:
+    """Serves objects to other processes until closed.
+
+    Args:
+        objects: by name; their public methods can be called and their plain public attributes read.
+        address: path of a Unix socket.
+        authkey: both sides must know it.
+        clock: whose time deadlines count in on this side.
+    """
+
+    def __init__(self, objects: Mapping[str, object], address: str, authkey: bytes, clock: Clock) -> None:
+        self._objects = objects
+        self._authkey = authkey
+        self._clock = clock
+        self._listener = Listener(address, "AF_UNIX", backlog=64, authkey=authkey)
+        self._is_closed = threading.Event()
+        self._connections: set[Connection] = set()
+        self._thread = threading.Thread(target=self._accept, name="host-accept", daemon=True)
+        self._thread.start()
+
+    @property
+    def address(self) -> str:
+        """Path of the Unix socket."""
+        return str(self._listener.address)
+
+    def close(self) -> None:
+        """Stop serving; running calls are not interrupted. A second call does nothing."""
+        if self._is_closed.is_set():
+            return
+        self._is_closed.set()
+        with contextlib.suppress(OSError, EOFError, multiprocessing.AuthenticationError):
+            Client(self.address, "AF_UNIX", authkey=self._authkey).close()  # wakes `accept`
+        self._thread.join(timeout=1.0)
+        self._listener.close()
+        for connection in list(self._connections):
+            with contextlib.suppress(OSError):
+                connection.close()
+
+    def _accept(self) -> None:
+        while not self._is_closed.is_set():
+            try:
+                connection = self._listener.accept()
+            except (OSError, EOFError, multiprocessing.AuthenticationError):
+                continue
+            threading.Thread(target=self._serve, args=(connection,), name="host-serve", daemon=True).start()
+
+    def _serve(self, connection: Connection) -> None:
+        self._connections.add(connection)
+        channel = Channel(connection, self._clock)
+        try:
+            target = self._objects.get(channel.receive())
+            channel.send(None if target is None else _describe(target))
+            while target is not None and not self._is_closed.is_set():
+                method, args, kwargs = channel.receive()
+                channel.send(_answer(target, method, args, kwargs))
+        except (EOFError, OSError):
+            pass  # the client went away; its calls go with it
+        finally:
+            self._connections.discard(connection)
+            channel.close()
+
+
+def _describe(target: object) -> tuple[frozenset[str], dict[str, Any]]:
+    """Names of the public methods, and values of the public attributes that never change (`name`, `kind`)."""
+    names = [name for name in dir(target) if not name.startswith("_")]
+    methods = frozenset(name for name in names if callable(getattr(target, name)))
+    constants: dict[str, Any] = {name: getattr(target, name) for name in ("name", "kind") if name in names}
+    return methods, constants
+
+
+def _answer(target: object, method: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[str, Any]:
+    try:
+        return "value", getattr(target, method)(*args, **kwargs)
+    except CellError as error:
+        return "error", error
+    except Exception as error:  # a defect on this side must reach the caller, not end the server
+        return "defect", f"{type(error).__name__}: {error}"
+
+
+class Proxy:
+    """Stands for an object of another process. Threads may share it; their calls queue."""
+
+    def __init__(self, address: str, authkey: bytes, name: str, clock: Clock) -> None:
+        self._address = address
+        self._authkey = authkey
+        self._name = name
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._channel: Channel | None = None
+        self._methods, self._constants = self._open()
+
+    def __getattr__(self, attribute: str) -> Any:
+        if attribute.startswith("_"):
+            raise AttributeError(attribute)
+        if attribute in self._constants:
+            return self._constants[attribute]
+        if attribute in self._methods:
+            return lambda *args, **kwargs: self._call(attribute, args, kwargs)
+        raise AttributeError(f"{self._name} has no {attribute!r}")
+
+    def disconnect(self) -> None:
+        """Close this proxy's own connection; the far object lives on."""
+        with self._lock:
+            self._drop()
+
+    def _open(self) -> tuple[frozenset[str], dict[str, Any]]:
+        try:
+            self._channel = Channel(Client(self._address, "AF_UNIX", authkey=self._authkey), self._clock)
+            self._channel.send(self._name)
+            described = self._channel.receive()
+        except (OSError, EOFError, multiprocessing.AuthenticationError) as error:
+            self._drop()
+            raise self._lost(error) from error
+        if described is None:
+            raise DeviceUnavailable(
+                f"the host has no object called {self._name!r}",
+                hint="check the names in the cell file",
+                device=self._name,
+            )
+        methods, constants = described
+        return methods, constants
+
+    def _call(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        deadline = kwargs.get("deadline")
+        with self._lock:
+            if self._channel is None:
+                self._open()
+            assert self._channel is not None  # noqa: S101 - narrowing: `_open` made it or raised
+            try:
+                self._channel.send((method, args, kwargs))
+                if isinstance(deadline, Deadline) and not self._channel.poll(deadline.remaining_s() + ANSWER_MARGIN_S):
+                    self._drop()  # a late answer must never be taken for the next one
+                    raise DeviceTimeout(
+                        f"{self._name}.{method} did not answer before its deadline",
+                        hint="its process may be busy or hung; see `panelwright devices`",
+                        device=self._name,
+                    )
+                outcome, value = self._channel.receive()
+            except (OSError, EOFError) as error:
+                self._drop()
+                raise self._lost(error) from error
+        if outcome == "value":
+            return value
+        if outcome == "error":
+            raise value
+        raise RuntimeError(f"{self._name}.{method} failed in its own process: {value}")
+
+    def _drop(self) -> None:
+        if self._channel is not None:
+            self._channel.close()
+        self._channel = None
+
+    def _lost(self, error: BaseException) -> DeviceUnavailable:
+        return DeviceUnavailable(
+            f"the process that holds {self._name} is gone ({type(error).__name__})",
+            hint="the supervisor restarts it; see `panelwright doctor` and the log",
+            device=self._name,
+        )
+
+
+def serve(
+    objects: Mapping[str, object],
+    address: str | None = None,
+    authkey: bytes | None = None,
+    *,
+    clock: Clock | None = None,
+) -> HostServer:
+    """Serve `objects` on a Unix socket; see `HostServer`."""
+    return HostServer(objects, address or new_address(), authkey or _inherited_key(), clock or WallClock())
+
+
+def connect(address: str, authkey: bytes | None, name: str, *, clock: Clock | None = None) -> Any:
+    """A proxy for the object called `name` behind `address`.
+
+    Raises:
+        DeviceUnavailable: nobody serves there, or has no such object.
+    """
+    return Proxy(address, authkey or _inherited_key(), name, clock or WallClock())
+
+
+def new_address() -> str:
+    """A fresh path for a Unix socket in a folder that only this user can enter."""
+    return str(Path(tempfile.mkdtemp(prefix="panelwright-")) / f"{secrets.token_hex(4)}.sock")
+
+
+def _inherited_key() -> bytes:
+    return bytes(multiprocessing.current_process().authkey)
+
+
+class HostProcess:
+    """A child process that makes objects and serves them; ends with its parent, however that ends.
+
+    Args:
+        make: importable function that makes the objects in the child; raises CellError when it cannot.
+        args: its arguments; they are pickled.
+    """
+
+    def __init__(self, make: Callable[..., Mapping[str, object]], *args: Any, name: str = "host") -> None:
+        self._context = multiprocessing.get_context("spawn")
+        self._lifeline, child_end = self._context.Pipe()
+        self.address = new_address()
+        self._process: BaseProcess = self._context.Process(
+            target=_run_host, args=(make, args, self.address, child_end), name=name, daemon=True
+        )
+        self._process.start()
+        child_end.close()
+        self._await_ready(name)
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the child."""
+        return self._process.pid
+
+    def is_alive(self) -> bool:
+        """Does the child run?"""
+        return self._process.is_alive()
+
+    def proxy(self, name: str) -> Any:
+        """A proxy for the child's object called `name`."""
+        return connect(self.address, None, name)
+
+    def close(self) -> None:
+        """End the child: first politely, then by force. A second call does nothing."""
+        self._lifeline.close()
+        self._process.join(timeout=3.0)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join(timeout=1.0)
+        with contextlib.suppress(OSError):
+            Path(self.address).unlink(missing_ok=True)
+            Path(self.address).parent.rmdir()
+
+    def _await_ready(self, name: str) -> None:
+        error: Exception | None = None
+        try:
+            if not self._lifeline.poll(CONNECT_TIMEOUT_S):
+                error = DeviceTimeout(
+                    f"process {name} was not ready in {CONNECT_TIMEOUT_S:.0f} s",
+                    hint="the machine may be overloaded; see the log",
+                    device=name,
+                )
+            else:
+                error = self._lifeline.recv()
+        except EOFError:
+            error = DeviceUnavailable(f"process {name} died while starting", hint="see the log above", device=name)
+        if error is not None:
+            self.close()
+            raise error
+
+
+def _run_host(
+    make: Callable[..., Mapping[str, object]], args: tuple[Any, ...], address: str, lifeline: Connection
+) -> None:
+    try:
+        objects = make(*args)
+        server = serve(objects, address)
+    except CellError as error:
+        lifeline.send(error)
+        return
+    lifeline.send(None)
+    with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
+        lifeline.recv()  # returns only when the parent closes it or dies
+    server.close()
+    for thing in objects.values():
+        close = getattr(thing, "close", None)
+        if close is not None:
+            with contextlib.suppress(Exception):  # the process ends anyway, and every object gets its turn
+                close()
+    os._exit(0)  # a driver's stuck thread must not keep the process
+
+
+def isolated_device(name: str, driver: str, options: dict[str, Any]) -> HostProcess:
+    """A process that holds one device under its own name; take it with `.proxy(name)`.
+
+    Raises:
+        ConfigError: a simulated driver shares its world with others and cannot be alone.
+    """
+    if driver.startswith("sim:"):
+        raise ConfigError(
+            f"devices.{name}: {driver} cannot be isolated",
+            hint="remove isolate = true; the world already has a process of its own",
+            key=f"devices.{name}.isolate",
+        )
+    return HostProcess(_make_device, name, driver, options, name=f"device-{name}")
+
+
+def _make_device(name: str, driver: str, options: dict[str, Any]) -> Mapping[str, object]:
+    from hal.registry import Context
+    from hal.registry import connect as connect_device
+
+    return {name: connect_device(Context(name=name), driver, options)}

@@ -1,0 +1,119 @@
+"""Objects behind process borders behave like themselves."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from hal.clock import Deadline, WallClock
+from hal.errors import ConfigError, DeviceFault, DeviceTimeout, DeviceUnavailable
+from hal.host import HostProcess, isolated_device
+from hal.readings import Stamped
+
+
+class Calculator:
+    """An object worth a process of its own."""
+
+    name = "calculator"
+
+    def double(self, image: np.ndarray) -> Stamped[np.ndarray]:
+        return Stamped(value=image * 2, host_time_s=1.5, sequence=3)
+
+    def fail(self) -> None:
+        raise DeviceFault("calculator overheats", hint="let it cool", device="calculator")
+
+    def crash(self) -> None:
+        raise ZeroDivisionError("oops")
+
+    def remaining(self, *, deadline: Deadline) -> float:
+        return deadline.remaining_s()
+
+    def hang(self, *, deadline: Deadline) -> None:
+        deadline.clock.sleep(30.0)
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+def make() -> dict[str, object]:
+    return {"calculator": Calculator()}
+
+
+def make_broken() -> dict[str, object]:
+    raise DeviceUnavailable("no such port", hint="plug it in", device="calculator")
+
+
+@pytest.fixture(scope="module")
+def host() -> Iterator[HostProcess]:
+    process = HostProcess(make)
+    yield process
+    process.close()
+
+
+@pytest.mark.parametrize("size", [1, 100, 20_000, 640 * 480, 10])
+def test_arrays_of_any_size_come_back_whole(host: HostProcess, size: int) -> None:
+    image = np.arange(size, dtype=np.uint16)
+    answer = host.proxy("calculator").double(image)
+    assert (answer.host_time_s, answer.sequence) == (1.5, 3)
+    np.testing.assert_array_equal(answer.value, image * 2)
+    answer.value[0] = 7  # a received array is the receiver's own
+
+
+def test_typed_errors_come_back_as_themselves(host: HostProcess) -> None:
+    with pytest.raises(DeviceFault, match="overheats") as caught:
+        host.proxy("calculator").fail()
+    assert caught.value.hint == "let it cool"
+    assert caught.value.details == {"device": "calculator"}
+
+
+def test_a_defect_over_there_is_a_defect_here(host: HostProcess) -> None:
+    proxy = host.proxy("calculator")
+    with pytest.raises(RuntimeError, match="ZeroDivisionError"):
+        proxy.crash()
+    assert proxy.double(np.ones(1)).value[0] == 2.0
+
+
+def test_a_deadline_travels_as_the_time_that_is_left(host: HostProcess) -> None:
+    left = host.proxy("calculator").remaining(deadline=Deadline.after(WallClock(), 5.0))
+    assert 0.0 < left <= 5.0
+
+
+def test_a_hung_object_is_a_timeout_and_the_next_call_is_answered(host: HostProcess) -> None:
+    proxy = host.proxy("calculator")
+    with pytest.raises(DeviceTimeout, match=r"calculator\.hang"):
+        proxy.hang(deadline=Deadline.after(WallClock(), 0.01))
+    assert proxy.double(np.ones(1)).value[0] == 2.0
+
+
+def test_constants_are_known_and_unknown_names_are_not(host: HostProcess) -> None:
+    proxy = host.proxy("calculator")
+    assert proxy.name == "calculator"
+    with pytest.raises(AttributeError, match="fly"):
+        proxy.fly()
+    with pytest.raises(DeviceUnavailable, match="abacus"):
+        host.proxy("abacus")
+
+
+def test_a_killed_host_is_unavailable() -> None:
+    process = HostProcess(make)
+    proxy = process.proxy("calculator")
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    with pytest.raises(DeviceUnavailable, match="calculator"):
+        proxy.double(np.ones(1))
+    process.close()
+    assert not process.is_alive()
+
+
+def test_an_error_while_starting_reaches_the_parent() -> None:
+    with pytest.raises(DeviceUnavailable, match="no such port"):
+        HostProcess(make_broken)
+
+
+def test_a_simulated_device_cannot_be_alone() -> None:
+    with pytest.raises(ConfigError, match="cannot be isolated"):
+        isolated_device("arm", "sim:arm", {})

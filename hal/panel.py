@@ -33,8 +33,8 @@ class Light(Strict):
 class Scale(Strict):
     """How an angle (or a length) shows a value.
 
-    `at_min` and `at_max` are the pointer's places at `minimum` and `maximum`; `table` holds further (place, value) pairs
-    of a scale that is not linear, in rising order of place.
+    `at_min` and `at_max` are the pointer's places at `minimum` and `maximum`; `table` holds further (place, value)
+    pairs of a scale that is not linear, in rising order of place.
     """
 
     minimum: float

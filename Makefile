@@ -1,0 +1,51 @@
+# Everything runs from here. Each target does its own set-up: Python 3.11 is all that a machine needs.
+PYTHON ?= python3.11
+BIN := .venv/bin
+PACKAGES := hal drivers simbackend perception fusion manipulation service benchmarks examples
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+
+.PHONY: help setup demo serve test test-fast lint format bench-cell bench-fusion bench-range bench-vision bench-drivers clean
+
+help:  ## Show this list
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 16
+
+setup: .venv/ready  ## Make .venv with everything in it
+
+.venv/ready: pyproject.toml constraints.txt
+	@command -v $(PYTHON) >/dev/null || { echo "error: $(PYTHON) not found. panelwright needs Python 3.11 (PyBullet has no newer wheels)."; \
+	    echo "  try    install python3.11 and python3.11-venv, or give its path: make PYTHON=/path/to/python3.11"; exit 2; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { echo "error: $(PYTHON) is $$($(PYTHON) --version 2>&1), not 3.11."; \
+	    echo "  try    make PYTHON=/path/to/python3.11"; exit 2; }
+	@echo "setup: making .venv (about 130 packages, 2 GB, a minute or two)"
+	@$(PYTHON) -m venv .venv
+	@$(BIN)/python -m pip install --progress-bar on --quiet -c constraints.txt -e '.[test]' 2>&1 | grep -v '^WARNING' || true
+	@$(BIN)/python -c 'import hal, numpy, cv2, pybullet' || { echo "error: the installation is not complete; the lines above say why"; exit 2; }
+	@touch $@
+	@echo "setup: ready"
+
+demo: setup  ## Run the whole mission on the simulated cell and leave a report in runs/
+	@$(BIN)/panelwright demo
+
+serve: setup  ## Start the service on http://127.0.0.1:8460
+	@$(BIN)/panelwright serve
+
+test: setup  ## Run all tests
+	@$(BIN)/python -m pytest
+
+test-fast: setup  ## Run the tests without missions and browsers
+	@$(BIN)/python -m pytest -m 'not slow'
+
+lint: setup  ## Style, types and layering
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports
+
+format: setup  ## Put the code into shape
+	@$(BIN)/ruff format . && $(BIN)/ruff check --fix .
+
+bench-cell bench-fusion bench-pose bench-range bench-vision bench-drivers: bench-%: setup  ## Measure, pass line beside figure
+	@$(BIN)/python -m benchmarks.$*
+
+clean:  ## Remove what was made
+	rm -rf .venv build runs *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,75 @@
+"""What an operation gets beside its request: the cell, its task, a folder and the memory of the cell."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from hal.geometry import UncertainPose
+from service.connection import CellConnection
+from service.tasks import TaskContext
+
+
+class CellMemory:
+    """What the cell has found out so far. Every access holds one lock; values are replaced, never changed in place."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._facts: dict[str, Any] = {}
+
+    def remember(self, key: str, value: Any) -> None:
+        """Keep `value` under `key` until it is replaced."""
+        with self._lock:
+            self._facts[key] = value
+
+    def recall(self, key: str) -> Any | None:
+        """The newest value under `key`, or None."""
+        with self._lock:
+            return self._facts.get(key)
+
+    def forget(self) -> None:
+        """Drop everything: another panel stands before the cell."""
+        with self._lock:
+            self._facts.clear()
+
+    @property
+    def base_from_panel(self) -> UncertainPose | None:
+        """Where the panel is believed to stand, with covariance; None until it was located."""
+        pose: UncertainPose | None = self.recall("base_from_panel")
+        return pose
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OperationContext:
+    """Handed to every operation. `runs_dir` is where missions leave their reports."""
+
+    connection: CellConnection
+    task: TaskContext
+    runs_dir: Path
+    state: CellMemory = field(default_factory=CellMemory)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Operation:
+    """A verb of the API.
+
+    Attributes:
+        name: path of the verb, e.g. `panel-pose`.
+        request_model: strict model of the body.
+        run: does the work in a worker thread; returns what JSON can hold; raises `CellError`.
+        summary: one line for the API document.
+        example: a body that works on the shipped cell.
+        moves: whether it may move the arm (needs the lease when one is held, and excludes other motion tasks).
+    """
+
+    name: str
+    request_model: type[BaseModel]
+    run: Callable[[OperationContext, Any], BaseModel | dict[str, Any]]
+    summary: str
+    example: dict[str, Any] = field(default_factory=dict)
+    moves: bool = True

@@ -49,7 +49,7 @@ class FrameTree:
         return pose
 
     def pose(self, parent: str, child: str) -> UncertainPose:
-        """`<parent>_from_<child>` for any two frames. Exact when `parent` is base; else links shared by both count twice."""
+        """`<parent>_from_<child>` for any two frames. Links that both share count twice."""
         if parent == BASE:
             return self.base_from(child)
         return compose(self.base_from(parent).inverse(), self.base_from(child))

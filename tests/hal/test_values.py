@@ -1,0 +1,131 @@
+"""Readings, clocks, errors, frames and the registry."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from hal import errors
+from hal.clock import Deadline, PacedClock, ReplayClock, SimClock
+from hal.errors import CellError, ConfigError, DeviceTimeout, InvalidRequest, Retry, StaleReading
+from hal.frames import FrameTree
+from hal.geometry import UncertainPose, certain, identity, transform_rpy
+from hal.readings import Cause, Quality, Stamped
+from hal.registry import Shared, device_factory
+
+
+def test_an_old_reading_is_not_usable() -> None:
+    reading = Stamped(value=1.0, host_time_s=10.0, sequence=1)
+    assert reading.usable(now_s=10.05, max_age_s=0.1, device="tip") == 1.0
+    with pytest.raises(StaleReading, match="tip reading is 0.200 s old"):
+        reading.usable(now_s=10.2, max_age_s=0.1, device="tip")
+
+
+def test_an_invalid_reading_is_not_usable_however_fresh() -> None:
+    reading = Stamped(value=1.0, host_time_s=10.0, sequence=1, quality=Quality.INVALID, cause=Cause.COMM)
+    with pytest.raises(StaleReading, match="comm"):
+        reading.usable(now_s=10.0, max_age_s=0.1, device="tip")
+
+
+def test_a_sim_clock_steps_its_world() -> None:
+    steps: list[float] = []
+    clock = SimClock()
+    clock.attach(lambda duration_s: steps.append(duration_s) or clock.now_s() + duration_s)  # type: ignore[func-returns-value]
+    clock.sleep(0.5)
+    clock.sleep(-1.0)
+    assert steps == [0.5]
+    assert clock.now_s() == 0.5
+
+
+def test_a_paced_clock_steps_its_world_and_waits_for_the_wall() -> None:
+    steps: list[float] = []
+    clock = PacedClock(lambda duration_s: steps.append(duration_s) or 0.0)  # type: ignore[func-returns-value]
+    before = clock.now_s()
+    clock.sleep(0.002)
+    assert steps == [0.002]
+    assert clock.now_s() - before >= 0.002
+
+
+def test_a_replay_clock_never_goes_back() -> None:
+    clock = ReplayClock(start_s=5.0)
+    clock.seek(4.0)
+    assert clock.now_s() == 5.0
+    clock.seek(6.0)
+    assert clock.now_s() == 6.0
+
+
+def test_a_deadline_counts_on_its_own_clock() -> None:
+    clock = SimClock()
+    deadline = Deadline.after(clock, 1.0)
+    clock.sleep(0.75)
+    assert deadline.remaining_s() == pytest.approx(0.25)
+    clock.sleep(1.0)
+    assert deadline.is_past()
+    assert deadline.remaining_s() == 0.0
+
+
+@pytest.mark.parametrize("kind", [e for e in vars(errors).values() if isinstance(e, type) and issubclass(e, CellError)])
+def test_every_error_crosses_a_process_border_whole(kind: type[CellError]) -> None:
+    error = kind("valve stuck", hint="oil it", device="arm")
+    copy = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own bytes
+    assert type(copy) is kind
+    assert (copy.what, copy.hint, copy.details, copy.retry) == ("valve stuck", "oil it", {"device": "arm"}, error.retry)
+
+
+def test_an_error_reads_well_at_3_a_m() -> None:
+    text = DeviceTimeout(
+        "wrist_ft silent for 0.50 s", hint="check power and cable", link="serial /dev/ttyUSB1"
+    ).for_people()
+    assert text == (
+        "DeviceTimeout: wrist_ft silent for 0.50 s\n"
+        "  link   serial /dev/ttyUSB1\n"
+        "  try    check power and cable\n"
+        "  retry  safe"
+    )
+    assert DeviceTimeout("x", hint="y").type_name == "device-timeout"
+    assert DeviceTimeout.retry is Retry.SAFE
+
+
+def test_frames_chain_with_covariance() -> None:
+    tree = FrameTree(links={"flange": ("base", certain(transform_rpy([1.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2])))})
+    tip = UncertainPose(parent_from_child=transform_rpy([0.5, 0.0, 0.0], [0.0, 0.0, 0.0]), covariance=np.eye(6) * 1e-6)
+    tree = tree.with_frame("tip", "flange", tip)
+    np.testing.assert_allclose(tree.base_from("tip").parent_from_child.translation, [1.0, 0.5, 0.0], atol=1e-12)
+    np.testing.assert_allclose(tree.base_from("tip").covariance, np.eye(6) * 1e-6, atol=1e-18)
+    back = tree.pose("tip", "base").parent_from_child * tree.base_from("tip").parent_from_child
+    np.testing.assert_allclose(back.as_matrix(), RigidTransform.identity().as_matrix(), atol=1e-12)
+
+
+def test_a_frame_cannot_hang_on_itself_or_on_nothing() -> None:
+    tree = FrameTree(links={"flange": ("base", certain(identity()))}).with_frame("tip", "flange", certain(identity()))
+    with pytest.raises(InvalidRequest, match="hang on itself"):
+        tree.with_frame("flange", "tip", certain(identity()))
+    with pytest.raises(InvalidRequest, match="no frame called 'nose'"):
+        tree.base_from("nose")
+
+
+def test_an_unknown_driver_names_the_nearest() -> None:
+    with pytest.raises(ConfigError) as caught:
+        device_factory("sim:amr")
+    assert "sim:arm" in caught.value.hint
+
+
+def test_shared_things_are_made_once_and_closed_in_reverse() -> None:
+    closed: list[str] = []
+
+    class Bus:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def close(self) -> None:
+            closed.append(self.name)
+
+    shared = Shared()
+    assert shared.get("a", lambda: Bus("a")) is shared.get("a", lambda: Bus("other"))
+    shared.get("b", lambda: Bus("b"))
+    shared.close()
+    shared.close()
+    assert closed == ["b", "a"]

@@ -130,7 +130,7 @@ def test_a_misspelt_key_deep_in_a_panel_is_named_without_union_tags(cell_path: P
 
 def test_an_object_off_the_plate_is_refused(cell_path: Path) -> None:
     path = edit(cell_path.parent.parent / "panels/tiny.toml", "position_m = [0.0, 0.0]", "position_m = [0.3, 0.0]")
-    with pytest.raises(ConfigError, match="pressure .* lies off the plate"):
+    with pytest.raises(ConfigError, match=r"pressure .* lies off the plate"):
         load_panel(path)
 
 

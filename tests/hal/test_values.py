@@ -20,7 +20,7 @@ from hal.registry import Shared, device_factory
 def test_an_old_reading_is_not_usable() -> None:
     reading = Stamped(value=1.0, host_time_s=10.0, sequence=1)
     assert reading.usable(now_s=10.05, max_age_s=0.1, device="tip") == 1.0
-    with pytest.raises(StaleReading, match="tip reading is 0.200 s old"):
+    with pytest.raises(StaleReading, match=r"tip reading is 0\.200 s old"):
         reading.usable(now_s=10.2, max_age_s=0.1, device="tip")
 
 

@@ -1,0 +1,1 @@
+"""A pose to a deed: kinematics, planning, trajectories, guarded and compliant motion, one file a skill."""

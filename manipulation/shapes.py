@@ -1,0 +1,125 @@
+"""What can touch what: arm and tool as capsules, panel and surroundings as boxes.
+
+A capsule is a segment with a radius. The distance from a point to a box is convex, so along a segment its minimum is found
+by a golden-section search; that makes a whole check of arm against panel a matter of microseconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from hal.geometry import identity, transform_rpy
+from hal.panel import (
+    Button,
+    Handwheel,
+    Lever,
+    Mushroom,
+    Panel,
+    PanelObject,
+    Rotary,
+    Slider,
+    Toggle,
+)
+
+Array = NDArray[np.float64]
+Vector3 = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Capsule:
+    """A capsule fixed to the flange: both ends in flange axes, m."""
+
+    name: str
+    start_m: Vector3
+    end_m: Vector3
+    radius_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Box:
+    """A box: pose of its middle in the parent, and half its edges, m."""
+
+    name: str
+    parent_from_box: RigidTransform
+    half_m: Vector3
+
+    def moved(self, grand_from_parent: RigidTransform) -> Box:
+        """The same box seen from the parent's parent."""
+        return Box(name=self.name, parent_from_box=grand_from_parent * self.parent_from_box, half_m=self.half_m)
+
+
+def panel_boxes(panel: Panel, angles_rad: Mapping[str, float] | None = None) -> tuple[Box, ...]:
+    """Plate and objects of a panel as boxes in the panel frame.
+
+    Args:
+        angles_rad: present angle (clockwise from up) of levers by name; one whose angle is unknown gets the box of its
+            whole sweep.
+    """
+    plate = Box(
+        name="plate",
+        parent_from_box=transform_rpy((0.0, 0.0, -panel.thickness_m / 2), (0.0, 0.0, 0.0)),
+        half_m=(panel.width_m / 2, panel.height_m / 2, panel.thickness_m / 2),
+    )
+    known = angles_rad or {}
+    return (plate, *(envelope(thing, angle_rad=known.get(thing.name)) for thing in panel.objects))
+
+
+def envelope(thing: PanelObject, *, angle_rad: float | None = None) -> Box:
+    """A box in the panel frame that holds the object in any state, or a lever at `angle_rad`."""
+    if isinstance(thing, Lever) and angle_rad is not None:
+        return _bar(thing, angle_rad)
+    half_x, half_y, height = _half_sizes(thing)
+    turn = thing.angle_rad if isinstance(thing, Slider) else 0.0
+    return Box(
+        name=thing.name,
+        parent_from_box=transform_rpy((*thing.position_m, height / 2), (0.0, 0.0, turn)),
+        half_m=(half_x, half_y, height / 2),
+    )
+
+
+def _bar(lever: Lever, angle_rad: float) -> Box:
+    # Hub and bar: from half a width behind the hub to the far end.
+    along = lever.length_m / 2
+    turned = transform_rpy((*lever.position_m, 0.0), (0.0, 0.0, -angle_rad))
+    return Box(
+        name=lever.name,
+        parent_from_box=turned * transform_rpy((0.0, along, lever.height_m / 2), (0.0, 0.0, 0.0)),
+        half_m=(lever.width_m, along + lever.width_m, lever.height_m / 2),
+    )
+
+
+def _half_sizes(thing: PanelObject) -> tuple[float, float, float]:
+    """Half width, half height and full height out of the plate."""
+    match thing:
+        case Lever():
+            reach = thing.length_m + thing.width_m
+            return reach, reach, thing.height_m
+        case Slider():
+            along, across, out = thing.cap_size_m
+            return (thing.travel_m + along) / 2, across / 2, out
+        case Toggle():
+            # The bat swings in the vertical plane.
+            half = thing.bat_length_m * math.sin(thing.tilt_rad) + 2 * thing.bat_radius_m
+            return 2 * thing.bat_radius_m, half, thing.bat_length_m + thing.bat_radius_m
+        case Rotary() | Button() | Mushroom():
+            return thing.radius_m, thing.radius_m, thing.height_m
+        case Handwheel():
+            reach = thing.radius_m + thing.rim_m
+            return reach, reach, thing.height_m + thing.rim_m
+    radius = getattr(thing, "radius_m", None)
+    half_x = radius if radius is not None else getattr(thing, "width_m", 0.02) / 2
+    half_y = radius if radius is not None else getattr(thing, "height_m", 0.02) / 2
+    depth = getattr(thing, "depth_m", 0.0)
+    lamp = getattr(thing, "height_m", 0.0) if thing.kind == "lamp" else 0.0
+    return half_x, half_y, max(depth, lamp, 0.004)
+
+
+def floor_box(z_m: float) -> Box:
+    """The floor as a box whose top lies at `z_m` of the base; it leaves a hole for the arm's own foot to the caller."""
+    return Box(name="floor", parent_from_box=identity() * transform_rpy((0.0, 0.0, z_m - 0.5), (0.0, 0.0, 0.0)), half_m=(3.0, 3.0, 0.5))

@@ -1,0 +1,1 @@
+"""Calibration of camera, hand, range scanner and wrist sensor, each with covariance."""

@@ -1,0 +1,1 @@
+"""Pixels to facts: lights, pose, segmentation, features, matching and reading."""

@@ -1,0 +1,211 @@
+# ruff: noqa: PLR0912, PLR0915, PLR0917 - compiled loops take plain arrays and keep one equation in one place
+"""Compiled three-point poses: the first half of the paper's direct route (Section II-B), and seeds for the refinement.
+
+The code reads from `real_cubic_root` down to `three_point`; conventions as in `quadrangle_core`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perception.vision.quadrangle_jit import jit, product3
+
+
+@jit
+def real_cubic_root(b, c, d):  # type: ignore[no-untyped-def]
+    """The largest real root of x^3 + b x^2 + c x + d (Viete and Cardano, then two Newton steps)."""
+    p = c - b * b / 3.0
+    q = 2.0 * b * b * b / 27.0 - b * c / 3.0 + d
+    disc = q * q / 4.0 + p * p * p / 27.0
+    if disc > 0.0:
+        s = np.sqrt(disc)
+        w = -q / 2.0 + s if q < 0.0 else -q / 2.0 - s
+        w = np.cbrt(w)
+        x = w - p / (3.0 * w) if w != 0.0 else 0.0
+    else:
+        r = np.sqrt(max(-p / 3.0, 0.0))
+        cosine = -q / (2.0 * r * r * r) if r > 0.0 else 1.0
+        x = 2.0 * r * np.cos(np.arccos(min(1.0, max(-1.0, cosine))) / 3.0)
+    x -= b / 3.0
+    for _ in range(2):
+        slope = (3.0 * x + 2.0 * b) * x + c
+        if slope != 0.0:
+            x -= (((x + b) * x + c) * x + d) / slope
+    return x
+
+
+@jit
+def cofactors(M):  # type: ignore[no-untyped-def]
+    """Adjugate of a symmetric 3x3 matrix."""
+    B = np.empty((3, 3))
+    B[0, 0] = M[1, 1] * M[2, 2] - M[1, 2] * M[1, 2]
+    B[1, 1] = M[0, 0] * M[2, 2] - M[0, 2] * M[0, 2]
+    B[2, 2] = M[0, 0] * M[1, 1] - M[0, 1] * M[0, 1]
+    B[0, 1] = B[1, 0] = M[0, 2] * M[1, 2] - M[0, 1] * M[2, 2]
+    B[0, 2] = B[2, 0] = M[0, 1] * M[1, 2] - M[0, 2] * M[1, 1]
+    B[1, 2] = B[2, 1] = M[0, 1] * M[0, 2] - M[1, 2] * M[0, 0]
+    return B
+
+
+@jit
+def triad(p0, p1, p2):  # type: ignore[no-untyped-def]
+    """Orthonormal frame (columns) of three points: along p1 - p0, in their plane, normal to it."""
+    a = p1 - p0
+    a = a / np.sqrt(np.sum(a * a))
+    n = np.cross(a, p2 - p0)
+    n = n / np.sqrt(np.sum(n * n))
+    b = np.cross(n, a)
+    F = np.empty((3, 3))
+    F[:, 0] = a
+    F[:, 1] = b
+    F[:, 2] = n
+    return F
+
+
+@jit
+def refine_depths(s, d2, cosines):  # type: ignore[no-untyped-def]
+    """Newton on the three law-of-cosines equations; leaves s where it does not help."""
+    for _ in range(3):
+        e0 = s[1] * s[1] + s[2] * s[2] - 2.0 * s[1] * s[2] * cosines[0] - d2[0]
+        e1 = s[0] * s[0] + s[2] * s[2] - 2.0 * s[0] * s[2] * cosines[1] - d2[1]
+        e2 = s[0] * s[0] + s[1] * s[1] - 2.0 * s[0] * s[1] * cosines[2] - d2[2]
+        # Jacobian rows / 2: (0, a, b), (c, 0, d), (e, f, 0)
+        a = s[1] - s[2] * cosines[0]
+        b = s[2] - s[1] * cosines[0]
+        c = s[0] - s[2] * cosines[1]
+        d = s[2] - s[0] * cosines[1]
+        e = s[0] - s[1] * cosines[2]
+        f = s[1] - s[0] * cosines[2]
+        det = a * d * e + b * c * f
+        if abs(det) < 1e-9 * d2[0] ** 1.5:
+            return
+        r0, r1, r2 = 0.5 * e0, 0.5 * e1, 0.5 * e2
+        x0 = (-d * f * r0 + b * f * r1 + a * d * r2) / det
+        x1 = (d * e * r0 - b * e * r1 + b * c * r2) / det
+        x2 = (c * f * r0 + a * e * r1 - a * c * r2) / det
+        s[0] -= x0
+        s[1] -= x1
+        s[2] -= x2
+
+
+@jit
+def three_point(P, f, Rs, ts):  # type: ignore[no-untyped-def]
+    """Poses that carry three points (3, 3) onto three unit rays (3, 3); fills Rs, ts (4 of them), returns how many.
+
+    The depths s solve three law-of-cosines equations. Two combinations without constant term are conics in s; the pencil
+    of both holds a pair of lines (a cubic), each of which meets a conic twice. Where noise makes a crossing complex its
+    real part is kept: close to a double root the truth is there.
+    Source: Grunert 1841; the pencil of conics as in Finsterwalder, see Haralick et al., IJCV 13(3), 1994, Section 2.
+    """
+    d2 = np.empty(3)
+    cosines = np.empty(3)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        d2[k] = np.sum((P[i] - P[j]) ** 2)
+        cosines[k] = f[i, 0] * f[j, 0] + f[i, 1] * f[j, 1] + f[i, 2] * f[j, 2]
+    # Conics D1 = d2[1] M0 - d2[0] M1 and D2 = d2[2] M0 - d2[0] M2, with M_k the form of equation k.
+    scale = 1.0 / d2[0]
+    r1, r2 = d2[1] * scale, d2[2] * scale
+    D1 = np.zeros((3, 3))
+    D2 = np.zeros((3, 3))
+    D1[0, 0] = -1.0
+    D1[1, 1] = r1
+    D1[2, 2] = r1 - 1.0
+    D1[1, 2] = D1[2, 1] = -r1 * cosines[0]
+    D1[0, 2] = D1[2, 0] = cosines[1]
+    D2[0, 0] = -1.0
+    D2[1, 1] = r2 - 1.0
+    D2[2, 2] = r2
+    D2[1, 2] = D2[2, 1] = -r2 * cosines[0]
+    D2[0, 1] = D2[1, 0] = cosines[2]
+    C1, C2 = cofactors(D1), cofactors(D2)
+    c3 = c2 = c1 = c0 = 0.0
+    for i in range(3):
+        c3 += D2[0, i] * C2[0, i]
+        c0 += D1[0, i] * C1[0, i]
+        for j in range(3):
+            c2 += D1[i, j] * C2[i, j]
+            c1 += D2[i, j] * C1[i, j]
+    # det(D1 + g D2) = c3 g^3 + c2 g^2 + c1 g + c0; solved for 1/g when that is better conditioned.
+    if abs(c3) >= abs(c0):
+        if c3 == 0.0:
+            return 0
+        D = D1 + real_cubic_root(c2 / c3, c1 / c3, c0 / c3) * D2
+    else:
+        D = D2 + real_cubic_root(c1 / c0, c2 / c0, c3 / c0) * D1
+    B = cofactors(D)
+    # A pair of lines l m^T + m l^T: -adj(D) = p p^T with p their crossing; D + [p]x has rank one.
+    k = 0
+    for i in range(1, 3):
+        if abs(B[i, i]) > abs(B[k, k]):
+            k = i
+    beta = np.sqrt(max(-B[k, k], 0.0))
+    p = B[:, k] / beta if beta > 0.0 else np.zeros(3)
+    E = D.copy()
+    E[0, 1] += p[2]
+    E[0, 2] -= p[1]
+    E[1, 0] -= p[2]
+    E[1, 2] += p[0]
+    E[2, 0] += p[1]
+    E[2, 1] -= p[0]
+    bi, bj = 0, 0
+    for i in range(3):
+        for j in range(3):
+            if abs(E[i, j]) > abs(E[bi, bj]):
+                bi, bj = i, j
+    lines = np.empty((2, 3))
+    lines[0] = E[bi, :]
+    lines[1] = E[:, bj]
+    count = 0
+    for side in range(2):
+        line = lines[side]
+        k = 0
+        for i in range(1, 3):
+            if abs(line[i]) > abs(line[k]):
+                k = i
+        if line[k] == 0.0:
+            continue
+        i, j = (k + 1) % 3, (k + 2) % 3
+        # s_k = -(l_i s_i + l_j s_j) / l_k into D1: q2 x^2 + q1 x + q0 = 0 for x = s_i / s_j
+        e, h = -line[i] / line[k], -line[j] / line[k]
+        q2 = D1[i, i] + 2.0 * e * D1[i, k] + e * e * D1[k, k]
+        q1 = 2.0 * (D1[i, j] + h * D1[i, k] + e * D1[j, k] + e * h * D1[k, k])
+        q0 = D1[j, j] + 2.0 * h * D1[j, k] + h * h * D1[k, k]
+        root = np.sqrt(max(q1 * q1 - 4.0 * q2 * q0, 0.0))
+        w = -0.5 * (q1 + root) if q1 >= 0.0 else -0.5 * (q1 - root)
+        for branch in range(2):
+            s = np.empty(3)
+            if branch == 0:
+                s[i], s[j] = w, q2
+            else:
+                s[i], s[j] = q0, w
+            s[k] = e * s[i] + h * s[j]
+            if s[0] + s[1] + s[2] < 0.0:
+                s = -s
+            if not (s[0] > 0.0 and s[1] > 0.0 and s[2] > 0.0):
+                continue
+            total = 0.0
+            for n in range(3):
+                a, b = (n + 1) % 3, (n + 2) % 3
+                total += s[a] * s[a] + s[b] * s[b] - 2.0 * s[a] * s[b] * cosines[n]
+            if not total > 0.0:
+                continue
+            s = s * np.sqrt((d2[0] + d2[1] + d2[2]) / total)
+            refined = s.copy()
+            refine_depths(refined, d2, cosines)
+            if refined[0] > 0.0 and refined[1] > 0.0 and refined[2] > 0.0 and np.isfinite(refined[0]):
+                s = refined
+            Q = np.empty((3, 3))
+            for n in range(3):
+                Q[n] = s[n] * f[n]
+            R = product3(triad(Q[0], Q[1], Q[2]), triad(P[0], P[1], P[2]).T)
+            if not np.isfinite(R[0, 0]):
+                continue
+            Rs[count] = R
+            for a in range(3):
+                t = 0.0
+                for n in range(3):
+                    t += Q[n, a] - R[a, 0] * P[n, 0] - R[a, 1] * P[n, 1] - R[a, 2] * P[n, 2]
+                ts[count, a] = t / 3.0
+            count += 1
+    return count

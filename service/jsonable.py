@@ -18,7 +18,7 @@ MAX_ARRAY = 4096  # longer arrays belong into artefacts; JSON gets their shape
 
 
 def jsonable(value: Any) -> Any:
-    """Plain JSON for dataclasses, models, enums, arrays and poses; NaN and infinity become null (JSON has no word for them)."""
+    """Plain JSON for dataclasses, models, enums, arrays and poses; NaN and infinity become null."""
     if value is None or isinstance(value, str | bool | int):
         return value.value if isinstance(value, Enum) else value
     if isinstance(value, float | np.floating):
@@ -38,7 +38,7 @@ def _array(value: np.ndarray[Any, Any]) -> Any:
     return jsonable(value.tolist())
 
 
-def _object(value: Any) -> Any:  # noqa: PLR0911 - one return a kind of thing
+def _object(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return _array(value)
     if isinstance(value, RigidTransform):

@@ -1,0 +1,236 @@
+"""The cell: devices, emulators, clock and control thread. A process of its own, or inline for tests."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import logging
+import pickle
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hal.clock import Clock, PacedClock, SimClock, WallClock
+from hal.config import Cell, DeviceSection, load_cell
+from hal.devices import DeviceKind
+from hal.errors import CellError, ConfigError, DeviceUnavailable
+from hal.registry import Context, Shared, emulator_factory
+from hal.registry import connect as connect_device
+from service.child import Lifeline, kill_own_group
+from service.connection import CLOCK, MOVER, PREFIX
+from service.latch import Beat, Latch
+from service.motion import start_controller
+
+BEAT_S = 0.05
+CLOSE_TIMEOUT_S = 4.0
+log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class CellRuntime:
+    """A running cell. `objects` maps names to what is served: devices, the mover and the clock."""
+
+    cell: Cell
+    clock: Clock
+    objects: Mapping[str, Any]
+    _closers: list[Callable[[], None]] = field(default_factory=list)
+
+    @classmethod
+    def start(cls, cell: Cell, *, is_latched: Callable[[], bool]) -> CellRuntime:
+        """Start emulators, connect all devices at once, then start the control thread.
+
+        Args:
+            is_latched: read by the control thread each tick.
+
+        Raises:
+            CellError: what could not be connected, all of it in one error; everything else is closed again.
+        """
+        clock = clock_for(cell)
+        shared = Shared()
+        closers: list[Callable[[], None]] = [shared.close]
+        try:
+            addresses = _start_emulators(cell, clock, shared, closers)
+            devices = _connect_all(cell, clock, shared, addresses, closers)
+            objects: dict[str, Any] = {**devices, PREFIX + CLOCK: clock}
+            if cell.names_of(DeviceKind.ARM):
+                controller = start_controller(cell, devices, clock=clock, is_latched=is_latched)
+                closers.append(controller.close)
+                objects[PREFIX + MOVER] = controller
+        except BaseException:
+            _close_all(closers)
+            raise
+        return cls(cell=cell, clock=clock, objects=objects, _closers=closers)
+
+    def close(self) -> None:
+        """Stop the arm, then close devices, emulators and world; one that fails holds up nobody. Idempotent."""
+        closers, self._closers = self._closers, []
+        _close_all(closers)
+
+
+def clock_for(cell: Cell) -> Clock:
+    """The clock of the cell's mode: simulated, wall, or wall beside a simulated world."""
+    clocks: dict[str, Callable[[], Clock]] = {"sim": SimClock, "mixed": PacedClock, "real": WallClock}
+    return clocks[cell.file.cell.mode]()
+
+
+def _start_emulators(
+    cell: Cell, clock: Clock, shared: Shared, closers: list[Callable[[], None]]
+) -> dict[str, dict[str, Any]]:
+    """Start the far side of each emulated wire; returns the options that make each device find its own."""
+    addresses: dict[str, dict[str, Any]] = {}
+    for name, section in cell.file.emulators.items():
+        key = f"emulators.{name}"
+        context = Context(name=name, clock=clock, cell=cell, shared=shared)
+        backing = connect_device(context, section.driver, section.options, key=key)
+        closers.append(backing.close)
+        try:
+            emulator = emulator_factory(section.emulator)(backing, section.emulator_options)
+        except ConfigError as error:
+            raise ConfigError(f"{cell.path}: {key}: {error.what}", hint=error.hint, **error.details) from error
+        closers.append(emulator.close)
+        addresses[name] = emulator.address
+    return addresses
+
+
+def _connect_all(
+    cell: Cell,
+    clock: Clock,
+    shared: Shared,
+    addresses: Mapping[str, Mapping[str, Any]],
+    closers: list[Callable[[], None]],
+) -> dict[str, Any]:
+    def connect(name: str, section: DeviceSection) -> Any:
+        context = Context(name=name, clock=clock, cell=cell, shared=shared)
+        return connect_device(context, section.driver, {**section.options, **addresses.get(name, {})})
+
+    sections = cell.file.devices
+    with ThreadPoolExecutor(len(sections), thread_name_prefix="connect") as pool:
+        waiting = {name: pool.submit(connect, name, section) for name, section in sections.items()}
+    failed: dict[str, CellError] = {}
+    devices: dict[str, Any] = {}
+    for name, future in waiting.items():
+        error = future.exception()
+        if error is None:
+            devices[name] = future.result()
+            closers.append(devices[name].close)
+        elif isinstance(error, CellError):
+            failed[name] = error
+        else:
+            text = f"its driver failed: {type(error).__name__}: {error}"
+            failed[name] = DeviceUnavailable(text, hint="report it to the driver's author", device=name)
+            log.error("devices.%s", name, exc_info=error)
+    if failed:
+        raise gathered(failed, total=len(sections), cell=cell)
+    return devices
+
+
+def gathered(failed: Mapping[str, CellError], *, total: int, cell: Cell) -> CellError:
+    """One error for all devices that did not connect; a single one stays itself."""
+    errors = list(failed.values())
+    if len(errors) == 1:
+        return errors[0]
+    is_config = all(isinstance(error, ConfigError) for error in errors)
+    kind: type[CellError] = ConfigError if is_config else DeviceUnavailable
+    return kind(
+        f"{len(errors)} of the {total} devices in {cell.path} did not connect",
+        hint="mend each; `panelwright doctor` tries them again",
+        **{name: f"{error.what} (try: {error.hint})" for name, error in failed.items()},
+    )
+
+
+def _close_all(closers: Iterable[Callable[[], None]]) -> None:
+    for close in list(closers)[::-1]:
+        try:
+            close()
+        except Exception:  # each thing gets its turn, whatever the one before did
+            log.exception("closing the cell")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CellOrder:
+    """What the supervisor tells a new cell process, over a pipe that nobody else reads."""
+
+    cell_path: str
+    seed: int | None
+    latch_path: str
+    beat_path: str
+    address: str
+    authkey: str
+
+    def to_line(self) -> str:
+        """One line of JSON."""
+        return json.dumps({name: getattr(self, name) for name in self.__slots__})
+
+    @classmethod
+    def from_line(cls, line: str) -> CellOrder:
+        """The inverse of `to_line`."""
+        return cls(**json.loads(line))
+
+
+def error_to_line(error: CellError) -> str:
+    """An error on its way to the supervisor."""
+    return "error " + base64.b64encode(pickle.dumps(error)).decode()
+
+
+def error_from_line(line: str) -> CellError:
+    """The inverse of `error_to_line`; only for lines of our own child."""
+    error: CellError = pickle.loads(base64.b64decode(line.removeprefix("error ")))  # noqa: S301 - our own child
+    return error
+
+
+def main() -> None:
+    """Entry point of the cell process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the supervisor's business; the pipe tells when it ends
+    logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="cell: %(levelname)s %(name)s: %(message)s")
+    lifeline = Lifeline()
+    order = CellOrder.from_line(lifeline.read_line() or "{}")
+    beat = Beat(Path(order.beat_path))
+    _in_background(lambda: _beat(beat))
+    with Latch(Path(order.latch_path)) as latch:
+        is_orphan = threading.Event()
+        _in_background(lambda: _end_with_parent(lifeline, is_orphan))
+        try:
+            _run(order, lifeline, lambda: is_orphan.is_set() or latch.is_set(), is_orphan)
+        except CellError as error:
+            lifeline.write_line(error_to_line(error))
+    kill_own_group()
+
+
+def _run(order: CellOrder, lifeline: Lifeline, is_latched: Callable[[], bool], end: threading.Event) -> None:
+    from hal.host import serve
+
+    runtime = CellRuntime.start(load_cell(Path(order.cell_path), seed=order.seed), is_latched=is_latched)
+    server = serve(runtime.objects, order.address, bytes.fromhex(order.authkey), clock=runtime.clock)
+    lifeline.write_line("ready")
+    end.wait()
+    runtime.close()
+    with contextlib.suppress(OSError):
+        server.close()
+
+
+def _end_with_parent(lifeline: Lifeline, is_orphan: threading.Event) -> None:
+    lifeline.wait_for_end()
+    is_orphan.set()  # the control thread sees it at its next tick and stops the arm
+    threading.Event().wait(CLOSE_TIMEOUT_S)
+    kill_own_group()  # a driver that hangs in `close` must not keep the process
+
+
+def _beat(beat: Beat) -> None:
+    pause = threading.Event()
+    while True:
+        beat.beat()
+        pause.wait(BEAT_S)
+
+
+def _in_background(work: Callable[[], None]) -> None:
+    threading.Thread(target=work, daemon=True).start()
+
+
+if __name__ == "__main__":
+    main()

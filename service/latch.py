@@ -1,0 +1,131 @@
+"""The stop latch: one byte of shared memory that the control thread reads each tick and the stop process writes.
+
+Nothing here imports more than the standard library: the stop process must start fast and stay small.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+SIZE = 128
+CLEAR = 0x5A  # every other byte, zeroed memory too, means latched: damage must not start an arm
+LATCHED = 0x01
+SEQUENCE = struct.Struct("<Q")
+BODY = struct.Struct("<BQd80s")  # flag, count, wall time, source
+BODY_AT = SEQUENCE.size
+TRIES = 100
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LatchState:
+    """What the latch says. `count` rises with each change; `time_s` is wall time, for people."""
+
+    is_latched: bool
+    count: int
+    time_s: float
+    source: str
+
+
+UNREADABLE = LatchState(is_latched=True, count=0, time_s=0.0, source="latch not readable")
+
+
+class Latch:
+    """A mapped latch file. One process writes; any number reads without a lock.
+
+    A sequence counter guards the record (a seqlock): odd while it is being written, different when it changed
+    meanwhile. The flag alone is one byte, so `is_set` needs no retry.
+    """
+
+    def __init__(self, path: Path) -> None:
+        with path.open("r+b") as file:
+            self._memory = mmap.mmap(file.fileno(), SIZE)
+
+    @classmethod
+    def create(cls, path: Path) -> Latch:
+        """Make the file; it starts latched."""
+        path.write_bytes(b"\0" * SIZE)
+        latch = cls(path)
+        latch.set("start: latched until an explicit reset")
+        return latch
+
+    def __enter__(self) -> Latch:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def is_set(self) -> bool:
+        """Is the stop latched? A closed or damaged latch counts as latched."""
+        try:
+            return self._memory[BODY_AT] != CLEAR
+        except ValueError:
+            return True
+
+    def state(self) -> LatchState:
+        """The whole record; latched when no consistent one can be read."""
+        for _ in range(TRIES):
+            try:
+                (before,) = SEQUENCE.unpack_from(self._memory, 0)
+                flag, count, time_s, source = BODY.unpack_from(self._memory, BODY_AT)
+                (after,) = SEQUENCE.unpack_from(self._memory, 0)
+            except ValueError:
+                break
+            if before == after and before % 2 == 0:
+                text = source.rstrip(b"\0").decode("utf-8", "replace")
+                return LatchState(is_latched=flag != CLEAR, count=count, time_s=time_s, source=text)
+        return UNREADABLE
+
+    def set(self, source: str) -> LatchState:
+        """Latch the stop. Always succeeds, also when it is latched already."""
+        return self._write(LATCHED, source)
+
+    def reset(self, source: str, *, seen_count: int) -> bool:
+        """Clear the latch, if nobody stopped again since the caller saw `seen_count`; tells whether it is clear."""
+        if self.state().count != seen_count:
+            return False
+        self._write(CLEAR, source)
+        return True
+
+    def close(self) -> None:
+        """Unmap; a second call does nothing."""
+        self._memory.close()
+
+    def _write(self, flag: int, source: str) -> LatchState:
+        if flag == LATCHED:
+            self._memory[BODY_AT] = LATCHED  # first of all: the control thread may look right now
+        (sequence,) = SEQUENCE.unpack_from(self._memory, 0)
+        sequence += 1 + sequence % 2  # odd, also after a writer died in the middle
+        SEQUENCE.pack_into(self._memory, 0, sequence)
+        _, count, _, _ = BODY.unpack_from(self._memory, BODY_AT)
+        text = source.encode("utf-8", "replace")[:80]
+        BODY.pack_into(self._memory, BODY_AT, flag, count + 1, time.time(), text)
+        SEQUENCE.pack_into(self._memory, 0, sequence + 1)
+        return self.state()
+
+
+class Beat:
+    """A sign of life in shared memory: one process writes its monotonic time, another looks how old it is."""
+
+    def __init__(self, path: Path) -> None:
+        if not path.exists():
+            path.write_bytes(b"\0" * 8)
+        with path.open("r+b") as file:
+            self._memory = mmap.mmap(file.fileno(), 8)
+
+    def beat(self) -> None:
+        """I live."""
+        struct.pack_into("<d", self._memory, 0, time.monotonic())
+
+    def age_s(self) -> float:
+        """Seconds since the last beat; both processes share the machine's monotonic clock."""
+        (at_s,) = struct.unpack_from("<d", self._memory, 0)
+        return time.monotonic() - float(at_s)
+
+    def close(self) -> None:
+        """Unmap; a second call does nothing."""
+        self._memory.close()

@@ -1,0 +1,169 @@
+"""Looking: images and range scans together with where the sensor stood."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.calibration import CameraIntrinsics
+from hal.clock import Deadline, WallClock
+from hal.config import Cell
+from hal.devices import DeviceKind, RangeScannerCapabilities
+from hal.errors import ConfigError, StaleReading
+from hal.frames import frame_tree
+from hal.geometry import UncertainPose
+from hal.motion import Hold, MotionOutcome
+from hal.readings import Cause, Stamped
+from service.operations.session import Session
+
+READ_S = 5.0  # wall seconds for one device call; a software renderer on a busy machine takes up to 0.5 s
+SETTLE_S = 0.06  # lamps and arm come to rest
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Look:
+    """One image: uint8 pixels, (H, W) or (H, W, 3), and where the camera stood."""
+
+    pixels: NDArray[np.uint8]
+    stamp_s: float
+    camera: str
+    intrinsics: CameraIntrinsics
+    base_from_camera: UncertainPose
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LightPair:
+    """The same view with the border lights off and on."""
+
+    off: Look
+    on: Look
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scan:
+    """One range image (float32 metres, NaN where nothing) and where the scanner stood."""
+
+    depth_m: NDArray[np.float32]
+    stamp_s: float
+    scanner: str
+    capabilities: RangeScannerCapabilities
+    base_from_scanner: UncertainPose
+
+
+def only_device(session: Session, kind: DeviceKind, name: str | None = None) -> tuple[str, Any]:
+    """The device of a kind: the named one, or the first in the cell file.
+
+    Raises:
+        ConfigError: the cell has none.
+        InvalidRequest: no device of that name.
+    """
+    if name is not None:
+        return name, session.connection.device(name)
+    devices = session.connection.devices_of(kind)
+    if not devices:
+        cell = session.connection.cell
+        raise ConfigError(
+            f"cell {cell.name!r} has no {kind}", hint=f"add a device of kind {kind} to {cell.path}", file=str(cell.path)
+        )
+    return next(iter(devices.items()))
+
+
+def deadline(duration_s: float = READ_S) -> Deadline:
+    """A deadline for one device call of this process."""
+    return Deadline.after(WallClock(), duration_s)
+
+
+def settle(session: Session, duration_s: float = SETTLE_S) -> None:
+    """Stand still until lamps and arm are at rest."""
+    session.run(Hold(name="settle", duration_s=duration_s), expect=(MotionOutcome.COMPLETED,))
+
+
+def look(session: Session, camera: str | None = None) -> Look:
+    """One image from where the arm stands now; the arm must be at rest.
+
+    Raises:
+        StaleReading: the camera repeats an old frame.
+        DeviceError: the camera does not deliver.
+    """
+    name, device = only_device(session, DeviceKind.CAMERA, camera)
+    sample = device.read_image(deadline=deadline())
+    pixels = sample.usable(now_s=session.connection.clock.now_s(), max_age_s=1.0, device=name).pixels
+    _refuse_frozen(session, name, sample, pixels)
+    record = session.connection.cell.calibration_of(name)
+    if record.intrinsics is None:
+        raise ConfigError(
+            f"calibration of {name} has no [intrinsics]", hint=f"run `panelwright calibrate {name}`", device=name
+        )
+    return Look(
+        pixels=pixels,
+        stamp_s=sample.host_time_s,
+        camera=name,
+        intrinsics=record.intrinsics.intrinsics(),
+        base_from_camera=base_from(session, name),
+    )
+
+
+def look_with_lights(session: Session) -> LightPair:
+    """The panel with its border lights off, then on; they are off again afterwards."""
+    name, lights = only_device(session, DeviceKind.LIGHTS)
+    channels = len(lights.capabilities().channels)
+    wait_s = max(SETTLE_S, lights.capabilities().settle_s)
+    _switch(session, name, lights, (False,) * channels, wait_s)
+    off = look(session)
+    _switch(session, name, lights, (True,) * channels, wait_s)
+    try:
+        on = look(session)
+    finally:
+        lights.set_on((False,) * channels, deadline=deadline())
+    return LightPair(off=off, on=on)
+
+
+def scan(session: Session) -> Scan:
+    """One range image from where the arm stands now; the arm must be at rest."""
+    name, device = only_device(session, DeviceKind.RANGE_SCANNER)
+    sample = device.read_range(deadline=deadline())
+    depth_m = sample.usable(now_s=session.connection.clock.now_s(), max_age_s=1.0, device=name).depth_m
+    _refuse_frozen(session, name, sample, depth_m)
+    return Scan(
+        depth_m=depth_m,
+        stamp_s=sample.host_time_s,
+        scanner=name,
+        capabilities=device.capabilities(),
+        base_from_scanner=base_from(session, name),
+    )
+
+
+def base_from(session: Session, device: str) -> UncertainPose:
+    """Where a mounted device stands now, with the covariance of its calibration."""
+    cell: Cell = session.connection.cell
+    return frame_tree(cell, session.connection.mover.state().base_from_flange).base_from(device)
+
+
+def _switch(session: Session, name: str, lights: Any, on: tuple[bool, ...], wait_s: float) -> None:
+    lights.set_on(on, deadline=deadline())
+    settle(session, wait_s)
+    feedback = lights.read_on(deadline=deadline())
+    seen = feedback.usable(now_s=session.connection.clock.now_s(), max_age_s=1.0, device=name)
+    if tuple(seen) != on:
+        dead = [channel for channel, a, b in zip(lights.capabilities().channels, seen, on, strict=True) if a != b]
+        raise StaleReading(
+            f"{name}: {', '.join(dead)} did not follow the command", hint="check lamp, fuse and wiring", device=name
+        )
+
+
+def _refuse_frozen(session: Session, name: str, sample: Stamped[Any], array: NDArray[Any]) -> None:
+    """Two frames of a live sensor are never equal to the last bit: its noise sees to that."""
+    digest = hashlib.blake2b(np.ascontiguousarray(array).tobytes(), digest_size=16).digest()
+    previous = session.memory.recall(f"frame.{name}")
+    session.memory.remember(f"frame.{name}", (sample.host_time_s, digest))
+    if previous is not None and previous[1] == digest and previous[0] != sample.host_time_s:
+        raise StaleReading(
+            f"{name} repeats the same frame under a new stamp",
+            hint="the camera is frozen: power-cycle it; nothing was measured with the old frame",
+            device=name,
+            cause=str(Cause.FROZEN),
+        )

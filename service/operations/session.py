@@ -1,0 +1,135 @@
+"""What all operations share while they run: the cell, what is known of it, and a hand on its motion port."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+
+from hal.config import Cell
+from hal.errors import DeviceFault, InvalidRequest, MotionError, NotFound, Stopped
+from hal.geometry import UncertainPose
+from hal.motion import DeclaredMotion, MotionOutcome, MotionReport, Mover
+from hal.panel import Panel
+from service.connection import CellConnection
+from service.operations.context import CellMemory, OperationContext
+from service.report.record import MissionRecord
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Session:
+    """One running operation.
+
+    Attributes:
+        record: where a mission keeps what happens; None outside missions.
+        span: the part of the task's progress that is this operation's, from 0 to 1.
+    """
+
+    context: OperationContext
+    record: MissionRecord | None = None
+    span: tuple[float, float] = (0.0, 1.0)
+    observers: tuple[Callable[[MotionReport], None], ...] = field(default=())
+
+    @property
+    def connection(self) -> CellConnection:
+        """The started cell."""
+        return self.context.connection
+
+    @property
+    def cell(self) -> Cell:
+        """The cell file with everything it points to."""
+        return self.context.connection.cell
+
+    @property
+    def panel(self) -> Panel:
+        """The panel file."""
+        return self.context.connection.cell.panel
+
+    @property
+    def mover(self) -> Mover:
+        """The motion port; `run` is the usual way to it."""
+        return self.context.connection.mover
+
+    @property
+    def memory(self) -> CellMemory:
+        """What the cell has found out so far."""
+        return self.context.state
+
+    def progress(self, fraction: float, step: str, detail: str = "") -> None:
+        """Tell watchers how far this operation is (0 to 1).
+
+        Raises:
+            Cancelled: the task was cancelled.
+        """
+        low, high = self.span
+        self.context.task.progress(low + fraction * (high - low), step, detail)
+
+    def part(self, low: float, high: float) -> Session:
+        """The same session for a part of the work."""
+        a, b = self.span
+        return Session(
+            context=self.context,
+            record=self.record,
+            span=(a + low * (b - a), a + high * (b - a)),
+            observers=self.observers,
+        )
+
+    def run(
+        self, motion: DeclaredMotion, *, expect: Collection[MotionOutcome] = (MotionOutcome.COMPLETED,)
+    ) -> MotionReport:
+        """Execute a declared motion and keep its report.
+
+        Raises:
+            Stopped, DeviceFault, MotionError: it ended in none of the expected ways.
+            Cancelled: the task was cancelled meanwhile.
+        """
+        self.context.task.check_cancelled()
+        report = self.mover.execute(motion)
+        self.note(report)
+        if report.outcome not in expect:
+            raise self._failure(report)
+        return report
+
+    def note(self, report: MotionReport) -> None:
+        """Keep the report of a motion that somebody else executed."""
+        if self.record is not None:
+            self.record.motions.append(report)
+        for observe in self.observers:
+            observe(report)
+
+    def known_panel(self) -> UncertainPose:
+        """Where the panel is believed to stand.
+
+        Raises:
+            NotFound: nobody has located it yet.
+        """
+        pose = self.memory.base_from_panel
+        if pose is None:
+            raise NotFound("the panel has not been located yet", hint="POST /v1/panel-pose first, or send a pose along")
+        return pose
+
+    def _failure(self, report: MotionReport) -> Exception:
+        self.context.task.check_cancelled()
+        what = f"motion {report.name!r} ended as {report.outcome}: {report.cause}"
+        match report.outcome:
+            case MotionOutcome.STOPPED:
+                return Stopped(what, hint="reset the stop (POST /v1/stop/reset), then command again")
+            case MotionOutcome.FAULT:
+                return DeviceFault(what, hint="see the named device in GET /v1/devices", motion=report.name)
+            case MotionOutcome.CANCELLED:
+                return MotionError(what, hint="start the task again when ready", motion=report.name)
+        return MotionError(what, hint="look at the wrench plot of the report", motion=report.name)
+
+
+def panel_object_or_all(panel: Panel, names: Collection[str] | None) -> tuple[str, ...]:
+    """The asked objects in the order of the panel file; all of them for None.
+
+    Raises:
+        InvalidRequest: an unknown name, with the nearest known one.
+    """
+    if names is None:
+        return tuple(thing.name for thing in panel.objects)
+    for name in names:
+        panel.object(name)
+    if not names:
+        raise InvalidRequest("no objects were named", hint="leave `objects` out to mean all of them")
+    return tuple(thing.name for thing in panel.objects if thing.name in names)

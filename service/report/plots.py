@@ -1,0 +1,120 @@
+"""The report's drawings: differences, ranges, wrenches and joints as PNG bytes."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+
+from hal.motion import MotionReport
+
+Pixels = NDArray[np.uint8]
+INK, SOFT = "#1c2733", "#5a6b7b"
+MAX_PLOT_POINTS = 4000
+
+
+def png_of(pixels: Pixels) -> bytes:
+    """(H, W) gray or (H, W, 3) RGB, uint8, as PNG."""
+    stream = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def lights_picture(image_off: Pixels, image_on: Pixels, centres_px: NDArray[Any], names: Sequence[str]) -> bytes:
+    """On, off, and their difference with the four lights ringed."""
+    figure = Figure(figsize=(10.5, 3.1), dpi=100, layout="constrained")
+    panes = figure.subplots(1, 3)
+    difference = image_on.astype(int) - image_off.astype(int)
+    if difference.ndim == 3:
+        difference = difference.mean(axis=2).astype(int)
+    for pane, pixels, title in zip(
+        panes,
+        (image_off, image_on, np.clip(difference, 0, 255)),
+        ("lights off", "lights on", "on minus off"),
+        strict=True,
+    ):
+        pane.imshow(pixels, cmap="gray", vmin=0, vmax=255)
+        pane.set_title(title, fontsize=9, color=INK)
+        pane.set_axis_off()
+    for (u, v), name in zip(centres_px, names, strict=True):
+        panes[2].plot(u, v, "o", ms=12, mfc="none", mec="#ff9f1c")
+        panes[2].annotate(
+            name, (u, v), xytext=(0, 10), textcoords="offset points", color="#ff9f1c", fontsize=6, ha="center"
+        )
+    return _png(figure)
+
+
+def range_picture(depth_m: NDArray[Any], residual_m: NDArray[Any]) -> bytes:
+    """The range image and its distance from the fitted plane."""
+    figure = Figure(figsize=(10.5, 4.2), dpi=100, layout="constrained")
+    left, right = figure.subplots(1, 2)
+    shown = left.imshow(depth_m, cmap="viridis")
+    left.set_title("range, m", fontsize=9, color=INK)
+    figure.colorbar(shown, ax=left, shrink=0.85)
+    shown = right.imshow(1e3 * residual_m, cmap="coolwarm", vmin=-40, vmax=40)
+    right.set_title("in front of the fitted panel plane (blue), mm", fontsize=9, color=INK)
+    figure.colorbar(shown, ax=right, shrink=0.85)
+    for pane in (left, right):
+        pane.set_axis_off()
+    return _png(figure)
+
+
+def wrench_picture(motions: Sequence[MotionReport]) -> bytes:
+    """Contact force and torque over the whole mission, with the names of the motions that pushed."""
+    figure = Figure(figsize=(10.5, 4.2), dpi=100, layout="constrained")
+    force, torque = figure.subplots(2, 1, sharex=True)
+    times, wrench = _joined(motions, lambda m: m.log.wrench)
+    for k, axis in enumerate("xyz"):
+        force.plot(times, wrench[:, k], lw=0.8, label=axis)
+        torque.plot(times, wrench[:, 3 + k], lw=0.8, label=axis)
+    for motion in motions:
+        if motion.peak_force_n > 6.0:
+            force.annotate(motion.name, (motion.started_s, motion.peak_force_n), fontsize=6, color=SOFT, rotation=30)
+    force.set_ylabel("contact force, N")
+    torque.set_ylabel("torque, N m")
+    torque.set_xlabel("s on the cell's clock")
+    force.legend(ncols=3, fontsize=7, frameon=False, loc="upper left")
+    return _finished(figure, (force, torque))
+
+
+def joints_picture(motions: Sequence[MotionReport]) -> bytes:
+    """Joint angles over the whole mission."""
+    figure = Figure(figsize=(10.5, 3.4), dpi=100, layout="constrained")
+    pane = figure.subplots()
+    times, joints = _joined(motions, lambda m: m.log.positions_rad)
+    for k in range(joints.shape[1]):
+        pane.plot(times, joints[:, k], lw=0.9, label=f"joint {k + 1}")
+    pane.set_ylabel("rad")
+    pane.set_xlabel("s on the cell's clock")
+    pane.legend(ncols=6, fontsize=7, frameon=False)
+    return _finished(figure, (pane,))
+
+
+def _joined(motions: Sequence[MotionReport], pick: Any) -> tuple[NDArray[Any], NDArray[Any]]:
+    pieces = [(m.log.times_s, pick(m)) for m in motions if len(m.log.times_s)]
+    if not pieces:
+        return np.zeros(1), np.zeros((1, 6))
+    times = np.concatenate([t for t, _ in pieces])
+    values = np.concatenate([v for _, v in pieces])
+    keep = slice(None, None, max(1, len(times) // MAX_PLOT_POINTS))
+    return times[keep], values[keep]
+
+
+def _finished(figure: Figure, panes: Sequence[Any]) -> bytes:
+    for pane in panes:
+        pane.spines[["top", "right"]].set_visible(False)
+        pane.tick_params(labelsize=8)
+        pane.grid(alpha=0.25)
+    return _png(figure)
+
+
+def _png(figure: Figure) -> bytes:
+    stream = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(stream)  # type: ignore[no-untyped-call]  # matplotlib types it not
+    return stream.getvalue()

@@ -1,0 +1,148 @@
+"""The record of a mission while it runs: facts only, in the order in which they became known."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from hal.errors import CellError
+from hal.motion import MotionReport
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """One step of the mission with its times: on the wall and on the cell's clock."""
+
+    name: str
+    wall_s: float
+    cell_s: float
+    ok: bool
+    detail: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reading:
+    """What one object said at one look."""
+
+    name: str
+    kind: str
+    present: bool
+    shows: str
+    value: float | None
+    unit: str
+    uncertainty: float | None
+    state: str | None
+    text: str | None
+    confidence: float
+    reason: str | None
+    when: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Action:
+    """One deed: what was asked, what the skill says, what a second look says."""
+
+    object: str
+    skill: str
+    target: str
+    outcome: str
+    detail: str
+    before: str
+    after: str
+    confirmed: bool
+    attempts: int
+    peak_force_n: float
+    cell_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Picture:
+    """An image of the report, PNG."""
+
+    name: str
+    title: str
+    png: bytes
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class MissionRecord:
+    """Grows while the mission runs; one thread writes it.
+
+    Attributes:
+        now_s: the cell's clock.
+        facts: named results (poses, fusion, planes) as plain JSON values.
+    """
+
+    mission: str
+    cell: str
+    panel: str
+    mode: str
+    seed: int
+    now_s: Callable[[], float]
+    started_wall: float = field(default_factory=time.time)
+    started_mono_s: float = field(default_factory=time.monotonic)
+    steps: list[Step] = field(default_factory=list)
+    readings: list[Reading] = field(default_factory=list)
+    actions: list[Action] = field(default_factory=list)
+    pictures: list[Picture] = field(default_factory=list)
+    motions: list[MotionReport] = field(default_factory=list)
+    facts: dict[str, Any] = field(default_factory=dict)
+    problem: dict[str, Any] | None = None
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Time one step; a step that fails is recorded too."""
+        wall_s, cell_s = time.monotonic(), self.now_s()
+        ok, detail = False, ""
+        try:
+            yield
+            ok = True
+        except CellError as error:
+            detail = error.what
+            raise
+        finally:
+            self.steps.append(
+                Step(
+                    name=name,
+                    wall_s=time.monotonic() - wall_s,
+                    cell_s=self._now_or(cell_s) - cell_s,
+                    ok=ok,
+                    detail=detail,
+                )
+            )
+
+    @property
+    def succeeded(self) -> bool:
+        """Every action confirmed and nothing failed."""
+        return self.problem is None and bool(self.actions) and all(action.confirmed for action in self.actions)
+
+    def summary(self) -> dict[str, Any]:
+        """The contents of `report.json`, without the pictures."""
+        return {
+            "schema": 1,
+            "mission": self.mission,
+            "cell": self.cell,
+            "panel": self.panel,
+            "mode": self.mode,
+            "seed": self.seed,
+            "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self.started_wall)),
+            "succeeded": self.succeeded,
+            "wall_s": sum(step.wall_s for step in self.steps),
+            "cell_s": sum(step.cell_s for step in self.steps),
+            "peak_force_n": max((motion.peak_force_n for motion in self.motions), default=0.0),
+            "steps": self.steps,
+            "readings": self.readings,
+            "actions": self.actions,
+            **self.facts,
+            "pictures": [f"{picture.name}.png" for picture in self.pictures],
+            "problem": self.problem,
+        }
+
+    def _now_or(self, fallback_s: float) -> float:
+        try:
+            return self.now_s()
+        except CellError:
+            return fallback_s  # the cell died in this step; the step's own error tells

@@ -1,0 +1,47 @@
+"""Writes a mission's folder: `report.json`, `report.html` and the pictures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from service.jsonable import jsonable
+from service.report.record import MissionRecord
+
+TEMPLATES = Path(__file__).parent
+
+
+def write_report(record: MissionRecord, folder: Path) -> Path:
+    """Write everything into `folder` (made if need be); returns the path of `report.html`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for picture in record.pictures:
+        (folder / f"{picture.name}.png").write_bytes(picture.png)
+    summary: dict[str, Any] = jsonable(record.summary())
+    write_json(folder, summary)
+    titles = {f"{picture.name}.png": picture.title for picture in record.pictures}
+    (folder / "titles.json").write_text(json.dumps(titles), encoding="utf-8")
+    return render(folder)
+
+
+def write_json(folder: Path, summary: dict[str, Any]) -> None:
+    """Replace `report.json` in one step, so that a reader never sees half of it."""
+    part = folder / "report.json.part"
+    part.write_text(json.dumps(summary, indent=1, allow_nan=False), encoding="utf-8")
+    part.replace(folder / "report.json")
+
+
+def render(folder: Path) -> Path:
+    """Make `report.html` from the folder's `report.json` (again, after the judge has added to it)."""
+    summary = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    titles = json.loads((folder / "titles.json").read_text(encoding="utf-8"))
+    environment = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined)
+    environment.filters["mm"] = lambda metres: f"{1e3 * metres:.2f}"
+    environment.filters["deg"] = lambda radians: f"{57.29577951308232 * radians:.3f}"
+    environment.filters["seconds"] = lambda s: f"{s:.2f}"
+    html = environment.get_template("report.html.jinja").render(r=summary, titles=titles)
+    path = folder / "report.html"
+    path.write_text(html, encoding="utf-8")
+    return path

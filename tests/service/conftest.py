@@ -1,0 +1,97 @@
+"""A cell of fakes: real processes, real sockets, no physics."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+FAKES = Path(__file__).parent / "fakes"
+PANEL = """
+schema = 1
+name = "fake"
+width_m = 0.6
+height_m = 0.4
+lights = [
+  { name = "a", position_m = [-0.28, 0.18, 0.0] },
+  { name = "b", position_m = [0.28, 0.18, 0.0] },
+  { name = "c", position_m = [0.28, -0.18, 0.0] },
+  { name = "d", position_m = [-0.28, -0.18, 0.0] },
+]
+[[objects]]
+kind = "lamp"
+name = "pump_lamp"
+position_m = [0.0, 0.0]
+radius_m = 0.01
+"""
+MOUNT = """
+schema = 1
+device = "{name}"
+date = "2026-11-20"
+method = "drawing"
+mount = {{ position_m = [0.0, 0.0, 0.05], rpy_rad = [0.0, 0.0, 0.0] }}
+load = {{ mass_kg = 0.0, centre_of_mass_m = [0.0, 0.0, 0.0] }}
+"""
+SENSORS = {
+    "wrist_camera": "camera",
+    "range_scanner": "range_scanner",
+    "finger_proximity": "proximity",
+    "panel_lights": "lights",
+}
+ROBOT = {"arm": "arm", "gripper": "gripper", "finger_touch": "touch", "wrist_ft": "force_torque"}
+MOUNTED = {"wrist_camera", "range_scanner", "finger_proximity", "wrist_ft"}
+
+WriteCell = Callable[..., Path]
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _fakes_are_installed() -> Iterator[None]:
+    """Put the fakes where entry points are looked up, here and in child processes."""
+    before = os.environ.get("PYTHONPATH")
+    paths = [str(FAKES), str(Path(__file__).parents[2]), *([before] if before else [])]
+    os.environ["PYTHONPATH"] = os.pathsep.join(paths)
+    sys.path.insert(0, str(FAKES))
+    yield
+    sys.path.remove(str(FAKES))
+    if before is None:
+        del os.environ["PYTHONPATH"]
+    else:
+        os.environ["PYTHONPATH"] = before
+
+
+@pytest.fixture
+def write_cell(tmp_path: Path) -> WriteCell:
+    """Writes a cell file of fakes: `write_cell(robot=True, options={"panel_lights": {...}}, mode="sim")`."""
+
+    def write(
+        *, robot: bool = False, options: dict[str, dict[str, object]] | None = None, mode: str = "sim", extra: str = ""
+    ) -> Path:
+        (tmp_path / "panel.toml").write_text(PANEL)
+        (tmp_path / "calibrations").mkdir(exist_ok=True)
+        lines = [
+            "schema = 1",
+            f'[cell]\nname = "fake"\nmode = "{mode}"\npanel = "panel.toml"\ncalibrations = "calibrations"\nseed = 3',
+            "[workspace]\npanel_position_m = [0.6, 0.0, 0.5]\npanel_rpy_rad = [0.0, -1.57, 0.0]",
+            "park_rad = [0.0, -1.2, 1.6, 0.0, 0.8, 0.0]",
+        ]
+        for name, kind in {**SENSORS, **(ROBOT if robot else {})}.items():
+            lines.append(f'[devices.{name}]\nkind = "{kind}"\ndriver = "fake:{kind}"')
+            given = (options or {}).get(name, {})
+            lines.append("options = { " + ", ".join(f"{k} = {_toml(v)}" for k, v in given.items()) + " }")
+            if name in MOUNTED:
+                lines.append(f'mount = {{ parent = "flange", calibration = "{name}" }}')
+                (tmp_path / "calibrations" / f"{name}.toml").write_text(MOUNT.format(name=name))
+        path = tmp_path / "cell.toml"
+        path.write_text("\n".join([*lines, extra]))
+        return path
+
+    return write
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value) if not isinstance(value, str) else f'"{value}"'

@@ -134,18 +134,18 @@ def least_clearance(
                 span = ends[i, 1] - ends[i, 0]
                 apart = centre - middles[j]
                 bound = np.sqrt(np.dot(apart, apart)) - reach - 0.5 * np.sqrt(np.dot(span, span)) - radii[i]
-                if bound >= enough:
+                if bound >= min(least, enough):
                     least = min(least, bound)
                     continue
                 gap = segment_box(ends[i, 0], ends[i, 1], rotations[j], middles[j], halves[j]) - radii[i]
                 least = min(least, gap)
-                if least < enough:
+                if least < enough < np.inf:
                     return least
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
         gap = segment_segment(ends[i, 0], ends[i, 1], ends[j, 0], ends[j, 1]) - radii[i] - radii[j]
         least = min(least, gap)
-        if least < enough:
+        if least < enough < np.inf:
             return least
     return least
 

@@ -1,0 +1,160 @@
+"""Cartesian paths: lines, arcs and sequences of poses, each from rest to rest with ramped speed.
+
+A step of the speed alone makes more than 8 N of tool inertia at 60 mm/s, which looks like contact; so every path begins and
+ends with a ramp.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from hal.geometry import difference, interpolate
+from hal.motion import CartesianPath, Compliance, Guard
+
+Array = NDArray[np.float64]
+
+RAMP_M_PER_S2 = 0.5  # a 0.9 kg tool pushes 0.5 N at this acceleration, far below any contact threshold
+TURN_ARM_M = 0.10  # a turn of 1 rad counts as this much way when a path is timed
+SAMPLE_S = 0.02
+
+
+def line(
+    start: RigidTransform,
+    end: RigidTransform,
+    *,
+    name: str,
+    speed_m_per_s: float,
+    flange_from_tool: RigidTransform,
+    guards: tuple[Guard, ...] = (),
+    compliance: Compliance | None = None,
+    ramp_m_per_s2: float = RAMP_M_PER_S2,
+) -> CartesianPath:
+    """A straight move with constant turn between two tool poses in the base frame."""
+    way = _way(start, end)
+    return along(
+        lambda s: interpolate(start, end, s / way if way > 0 else 1.0),
+        way,
+        name=name,
+        speed_m_per_s=speed_m_per_s,
+        flange_from_tool=flange_from_tool,
+        guards=guards,
+        compliance=compliance,
+        ramp_m_per_s2=ramp_m_per_s2,
+    )
+
+
+def through(
+    poses: Sequence[RigidTransform],
+    *,
+    name: str,
+    speed_m_per_s: float,
+    flange_from_tool: RigidTransform,
+    guards: tuple[Guard, ...] = (),
+    compliance: Compliance | None = None,
+    slow_last_m: float = 0.0,
+    slow_ratio: float = 0.3,
+) -> CartesianPath:
+    """A path through dense poses; over the last `slow_last_m` the speed is `slow_ratio` of the rest."""
+    marks = np.concatenate([[0.0], np.cumsum([_way(a, b) for a, b in zip(poses, poses[1:], strict=False)])])
+
+    def pose_at(s: float) -> RigidTransform:
+        k = int(np.clip(np.searchsorted(marks, s, side="right") - 1, 0, len(poses) - 2))
+        span = marks[k + 1] - marks[k]
+        return interpolate(poses[k], poses[k + 1], (s - marks[k]) / span if span > 0 else 1.0)
+
+    return along(
+        pose_at,
+        float(marks[-1]),
+        name=name,
+        speed_m_per_s=speed_m_per_s,
+        flange_from_tool=flange_from_tool,
+        guards=guards,
+        compliance=compliance,
+        slow_last_m=slow_last_m,
+        slow_ratio=slow_ratio,
+    )
+
+
+def along(
+    pose_at: Callable[[float], RigidTransform],
+    way_m: float,
+    *,
+    name: str,
+    speed_m_per_s: float,
+    flange_from_tool: RigidTransform,
+    guards: tuple[Guard, ...] = (),
+    compliance: Compliance | None = None,
+    ramp_m_per_s2: float = RAMP_M_PER_S2,
+    slow_last_m: float = 0.0,
+    slow_ratio: float = 0.3,
+) -> CartesianPath:
+    """Sample `pose_at(s)`, s from 0 to `way_m`, in time with a trapezoid of speed."""
+    times, places = ramped(
+        way_m, speed_m_per_s, ramp_m_per_s2=ramp_m_per_s2, slow_last_m=slow_last_m, slow_ratio=slow_ratio
+    )
+    return CartesianPath(
+        name=name,
+        flange_from_tool=flange_from_tool,
+        times_s=times,
+        base_from_tool=tuple(pose_at(float(s)) for s in places),
+        guards=guards,
+        compliance=compliance,
+    )
+
+
+def ramped(
+    way_m: float,
+    speed_m_per_s: float,
+    *,
+    ramp_m_per_s2: float = RAMP_M_PER_S2,
+    slow_last_m: float = 0.0,
+    slow_ratio: float = 0.3,
+) -> tuple[Array, Array]:
+    """Times (N,) s and places (N,) m of a move from rest to rest: ramp, cruise, an optional slow end, ramp.
+
+    v(s) = min(v_max, sqrt(2 a s), sqrt(2 a (way - s))), and near the slow part sqrt(v_slow^2 + 2 a (s_slow - s)).
+    """
+    if way_m <= 0.0:
+        return np.array([0.0, SAMPLE_S]), np.array([0.0, 0.0])
+    s = way_m * 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, 401)))  # dense at both ends, where the speed changes
+    v = np.minimum(speed_m_per_s, np.sqrt(2.0 * ramp_m_per_s2 * np.minimum(s, way_m - s)))
+    if slow_last_m > 0.0:
+        to_slow = np.maximum(0.0, way_m - slow_last_m - s)
+        v = np.minimum(v, np.sqrt((slow_ratio * speed_m_per_s) ** 2 + 2.0 * ramp_m_per_s2 * to_slow))
+    # Between samples the speed changes evenly with time: dt = 2 ds / (v0 + v1).
+    t = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(s) / np.maximum(v[1:] + v[:-1], 1e-9))])
+    count = max(3, int(np.ceil(t[-1] / SAMPLE_S)) + 1)
+    times = np.linspace(0.0, t[-1], count)
+    return times, np.interp(times, t, s)
+
+
+def arc(
+    start: RigidTransform, *, centre_m: ArrayLike, axis: ArrayLike, angle_rad: float, step_rad: float = 0.03
+) -> tuple[RigidTransform, ...]:
+    """Poses from `start` turned rigidly about a line in the base frame, in even steps; both ends included."""
+    centre = np.asarray(centre_m, float)
+    unit = np.asarray(axis, float) / np.linalg.norm(axis)
+    count = max(2, int(np.ceil(abs(angle_rad) / step_rad)) + 1)
+    return tuple(turned_about(start, centre, unit, float(a)) for a in np.linspace(0.0, angle_rad, count))
+
+
+def turned_about(pose: RigidTransform, centre_m: Array, unit_axis: Array, angle_rad: float) -> RigidTransform:
+    """The pose turned by `angle_rad` about the line through `centre_m`, all in the base frame."""
+    turn = Rotation.from_rotvec(angle_rad * unit_axis)
+    return RigidTransform.from_components(
+        centre_m + turn.apply(pose.translation - centre_m), turn * pose.rotation
+    )
+
+
+def shifted(pose: RigidTransform, offset_m: ArrayLike) -> RigidTransform:
+    """The pose moved by an offset given in its own axes."""
+    return pose * RigidTransform.from_translation(np.asarray(offset_m, float))
+
+
+def _way(start: RigidTransform, end: RigidTransform) -> float:
+    moved = difference(end, start)
+    return float(max(np.linalg.norm(moved[:3]), TURN_ARM_M * np.linalg.norm(moved[3:])))

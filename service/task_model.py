@@ -184,7 +184,7 @@ class Task:
 
     def _why(self) -> str:
         if self.problem is not None:
-            return str(self.problem["title"])
+            return str(self.problem["detail"])
         return self.cancel_reason if self.cancel_asked.is_set() else ""
 
     def _tell(self) -> None:

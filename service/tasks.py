@@ -15,6 +15,7 @@ from typing import Any, Protocol
 from hal.errors import Cancelled, CellError, InvalidRequest
 from service.errors import Aborted, Busy, Defect, NoSuchTask, NotPossibleNow
 from service.jsonable import jsonable
+from service.problem import problem_of
 from service.task_model import Artefact, Task, TaskEvent, TaskState
 
 __all__ = ["Artefact", "Recorder", "Task", "TaskContext", "TaskEvent", "TaskState", "TaskStore"]
@@ -319,14 +320,3 @@ class TaskStore:
     def _changed(self, task: Task) -> None:
         for listener in list(self._listeners):
             listener(task)
-
-
-def problem_of(error: CellError) -> dict[str, Any]:
-    """The error as plain values: type, what, hint, retry and details."""
-    return {
-        "type": error.type_name,
-        "title": error.what,
-        "hint": error.hint,
-        "retry": str(error.retry),
-        "details": jsonable(error.details),
-    }

@@ -1,0 +1,177 @@
+"""The service without its front: processes, journal, lease, tasks and memory of one cell, joined."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from hal.config import Cell
+from hal.errors import CellError, InvalidRequest, Stopped
+from service.gate import GatedConnection
+from service.journal import Journal
+from service.lease import LeaseDesk
+from service.operations.context import CellMemory, Operation, OperationContext
+from service.supervisor import Supervisor
+from service.task_model import Artefact, Task, TaskState
+from service.tasks import TaskContext, TaskStore
+
+RESTORED_TASKS = 100
+LEASE_LOOK_S = 0.05
+log = logging.getLogger(__name__)
+
+
+class Service:
+    """Everything behind the HTTP front.
+
+    Args:
+        cell: the cell to run.
+        operations: the verbs.
+        runs_dir: missions leave their reports here; tasks and journal live in `runs_dir/.service`.
+        stop_listener, origins, inline: see `Supervisor`.
+    """
+
+    def __init__(
+        self,
+        cell: Cell,
+        operations: Mapping[str, Operation],
+        *,
+        runs_dir: Path,
+        stop_listener: socket.socket | None = None,
+        origins: tuple[str, ...] = (),
+        inline: bool = False,
+    ) -> None:
+        self.cell = cell
+        self.operations = operations
+        self.runs_dir = runs_dir
+        self.memory = CellMemory()
+        self.started_s = time.monotonic()
+        state_dir = runs_dir / ".service"
+        self.journal = Journal(state_dir / "journal.sqlite")
+        self.supervisor = Supervisor(
+            cell, stop_listener=stop_listener, origins=origins, inline=inline, report=self._note
+        )
+        self.tasks = TaskStore(state_dir / "tasks", recorder=self.journal, stop_motion=self._stop_motion)
+        self.lease = LeaseDesk(ttl_s=cell.file.safety.lease_ttl_s, on_loss=self.tasks.cancel_moving, report=self._note)
+        self._is_closing = threading.Event()
+        self._restore_tasks()
+
+    def start(self) -> None:
+        """Start the cell and wait until it is ready.
+
+        Raises:
+            CellError: it could not start.
+        """
+        self._note("service-start", {"cell": self.cell.name, "mode": self.cell.file.cell.mode})
+        threading.Thread(target=self._watch_lease, name="watch-lease", daemon=True).start()
+        self.supervisor.start()
+
+    def submit(self, verb: str, request: BaseModel, *, lease_token: str | None = None, key: str | None = None) -> Task:
+        """Start the operation `verb` as a task.
+
+        Raises:
+            InvalidRequest: no such verb.
+            LeaseError: another client holds the cell.
+            Stopped: it would move, and the stop is latched.
+            DeviceUnavailable: the cell is not up.
+            Busy, JournalError: it could not be accepted.
+        """
+        operation = self.operations.get(verb)
+        if operation is None:
+            raise InvalidRequest(f"there is no verb {verb!r}", hint=f"verbs: {', '.join(self.operations)}")
+        holder = self.lease.check(lease_token) if operation.moves else None
+        self._check_cell()
+        if operation.moves and self.supervisor.latch.is_set():
+            raise stopped(self.supervisor.latch.state().source)
+
+        def work(task: TaskContext) -> Any:
+            return operation.run(
+                OperationContext(
+                    connection=GatedConnection(self.supervisor.connection, task.check_cancelled),
+                    task=task,
+                    runs_dir=self.runs_dir,
+                    state=self.memory,
+                ),
+                request,
+            )
+
+        plain = request.model_dump(mode="json")
+        return self.tasks.start(verb, plain, work, moves=operation.moves, holder=holder, key=key)
+
+    def close(self) -> None:
+        """Stop the arm, end tasks and processes, close the journal. Bounded and idempotent."""
+        if self._is_closing.is_set():
+            return
+        self._is_closing.set()
+        self.stop_quietly("the service ends")
+        self.tasks.close()
+        self.supervisor.close()
+        self._note("service-end", {})
+        self.journal.close()
+
+    def stop_quietly(self, source: str) -> None:
+        """Latch the stop and never fail; for the way out."""
+        try:
+            self.supervisor.stop(source)
+        except Exception:  # whatever it was, the way out goes on
+            log.exception("latching the stop")
+
+    def _check_cell(self) -> None:
+        if self.supervisor.is_ready:
+            return
+        if self.supervisor.problem is not None:
+            raise self.supervisor.problem
+        from hal.errors import DeviceUnavailable
+
+        raise DeviceUnavailable("the cell is starting", hint="GET /readyz tells when it is up", device="cell")
+
+    def _stop_motion(self) -> None:
+        if self.supervisor.is_ready:
+            self.supervisor.connection.mover.cancel()
+
+    def _watch_lease(self) -> None:
+        while not self._is_closing.wait(LEASE_LOOK_S):
+            self.lease.expire()
+
+    def _note(self, kind: str, data: dict[str, Any]) -> None:
+        try:
+            self.journal.note(kind, data)
+        except CellError as error:
+            log.error("not recorded: %s %s: %s", kind, data, error)
+
+    def _restore_tasks(self) -> None:
+        """Take up the tasks of earlier runs from the journal."""
+        tasks: dict[str, Task] = {}
+        records = self.journal.records(kinds=("task-queued", "task-ended"), limit=2 * RESTORED_TASKS)
+        for record in records:
+            data = record.data
+            if record.kind == "task-queued":
+                tasks[data["task"]] = Task(
+                    id=data["task"],
+                    verb=data["verb"],
+                    request=data["request"],
+                    moves=True,
+                    holder=data["holder"],
+                    created_s=record.wall_time_s,
+                )
+            elif data["task"] in tasks:
+                task = tasks[data["task"]]
+                task.state = TaskState(data["state"])
+                task.result, task.problem = data["result"], data["problem"]
+                task.artefacts = [Artefact(**item) for item in data["artefacts"]]
+                task.ended_s = record.wall_time_s
+        for task in tasks.values():
+            self.tasks.restore(task)
+
+
+def stopped(source: str) -> Stopped:
+    """The refusal of a motion while the stop is latched."""
+    return Stopped(
+        f"the software stop is latched ({source})", hint="look at the cell, then POST /v1/stop/reset and command again"
+    )

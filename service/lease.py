@@ -1,0 +1,157 @@
+"""The lease: who may move the arm. One holder, an epoch that rises with each grant, a time to live."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from hal.clock import Clock, WallClock
+from hal.errors import LeaseError
+from service.errors import StaleEpoch
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Grant:
+    """A lease as its holder got it. Only the holder knows `token`."""
+
+    holder: str
+    epoch: int
+    token: str
+    ttl_s: float
+    remaining_s: float
+
+
+class LeaseDesk:
+    """Grants, renews, checks and ends the lease. Time is monotonic; the wall clock decides nothing.
+
+    Args:
+        ttl_s: without a heartbeat for so long, the lease lapses.
+        on_loss: called with a reason when a holder lost the lease by lapse or take-over; stops what it started.
+        report: told about each grant, take-over, release and lapse.
+    """
+
+    def __init__(
+        self,
+        *,
+        ttl_s: float,
+        clock: Clock | None = None,
+        on_loss: Callable[[str], None] = lambda _reason: None,
+        report: Callable[[str, dict[str, Any]], None] = lambda _kind, _data: None,
+    ) -> None:
+        self.ttl_s = ttl_s
+        self._clock = clock or WallClock()
+        self._on_loss = on_loss
+        self._report = report
+        self._lock = threading.RLock()
+        self._epoch = 0
+        self._holder: str | None = None
+        self._token = ""
+        self._ends_s = 0.0
+
+    def acquire(self, holder: str) -> Grant:
+        """Take the free lease.
+
+        Raises:
+            LeaseError: somebody holds it; `details["holder"]` says who.
+        """
+        self.expire()
+        with self._lock:
+            if self._holder is not None:
+                raise LeaseError(
+                    f"{self._holder} holds the cell",
+                    hint="wait for its release, or take over on purpose: POST /v1/lease/take-over",
+                    holder=self._holder,
+                    epoch=self._epoch,
+                )
+            return self._grant(holder, "lease-acquired")
+
+    def take_over(self, holder: str) -> Grant:
+        """Take the lease from whoever holds it; what that one started is stopped."""
+        self.expire()
+        with self._lock:
+            before = self._holder
+            grant = self._grant(holder, "lease-taken-over")
+        if before is not None:
+            self._on_loss(f"{holder} took the lease over from {before}")
+        return grant
+
+    def heartbeat(self, token: str) -> Grant:
+        """Renew.
+
+        Raises:
+            StaleEpoch: the lease is somebody else's now, or nobody's.
+        """
+        self.expire()
+        with self._lock:
+            self.check(token)
+            self._ends_s = self._clock.now_s() + self.ttl_s
+            return self._shown()
+
+    def release(self, token: str) -> None:
+        """Give it back.
+
+        Raises:
+            StaleEpoch: it was not yours any more.
+        """
+        self.expire()
+        with self._lock:
+            self.check(token)
+            self._report("lease-released", {"holder": self._holder, "epoch": self._epoch})
+            self._holder, self._token = None, ""
+
+    def check(self, token: str | None) -> str | None:
+        """May the bearer of `token` move? Returns the holder's name; None when nobody holds the lease.
+
+        Raises:
+            LeaseError: another one holds it.
+            StaleEpoch: the token is of an earlier epoch.
+        """
+        self.expire()
+        with self._lock:
+            if token is not None and not secrets.compare_digest(token.encode(), self._token.encode()):
+                raise StaleEpoch("this lease has ended", hint="acquire it again: POST /v1/lease", epoch=self._epoch)
+            if token is None and self._holder is not None:
+                raise LeaseError(
+                    f"{self._holder} holds the cell",
+                    hint="send its token as Lease-Token, wait, or take over on purpose",
+                    holder=self._holder,
+                    epoch=self._epoch,
+                )
+            return self._holder
+
+    def holder(self) -> tuple[str | None, int, float]:
+        """Who holds it (or None), the epoch, and the seconds that are left."""
+        self.expire()
+        with self._lock:
+            left_s = max(0.0, self._ends_s - self._clock.now_s()) if self._holder is not None else 0.0
+            return self._holder, self._epoch, left_s
+
+    def expire(self) -> None:
+        """End a lease whose heartbeat stayed out; called before every decision and by a timer."""
+        with self._lock:
+            if self._holder is None or self._clock.now_s() < self._ends_s:
+                return
+            lost, self._holder, self._token = self._holder, None, ""
+            self._report("lease-lapsed", {"holder": lost, "epoch": self._epoch})
+        self._on_loss(f"the lease of {lost} lapsed: no heartbeat for {self.ttl_s:g} s")
+
+    def _grant(self, holder: str, kind: str) -> Grant:
+        self._report(kind, {"holder": holder, "before": self._holder, "epoch": self._epoch + 1})
+        self._epoch += 1
+        self._holder = holder
+        self._token = f"{self._epoch}.{secrets.token_urlsafe(16)}"
+        self._ends_s = self._clock.now_s() + self.ttl_s
+        return self._shown()
+
+    def _shown(self) -> Grant:
+        assert self._holder is not None  # noqa: S101 - narrowing: only called for a holder
+        return Grant(
+            holder=self._holder,
+            epoch=self._epoch,
+            token=self._token,
+            ttl_s=self.ttl_s,
+            remaining_s=max(0.0, self._ends_s - self._clock.now_s()),
+        )

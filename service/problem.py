@@ -1,0 +1,49 @@
+"""Errors as RFC 9457 problems: plain values, the same in HTTP answers, in tasks and in the journal."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+from typing import Any
+
+from hal import errors as hal_errors
+from hal.errors import CellError
+from service import errors
+from service.jsonable import jsonable
+
+STATUS: dict[type[CellError], HTTPStatus] = {
+    # The nearest class up the tree decides.
+    CellError: HTTPStatus.INTERNAL_SERVER_ERROR,
+    hal_errors.ConfigError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    hal_errors.InvalidRequest: HTTPStatus.UNPROCESSABLE_ENTITY,
+    hal_errors.Unsupported: HTTPStatus.CONFLICT,
+    hal_errors.DeviceError: HTTPStatus.SERVICE_UNAVAILABLE,
+    hal_errors.DeviceTimeout: HTTPStatus.GATEWAY_TIMEOUT,
+    hal_errors.DeviceFault: HTTPStatus.BAD_GATEWAY,
+    hal_errors.MotionError: HTTPStatus.CONFLICT,
+    hal_errors.Cancelled: HTTPStatus.CONFLICT,
+    hal_errors.LeaseError: HTTPStatus.CONFLICT,
+    hal_errors.PerceptionError: HTTPStatus.CONFLICT,
+    errors.NoSuchTask: HTTPStatus.NOT_FOUND,
+    errors.NotPossibleNow: HTTPStatus.CONFLICT,
+    errors.Busy: HTTPStatus.SERVICE_UNAVAILABLE,
+    errors.JournalError: HTTPStatus.SERVICE_UNAVAILABLE,
+    errors.Aborted: HTTPStatus.CONFLICT,
+}
+
+
+def status_of(error: CellError) -> int:
+    """The HTTP status that tells the kind of an error."""
+    return int(next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS))
+
+
+def problem_of(error: CellError) -> dict[str, Any]:
+    """`type`, `title`, `status`, `detail`, `hint`, `retry` and `details` of an error, as plain JSON values."""
+    return {
+        "type": f"urn:panelwright:{error.type_name}",
+        "title": error.type_name.replace("-", " ").capitalize(),
+        "status": status_of(error),
+        "detail": error.what,
+        "hint": error.hint,
+        "retry": str(error.retry),
+        "details": jsonable(error.details),
+    }

@@ -1,0 +1,155 @@
+"""Compares a finished report with what the simulator says really happened. Nothing else ever asks for the truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.stats import chi2
+
+from hal.devices import DeviceKind, ObjectTruth, Truth
+from hal.errors import Unsupported
+from hal.geometry import difference
+from hal.panel import Panel, PanelObject
+from service.connection import CellConnection
+from service.report.write import render, write_json
+
+GAUGE_SHARE = 0.02  # of full scale: a reading further off is wrong
+WHEEL_RAD = 0.105
+AFTER = "after the actions"
+
+
+def judge(connection: CellConnection, folder: Path) -> dict[str, Any]:
+    """Add `judge` to the report in `folder` and draw it again; returns that part.
+
+    Raises:
+        Unsupported: the cell is not simulated, so nobody knows the truth.
+    """
+    report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    verdict = compare(report, truth_of(connection), connection.cell.panel)
+    write_json(folder, {**report, "judge": verdict})
+    render(folder)
+    return verdict
+
+
+def truth_of(connection: CellConnection) -> Truth:
+    """The truth of a simulated cell; ask only when the mission is over."""
+    for arm in connection.devices_of(DeviceKind.ARM).values():
+        if hasattr(arm, "truth"):
+            truth: Truth = arm.truth()
+            return truth
+    raise Unsupported(
+        "this cell has no simulated arm, so there is no truth to judge by", hint="use a cell with sim:arm"
+    )
+
+
+def compare(report: dict[str, Any], truth: Truth, panel: Panel) -> dict[str, Any]:
+    """Pose error, reading errors and what really moved, against a report's claims."""
+    before = {thing.name: thing for thing in truth.initial}
+    after = {thing.name: thing for thing in truth.objects}
+    claims = [
+        _reading_claim(reading, (after if reading["when"] == AFTER else before)[reading["name"]], panel)
+        for reading in report["readings"]
+        if reading["reason"] is None and reading["present"]
+    ]
+    actions = [_action_claim(action, before, after, panel) for action in report["actions"]]
+    return {
+        **_pose_verdict(report.get("fused"), truth),
+        "claims": claims + actions,
+        "readings_right": sum(claim["right"] for claim in claims),
+        "readings_given": len(claims),
+        "actions_confirmed": sum(action["confirmed"] for action in report["actions"]),
+        "agrees": all(action["right"] for action in actions),
+        "peak_force_n": truth.peak_force_n,
+        "sim_time_s": truth.sim_time_s,
+    }
+
+
+def _pose_verdict(fused: dict[str, Any] | None, truth: Truth) -> dict[str, Any]:
+    if not fused:
+        return {"pose_error_m": None, "pose_error_rad": None, "mahalanobis": None, "inside_95": None}
+    estimate = RigidTransform.from_components(fused["translation_m"], Rotation.from_quat(fused["quaternion_xyzw"]))
+    delta = difference(RigidTransform.from_matrix(truth.base_from_panel_matrix), estimate)
+    distance = float(delta @ np.linalg.solve(np.array(fused["covariance"]), delta))
+    return {
+        "pose_error_m": float(np.linalg.norm(delta[:3])),
+        "pose_error_rad": float(np.linalg.norm(delta[3:])),
+        "mahalanobis": distance,
+        "inside_95": bool(distance <= chi2.ppf(0.95, 6)),
+    }
+
+
+def _reading_claim(reading: dict[str, Any], truth: ObjectTruth, panel: Panel) -> dict[str, Any]:
+    spec = panel.object(reading["name"])
+    return {
+        "name": reading["name"],
+        "what": f"read {reading['when']}",
+        "claimed": reading["shows"],
+        "truth": _shown(truth),
+        "right": agrees(spec, truth, value=reading["value"], state=reading["state"], text=reading["text"]),
+    }
+
+
+def agrees(
+    spec: PanelObject, truth: ObjectTruth, *, value: float | None, state: str | None, text: str | None = None
+) -> bool:
+    """Is what was said of an object true, within 2 % of full scale (6 degrees for a wheel) and exactly for states?"""
+    if spec.kind == "display":
+        return text is not None and text.strip() == (truth.text or "").strip()
+    if truth.state is not None:
+        return state == truth.state
+    if value is None or truth.value is None:
+        return False
+    if spec.kind == "handwheel":
+        turn = 2 * np.pi / spec.spokes if spec.spokes < 2 else 2 * np.pi
+        return bool(abs((value - truth.value + turn / 2) % turn - turn / 2) <= WHEEL_RAD)
+    scale = getattr(spec, "scale", None)
+    span = scale.maximum - scale.minimum if scale is not None else 1.0
+    return bool(abs(value - truth.value) <= GAUGE_SHARE * span)
+
+
+def _action_claim(
+    action: dict[str, Any], before: dict[str, ObjectTruth], after: dict[str, ObjectTruth], panel: Panel
+) -> dict[str, Any]:
+    """A confirmed action must be true; an unconfirmed one must not claim anything."""
+    name = action["object"]
+    spec = panel.object(name)
+    reached = _reached(spec, action, before[name], after[name])
+    return {
+        "name": name,
+        "what": f"{action['skill']} to {action['target']}",
+        "claimed": f"{action['outcome']}, {'confirmed' if action['confirmed'] else 'not confirmed'}",
+        "truth": f"{_shown(before[name])} to {_shown(after[name])}",
+        "right": reached or not action["confirmed"],
+        "reached": reached,
+    }
+
+
+def _reached(
+    spec: PanelObject,
+    action: dict[str, Any],
+    before: ObjectTruth,
+    after: ObjectTruth,
+) -> bool:
+    target = action["target"]
+    if spec.kind == "button":
+        # A button springs back: what it worked is what counts, and the simulator counts its strokes.
+        return (after.value or 0.0) > (before.value or 0.0)
+    if spec.kind == "slider":
+        return after.value is not None and abs(after.value - float(target)) <= GAUGE_SHARE * (
+            spec.scale.maximum - spec.scale.minimum
+        )
+    if spec.kind == "handwheel":
+        return after.value is not None and bool(abs(after.value - float(target)) <= WHEEL_RAD)
+    return after.state == target
+
+
+def _shown(truth: ObjectTruth) -> str:
+    if truth.text is not None:
+        return truth.text
+    if truth.state is not None:
+        return truth.state
+    return "?" if truth.value is None else f"{truth.value:.4g}"

@@ -1,0 +1,130 @@
+"""Bodies of the verbs: strict, with units in the names; unknown keys and numbers that are not finite are refused."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from hal.geometry import UncertainPose, from_json
+from hal.strict import Strict
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Row3 = tuple[Vector3, Vector3, Vector3]
+Length = Annotated[float, Field(ge=-100.0, le=100.0)]
+Point = tuple[Length, Length, Length]
+ObjectName = Annotated[str, Field(min_length=1, max_length=41)]
+
+
+class PoseBody(Strict):
+    """A pose with its covariance: 6x6 row by row over (dx, dy, dz, rx, ry, rz), m and rad, parent axes."""
+
+    translation_m: Point
+    quaternion_xyzw: Quaternion
+    covariance: Annotated[
+        list[Annotated[list[float], Field(min_length=6, max_length=6)]], Field(min_length=6, max_length=6)
+    ]
+
+    def pose(self) -> UncertainPose:
+        """The value that operations compute with."""
+        import numpy as np
+
+        return UncertainPose(parent_from_child=from_json(self.model_dump()), covariance=np.array(self.covariance))
+
+
+class PanelPoseRequest(Strict):
+    """Locate the panel by its four lights."""
+
+    move: Annotated[bool, Field(description="drive to a view of the whole panel first; false looks from here")] = True
+    scan: Annotated[bool, Field(description="also fit the plate's plane to a range image")] = False
+
+
+class RecogniseRequest(Strict):
+    """Find the objects of the panel file in the camera's image, or surfaces in the range image."""
+
+    use: Annotated[tuple[Literal["vision", "range"], ...], Field(min_length=1)] = ("vision",)
+    mode: Literal["taught", "blind"] = "taught"
+    camera: ObjectName | None = None
+    objects: Annotated[tuple[ObjectName, ...], Field(max_length=200)] | None = None
+    move: bool = True
+
+
+class InspectRequest(Strict):
+    """Read instruments, lamps, switches and valves from close up."""
+
+    objects: Annotated[tuple[ObjectName, ...], Field(max_length=200)] | None = None
+    close_up: Annotated[bool, Field(description="drive to close-ups; false reads the overview only")] = True
+
+
+SENSING = Literal[
+    "point-point", "point-line", "point-plane", "line-point", "line-line", "line-plane", "plane-point", "plane-line",
+    "plane-plane",
+]  # fmt: skip
+
+
+class MeasurementBody(Strict):
+    """One sensing of one object feature (paper, section IV): `g(y, v) = (y - mu)^T C^-1 (y - mu) + v^T M v`."""
+
+    sensing: Annotated[SENSING, Field(description="sensor feature, then object feature")]
+    x_m: Annotated[Point, Field(description="point of the object feature, object frame")]
+    u: Annotated[Vector3, Field(description="unit direction or normal of the object feature")] = (0.0, 0.0, 1.0)
+    mu_m: Annotated[Point, Field(description="sensed point, or a point of the sensed line or plane, base frame")]
+    c_m2: Annotated[Row3, Field(description="covariance of mu, m^2")]
+    m_per_rad2: Annotated[Row3, Field(description="information of the sensed direction, 1/rad^2; null along it")] = (
+        (0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.0),
+    )
+    label: Annotated[str, Field(max_length=80)] = ""
+    sensor: Annotated[str, Field(max_length=80)] = ""
+
+
+class FuseRequest(Strict):
+    """Fuse measurements into one pose: those given, or those that the cell collects itself."""
+
+    measurements: Annotated[tuple[MeasurementBody, ...], Field(max_length=10_000)] = ()
+    collect: Annotated[bool, Field(description="look, scan, touch and measure distances first")] = False
+    touches: Annotated[int, Field(ge=3, le=12, description="how many touches to collect")] = 4
+    prior: PoseBody | None = None
+    certify: Annotated[bool, Field(description="prove global optimality by a semidefinite relaxation")] = False
+
+    @model_validator(mode="after")
+    def _has_something_to_fuse(self) -> FuseRequest:
+        if not self.measurements and not self.collect:
+            raise ValueError("give measurements, or collect = true")
+        return self
+
+
+class ActionBody(Strict):
+    """One deed: `state` for levers, toggles, rotaries and buttons, `value` for sliders, `angle_rad` for wheels."""
+
+    object: ObjectName
+    state: Annotated[str, Field(max_length=41)] | None = None
+    value: float | None = None
+    angle_rad: Annotated[float, Field(ge=-100.0, le=100.0)] | None = None
+
+    @model_validator(mode="after")
+    def _has_at_most_one_target(self) -> ActionBody:
+        if sum(target is not None for target in (self.state, self.value, self.angle_rad)) > 1:
+            raise ValueError("give one of state, value and angle_rad")
+        return self
+
+
+class ManipulateRequest(ActionBody):
+    """Work one control and look whether it worked."""
+
+    verify: Annotated[bool, Field(description="look again afterwards; without it the outcome is `unverified`")] = True
+
+
+class MissionRequest(Strict):
+    """The whole mission. Without actions: lever, slider, button and toggle of the panel file, one each."""
+
+    actions: Annotated[tuple[ActionBody, ...], Field(max_length=50)] | None = None
+    touches: Annotated[int, Field(ge=3, le=12)] = 4
+
+
+class JudgeRequest(Strict):
+    """Compare a finished mission's report with what the simulator says (simulated cells only)."""
+
+    mission: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,80}$")]

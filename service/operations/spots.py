@@ -1,0 +1,76 @@
+"""Bare places of the plate where a finger may touch."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.errors import NotFound
+from hal.panel import Panel, PanelObject
+
+Array = NDArray[np.float64]
+GRID_M = 0.005
+EDGE_M = 0.025  # a finger that misses the plate finds nothing
+
+
+def bare_spots(panel: Panel, count: int, *, clearance_m: float = 0.030) -> Array:
+    """(count, 2) panel points far from every object and light, and far from each other.
+
+    Greedy farthest points, which for a plate with instruments are its bare corners and the gaps between rows: the
+    spread makes the touched plane's normal as well known as it can be.
+
+    Raises:
+        NotFound: the panel has too few bare places.
+    """
+    candidates = _candidates(panel, clearance_m)
+    if len(candidates) == 0:
+        raise NotFound(
+            f"panel {panel.name!r} has no bare place with {1e3 * clearance_m:.0f} mm round it",
+            hint="give the points to touch, or a smaller clearance",
+        )
+    chosen = [candidates[int(np.argmax(np.linalg.norm(candidates, axis=1)))]]
+    while len(chosen) < count:
+        gaps = np.min([np.linalg.norm(candidates - spot, axis=1) for spot in chosen], axis=0)
+        if gaps.max() < 2 * GRID_M:
+            raise NotFound(
+                f"panel {panel.name!r} has only {len(chosen)} bare places, {count} are wanted",
+                hint="touch fewer points",
+            )
+        chosen.append(candidates[int(np.argmax(gaps))])
+    return np.array(chosen)
+
+
+def _candidates(panel: Panel, clearance_m: float) -> Array:
+    x = np.arange(-panel.width_m / 2 + EDGE_M, panel.width_m / 2 - EDGE_M + 1e-9, GRID_M)
+    y = np.arange(-panel.height_m / 2 + EDGE_M, panel.height_m / 2 - EDGE_M + 1e-9, GRID_M)
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    gaps = [np.linalg.norm(points - light.position_m[:2], axis=1) - light.radius_m for light in panel.lights]
+    gaps += [_distance_to(points, thing) for thing in panel.objects]
+    return points[np.min(gaps, axis=0) >= clearance_m]
+
+
+def _distance_to(points: Array, thing: PanelObject) -> Array:
+    """From (N, 2) panel points to the footprint of an object, in any of its states; negative inside."""
+    half = np.array(half_footprint_m(thing))
+    outside = np.abs(points - np.array(thing.position_m)) - half
+    return np.asarray(np.linalg.norm(np.maximum(outside, 0.0), axis=1) + np.minimum(outside.max(axis=1), 0.0))
+
+
+def half_footprint_m(thing: PanelObject) -> tuple[float, float]:
+    """Half width and half height of the upright box on the plate that holds an object in any state."""
+    match thing.kind:
+        case "lever":
+            reach = thing.length_m + thing.width_m
+            return reach, reach
+        case "slider":
+            along = thing.travel_m / 2 + thing.cap_size_m[0] / 2
+            c, s = abs(np.cos(thing.angle_rad)), abs(np.sin(thing.angle_rad))
+            across = thing.cap_size_m[1] / 2
+            return float(c * along + s * across), float(s * along + c * across)
+        case "toggle":
+            return thing.bat_length_m, thing.bat_length_m
+        case "panel_meter" | "display":
+            return thing.width_m / 2, thing.height_m / 2
+        case "handwheel":
+            return thing.radius_m + thing.rim_m, thing.radius_m + thing.rim_m
+    return thing.radius_m, thing.radius_m

@@ -1,0 +1,92 @@
+"""Where to put the camera: square in front of what it shall see, near enough to read, far enough to see all."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from hal.calibration import CameraIntrinsics
+from hal.geometry import transform
+from hal.panel import Panel, PanelObject
+
+FILL = 0.85  # share of the image that the target may fill: pose and mount are not exact
+CLOSE_UP_M = 0.30  # at 460 px focal length a 36 mm gauge face is 110 px wide
+REACH_M = 0.045  # half size that a close-up leaves round an object's middle
+
+
+def facing(
+    base_from_panel: RigidTransform,
+    point_m: Sequence[float],
+    distance_m: float,
+    *,
+    roll_rad: float = 0.0,
+    tilt_rad: tuple[float, float] = (0.0, 0.0),
+) -> RigidTransform:
+    """`base_from_camera` that looks at a panel point along the panel's normal.
+
+    Args:
+        point_m: (3,) in the panel frame.
+        roll_rad: turn of the camera about its view.
+        tilt_rad: how far the camera stands off the normal, about the panel's x and y axes.
+    """
+    upright = np.diag([1.0, -1.0, -1.0])  # camera x along panel x, camera z into the panel
+    stand = Rotation.from_euler("xyz", [tilt_rad[0], tilt_rad[1], 0.0])
+    turn = Rotation.from_rotvec([0.0, 0.0, roll_rad])
+    rotation = stand * Rotation.from_matrix(upright) * turn
+    place = np.asarray(point_m, float) - distance_m * rotation.apply([0.0, 0.0, 1.0])
+    return base_from_panel * transform(rotation.as_matrix(), place)
+
+
+def overview_distance_m(panel: Panel, intrinsics: CameraIntrinsics, slack_m: float) -> float:
+    """How far the camera must stand back to have the whole plate in view, wherever it is within `slack_m`."""
+    half_view_x = FILL * min(intrinsics.cx_px, intrinsics.width_px - intrinsics.cx_px) / intrinsics.fx_px
+    half_view_y = FILL * min(intrinsics.cy_px, intrinsics.height_px - intrinsics.cy_px) / intrinsics.fy_px
+    return max((panel.width_m / 2 + slack_m) / half_view_x, (panel.height_m / 2 + slack_m) / half_view_y)
+
+
+def overview_poses(
+    base_from_panel: RigidTransform, panel: Panel, intrinsics: CameraIntrinsics, slack_m: float
+) -> Iterator[RigidTransform]:
+    """Camera poses that see the whole panel, best first: square on, then from further off, then from the side."""
+    distance_m = overview_distance_m(panel, intrinsics, slack_m)
+    for tilt_x in (0.0, 0.2, -0.2, 0.35, -0.35):
+        for stretch in (1.0, 0.92, 1.1):
+            for tilt_y in (0.0, 0.2, -0.2):
+                yield facing(base_from_panel, (0.0, 0.0, 0.0), stretch * distance_m, tilt_rad=(tilt_x, tilt_y))
+
+
+def close_up_poses(base_from_panel: RigidTransform, point_m: Sequence[float]) -> Iterator[RigidTransform]:
+    """Camera poses for reading what lies about one panel point, best first."""
+    for distance_m in (CLOSE_UP_M, 0.34, 0.38):
+        for tilt in ((0.0, 0.0), (0.12, 0.0), (-0.12, 0.0), (0.0, 0.12), (0.0, -0.12), (0.22, 0.0), (-0.22, 0.0)):
+            for roll in (0.0, math.pi / 2, -math.pi / 2, math.pi):
+                yield facing(base_from_panel, point_m, distance_m, roll_rad=roll, tilt_rad=tilt)
+
+
+def close_up_groups(
+    objects: Sequence[PanelObject], intrinsics: CameraIntrinsics, distance_m: float = CLOSE_UP_M
+) -> list[tuple[NDArray[np.float64], tuple[str, ...]]]:
+    """Few close-ups that together show every object: (view centre in the panel frame, names), left to right.
+
+    Greedy cover: each view is centred where it takes in most of the objects that are still unseen.
+    """
+    half_x = FILL * 0.5 * intrinsics.width_px / intrinsics.fx_px * distance_m - REACH_M
+    half_y = FILL * 0.5 * intrinsics.height_px / intrinsics.fy_px * distance_m - REACH_M
+    span = np.array([2 * half_x, 2 * half_y])
+    unseen = {thing.name: np.array(thing.position_m) for thing in objects}
+    groups: list[tuple[NDArray[np.float64], tuple[str, ...]]] = []
+    while unseen:
+        best: tuple[str, ...] = ()
+        for corner_x in unseen.values():
+            for corner_y in unseen.values():
+                low = np.array([corner_x[0], corner_y[1]])
+                inside = tuple(name for name, p in unseen.items() if np.all(p >= low) and np.all(p <= low + span))
+                best = max(best, inside, key=len)
+        places = np.array([unseen.pop(name) for name in best])
+        centre = 0.5 * (places.min(axis=0) + places.max(axis=0))
+        groups.append((np.array([*centre, 0.0]), best))
+    return sorted(groups, key=lambda group: (round(-group[0][1], 2), group[0][0]))

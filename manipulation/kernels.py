@@ -130,6 +130,44 @@ def follow_pose(dh: Array, flange_from_tool: Array, q: Array, goal: Array, dampi
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
+def path_joints(
+    dh: Array,
+    flange_from_tool: Array,
+    times_s: Array,
+    points: Array,
+    rotations: Array,
+    turns: Array,
+    t_s: float,
+    shift: Array,
+    offset: Array,
+    q: Array,
+    damping: float,
+) -> Any:
+    """Joints (n,) near `q` for the path's pose at `t_s`, moved by `shift` (6,) in base axes and by `offset` (6,) in tool axes."""
+    pose = pose_on_path(times_s, points, rotations, turns, t_s)
+    rotation = rotation_exp(shift[3:]) @ np.ascontiguousarray(pose[:3, :3])
+    pose[:3, 3] += shift[:3] + rotation @ offset[:3]
+    pose[:3, :3] = rotation @ rotation_exp(offset[3:])
+    return follow_pose(dh, flange_from_tool, q, pose, damping, 2)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def hermite(times_s: Array, positions: Array, velocities: Array, t_s: float) -> Any:
+    """The cubic Hermite interpolant (n,) through (N, n) positions and velocities; constant beyond the ends."""
+    last = times_s.shape[0] - 1
+    if t_s <= times_s[0]:
+        return positions[0].copy()
+    if t_s >= times_s[last]:
+        return positions[last].copy()
+    i = np.searchsorted(times_s, t_s, side="right") - 1
+    h = times_s[i + 1] - times_s[i]
+    u = (t_s - times_s[i]) / h
+    h00, h10 = (1.0 + 2.0 * u) * (1.0 - u) ** 2, u * (1.0 - u) ** 2
+    h01, h11 = u * u * (3.0 - 2.0 * u), u * u * (u - 1.0)
+    return h00 * positions[i] + h10 * h * velocities[i] + h01 * positions[i + 1] + h11 * h * velocities[i + 1]
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def admittance_step(
     state: Array, wrench: Array, stiffness: Array, damping: Array, mass: Array, bound: Array, dt_s: float
 ) -> None:
@@ -178,3 +216,41 @@ def wrench_at(wrench: Array, child_from_parent: Array) -> Any:
     out[4] = torque[1] + p[2] * force[0] - p[0] * force[2]
     out[5] = torque[2] + p[0] * force[1] - p[1] * force[0]
     return out
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def safe_step(
+    dh: Array,
+    flange_from_tool: Array,
+    wanted: Array,
+    last: Array,
+    last_velocity: Array,
+    velocity: Array,
+    acceleration: Array,
+    lower: Array,
+    upper: Array,
+    tip_limit_m_per_s: float,
+    dt_s: float,
+) -> Any:
+    """The last filter before the drive: joint speed, acceleration and range, and the speed of the tool's tip."""
+    out = limited_step(wanted, last, last_velocity, velocity, acceleration, dt_s)
+    out = np.minimum(np.maximum(out, lower), upper)
+    _, jacobian = tool_and_jacobian(dh, last, flange_from_tool)
+    twist = jacobian @ ((out - last) / dt_s)
+    tip = np.sqrt(twist[0] * twist[0] + twist[1] * twist[1] + twist[2] * twist[2])
+    if tip > tip_limit_m_per_s:
+        out = last + (out - last) * (tip_limit_m_per_s / tip)
+    return out
+
+
+def warm(dh: Array) -> None:
+    """Compile (or load from the cache) every kernel of the control tick, so that no tick waits for a compiler."""
+    n, eye = dh.shape[0], np.eye(4)
+    q, ones = np.full(n, 0.1), np.ones(n)
+    times, points, rotations = np.array([0.0, 1.0]), np.zeros((2, 3)), np.array([np.eye(3), np.eye(3)])
+    frames(dh, q)
+    path_joints(dh, eye, times, points, rotations, np.zeros((1, 3)), 0.5, np.zeros(6), np.zeros(6), q, 1.0)
+    hermite(times, np.zeros((2, n)), np.zeros((2, n)), 0.5)
+    admittance_step(np.zeros((2, 6)), np.zeros(6), np.ones(6), np.ones(6), np.ones(6), np.ones(6), 0.01)
+    safe_step(dh, eye, q, q, np.zeros(n), ones, ones, -ones, ones, 1.0, 0.01)
+    wrench_at(np.zeros(6), eye)

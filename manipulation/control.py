@@ -1,0 +1,476 @@
+"""The control thread: executes declared motions, one at a time, and reports what really happened.
+
+Every tick: read all devices, look at stop latch, cancel and guards, compute the set-point, filter it, send it, let one
+period pass. On a simulated clock the period steps the world in lockstep, and nothing ticks between motions; on a wall clock
+the thread always ticks and holds the arm.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from hal.calibration import ToolLoad
+from hal.clock import Clock, Deadline, SimClock, WallClock
+from hal.config import SafetySection
+from hal.devices import Arm, ForceTorque, Gripper, Proximity, Touch
+from hal.errors import CellError, DeviceFault, MotionRefused, Stopped
+from hal.geometry import identity
+from hal.motion import (
+    CartesianPath,
+    DeclaredMotion,
+    Guard,
+    GripperMotion,
+    Hold,
+    MotionOutcome,
+    MotionReport,
+    Quantity,
+    Reaction,
+    RobotState,
+)
+from manipulation import kernels
+from manipulation.guards import GuardSet, Measured
+from manipulation.kinematics import Kinematics
+from manipulation.recorder import Recorder
+from manipulation.runs import Run, begin
+from manipulation.sensing import READ_WAIT_S, ContactWrench, DeviceFailure, Devices, Sample
+from manipulation.setpoint import SetPointFilter, check, flange_matrix
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+TRACKING_LIMIT_M = 0.02
+SETTLE_S = 0.3
+SETTLED_RAD = 2e-4
+SETTLED_RAD_PER_S = 0.02
+TARE_S = 0.1
+COMMAND_WAIT_S = 0.25
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _End:
+    """Why a motion is over."""
+
+    outcome: MotionOutcome
+    cause: str
+    tripped: str | None = None
+    device: str | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Job:
+    """Work for the control thread."""
+
+    call: Callable[[], Any]
+    result: Future[Any]
+
+
+class Controller:
+    """Implements `hal.motion.Mover` over the devices of one cell.
+
+    Args:
+        safety: force and speed limits that hold in every motion.
+        load: what hangs below the sensor; `tare` corrects its bias.
+        is_latched: reads the stop latch; called every tick.
+        flange_from_grip: the tool of motions that name none.
+        rate_hz: control rate; None takes the arm's.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        gripper: Gripper,
+        force_torque: ForceTorque | None,
+        touch: Touch | None,
+        proximities: Sequence[Proximity] = (),
+        *,
+        clock: Clock,
+        safety: SafetySection,
+        load: ToolLoad,
+        flange_from_sensor: RigidTransform,
+        is_latched: Callable[[], bool],
+        flange_from_grip: RigidTransform | None = None,
+        rate_hz: float | None = None,
+    ) -> None:
+        self._devices = Devices(
+            arm=arm,
+            gripper=gripper,
+            force_torque=force_torque,
+            touch=touch,
+            proximities=tuple(proximities),
+            clock=clock,
+            max_age_s=safety.max_reading_age_s,
+        )
+        capabilities = arm.capabilities()
+        self.kinematics = Kinematics.of(capabilities)
+        self._clock = clock
+        self._safety = safety
+        self._contact = ContactWrench(load, flange_from_sensor)
+        self._is_latched = is_latched
+        self._grip = flange_matrix(identity() if flange_from_grip is None else flange_from_grip)
+        self._dt_s = 1.0 / (rate_hz or capabilities.command_rate_hz)
+        self._filter = SetPointFilter(self.kinematics, self._grip, safety.speed_limit_m_per_s, self._dt_s)
+        self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._busy = threading.Lock()
+        self._cancel = threading.Event()
+        self._closing = threading.Event()
+        self._newest: Sample | None = None
+        self._faults: tuple[str, ...] = ()
+        self._is_moving = False
+        self._is_holding = False
+        self._next_tick_s = clock.now_s()
+
+    # -- life ------------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Warm the compiled kernels, then start the control thread; a second call does nothing."""
+        if self._thread is not None:
+            return
+        kernels.warm(self.kinematics.dh)
+        self._thread = threading.Thread(target=self._loop, name="control", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Cancel what runs, stop the arm, end the thread; a second call does nothing."""
+        self._closing.set()
+        self._cancel.set()
+        self._jobs.put(None)
+        if self._thread is not None:
+            self._thread.join(timeout=2.0)
+
+    # -- the Mover port --------------------------------------------------------------------------------------------
+
+    def execute(self, motion: DeclaredMotion) -> MotionReport:
+        """Run the motion on the control thread and wait for its end.
+
+        Raises:
+            MotionRefused: not finite, outside limits, start too far away, or another motion runs.
+            Stopped: the stop latch is set.
+        """
+        if not self._busy.acquire(blocking=False):
+            raise MotionRefused(f"motion {motion.name!r} refused: another motion runs", hint="wait for it or cancel it")
+        try:
+            self._cancel.clear()
+            return self._on_thread(lambda: self._execute(motion))
+        finally:
+            self._busy.release()
+
+    def cancel(self) -> None:
+        """Let the running motion decelerate and end with outcome `cancelled`; returns at once."""
+        self._cancel.set()
+
+    def tare(self) -> Array:
+        """Take the present wrench, averaged over 0.1 s at rest, as zero contact; returns the bias (6,), sensor axes.
+
+        Raises:
+            MotionRefused: a motion runs.
+            Stopped: the stop latch is set.
+            DeviceFault: a device failed meanwhile; names it.
+        """
+        if not self._busy.acquire(blocking=False):
+            raise MotionRefused("tare refused: a motion runs", hint="tare when the arm rests")
+        try:
+            return self._on_thread(self._tare)
+        finally:
+            self._busy.release()
+
+    def state(self) -> RobotState:
+        """Newest snapshot; between motions on a simulated clock the devices are read for it.
+
+        Raises:
+            DeviceFault: there is no snapshot, and a device fails.
+        """
+        if self._ticks_only_in_motion and self._busy.acquire(blocking=False):
+            try:
+                self._on_thread(self._refresh)
+            finally:
+                self._busy.release()
+        sample = self._newest
+        if sample is None:
+            sample = self._on_thread(self._refresh)
+        return self._state_of(sample)
+
+    # -- the thread ------------------------------------------------------------------------------------------------
+
+    @property
+    def _ticks_only_in_motion(self) -> bool:
+        return isinstance(self._clock, SimClock)
+
+    def _on_thread(self, call: Callable[[], T]) -> T:
+        if self._thread is None or self._closing.is_set():
+            raise MotionRefused("the controller does not run", hint="start the cell first")
+        result: Future[T] = Future()
+        self._jobs.put(_Job(call, result))
+        return result.result()
+
+    def _loop(self) -> None:
+        while not self._closing.is_set():
+            try:
+                job = self._jobs.get(block=self._ticks_only_in_motion)
+            except queue.Empty:
+                self._idle_tick()
+                continue
+            if job is not None:
+                self._do(job)
+        self._drain()
+        with suppress(CellError):
+            self._devices.arm.stop(deadline=Deadline.after(self._clock, COMMAND_WAIT_S))
+
+    def _drain(self) -> None:
+        # Callers that asked while the controller closed get an answer too.
+        while True:
+            try:
+                job = self._jobs.get(block=False)
+            except queue.Empty:
+                return
+            if job is not None:
+                job.result.set_exception(MotionRefused("the controller was closed", hint="start the cell again"))
+
+    def _do(self, job: _Job) -> None:
+        try:
+            job.result.set_result(job.call())
+        except BaseException as error:  # noqa: BLE001  # whatever went wrong belongs to the caller; the thread lives on
+            self._is_moving = False
+            job.result.set_exception(error)
+
+    def _idle_tick(self) -> None:
+        """Hold the arm between motions on a wall clock, so that its watchdog stays quiet and the state fresh."""
+        with suppress(DeviceFailure):
+            sample = self._read()
+            if self._is_latched():
+                self._release()
+            elif self._is_holding:
+                self._send(self._filter.last_rad)
+            self._newest = sample
+        self._pass_tick()
+
+    def _refresh(self) -> Sample:
+        try:
+            self._newest = self._read()
+        except DeviceFailure as failure:
+            if self._newest is None:
+                raise DeviceFault(str(failure), hint="run `panelwright devices`", device=failure.device) from failure
+        return self._newest
+
+    # -- one motion ------------------------------------------------------------------------------------------------
+
+    def _execute(self, motion: DeclaredMotion) -> MotionReport:
+        if self._is_latched():
+            raise Stopped("the stop latch is set", hint="reset the stop, then command again")
+        tool = flange_matrix(motion.flange_from_tool) if isinstance(motion, CartesianPath) else self._grip
+        started_s = self._clock.now_s()
+        recorder = Recorder(self.kinematics.dh, tool, self._dt_s)
+        try:
+            sample = self._read()
+            check(motion, self.kinematics, sample.position_rad)
+            self._filter = SetPointFilter(self.kinematics, tool, self._safety.speed_limit_m_per_s, self._dt_s)
+            self._filter.begin_at(sample.position_rad)
+            self._enable()
+            run = self._begin(motion, sample)
+        except DeviceFailure as failure:
+            end = _End(outcome=MotionOutcome.FAULT, cause=f"{failure}; nothing moved", device=failure.device)
+            return self._report(motion, end, started_s, tool, recorder)
+        self._is_moving = True
+        self._next_tick_s = self._clock.now_s()
+        try:
+            end = self._run(motion, run, sample, tool, recorder)
+        finally:
+            self._is_moving = False
+        return self._report(motion, end, started_s, tool, recorder)
+
+    def _begin(self, motion: DeclaredMotion, sample: Sample) -> Run:
+        try:
+            return begin(motion, self.kinematics, self._devices.gripper, sample, self._clock)
+        except CellError as error:
+            device = str(error.details.get("device", self._devices.gripper.name))
+            raise DeviceFailure(device, error.what) from error
+
+    def _run(self, motion: DeclaredMotion, run: Run, sample: Sample, tool: Array, recorder: Recorder) -> _End:
+        started_s = sample.stamp_s
+        base_from_tool = recorder.pose_of(sample.position_rad)
+        guards = GuardSet((*motion.guards, *self._standing_guards()), base_from_tool)
+        tool_from_sensor = self._contact.tool_from_sensor(tool)
+        over_since_s: float | None = None
+        while True:
+            elapsed_s = sample.stamp_s - started_s
+            flange, base_from_tool = recorder.poses_of(sample.position_rad)
+            wrench = kernels.wrench_at(self._contact.of(sample.raw_wrench, flange), tool_from_sensor)
+            recorder.note(elapsed_s, sample.position_rad, wrench, base_from_tool[:3, 3])
+            end = self._why_end(guards, elapsed_s, sample, wrench, base_from_tool, recorder)
+            try:
+                if end is None:
+                    wanted = run.wanted(elapsed_s, sample, wrench, self._filter.last_rad, self._dt_s)
+                    if run.is_over(elapsed_s, sample):
+                        over_since_s = elapsed_s if over_since_s is None else over_since_s
+                        if self._has_settled(motion, wanted, sample, elapsed_s - over_since_s):
+                            return _End(outcome=MotionOutcome.COMPLETED, cause="ran to its declared end")
+                    self._send(self._filter.apply(wanted))
+                    self._pass_tick()
+                    sample = self._newest = self._read()
+                    continue
+            except DeviceFailure as failure:
+                end = _End(outcome=MotionOutcome.FAULT, cause=str(failure), device=failure.device)
+            self._come_to_rest(end, recorder)
+            return end
+
+    def _why_end(
+        self, guards: GuardSet, elapsed_s: float, sample: Sample, wrench: Array, pose: Array, recorder: Recorder
+    ) -> _End | None:
+        if self._is_latched():
+            return _End(outcome=MotionOutcome.STOPPED, cause="the stop latch was set")
+        if self._cancel.is_set():
+            return _End(outcome=MotionOutcome.CANCELLED, cause="cancelled by the caller")
+        guard = guards.tripped(
+            Measured(
+                elapsed_s=elapsed_s,
+                wrench=wrench,
+                base_from_tool=pose,
+                commanded_tip_m=recorder.pose_of(self._filter.last_rad)[:3, 3],
+                contacts=sample.contacts,
+                proximity_m=sample.proximity_m,
+            )
+        )
+        if guard is None:
+            return None
+        outcome = MotionOutcome.FAULT if guard.reaction is Reaction.FAULT else MotionOutcome.GUARD
+        side = "at most" if guard.below else "at least"
+        return _End(outcome=outcome, cause=f"guard {guard.name}: {guard.quantity} {side} {guard.limit:g}", tripped=guard.name)
+
+    def _standing_guards(self) -> tuple[Guard, ...]:
+        force, tracking = self._safety.force_limit_n, TRACKING_LIMIT_M
+        return (
+            Guard(name="force_limit", quantity=Quantity.FORCE, limit=force, reaction=Reaction.FAULT),
+            Guard(name="tracking", quantity=Quantity.TRACKING, limit=tracking, ticks=5, reaction=Reaction.FAULT),
+        )
+
+    def _has_settled(self, motion: DeclaredMotion, wanted: Array, sample: Sample, over_s: float) -> bool:
+        if isinstance(motion, Hold | GripperMotion) or over_s >= SETTLE_S:
+            return True
+        at_goal = np.abs(wanted - self._filter.last_rad).max() < SETTLED_RAD
+        return bool(at_goal and np.abs(sample.velocity_rad_per_s).max() < SETTLED_RAD_PER_S)
+
+    def _come_to_rest(self, end: _End, recorder: Recorder) -> None:
+        """Decelerate at the limit, then hold; only the arm is listened to, since another device may be what failed."""
+        if end.device is not None:
+            self._faults = (f"{end.device}: {end.cause}",)
+        try:
+            while True:
+                self._send(self._filter.apply(self._filter.last_rad))
+                self._pass_tick()
+                if self._filter.is_at_rest:
+                    break
+        except DeviceFailure:
+            self._release()
+        if end.outcome is MotionOutcome.STOPPED:
+            self._release()
+        with suppress(DeviceFailure):
+            self._newest = self._read()
+
+    def _release(self) -> None:
+        """Take the drives off: stop latched, or the arm does not answer."""
+        if self._is_holding:
+            with suppress(CellError):
+                self._devices.arm.stop(deadline=Deadline.after(self._clock, COMMAND_WAIT_S))
+        self._is_holding = False
+
+    def _tare(self) -> Array:
+        if self._is_latched():
+            raise Stopped("the stop latch is set", hint="reset the stop, then command again")
+        free: list[Array] = []
+        try:
+            sample = self._read()
+            self._filter.begin_at(sample.position_rad)
+            self._enable()
+            self._next_tick_s = self._clock.now_s()
+            for _ in range(max(2, round(TARE_S / self._dt_s))):
+                self._send(self._filter.last_rad)
+                self._pass_tick()
+                sample = self._newest = self._read()
+                flange = kernels.frames(self.kinematics.dh, sample.position_rad)[-1]
+                free.append(sample.raw_wrench - self._contact.weight(flange))
+        except DeviceFailure as failure:
+            raise DeviceFault(f"tare: {failure}", hint="run `panelwright devices`", device=failure.device) from failure
+        self._contact.bias = np.mean(free, axis=0)
+        return self._contact.bias.copy()
+
+    # -- small steps -----------------------------------------------------------------------------------------------
+
+    def _read(self) -> Sample:
+        sample = self._devices.read()
+        self._faults = ()
+        return sample
+
+    def _enable(self) -> None:
+        try:
+            self._devices.arm.enable(deadline=Deadline.after(self._clock, COMMAND_WAIT_S))
+        except CellError as error:
+            raise DeviceFailure(self._devices.arm.name, error.what) from error
+        self._is_holding = True
+
+    def _send(self, position_rad: Array) -> None:
+        try:
+            deadline = Deadline(self._clock.now_s() + READ_WAIT_S, self._clock)
+            self._filter.sent(self._devices.arm.command_position(position_rad, deadline=deadline))
+        except CellError as error:
+            raise DeviceFailure(self._devices.arm.name, error.what) from error
+
+    def _pass_tick(self) -> None:
+        if not isinstance(self._clock, WallClock):
+            self._clock.sleep(self._dt_s)
+            return
+        now_s = self._clock.now_s()
+        # After a late tick the rhythm starts anew: catching up would bunch set-points.
+        self._next_tick_s = max(self._next_tick_s + self._dt_s, now_s)
+        self._clock.sleep(self._next_tick_s - now_s)
+
+    def _report(
+        self, motion: DeclaredMotion, end: _End, started_s: float, tool: Array, recorder: Recorder
+    ) -> MotionReport:
+        sample = self._newest
+        n = len(self.kinematics.dh)
+        q = np.zeros(n) if sample is None else sample.position_rad
+        flange, base_from_tool = recorder.poses_of(q)
+        wrench = np.zeros(6)
+        if sample is not None:
+            contact = self._contact.of(sample.raw_wrench, flange)
+            wrench = kernels.wrench_at(contact, self._contact.tool_from_sensor(tool))
+        return MotionReport(
+            name=motion.name,
+            outcome=end.outcome,
+            tripped=end.tripped,
+            cause=end.cause,
+            started_s=started_s,
+            ended_s=self._clock.now_s(),
+            position_rad=q,
+            base_from_tool=RigidTransform.from_matrix(base_from_tool),
+            wrench=wrench,
+            peak_force_n=recorder.peak_force_n,
+            gripper_width_m=None if sample is None else sample.gripper_width_m,
+            log=recorder.log(n),
+        )
+
+    def _state_of(self, sample: Sample) -> RobotState:
+        flange = kernels.frames(self.kinematics.dh, sample.position_rad)[-1]
+        return RobotState(
+            stamp_s=sample.stamp_s,
+            position_rad=sample.position_rad,
+            velocity_rad_per_s=sample.velocity_rad_per_s,
+            base_from_flange=RigidTransform.from_matrix(flange),
+            wrench=self._contact.in_flange(self._contact.of(sample.raw_wrench, flange)),
+            contacts=sample.contacts,
+            proximity_m=sample.proximity_m,
+            gripper_width_m=sample.gripper_width_m,
+            is_moving=self._is_moving,
+            is_stopped=self._is_latched(),
+            faults=self._faults,
+        )

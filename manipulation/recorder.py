@@ -1,0 +1,55 @@
+"""What a motion did, sampled for its report."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.motion import MotionLog
+from manipulation import kernels
+
+Array = NDArray[np.float64]
+
+LOG_RATE_HZ = 125.0
+
+
+class Recorder:
+    """Keeps every n-th tick and the peak of the contact force over all ticks."""
+
+    def __init__(self, dh: Array, flange_from_tool: Array, dt_s: float) -> None:
+        self._dh = dh
+        self._tool = flange_from_tool
+        self._stride = max(1, round(1.0 / (LOG_RATE_HZ * dt_s)))
+        self._ticks = 0
+        self._rows: list[tuple[float, Array, Array, Array]] = []
+        self.peak_force_n = 0.0
+
+    def poses_of(self, q_rad: Array) -> tuple[Array, Array]:
+        """(4, 4) base_from_flange and base_from_tool."""
+        flange = np.ascontiguousarray(kernels.frames(self._dh, q_rad)[-1])
+        return flange, flange @ self._tool
+
+    def pose_of(self, q_rad: Array) -> Array:
+        """(4, 4) base_from_tool."""
+        return self.poses_of(q_rad)[1]
+
+    def note(self, elapsed_s: float, q_rad: Array, wrench: Array, tip_m: Array) -> None:
+        """Take one tick in."""
+        force = math.sqrt(float(wrench[:3] @ wrench[:3]))
+        self.peak_force_n = max(self.peak_force_n, force)
+        if self._ticks % self._stride == 0:
+            self._rows.append((elapsed_s, q_rad, wrench, tip_m))
+        self._ticks += 1
+
+    def log(self, joints: int) -> MotionLog:
+        """The samples so far; empty arrays of the right shape when nothing ran."""
+        if not self._rows:
+            return MotionLog(
+                times_s=np.empty(0), positions_rad=np.empty((0, joints)), wrench=np.empty((0, 6)), tip_m=np.empty((0, 3))
+            )
+        times, positions, wrenches, tips = zip(*self._rows, strict=True)
+        return MotionLog(
+            times_s=np.array(times), positions_rad=np.array(positions), wrench=np.array(wrenches), tip_m=np.array(tips)
+        )

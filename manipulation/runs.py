@@ -1,0 +1,165 @@
+"""One run per kind of declared motion: where the arm should be in this tick, and whether the motion is over."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.clock import Clock, Deadline
+from hal.devices import Gripper
+from hal.motion import CartesianPath, Compliance, GripperMotion, Hold, JointTrajectory
+from manipulation import kernels
+from manipulation.kinematics import Kinematics
+from manipulation.sensing import Sample
+
+Array = NDArray[np.float64]
+
+BLEND_S = 0.25  # the gap between the declared and the measured start is closed over this time
+DAMPING = 1e-3  # of the damped least squares; strokes are chosen clear of singularities beforehand
+GRIP_START_S = 0.08  # a gripper needs this long to report that it moves
+GRIP_REST_S = 0.05
+COMMAND_WAIT_S = 0.25  # a gripper's command crosses a slow bus once a motion, not every tick
+
+
+class Run(Protocol):
+    """A motion in execution."""
+
+    def wanted(self, elapsed_s: float, sample: Sample, wrench: Array, last_rad: Array, dt_s: float) -> Array:
+        """Joint set-point (n,) for this tick. `wrench`: contact wrench (6,) in tool axes."""
+        ...
+
+    def is_over(self, elapsed_s: float, sample: Sample) -> bool:
+        """Has the declared course been run?"""
+        ...
+
+
+class TrajectoryRun:
+    """Cubic Hermite between the declared joint states, blended from the measured start."""
+
+    def __init__(self, motion: JointTrajectory, start_rad: Array) -> None:
+        self._t = motion.times_s
+        self._q, self._v = motion.positions_rad, motion.velocities_rad_per_s
+        self._gap = start_rad - motion.positions_rad[0]
+
+    def wanted(self, elapsed_s: float, sample: Sample, wrench: Array, last_rad: Array, dt_s: float) -> Array:
+        """The point of the trajectory at this time."""
+        q: Array = kernels.hermite(self._t, self._q, self._v, elapsed_s)
+        return q + self._gap * _fade(elapsed_s)
+
+    def is_over(self, elapsed_s: float, sample: Sample) -> bool:
+        """The declared time is over."""
+        return bool(elapsed_s >= self._t[-1])
+
+
+class PathRun:
+    """Tool poses in time; with compliance the tool yields about them by an admittance in tool axes."""
+
+    def __init__(self, motion: CartesianPath, kinematics: Kinematics, start_rad: Array) -> None:
+        poses = motion.base_from_tool
+        self._dh = kinematics.dh
+        self._tool = np.ascontiguousarray(motion.flange_from_tool.as_matrix())
+        self._t = np.ascontiguousarray(motion.times_s, float)
+        self._p = np.array([pose.translation for pose in poses])
+        self._r = np.array([pose.rotation.as_matrix() for pose in poses])
+        turns = [(b.rotation * a.rotation.inv()).as_rotvec() for a, b in zip(poses, poses[1:], strict=False)]
+        self._w = np.array(turns).reshape(-1, 3)
+        first = np.ascontiguousarray(poses[0].as_matrix())
+        measured, _ = kernels.tool_and_jacobian(self._dh, start_rad, self._tool)
+        self._gap = kernels.pose_error(measured, first)
+        self._admittance = None if motion.compliance is None else Admittance(motion.compliance)
+
+    def wanted(self, elapsed_s: float, sample: Sample, wrench: Array, last_rad: Array, dt_s: float) -> Array:
+        """Joints whose tool pose is the path's, displaced by the admittance."""
+        offset = np.zeros(6) if self._admittance is None else self._admittance.step(wrench, dt_s)
+        q: Array = kernels.path_joints(
+            self._dh, self._tool, self._t, self._p, self._r, self._w, elapsed_s, self._gap * _fade(elapsed_s), offset,
+            last_rad, DAMPING,
+        )  # fmt: skip
+        return q
+
+    def is_over(self, elapsed_s: float, sample: Sample) -> bool:
+        """The declared time is over."""
+        return bool(elapsed_s >= self._t[-1])
+
+
+class Admittance:
+    """A virtual mass, damper and spring on each tool axis; its offset (6,) is added to the path in tool axes."""
+
+    def __init__(self, compliance: Compliance) -> None:
+        self._k = np.array(compliance.stiffness)
+        self._d = np.array(compliance.damping)
+        self._m = np.array(compliance.mass)
+        self._target = np.array(compliance.target_wrench)
+        self._bound = np.array([compliance.max_offset_m] * 3 + [compliance.max_offset_rad] * 3)
+        self._state = np.zeros((2, 6))
+
+    def step(self, wrench: Array, dt_s: float) -> Array:
+        """Advance by one tick under the contact wrench; returns the offset (6,)."""
+        kernels.admittance_step(self._state, wrench - self._target, self._k, self._d, self._m, self._bound, dt_s)
+        return self._state[0]
+
+
+class HoldRun:
+    """Stand still."""
+
+    def __init__(self, motion: Hold) -> None:
+        self._duration_s = motion.duration_s
+
+    def wanted(self, elapsed_s: float, sample: Sample, wrench: Array, last_rad: Array, dt_s: float) -> Array:
+        """Where it is."""
+        return last_rad
+
+    def is_over(self, elapsed_s: float, sample: Sample) -> bool:
+        """The time is over."""
+        return elapsed_s >= self._duration_s
+
+
+class GripperRun:
+    """The arm holds while the pads move; over when they rest."""
+
+    def __init__(self, motion: GripperMotion, gripper: Gripper, deadline: Deadline) -> None:
+        self._timeout_s = motion.timeout_s
+        self._resting_since_s: float | None = None
+        gripper.command(
+            width_m=motion.width_m, force_n=motion.force_n, speed_m_per_s=motion.speed_m_per_s, deadline=deadline
+        )
+
+    def wanted(self, elapsed_s: float, sample: Sample, wrench: Array, last_rad: Array, dt_s: float) -> Array:
+        """Where it is."""
+        return last_rad
+
+    def is_over(self, elapsed_s: float, sample: Sample) -> bool:
+        """The pads have rested for a moment, or the time is over."""
+        if sample.gripper_is_moving or elapsed_s < GRIP_START_S:
+            self._resting_since_s = None
+        elif self._resting_since_s is None:
+            self._resting_since_s = elapsed_s
+        rested = self._resting_since_s is not None and elapsed_s - self._resting_since_s >= GRIP_REST_S
+        return rested or elapsed_s >= self._timeout_s
+
+
+def begin(
+    motion: JointTrajectory | CartesianPath | Hold | GripperMotion,
+    kinematics: Kinematics,
+    gripper: Gripper,
+    sample: Sample,
+    clock: Clock,
+) -> Run:
+    """The run of a motion that starts at the measured joints of `sample`."""
+    match motion:
+        case JointTrajectory():
+            return TrajectoryRun(motion, sample.position_rad)
+        case CartesianPath():
+            return PathRun(motion, kinematics, sample.position_rad)
+        case Hold():
+            return HoldRun(motion)
+        case GripperMotion():
+            return GripperRun(motion, gripper, Deadline.after(clock, COMMAND_WAIT_S))
+
+
+def _fade(elapsed_s: float) -> float:
+    """1 at the start, 0 after BLEND_S, level at both ends."""
+    u = min(1.0, elapsed_s / BLEND_S)
+    return 1.0 - u * u * (3.0 - 2.0 * u)

@@ -1,0 +1,154 @@
+"""One look at all motion devices per control tick, and the contact wrench behind the raw one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from hal.calibration import ToolLoad
+from hal.clock import Clock, Deadline
+from hal.devices import Arm, ForceTorque, Gripper, Proximity, Touch
+from hal.errors import CellError, DeviceError, StaleReading
+from hal.readings import Cause, Quality
+from manipulation import kernels
+
+Array = NDArray[np.float64]
+
+GRAVITY_M_PER_S2 = 9.80665
+READ_WAIT_S = 0.02  # longest that one tick waits for a device; a tick itself lasts 2 to 8 ms
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sample:
+    """What the devices said in one tick; `raw_wrench` (6,) in sensor axes with bias and weight inside."""
+
+    stamp_s: float
+    position_rad: Array
+    velocity_rad_per_s: Array
+    raw_wrench: Array
+    contacts: tuple[bool, ...]
+    proximity_m: tuple[float, ...]
+    gripper_width_m: float
+    gripper_is_moving: bool
+
+
+class DeviceFailure(Exception):
+    """A device could not be used in this tick; `device` names it."""
+
+    def __init__(self, device: str, cause: str) -> None:
+        super().__init__(f"{device}: {cause}")
+        self.device = device
+        self.cause = cause
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Devices:
+    """The devices of the control loop. All but the arm and its gripper may be absent."""
+
+    arm: Arm
+    gripper: Gripper
+    force_torque: ForceTorque | None
+    touch: Touch | None
+    proximities: Sequence[Proximity]
+    clock: Clock
+    max_age_s: float
+
+    def read(self) -> Sample:
+        """Read every device once.
+
+        Raises:
+            DeviceFailure: the first device that is silent, broken, stale or invalid. "Nothing in range" is a proximity reading.
+        """
+        now_s = self.clock.now_s()
+        deadline = Deadline(now_s + READ_WAIT_S, self.clock)
+        device = self.arm.name
+        try:
+            joints = self.arm.read_state(deadline=deadline).usable(now_s=now_s, max_age_s=self.max_age_s, device=device)
+            device = self.gripper.name
+            grip = self.gripper.read_state(deadline=deadline).usable(
+                now_s=now_s, max_age_s=self.max_age_s, device=device
+            )
+            raw = np.zeros(6)
+            if self.force_torque is not None:
+                device = self.force_torque.name
+                wrench = self.force_torque.read_wrench(deadline=deadline).usable(
+                    now_s=now_s, max_age_s=self.max_age_s, device=device
+                )
+                raw[:3], raw[3:] = wrench.force_n, wrench.torque_nm
+            contacts: tuple[bool, ...] = ()
+            if self.touch is not None:
+                device = self.touch.name
+                contacts = self.touch.read_contacts(deadline=deadline).usable(
+                    now_s=now_s, max_age_s=self.max_age_s, device=device
+                )
+            ranges = []
+            for sensor in self.proximities:
+                device = sensor.name
+                ranges.append(self._range(sensor, now_s, deadline))
+        except CellError as error:
+            named = error.details.get("device") if isinstance(error, DeviceError) else None
+            raise DeviceFailure(str(named or device), error.what) from error
+        if not (np.isfinite(joints.position_rad).all() and np.isfinite(raw).all()):
+            raise DeviceFailure(device, "a reading is not finite")
+        return Sample(
+            stamp_s=now_s,
+            position_rad=joints.position_rad,
+            velocity_rad_per_s=joints.velocity_rad_per_s,
+            raw_wrench=raw,
+            contacts=contacts,
+            proximity_m=tuple(ranges),
+            gripper_width_m=grip.width_m,
+            gripper_is_moving=grip.is_moving,
+        )
+
+    def _range(self, sensor: Proximity, now_s: float, deadline: Deadline) -> float:
+        reading = sensor.read_distance_m(deadline=deadline)
+        if reading.quality is Quality.INVALID and reading.cause is Cause.OUT_OF_RANGE:
+            if reading.age_s(now_s) > self.max_age_s:
+                raise StaleReading(
+                    f"{sensor.name} reading is {reading.age_s(now_s):.3f} s old",
+                    hint="check the device's rate and cable",
+                    device=sensor.name,
+                )
+            return float("nan")
+        return reading.usable(now_s=now_s, max_age_s=self.max_age_s, device=sensor.name)
+
+
+class ContactWrench:
+    """Takes bias and tool weight off the raw wrench: contact = raw - bias - weight, sensor axes.
+
+    weight: f = m R^T g, t = c x f, with R the rotation base_from_sensor and c the centre of mass in sensor axes.
+    """
+
+    def __init__(self, load: ToolLoad, flange_from_sensor: RigidTransform) -> None:
+        self._mass_kg = load.mass_kg
+        self._centre_m = np.asarray(load.centre_of_mass_m, float)
+        self._flange_from_sensor = np.ascontiguousarray(flange_from_sensor.as_matrix())
+        self.bias = np.asarray(load.bias, float)
+
+    def of(self, raw_wrench: Array, base_from_flange: Array) -> Array:
+        """(6,) contact wrench in sensor axes about the sensor's origin."""
+        return raw_wrench - self.bias - self.weight(base_from_flange)
+
+    def weight(self, base_from_flange: Array) -> Array:
+        """(6,) what gravity alone makes the sensor read."""
+        # The third row of base_from_sensor is "up" seen by the sensor.
+        up = base_from_flange[2, :3] @ self._flange_from_sensor[:3, :3]
+        f = -self._mass_kg * GRAVITY_M_PER_S2 * up
+        c = self._centre_m
+        out: Array = np.array(
+            [f[0], f[1], f[2], c[1] * f[2] - c[2] * f[1], c[2] * f[0] - c[0] * f[2], c[0] * f[1] - c[1] * f[0]]
+        )
+        return out
+
+    def tool_from_sensor(self, flange_from_tool: Array) -> Array:
+        """(4, 4) pose of the sensor on a tool, for carrying wrenches over with `kernels.wrench_at`."""
+        return np.ascontiguousarray(np.linalg.inv(flange_from_tool) @ self._flange_from_sensor)
+
+    def in_flange(self, contact: Array) -> Array:
+        """(6,) the contact wrench in flange axes about the flange."""
+        return np.asarray(kernels.wrench_at(contact, self._flange_from_sensor))

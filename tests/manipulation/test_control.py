@@ -1,0 +1,281 @@
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from hal.errors import MotionRefused, Stopped
+from hal.geometry import difference, perturbed
+from hal.motion import (
+    CartesianPath,
+    Compliance,
+    GripperMotion,
+    Guard,
+    Hold,
+    JointTrajectory,
+    MotionOutcome,
+    Quantity,
+)
+from manipulation.stroke import line
+from tests.manipulation.rig import GRIP, HOME, LOAD, Rig, make_rig, tool_pose
+
+INF = float("inf")
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    rig = make_rig()
+    yield rig
+    rig.controller.close()
+
+
+def forwards(distance_m: float, *, speed: float = 0.06, start: np.ndarray = HOME, guards: tuple[Guard, ...] = (), compliance: Compliance | None = None) -> CartesianPath:
+    pose = tool_pose(start)
+    return line(
+        pose,
+        perturbed(pose, np.array([distance_m, 0, 0, 0, 0, 0])),
+        name="forwards",
+        speed_m_per_s=speed,
+        flange_from_tool=GRIP,
+        guards=guards,
+        compliance=compliance,
+    )
+
+
+def joints(goal: np.ndarray, duration_s: float = 2.0) -> JointTrajectory:
+    t = np.linspace(0, 1, 20)
+    u = t * t * (3 - 2 * t)
+    du = 6 * t * (1 - t) / duration_s
+    return JointTrajectory(
+        name="joints",
+        times_s=t * duration_s,
+        positions_rad=HOME + u[:, None] * (goal - HOME),
+        velocities_rad_per_s=du[:, None] * (goal - HOME),
+    )
+
+
+def test_a_path_ends_where_it_was_declared(rig: Rig) -> None:
+    motion = forwards(0.05)
+    report = rig.controller.execute(motion)
+    assert report.outcome is MotionOutcome.COMPLETED
+    assert np.linalg.norm(difference(motion.base_from_tool[-1], report.base_from_tool)) < 1e-4
+    assert report.duration_s == pytest.approx(motion.times_s[-1], abs=0.1)
+    assert report.log.positions_rad.shape[1] == 6 and len(report.log.times_s) > 20
+    assert report.peak_force_n < 0.05
+
+
+def test_a_trajectory_ends_where_it_was_declared_and_begins_at_the_measured_joints(rig: Rig) -> None:
+    goal = HOME + np.array([0.2, -0.1, 0.1, 0.3, -0.2, 0.4])
+    rig.world.q = rig.world.target = HOME + 0.02
+    report = rig.controller.execute(joints(goal))
+    assert report.outcome is MotionOutcome.COMPLETED
+    assert np.abs(report.position_rad - goal).max() < 1e-3
+    assert np.abs(rig.world.commands[0] - (HOME + 0.02)).max() < 1e-3
+
+
+def test_contact_stops_an_approach_close_to_the_wall(rig: Rig) -> None:
+    rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) + 0.03
+    guard = Guard(name="contact", quantity=Quantity.FORCE, limit=8.0)
+    report = rig.controller.execute(forwards(0.08, guards=(guard,)))
+    assert report.outcome is MotionOutcome.GUARD and report.tripped == "contact"
+    assert 8.0 <= report.peak_force_n < 14.0
+    assert report.base_from_tool.translation[0] - rig.world.wall_x_m < 0.003
+
+
+def test_the_contact_wrench_is_free_of_weight_and_bias_and_in_tool_axes(rig: Rig) -> None:
+    rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) - 0.002
+    report = rig.controller.execute(Hold(name="look", duration_s=0.02))
+    force = tool_pose(HOME).rotation.inv().apply([-0.002 * rig.world.wall_n_per_m, 0, 0])
+    assert np.allclose(report.wrench[:3], force, atol=1e-6)
+    assert np.allclose(report.wrench[3:], 0.0, atol=1e-6)  # the wall acts at the tip
+
+
+def test_tare_finds_the_bias(rig: Rig) -> None:
+    assert np.allclose(rig.controller.tare(), LOAD.bias, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "limit", "axis", "below"),
+    [
+        (Quantity.TRAVEL, 0.02, None, False),
+        (Quantity.PROXIMITY, 0.03, None, True),
+        (Quantity.TOUCH, 1, None, False),
+        (Quantity.FORCE_RISE, 5.0, None, False),
+        (Quantity.TORQUE, -1.0, None, False),
+    ],
+)
+def test_every_quantity_can_end_a_motion(
+    rig: Rig, quantity: Quantity, limit: float, axis: tuple[float, float, float] | None, below: bool
+) -> None:
+    rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) + 0.05
+    guard = Guard(name="it", quantity=quantity, limit=limit, axis=axis, below=below)
+    report = rig.controller.execute(forwards(0.1, guards=(guard,)))
+    assert (report.outcome, report.tripped) == (MotionOutcome.GUARD, "it")
+
+
+def test_rotation_ends_a_turn(rig: Rig) -> None:
+    pose = tool_pose(HOME)
+    motion = line(
+        pose,
+        perturbed(pose, np.array([0, 0, 0, 0.4, 0, 0])),
+        name="turn",
+        speed_m_per_s=0.02,
+        flange_from_tool=GRIP,
+        guards=(Guard(name="turned", quantity=Quantity.ROTATION, limit=0.2),),
+    )
+    report = rig.controller.execute(motion)
+    assert report.tripped == "turned"
+    assert np.linalg.norm(difference(report.base_from_tool, pose)[3:]) == pytest.approx(0.2, abs=0.01)
+
+
+def test_too_much_force_is_a_fault_in_any_motion(rig: Rig) -> None:
+    rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) + 0.01
+    report = rig.controller.execute(forwards(0.1))
+    assert report.outcome is MotionOutcome.FAULT and report.tripped == "force_limit"
+    assert report.peak_force_n < 130.0
+
+
+def test_an_arm_that_does_not_follow_is_a_fault(rig: Rig) -> None:
+    stuck = HOME.copy()
+
+    def jam() -> None:
+        rig.world.target = stuck
+
+    rig.world.before_step = jam
+    report = rig.controller.execute(forwards(0.1))
+    assert report.outcome is MotionOutcome.FAULT and report.tripped == "tracking"
+
+
+def test_compliance_yields_to_the_wall(rig: Rig) -> None:
+    rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) + 0.02
+    soft = Compliance(stiffness=(300.0,) * 3 + (INF,) * 3, damping=(80.0,) * 6)
+    report = rig.controller.execute(forwards(0.04, compliance=soft))
+    # 20 mm beyond the wall: the series of 300 and 5000 N/m carries 5.7 N, where a stiff arm would press 100 N.
+    assert report.outcome is MotionOutcome.COMPLETED
+    assert np.linalg.norm(report.wrench[:3]) == pytest.approx(0.02 / (1 / 300 + 1 / 5000), rel=0.15)
+
+
+@pytest.mark.parametrize("device", ["arm", "gripper", "wrist_ft", "finger_touch", "proximity_left"])
+@pytest.mark.parametrize("how", ["silent", "frozen"])
+def test_a_device_that_fails_in_motion_stops_the_arm_and_is_named(rig: Rig, device: str, how: str) -> None:
+    def fail() -> None:
+        if rig.world.ticks == 300:
+            getattr(rig.world, how).add(device)
+
+    rig.world.before_step = fail
+    report = rig.controller.execute(forwards(0.1))
+    assert report.outcome is MotionOutcome.FAULT
+    assert device in report.cause
+    after = rig.world.ticks
+    assert after < 300 + 120
+    assert np.abs(rig.world.velocity).max() < 1e-3
+
+
+def test_a_device_that_is_dead_before_the_start_moves_nothing(rig: Rig) -> None:
+    rig.world.silent.add("wrist_ft")
+    report = rig.controller.execute(forwards(0.1))
+    assert report.outcome is MotionOutcome.FAULT and "wrist_ft" in report.cause
+    assert rig.world.commands == []
+
+
+def test_the_latch_stops_a_motion_and_refuses_the_next(rig: Rig) -> None:
+    def press() -> None:
+        rig.latched[0] = rig.world.ticks >= 200
+
+    rig.world.before_step = press
+    report = rig.controller.execute(forwards(0.1))
+    assert report.outcome is MotionOutcome.STOPPED
+    assert not rig.world.enabled
+    assert np.abs(rig.world.velocity).max() < 1e-3
+    with pytest.raises(Stopped):
+        rig.controller.execute(forwards(0.1))
+
+
+def test_after_a_stop_the_first_set_point_is_the_measured_position(rig: Rig) -> None:
+    rig.world.before_step = lambda: rig.latched.__setitem__(0, rig.world.ticks == 200)
+    rig.controller.execute(forwards(0.1))
+    rig.latched[0] = False
+    rig.world.before_step = lambda: None
+    moved = rig.world.q + 0.1  # somebody jogged the arm meanwhile
+    rig.world.q = rig.world.target = moved
+    rig.world.commands.clear()
+    rig.controller.execute(Hold(name="still", duration_s=0.02))
+    assert np.abs(rig.world.commands[0] - moved).max() < 1e-9
+
+
+def test_cancel_ends_the_motion(rig: Rig) -> None:
+    rig.world.before_step = lambda: rig.controller.cancel() if rig.world.ticks == 150 else None
+    report = rig.controller.execute(forwards(0.1))
+    assert report.outcome is MotionOutcome.CANCELLED
+    assert rig.controller.execute(Hold(name="still", duration_s=0.02)).outcome is MotionOutcome.COMPLETED
+
+
+def test_set_points_never_break_the_limits_even_when_a_path_asks_for_it(rig: Rig) -> None:
+    rig.controller.execute(forwards(0.12, speed=2.0))
+    commands = np.array(rig.world.commands)
+    velocity = np.diff(commands, axis=0) / 0.002
+    tips = np.array([tool_pose(q).translation for q in commands])
+    assert np.all(np.abs(velocity) <= 3.2 + 1e-6)
+    assert np.linalg.norm(np.diff(tips, axis=0), axis=1).max() / 0.002 <= 0.2505
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        forwards(0.1, start=HOME + 0.2),
+        joints(HOME + 5.0),
+        joints(HOME + np.nan),
+        joints(HOME + 1.0, duration_s=0.1),
+        Hold(name="long", duration_s=float("nan")),
+        GripperMotion(name="wide", width_m=-1.0, force_n=1.0),
+        CartesianPath(name="empty", flange_from_tool=GRIP, times_s=np.array([0.0]), base_from_tool=(tool_pose(HOME),)),
+    ],
+    ids=lambda motion: motion.name,
+)  # fmt: skip
+def test_nonsense_is_refused_and_nothing_moves(rig: Rig, motion: CartesianPath) -> None:
+    with pytest.raises(MotionRefused):
+        rig.controller.execute(motion)
+    assert rig.world.commands == []
+
+
+def test_a_second_motion_at_the_same_time_is_refused(rig: Rig) -> None:
+    running, release = threading.Event(), threading.Event()
+
+    def wait() -> None:
+        running.set()
+        release.wait(5.0)
+
+    rig.world.before_step = wait
+    first = threading.Thread(target=lambda: rig.controller.execute(Hold(name="long", duration_s=0.1)))
+    first.start()
+    assert running.wait(5.0)
+    with pytest.raises(MotionRefused, match="another motion"):
+        rig.controller.execute(Hold(name="second", duration_s=0.1))
+    release.set()
+    first.join()
+
+
+def test_the_gripper_moves_while_the_arm_holds(rig: Rig) -> None:
+    report = rig.controller.execute(GripperMotion(name="close", width_m=0.01, force_n=10.0))
+    assert report.outcome is MotionOutcome.COMPLETED
+    assert report.gripper_width_m == pytest.approx(0.01, abs=1e-4)
+    assert np.allclose(rig.world.q, HOME)
+
+
+def test_the_state_tells_joints_contacts_and_the_latch(rig: Rig) -> None:
+    rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) - 0.001
+    rig.latched[0] = True
+    state = rig.controller.state()
+    assert np.array_equal(state.position_rad, HOME)
+    assert state.contacts == (True, False) and state.is_stopped and not state.is_moving
+    assert np.linalg.norm(state.wrench[:3]) == pytest.approx(5.0, rel=1e-6)
+
+
+def test_a_closed_controller_refuses_and_closes_twice() -> None:
+    rig = make_rig()
+    rig.controller.close()
+    rig.controller.close()
+    with pytest.raises(MotionRefused):
+        rig.controller.execute(Hold(name="late", duration_s=0.1))

@@ -139,12 +139,11 @@ def _reached(
         # A button springs back: what it worked is what counts, and the simulator counts its strokes.
         return (after.value or 0.0) > (before.value or 0.0)
     if spec.kind == "slider":
-        return after.value is not None and abs(after.value - float(target)) <= GAUGE_SHARE * (
-            spec.scale.maximum - spec.scale.minimum
-        )
+        span = spec.scale.maximum - spec.scale.minimum
+        return after.value is not None and bool(abs(after.value - float(target)) <= GAUGE_SHARE * span)
     if spec.kind == "handwheel":
         return after.value is not None and bool(abs(after.value - float(target)) <= WHEEL_RAD)
-    return after.state == target
+    return bool(after.state == target)
 
 
 def _shown(truth: ObjectTruth) -> str:

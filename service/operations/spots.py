@@ -46,7 +46,7 @@ def _candidates(panel: Panel, clearance_m: float) -> Array:
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     gaps = [np.linalg.norm(points - light.position_m[:2], axis=1) - light.radius_m for light in panel.lights]
     gaps += [_distance_to(points, thing) for thing in panel.objects]
-    return points[np.min(gaps, axis=0) >= clearance_m]
+    return np.asarray(points[np.min(gaps, axis=0) >= clearance_m])
 
 
 def _distance_to(points: Array, thing: PanelObject) -> Array:

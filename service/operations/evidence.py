@@ -1,0 +1,259 @@
+"""From readings and arm poses to one panel pose with an honest covariance.
+
+All readings of one sensor share the error of its mounting. Each measurement carries that error in its weight, as if it
+were its own; the covariance of the answer is then summed over the errors that are really independent: each reading's
+own, and each mounting's once. One sigma of each is put in, and the answer solved again:
+`covariance = sum_k delta_k delta_k^T`, `delta_k` the change of the pose (linear error propagation).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from fusion import sensing
+from fusion.features import plane, point
+from fusion.measurement import Measurement, pack
+from fusion.robust import FusedPose, fuse
+from fusion.solve import local_solution
+from hal.calibration import CameraIntrinsics
+from hal.geometry import UncertainPose, certain, compose, difference, matrix_of, perturbed
+from perception.camera_model import undistort_pixels
+from perception.range import PlaneFit
+
+Array = NDArray[np.float64]
+PLATE = plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), name="plate")
+
+
+class Evidence(Protocol):
+    """One reading, with where the arm stood.
+
+    Attributes:
+        sensor: mounted device that gave it.
+        base_from_flange: at the time of the reading.
+        sigmas: (k,) one sigma of each independent error of the reading itself.
+    """
+
+    @property
+    def sensor(self) -> str: ...
+
+    @property
+    def base_from_flange(self) -> RigidTransform: ...
+
+    @property
+    def sigmas(self) -> Array: ...
+
+    def measurement(self, base_from_sensor: UncertainPose, errors: Array) -> Measurement:
+        """What fusion takes, with `errors` (k,) added to the reading."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LightEvidence:
+    """A border light seen by the camera. `covariance_px` (2, 2); `light_sigma_m` is the panel's own tolerance."""
+
+    sensor: str
+    base_from_flange: RigidTransform
+    light: str
+    light_m: Array
+    pixel_px: Array
+    covariance_px: Array
+    intrinsics: CameraIntrinsics
+    distance_m: float
+    light_sigma_m: float
+
+    @property
+    def sigmas(self) -> Array:
+        """Across and along the image, px."""
+        own = np.sqrt(np.trace(self.covariance_px) / 2.0)
+        return np.full(2, float(np.hypot(own, self.light_sigma_m * self.intrinsics.fx_px / self.distance_m)))
+
+    def measurement(self, base_from_sensor: UncertainPose, errors: Array) -> Measurement:
+        """The ray through the light: line-point."""
+        lens = self.intrinsics
+        return sensing.pixel(
+            point(self.light_m, name=self.light),
+            base_from_sensor,
+            pixel_px=undistort_pixels((self.pixel_px + errors)[None], lens)[0],
+            sigma_px=float(self.sigmas[0]),
+            camera=sensing.Pinhole(fx_px=lens.fx_px, fy_px=lens.fy_px, cx_px=lens.cx_px, cy_px=lens.cy_px),
+            label=f"ray to {self.light}",
+            sensor=self.sensor,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PlaneEvidence:
+    """The plate's plane in a range image; `systematic_*` is what the scanner's maker allows beyond noise."""
+
+    sensor: str
+    base_from_flange: RigidTransform
+    fit: PlaneFit
+    systematic_offset_m: float = 0.0003
+    systematic_angle_rad: float = 0.0005
+
+    @property
+    def sigmas(self) -> Array:
+        """Offset along the normal (m), then tilt about two axes across it (rad)."""
+        feature = self.fit.feature
+        offset = np.sqrt(max(0.0, float(feature.direction @ feature.point_covariance @ feature.direction)))
+        tilt = np.sqrt(float(np.trace(feature.direction_covariance)) / 2.0)
+        angle = float(np.hypot(tilt, self.systematic_angle_rad))
+        return np.array([float(np.hypot(offset, self.systematic_offset_m)), angle, angle])
+
+    def measurement(self, base_from_sensor: UncertainPose, errors: Array) -> Measurement:
+        """The fitted plane: plane-plane."""
+        feature = self.fit.feature
+        across = np.linalg.svd(feature.direction[None])[2][1:]
+        turn = Rotation.from_rotvec(errors[1] * across[0] + errors[2] * across[1])
+        return sensing.range_plane(
+            PLATE,
+            base_from_sensor,
+            point_m=feature.point_m + errors[0] * feature.direction,
+            normal=turn.apply(feature.direction),
+            offset_sigma_m=float(self.sigmas[0]),
+            normal_sigma_rad=float(self.sigmas[1]),
+            label="plate by range",
+            sensor=self.sensor,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TouchEvidence:
+    """The finger tip on the bare plate: `tip_m` (3,) in the sensor's frame."""
+
+    sensor: str
+    base_from_flange: RigidTransform
+    tip_m: Array
+    sigma_m: float
+    label: str
+
+    @property
+    def sigmas(self) -> Array:
+        """Along the finger, m: across it nothing is measured."""
+        return np.array([self.sigma_m])
+
+    def measurement(self, base_from_sensor: UncertainPose, errors: Array) -> Measurement:
+        """A point of the plate: point-plane."""
+        tip = self.tip_m + np.array([0.0, 0.0, errors[0]])
+        return sensing.touch(
+            PLATE, base_from_sensor, sigma_m=self.sigma_m, tip_m=tip, label=self.label, sensor=self.sensor
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ProximityEvidence:
+    """A distance to the bare plate along the sensor's z axis."""
+
+    sensor: str
+    base_from_flange: RigidTransform
+    distance_m: float
+    sigma_m: float
+    label: str
+
+    @property
+    def sigmas(self) -> Array:
+        """Along the beam, m."""
+        return np.array([self.sigma_m])
+
+    def measurement(self, base_from_sensor: UncertainPose, errors: Array) -> Measurement:
+        """A point of the plate: point-plane."""
+        return sensing.proximity(
+            PLATE,
+            base_from_sensor,
+            distance_m=self.distance_m + float(errors[0]),
+            sigma_m=self.sigma_m,
+            lateral_sigma_m=0.002,
+            label=self.label,
+            sensor=self.sensor,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FusedEvidence:
+    """The panel's pose, the measurements in the order of the evidence, and the fusion's own account."""
+
+    base_from_panel: UncertainPose
+    measurements: tuple[Measurement, ...]
+    fused: FusedPose
+
+
+def fuse_evidence(
+    evidence: Sequence[Evidence], mounts: Mapping[str, UncertainPose], *, prior: UncertainPose | None = None
+) -> FusedEvidence:
+    """The pose that the evidence points to.
+
+    Args:
+        evidence: readings of any sensors.
+        mounts: `flange_from_sensor` of every sensor in `evidence`.
+        prior: a pose believed beforehand; it only helps the search and is not part of the answer's covariance.
+
+    Raises:
+        InvalidRequest, Contradiction: see `fusion.robust.fuse`.
+    """
+    measurements = tuple(_measure(e, mounts[e.sensor], np.zeros(len(e.sigmas))) for e in evidence)
+    fused = fuse(measurements)
+    start = _mirror_resolved(fused, prior)
+    rejected = {r.index for r in fused.rejected}
+    good = [i for i in range(len(evidence)) if i not in rejected]
+    pose = _solve([measurements[i] for i in good], start)
+    covariance = np.zeros((6, 6))
+    for changed in _one_sigma_changes([evidence[i] for i in good], mounts):
+        moved = [changed.get(k, measurements[i]) for k, i in enumerate(good)]
+        delta = difference(_solve(moved, pose), pose)
+        covariance += np.outer(delta, delta)
+    fused = replace(fused, pose=pose)
+    return FusedEvidence(
+        base_from_panel=UncertainPose(parent_from_child=pose, covariance=covariance),
+        measurements=measurements,
+        fused=fused,
+    )
+
+
+def _measure(e: Evidence, mount: UncertainPose, errors: Array) -> Measurement:
+    return e.measurement(compose(certain(e.base_from_flange), mount), errors)
+
+
+def _one_sigma_changes(
+    evidence: Sequence[Evidence], mounts: Mapping[str, UncertainPose]
+) -> list[dict[int, Measurement]]:
+    """For each independent error, the measurements that it changes when it is one sigma large."""
+    changes: list[dict[int, Measurement]] = []
+    for k, e in enumerate(evidence):
+        changes += [{k: _measure(e, mounts[e.sensor], error)} for error in np.diag(e.sigmas)]
+    for sensor in sorted({e.sensor for e in evidence}):
+        mount = mounts[sensor]
+        for error in _one_sigma(mount.covariance):
+            moved = UncertainPose(
+                parent_from_child=perturbed(mount.parent_from_child, error), covariance=mount.covariance
+            )
+            changes.append(
+                {k: _measure(e, moved, np.zeros(len(e.sigmas))) for k, e in enumerate(evidence) if e.sensor == sensor}
+            )
+    return changes
+
+
+def _one_sigma(covariance: Array) -> Array:
+    """Rows are independent errors of one sigma whose outer products sum to the covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T)
+
+
+def _solve(measurements: Sequence[Measurement], start: RigidTransform) -> RigidTransform:
+    batch = pack(measurements)
+    return local_solution(
+        batch, np.ones(len(measurements)), matrix_of(start), np.asarray(start.translation), far=False
+    ).base_from_object
+
+
+def _mirror_resolved(fused: FusedPose, prior: UncertainPose | None) -> RigidTransform:
+    """Of the answer and the alternatives that fit as well, the one nearest to the prior."""
+    if prior is None or not fused.is_ambiguous:
+        return fused.pose
+    poses = [fused.pose, *(a.base_from_object for a in fused.alternatives if a.odds > 0.01)]
+    return min(poses, key=lambda pose: float(np.linalg.norm(difference(pose, prior.parent_from_child))))

@@ -1,0 +1,182 @@
+"""Panel model to image: every model edge looks along its normal for an image edge, and the view follows them all.
+
+The scheme is that of C. Harris and C. Stennett, RAPID, BMVC 1990, with a shrinking search window, a prior from the
+known pose, and Cauchy weights (Huber, Robust Statistics, 1981) so that labels, shadows and cables do not pull.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.panel import Panel
+from perception.vision.image import Image
+from perception.vision.outline import Outline, edges_of, plate_edges
+from perception.vision.patch import sample_at
+from perception.vision.view import Array, View
+
+WINDOWS_PX = (8.0, 5.0, 3.0, 2.0)  # search to either side; the pose is known to a few pixels
+STEP_PX = 0.5
+SMOOTHING_SIGMA_PX = 0.8
+EDGE_TO_NOISE = 4.0  # an edge counts when its slope exceeds that many sigmas of the slope's noise
+NORMAL_STEP_M = 1e-3
+MEASUREMENT_SIGMA_PX = 0.5
+GROWTH_SIGMA_PX = 2.0
+MIN_VISIBLE = 16  # fewer edge samples in the image say nothing about the panel
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Registration:
+    """The view after registration and how well the model's edges were found.
+
+    Attributes:
+        view: the moved view.
+        covariance: of the motion parameters, after registration.
+        support: share of the visible model edges with an image edge within 2 px; NaN when too few are in view.
+        rms_px: of the supporting edges.
+        shift_px: per object name, the (2,) local shift on top of the view; zero where it could not be measured.
+        shift_sigma_px: per object name, one sigma of that shift's coordinates.
+        edge_share: per object name, the share of its own edges found; NaN for kinds without fixed edges.
+    """
+
+    view: View
+    covariance: Array
+    support: float
+    rms_px: float
+    shift_px: dict[str, Array]
+    shift_sigma_px: dict[str, float]
+    edge_share: dict[str, float]
+
+
+def register(gray: Image, view: View, panel: Panel) -> Registration:
+    """Move `view` so that the panel's edges lie on the image's.
+
+    Args:
+        gray: (H, W) uint8, as the camera saw it (distorted).
+        view: prediction, good to a few pixels.
+    """
+    smooth = np.asarray(cv2.GaussianBlur(gray.astype(np.float32), (0, 0), SMOOTHING_SIGMA_PX), np.float32)
+    slope_noise = noise_sigma(gray) * 0.35  # of the central difference after that smoothing
+    own = {thing.name: edges for thing in panel.objects if (edges := edges_of(thing)) is not None}
+    everything = _joined([plate_edges(panel), *own.values()])
+    covariance = np.diag(view.prior_sigma**2)
+    reference = view
+    delta = np.zeros(len(view.prior_sigma))
+    for window in WINDOWS_PX:
+        delta, covariance = _step(smooth, slope_noise, reference, delta, edges=everything, window_px=window)
+    moved = reference.moved(delta)
+    found = _look(smooth, slope_noise, moved, everything, 2.5)
+    near = found.ok & (np.abs(found.offset_px) <= 2.0)
+    local = {name: _local_shift(smooth, slope_noise, moved, edges) for name, edges in own.items()}
+    return Registration(
+        view=moved,
+        covariance=covariance,
+        support=float(near.sum() / found.visible.sum()) if found.visible.sum() >= MIN_VISIBLE else float("nan"),
+        rms_px=float(np.sqrt(np.mean(found.offset_px[near] ** 2))) if near.any() else float("nan"),
+        shift_px={name: shift for name, (shift, _, _) in local.items()},
+        shift_sigma_px={name: sigma for name, (_, sigma, _) in local.items()},
+        edge_share={name: share for name, (_, _, share) in local.items()},
+    )
+
+
+def noise_sigma(gray: Image) -> float:
+    """Standard deviation of the pixel noise: J. Immerkaer, CVIU 64(2), 1996, with the median for the mean."""
+    part = gray[::2].astype(np.float32) if gray.size > 1_000_000 else gray.astype(np.float32)
+    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    response = np.abs(cv2.filter2D(part, -1, kernel))
+    return float(max(np.median(response) / 0.6745 / 6.0, 0.3))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Found:
+    offset_px: Array
+    normals_px: Array
+    visible: NDArray[np.bool_]
+    ok: NDArray[np.bool_]
+
+
+def _look(smooth: NDArray[np.float32], slope_noise: float, view: View, edges: Outline, window_px: float) -> _Found:
+    """The strongest image edge along every model normal: signed offset in px."""
+    points = view.project(edges.points_m)
+    ahead = view.project(
+        edges.points_m + NORMAL_STEP_M * np.column_stack([edges.normals, np.zeros(len(edges.normals))])
+    )
+    normals = ahead - points
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals / np.where(length > 0, length, 1.0)
+    t = np.arange(-window_px - STEP_PX, window_px + 1.5 * STEP_PX, STEP_PX)
+    u = points[:, :1] + normals[:, :1] * t
+    v = points[:, 1:] + normals[:, 1:] * t
+    height, width = smooth.shape
+    visible = np.isfinite(u).all(axis=1) & (u >= 1).all(axis=1) & (v >= 1).all(axis=1)
+    visible &= (u < width - 2).all(axis=1) & (v < height - 2).all(axis=1)
+    values = sample_at(smooth, np.where(visible[:, None], u, 0.0), np.where(visible[:, None], v, 0.0))
+    slope = np.abs(values[:, 2:] - values[:, :-2]) / (2 * STEP_PX)
+    inner = t[1:-1]
+    weighted = slope * np.exp(-0.5 * (inner / window_px) ** 2)
+    best = np.clip(weighted.argmax(axis=1), 1, len(inner) - 2)
+    rows = np.arange(len(best))
+    before, peak, after = slope[rows, best - 1], slope[rows, best], slope[rows, best + 1]
+    bend = before - 2 * peak + after
+    sub = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
+    offset = inner[best] + STEP_PX * np.clip(sub, -1, 1)
+    ok = visible & (peak > EDGE_TO_NOISE * slope_noise + 0.5)
+    return _Found(offset_px=offset, normals_px=normals, visible=visible, ok=ok)
+
+
+def _step(
+    smooth: NDArray[np.float32], slope_noise: float, reference: View, delta: Array, *, edges: Outline, window_px: float
+) -> tuple[Array, Array]:
+    """Two Gauss-Newton steps on the edges found in one window."""
+    sigma = reference.prior_sigma
+    information = np.diag(1.0 / sigma**2)
+    for _ in range(2):
+        view = reference.moved(delta)
+        found = _look(smooth, slope_noise, view, edges, window_px)
+        if found.ok.sum() < len(delta):
+            return delta, np.diag(sigma**2)
+        n = found.normals_px[found.ok]
+        points = edges.points_m[found.ok]
+        base = view.project(points)
+        J = np.empty((len(points), len(delta)))
+        for k in range(len(delta)):
+            bump = np.zeros(len(delta))
+            bump[k] = 1e-3 * sigma[k]
+            J[:, k] = ((reference.moved(delta + bump).project(points) - base) * n).sum(axis=1) / bump[k]
+        r = found.offset_px[found.ok]
+        scale = max(1.4826 * float(np.median(np.abs(r))), MEASUREMENT_SIGMA_PX)
+        w = 1.0 / (1.0 + (r / (1.5 * scale)) ** 2) / scale**2
+        N = J.T @ (w[:, None] * J) + information
+        delta = delta + np.linalg.solve(N, J.T @ (w * r) - information @ delta)
+    return delta, np.asarray(np.linalg.inv(N), float)
+
+
+def _local_shift(
+    smooth: NDArray[np.float32], slope_noise: float, view: View, edges: Outline
+) -> tuple[Array, float, float]:
+    """An object's own (2,) shift in px, its sigma, and the share of its edges found near the model."""
+    prior_px = 0.7  # building tolerance and what is left of the pose
+    found = _look(smooth, slope_noise, view, edges, 4.0)
+    visible = int(found.visible.sum())
+    if found.ok.sum() < 6:
+        return np.zeros(2), prior_px, 0.0 if visible >= 6 else float("nan")
+    r = found.offset_px[found.ok]
+    # The third unknown is growth: a bezel or a printed ring may be the stronger edge, all around the object.
+    J = np.column_stack([found.normals_px[found.ok], np.ones(len(r))])
+    prior = np.diag([1 / prior_px**2, 1 / prior_px**2, 1 / GROWTH_SIGMA_PX**2])
+    solution, N = np.array([0.0, 0.0, float(np.median(r))]), prior
+    for _ in range(4):
+        e = r - J @ solution
+        scale = max(1.4826 * float(np.median(np.abs(e))), 0.3)
+        w = 1.0 / (1.0 + (e / (1.5 * scale)) ** 2) / scale**2 / 2.0  # neighbouring samples share their noise
+        N = J.T @ (w[:, None] * J) + prior
+        solution = np.linalg.solve(N, J.T @ (w * r))
+    share = float((np.abs(r - J @ solution) < 1.5).sum() / max(1, visible))
+    return solution[:2], float(np.sqrt(np.trace(np.linalg.inv(N)[:2, :2]) / 2)), share
+
+
+def _joined(outlines: list[Outline]) -> Outline:
+    return Outline(points_m=np.vstack([o.points_m for o in outlines]), normals=np.vstack([o.normals for o in outlines]))

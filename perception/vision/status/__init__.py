@@ -1,0 +1,1 @@
+"""One reader a kind: a rectified patch and the panel file's description in, a `Status` out."""

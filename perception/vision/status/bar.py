@@ -1,0 +1,65 @@
+"""Bars that stick out of a hub: knob marks, lever handles, toggle bats. They differ from what lies on both sides."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from perception.vision.patch import Patch
+from perception.vision.view import Array
+
+CORE = (-0.5, 0.0, 0.5)  # of the half width
+FLANK = (1.7, 2.1)
+
+
+def bar_contrast(
+    patch: Patch,
+    angles_rad: ArrayLike,
+    *,
+    along_m: tuple[float, float],
+    half_width_m: float,
+    height_m: ArrayLike | None = None,
+    quantile: float = 0.3,
+    flank: tuple[float, float] = FLANK,
+) -> Array:
+    """(N,) signed contrast (gray levels) of a bar from the object's middle towards each angle, clockwise from up.
+
+    At every station along the bar the core is compared with both flanks; the station counts with the smaller of the two
+    differences, and with nothing when their signs disagree (an edge, not a bar). The result is a low quantile over the
+    stations, of the sign that the bar has: positive for bars brighter than their surroundings.
+
+    Args:
+        height_m: height above the plate of the bar's ends (inner, outer), or one height, or None for the patch's plane.
+    """
+    angle = np.atleast_1d(np.asarray(angles_rad, float))[:, None, None]
+    count = max(6, round((along_m[1] - along_m[0]) * patch.px_per_m))
+    r = np.linspace(*along_m, count)[None, :, None]
+    offsets = np.array([*CORE, -flank[0], -flank[1], flank[0], flank[1]]) * half_width_m
+    o = offsets[None, None, :]
+    x = r * np.sin(angle) + o * np.cos(angle)
+    y = r * np.cos(angle) - o * np.sin(angle)
+    z = _heights(height_m, count, x.shape)
+    shape = (len(angle) * count, len(offsets))
+    values = patch.sample(x.reshape(shape), y.reshape(shape), None if z is None else z.reshape(shape))
+    values = values.reshape(len(angle), count, len(offsets)).astype(float)
+    core = values[:, :, :3].mean(axis=2)
+    left = core - values[:, :, 3:5].mean(axis=2)
+    right = core - values[:, :, 5:7].mean(axis=2)
+    bright = np.maximum(np.minimum(left, right), 0.0)
+    dark = np.maximum(np.minimum(-left, -right), 0.0)
+    b, d = _low(bright, quantile), _low(dark, quantile)
+    return np.where(b >= d, b, -d)
+
+
+def _low(stations: Array, quantile: float) -> Array:
+    """Mean of the lower half around a quantile: smoother than the quantile itself."""
+    ordered = np.sort(stations, axis=1)
+    top = max(2, round(stations.shape[1] * 2 * quantile))
+    return np.asarray(ordered[:, :top].mean(axis=1))
+
+
+def _heights(height_m: ArrayLike | None, count: int, shape: tuple[int, ...]) -> Array | None:
+    if height_m is None:
+        return None
+    ends = np.broadcast_to(np.asarray(height_m, float), (2,))
+    return np.broadcast_to(np.linspace(ends[0], ends[1], count)[None, :, None], shape).copy()

@@ -1,0 +1,50 @@
+"""Push buttons: pressed or released."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hal.panel import Button, Mushroom
+from perception.vision.patch import Patch
+from perception.vision.reading import Status, gated, refused
+from perception.vision.status.press import cap_height, one_sided_shade
+
+SHADE_HALF = 0.16  # first harmonic between a flush cap (below 0.1) and one that stands out (above 0.2)
+SHADE_SCALE = 0.04
+
+
+def read_button(patch: Patch, spec: Button) -> Status:
+    """State of a push button. `patch` shows any plane near the cap."""
+    return read_cap(patch, spec)
+
+
+def read_cap(patch: Patch, spec: Button | Mushroom) -> Status:
+    """`pressed` or `released` by the height of the cap, else by its one-sided shade."""
+    R = spec.radius_m
+    a = np.linspace(0, 2 * np.pi, 24)
+    seen = patch.seen(np.outer([0.5, 0.8, 1.0], np.sin(a)) * R, np.outer([0.5, 0.8, 1.0], np.cos(a)) * R)
+    if seen < 0.4:
+        return refused("the button cannot be seen (glare, shadow or cover): change the angle or the light")
+    evidence = _by_height(patch, spec) if patch.growth_per_m > 0 else _by_shade(patch, R)
+    if evidence is None:
+        return refused("the cap's edge cannot be found: come closer or add light")
+    confidence = float(1.0 / (1.0 + np.exp(-abs(evidence)))) * min(1.0, seen + 0.2)
+    if confidence < 0.75:
+        return refused(
+            "pressed and released look alike from here: look from the side or closer", confidence=2 * confidence - 1
+        )
+    return gated(Status(state="pressed" if evidence < 0 else "released", confidence=confidence))
+
+
+def _by_height(patch: Patch, spec: Button | Mushroom) -> float | None:
+    """Log odds of `released` from the measured height."""
+    low, high = spec.height_m - spec.travel_m, spec.height_m
+    cap = cap_height(patch, radius_m=spec.radius_m, low_m=low, high_m=high)
+    if cap is None:
+        return None
+    return float((cap.height_m - (low + high) / 2) * (high - low) / cap.sigma_m**2)
+
+
+def _by_shade(patch: Patch, radius_m: float) -> float:
+    shade, _ = one_sided_shade(patch, radius_m=radius_m, ring=(0.80, 0.97), outside=(1.12, 1.3))
+    return (shade - SHADE_HALF) / SHADE_SCALE

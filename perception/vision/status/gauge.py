@@ -1,0 +1,73 @@
+"""Round pointer gauges: linear or taught non-linear scale, any polarity."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hal.panel import Gauge, Scale
+from perception.vision.patch import Patch
+from perception.vision.reading import Status, gated, probability, refused
+from perception.vision.status.pointer import PointerFit, find_pointer, wrapped
+
+POINTER_FROM, POINTER_TO = 0.25, 0.60  # share of the radius over which every gauge pointer has ink and no numeral is
+FINE_TO = 0.72
+STOP_RAD = np.deg2rad(6.0)  # a pointer rests that far beyond its scale at most
+UNREADABLE = "the face cannot be seen (glare, shadow or cover): change the angle or the light"
+
+
+def read_gauge(patch: Patch, spec: Gauge) -> Status:
+    """Value of a round gauge. `patch` shows the plane of the face, origin at its middle."""
+    R = spec.radius_m
+    seen = _seen(patch, R)
+    if seen < 0.5:
+        return refused(UNREADABLE, unit=spec.scale.unit)
+    fit = find_pointer(
+        patch,
+        pivot_m=(0.0, 0.0),
+        inner_m=POINTER_FROM * R,
+        outer_m=POINTER_TO * R,
+        fine_m=(POINTER_FROM * R, FINE_TO * R),
+    )
+    if fit is None:
+        return refused("no pointer stands out on the face: come closer or add light", unit=spec.scale.unit)
+    return status_of_pointer(fit, spec.scale, seen)
+
+
+def status_of_pointer(fit: PointerFit, scale: Scale, seen: float) -> Status:
+    """Value and confidence of a pointer on a scale, or the refusal of a pointer that is off the scale."""
+    lo, hi = sorted((scale.at_min, scale.at_max))
+    middle = (lo + hi) / 2
+    place = middle + float(wrapped(np.array(fit.angle_rad - middle)))
+    if not lo - STOP_RAD <= place <= hi + STOP_RAD:
+        return refused(
+            "the pointer is off its scale, so what was found may not be the pointer: look again, closer",
+            unit=scale.unit,
+        )
+    value = scale.value_at(place)
+    slope = abs(scale.value_at(place + 1e-3) - scale.value_at(place - 1e-3)) / 2e-3
+    return gated(
+        Status(
+            value=float(value),
+            unit=scale.unit,
+            uncertainty=float(slope * fit.sigma_rad),
+            confidence=pointer_confidence(fit, seen),
+        )
+    )
+
+
+def pointer_confidence(fit: PointerFit, seen: float) -> float:
+    """Confidence of a pointer from contrast, rival, support and visibility."""
+    return probability(
+        [
+            (np.log(fit.strength), np.log(3.0), 0.25),
+            (0.75 - fit.rival_ratio, 0.0, 0.08),
+            (fit.supported, 0.6, 0.15),
+            (seen, 0.7, 0.15),
+        ]
+    )
+
+
+def _seen(patch: Patch, radius_m: float) -> float:
+    a = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    r = np.array([0.2, 0.4, 0.6, 0.75])[:, None] * radius_m
+    return patch.seen(r * np.sin(a), r * np.cos(a))

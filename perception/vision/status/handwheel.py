@@ -1,0 +1,91 @@
+"""Handwheels: the phase of all spokes gives the angle within one spacing, the marked spoke says which spacing."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.panel import Handwheel
+from perception.vision.patch import Patch
+from perception.vision.reading import Status, gated, probability, refused
+from perception.vision.status.choice import contrast_noise
+from perception.vision.status.pointer import unroll, wrapped
+from perception.vision.view import Array
+
+STEPS = 720
+
+
+def read_handwheel(patch: Patch, spec: Handwheel) -> Status:
+    """Angle (rad, clockwise from straight up, -pi..pi) of the marked spoke. `patch` shows the wheel's plane."""
+    R, n = spec.radius_m + spec.rim_m, spec.spokes
+    angles = 2 * np.pi * np.arange(STEPS) / STEPS
+    spoke = unroll(patch, (0.0, 0.0), np.linspace(0.42, 0.72, 8) * R, angles, None)
+    mark = unroll(patch, (0.0, 0.0), np.linspace(0.45, 0.97, 12) * R, angles, None)
+    seen = patch.seen(
+        np.outer([0.5, 0.7, 0.9], np.sin(angles[::20])) * R, np.outer([0.5, 0.7, 0.9], np.cos(angles[::20])) * R
+    )
+    if seen < 0.4:
+        return refused("the wheel cannot be seen (glare, shadow or cover): change the angle or the light", unit="rad")
+    noise = contrast_noise(patch)
+    ink = np.median(np.abs(spoke - np.median(spoke, axis=1, keepdims=True)), axis=0)
+    window = STEPS // 60
+    ink = _smooth(ink, window)
+    folded = np.sort(ink.reshape(n, -1), axis=0)[: max(1, n - 1)].mean(axis=0) if STEPS % n == 0 else _fold(ink, n)
+    phase_step = int(folded.argmax())
+    contrast = float(folded.max() - np.median(folded))
+    phase = _peak(folded, phase_step) * 2 * np.pi / STEPS
+    places = phase + 2 * np.pi * np.arange(n) / n
+    profile = np.array([_at(mark, p) for p in places])
+    deviation = np.array([_mark_evidence(profile, k) for k in range(n)])
+    best = int(deviation.argmax())
+    second = float(np.sort(deviation)[-2]) if n > 1 else 0.0
+    if contrast < noise or deviation[best] < 2 * noise:
+        return refused("no marked spoke stands out: come closer or add light", unit="rad")
+    confidence = probability(
+        [
+            (np.log(contrast / noise), np.log(1.5), 0.3),
+            (np.log((second + noise) / (deviation[best] + noise)), np.log(0.7), -0.12),
+            (seen, 0.55, 0.1),
+        ]
+    )
+    sigma = max(0.35 / (patch.image_px_per_m * 0.6 * R * np.sqrt(n)), 0.5 / (patch.image_px_per_m * R))
+    return gated(
+        Status(
+            value=float(wrapped(np.array(places[best]))), unit="rad", uncertainty=float(sigma), confidence=confidence
+        )
+    )
+
+
+def _smooth(values: Array, width: int) -> Array:
+    kernel = np.hanning(width + 2)[1:-1]
+    padded = np.concatenate([values[-width:], values, values[:width]])
+    return np.convolve(padded, kernel / kernel.sum(), "same")[width:-width]
+
+
+def _fold(ink: Array, n: int) -> Array:
+    period = STEPS / n
+    steps = np.arange(int(period))
+    stacked = np.array([np.interp(steps + k * period, np.arange(STEPS), ink, period=STEPS) for k in range(n)])
+    return np.asarray(np.sort(stacked, axis=0)[: max(1, n - 1)].mean(axis=0))
+
+
+def _peak(folded: Array, top: int) -> float:
+    """Centre of mass of the peak: spokes are wide and flat."""
+    half = len(folded) // 4
+    offsets = np.arange(-half, half + 1)
+    values = folded[(top + offsets) % len(folded)]
+    weight = np.maximum(values - (values.max() + values.min()) / 2, 0.0)
+    return float(top + (weight * offsets).sum() / max(weight.sum(), 1e-9))
+
+
+def _at(mark: NDArray[np.float32], angle: float) -> Array:
+    step = round(angle / (2 * np.pi) * STEPS)
+    near = (step + np.arange(-6, 7)) % STEPS
+    return np.asarray(mark[:, near].mean(axis=1), float)
+
+
+def _mark_evidence(profile: Array, k: int) -> float:
+    """How far spoke `k` differs from the others over at least two neighbouring radii, gray levels."""
+    others = np.median(np.delete(profile, k, axis=0), axis=0)
+    difference = np.abs(profile[k] - others)
+    return float(np.minimum(difference[:-1], difference[1:]).max())

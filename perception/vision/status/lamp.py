@@ -1,0 +1,40 @@
+"""Indicator lamps: a lit one is brighter than the plate around it and brightest in the middle."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hal.panel import Lamp
+from perception.vision.image import WHITE_LEVEL, Image
+from perception.vision.patch import Patch, sample_at
+from perception.vision.reading import Status, gated, refused
+from perception.vision.view import Array
+
+LIT_RATIO = 0.85  # between an unlit lens (0.3 to 0.6 of a gray plate) and a lit one (above 1)
+
+
+def read_lamp(patch: Patch, spec: Lamp) -> Status:
+    """State of a lamp. `patch` shows the plate plane or the lens."""
+    light = patch.gray if patch.colour is None else patch.colour.max(axis=2)
+    a = np.linspace(0, 2 * np.pi, 36, endpoint=False)
+    core, rim, plate = (
+        _ring(patch, light, spec.radius_m, r, a) for r in ((0.0, 0.15, 0.3), (0.5, 0.6, 0.7), (1.45, 1.6, 1.75))
+    )
+    around = float(np.median(plate))
+    if around >= WHITE_LEVEL - 2:
+        return refused("glare covers the lamp: change the angle or the light")
+    level = max(around, 8.0)
+    brightness = np.log(max(float(core.mean()), 2.0) / level / LIT_RATIO)
+    peaked = np.log((float(core.mean()) + 8.0) / (float(np.median(rim)) + 8.0))
+    evidence = brightness / 0.12 + 1.5 * np.clip(peaked / 0.2, -1.0, 1.0)
+    inside = patch.inside.mean()
+    if inside < 0.7:
+        return refused("the lamp is outside the image: move the camera")
+    confidence = float(1.0 / (1.0 + np.exp(-min(abs(evidence), 8.0))))
+    return gated(Status(state="on" if evidence > 0 else "off", confidence=float(np.clip(2 * confidence - 1, 0, 1))))
+
+
+def _ring(patch: Patch, light: Image, radius_m: float, radii: tuple[float, ...], angles: Array) -> Array:
+    r = np.array(radii)[:, None] * radius_m
+    u, v = patch.pixel_of(r * np.sin(angles), r * np.cos(angles))
+    return np.asarray(sample_at(light, u, v), float)

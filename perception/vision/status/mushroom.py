@@ -1,0 +1,13 @@
+"""Emergency mushrooms: pressed ones stay in."""
+
+from __future__ import annotations
+
+from hal.panel import Mushroom
+from perception.vision.patch import Patch
+from perception.vision.reading import Status
+from perception.vision.status.button import read_cap
+
+
+def read_mushroom(patch: Patch, spec: Mushroom) -> Status:
+    """State of an emergency mushroom. `patch` shows any plane near the cap."""
+    return read_cap(patch, spec)

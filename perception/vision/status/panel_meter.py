@@ -1,0 +1,41 @@
+"""Rectangular moving-coil meters: a thin pointer about a pivot that may lie behind the lower cover."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hal.panel import PanelMeter
+from perception.vision.patch import Patch
+from perception.vision.reading import Status, refused
+from perception.vision.status.gauge import STOP_RAD, UNREADABLE, status_of_pointer
+from perception.vision.status.pointer import find_pointer
+
+POINTER_FROM, POINTER_TO = 0.30, 0.85  # share of the needle's length that is in the window, before the ticks begin
+
+
+def read_panel_meter(patch: Patch, spec: PanelMeter) -> Status:
+    """Value of a panel meter. `patch` shows the plane of the face, origin at the middle of the housing."""
+    lo, hi = sorted((spec.scale.at_min, spec.scale.at_max))
+    pivot = (0.0, -spec.pivot_below_m)
+    seen = _seen(patch, spec, lo, hi)
+    if seen < 0.5:
+        return refused(UNREADABLE, unit=spec.scale.unit)
+    margin = 1.5 * STOP_RAD
+    fit = find_pointer(
+        patch,
+        pivot_m=pivot,
+        inner_m=POINTER_FROM * spec.needle_m,
+        outer_m=POINTER_TO * spec.needle_m,
+        fine_m=(POINTER_FROM * spec.needle_m, 0.92 * spec.needle_m),
+        limits_rad=(lo - margin, hi + margin),
+        width_rad=np.deg2rad(14.0),
+    )
+    if fit is None:
+        return refused("no pointer stands out on the face: come closer or add light", unit=spec.scale.unit)
+    return status_of_pointer(fit, spec.scale, seen)
+
+
+def _seen(patch: Patch, spec: PanelMeter, lo: float, hi: float) -> float:
+    a = np.linspace(lo, hi, 24)
+    r = np.array([0.5, 0.65, 0.8, 0.95])[:, None] * spec.needle_m
+    return patch.seen(r * np.sin(a), r * np.cos(a) - spec.pivot_below_m)

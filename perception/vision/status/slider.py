@@ -1,0 +1,89 @@
+"""Sliders: the cap covers what lies to both sides of the slot."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hal.panel import Slider
+from perception.vision.patch import Patch
+from perception.vision.reading import Status, gated, probability, refused
+from perception.vision.status.choice import contrast_noise
+from perception.vision.view import Array
+
+SIDE = (0.22, 0.32, 0.40)  # of the cap's width: beyond the slot, inside the cap
+
+
+def read_slider(patch: Patch, spec: Slider) -> Status:
+    """Value of a slider. `patch` shows the plane of the cap's top."""
+    along, across = spec.cap_size_m[0], spec.cap_size_m[1]
+    lo, hi = sorted((spec.scale.at_min, spec.scale.at_max))
+    step = 1.0 / patch.px_per_m
+    s = np.arange(lo - along, hi + along, step)
+    left, right = (_profile(patch, spec.angle_rad, s, side * across * np.array(SIDE)) for side in (-1.0, 1.0))
+    seen = float(np.mean([patch.seen(*_place(spec.angle_rad, s, np.array([o * across]))) for o in (-0.3, 0.3)]))
+    if seen < 0.4:
+        return refused(
+            "the slider cannot be seen (glare, shadow or cover): change the angle or the light", unit=spec.scale.unit
+        )
+    lean_m = _base_shift_m(patch, spec)  # the foot of the cap shows on that side of its top
+    width = max(3, round((along + abs(lean_m)) / step))
+    kernel = np.ones(width) / width
+    best = (-1.0, 0, np.zeros_like(s))
+    for sign in (-1.0, 1.0):
+        both = np.minimum(sign * (left - np.median(left)), sign * (right - np.median(right)))
+        score = np.convolve(np.maximum(both, 0.0), kernel, "same")
+        score[(s - lean_m / 2 < lo - 2 * step) | (s - lean_m / 2 > hi + 2 * step)] = 0.0
+        top = int(score.argmax())
+        if score[top] > best[0]:
+            best = (float(score[top]), top, score)
+    peak, top, score = best
+    noise = contrast_noise(patch)
+    apart = np.abs(s - s[top]) > 1.2 * along
+    rival = float(score[apart].max()) if apart.any() else 0.0
+    if peak < 2.0 * noise:
+        return refused("no cap stands out on the track: come closer or add light", unit=spec.scale.unit)
+    place = float(np.clip(_centre(score, top, s) - lean_m / 2, lo, hi))
+    slope = abs(spec.scale.value_at(place + 1e-4) - spec.scale.value_at(place - 1e-4)) / 2e-4
+    confidence = probability(
+        [
+            (np.log(peak / noise), np.log(3.0), 0.3),
+            (np.log((rival + noise) / (peak + noise)), np.log(0.7), -0.12),
+            (seen, 0.55, 0.1),
+        ]
+    )
+    return gated(
+        Status(
+            value=spec.scale.value_at(place),
+            unit=spec.scale.unit,
+            uncertainty=slope * 0.5 / patch.image_px_per_m,
+            confidence=confidence,
+        )
+    )
+
+
+def _base_shift_m(patch: Patch, spec: Slider) -> float:
+    """How far along the track the foot of the cap appears beside its top in the patch, m."""
+    u, v = -patch.parallax_px_per_m * spec.cap_size_m[2] / patch.px_per_m
+    return float(u * np.cos(spec.angle_rad) - v * np.sin(spec.angle_rad))
+
+
+def _place(angle_rad: float, s: Array, across: Array) -> tuple[Array, Array]:
+    c, n = np.cos(angle_rad), np.sin(angle_rad)
+    return s[:, None] * c - across * n, s[:, None] * n + across * c
+
+
+def _profile(patch: Patch, angle_rad: float, s: Array, across: Array) -> Array:
+    return np.asarray(patch.sample(*_place(angle_rad, s, across)).mean(axis=1), float)
+
+
+def _centre(score: Array, top: int, s: Array) -> float:
+    """Middle of the top of the matched filter's triangle."""
+    high = score > 0.6 * score[top]
+    first, last = top, top
+    while first > 0 and high[first - 1]:
+        first -= 1
+    while last < len(score) - 1 and high[last + 1]:
+        last += 1
+    part = slice(first, last + 1)
+    weight = score[part] - 0.6 * score[top]
+    return float((weight * s[part]).sum() / max(weight.sum(), 1e-9))

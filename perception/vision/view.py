@@ -1,0 +1,109 @@
+"""How panel points come to pixels: through a calibrated camera with a pose, or through a homography of the plate.
+
+Both views can be moved by a small parameter vector with a prior, so that registration is the same for both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hal.calibration import CameraIntrinsics
+from hal.geometry import UncertainPose, perturbed
+from perception.camera_model import project
+
+Array = NDArray[np.float64]
+
+
+class View(Protocol):
+    """Panel points (m, panel frame, z towards the viewer) to pixels, with small uncertain motion."""
+
+    @property
+    def prior_sigma(self) -> Array:
+        """(n,) one sigma of every motion parameter."""
+        ...
+
+    def project(self, points_m: ArrayLike) -> Array:
+        """(N, 2) pixels of (N, 3) panel points; NaN behind the camera."""
+        ...
+
+    def moved(self, delta: Array) -> Self:
+        """The view after a motion by (n,) parameters."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CameraView:
+    """A calibrated camera before the panel; moves by `delta = (d, r)` of hal.geometry, m and rad, camera axes."""
+
+    intrinsics: CameraIntrinsics
+    camera_from_panel: UncertainPose
+
+    @property
+    def prior_sigma(self) -> Array:
+        """One sigma of the pose, floored so that an exact pose may still follow the building tolerance."""
+        floor = np.array([2e-4, 2e-4, 5e-4, 5e-4, 5e-4, 5e-4])
+        return np.maximum(np.sqrt(np.diag(self.camera_from_panel.covariance)), floor)
+
+    def project(self, points_m: ArrayLike) -> Array:
+        """(N, 2) pixels of (N, 3) panel points."""
+        points = self.camera_from_panel.parent_from_child.apply(np.asarray(points_m, float))
+        return np.asarray(project(points, self.intrinsics))
+
+    def moved(self, delta: Array) -> CameraView:
+        """The view with the pose perturbed by `delta` (6,)."""
+        pose = perturbed(self.camera_from_panel.parent_from_child, delta)
+        return CameraView(
+            intrinsics=self.intrinsics,
+            camera_from_panel=UncertainPose(parent_from_child=pose, covariance=self.camera_from_panel.covariance),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PlaneView:
+    """A homography from the plate (x, y in m, y up) to pixels: heights do not matter.
+
+    Moves by the shifts (px) of four control points, so that the prior is in pixels.
+
+    Attributes:
+        px_from_plate: (3, 3).
+        corners_m: (4, 2) the control points on the plate.
+        sigma_px: one sigma of every control point's coordinate.
+    """
+
+    px_from_plate: Array
+    corners_m: Array
+    sigma_px: float = 2.0
+
+    @property
+    def prior_sigma(self) -> Array:
+        """One sigma of the eight corner shifts, px."""
+        return np.full(8, self.sigma_px)
+
+    def project(self, points_m: ArrayLike) -> Array:
+        """(N, 2) pixels of (N, 2 or 3) plate points."""
+        points = np.asarray(points_m, float)[:, :2]
+        u = np.column_stack([points, np.ones(len(points))]) @ self.px_from_plate.T
+        return np.asarray(u[:, :2] / u[:, 2:])
+
+    def moved(self, delta: Array) -> PlaneView:
+        """The view with the control points shifted by `delta` (8,), px."""
+        shifted = self.project(self.corners_m) + delta.reshape(4, 2)
+        return PlaneView(
+            px_from_plate=homography(self.corners_m, shifted), corners_m=self.corners_m, sigma_px=self.sigma_px
+        )
+
+
+def homography(source: Array, target: Array) -> Array:
+    """(3, 3) homography that takes four (4, 2) source points to four target points."""
+    A = np.zeros((8, 8))
+    x, y = source.T
+    u, v = target.T
+    A[:4, 0], A[:4, 1], A[:4, 2] = x, y, 1.0
+    A[:4, 6], A[:4, 7] = -u * x, -u * y
+    A[4:, 3], A[4:, 4], A[4:, 5] = x, y, 1.0
+    A[4:, 6], A[4:, 7] = -v * x, -v * y
+    return np.append(np.linalg.solve(A, np.concatenate([u, v])), 1.0).reshape(3, 3)

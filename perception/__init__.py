@@ -1,0 +1,1 @@
+"""Pixels and ranges to facts: vision, range images, calibration."""

@@ -1,0 +1,164 @@
+"""One range image in, named surfaces out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hal.errors import InvalidRequest, NotFound
+from perception.range import finish, join
+from perception.range.features import RangeFeature, features_of
+from perception.range.noise import NoiseModel, estimate_noise
+from perception.range.primitives import Plane, Surface, SurfaceType
+from perception.range.segment import Candidates, segment
+from perception.range.sensor import RangeSensorModel
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int32]
+
+LEAST_VALID_PIXELS = 16
+LARGEST_PIXELS = 2**26  # 8192 x 8192; about 0.2 kB of working memory a pixel
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RangeScene:
+    """What one range image shows.
+
+    Attributes:
+        labels: (H, W) int32, label of the surface at each pixel, 0 = none.
+        surfaces: largest first, parameters in the sensor frame; `surfaces[i].label` indexes `labels`.
+        noise: the noise model that was estimated from the image, or given.
+        sensor: the sensor model used.
+        warnings: plain sentences about what limits this result.
+    """
+
+    labels: Labels
+    surfaces: tuple[Surface, ...]
+    noise: NoiseModel
+    sensor: RangeSensorModel
+    warnings: tuple[str, ...]
+
+    def features(self) -> tuple[RangeFeature, ...]:
+        """Planes, axes and points with covariance, one a surface, for fusion."""
+        return features_of(self.surfaces)
+
+    def of_type(self, kind: SurfaceType) -> tuple[Surface, ...]:
+        """The surfaces of one type, largest first."""
+        return tuple(s for s in self.surfaces if s.type == kind)
+
+    def largest_plane(self) -> Surface:
+        """The plane with the most pixels.
+
+        Raises:
+            NotFound: the image shows no plane.
+        """
+        for surface in self.surfaces:
+            if isinstance(surface.primitive, Plane):
+                return surface
+        raise NotFound("the range image shows no plane", hint="move closer, or check the sensor model and its scale")
+
+
+def analyse(
+    depth_m: ArrayLike, sensor: RangeSensorModel, *, noise: NoiseModel | None = None
+) -> RangeScene:
+    """Segment a range image into planes, spheres, cylinders, cones and ellipsoids, with parameters and covariance.
+
+    Args:
+        depth_m: (H, W) depth along the sensor's z axis, metres; NaN, infinite or <= 0 (pinhole) = no reading.
+        sensor: pinhole or orthographic model of that size.
+        noise: used instead of the estimate from the image when given.
+
+    Raises:
+        InvalidRequest: wrong shape or type, a sensor of another size, or depth that cannot be metres.
+        NotFound: fewer than 16 valid pixels.
+    """
+    depth = checked_depth(depth_m, sensor)
+    law = noise or estimate_noise(depth, sensor)
+    labels, found = segment(depth, sensor, law)
+    labels, surfaces = _finished(depth, sensor, law, labels, found)
+    return RangeScene(
+        labels=labels, surfaces=surfaces, noise=law, sensor=sensor, warnings=_warnings(depth, sensor, law, surfaces)
+    )
+
+
+def checked_depth(depth_m: ArrayLike, sensor: RangeSensorModel) -> Array:
+    """The depth image as (H, W) float64 with NaN for every kind of missing reading; see `analyse` for errors."""
+    raw = np.asarray(depth_m)
+    if raw.ndim != 2 or raw.dtype.kind not in "fiu":
+        raise InvalidRequest(
+            f"depth must be one (H, W) image of numbers, not shape {raw.shape} of {raw.dtype}",
+            hint="pass one channel; convert integer codes with window.decode",
+        )
+    if raw.shape != (sensor.height_px, sensor.width_px):
+        raise InvalidRequest(
+            f"depth is {raw.shape[1]}x{raw.shape[0]} but the sensor model is {sensor.width_px}x{sensor.height_px}",
+            hint="use the calibration of this resolution",
+        )
+    if raw.size > LARGEST_PIXELS:
+        raise InvalidRequest(f"image of {raw.size} pixels", hint=f"at most {LARGEST_PIXELS} pixels; cut it into parts")
+    depth = np.array(raw, dtype=np.float64, order="C")
+    missing = ~np.isfinite(depth)
+    if sensor.packed()[0] > 0:
+        missing |= depth <= 0.0
+    depth[missing] = np.nan
+    valid = depth.size - int(missing.sum())
+    if valid < LEAST_VALID_PIXELS:
+        raise NotFound(
+            f"only {valid} of {depth.size} pixels hold a depth", hint="check range, exposure and the invalid value"
+        )
+    _check_scale(depth, sensor)
+    return depth
+
+
+def _check_scale(depth: Array, sensor: RangeSensorModel) -> None:
+    middle = float(np.nanmedian(depth[:: max(1, depth.shape[0] // 64), :: max(1, depth.shape[1] // 64)]))
+    if not np.isfinite(middle):
+        middle = float(np.nanmedian(depth))
+    if abs(middle) > 200.0:
+        raise InvalidRequest(
+            f"median depth is {middle:.0f} m: the image is probably in millimetres",
+            hint="divide by 1000, or decode codes with their scale", median_depth_m=middle,
+        )
+    if sensor.packed()[0] > 0 and middle < 1e-3:
+        raise InvalidRequest(
+            f"median depth is {middle:.2g} m: the scale is wrong", hint="give depth in metres", median_depth_m=middle
+        )
+
+
+def _finished(
+    depth: Array, sensor: RangeSensorModel, noise: NoiseModel, labels: Labels, found: Candidates
+) -> tuple[Labels, tuple[Surface, ...]]:
+    count = len(found.kinds)
+    samples = finish.samples_by_label(depth, sensor, noise, labels, count)
+    owner = join.join_pieces(depth, sensor.packed(), found.kinds, found.parameters, samples)
+    joined = np.array([0, *owner], np.int32)[labels]
+    if owner != list(range(1, count + 1)):
+        samples = finish.samples_by_label(depth, sensor, noise, joined, count)
+    keep = [k for k in range(count) if owner[k] == k + 1 and samples[k].x.size >= 8]
+    keep.sort(key=lambda k: -samples[k].x.size)
+    surfaces = []
+    renamed = np.zeros(count + 1, np.int32)
+    for new, k in enumerate(keep, 1):
+        surface, _ = finish.refine_surface(
+            new, found.kinds[k], found.parameters[k], samples[k], sensor=sensor, noise=noise
+        )
+        surfaces.append(surface)
+        renamed[k + 1] = new
+    return renamed[joined], tuple(surfaces)
+
+
+def _warnings(
+    depth: Array, sensor: RangeSensorModel, noise: NoiseModel, surfaces: tuple[Surface, ...]
+) -> tuple[str, ...]:
+    out = []
+    middle = float(np.nanmedian(depth))
+    sigma = float(noise.sigma_m(middle))
+    if sigma > 2.0 * sensor.pitch_m(middle):
+        out.append(f"noise of {1e3 * sigma:.1f} mm exceeds two pixels: small surfaces are lost")
+    if noise.is_stepped:
+        out.append("depth comes in steps coarser than the noise: reprogram the sensor window if it allows")
+    if not surfaces:
+        out.append("no primitive explains any part of the image: check the sensor model and the scale")
+    return tuple(out)

@@ -1,0 +1,130 @@
+"""From blocks back to pixels: every pixel goes to the neighbouring surface that explains its depth best."""
+
+# ruff: noqa: PLR0912, PLR0917, PLR1714 - compiled loops take plain arrays, and long
+# bodies and plain comparisons are what compiles fast.
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.grid import sigma_at
+from perception.range.surfaces import depth_on, normal_on
+
+CLAIM_SIGMAS = 3.5
+MAX_CANDIDATES = 8
+
+
+@njit(cache=True)
+def claim_pixels(depth, sen, noise, blocks, size, kinds, ths, out):  # type: ignore[no-untyped-def]
+    """Label each pixel of `depth` (H, W) with the best surface among those of the 3x3 blocks around it.
+
+    Writes `out` (H, W) int32: label, or 0 where nothing explains the depth within `CLAIM_SIGMAS`. Labels index
+    `kinds` and `ths` from 1.
+    """
+    H, W = depth.shape
+    h, w = blocks.shape
+    perspective = sen[0] > 0
+    near = np.empty(MAX_CANDIDATES, np.int32)
+    for r in range(h):
+        for c in range(w):
+            n = 0
+            for i in range(max(0, r - 1), min(h, r + 2)):
+                for j in range(max(0, c - 1), min(w, c + 2)):
+                    k = blocks[i, j]
+                    if k == 0:
+                        continue
+                    new = True
+                    for m in range(n):
+                        if near[m] == k:
+                            new = False
+                    if new and n < MAX_CANDIDATES:
+                        near[n] = k
+                        n += 1
+            for v in range(r * size, min(r * size + size, H)):
+                y = (v - sen[4]) / sen[2]
+                for u in range(c * size, min(c * size + size, W)):
+                    out[v, u] = 0
+                    z = depth[v, u]
+                    if n == 0 or not np.isfinite(z):
+                        continue
+                    x = (u - sen[3]) / sen[1]
+                    best, label = CLAIM_SIGMAS, 0
+                    sigma = sigma_at(noise, z)
+                    for m in range(n):
+                        e = misfit(kinds[near[m]], ths[near[m]], x, y, z, sigma, perspective)
+                        if e < best:
+                            best, label = e, near[m]
+                    out[v, u] = label
+
+
+@njit(cache=True)
+def misfit(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]
+    """|z - surface| in sigmas, eased at grazing rays where half a pixel moves the depth far; infinite on a miss."""
+    zm = depth_on(kind, th, x, y, perspective)
+    if not np.isfinite(zm):
+        return np.inf
+    e = abs(z - zm) / sigma
+    if e < CLAIM_SIGMAS or kind == 0:
+        return e
+    px, py = (x * zm, y * zm) if perspective else (x, y)
+    nx, ny, nz = normal_on(kind, th, px, py, zm)
+    facing = abs(nx * x + ny * y + nz) / np.sqrt(x * x + y * y + 1.0) if perspective else abs(nz)
+    return e * min(1.0, max(facing, 0.2) / 0.5)
+
+
+@njit(cache=True)
+def fill_small_gaps(label, finite, sweeps):  # type: ignore[no-untyped-def]
+    """Give each unlabelled valid pixel the label that at least 4 of its 8 neighbours agree on; `sweeps` times."""
+    H, W = label.shape
+    for _ in range(sweeps):
+        before = label.copy()
+        for v in range(1, H - 1):
+            for u in range(1, W - 1):
+                if before[v, u] or not finite[v, u]:
+                    continue
+                best, most = 0, 0
+                for i in range(v - 1, v + 2):
+                    for j in range(u - 1, u + 2):
+                        k = before[i, j]
+                        if k == 0 or k == best:
+                            continue
+                        n = 0
+                        for p in range(v - 1, v + 2):
+                            for q in range(u - 1, u + 2):
+                                if before[p, q] == k:
+                                    n += 1
+                        if n > most:
+                            best, most = k, n
+                if most >= 3:
+                    label[v, u] = best
+
+
+@njit(cache=True)
+def bucket(label, count):  # type: ignore[no-untyped-def]
+    """Flat pixel indices grouped by label: label k owns indices[starts[k] : starts[k + 1]]; starts is (count + 2,)."""
+    flat = label.ravel()
+    starts = np.zeros(count + 2, np.int64)
+    for i in range(flat.shape[0]):
+        starts[flat[i] + 1] += 1
+    for k in range(count + 1):
+        starts[k + 1] += starts[k]
+    place = starts.copy()
+    indices = np.empty(flat.shape[0], np.int32)
+    for i in range(flat.shape[0]):
+        k = flat[i]
+        indices[place[k]] = i
+        place[k] += 1
+    return starts, indices
+
+
+@njit(cache=True)
+def gather(depth, sen, noise, indices, x, y, z, sigma):  # type: ignore[no-untyped-def]
+    """Fill ray coordinates, depth and sigma of the pixels `indices` (flat) into the given (N,) arrays."""
+    W = depth.shape[1]
+    flat = depth.ravel()
+    for k in range(indices.shape[0]):
+        i = indices[k]
+        x[k] = (i % W - sen[3]) / sen[1]
+        y[k] = (i // W - sen[4]) / sen[2]
+        z[k] = flat[i]
+        sigma[k] = sigma_at(noise, flat[i])

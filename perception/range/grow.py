@@ -1,0 +1,325 @@
+"""Growing surfaces over the grid: planes from flat seeds, curved surfaces from a fitted start.
+
+A region grows while its own model explains the next block, so it stops at a crease however gentle the normals change
+there. A plane that grew on a curved surface betrays itself: a quadratic explains its support clearly better.
+"""
+
+# ruff: noqa: PLR0912, PLR0915, PLR0917 - compiled loops take plain arrays, and long
+# bodies and plain comparisons are what compiles fast.
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.surfaces import PLANE, depth_on, normal_on
+
+GROW_SIGMAS = 3.0
+CURVED_RMS = 0.4  # in sigmas: how much a quadratic may gain over a plane before the plane is a strip of something bent
+CURVED_F = 4.0  # and how significant that gain must be (F ratio)
+SEED_LEVELS = 64
+
+
+@njit(cache=True)
+def seed_order(normal, rms, free, reach):  # type: ignore[no-untyped-def]
+    """Free blocks with a tangent plane, flattest neighbourhood first (counting sort), as flat indices."""
+    h, w = rms.shape
+    key = np.full(h * w, -1, np.int32)
+    counts = np.zeros(SEED_LEVELS + 1, np.int32)
+    for r in range(h):
+        for c in range(w):
+            if not free[r, c] or not np.isfinite(rms[r, c]):
+                continue
+            bend = 0.0
+            for s in range(4):
+                i = r + (reach if s == 0 else -reach if s == 1 else 0)
+                j = c + (reach if s == 2 else -reach if s == 3 else 0)
+                if i < 0 or j < 0 or i >= h or j >= w or not np.isfinite(rms[i, j]) or not free[i, j]:
+                    bend += 0.02
+                    continue
+                dot = 0.0
+                for k in range(3):
+                    dot += normal[r, c, k] * normal[i, j, k]
+                bend += 1.0 - dot
+            level = int(min(SEED_LEVELS - 1.0, 12.0 * np.sqrt(bend * 25.0) + 4.0 * max(rms[r, c] - 1.0, 0.0)))
+            key[r * w + c] = level
+            counts[level + 1] += 1
+    for k in range(SEED_LEVELS):
+        counts[k + 1] += counts[k]
+    out = np.empty(counts[SEED_LEVELS], np.int32)
+    for i in range(h * w):
+        if key[i] >= 0:
+            out[counts[key[i]]] = i
+            counts[key[i]] += 1
+    return out
+
+
+@njit(cache=True)
+def solve3(S, out):  # type: ignore[no-untyped-def]
+    """Coefficients (a, b, c) of g = a x + b y + c from sums (n, x, y, xx, xy, yy, g, xg, yg); False if degenerate."""
+    n = S[0]
+    if n <= 0.0:
+        return False
+    mx, my, mg = S[1] / n, S[2] / n, S[6] / n
+    sxx, sxy, syy = S[3] / n - mx * mx, S[4] / n - mx * my, S[5] / n - my * my
+    sxg, syg = S[7] / n - mx * mg, S[8] / n - my * mg
+    det = sxx * syy - sxy * sxy
+    if det <= 1e-6 * sxx * syy or det <= 0.0:
+        return False
+    out[0] = (syy * sxg - sxy * syg) / det
+    out[1] = (sxx * syg - sxy * sxg) / det
+    out[2] = mg - out[0] * mx - out[1] * my
+    return True
+
+
+@njit(cache=True)
+def plane_from_coefficients(m, perspective, th):  # type: ignore[no-untyped-def]
+    """PLANE parameters, normal towards the sensor, from g = a x + b y + c."""
+    if perspective:
+        nx, ny, nz, d = m[0], m[1], m[2], 1.0  # (a, b, c) . X = 1 and z > 0: this normal points away
+    else:
+        nx, ny, nz, d = -m[0], -m[1], 1.0, m[2]
+    length = -np.sqrt(nx * nx + ny * ny + nz * nz)
+    th[0], th[1], th[2], th[3] = nx / length, ny / length, nz / length, d / length
+
+
+@njit(cache=True)
+def _quadratic_gain(idx, count, x, y, g, weight, x0, y0, scale):  # type: ignore[no-untyped-def]
+    """Sum of squares (in sigmas) left by a plane and by a quadratic over the blocks idx[:count]."""
+    A, b, row = np.zeros((6, 6)), np.zeros(6), np.empty(6)
+    total = 0.0
+    g0 = g[idx[0]]
+    for k in range(count):
+        i = idx[k]
+        px, py = (x[i] - x0) / scale, (y[i] - y0) / scale
+        row[0], row[1], row[2], row[3], row[4], row[5] = 1.0, px, py, px * px, px * py, py * py
+        w, value = weight[i], g[i] - g0
+        total += w * value * value
+        for a in range(6):
+            b[a] += w * row[a] * value
+            for e in range(a + 1):
+                A[a, e] += w * row[a] * row[e]
+    for a in range(6):
+        for e in range(a):
+            A[e, a] = A[a, e]
+        A[a, a] *= 1.0 + 1e-10
+    plane = np.linalg.solve(A[:3, :3].copy(), b[:3].copy())
+    left_plane = total - plane @ b[:3]
+    full = np.linalg.solve(A, b)
+    return max(left_plane, 0.0), max(total - full @ b, 0.0)
+
+
+@njit(cache=True)
+def grow_planes(  # type: ignore[no-untyped-def]
+    x, y, z, sigma, normal, rms, free, label, first_label, perspective, order, least, cos_limit, tried
+):
+    """Planes over the free blocks; writes labels and returns parameters (M, 16), sums (M, 9), mean squares (M,).
+
+    Blocks of supports that turned out curved are marked in `tried` so that they seed nothing again.
+    """
+    h, w = z.shape
+    n_all = h * w
+    fx, fy, fz, fs = x.ravel(), y.ravel(), z.ravel(), sigma.ravel()
+    ff, fl, ft, fr = free.ravel(), label.ravel(), tried.ravel(), rms.ravel()
+    fn = normal.reshape(n_all, 3)
+    g, weight = np.empty(n_all), np.empty(n_all)
+    for i in range(n_all):
+        zi = fz[i]
+        g[i] = 1.0 / zi if perspective else zi
+        s = fs[i] / (zi * zi) if perspective else fs[i]
+        weight[i] = 1.0 / (s * s)
+    mark = np.zeros(n_all, np.int32)
+    queue = np.empty(n_all, np.int32)
+    ths, sums, mean2 = np.zeros((512, 16)), np.zeros((512, 9)), np.zeros(512)
+    found = 0
+    stamp = 0
+    m, S, th = np.zeros(3), np.zeros(9), np.zeros(16)
+    for o in range(order.shape[0]):
+        seed = order[o]
+        if not ff[seed] or ft[seed] or found == 512:
+            continue
+        nx, ny, nz = fn[seed, 0], fn[seed, 1], fn[seed, 2]
+        if perspective:
+            d = (nx * fx[seed] + ny * fy[seed] + nz) * fz[seed]
+            if abs(d) < 1e-9:
+                continue
+            m[0], m[1], m[2] = nx / d, ny / d, nz / d
+        else:
+            m[0], m[1] = -nx / nz, -ny / nz
+            m[2] = g[seed] - m[0] * fx[seed] - m[1] * fy[seed]
+        plane_from_coefficients(m, perspective, th)
+        count = 0
+        for sweep in range(3):
+            stamp += 1
+            S[:] = 0.0
+            queue[0] = seed
+            mark[seed] = stamp
+            count, head, refit_at = 1, 0, 8
+            while head < count:
+                i = queue[head]
+                head += 1
+                wgt = weight[i]
+                S[0] += wgt
+                S[1] += wgt * fx[i]
+                S[2] += wgt * fy[i]
+                S[3] += wgt * fx[i] * fx[i]
+                S[4] += wgt * fx[i] * fy[i]
+                S[5] += wgt * fy[i] * fy[i]
+                S[6] += wgt * g[i]
+                S[7] += wgt * fx[i] * g[i]
+                S[8] += wgt * fy[i] * g[i]
+                if sweep == 0 and head == refit_at:
+                    refit_at *= 2
+                    if solve3(S, m):
+                        plane_from_coefficients(m, perspective, th)
+                r, c = i // w, i % w
+                slack = GROW_SIGMAS if sweep else GROW_SIGMAS + 2.0 / np.sqrt(head)
+                for s in range(4):
+                    rr = r + (1 if s == 0 else -1 if s == 1 else 0)
+                    cc = c + (1 if s == 2 else -1 if s == 3 else 0)
+                    if rr < 0 or cc < 0 or rr >= h or cc >= w:
+                        continue
+                    j = rr * w + cc
+                    if mark[j] == stamp or not ff[j]:
+                        continue
+                    e = (g[j] - m[0] * fx[j] - m[1] * fy[j] - m[2]) ** 2 * weight[j]
+                    if not e <= slack * slack:
+                        continue
+                    if fr[j] < 1.8:
+                        turn = th[0] * fn[j, 0] + th[1] * fn[j, 1] + th[2] * fn[j, 2]
+                        if turn < cos_limit:
+                            continue
+                    mark[j] = stamp
+                    queue[count] = j
+                    count += 1
+            if count < least or not solve3(S, m):
+                count = 0
+                break
+            plane_from_coefficients(m, perspective, th)
+        if count == 0:
+            ft[seed] = True
+            continue
+        x0, y0 = S[1] / S[0], S[2] / S[0]
+        scale = np.sqrt(max(S[3] / S[0] - x0 * x0 + S[5] / S[0] - y0 * y0, 1e-30))
+        flat, bent = _quadratic_gain(queue, count, fx, fy, g, weight, x0, y0, scale)
+        gain = (flat - bent) / 3.0
+        ratio = gain / max(bent / max(count - 6, 1), 0.3)
+        if (flat - bent > CURVED_RMS * CURVED_RMS * count and ratio > CURVED_F) or flat > 3.0 * count:
+            for k in range(count):
+                ft[queue[k]] = True
+            continue
+        for k in range(count):
+            ff[queue[k]] = False
+            fl[queue[k]] = first_label + found
+        ths[found] = th
+        sums[found] = S
+        mean2[found] = flat / max(count - 3, 1)
+        found += 1
+    return ths[:found].copy(), sums[:found].copy(), mean2[:found].copy()
+
+
+@njit(cache=True)
+def grow_surface(  # type: ignore[no-untyped-def]
+    kind, th, x, y, z, sigma, normal, rms, free, seeds, perspective, cos_limit, mark, stamp, queue
+):
+    """Blocks connected to `seeds` that the surface explains; returns their number, indices in queue[:number].
+
+    Also returns the sum of squared residuals. `mark` receives `stamp` where a block belongs.
+    """
+    h, w = z.shape
+    fx, fy, fz, fs = x.ravel(), y.ravel(), z.ravel(), sigma.ravel()
+    ff, fr = free.ravel(), rms.ravel()
+    fn = normal.reshape(h * w, 3)
+    count, head, total = 0, 0, 0.0
+    for k in range(seeds.shape[0]):
+        j = seeds[k]
+        e2 = _explained(kind, th, fx[j], fy[j], fz[j], fs[j], fn[j], fr[j], perspective, cos_limit)
+        if ff[j] and e2 >= 0.0 and mark[j] != stamp:
+            mark[j] = stamp
+            queue[count] = j
+            count += 1
+            total += e2
+    while head < count:
+        i = queue[head]
+        head += 1
+        r, c = i // w, i % w
+        for s in range(4):
+            rr = r + (1 if s == 0 else -1 if s == 1 else 0)
+            cc = c + (1 if s == 2 else -1 if s == 3 else 0)
+            if rr < 0 or cc < 0 or rr >= h or cc >= w:
+                continue
+            j = rr * w + cc
+            if mark[j] == stamp or not ff[j]:
+                continue
+            e2 = _explained(kind, th, fx[j], fy[j], fz[j], fs[j], fn[j], fr[j], perspective, cos_limit)
+            if e2 < 0.0:
+                continue
+            mark[j] = stamp
+            queue[count] = j
+            count += 1
+            total += e2
+    return count, total
+
+
+@njit(cache=True)
+def _explained(kind, th, x, y, z, sigma, n, rms, perspective, cos_limit):  # type: ignore[no-untyped-def]
+    """Squared residual in sigmas if the surface explains the block, else -1."""
+    zm = depth_on(kind, th, x, y, perspective)
+    if not np.isfinite(zm):
+        return -1.0
+    e = (z - zm) / sigma
+    px, py = (x * zm, y * zm) if perspective else (x, y)
+    nx, ny, nz = normal_on(kind, th, px, py, zm)
+    facing = nx * x + ny * y + nz if perspective else nz
+    reach = np.sqrt(x * x + y * y + 1.0) if perspective else 1.0
+    # The block's own sampling error grows with the slope; at the rim of a curved surface it rules.
+    limit = GROW_SIGMAS * min(3.0, max(1.0, 0.5 * reach / max(abs(facing), 1e-3)))
+    if abs(e) > limit:
+        return -1.0
+    if rms < 1.8 and kind != PLANE:
+        turn = nx * n[0] + ny * n[1] + nz * n[2]
+        if facing > 0.0:
+            turn = -turn
+        if turn < cos_limit:
+            return -1.0
+    return e * e
+
+
+@njit(cache=True)
+def range_components(z, sigma, free, slope, inverse_f, perspective, normal, rms, cos_limit):  # type: ignore[no-untyped-def]
+    """Components of the free blocks linked over small depth steps and turns; labels (h, w) from 1, and sizes."""
+    h, w = z.shape
+    label = np.zeros((h, w), np.int32)
+    stack = np.empty(h * w, np.int32)
+    sizes = np.zeros(h * w + 1, np.int32)
+    found = 0
+    for r0 in range(h):
+        for c0 in range(w):
+            if label[r0, c0] or not free[r0, c0]:
+                continue
+            found += 1
+            label[r0, c0] = found
+            stack[0] = r0 * w + c0
+            top = 1
+            while top > 0:
+                top -= 1
+                i = stack[top]
+                r, c = i // w, i % w
+                sizes[found] += 1
+                pitch = (z[r, c] if perspective else 1.0) * inverse_f
+                for s in range(4):
+                    rr = r + (1 if s == 0 else -1 if s == 1 else 0)
+                    cc = c + (1 if s == 2 else -1 if s == 3 else 0)
+                    if rr < 0 or cc < 0 or rr >= h or cc >= w or label[rr, cc] or not free[rr, cc]:
+                        continue
+                    if not abs(z[rr, cc] - z[r, c]) <= slope * pitch + 4.0 * sigma[r, c]:
+                        continue
+                    if rms[r, c] < 1.8 and rms[rr, cc] < 1.8:
+                        dot = 0.0
+                        for k in range(3):
+                            dot += normal[r, c, k] * normal[rr, cc, k]
+                        if dot < cos_limit:
+                            continue
+                    label[rr, cc] = found
+                    stack[top] = rr * w + cc
+                    top += 1
+    return label, sizes[: found + 1].copy()

@@ -1,0 +1,98 @@
+"""Joining pieces of one surface that something in front has parted."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.range import fit
+from perception.range.finish import FREE, Samples, thinned
+from perception.range.surfaces import PLANE, depth_on
+
+Array = NDArray[np.float64]
+
+PAIR_SAMPLES = 150
+JOINED_SHARE = 0.85
+JOINED_MEAN_SQUARE = 1.6
+LARGEST_TURN_RAD = 0.2
+SIGHT_SAMPLES = 40
+BEHIND_SHARE = 0.15  # more of the sight line than this seen behind the surface: a gap, not an occluder
+
+
+def join_pieces(
+    depth_m: Array, packed: Array, kinds: list[int], parameters: list[Array], samples: list[Samples]
+) -> list[int]:
+    """For each surface (label k at k - 1) the label that it belongs to after joining, itself when it stays alone.
+
+    Parameters of the surviving labels are updated in place.
+    """
+    owner = list(range(1, len(kinds) + 1))
+    order = sorted(range(len(kinds)), key=lambda k: -samples[k].x.size)
+    thin = [thinned(s, PAIR_SAMPLES) for s in samples]
+    for position, big in enumerate(order):
+        if owner[big] != big + 1:
+            continue
+        for small in order[position + 1 :]:
+            if owner[small] != small + 1 or samples[small].x.size < 4:
+                continue
+            joined = _joint_fit(kinds, parameters, thin, big=big, small=small, perspective=bool(packed[0] > 0))
+            if joined is None or _gap_between(depth_m, packed, (kinds[big], joined), thin[big], thin[small]):
+                continue
+            owner[small] = big + 1
+            parameters[big] = joined
+            thin[big] = _together(thin[big], thin[small])
+    return owner
+
+
+def _joint_fit(
+    kinds: list[int], parameters: list[Array], thin: list[Samples], *, big: int, small: int, perspective: bool
+) -> Array | None:
+    kind, th = kinds[big], parameters[big]
+    a, b = thin[big], thin[small]
+    if kind == PLANE and kinds[small] == PLANE:
+        turn = float(th[:3] @ parameters[small][:3])
+        if turn < np.cos(LARGEST_TURN_RAD):
+            return None
+    if not _near(kind, th, b, perspective):
+        return None
+    both = _together(a, b)
+    joint, _, _, _, _ = fit.fit_robust(
+        kind, th, both.x, both.y, both.z, both.sigma, perspective, FREE, 3
+    )
+    for s in (a, b):
+        e = np.empty(s.x.size)
+        fit.residuals(kind, joint, s.x, s.y, s.z, s.sigma, perspective, e)
+        good = np.abs(e) < fit.TRIM_SIGMAS
+        if good.mean() < JOINED_SHARE or float(np.mean(e[good] ** 2)) > JOINED_MEAN_SQUARE:
+            return None
+    return np.asarray(joint)
+
+
+def _near(kind: int, th: Array, s: Samples, perspective: bool) -> bool:
+    """Whether the surface, extended, passes near the piece: a cheap refusal before the joint fit."""
+    e = np.empty(s.x.size)
+    fit.residuals(kind, th, s.x, s.y, s.z, s.sigma, perspective, e)
+    return bool(np.nanmedian(np.abs(e)) < 25.0) if np.isfinite(e).mean() > 0.5 else False
+
+
+def _together(a: Samples, b: Samples) -> Samples:
+    return Samples(
+        x=np.concatenate([a.x, b.x]), y=np.concatenate([a.y, b.y]), z=np.concatenate([a.z, b.z]),
+        sigma=np.concatenate([a.sigma, b.sigma]),
+    )
+
+
+def _gap_between(depth_m: Array, packed: Array, surface: tuple[int, Array], a: Samples, b: Samples) -> bool:
+    """Whether the sensor sees past the surface on the shortest line between the two pieces."""
+    d2 = (a.x[:, None] - b.x[None, :]) ** 2 + (a.y[:, None] - b.y[None, :]) ** 2
+    i, j = np.unravel_index(int(np.argmin(d2)), d2.shape)
+    t = np.linspace(0.0, 1.0, SIGHT_SAMPLES)[1:-1]
+    x, y = a.x[i] + t * (b.x[j] - a.x[i]), a.y[i] + t * (b.y[j] - a.y[i])
+    u = np.clip(np.rint(x * packed[1] + packed[3]).astype(int), 0, depth_m.shape[1] - 1)
+    v = np.clip(np.rint(y * packed[2] + packed[4]).astype(int), 0, depth_m.shape[0] - 1)
+    seen = depth_m[v, u]
+    perspective = bool(packed[0] > 0)
+    model = np.array([depth_on(*surface, p, q, perspective) for p, q in zip(x, y, strict=True)])
+    slack = 6.0 * float(np.median(a.sigma))
+    behind = seen > model + np.maximum(slack, 3.0 * np.abs(seen) / packed[1] if perspective else 3.0 / packed[1])
+    return bool(np.mean(behind) > BEHIND_SHARE)

@@ -1,0 +1,192 @@
+"""How noisy a range image is, from the image itself.
+
+Three causes are told apart, because a method tuned to one fails on the others: white noise, seen in small windows;
+correlated noise, which only larger windows see; and the step between codes, which hides noise smaller than itself.
+Each grows with depth as `a + b z^2`, the law of triangulating sensors; laser scanners have b near 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from perception.range.sensor import RangeSensorModel
+
+Array = NDArray[np.float64]
+
+WINDOW = 5  # samples across; a window of 25 samples rarely holds a gross error
+LARGE_SPACING_PX = 4  # the large window spreads its 25 samples over 17 pixels
+QUANTILE = 0.25  # windows on creases, jumps and gross errors lie above it in all but the busiest scenes
+NORMAL_QUANTILE = -0.6745
+DEPTH_BINS = 6
+STEPPED_SHARE = 0.25  # fewer distinct values than this share of the pixels: the depth comes in codes
+FLOOR_RATIO = 0.02  # of the pixel pitch: noise-free images keep finite weights
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoiseModel:
+    """Standard deviation of depth as a function of depth z in metres, each part `(a, b)` as `a + b z^2` (m, 1/m)."""
+
+    white: tuple[float, float]
+    correlated: tuple[float, float]
+    step: tuple[float, float]
+
+    def sigma_m(self, depth_m: Array | float) -> Array:
+        """Total standard deviation of one pixel at `depth_m`: white, correlated and coding, metres."""
+        z2 = np.asarray(depth_m, float) ** 2
+        white, slow, step = (a + b * z2 for a, b in (self.white, self.correlated, self.step))
+        return np.asarray(np.sqrt(np.maximum(white**2, step**2 / 12.0) + slow**2))
+
+    def packed(self) -> Array:
+        """(6,) white, correlated and step pairs: what the compiled loops read."""
+        return np.array([*self.white, *self.correlated, *self.step])
+
+    @property
+    def is_stepped(self) -> bool:
+        """Whether the step between codes is coarser than the noise that it should resolve, at one metre."""
+        return self.step[0] + self.step[1] > 2.0 * (self.white[0] + self.white[1])
+
+
+def estimate_noise(depth_m: Array, sensor: RangeSensorModel) -> NoiseModel:
+    """The noise model of an (H, W) depth image in metres with NaN holes.
+
+    Smooth surfaces are locally quadratic in 1/z (pinhole) or z (orthographic), so what a quadratic leaves over in a
+    window is noise. A low quantile over the windows ignores those that hold an edge.
+    """
+    packed = sensor.packed()
+    perspective = packed[0] > 0
+    g = 1.0 / depth_m if perspective else depth_m
+    floor = FLOOR_RATIO * sensor.pitch_m(1.0)
+    floor_pair = (0.0, floor) if perspective else (floor, 0.0)
+    small = _window_law(g, perspective, spacing_px=1, stride_px=5)
+    large = _window_law(g, perspective, spacing_px=LARGE_SPACING_PX, stride_px=8)
+    step = coding_step(depth_m)
+    white = (max(small[0], floor_pair[0]), max(small[1], floor_pair[1]))
+    # The slow part is what the large windows see beyond the small ones and beyond the code step itself.
+    z2 = _typical_depth_squared(depth_m)
+    seen = np.maximum(white[0] + white[1] * z2, (step[0] + step[1] * z2) / np.sqrt(12.0))
+    slow = np.sqrt(np.maximum((large[0] + large[1] * z2) ** 2 - 1.4 * seen**2, 0.0))
+    return NoiseModel(white=white, correlated=_fit_law(z2, slow), step=step)
+
+
+def coding_step(depth_m: Array) -> tuple[float, float]:
+    """`(a, b)` of the step between neighbouring depth codes `a + b z^2`; (0, 0) for continuous depth."""
+    values = depth_m[np.isfinite(depth_m)]
+    if values.size < 16:
+        return 0.0, 0.0
+    # A sample decides quickly whether the depth is continuous; only coded depth is worth a full sort.
+    sample = values[:: max(1, values.size // 4096)]
+    if np.unique(sample).size > 0.7 * sample.size:
+        return 0.0, 0.0
+    codes = np.unique(values)
+    if codes.size > STEPPED_SHARE * values.size or codes.size < 4:
+        return 0.0, 0.0
+    gaps, middles = np.diff(codes), 0.5 * (codes[1:] + codes[:-1])
+    bins = np.array_split(np.arange(gaps.size), min(DEPTH_BINS, max(1, gaps.size // 8)))
+    # Unused codes make gaps too long, never too short.
+    low = np.array([np.quantile(gaps[b], 0.25) for b in bins])
+    at = np.array([middles[b].mean() for b in bins])
+    return _fit_law(at**2, low)
+
+
+def _typical_depth_squared(depth_m: Array) -> Array:
+    values = depth_m[np.isfinite(depth_m)]
+    if values.size == 0:
+        return np.array([1.0])
+    sample = values[:: max(1, values.size // 4096)]
+    return np.asarray(np.quantile(sample, [0.1, 0.3, 0.5, 0.7, 0.9]) ** 2)
+
+
+def _window_law(g: Array, perspective: bool, *, spacing_px: int, stride_px: int) -> tuple[float, float]:
+    if min(g.shape) <= (WINDOW - 1) * spacing_px:
+        return 0.0, 0.0
+    freedom = WINDOW * WINDOW - BASIS.shape[0]
+    z, rms = _window_rms(g, BASIS, spacing_px, stride_px, perspective)
+    if z.size == 0:
+        return 0.0, 0.0
+    rms *= WINDOW / np.sqrt(freedom)
+    order = np.argsort(z)
+    bins = np.array_split(order, min(DEPTH_BINS, max(1, z.size // 24)))
+    # rms^2 freedom / sigma^2 is chi-square: Wilson and Hilferty's quantile removes the bias of looking low.
+    expected = (1.0 - 2.0 / (9.0 * freedom) + NORMAL_QUANTILE * np.sqrt(2.0 / (9.0 * freedom))) ** 1.5
+    low = np.array([np.quantile(rms[b], QUANTILE) for b in bins]) / expected
+    at = np.array([z[b].mean() for b in bins])
+    return _fit_law(at**2, low)
+
+
+def _fit_law(z2: Array, values: Array) -> tuple[float, float]:
+    """Non-negative `a + b z^2` through the values, relative errors weighed, robust to a bin without a clean window."""
+    typical = float(np.median(values))
+    if typical <= 0.0:
+        return float(np.mean(values)), 0.0
+    w = 1.0 / np.maximum(values, 0.1 * typical)
+    a, b = typical, 0.0
+    for _ in range(3):
+        a, b = _two_non_negative(w, w * z2, w * values)
+        law = a + b * z2
+        # A bin far above the law is busy, not noisy.
+        w = np.where(values > 1.5 * law, 0.25 * w, w)
+    return a, b
+
+
+def _two_non_negative(p: Array, q: Array, y: Array) -> tuple[float, float]:
+    """Least squares `y = a p + b q` with a, b >= 0: the free solution, or the better of the two edges."""
+    pp, qq, pq, py, qy = (float(a @ b) for a, b in ((p, p), (q, q), (p, q), (p, y), (q, y)))
+    det = pp * qq - pq * pq
+    if det > 1e-9 * pp * qq:
+        a, b = (qq * py - pq * qy) / det, (pp * qy - pq * py) / det
+        if a >= 0.0 and b >= 0.0:
+            return a, b
+    only_a, only_b = float(max(py / pp, 0.0)), float(max(qy / qq, 0.0))
+    if only_a * py >= only_b * qy:
+        return only_a, 0.0
+    return 0.0, only_b
+
+
+def _orthonormal_quadratics(side: int) -> Array:
+    """(6, side^2) orthonormal polynomials up to degree 2 on a square window."""
+    t = np.arange(side) - (side - 1) / 2
+    v, u = np.meshgrid(t, t, indexing="ij")
+    columns = [np.ones_like(u), u, v, u * u, u * v, v * v]
+    q, _ = np.linalg.qr(np.stack([c.ravel() for c in columns], axis=1))
+    return np.ascontiguousarray(q.T)
+
+
+BASIS = _orthonormal_quadratics(WINDOW)
+
+
+@njit(cache=True)
+def _window_rms(g, basis, spacing, stride, perspective):  # type: ignore[no-untyped-def]
+    """Depth at the middle of each complete window, and the rms in metres that a quadratic leaves over in it."""
+    H, W = g.shape
+    side = int(np.sqrt(basis.shape[1]) + 0.5)
+    extent = (side - 1) * spacing + 1
+    count = ((H - extent) // stride + 1) * ((W - extent) // stride + 1)
+    z_out, rms_out = np.empty(count), np.empty(count)
+    window = np.empty(side * side)
+    n = 0
+    for top in range(0, H - extent + 1, stride):
+        for left in range(0, W - extent + 1, stride):
+            middle = g[top + extent // 2, left + extent // 2]
+            total = 0.0
+            for i in range(side):
+                for j in range(side):
+                    value = g[top + i * spacing, left + j * spacing] - middle
+                    window[i * side + j] = value
+                    total += value * value
+            if not np.isfinite(total):
+                continue
+            for m in range(basis.shape[0]):
+                dot = 0.0
+                for k in range(side * side):
+                    dot += basis[m, k] * window[k]
+                total -= dot * dot
+            rms = np.sqrt(max(total, 0.0)) / side
+            z = 1.0 / middle if perspective else middle
+            z_out[n] = z
+            rms_out[n] = rms * z * z if perspective else rms  # dz = z^2 dw
+            n += 1
+    return z_out[:n], rms_out[:n]

@@ -1,0 +1,194 @@
+"""The dominant plane near an expected one: the mission's "scan the panel and fit its plane"."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hal.errors import InvalidRequest, NotFound
+from perception.range.analyse import checked_depth
+from perception.range.features import RangeFeature, plane_feature
+from perception.range.finish import Samples, refine_surface
+from perception.range.grid import Grid, block_size, build_grid
+from perception.range.noise import NoiseModel, estimate_noise
+from perception.range.primitives import Surface
+from perception.range.sensor import RangeSensorModel
+from perception.range.surfaces import PLANE, SIZE
+
+Array = NDArray[np.float64]
+
+HYPOTHESES = 24
+INLIER_SIGMAS = 3.0
+LEAST_BLOCKS = 12
+LEAST_SHARE = 0.05  # of the valid blocks: a plane that holds less is not the panel
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PlaneFit:
+    """The plane found, as a surface and as a fusion feature, and how much of the image it holds.
+
+    `sight_share` is the share of all valid pixels on the plane; `inliers` (H, W) says which.
+    """
+
+    surface: Surface
+    feature: RangeFeature
+    inliers: NDArray[np.bool_]
+    sight_share: float
+    noise: NoiseModel
+
+
+def fit_plane_near(
+    depth_m: ArrayLike,
+    sensor: RangeSensorModel,
+    *,
+    point_m: ArrayLike,
+    normal: ArrayLike,
+    sigma_offset_m: float = 0.02,
+    sigma_angle_rad: float = 0.1,
+    noise: NoiseModel | None = None,
+) -> PlaneFit:
+    """The largest plane within three standard deviations of an expected one, fitted on depth residuals.
+
+    The expectation only selects; it does not pull the fit, so the result may be fused with where it came from.
+
+    Args:
+        depth_m: (H, W) depth in metres, NaN where missing.
+        point_m, normal: (3,) expected plane in the sensor frame; either sense of the normal.
+        sigma_offset_m, sigma_angle_rad: how well the expectation is known.
+        noise: used instead of the estimate from the image when given.
+
+    Raises:
+        InvalidRequest: the image, sensor or expectation is not usable.
+        NotFound: no plane of at least 5 % of the image lies near the expectation.
+    """
+    depth = checked_depth(depth_m, sensor)
+    expected, through = _checked_expectation(point_m, normal, sigma_offset_m, sigma_angle_rad)
+    law = noise or estimate_noise(depth, sensor)
+    middle = float(np.nanmedian(depth))
+    grid = build_grid(depth, sensor, law, block_size((depth.shape[0], depth.shape[1]), law, sensor, middle))
+    points, sigma, normals = _block_points(grid)
+    near = _near_expectation(
+        points, sigma, expected, through, sigma_offset_m=sigma_offset_m, sigma_angle_rad=sigma_angle_rad
+    )
+    if near.sum() < LEAST_BLOCKS:
+        raise _nothing_near(sigma_offset_m, sigma_angle_rad)
+    plane = _most_supported(
+        points[near], sigma[near], normals[near], expected,
+        sigma_angle_rad=sigma_angle_rad, normal_sigma_rad=grid.normal_sigma_rad,
+    )
+    if plane is None:
+        raise _nothing_near(sigma_offset_m, sigma_angle_rad)
+    return _fitted(depth, sensor, law, plane)
+
+
+def _checked_expectation(
+    point_m: ArrayLike, normal: ArrayLike, sigma_offset_m: float, sigma_angle_rad: float
+) -> tuple[Array, Array]:
+    n, p = np.asarray(normal, float), np.asarray(point_m, float)
+    length = float(np.linalg.norm(n)) if n.shape == (3,) else 0.0
+    if n.shape != (3,) or p.shape != (3,) or not np.isfinite([*n, *p]).all() or length < 1e-9:
+        raise InvalidRequest("expected plane needs a finite point and a normal", hint="pass two vectors of 3 numbers")
+    if not (sigma_offset_m > 0 and sigma_angle_rad > 0):
+        raise InvalidRequest("the expectation's sigmas must be positive", hint="say how well the plane is known")
+    n = n / length
+    return (n if n @ p < 0 else -n), p
+
+
+def _block_points(grid: Grid) -> tuple[Array, Array, Array]:
+    x, y, z = grid.x.ravel(), grid.y.ravel(), grid.z.ravel()
+    points = np.stack([x * z, y * z, z] if grid.perspective else [x, y, z], axis=1)
+    ok = np.isfinite(z) & np.isfinite(grid.rms.ravel())
+    return points[ok], grid.sigma.ravel()[ok], grid.normal.reshape(-1, 3)[ok]
+
+
+def _near_expectation(
+    points: Array, sigma: Array, expected: Array, through: Array, *, sigma_offset_m: float, sigma_angle_rad: float
+) -> NDArray[np.bool_]:
+    away = (points - through) @ expected
+    lateral = np.linalg.norm(points - through - away[:, None] * expected, axis=1)
+    gate = 3.0 * np.sqrt(sigma_offset_m**2 + (lateral * np.tan(min(sigma_angle_rad, 1.0))) ** 2 + sigma**2)
+    return np.asarray(np.abs(away) <= gate)
+
+
+def _most_supported(
+    points: Array, sigma: Array, normals: Array, expected: Array, *, sigma_angle_rad: float, normal_sigma_rad: float
+) -> Array | None:
+    """(4,) normal and offset of the plane through one block that most blocks agree with, after two refits."""
+    turn = np.arccos(np.clip(normals @ expected, -1.0, 1.0))
+    facing = np.flatnonzero(turn <= 3.0 * np.hypot(sigma_angle_rad, normal_sigma_rad) + 0.05)
+    if facing.size < LEAST_BLOCKS:
+        return None
+    seeds = facing[np.linspace(0, facing.size - 1, min(HYPOTHESES, facing.size)).astype(int)]
+    # A seed's own normal is too noisy to reach across the panel, so it only supplies the offset at first.
+    plane, support = None, LEAST_BLOCKS - 1
+    for n in (expected, *(_mean_normal(normals[facing], expected),)):
+        for seed in seeds:
+            candidate = np.array([*n, n @ points[seed]])
+            candidate, count = _refitted(points, sigma, candidate, sigma_angle_rad)
+            if count > support:
+                plane, support = candidate, count
+    if plane is None:
+        return None
+    limit = 3.0 * sigma_angle_rad + 0.02
+    return plane if np.arccos(np.clip(plane[:3] @ expected, -1.0, 1.0)) <= limit else None
+
+
+def _mean_normal(normals: Array, expected: Array) -> Array:
+    middle = np.median(normals, axis=0)
+    length = float(np.linalg.norm(middle))
+    return np.asarray(middle / length) if length > 0.5 else expected
+
+
+def _refitted(points: Array, sigma: Array, plane: Array, sigma_angle_rad: float) -> tuple[Array, int]:
+    """Alternate inliers and weighted principal axes, the gate narrowing from the angle's slack to the noise."""
+    thin = max(1, len(points) // 1500)
+    P, s = points[::thin], sigma[::thin]
+    inside = np.zeros(len(P), bool)
+    for slack in (0.5 * min(sigma_angle_rad, 0.2), 0.1 * min(sigma_angle_rad, 0.2), 0.0, 0.0):
+        lateral = np.linalg.norm(P - plane[3] * plane[:3], axis=1)
+        inside = np.abs(P @ plane[:3] - plane[3]) <= INLIER_SIGMAS * s + slack * np.minimum(lateral, 0.1)
+        if inside.sum() < LEAST_BLOCKS // 2:
+            return plane, 0
+        w = 1.0 / s[inside] ** 2
+        centre = (w[:, None] * P[inside]).sum(axis=0) / w.sum()
+        d = P[inside] - centre
+        n = np.linalg.eigh((w[:, None] * d).T @ d)[1][:, 0]
+        n = n if n @ plane[:3] > 0 else -n
+        plane = np.array([*n, n @ centre])
+    return plane, int(inside.sum()) * thin
+
+
+def _fitted(depth: Array, sensor: RangeSensorModel, noise: NoiseModel, plane: Array) -> PlaneFit:
+    th = np.zeros(SIZE)
+    th[:4] = plane
+    points = sensor.points(depth)
+    sigma = noise.sigma_m(depth)
+    for _ in range(2):
+        with np.errstate(invalid="ignore"):
+            inliers = np.abs(points @ th[:3] - th[3]) <= INLIER_SIGMAS * sigma
+        z = depth[inliers]
+        packed = sensor.packed()
+        v, u = np.nonzero(inliers)
+        samples = Samples(
+            x=(u - packed[3]) / packed[1], y=(v - packed[4]) / packed[2], z=z, sigma=sigma[inliers]
+        )
+        surface, th = refine_surface(1, PLANE, th, samples, sensor=sensor, noise=noise)
+    valid = int(np.isfinite(depth).sum())
+    share = float(inliers.sum()) / valid
+    if share < LEAST_SHARE:
+        raise NotFound(
+            f"the plane near the expected place holds only {100 * share:.1f} % of the image",
+            hint="point the scanner at the panel, or widen the expectation",
+        )
+    return PlaneFit(
+        surface=surface, feature=plane_feature(surface), inliers=inliers, sight_share=share, noise=noise
+    )
+
+
+def _nothing_near(sigma_offset_m: float, sigma_angle_rad: float) -> NotFound:
+    return NotFound(
+        "no plane lies near the expected one",
+        hint=f"widen the expectation ({sigma_offset_m:.3f} m, {sigma_angle_rad:.2f} rad) or rescan from elsewhere",
+    )

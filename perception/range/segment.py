@@ -1,0 +1,208 @@
+"""Segmentation: lowest order first, and models compete.
+
+1. Planes grow from the flattest blocks while their own model explains the next block (range and orientation).
+2. What is left falls into components of smooth range; each is offered to every primitive, and the cheapest that
+   explains it wins (Schwarz's criterion). A component that no primitive explains is split by growing local fits.
+3. Pieces of one surface that an occluder parted are joined when one model explains both.
+4. Pixels are claimed by the surface that explains them best; what no block could hold is tried again pixel by pixel.
+Each round leaves fewer free blocks, and rounds end when no surface is added.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.range import fit, grow
+from perception.range.claim import claim_pixels, fill_small_gaps
+from perception.range.grid import JUMP_SLOPE, Grid, block_size, build_grid
+from perception.range.noise import NoiseModel
+from perception.range.sensor import RangeSensorModel
+from perception.range.surfaces import CONE, CYLINDER, PLANE, QUADRIC, SIZE, SPHERE
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int32]
+Flags = NDArray[np.bool_]
+
+LEAST_PIXELS_AT_256 = 24  # per 256 x 256 pixels of image
+FIT_SAMPLES = 120
+LEAST_FLAT_BLOCKS = 24  # a smaller flat patch may be a facet of something bent; whole components decide about it
+GOOD_MEAN_SQUARE = 2.0
+GOOD_SHARE = 0.75
+LOCAL_BLOCKS = 45
+LOCAL_TRIES = 6
+ALL_KINDS = np.ones(5, np.bool_)
+FEW_BLOCKS_FOR_QUADRIC = 60
+
+
+@dataclass(slots=True, eq=False)
+class Candidates:
+    """Surfaces found so far; label k is `kinds[k - 1]`, `parameters[k - 1]`. Grows while segmentation runs."""
+
+    kinds: list[int] = field(default_factory=list)
+    parameters: list[Array] = field(default_factory=list)
+
+    def add(self, kind: int, parameters: Array) -> int:
+        """Append a surface and return its label."""
+        self.kinds.append(kind)
+        self.parameters.append(parameters)
+        return len(self.kinds)
+
+    def arrays(self) -> tuple[NDArray[np.int64], Array]:
+        """Kinds (n + 1,) and parameters (n + 1, 16), entry 0 unused, for compiled loops."""
+        kinds = np.zeros(len(self.kinds) + 1, np.int64)
+        table = np.zeros((len(self.kinds) + 1, SIZE))
+        for k, (kind, th) in enumerate(zip(self.kinds, self.parameters, strict=True), 1):
+            kinds[k], table[k] = kind, th
+        return kinds, table
+
+
+def segment(depth_m: Array, sensor: RangeSensorModel, noise: NoiseModel) -> tuple[Labels, Candidates]:
+    """Labels (H, W), 0 = none, and the surfaces behind them, of an (H, W) depth image in metres."""
+    packed, law = sensor.packed(), noise.packed()
+    finite = np.isfinite(depth_m)
+    middle = float(np.median(depth_m[finite][:: max(1, int(finite.sum()) // 4096)]))
+    size = block_size((depth_m.shape[0], depth_m.shape[1]), noise, sensor, middle)
+    least = LEAST_PIXELS_AT_256 * depth_m.size / 65536
+    found = Candidates()
+    grid = build_grid(depth_m, sensor, noise, size)
+    blocks = np.zeros(grid.z.shape, np.int32)
+    recover(grid, packed, blocks, found, least_blocks=max(6, round(least / size**2)))
+    labels = np.zeros(depth_m.shape, np.int32)
+    kinds, table = found.arrays()
+    claim_pixels(depth_m, packed, law, blocks, size, kinds, table, labels)
+    if size > 1:
+        left = np.where(labels == 0, depth_m, np.nan)
+        fine = build_grid(left, sensor, noise, 1)
+        pixels = labels.copy()
+        before = len(found.kinds)
+        recover(fine, packed, pixels, found, least_blocks=max(8, round(least)))
+        if len(found.kinds) > before:
+            kinds, table = found.arrays()
+            claim_pixels(depth_m, packed, law, pixels, 1, kinds, table, labels)
+    fill_small_gaps(labels, finite, 2)
+    return labels, found
+
+
+def recover(grid: Grid, packed: Array, blocks: Labels, found: Candidates, *, least_blocks: int) -> None:
+    """Find surfaces on the unlabelled blocks of a grid; extends `blocks` and `found` in place."""
+    free = np.isfinite(grid.z) & (blocks == 0)
+    cos_limit = float(np.cos(max(0.26, 4.0 * grid.normal_sigma_rad)))
+    tried = np.zeros(free.shape, np.bool_)
+    order = grow.seed_order(grid.normal, grid.rms, free, grid.radius + 1)
+    planes, _, _ = grow.grow_planes(
+        grid.x, grid.y, grid.z, grid.sigma, grid.normal, grid.rms, free, blocks, len(found.kinds) + 1,
+        grid.perspective, order, max(LEAST_FLAT_BLOCKS, least_blocks), cos_limit, tried,
+    )
+    for th in planes:
+        found.add(PLANE, th)
+    _recover_curved(grid, packed, free, blocks, found=found, least=least_blocks)
+
+
+def _recover_curved(
+    grid: Grid, packed: Array, free: Flags, blocks: Labels, *, found: Candidates, least: int
+) -> None:
+    dead = np.zeros(free.shape, np.bool_)
+    turn_limit = float(np.cos(max(0.7, 5.0 * grid.normal_sigma_rad)))
+    step = JUMP_SLOPE * grid.size_px
+    for _ in range(6):
+        label, sizes = grow.range_components(
+            grid.z, grid.sigma, free & ~dead, step, 1.0 / packed[1], grid.perspective, grid.normal, grid.rms,
+            turn_limit,
+        )
+        big = np.flatnonzero(sizes >= least)
+        if big.size == 0:
+            return
+        for component in big:
+            members = np.flatnonzero(label.ravel() == component)
+            members = members[free.ravel()[members]]
+            if members.size < least:
+                continue
+            if not _explain(grid, members, free, blocks, found=found, least=least):
+                dead.ravel()[members] = True
+
+
+def _explain(
+    grid: Grid, members: NDArray[np.int64], free: Flags, blocks: Labels, *, found: Candidates, least: int
+) -> bool:
+    whole = _fit_best(grid, members)
+    options = [] if whole is None else [whole]
+    if whole is None or whole[2] < 0.85:
+        options += _local_fits(grid, members)
+    best, best_gain, best_blocks = None, 0.0, np.empty(0, np.int32)
+    for kind, th, _ in options:
+        indices, total = _grown(grid, kind, th, free, members)
+        if indices.size < least or total > GOOD_MEAN_SQUARE * indices.size:
+            continue
+        gain = 9.0 * indices.size - total
+        if gain > best_gain:
+            best, best_gain, best_blocks = (kind, th), gain, indices
+    if best is None:
+        return False
+    kind, th = best
+    refit = _fit_best(grid, best_blocks.astype(np.int64))
+    if refit is not None:
+        kind, th = refit[0], refit[1]
+    label = found.add(kind, th)
+    blocks.ravel()[best_blocks] = label
+    free.ravel()[best_blocks] = False
+    return True
+
+
+def _fit_best(grid: Grid, members: NDArray[np.int64]) -> tuple[int, Array, float] | None:
+    """Cheapest kind for these blocks with its parameters and the share that it explains, or None."""
+    normals = grid.normal.reshape(-1, 3)
+    usable = members[np.isfinite(normals[members, 0])]
+    if usable.size < 5:
+        return None
+    # Evenly spread over the region; a fixed choice keeps results equal from run to run.
+    pick = usable if usable.size <= FIT_SAMPLES else usable[np.linspace(0, usable.size - 1, FIT_SAMPLES).astype(int)]
+    x, y, z, sigma = (a.ravel()[pick] for a in (grid.x, grid.y, grid.z, grid.sigma))
+    points = np.stack([x * z, y * z, z] if grid.perspective else [x, y, z], axis=1)
+    kinds = ALL_KINDS.copy()
+    if members.size < FEW_BLOCKS_FOR_QUADRIC:
+        kinds[QUADRIC] = False
+    if usable.size < 10:
+        kinds[[SPHERE, CYLINDER, CONE]] = False
+    ths, mean2, kept, score = fit.fit_kinds(
+        points, np.ascontiguousarray(normals[pick]), x, y, z, sigma, grid.perspective, kinds, 1.0
+    )
+    score = np.where((mean2 < GOOD_MEAN_SQUARE) & (kept > GOOD_SHARE), score, np.inf)
+    best = int(np.argmin(score))
+    if not np.isfinite(score[best]):
+        return None
+    return best, ths[best], float(kept[best])
+
+
+def _local_fits(grid: Grid, members: NDArray[np.int64]) -> list[tuple[int, Array, float]]:
+    """Fits to small neighbourhoods spread over a component that no single primitive explains."""
+    w = grid.z.shape[1]
+    rows, columns = members // w, members % w
+    inside = np.isfinite(grid.rms.ravel()[members])
+    if inside.sum() < 8:
+        return []
+    out = []
+    seeds = np.flatnonzero(inside)[np.linspace(0, inside.sum() - 1, LOCAL_TRIES + 2).astype(int)[1:-1]]
+    reach = np.sqrt(LOCAL_BLOCKS / np.pi)
+    for seed in seeds:
+        near = np.hypot(rows - rows[seed], columns - columns[seed]) <= reach
+        best = _fit_best(grid, members[near])
+        if best is not None:
+            out.append(best)
+    return out
+
+
+def _grown(
+    grid: Grid, kind: int, th: Array, free: Flags, members: NDArray[np.int64]
+) -> tuple[NDArray[np.int32], float]:
+    h, w = grid.z.shape
+    queue = np.empty(h * w, np.int32)
+    mark = np.zeros(h * w, np.int32)
+    cos_limit = float(np.cos(max(0.5, 4.0 * grid.normal_sigma_rad)))
+    count, total = grow.grow_surface(
+        kind, th, grid.x, grid.y, grid.z, grid.sigma, grid.normal, grid.rms, free, members, grid.perspective,
+        cos_limit, mark, 1, queue,
+    )
+    return queue[:count].copy(), float(total)

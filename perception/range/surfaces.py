@@ -1,0 +1,239 @@
+"""Primitives met along a ray: depth and its derivatives, compiled.
+
+A surface is a kind and a parameter vector of 16 numbers:
+
+    PLANE      n (3), d                          n . X = d
+    SPHERE     c (3), r, side                    |X - c| = r
+    CYLINDER   c (3), axis (3), r, side          distance from the axis = r
+    CONE       apex (3), axis (3), angle, side   angle between X - apex and the axis (into the cone) = angle
+    QUADRIC    centre (3), scale, then 10 coefficients over (xx, yy, zz, xy, xz, yz, x, y, z, 1) of (X - centre) / scale
+
+`side` is +1 for a surface seen from outside (the nearer root along the ray) and -1 from inside.
+Steps live in a tangent space: shifts across the axis and tilts of unit vectors in the frame of `tangent_frame`.
+"""
+
+# ruff: noqa: PLR0911, PLR0912, PLR0917, PLR1714, SIM109 - compiled loops take plain arrays, and long
+# bodies and plain comparisons are what compiles fast.
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+PLANE, SPHERE, CYLINDER, CONE, QUADRIC = 0, 1, 2, 3, 4
+SIZE = 16
+FREEDOM = np.array([3, 4, 5, 6, 9])
+GRAZING_COSINE = 0.3  # below it a depth residual says little about the surface: pixels there lose weight
+
+
+@njit(cache=True)
+def tangent_frame(ax, ay, az):  # type: ignore[no-untyped-def]
+    """Two unit vectors that complete (ax, ay, az) to a right-handed frame."""
+    if abs(ax) < 0.8:
+        ux, uy, uz = 0.0, az, -ay
+    else:
+        ux, uy, uz = -az, 0.0, ax
+    n = np.sqrt(ux * ux + uy * uy + uz * uz)
+    ux, uy, uz = ux / n, uy / n, uz / n
+    return ux, uy, uz, ay * uz - az * uy, az * ux - ax * uz, ax * uy - ay * ux
+
+
+@njit(cache=True)
+def _roots(a, b, c, side):  # type: ignore[no-untyped-def]
+    """Root of a z^2 + 2 b z + c: the nearer for side +1, the farther for -1; NaN without a real root."""
+    disc = b * b - a * c
+    if disc < 0.0:
+        return np.nan
+    root = np.sqrt(disc)
+    if abs(a) < 1e-14 * (abs(b) + 1e-30):
+        return -0.5 * c / b
+    if a < 0.0:
+        root = -root
+    return (-b - root) / a if side > 0 else (-b + root) / a
+
+
+@njit(cache=True)
+def depth_on(kind, th, x, y, perspective):  # type: ignore[no-untyped-def]
+    """Depth z where the ray of (x, y) meets the surface; NaN where it does not."""
+    if perspective:
+        ox, oy, dx, dy = 0.0, 0.0, x, y
+    else:
+        ox, oy, dx, dy = x, y, 0.0, 0.0
+    if kind == PLANE:
+        facing = th[0] * dx + th[1] * dy + th[2]
+        if abs(facing) < 1e-9:
+            return np.nan
+        return (th[3] - th[0] * ox - th[1] * oy) / facing
+    wx, wy, wz = ox - th[0], oy - th[1], -th[2]
+    if kind == SPHERE:
+        a = dx * dx + dy * dy + 1.0
+        b = dx * wx + dy * wy + wz
+        return _roots(a, b, wx * wx + wy * wy + wz * wz - th[3] * th[3], th[4])
+    if kind == CYLINDER:
+        da = dx * th[3] + dy * th[4] + th[5]
+        wa = wx * th[3] + wy * th[4] + wz * th[5]
+        a = dx * dx + dy * dy + 1.0 - da * da
+        b = dx * wx + dy * wy + wz - da * wa
+        c = wx * wx + wy * wy + wz * wz - wa * wa - th[6] * th[6]
+        return _roots(a, b, c, th[7])
+    if kind == CONE:
+        da = dx * th[3] + dy * th[4] + th[5]
+        wa = wx * th[3] + wy * th[4] + wz * th[5]
+        k = np.cos(th[6]) ** 2
+        a = k * (dx * dx + dy * dy + 1.0) - da * da
+        b = k * (dx * wx + dy * wy + wz) - da * wa
+        c = k * (wx * wx + wy * wy + wz * wz) - wa * wa
+        disc = b * b - a * c
+        if disc < 0.0 or abs(a) < 1e-15:
+            return np.nan
+        root = np.sqrt(disc)
+        near, far = (-b - root) / a, (-b + root) / a
+        if near > far:
+            near, far = far, near
+        near_ok, far_ok = wa + near * da > 0.0, wa + far * da > 0.0
+        if near_ok and far_ok:
+            return near if th[7] > 0 else far
+        if near_ok:
+            return near
+        return far if far_ok else np.nan
+    inverse = 1.0 / th[3]
+    wx, wy, wz = wx * inverse, wy * inverse, wz * inverse
+    dx, dy, dz = dx * inverse, dy * inverse, inverse
+    a = th[4] * dx * dx + th[5] * dy * dy + th[6] * dz * dz + th[7] * dx * dy + th[8] * dx * dz + th[9] * dy * dz
+    b = th[4] * dx * wx + th[5] * dy * wy + th[6] * dz * wz + 0.5 * (
+        th[7] * (dx * wy + dy * wx) + th[8] * (dx * wz + dz * wx) + th[9] * (dy * wz + dz * wy)
+        + th[10] * dx + th[11] * dy + th[12] * dz
+    )
+    c = (th[4] * wx * wx + th[5] * wy * wy + th[6] * wz * wz + th[7] * wx * wy + th[8] * wx * wz + th[9] * wy * wz
+         + th[10] * wx + th[11] * wy + th[12] * wz + th[13])
+    return _roots(a, b, c, 1.0)
+
+
+@njit(cache=True)
+def normal_on(kind, th, px, py, pz):  # type: ignore[no-untyped-def]
+    """Unit gradient of the surface at a point on it (not oriented)."""
+    if kind == PLANE:
+        return th[0], th[1], th[2]
+    wx, wy, wz = px - th[0], py - th[1], pz - th[2]
+    if kind == SPHERE:
+        gx, gy, gz = wx, wy, wz
+    elif kind == CYLINDER or kind == CONE:
+        h = wx * th[3] + wy * th[4] + wz * th[5]
+        gx, gy, gz = wx - h * th[3], wy - h * th[4], wz - h * th[5]
+        if kind == CONE:
+            n = np.sqrt(gx * gx + gy * gy + gz * gz) + 1e-30
+            ca, sa = np.cos(th[6]), np.sin(th[6])
+            gx, gy, gz = ca * gx / n - sa * th[3], ca * gy / n - sa * th[4], ca * gz / n - sa * th[5]
+    else:
+        inverse = 1.0 / th[3]
+        wx, wy, wz = wx * inverse, wy * inverse, wz * inverse
+        gx = 2.0 * th[4] * wx + th[7] * wy + th[8] * wz + th[10]
+        gy = 2.0 * th[5] * wy + th[7] * wx + th[9] * wz + th[11]
+        gz = 2.0 * th[6] * wz + th[8] * wx + th[9] * wy + th[12]
+    n = np.sqrt(gx * gx + gy * gy + gz * gz) + 1e-30
+    return gx / n, gy / n, gz / n
+
+
+@njit(cache=True)
+def depth_and_jacobian(kind, th, frame, x, y, perspective, J):  # type: ignore[no-untyped-def]
+    """Depth, cosine of incidence, and J = dz / d(tangent parameters): dz = -(dF/dtheta) / (dF/dz) on F = 0."""
+    z = depth_on(kind, th, x, y, perspective)
+    if not np.isfinite(z):
+        return z, 0.0
+    if perspective:
+        px, py, dx, dy = x * z, y * z, x, y
+    else:
+        px, py, dx, dy = x, y, 0.0, 0.0
+    nx, ny, nz = normal_on(kind, th, px, py, z)
+    fz = nx * dx + ny * dy + nz
+    cosine = abs(fz) / np.sqrt(dx * dx + dy * dy + 1.0)
+    if abs(fz) < 1e-6:
+        return np.nan, 0.0
+    k = -1.0 / fz
+    e1x, e1y, e1z, e2x, e2y, e2z = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
+    if kind == PLANE:
+        J[0] = k * (px * e1x + py * e1y + z * e1z)
+        J[1] = k * (px * e2x + py * e2y + z * e2z)
+        J[2] = -k
+        return z, cosine
+    wx, wy, wz = px - th[0], py - th[1], z - th[2]
+    if kind == SPHERE:
+        J[0], J[1], J[2], J[3] = -k * nx, -k * ny, -k * nz, -k
+    elif kind == CYLINDER:
+        h = wx * th[3] + wy * th[4] + wz * th[5]
+        n1, n2 = nx * e1x + ny * e1y + nz * e1z, nx * e2x + ny * e2y + nz * e2z
+        J[0], J[1], J[2], J[3], J[4] = -k * n1, -k * n2, -k * h * n1, -k * h * n2, -k
+    elif kind == CONE:
+        h = wx * th[3] + wy * th[4] + wz * th[5]
+        q1, q2 = wx * e1x + wy * e1y + wz * e1z, wx * e2x + wy * e2y + wz * e2z
+        rho = np.sqrt(q1 * q1 + q2 * q2) + 1e-30
+        ca, sa = np.cos(th[6]), np.sin(th[6])
+        tilt = -(ca * h / rho + sa)
+        J[0], J[1], J[2] = -k * nx, -k * ny, -k * nz
+        J[3], J[4] = k * tilt * q1, k * tilt * q2
+        J[5] = -k * (rho * sa + h * ca)
+    else:
+        s = 1.0 / th[3]
+        wx, wy, wz = wx * s, wy * s, wz * s
+        gx = 2.0 * th[4] * wx + th[7] * wy + th[8] * wz + th[10]
+        gy = 2.0 * th[5] * wy + th[7] * wx + th[9] * wz + th[11]
+        gz = 2.0 * th[6] * wz + th[8] * wx + th[9] * wy + th[12]
+        slope = (gx * dx + gy * dy + gz) * s
+        if abs(slope) < 1e-12:
+            return np.nan, 0.0
+        k = -1.0 / slope
+        zz = wz * wz
+        J[0], J[1] = k * (wx * wx - zz), k * (wy * wy - zz)
+        J[2], J[3], J[4] = k * wx * wy, k * wx * wz, k * wy * wz
+        J[5], J[6], J[7], J[8] = k * wx, k * wy, k * wz, k
+    return z, cosine
+
+
+@njit(cache=True)
+def frame_of(kind, th, frame):  # type: ignore[no-untyped-def]
+    """Fill `frame` (6,) with the tangent frame that the steps of this surface refer to."""
+    if kind == PLANE:
+        f = tangent_frame(th[0], th[1], th[2])
+    elif kind == CYLINDER or kind == CONE:
+        f = tangent_frame(th[3], th[4], th[5])
+    else:
+        f = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+    for i in range(6):
+        frame[i] = f[i]
+
+
+@njit(cache=True)
+def stepped(kind, th, frame, step):  # type: ignore[no-untyped-def]
+    """The surface after a tangent step; unit vectors stay unit, quadrics keep the trace of their matrix."""
+    out = th.copy()
+    if kind == PLANE or kind == CYLINDER or kind == CONE:
+        at, t1, t2 = (0, step[0], step[1]) if kind == PLANE else (3, step[2], step[3])
+        if kind == CONE:
+            t1, t2 = step[3], step[4]
+        n = 0.0
+        for i in range(3):
+            out[at + i] = th[at + i] + t1 * frame[i] + t2 * frame[3 + i]
+            n += out[at + i] ** 2
+        n = np.sqrt(n)
+        for i in range(3):
+            out[at + i] /= n
+    if kind == PLANE:
+        out[3] += step[2]
+    elif kind == SPHERE:
+        for i in range(4):
+            out[i] += step[i]
+        out[3] = abs(out[3])
+    elif kind == CYLINDER:
+        for i in range(3):
+            out[i] += step[0] * frame[i] + step[1] * frame[3 + i]
+        out[6] = abs(out[6] + step[4])
+    elif kind == CONE:
+        for i in range(3):
+            out[i] += step[i]
+        out[6] = min(max(out[6] + step[5], 1e-3), 1.55)
+    else:
+        out[4] += step[0]
+        out[5] += step[1]
+        out[6] -= step[0] + step[1]
+        for i in range(7):
+            out[7 + i] += step[2 + i]
+    return out

@@ -61,7 +61,7 @@ class QuadranglePose:
             It is the Cramer-Rao bound at the pose; near fronto-parallel the truth is wider, see `ambiguous`.
         chi_square: weighted squared reprojection error, 2 degrees of freedom.
         probability: posterior probability that the truth is near this pose and not near one of `alternatives`.
-        ambiguous: another pose cannot be ruled out (`probability` below 0.9): one more view, touch or range point decides.
+        ambiguous: another pose cannot be ruled out (`probability` below 0.9): one more view or touch decides.
         alternatives: the other poses, most likely first.
     """
 
@@ -85,7 +85,7 @@ class QuadranglePose:
 
     @property
     def p_value(self) -> float:
-        """Chance of a worse fit if model and noise are right; 0.001 means a wrong lamp, a wrong model or a wrong lens."""
+        """Chance of a worse fit if model and noise are right; 0.001 means a wrong lamp, model or lens."""
         return math.exp(-0.5 * self.chi_square)  # chi-square of 2 degrees of freedom
 
 

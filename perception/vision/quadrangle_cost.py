@@ -1,8 +1,8 @@
-# ruff: noqa: PLR0912, PLR0915, PLR0917 - compiled loops take plain arrays and keep one equation in one place
+# ruff: noqa: PLR0915, PLR0917 - compiled loops take plain arrays and keep one equation in one place
 """Compiled inner loops of the four-light pose: reprojection chi-square, its derivatives and its local minimiser.
 
-Everything here works on normalised image coordinates `m` (4, 2) with information matrices `A` (4, 3) as (a_uu, a_uv, a_vv)
-and on object points `X` (4, 3) whose centroid is the origin. A pose is `R` (3, 3) and `t` (3,), camera_from_object;
+Everything works on normalised image coordinates `m` (4, 2) with information matrices `A` (4, 3) = (a_uu, a_uv, a_vv) and
+on object points `X` (4, 3) whose centroid is the origin. A pose is `R` (3, 3) and `t` (3,), camera_from_object;
 perturbations are ordered translation then rotation: t <- t + d, R <- Exp(w) R. Costs are chi-squares.
 """
 
@@ -189,7 +189,7 @@ def solve_damped(M, D, damping, g, x, L):  # type: ignore[no-untyped-def]
 
 @jit
 def minimise(R, t, X, m, A):  # type: ignore[no-untyped-def]
-    """The local minimum of chi-square below a start: damped Newton with the exact Hessian, Gauss-Newton where it is not convex.
+    """The local minimum of chi-square below a start: damped Newton, Gauss-Newton where the Hessian is indefinite.
 
     Gauss-Newton alone crawls near fronto-parallel, where two minima merge.
 

@@ -1,4 +1,4 @@
-# ruff: noqa: PLR0912, PLR0915, PLR0917 - compiled loops take plain arrays and keep one equation in one place
+# ruff: noqa: PLR0912, PLR0915 - compiled loops take plain arrays and keep one equation in one place
 """Compiled three-point poses: the first half of the paper's direct route (Section II-B), and seeds for the refinement.
 
 The code reads from `real_cubic_root` down to `three_point`; conventions as in `quadrangle_core`.
@@ -92,8 +92,8 @@ def refine_depths(s, d2, cosines):  # type: ignore[no-untyped-def]
 def three_point(P, f, Rs, ts):  # type: ignore[no-untyped-def]
     """Poses that carry three points (3, 3) onto three unit rays (3, 3); fills Rs, ts (4 of them), returns how many.
 
-    The depths s solve three law-of-cosines equations. Two combinations without constant term are conics in s; the pencil
-    of both holds a pair of lines (a cubic), each of which meets a conic twice. Where noise makes a crossing complex its
+    The depths s solve three law-of-cosines equations. Two combinations without constant term are conics in s; the
+    pencil of both holds a pair of lines (a cubic), each of which meets a conic twice. Where noise makes a crossing complex its
     real part is kept: close to a double root the truth is there.
     Source: Grunert 1841; the pencil of conics as in Finsterwalder, see Haralick et al., IJCV 13(3), 1994, Section 2.
     """

@@ -1,5 +1,5 @@
-# ruff: noqa: PLR0912, PLR0915, PLR0917 - compiled loops take plain arrays and keep one equation in one place
-"""Compiled search of the four-light pose: every local minimum, the profile over the object's normal, the mirror's share.
+# ruff: noqa: PLR0912, PLR0917 - compiled loops take plain arrays and keep one equation in one place
+"""Compiled search of the four-light pose: every local minimum, the profile over the normal, the mirror's share.
 
 Conventions as in `quadrangle_cost`.
 """
@@ -76,7 +76,7 @@ def mirrored(R, t, normal):  # type: ignore[no-untyped-def]
 def all_minima(X, m, A, normal, Rs, ts, costs, Ns):  # type: ignore[no-untyped-def]
     """Distinct local minima of chi-square, lowest first, into Rs (M,3,3), ts, costs, Ns (M,6,6); returns how many.
 
-    Starts: the best three-point pose, the mirror of its minimum, then every three-point pose far from the starts so far.
+    Starts: the best three-point pose, the mirror of its minimum, then every three-point pose far from these.
     """
     f = np.empty((4, 3))
     for i in range(4):
@@ -318,7 +318,7 @@ def normal_spread(R, t, C, normal):  # type: ignore[no-untyped-def]
 def opposite(normal_camera, best, far):  # type: ignore[no-untyped-def]
     """Is this normal nearer to the mirror of the best one than to itself, and more than `far` (cosine) off it?
 
-    Both face the camera (n . k > 0) and are given in coordinates with the line of sight as third axis. The mirror of n is 2 (n.k) k - n.
+    Both face the camera (n . k > 0), in axes whose third is the line of sight k. The mirror of n is 2 (n.k) k - n.
     """
     lateral = normal_camera[0] * best[0] + normal_camera[1] * best[1]
     return lateral < 1e-9 and lateral + normal_camera[2] * best[2] < far
@@ -339,12 +339,12 @@ def sight_frame(t):  # type: ignore[no-untyped-def]
 
 @jit
 def ring_mass(R, t, cost, X, m, A, normal):  # type: ignore[no-untyped-def]
-    """Posterior mass of the normals on this and on the other side of the line of sight, and the best pose over there.
+    """Posterior mass of the normals on this and on the other side of the line of sight, and the best pose there.
 
-    The posterior over the normal is exp(-chi2 / 2) det(information of position and roll)^(-1/2); beforehand all directions
-    in space are equally likely. It is summed over rings of tilt about the line of sight through the centroid.
+    The posterior over the normal is exp(-chi2 / 2) det(information of position and roll)^(-1/2); beforehand all
+    directions in space are equally likely. It is summed over rings of tilt about the line of sight to the centroid.
 
-    Returns: mass here, mass there (sr, in units of the density at the best pose), R, t, chi-square of the best pose there.
+    Returns: mass here, mass there (sr, in units of the density at the best pose), R, t, chi-square of the best there.
     """
     F = sight_frame(t)
     best = F @ (R @ normal)
@@ -384,11 +384,11 @@ def solve(points, pixels, covariance, camera, near_sigmas2, Rs, ts, costs, Cs, m
     """Everything about one view: minima with covariance and posterior mass, lowest chi-square first.
 
     Args:
-        near_sigmas2: the rings are summed when the line of sight is nearer to the best normal than this (sigmas squared).
+        near_sigmas2: the rings are summed when the line of sight is nearer to the best normal (sigmas squared).
         Rs (M, 3, 3), ts (M, 3), costs (M,), Cs (M, 6, 6), masses (M,): filled. Poses are of the object's own origin.
-            When the other side of the line of sight has mass but no minimum, its best pose is appended with covariance 0.
+            When the other side of the line of sight has mass but no minimum, its best pose is appended, covariance 0.
 
-    Returns: number of poses, number of them that are minima, error code (0 fine; see `quadrangle.estimate` for the others).
+    Returns: number of poses, number of them that are minima, error code (0 fine, others in `quadrangle`).
     """
     m, A, X = np.empty((4, 2)), np.empty((4, 3)), np.empty((4, 3))
     bad = prepare(pixels, covariance, camera, m, A)

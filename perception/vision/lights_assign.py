@@ -1,0 +1,232 @@
+"""Which of the bright blobs are the panel's four lights: the taught quadrangle picks (paper, Section II-B).
+
+A hypothesis names up to four blobs. It is scored by how lamp-like they are, how equal in true size and contrast, how
+plainly the camera would have to stand, and how well the fourth light falls where the other three predict it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hal.calibration import CameraIntrinsics
+from hal.errors import Ambiguous, InvalidRequest, NotFound
+from perception.camera_model import undistort_pixels
+from perception.vision.lights_find import LightBlobs
+from perception.vision.lights_search import (
+    CONTRAST_SPREAD,
+    MISSING_INSIDE,
+    MISSING_OUTSIDE,
+    OUTSIDE_PER_WIDTH,
+    SIZE_SPREAD,
+    UNCHECKED,
+    insert,
+    search,
+)
+
+Array = NDArray[np.float64]
+
+UPRIGHT = np.diag([1.0, -1.0, -1.0])  # camera x right, y down, z forward; panel x right, y up, z towards the viewer
+CANDIDATES = 16
+LEAST_SCORE = 0.1
+FOCAL_TRIALS = (1.25, 0.95, 1.65)  # of the image width, when the camera is unknown; neighbours share a 4 px gate
+TILT_SIGMA_RAD = 0.4
+ROLL_SIGMA_RAD = 0.35
+RIVAL_MARGIN = 2.0  # in log-odds: closer hypotheses with other blobs are a tie
+
+
+class LightMissing(NotFound):
+    """Fewer lights than needed are seen; the message names the missing ones."""
+
+
+class WrongLamp(NotFound):
+    """Enough bright blobs are seen, but they do not stand as the panel's lights do."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AssignedLights:
+    """The panel's lights in the image, in the order of the taught ones.
+
+    Attributes:
+        points_px: (4, 2) centres as measured (not undistorted); NaN for a light that is not seen.
+        covariance_px: (4, 2, 2); NaN likewise.
+        seen: (4,) which lights are there.
+        blobs: (4,) index into the blobs, -1 when not seen.
+        score: log-odds of this choice; `margin` is its lead over the best choice with other blobs.
+    """
+
+    points_px: Array
+    covariance_px: Array
+    seen: NDArray[np.bool_]
+    blobs: NDArray[np.intp]
+    score: float
+    margin: float
+
+
+def assign_lights(
+    blobs: LightBlobs,
+    lights_m: ArrayLike,
+    *,
+    image_size_px: tuple[int, int],
+    intrinsics: CameraIntrinsics | None = None,
+    upright: ArrayLike = UPRIGHT,
+    least: int = 4,
+) -> AssignedLights:
+    """Choose the panel's lights among the blobs of `find_lights`.
+
+    Args:
+        blobs: candidates.
+        lights_m: (4, 3) or (4, 2) places of the lights in the panel's frame, m.
+        image_size_px: (width, height).
+        intrinsics: the camera; without it several focal lengths and an ideal lens are tried.
+        upright: (3, 3) rotation camera_from_panel about which the camera stands, within some tens of degrees. A panel
+            that looks the same upside down needs it; the default is an upright panel seen from the front.
+        least: how many lights must be seen, 2 to 4; the pose needs 4.
+
+    Raises:
+        LightMissing: fewer than `least` lights are seen.
+        WrongLamp: four or more lamp-like blobs, but not where the panel has its lights.
+        Ambiguous: two choices of blobs fit equally well.
+        InvalidRequest: wrong shapes.
+    """
+    lights = _lights(lights_m)
+    if not 2 <= least <= 4:
+        raise InvalidRequest(f"least must be 2, 3 or 4, not {least}", hint="the pose needs 4")
+    usable = _usable(blobs)
+    if len(usable) < 2:
+        raise LightMissing(
+            f"{len(usable)} lamp-like blobs became brighter, {least} lights are needed",
+            hint="check that the panel's lights switch, and that the camera sees all of them",
+        )
+    best, chosen = _hypotheses(blobs, usable, lights, (image_size_px, intrinsics, np.asarray(upright, float)))
+    if not np.isfinite(best[0]):
+        raise WrongLamp(
+            f"{len(usable)} blobs became brighter, but no choice of them stands as the taught lights",
+            hint="check the panel file's lights and the camera calibration",
+        )
+    return _accept(blobs, usable, best, chosen, least)
+
+
+def _lights(lights_m: ArrayLike) -> Array:
+    lights = np.asarray(lights_m, float)
+    if lights.shape == (4, 2):
+        lights = np.column_stack([lights, np.zeros(4)])
+    if lights.shape != (4, 3) or not np.isfinite(lights).all():
+        raise InvalidRequest(f"lights must be (4, 3) and finite, not {lights.shape}", hint="see the panel file")
+    return lights
+
+
+def _usable(blobs: LightBlobs) -> NDArray[np.intp]:
+    """Lamp-like blobs, best first, each place once."""
+    keep: list[int] = []
+    for i in np.argsort(-blobs.score, kind="stable"):
+        if blobs.score[i] < LEAST_SCORE or len(keep) == CANDIDATES:
+            break
+        radius = np.sqrt(blobs.area_px[i] / np.pi)
+        if all(np.linalg.norm(blobs.centres_px[i] - blobs.centres_px[k]) > radius for k in keep):
+            keep.append(int(i))
+    return np.array(keep, np.intp)
+
+
+def _hypotheses(
+    blobs: LightBlobs,
+    usable: NDArray[np.intp],
+    lights: Array,
+    view: tuple[tuple[int, int], CameraIntrinsics | None, Array],
+) -> tuple[Array, NDArray[np.int64]]:
+    """Best scores and their blobs; `view` is image size, camera if known, upright rotation."""
+    size, intrinsics, upright = view
+    centres = blobs.centres_px[usable]
+    traits = np.stack([
+        6.0 + 2.0 * np.log(blobs.score[usable]), 0.5 * np.log(blobs.area_px[usable]), np.log(blobs.contrast[usable]),
+        blobs.aspect[usable],
+    ])  # fmt: skip
+    best, chosen = np.full(8, -np.inf), np.full((8, 4), -1, np.int64)
+    frame = np.array(size, float)
+    X = lights - lights.mean(axis=0)
+    for camera, ideal, gate_px in _cameras(centres, size, intrinsics):
+        prior = np.array([TILT_SIGMA_RAD, ROLL_SIGMA_RAD, gate_px])
+        for omit in (3, 2, 1, 0):
+            search(ideal, traits, X, upright, camera, frame, prior, omit, best, chosen)
+    _pairs(centres, traits, X @ upright.T, frame, (best, chosen))
+    return best, chosen
+
+
+def _cameras(
+    centres: Array, size: tuple[int, int], intrinsics: CameraIntrinsics | None
+) -> list[tuple[Array, Array, float]]:
+    """(fx fy cx cy, ideal pixels, gate of the fourth light in px) for the known camera or for several guesses."""
+    if intrinsics is not None:
+        camera = np.array([intrinsics.fx_px, intrinsics.fy_px, intrinsics.cx_px, intrinsics.cy_px])
+        return [(camera, undistort_pixels(centres, intrinsics), 2.5)]
+    width, height = size
+    centre = [(width - 1) / 2.0, (height - 1) / 2.0]
+    return [(np.array([k * width, k * width, *centre]), centres, 4.0) for k in FOCAL_TRIALS]
+
+
+def _pairs(
+    centres: Array, traits: Array, model: Array, frame: Array, into: tuple[Array, NDArray[np.int64]]
+) -> None:
+    """Hypotheses with two lights only: nearly frontal, so a similarity of the plane predicts the other two."""
+    reward, log_size, log_contrast, _ = traits
+    flat = model[:, :2]
+    for a, b in permutations(range(4), 2):
+        if a > b:
+            continue
+        for i, j in permutations(range(len(centres)), 2):
+            taught, image = complex(*(flat[b] - flat[a])), complex(*(centres[j] - centres[i]))
+            if taught == 0:
+                continue
+            ratio = image / taught
+            roll = float(np.angle(ratio))
+            spread = 0.25 * (log_size[i] - log_size[j]) ** 2 / SIZE_SPREAD**2
+            spread += 0.25 * (log_contrast[i] - log_contrast[j]) ** 2 / CONTRAST_SPREAD**2
+            order = np.full(4, -1, np.int64)
+            order[a], order[b] = i, j
+            others = [k for k in range(4) if k not in (a, b)]
+            offsets = [ratio * complex(*(flat[k] - flat[a])) for k in others]
+            places = [centres[i] + [o.real, o.imag] for o in offsets]
+            score = reward[i] + reward[j] - UNCHECKED - spread - 0.5 * (roll / (0.5 * ROLL_SIGMA_RAD)) ** 2
+            insert(float(score - sum(_missing(place, frame) for place in places)), order, *into)
+
+
+def _missing(place_px: Array, frame: Array) -> float:
+    """What it costs that a light is not seen at this place."""
+    beyond = float(np.maximum(np.maximum(-place_px, place_px - frame), 0.0).sum())
+    return MISSING_OUTSIDE + OUTSIDE_PER_WIDTH * beyond / float(frame[0]) if beyond > 0.0 else MISSING_INSIDE
+
+
+def _accept(
+    blobs: LightBlobs, usable: NDArray[np.intp], best: Array, chosen: NDArray[np.int64], least: int
+) -> AssignedLights:
+    first = chosen[0]
+    seen = first >= 0
+    if seen.sum() < least:
+        missing = ", ".join(str(k) for k in np.flatnonzero(~seen))
+        if len(usable) >= 4 and seen.sum() < 3:
+            raise WrongLamp(
+                f"{len(usable)} blobs became brighter, but only {int(seen.sum())} of them stand as the taught lights",
+                hint="check the panel file's lights, and that no other lamps were switched in between",
+            )
+        raise LightMissing(
+            f"light {missing} is not seen",
+            hint="look for something in front of it, or move until all four are in view",
+            missing=missing,
+        )
+    rivals = [r for r in range(1, len(best)) if np.isfinite(best[r]) and set(chosen[r]) - {-1} != set(first) - {-1}
+              and (chosen[r] >= 0).sum() >= seen.sum()]
+    margin = float(best[0] - best[rivals[0]]) if rivals else float(best[0])
+    if margin < RIVAL_MARGIN and seen.all():
+        raise Ambiguous(
+            "two choices of lamps fit the taught lights equally well",
+            hint="keep other lamps steady between the two images, or move closer",
+        )
+    index = np.where(seen, usable[np.where(seen, first, 0)], -1)
+    return AssignedLights(
+        points_px=np.where(seen[:, None], blobs.centres_px[index], np.nan),
+        covariance_px=np.where(seen[:, None, None], blobs.covariance_px[index], np.nan),
+        seen=seen, blobs=index, score=float(best[0]), margin=margin,
+    )  # fmt: skip

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from hal.calibration import CameraIntrinsics
 from hal.geometry import UncertainPose, perturbed
-from perception.camera_model import project
 
 Array = NDArray[np.float64]
 
@@ -46,12 +45,13 @@ class CameraView:
     def prior_sigma(self) -> Array:
         """One sigma of the pose, floored so that an exact pose may still follow the building tolerance."""
         floor = np.array([2e-4, 2e-4, 5e-4, 5e-4, 5e-4, 5e-4])
-        return np.maximum(np.sqrt(np.diag(self.camera_from_panel.covariance)), floor)
+        return np.asarray(np.maximum(np.sqrt(np.diag(self.camera_from_panel.covariance)), floor))
 
     def project(self, points_m: ArrayLike) -> Array:
         """(N, 2) pixels of (N, 3) panel points."""
         points = self.camera_from_panel.parent_from_child.apply(np.asarray(points_m, float))
-        return np.asarray(project(points, self.intrinsics))
+
+    X
 
     def moved(self, delta: Array) -> CameraView:
         """The view with the pose perturbed by `delta` (6,)."""

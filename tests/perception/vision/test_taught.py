@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from bench_panel import SHOWN, panel, scene
 
 from benchmarks.vision_drawing import Disturbance, Shown
 from hal.errors import InvalidRequest, NotFound, NotObservable
 from perception.vision.annotate import draw_annotated
 from perception.vision.reading import ObjectReading
 from perception.vision.taught import inspect
+from tests.perception.vision.bench_panel import SHOWN, panel, scene
 
 VIEWS = [(0.0, 0.0, (1280, 960)), (8.0, 30.0, (1280, 960)), (15.0, 200.0, (640, 480)), (20.0, 100.0, (1280, 960))]
 

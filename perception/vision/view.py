@@ -51,7 +51,7 @@ class CameraView:
         """(N, 2) pixels of (N, 3) panel points."""
         points = self.camera_from_panel.parent_from_child.apply(np.asarray(points_m, float))
 
-    X
+        return np.asarray(project(points, self.intrinsics))
 
     def moved(self, delta: Array) -> CameraView:
         """The view with the pose perturbed by `delta` (6,)."""

@@ -1,9 +1,9 @@
 """A pointer about a known pivot, found without outliers.
 
 The face is unrolled to (angle, radius). Along the angle, a morphological closing or opening paints the face without
-thin structures, so glare, gradients and shadow borders vanish and what is left is ink (black-hat, white-hat). A pointer
-has ink at *every* radius between hub and numerals; a numeral, a tick or a cable has it at some. The score of an angle is
-therefore a low quantile over the radii, not their mean. The opposite end is shorter, so it fails the same test.
+thin structures, so glare, gradients and shadow borders vanish and what is left is ink (black-hat, white-hat). A
+pointer has ink at *every* radius between hub and numerals; a numeral, a tick or a cable has it at some. The score of an
+angle is therefore a low quantile over the radii, not their mean. The opposite end is shorter and fails the same test.
 """
 
 from __future__ import annotations

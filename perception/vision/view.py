@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hal.calibration import CameraIntrinsics
 from hal.geometry import UncertainPose, perturbed
+from perception.camera_model import project
 
 Array = NDArray[np.float64]
 

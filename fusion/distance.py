@@ -1,0 +1,48 @@
+"""The nine local pose functions: how badly a pose fits each measurement, exactly (paper eqs 10-13, Fig. 12).
+
+`f(X) = min over Y of g(Y)` under the class's constraint. Formulas: notes/fusion.md, table of section 2; the compiled code is in
+`fusion.exact`, a slow independent one in `fusion.reference`. At the true pose f follows chi-square with `Measurement.dof`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from fusion.exact import evaluate
+from fusion.measurement import Batch, Measurement, checked, pack
+from hal.geometry import Array, matrix_of
+
+
+def local_values(measurements: Sequence[Measurement], base_from_object: RigidTransform) -> Array:
+    """(N,) exact local pose functions f_i at a pose, without unit.
+
+    Raises:
+        InvalidRequest: a measurement makes no sense; see `fusion.measurement.checked`.
+    """
+    return local_values_and_gradients(measurements, base_from_object)[0]
+
+
+def local_values_and_gradients(
+    measurements: Sequence[Measurement], base_from_object: RigidTransform
+) -> tuple[Array, Array]:
+    """f (N,) and its gradients (N, 6) over (translation, rotation) in base axes, 1/m and 1/rad.
+
+    The gradients follow from the envelope theorem: the sensed feature is already at its best.
+
+    Raises:
+        InvalidRequest: a measurement makes no sense.
+    """
+    b = pack(checked(measurements))
+    f, gradients, _ = batch_values(b, matrix_of(base_from_object), np.array(base_from_object.translation))
+    return f, gradients
+
+
+def batch_values(b: Batch, R: Array, t: Array) -> tuple[Array, Array, Array]:
+    """f (N,), gradients (N, 6) and best sensed directions (N, 3) of packed measurements; zero for a prior entry."""
+    n = len(b.cls)
+    f, gradients, directions = np.zeros(n), np.zeros((n, 6)), np.zeros((n, 3))
+    evaluate(b, R, t, True, f, gradients, directions)
+    return f, gradients, directions

@@ -1,0 +1,35 @@
+"""Do measurements agree because of the pose, or by chance?"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fusion.measurement import Batch
+from fusion.rows import log_volumes
+from fusion.solve import LocalSolution
+from hal.geometry import Array, matrix_of
+
+POSE_VOLUME = 8.0 * math.pi**2  # of all rotations (as rotation vectors spread evenly), times one cubic metre
+
+
+def log_evidence(b: Batch, used: Array, local: LocalSolution) -> float:
+    """Log odds of the used measurements stemming from one pose, against all N being strays; natural logarithm.
+
+    A stray hits anywhere within a metre and any direction cosine; a good one falls near its place with its own covariance.
+    The pose pays for its freedom (posterior over prior volume, Laplace), and for the choice of this set among all of its size.
+
+    Args:
+        b: packed measurements.
+        used: (N,) which agree.
+        local: the solution from those.
+    """
+    n, k = len(b.cls), int(np.sum(used))
+    volumes = np.zeros(n)
+    R = matrix_of(local.base_from_object)
+    log_volumes(b, R, np.array(local.base_from_object.translation), volumes)
+    gains = -volumes[used] - 0.5 * local.values[used]
+    spread = 0.5 * np.linalg.slogdet(2.0 * math.pi * local.covariance)[1]
+    choices = math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
+    return float(gains.sum() + min(spread - math.log(POSE_VOLUME), 0.0) - choices)

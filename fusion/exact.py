@@ -1,0 +1,321 @@
+"""The nine local pose functions without approximation, and their gradients, compiled (paper eq 10; notes/fusion.md table).
+
+Classes 1, 2, 3, 5, 6 and 9 have closed forms. In 4, 7 and 8 the sensed point and direction are coupled, and what is left is
+
+    F(v) = F0 + s (h.v)^2 / (v.A v) + v.M v,    |v| = 1
+
+with (s, h, A) = (-1, C^-1 e, C^-1) for line-point and (+1, e, C) for plane-point; plane-line is plane-point with v held
+across u. F has several minima; each is reached by Newton's method on the sphere from starts at the minima of either term, from
+the arcs between those, and from a coarse grid.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fusion.measurement import Batch
+from fusion.vectors import (
+    Sym,
+    Vec,
+    across,
+    blend,
+    compiled,
+    cross,
+    dot,
+    form,
+    inlined,
+    normalised,
+    sym,
+    times,
+    turned,
+    vec,
+)
+from hal.geometry import Array
+
+REFINED = 5  # starts that Newton's method follows, best first
+CIRCLE = 24  # starts on the half circle of plane-line
+
+# Half of the 26 neighbours of a cube's centre: any direction is within 23 degrees of one of them or its opposite.
+_GRID = np.array([
+    [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1], [0, 1, 1], [0, 1, -1],
+    [1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1],
+], float)  # fmt: skip
+
+
+@inlined
+def _line_value(e: Vec, A: Sym, M: Sym, v: Vec) -> float:
+    """Line-point: distance of the nearest point of the line plus the direction's share; subtracts before it squares."""
+    k = form(v, A, e) / form(v, A, v)
+    y = blend(1.0, e, -k, v)
+    return form(y, A, y) + form(v, M, v)
+
+
+@inlined
+def _plane_value(e: Vec, C: Sym, M: Sym, v: Vec) -> float:
+    p = dot(v, e)
+    return p * p / form(v, C, v) + form(v, M, v)
+
+
+@inlined
+def _value(line: bool, e: Vec, A: Sym, M: Sym, v: Vec) -> float:
+    return _line_value(e, A, M, v) if line else _plane_value(e, A, M, v)
+
+
+@inlined
+def _newton(line: bool, e: Vec, A: Sym, M: Sym, v: Vec, steps: int) -> Vec:
+    """A minimum of F near v. Written for v of any length, F is of degree 0, so its tangent Hessian is the plain one."""
+    h = times(A, e) if line else e
+    s = -1.0 if line else 1.0
+    best = _value(line, e, A, M, v)
+    for _ in range(steps):
+        b1 = across(v)
+        b2 = cross(v, b1)
+        q = form(v, A, v)
+        tau = dot(h, v) / q
+        c = blend(1.0, h, -2.0 * tau, times(A, v))
+        pull = blend(2.0 * s * tau, blend(1.0, h, -tau, times(A, v)), 2.0, times(M, v))
+        m = form(v, M, v)
+        g1, g2 = dot(b1, pull), dot(b2, pull)
+        c1, c2 = dot(b1, c), dot(b2, c)
+        h11 = 2.0 * (s * (c1 * c1 / q - tau * tau * form(b1, A, b1)) + form(b1, M, b1) - m)
+        h12 = 2.0 * (s * (c1 * c2 / q - tau * tau * form(b1, A, b2)) + form(b1, M, b2))
+        h22 = 2.0 * (s * (c2 * c2 / q - tau * tau * form(b2, A, b2)) + form(b2, M, b2) - m)
+        middle, radius = 0.5 * (h11 + h22), math.hypot(0.5 * (h11 - h22), h12)
+        top = abs(middle) + radius
+        if top <= 0.0:
+            break
+        # Shift an indefinite Hessian to the size of its own curvature, so that the step leaves a saddle downhill.
+        shift = max(0.0, 1e-12 * top - (middle - radius))
+        if shift > 1e-11 * top:
+            shift += radius
+        a, d = h11 + shift, h22 + shift
+        det = a * d - h12 * h12
+        x1, x2 = -(d * g1 - h12 * g2) / det, -(a * g2 - h12 * g1) / det
+        size = math.hypot(x1, x2)
+        if size > 1.0:
+            x1, x2 = x1 / size, x2 / size
+        scale, accepted = 1.0, False
+        for _ in range(30):
+            w = normalised(blend(1.0, v, scale, blend(x1, b1, x2, b2)))
+            value = _value(line, e, A, M, w)
+            if value < best:
+                v, best, accepted = w, value, True
+                break
+            scale *= 0.4
+            if scale * size < 1e-13:
+                break
+        if not accepted or size < 1e-13:
+            break
+    return v
+
+
+@inlined
+def _sphere(line: bool, e: Vec, A: Sym, M: Sym, d: Vec, a1: Vec, a2: Vec) -> Vec:
+    """Where F is least on the whole sphere: starts by value, the best ones refined."""
+    starts, cost = np.empty((40, 3)), np.empty(40)
+    n = 0
+    for k in range(13):
+        n = _start(starts, n, normalised(vec(_GRID, k)))
+    for v in (d, a1, a2):
+        n = _start(starts, n, v)
+    size = math.sqrt(dot(e, e))
+    if size > 1e-12:
+        toward = blend(1.0 / size, e, 0.0, e)
+        n1 = across(toward)
+        n2 = cross(toward, n1)
+        if line:
+            # The minimum moves from d (direction known well) towards e (point known well) as |e| grows.
+            for k in range(1, 9):
+                n = _start(starts, n, normalised(blend(1.0 - k / 8.0, d, k / 8.0, toward)))
+                n = _start(starts, n, normalised(blend(1.0 - k / 8.0, d, -k / 8.0, toward)))
+        else:
+            # e-perp is where the first term vanishes; the second is least there at one of two directions.
+            m11, m12, m22 = form(n1, M, n1), form(n1, M, n2), form(n2, M, n2)
+            angle = 0.5 * math.atan2(2.0 * m12, m11 - m22)
+            low = blend(-math.sin(angle), n1, math.cos(angle), n2)
+            for k in range(1, 9):
+                n = _start(starts, n, normalised(blend(1.0 - k / 8.0, d, k / 8.0, low)))
+                n = _start(starts, n, normalised(blend(1.0 - k / 8.0, d, -k / 8.0, low)))
+            n = _start(starts, n, blend(math.cos(angle), n1, math.sin(angle), n2))
+    for k in range(n):
+        cost[k] = _value(line, e, A, M, vec(starts, k))
+    best, least = d, np.inf
+    for _ in range(REFINED):
+        k = int(np.argmin(cost[:n]))
+        if not np.isfinite(cost[k]):
+            break
+        v = _newton(line, e, A, M, vec(starts, k), 40)
+        value = _value(line, e, A, M, v)
+        if value < least:
+            best, least = v, value
+        for j in range(n):  # what lies close to this minimum would lead here again
+            if abs(dot(v, vec(starts, j))) > 0.98:
+                cost[j] = np.inf
+        cost[k] = np.inf
+    return best
+
+
+@inlined
+def _start(starts: Array, n: int, v: Vec) -> int:
+    starts[n, 0], starts[n, 1], starts[n, 2] = v[0], v[1], v[2]
+    return n + 1
+
+
+@inlined
+def _circle(e: Vec, C: Sym, M: Sym, u: Vec, d: Vec) -> Vec:
+    """Where F of plane-line is least: v across u, one angle; stationary points of degree 6, so at most 6 in half a turn."""
+    n1 = across(u)
+    n2 = cross(u, n1)
+    h1, h2 = dot(n1, e), dot(n2, e)
+    c11, c12, c22 = form(n1, C, n1), form(n1, C, n2), form(n2, C, n2)
+    m11, m12, m22 = form(n1, M, n1), form(n1, M, n2), form(n2, M, n2)
+    # Numerators over t = tan(angle): F' = 2 (h1 + h2 t)(k0 + k1 t) / Q^2 + 2 (m12 + (m22 - m11) t - m12 t^2) / P^2
+    k0, k1 = h2 * c11 - h1 * c12, h2 * c12 - h1 * c22
+    n_0, n_1, n_2 = h1 * k0, h1 * k1 + h2 * k0, h2 * k1
+    q0, q1, q2 = c11, 2.0 * c12, c22
+    Q2 = (q0 * q0, 2.0 * q0 * q1, q1 * q1 + 2.0 * q0 * q2, 2.0 * q1 * q2, q2 * q2)
+    P2 = (1.0, 0.0, 2.0, 0.0, 1.0)
+    ratio, flat = (n_0, n_1, n_2), (m12, m22 - m11, -m12)
+    poly = np.zeros(7, np.complex128)
+    for i in range(3):
+        for j in range(5):
+            poly[6 - i - j] += ratio[i] * P2[j] + flat[i] * Q2[j]
+    angles, n = np.empty(CIRCLE + 10), 0
+    largest = np.max(np.abs(poly))
+    if largest > 0.0:
+        first = 0
+        while first < 6 and abs(poly[first]) < 1e-14 * largest:
+            first += 1
+        if first < 6:
+            for root in np.roots(poly[first:]):
+                if abs(root.imag) < 1e-3 * (1.0 + abs(root.real)):
+                    angles[n] = math.atan(root.real)
+                    n += 1
+    angles[n] = 0.5 * math.pi
+    angles[n + 1] = math.atan2(dot(n2, d), dot(n1, d))
+    angles[n + 2] = math.atan2(-h1, h2)
+    n += 3
+    for k in range(CIRCLE):
+        angles[n] = math.pi * k / CIRCLE
+        n += 1
+    least, where = np.inf, 0.0
+    for k in range(n):
+        value = _plane_value(e, C, M, blend(math.cos(angles[k]), n1, math.sin(angles[k]), n2))
+        if value < least:
+            least, where = value, angles[k]
+    where = _polish_angle(h1, h2, c11, c12, c22, m11, m12, m22, where)
+    return blend(math.cos(where), n1, math.sin(where), n2)
+
+
+@inlined
+def _polish_angle(
+    h1: float, h2: float, c11: float, c12: float, c22: float, m11: float, m12: float, m22: float, x: float
+) -> float:
+    """Newton's method on the angle; keeps the old one where a step does not help."""
+    best = np.inf
+    kept = x
+    for _ in range(25):
+        c, s = math.cos(x), math.sin(x)
+        p, dp = h1 * c + h2 * s, h2 * c - h1 * s
+        q = c11 * c * c + 2 * c12 * c * s + c22 * s * s
+        dq = 2 * ((c22 - c11) * c * s + c12 * (c * c - s * s))
+        d2q = 2 * ((c22 - c11) * (c * c - s * s) - 4 * c12 * c * s)
+        dm = 2 * ((m22 - m11) * c * s + m12 * (c * c - s * s))
+        d2m = 2 * ((m22 - m11) * (c * c - s * s) - 4 * m12 * c * s)
+        value = p * p / q + m11 * c * c + 2 * m12 * c * s + m22 * s * s
+        if value < best:
+            best, kept = value, x
+        slope = 2 * p * dp / q - p * p * dq / q**2 + dm
+        bend = 2 * (dp * dp - p * p) / q - 4 * p * dp * dq / q**2 - p * p * d2q / q**2 + 2 * p * p * dq**2 / q**3 + d2m
+        if not bend > 0.0:
+            break
+        step = -slope / bend
+        if abs(step) < 1e-15:
+            break
+        x += max(-0.2, min(0.2, step))
+    return kept
+
+
+@inlined
+def _least_across(M: Sym, u: Vec) -> Vec:
+    """The unit v across u with least v.M v: class 6."""
+    n1 = across(u)
+    n2 = cross(u, n1)
+    m11, m12, m22 = form(n1, M, n1), form(n1, M, n2), form(n2, M, n2)
+    angle = 0.5 * math.atan2(2.0 * m12, m11 - m22)  # of the larger one
+    return blend(-math.sin(angle), n1, math.cos(angle), n2)
+
+
+@inlined
+def local(b: Batch, i: int, q: Vec, u: Vec, e: Vec, v: Vec, search: bool) -> tuple[float, Vec, Vec, Vec]:
+    """f, df/dx, df/du and v* of entry i. `search`: over the whole sphere; else by Newton's method from v (classes 4, 7)."""
+    c = b.cls[i]
+    C, A, M = sym(b.C, i), sym(b.A, i), sym(b.M, i)
+    zero = (0.0, 0.0, 0.0)
+    if c == 1:
+        Ae = times(A, e)
+        return dot(e, Ae), blend(2.0, Ae, 0.0, Ae), zero, v
+    if c == 2 or c == 5:
+        s = -form(u, A, e) / form(u, A, u)
+        y = blend(1.0, e, s, u)
+        Ay = times(A, y)
+        f, gx, gu = dot(y, Ay), blend(2.0, Ay, 0.0, Ay), blend(2.0 * s, Ay, 0.0, Ay)
+        if c == 5:
+            Mu = times(M, u)
+            f, gu = f + dot(u, Mu), blend(1.0, gu, 2.0, Mu)
+        return f, gx, gu, u
+    if c == 3 or c == 6 or c == 9:
+        Cu = times(C, u)
+        ue = dot(u, e)
+        tau = ue / dot(u, Cu)
+        f, gx, gu = ue * tau, blend(2.0 * tau, u, 0.0, u), blend(2.0 * tau, e, -2.0 * tau * tau, Cu)
+        if c == 9:
+            Mu = times(M, u)
+            return f + dot(u, Mu), gx, blend(1.0, gu, 2.0, Mu), u
+        if c == 6:
+            v = _least_across(M, u)
+            return f + form(v, M, v), gx, blend(1.0, gu, -2.0 * form(u, M, v), v), v
+        return f, gx, gu, u
+    d, a1, a2 = vec(b.d, i), vec(b.a1, i), vec(b.a2, i)
+    if c == 4:
+        v = _sphere(True, e, A, M, d, a1, a2) if search else _newton(True, e, A, M, v, 6)
+        y = blend(1.0, e, -form(v, A, e) / form(v, A, v), v)
+        Ay = times(A, y)
+        return _line_value(e, A, M, v), blend(2.0, Ay, 0.0, Ay), zero, v
+    if c == 7:
+        v = _sphere(False, e, C, M, d, a1, a2) if search else _newton(False, e, C, M, v, 6)
+        tau = dot(v, e) / form(v, C, v)
+        return _plane_value(e, C, M, v), blend(2.0 * tau, v, 0.0, v), zero, v
+    if search:
+        v = _circle(e, C, M, u, d)
+    else:
+        n1 = across(u)
+        n2 = cross(u, n1)
+        x = _polish_angle(
+            dot(n1, e), dot(n2, e), form(n1, C, n1), form(n1, C, n2), form(n2, C, n2),
+            form(n1, M, n1), form(n1, M, n2), form(n2, M, n2), math.atan2(dot(n2, v), dot(n1, v)),
+        )  # fmt: skip
+        v = blend(math.cos(x), n1, math.sin(x), n2)
+    Cv = times(C, v)
+    tau = dot(v, e) / dot(v, Cv)
+    held = tau * dot(u, e) - tau * tau * dot(u, Cv) + form(u, M, v)
+    return _plane_value(e, C, M, v), blend(2.0 * tau, v, 0.0, v), blend(-2.0 * held, v, 0.0, v), v
+
+
+@compiled
+def evaluate(b: Batch, R: Array, t: Array, search: bool, f: Array, grad: Array, direction: Array) -> None:
+    """Exact f (N,) and its gradients grad (N, 6) over (translation, rotation) at a pose; `direction` (N, 3) is v*.
+
+    With `search` the global minimum over v is sought; otherwise `direction` is where to start (and is updated).
+    """
+    for i in range(b.cls.size):
+        if b.cls[i] == 0:
+            continue
+        q, u, mu = turned(R, vec(b.m, i)), turned(R, vec(b.w, i)), vec(b.mu, i)
+        e = (q[0] + t[0] - mu[0], q[1] + t[1] - mu[1], q[2] + t[2] - mu[2])
+        f[i], gx, gu, v = local(b, i, q, u, e, vec(direction, i), search)
+        turn, tilt = cross(q, gx), cross(u, gu)
+        for k in range(3):
+            grad[i, k], grad[i, 3 + k], direction[i, k] = gx[k], turn[k] + tilt[k], v[k]

@@ -1,0 +1,305 @@
+"""Whitened residual rows of the nine classes and descent on their squared sum, compiled (notes/fusion.md, "Residual rows").
+
+With e = R m + t - mu, the three kinds of row and their derivatives over (translation, rotation) are
+
+    A   (R a)^T e    [R a,  R a x e + R m x R a]
+    B   n^T e        [n,    R m x n]
+    D   n^T R w      [0,    R w x n]
+
+Classes 1, 2, 3, 5 and 9 are exact; 4, 6, 7 and 8 are first order in the direction error, and `fusion.exact` finishes them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fusion.measurement import Batch
+from fusion.vectors import (
+    Vec,
+    across,
+    cholesky,
+    compiled,
+    cross,
+    dot,
+    form,
+    inlined,
+    move,
+    rotation_vector,
+    solve_lower,
+    solve_upper,
+    sym,
+    turned,
+    vec,
+)
+from hal.geometry import Array
+
+HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
+FLOOR = 1e-6  # share of the direction variance that is kept where u^T S u vanishes far from the solution
+
+
+@inlined
+def _put(J: Array, k: int, n: Vec, c: Vec, moved: float) -> None:
+    J[k, 0], J[k, 1], J[k, 2] = moved * n[0], moved * n[1], moved * n[2]
+    J[k, 3], J[k, 4], J[k, 5] = c[0], c[1], c[2]
+
+
+@inlined
+def _row_a(r: Array, J: Array, k: int, n: Vec, e: Vec, q: Vec) -> None:
+    a, b = cross(n, e), cross(q, n)
+    r[k] = dot(n, e)
+    _put(J, k, n, (a[0] + b[0], a[1] + b[1], a[2] + b[2]), 1.0)
+
+
+@inlined
+def _row_b(r: Array, J: Array, k: int, n: Vec, e: Vec, q: Vec) -> None:
+    r[k] = dot(n, e)
+    _put(J, k, n, cross(q, n), 1.0)
+
+
+@inlined
+def _row_d(r: Array, J: Array, k: int, n: Vec, g: Vec) -> None:
+    r[k] = dot(n, g)
+    _put(J, k, n, cross(g, n), 0.0)
+
+
+@inlined
+def _variance(p: float) -> float:
+    """1/p, and a very large number where nothing is known."""
+    return 1.0 / p if p > 1e-12 else 1e12
+
+
+@inlined
+def rows(b: Batch, i: int, R: Array, t: Array, far: bool, r: Array, J: Array, V: Array) -> int:
+    """Fill residuals r (6,), Jacobian J (6, 6) and their covariance V (6, 6) of entry i; returns the number of rows.
+
+    `far`: away from the solution the direction variance is averaged over directions, so that it cannot vanish.
+    """
+    c = b.cls[i]
+    if c == 0:
+        return _prior_rows(b, R, t, r, J, V)
+    q = turned(R, vec(b.m, i))
+    mu = vec(b.mu, i)
+    e = (q[0] + t[0] - mu[0], q[1] + t[1] - mu[1], q[2] + t[2] - mu[2])
+    C = sym(b.C, i)
+    if c == 1:
+        for k in range(3):
+            n = (1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0)
+            _row_b(r, J, k, n, e, q)
+        V[0, 0], V[1, 0], V[1, 1], V[2, 0], V[2, 1], V[2, 2] = C[0], C[1], C[3], C[2], C[4], C[5]
+        return 3
+    d, a1, a2 = vec(b.d, i), vec(b.a1, i), vec(b.a2, i)
+    v1, v2 = _variance(b.p[i, 0]), _variance(b.p[i, 1])
+    if c == 4:
+        lever = dot(d, e) ** 2
+        _row_b(r, J, 0, a1, e, q)
+        _row_b(r, J, 1, a2, e, q)
+        V[0, 0], V[1, 0], V[1, 1] = form(a1, C, a1) + lever * v1, form(a1, C, a2), form(a2, C, a2) + lever * v2
+        return 2
+    e1, e2 = dot(a1, e), dot(a2, e)
+    if c == 7:
+        _row_b(r, J, 0, d, e, q)
+        V[0, 0] = form(d, C, d) + v1 * e1 * e1 + v2 * e2 * e2
+        return 1
+    w = vec(b.w, i)
+    u = turned(R, w)
+    if c == 8:
+        u1, u2 = dot(a1, u), dot(a2, u)
+        _row_b(r, J, 0, d, e, q)
+        _row_d(r, J, 1, d, u)
+        V[0, 0] = form(d, C, d) + v1 * e1 * e1 + v2 * e2 * e2
+        if far:
+            V[1, 0], V[1, 1] = 0.0, 0.5 * (v1 + v2)
+        else:
+            V[1, 0], V[1, 1] = v1 * e1 * u1 + v2 * e2 * u2, v1 * u1 * u1 + v2 * u2 * u2 + FLOOR * (v1 + v2)
+        return 2
+    if c == 2 or c == 5:
+        n1 = across(u)
+        n2 = cross(u, n1)
+        _row_a(r, J, 0, n1, e, q)
+        _row_a(r, J, 1, n2, e, q)
+        V[0, 0], V[1, 0], V[1, 1] = form(n1, C, n1), form(n1, C, n2), form(n2, C, n2)
+        if c == 2:
+            return 2
+        _direction_rows(r, J, V, 2, a1, a2, v1, v2, u)
+        return 4
+    _row_a(r, J, 0, u, e, q)
+    V[0, 0] = form(u, C, u)
+    if c == 3:
+        return 1
+    if c == 6:
+        u1, u2 = dot(a1, u), dot(a2, u)
+        _row_d(r, J, 1, d, u)
+        V[1, 0] = 0.0
+        V[1, 1] = 0.5 * (v1 + v2) if far else v1 * u1 * u1 + v2 * u2 * u2 + FLOOR * (v1 + v2)
+        return 2
+    _direction_rows(r, J, V, 1, a1, a2, v1, v2, u)
+    return 3
+
+
+@inlined
+def _direction_rows(r: Array, J: Array, V: Array, k: int, a1: Vec, a2: Vec, v1: float, v2: float, u: Vec) -> None:
+    """Rows D(a1), D(a2) at k and k + 1, independent of the rows before."""
+    _row_d(r, J, k, a1, u)
+    _row_d(r, J, k + 1, a2, u)
+    for j in range(k):
+        V[k, j] = V[k + 1, j] = 0.0
+    V[k, k], V[k + 1, k], V[k + 1, k + 1] = v1, 0.0, v2
+
+
+@inlined
+def _prior_rows(b: Batch, R: Array, t: Array, r: Array, J: Array, V: Array) -> int:
+    """A prior pose as six rows that are white already: W (delta), first order in the rotation."""
+    x = rotation_vector(R, b.prior_r)
+    for k in range(6):
+        s = 0.0
+        for j in range(3):
+            s += b.prior_w[k, j] * (t[j] - b.prior_t[j]) + b.prior_w[k, 3 + j] * x[j]
+        r[k] = s
+        for j in range(6):
+            J[k, j] = b.prior_w[k, j]
+            V[k, j] = 1.0 if j == k else 0.0
+    return 6
+
+
+@inlined
+def whitened(b: Batch, i: int, R: Array, t: Array, far: bool, r: Array, J: Array, V: Array) -> int:
+    """As `rows`, with r and J divided by the root of the covariance: f = |r|^2."""
+    k = rows(b, i, R, t, far, r, J, V)
+    if b.cls[i] == 0:
+        return k
+    if not cholesky(V, k):
+        return 0
+    solve_lower(V, r, k)
+    for j in range(6):
+        for row in range(k):
+            s = J[row, j]
+            for c in range(row):
+                s -= V[row, c] * J[c, j]
+            J[row, j] = s / V[row, row]
+    return k
+
+
+@compiled
+def values(b: Batch, R: Array, t: Array, far: bool, f: Array) -> None:
+    """First-order local pose functions f (N,) at a pose."""
+    r, J, V = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
+    for i in range(b.cls.size):
+        k = rows(b, i, R, t, far, r, J, V)
+        s = 0.0
+        if b.cls[i] == 0:
+            for j in range(k):
+                s += r[j] * r[j]
+        elif cholesky(V, k):
+            solve_lower(V, r, k)
+            for j in range(k):
+                s += r[j] * r[j]
+        f[i] = s
+
+
+@compiled
+def log_volumes(b: Batch, R: Array, t: Array, out: Array) -> None:
+    """out (N,) = log sqrt det(2 pi V_i): how much room (m, rad) a good measurement's residual has; 0 for a prior."""
+    r, J, V = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
+    for i in range(b.cls.size):
+        out[i] = 0.0
+        k = rows(b, i, R, t, False, r, J, V)
+        if b.cls[i] != 0 and cholesky(V, k):
+            for j in range(k):
+                out[i] += min(0.0, math.log(V[j, j]) + HALF_LOG_2PI)
+
+
+@inlined
+def accumulate(b: Batch, use: Array, R: Array, t: Array, far: bool, H: Array, g: Array, work: Array) -> float:
+    """H (6, 6) lower = sum J^T J, g (6,) = sum J^T r over entries with use > 0; returns sum |r|^2.
+
+    work: (13, 6) scratch.
+    """
+    r, J, V = work[0], work[1:7], work[7:13]
+    for j in range(6):
+        g[j] = 0.0
+        for k in range(6):
+            H[j, k] = 0.0
+    cost = 0.0
+    for i in range(b.cls.size):
+        if use[i] <= 0.0:
+            continue
+        n = whitened(b, i, R, t, far, r, J, V)
+        for k in range(n):
+            cost += r[k] * r[k]
+            for p in range(6):
+                g[p] += J[k, p] * r[k]
+                for c in range(p + 1):
+                    H[p, c] += J[k, p] * J[k, c]
+    return cost
+
+
+@inlined
+def cost_of(b: Batch, use: Array, R: Array, t: Array, far: bool, work: Array) -> float:
+    """sum |r|^2 over entries with use > 0."""
+    r, J, V = work[0], work[1:7], work[7:13]
+    cost = 0.0
+    for i in range(b.cls.size):
+        if use[i] <= 0.0:
+            continue
+        k = rows(b, i, R, t, far, r, J, V)
+        if b.cls[i] != 0:
+            if not cholesky(V, k):
+                continue
+            solve_lower(V, r, k)
+        for j in range(k):
+            cost += r[j] * r[j]
+    return cost
+
+
+@compiled
+def descend(b: Batch, use: Array, R: Array, t: Array, far: bool, steps: int, tolerance: float) -> float:
+    """Levenberg-Marquardt on sum |r|^2 over entries with use > 0; moves R (3, 3) and t (3,) in place, returns the cost.
+
+    The step is damped in proportion to the diagonal of J^T J (Marquardt), so metres and radians need no common scale.
+    Stops when the predicted fall is below `tolerance`.
+    """
+    H, L, g, step = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty(6)
+    work = np.empty((13, 6))
+    R1, t1 = np.empty((3, 3)), np.empty(3)
+    damping = 1e-3 if far else 1e-6
+    cost = accumulate(b, use, R, t, far, H, g, work)
+    for _ in range(steps):
+        size = 0.0
+        for j in range(6):
+            size = max(size, H[j, j])
+        for p in range(6):
+            for c in range(p):
+                L[p, c] = H[p, c]
+            L[p, p] = H[p, p] * (1.0 + damping) + 1e-12 * size
+            step[p] = -g[p]
+        if not cholesky(L, 6):
+            damping = max(10.0 * damping, 1e-6)
+            continue
+        solve_lower(L, step, 6)
+        fall = 0.0
+        for j in range(6):
+            fall += step[j] * step[j]
+        solve_upper(L, step, 6)
+        turn = step[3] ** 2 + step[4] ** 2 + step[5] ** 2
+        if turn > 1.0:  # beyond a radian the linearisation says nothing
+            for j in range(6):
+                step[j] /= turn**0.5
+        R1[:], t1[:] = R, t
+        move(R1, t1, step)
+        lower = cost_of(b, use, R1, t1, far, work)
+        if lower < cost:
+            R[:], t[:] = R1, t1
+            damping = max(0.1 * damping, 1e-9)
+            cost = accumulate(b, use, R, t, far, H, g, work)
+            if fall < tolerance:
+                break
+        else:
+            if fall < tolerance:
+                break
+            damping = max(8.0 * damping, 1e-6)
+            if damping > 1e8:
+                break
+    return cost
+

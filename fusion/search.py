@@ -1,0 +1,143 @@
+"""Poses from small random subsets, and their refinement on everything that agrees, compiled (notes/fusion.md, "Robust").
+
+Annealed truncation alone loses the right pose when a quarter of the measurements are bad; subsets that happen to be clean do
+not. A subset carries just enough freedom to be checked (8 degrees of freedom for 6 unknowns).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fusion.measurement import Batch
+from fusion.rows import descend, rows, values
+from fusion.vectors import cholesky, compiled, inlined, solve_lower, solve_upper, turned, vec
+from hal.geometry import Array
+
+SUBSET_DOF = 8  # six unknowns and two to check them by
+SUBSET_MOST = 8  # measurements in a subset
+DRAWS = SUBSET_MOST + 4  # random numbers a hypothesis uses: picks and a quaternion
+STEPS = 14
+FIT_LIMIT = 60.0  # a subset that its own pose explains no better than this is not clean
+ANNEAL = (8.0, 4.0, 2.0, 1.0)
+
+
+@inlined
+def _rotation(R: Array, x: float, y: float, z: float, w: float) -> None:
+    n = math.sqrt(x * x + y * y + z * z + w * w) + 1e-300
+    x, y, z, w = x / n, y / n, z / n, w / n
+    R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+    R[1, 0], R[1, 1], R[1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+    R[2, 0], R[2, 1], R[2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+
+
+@inlined
+def place(b: Batch, use: Array, R: Array, t: Array) -> None:
+    """t (3,) in place: the translation that fits the used entries best at rotation R, every row weighing the same.
+
+    At a fixed rotation all rows are linear in t. What they leave free is taken from the centroids; lines and planes that a
+    camera sees do not count there, since their mu is the camera.
+    """
+    r, J, V = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
+    A, x = np.zeros((3, 3)), np.zeros(3)
+    n = 0.0
+    for k in range(3):
+        t[k] = 0.0
+    for camera in (False, True):
+        for i in range(b.cls.size):
+            c = b.cls[i]
+            if use[i] <= 0.0 or c == 0 or ((c == 4 or c == 8) != camera):
+                continue
+            q = turned(R, vec(b.m, i))
+            t[0] += b.mu[i, 0] - q[0]
+            t[1] += b.mu[i, 1] - q[1]
+            t[2] += b.mu[i, 2] - q[2]
+            n += 1.0
+        if n > 0.0:
+            break
+    for k in range(3):
+        t[k] /= max(n, 1.0)
+        A[k, k] = 1e-3
+    for i in range(b.cls.size):
+        if use[i] <= 0.0 or b.cls[i] == 0:
+            continue
+        for k in range(rows(b, i, R, t, True, r, J, V)):
+            for p in range(3):
+                x[p] -= J[k, p] * r[k]
+                for c in range(p + 1):
+                    A[p, c] += J[k, p] * J[k, c]
+    if cholesky(A, 3):
+        solve_lower(A, x, 3)
+        solve_upper(A, x, 3)
+        for k in range(3):
+            t[k] += x[k]
+
+
+@inlined
+def _pick(b: Batch, draws: Array, h: int, order: Array, use: Array) -> None:
+    """Mark a random subset of SUBSET_DOF degrees of freedom; a partial shuffle of `order`."""
+    n = order.size
+    use[:] = 0.0
+    dof = 0
+    for k in range(min(SUBSET_MOST, n)):
+        j = k + int(draws[h, k] * (n - k))
+        order[k], order[j] = order[j], order[k]
+        use[order[k]] = 1.0
+        dof += b.dof[order[k]]
+        if dof >= SUBSET_DOF:
+            break
+
+
+@compiled
+def hypotheses(b: Batch, draws: Array, Rs: Array, ts: Array, costs: Array) -> None:
+    """One pose per row of `draws` (H, DRAWS): Rs (H, 3, 3), ts (H, 3) and truncated costs (H,), infinite if unfit."""
+    n = b.cls.size
+    order, use, f = np.arange(n), np.empty(n), np.empty(n)
+    for h in range(draws.shape[0]):
+        R, t = Rs[h], ts[h]
+        _pick(b, draws, h, order, use)
+        if b.cls[n - 1] == 0 and use[n - 1] > 0.0:
+            R[:], t[:] = b.prior_r, b.prior_t
+        else:
+            k = SUBSET_MOST
+            _rotation(R, draws[h, k], draws[h, k + 1], draws[h, k + 2], draws[h, k + 3])
+            place(b, use, R, t)
+        costs[h] = np.inf
+        if descend(b, use, R, t, True, STEPS, 1e-2) < FIT_LIMIT:
+            values(b, R, t, False, f)
+            costs[h] = truncated(b, f)
+
+
+@inlined
+def truncated(b: Batch, f: Array) -> float:
+    """sum min(f_i, gate_i) (TLS)"""
+    cost = 0.0
+    for i in range(f.size):
+        cost += min(f[i], b.gate[i])
+    return cost
+
+
+@compiled
+def settle(b: Batch, R: Array, t: Array, f: Array, annealed: bool) -> float:
+    """Refine R, t in place on the measurements inside a shrinking gate until the set stands; fills f (N,), returns TLS."""
+    n = b.cls.size
+    use, before = np.ones(n), np.ones(n)
+    if annealed:
+        for k in range(4):
+            values(b, R, t, False, f)
+            for i in range(n):
+                use[i] = 1.0 if f[i] < ANNEAL[k] * b.gate[i] else 0.0
+            descend(b, use, R, t, False, 4, 1e-3)
+    for _ in range(12):
+        values(b, R, t, False, f)
+        same = True
+        for i in range(n):
+            use[i] = 1.0 if f[i] < b.gate[i] else 0.0
+            same = same and use[i] == before[i]
+            before[i] = use[i]
+        if same:
+            break
+        descend(b, use, R, t, False, 12, 1e-8)
+    values(b, R, t, False, f)
+    return truncated(b, f)

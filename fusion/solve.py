@@ -1,0 +1,110 @@
+"""The local solve: from a start to the nearest minimum of E, with covariance, fit and what stays free (paper eqs 11, 12)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from fusion.measurement import Batch, Measurement, checked, pack
+from fusion.observability import FreeDirection, covariance_and_freedom
+from fusion.polish import solve_from
+from fusion.search import place
+from hal.errors import InvalidRequest
+from hal.geometry import Array, UncertainPose, matrix_of
+
+MIN_SIZE_M = 0.05  # features closer together than this still make an object of this size
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LocalSolution:
+    """A minimum of the error over all given measurements.
+
+    Attributes:
+        base_from_object: the pose.
+        covariance: 6x6, translation then rotation, base axes, m and rad; free directions carry 10 object sizes or 10 rad.
+        information: 6x6 in the same order.
+        values: (N,) exact local pose functions, the prior's share last if there was one.
+        chi_square: their sum, E.
+        dof: degrees of freedom of E: constraints minus observed unknowns.
+        unobservable: motions that the measurements leave free.
+    """
+
+    base_from_object: RigidTransform
+    covariance: Array
+    information: Array
+    values: Array
+    chi_square: float
+    dof: int
+    unobservable: tuple[FreeDirection, ...]
+
+
+def solve(
+    measurements: Sequence[Measurement], start: RigidTransform, *, prior: UncertainPose | None = None
+) -> LocalSolution:
+    """The minimum of E = sum f_i near `start`; believes every measurement.
+
+    Raises:
+        InvalidRequest: a measurement makes no sense, or there is none.
+    """
+    if not len(measurements) and prior is None:
+        raise InvalidRequest("no measurement to fuse", hint="give at least one measurement or a prior pose")
+    b = pack(checked(measurements), prior)
+    return local_solution(b, np.ones(len(b.cls)), matrix_of(start), np.array(start.translation))
+
+
+def solve_from_many(
+    measurements: Sequence[Measurement],
+    *,
+    starts: int = 64,
+    seed: int = 0,
+    prior: UncertainPose | None = None,
+) -> LocalSolution:
+    """The best of several local solves from random rotations: plain least squares over all measurements (paper, 1990).
+
+    Raises:
+        InvalidRequest: a measurement makes no sense, or there is none.
+    """
+    if not len(measurements):
+        raise InvalidRequest("no measurement to fuse", hint="give at least one measurement")
+    b = pack(checked(measurements), prior)
+    use = np.ones(len(b.cls))
+    found = [_started(b, use, R) for R in Rotation.random(starts, rng=np.random.default_rng(seed)).as_matrix()]
+    return min(found, key=lambda s: s.chi_square)
+
+
+def _started(b: Batch, use: Array, rotation: Array) -> LocalSolution:
+    t = np.zeros(3)
+    place(b, use, rotation, t)
+    return local_solution(b, use, rotation, t)
+
+
+def local_solution(b: Batch, use: Array, rotation: Array, translation_m: Array, *, far: bool = True) -> LocalSolution:
+    """As `solve`, on packed measurements of which `use` (N,) > 0 count; the arguments stay untouched."""
+    n = len(b.cls)
+    R, t = np.array(rotation, float), np.array(translation_m, float)
+    H, f, gradient, direction = np.zeros((6, 6)), np.zeros(n), np.zeros((n, 6)), np.zeros((n, 3))
+    solve_from(b, use, R, t, far, H, f, gradient, direction)
+    chosen = use > 0
+    covariance, free = covariance_and_freedom(H, *middle_and_size(b, chosen, R))
+    return LocalSolution(
+        base_from_object=RigidTransform.from_components(t, Rotation.from_matrix(R)),
+        covariance=covariance,
+        information=H,
+        values=f,
+        chi_square=float(f[chosen].sum()),
+        dof=int(b.dof[chosen].sum()) - 6 + len(free),
+        unobservable=free,
+    )
+
+
+def middle_and_size(b: Batch, chosen: Array, R: Array) -> tuple[Array, float]:
+    """Middle of the chosen features (3,), from the object's origin in base axes, and their spread, m."""
+    points = b.m[chosen & (b.cls > 0)]
+    if not len(points):
+        return np.zeros(3), 1.0
+    middle = points.mean(axis=0)
+    size = float(np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1))))
+    return R @ middle, max(size, MIN_SIZE_M)

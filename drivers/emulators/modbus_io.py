@@ -1,0 +1,116 @@
+"""Remote I/O with the Moxa ioLogik E1200 map and the cell's wiring, worked by lights, touch or proximity of any kind.
+
+DO0-3 lights; DI0-3 their feedback; DI4/5 touch left/right; DI6 proximity switch; DI7 stop circuit (1 = healthy).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from drivers.emulators.faults import FaultOptions
+from drivers.emulators.modbus_server import ILLEGAL_ADDRESS, ModbusException, ModbusFarSide
+from drivers.emulators.ports import PtyPort, TcpPort
+from hal.clock import Deadline, WallClock
+from hal.devices import Device, Lights, Proximity, Touch
+from hal.readings import Quality
+from hal.strict import validate
+
+POINTS = 8
+DI_WORD, DO_WORD, COUNTERS = 0x30, 0x20, 0x10
+BACKING_S = 0.2
+
+
+class ModbusIoOptions(FaultOptions):
+    """`[emulators.NAME.emulator_options]`"""
+
+    transport: Literal["tcp", "rtu"] = "tcp"
+    tcp_port: Annotated[int, Field(ge=0, le=65535)] = 0
+    unit: Annotated[int, Field(ge=1, le=247)] = 1
+    switching_distance_m: Annotated[float, Field(gt=0)] = 0.02
+
+
+class IoTable:
+    """Eight outputs and eight inputs, some of them worked by a device of another backend."""
+
+    def __init__(self, backing: Device, switching_distance_m: float) -> None:
+        self._backing = backing
+        self._switching_distance_m = switching_distance_m
+        self._clock = WallClock()
+        self.outputs = [False] * POINTS
+        self.is_healthy = True
+        self.counters = [0] * POINTS
+        self._before = [False] * POINTS
+
+    def inputs(self) -> list[bool]:
+        """DI0 to DI7 now."""
+        now = [False] * 7 + [self.is_healthy]
+        deadline = Deadline.after(self._clock, BACKING_S)
+        if isinstance(self._backing, Lights):
+            lit = self._backing.read_on(deadline=deadline).value
+            now[: len(lit)] = lit
+        if isinstance(self._backing, Touch):
+            contacts = self._backing.read_contacts(deadline=deadline).value
+            now[4:6] = (*contacts, False, False)[:2]
+        if isinstance(self._backing, Proximity):
+            sample = self._backing.read_distance_m(deadline=deadline)
+            now[6] = sample.quality is not Quality.INVALID and sample.value <= self._switching_distance_m
+        for i, (was, is_on) in enumerate(zip(self._before, now, strict=True)):
+            self.counters[i] += is_on and not was
+        self._before = now
+        return now
+
+    def read_bits(self, function: int, address: int, count: int) -> Sequence[bool]:
+        """Coils 0-7 or discrete inputs 0-7."""
+        if address + count > POINTS or count < 1:
+            raise ModbusException(ILLEGAL_ADDRESS)
+        points = self.outputs if function == 1 else self.inputs()
+        return points[address : address + count]
+
+    def read_registers(self, function: int, address: int, count: int) -> Sequence[int]:
+        """Input register 30h: DI word, 10h..: counters, high word first; holding register 20h: DO word."""
+        if (function, address, count) == (4, DI_WORD, 1):
+            return [_word(self.inputs())]
+        if (function, address, count) == (3, DO_WORD, 1):
+            return [_word(self.outputs)]
+        if function == 4 and address >= COUNTERS and address + count <= COUNTERS + 2 * POINTS:
+            words = [half for c in self.counters for half in (c >> 16 & 0xFFFF, c & 0xFFFF)]
+            return words[address - COUNTERS :][:count]
+        raise ModbusException(ILLEGAL_ADDRESS)
+
+    def write_bits(self, address: int, values: Sequence[bool]) -> None:
+        """Coils 0-7; the first four switch the lights."""
+        if address + len(values) > POINTS:
+            raise ModbusException(ILLEGAL_ADDRESS)
+        self.outputs[address : address + len(values)] = values
+        if isinstance(self._backing, Lights):
+            count = len(self._backing.capabilities().channels)
+            self._backing.set_on(self.outputs[:count], deadline=Deadline.after(self._clock, BACKING_S))
+
+    def write_registers(self, address: int, values: Sequence[int]) -> None:
+        """Holding register 20h: all outputs."""
+        if address != DO_WORD or len(values) != 1:
+            raise ModbusException(ILLEGAL_ADDRESS)
+        self.write_bits(0, [bool(values[0] >> i & 1) for i in range(POINTS)])
+
+
+def _word(points: Sequence[bool]) -> int:
+    return sum(1 << i for i, on in enumerate(points) if on)
+
+
+class ModbusIoEmulator(ModbusFarSide):
+    """The remote I/O, running; `table` lets tests work inputs and look at outputs."""
+
+    def __init__(self, backing: Device, options: ModbusIoOptions) -> None:
+        self.table = IoTable(backing, options.switching_distance_m)
+        port = PtyPort("modbus-io") if options.transport == "rtu" else TcpPort(options.tcp_port)
+        super().__init__(port, options, self.table, unit=options.unit, name="modbus_io")
+
+
+def start(backing: Device, options: dict[str, Any]) -> ModbusIoEmulator:
+    """Entry point `modbus_io`."""
+    emulator = ModbusIoEmulator(backing, validate(options, ModbusIoOptions, source="emulators.modbus_io"))
+    emulator.begin()
+    return emulator

@@ -1,0 +1,137 @@
+"""Modbus far side for RTU and TCP: frames in, a register map's answers out."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import Protocol
+
+from drivers.emulators.base import WireEmulator
+from drivers.emulators.faults import FaultOptions
+from drivers.emulators.ports import FarPort, Peer, PtyPort
+from drivers.transport.checks import crc_modbus
+from drivers.transport.framing import Framer
+from hal.errors import CellError
+
+ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 1, 2, 3, 4
+MBAP = 7
+
+
+class ModbusException(Exception):
+    """The map refuses; `code` goes over the wire."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"exception {code}")
+        self.code = code
+
+
+class RegisterMap(Protocol):
+    """What a Modbus device knows; each method raises `ModbusException` for addresses that it does not have."""
+
+    def read_bits(self, function: int, address: int, count: int) -> Sequence[bool]:
+        """Coils (1) or discrete inputs (2)."""
+        ...
+
+    def read_registers(self, function: int, address: int, count: int) -> Sequence[int]:
+        """Holding (3) or input (4) registers, unsigned."""
+        ...
+
+    def write_bits(self, address: int, values: Sequence[bool]) -> None:
+        """Coils."""
+        ...
+
+    def write_registers(self, address: int, values: Sequence[int]) -> None:
+        """Holding registers."""
+        ...
+
+
+class ModbusFarSide(WireEmulator):
+    """A server on a pty (RTU) or a listener (TCP)."""
+
+    def __init__(self, port: FarPort, options: FaultOptions, table: RegisterMap, *, unit: int, name: str) -> None:
+        super().__init__(port, options, name=name)
+        self._table = table
+        self._unit = unit
+        self._is_rtu = isinstance(port, PtyPort)
+        self._rtu = Framer(bytes([unit]), _rtu_request_length, lambda f: crc_modbus(f) == 0)
+        self._tcp: dict[Peer, bytes] = {}
+        self._last_request = b""
+
+    def on_bytes(self, peer: Peer, data: bytes) -> None:
+        """Answer each complete request."""
+        if self._is_rtu:
+            for frame in self._rtu.feed(data):
+                answer = bytes([self._unit]) + self._answer(frame[1:-2])
+                self.send(peer, answer + struct.pack("<H", crc_modbus(answer)))
+            return
+        buffer = self._tcp.get(peer, b"") + data
+        while len(buffer) > MBAP and len(buffer) >= 6 + (size := struct.unpack_from(">H", buffer, 4)[0]):
+            head, pdu, buffer = buffer[:MBAP], buffer[MBAP : 6 + size], buffer[6 + size :]
+            answer = self._answer(pdu)
+            self.send(peer, head[:4] + struct.pack(">HB", len(answer) + 1, head[6]) + answer, protected=slice(0, 8))
+        self._tcp[peer] = buffer
+
+    def status_frame(self) -> bytes | None:
+        """Modbus exception 4: device failure."""
+        pdu = bytes([self._last_request[0] | 0x80, DEVICE_FAILURE])
+        if self._is_rtu:
+            return bytes([self._unit]) + pdu + struct.pack("<H", crc_modbus(bytes([self._unit]) + pdu))
+        return None
+
+    def _answer(self, pdu: bytes) -> bytes:
+        self._last_request = pdu
+        try:
+            return answer_pdu(self._table, pdu)
+        except ModbusException as error:
+            return bytes([pdu[0] | 0x80, error.code])
+        except CellError:
+            return bytes([pdu[0] | 0x80, DEVICE_FAILURE])
+
+
+def answer_pdu(table: RegisterMap, pdu: bytes) -> bytes:
+    """The answer to one request, without unit and check sum (Modbus application protocol V1.1b3, chapter 6)."""
+    function = pdu[0]
+    if function not in (1, 2, 3, 4, 5, 6, 15, 16, 23):
+        raise ModbusException(ILLEGAL_FUNCTION)
+    address, number = struct.unpack_from(">HH", pdu, 1)
+    match function:
+        case 1 | 2:
+            bits = table.read_bits(function, address, number)
+            word = sum(1 << i for i, bit in enumerate(bits) if bit)
+            data = word.to_bytes((number + 7) // 8, "little")
+            return bytes([function, len(data)]) + data
+        case 3 | 4:
+            return _registers(function, table.read_registers(function, address, number))
+        case 5:
+            if number not in (0, 0xFF00):
+                raise ModbusException(ILLEGAL_VALUE)
+            table.write_bits(address, [number == 0xFF00])
+        case 6:
+            table.write_registers(address, [number])
+        case 15:
+            word = int.from_bytes(pdu[6:], "little")
+            table.write_bits(address, [bool(word >> i & 1) for i in range(number)])
+        case 16:
+            table.write_registers(address, struct.unpack(f">{number}H", pdu[6 : 6 + 2 * number]))
+        case _:
+            write_address, write_count = struct.unpack_from(">HH", pdu, 5)
+            table.write_registers(write_address, struct.unpack(f">{write_count}H", pdu[10 : 10 + 2 * write_count]))
+            return _registers(function, table.read_registers(3, address, number))
+    return pdu[:5]
+
+
+def _registers(function: int, values: Sequence[int]) -> bytes:
+    return bytes([function, 2 * len(values)]) + struct.pack(f">{len(values)}H", *values)
+
+
+def _rtu_request_length(data: bytes) -> int | None:
+    """Total length of the RTU request at the start of `data`."""
+    if len(data) < 2:
+        return None
+    function = data[1]
+    if 1 <= function <= 6:
+        return 8
+    count_at = {15: 6, 16: 6, 23: 10}.get(function)
+    if count_at is None:
+        return 0
+    return None if len(data) <= count_at else count_at + 1 + data[count_at] + 2

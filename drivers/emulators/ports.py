@@ -1,0 +1,239 @@
+"""Far ends of wires: a pty under a stable name, a TCP listener, a UDP socket; all on this machine alone."""
+
+from __future__ import annotations
+
+import errno
+import os
+import pty
+import select
+import shutil
+import socket
+import tempfile
+import time
+import tty
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Protocol
+
+LOOPBACK = "127.0.0.1"
+Peer = Any  # whatever tells a port's peers apart: a connection, an address, nothing
+
+
+class FarPort(Protocol):
+    """The emulator's end."""
+
+    @property
+    def address(self) -> dict[str, Any]:
+        """Options that lead a driver here."""
+        ...
+
+    def receive(self, timeout_s: float) -> list[tuple[Peer, bytes]]:
+        """What has come, by peer; waits at most `timeout_s`."""
+        ...
+
+    def send(self, peer: Peer, data: bytes) -> None:
+        """Send, or lose the bytes when nobody takes them, as a real line does."""
+        ...
+
+    def vanish(self) -> None:
+        """Unplug."""
+        ...
+
+    def appear(self) -> None:
+        """Plug in again."""
+        ...
+
+    def close(self) -> None:
+        """End for good."""
+        ...
+
+
+class PtyPort:
+    """A pseudo terminal whose slave is found under a symbolic link, as `/dev/serial/by-id` does it."""
+
+    def __init__(self, name: str) -> None:
+        self._folder = Path(tempfile.mkdtemp(prefix="panelwright-"))
+        self.path = self._folder / name
+        self._fds: tuple[int, int] | None = None
+        self._held: list[int] = []
+        self.appear()
+
+    @property
+    def address(self) -> dict[str, Any]:
+        """`{"port": PATH}`"""
+        return {"port": str(self.path)}
+
+    def appear(self) -> None:
+        """A new pseudo terminal under the same name."""
+        master, slave = pty.openpty()
+        tty.setraw(slave)
+        os.set_blocking(master, False)
+        fresh = self.path.with_suffix(".new")
+        fresh.symlink_to(os.ttyname(slave))
+        fresh.replace(self.path)
+        self._fds = (master, slave)  # the slave stays open here, so that the master never reads a hang-up
+
+    def vanish(self) -> None:
+        """Hang up and take the name away."""
+        self.path.unlink(missing_ok=True)
+        fds, self._fds = self._fds, None
+        for fd in fds or ():
+            os.close(fd)
+
+    def receive(self, timeout_s: float) -> list[tuple[Peer, bytes]]:
+        """Bytes from whoever has the slave open."""
+        if self._fds is None:
+            time.sleep(max(0.0, timeout_s))
+            return []
+        master = self._fds[0]
+        if not select.select([master], [], [], max(0.0, timeout_s))[0]:
+            return []
+        try:
+            data = os.read(master, 65_536)
+        except OSError:
+            return []
+        return [(None, data)] if data else []
+
+    def send(self, peer: Peer, data: bytes) -> None:  # noqa: ARG002  # a line has one peer
+        """Write what fits into the line's buffer; the rest is lost."""
+        if self._fds is None:
+            return
+        with suppress(BlockingIOError):
+            os.write(self._fds[0], data)
+
+    def close(self) -> None:
+        """Hang up and remove the folder."""
+        self.vanish()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+class TcpPort:
+    """A listener on loopback; each connection is a peer."""
+
+    def __init__(self, port: int = 0, *, key: str = "port") -> None:
+        self._key = key
+        self._port = port
+        self._listener: socket.socket | None = None
+        self._peers: list[socket.socket] = []
+        self.appear()
+
+    @property
+    def address(self) -> dict[str, Any]:
+        """`{"host": "127.0.0.1", "port": N}`"""
+        return {"host": LOOPBACK, self._key: self._port}
+
+    @property
+    def peers(self) -> tuple[socket.socket, ...]:
+        """Connections now open."""
+        return tuple(self._peers)
+
+    def appear(self) -> None:
+        """Listen, always on the same port."""
+        listener = socket.socket()
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((LOOPBACK, self._port))
+        listener.listen(8)
+        listener.setblocking(False)
+        self._port = listener.getsockname()[1]
+        self._listener = listener
+
+    def vanish(self) -> None:
+        """Hang up on everybody and refuse new connections."""
+        if self._listener is not None:
+            self._listener.close()
+        self._listener = None
+        for peer in self._peers:
+            peer.close()
+        self._peers.clear()
+
+    def receive(self, timeout_s: float) -> list[tuple[Peer, bytes]]:
+        """Bytes of each connection; a new connection comes with no bytes."""
+        if self._listener is None:
+            time.sleep(max(0.0, timeout_s))
+            return []
+        ready = select.select([self._listener, *self._peers], [], [], max(0.0, timeout_s))[0]
+        return [item for sock in ready for item in self._take(sock)]
+
+    def _take(self, sock: socket.socket) -> list[tuple[Peer, bytes]]:
+        try:
+            if sock is self._listener:
+                peer, _ = sock.accept()
+                peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                peer.setblocking(False)
+                self._peers.append(peer)
+                return [(peer, b"")]
+            data = sock.recv(65_536)
+        except BlockingIOError:
+            return []
+        except OSError:
+            data = b""
+        if data:
+            return [(sock, data)]
+        self._peers.remove(sock)
+        sock.close()
+        return []
+
+    def send(self, peer: Peer, data: bytes) -> None:
+        """To one connection, or to all when `peer` is None."""
+        for sock in self._peers if peer is None else [peer]:
+            with suppress(OSError):
+                sock.sendall(data)
+
+    def close(self) -> None:
+        """As `vanish`, for good."""
+        self.vanish()
+
+
+class UdpPort:
+    """A UDP socket on loopback; each sender's address is a peer."""
+
+    def __init__(self, port: int = 0) -> None:
+        self._port = port
+        self._sock: socket.socket | None = None
+        self.appear()
+
+    @property
+    def address(self) -> dict[str, Any]:
+        """`{"host": "127.0.0.1", "port": N}`"""
+        return {"host": LOOPBACK, "port": self._port}
+
+    def appear(self) -> None:
+        """Bind, always to the same port."""
+        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        sock.bind((LOOPBACK, self._port))
+        sock.setblocking(False)
+        self._port = sock.getsockname()[1]
+        self._sock = sock
+
+    def vanish(self) -> None:
+        """Close the socket."""
+        if self._sock is not None:
+            self._sock.close()
+        self._sock = None
+
+    def receive(self, timeout_s: float) -> list[tuple[Peer, bytes]]:
+        """One datagram."""
+        if self._sock is None:
+            time.sleep(max(0.0, timeout_s))
+            return []
+        if not select.select([self._sock], [], [], max(0.0, timeout_s))[0]:
+            return []
+        try:
+            data, peer = self._sock.recvfrom(65_536)
+        except OSError:
+            return []
+        return [(peer, data)]
+
+    def send(self, peer: Peer, data: bytes) -> None:
+        """One datagram to `peer`."""
+        if self._sock is None or peer is None:
+            return
+        try:
+            self._sock.sendto(data, peer)
+        except OSError as error:
+            if error.errno not in (errno.ECONNREFUSED, errno.EAGAIN):
+                raise
+
+    def close(self) -> None:
+        """As `vanish`, for good."""
+        self.vanish()

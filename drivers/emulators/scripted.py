@@ -1,0 +1,153 @@
+"""Devices that exist in memory alone: what an emulator can stand on without a simulator.
+
+Each sample tells its index (a value that rises by one step a read), so a test can tell true, stale and wrong apart.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from hal.clock import Clock, Deadline, WallClock
+from hal.devices import (
+    DeviceKind,
+    ForceTorqueCapabilities,
+    Health,
+    LightsCapabilities,
+    ProximityCapabilities,
+    TouchCapabilities,
+    Wrench,
+)
+from hal.errors import DeviceTimeout
+from hal.readings import Cause, Quality, Stamped
+
+LIGHT_NAMES = ("top_left", "top_right", "bottom_right", "bottom_left")
+
+
+class Scripted:
+    """What all share: a name, a count of reads, a stamp from the clock."""
+
+    kind: ClassVar[DeviceKind]
+
+    def __init__(self, name: str = "scripted", clock: Clock | None = None) -> None:
+        self.name = name
+        self.reads = 0
+        self._clock = clock or WallClock()
+
+    def health(self) -> Health:
+        """Always well."""
+        return Health(connected=True, quality=Quality.VALID, cause=Cause.NONE, samples=self.reads)
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def count(self, deadline: Deadline) -> tuple[int, float]:
+        """Index of this read and its time."""
+        if deadline.is_past():
+            raise DeviceTimeout(f"{self.name} was asked too late", hint="give it more time", device=self.name)
+        self.reads += 1
+        return self.reads, self._clock.now_s()
+
+
+class ScriptedProximity(Scripted):
+    """A saw tooth: `first_m` plus a millimetre a read, 1000 steps long; or `fixed_m`."""
+
+    kind = DeviceKind.PROXIMITY
+
+    def __init__(self, *, first_m: float = 0.1, fixed_m: float | None = None) -> None:
+        super().__init__("scripted_proximity")
+        self.first_m = first_m
+        self.fixed_m = fixed_m
+
+    def capabilities(self) -> ProximityCapabilities:
+        """Up to 12 m."""
+        return ProximityCapabilities(min_range_m=0.0, max_range_m=12.0, sigma_m=0.001, rate_hz=100.0)
+
+    def read_distance_m(self, *, deadline: Deadline) -> Stamped[float]:
+        """The next step; NaN and invalid when `fixed_m` is NaN."""
+        index, now_s = self.count(deadline)
+        value = self.first_m + 0.001 * (index % 1000) if self.fixed_m is None else self.fixed_m
+        is_seen = math.isfinite(value)
+        return Stamped(
+            value=value,
+            host_time_s=now_s,
+            sequence=index,
+            quality=Quality.VALID if is_seen else Quality.INVALID,
+            cause=Cause.NONE if is_seen else Cause.OUT_OF_RANGE,
+        )
+
+
+class ScriptedLights(Scripted):
+    """Four lamps whose feedback is what was commanded."""
+
+    kind = DeviceKind.LIGHTS
+
+    def __init__(self) -> None:
+        super().__init__("scripted_lights")
+        self.on: tuple[bool, ...] = (False,) * len(LIGHT_NAMES)
+
+    def capabilities(self) -> LightsCapabilities:
+        """Four, at once."""
+        return LightsCapabilities(channels=LIGHT_NAMES, settle_s=0.01)
+
+    def set_on(self, on: Sequence[bool], *, deadline: Deadline) -> tuple[bool, ...]:
+        """Switch."""
+        self.count(deadline)
+        self.on = tuple(on)
+        return self.on
+
+    def read_on(self, *, deadline: Deadline) -> Stamped[tuple[bool, ...]]:
+        """What was commanded."""
+        index, now_s = self.count(deadline)
+        return Stamped(value=self.on, host_time_s=now_s, sequence=index)
+
+
+class ScriptedTouch(Scripted):
+    """Two pads; `contacts` is theirs to set."""
+
+    kind = DeviceKind.TOUCH
+
+    def __init__(self) -> None:
+        super().__init__("scripted_touch")
+        self.contacts: tuple[bool, ...] = (False, False)
+
+    def capabilities(self) -> TouchCapabilities:
+        """Left and right."""
+        return TouchCapabilities(channels=("left", "right"), threshold_n=1.0, rate_hz=100.0)
+
+    def read_contacts(self, *, deadline: Deadline) -> Stamped[tuple[bool, ...]]:
+        """As set."""
+        index, now_s = self.count(deadline)
+        return Stamped(value=self.contacts, host_time_s=now_s, sequence=index)
+
+
+class ScriptedForceTorque(Scripted):
+    """Fx counts reads in steps of 0.01 N over 250 N; the other five components are fixed functions of it."""
+
+    kind = DeviceKind.FORCE_TORQUE
+
+    def __init__(self) -> None:
+        super().__init__("scripted_ft")
+
+    def capabilities(self) -> ForceTorqueCapabilities:
+        """300 N, 30 N m."""
+        return ForceTorqueCapabilities(
+            force_range_n=300.0, torque_range_nm=30.0, force_sigma_n=0.1, torque_sigma_nm=0.005, rate_hz=100.0
+        )
+
+    def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:
+        """The next step."""
+        index, now_s = self.count(deadline)
+        return Stamped(value=scripted_wrench(index), host_time_s=now_s, sequence=index)
+
+
+def scripted_wrench(index: int) -> Wrench:
+    """The wrench of read number `index`."""
+    fx_n = 0.01 * (index % 25_000)
+    return Wrench(
+        force_n=np.array([fx_n, 100.0 - fx_n / 2.5, -0.5 * fx_n]),
+        torque_nm=np.array([0.01 * fx_n, -0.02 * fx_n, 5.0 - 0.01 * fx_n]),
+    )

@@ -1,0 +1,290 @@
+"""Remote I/O over Modbus TCP or RTU (Moxa ioLogik E1200 map): lights, touch, proximity switches, stop input.
+
+Outputs are coils from 0, inputs discrete inputs from 0; all inputs come in one request, so they belong together.
+Devices with the same wire share one bus.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Annotated, Any, Self, TypeVar
+
+from pydantic import Field, model_validator
+
+from drivers.transport.bus import Bus, PolledDevice
+from drivers.transport.link import Link, WireError, now_s
+from drivers.transport.modbus import RTU_GAP_S, ModbusMaster, ModbusRtu, ModbusTcp
+from drivers.transport.options import EitherOptions, Seconds, either_opener, read_options
+from hal.clock import Deadline
+from hal.devices import DeviceKind, LightsCapabilities, ProximityCapabilities, TouchCapabilities
+from hal.errors import InvalidRequest
+from hal.readings import Cause, Quality, Stamped
+from hal.registry import Context
+
+Point = Annotated[int, Field(ge=0, le=255)]
+T = TypeVar("T")
+CLOSE_S = 0.08
+
+
+class IoOptions(EitherOptions):
+    """Options that all points of a remote I/O share: `port = 502` with `host` for TCP, a path for RTU."""
+
+    unit: Annotated[int, Field(ge=1, le=247)] = 1
+    rate_hz: Annotated[float, Field(gt=0, le=500)] = 100.0
+    inputs: Annotated[int, Field(ge=1, le=256)] = 8
+    timeout_s: Seconds = 0.1
+    gap_s: Annotated[float, Field(ge=0, le=0.1)] = RTU_GAP_S
+    max_age_s: Seconds = 0.1
+
+    @model_validator(mode="after")
+    def _points_exist(self) -> Self:
+        wired = self.wired()
+        if wired and max(wired) >= self.inputs:
+            raise ValueError(f"input {max(wired)} is wired, but only {self.inputs} inputs are read (key `inputs`)")
+        return self
+
+    def wired(self) -> tuple[int, ...]:
+        """Inputs in use."""
+        return ()
+
+
+class LightsOptions(IoOptions):
+    """Options of `modbus:lights`: the coil and the feedback input of each light, in the panel's order.
+
+    `channels` names them; without it they bear the names in the cell's panel file.
+    """
+
+    channels: tuple[str, ...] | None = None
+    outputs: tuple[Point, ...] = (0, 1, 2, 3)
+    feedback: tuple[Point, ...] = (0, 1, 2, 3)
+    settle_s: Seconds = 0.05
+    stop_input: Point | None = 7
+
+    @model_validator(mode="after")
+    def _one_point_a_light(self) -> Self:
+        count = len(self.outputs) if self.channels is None else len(self.channels)
+        if not count == len(self.outputs) == len(self.feedback) >= 1:
+            raise ValueError("channels, outputs and feedback need the same number of entries, at least one")
+        return self
+
+    def wired(self) -> tuple[int, ...]:
+        """Feedback and stop input."""
+        return self.feedback if self.stop_input is None else (*self.feedback, self.stop_input)
+
+
+class TouchOptions(IoOptions):
+    """Options of `modbus:touch`: one input a pad."""
+
+    channels: tuple[str, ...] = ("left", "right")
+    contacts: tuple[Point, ...] = (4, 5)
+    threshold_n: Annotated[float, Field(gt=0)] = 1.0
+
+    @model_validator(mode="after")
+    def _one_point_a_pad(self) -> Self:
+        if not len(self.channels) == len(self.contacts) >= 1:
+            raise ValueError("channels and contacts need the same number of entries, at least one")
+        return self
+
+    def wired(self) -> tuple[int, ...]:
+        """The pads' inputs."""
+        return self.contacts
+
+
+class SwitchOptions(IoOptions):
+    """Options of `modbus:proximity`: a proximity switch as a sensor of one distance."""
+
+    input: Point = 6
+    switching_distance_m: Annotated[float, Field(gt=0)] = 0.02
+    sigma_m: Annotated[float, Field(gt=0)] = 0.002
+
+    def wired(self) -> tuple[int, ...]:
+        """The switch's input."""
+        return (self.input,)
+
+
+def io_bus(context: Context, options: IoOptions) -> Bus[ModbusMaster]:
+    """The bus of this wire; devices that name the same wire get the same one."""
+    opener, name = either_opener(options, context.name)
+
+    def client(link: Link) -> ModbusMaster:
+        if options.transport == "tcp":
+            return ModbusTcp(link, timeout_s=options.timeout_s)
+        return ModbusRtu(link, timeout_s=options.timeout_s, gap_s=options.gap_s)
+
+    bus: Bus[ModbusMaster] = context.shared.get(f"modbus {name}", lambda: Bus(name, open_link=opener, client=client))
+    return bus
+
+
+class IoDevice(PolledDevice[T, ModbusMaster]):
+    """Some inputs of a remote I/O, read together."""
+
+    def __init__(self, context: Context, options: IoOptions) -> None:
+        super().__init__(context, io_bus(context, options), rate_hz=options.rate_hz, max_age_s=options.max_age_s)
+        self._io = options
+
+    def set_up(self, client: ModbusMaster) -> None:
+        """Nothing to set: the poll identifies it."""
+
+    def poll(self, client: ModbusMaster) -> None:
+        """All inputs in one request, stamped in the middle of the exchange."""
+        asked_s = now_s()
+        io = self._io
+        inputs = client.read_bits(unit=io.unit, address=0, count=io.inputs, until_s=asked_s + io.timeout_s)
+        self.take(inputs, 0.5 * (asked_s + now_s()))
+
+    @abstractmethod
+    def take(self, inputs: tuple[bool, ...], valid_s: float) -> None:
+        """Publish what these inputs mean."""
+
+
+class IoLights(IoDevice[tuple[bool, ...]]):
+    """The panel's border lights: outputs switch them, inputs say whether they burn."""
+
+    kind = DeviceKind.LIGHTS
+
+    def __init__(self, context: Context, options: LightsOptions) -> None:
+        super().__init__(context, options)
+        self._options = options
+        self._channels = options.channels or _panel_lights(context, len(options.outputs))
+        self._wanted: tuple[bool, ...] | None = None
+        self._commanded_s = -math.inf
+
+    def capabilities(self) -> LightsCapabilities:
+        """Channel names from the options."""
+        return LightsCapabilities(channels=self._channels, settle_s=self._options.settle_s)
+
+    def set_on(self, on: Sequence[bool], *, deadline: Deadline) -> tuple[bool, ...]:
+        """Switch all lights; the device's acknowledgement is awaited."""
+        wanted = tuple(bool(value) for value in on)
+        if len(wanted) != len(self._channels):
+            raise InvalidRequest(
+                f"{self.name} has {len(self._channels)} lights, not {len(wanted)}",
+                hint=f"give one value for each of {', '.join(self._channels)}",
+                device=self.name,
+            )
+        self.call(lambda client, until_s: self._write(client, wanted, until_s), deadline)
+        self._wanted = wanted
+        self._commanded_s = self.context.clock.now_s()
+        return wanted
+
+    def read_on(self, *, deadline: Deadline) -> Stamped[tuple[bool, ...]]:
+        """Newest feedback, never from before the last command."""
+        oldest_s = self.context.clock.now_s() - self.max_age_s
+        return self.newest(deadline, not_before_s=max(oldest_s, self._commanded_s))
+
+    def set_up(self, client: ModbusMaster) -> None:
+        """After a loss the lights return to what was last commanded."""
+        if self._wanted is not None:
+            self._write(client, self._wanted, now_s() + self._options.timeout_s)
+
+    def take(self, inputs: tuple[bool, ...], valid_s: float) -> None:
+        """Feedback; degraded while the stop circuit is open."""
+        stop = self._options.stop_input
+        is_healthy = stop is None or inputs[stop]
+        self.publish(
+            tuple(inputs[i] for i in self._options.feedback),
+            valid_s=valid_s,
+            quality=Quality.VALID if is_healthy else Quality.DEGRADED,
+            cause=Cause.NONE if is_healthy else Cause.DEVICE,
+        )
+
+    def release(self) -> None:
+        """Leave the lights off, if the wire still takes it, and leave the bus."""
+        with suppress(WireError):
+            off = (False,) * len(self._channels)
+            self.bus.call(lambda client, until_s: self._write(client, off, until_s), now_s() + CLOSE_S)
+        super().release()
+
+    def _write(self, client: ModbusMaster, wanted: tuple[bool, ...], until_s: float) -> None:
+        outputs = self._options.outputs
+        if outputs == tuple(range(outputs[0], outputs[0] + len(outputs))):
+            client.write_coils(unit=self._io.unit, address=outputs[0], values=wanted, until_s=until_s)
+            return
+        for output, value in zip(outputs, wanted, strict=True):
+            client.write_coils(unit=self._io.unit, address=output, values=[value], until_s=until_s)
+
+
+def _panel_lights(context: Context, count: int) -> tuple[str, ...]:
+    names = tuple(light.name for light in context.cell.panel.lights) if context.cell is not None else ()
+    return names if len(names) == count else tuple(f"light_{i}" for i in range(count))
+
+
+class IoTouch(IoDevice[tuple[bool, ...]]):
+    """Contact switches on inputs."""
+
+    kind = DeviceKind.TOUCH
+
+    def __init__(self, context: Context, options: TouchOptions) -> None:
+        super().__init__(context, options)
+        self._options = options
+
+    def capabilities(self) -> TouchCapabilities:
+        """Channel names and threshold from the options."""
+        o = self._options
+        return TouchCapabilities(channels=o.channels, threshold_n=o.threshold_n, rate_hz=o.rate_hz)
+
+    def read_contacts(self, *, deadline: Deadline) -> Stamped[tuple[bool, ...]]:
+        """Newest state of the pads."""
+        return self.newest(deadline)
+
+    def take(self, inputs: tuple[bool, ...], valid_s: float) -> None:
+        """The pads' inputs."""
+        self.publish(tuple(inputs[i] for i in self._options.contacts), valid_s=valid_s)
+
+
+class IoSwitch(IoDevice[float]):
+    """A proximity switch: it knows one distance, and says nothing beyond it."""
+
+    kind = DeviceKind.PROXIMITY
+
+    def __init__(self, context: Context, options: SwitchOptions) -> None:
+        super().__init__(context, options)
+        self._options = options
+
+    def capabilities(self) -> ProximityCapabilities:
+        """One distance."""
+        o = self._options
+        return ProximityCapabilities(
+            min_range_m=0.0, max_range_m=o.switching_distance_m, sigma_m=o.sigma_m, rate_hz=o.rate_hz
+        )
+
+    def read_distance_m(self, *, deadline: Deadline) -> Stamped[float]:
+        """The switching distance while the switch is on (degraded: nearer is possible), else invalid."""
+        return self.newest(deadline)
+
+    def take(self, inputs: tuple[bool, ...], valid_s: float) -> None:
+        """On: at most the switching distance away."""
+        is_near = inputs[self._options.input]
+        self.publish(
+            self._options.switching_distance_m if is_near else math.nan,
+            valid_s=valid_s,
+            quality=Quality.DEGRADED if is_near else Quality.INVALID,
+            cause=Cause.SATURATED if is_near else Cause.OUT_OF_RANGE,
+        )
+
+
+def connect_lights(context: Context, options: dict[str, Any]) -> IoLights:
+    """Entry point `modbus:lights`."""
+    return _joined(IoLights(context, read_options(context, options, LightsOptions)))
+
+
+def connect_touch(context: Context, options: dict[str, Any]) -> IoTouch:
+    """Entry point `modbus:touch`."""
+    return _joined(IoTouch(context, read_options(context, options, TouchOptions)))
+
+
+def connect_switch(context: Context, options: dict[str, Any]) -> IoSwitch:
+    """Entry point `modbus:proximity`."""
+    return _joined(IoSwitch(context, read_options(context, options, SwitchOptions)))
+
+
+D = TypeVar("D", bound=IoDevice[Any])
+
+
+def _joined(device: D) -> D:
+    device.bus.attach(device)
+    device.await_first()
+    return device

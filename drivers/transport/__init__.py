@@ -1,0 +1,1 @@
+"""Wires: links, framing, request and answer, owner threads, mailboxes. Devices are built from these."""

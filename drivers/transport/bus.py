@@ -1,0 +1,228 @@
+"""A bus of devices that answer when asked: one lock, one owner thread, health per station."""
+
+from __future__ import annotations
+
+import threading
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Generic, Protocol, TypeVar
+
+from drivers.transport.device import WireDevice
+from drivers.transport.link import BadAnswer, Link, LinkLost, NoAnswer, WireError, now_s
+from drivers.transport.port import Port
+from hal.clock import Deadline
+from hal.errors import CellError
+from hal.registry import Context
+
+C = TypeVar("C")
+C_contra = TypeVar("C_contra", contravariant=True)
+R = TypeVar("R")
+T = TypeVar("T")
+IDLE_S = 0.02
+SET_UP_AGAIN_AFTER = 5  # polls without an answer: it may have been switched off and on
+SLOWEST_POLL_S = 0.5  # a dead station may cost a live one at most one time-out in this time
+
+
+class Station(Protocol[C_contra]):
+    """One device of a bus, as the owner thread sees it."""
+
+    @property
+    def period_s(self) -> float:
+        """Time between polls."""
+        ...
+
+    def set_up(self, client: C_contra) -> None:
+        """Identify and configure the device; repeated after each loss."""
+        ...
+
+    def poll(self, client: C_contra) -> None:
+        """Ask for the newest values and publish them."""
+        ...
+
+    def fail(self, error: Exception) -> None:
+        """A poll or set-up went wrong, or the bus was lost."""
+        ...
+
+
+class _Slot(Generic[C]):
+    """A station with its schedule."""
+
+    def __init__(self, station: Station[C]) -> None:
+        self.station = station
+        self.needs_set_up = True
+        self.failures = 0
+        self.due_s = 0.0
+
+
+class Bus(Generic[C]):
+    """Polls its stations and lets callers talk in between.
+
+    Args:
+        client: makes the protocol's client over a fresh link.
+    """
+
+    def __init__(self, name: str, *, open_link: Callable[[], Link], client: Callable[[Link], C]) -> None:
+        self.name = name
+        self._make_client = client
+        self._client: C | None = None
+        self._slots: list[_Slot[C]] = []
+        self._lock = threading.Lock()
+        self._open_link = open_link
+        self._rest = threading.Event()  # never set: a rest that needs no other clock
+        self._port: Port | None = None
+        self._members = threading.Lock()
+
+    def attach(self, station: Station[C]) -> None:
+        """Take a station in; the first one starts the owner thread."""
+        with self._members:
+            self._slots = [*self._slots, _Slot(station)]
+            if self._port is None:
+                self._port = Port(self.name, open_link=self._open_link, tenant=self)
+                self._port.start()
+
+    def detach(self, station: Station[C]) -> None:
+        """Let a station go; the last one ends the thread and frees the port, which a later one may open again."""
+        with self._members:
+            self._slots = [slot for slot in self._slots if slot.station is not station]
+            port = self._port
+            if self._slots or port is None:
+                return
+            self._port = None
+        port.close()
+
+    @property
+    def is_up(self) -> bool:
+        """Is the port open?"""
+        return self._client is not None
+
+    @property
+    def reconnects(self) -> int:
+        """How often the port was opened again."""
+        return self._port.reconnects if self._port is not None else 0
+
+    def call(self, work: Callable[[C, float], R], until_s: float) -> R:
+        """Run `work(client, until_s)` alone on the bus, in the caller's thread.
+
+        Raises:
+            NoAnswer: the bus stayed busy until `until_s`. LinkLost: the bus is down. What `work` raises.
+        """
+        if not self._lock.acquire(timeout=max(0.0, until_s - now_s())):
+            raise NoAnswer(f"bus {self.name} stays busy")
+        try:
+            if self._client is None:
+                raise LinkLost(f"bus {self.name} is down")
+            return work(self._client, until_s)
+        finally:
+            self._lock.release()
+
+    def close(self) -> None:
+        """End the owner thread; a second call does nothing."""
+        with self._members:
+            port, self._port, self._slots = self._port, None, []
+        if port is not None:
+            port.close()
+
+    def set_up(self, link: Link) -> None:
+        """A fresh link: every station needs its set-up again (owner thread)."""
+        with self._lock:
+            self._client = self._make_client(link)
+        for slot in self._slots:
+            slot.needs_set_up, slot.failures, slot.due_s = True, 0, 0.0
+
+    def serve(self, link: Link) -> None:
+        """Serve the station that is due, or rest (owner thread)."""
+        slot = min(self._slots, key=lambda s: s.due_s, default=None)
+        wait_s = IDLE_S if slot is None else slot.due_s - now_s()
+        if slot is None or wait_s > 0.0:
+            self._rest.wait(min(wait_s, IDLE_S))
+            return
+        try:
+            with self._lock:
+                self._serve(slot)
+        except LinkLost:
+            raise
+        except (WireError, CellError) as error:
+            self._note_failure(slot, error, link)
+
+    def _serve(self, slot: _Slot[C]) -> None:
+        if self._client is None:
+            raise LinkLost(f"bus {self.name} is down")
+        if slot.needs_set_up:
+            slot.station.set_up(self._client)
+            slot.needs_set_up = False
+        slot.due_s = max(slot.due_s + slot.station.period_s, now_s() - slot.station.period_s)
+        slot.station.poll(self._client)
+        slot.failures = 0
+
+    def _note_failure(self, slot: _Slot[C], error: Exception, link: Link) -> None:
+        slot.failures += 1
+        backoff_s = min(slot.station.period_s * 2.0 ** max(0, slot.failures - 2), SLOWEST_POLL_S)
+        slot.due_s = now_s() + backoff_s
+        if slot.failures >= SET_UP_AGAIN_AFTER:
+            slot.needs_set_up = True
+        slot.station.fail(error)
+        if isinstance(error, NoAnswer) and not link.is_present():
+            raise LinkLost(f"{link.name}: its name has vanished or leads to another port")
+
+    def lost(self, error: Exception) -> None:
+        """Tell every station (owner thread)."""
+        with self._lock:
+            self._client = None
+        for slot in self._slots:
+            slot.station.fail(error)
+
+
+class PolledDevice(WireDevice[T], Generic[T, C]):
+    """A device on a bus. The subclass says how to set it up and what a poll brings."""
+
+    def __init__(self, context: Context, bus: Bus[C], *, rate_hz: float, max_age_s: float) -> None:
+        super().__init__(context, max_age_s=max_age_s)
+        self.bus = bus
+        self.rate_hz = rate_hz
+
+    @property
+    def period_s(self) -> float:
+        """Time between polls."""
+        return 1.0 / self.rate_hz
+
+    @abstractmethod
+    def set_up(self, client: C) -> None:
+        """Identify and configure the device; repeated after each loss."""
+
+    @abstractmethod
+    def poll(self, client: C) -> None:
+        """Ask for the newest values and publish them."""
+
+    def fail(self, error: Exception) -> None:
+        """A lost answer leaves a gap in the sequence and readers wait for the next; anything worse reaches them."""
+        if isinstance(error, NoAnswer | BadAnswer):
+            self.errors += 1
+            self._sequence += 1
+            self._last_error = str(error)
+            return
+        super().fail(error)
+
+    def call(self, work: Callable[[C, float], R], deadline: Deadline) -> R:
+        """Talk with the device in the caller's thread, with errors that name it."""
+        self.require_open()
+        try:
+            return self.bus.call(work, now_s() + deadline.remaining_s())
+        except WireError as error:
+            self.errors += 1
+            raise self.translate(error) from error
+
+    def release(self) -> None:
+        """Leave the bus."""
+        self.bus.detach(self)
+
+    def is_up(self) -> bool:
+        """Is the link open and set up?"""
+        return self.bus.is_up
+
+    def reconnects(self) -> int:
+        """How often the link was set up again."""
+        return self.bus.reconnects
+
+    def link_name(self) -> str:
+        """Port and speed, or address."""
+        return self.bus.name

@@ -1,0 +1,301 @@
+"""What every wired device shares: mailbox, health, stamps, errors with the device's name."""
+
+from __future__ import annotations
+
+import threading
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import ClassVar, Generic, TypeVar
+
+from drivers.transport.link import Link, LinkLost, NoAnswer, Refused, now_s
+from drivers.transport.mailbox import Mailbox
+from drivers.transport.port import Port
+from hal.clock import Deadline
+from hal.devices import DeviceKind, Health
+from hal.errors import CellError, DeviceFault, DeviceTimeout, DeviceUnavailable
+from hal.readings import Cause, Quality, Stamped
+from hal.registry import Context
+
+T = TypeVar("T")
+SLICE_S = 0.02  # a stream reader looks up this often, so that close() is quick
+CONNECT_S = 2.0
+REFUSED_S = 0.4  # a port that cannot be opened for so long is not there
+
+
+def wall_until(deadline: Deadline, cap_s: float = 3600.0) -> float:
+    """The moment of a deadline on the links' clock: a wire waits in wall time whatever clock the cell has."""
+    return now_s() + min(deadline.remaining_s(), cap_s)
+
+
+class WireDevice(Generic[T]):
+    """Base of all drivers: the newest sample, its health and its errors.
+
+    Args:
+        max_age_s: samples older than this are never given out; three periods are usual.
+    """
+
+    kind: ClassVar[DeviceKind]
+
+    def __init__(self, context: Context, *, max_age_s: float) -> None:
+        self.context = context
+        self.max_age_s = max_age_s
+        self.mailbox: Mailbox[T] = Mailbox()
+        self.errors = 0
+        self._sequence = 0
+        self._is_closed = False
+        self._state = threading.Lock()
+        self._last_error = "not connected yet"
+
+    @property
+    def name(self) -> str:
+        """Name in the cell file."""
+        return self.context.name
+
+    def publish(
+        self,
+        value: T,
+        *,
+        valid_s: float,
+        device_time_s: float | None = None,
+        quality: Quality = Quality.VALID,
+        cause: Cause = Cause.NONE,
+        missed: int = 0,
+    ) -> None:
+        """Put a new sample for all readers.
+
+        Args:
+            valid_s: when it was valid, on the links' clock.
+            missed: samples known to be lost just before this one; the sequence skips them.
+        """
+        self._sequence += 1 + missed
+        self.errors += missed
+        self.mailbox.publish(
+            Stamped(
+                value=value,
+                host_time_s=self.context.clock.now_s() - (now_s() - valid_s),
+                sequence=self._sequence,
+                device_time_s=device_time_s,
+                quality=quality,
+                cause=cause,
+            )
+        )
+
+    def newest(self, deadline: Deadline, *, not_before_s: float | None = None) -> Stamped[T]:
+        """The newest sample, at most `max_age_s` old; waits for one until the deadline.
+
+        Args:
+            not_before_s: on the cell's clock; only a sample that was valid then or later will do.
+
+        Raises:
+            DeviceTimeout: none came in time. DeviceUnavailable: the link is down. DeviceFault: the device says so.
+        """
+        self.require_open()
+        oldest_s = self.context.clock.now_s() - self.max_age_s if not_before_s is None else not_before_s
+        started_s = now_s()
+        sample = self.mailbox.wait(oldest_host_s=oldest_s, until_s=wall_until(deadline))
+        if sample is None:
+            raise self.timeout(now_s() - started_s)
+        return sample
+
+    def require_open(self) -> None:
+        """Refuse to work after `close`."""
+        if self._is_closed:
+            raise DeviceUnavailable(f"{self.name} is closed", hint="connect it again", device=self.name)
+
+    def timeout(self, waited_s: float) -> DeviceTimeout:
+        """The error for silence, with what is known about it."""
+        self.errors += 1
+        newest = self.mailbox.peek()
+        age = "no good reading so far"
+        if newest is not None:
+            age = f"last good reading {newest.age_s(self.context.clock.now_s()):.2f} s old"
+        return DeviceTimeout(
+            f"{self.name} silent for {waited_s:.2f} s; {age}",
+            hint="check power and cable; a wrong baud rate or another device on the port looks the same",
+            device=self.name,
+            link=self.link_name(),
+            counts=self.wire_counts(),
+        )
+
+    def fail(self, error: Exception) -> None:
+        """Readers get this error until the next sample."""
+        self.errors += 1
+        as_cell_error = self.translate(error)
+        self._last_error = str(as_cell_error)
+        self.mailbox.fail(as_cell_error)
+
+    def translate(self, error: Exception) -> CellError:
+        """A wire's error as one of `hal`, with the device's name."""
+        if isinstance(error, CellError):
+            return error
+        where = {"device": self.name, "link": self.link_name()}
+        if isinstance(error, Refused):
+            return DeviceFault(
+                f"{self.name}: {error}", hint="look the code up in the device's manual", code=error.code, **where
+            )
+        if isinstance(error, LinkLost):
+            return DeviceUnavailable(
+                f"{self.name} is disconnected: {error}", hint="plug it in; it reconnects by itself", **where
+            )
+        hint = "check power and cable; is it the right device and baud rate?"
+        return DeviceTimeout(f"{self.name}: {error}", hint=hint, counts=self.wire_counts(), **where)
+
+    def health(self) -> Health:
+        """State of link and newest sample; returns at once."""
+        newest, error = self.mailbox.peek(), self.mailbox.error()
+        quality, cause = self._condition(newest, error)
+        return Health(
+            connected=self.is_up() and not self._is_closed,
+            quality=quality,
+            cause=cause,
+            detail=f"{self.link_name()}; {self.wire_counts()}" + (f"; {error.what}" if error else ""),
+            samples=self.mailbox.published,
+            errors=self.errors,
+            reconnects=self.reconnects(),
+            last_sample_s=newest.host_time_s if newest else None,
+        )
+
+    def _condition(self, newest: Stamped[T] | None, error: CellError | None) -> tuple[Quality, Cause]:
+        if self._is_closed or isinstance(error, DeviceUnavailable) or not self.is_up():
+            return Quality.INVALID, Cause.COMM
+        if isinstance(error, DeviceFault):
+            return Quality.INVALID, Cause.DEVICE
+        if error or newest is None or newest.age_s(self.context.clock.now_s()) > self.max_age_s:
+            return Quality.INVALID, Cause.TIMEOUT
+        return newest.quality, newest.cause
+
+    def await_first(self, timeout_s: float = CONNECT_S) -> None:
+        """Wait until the first sample is there, or close and say why none came.
+
+        Raises:
+            DeviceUnavailable: with the last error as its cause.
+        """
+        started_s = now_s()
+        until_s = started_s + timeout_s
+        while now_s() < until_s and self.mailbox.peek() is None:
+            try:
+                self.mailbox.wait(oldest_host_s=-float("inf"), until_s=until_s)
+            except DeviceUnavailable:
+                if now_s() > started_s + REFUSED_S:
+                    break
+                threading.Event().wait(SLICE_S)  # the port is being tried again
+            except CellError:
+                threading.Event().wait(SLICE_S)
+        if self.mailbox.peek() is not None:
+            return
+        why, counts, error = self._last_error, self.wire_counts(), self.mailbox.error()
+        self.close()
+        raise DeviceUnavailable(
+            f"{self.name} gives no valid data: {error.what if error else why} ({counts})",
+            hint=error.hint if error else "check power, cable, baud rate and address; is it the right device?",
+            device=self.name,
+            link=self.link_name(),
+        )
+
+    def close(self) -> None:
+        """Release port and thread; a second call does nothing."""
+        with self._state:
+            if self._is_closed:
+                return
+            self._is_closed = True
+        self.mailbox.fail(DeviceUnavailable(f"{self.name} is closed", hint="connect it again", device=self.name))
+        self.release()
+
+    @abstractmethod
+    def release(self) -> None:
+        """Give up thread and port; called once."""
+
+    @abstractmethod
+    def is_up(self) -> bool:
+        """Is the link open and set up?"""
+
+    @abstractmethod
+    def reconnects(self) -> int:
+        """How often the link was set up again."""
+
+    @abstractmethod
+    def link_name(self) -> str:
+        """Port and speed, or address."""
+
+    def wire_counts(self) -> str:
+        """Counters that tell a wrong baud rate from a dead device."""
+        return f"{self.mailbox.published} samples, {self.errors} errors"
+
+
+class StreamDevice(WireDevice[T]):
+    """A device that talks by itself. The subclass says how to start it and what its bytes mean.
+
+    Args:
+        open_link: opens the port.
+        silence_s: after this long without a sample the link is checked, then opened and set up anew.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        *,
+        open_link: Callable[[], Link],
+        link_name: str,
+        max_age_s: float,
+        silence_s: float = 0.5,
+    ) -> None:
+        super().__init__(context, max_age_s=max_age_s)
+        self._link_name = link_name
+        self._silence_s = silence_s
+        self._heard_s = now_s()
+        self.bytes_in = 0
+        self.port = Port(context.name, open_link=open_link, tenant=self)
+
+    @abstractmethod
+    def start(self, link: Link) -> None:
+        """Stop a running stream, flush, identify, configure, start: as if the device had been left in any state."""
+
+    @abstractmethod
+    def receive(self, chunk: bytes, arrived_s: float) -> None:
+        """Parse bytes and `publish` what is complete; never raises on bad data, may raise `WireError` to start anew."""
+
+    def set_up(self, link: Link) -> None:
+        """Start the stream (owner thread)."""
+        self.start(link)
+        self._heard_s = now_s()
+
+    def serve(self, link: Link) -> None:
+        """Read one chunk (owner thread)."""
+        chunk = link.read(now_s() + SLICE_S)
+        arrived_s = now_s()
+        if chunk:
+            self.bytes_in += len(chunk)
+            before = self.mailbox.published
+            self.receive(chunk, arrived_s)
+            if self.mailbox.published > before:
+                self._heard_s = arrived_s
+                return
+        silent_s = arrived_s - self._heard_s
+        if silent_s > 3 * SLICE_S and not link.is_present():
+            raise LinkLost(f"{link.name}: its name has vanished or leads to another port")
+        if silent_s > self._silence_s:
+            raise NoAnswer(f"no valid data for {silent_s:.2f} s; {self.wire_counts()}")
+
+    def lost(self, error: Exception) -> None:
+        """Tell all readers (owner thread)."""
+        self.fail(error)
+
+    def release(self) -> None:
+        """End the owner thread."""
+        self.port.close()
+
+    def is_up(self) -> bool:
+        """Is the link open and set up?"""
+        return self.port.link is not None
+
+    def reconnects(self) -> int:
+        """How often the link was set up again."""
+        return self.port.reconnects
+
+    def link_name(self) -> str:
+        """Port and speed, or address."""
+        return self._link_name
+
+    def wire_counts(self) -> str:
+        """Bytes without frames mean a wrong baud rate or a wrong device."""
+        return f"{self.bytes_in} bytes, {self.mailbox.published} samples, {self.errors} errors"

@@ -1,0 +1,82 @@
+"""Deadline-bound bytes over a non-blocking file descriptor: what serial ports and sockets share."""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import threading
+
+from drivers.transport.link import LinkLost, NoAnswer, now_s
+
+CHUNK_BYTES = 65_536
+
+
+class FdLink:
+    """A link over an open, non-blocking descriptor that this object owns."""
+
+    def __init__(self, fd: int, name: str) -> None:
+        self._fd = fd
+        self._name = name
+        self._write_lock = threading.Lock()
+        self._close_lock = threading.Lock()
+        self._poll_in = select.poll()
+        self._poll_in.register(fd, select.POLLIN)
+
+    @property
+    def name(self) -> str:
+        """What a person would call it."""
+        return self._name
+
+    def read(self, until_s: float) -> bytes:
+        """At least one byte, or `b""` at `until_s`."""
+        try:
+            if not self._poll_in.poll(max(0.0, (until_s - now_s()) * 1e3)):
+                return b""
+            data = os.read(self._fd, CHUNK_BYTES)
+        except BlockingIOError:
+            return b""
+        except (OSError, ValueError) as error:
+            raise LinkLost(f"{self._name}: {error}") from error
+        if not data:
+            raise LinkLost(f"{self._name}: the far side hung up")
+        return data
+
+    def write(self, data: bytes, until_s: float) -> None:
+        """Send all of `data` before `until_s`."""
+        if not self._write_lock.acquire(timeout=max(0.0, until_s - now_s())):
+            raise NoAnswer(f"{self._name}: another write blocks the port")
+        try:
+            self._write_all(data, until_s)
+        except (OSError, ValueError) as error:
+            raise LinkLost(f"{self._name}: {error}") from error
+        finally:
+            self._write_lock.release()
+
+    def _write_all(self, data: bytes, until_s: float) -> None:
+        rest = memoryview(data)
+        while rest:
+            try:
+                rest = rest[os.write(self._fd, rest) :]
+            except BlockingIOError:
+                wait_s = until_s - now_s()
+                if wait_s <= 0.0 or not select.select([], [self._fd], [], wait_s)[1]:
+                    raise NoAnswer(f"{self._name}: the port takes no more bytes") from None
+
+    def is_present(self) -> bool:
+        """Sockets have no name that could vanish; serial ports override this."""
+        return True
+
+    def close(self) -> None:
+        """Close the descriptor once."""
+        with self._close_lock:
+            fd, self._fd = self._fd, -1
+        if fd >= 0:
+            self._release(fd)
+
+    def _release(self, fd: int) -> None:
+        try:
+            os.close(fd)
+        except OSError as error:
+            if error.errno != errno.EBADF:
+                raise

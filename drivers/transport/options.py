@@ -1,0 +1,109 @@
+"""Option models that drivers share, and how a link is opened from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import Field
+
+from drivers.transport.link import CaptureLink, Link, ReplayLink
+from drivers.transport.serial_link import open_serial
+from drivers.transport.socket_link import open_tcp, open_udp
+from hal.registry import Context
+from hal.strict import Strict, validate
+
+M = TypeVar("M", bound=Strict)
+PortNumber = Annotated[int, Field(ge=1, le=65535)]
+Rate = Annotated[float, Field(gt=0, le=1000)]
+Seconds = Annotated[float, Field(gt=0, le=60)]
+CONNECT_TIMEOUT_S = 0.5
+
+
+class Captured(Strict):
+    """Keys of every wired driver: `capture` writes all traffic to a file, `replay` reads one instead of the wire."""
+
+    capture: Path | None = None
+    replay: Path | None = None
+
+
+class SerialOptions(Captured):
+    """A serial port. Give `port` a stable name, from `/dev/serial/by-id`."""
+
+    port: str
+    baud: Annotated[int, Field(ge=300, le=4_500_000)] = 115_200
+
+
+class TcpOptions(Captured):
+    """A TCP server."""
+
+    host: str
+    port: PortNumber
+
+
+class UdpOptions(Captured):
+    """A UDP server."""
+
+    host: str
+    port: PortNumber
+
+
+class EitherOptions(Captured):
+    """Serial or TCP, by the type of `port`: a path, or a number with `host`."""
+
+    host: str | None = None
+    port: str | PortNumber
+    baud: Annotated[int, Field(ge=300, le=4_500_000)] = 115_200
+
+    @property
+    def transport(self) -> Literal["tcp", "serial"]:
+        """Which of the two the options mean."""
+        return "tcp" if isinstance(self.port, int) else "serial"
+
+
+def read_options(context: Context, options: dict[str, Any], model: type[M]) -> M:
+    """Validate a driver's options; a fault names `devices.NAME.options.KEY` (`ConfigError`)."""
+    return validate(options, model, source=f"devices.{context.name}.options")
+
+
+def serial_opener(options: SerialOptions, device: str) -> tuple[Callable[[], Link], str]:
+    """What opens the port, and the link's name."""
+    return _with_files(options, lambda: open_serial(options.port, baud=options.baud, device=device)), (
+        f"serial {options.port}, {options.baud} baud"
+    )
+
+
+def tcp_opener(options: TcpOptions, device: str) -> tuple[Callable[[], Link], str]:
+    """What connects, and the link's name."""
+    opener = _with_files(
+        options, lambda: open_tcp(options.host, options.port, timeout_s=CONNECT_TIMEOUT_S, device=device)
+    )
+    return opener, f"tcp {options.host}:{options.port}"
+
+
+def udp_opener(options: UdpOptions, device: str) -> tuple[Callable[[], Link], str]:
+    """What makes the socket, and the link's name."""
+    opener = _with_files(options, lambda: open_udp(options.host, options.port, device=device))
+    return opener, f"udp {options.host}:{options.port}"
+
+
+def either_opener(options: EitherOptions, device: str) -> tuple[Callable[[], Link], str]:
+    """Serial or TCP."""
+    if isinstance(options.port, int):
+        host, number = options.host or "127.0.0.1", options.port
+        opener = _with_files(options, lambda: open_tcp(host, number, timeout_s=CONNECT_TIMEOUT_S, device=device))
+        return opener, f"tcp {host}:{number}"
+    path = options.port
+    opener = _with_files(options, lambda: open_serial(path, baud=options.baud, device=device))
+    return opener, f"serial {path}, {options.baud} baud"
+
+
+def _with_files(options: Captured, opener: Callable[[], Link]) -> Callable[[], Link]:
+    """The opener itself, or one that captures or replays."""
+    capture, replay = options.capture, options.replay
+    if replay is not None:
+        return lambda: ReplayLink(replay)
+    if capture is not None:
+        return lambda: CaptureLink(opener(), capture)
+    return opener

@@ -1,0 +1,97 @@
+"""The owner thread of one port: opens it, lets its tenant set up and serve, and opens it again after every loss."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Protocol
+
+from drivers.transport.link import Link, WireError
+from hal.errors import CellError
+
+FIRST_RETRY_S = 0.05
+LAST_RETRY_S = 0.25  # a port that returns is in use again within 0.5 s
+JOIN_S = 1.0
+
+
+class Tenant(Protocol):
+    """What lives on a port. All three are called by the owner thread alone."""
+
+    def set_up(self, link: Link) -> None:
+        """Bring the far side to the state that `serve` needs; repeated after each loss.
+
+        Raises:
+            WireError, CellError: it did not work; the port is closed and tried again.
+        """
+        ...
+
+    def serve(self, link: Link) -> None:
+        """One piece of work of at most some 50 ms.
+
+        Raises:
+            WireError, CellError: the port is closed and opened again.
+        """
+        ...
+
+    def lost(self, error: Exception) -> None:
+        """The port could not be opened, could not be set up, or was lost while serving."""
+        ...
+
+
+class Port:
+    """Keeps a tenant on its wire.
+
+    Args:
+        name: of the device or bus; the thread carries it.
+        open_link: opens the port; raises `DeviceUnavailable`.
+    """
+
+    def __init__(self, name: str, *, open_link: Callable[[], Link], tenant: Tenant) -> None:
+        self._open_link = open_link
+        self._tenant = tenant
+        self._closing = threading.Event()
+        self._link: Link | None = None
+        self._sessions = 0
+        self._thread = threading.Thread(target=self._run, name=f"port {name}", daemon=True)
+
+    def start(self) -> None:
+        """Begin to open the port."""
+        self._thread.start()
+
+    @property
+    def link(self) -> Link | None:
+        """The link while it is open and set up, else None."""
+        return self._link
+
+    @property
+    def reconnects(self) -> int:
+        """How often the port was set up again after the first time."""
+        return max(0, self._sessions - 1)
+
+    def close(self) -> None:
+        """End the thread and release the port; bounded, idempotent."""
+        self._closing.set()
+        if self._thread.is_alive() and self._thread is not threading.current_thread():
+            self._thread.join(JOIN_S)
+
+    def _run(self) -> None:
+        retry_s = FIRST_RETRY_S
+        while not self._closing.is_set():
+            try:
+                self._session()
+            except (WireError, CellError) as error:
+                retry_s = FIRST_RETRY_S if self._link is not None else min(2.0 * retry_s, LAST_RETRY_S)
+                self._link = None
+                self._tenant.lost(error)
+                self._closing.wait(retry_s)
+
+    def _session(self) -> None:
+        link = self._open_link()
+        try:
+            self._tenant.set_up(link)
+            self._link = link
+            self._sessions += 1
+            while not self._closing.is_set():
+                self._tenant.serve(link)
+        finally:
+            link.close()

@@ -1,0 +1,107 @@
+"""Serial ports: exclusive, by stable name, low latency, with errors that name port, owner and remedy."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import serial
+import serial.tools.list_ports
+
+from drivers.transport.fd_link import FdLink
+from hal.errors import DeviceUnavailable
+
+STABLE_NAMES = Path("/dev/serial/by-id")
+
+
+class SerialLink(FdLink):
+    """An open serial port."""
+
+    def __init__(self, port: serial.Serial, *, path: str, baud: int) -> None:
+        super().__init__(port.fileno(), f"serial {path}, {baud} baud")
+        self._port = port
+        self._path = path
+        self._device_id = os.fstat(port.fileno()).st_rdev
+        self.is_low_latency = _ask_for_low_latency(port)
+
+    def is_present(self) -> bool:
+        """Does the name still lead to the character device that is open? A re-plugged adapter is another one."""
+        try:
+            return os.stat(self._path).st_rdev == self._device_id  # noqa: PTH116  # st_rdev of the link's end
+        except OSError:
+            return False
+
+    def set_baud(self, baud: int) -> None:
+        """Change the speed of the open port."""
+        self._port.baudrate = baud
+        self._name = f"serial {self._path}, {baud} baud"
+
+    def _release(self, fd: int) -> None:  # noqa: ARG002  # pyserial closes it
+        try:
+            self._port.close()
+        except OSError as error:  # an unplugged port may refuse even to close
+            if error.errno not in (errno.EIO, errno.EBADF, errno.ENODEV):
+                raise
+
+
+def open_serial(path: str, *, baud: int, device: str, parity: str = "N", stop_bits: int = 1) -> SerialLink:
+    """Open a port for this process alone.
+
+    Args:
+        path: give a name that survives re-plugging, from `/dev/serial/by-id`.
+        device: name of the device in the cell file, for errors.
+
+    Raises:
+        DeviceUnavailable: no such port, no right to open it, or another program has it.
+    """
+    try:
+        port = serial.Serial(path, baud, parity=parity, stopbits=stop_bits, timeout=0, write_timeout=0, exclusive=True)
+    except (serial.SerialException, OSError, ValueError) as error:
+        raise _unavailable(path, device, error) from error
+    return SerialLink(port, path=path, baud=baud)
+
+
+def _ask_for_low_latency(port: serial.Serial) -> bool:
+    """FTDI adapters hold bytes back for 16 ms unless told otherwise (pyserial PR 290). Does the driver comply?"""
+    try:
+        port.set_low_latency_mode(True)
+    except (OSError, ValueError, NotImplementedError):
+        return False
+    return True
+
+
+def _unavailable(path: str, device: str, error: Exception) -> DeviceUnavailable:
+    what, hint = _diagnose(path, error)
+    return DeviceUnavailable(f"{device}: {what}", hint=hint, device=device, link=path)
+
+
+def _diagnose(path: str, error: Exception) -> tuple[str, str]:
+    number = getattr(error, "errno", None)
+    if number == errno.ENOENT or not Path(path).exists():
+        return f"port {path} does not exist", f"plug the device in; ports now: {_ports_now()}"
+    if number in (errno.EACCES, errno.EPERM):
+        return f"no permission to open {path}", "add your user to the group that owns the port, usually `dialout`"
+    if number in (errno.EBUSY, errno.EAGAIN) or "lock" in str(error).lower():
+        owner = port_owner(path) or "another program"
+        return f"port {path} is taken by {owner}", "close that program or choose another port"
+    return f"port {path} cannot be opened: {error}", "check the port's name and that it is a serial port"
+
+
+def _ports_now() -> str:
+    stable = sorted(str(p) for p in STABLE_NAMES.glob("*")) if STABLE_NAMES.is_dir() else []
+    ports = stable or sorted(p.device for p in serial.tools.list_ports.comports())
+    return ", ".join(ports) or "none"
+
+
+def port_owner(path: str) -> str | None:
+    """`name (pid N)` of a process that has `path` open, or None when it cannot be seen."""
+    wanted = os.path.realpath(path)
+    for folder in Path("/proc").glob("[0-9]*/fd"):
+        try:
+            if any(os.path.realpath(fd) == wanted for fd in folder.iterdir()):
+                process = folder.parent
+                return f"{(process / 'comm').read_text().strip()} (pid {process.name})"
+        except OSError:
+            continue
+    return None

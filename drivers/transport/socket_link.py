@@ -1,0 +1,85 @@
+"""TCP and UDP links. A UDP link is connected, so datagrams of strangers never reach the driver."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+
+from drivers.transport.fd_link import CHUNK_BYTES, FdLink
+from drivers.transport.link import LinkLost, now_s
+from hal.errors import DeviceUnavailable
+
+
+class SocketLink(FdLink):
+    """An open, connected socket."""
+
+    def __init__(self, sock: socket.socket, name: str) -> None:
+        super().__init__(sock.fileno(), name)
+        self._sock = sock
+
+    def _release(self, fd: int) -> None:  # noqa: ARG002  # the socket closes it
+        self._sock.close()
+
+
+class DatagramLink(SocketLink):
+    """A connected UDP socket: each read is one datagram."""
+
+    def read(self, until_s: float) -> bytes:
+        """One datagram; a far side that is not there yet counts as silence, not as loss."""
+        try:
+            if self._poll_in.poll(max(0.0, (until_s - now_s()) * 1e3)):
+                return self._sock.recv(CHUNK_BYTES)
+        except (ConnectionRefusedError, BlockingIOError):
+            return b""
+        except (OSError, ValueError) as error:
+            raise LinkLost(f"{self.name}: {error}") from error
+        return b""
+
+    def _write_all(self, data: bytes, until_s: float) -> None:
+        try:
+            super()._write_all(data, until_s)
+        except ConnectionRefusedError:
+            os.write(self._fd, data)  # the refusal belonged to an earlier datagram
+
+
+def open_tcp(host: str, port: int, *, timeout_s: float, device: str) -> SocketLink:
+    """Connect within `timeout_s`.
+
+    Raises:
+        DeviceUnavailable: nobody answers there.
+    """
+    try:
+        sock = socket.create_connection((host, port), timeout=timeout_s)
+    except OSError as error:
+        raise _unavailable(host, port, device, error) from error
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    sock.setblocking(False)
+    return SocketLink(sock, f"tcp {host}:{port}")
+
+
+def open_udp(host: str, port: int, *, device: str) -> DatagramLink:
+    """A UDP socket that talks with `host:port` alone.
+
+    Raises:
+        DeviceUnavailable: the host's name cannot be resolved or no network leads there.
+    """
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        sock.connect((host, port))
+    except OSError as error:
+        sock.close()
+        raise _unavailable(host, port, device, error) from error
+    sock.setblocking(False)
+    return DatagramLink(sock, f"udp {host}:{port}")
+
+
+def _unavailable(host: str, port: int, device: str, error: OSError) -> DeviceUnavailable:
+    if error.errno == errno.ECONNREFUSED:
+        what, hint = f"{host}:{port} refuses the connection", "is the device's server on, and the port right?"
+    elif isinstance(error, TimeoutError):
+        what, hint = f"{host}:{port} does not answer", "check power, cable, address and firewall"
+    else:
+        what, hint = f"{host}:{port} cannot be reached: {error}", "check host and port"
+    return DeviceUnavailable(f"{device}: {what}", hint=hint, device=device, link=f"{host}:{port}")

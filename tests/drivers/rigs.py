@@ -1,0 +1,51 @@
+"""Rigs of wired devices: an emulator, the driver that it answers, and the means to break the wire."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from drivers.emulators.base import WireEmulator
+from hal.clock import Deadline, WallClock
+from hal.conformance import Rig
+from hal.registry import Context, connect
+
+CLOCK = WallClock()
+
+
+def soon(duration_s: float = 1.0) -> Deadline:
+    """A deadline on the wall's clock."""
+    return Deadline.after(CLOCK, duration_s)
+
+
+def until(condition: Callable[[], bool], within_s: float = 5.0) -> None:
+    """Look again and again until `condition` holds; fails when it never does."""
+    give_up = soon(within_s)
+    rest = threading.Event()
+    while not condition():
+        assert not give_up.is_past(), "it did not happen"
+        rest.wait(0.002)
+
+
+@contextmanager
+def wired(emulator: WireEmulator, driver: str, options: dict[str, Any] | None = None) -> Iterator[Any]:
+    """The real driver connected to an emulator that is already running; both are closed at the end."""
+    device = None
+    try:
+        device = connect(Context(name="wired"), driver, {**emulator.address, **(options or {})})
+        yield device
+    finally:
+        if device is not None:
+            device.close()
+        emulator.close()
+
+
+@contextmanager
+def wired_rig(
+    emulator: WireEmulator, driver: str, options: dict[str, Any] | None = None, *, sample_period_s: float = 0.1
+) -> Iterator[Rig[Any]]:
+    """A rig for the conformance kit."""
+    with wired(emulator, driver, options) as device:
+        yield Rig(device=device, clock=CLOCK, sample_period_s=sample_period_s, inject=emulator.inject)

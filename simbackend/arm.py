@@ -1,0 +1,97 @@
+"""`sim:arm`: the simulated arm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.clock import Deadline
+from hal.devices import ArmCapabilities, DeviceKind, JointState, Truth
+from hal.errors import InvalidRequest, MotionRefused
+from hal.readings import Cause, Quality, Stamped
+from hal.registry import Context
+from simbackend.arm_model import MODELS
+from simbackend.client import Frame
+from simbackend.device import VALID, SimDevice, SimOptions, parse
+
+Array = NDArray[np.float64]
+
+RESOLUTION_RAD = 1e-6
+MOVING_RAD_PER_S = 0.002
+
+
+class ArmOptions(SimOptions):
+    """`model`: which arm."""
+
+    model: Literal["t3", "ur10e"] = "t3"
+
+
+class SimArm(SimDevice[JointState]):
+    """Position-controlled arm; set-points go out with the next step of the clock."""
+
+    def __init__(self, context: Context, options: ArmOptions) -> None:
+        super().__init__(context, DeviceKind.ARM, options)
+        self._capabilities = replace(MODELS[options.model]().capabilities, command_rate_hz=self._world.rate_hz)
+        self._lower = np.asarray(self._capabilities.lower_rad)
+        self._upper = np.asarray(self._capabilities.upper_rad)
+        # One tick late is two ticks of way, so a single missed tick is no clipped set-point.
+        self._stride = 2.0 * np.asarray(self._capabilities.velocity_rad_per_s) / self._world.rate_hz
+
+    def capabilities(self) -> ArmCapabilities:
+        """Kinematics and limits."""
+        return self._capabilities
+
+    def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
+        """Newest measured joints."""
+        return self._sample(deadline)
+
+    def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:
+        """Store the set-point of the next tick, clipped to joint limits and twice the speed limit.
+
+        Raises:
+            InvalidRequest: wrong shape or not finite.
+            MotionRefused: drives are off.
+        """
+        self._check(deadline)
+        wanted = np.asarray(position_rad, float)
+        if wanted.shape != self._lower.shape or not np.isfinite(wanted).all():
+            raise InvalidRequest(f"{self._name}: a set-point is six finite joint angles", hint="check the planner", device=self._name)
+        if not self._world.is_enabled:
+            raise MotionRefused(f"{self._name}: the drives are off", hint="call enable first", device=self._name)
+        last = self._world.frame.snapshot.setpoint_rad
+        sent = np.clip(np.clip(wanted, last - self._stride, last + self._stride), self._lower, self._upper)
+        self._world.aim_arm(sent)
+        return sent
+
+    def enable(self, *, deadline: Deadline) -> None:
+        """Let the drives follow from the next tick on."""
+        self._check(deadline)
+        self._world.enable()
+
+    def stop(self, *, deadline: Deadline) -> None:
+        """Brake from the next tick on."""
+        self._check(deadline)
+        self._world.stop()
+
+    def truth(self) -> Truth:
+        """For the judge of a finished mission and for tests; nothing else may call it."""
+        return self._world.truth()
+
+    def _measure(self, frame: Frame, bias: float) -> tuple[JointState, Quality, Cause]:
+        snapshot = frame.snapshot
+        position = np.round(snapshot.position_rad / RESOLUTION_RAD) * RESOLUTION_RAD + bias
+        state = JointState(
+            position_rad=position,
+            velocity_rad_per_s=snapshot.velocity_rad_per_s.copy(),
+            is_enabled=snapshot.is_enabled,
+            is_moving=bool(np.abs(snapshot.velocity_rad_per_s).max() > MOVING_RAD_PER_S),
+        )
+        return state, *VALID
+
+
+def connect(context: Context, options: dict[str, Any]) -> SimArm:
+    """Entry point `sim:arm`."""
+    return SimArm(context, parse(options, ArmOptions, context))

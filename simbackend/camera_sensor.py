@@ -1,0 +1,159 @@
+"""From an ideal drawing to what a camera would have delivered: lens, glow, glare, vignette, blur, exposure, noise.
+
+The engine has neither anti-aliasing nor emission: the drawing is made larger and reduced, and whatever shines is added here.
+Without the glow round a lamp, subtracting lights-off from lights-on would be trivially perfect.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from hal.calibration import CameraIntrinsics
+from simbackend.wire import Emitter, PictureInfo
+
+Grey = NDArray[np.float32]
+Pixels = NDArray[np.uint8]
+
+NOMINAL_EXPOSURE_S = 0.010
+LAMP_RADIANCE = 1.8
+LIGHT_RADIANCE = 5.0
+GLOW_RADIUS_M = 0.035
+GLOW_GAIN = 0.9
+GLARE_RADIUS_M = 0.006
+GLARE_GAIN = 0.5
+GLOW_STEP_PX = 4  # the glow is smooth: computed on every fourth pixel
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorOptions:
+    """What corrupts an image. Radiance 1 at 10 ms is full scale."""
+
+    exposure_s: float
+    oversample: float
+    blur_px: float
+    vignette: float
+    full_well_electrons: float
+    read_noise_electrons: float
+    is_colour: bool
+
+
+class CameraSensor:
+    """The sensor behind one true lens."""
+
+    def __init__(self, lens: CameraIntrinsics, options: SensorOptions) -> None:
+        self._lens, self._options = lens, options
+        ideal = _ideal_grid(lens)
+        low, high = ideal.reshape(-1, 2).min(axis=0), ideal.reshape(-1, 2).max(axis=0)
+        f = np.array([lens.fx_px, lens.fy_px])
+        margin_px = 2.0
+        size = np.ceil((high - low) * f + 2 * margin_px).astype(int)
+        s = options.oversample
+        self.drawn = (int(round(size[0] * s)), int(round(size[1] * s)))
+        scale = np.array(self.drawn) / size
+        centre = -low * f + margin_px
+        self.focal = (float(f[0] * scale[0]), float(f[1] * scale[1]))
+        # A reduced pixel covers `scale` drawn ones: its centre u is at scale (u + 1/2) - 1/2.
+        drawn_centre = scale * (centre + 0.5) - 0.5
+        self.centre = (float(drawn_centre[0]), float(drawn_centre[1]))
+        self._reduced = (int(size[0]), int(size[1]))
+        self._maps = cv2.convertMaps((ideal * f + centre).astype(np.float32), None, cv2.CV_16SC2)
+        self._vignette = _vignette(lens, options.vignette)
+
+    def expose(self, info: PictureInfo, rgba: Pixels, ids: NDArray[np.int32], random: np.random.Generator) -> Pixels:
+        """The image, (H, W) or (H, W, 3) uint8, of a drawing of size `drawn`."""
+        radiance = self._radiance(info, rgba, ids)
+        radiance = cv2.resize(radiance, self._reduced, interpolation=cv2.INTER_AREA)
+        radiance = cv2.remap(radiance, *self._maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        radiance = self._glow(info, radiance)
+        if self._options.blur_px > 0.0:
+            radiance = cv2.GaussianBlur(radiance, (0, 0), self._options.blur_px)
+        gain = np.float32(self._options.exposure_s / NOMINAL_EXPOSURE_S)
+        vignette = self._vignette if radiance.ndim == 2 else self._vignette[:, :, None]
+        return self._digitise(radiance * (vignette * gain), random)
+
+    def _radiance(self, info: PictureInfo, rgba: Pixels, ids: NDArray[np.int32]) -> Grey:
+        """Reflected light of the drawing, with what shines put in its place."""
+        if self._options.is_colour:
+            image = rgba[:, :, :3].astype(np.float32) / np.float32(255.0)
+        else:
+            image = cv2.cvtColor(rgba, cv2.COLOR_RGBA2GRAY).astype(np.float32) / np.float32(255.0)
+        for emitter in info.lit:
+            mask = ids == emitter.body
+            if mask.any():
+                level = LIGHT_RADIANCE if emitter.is_border_light else LAMP_RADIANCE
+                colour = np.asarray(emitter.colour, np.float32) * np.float32(level)
+                image[mask] = colour if self._options.is_colour else float(colour @ LUMA)
+        return image
+
+    def _glow(self, info: PictureInfo, radiance: Grey) -> Grey:
+        """Light that a lamp throws on the plate round it (times what is there), and glare in the lens (beside it)."""
+        h, w = radiance.shape[:2]
+        v, u = np.mgrid[0:h:GLOW_STEP_PX, 0:w:GLOW_STEP_PX].astype(np.float32)
+        spill = np.zeros_like(u)
+        glare = np.zeros_like(u)
+        tint = np.zeros((*u.shape, 3), np.float32)
+        for emitter in info.lit:
+            place = self._pixel(info.camera_from_base, emitter)
+            if place is None:
+                continue
+            (x, y), px_per_m = place
+            strength = 1.0 if emitter.is_border_light else 0.15
+            r2 = (u - np.float32(x)) ** 2 + (v - np.float32(y)) ** 2
+            near = 1.0 + r2 / np.float32((GLOW_RADIUS_M * px_per_m) ** 2)
+            lens = 1.0 + r2 / np.float32((GLARE_RADIUS_M * px_per_m) ** 2)
+            thrown = np.float32(strength * GLOW_GAIN) / (near * np.sqrt(near))
+            spill += thrown
+            glare += np.float32(strength * GLARE_GAIN) / (lens * np.sqrt(lens))
+            tint += thrown[:, :, None] * np.asarray(emitter.colour, np.float32)
+        if not info.lit:
+            return radiance
+        glare = _enlarge(glare, w, h)
+        if radiance.ndim == 2:
+            return radiance * (1.0 + _enlarge(spill, w, h)) + glare
+        return radiance * (1.0 + _enlarge(tint, w, h)) + glare[:, :, None]
+
+    def _pixel(self, camera_from_base: RigidTransform, emitter: Emitter) -> tuple[tuple[float, float], float] | None:
+        point = camera_from_base.apply(emitter.position_m)
+        if point[2] < 0.02:
+            return None
+        lens = self._lens
+        x, y = point[:2] / point[2]
+        return (float(lens.fx_px * x + lens.cx_px), float(lens.fy_px * y + lens.cy_px)), float(lens.fx_px / point[2])
+
+    def _digitise(self, radiance: Grey, random: np.random.Generator) -> Pixels:
+        """Shot noise (variance = mean, in electrons), read noise, full well, eight bits."""
+        well = np.float32(self._options.full_well_electrons)
+        electrons = np.minimum(radiance, np.float32(1.2)) * well
+        sigma = np.sqrt(electrons + np.float32(self._options.read_noise_electrons**2))
+        electrons += sigma * random.standard_normal(electrons.shape, np.float32)
+        return np.clip(electrons * (np.float32(255.0) / well) + np.float32(0.5), 0, 255).astype(np.uint8)
+
+
+def _enlarge(image: Grey, width: int, height: int) -> Grey:
+    """Back to full size: coarse pixel i is at fine pixel i * step."""
+    step = GLOW_STEP_PX
+    matrix = np.array([[step, 0, 0], [0, step, 0]], np.float32)
+    return cv2.warpAffine(image, matrix, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _ideal_grid(lens: CameraIntrinsics) -> NDArray[np.float64]:
+    """(H, W, 2) undistorted normalised coordinates of every pixel."""
+    u, v = np.meshgrid(np.arange(lens.width_px, dtype=float), np.arange(lens.height_px, dtype=float))
+    matrix = np.array([[lens.fx_px, 0, lens.cx_px], [0, lens.fy_px, lens.cy_px], [0, 0, 1.0]])
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-10)
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1)[:, None]
+    ideal = cv2.undistortPointsIter(pixels, matrix, np.asarray(lens.distortion), None, None, criteria)
+    return np.asarray(ideal, float).reshape(lens.height_px, lens.width_px, 2)
+
+
+def _vignette(lens: CameraIntrinsics, strength: float) -> Grey:
+    """Cosine-fourth fall-off, `strength` 1 for all of it."""
+    u, v = np.meshgrid(np.arange(lens.width_px), np.arange(lens.height_px))
+    tan2 = ((u - lens.cx_px) / lens.fx_px) ** 2 + ((v - lens.cy_px) / lens.fy_px) ** 2
+    return (1.0 - strength * (1.0 - 1.0 / (1.0 + tan2) ** 2)).astype(np.float32)

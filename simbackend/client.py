@@ -1,0 +1,329 @@
+"""The cell's side of the pipe: owns the world process, keeps the newest snapshot, and lets the clock drive the world."""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+import mmap
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from hal.clock import Clock, SimClock
+from hal.config import Cell
+from hal.devices import Truth
+from hal.errors import ConfigError, DeviceFault, DeviceUnavailable
+from hal.registry import Context
+from simbackend.arm_model import MODELS
+from simbackend.draws import Draws
+from simbackend.wire import (
+    CAMERA_AT,
+    GRIPPER_AT,
+    IMAGE_BYTES,
+    JOINTS_AT,
+    LIGHTS_AT,
+    REQUEST,
+    Drive,
+    Op,
+    Picture,
+    PictureInfo,
+    Snapshot,
+    WorldConfig,
+)
+
+Array = NDArray[np.float64]
+
+START_S = 60.0
+CLOSE_S = 2.0
+PROXIMITY_RANGE_M = 0.6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """A snapshot and when it was valid on the cell's clock."""
+
+    snapshot: Snapshot
+    host_time_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CameraView:
+    """A pinhole picture to draw; pixel (0, 0) is a pixel's centre."""
+
+    flange_from_camera: RigidTransform
+    width: int
+    height: int
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    near_m: float
+    far_m: float
+
+
+class WorldClient:
+    """One world process. Commands are stored and go out with the next step; `advance` is all that lets time pass."""
+
+    def __init__(self, config: WorldConfig, clock: Clock) -> None:
+        self.cell = config.cell
+        self.draws = Draws(config.cell.file.cell.seed)
+        self.rate_hz = config.cell.file.cell.control_rate_hz
+        self.proximity: tuple[str, ...] = ()
+        self._clock = clock
+        self._lock = threading.RLock()
+        self._request = np.zeros(REQUEST)
+        self._owed_ticks = 0.0
+        self._events: list[tuple[int, int, Callable[[], None]]] = []
+        self._is_closed = False
+        self._launch(config)
+        clock.attach(self.advance)  # type: ignore[attr-defined]  # checked by `start`
+
+    @classmethod
+    def shared(cls, context: Context) -> WorldClient:
+        """The world of a device's cell; the first device starts it."""
+        return context.shared.get("world", lambda: cls.start(context))
+
+    @classmethod
+    def start(cls, context: Context) -> WorldClient:
+        """Start the world of a cell.
+
+        Raises:
+            ConfigError: no cell, a clock that no world can drive, or an unknown arm model.
+            DeviceUnavailable: the world process does not come up.
+        """
+        cell = context.cell
+        if cell is None:
+            raise ConfigError("a simulated device needs a cell file", hint="load it with a cell, e.g. cells/bench.toml")
+        if not hasattr(context.clock, "attach"):
+            raise ConfigError(
+                "a simulated device needs a clock that its world can drive",
+                hint='set cell.mode = "sim" or "mixed"',
+                key="cell.mode",
+            )
+        names = [name for name, driver, _ in _sim_devices(cell) if driver == "sim:proximity"]
+        draws = Draws(cell.file.cell.seed)
+        config = WorldConfig(
+            cell=cell,
+            model=_arm_model(cell),
+            proximity=tuple(true_mount(cell, draws, name) for name in names),
+            proximity_range_m=PROXIMITY_RANGE_M,
+        )
+        client = cls(config, context.clock)
+        client.proximity = tuple(names)
+        return client
+
+    def _launch(self, config: WorldConfig) -> None:
+        ours, theirs = socket.socketpair()
+        with tempfile.TemporaryFile(prefix="panelwright-images-") as file:
+            file.truncate(IMAGE_BYTES)
+            self._images = mmap.mmap(file.fileno(), IMAGE_BYTES)
+            fds = (theirs.fileno(), file.fileno())
+            command = [sys.executable, "-m", "simbackend.world_process", *map(str, fds)]
+            self._process = subprocess.Popen(command, pass_fds=fds, env=_environment(), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)  # noqa: S603
+        theirs.close()
+        self._pipe = Connection(ours.detach())
+        try:
+            self._pipe.send(config)
+            complaint = self._pipe.recv() if self._pipe.poll(START_S) else f"no answer within {START_S:.0f} s"
+            if complaint is not None:
+                raise DeviceUnavailable(f"the simulated world did not start: {complaint}", hint="run `panelwright doctor`", device="world")
+            self._take(self._pipe.recv_bytes())
+        except (EOFError, OSError) as error:
+            self.close()
+            raise DeviceUnavailable(
+                "the simulated world ended while starting", hint="run `panelwright doctor`; is pybullet installed?", device="world"
+            ) from error
+        except DeviceUnavailable:
+            self.close()
+            raise
+
+    # -- time -----------------------------------------------------------------------------------------------------
+
+    def advance(self, duration_s: float) -> float:
+        """Send what is pending, step the world, take its snapshot; returns the new simulated time."""
+        with self._lock:
+            self._owed_ticks += duration_s * self.rate_hz
+            ticks = max(1, int(self._owed_ticks + 0.5))
+            self._owed_ticks -= ticks
+            while ticks > 0:
+                now = self.frame.snapshot.tick
+                part = min(ticks, max(1, self._events[0][0] - now)) if self._events else ticks
+                self._step(part)
+                ticks -= part
+                self._run_events()
+            return self.frame.snapshot.stamp_s
+
+    def _step(self, ticks: int) -> None:
+        request = self._request
+        request[0], request[1] = Op.STEP, ticks
+        message = request.tobytes()
+        request[:] = 0.0
+        self._take(self._ask(message))
+
+    def _take(self, message: bytes) -> None:
+        snapshot = Snapshot(np.frombuffer(message))
+        stamp_s = snapshot.stamp_s if isinstance(self._clock, SimClock) else self._clock.now_s()
+        self.frame = Frame(snapshot, stamp_s)
+
+    def _ask(self, message: bytes) -> bytes:
+        with self._guarded():
+            self._pipe.send_bytes(message)
+            return self._pipe.recv_bytes()
+
+    @contextlib.contextmanager
+    def _guarded(self):  # type: ignore[no-untyped-def]
+        if self._is_closed:
+            raise DeviceUnavailable("the simulated world is closed", hint="open the cell again", device="world")
+        try:
+            yield
+        except (EOFError, OSError) as error:
+            raise DeviceUnavailable(
+                f"the simulated world has ended (exit code {self._process.poll()})",
+                hint="start the cell again; its log says why the world ended",
+                device="world",
+            ) from error
+
+    def at(self, time_s: float, action: Callable[[], None]) -> None:
+        """Run `action` when the world reaches a simulated time; at once when it has."""
+        tick = round(time_s * self.rate_hz)
+        with self._lock:
+            if tick <= self.frame.snapshot.tick:
+                action()
+                return
+            heapq.heappush(self._events, (tick, len(self._events), action))
+
+    def _run_events(self) -> None:
+        while self._events and self._events[0][0] <= self.frame.snapshot.tick:
+            heapq.heappop(self._events)[2]()
+
+    # -- commands, all stored until the next step ---------------------------------------------------------------------
+
+    @property
+    def is_enabled(self) -> bool:
+        """Will the drives follow a set-point that is given now?"""
+        pending = int(self._request[2])
+        if pending & Drive.ENABLE:
+            return True
+        return self.frame.snapshot.is_enabled and not pending & Drive.STOP
+
+    def enable(self) -> None:
+        """Drives follow from the next tick on."""
+        with self._lock:
+            self._request[2] = (int(self._request[2]) & Drive.STOP) | Drive.ENABLE
+
+    def stop(self) -> None:
+        """Drives brake from the next tick on, whatever else was pending."""
+        with self._lock:
+            self._request[2] = Drive.STOP
+
+    def aim_arm(self, position_rad: Array) -> None:
+        """The set-point of the next tick."""
+        with self._lock:
+            self._request[2] = int(self._request[2]) | Drive.SETPOINT
+            self._request[JOINTS_AT : JOINTS_AT + len(position_rad)] = position_rad
+
+    def aim_gripper(self, width_m: float, force_n: float, speed_m_per_s: float) -> None:
+        """The gripper's next goal."""
+        with self._lock:
+            self._request[GRIPPER_AT : GRIPPER_AT + 4] = (1.0, width_m, force_n, speed_m_per_s)
+
+    def switch_lights(self, on: tuple[bool, ...]) -> None:
+        """The border lights from the next tick on."""
+        with self._lock:
+            self._request[LIGHTS_AT : LIGHTS_AT + 1 + len(on)] = (1.0, *on)
+
+    # -- pictures and truth ---------------------------------------------------------------------------------------
+
+    def colour_picture(self, view: CameraView) -> tuple[PictureInfo, NDArray[np.uint8], NDArray[np.int32]]:
+        """RGBA and body ids at the present tick."""
+        with self._lock:
+            info = self._draw(view, Picture.COLOUR)
+            pixels = view.width * view.height
+            rgba = np.frombuffer(self._images, np.uint8, 4 * pixels).reshape(view.height, view.width, 4).copy()
+            ids = np.frombuffer(self._images, np.int32, pixels, 4 * pixels).reshape(view.height, view.width).copy()
+        return info, rgba, ids
+
+    def depth_picture(self, view: CameraView) -> tuple[PictureInfo, NDArray[np.float32]]:
+        """Depth along the view in metres, NaN where there is nothing, at the present tick."""
+        with self._lock:
+            info = self._draw(view, Picture.DEPTH)
+            depth = np.frombuffer(self._images, np.float32, view.width * view.height)
+            return info, depth.reshape(view.height, view.width).copy()
+
+    def _draw(self, view: CameraView, kind: Picture) -> PictureInfo:
+        matrix = np.asarray(view.flange_from_camera.as_matrix())[:3]
+        head = [Op.RENDER, view.width, view.height, view.near_m, view.far_m, *view.focal, *view.centre, kind]
+        request = np.concatenate([np.asarray(head, float), matrix.ravel()])
+        assert len(head) == CAMERA_AT  # noqa: S101  # the layout of the wire
+        with self._guarded():
+            self._pipe.send_bytes(request.tobytes())
+            info: PictureInfo = self._pipe.recv()
+            return info
+
+    def truth(self) -> Truth:
+        """What the judge may ask for when a mission has ended."""
+        with self._lock, self._guarded():
+            self._pipe.send_bytes(np.array([float(Op.TRUTH)]).tobytes())
+            truth = self._pipe.recv()
+        if not isinstance(truth, Truth):
+            raise DeviceFault("the simulated world gave no truth", hint="report this", device="world")
+        return truth
+
+    def close(self) -> None:
+        """End the process; a second call does nothing."""
+        with self._lock:
+            if self._is_closed:
+                return
+            self._is_closed = True
+            with contextlib.suppress(OSError):
+                self._pipe.send_bytes(np.array([float(Op.CLOSE)]).tobytes())
+            self._pipe.close()
+            try:
+                self._process.wait(CLOSE_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait(CLOSE_S)
+
+
+def true_mount(cell: Cell, draws: Draws, device: str) -> RigidTransform:
+    """Where a device truly sits on its parent.
+
+    Raises:
+        ConfigError: no mount, or a calibration record without one.
+    """
+    record = cell.calibration_of(device).mount
+    if record is None:
+        raise ConfigError(f"the calibration record of {device} has no [mount]", hint="add position_m and rpy_rad", device=device)
+    return draws.mount(device, record)
+
+
+def _sim_devices(cell: Cell) -> list[tuple[str, str, dict[str, object]]]:
+    """(device, driver, options) of all that this world stands behind, on its own or behind an emulator."""
+    direct = [(name, device.driver, device.options) for name, device in cell.file.devices.items()]
+    behind = [(name, emulator.driver, emulator.options) for name, emulator in cell.file.emulators.items()]
+    return [entry for entry in direct + behind if entry[1].startswith("sim:")]
+
+
+def _arm_model(cell: Cell) -> str:
+    for _, driver, options in _sim_devices(cell):
+        if driver == "sim:arm":
+            model = str(options.get("model", "t3"))
+            if model not in MODELS:
+                raise ConfigError(f"no arm model called {model!r}", hint=f"models: {', '.join(MODELS)}", model=model)
+            return model
+    return "t3"
+
+
+def _environment() -> dict[str, str]:
+    # The world finds its code where this process found it, and uses one core: the other belongs to the cell.
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    return {**os.environ, **threads, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+

@@ -1,0 +1,155 @@
+"""What all simulated devices share: stamps, health, and the five faults that can be injected."""
+
+from __future__ import annotations
+
+
+from typing import Any, Generic, TypeVar
+
+
+from hal.clock import Deadline
+from hal.devices import DeviceKind, Fault, Health
+from hal.errors import DeviceTimeout, DeviceUnavailable
+from hal.readings import Cause, Quality, Stamped
+from hal.registry import Context
+from hal.strict import Strict, validate
+from simbackend.client import Frame, WorldClient
+
+T = TypeVar("T")
+O = TypeVar("O", bound="SimOptions")
+
+
+class FaultOption(Strict):
+    """`fault = { kind = "stale", at_s = 3.0 }`: begins at a simulated time."""
+
+    kind: Fault
+    magnitude: float = 0.0
+    at_s: float = 0.0
+
+
+class SimOptions(Strict):
+    """Options of every simulated device."""
+
+    fault: FaultOption | None = None
+
+
+def parse(options: dict[str, Any], model: type[O], context: Context) -> O:
+    """Options as their strict model.
+
+    Raises:
+        ConfigError: names the key.
+    """
+    return validate(options, model, source=f"devices.{context.name}.options")
+
+
+class SimDevice(Generic[T]):
+    """One device over the world. A subclass says what it `_measure`s and how a bias changes it.
+
+    Noise is drawn from (seed, device, tick) alone, so reading twice, or from a second thread, changes nothing.
+    """
+
+    def __init__(self, context: Context, kind: DeviceKind, options: SimOptions) -> None:
+        self._name, self._kind = context.name, kind
+        self._world = WorldClient.shared(context)
+        self._fault: Fault | None = None
+        self._magnitude = 0.0
+        self._kept: Stamped[T] | None = None
+        self._is_closed = False
+        self._samples = self._errors = 0
+        self._last_s: float | None = None
+        if options.fault is not None:
+            fault = options.fault
+            self._world.at(fault.at_s, lambda: self.inject_fault(fault.kind, magnitude=fault.magnitude))
+
+    @property
+    def name(self) -> str:
+        """Name in the cell file."""
+        return self._name
+
+    @property
+    def kind(self) -> DeviceKind:
+        """Which interface this is."""
+        return self._kind
+
+    def health(self) -> Health:
+        """State of the link and the newest sample."""
+        cause = {Fault.SILENT: Cause.TIMEOUT, Fault.DISCONNECTED: Cause.COMM}.get(self._fault or Fault.BIASED, Cause.NONE)
+        connected = not self._is_closed and self._fault is not Fault.DISCONNECTED
+        is_good = connected and cause is Cause.NONE
+        return Health(
+            connected=connected,
+            quality=Quality.VALID if is_good else Quality.INVALID,
+            cause=cause if connected or self._fault else Cause.COMM,
+            samples=self._samples,
+            errors=self._errors,
+            last_sample_s=self._last_s,
+        )
+
+    def close(self) -> None:
+        """Later calls raise `DeviceUnavailable`; the world itself belongs to the cell."""
+        self._is_closed = True
+
+    def inject_fault(self, fault: Fault | None, *, magnitude: float = 0.0) -> None:
+        """Begin a fault, or end it with None. Stale and frozen devices keep the sample of this moment."""
+        self._kept = self._fresh(0.0) if fault in (Fault.STALE, Fault.FROZEN) else None
+        self._fault, self._magnitude = fault, magnitude
+
+    def _sample(self, deadline: Deadline) -> Stamped[T]:
+        """The newest sample, as the fault lets it through.
+
+        Raises:
+            DeviceTimeout: silent; at once, because no waiting would help and a wait would move the world.
+            DeviceUnavailable: closed or disconnected.
+        """
+        self._check(deadline)
+        kept = self._kept
+        if kept is not None and self._fault is Fault.STALE:
+            return kept
+        if kept is not None and self._fault is Fault.FROZEN:
+            frame = self._world.frame
+            return Stamped(
+                value=kept.value,
+                host_time_s=frame.host_time_s,
+                device_time_s=frame.snapshot.stamp_s,
+                sequence=frame.snapshot.tick,
+                quality=kept.quality,
+                cause=kept.cause,
+            )
+        sample = self._fresh(self._magnitude if self._fault is Fault.BIASED else 0.0)
+        self._samples += 1
+        self._last_s = sample.host_time_s
+        return sample
+
+    def _check(self, deadline: Deadline) -> None:
+        """Refuse when closed, lost or silent."""
+        if self._is_closed or self._fault is Fault.DISCONNECTED:
+            self._errors += 1
+            what = "is closed" if self._is_closed else "is not connected"
+            raise DeviceUnavailable(f"{self._name} {what}", hint="check the cable, or end the injected fault", device=self._name)
+        if self._fault is Fault.SILENT:
+            self._errors += 1
+            waited_s = deadline.remaining_s()
+            raise DeviceTimeout(
+                f"{self._name} silent for {waited_s:.3f} s",
+                hint="check power and cable, or end the injected fault",
+                device=self._name,
+                waited_s=waited_s,
+            )
+
+    def _fresh(self, bias: float) -> Stamped[T]:
+        frame = self._world.frame
+        value, quality, cause = self._measure(frame, bias)
+        return Stamped(
+            value=value,
+            host_time_s=frame.host_time_s,
+            device_time_s=frame.snapshot.stamp_s,
+            sequence=frame.snapshot.tick,
+            quality=quality,
+            cause=cause,
+        )
+
+    def _measure(self, frame: Frame, bias: float) -> tuple[T, Quality, Cause]:
+        """Value at a frame, with the bias of an injected fault in the device's own unit."""
+        raise NotImplementedError
+
+
+VALID = (Quality.VALID, Cause.NONE)

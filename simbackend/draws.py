@@ -1,0 +1,83 @@
+"""What the seed decides: every quantity has a stream of its own, so adding one never changes another."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from hal.calibration import CameraIntrinsics, MountRecord, ToolLoad
+from hal.config import WorkspaceSection
+from hal.geometry import perturbed, transform_rpy
+
+Array = NDArray[np.float64]
+
+PANEL_SPREAD_M = 0.06
+PANEL_SPREAD_RAD = 0.14
+FOCAL_RATIO_SIGMA = 0.0005
+CENTRE_SIGMA_PX = 0.3
+RADIAL_SIGMA = 0.002
+MASS_RATIO_SIGMA = 0.02
+CENTRE_OF_MASS_SIGMA_M = 0.001
+BIAS_SIGMA_N = 1.0
+BIAS_SIGMA_NM = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Draws:
+    """Random numbers by name."""
+
+    seed: int
+
+    def stream(self, name: str) -> np.random.Generator:
+        """A generator that depends on the seed and the name only."""
+        return np.random.default_rng([self.seed, zlib.crc32(name.encode())])
+
+    def at_tick(self, name: str, tick: int) -> np.random.Generator:
+        """Counter-based: the noise of `name` at `tick`, whoever asks and however often."""
+        return np.random.Generator(np.random.Philox(key=[self.seed, zlib.crc32(name.encode())], counter=[0, 0, 0, tick]))
+
+    def mount(self, device: str, record: MountRecord) -> RigidTransform:
+        """Where the device truly sits: the record's pose, off by its own sigma."""
+        sigma = np.array([*record.sigma_m, *record.sigma_rad])
+        return perturbed(record.pose().parent_from_child, sigma * self.stream(f"mount/{device}").standard_normal(6))
+
+    def lens(self, device: str, nominal: CameraIntrinsics) -> CameraIntrinsics:
+        """The true lens of a camera whose record says `nominal`."""
+        z = self.stream(f"lens/{device}").standard_normal(4)
+        focal = 1.0 + FOCAL_RATIO_SIGMA * z[0]
+        k1, k2, p1, p2, k3 = nominal.distortion
+        return CameraIntrinsics(
+            width_px=nominal.width_px,
+            height_px=nominal.height_px,
+            fx_px=nominal.fx_px * focal,
+            fy_px=nominal.fy_px * focal,
+            cx_px=nominal.cx_px + CENTRE_SIGMA_PX * z[1],
+            cy_px=nominal.cy_px + CENTRE_SIGMA_PX * z[2],
+            distortion=(k1 + RADIAL_SIGMA * z[3], k2, p1, p2, k3),
+        )
+
+    def load(self, device: str, nominal: ToolLoad) -> ToolLoad:
+        """The true tool load and sensor bias."""
+        z = self.stream(f"load/{device}").standard_normal(10)
+        centre = np.asarray(nominal.centre_of_mass_m) + CENTRE_OF_MASS_SIGMA_M * z[1:4]
+        bias = np.asarray(nominal.bias) + np.array([BIAS_SIGMA_N] * 3 + [BIAS_SIGMA_NM] * 3) * z[4:]
+        return ToolLoad(
+            mass_kg=nominal.mass_kg * (1.0 + MASS_RATIO_SIGMA * z[0]),
+            centre_of_mass_m=(float(centre[0]), float(centre[1]), float(centre[2])),
+            bias=tuple(float(b) for b in bias),  # type: ignore[arg-type]  # six by construction
+        )
+
+    def panel_pose(self, workspace: WorkspaceSection) -> RigidTransform:
+        """base_from_panel, uniform about the expected pose."""
+        spread_m = min(PANEL_SPREAD_M, workspace.position_tolerance_m)
+        spread_rad = min(PANEL_SPREAD_RAD, workspace.angle_tolerance_rad)
+        u = self.stream("panel/pose").uniform(-1.0, 1.0, 6)
+        # The six are drawn in a cube; a norm over the file's tolerance would break its promise, so the corners are drawn in.
+        shift = spread_m * u[:3]
+        turn = spread_rad * u[3:] / max(1.0, float(np.linalg.norm(u[3:])))
+        expected = transform_rpy(workspace.panel_position_m, workspace.panel_rpy_rad)
+        return perturbed(expected, np.concatenate([shift, turn]))

@@ -1,0 +1,109 @@
+"""The drives of arm and gripper: what happens between a set-point and the motors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.devices import ArmCapabilities
+from simbackend.tool_model import MAX_WIDTH_M
+
+Array = NDArray[np.float64]
+
+MOVING_RAD_PER_S = 0.05
+START_WIDTH_M = 0.040
+
+
+class ArmDrive:
+    """Follows set-points, brakes at the acceleration limit on `stop`, and gives up when a moving stream breaks off."""
+
+    def __init__(self, capabilities: ArmCapabilities, position_rad: Array, dt_s: float) -> None:
+        self._limit = np.asarray(capabilities.acceleration_rad_per_s2)
+        self._watchdog_s = capabilities.watchdog_s or np.inf
+        self._dt_s = dt_s
+        self._age_s = 0.0
+        self._fresh = False
+        self._is_braking = False
+        self.setpoint = np.asarray(position_rad, float).copy()
+        self.speed = np.zeros_like(self.setpoint)
+        self.is_enabled = False
+
+    def aim(self, position_rad: Array) -> None:
+        """A new set-point for the next tick; ignored while disabled."""
+        if not self.is_enabled:
+            return
+        self._last_speed = (position_rad - self.setpoint) / self._dt_s
+        self.setpoint = position_rad.copy()
+        self.speed = self._last_speed
+        self._fresh = True
+
+    def enable(self, measured_rad: list[float]) -> None:
+        """Begin to follow; the set-point is where the arm is."""
+        self.setpoint = np.asarray(measured_rad, float).copy()
+        self.speed = np.zeros_like(self.setpoint)
+        self.is_enabled, self._is_braking, self._age_s = True, False, 0.0
+        self._last_speed = self.speed
+
+    def stop(self) -> None:
+        """Brake and refuse set-points."""
+        self.is_enabled, self._is_braking = False, True
+
+    _last_speed: Array = np.zeros(6)
+
+    def tick(self) -> None:
+        """Move on by one tick."""
+        if self._is_braking:
+            self._brake()
+            return
+        if self._fresh:
+            self._fresh, self._age_s = False, 0.0
+            return
+        self._age_s += self._dt_s
+        self.speed = np.zeros_like(self.setpoint)
+        if self.is_enabled and self._age_s > self._watchdog_s and np.abs(self._last_speed).max() > MOVING_RAD_PER_S:
+            self.is_enabled = False
+
+    def _brake(self) -> None:
+        step = self._limit * self._dt_s
+        self.speed = np.sign(self.speed) * np.maximum(np.abs(self.speed) - step, 0.0)
+        self.setpoint = self.setpoint + self.speed * self._dt_s
+        self._is_braking = bool(self.speed.any())
+
+
+@dataclass(slots=True, eq=False)
+class GripperDrive:
+    """Pads on one screw: both move alike, stop at the set force and stay locked there."""
+
+    dt_s: float
+    width_m: float = START_WIDTH_M
+    speed: float = 0.0
+    is_moving: bool = False
+    is_holding: bool = False
+    _target_m: float = field(default=START_WIDTH_M)
+    _speed_m_per_s: float = 0.05
+    _force_n: float = 20.0
+
+    def aim(self, width_m: float, force_n: float, speed_m_per_s: float) -> None:
+        """Start to move towards a width."""
+        self._target_m = min(max(width_m, 0.0), MAX_WIDTH_M)
+        self._force_n, self._speed_m_per_s = force_n, speed_m_per_s
+        self.is_moving, self.is_holding = True, False
+
+    def tick(self, pad_force_n: tuple[float, float]) -> None:
+        """Move the screw by one tick."""
+        self.speed = 0.0
+        if not self.is_moving:
+            return
+        gap_m = self._target_m - self.width_m
+        # One screw drives both pads, so it feels the mean of their forces.
+        if gap_m < 0.0 and sum(pad_force_n) / 2.0 >= self._force_n:
+            self.is_moving, self.is_holding = False, True
+            return
+        step_m = self._speed_m_per_s * self.dt_s
+        if abs(gap_m) <= step_m:
+            self.width_m, self.is_moving = self._target_m, False
+            return
+        self.speed = self._speed_m_per_s if gap_m > 0.0 else -self._speed_m_per_s
+        self.width_m += self.speed * self.dt_s

@@ -1,0 +1,92 @@
+"""What the seeded panel shows when the mission begins: needle values, initial states, built positions, efforts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hal.panel import (
+    Button,
+    Display,
+    Gauge,
+    Handwheel,
+    Lamp,
+    Lever,
+    Mushroom,
+    Panel,
+    PanelMeter,
+    PanelObject,
+    Rotary,
+    Slider,
+    Toggle,
+)
+from simbackend.draws import Draws
+
+WHEEL_SPREAD_RAD = 2.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Built:
+    """One object as it was built.
+
+    Attributes:
+        offset_m: where it sits beside its place in the panel file (x, y).
+        effort_ratio: its friction, spring or detent over the file's.
+        place: joint position at the start (rad clockwise, m along the track), needle angle of an instrument.
+        is_on: lamp lit, button latched.
+        text: what a display shows.
+        value: the value behind `place` or `text`.
+    """
+
+    thing: PanelObject
+    offset_m: tuple[float, float]
+    effort_ratio: float
+    place: float = 0.0
+    is_on: bool = False
+    text: str | None = None
+    value: float | None = None
+
+
+def build(panel: Panel, draws: Draws) -> tuple[Built, ...]:
+    """All objects of the panel, drawn from the seed; the streams are named by object, so the order does not matter."""
+    button_lamps = {thing.lights_lamp for thing in panel.objects if isinstance(thing, Button) and thing.lights_lamp}
+    return tuple(_built(thing, panel, draws, button_lamps) for thing in panel.objects)
+
+
+def _built(thing: PanelObject, panel: Panel, draws: Draws, button_lamps: set[str]) -> Built:
+    random = draws.stream(f"object/{thing.name}")
+    dx, dy = panel.tolerances.position_m * random.standard_normal(2)
+    # A tenth is the least: a part without any friction would never rest.
+    ratio = max(0.1, 1.0 + panel.tolerances.effort_ratio * float(random.standard_normal()))
+    u = float(random.uniform())
+    common = {"thing": thing, "offset_m": (float(dx), float(dy)), "effort_ratio": ratio}
+    match thing:
+        case Gauge() | PanelMeter():
+            value = thing.scale.minimum + (0.05 + 0.9 * u) * (thing.scale.maximum - thing.scale.minimum)
+            return Built(**common, place=thing.scale.place_of(value), value=value)  # type: ignore[arg-type]
+        case Display():
+            value = round(thing.minimum + (0.02 + 0.96 * u) * (thing.maximum - thing.minimum), thing.decimals)
+            return Built(**common, text=display_text(thing, value), value=value)  # type: ignore[arg-type]
+        case Lamp():
+            return Built(**common, is_on=thing.name not in button_lamps and u < 0.5)  # type: ignore[arg-type]
+        case Button():
+            return Built(**common, is_on=thing.latching and u < 0.5)  # type: ignore[arg-type]
+        case Mushroom():
+            return Built(**common)  # type: ignore[arg-type]
+        case Toggle():
+            return Built(**common, place=thing.tilt_rad if u < 0.5 else -thing.tilt_rad)  # type: ignore[arg-type]
+        case Rotary() | Lever():
+            return Built(**common, place=thing.states[int(u * len(thing.states))].angle_rad)  # type: ignore[arg-type]
+        case Slider():
+            value = thing.scale.minimum + (0.1 + 0.8 * u) * (thing.scale.maximum - thing.scale.minimum)
+            return Built(**common, place=thing.scale.place_of(value), value=value)  # type: ignore[arg-type]
+        case Handwheel():
+            low = max(thing.minimum_rad, -WHEEL_SPREAD_RAD)
+            high = min(thing.maximum_rad, WHEEL_SPREAD_RAD)
+            return Built(**common, place=low + u * (high - low))  # type: ignore[arg-type]
+
+
+def display_text(thing: Display, value: float) -> str:
+    """The characters on the display, right-justified; a point does not take a digit's place."""
+    text = f"{value:.{thing.decimals}f}"
+    width = thing.digits + (1 if thing.decimals else 0)
+    return text.rjust(width)

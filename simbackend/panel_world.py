@@ -1,0 +1,295 @@
+"""The panel inside the engine: bodies, printed faces, lamps, mechanisms, and what they truly show."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from hal.config import Cell
+from hal.devices import ObjectTruth
+from hal.panel import (
+    Button,
+    Gauge,
+    Handwheel,
+    Lamp,
+    Lever,
+    Mushroom,
+    Panel,
+    PanelMeter,
+    Rotary,
+    Slider,
+    State,
+    Toggle,
+)
+from simbackend import textures
+from simbackend.draws import Draws
+from simbackend.mechanisms import JOINT, Detent, Friction, Mechanism, Spring
+from simbackend.panel_model import PAINT, Quad, light_urdf, object_model, robot
+from simbackend.panel_state import Built, build
+from simbackend.quads import write_quad
+from simbackend.wire import Emitter
+
+NEAR_M = 0.14  # a mechanism is alive while the finger tips are nearer than this
+STATE_SLACK_RAD = 0.2
+LIGHT_GLOW = (1.0, 0.97, 0.88)
+LIGHT_OFF = (0.42, 0.42, 0.40)
+DIM = 0.35
+GLOW: dict[str, tuple[float, float, float]] = {
+    "red": (1.0, 0.12, 0.08),
+    "green": (0.15, 1.0, 0.30),
+    "amber": (1.0, 0.65, 0.10),
+    "blue": (0.20, 0.45, 1.0),
+    "white": (1.0, 1.0, 0.95),
+}
+
+
+class PanelWorld:
+    """All bodies of the panel and the room behind it."""
+
+    def __init__(self, engine: Any, cell: Cell, draws: Draws, folder: Path) -> None:
+        self.engine = engine
+        self.panel: Panel = cell.panel
+        self.folder = folder
+        self.base_from_panel = draws.panel_pose(cell.file.workspace)
+        self.built = {built.thing.name: built for built in build(cell.panel, draws)}
+        self.bodies: dict[str, int] = {}
+        self.mechanisms: dict[str, Mechanism] = {}
+        self.lights_on = [0.0] * len(cell.panel.lights)
+        self._load_room(cell.file.workspace.floor_z_m)
+        self._load_plate()
+        self._light_places: list[tuple[float, float, float]] = []
+        for light in cell.panel.lights:
+            jitter = cell.panel.tolerances.light_m * draws.stream(f"light/{light.name}").standard_normal(3)
+            self._load_light(light, jitter)
+        for built in self.built.values():
+            self._load_object(built)
+        self.lamps_on = {name: built.is_on for name, built in self.built.items() if isinstance(built.thing, Lamp)}
+        self._presses = dict.fromkeys(self.mechanisms, 0)
+        points = {name: self._point(self.built[name]) for name in self.mechanisms}
+        self._names = list(points)
+        self._points = np.array([points[name] for name in self._names]).reshape(-1, 3)
+        self._alive: set[str] = set()
+        for mechanism in self.mechanisms.values():
+            mechanism.lock()
+
+    # -- building -------------------------------------------------------------------------------------------------
+
+    def _load_room(self, floor_z_m: float) -> None:
+        """Floor and a wall far behind, so that the plate stands before something; the wall cannot be touched."""
+        engine = self.engine
+        floor = engine.createCollisionShape(engine.GEOM_BOX, halfExtents=[2, 2, 0.05])
+        look = engine.createVisualShape(engine.GEOM_BOX, halfExtents=[2, 2, 0.05], rgbaColor=[0.35, 0.36, 0.38, 1])
+        engine.createMultiBody(0, floor, look, basePosition=[0, 0, floor_z_m - 0.05])
+        wall = engine.createVisualShape(engine.GEOM_BOX, halfExtents=[0.02, 3, 3], rgbaColor=[0.30, 0.33, 0.36, 1])
+        behind = self.base_from_panel.apply([0.0, 0.0, -0.6])
+        quaternion = self.base_from_panel.rotation * _wall_turn()
+        engine.createMultiBody(0, -1, wall, basePosition=list(behind), baseOrientation=quaternion.as_quat().tolist())
+
+    def _load_plate(self) -> None:
+        engine, panel = self.engine, self.panel
+        half = [panel.width_m / 2, panel.height_m / 2, panel.thickness_m / 2]
+        solid = engine.createCollisionShape(engine.GEOM_BOX, halfExtents=half)
+        look = engine.createVisualShape(engine.GEOM_BOX, halfExtents=[half[0], half[1], half[2] - 1e-4], rgbaColor=[0.5, 0.5, 0.5, 1])
+        pose = self.base_from_panel * RigidTransform.from_translation([0, 0, -half[2]])
+        self.bodies["plate"] = engine.createMultiBody(0, solid, look, *_pose(pose))
+        picture = Quad(pixels=textures.plate(panel), size_m=(panel.width_m, panel.height_m), centre_m=(0, 0, 0))
+        self._load_quad("plate", picture, self.base_from_panel)
+
+    def _load_quad(self, name: str, quad: Quad, base_from_object: RigidTransform) -> None:
+        engine = self.engine
+        mesh, picture = write_quad(self.folder, name, quad)
+        look = engine.createVisualShape(engine.GEOM_MESH, fileName=str(mesh), rgbaColor=[1, 1, 1, 1], specularColor=[0, 0, 0])
+        pose = base_from_object * RigidTransform.from_translation(quad.centre_m)
+        body = engine.createMultiBody(0, -1, look, *_pose(pose))
+        engine.changeVisualShape(body, -1, textureUniqueId=engine.loadTexture(str(picture)))
+
+    def _load_light(self, light: Any, jitter: Any) -> None:
+        x, y, z = light.position_m
+        pose = self.base_from_panel * RigidTransform.from_translation([x + jitter[0], y + jitter[1], jitter[2]])
+        body = self._load_urdf(light.name, light_urdf(light), pose)
+        self.engine.changeVisualShape(body, -1, rgbaColor=[*LIGHT_OFF, 1])
+        self._light_places.append(tuple(float(c) for c in pose.apply([0, 0, z])))  # type: ignore[arg-type]
+
+    def _load_urdf(self, name: str, text: str, pose: RigidTransform) -> int:
+        path = self.folder / f"{name}.urdf"
+        path.write_text(text, encoding="ascii")
+        position, quaternion = _pose(pose)
+        body = self.engine.loadURDF(str(path), position, quaternion, useFixedBase=True)
+        self.bodies[name] = int(body)
+        return int(body)
+
+    def _load_object(self, built: Built) -> None:
+        name = built.thing.name
+        pose = self.object_pose(built)
+        model = object_model(built)
+        for i, quad in enumerate(model.quads):
+            self._load_quad(f"{name}_{i}", quad, pose)
+        if not model.urdf:
+            return
+        body = self._load_urdf(name, robot(model.urdf), pose)
+        if self.engine.getNumJoints(body):
+            self.engine.resetJointState(body, JOINT, model.place)
+            for link in (-1, JOINT):
+                self.engine.changeDynamics(body, link, lateralFriction=1.0, jointDamping=0.0)
+            self.mechanisms[name] = self._mechanism(built, body)
+        if isinstance(built.thing, Lamp):
+            self._paint_lamp(name, on=built.is_on)
+
+    def _mechanism(self, built: Built, body: int) -> Mechanism:
+        thing, ratio = built.thing, built.effort_ratio
+        match thing:
+            case Button() | Mushroom():
+                spring = Spring(
+                    engine=self.engine,
+                    body=body,
+                    travel_m=thing.travel_m,
+                    spring_n_per_m=thing.spring_n_per_m * ratio,
+                    preload_n=thing.preload_n * ratio,
+                    latching=isinstance(thing, Mushroom) or thing.latching,
+                    releases=isinstance(thing, Button),
+                    is_latched=built.is_on,
+                )
+                if built.is_on:
+                    self.engine.resetJointState(body, JOINT, -spring.latched_depth_m)
+                return spring
+            case Toggle():
+                places = (-thing.tilt_rad, thing.tilt_rad)
+                effort = thing.force_n * thing.bat_length_m * ratio
+                return Detent(engine=self.engine, body=body, places=places, effort=effort, max_speed=8.0)
+            case Rotary():
+                places = tuple(state.angle_rad for state in thing.states)
+                return Detent(engine=self.engine, body=body, places=places, effort=thing.torque_nm * ratio, max_speed=6.0)
+            case Slider():
+                return Friction(engine=self.engine, body=body, effort=thing.friction_n * ratio)
+            case Lever() | Handwheel():
+                return Friction(engine=self.engine, body=body, effort=thing.torque_nm * ratio)
+            case _:  # a needle: its movement holds it
+                return Friction(engine=self.engine, body=body, effort=1.0)
+
+    def object_pose(self, built: Built) -> RigidTransform:
+        """base_from_object as built."""
+        x, y = built.thing.position_m
+        dx, dy = built.offset_m
+        return self.base_from_panel * RigidTransform.from_translation([x + dx, y + dy, 0.0])
+
+    def _point(self, built: Built) -> Any:
+        return self.object_pose(built).translation
+
+    # -- running --------------------------------------------------------------------------------------------------
+
+    def drive(self, tip_m: tuple[float, float, float]) -> None:
+        """One tick of the mechanisms round the finger tips; the others stay locked."""
+        away = self._points - tip_m
+        near = (away * away).sum(axis=1) < NEAR_M**2
+        if near.any() or self._alive:
+            self._wake({self._names[i] for i in np.flatnonzero(near)})
+        for name in sorted(self._alive):
+            mechanism = self.mechanisms[name]
+            if isinstance(mechanism, Spring):
+                mechanism.drive()
+                self._work_lamp(name, mechanism)
+            elif isinstance(mechanism, Detent):
+                mechanism.drive()
+
+    def _wake(self, near: set[str]) -> None:
+        for name in sorted(near - self._alive):
+            mechanism = self.mechanisms[name]
+            if isinstance(mechanism, Spring):
+                mechanism.free()
+        for name in sorted(self._alive - near):
+            self.mechanisms[name].lock()
+        self._alive = near
+
+    def _work_lamp(self, name: str, button: Spring) -> None:
+        """Each press of a button turns its lamp over."""
+        if button.presses == self._presses[name]:
+            return
+        self._presses[name] = button.presses
+        lamp = getattr(self.built[name].thing, "lights_lamp", None)
+        if lamp is not None:
+            self.lamps_on[lamp] = not self.lamps_on[lamp]
+            self._paint_lamp(lamp, on=self.lamps_on[lamp])
+
+    def _paint_lamp(self, name: str, *, on: bool) -> None:
+        thing = self.built[name].thing
+        colour = thing.colour  # type: ignore[union-attr]
+        rgb = GLOW[colour] if on else tuple(DIM * c for c in PAINT[colour])
+        self.engine.changeVisualShape(self.bodies[name], -1, rgbaColor=[*rgb, 1])
+
+    def switch_lights(self, on: list[bool]) -> None:
+        """Border lights, in the order of the panel file."""
+        for i, (light, lit) in enumerate(zip(self.panel.lights, on, strict=True)):
+            if bool(self.lights_on[i]) != lit:
+                self.lights_on[i] = float(lit)
+                rgb = LIGHT_GLOW if lit else LIGHT_OFF
+                self.engine.changeVisualShape(self.bodies[light.name], -1, rgbaColor=[*rgb, 1])
+
+    def emitters(self) -> tuple[Emitter, ...]:
+        """Everything that shines now."""
+        lit = [
+            Emitter(body=self.bodies[light.name], colour=LIGHT_GLOW, position_m=place, radius_m=light.radius_m, is_border_light=True)
+            for light, place, on in zip(self.panel.lights, self._light_places, self.lights_on, strict=True)
+            if on
+        ]
+        for name, on in self.lamps_on.items():
+            if on:
+                thing = self.built[name].thing
+                assert isinstance(thing, Lamp)  # noqa: S101
+                place = self.object_pose(self.built[name]).apply([0, 0, thing.height_m])
+                lit.append(
+                    Emitter(
+                        body=self.bodies[name],
+                        colour=GLOW[thing.colour],
+                        position_m=(float(place[0]), float(place[1]), float(place[2])),
+                        radius_m=thing.radius_m,
+                        is_border_light=False,
+                    )
+                )
+        return tuple(lit)
+
+    # -- judging --------------------------------------------------------------------------------------------------
+
+    def truth(self) -> tuple[ObjectTruth, ...]:
+        """What each object shows at this tick."""
+        return tuple(self._truth_of(built) for built in self.built.values())
+
+    def _truth_of(self, built: Built) -> ObjectTruth:
+        thing = built.thing
+        name = thing.name
+        mechanism = self.mechanisms.get(name)
+        place = mechanism.place() if mechanism is not None else 0.0
+        match thing:
+            case Gauge() | PanelMeter() | Slider():
+                return ObjectTruth(name=name, value=thing.scale.value_at(place))
+            case Lamp():
+                return ObjectTruth(name=name, state="on" if self.lamps_on[name] else "off")
+            case Button() | Mushroom():
+                assert isinstance(mechanism, Spring)  # noqa: S101
+                pressed = mechanism.is_latched or mechanism.is_in
+                return ObjectTruth(name=name, state="pressed" if pressed else "released", value=float(mechanism.presses))
+            case Toggle():
+                return ObjectTruth(name=name, state="on" if place > 0.0 else "off", value=place)
+            case Rotary() | Lever():
+                return ObjectTruth(name=name, state=_nearest(thing.states, place), value=place)
+            case Handwheel():
+                return ObjectTruth(name=name, value=place)
+            case _:
+                return ObjectTruth(name=name, value=built.value, text=built.text)
+
+
+def _nearest(states: tuple[State, ...], angle_rad: float) -> str | None:
+    state = min(states, key=lambda s: abs(s.angle_rad - angle_rad))
+    return state.name if abs(state.angle_rad - angle_rad) <= STATE_SLACK_RAD else None
+
+
+def _pose(pose: RigidTransform) -> tuple[list[float], list[float]]:
+    return pose.translation.tolist(), pose.rotation.as_quat().tolist()
+
+
+def _wall_turn() -> Any:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_euler("y", np.pi / 2)  # the thin side of the wall along the panel's z

@@ -1,0 +1,259 @@
+"""The PyBullet world of one cell: arm, tool and panel, stepped tick by tick. Runs in a process of its own."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from hal.devices import Truth
+from simbackend.arm_model import MODELS, arm_urdf, base_from_flange
+from simbackend.draws import Draws
+from simbackend.drive import ArmDrive, GripperDrive
+from simbackend.panel_world import PanelWorld
+from simbackend.renderer import Renderer
+from simbackend.tool_model import PAD_DAMPING_N_S_PER_M, PAD_FRICTION, PAD_STIFFNESS_N_PER_M
+from simbackend.wire import DOF, GRIPPER_AT, JOINTS_AT, LIGHTS, LIGHTS_AT, SNAPSHOT, Drive, WorldConfig
+
+Array = NDArray[np.float64]
+
+GRAVITY_M_PER_S2 = 9.81
+CONE_RAYS = 6
+CONE_RAD = 0.0175
+CONE_DEPTH_M = 0.02
+
+
+class World:
+    """One simulated cell. Deterministic: the same config and the same commands give the same bits."""
+
+    def __init__(self, config: WorldConfig) -> None:
+        import pybullet
+
+        self.config = config
+        self.cell = config.cell
+        self.dt_s = 1.0 / self.cell.file.cell.control_rate_hz
+        self.draws = Draws(self.cell.file.cell.seed)
+        self.tick = 0
+        self.peak_force_n = 0.0
+        self.engine: Any = pybullet
+        pybullet.connect(pybullet.DIRECT)
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=self.dt_s, deterministicOverlappingPairs=1, enableFileCaching=0, numSolverIterations=50
+        )
+        pybullet.setGravity(0, 0, -GRAVITY_M_PER_S2)
+        with tempfile.TemporaryDirectory(prefix="panelwright-world-") as folder:
+            self._load_arm(Path(folder))
+            self.panel = PanelWorld(pybullet, self.cell, self.draws, Path(folder))
+        self.renderer = Renderer(pybullet)
+        self._ray_starts = np.repeat([mount.translation for mount in config.proximity], len(RAYS), axis=0).reshape(-1, 3)
+        self._ray_directions = np.concatenate([np.empty((0, 3)), *(mount.rotation.apply(RAYS) for mount in config.proximity)])
+        self.initial = self.panel.truth()
+        self._settle()
+
+    def _load_arm(self, folder: Path) -> None:
+        engine = self.engine
+        self.model = MODELS[self.config.model]()
+        mounts = {name: self._true_mount(name) for name in ("wrist_ft", "gripper")}
+        load_kg = self._load_kg()
+        urdf = arm_urdf(
+            self.model, flange_from_sensor=mounts["wrist_ft"], flange_from_grip=mounts["gripper"], load_kg=load_kg
+        )
+        path = folder / "arm.urdf"
+        path.write_text(urdf, encoding="ascii")
+        self.arm = engine.loadURDF(str(path), useFixedBase=True)
+        index = {engine.getJointInfo(self.arm, i)[1].decode(): i for i in range(engine.getNumJoints(self.arm))}
+        self.joints = [index[f"link{i + 1}"] for i in range(DOF)]
+        self.fingers = [index["finger_left"], index["finger_right"]]
+        self.moving = [*self.joints, *self.fingers]
+        self.sensor, self.flange_link = index["sensor"], index["flange"]
+        self.flange_from_grip = mounts["gripper"]
+        self.tool_links = frozenset((self.sensor, index["gripper"], *self.fingers))
+        for i in range(-1, engine.getNumJoints(self.arm)):
+            engine.changeDynamics(self.arm, i, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0)
+        for finger in self.fingers:
+            engine.changeDynamics(
+                self.arm,
+                finger,
+                lateralFriction=PAD_FRICTION,
+                contactStiffness=PAD_STIFFNESS_N_PER_M,
+                contactDamping=PAD_DAMPING_N_S_PER_M,
+            )
+        engine.enableJointForceTorqueSensor(self.arm, self.sensor, 1)
+        park = np.asarray(self.cell.file.workspace.park_rad, float)
+        self.drive = ArmDrive(self.model.capabilities, park, self.dt_s)
+        self.gripper = GripperDrive(self.dt_s)
+        places = [*park, self.gripper.width_m / 2, self.gripper.width_m / 2]
+        for joint, place in zip(self.moving, places, strict=True):
+            engine.resetJointState(self.arm, joint, place)
+        self._forces = [*self.model.torque_nm, 250.0, 250.0]
+        self._gains = [0.45] * DOF + [0.6, 0.6]
+        self._damps = [1.0] * (DOF + 2)
+        self._zeros = [0.0] * (DOF + 2)
+
+    def _true_mount(self, device: str) -> RigidTransform:
+        section = self.cell.file.devices.get(device)
+        kinds = {"wrist_ft": "force_torque", "gripper": "gripper"}
+        if section is None:
+            names = [n for n, d in self.cell.file.devices.items() if d.kind == kinds[device]]
+            device = names[0] if names else device
+        section = self.cell.file.devices.get(device)
+        if section is None or section.mount is None:
+            return RigidTransform.from_translation([0.0, 0.0, 0.0 if kinds.get(device) == "force_torque" else 0.21])
+        record = self.cell.calibration_of(device).mount
+        return self.draws.mount(device, record) if record is not None else RigidTransform.identity()
+
+    def _load_kg(self) -> float:
+        for name, device in self.cell.file.devices.items():
+            if device.kind == "force_torque" and device.mount is not None:
+                record = self.cell.calibration_of(name).load
+                if record is not None:
+                    return self.draws.load(name, record.load()).mass_kg
+        return 0.9
+
+    def _settle(self) -> None:
+        """Let the joints find their rest before time begins."""
+        self._read_joints()
+        for _ in range(20):
+            self._advance()
+        self.tick = 0
+        self.peak_force_n = 0.0
+
+    def step(self, request: Array) -> Array:
+        """Obey one request and pass its number of ticks; returns the snapshot vector."""
+        self._obey(request)
+        for _ in range(int(request[1])):
+            self._advance()
+        return self.snapshot()
+
+    def _obey(self, request: Array) -> None:
+        orders = int(request[2])
+        if orders & Drive.STOP:
+            self.drive.stop()
+        if orders & Drive.ENABLE:
+            self.drive.enable(self.q[:DOF])
+        if orders & Drive.SETPOINT:
+            self.drive.aim(request[JOINTS_AT : JOINTS_AT + DOF])
+        if request[GRIPPER_AT]:
+            self.gripper.aim(*(float(x) for x in request[GRIPPER_AT + 1 : GRIPPER_AT + 4]))
+        if request[LIGHTS_AT]:
+            self.panel.switch_lights([bool(x) for x in request[LIGHTS_AT + 1 : LIGHTS_AT + 1 + LIGHTS]])
+
+    def _advance(self) -> None:
+        engine = self.engine
+        self.drive.tick()
+        self.gripper.tick(self.pad_force_n)
+        half = self.gripper.width_m / 2
+        # Gravity torque beside the position motor: the servo sags by 2 to 12 mrad without it and by 1e-16 with it.
+        gravity = engine.calculateInverseDynamics(self.arm, self.q, self._zeros, self._zeros)
+        engine.setJointMotorControlArray(self.arm, self.moving, engine.TORQUE_CONTROL, forces=gravity)
+        engine.setJointMotorControlArray(
+            self.arm,
+            self.moving,
+            engine.POSITION_CONTROL,
+            targetPositions=[*self.drive.setpoint, half, half],
+            targetVelocities=[*self.drive.speed, *([self.gripper.speed / 2] * 2)],
+            forces=self._forces,
+            positionGains=self._gains,
+            velocityGains=self._damps,
+        )
+        self.panel.drive(self.tip_m)
+        engine.stepSimulation()
+        self.tick += 1
+        self._read_joints()
+        self._read_contacts()
+
+    def _read_joints(self) -> None:
+        engine = self.engine
+        states = engine.getJointStates(self.arm, [*self.moving, self.sensor])
+        self.q = [state[0] for state in states[:-1]]
+        self.v = [state[1] for state in states[:-1]]
+        self.reaction = states[-1][2]
+        tip = engine.getLinkState(self.arm, self.fingers[0] - 1, computeForwardKinematics=1)
+        self.tip_m = tip[4]
+        if not hasattr(self, "pad_force_n"):
+            self.pad_force_n = (0.0, 0.0)
+
+    def _read_contacts(self) -> None:
+        contacts = self.engine.getContactPoints(bodyA=self.arm)
+        if not contacts:
+            self.pad_force_n = (0.0, 0.0)
+            return
+        pads = [0.0, 0.0]
+        total = np.zeros(3)
+        for contact in contacts:
+            link, force = contact[3], contact[9]
+            if link in self.fingers:
+                pads[self.fingers.index(link)] += force
+            total += force * np.asarray(contact[7])
+            total += contact[10] * np.asarray(contact[11]) + contact[12] * np.asarray(contact[13])
+        self.pad_force_n = (pads[0], pads[1])
+        self.peak_force_n = max(self.peak_force_n, float(np.linalg.norm(total)))
+
+    def snapshot(self) -> Array:
+        """The vector that `Snapshot` names."""
+        out = np.zeros(SNAPSHOT)
+        out[0], out[1], out[2] = self.tick, self.tick * self.dt_s, self.drive.is_enabled
+        out[10:16], out[16:22], out[22:28] = self.q[:DOF], self.v[:DOF], self.drive.setpoint
+        out[28:34] = self.reaction
+        out[28:34] *= -1.0  # the engine reports the sensor on the tool's mount; we want the world on the tool
+        out[34:36] = self.pad_force_n
+        out[36] = self.q[DOF] + self.q[DOF + 1]
+        out[37], out[38] = self.gripper.is_moving, self.gripper.is_holding
+        out[40:44] = self.panel.lights_on
+        out[44:48] = np.nan
+        if self.config.proximity:
+            out[44 : 44 + len(self.config.proximity)] = self._distances()
+        return out
+
+    def flange(self) -> RigidTransform:
+        """True base_from_flange."""
+        return base_from_flange(self.model.capabilities.links, np.asarray(self.q[:DOF]))
+
+    def _distances(self) -> list[float]:
+        """Nearest surface in a narrow cone along each sensor's z, averaged over the rays that see the nearest thing."""
+        engine = self.engine
+        state = engine.getLinkState(self.arm, self.flange_link)
+        turn = np.array(engine.getMatrixFromQuaternion(state[5])).reshape(3, 3)
+        reach = self.config.proximity_range_m
+        starts = self._ray_starts @ turn.T + state[4]
+        ends = starts + reach * (self._ray_directions @ turn.T)
+        hits = engine.rayTestBatch(starts.tolist(), ends.tolist())
+        depths = [hit[2] * reach if hit[0] >= 0 and hit[0] != self.arm else math.inf for hit in hits]
+        return [_nearest(depths[i : i + len(RAYS)]) for i in range(0, len(depths), len(RAYS))]
+
+    def truth(self) -> Truth:
+        """What the judge compares with."""
+        return Truth(
+            base_from_panel_matrix=np.asarray(self.panel.base_from_panel.as_matrix()),
+            objects=self.panel.truth(),
+            peak_force_n=self.peak_force_n,
+            sim_time_s=self.tick * self.dt_s,
+            initial=self.initial,
+        )
+
+    def close(self) -> None:
+        """Let the engine go."""
+        self.engine.disconnect()
+
+
+def _nearest(depths_m: list[float]) -> float:
+    """Mean depth of the rays that see the nearest thing; NaN when none sees anything."""
+    first_m = min(depths_m)
+    if math.isinf(first_m):
+        return math.nan
+    seen = [depth for depth in depths_m if depth < first_m + CONE_DEPTH_M]
+    return sum(seen) / len(seen)
+
+
+def _cone() -> Array:
+    turns = 2.0 * np.pi * np.arange(CONE_RAYS) / CONE_RAYS
+    around = np.column_stack([np.sin(CONE_RAD) * np.cos(turns), np.sin(CONE_RAD) * np.sin(turns), np.full(CONE_RAYS, np.cos(CONE_RAD))])
+    return np.vstack([[0.0, 0.0, 1.0], around])
+
+
+RAYS = _cone()

@@ -1,0 +1,90 @@
+"""`python -m simbackend.world_process FD_PIPE FD_IMAGE`: one world, obeying one pipe until it closes."""
+
+from __future__ import annotations
+
+import mmap
+import signal
+import sys
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from simbackend.wire import CAMERA_AT, IMAGE_BYTES, Op, Picture, PictureInfo
+from simbackend.world import World
+
+Array = NDArray[np.float64]
+
+
+def serve(pipe: Connection, images: mmap.mmap) -> None:
+    """Build the world that the first message describes, then answer requests until the other side goes."""
+    try:
+        world = World(pipe.recv())
+    except Exception as error:  # whatever keeps a world from being built must reach the person who asked for it
+        pipe.send(f"{type(error).__name__}: {error}")
+        return
+    pipe.send(None)
+    pipe.send_bytes(world.snapshot().tobytes())
+    while True:
+        try:
+            message = pipe.recv_bytes()
+        except (EOFError, OSError):
+            break
+        request = np.frombuffer(message)
+        match Op(int(request[0])):
+            case Op.STEP:
+                pipe.send_bytes(world.step(request).tobytes())
+            case Op.RENDER:
+                pipe.send(picture(world, request, images))
+            case Op.TRUTH:
+                pipe.send(world.truth())
+            case Op.CLOSE:
+                break
+    world.close()
+
+
+def picture(world: World, request: Array, images: mmap.mmap) -> PictureInfo:
+    """Draw into the shared memory."""
+    width, height, near_m, far_m, fx, fy, cx, cy, kind = (float(x) for x in request[1:CAMERA_AT])
+    matrix = np.eye(4)
+    matrix[:3] = request[CAMERA_AT : CAMERA_AT + 12].reshape(3, 4)
+    base_from_camera = world.flange() * RigidTransform.from_matrix(matrix)
+    rgba, depth_m, ids = world.renderer.draw(
+        base_from_camera,
+        width=int(width),
+        height=int(height),
+        focal=(fx, fy),
+        centre=(cx, cy),
+        near_m=near_m,
+        far_m=far_m,
+    )
+    if Picture(int(kind)) is Picture.DEPTH:
+        _put(images, 0, np.where(ids >= 0, depth_m, np.nan).astype(np.float32))
+    else:
+        _put(images, 0, rgba)
+        _put(images, rgba.nbytes, ids)
+    return PictureInfo(
+        tick=world.tick,
+        stamp_s=world.tick * world.dt_s,
+        camera_from_base=base_from_camera.inv(),
+        base_from_panel=world.panel.base_from_panel,
+        lit=world.panel.emitters(),
+    )
+
+
+def _put(images: mmap.mmap, at: int, array: NDArray[Any]) -> None:
+    images[at : at + array.nbytes] = np.ascontiguousarray(array).data.cast("B")
+
+
+def main() -> None:
+    """Entry of the process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which closes the pipe
+    pipe_fd, image_fd = int(sys.argv[1]), int(sys.argv[2])
+    with mmap.mmap(image_fd, IMAGE_BYTES) as images, Connection(pipe_fd) as pipe:
+        serve(pipe, images)
+
+
+if __name__ == "__main__":
+    main()

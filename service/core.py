@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from hal.config import Cell
-from hal.errors import CellError, InvalidRequest, Stopped
+from hal.errors import CellError, DeviceUnavailable, InvalidRequest, Stopped
 from service.gate import GatedConnection
 from service.journal import Journal
 from service.lease import LeaseDesk
@@ -55,10 +55,10 @@ class Service:
         state_dir = runs_dir / ".service"
         self.journal = Journal(state_dir / "journal.sqlite")
         self.supervisor = Supervisor(
-            cell, stop_listener=stop_listener, origins=origins, inline=inline, report=self._note
+            cell, stop_listener=stop_listener, origins=origins, inline=inline, report=self.note
         )
         self.tasks = TaskStore(state_dir / "tasks", recorder=self.journal, stop_motion=self._stop_motion)
-        self.lease = LeaseDesk(ttl_s=cell.file.safety.lease_ttl_s, on_loss=self.tasks.cancel_moving, report=self._note)
+        self.lease = LeaseDesk(ttl_s=cell.file.safety.lease_ttl_s, on_loss=self.tasks.cancel_moving, report=self.note)
         self._is_closing = threading.Event()
         self._restore_tasks()
 
@@ -68,7 +68,7 @@ class Service:
         Raises:
             CellError: it could not start.
         """
-        self._note("service-start", {"cell": self.cell.name, "mode": self.cell.file.cell.mode})
+        self.note("service-start", {"cell": self.cell.name, "mode": self.cell.file.cell.mode})
         threading.Thread(target=self._watch_lease, name="watch-lease", daemon=True).start()
         self.supervisor.start()
 
@@ -112,7 +112,7 @@ class Service:
         self.stop_quietly("the service ends")
         self.tasks.close()
         self.supervisor.close()
-        self._note("service-end", {})
+        self.note("service-end", {})
         self.journal.close()
 
     def stop_quietly(self, source: str) -> None:
@@ -127,8 +127,6 @@ class Service:
             return
         if self.supervisor.problem is not None:
             raise self.supervisor.problem
-        from hal.errors import DeviceUnavailable
-
         raise DeviceUnavailable("the cell is starting", hint="GET /readyz tells when it is up", device="cell")
 
     def _stop_motion(self) -> None:
@@ -139,7 +137,8 @@ class Service:
         while not self._is_closing.wait(LEASE_LOOK_S):
             self.lease.expire()
 
-    def _note(self, kind: str, data: dict[str, Any]) -> None:
+    def note(self, kind: str, data: dict[str, Any]) -> None:
+        """Record something without waiting for it."""
         try:
             self.journal.note(kind, data)
         except CellError as error:

@@ -2,16 +2,81 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
+from scipy.spatial.transform import RigidTransform
+
+from hal.calibration import ToolLoad
 from hal.clock import Clock
 from hal.config import Cell
 from hal.devices import DeviceKind
-from hal.errors import CellError, ConfigError
+from hal.errors import CellError, ConfigError, MotionRefused
+from hal.geometry import Array, identity
+from hal.motion import DeclaredMotion, MotionReport, Mover, RobotState
+
+STATE_WAIT_S = 2.0
+T = TypeVar("T")
 
 
-def start_controller(cell: Cell, devices: Mapping[str, Any], *, clock: Clock, is_latched: Callable[[], bool]) -> Any:
+class MotionPort:
+    """The mover as many clients see it: watching the state never gets in the way of a motion.
+
+    A state that reads the devices and a motion exclude each other in the controller; here the motion waits the moment
+    that a read takes, and the readers get the newest snapshot while a motion runs.
+    """
+
+    def __init__(self, controller: Mover, *, close: Callable[[], None]) -> None:
+        self._controller = controller
+        self._close = close
+        self._is_executing = threading.Lock()
+        self._devices_in_use = threading.Lock()
+
+    def execute(self, motion: DeclaredMotion) -> MotionReport:
+        """Run the motion; see `hal.motion.Mover`."""
+        return self._alone(motion.name, lambda: self._controller.execute(motion))
+
+    def tare(self) -> Array:
+        """Zero the contact wrench; see `hal.motion.Mover`."""
+        return self._alone("tare", self._controller.tare)
+
+    def cancel(self) -> None:
+        """End the running motion."""
+        self._controller.cancel()
+
+    def state(self) -> RobotState:
+        """Newest snapshot."""
+        is_free = self._devices_in_use.acquire(blocking=False)
+        try:
+            return self._controller.state()
+        finally:
+            if is_free:
+                self._devices_in_use.release()
+
+    def close(self) -> None:
+        """Stop the arm and end the control thread."""
+        self._close()
+
+    def _alone(self, name: str, work: Callable[[], T]) -> T:
+        if not self._is_executing.acquire(blocking=False):
+            raise MotionRefused(f"motion {name!r} refused: another motion runs", hint="wait for it or cancel it")
+        try:
+            if not self._devices_in_use.acquire(timeout=STATE_WAIT_S):
+                raise MotionRefused(
+                    f"motion {name!r} refused: the state cannot be read", hint="a device hangs; see GET /v1/devices"
+                )
+            try:
+                return work()
+            finally:
+                self._devices_in_use.release()
+        finally:
+            self._is_executing.release()
+
+
+def start_controller(
+    cell: Cell, devices: Mapping[str, Any], *, clock: Clock, is_latched: Callable[[], bool]
+) -> MotionPort:
     """The control thread over the first arm, gripper, force/torque and touch sensor and all proximity sensors.
 
     Raises:
@@ -19,41 +84,63 @@ def start_controller(cell: Cell, devices: Mapping[str, Any], *, clock: Clock, is
     """
     from manipulation.control import Controller
 
-    wrist = _one(cell, devices, DeviceKind.FORCE_TORQUE)
-    record = cell.calibration_of(wrist.name)
-    if record.mount is None or record.load is None:
+    gripper = _first(cell, devices, DeviceKind.GRIPPER)
+    if gripper is None:
         raise ConfigError(
-            f"the calibration record of {wrist.name} has no mount or no load",
-            hint="add [mount] and [load] (tool mass and centre) to it",
-            key=f"devices.{wrist.name}.mount.calibration",
+            f"{cell.path}: a cell with an arm needs a gripper",
+            hint='add [devices.gripper] with kind = "gripper"',
+            file=str(cell.path),
+            key="devices",
         )
+    wrist = _first(cell, devices, DeviceKind.FORCE_TORQUE)
     controller = Controller(
-        _one(cell, devices, DeviceKind.ARM),
-        _one(cell, devices, DeviceKind.GRIPPER),
+        _first(cell, devices, DeviceKind.ARM),
+        gripper,
         wrist,
-        _one(cell, devices, DeviceKind.TOUCH),
+        _first(cell, devices, DeviceKind.TOUCH),
         tuple(devices[name] for name in cell.names_of(DeviceKind.PROXIMITY)),
         clock=clock,
         safety=cell.file.safety,
-        load=record.load.load(),
-        flange_from_sensor=record.mount.pose().parent_from_child,
+        load=_load(cell, wrist),
+        flange_from_sensor=_flange_from(cell, wrist),
         is_latched=is_latched,
+        flange_from_grip=_flange_from(cell, gripper),
+        rate_hz=cell.file.cell.control_rate_hz,
     )
     try:
         controller.start()
     except CellError:
         controller.close()
         raise
-    return controller
+    return MotionPort(controller, close=controller.close)
 
 
-def _one(cell: Cell, devices: Mapping[str, Any], kind: DeviceKind) -> Any:
+def _first(cell: Cell, devices: Mapping[str, Any], kind: DeviceKind) -> Any:
     names = cell.names_of(kind)
-    if not names:
+    return devices[names[0]] if names else None
+
+
+def _flange_from(cell: Cell, device: Any) -> RigidTransform:
+    """Pose of a device on the flange by its calibration record; the flange itself when it has no mount."""
+    if device is None or cell.file.devices[device.name].mount is None:
+        return identity()
+    mount = cell.calibration_of(device.name).mount
+    return identity() if mount is None else mount.pose().parent_from_child
+
+
+def _load(cell: Cell, wrist: Any) -> ToolLoad:
+    """What hangs below the force/torque sensor.
+
+    Raises:
+        ConfigError: the sensor's record does not say.
+    """
+    if wrist is None:
+        return ToolLoad(mass_kg=0.0, centre_of_mass_m=(0.0, 0.0, 0.0), bias=(0.0,) * 6)
+    record = cell.calibration_of(wrist.name)
+    if record.load is None:
         raise ConfigError(
-            f"{cell.path}: a cell with an arm needs a device of kind {kind}",
-            hint=f"add [devices.NAME] with kind = {str(kind)!r}",
-            file=str(cell.path),
-            key="devices",
+            f"the calibration record of {wrist.name} has no load",
+            hint="add [load] with mass_kg and centre_of_mass_m of the tool",
+            key=f"devices.{wrist.name}.mount.calibration",
         )
-    return devices[names[0]]
+    return record.load.load()

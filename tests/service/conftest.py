@@ -7,7 +7,12 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import httpx2
 import pytest
+
+from hal.config import load_cell
+from service.serve import Options, Panelwright
+from tests.service.verbs import OPERATIONS
 
 FAKES = Path(__file__).parent / "fakes"
 PANEL = """
@@ -65,33 +70,70 @@ def _fakes_are_installed() -> Iterator[None]:
 @pytest.fixture
 def write_cell(tmp_path: Path) -> WriteCell:
     """Writes a cell file of fakes: `write_cell(robot=True, options={"panel_lights": {...}}, mode="sim")`."""
+    return lambda **given: _write(tmp_path, **given)
 
-    def write(
-        *, robot: bool = False, options: dict[str, dict[str, object]] | None = None, mode: str = "sim", extra: str = ""
-    ) -> Path:
-        (tmp_path / "panel.toml").write_text(PANEL)
-        (tmp_path / "calibrations").mkdir(exist_ok=True)
-        lines = [
-            "schema = 1",
-            f'[cell]\nname = "fake"\nmode = "{mode}"\npanel = "panel.toml"\ncalibrations = "calibrations"\nseed = 3',
-            "[workspace]\npanel_position_m = [0.6, 0.0, 0.5]\npanel_rpy_rad = [0.0, -1.57, 0.0]",
-            "park_rad = [0.0, -1.2, 1.6, 0.0, 0.8, 0.0]",
-        ]
-        for name, kind in {**SENSORS, **(ROBOT if robot else {})}.items():
-            lines.append(f'[devices.{name}]\nkind = "{kind}"\ndriver = "fake:{kind}"')
-            given = (options or {}).get(name, {})
-            lines.append("options = { " + ", ".join(f"{k} = {_toml(v)}" for k, v in given.items()) + " }")
-            if name in MOUNTED:
-                lines.append(f'mount = {{ parent = "flange", calibration = "{name}" }}')
-                (tmp_path / "calibrations" / f"{name}.toml").write_text(MOUNT.format(name=name))
-        path = tmp_path / "cell.toml"
-        path.write_text("\n".join([*lines, extra]))
-        return path
 
-    return write
+def _write(
+    folder: Path,
+    *,
+    robot: bool = False,
+    options: dict[str, dict[str, object]] | None = None,
+    mode: str = "sim",
+    extra: str = "",
+) -> Path:
+    (folder / "panel.toml").write_text(PANEL)
+    (folder / "calibrations").mkdir(exist_ok=True)
+    lines = [
+        "schema = 1",
+        f'[cell]\nname = "fake"\nmode = "{mode}"\npanel = "panel.toml"\ncalibrations = "calibrations"\nseed = 3',
+        "[workspace]\npanel_position_m = [0.6, 0.0, 0.5]\npanel_rpy_rad = [0.0, -1.57, 0.0]",
+        "park_rad = [0.0, -1.2, 1.6, 0.0, 0.8, 0.0]",
+    ]
+    for name, kind in {**SENSORS, **(ROBOT if robot else {})}.items():
+        lines.append(f'[devices.{name}]\nkind = "{kind}"\ndriver = "fake:{kind}"')
+        given = (options or {}).get(name, {})
+        lines.append("options = { " + ", ".join(f"{k} = {_toml(v)}" for k, v in given.items()) + " }")
+        if name in MOUNTED:
+            lines.append(f'mount = {{ parent = "flange", calibration = "{name}" }}')
+            (folder / "calibrations" / f"{name}.toml").write_text(MOUNT.format(name=name))
+    path = folder / "cell.toml"
+    path.write_text("\n".join([*lines, extra]))
+    return path
 
 
 def _toml(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return repr(value) if not isinstance(value, str) else f'"{value}"'
+
+
+@pytest.fixture(scope="module")
+def write_module_cell(tmp_path_factory: pytest.TempPathFactory) -> WriteCell:
+    """`write_cell` for fixtures that live as long as a test module."""
+    folder = tmp_path_factory.mktemp("cell")
+    return lambda **given: _write(folder, **given)
+
+
+@pytest.fixture(scope="module")
+def served(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Panelwright]:
+    """A whole panelwright over a cell of fakes with a robot, inline, on free ports, with the verbs of `verbs.py`."""
+    options = Options(port=0, runs_dir=tmp_path_factory.mktemp("runs"), inline=True)
+    panelwright = Panelwright(load_cell(write_module_cell(robot=True)), options, operations=OPERATIONS)
+    panelwright.start()
+    yield panelwright
+    panelwright.close()
+
+
+@pytest.fixture
+def client(served: Panelwright) -> Iterator[httpx2.Client]:
+    """A client of `served`; everything is in order when a test begins."""
+    with httpx2.Client(base_url=served.url, timeout=30.0, trust_env=False) as http:
+        for task in http.get("/v1/tasks").json()["tasks"]:
+            if task["state"] in ("queued", "running", "cancelling"):
+                http.post(f"/v1/tasks/{task['id']}/cancel?wait_s=10")
+        served.service.lease.take_over("cleaner")
+        served.service.lease.release(served.service.lease.take_over("cleaner").token)
+        for name in served.service.cell.file.devices:
+            served.service.supervisor.connection.device(name).inject_fault(None)
+        assert http.post("/v1/stop/reset").status_code == 200
+        yield http

@@ -1,0 +1,1 @@
+"""The HTTP front: thin routers over `service.core`. The only place that knows FastAPI."""

@@ -1,0 +1,124 @@
+"""The application: routers, guard, problems, API document and web page, put together."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from pydantic import BaseModel
+from pydantic.json_schema import models_json_schema
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp
+
+from service.core import Service
+from service.http import control, devices, health, knowledge, missions, stream, tasks, verbs
+from service.http.guard import Allowed, Guard
+from service.http.health import SAFETY_NOTE, own_version
+from service.http.hub import Hub
+from service.http.metrics import Metrics
+from service.http.models import FaultRequest, LeaseRequest, ResetRequest
+from service.http.problems import Problem, install
+from service.http.readings import ReadingDesk
+from service.http.state import AppState
+
+WEB = Path(__file__).parents[1] / "web"
+DESCRIPTION = f"""
+A robot cell that inspects and works an industrial control panel.
+
+Long work is a task: the verbs answer 202 with `Location: /v1/tasks/{{id}}`, or 200 when `wait_s` was enough.
+Errors are RFC 9457 problems with `hint` and `retry`. Lengths are metres, angles radians, forces newtons.
+Poses are named `parent_from_child`; covariances are 6x6 over (dx, dy, dz, rx, ry, rz) in the parent's axes.
+
+**{SAFETY_NOTE}**
+"""
+
+
+def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
+    """The ASGI application over a service (started or still starting).
+
+    Args:
+        allowed: hosts and origins that may reach it.
+        stop_url: where the stop process listens, for clients to see.
+    """
+    state = AppState(
+        service=service,
+        stop_url=stop_url,
+        hub=Hub(),
+        metrics=Metrics(service),
+        readings=ReadingDesk(lambda: service.supervisor.connection),
+    )
+    app = FastAPI(
+        title="panelwright",
+        version=own_version(),
+        description=DESCRIPTION,
+        docs_url=None,  # their pages load scripts from elsewhere
+        redoc_url=None,
+        lifespan=_lifespan,
+    )
+    app.state.panelwright = state
+    app.state.sampler = stream.Sampler(state)
+    install(app)
+    for router in (
+        verbs.router(dict(service.operations)),
+        tasks.router,
+        devices.router,
+        knowledge.router,
+        control.router,
+        missions.router,
+        health.router,
+        stream.router,
+    ):
+        app.include_router(router)
+    app.mount("/", StaticFiles(directory=WEB, html=True), name="page")
+    bodies = [operation.request_model for operation in service.operations.values()]
+    app.openapi = lambda: _document(app, bodies)  # type: ignore[method-assign]  # the documented way to extend it
+    return Guard(app, allowed=allowed, count=state.metrics.count_answer)
+
+
+def state_of_app(guarded: ASGIApp) -> AppState:
+    """The state inside an application that `create_app` made."""
+    assert isinstance(guarded, Guard)  # noqa: S101 - only ours come here
+    state: AppState = guarded.inner.state.panelwright
+    return state
+
+
+@contextlib.asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
+    state: AppState = app.state.panelwright
+    state.hub.open(state.service.tasks)
+    probe = asyncio.create_task(state.metrics.probe_lag())
+    yield
+    probe.cancel()
+    state.hub.close()
+    state.pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _document(app: FastAPI, bodies: list[type[BaseModel]]) -> dict[str, Any]:
+    """The API document, with the schemas of bodies that strict readers parse."""
+    if app.openapi_schema:
+        return app.openapi_schema
+    document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+    models: list[type[BaseModel]] = [*dict.fromkeys(bodies), FaultRequest, LeaseRequest, ResetRequest, Problem]
+    _, extra = models_json_schema(
+        [(model, "validation") for model in models], ref_template="#/components/schemas/{model}"
+    )
+    schemas = document.setdefault("components", {}).setdefault("schemas", {})
+    for name, schema in extra.get("$defs", {}).items():
+        schemas.setdefault(name, schema)
+    _drop_unused_validation(document)
+    app.openapi_schema = document
+    return document
+
+
+def _drop_unused_validation(document: dict[str, Any]) -> None:
+    """FastAPI documents its own 422 body, which we never send."""
+    for path in document["paths"].values():
+        for operation in path.values():
+            operation.get("responses", {}).pop("422", None)
+    for name in ("HTTPValidationError", "ValidationError"):
+        document["components"]["schemas"].pop(name, None)

@@ -1,0 +1,108 @@
+"""`/v1/lease` and `/v1/stop`: who may move, and the software stop (not a safety function)."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import asdict
+from typing import Annotated
+
+from fastapi import APIRouter, Header, Request
+from fastapi import Depends as DependsOn
+
+from service.http.body import body_schema, strict_body
+from service.http.models import GrantView, LeaseRequest, LeaseView, ResetRequest, StopView
+from service.http.problems import RESPONSES
+from service.http.state import AppState, LeaseToken, State
+from service.latch import LatchState
+from service.lease import Grant
+
+router = APIRouter(prefix="/v1", responses=RESPONSES)
+OwnToken = Annotated[str, Header(alias="Lease-Token", max_length=200, description="token from POST /v1/lease")]
+HolderBody = Annotated[LeaseRequest, DependsOn(strict_body(LeaseRequest))]
+HOLDER_SCHEMA = body_schema(LeaseRequest, {"holder": "alice@console-2"}, required=True)
+
+
+@router.get("/lease", summary="Who may move", operation_id="show_lease", tags=["lease"])
+async def show_lease(state: State) -> LeaseView:
+    return _lease(state)
+
+
+@router.post(
+    "/lease", summary="Take the free lease", operation_id="acquire_lease", tags=["lease"], openapi_extra=HOLDER_SCHEMA
+)
+async def acquire_lease(state: State, request: HolderBody) -> GrantView:
+    return _grant(state.service.lease.acquire(request.holder))
+
+
+@router.post("/lease/heartbeat", summary="Renew the lease", operation_id="renew_lease", tags=["lease"])
+async def renew_lease(state: State, lease_token: OwnToken) -> GrantView:
+    return _grant(state.service.lease.heartbeat(lease_token))
+
+
+@router.post("/lease/release", summary="Give the lease back", operation_id="release_lease", tags=["lease"])
+async def release_lease(state: State, lease_token: OwnToken) -> LeaseView:
+    state.service.lease.release(lease_token)
+    return _lease(state)
+
+
+@router.post(
+    "/lease/take-over",
+    summary="Take the lease from its holder; what that one started is stopped",
+    operation_id="take_over_lease",
+    tags=["lease"],
+    openapi_extra=HOLDER_SCHEMA,
+)
+async def take_over_lease(state: State, request: HolderBody) -> GrantView:
+    return _grant(await state.in_thread(functools.partial(state.service.lease.take_over, request.holder)))
+
+
+@router.get("/stop", summary="Is the software stop latched?", operation_id="show_stop", tags=["stop"])
+async def show_stop(state: State) -> StopView:
+    return _stop(state, state.service.supervisor.latch.state())
+
+
+@router.post("/stop", summary="Stop the arm: anybody, any time, no body", operation_id="stop", tags=["stop"])
+async def stop(state: State, request: Request) -> StopView:
+    """Latches. The same on the port of the stop process (`stop_url`) is faster and works when this service hangs."""
+    peer = request.client.host if request.client is not None else "local"
+    return _stop(state, await state.in_thread(lambda: state.service.supervisor.stop(f"POST /v1/stop from {peer}")))
+
+
+@router.post(
+    "/stop/reset",
+    summary="Clear the stop; this alone moves nothing",
+    operation_id="reset_stop",
+    tags=["stop"],
+    openapi_extra=body_schema(ResetRequest, {"seen_count": 3}),
+)
+async def reset_stop(
+    state: State,
+    request: Annotated[ResetRequest, DependsOn(strict_body(ResetRequest))],
+    lease_token: LeaseToken = None,
+) -> StopView:
+    holder = state.service.lease.check(lease_token)
+    supervisor = state.service.supervisor
+    seen = supervisor.latch.state().count if request.seen_count is None else request.seen_count
+    source = f"POST /v1/stop/reset by {holder or 'nobody in particular'}"
+    return _stop(state, await state.in_thread(functools.partial(supervisor.reset, source, seen_count=seen)))
+
+
+def _lease(state: AppState) -> LeaseView:
+    holder, epoch, left_s = state.service.lease.holder()
+    return LeaseView(
+        is_held=holder is not None, holder=holder, epoch=epoch, ttl_s=state.service.lease.ttl_s, remaining_s=left_s
+    )
+
+
+def _grant(grant: Grant) -> GrantView:
+    return GrantView(is_held=True, **asdict(grant))
+
+
+def _stop(state: AppState, latch: LatchState) -> StopView:
+    return StopView(
+        is_latched=latch.is_latched,
+        count=latch.count,
+        changed_time_s=latch.time_s,
+        source=latch.source,
+        stop_url=state.stop_url,
+    )

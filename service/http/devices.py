@@ -1,0 +1,138 @@
+"""`/v1/devices`: health, newest reading, and faults for simulated devices."""
+
+from __future__ import annotations
+
+import functools
+from enum import StrEnum
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query
+from fastapi import Depends as DependsOn
+from starlette.responses import JSONResponse, Response
+
+from hal.errors import CellError, Unsupported
+from service.connection import check_name
+from service.core import Service
+from service.http.body import body_schema, strict_body
+from service.http.models import DeviceDetail, DeviceList, DeviceView, FaultRequest, HealthView, ReadingView
+from service.http.problems import RESPONSES
+from service.http.readings import as_json
+from service.http.state import LeaseToken, State
+from service.jsonable import jsonable
+
+router = APIRouter(prefix="/v1/devices", tags=["devices"], responses=RESPONSES)
+Name = Annotated[str, Path(max_length=64, examples=["wrist_camera"])]
+SECRET = ("password", "token", "key", "secret")
+
+
+class Format(StrEnum):
+    """How a reading is sent."""
+
+    JSON = "json"
+    PNG = "png"
+    NPZ = "npz"
+
+
+@router.get("", summary="All devices with their health", operation_id="list_devices")
+async def list_devices(state: State) -> DeviceList:
+    names = list(state.service.cell.file.devices)
+    return DeviceList(devices=await state.in_thread(lambda: [_view(state.service, name) for name in names]))
+
+
+@router.get("/{name}", summary="One device with capabilities and mount", operation_id="show_device")
+async def show_device(state: State, name: Name) -> DeviceDetail:
+    check_name(state.service.cell, name)
+    return await state.in_thread(functools.partial(_detail, state.service, name))
+
+
+@router.get(
+    "/{name}/reading",
+    summary="The newest reading: JSON, or PNG and npz for images and ranges",
+    operation_id="read_device",
+    response_model=ReadingView,
+    responses={200: {"content": {"image/png": {}, "application/octet-stream": {}}}},
+)
+async def read_device(
+    state: State,
+    name: Name,
+    form: Annotated[Format, Query(alias="format")] = Format.JSON,
+    max_age_s: Annotated[
+        float, Query(ge=0.0, le=60.0, allow_inf_nan=False, description="a reading so young is not read again")
+    ] = 0.0,
+) -> Response:
+    check_name(state.service.cell, name)
+    desk = state.readings
+    headers = {"Cache-Control": "no-store"}
+    if form is Format.PNG:
+        png = await state.in_thread(functools.partial(desk.png, name, max_age_s=max_age_s))
+        return Response(png, media_type="image/png", headers=headers)
+    if form is Format.NPZ:
+        npz = await state.in_thread(functools.partial(desk.npz, name, max_age_s=max_age_s))
+        disposition = {"Content-Disposition": f'attachment; filename="{name}.npz"'}
+        return Response(npz, media_type="application/octet-stream", headers={**headers, **disposition})
+    snapshot = await state.in_thread(functools.partial(desk.read, name, max_age_s=max_age_s))
+    return JSONResponse(as_json(name, state.service.cell.file.devices[name].kind, snapshot), headers=headers)
+
+
+@router.post(
+    "/{name}/fault",
+    summary="Simulated cells: begin or end a fault in a device",
+    operation_id="inject_fault",
+    openapi_extra=body_schema(FaultRequest, {"fault": "silent", "magnitude": 0.0}),
+)
+async def inject_fault(
+    state: State,
+    name: Name,
+    request: Annotated[FaultRequest, DependsOn(strict_body(FaultRequest))],
+    lease_token: LeaseToken = None,
+) -> DeviceView:
+    check_name(state.service.cell, name)
+    state.service.lease.check(lease_token)
+    return await state.in_thread(functools.partial(_inject, state.service, name, request))
+
+
+def _inject(service: Service, name: str, request: FaultRequest) -> DeviceView:
+    device = service.supervisor.connection.device(name)
+    if service.cell.file.cell.mode == "real" or not hasattr(device, "inject_fault"):
+        raise Unsupported(f"{name} is real, so faults cannot be injected", hint="use a simulated cell", device=name)
+    device.inject_fault(request.fault, magnitude=request.magnitude)
+    service.note("fault-injected", {"device": name, "fault": request.fault, "magnitude": request.magnitude})
+    return _view(service, name)
+
+
+def _view(service: Service, name: str) -> DeviceView:
+    section = service.cell.file.devices[name]
+    return DeviceView(
+        name=name,
+        kind=section.kind,
+        driver=section.driver,
+        health=_health(service, name),
+        reading_url=f"/v1/devices/{name}/reading",
+    )
+
+
+def _health(service: Service, name: str) -> HealthView:
+    """A device that cannot be asked is not connected; that is an answer, not an error."""
+    try:
+        return HealthView(**jsonable(service.supervisor.connection.device(name).health()))
+    except CellError as error:
+        return HealthView(connected=False, quality="invalid", cause="comm", detail=error.what)
+
+
+def _detail(service: Service, name: str) -> DeviceDetail:
+    section = service.cell.file.devices[name]
+    capabilities: dict[str, Any] | None = None
+    try:
+        capabilities = jsonable(service.supervisor.connection.device(name).capabilities())
+    except CellError:
+        capabilities = None  # the health says why
+    return DeviceDetail(
+        **_view(service, name).model_dump(),
+        capabilities=capabilities,
+        mount=section.mount.model_dump() if section.mount is not None else None,
+        options={key: _shown(key, value) for key, value in section.options.items()},
+    )
+
+
+def _shown(key: str, value: Any) -> Any:
+    return "***" if any(word in key.lower() for word in SECRET) else jsonable(value)

@@ -1,0 +1,119 @@
+"""What a request must pass before any route sees it: known host, own origin, small body."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from fastapi import FastAPI
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.http.problems import problem_response
+
+MAX_BODY_BYTES = 1_000_000
+SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
+SECURITY_HEADERS = [
+    (b"x-content-type-options", b"nosniff"),
+    (b"x-frame-options", b"DENY"),
+    (b"referrer-policy", b"no-referrer"),
+    (
+        b"content-security-policy",
+        b"default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; connect-src 'self' "
+        b"http://127.0.0.1:* http://localhost:*; frame-ancestors 'none'",
+    ),
+]
+
+
+class BodyTooLarge(Exception):
+    """More bytes arrived than a request may have."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Allowed:
+    """Names under which this service is reached.
+
+    `hosts` may stand in the Host header (without port): a page that a stranger's name server points at us is refused.
+    `origins` may write from a browser.
+    """
+
+    hosts: frozenset[str]
+    origins: frozenset[str]
+
+
+class Guard:
+    """ASGI middleware around the app."""
+
+    def __init__(self, app: FastAPI, *, allowed: Allowed, count: Callable[[int], None]) -> None:
+        self.inner = app
+        self._app: ASGIApp = app
+        self._allowed = allowed
+        self._count = count
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Refuse, or pass on with a counted body and security headers."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        refusal = self._refusal(scope, headers)
+        if refusal is not None and scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008, "reason": refusal[1]})
+            return
+        if refusal is not None:
+            status, what, hint = refusal
+            self._count(status)
+            await problem_response(status, "request-refused", what, hint=hint)(scope, receive, send)
+            return
+        await self._app(scope, _limited(receive), self._sender(send))
+
+    def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str, str] | None:
+        if _hostname(headers.get("host", "")) not in self._allowed.hosts:
+            return 400, "this service is not known under that Host", "use the address that `panelwright serve` printed"
+        writes = scope["type"] == "websocket" or scope["method"] not in SAFE_METHODS
+        if writes and not self._is_own(headers):
+            return 403, "requests from other web pages are refused", "use the page of this service, or no browser"
+        length = headers.get("content-length", "0")
+        if not length.isascii() or not length.isdigit():
+            return 400, "Content-Length is not a number", "send a correct request"
+        if int(length[:20]) > MAX_BODY_BYTES:
+            return 413, f"a body may have at most {MAX_BODY_BYTES} bytes", "send less"
+        return None
+
+    def _is_own(self, headers: Headers) -> bool:
+        if headers.get("sec-fetch-site", "none") not in ("none", "same-origin"):
+            return False
+        origin = headers.get("origin")
+        return origin is None or origin in self._allowed.origins
+
+    def _sender(self, send: Send) -> Send:
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                self._count(message["status"])
+                have = {name.lower() for name, _ in message["headers"]}
+                extra = [pair for pair in SECURITY_HEADERS if pair[0] not in have]
+                message = {**message, "headers": [*message["headers"], *extra]}
+            await send(message)
+
+        return with_headers
+
+
+def _limited(receive: Receive) -> Receive:
+    """Count what really arrives: a chunked body announces no length."""
+    total = 0
+
+    async def counted() -> Message:
+        nonlocal total
+        message = await receive()
+        if message["type"] == "http.request":
+            total += len(message.get("body", b""))
+            if total > MAX_BODY_BYTES:
+                raise BodyTooLarge
+        return message
+
+    return counted
+
+
+def _hostname(host: str) -> str:
+    name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
+    return name.strip("[]").lower()

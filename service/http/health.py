@@ -1,0 +1,73 @@
+"""`/healthz`, `/readyz`, `/metrics`, `/v1/info`: up before the hardware is."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+
+from fastapi import APIRouter
+from starlette.responses import JSONResponse, Response
+
+from service.http.models import HealthzView, InfoView, ProcessView, ReadyView
+from service.http.problems import RESPONSES
+from service.http.state import State
+
+router = APIRouter(tags=["health"], responses=RESPONSES)
+SAFETY_NOTE = "The software stop is not a safety function; an external hardware stop is required."
+
+
+@router.get("/healthz", summary="The service answers", operation_id="healthz")
+async def healthz() -> HealthzView:
+    return HealthzView()
+
+
+@router.get(
+    "/readyz",
+    summary="The cell is up",
+    operation_id="readyz",
+    responses={503: {"description": "not yet, or not any more", "model": ReadyView}},
+    response_model=ReadyView,
+)
+async def readyz(state: State) -> JSONResponse:
+    supervisor = state.service.supervisor
+    processes = [ProcessView(**asdict(process)) for process in supervisor.processes()]
+    view = ReadyView(is_ready=supervisor.is_ready, processes=processes)
+    return JSONResponse(view.model_dump(mode="json"), 200 if supervisor.is_ready else 503)
+
+
+@router.get(
+    "/metrics",
+    summary="Prometheus metrics",
+    operation_id="metrics",
+    response_class=Response,
+    responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
+)
+async def metrics(state: State) -> Response:
+    return Response(state.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+@router.get("/v1/info", summary="What this is", operation_id="info")
+async def info(state: State) -> InfoView:
+    file = state.service.cell.file
+    return InfoView(
+        name="panelwright",
+        version=own_version(),
+        cell=file.cell.name,
+        mode=file.cell.mode,
+        panel=state.service.cell.panel.name,
+        seed=file.cell.seed,
+        verbs=list(state.service.operations),
+        stop_url=state.stop_url,
+        uptime_s=time.monotonic() - state.started_s,
+        event_loop_lag_p99_s=state.metrics.lag_p99_s(),
+        safety_note=SAFETY_NOTE,
+    )
+
+
+def own_version() -> str:
+    """The installed version, or `unknown` in a bare checkout."""
+    try:
+        return version("panelwright")
+    except PackageNotFoundError:
+        return "unknown"

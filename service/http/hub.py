@@ -1,0 +1,67 @@
+"""Wakes waiting requests when a task changes: from worker threads into the event loop."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from service.task_model import Task
+from service.tasks import TaskStore
+
+
+class Hub:
+    """One subscription to all tasks, shared by all waiting requests of the event loop."""
+
+    def __init__(self) -> None:
+        self._watchers: set[asyncio.Event] = set()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._unsubscribe: Callable[[], None] = lambda: None
+        self.is_closing = False
+
+    def open(self, tasks: TaskStore) -> None:
+        """Begin; call inside the event loop."""
+        self._loop = asyncio.get_running_loop()
+        self._unsubscribe = tasks.subscribe(self._changed)
+
+    def close(self) -> None:
+        """Let every stream end; from any thread."""
+        self.is_closing = True
+        self._unsubscribe()
+        self._call(self._wake)
+
+    @contextmanager
+    def watch(self) -> Iterator[asyncio.Event]:
+        """An event that is set after each change; the watcher clears it before it looks."""
+        event = asyncio.Event()
+        self._watchers.add(event)
+        try:
+            yield event
+        finally:
+            self._watchers.discard(event)
+
+    async def wait_for(self, task: Task, timeout_s: float) -> bool:
+        """Wait until the task has ended, without a thread; tells whether it has."""
+        loop = asyncio.get_running_loop()
+        end_s = loop.time() + timeout_s
+        with self.watch() as changed:
+            while not task.state.is_final and not self.is_closing:
+                changed.clear()
+                if task.state.is_final:
+                    break
+                try:
+                    await asyncio.wait_for(changed.wait(), end_s - loop.time())
+                except TimeoutError:
+                    break
+        return task.state.is_final
+
+    def _changed(self, _task: Task) -> None:
+        self._call(self._wake)
+
+    def _call(self, what: Callable[[], None]) -> None:
+        if self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(what)
+
+    def _wake(self) -> None:
+        for event in self._watchers:
+            event.set()

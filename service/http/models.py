@@ -1,0 +1,252 @@
+"""What the API answers with. Lengths in metres, angles in radians, forces in newtons, the unit in the name."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, Field
+
+from hal.devices import DeviceKind, Fault
+from hal.strict import Strict
+from service.jsonable import jsonable
+from service.task_model import Task, TaskEvent, TaskState
+
+Finite = Annotated[float, Field(ge=-1e9, le=1e9)]
+Holder = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[ -~]+$", examples=["alice@console-2"])]
+
+
+class ArtefactView(BaseModel):
+    """A file that a task left."""
+
+    name: str
+    media_type: str
+    size_bytes: int
+    url: str
+
+
+class TaskView(BaseModel):
+    """A task. `result` is there when it succeeded, `problem` when it failed or was cancelled."""
+
+    id: str
+    verb: str
+    state: TaskState
+    fraction: Annotated[float, Field(ge=0, le=1)]
+    step: str
+    request: dict[str, Any]
+    result: Any = None
+    problem: dict[str, Any] | None = None
+    artefacts: list[ArtefactView] = []
+    holder: str | None = None
+    moves: bool = True
+    created_s: Annotated[float, Field(description="wall time, seconds since 1970")]
+    started_s: float | None = None
+    ended_s: float | None = None
+    events_url: str
+
+    @classmethod
+    def of(cls, task: Task) -> TaskView:
+        """The view of a task."""
+        return cls(
+            id=task.id,
+            verb=task.verb,
+            state=task.state,
+            fraction=task.fraction,
+            step=task.step,
+            request=task.request,
+            result=task.result,
+            problem=task.problem,
+            artefacts=[
+                ArtefactView(
+                    name=item.name,
+                    media_type=item.media_type,
+                    size_bytes=item.size_bytes,
+                    url=f"/v1/tasks/{task.id}/artefacts/{item.name}",
+                )
+                for item in task.artefacts
+            ],
+            holder=task.holder,
+            moves=task.moves,
+            created_s=task.created_s,
+            started_s=task.started_s,
+            ended_s=task.ended_s,
+            events_url=f"/v1/tasks/{task.id}/events",
+        )
+
+
+class TaskList(BaseModel):
+    """Kept tasks, newest first."""
+
+    tasks: list[TaskView]
+
+
+def event_data(event: TaskEvent) -> dict[str, Any]:
+    """An event as it goes over the wire."""
+    data: dict[str, Any] = jsonable(event)
+    return data
+
+
+class HealthView(BaseModel):
+    """What a device's owner knows about it."""
+
+    connected: bool
+    quality: str
+    cause: str
+    detail: str
+    samples: int = 0
+    errors: int = 0
+    reconnects: int = 0
+    last_sample_s: float | None = None
+
+
+class DeviceView(BaseModel):
+    """A device of the cell file and its health."""
+
+    name: str
+    kind: DeviceKind
+    driver: str
+    health: HealthView
+    reading_url: str
+
+
+class DeviceList(BaseModel):
+    """All devices, in the order of the cell file."""
+
+    devices: list[DeviceView]
+
+
+class DeviceDetail(DeviceView):
+    """A device with its capabilities and where it sits."""
+
+    capabilities: dict[str, Any] | None = None
+    mount: dict[str, Any] | None = None
+    options: dict[str, Any] = {}
+
+
+class ReadingView(BaseModel):
+    """A reading with its stamps; age decides whether it is good, not the success of this call."""
+
+    device: str
+    kind: DeviceKind
+    value: Any
+    host_time_s: Annotated[float, Field(description="on the cell's clock")]
+    device_time_s: float | None
+    age_s: float | None
+    sequence: int
+    quality: str
+    cause: str
+
+
+class FaultRequest(Strict):
+    """Begin a fault in a simulated device, or end it with null."""
+
+    fault: Fault | None = None
+    magnitude: Finite = 0.0
+
+
+class FrameView(BaseModel):
+    """Pose of `child` in `parent`; covariance over (dx, dy, dz, rx, ry, rz), m and rad, in the parent's axes."""
+
+    parent: str
+    child: str
+    translation_m: list[float]
+    quaternion_xyzw: list[float]
+    covariance: list[list[float]] | None = None
+    source: Literal["calibration", "measured", "estimated"]
+
+
+class FrameList(BaseModel):
+    """What the cell knows about where things are."""
+
+    frames: list[FrameView]
+
+
+class LeaseRequest(Strict):
+    """Who wants the cell."""
+
+    holder: Holder
+
+
+class LeaseView(BaseModel):
+    """Who may move. `is_held` false: everybody may."""
+
+    is_held: bool
+    holder: str | None
+    epoch: int
+    ttl_s: float
+    remaining_s: float
+
+
+class GrantView(LeaseView):
+    """The lease as its new holder gets it; send `token` as `Lease-Token` and renew it in time."""
+
+    token: str
+
+
+class StopView(BaseModel):
+    """The software stop. Not a safety function: a hardware stop is required."""
+
+    is_latched: bool
+    count: Annotated[int, Field(description="rises with each change")]
+    changed_time_s: float
+    source: str
+    stop_url: Annotated[str, Field(description="port of the stop process; POST there when every millisecond counts")]
+
+
+class ResetRequest(Strict):
+    """Clear the latch. `seen_count`: refuse if somebody stopped after the caller looked."""
+
+    seen_count: Annotated[int, Field(ge=0, lt=2**63)] | None = None
+
+
+class MissionView(BaseModel):
+    """A finished mission's folder."""
+
+    name: str
+    report_url: str | None
+    json_url: str | None
+    files: list[str]
+
+
+class MissionList(BaseModel):
+    """Missions with reports, newest first."""
+
+    missions: list[MissionView]
+
+
+class ProcessView(BaseModel):
+    """A supervised process."""
+
+    name: str
+    pid: int | None
+    is_alive: bool
+    restarts: int
+    detail: str
+
+
+class ReadyView(BaseModel):
+    """May work begin?"""
+
+    is_ready: bool
+    processes: list[ProcessView]
+
+
+class HealthzView(BaseModel):
+    """The service answers."""
+
+    status: Literal["up"] = "up"
+
+
+class InfoView(BaseModel):
+    """What this is."""
+
+    name: str
+    version: str
+    cell: str
+    mode: str
+    panel: str
+    seed: int
+    verbs: list[str]
+    stop_url: str
+    uptime_s: float
+    event_loop_lag_p99_s: float
+    safety_note: str

@@ -1,0 +1,155 @@
+"""Every error leaves as an RFC 9457 problem, and none repeats what the caller sent."""
+
+from __future__ import annotations
+
+import json
+import logging
+from http import HTTPStatus
+from typing import Annotated, Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from hal.errors import CellError, Retry
+from service.errors import Busy
+from service.problem import problem_of, status_of
+
+MEDIA = "application/problem+json"
+log = logging.getLogger(__name__)
+
+
+class FieldFault(BaseModel):
+    """One thing that is wrong with a request; `path` says where, e.g. `body.actions.0.object`."""
+
+    path: str
+    message: str
+
+
+class Problem(BaseModel):
+    """RFC 9457 problem with what to do about it."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "type": "urn:panelwright:device-timeout",
+                "title": "Device timeout",
+                "status": 504,
+                "detail": "wrist_ft silent for 0.50 s; last good reading 3.2 s old",
+                "hint": "check power and cable; another program may hold the port",
+                "retry": "safe",
+                "details": {"device": "wrist_ft"},
+            }
+        }
+    )
+
+    type: Annotated[str, Field(description="stable name of the kind of problem")]
+    title: str
+    status: int
+    detail: Annotated[str, Field(description="what happened this time")]
+    hint: Annotated[str, Field(description="what to do about it")]
+    retry: Annotated[Retry, Field(description="may the same request be sent again?")]
+    details: dict[str, Any] = {}
+    errors: list[FieldFault] = []
+
+
+class ProblemResponse(Response):
+    """A problem document."""
+
+    media_type = MEDIA
+
+
+def problem_response(
+    status: int,
+    name: str,
+    what: str,
+    *,
+    hint: str,
+    retry: Retry = Retry.AFTER_FIX,
+    faults: list[FieldFault] | None = None,
+    headers: dict[str, str] | None = None,
+) -> ProblemResponse:
+    """A problem that is no `CellError`."""
+    body = Problem(
+        type=f"urn:panelwright:{name}",
+        title=name.replace("-", " ").capitalize(),
+        status=status,
+        detail=what,
+        hint=hint,
+        retry=retry,
+        errors=faults or [],
+    )
+    return ProblemResponse(body.model_dump_json(), status_code=status, headers=headers)
+
+
+def error_response(error: CellError) -> ProblemResponse:
+    """The problem that a `CellError` is."""
+    headers = {"Retry-After": "1"} if isinstance(error, Busy) or error.retry is Retry.SAFE else None
+    return ProblemResponse(json.dumps(problem_of(error)), status_code=status_of(error), headers=headers)
+
+
+def refuse_body(status: int, what: str, *, hint: str, faults: list[FieldFault] | None = None) -> BadBody:
+    """For body readers: an exception that becomes a problem."""
+    return BadBody(status, what, hint, faults or [])
+
+
+class BadBody(Exception):
+    """The request's body was not understood."""
+
+    def __init__(self, status: int, what: str, hint: str, faults: list[FieldFault]) -> None:
+        super().__init__(what)
+        self.status = status
+        self.what = what
+        self.hint = hint
+        self.faults = faults
+
+
+def install(app: FastAPI) -> None:
+    """Register the handlers."""
+    from service.http.guard import BodyTooLarge
+
+    @app.exception_handler(CellError)
+    async def _cell_error(_request: Request, error: CellError) -> Response:
+        return error_response(error)
+
+    @app.exception_handler(BadBody)
+    async def _bad_body(_request: Request, error: BadBody) -> Response:
+        return problem_response(error.status, "bad-body", error.what, hint=error.hint, faults=error.faults)
+
+    @app.exception_handler(BodyTooLarge)
+    async def _too_large(_request: Request, _error: BodyTooLarge) -> Response:
+        return problem_response(413, "body-too-large", "the body is too big", hint="send less than 1 MB")
+
+    @app.exception_handler(RequestValidationError)
+    async def _invalid(_request: Request, error: RequestValidationError) -> Response:
+        # pydantic's own text would echo the input, which may be huge or hostile
+        faults = [FieldFault(path=path_of(item["loc"]), message=item["msg"]) for item in error.errors()[:20]]
+        what = f"{faults[0].path}: {faults[0].message}" if faults else "the request is not valid"
+        return problem_response(422, "invalid-request", what, hint="see /openapi.json", faults=faults)
+
+    @app.exception_handler(HTTPException)
+    async def _http(_request: Request, error: HTTPException) -> Response:
+        name = HTTPStatus(error.status_code).phrase.lower().replace(" ", "-")
+        headers = dict(error.headers) if error.headers else None
+        return problem_response(error.status_code, name, str(error.detail), hint="see /openapi.json", headers=headers)
+
+    @app.exception_handler(Exception)
+    async def _defect(request: Request, error: Exception) -> Response:
+        log.error("%s %s failed by a defect", request.method, request.url.path, exc_info=error)
+        what = f"the service failed by a defect: {type(error).__name__}"
+        return problem_response(500, "defect", what, hint="the log has more; please report it", retry=Retry.NEVER)
+
+
+def path_of(location: tuple[int | str, ...]) -> str:
+    """A key path for people; parts that the caller chose are shortened."""
+    return ".".join(str(part)[:40] for part in location) or "body"
+
+
+RESPONSES: dict[int | str, dict[str, Any]] = {
+    "default": {
+        "description": "Problem (RFC 9457)",
+        "content": {MEDIA: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+    }
+}

@@ -1,0 +1,87 @@
+"""Runs the application with uvicorn, in the main thread or beside it, and ends it in bounded time."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Callable
+from types import FrameType
+
+import uvicorn
+from starlette.types import ASGIApp
+
+GRACE_S = 2
+LOCAL_NAMES = ("127.0.0.1", "localhost", "::1")
+
+
+class _Server(uvicorn.Server):
+    """uvicorn that tells when a signal comes: streams must be told to end, or it would wait for them."""
+
+    def __init__(self, config: uvicorn.Config, on_exit: Callable[[str], None]) -> None:
+        super().__init__(config)
+        self._on_exit = on_exit
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Called by uvicorn for SIGINT and SIGTERM."""
+        self._on_exit("Ctrl-C" if sig == 2 else f"signal {sig}")
+        super().handle_exit(sig, frame)
+
+
+class HttpServer:
+    """One HTTP server on a bound socket.
+
+    Args:
+        on_exit: called first when a signal asks for the end (or `stop` does); stops the arm and ends streams.
+    """
+
+    def __init__(self, app: ASGIApp, listener: socket.socket, *, on_exit: Callable[[str], None]) -> None:
+        config = uvicorn.Config(
+            app,
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            timeout_graceful_shutdown=GRACE_S,
+            timeout_keep_alive=10,
+            limit_concurrency=400,
+            h11_max_incomplete_event_size=65_536,
+            ws_max_size=65_536,
+        )
+        self._listener = listener
+        self._on_exit = on_exit
+        self._server = _Server(config, on_exit)
+        self._thread: threading.Thread | None = None
+
+    @property
+    def is_up(self) -> bool:
+        """Does it answer?"""
+        return bool(self._server.started)
+
+    def run(self) -> None:
+        """Serve in this (the main) thread until a signal or `stop`."""
+        self._server.run(sockets=[self._listener])
+
+    def start(self) -> None:
+        """Serve in a thread of its own."""
+        self._thread = threading.Thread(target=self.run, name="http", daemon=True)
+        self._thread.start()
+        pause = threading.Event()
+        while not self._server.started and self._thread.is_alive():
+            pause.wait(0.01)
+
+    def stop(self) -> None:
+        """End it; from any thread. A second call does nothing."""
+        if not self._server.should_exit:
+            self._on_exit("the server ends")
+            self._server.should_exit = True
+        if self._thread is not None:
+            self._thread.join(GRACE_S + 3.0)
+
+
+def names_of(host: str, port: int) -> tuple[frozenset[str], frozenset[str]]:
+    """Hosts and origins under which a server on `host` and `port` is reached."""
+    hosts = {*LOCAL_NAMES, host.lower()}
+    return frozenset(hosts), frozenset(f"http://{_in_url(name)}:{port}" for name in hosts)
+
+
+def _in_url(name: str) -> str:
+    return f"[{name}]" if ":" in name else name

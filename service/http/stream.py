@@ -1,0 +1,106 @@
+"""`WS /v1/stream`: joints, wrench, contacts and frames many times a second, sampled and encoded once for all."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from typing import Any
+
+from fastapi import APIRouter, WebSocket, WebSocketDisconnect
+
+from hal.errors import CellError
+from hal.geometry import to_json
+from hal.motion import RobotState
+from service.http.state import AppState, socket_state
+from service.jsonable import jsonable
+
+router = APIRouter()
+RATE_HZ = 20.0
+MAX_CLIENTS = 100
+log = logging.getLogger(__name__)
+
+
+class Sampler:
+    """Reads the state while anybody listens. A slow listener misses samples; it never holds up another."""
+
+    def __init__(self, state: AppState) -> None:
+        self._state = state
+        self._listeners: set[asyncio.Queue[str]] = set()
+        self._task: asyncio.Task[None] | None = None
+
+    def join(self) -> asyncio.Queue[str]:
+        """A mailbox that holds the newest sample."""
+        mailbox: asyncio.Queue[str] = asyncio.Queue(maxsize=1)
+        self._listeners.add(mailbox)
+        if self._task is None or self._task.done():
+            self._task = asyncio.create_task(self._run())
+        return mailbox
+
+    def leave(self, mailbox: asyncio.Queue[str]) -> None:
+        """No more samples, please."""
+        self._listeners.discard(mailbox)
+
+    def __len__(self) -> int:
+        return len(self._listeners)
+
+    async def _run(self) -> None:
+        loop = asyncio.get_running_loop()
+        while self._listeners:
+            next_s = loop.time() + 1.0 / RATE_HZ
+            text = json.dumps(await self._state.in_thread(self._sample))
+            for mailbox in self._listeners:
+                if mailbox.full():
+                    mailbox.get_nowait()
+                mailbox.put_nowait(text)
+            await asyncio.sleep(max(0.0, next_s - loop.time()))
+
+    def _sample(self) -> dict[str, Any]:
+        service = self._state.service
+        sample: dict[str, Any] = {"is_latched": service.supervisor.latch.is_set()}
+        try:
+            sample |= _shown(service.supervisor.connection.mover.state())
+        except CellError as error:
+            sample["problem"] = error.what
+        panel = service.memory.base_from_panel
+        sample["base_from_panel"] = to_json(panel.parent_from_child) if panel is not None else None
+        return sample
+
+
+def _shown(state: RobotState) -> dict[str, Any]:
+    data: dict[str, Any] = jsonable(state)
+    return data
+
+
+@router.websocket("/v1/stream")
+async def stream(socket: WebSocket) -> None:
+    state = socket_state(socket)
+    sampler: Sampler = socket.app.state.sampler
+    if len(sampler) >= MAX_CLIENTS:
+        await socket.close(1013, "too many listeners")
+        return
+    await socket.accept()
+    mailbox = sampler.join()
+    watch = asyncio.create_task(_until_gone(socket))
+    try:
+        while not state.hub.is_closing and not watch.done():
+            await _forward(socket, mailbox)
+        await socket.close(1001)
+    except (WebSocketDisconnect, RuntimeError):
+        pass  # the listener is gone
+    finally:
+        sampler.leave(mailbox)
+        watch.cancel()
+
+
+async def _forward(socket: WebSocket, mailbox: asyncio.Queue[str]) -> None:
+    try:
+        await socket.send_text(await asyncio.wait_for(mailbox.get(), 0.5))
+    except TimeoutError:
+        return
+
+
+async def _until_gone(socket: WebSocket) -> None:
+    """Read and drop what a listener says, to notice when it leaves."""
+    while (await socket.receive())["type"] != "websocket.disconnect":
+        pass

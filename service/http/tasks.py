@@ -1,0 +1,103 @@
+"""`/v1/tasks`: watch, cancel, fetch what was left."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import json
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+from fastapi import APIRouter, Header, Path, Query
+from starlette.responses import FileResponse, StreamingResponse
+
+from service.http.hub import Hub
+from service.http.models import TaskList, TaskView, event_data
+from service.http.problems import RESPONSES
+from service.http.state import LeaseToken, State
+from service.http.verbs import Wait
+from service.task_model import Task, TaskState
+
+router = APIRouter(prefix="/v1/tasks", tags=["tasks"], responses=RESPONSES)
+TaskId = Annotated[str, Path(max_length=64, examples=["3f9c2a7be01d4c55"])]
+KEEPALIVE_S = 10.0
+
+
+@router.get("", summary="Kept tasks, newest first", operation_id="list_tasks")
+async def list_tasks(
+    state: State,
+    task_state: Annotated[TaskState | None, Query(alias="state")] = None,
+    limit: Annotated[int, Query(ge=1, le=500)] = 100,
+) -> TaskList:
+    tasks = [task for task in state.service.tasks.all() if task_state in (None, task.state)]
+    return TaskList(tasks=[TaskView.of(task) for task in tasks[:limit]])
+
+
+@router.get("/{task_id}", summary="One task", operation_id="show_task")
+async def show_task(state: State, task_id: TaskId, wait_s: Wait = 0.0) -> TaskView:
+    task = state.service.tasks.get(task_id)
+    if wait_s > 0.0:
+        await state.hub.wait_for(task, wait_s)
+    return TaskView.of(task)
+
+
+@router.post("/{task_id}/cancel", summary="Stop the arm, then end the task", operation_id="cancel_task")
+async def cancel_task(state: State, task_id: TaskId, lease_token: LeaseToken = None, wait_s: Wait = 0.0) -> TaskView:
+    """Anybody may cancel: ending a motion is always allowed. Answers with the task as it is after `wait_s`."""
+    del lease_token  # accepted so that clients may send it with everything
+    task = await state.in_thread(functools.partial(state.service.tasks.cancel, task_id, reason="asked for over HTTP"))
+    if wait_s > 0.0:
+        await state.hub.wait_for(task, wait_s)
+    return TaskView.of(task)
+
+
+@router.get(
+    "/{task_id}/events",
+    summary="Progress as server-sent events; resume with Last-Event-ID",
+    operation_id="watch_task",
+    response_class=StreamingResponse,
+    responses={
+        200: {
+            "description": "one event a change: `id` counts up, `event` is state, progress or artefact, `data` is "
+            "JSON; the stream ends with the task",
+            "content": {"text/event-stream": {"schema": {"type": "string"}}},
+        }
+    },
+)
+async def watch_task(
+    state: State,
+    task_id: TaskId,
+    last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", max_length=20)] = None,
+) -> StreamingResponse:
+    task = state.service.tasks.get(task_id)
+    seen = int(last_event_id) if last_event_id and last_event_id.isascii() and last_event_id.isdigit() else 0
+    headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+    return StreamingResponse(_events(state.hub, task, seen), media_type="text/event-stream", headers=headers)
+
+
+@router.get(
+    "/{task_id}/artefacts/{name}",
+    summary="A file that the task left",
+    operation_id="fetch_artefact",
+    response_class=FileResponse,
+    responses={200: {"content": {"application/octet-stream": {}}}},
+)
+async def fetch_artefact(state: State, task_id: TaskId, name: Annotated[str, Path(max_length=100)]) -> FileResponse:
+    path, artefact = state.service.tasks.artefact_path(task_id, name)
+    return FileResponse(path, media_type=artefact.media_type, filename=name, content_disposition_type="inline")
+
+
+async def _events(hub: Hub, task: Task, seen: int) -> AsyncIterator[str]:
+    with hub.watch() as changed:
+        while True:
+            changed.clear()
+            is_over = task.state.is_final or hub.is_closing  # looked at before the events, so that none is missed
+            for event in task.events_after(seen):
+                seen = event.sequence
+                yield f"id: {seen}\nevent: {event.kind}\ndata: {json.dumps(event_data(event))}\n\n"
+            if is_over:
+                return
+            try:
+                await asyncio.wait_for(changed.wait(), KEEPALIVE_S)
+            except TimeoutError:
+                yield ": still here\n\n"

@@ -1,0 +1,75 @@
+"""`POST /v1/<verb>`: start an operation as a task, and wait for it a little if asked."""
+
+from __future__ import annotations
+
+import functools
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Response, params
+from fastapi import Depends as DependsOn
+from starlette.responses import JSONResponse
+
+from service.http.body import body_schema, strict_body
+from service.http.models import TaskView
+from service.http.problems import MEDIA, RESPONSES
+from service.http.state import IdempotencyKey, LeaseToken, State
+from service.operations.context import Operation
+from service.task_model import Task, TaskState
+
+Wait = Annotated[
+    float, Query(ge=0.0, le=30.0, allow_inf_nan=False, description="wait so long for the end before answering")
+]
+
+
+def router(operations: dict[str, Operation]) -> APIRouter:
+    """One route an operation."""
+    routes = APIRouter(tags=["verbs"], responses=RESPONSES)
+    for operation in operations.values():
+        _add(routes, operation)
+    return routes
+
+
+def _add(routes: APIRouter, operation: Operation) -> None:
+    body: params.Depends = DependsOn(strict_body(operation.request_model))
+
+    async def start(
+        state: State,
+        request: Any = body,
+        wait_s: Wait = 0.0,
+        lease_token: LeaseToken = None,
+        idempotency_key: IdempotencyKey = None,
+    ) -> Response:
+        submit = functools.partial(
+            state.service.submit, operation.name, request, lease_token=lease_token, key=idempotency_key
+        )
+        task = await state.in_thread(submit)
+        if wait_s > 0.0:
+            await state.hub.wait_for(task, wait_s)
+        return answer(task)
+
+    name = operation.name.replace("-", "_")
+    routes.add_api_route(
+        f"/v1/{operation.name}",
+        start,
+        methods=["POST"],
+        name=name,
+        operation_id=name,
+        summary=operation.summary,
+        response_model=TaskView,
+        responses={
+            200: {"description": "the task has ended in time; `result` holds the answer", "model": TaskView},
+            202: {"description": "the task goes on; `Location` says where to look", "model": TaskView},
+        },
+        openapi_extra=body_schema(operation.request_model, operation.example),
+    )
+
+
+def answer(task: Task) -> Response:
+    """200 with the result, 202 while it goes on, and the problem itself when it failed."""
+    location = {"Location": f"/v1/tasks/{task.id}"}
+    if task.state is TaskState.SUCCEEDED:
+        return JSONResponse(TaskView.of(task).model_dump(mode="json"), 200, headers=location)
+    if not task.state.is_final:
+        return JSONResponse(TaskView.of(task).model_dump(mode="json"), 202, headers={**location, "Retry-After": "1"})
+    problem = task.problem or {"type": "urn:panelwright:cancelled", "title": "Cancelled", "status": 409}
+    return JSONResponse({**problem, "instance": location["Location"]}, problem["status"], location, media_type=MEDIA)

@@ -1,0 +1,173 @@
+"""A whole panelwright: service, HTTP server, stop port. `panelwright serve` and `panelwright demo` run this."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING
+
+from hal.config import Cell
+from hal.errors import CellError
+from service.core import Service
+from service.operations.context import Operation
+from service.stop_host import bound_socket
+
+if TYPE_CHECKING:
+    from service.http.server import HttpServer
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """How to serve. `stop_port` None: the port after `port` (any free one when `port` is 0)."""
+
+    host: str = "127.0.0.1"
+    port: int = 8420
+    stop_port: int | None = None
+    runs_dir: Path = Path("runs")
+    inline: bool = False
+
+
+class Panelwright:
+    """Everything that `serve` starts, with one way up and one way down.
+
+    Raises:
+        ConfigError: a port is in use.
+    """
+
+    def __init__(self, cell: Cell, options: Options, *, operations: Mapping[str, Operation] | None = None) -> None:
+        listener = bound_socket(options.host, options.port)
+        self.port: int = listener.getsockname()[1]
+        stop_port = options.stop_port if options.stop_port is not None else (options.port and self.port + 1)
+        try:
+            stop_listener = bound_socket(options.host, stop_port)
+        except CellError:
+            listener.close()
+            raise
+        self.host = options.host
+        self.stop_port: int = stop_listener.getsockname()[1]
+        self._error: CellError | None = None
+        self._is_settled = threading.Event()
+        self._server: HttpServer | None = None
+        self._listener = listener
+        from service.http.server import names_of
+
+        hosts, origins = names_of(options.host, self.port)
+        self._hosts, self._origins = hosts, origins
+        self.service = Service(
+            cell,
+            _shipped() if operations is None else operations,
+            runs_dir=options.runs_dir,
+            stop_listener=stop_listener,
+            origins=tuple(sorted(origins)),
+            inline=options.inline,
+        )
+
+    @property
+    def url(self) -> str:
+        """Where it answers."""
+        return f"http://{self.host}:{self.port}"
+
+    @property
+    def stop_url(self) -> str:
+        """Where the stop process answers."""
+        return f"http://{self.host}:{self.stop_port}/v1/stop"
+
+    @property
+    def error(self) -> CellError | None:
+        """Why the cell could not start."""
+        return self._error
+
+    def start(self) -> None:
+        """Start the server in a thread and the cell, and wait until both are up.
+
+        Raises:
+            CellError: the cell could not start; everything is closed again.
+        """
+        self._begin()
+        assert self._server is not None  # noqa: S101 - narrowing: `_begin` made it
+        self._server.start()
+        self._is_settled.wait()
+        if self._error is not None:
+            self.close()
+            raise self._error
+
+    def run(self) -> None:
+        """Serve in the main thread until Ctrl-C or SIGTERM, then close.
+
+        The front is up before the hardware; a cell that cannot start ends it.
+
+        Raises:
+            CellError: the cell could not start.
+        """
+        # uvicorn raises a caught signal again when it is done; SIGTERM's default would skip all cleaning up.
+        signal.signal(signal.SIGTERM, _exit)
+        try:
+            self._begin()
+            assert self._server is not None  # noqa: S101 - narrowing: `_begin` made it
+            self._server.run()
+        finally:
+            self.close()
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        """Stop the arm, end server and processes; bounded, idempotent."""
+        if self._server is not None:
+            self._server.stop()
+        self.service.close()
+        self._listener.close()
+
+    def wait_until_settled(self, timeout_s: float) -> bool:
+        """Wait until the cell is up or has failed; tells whether that happened."""
+        return self._is_settled.wait(timeout_s)
+
+    def _begin(self) -> None:
+        """Start the cell in the background: it needs seconds, while this process imports its web framework."""
+        threading.Thread(target=self._start_service, name="start-cell", daemon=True).start()
+        from service.http.app import create_app, state_of_app
+        from service.http.guard import Allowed
+        from service.http.server import HttpServer
+
+        app = create_app(
+            self.service, allowed=Allowed(hosts=self._hosts, origins=self._origins), stop_url=self.stop_url
+        )
+
+        def on_exit(why: str) -> None:
+            # The latch first, by the stop process: then every stream is told to end.
+            self.service.stop_quietly(why)
+            state_of_app(app).hub.close()
+
+        self._server = HttpServer(app, self._listener, on_exit=on_exit)
+        if self._error is not None:
+            self._server.stop()  # the cell failed before there was a server to end
+
+    def _start_service(self) -> None:
+        try:
+            self.service.start()
+        except CellError as error:
+            self._error = error
+        except Exception as error:  # a defect must end the program with a message, not hang it
+            log.exception("starting the cell")
+            from service.errors import Defect
+
+            self._error = Defect(f"the cell could not start: {error}", hint="the log has the traceback; report it")
+        self._is_settled.set()
+        if self._error is not None and self._server is not None:
+            self._server.stop()
+
+
+def _exit(_signal: int, _frame: FrameType | None) -> None:
+    raise SystemExit(128 + signal.SIGTERM)
+
+
+def _shipped() -> Mapping[str, Operation]:
+    from service.operations import OPERATIONS
+
+    return OPERATIONS

@@ -1,0 +1,86 @@
+"""Operations for tests: they do what their request says, on the cell of fakes."""
+
+from __future__ import annotations
+
+import threading
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from hal.clock import Deadline
+from hal.errors import DeviceTimeout
+from hal.motion import Hold
+from hal.strict import Strict
+from service.operations.context import Operation, OperationContext
+
+
+class EchoRequest(Strict):
+    """Gives back what it got."""
+
+    text: Annotated[str, Field(max_length=100)] = "hello"
+    number: Annotated[float, Field(ge=-1e6, le=1e6)] = 1.0
+    point_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class HoldRequest(Strict):
+    """Stands still for a while, in small motions."""
+
+    seconds: Annotated[float, Field(gt=0, le=1e6)] = 1e6
+
+
+class FailRequest(Strict):
+    """Fails."""
+
+    defect: bool = False
+
+
+def echo(context: OperationContext, request: EchoRequest) -> dict[str, Any]:
+    context.task.progress(0.25, "listening")
+    context.task.progress(0.75, "speaking", request.text)
+    context.task.artefact("said.txt", request.text.encode(), "text/plain")
+    return {"text": request.text, "number": request.number, "nothing": float("nan")}
+
+
+def hold(context: OperationContext, request: HoldRequest) -> dict[str, Any]:
+    """Moves until it is cancelled."""
+    mover = context.connection.mover
+    done_s = 0.0
+    while done_s < request.seconds:
+        context.task.progress(min(0.99, done_s / request.seconds), "holding")
+        report = mover.execute(Hold(name="hold", duration_s=0.2))
+        done_s += report.duration_s
+        if report.outcome == "stopped":
+            raise DeviceTimeout("the arm was stopped", hint="reset", device="arm")
+        threading.Event().wait(0.001)
+    return {"held_s": done_s}
+
+
+def wait(context: OperationContext, request: HoldRequest) -> dict[str, Any]:
+    """Waits without an arm until it is cancelled."""
+    while True:
+        context.task.check_cancelled()
+        threading.Event().wait(0.001)
+
+
+def fail(context: OperationContext, request: FailRequest) -> dict[str, Any]:
+    if request.defect:
+        raise ZeroDivisionError("planted")
+    raise DeviceTimeout("wrist_ft silent for 0.50 s", hint="check power and cable", device="wrist_ft")
+
+
+def measure(context: OperationContext, request: EchoRequest) -> dict[str, Any]:
+    device = context.connection.device("finger_proximity")
+    deadline = Deadline.after(context.connection.clock, 1.0)
+    return {"distance_m": device.read_distance_m(deadline=deadline).value}
+
+
+OPERATIONS = {
+    operation.name: operation
+    for operation in (
+        Operation(name="echo", request_model=EchoRequest, run=echo, summary="Echo", example={"text": "a"}, moves=False),
+        Operation(name="hold", request_model=HoldRequest, run=hold, summary="Hold", example={"seconds": 0.1}),
+        Operation(name="wait", request_model=HoldRequest, run=wait, summary="Wait", example={"seconds": 0.1}),
+        Operation(name="fail", request_model=FailRequest, run=fail, summary="Fail", example={"defect": False}),
+        Operation(name="measure", request_model=EchoRequest, run=measure, summary="Measure", moves=False),
+    )
+}

@@ -27,11 +27,13 @@ from hal.errors import DeviceTimeout, DeviceUnavailable
 from hal.geometry import transform_rpy
 from hal.readings import Cause, Quality, Stamped
 from manipulation.control import Controller
-from tests.manipulation.arms import T3, forward
+from manipulation.kinematics import Kinematics
+from tests.manipulation.arms import T3
 
 GRIP = transform_rpy((0.0, 0.0, 0.2), (0.0, 0.0, 0.0))
 SENSOR = transform_rpy((0.0, 0.0, 0.02), (0.1, -0.2, 0.3))
 LOAD = ToolLoad(mass_kg=0.9, centre_of_mass_m=(0.01, 0.0, 0.09), bias=(1.0, -2.0, 0.5, 0.02, 0.0, -0.01))
+FRAMES = Kinematics.of(T3)  # test_kinematics holds the independent oracle
 HOME = np.array([0.0, 0.6, 0.3, 0.2, 0.7, 0.1])
 
 
@@ -70,7 +72,7 @@ class World:
 
     def tip(self) -> np.ndarray:
         """(4, 4) base_from_grip."""
-        return forward(T3, self.q) @ GRIP.as_matrix()
+        return FRAMES.flange(self.q).as_matrix() @ GRIP.as_matrix()
 
     def contact_force(self) -> np.ndarray:
         """Force of the wall on the tip, base axes."""
@@ -79,7 +81,7 @@ class World:
 
     def wrench(self) -> np.ndarray:
         """Raw wrench in sensor axes: contact at the tip, weight at the centre of mass, bias."""
-        sensor = forward(T3, self.q) @ SENSOR.as_matrix()
+        sensor = FRAMES.flange(self.q).as_matrix() @ SENSOR.as_matrix()
         rotation = sensor[:3, :3].T
         weight = rotation @ np.array([0.0, 0.0, -9.80665 * LOAD.mass_kg])
         force = rotation @ self.contact_force()
@@ -221,4 +223,4 @@ def make_rig(*, force_limit_n: float = 100.0, speed_limit_m_per_s: float = 0.25)
 
 def tool_pose(q: np.ndarray) -> RigidTransform:
     """base_from_grip for joints."""
-    return RigidTransform.from_matrix(forward(T3, q)) * GRIP
+    return FRAMES.tool(q, GRIP)

@@ -150,8 +150,8 @@ def test_an_arm_that_does_not_follow_is_a_fault(rig: Rig) -> None:
 
 def test_compliance_yields_to_the_wall(rig: Rig) -> None:
     rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) + 0.02
-    soft = Compliance(stiffness=(300.0,) * 3 + (INF,) * 3, damping=(80.0,) * 6)
-    report = rig.controller.execute(forwards(0.04, compliance=soft))
+    soft = Compliance(stiffness=(300.0,) * 3 + (INF,) * 3, damping=(100.0,) * 6, mass=(2.0,) * 6)
+    report = rig.controller.execute(forwards(0.04, speed=0.02, compliance=soft))
     # 20 mm beyond the wall: the series of 300 and 5000 N/m carries 5.7 N, where a stiff arm would press 100 N.
     assert report.outcome is MotionOutcome.COMPLETED
     assert np.linalg.norm(report.wrench[:3]) == pytest.approx(0.02 / (1 / 300 + 1 / 5000), rel=0.15)

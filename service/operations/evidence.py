@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion import sensing
+from fusion.batch import pack
 from fusion.features import plane, point
-from fusion.measurement import Measurement, pack
+from fusion.measurement import Measurement
 from fusion.robust import FusedPose, fuse
 from fusion.solve import local_solution
 from hal.calibration import CameraIntrinsics

@@ -13,7 +13,7 @@ from hal.calibration import CameraIntrinsics
 from hal.clock import Deadline, WallClock
 from hal.config import Cell
 from hal.devices import DeviceKind, RangeScannerCapabilities
-from hal.errors import ConfigError, StaleReading
+from hal.errors import StaleReading
 from hal.frames import frame_tree
 from hal.geometry import UncertainPose
 from hal.motion import Hold, MotionOutcome
@@ -63,13 +63,8 @@ def only_device(session: Session, kind: DeviceKind, name: str | None = None) -> 
     """
     if name is not None:
         return name, session.connection.device(name)
-    devices = session.connection.devices_of(kind)
-    if not devices:
-        cell = session.connection.cell
-        raise ConfigError(
-            f"cell {cell.name!r} has no {kind}", hint=f"add a device of kind {kind} to {cell.path}", file=str(cell.path)
-        )
-    return next(iter(devices.items()))
+    first = session.first(kind)
+    return first, session.connection.device(first)
 
 
 def deadline(duration_s: float = READ_S) -> Deadline:
@@ -93,16 +88,11 @@ def look(session: Session, camera: str | None = None) -> Look:
     sample = device.read_image(deadline=deadline())
     pixels = sample.usable(now_s=session.connection.clock.now_s(), max_age_s=1.0, device=name).pixels
     _refuse_frozen(session, name, sample, pixels)
-    record = session.connection.cell.calibration_of(name)
-    if record.intrinsics is None:
-        raise ConfigError(
-            f"calibration of {name} has no [intrinsics]", hint=f"run `panelwright calibrate {name}`", device=name
-        )
     return Look(
         pixels=pixels,
         stamp_s=sample.host_time_s,
         camera=name,
-        intrinsics=record.intrinsics.intrinsics(),
+        intrinsics=session.lens(name),
         base_from_camera=base_from(session, name),
     )
 

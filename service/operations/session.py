@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
+from hal.calibration import CameraIntrinsics
 from hal.config import Cell
-from hal.errors import DeviceFault, InvalidRequest, MotionError, NotFound, Stopped
-from hal.geometry import UncertainPose
+from hal.devices import DeviceKind
+from hal.errors import ConfigError, DeviceFault, InvalidRequest, MotionError, NotFound, Stopped
+from hal.frames import frame_tree
+from hal.geometry import UncertainPose, identity
 from hal.motion import DeclaredMotion, MotionOutcome, MotionReport, Mover
 from hal.panel import Panel
 from service.connection import CellConnection
@@ -95,6 +98,43 @@ class Session:
             self.record.motions.append(report)
         for observe in self.observers:
             observe(report)
+
+    def first(self, kind: DeviceKind) -> str:
+        """Name of the first device of a kind.
+
+        Raises:
+            ConfigError: the cell file has none.
+        """
+        names = self.cell.names_of(kind)
+        if not names:
+            raise ConfigError(
+                f"cell {self.cell.name!r} has no {kind}",
+                hint=f"add a device of kind {kind} to {self.cell.path}",
+                file=str(self.cell.path),
+            )
+        return names[0]
+
+    def has_mount(self, device: str) -> bool:
+        """Does the cell file say where this device sits?"""
+        return self.cell.file.devices[device].mount is not None and self.cell.calibration_of(device).mount is not None
+
+    def mount(self, device: str) -> UncertainPose:
+        """`flange_from_device` of a mounted device, with the covariance of its calibration."""
+        return frame_tree(self.cell, identity()).base_from(device)
+
+    def lens(self, camera: str | None = None) -> CameraIntrinsics:
+        """Intrinsics of the camera (the first one by default).
+
+        Raises:
+            ConfigError: its calibration has none.
+        """
+        name = camera or self.first(DeviceKind.CAMERA)
+        record = self.cell.calibration_of(name)
+        if record.intrinsics is None:
+            raise ConfigError(
+                f"calibration of {name} has no [intrinsics]", hint=f"run `panelwright calibrate {name}`", device=name
+            )
+        return record.intrinsics.intrinsics()
 
     def known_panel(self) -> UncertainPose:
         """Where the panel is believed to stand.

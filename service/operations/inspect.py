@@ -1,0 +1,174 @@
+"""Reading the panel: an overview to find the objects, close-ups to read them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.errors import NotFound
+from hal.geometry import compose
+from hal.panel import PanelObject
+from perception.vision.annotate import draw_annotated, said
+from perception.vision.reading import ObjectReading
+from perception.vision.taught import inspect as inspect_image
+from service.operations.beliefs import READINGS, known_readings
+from service.operations.eyes import Look, look, settle
+from service.operations.locate import go_to_overview, locate
+from service.operations.requests import InspectRequest, RecogniseRequest
+from service.operations.session import Session, panel_object_or_all
+from service.operations.travel import go_to_camera_view
+from service.operations.views import close_up_groups, close_up_poses
+from service.report.plots import png_of
+from service.report.record import Reading
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Inspection:
+    """What one or several looks said. `pictures` are annotated RGB images, one a look."""
+
+    readings: dict[str, ObjectReading]
+    pictures: tuple[NDArray[np.uint8], ...]
+
+
+def inspect_here(session: Session, names: Collection[str], seen: Look | None = None) -> Inspection:
+    """Read objects from where the camera is now."""
+    view = seen or look(session)
+    camera_from_panel = compose(view.base_from_camera.inverse(), session.known_panel())
+    readings = inspect_image(
+        view.pixels, view.intrinsics, camera_from_panel, session.panel, names=names, previous=known_readings(session)
+    )
+    _remember(session, readings)
+    return Inspection(readings={r.name: r for r in readings}, pictures=(draw_annotated(view.pixels, readings),))
+
+
+def inspect_close(session: Session, names: Collection[str]) -> Inspection:
+    """Read objects from close-ups, as few as show them all."""
+    objects = [session.panel.object(name) for name in names]
+    groups = close_up_groups(objects, session.lens())
+    readings: dict[str, ObjectReading] = {}
+    pictures: list[NDArray[np.uint8]] = []
+    for k, (centre_m, group) in enumerate(groups):
+        session.progress(k / len(groups), "close-up", ", ".join(group))
+        closer = look_close(session, centre_m, group)
+        readings |= closer.readings
+        pictures += closer.pictures
+    return Inspection(readings=readings, pictures=tuple(pictures))
+
+
+def look_close(session: Session, centre_m: Iterable[float], names: Collection[str]) -> Inspection:
+    """Drive the camera close before a panel point and read what is there."""
+    pose = session.known_panel().parent_from_child
+    go_to_camera_view(session, close_up_poses(pose, tuple(centre_m)), name=f"close-up of {', '.join(names)}"[:60])
+    settle(session)
+    return inspect_here(session, names)
+
+
+def reading_row(reading: ObjectReading, when: str) -> Reading:
+    """A reading as the report keeps it."""
+    return Reading(
+        name=reading.name,
+        kind=reading.kind,
+        present=reading.present,
+        shows=said(reading),
+        value=reading.value,
+        unit=reading.unit,
+        uncertainty=reading.uncertainty,
+        state=reading.state,
+        text=reading.text,
+        confidence=reading.confidence,
+        reason=reading.reason,
+        when=when,
+    )
+
+
+def reading_json(session: Session, reading: ObjectReading) -> dict[str, Any]:
+    """A reading as the API gives it; the place in the base frame when the panel's pose is known."""
+    row: dict[str, Any] = {
+        "name": reading.name,
+        "kind": reading.kind,
+        "present": reading.present,
+        "value": reading.value,
+        "unit": reading.unit,
+        "uncertainty": reading.uncertainty,
+        "state": reading.state,
+        "text": reading.text,
+        "confidence": reading.confidence,
+        "reason": reading.reason,
+        "centre_px": list(reading.centre_px),
+    }
+    panel = session.memory.base_from_panel
+    if reading.centre_m is not None and panel is not None:
+        row["centre_in_panel_m"] = list(reading.centre_m)
+        row["centre_in_base_m"] = list(panel.parent_from_child.apply(reading.centre_m))
+    return row
+
+
+def run_inspect(session: Session, request: InspectRequest) -> dict[str, Any]:
+    """The verb `inspect`."""
+    names = panel_object_or_all(session.panel, request.objects)
+    ensure_located(session.part(0.0, 0.3))
+    found = inspect_close(session.part(0.3, 1.0), names) if request.close_up else inspect_here(session, names)
+    return _answer(session, found)
+
+
+def run_recognise_taught(session: Session, request: RecogniseRequest) -> dict[str, Any]:
+    """The verb `recognise` with a taught panel, by vision."""
+    names = panel_object_or_all(session.panel, request.objects)
+    if request.move:
+        ensure_located(session.part(0.0, 0.5))
+        go_to_overview(session)
+        settle(session)
+    session.progress(0.8, "recognise")
+    return _answer(session, inspect_here(session, names, look(session, request.camera)))
+
+
+def ensure_located(session: Session) -> None:
+    """Locate the panel unless that was done before."""
+    if session.memory.base_from_panel is not None:
+        return
+    session.progress(0.1, "drive to the overview")
+    go_to_overview(session)
+    locate(session.part(0.3, 1.0))
+
+
+def missing(readings: Iterable[ObjectReading], wanted: Iterable[PanelObject]) -> tuple[str, ...]:
+    """Names of objects that are not where the panel file says."""
+    present = {r.name for r in readings if r.present}
+    return tuple(thing.name for thing in wanted if thing.name not in present)
+
+
+def need_all_present(found: Inspection, session: Session) -> None:
+    """Raise `NotFound` naming what is missing.
+
+    Working a panel that is not the one in the file would be dangerous.
+    """
+    lost = missing(found.readings.values(), session.panel.objects)
+    if lost:
+        raise NotFound(
+            f"{', '.join(lost)} {'is' if len(lost) == 1 else 'are'} not where panel {session.panel.name!r} has it",
+            hint="is this the right panel file? is something in the way? see the annotated picture",
+            objects=list(lost),
+        )
+
+
+def _answer(session: Session, found: Inspection) -> dict[str, Any]:
+    pictures = [
+        session.context.task.artefact(f"annotated-{k}.png", png_of(picture), "image/png")
+        for k, picture in enumerate(found.pictures)
+    ]
+    return {
+        "objects": [reading_json(session, reading) for reading in found.readings.values()],
+        "missing": list(
+            missing(found.readings.values(), [t for t in session.panel.objects if t.name in found.readings])
+        ),
+        "pictures": pictures,
+    }
+
+
+def _remember(session: Session, readings: Iterable[ObjectReading]) -> None:
+    answered = {r.name: r for r in readings if r.answered}
+    session.memory.remember(READINGS, known_readings(session) | answered)

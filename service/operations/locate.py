@@ -1,0 +1,230 @@
+"""Where is the panel? Lights on minus lights off, four-light pose, and the plate's plane by range."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from hal.errors import Ambiguous, NotFound
+from hal.geometry import UncertainPose, compose, difference, matrix_of, to_json
+from perception.range import PinholeSensor, PlaneFit, fit_plane_near
+from perception.vision.lights import find_lights
+from perception.vision.lights_assign import assign_lights
+from perception.vision.quadrangle import QuadranglePose, estimate
+from service.operations.beliefs import believed_panel, expected_panel
+from service.operations.evidence import LightEvidence, PlaneEvidence
+from service.operations.eyes import LightPair, Look, Scan, base_from, look_with_lights, scan
+from service.operations.requests import PanelPoseRequest
+from service.operations.session import Session
+from service.operations.travel import go_to_camera_view
+from service.operations.views import overview_poses
+
+Array = NDArray[np.float64]
+WRONG_FIT_P = 1e-4  # a worse fit than one in ten thousand means a wrong lamp, panel file or lens
+GATE_SIGMAS = 4.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Located:
+    """The panel found by its lights.
+
+    Attributes:
+        base_from_panel: with covariance (image noise and camera mounting).
+        lights_px: (4, 2) in the order of the panel file.
+    """
+
+    base_from_panel: UncertainPose
+    pose: QuadranglePose
+    pair: LightPair
+    lights_px: Array
+    evidence: tuple[LightEvidence, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScannedPlane:
+    """The plate's plane found by the range scanner."""
+
+    fit: PlaneFit
+    scan: Scan
+    evidence: PlaneEvidence
+
+
+def go_to_overview(session: Session) -> None:
+    """Drive the camera to where it sees the whole panel."""
+    known = session.memory.base_from_panel
+    slack_m = 0.01 if known is not None else 0.6 * session.cell.file.workspace.position_tolerance_m
+    pose = believed_panel(session).parent_from_child
+    lens = session.lens()
+    go_to_camera_view(session, overview_poses(pose, session.panel, lens, slack_m), name="overview")
+
+
+def locate(session: Session) -> Located:
+    """Find the panel from where the arm stands now; remembers the pose.
+
+    Raises:
+        NotFound, Ambiguous: lights missing, wrong, or in a place where the panel cannot be.
+    """
+    session.progress(0.3, "lights off, lights on")
+    pair = look_with_lights(session)
+    session.progress(0.8, "pose of the four lights")
+    found = locate_in(session, pair)
+    session.memory.remember("base_from_panel", found.base_from_panel)
+    return found
+
+
+def locate_in(session: Session, pair: LightPair) -> Located:
+    """The panel's pose in a pair of images."""
+    look, lights = pair.on, session.panel.lights
+    lights_m = np.array([light.position_m for light in lights])
+    blobs = find_lights(pair.off.pixels, pair.on.pixels)
+    expected = believed_panel(session).parent_from_child
+    upright = matrix_of(look.base_from_camera.parent_from_child.inv() * expected)
+    chosen = assign_lights(
+        blobs,
+        lights_m,
+        image_size_px=(look.intrinsics.width_px, look.intrinsics.height_px),
+        intrinsics=look.intrinsics,
+        upright=upright,
+    )
+    pose = estimate(lights_m, chosen.points_px, chosen.covariance_px, look.intrinsics)
+    _check_fit(session, pose)
+    camera_from_panel, covariance = _plausible(session, look, pose)
+    seen = UncertainPose(parent_from_child=camera_from_panel, covariance=covariance)
+    return Located(
+        base_from_panel=compose(look.base_from_camera, seen),
+        pose=pose,
+        pair=pair,
+        lights_px=chosen.points_px,
+        evidence=_light_evidence(session, look, camera_from_panel, chosen.points_px, chosen.covariance_px),
+    )
+
+
+def scan_plate(session: Session) -> ScannedPlane:
+    """The plate's plane from where the arm stands now."""
+    image = scan(session)
+    believed = believed_panel(session)
+    scanner_from_panel = compose(image.base_from_scanner.inverse(), believed)
+    c = image.capabilities
+    if c.projection != "pinhole":
+        raise NotFound(
+            f"{image.scanner} has {c.projection} projection; the plate is fitted to pinhole range images",
+            hint="sweep the scanner with the wrist first",
+        )
+    pose = scanner_from_panel.parent_from_child
+    sigma = np.sqrt(np.diag(scanner_from_panel.covariance))
+    fit = fit_plane_near(
+        image.depth_m,
+        PinholeSensor(width_px=c.width, height_px=c.height, fx_px=c.fx, fy_px=c.fy, cx_px=c.cx, cy_px=c.cy),
+        point_m=pose.translation,
+        normal=pose.rotation.apply([0.0, 0.0, 1.0]),
+        sigma_offset_m=float(max(sigma[:3].max(), 0.005)),
+        sigma_angle_rad=float(max(sigma[3:].max(), 0.01)),
+    )
+    flange = session.mover.state().base_from_flange
+    return ScannedPlane(
+        fit=fit, scan=image, evidence=PlaneEvidence(sensor=image.scanner, base_from_flange=flange, fit=fit)
+    )
+
+
+def run_panel_pose(session: Session, request: PanelPoseRequest) -> dict[str, Any]:
+    """The verb `panel-pose`."""
+    if request.move:
+        session.progress(0.05, "drive to the overview")
+        go_to_overview(session)
+    found = locate(session)
+    answer: dict[str, Any] = {
+        "base_from_panel": pose_json(found.base_from_panel),
+        "chi_square": found.pose.chi_square,
+        "ambiguous": found.pose.ambiguous,
+        "alternatives": len(found.pose.alternatives),
+        "lights_px": {
+            light.name: list(pixel) for light, pixel in zip(session.panel.lights, found.lights_px, strict=True)
+        },
+    }
+    if request.scan:
+        session.progress(0.9, "scan the plate")
+        feature = scan_plate(session).fit.feature
+        answer["plate_in_scanner"] = {"point_m": list(feature.point_m), "normal": list(feature.direction)}
+    return answer
+
+
+def pose_json(pose: UncertainPose) -> dict[str, Any]:
+    """A pose with its covariance, and one sigma of each axis for people."""
+    sigma = np.sqrt(np.diag(pose.covariance))
+    return {
+        **to_json(pose.parent_from_child),
+        "covariance": pose.covariance.tolist(),
+        "sigma_m": sigma[:3].tolist(),
+        "sigma_rad": sigma[3:].tolist(),
+    }
+
+
+def _check_fit(session: Session, pose: QuadranglePose) -> None:
+    if pose.p_value < WRONG_FIT_P:
+        raise NotFound(
+            f"four lights were seen, but not where panel {session.panel.name!r} has them"
+            f" (chi-square {pose.chi_square:.0f} on 2 degrees of freedom)",
+            hint="check the panel file's light positions, the lens calibration, and for reflections",
+        )
+
+
+def _plausible(session: Session, look: Look, pose: QuadranglePose) -> tuple[RigidTransform, Array]:
+    """The pose that agrees with where the panel can be; of several, the only one that does."""
+    candidates = [(pose.camera_from_object, pose.covariance)]
+    if pose.ambiguous:
+        candidates += [(a.camera_from_object, a.covariance) for a in pose.alternatives if a.covariance is not None]
+    fitting = [c for c in candidates if _is_expected(session, look.base_from_camera.parent_from_child * c[0])]
+    if not fitting:
+        offset = difference(
+            look.base_from_camera.parent_from_child * pose.camera_from_object, expected_panel(session).parent_from_child
+        )
+        raise NotFound(
+            f"the lights put the panel {np.linalg.norm(offset[:3]):.3f} m and {np.linalg.norm(offset[3:]):.3f} rad from"
+            " where the cell file expects it",
+            hint="correct workspace.panel_position_m and panel_rpy_rad, or widen their tolerances",
+        )
+    if len(fitting) > 1:
+        raise Ambiguous(
+            "two panel poses fit the four lights equally well",
+            hint="look from another side: tilt the camera 15 degrees or come nearer",
+        )
+    return fitting[0]
+
+
+def _is_expected(session: Session, base_from_panel: RigidTransform) -> bool:
+    w = session.cell.file.workspace
+    offset = difference(base_from_panel, expected_panel(session).parent_from_child)
+    # The tolerances bound each axis; their corners lie a factor sqrt(3) further out.
+    return bool(
+        np.linalg.norm(offset[:3]) <= 1.75 * w.position_tolerance_m
+        and np.linalg.norm(offset[3:]) <= 1.75 * w.angle_tolerance_rad
+    )
+
+
+def _light_evidence(
+    session: Session, look: Look, camera_from_panel: RigidTransform, pixels: Array, covariances: Array
+) -> tuple[LightEvidence, ...]:
+    flange = session.mover.state().base_from_flange
+    return tuple(
+        LightEvidence(
+            sensor=look.camera,
+            base_from_flange=flange,
+            light=light.name,
+            light_m=np.array(light.position_m),
+            pixel_px=pixel,
+            covariance_px=covariance,
+            intrinsics=look.intrinsics,
+            distance_m=float(camera_from_panel.apply(np.array(light.position_m))[2]),
+            light_sigma_m=session.panel.tolerances.light_m,
+        )
+        for light, pixel, covariance in zip(session.panel.lights, pixels, covariances, strict=True)
+    )
+
+
+def camera_from_panel_now(session: Session, camera: str) -> UncertainPose:
+    """Where the panel is believed to stand, seen from a camera at the arm's present place."""
+    return compose(base_from(session, camera).inverse(), session.known_panel())

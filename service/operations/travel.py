@@ -1,0 +1,128 @@
+"""Driving through free space: which arm configuration, along which collision-free way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from hal.devices import DeviceKind
+from hal.errors import Unreachable
+from hal.geometry import transform_rpy
+from hal.motion import MotionReport
+from hal.panel import Lever
+from manipulation.collision import CollisionModel
+from manipulation.kinematics import Kinematics
+from manipulation.shapes import Box
+from manipulation.skills.steps import park as park_arm
+from manipulation.timing import SpeedLimits
+from manipulation.workcell import Workcell
+from service.operations.beliefs import believed_panel, known_readings
+from service.operations.session import Session
+
+Array = NDArray[np.float64]
+ENOUGH_CONDITIONING = 0.06  # smallest singular value over the largest: below it, small moves need fast wrists
+CLEAR_M = 0.004
+MOST_TRIES = 24
+
+
+def go_to_camera_view(session: Session, base_from_camera: Iterable[RigidTransform], *, name: str) -> MotionReport:
+    """Drive the camera to the first of the poses that the arm reaches without collision.
+
+    Raises:
+        Unreachable: none of them.
+    """
+    flange_from_camera = session.mount(session.first(DeviceKind.CAMERA)).parent_from_child
+    return go_to_first(session, (pose * flange_from_camera.inv() for pose in base_from_camera), name=name)
+
+
+def go_to_first(session: Session, base_from_flange: Iterable[RigidTransform], *, name: str) -> MotionReport:
+    """Drive the flange to the first of the poses that is reachable without collision.
+
+    Raises:
+        Unreachable: none of them; says what is in the way of the last one.
+    """
+    cell = workcell(session)
+    state = session.mover.state()
+    model = cell.collision(width_m=state.gripper_width_m)
+    reason, tries = "no arm configuration reaches any of the poses", 0
+    for pose in base_from_flange:
+        for goal in _goals(model, pose, state.position_rad):
+            tries += 1
+            try:
+                trajectory = cell.transfer(state.position_rad, goal, width_m=state.gripper_width_m, name=name)
+            except Unreachable as error:
+                reason = error.what
+                continue
+            return session.run(trajectory)
+        if tries > MOST_TRIES:
+            break
+    raise Unreachable(f"{name}: {reason}", hint="move the panel or the arm's foot; see workspace in the cell file")
+
+
+def park(session: Session) -> None:
+    """Back off from the panel if need be, then drive to the parking place of the cell file."""
+    park_arm(workcell(session))
+
+
+def workcell(session: Session) -> Workcell:
+    """What skills work with, from what is known now; an unlocated panel takes all the room that it may stand in."""
+    file = session.cell.file
+    return Workcell(
+        mover=session.mover,
+        kinematics=kinematics(session),
+        panel=session.panel,
+        base_from_panel=believed_panel(session),
+        flange_from_grip=session.mount(session.first(DeviceKind.GRIPPER)).parent_from_child,
+        limits=SpeedLimits(tip_m_per_s=file.safety.speed_limit_m_per_s),
+        park_rad=np.array(file.workspace.park_rad),
+        angles_rad=lever_angles(session),
+        floor_z_m=file.workspace.floor_z_m,
+        obstacles=() if session.memory.base_from_panel is not None else (_where_the_panel_may_be(session),),
+        seed=file.cell.seed,
+        progress=session.progress,
+    )
+
+
+def kinematics(session: Session) -> Kinematics:
+    """The arm's kinematics, made once a cell."""
+    known: Kinematics | None = session.memory.recall("kinematics")
+    if known is None:
+        arm = session.connection.device(session.first(DeviceKind.ARM))
+        known = Kinematics.of(arm.capabilities())
+        session.memory.remember("kinematics", known)
+    return known
+
+
+def lever_angles(session: Session) -> Mapping[str, float]:
+    """Angles of the levers whose state has been read."""
+    readings = known_readings(session)
+    return {
+        lever.name: state.angle_rad
+        for lever in session.panel.objects
+        if isinstance(lever, Lever) and lever.name in readings
+        for state in lever.states
+        if state.name == readings[lever.name].state
+    }
+
+
+def _where_the_panel_may_be(session: Session) -> Box:
+    w, panel = session.cell.file.workspace, session.panel
+    slack = w.position_tolerance_m + 0.5 * max(panel.width_m, panel.height_m) * np.sin(w.angle_tolerance_rad)
+    return Box(
+        name="where the panel may be",
+        parent_from_box=transform_rpy(w.panel_position_m, w.panel_rpy_rad),
+        half_m=(panel.width_m / 2 + w.position_tolerance_m, panel.height_m / 2 + w.position_tolerance_m, float(slack)),
+    )
+
+
+def _goals(model: CollisionModel, base_from_flange: RigidTransform, here: Array) -> list[Array]:
+    """Arm configurations for a flange pose, well-conditioned and free ones, nearest first."""
+    found = [
+        q
+        for q in model.kinematics.inverse(base_from_flange)
+        if model.kinematics.conditioning(q) > ENOUGH_CONDITIONING and model.is_clear(q, margin_m=CLEAR_M)
+    ]
+    return sorted(found, key=lambda q: float(np.abs(q - here).max()))[:3]

@@ -9,10 +9,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from hal.errors import InvalidRequest, NotFound
 from perception.range import finish, join
+from perception.range.claim import fill_small_gaps
 from perception.range.features import RangeFeature, features_of
 from perception.range.noise import NoiseModel, estimate_noise
 from perception.range.primitives import Plane, Surface, SurfaceType
-from perception.range.segment import Candidates, segment
+from perception.range.segment import Candidates, reclaimed, segment
 from perception.range.sensor import RangeSensorModel
 
 Array = NDArray[np.float64]
@@ -138,15 +139,18 @@ def _finished(
         samples = finish.samples_by_label(depth, sensor, noise, joined, count)
     keep = [k for k in range(count) if owner[k] == k + 1 and samples[k].x.size >= 8]
     keep.sort(key=lambda k: -samples[k].x.size)
-    surfaces = []
+    surfaces, final = [], Candidates()
     renamed = np.zeros(count + 1, np.int32)
     for new, k in enumerate(keep, 1):
-        surface, _ = finish.refine_surface(
+        surface, th = finish.refine_surface(
             new, found.kinds[k], found.parameters[k], samples[k], sensor=sensor, noise=noise
         )
         surfaces.append(surface)
+        final.add(found.kinds[k], th)
         renamed[k + 1] = new
-    return renamed[joined], tuple(surfaces)
+    labels = reclaimed(depth, sensor.packed(), noise.packed(), renamed[joined], final, sweeps=1)
+    fill_small_gaps(labels, np.isfinite(depth), 2)
+    return labels, tuple(surfaces)
 
 
 def _warnings(

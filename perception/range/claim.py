@@ -58,6 +58,52 @@ def claim_pixels(depth, sen, noise, blocks, size, kinds, ths, out):  # type: ign
 
 
 @njit(cache=True)
+def claim_borders(depth, sen, noise, labels, kinds, ths, out):  # type: ignore[no-untyped-def]
+    """Judge again each pixel whose 3x3 neighbourhood holds another label; regions gain or lose at most one pixel.
+
+    Reads `labels` (H, W), writes all of `out` (H, W).
+    """
+    H, W = depth.shape
+    perspective = sen[0] > 0
+    near = np.empty(9, np.int32)
+    for v in range(H):
+        y = (v - sen[4]) / sen[2]
+        for u in range(W):
+            own = labels[v, u]
+            z = depth[v, u]
+            out[v, u] = own
+            if not np.isfinite(z):
+                out[v, u] = 0
+                continue
+            mixed = False
+            for i in range(max(0, v - 1), min(H, v + 2)):
+                for j in range(max(0, u - 1), min(W, u + 2)):
+                    if labels[i, j] != own:
+                        mixed = True
+            if not mixed:
+                continue
+            n = 0
+            for i in range(max(0, v - 1), min(H, v + 2)):
+                for j in range(max(0, u - 1), min(W, u + 2)):
+                    k = labels[i, j]
+                    new = k > 0
+                    for m in range(n):
+                        if near[m] == k:
+                            new = False
+                    if new:
+                        near[n] = k
+                        n += 1
+            x = (u - sen[3]) / sen[1]
+            best, label = CLAIM_SIGMAS, 0
+            sigma = sigma_at(noise, z)
+            for m in range(n):
+                e = misfit(kinds[near[m]], ths[near[m]], x, y, z, sigma, perspective)
+                if e < best:
+                    best, label = e, near[m]
+            out[v, u] = label
+
+
+@njit(cache=True)
 def misfit(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]
     """|z - surface| in sigmas, eased at grazing rays where half a pixel moves the depth far; infinite on a miss."""
     zm = depth_on(kind, th, x, y, perspective)
@@ -74,7 +120,7 @@ def misfit(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-de
 
 @njit(cache=True)
 def fill_small_gaps(label, finite, sweeps):  # type: ignore[no-untyped-def]
-    """Give each unlabelled valid pixel the label that at least 4 of its 8 neighbours agree on; `sweeps` times."""
+    """Give each unlabelled valid pixel the label that at least 5 of its 8 neighbours agree on; `sweeps` times."""
     H, W = label.shape
     for _ in range(sweeps):
         before = label.copy()
@@ -95,7 +141,7 @@ def fill_small_gaps(label, finite, sweeps):  # type: ignore[no-untyped-def]
                                     n += 1
                         if n > most:
                             best, most = k, n
-                if most >= 3:
+                if most >= 5:
                     label[v, u] = best
 
 

@@ -192,7 +192,7 @@ def fit_robust(kind, th, x, y, z, sigma, perspective, fixed, rounds):  # type: i
 
 
 @njit(cache=True)
-def start_plane(P, N):  # type: ignore[no-untyped-def]
+def start_plane(P):  # type: ignore[no-untyped-def]
     """Plane through points (N, 3) by principal axes."""
     th = np.zeros(SIZE)
     c = np.zeros(3)
@@ -207,7 +207,7 @@ def start_plane(P, N):  # type: ignore[no-untyped-def]
                 S[a, b] += d[a] * d[b]
     _, V = np.linalg.eigh(S)
     n = V[:, 0].copy()
-    if n[0] * N[0, 0] + n[1] * N[0, 1] + n[2] * N[0, 2] < 0:
+    if n[2] > 0:  # towards the sensor, but for planes that the ray only grazes
         n = -n
     th[:3] = n
     th[3] = n @ c
@@ -369,8 +369,10 @@ def is_ellipsoid(th):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def fit_kinds(P, N, x, y, z, sigma, perspective, kinds, correlated_samples):  # type: ignore[no-untyped-def]
-    """Fit every kind in the (5,) mask `kinds` to one set of samples.
+def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_samples):  # type: ignore[no-untyped-def]
+    """Fit every kind in the (5,) mask `kinds` to one set of samples, `points` (N, 3).
+
+    `P` and `N` (M, 3) are those points that have a tangent plane, and its normal; only starts use them.
 
     Returns per kind: parameters (5, SIZE), mean squared residual, share kept, and the criterion
     `trimmed cost / correlated_samples + p ln n` by which kinds compete (Schwarz), infinite where a kind does not fit.
@@ -381,9 +383,11 @@ def fit_kinds(P, N, x, y, z, sigma, perspective, kinds, correlated_samples):  # 
     n = x.shape[0]
     price = np.log(max(n / correlated_samples, 2.0))
     if kinds[PLANE]:
-        th = start_plane(P, N)
+        th = start_plane(points)
         ths[PLANE], _, mean2[PLANE], kept[PLANE], cost = fit_robust(PLANE, th, x, y, z, sigma, perspective, free, 4)
         score[PLANE] = cost / correlated_samples + 3 * price
+    if P.shape[0] < 10:
+        return ths, mean2, kept, score
     sphere, ok = start_sphere(P, N)
     if ok and (kinds[SPHERE] or kinds[QUADRIC]):
         sphere, _, m, k, cost = fit_robust(SPHERE, sphere, x, y, z, sigma, perspective, free, 4)

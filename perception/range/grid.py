@@ -57,15 +57,20 @@ def block_size(depth_shape: tuple[int, int], noise: NoiseModel, sensor: RangeSen
     return 3 if ratio > 0.9 and min(depth_shape) >= 384 else 2
 
 
-def build_grid(depth_m: Array, sensor: RangeSensorModel, noise: NoiseModel, size_px: int) -> Grid:
-    """Blocks of `size_px` pixels of an (H, W) depth image and their tangent planes; the window radius follows noise."""
+def build_grid(
+    depth_m: Array, sensor: RangeSensorModel, noise: NoiseModel, size_px: int, *, jump_slope: float = JUMP_SLOPE
+) -> Grid:
+    """Blocks of `size_px` pixels of an (H, W) depth image and their tangent planes; the window radius follows noise.
+
+    Neighbours steeper than `jump_slope` (metres of depth per metre across) are apart.
+    """
     packed = sensor.packed()
     x, y, z, count, sigma = _blocks(depth_m, packed, noise.packed(), size_px)
     perspective = bool(packed[0] > 0)
     middle = float(np.nanmedian(z[:: max(1, z.shape[0] // 32), :: max(1, z.shape[1] // 32)])) if z.size else 1.0
     middle = middle if np.isfinite(middle) else 1.0
     radius, slope_sigma = _radius(noise, sensor, middle, size_px)
-    normal, rms = _tangents(x, y, z, count, sigma, perspective, radius, 1.0 / packed[1], size_px)
+    normal, rms = _tangents(x, y, z, count, sigma, perspective, radius, jump_slope / packed[1], size_px)
     return Grid(
         size_px=size_px, radius=radius, perspective=perspective, x=x, y=y, z=z, sigma=sigma, normal=normal, rms=rms,
         normal_sigma_rad=slope_sigma,
@@ -155,7 +160,7 @@ def _blocks(depth, sen, noise, b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _tangents(x, y, z, count, sigma, perspective, radius, inverse_f, b):  # type: ignore[no-untyped-def]
+def _tangents(x, y, z, count, sigma, perspective, radius, slope_per_pixel, b):  # type: ignore[no-untyped-def]
     h, w = z.shape
     normal = np.full((h, w, 3), np.nan)
     rms = np.full((h, w), np.nan)
@@ -165,8 +170,7 @@ def _tangents(x, y, z, count, sigma, perspective, radius, inverse_f, b):  # type
             z0 = z[r, c]
             if not np.isfinite(z0):
                 continue
-            pitch = (z0 if perspective else 1.0) * inverse_f * b
-            base, slope = JUMP_SIGMAS * sigma[r, c], JUMP_SLOPE * pitch
+            base, slope = JUMP_SIGMAS * sigma[r, c], (z0 if perspective else 1.0) * slope_per_pixel * b
             x0, y0 = x[r, c], y[r, c]
             g0 = 1.0 / z0 if perspective else z0
             n = 0

@@ -262,7 +262,7 @@ def grow_surface(  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _explained(kind, th, x, y, z, sigma, n, rms, perspective, cos_limit):  # type: ignore[no-untyped-def]
-    """Squared residual in sigmas if the surface explains the block, else -1."""
+    """Squared residual in sigmas (eased where grazing) if the surface explains the block, else -1."""
     zm = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(zm):
         return -1.0
@@ -281,6 +281,7 @@ def _explained(kind, th, x, y, z, sigma, n, rms, perspective, cos_limit):  # typ
             turn = -turn
         if turn < cos_limit:
             return -1.0
+    e *= GROW_SIGMAS / limit
     return e * e
 
 

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.range import fit, grow
-from perception.range.claim import claim_pixels, fill_small_gaps
-from perception.range.grid import JUMP_SLOPE, Grid, block_size, build_grid
+from perception.range.claim import claim_borders, claim_pixels
+from perception.range.grid import Grid, block_size, build_grid
 from perception.range.noise import NoiseModel
 from perception.range.sensor import RangeSensorModel
 from perception.range.surfaces import CONE, CYLINDER, PLANE, QUADRIC, SIZE, SPHERE
@@ -29,6 +29,8 @@ Flags = NDArray[np.bool_]
 LEAST_PIXELS_AT_256 = 24  # per 256 x 256 pixels of image
 FIT_SAMPLES = 120
 LEAST_FLAT_BLOCKS = 24  # a smaller flat patch may be a facet of something bent; whole components decide about it
+STEEP_SLOPE = 7.0  # what is left once the large surfaces are named may be seen as steep as 82 degrees
+LEAST_CURVED_BLOCKS = 16  # smaller things wait for the pixels themselves
 GOOD_MEAN_SQUARE = 2.0
 GOOD_SHARE = 0.75
 LOCAL_BLOCKS = 45
@@ -74,16 +76,27 @@ def segment(depth_m: Array, sensor: RangeSensorModel, noise: NoiseModel) -> tupl
     kinds, table = found.arrays()
     claim_pixels(depth_m, packed, law, blocks, size, kinds, table, labels)
     if size > 1:
+        labels = reclaimed(depth_m, packed, law, labels, found)
         left = np.where(labels == 0, depth_m, np.nan)
-        fine = build_grid(left, sensor, noise, 1)
+        fine = build_grid(left, sensor, noise, 1, jump_slope=STEEP_SLOPE)
         pixels = labels.copy()
         before = len(found.kinds)
         recover(fine, packed, pixels, found, least_blocks=max(8, round(least)))
         if len(found.kinds) > before:
-            kinds, table = found.arrays()
-            claim_pixels(depth_m, packed, law, pixels, 1, kinds, table, labels)
-    fill_small_gaps(labels, finite, 2)
-    return labels, found
+            labels = pixels
+    return reclaimed(depth_m, packed, law, labels, found), found
+
+
+def reclaimed(
+    depth_m: Array, packed: Array, law: Array, labels: Labels, found: Candidates, *, sweeps: int = 2
+) -> Labels:
+    """Labels after judging border pixels again `sweeps` times against the surfaces of `found`."""
+    kinds, table = found.arrays()
+    for _ in range(sweeps):
+        out = np.empty_like(labels)
+        claim_borders(depth_m, packed, law, labels, kinds, table, out)
+        labels = out
+    return labels
 
 
 def recover(grid: Grid, packed: Array, blocks: Labels, found: Candidates, *, least_blocks: int) -> None:
@@ -98,7 +111,8 @@ def recover(grid: Grid, packed: Array, blocks: Labels, found: Candidates, *, lea
     )
     for th in planes:
         found.add(PLANE, th)
-    _recover_curved(grid, packed, free, blocks, found=found, least=least_blocks)
+    least_curved = max(LEAST_CURVED_BLOCKS, least_blocks) if grid.size_px > 1 else least_blocks
+    _recover_curved(grid, packed, free, blocks, found=found, least=least_curved)
 
 
 def _recover_curved(
@@ -106,7 +120,7 @@ def _recover_curved(
 ) -> None:
     dead = np.zeros(free.shape, np.bool_)
     turn_limit = float(np.cos(max(0.7, 5.0 * grid.normal_sigma_rad)))
-    step = JUMP_SLOPE * grid.size_px
+    step = STEEP_SLOPE * grid.size_px
     for _ in range(6):
         label, sizes = grow.range_components(
             grid.z, grid.sigma, free & ~dead, step, 1.0 / packed[1], grid.perspective, grid.normal, grid.rms,
@@ -154,26 +168,30 @@ def _explain(
 def _fit_best(grid: Grid, members: NDArray[np.int64]) -> tuple[int, Array, float] | None:
     """Cheapest kind for these blocks with its parameters and the share that it explains, or None."""
     normals = grid.normal.reshape(-1, 3)
-    usable = members[np.isfinite(normals[members, 0])]
-    if usable.size < 5:
+    if members.size < 5:
         return None
     # Evenly spread over the region; a fixed choice keeps results equal from run to run.
-    pick = usable if usable.size <= FIT_SAMPLES else usable[np.linspace(0, usable.size - 1, FIT_SAMPLES).astype(int)]
+    pick = members if members.size <= FIT_SAMPLES else members[_spread(members.size, FIT_SAMPLES)]
     x, y, z, sigma = (a.ravel()[pick] for a in (grid.x, grid.y, grid.z, grid.sigma))
     points = np.stack([x * z, y * z, z] if grid.perspective else [x, y, z], axis=1)
     kinds = ALL_KINDS.copy()
     if members.size < FEW_BLOCKS_FOR_QUADRIC:
         kinds[QUADRIC] = False
-    if usable.size < 10:
+    known = np.isfinite(normals[pick, 0])
+    if known.sum() < 10:
         kinds[[SPHERE, CYLINDER, CONE]] = False
     ths, mean2, kept, score = fit.fit_kinds(
-        points, np.ascontiguousarray(normals[pick]), x, y, z, sigma, grid.perspective, kinds, 1.0
+        points, points[known], normals[pick[known]], x, y, z, sigma, grid.perspective, kinds, 1.0
     )
     score = np.where((mean2 < GOOD_MEAN_SQUARE) & (kept > GOOD_SHARE), score, np.inf)
     best = int(np.argmin(score))
     if not np.isfinite(score[best]):
         return None
     return best, ths[best], float(kept[best])
+
+
+def _spread(size: int, count: int) -> NDArray[np.int64]:
+    return np.linspace(0, size - 1, count).astype(np.int64)
 
 
 def _local_fits(grid: Grid, members: NDArray[np.int64]) -> list[tuple[int, Array, float]]:

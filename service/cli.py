@@ -1,0 +1,55 @@
+"""The command line: `panelwright serve | demo | doctor | devices | task | stop | …`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+
+def main() -> None:
+    """Entry point: an error that we know ends with one clear message and exit code 2, never with a traceback."""
+    if sys.version_info[:2] != (3, 11):  # before any import that would fail with something less clear
+        found = f"{sys.version_info[0]}.{sys.version_info[1]}"
+        sys.stderr.write(
+            f"panelwright needs Python 3.11, this is {found}\n  try    run `make setup` with Python 3.11\n"
+        )
+        raise SystemExit(2)
+    from hal.errors import CellError
+
+    try:
+        _app()()
+    except CellError as error:
+        sys.stderr.write(error.for_people() + "\n")
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
+    except ModuleNotFoundError as error:
+        sys.stderr.write(f"the Python package {error.name!r} is not installed\n  try    run `make setup`\n")
+        raise SystemExit(2) from None
+
+
+def _app() -> Callable[[], None]:
+    import typer
+
+    from service.commands import devices, tasks
+    from service.commands.demo import demo
+    from service.commands.doctor import doctor
+    from service.commands.serve import serve
+
+    app = typer.Typer(
+        help="A robot cell that inspects and works industrial control panels.",
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        add_completion=False,
+    )
+    app.command()(serve)
+    app.command()(demo)
+    app.command()(doctor)
+    app.add_typer(devices.app, name="devices")
+    app.add_typer(tasks.app, name="task")
+    app.command()(tasks.stop)
+    return app
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""What commands share: the console, where cell files are, options that several have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from hal.config import Cell, load_cell
+from service.client import DEFAULT_URL, Client
+
+ROOT = Path(__file__).parents[2]
+console = Console(highlight=False)
+
+Url = Annotated[str, typer.Option("--url", help="Address of a running service.", show_default=True)]
+CellOption = Annotated[
+    Path, typer.Option("--cell", help="Cell file (TOML); shipped ones are found by their path in the project.")
+]
+SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Replaces the seed of the cell file.")]
+DEFAULT_CELL = Path("cells/bench.toml")
+UrlDefault = DEFAULT_URL
+
+
+def client_of(url: str) -> Client:
+    """A client of the service at `url`."""
+    return Client(url=url.rstrip("/"))
+
+
+def find_cell(path: Path) -> Path:
+    """`path` as given, or the shipped file of that name when there is none here."""
+    shipped = ROOT / path
+    return shipped if not path.exists() and not path.is_absolute() and shipped.exists() else path
+
+
+def read_cell(path: Path, seed: int | None) -> Cell:
+    """Load a cell file and check what it needs of this machine.
+
+    Raises:
+        ConfigError: file, panel, calibration or machine is not in order.
+    """
+    from service.preflight import check_machine
+
+    cell = load_cell(find_cell(path), seed=seed)
+    check_machine(cell)
+    return cell
+
+
+def state_style(state: str) -> str:
+    """The colour of a task's state."""
+    styles = {"succeeded": "green", "failed": "red", "cancelled": "yellow", "running": "cyan", "cancelling": "yellow"}
+    return styles.get(state, "white")

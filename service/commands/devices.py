@@ -1,0 +1,98 @@
+"""`panelwright devices …`: look at the devices of a running service."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.live import Live
+from rich.markup import escape
+from rich.table import Table
+
+from service.client import ApiError, Client
+from service.commands.common import Url, UrlDefault, client_of, console
+
+app = typer.Typer(help="Look at the devices of a running service.", invoke_without_command=True)
+Name = Annotated[str, typer.Argument(help="Name of the device in the cell file.")]
+STYLES = {"valid": "green", "degraded": "yellow", "invalid": "red"}
+
+
+@app.callback()
+def devices(context: typer.Context, url: Url = UrlDefault) -> None:
+    """List the devices when no command is given."""
+    if context.invoked_subcommand is None:
+        console.print(_table(client_of(url)))
+
+
+@app.command("list")
+def list_devices(url: Url = UrlDefault) -> None:
+    """All devices with their health."""
+    console.print(_table(client_of(url)))
+
+
+@app.command("read")
+def read_device(
+    name: Name,
+    samples: Annotated[int, typer.Option(min=1, max=1_000_000, help="How many readings.")] = 1,
+    jsonl: Annotated[bool, typer.Option("--jsonl", help="One JSON object a line.")] = False,
+    save: Annotated[Path | None, typer.Option(help="Write a picture (.png) or array (.npz) instead.")] = None,
+    url: Url = UrlDefault,
+) -> None:
+    """Read a device."""
+    client = client_of(url)
+    if save is not None:
+        form = "npz" if save.suffix == ".npz" else "png"
+        save.write_bytes(client.fetch("GET", f"/v1/devices/{name}/reading?format={form}"))
+        console.print(f"wrote {save}")
+        return
+    for _ in range(samples):
+        reading = client.get(f"/v1/devices/{name}/reading")
+        if jsonl:
+            sys.stdout.write(json.dumps(reading) + "\n")
+        else:
+            console.print_json(json.dumps(reading))
+
+
+@app.command("watch")
+def watch_devices(url: Url = UrlDefault, period_s: Annotated[float, typer.Option(min=0.1)] = 1.0) -> None:
+    """Health of all devices, again and again, until Ctrl-C."""
+    client = client_of(url)
+    with Live(_table(client), console=console) as live:
+        while True:
+            time.sleep(period_s)
+            live.update(_table(client))
+
+
+@app.command("fault")
+def inject_fault(
+    name: Name,
+    fault: Annotated[str, typer.Argument(help="silent, stale, frozen, biased, disconnected, or none to end it.")],
+    magnitude: Annotated[float, typer.Option(help="Size of a bias.")] = 0.0,
+    url: Url = UrlDefault,
+) -> None:
+    """Begin or end a fault in a simulated device."""
+    body = {"fault": None if fault == "none" else fault, "magnitude": magnitude}
+    view = client_of(url).post(f"/v1/devices/{name}/fault", body)
+    console.print(f"{name}: {view['health']['quality']} ({view['health']['cause']})")
+
+
+def _table(client: Client) -> Table:
+    table = Table("name", "kind", "driver", "health", "samples", "errors", "detail", box=None, pad_edge=False)
+    try:
+        views = client.get("/v1/devices")["devices"]
+    except ApiError as error:
+        table.caption = escape(error.what)
+        return table
+    for view in views:
+        health = view["health"]
+        style = STYLES.get(health["quality"], "white") if health["connected"] else "red"
+        word = health["quality"] if health["connected"] else "disconnected"
+        cause = "" if health["cause"] == "none" else f" ({health['cause']})"
+        counts = (str(health["samples"]), str(health["errors"]))
+        shown = (view["name"], view["kind"], view["driver"], f"[{style}]{word}{cause}[/]")
+        table.add_row(*shown, *counts, escape(health["detail"]))
+    return table

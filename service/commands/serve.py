@@ -1,0 +1,61 @@
+"""`panelwright serve`: the cell, over HTTP, until Ctrl-C."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console, read_cell
+from service.serve import Options, Panelwright
+
+START_PATIENCE_S = 120.0
+LOOPBACK = ("127.0.0.1", "localhost")
+
+
+def serve(
+    *,
+    cell: CellOption = DEFAULT_CELL,
+    port: Annotated[int, typer.Option(min=0, max=65534, help="HTTP port; 0 takes a free one.")] = 8420,
+    stop_port: Annotated[
+        int | None, typer.Option(min=0, max=65535, help="Port of the stop process; default: the next one.")
+    ] = None,
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; without keys only loopback is allowed.")
+    ] = "127.0.0.1",
+    runs: Annotated[Path, typer.Option(help="Folder for reports, journal and artefacts.")] = Path("runs"),
+    seed: SeedOption = None,
+    inline: Annotated[bool, typer.Option("--inline", help="Cell and stop port in this process (debugging).")] = False,
+) -> None:
+    """Start the cell and serve it until Ctrl-C."""
+    check_host(host)
+    loaded = read_cell(cell, seed)
+    options = Options(host=host, port=port, stop_port=stop_port, runs_dir=runs, inline=inline)
+    panelwright = Panelwright(loaded, options)
+    threading.Thread(target=_announce, args=(panelwright,), daemon=True).start()
+    console.print(f"panelwright: cell [bold]{loaded.name}[/] ({loaded.file.cell.mode}) is starting")
+    try:
+        panelwright.run()
+    except KeyboardInterrupt:
+        console.print("panelwright: stopped by Ctrl-C; arm stopped, processes ended")
+
+
+def check_host(host: str) -> None:
+    """Raise `ConfigError` for an address that strangers can reach: there are no keys yet."""
+    from hal.errors import ConfigError
+
+    if host not in LOOPBACK:
+        raise ConfigError(
+            f"refusing to listen on {host}: anybody there could move the arm",
+            hint="listen on 127.0.0.1 and reach it through ssh -L or a proxy that asks who comes",
+        )
+
+
+def _announce(panelwright: Panelwright) -> None:
+    panelwright.wait_until_settled(START_PATIENCE_S)
+    if panelwright.error is None:
+        console.print(f"panelwright: ready at [bold]{panelwright.url}[/]   stop: POST {panelwright.stop_url}")
+        if panelwright.service.supervisor.latch.is_set():
+            console.print("panelwright: the stop is latched; `panelwright stop --reset` when the cell is clear")

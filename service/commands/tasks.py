@@ -1,0 +1,79 @@
+"""`panelwright task …` and `panelwright stop`: clients of a running service."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from service.client import Client
+from service.commands.common import Url, UrlDefault, client_of, console, state_style
+
+app = typer.Typer(help="List, show, watch and cancel tasks of a running service.", no_args_is_help=True)
+TaskId = Annotated[str, typer.Argument(help="Id of the task, as `task list` shows it.")]
+
+
+@app.command("list")
+def list_tasks(url: Url = UrlDefault) -> None:
+    """Kept tasks, newest first."""
+    table = Table("id", "verb", "state", "progress", "step", "age", box=None, pad_edge=False)
+    for task in client_of(url).get("/v1/tasks")["tasks"]:
+        style = state_style(task["state"])
+        age_s = time.time() - task["created_s"]
+        row = (task["id"], task["verb"], f"[{style}]{task['state']}[/]", f"{100 * task['fraction']:.0f} %")
+        table.add_row(*row, escape(task["step"]), f"{age_s:.0f} s")
+    console.print(table)
+
+
+@app.command("show")
+def show_task(task_id: TaskId, url: Url = UrlDefault) -> None:
+    """One task with result and problem, as JSON."""
+    console.print_json(json.dumps(client_of(url).get(f"/v1/tasks/{task_id}")))
+
+
+@app.command("watch")
+def watch_task(task_id: TaskId, url: Url = UrlDefault) -> None:
+    """Follow a task to its end."""
+    task = follow(client_of(url), task_id)
+    raise typer.Exit(0 if task["state"] == "succeeded" else 1)
+
+
+@app.command("cancel")
+def cancel_task(task_id: TaskId, url: Url = UrlDefault) -> None:
+    """Stop the arm and end a task."""
+    task = client_of(url).post(f"/v1/tasks/{task_id}/cancel?wait_s=5")
+    console.print(f"{task_id} {task['state']}")
+
+
+def follow(client: Client, task_id: str) -> dict[str, Any]:
+    """Show a task's progress until it ends; returns the task."""
+    columns = (SpinnerColumn(), TextColumn("{task.description:<34.34}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as progress:
+        bar = progress.add_task("queued", total=1.0)
+        for event in client.events(task_id):
+            words = " · ".join(escape(word) for word in (event["step"], event["detail"]) if word)
+            progress.update(bar, completed=event["fraction"], description=words or event["state"])
+    task: dict[str, Any] = client.get(f"/v1/tasks/{task_id}")
+    console.print(f"task {task_id} [{state_style(task['state'])}]{task['state']}[/]")
+    if task["problem"] is not None:
+        console.print(f"  {escape(task['problem']['detail'])}\n  try    {escape(task['problem']['hint'])}")
+    return task
+
+
+def stop(
+    url: Url = UrlDefault,
+    reset: Annotated[bool, typer.Option("--reset", help="Clear the latch instead; moves nothing.")] = False,
+) -> None:
+    """Latch the software stop of a running service (not a safety function)."""
+    client = client_of(url)
+    if reset:
+        seen = client.get("/v1/stop")["count"]
+        state = client.post("/v1/stop/reset", {"seen_count": seen})
+    else:
+        state = client.post("/v1/stop")
+    console.print("the stop is [red]latched[/]" if state["is_latched"] else "the stop is clear")

@@ -20,7 +20,7 @@ Grey = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
 
 NOMINAL_EXPOSURE_S = 0.010
-LAMP_RADIANCE = 1.8
+LAMP_RADIANCE = 3.2  # a lit red lamp has to outshine the plate in a grey image too
 LIGHT_RADIANCE = 5.0
 GLOW_RADIUS_M = 0.035
 GLOW_GAIN = 0.9

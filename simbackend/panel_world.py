@@ -33,6 +33,8 @@ from simbackend.quads import write_quad
 from simbackend.wire import Emitter
 
 NEAR_M = 0.14  # a mechanism is alive while the finger tips are nearer than this
+# Parts of the panel never collide with one another (a button sinks into its plate), only with the arm.
+ARM_GROUP, PANEL_GROUP = 1, 2
 STATE_SLACK_RAD = 0.2
 LIGHT_GLOW = (1.0, 0.97, 0.88)
 LIGHT_OFF = (0.42, 0.42, 0.40)
@@ -58,6 +60,7 @@ class PanelWorld:
         self.bodies: dict[str, int] = {}
         self.mechanisms: dict[str, Mechanism] = {}
         self.lights_on = [0.0] * len(cell.panel.lights)
+        self._first_body = engine.getNumBodies()
         self._load_room(cell.file.workspace.floor_z_m)
         self._load_plate()
         self._light_places: list[tuple[float, float, float]] = []
@@ -66,6 +69,7 @@ class PanelWorld:
             self._load_light(light, jitter)
         for built in self.built.values():
             self._load_object(built)
+        self._keep_apart()
         self.lamps_on = {name: built.is_on for name, built in self.built.items() if isinstance(built.thing, Lamp)}
         self._presses = dict.fromkeys(self.mechanisms, 0)
         points = {name: self._point(self.built[name]) for name in self.mechanisms}
@@ -98,6 +102,12 @@ class PanelWorld:
         picture = Quad(pixels=textures.plate(panel), size_m=(panel.width_m, panel.height_m), centre_m=(0, 0, 0))
         self._load_quad("plate", picture, self.base_from_panel)
 
+    def _keep_apart(self) -> None:
+        """Let the bodies of room and panel touch the arm and nothing else."""
+        for body in range(self._first_body, self.engine.getNumBodies()):
+            for link in range(-1, self.engine.getNumJoints(body)):
+                self.engine.setCollisionFilterGroupMask(body, link, PANEL_GROUP, ARM_GROUP)
+
     def _load_quad(self, name: str, quad: Quad, base_from_object: RigidTransform) -> None:
         engine = self.engine
         mesh, picture = write_quad(self.folder, name, quad)
@@ -117,7 +127,9 @@ class PanelWorld:
         path = self.folder / f"{name}.urdf"
         path.write_text(text, encoding="ascii")
         position, quaternion = _pose(pose)
-        body = self.engine.loadURDF(str(path), position, quaternion, useFixedBase=True)
+        body = self.engine.loadURDF(
+            str(path), position, quaternion, useFixedBase=True, flags=self.engine.URDF_USE_INERTIA_FROM_FILE
+        )
         self.bodies[name] = int(body)
         return int(body)
 

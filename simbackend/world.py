@@ -15,7 +15,7 @@ from hal.devices import Truth
 from simbackend.arm_model import MODELS, arm_urdf, base_from_flange
 from simbackend.draws import Draws
 from simbackend.drive import ArmDrive, GripperDrive
-from simbackend.panel_world import PanelWorld
+from simbackend.panel_world import ARM_GROUP, PANEL_GROUP, PanelWorld
 from simbackend.renderer import Renderer
 from simbackend.tool_model import PAD_DAMPING_N_S_PER_M, PAD_FRICTION, PAD_STIFFNESS_N_PER_M
 from simbackend.wire import DOF, GRIPPER_AT, JOINTS_AT, LIGHTS, LIGHTS_AT, SNAPSHOT, Drive, WorldConfig
@@ -65,7 +65,8 @@ class World:
         )
         path = folder / "arm.urdf"
         path.write_text(urdf, encoding="ascii")
-        self.arm = engine.loadURDF(str(path), useFixedBase=True)
+        # Without the flag the engine makes inertia up from the shapes, and a light bat leaps through its stop.
+        self.arm = engine.loadURDF(str(path), useFixedBase=True, flags=engine.URDF_USE_INERTIA_FROM_FILE)
         index = {engine.getJointInfo(self.arm, i)[1].decode(): i for i in range(engine.getNumJoints(self.arm))}
         self.joints = [index[f"link{i + 1}"] for i in range(DOF)]
         self.fingers = [index["finger_left"], index["finger_right"]]
@@ -75,6 +76,8 @@ class World:
         self.tool_links = frozenset((self.sensor, index["gripper"], *self.fingers))
         for i in range(-1, engine.getNumJoints(self.arm)):
             engine.changeDynamics(self.arm, i, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0)
+            meets = PANEL_GROUP if i > self.joints[0] else 0  # the foot of the arm stands on the floor for good
+            engine.setCollisionFilterGroupMask(self.arm, i, ARM_GROUP, meets)
         for finger in self.fingers:
             engine.changeDynamics(
                 self.arm,

@@ -14,10 +14,11 @@ from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import Field, model_validator
 
-from drivers.transport.bus import Bus, PolledDevice
-from drivers.transport.link import Link, WireError, now_s
-from drivers.transport.modbus import RTU_GAP_S, ModbusMaster, ModbusRtu, ModbusTcp
-from drivers.transport.options import EitherOptions, Seconds, either_opener, read_options
+from drivers.transport.bus import PolledDevice
+from drivers.transport.link import WireError, now_s
+from drivers.transport.modbus import ModbusMaster
+from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
+from drivers.transport.options import Seconds, read_options
 from hal.clock import Deadline
 from hal.devices import DeviceKind, LightsCapabilities, ProximityCapabilities, TouchCapabilities
 from hal.errors import InvalidRequest
@@ -29,15 +30,10 @@ T = TypeVar("T")
 CLOSE_S = 0.08
 
 
-class IoOptions(EitherOptions):
+class IoOptions(ModbusOptions):
     """Options that all points of a remote I/O share: `port = 502` with `host` for TCP, a path for RTU."""
 
-    unit: Annotated[int, Field(ge=1, le=247)] = 1
-    rate_hz: Annotated[float, Field(gt=0, le=500)] = 100.0
     inputs: Annotated[int, Field(ge=1, le=256)] = 8
-    timeout_s: Seconds = 0.1
-    gap_s: Annotated[float, Field(ge=0, le=0.1)] = RTU_GAP_S
-    max_age_s: Seconds = 0.1
 
     @model_validator(mode="after")
     def _points_exist(self) -> Self:
@@ -105,24 +101,11 @@ class SwitchOptions(IoOptions):
         return (self.input,)
 
 
-def io_bus(context: Context, options: IoOptions) -> Bus[ModbusMaster]:
-    """The bus of this wire; devices that name the same wire get the same one."""
-    opener, name = either_opener(options, context.name)
-
-    def client(link: Link) -> ModbusMaster:
-        if options.transport == "tcp":
-            return ModbusTcp(link, timeout_s=options.timeout_s)
-        return ModbusRtu(link, timeout_s=options.timeout_s, gap_s=options.gap_s)
-
-    bus: Bus[ModbusMaster] = context.shared.get(f"modbus {name}", lambda: Bus(name, open_link=opener, client=client))
-    return bus
-
-
 class IoDevice(PolledDevice[T, ModbusMaster]):
     """Some inputs of a remote I/O, read together."""
 
     def __init__(self, context: Context, options: IoOptions) -> None:
-        super().__init__(context, io_bus(context, options), rate_hz=options.rate_hz, max_age_s=options.max_age_s)
+        super().__init__(context, modbus_bus(context, options), rate_hz=options.rate_hz, max_age_s=options.max_age_s)
         self._io = options
 
     def set_up(self, client: ModbusMaster) -> None:
@@ -268,23 +251,20 @@ class IoSwitch(IoDevice[float]):
 
 def connect_lights(context: Context, options: dict[str, Any]) -> IoLights:
     """Entry point `modbus:lights`."""
-    return _joined(IoLights(context, read_options(context, options, LightsOptions)))
+    device = IoLights(context, read_options(context, options, LightsOptions))
+    device.join()
+    return device
 
 
 def connect_touch(context: Context, options: dict[str, Any]) -> IoTouch:
     """Entry point `modbus:touch`."""
-    return _joined(IoTouch(context, read_options(context, options, TouchOptions)))
+    device = IoTouch(context, read_options(context, options, TouchOptions))
+    device.join()
+    return device
 
 
 def connect_switch(context: Context, options: dict[str, Any]) -> IoSwitch:
     """Entry point `modbus:proximity`."""
-    return _joined(IoSwitch(context, read_options(context, options, SwitchOptions)))
-
-
-D = TypeVar("D", bound=IoDevice[Any])
-
-
-def _joined(device: D) -> D:
-    device.bus.attach(device)
-    device.await_first()
+    device = IoSwitch(context, read_options(context, options, SwitchOptions))
+    device.join()
     return device

@@ -130,6 +130,5 @@ class Tfmini(StreamDevice[float]):
 def connect(context: Context, options: dict[str, Any]) -> Tfmini:
     """Entry point `serial:tfmini`."""
     device = Tfmini(context, read_options(context, options, TfminiOptions))
-    device.port.start()
-    device.await_first()
+    device.join()
     return device

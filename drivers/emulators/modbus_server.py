@@ -45,6 +45,37 @@ class RegisterMap(Protocol):
         ...
 
 
+class RegistersOnly:
+    """A map without coils and inputs whose holding and input registers are the same."""
+
+    def registers(self, address: int, count: int) -> Sequence[int]:
+        """What stands from `address` on."""
+        raise no_such(address, count)
+
+    def write_registers(self, address: int, values: Sequence[int]) -> None:
+        """Take what the host writes."""
+        raise no_such(address, *values)
+
+    def read_registers(self, function: int, address: int, count: int) -> Sequence[int]:
+        """Both functions read the same."""
+        return self.registers(address, count) if function in (3, 4) else []
+
+    def read_bits(self, function: int, address: int, count: int) -> Sequence[bool]:
+        """It has none."""
+        raise no_such(function, address, count)
+
+    def write_bits(self, address: int, values: Sequence[bool]) -> None:
+        """It has none."""
+        raise no_such(address, *values)
+
+
+def no_such(*asked: int) -> ModbusException:
+    """The refusal of an address; what was asked is kept for whoever debugs."""
+    error = ModbusException(ILLEGAL_ADDRESS)
+    error.add_note(f"asked: {asked}")
+    return error
+
+
 class ModbusFarSide(WireEmulator):
     """A server on a pty (RTU) or a listener (TCP)."""
 

@@ -15,6 +15,8 @@ from hal.clock import Clock, Deadline, WallClock
 from hal.devices import (
     DeviceKind,
     ForceTorqueCapabilities,
+    GripperCapabilities,
+    GripperState,
     Health,
     LightsCapabilities,
     ProximityCapabilities,
@@ -151,3 +153,45 @@ def scripted_wrench(index: int) -> Wrench:
         force_n=np.array([fx_n, 100.0 - fx_n / 2.5, -0.5 * fx_n]),
         torque_nm=np.array([0.01 * fx_n, -0.02 * fx_n, 5.0 - 0.01 * fx_n]),
     )
+
+
+class ScriptedGripper(Scripted):
+    """Jaws that move at the commanded speed; `object_m` is the width of a thing between them."""
+
+    kind = DeviceKind.GRIPPER
+
+    def __init__(self, *, object_m: float = 0.0) -> None:
+        super().__init__("scripted_gripper")
+        self.object_m = object_m
+        self._from_m = self._goal_m = 0.04
+        self._speed_m_per_s = 0.1
+        self._since_s = 0.0
+
+    def capabilities(self) -> GripperCapabilities:
+        """85 mm, 100 N, 0.15 m/s."""
+        return GripperCapabilities(min_width_m=0.0, max_width_m=0.085, max_force_n=100.0, max_speed_m_per_s=0.15)
+
+    def read_state(self, *, deadline: Deadline) -> Stamped[GripperState]:
+        """Where the jaws are by now."""
+        index, now_s = self.count(deadline)
+        width_m = self._width_m(now_s)
+        is_holding = self.object_m > 0.0 and width_m <= self.object_m + 1e-9
+        state = GripperState(
+            width_m=width_m,
+            force_n=20.0 if is_holding else 0.0,
+            is_moving=not is_holding and abs(width_m - self._goal_m) > 1e-6,
+            is_holding=is_holding,
+        )
+        return Stamped(value=state, host_time_s=now_s, sequence=index)
+
+    def command(self, *, width_m: float, force_n: float, speed_m_per_s: float, deadline: Deadline) -> float:  # noqa: ARG002
+        """Set off."""
+        _, now_s = self.count(deadline)
+        self._from_m, self._since_s = self._width_m(now_s), now_s
+        self._goal_m, self._speed_m_per_s = min(max(width_m, 0.0), 0.085), speed_m_per_s
+        return self._goal_m
+
+    def _width_m(self, now_s: float) -> float:
+        way_m = self._goal_m - self._from_m
+        moved_m = min(abs(way_m), self._speed_m_per_s * (now_s - self._since_s))
+        return max(self.object_m, self._from_m + math.copysign(moved_m, way_m))

@@ -115,6 +115,10 @@ class Bus(Generic[C]):
         finally:
             self._lock.release()
 
+    def rest(self, duration_s: float) -> None:
+        """Let a caller wait between two talks."""
+        self._rest.wait(duration_s)
+
     def close(self) -> None:
         """End the owner thread; a second call does nothing."""
         with self._members:
@@ -203,13 +207,31 @@ class PolledDevice(WireDevice[T], Generic[T, C]):
         super().fail(error)
 
     def call(self, work: Callable[[C, float], R], deadline: Deadline) -> R:
-        """Talk with the device in the caller's thread, with errors that name it."""
+        """Talk with the device in the caller's thread, again after a lost answer while the deadline lasts.
+
+        `work` must do the same thing when it is done twice.
+
+        Raises:
+            DeviceTimeout, DeviceFault, DeviceUnavailable: with the device's name.
+        """
         self.require_open()
-        try:
-            return self.bus.call(work, now_s() + deadline.remaining_s())
-        except WireError as error:
-            self.errors += 1
-            raise self.translate(error) from error
+        until_s = now_s() + deadline.remaining_s()
+        while True:
+            try:
+                return self.bus.call(work, until_s)
+            except WireError as error:
+                self.errors += 1
+                if not isinstance(error, NoAnswer) or now_s() >= until_s:
+                    raise self.translate(error) from error
+
+    def join(self) -> None:
+        """Enter the bus and wait for the first sample.
+
+        Raises:
+            DeviceUnavailable: none came.
+        """
+        self.bus.attach(self)
+        self.await_first()
 
     def release(self) -> None:
         """Leave the bus."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from abc import abstractmethod
 from collections.abc import Callable
@@ -92,7 +93,8 @@ class WireDevice(Generic[T]):
         self.require_open()
         oldest_s = self.context.clock.now_s() - self.max_age_s if not_before_s is None else not_before_s
         started_s = now_s()
-        sample = self.mailbox.wait(oldest_host_s=oldest_s, until_s=wall_until(deadline))
+        errors_since_s = -math.inf if not_before_s is None else started_s
+        sample = self.mailbox.wait(oldest_host_s=oldest_s, until_s=wall_until(deadline), errors_since_s=errors_since_s)
         if sample is None:
             raise self.timeout(now_s() - started_s)
         return sample
@@ -174,7 +176,7 @@ class WireDevice(Generic[T]):
         until_s = started_s + timeout_s
         while now_s() < until_s and self.mailbox.peek() is None:
             try:
-                self.mailbox.wait(oldest_host_s=-float("inf"), until_s=until_s)
+                self.mailbox.wait(oldest_host_s=-math.inf, until_s=until_s)
             except DeviceUnavailable:
                 if now_s() > started_s + REFUSED_S:
                     break
@@ -253,6 +255,15 @@ class StreamDevice(WireDevice[T]):
     @abstractmethod
     def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Parse bytes and `publish` what is complete; never raises on bad data, may raise `WireError` to start anew."""
+
+    def join(self) -> None:
+        """Start the owner thread and wait for the first sample.
+
+        Raises:
+            DeviceUnavailable: none came.
+        """
+        self.port.start()
+        self.await_first()
 
     def set_up(self, link: Link) -> None:
         """Start the stream (owner thread)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from copy import copy
@@ -22,6 +23,7 @@ class Mailbox(Generic[T]):
         self._changed = threading.Condition()
         self._ring: deque[Stamped[T]] = deque(maxlen=ring)
         self._error: CellError | None = None
+        self._error_s = 0.0
         self._published = 0
 
     @property
@@ -40,7 +42,7 @@ class Mailbox(Generic[T]):
     def fail(self, error: CellError) -> None:
         """Let readers raise `error` until the next sample comes."""
         with self._changed:
-            self._error = error
+            self._error, self._error_s = error, now_s()
             self._changed.notify_all()
 
     def clear(self) -> None:
@@ -57,15 +59,18 @@ class Mailbox(Generic[T]):
         """What readers would raise now."""
         return self._error
 
-    def wait(self, *, oldest_host_s: float, until_s: float) -> Stamped[T] | None:
+    def wait(self, *, oldest_host_s: float, until_s: float, errors_since_s: float = -math.inf) -> Stamped[T] | None:
         """The newest sample that was valid at or after `oldest_host_s`; None when none has come at `until_s`.
+
+        Args:
+            errors_since_s: on the links' clock; an older error is no answer to a reader who wants a newer sample.
 
         Raises:
             CellError: what the owner thread has put with `fail`.
         """
         with self._changed:
             while True:
-                if self._error is not None:
+                if self._error is not None and self._error_s >= errors_since_s:
                     raise copy(self._error)  # each reader gets its own, so that tracebacks do not pile up
                 newest = self.peek()
                 if newest is not None and newest.host_time_s >= oldest_host_s:

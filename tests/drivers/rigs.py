@@ -10,6 +10,8 @@ from typing import Any
 from drivers.emulators.base import WireEmulator
 from hal.clock import Deadline, WallClock
 from hal.conformance import Rig
+from hal.errors import CellError
+from hal.readings import Quality
 from hal.registry import Context, connect
 
 CLOCK = WallClock()
@@ -27,6 +29,24 @@ def until(condition: Callable[[], bool], within_s: float = 5.0) -> None:
     while not condition():
         assert not give_up.is_past(), "it did not happen"
         rest.wait(0.002)
+
+
+def count_good(device: Any, is_true: Callable[[Any], bool], *, wanted: int = 5, within_s: float = 8.0) -> int:
+    """Take fresh samples over a bad wire until `wanted` came; each must be true, each error typed and named."""
+    give_up = soon(within_s)
+    rest = threading.Event()
+    good = 0
+    while good < wanted and not give_up.is_past():
+        try:
+            sample = device.newest(soon(0.4), not_before_s=CLOCK.now_s())
+        except CellError as error:
+            assert device.name in str(error)
+            rest.wait(0.005)
+            continue
+        if sample.quality is not Quality.INVALID:
+            assert is_true(sample.value), f"a wrong value got through: {sample.value}"
+            good += 1
+    return good
 
 
 @contextmanager

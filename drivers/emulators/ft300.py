@@ -1,0 +1,94 @@
+"""Robotiq FT 300 on a pty: Modbus registers and the stream, with what a force/torque device of any kind measures."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from drivers.emulators.faults import FaultOptions
+from drivers.emulators.modbus_server import ModbusFarSide, RegistersOnly, no_such
+from drivers.emulators.ports import Peer, PtyPort
+from drivers.transport.checks import crc_modbus
+from hal.clock import Deadline, WallClock
+from hal.devices import Device, ForceTorque
+from hal.errors import Unsupported
+from hal.strict import validate
+
+UNIT = 9
+WRENCH, FIRMWARE, STREAM = 180, 500, 410
+STOP_BYTES = 200  # FF bytes in a row that end the stream
+
+
+def counts(backing: ForceTorque) -> list[int]:
+    """Six signed counts of the newest wrench, within 16 bits."""
+    wrench = backing.read_wrench(deadline=Deadline.after(WallClock(), 0.2)).value
+    scaled = np.concatenate((wrench.force_n * 100.0, wrench.torque_nm * 1000.0))
+    return [int(c) for c in np.clip(np.round(scaled), -32768, 32767)]
+
+
+class Ft300Table(RegistersOnly):
+    """Registers 180-185, 500-502; writing 200h to 410 starts the stream."""
+
+    def __init__(self, backing: ForceTorque) -> None:
+        self.backing = backing
+        self.is_streaming = False
+
+    def registers(self, address: int, count: int) -> Sequence[int]:
+        """Wrench or firmware."""
+        if address >= FIRMWARE and address + count <= FIRMWARE + 3:
+            return [1, 2, 3][address - FIRMWARE :][:count]
+        if address >= WRENCH and address + count <= WRENCH + 6:
+            return [c & 0xFFFF for c in counts(self.backing)][address - WRENCH :][:count]
+        raise no_such(address, count)
+
+    def write_registers(self, address: int, values: Sequence[int]) -> None:
+        """Only the stream register."""
+        if address != STREAM or list(values) != [0x200]:
+            raise no_such(address, *values)
+        self.is_streaming = True
+
+
+class Ft300Emulator(ModbusFarSide):
+    """The sensor, running."""
+
+    def __init__(self, backing: ForceTorque, options: FaultOptions) -> None:
+        self.table = Ft300Table(backing)
+        self._stop_bytes = 0
+        self.period_s = 0.01
+        super().__init__(PtyPort("ft300"), options, self.table, unit=UNIT, name="ft300")
+
+    def on_bytes(self, peer: Peer, data: bytes) -> None:
+        """Streaming, it hears only the end of the stream."""
+        if not self.table.is_streaming:
+            super().on_bytes(peer, data.lstrip(b"\xff"))
+            return
+        self._stop_bytes = self._stop_bytes + len(data) if set(data) == {0xFF} else 0
+        if self._stop_bytes >= STOP_BYTES:
+            self.table.is_streaming, self._stop_bytes = False, 0
+
+    def on_tick(self) -> None:
+        """One frame of the stream."""
+        if self.table.is_streaming:
+            self.send(None, stream_frame(counts(self.table.backing)))
+
+    def status_frame(self) -> bytes | None:
+        """Streaming it has no report; asked, it answers with an exception."""
+        return None if self.table.is_streaming else super().status_frame()
+
+
+def stream_frame(values: Sequence[int]) -> bytes:
+    """`20 4E`, six counts, CRC."""
+    body = b"\x20\x4e" + struct.pack("<6h", *values)
+    return body + struct.pack("<H", crc_modbus(body))
+
+
+def start(backing: Device, options: dict[str, Any]) -> Ft300Emulator:
+    """Entry point `ft300`."""
+    if not isinstance(backing, ForceTorque):
+        raise Unsupported(f"an FT 300 cannot stand for a {backing.kind}", hint="back it with a force/torque device")
+    emulator = Ft300Emulator(backing, validate(options, FaultOptions, source="emulators.ft300"))
+    emulator.begin()
+    return emulator

@@ -1,0 +1,192 @@
+"""Robotiq FT 300 and 300-S force/torque sensors: the 100 Hz stream, or registers over Modbus RTU (FT-300 manual, p 65).
+
+Neither way brings a time stamp: the host's time less the frame's time on the line, or the middle of the exchange.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from drivers.transport.bus import PolledDevice
+from drivers.transport.checks import crc_modbus
+from drivers.transport.device import StreamDevice
+from drivers.transport.framing import Framer
+from drivers.transport.link import Link, drain_until_quiet, now_s
+from drivers.transport.modbus import ModbusMaster, ModbusRtu
+from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
+from drivers.transport.options import SerialOptions, read_options, serial_opener
+from hal.clock import Deadline
+from hal.devices import DeviceKind, ForceTorqueCapabilities, Wrench
+from hal.readings import Cause, Quality, Stamped
+from hal.registry import Context
+from hal.strict import Strict
+
+FRAME_BYTES = 16
+STREAM_RATE_HZ = 100.0
+COUNTS_PER_N, COUNTS_PER_NM = 100.0, 1000.0
+WRENCH_REGISTER, FIRMWARE_REGISTER, STREAM_REGISTER = 180, 500, 410
+START_STREAM = 0x0200
+STOP_S, STOP_BURST = 0.5, 50  # FF bytes for half a second end a stream
+BITS_PER_BYTE = 10
+ANSWER_S = 0.3
+
+
+class RangeOptions(Strict):
+    """The maker's figures (FT 300-S)."""
+
+    force_range_n: Annotated[float, Field(gt=0)] = 300.0
+    torque_range_nm: Annotated[float, Field(gt=0)] = 30.0
+    force_sigma_n: Annotated[float, Field(gt=0)] = 0.1
+    torque_sigma_nm: Annotated[float, Field(gt=0)] = 0.005
+
+
+class StreamOptions(SerialOptions, RangeOptions):
+    """Options of `serial:ft300`."""
+
+    baud: Annotated[int, Field(ge=300, le=4_500_000)] = 19_200
+    unit: Annotated[int, Field(ge=1, le=247)] = 9
+    max_age_s: Annotated[float, Field(gt=0, le=1)] = 0.16  # Robotiq's own code gives up after 160 ms
+
+
+class PollOptions(ModbusOptions, RangeOptions):
+    """Options of `modbus:ft300`."""
+
+    baud: Annotated[int, Field(ge=300, le=4_500_000)] = 19_200
+    unit: Annotated[int, Field(ge=1, le=247)] = 9
+    rate_hz: Annotated[float, Field(gt=0, le=100)] = 50.0
+
+
+def wrench(counts: tuple[int, ...]) -> Wrench:
+    """Newtons and newton metres from the six signed counts."""
+    return Wrench(
+        force_n=np.array(counts[:3], dtype=float) / COUNTS_PER_N,
+        torque_nm=np.array(counts[3:6], dtype=float) / COUNTS_PER_NM,
+    )
+
+
+def stream_framer() -> Framer:
+    """`20 4E`, six counts, CRC; little-endian."""
+    return Framer(b"\x20\x4e", FRAME_BYTES, lambda f: crc_modbus(f[:-2]) == f[-2] | f[-1] << 8)
+
+
+def capabilities(options: RangeOptions, rate_hz: float) -> ForceTorqueCapabilities:
+    """From the options."""
+    return ForceTorqueCapabilities(
+        force_range_n=options.force_range_n,
+        torque_range_nm=options.torque_range_nm,
+        force_sigma_n=options.force_sigma_n,
+        torque_sigma_nm=options.torque_sigma_nm,
+        rate_hz=rate_hz,
+    )
+
+
+def condition(value: Wrench, options: RangeOptions) -> tuple[Quality, Cause]:
+    """Saturated beyond the measuring range."""
+    is_over = bool(
+        np.any(np.abs(value.force_n) > options.force_range_n)
+        or np.any(np.abs(value.torque_nm) > options.torque_range_nm)
+    )
+    return (Quality.INVALID, Cause.SATURATED) if is_over else (Quality.VALID, Cause.NONE)
+
+
+class Ft300Stream(StreamDevice[Wrench]):
+    """The sensor as a talker: 100 frames a second."""
+
+    kind = DeviceKind.FORCE_TORQUE
+
+    def __init__(self, context: Context, options: StreamOptions) -> None:
+        opener, name = serial_opener(options, context.name)
+        super().__init__(context, open_link=opener, link_name=name, max_age_s=options.max_age_s)
+        self._options = options
+        self._framer = stream_framer()
+        self._bad_before = 0
+        self._last = (b"", 0.0)
+
+    def capabilities(self) -> ForceTorqueCapabilities:
+        """From the options."""
+        return capabilities(self._options, STREAM_RATE_HZ)
+
+    def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:
+        """Newest raw wrench."""
+        return self.newest(deadline)
+
+    def start(self, link: Link) -> None:
+        """End a running stream, see that it is the sensor, start the stream."""
+        until_s = now_s() + STOP_S
+        while now_s() < until_s:
+            link.write(b"\xff" * STOP_BURST, until_s + ANSWER_S)
+            drain_until_quiet(link, quiet_s=0.025, until_s=now_s() + 0.025)
+        drain_until_quiet(link, quiet_s=0.05, until_s=now_s() + ANSWER_S)
+        master, unit = ModbusRtu(link, timeout_s=ANSWER_S), self._options.unit
+        master.read_registers(unit=unit, address=FIRMWARE_REGISTER, count=3, until_s=now_s() + ANSWER_S)
+        start = [START_STREAM]
+        master.write_registers(unit=unit, address=STREAM_REGISTER, values=start, until_s=now_s() + ANSWER_S)
+        self._framer.reset()
+
+    def receive(self, chunk: bytes, arrived_s: float) -> None:
+        """Publish each complete frame; those before the last ended a period earlier each."""
+        line_s = FRAME_BYTES * BITS_PER_BYTE / self._options.baud
+        frames = self._framer.feed(chunk)
+        for back, frame in zip(range(len(frames) - 1, -1, -1), frames, strict=True):
+            self._publish(frame, arrived_s - line_s - back / STREAM_RATE_HZ)
+
+    def _publish(self, frame: bytes, valid_s: float) -> None:
+        if frame == self._last[0] and valid_s - self._last[1] < 0.3 / STREAM_RATE_HZ:
+            return  # the same bytes at the same moment are a repeated frame
+        self._last = (frame, valid_s)
+        value = wrench(struct.unpack("<6h", frame[2:14]))
+        quality, cause = condition(value, self._options)
+        bad, self._bad_before = self._framer.counts.bad - self._bad_before, self._framer.counts.bad
+        self.publish(value, valid_s=valid_s, quality=quality, cause=cause, missed=bad)
+
+
+class Ft300Registers(PolledDevice[Wrench, ModbusMaster]):
+    """The sensor as a Modbus slave, beside others on its bus."""
+
+    kind = DeviceKind.FORCE_TORQUE
+
+    def __init__(self, context: Context, options: PollOptions) -> None:
+        bus = modbus_bus(context, options)
+        super().__init__(context, bus, rate_hz=options.rate_hz, max_age_s=options.max_age_s)
+        self._options = options
+
+    def capabilities(self) -> ForceTorqueCapabilities:
+        """From the options."""
+        return capabilities(self._options, self._options.rate_hz)
+
+    def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:
+        """Newest raw wrench."""
+        return self.newest(deadline)
+
+    def set_up(self, client: ModbusMaster) -> None:
+        """The firmware registers tell a sensor from another slave."""
+        until_s = now_s() + self._options.timeout_s
+        client.read_registers(unit=self._options.unit, address=FIRMWARE_REGISTER, count=3, until_s=until_s)
+
+    def poll(self, client: ModbusMaster) -> None:
+        """Six registers."""
+        asked_s = now_s()
+        words = client.read_registers(
+            unit=self._options.unit, address=WRENCH_REGISTER, count=6, until_s=asked_s + self._options.timeout_s
+        )
+        value = wrench(struct.unpack(">6h", struct.pack(">6H", *words)))
+        quality, cause = condition(value, self._options)
+        self.publish(value, valid_s=0.5 * (asked_s + now_s()), quality=quality, cause=cause)
+
+
+def connect_stream(context: Context, options: dict[str, Any]) -> Ft300Stream:
+    """Entry point `serial:ft300`."""
+    device = Ft300Stream(context, read_options(context, options, StreamOptions))
+    device.join()
+    return device
+
+
+def connect_registers(context: Context, options: dict[str, Any]) -> Ft300Registers:
+    """Entry point `modbus:ft300`."""
+    device = Ft300Registers(context, read_options(context, options, PollOptions))
+    device.join()
+    return device

@@ -1,0 +1,212 @@
+"""Robotiq 2F-85, 2F-140 and Hand-E grippers over Modbus RTU (2F-85/140 manual, pp 58-60).
+
+Activation moves the jaws, so it happens once, when the driver is connected; a gripper that loses its activation
+later says so and waits to be connected again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from drivers.transport.bus import PolledDevice
+from drivers.transport.link import Refused, now_s
+from drivers.transport.modbus import ModbusMaster
+from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
+from drivers.transport.options import read_options
+from hal.clock import Deadline
+from hal.devices import DeviceKind, GripperCapabilities, GripperState
+from hal.errors import DeviceFault, InvalidRequest
+from hal.readings import Stamped
+from hal.registry import Context
+
+OUTPUT, INPUT = 0x03E8, 0x07D0
+ACTIVATE, GO_TO = 0x01, 0x08
+READY = 3
+OPENED_ON, CLOSED_ON = 1, 2
+ACTIVATION_PENDING = 5
+FAULTS = {
+    7: "not activated",
+    8: "too hot",
+    9: "no host for 1 s",
+    10: "supply too low",
+    11: "automatic release under way",
+    12: "internal fault",
+    13: "activation failed",
+    14: "too much current",
+    15: "automatic release done",
+}
+
+
+class GripperOptions(ModbusOptions):
+    """Options of `modbus:robotiq_2f`; the counts at the ends of the stroke differ from gripper to gripper."""
+
+    unit: Annotated[int, Field(ge=1, le=247)] = 9
+    stroke_m: Annotated[float, Field(gt=0, le=0.2)] = 0.085
+    open_count: Annotated[int, Field(ge=0, le=255)] = 3
+    closed_count: Annotated[int, Field(ge=1, le=255)] = 230
+    min_force_n: Annotated[float, Field(ge=0)] = 20.0
+    max_force_n: Annotated[float, Field(gt=0)] = 235.0
+    min_speed_m_per_s: Annotated[float, Field(ge=0)] = 0.02
+    max_speed_m_per_s: Annotated[float, Field(gt=0)] = 0.15
+    activate: bool = True
+    activation_s: Annotated[float, Field(gt=0, le=30)] = 8.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Status:
+    """Registers 07D0-07D2."""
+
+    is_activated: bool
+    goes_to: bool
+    state: int
+    object: int
+    fault: int
+    echo: int
+    position: int
+    current_ma: int
+
+
+def decode_status(words: tuple[int, ...]) -> Status:
+    """gACT, gGTO, gSTA, gOBJ | 0 | 0, gFLT | gPR | gPO | gCU of three registers."""
+    s = words[0] >> 8
+    return Status(
+        is_activated=bool(s & 1),
+        goes_to=bool(s >> 3 & 1),
+        state=s >> 4 & 3,
+        object=s >> 6 & 3,
+        fault=words[1] >> 8 & 0x0F,
+        echo=words[1] & 0xFF,
+        position=words[2] >> 8,
+        current_ma=10 * (words[2] & 0xFF),
+    )
+
+
+def encode_command(*, action: int, position: int = 0, speed: int = 0, force: int = 0) -> tuple[int, int, int]:
+    """rACT, rGTO | 0 | 0 | rPR | rSP | rFR as three registers."""
+    return action << 8, position, speed << 8 | force
+
+
+class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
+    """A two-finger gripper."""
+
+    kind = DeviceKind.GRIPPER
+
+    def __init__(self, context: Context, options: GripperOptions) -> None:
+        bus = modbus_bus(context, options)
+        super().__init__(context, bus, rate_hz=options.rate_hz, max_age_s=options.max_age_s)
+        self._options = options
+        self._goal: int | None = None
+        self._force_n = 0.0
+
+    def capabilities(self) -> GripperCapabilities:
+        """From the options."""
+        o = self._options
+        return GripperCapabilities(
+            min_width_m=0.0, max_width_m=o.stroke_m, max_force_n=o.max_force_n, max_speed_m_per_s=o.max_speed_m_per_s
+        )
+
+    def read_state(self, *, deadline: Deadline) -> Stamped[GripperState]:
+        """Newest width and grip; the force is the commanded one while it holds, as the gripper measures none."""
+        return self.newest(deadline)
+
+    def command(self, *, width_m: float, force_n: float, speed_m_per_s: float, deadline: Deadline) -> float:
+        """Start to move; returns the width that the nearest count stands for."""
+        o = self._options
+        if not all(abs(v) < float("inf") for v in (width_m, force_n, speed_m_per_s)):
+            raise InvalidRequest(f"{self.name}: width, force and speed must be finite", hint="send numbers")
+        goal = self._count(min(max(width_m, 0.0), o.stroke_m))
+        force = _part(force_n, o.min_force_n, o.max_force_n)
+        speed = _part(speed_m_per_s, o.min_speed_m_per_s, o.max_speed_m_per_s)
+        words = encode_command(action=ACTIVATE | GO_TO, position=goal, speed=speed, force=force)
+
+        def work(client: ModbusMaster, until_s: float) -> None:
+            self._require_ready(self._status(client, until_s))
+            client.write_registers(unit=o.unit, address=OUTPUT, values=words, until_s=until_s)
+
+        self.call(work, deadline)
+        self._goal = goal
+        self._force_n = o.min_force_n + force / 255.0 * (o.max_force_n - o.min_force_n)
+        return self._width_m(goal)
+
+    def activate(self) -> None:
+        """Clear and set rACT, then wait for the jaws to have found their ends."""
+        o = self._options
+
+        def begin(client: ModbusMaster, until_s: float) -> None:
+            if self._status(client, until_s).state != READY:
+                for action in (0, ACTIVATE):
+                    words = encode_command(action=action)
+                    client.write_registers(unit=o.unit, address=OUTPUT, values=words, until_s=until_s)
+
+        until_s = now_s() + o.activation_s
+        deadline = Deadline.after(self.context.clock, o.activation_s)
+        self.call(begin, deadline)
+        while self.call(self._status, deadline).state != READY:
+            if now_s() > until_s:
+                raise self._inactive()
+            self.bus.rest(self.period_s)
+
+    def set_up(self, client: ModbusMaster) -> None:
+        """Nothing that moves: the poll tells what state it is in."""
+
+    def poll(self, client: ModbusMaster) -> None:
+        """Three registers to width and grip."""
+        asked_s = now_s()
+        status = self._status(client, asked_s + self._options.timeout_s)
+        if status.fault > ACTIVATION_PENDING:
+            text = FAULTS.get(status.fault, "fault not in the manual")
+            raise Refused(f"gripper fault {status.fault:X}h: {text}", code=status.fault)
+        is_current = self._goal is None or status.echo == self._goal
+        is_holding = is_current and status.object in (OPENED_ON, CLOSED_ON)
+        self.publish(
+            GripperState(
+                width_m=self._width_m(status.position),
+                force_n=self._force_n if is_holding else 0.0,
+                is_moving=status.goes_to and (status.object == 0 or not is_current),
+                is_holding=is_holding,
+            ),
+            valid_s=0.5 * (asked_s + now_s()),
+        )
+
+    def _status(self, client: ModbusMaster, until_s: float) -> Status:
+        return decode_status(client.read_registers(unit=self._options.unit, address=INPUT, count=3, until_s=until_s))
+
+    def _require_ready(self, status: Status) -> None:
+        if status.state != READY:
+            raise self._inactive()
+
+    def _inactive(self) -> DeviceFault:
+        return DeviceFault(
+            f"{self.name} is not activated", hint="connect it again: activation moves the jaws", device=self.name
+        )
+
+    def _count(self, width_m: float) -> int:
+        o = self._options
+        return round(o.closed_count + width_m / o.stroke_m * (o.open_count - o.closed_count))
+
+    def _width_m(self, count: int) -> float:
+        o = self._options
+        part = (o.closed_count - count) / (o.closed_count - o.open_count)
+        return o.stroke_m * min(max(part, 0.0), 1.0)
+
+
+def _part(value: float, low: float, high: float) -> int:
+    return round(255 * min(max((value - low) / (high - low), 0.0), 1.0))
+
+
+def connect(context: Context, options: dict[str, Any]) -> Robotiq2F:
+    """Entry point `modbus:robotiq_2f`; activates the gripper unless told not to."""
+    parsed = read_options(context, options, GripperOptions)
+    device = Robotiq2F(context, parsed)
+    device.join()
+    if not parsed.activate:
+        return device
+    try:
+        device.activate()
+    except BaseException:
+        device.close()
+        raise
+    return device

@@ -1,0 +1,38 @@
+"""Modbus buses from options: RTU when `port` is a path, TCP when it is a number; one bus for all devices on a wire."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from drivers.transport.bus import Bus
+from drivers.transport.link import Link
+from drivers.transport.modbus import RTU_GAP_S, ModbusMaster, ModbusRtu, ModbusTcp
+from drivers.transport.options import EitherOptions, Seconds, either_opener
+from hal.registry import Context
+
+
+class ModbusOptions(EitherOptions):
+    """Keys of every Modbus device."""
+
+    unit: Annotated[int, Field(ge=1, le=247)] = 1
+    rate_hz: Annotated[float, Field(gt=0, le=500)] = 100.0
+    timeout_s: Seconds = 0.1
+    gap_s: Annotated[float, Field(ge=0, le=0.1)] = RTU_GAP_S
+    max_age_s: Seconds = 0.1
+
+
+def modbus_bus(context: Context, options: ModbusOptions) -> Bus[ModbusMaster]:
+    """The bus of this wire; devices that name the same wire get the same one."""
+    opener, name = either_opener(options, context.name)
+
+    def client(link: Link) -> ModbusMaster:
+        if options.transport == "tcp":
+            return ModbusTcp(link, timeout_s=options.timeout_s)
+        return ModbusRtu(link, timeout_s=options.timeout_s, gap_s=options.gap_s)
+
+    def make() -> Bus[ModbusMaster]:
+        return Bus(name, open_link=opener, client=client)
+
+    return context.shared.get(f"modbus {name}", make)

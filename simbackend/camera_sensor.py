@@ -20,14 +20,11 @@ Grey = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
 
 NOMINAL_EXPOSURE_S = 0.010
-LAMP_RADIANCE = 3.2  # a lit red lamp has to outshine the plate in a grey image too
-LIGHT_RADIANCE = 5.0
 GLOW_RADIUS_M = 0.035
 GLOW_GAIN = 0.9
 GLARE_RADIUS_M = 0.006
 GLARE_GAIN = 0.5
 GLOW_STEP_PX = 4  # the glow is smooth: computed on every fourth pixel
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,9 +62,8 @@ class CameraSensor:
         self._maps = cv2.convertMaps((ideal * f + centre).astype(np.float32), None, cv2.CV_16SC2)
         self._vignette = _vignette(lens, options.vignette)
 
-    def expose(self, info: PictureInfo, rgba: Pixels, ids: NDArray[np.int32], random: np.random.Generator) -> Pixels:
-        """The image, (H, W) or (H, W, 3) uint8, of a drawing of size `drawn`."""
-        radiance = self._radiance(info, rgba, ids)
+    def expose(self, info: PictureInfo, radiance: Grey, random: np.random.Generator) -> Pixels:
+        """The image, (H, W) or (H, W, 3) uint8, of an ideal drawing of size `drawn`."""
         radiance = cv2.resize(radiance, self._reduced, interpolation=cv2.INTER_AREA)
         radiance = cv2.remap(radiance, *self._maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         radiance = self._glow(info, radiance)
@@ -76,20 +72,6 @@ class CameraSensor:
         gain = np.float32(self._options.exposure_s / NOMINAL_EXPOSURE_S)
         vignette = self._vignette if radiance.ndim == 2 else self._vignette[:, :, None]
         return self._digitise(radiance * (vignette * gain), random)
-
-    def _radiance(self, info: PictureInfo, rgba: Pixels, ids: NDArray[np.int32]) -> Grey:
-        """Reflected light of the drawing, with what shines put in its place."""
-        if self._options.is_colour:
-            image = rgba[:, :, :3].astype(np.float32) / np.float32(255.0)
-        else:
-            image = cv2.cvtColor(rgba, cv2.COLOR_RGBA2GRAY).astype(np.float32) / np.float32(255.0)
-        for emitter in info.lit:
-            mask = ids == emitter.body
-            if mask.any():
-                level = LIGHT_RADIANCE if emitter.is_border_light else LAMP_RADIANCE
-                colour = np.asarray(emitter.colour, np.float32) * np.float32(level)
-                image[mask] = colour if self._options.is_colour else float(colour @ LUMA)
-        return image
 
     def _glow(self, info: PictureInfo, radiance: Grey) -> Grey:
         """Light that a lamp throws on the plate round it (times what is there), and glare in the lens (beside it)."""
@@ -123,8 +105,10 @@ class CameraSensor:
         if point[2] < 0.02:
             return None
         lens = self._lens
-        x, y = point[:2] / point[2]
-        return (float(lens.fx_px * x + lens.cx_px), float(lens.fy_px * y + lens.cy_px)), float(lens.fx_px / point[2])
+        matrix = np.array([[lens.fx_px, 0.0, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0.0, 0.0, 1.0]])
+        pixel, _ = cv2.projectPoints(point.reshape(1, 3), np.zeros(3), np.zeros(3), matrix, np.array(lens.distortion))
+        u, v = pixel.reshape(2)
+        return (float(u), float(v)), float(lens.fx_px / point[2])
 
     def _digitise(self, radiance: Grey, random: np.random.Generator) -> Pixels:
         """Shot noise (variance = mean, in electrons), read noise, full well, eight bits."""

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.errors import InvalidRequest
+from perception.vision.lights_core import Core, lamp_core
 from perception.vision.lights_registration import Registration, register
 
 Array = NDArray[np.float64]
@@ -23,6 +24,8 @@ GROW_SHARE = 0.5  # a region ends where the difference falls to half of its top:
 LEAST_AREA_PX = 4.0
 CENTRE_FLOOR_PX = 0.04  # registration and lens blooming, measured on drawn pairs
 MOST_BLOBS = 24
+CLEAR_SIGMAS = 15.0  # a blob that stands out by this much is certain; glare that moved leaves 4 to 8
+CLEAR_BLOB_SIGMAS = 60.0  # of the whole blob; what noise and edges leave reaches about 20
 LEAST_ASPECT = 0.25  # a round lamp seen 75 degrees aslant
 
 
@@ -77,7 +80,7 @@ def find_lights(
     registration = register(off, on, noise=_raw_noise(off, on))
     diameter = largest_diameter_px if largest_diameter_px is not None else on.shape[0] / 12.0
     rise = _rise(on, registration, diameter)
-    sigma = _noise(on, registration)
+    sigma = _noise(rise, registration)
     regions = _grow(rise, sigma, registration.inside, diameter)
     return _describe(regions, sigma, registration)
 
@@ -121,29 +124,28 @@ def _rise(on: Image, registration: Registration, diameter: float) -> Image:
     return np.asarray(difference - np.maximum(wide, 0.0), np.float32)
 
 
-def _noise(on: Image, registration: Registration) -> Image:
-    """(H, W) standard deviation of `_rise` where nothing changed.
+def _noise(rise: Image, registration: Registration) -> Image:
+    """(H, W) standard deviation of `rise` where nothing changed.
 
-    sigma^2 = a + b I + c |grad I|^2: read noise, shot noise, and misregistered edges; each from medians of this pair.
+    sigma^2 = a + b I + c |grad I|^2: read noise, shot noise, and misregistered edges; each from quantiles of this pair.
     """
     import cv2
 
     base = registration.warped
-    difference = np.asarray(cv2.blur(on - base, (3, 3)))[2:-2, 2:-2]
     gx = cv2.Sobel(base, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
     gy = cv2.Sobel(base, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
     slope2 = np.asarray(gx * gx + gy * gy)
-    sample = (slice(None, None, 3), slice(None, None, 3))
-    level, slope, change = base[2:-2, 2:-2][sample], slope2[2:-2, 2:-2][sample], difference[sample]
+    sample = (slice(2, -2, 3), slice(2, -2, 3))
+    level, slope, change = base[sample], slope2[sample], rise[sample]
     flat = slope <= np.median(slope)
     a, b = _level_noise(level[flat], change[flat])
     steep = slope >= max(float(np.quantile(slope, 0.95)), 1.0)
     c = 0.0
     if steep.sum() > 50:
         excess = change[steep] ** 2 - (a + b * level[steep])
-        c = max(float(np.median(excess / slope[steep])) * 2.2, 0.0)  # the median of chi-square 1 is 0.455
-    widened = cv2.dilate(slope2, np.ones((3, 3), np.uint8))
-    return np.sqrt(np.maximum(a + b * np.clip(base, 0.0, 255.0), 0.05) + max(c, 0.01) * widened).astype(np.float32)
+        # The lower quartile, 0.10 of chi-square 1, is the median of the clean half when glare moved over the other.
+        c = max(float(np.quantile(excess / slope[steep], 0.25)) / 0.2, 0.0)
+    return np.sqrt(np.maximum(a + b * np.clip(base, 0.0, 255.0), 0.05) + max(c, 0.01) * slope2).astype(np.float32)
 
 
 def _level_noise(level: NDArray[Any], change: NDArray[Any]) -> tuple[float, float]:
@@ -157,63 +159,101 @@ def _level_noise(level: NDArray[Any], change: NDArray[Any]) -> tuple[float, floa
     y = np.array([(1.4826 * float(np.median(np.abs(change[part] - np.median(change[part]))))) ** 2 for part in bands])
     if np.ptp(x) < 10.0:
         return max(overall, 0.05), 0.0
-    b = max(float(np.polyfit(x, y, 1)[0]), 0.0)
+    i, j = np.triu_indices(len(x), 1)
+    b = max(float(np.median((y[j] - y[i]) / np.maximum(x[j] - x[i], 1.0))), 0.0)  # Theil-Sen: glare spoils some bands
     return max(float(np.median(y - b * x)), 0.05), b
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Region:
-    """Pixels of one blob: coordinates (n, 2), coverage weights (n,) 0..1, rise at the top, mean noise."""
+    """One blob.
+
+    Attributes:
+        pixels, weights: (n, 2) coordinates and (n,) coverage 0..1.
+        top: rise in the middle. sigma: noise.
+        rim: width of the fall from 3/4 to 1/4 of the top over the radius; 0.8 for a Gaussian bump, less for a lamp.
+        surround: unevenness of the rise just outside over the top; 0 for a lamp, more for a piece of glare.
+    """
 
     pixels: Array
     weights: Array
     top: float
     sigma: float
+    rim: float
+    surround: float
 
 
 def _grow(rise: Image, sigma: Image, inside: NDArray[np.bool_], diameter: float) -> list[_Region]:
-    """Connected regions above `GROW_SHARE` of their own top, around pixels that stand out of the noise."""
-    import cv2
-
-    seeds = ((rise > SEED_SIGMAS * sigma) & inside).astype(np.uint8)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(seeds, connectivity=8)
+    """Lamp-like parts of the connected regions that stand out of the noise."""
     regions = []
-    margin = 6
-    for k in np.argsort(-stats[1:, cv2.CC_STAT_AREA])[: 4 * MOST_BLOBS] + 1:
-        x, y, w, h, area = (int(v) for v in stats[k])
-        if area < 3 or max(w, h) > 1.5 * diameter:
-            continue
+    margin = 8
+    for x, y, seed in _seeds(rise, (rise > SEED_SIGMAS * sigma) & inside, diameter):
         x0, y0 = max(x - margin, 0), max(y - margin, 0)
-        window = (slice(y0, y + h + margin), slice(x0, x + w + margin))
-        region = _region(rise[window], sigma[window], labels[window] == k, (x0, y0))
+        window = (slice(y0, y + seed.shape[0] + margin), slice(x0, x + seed.shape[1] + margin))
+        padded = np.zeros(rise[window].shape, bool)
+        padded[y - y0 : y - y0 + seed.shape[0], x - x0 : x - x0 + seed.shape[1]] = seed
+        region = _region(rise[window], sigma[window], padded, (x0, y0))
         if region is not None:
             regions.append(region)
     return regions
 
 
-def _region(rise: Image, sigma: Image, seed: NDArray[np.bool_], corner: tuple[int, int]) -> _Region | None:
+def _seeds(rise: Image, lit: NDArray[np.bool_], diameter: float) -> list[tuple[int, int, NDArray[np.bool_]]]:
+    """Connected parts as (left, top, mask), largest first; what is too large for a lamp is split at half its height.
+
+    Glow that joins a lamp with its surroundings is lower than the lamp, so splitting frees the lamp and drops the glow.
+    """
     import cv2
 
-    top = float(np.quantile(rise[seed], 0.7))
-    lit = (rise > GROW_SHARE * top).astype(np.uint8)
-    _, labels = cv2.connectedComponents(lit, connectivity=4)
-    touched = np.unique(labels[seed & (lit > 0)])
-    touched = touched[touched > 0]
-    if not len(touched):
+    found = []
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(lit.astype(np.uint8), connectivity=8)
+    for k in np.argsort(-stats[1:, cv2.CC_STAT_AREA])[: 4 * MOST_BLOBS] + 1:
+        x, y, w, h, area = (int(v) for v in stats[k])
+        if area < 3:
+            continue
+        part = labels[y : y + h, x : x + w] == k
+        if max(w, h) <= 1.5 * diameter:
+            found.append((x, y, part))
+            continue
+        inner = rise[y : y + h, x : x + w]
+        level = 0.5 * (float(np.quantile(inner[part], 0.999)) + float(inner[part].min()))
+        higher = part & (inner > level)
+        if 3 <= higher.sum() < area:
+            found += [(x + a, y + b, mask) for a, b, mask in _seeds(inner, higher, diameter)]
+    return found
+
+
+def _region(rise: Image, sigma: Image, seed: NDArray[np.bool_], corner: tuple[int, int]) -> _Region | None:
+    core = lamp_core(rise, seed)
+    if core is None or core.weights.sum() < LEAST_AREA_PX:
         return None
-    main = max(touched, key=lambda t: int(((labels == t) & seed).sum()))
-    body = (labels == main).astype(np.uint8)
-    near = cv2.dilate(body, np.ones((3, 3), np.uint8)) > 0
-    weights = np.where(near, np.clip(rise / top, 0.0, 1.0), 0.0)
-    rows, columns = np.nonzero(weights > 0.05)
-    if weights.sum() < LEAST_AREA_PX:
-        return None
+    if core.top > 1.3 * float(np.quantile(rise[seed], 0.99)):
+        return None  # a rim of something brighter, which has a seed of its own
+    rows, columns = np.nonzero(core.weights > 0.05)
+    rim, surround = _edge_quality(rise, core)
     return _Region(
         pixels=np.column_stack([columns + corner[0], rows + corner[1]]).astype(float),
-        weights=weights[rows, columns].astype(float),
-        top=top,
+        weights=core.weights[rows, columns].astype(float),
+        top=core.top - core.glow,
         sigma=float(np.sqrt(np.mean(sigma[rows, columns] ** 2))),
+        rim=rim,
+        surround=surround,
     )
+
+
+def _edge_quality(rise: Image, core: Core) -> tuple[float, float]:
+    """`rim` and `surround` of a region."""
+    import cv2
+
+    square = np.ones((3, 3), np.uint8)
+    reach = cv2.dilate((core.weights > 0.05).astype(np.uint8), square)
+    ring = (cv2.dilate(reach, square, iterations=3) > 0) & (reach == 0)
+    step = core.top - core.glow
+    outer, middle, inner = (
+        np.sqrt(float((rise[reach > 0] > core.glow + share * step).sum())) for share in (0.25, 0.5, 0.75)
+    )
+    uneven = float(np.median(np.abs(rise[ring] - core.glow))) / step if ring.any() else 0.0
+    return (outer - inner) / max(middle, 1.0), uneven
 
 
 def _describe(regions: list[_Region], sigma: Image, registration: Registration) -> LightBlobs:
@@ -240,7 +280,11 @@ def _measure(region: _Region) -> tuple[Array, Array, float, float, float, float,
     fill = area / (4.0 * np.pi * np.sqrt(max(low * high, 1e-6)))  # a uniform ellipse has area 4 pi sqrt(det moments)
     # d centre = sum e dw / area with dw = noise / top; smoothing ties about three neighbours together, hence the 3.
     covariance = 3.0 * (region.sigma / region.top / area) ** 2 * (e.T @ e) + CENTRE_FLOOR_PX**2 * np.eye(2)
-    clear = min(region.top / region.sigma / 20.0, 1.0)
+    sigmas = region.top / region.sigma
+    clear = min(sigmas / CLEAR_SIGMAS, 1.0) * min(sigmas * np.sqrt(area) / CLEAR_BLOB_SIGMAS, 1.0)
     round_ = min(aspect / 0.5, 1.0)
-    full = float(np.exp(-0.5 * ((fill - 0.97) / 0.12) ** 2))
-    return centre, covariance, area, region.top, aspect, fill, clear * round_ * full
+    full = float(np.exp(-0.5 * ((fill - 0.96) / 0.1) ** 2))
+    sharp = float(np.exp(-0.5 * (max(region.rim - 0.4, 0.0) / 0.15) ** 2))
+    # A lamp lights the plate round it (measured: up to 0.55 of its own rise where the image saturates); glare has no plateau.
+    alone = float(np.exp(-0.5 * (max(region.surround - 0.55, 0.0) / 0.15) ** 2))
+    return centre, covariance, area, region.top, aspect, fill, clear * round_ * full * sharp * alone

@@ -16,7 +16,7 @@ from simbackend.camera_sensor import CameraSensor, SensorOptions
 from simbackend.client import CameraView, Frame, true_mount
 from simbackend.device import VALID, SimDevice, SimOptions, parse
 
-NEAR_M, FAR_M = 0.03, 6.0
+NEAR_M = 0.02
 RATE_HZ = 20.0
 FOCAL_RATIO = 460.0 / 640.0  # the maker's lens: 70 degrees across
 
@@ -63,7 +63,6 @@ class SimCamera(SimDevice[Image]):
             focal=self._sensor.focal,
             centre=self._sensor.centre,
             near_m=NEAR_M,
-            far_m=FAR_M,
         )
         self._newest: tuple[int, float, Image] | None = None
 
@@ -88,9 +87,9 @@ class SimCamera(SimDevice[Image]):
         return newest[2], *VALID
 
     def _draw(self, bias: float) -> Image:
-        info, rgba, ids = self._world.colour_picture(self._view)
+        info, radiance = self._world.radiance(self._view, is_colour=self._options.colour)
         random = self._world.draws.at_tick(self._name, info.tick)
-        pixels = self._sensor.expose(info, rgba, ids, random)
+        pixels = self._sensor.expose(info, radiance, random)
         if bias:
             pixels = np.clip(pixels.astype(float) + bias, 0, 255).astype(np.uint8)  # an offset in grey levels
         return Image(pixels=pixels, exposure_s=self._options.exposure_s)

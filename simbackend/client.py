@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import heapq
+import math
 import mmap
 import os
 import socket
@@ -66,7 +67,6 @@ class CameraView:
     focal: tuple[float, float]
     centre: tuple[float, float]
     near_m: float
-    far_m: float
 
 
 class WorldClient:
@@ -242,25 +242,25 @@ class WorldClient:
 
     # -- pictures and truth ---------------------------------------------------------------------------------------
 
-    def colour_picture(self, view: CameraView) -> tuple[PictureInfo, NDArray[np.uint8], NDArray[np.int32]]:
-        """RGBA and body ids at the present tick."""
-        with self._lock:
-            info = self._draw(view, Picture.COLOUR)
-            pixels = view.width * view.height
-            rgba = np.frombuffer(self._images, np.uint8, 4 * pixels).reshape(view.height, view.width, 4).copy()
-            ids = np.frombuffer(self._images, np.int32, pixels, 4 * pixels).reshape(view.height, view.width).copy()
-        return info, rgba, ids
+    def radiance(self, view: CameraView, *, is_colour: bool) -> tuple[PictureInfo, NDArray[np.float32]]:
+        """Light that reaches an ideal pinhole at the present tick, (H, W, 1) or (H, W, 3), white plate = about 0.8."""
+        channels = 3 if is_colour else 1
+        return self._picture(view, Picture(channels), (view.height, view.width, channels))
 
-    def depth_picture(self, view: CameraView) -> tuple[PictureInfo, NDArray[np.float32]]:
-        """Depth along the view in metres, NaN where there is nothing, at the present tick."""
+    def depth_m(self, view: CameraView) -> tuple[PictureInfo, NDArray[np.float32]]:
+        """Depth along the view, (H, W), NaN where there is nothing, at the present tick."""
+        return self._picture(view, Picture.DEPTH, (view.height, view.width))
+
+    def _picture(
+        self, view: CameraView, kind: Picture, shape: tuple[int, ...]
+    ) -> tuple[PictureInfo, NDArray[np.float32]]:
         with self._lock:
-            info = self._draw(view, Picture.DEPTH)
-            depth = np.frombuffer(self._images, np.float32, view.width * view.height)
-            return info, depth.reshape(view.height, view.width).copy()
+            info = self._draw(view, kind)
+            return info, np.frombuffer(self._images, np.float32, math.prod(shape)).reshape(shape).copy()
 
     def _draw(self, view: CameraView, kind: Picture) -> PictureInfo:
         matrix = np.asarray(view.flange_from_camera.as_matrix())[:3]
-        head = [Op.RENDER, view.width, view.height, view.near_m, view.far_m, *view.focal, *view.centre, kind]
+        head = [Op.RENDER, view.width, view.height, view.near_m, *view.focal, *view.centre, kind]
         request = np.concatenate([np.asarray(head, float), matrix.ravel()])
         assert len(head) == CAMERA_AT  # noqa: S101  # the layout of the wire
         with self._guarded():

@@ -29,7 +29,8 @@ from simbackend.draws import Draws
 from simbackend.mechanisms import JOINT, Detent, Friction, Mechanism, Spring
 from simbackend.panel_model import PAINT, Quad, light_urdf, object_model, robot
 from simbackend.panel_state import Built, build
-from simbackend.quads import write_quad
+from simbackend.scene import Scene
+from simbackend.urdf import Colour
 from simbackend.wire import Emitter
 
 NEAR_M = 0.14  # a mechanism is alive while the finger tips are nearer than this
@@ -39,6 +40,8 @@ STATE_SLACK_RAD = 0.2
 LIGHT_GLOW = (1.0, 0.97, 0.88)
 LIGHT_OFF = (0.42, 0.42, 0.40)
 DIM = 0.35
+LAMP_RADIANCE = 3.2  # a lit red lamp has to outshine the plate in a grey image too
+LIGHT_RADIANCE = 5.0
 GLOW: dict[str, tuple[float, float, float]] = {
     "red": (1.0, 0.12, 0.08),
     "green": (0.15, 1.0, 0.30),
@@ -61,6 +64,7 @@ class PanelWorld:
         self.mechanisms: dict[str, Mechanism] = {}
         self.lights_on = [0.0] * len(cell.panel.lights)
         self._first_body = engine.getNumBodies()
+        self._pictures: list[tuple[Quad, RigidTransform]] = []
         self._load_room(cell.file.workspace.floor_z_m)
         self._load_plate()
         self._light_places: list[tuple[float, float, float]] = []
@@ -70,7 +74,12 @@ class PanelWorld:
         for built in self.built.values():
             self._load_object(built)
         self._keep_apart()
+        self.scene = self._draw_up()
         self.lamps_on = {name: built.is_on for name, built in self.built.items() if isinstance(built.thing, Lamp)}
+        for name, on in self.lamps_on.items():
+            self._paint_lamp(name, on=on)
+        for light in cell.panel.lights:
+            self._paint(light.name, LIGHT_OFF, 1.0, on=False)
         self._presses = dict.fromkeys(self.mechanisms, 0)
         points = {name: self._point(self.built[name]) for name in self.mechanisms}
         self._names = list(points)
@@ -82,25 +91,21 @@ class PanelWorld:
     # -- building -------------------------------------------------------------------------------------------------
 
     def _load_room(self, floor_z_m: float) -> None:
-        """Floor and a wall far behind, so that the plate stands before something; the wall cannot be touched."""
+        """The floor that the arm stands on."""
         engine = self.engine
         floor = engine.createCollisionShape(engine.GEOM_BOX, halfExtents=[2, 2, 0.05])
-        look = engine.createVisualShape(engine.GEOM_BOX, halfExtents=[2, 2, 0.05], rgbaColor=[0.35, 0.36, 0.38, 1])
-        engine.createMultiBody(0, floor, look, basePosition=[0, 0, floor_z_m - 0.05])
-        wall = engine.createVisualShape(engine.GEOM_BOX, halfExtents=[0.02, 3, 3], rgbaColor=[0.30, 0.33, 0.36, 1])
-        behind = self.base_from_panel.apply([0.0, 0.0, -0.6])
-        quaternion = self.base_from_panel.rotation * _wall_turn()
-        engine.createMultiBody(0, -1, wall, basePosition=list(behind), baseOrientation=quaternion.as_quat().tolist())
+        look = engine.createVisualShape(engine.GEOM_BOX, halfExtents=[2, 2, 0.05], rgbaColor=[0.28, 0.29, 0.30, 1])
+        self.bodies["floor"] = engine.createMultiBody(0, floor, look, basePosition=[0, 0, floor_z_m - 0.05])
 
     def _load_plate(self) -> None:
         engine, panel = self.engine, self.panel
         half = [panel.width_m / 2, panel.height_m / 2, panel.thickness_m / 2]
         solid = engine.createCollisionShape(engine.GEOM_BOX, halfExtents=half)
-        look = engine.createVisualShape(engine.GEOM_BOX, halfExtents=[half[0], half[1], half[2] - 1e-4], rgbaColor=[0.5, 0.5, 0.5, 1])
+        look = engine.createVisualShape(engine.GEOM_BOX, halfExtents=[half[0], half[1], half[2] - 2e-4], rgbaColor=[0.5, 0.5, 0.5, 1])
         pose = self.base_from_panel * RigidTransform.from_translation([0, 0, -half[2]])
         self.bodies["plate"] = engine.createMultiBody(0, solid, look, *_pose(pose))
         picture = Quad(pixels=textures.plate(panel), size_m=(panel.width_m, panel.height_m), centre_m=(0, 0, 0))
-        self._load_quad("plate", picture, self.base_from_panel)
+        self._pictures.append((picture, self.base_from_panel))
 
     def _keep_apart(self) -> None:
         """Let the bodies of room and panel touch the arm and nothing else."""
@@ -108,19 +113,21 @@ class PanelWorld:
             for link in range(-1, self.engine.getNumJoints(body)):
                 self.engine.setCollisionFilterGroupMask(body, link, PANEL_GROUP, ARM_GROUP)
 
-    def _load_quad(self, name: str, quad: Quad, base_from_object: RigidTransform) -> None:
-        engine = self.engine
-        mesh, picture = write_quad(self.folder, name, quad)
-        look = engine.createVisualShape(engine.GEOM_MESH, fileName=str(mesh), rgbaColor=[1, 1, 1, 1], specularColor=[0, 0, 0])
-        pose = base_from_object * RigidTransform.from_translation(quad.centre_m)
-        body = engine.createMultiBody(0, -1, look, *_pose(pose))
-        engine.changeVisualShape(body, -1, textureUniqueId=engine.loadTexture(str(picture)))
+    def _draw_up(self) -> Scene:
+        """Everything to see: all bodies of the engine (the arm too) and the printed faces."""
+        scene = Scene(self.engine)
+        for body in range(self.engine.getNumBodies()):
+            scene.add_body(body)
+        for quad, pose in self._pictures:
+            base_from_quad = pose * RigidTransform.from_translation(quad.centre_m)
+            scene.add_picture(quad.pixels, quad.size_m, base_from_quad, is_round=quad.is_round)
+        scene.compile()
+        return scene
 
     def _load_light(self, light: Any, jitter: Any) -> None:
         x, y, z = light.position_m
         pose = self.base_from_panel * RigidTransform.from_translation([x + jitter[0], y + jitter[1], jitter[2]])
         body = self._load_urdf(light.name, light_urdf(light), pose)
-        self.engine.changeVisualShape(body, -1, rgbaColor=[*LIGHT_OFF, 1])
         self._light_places.append(tuple(float(c) for c in pose.apply([0, 0, z])))  # type: ignore[arg-type]
 
     def _load_urdf(self, name: str, text: str, pose: RigidTransform) -> int:
@@ -137,8 +144,7 @@ class PanelWorld:
         name = built.thing.name
         pose = self.object_pose(built)
         model = object_model(built)
-        for i, quad in enumerate(model.quads):
-            self._load_quad(f"{name}_{i}", quad, pose)
+        self._pictures += [(quad, pose) for quad in model.quads]
         if not model.urdf:
             return
         body = self._load_urdf(name, robot(model.urdf), pose)
@@ -147,8 +153,6 @@ class PanelWorld:
             for link in (-1, JOINT):
                 self.engine.changeDynamics(body, link, lateralFriction=1.0, jointDamping=0.0)
             self.mechanisms[name] = self._mechanism(built, body)
-        if isinstance(built.thing, Lamp):
-            self._paint_lamp(name, on=built.is_on)
 
     def _mechanism(self, built: Built, body: int) -> Mechanism:
         thing, ratio = built.thing, built.effort_ratio
@@ -228,21 +232,24 @@ class PanelWorld:
     def _paint_lamp(self, name: str, *, on: bool) -> None:
         thing = self.built[name].thing
         colour = thing.colour  # type: ignore[union-attr]
-        rgb = GLOW[colour] if on else tuple(DIM * c for c in PAINT[colour])
-        self.engine.changeVisualShape(self.bodies[name], -1, rgbaColor=[*rgb, 1])
+        self._paint(name, GLOW[colour] if on else PAINT[colour], LAMP_RADIANCE if on else DIM, on=on)
+
+    def _paint(self, name: str, colour: Colour, level: float, *, on: bool) -> None:
+        r, g, b = colour
+        self.scene.paint(self.bodies[name], (level * r, level * g, level * b))
+        self.scene.shine(self.bodies[name], on=on)
 
     def switch_lights(self, on: list[bool]) -> None:
         """Border lights, in the order of the panel file."""
         for i, (light, lit) in enumerate(zip(self.panel.lights, on, strict=True)):
             if bool(self.lights_on[i]) != lit:
                 self.lights_on[i] = float(lit)
-                rgb = LIGHT_GLOW if lit else LIGHT_OFF
-                self.engine.changeVisualShape(self.bodies[light.name], -1, rgbaColor=[*rgb, 1])
+                self._paint(light.name, LIGHT_GLOW if lit else LIGHT_OFF, LIGHT_RADIANCE if lit else 1.0, on=lit)
 
     def emitters(self) -> tuple[Emitter, ...]:
         """Everything that shines now."""
         lit = [
-            Emitter(body=self.bodies[light.name], colour=LIGHT_GLOW, position_m=place, radius_m=light.radius_m, is_border_light=True)
+            Emitter(colour=LIGHT_GLOW, position_m=place, radius_m=light.radius_m, is_border_light=True)
             for light, place, on in zip(self.panel.lights, self._light_places, self.lights_on, strict=True)
             if on
         ]
@@ -253,7 +260,6 @@ class PanelWorld:
                 place = self.object_pose(self.built[name]).apply([0, 0, thing.height_m])
                 lit.append(
                     Emitter(
-                        body=self.bodies[name],
                         colour=GLOW[thing.colour],
                         position_m=(float(place[0]), float(place[1]), float(place[2])),
                         radius_m=thing.radius_m,
@@ -299,9 +305,3 @@ def _nearest(states: tuple[State, ...], angle_rad: float) -> str | None:
 
 def _pose(pose: RigidTransform) -> tuple[list[float], list[float]]:
     return pose.translation.tolist(), pose.rotation.as_quat().tolist()
-
-
-def _wall_turn() -> Any:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_euler("y", np.pi / 2)  # the thin side of the wall along the panel's z

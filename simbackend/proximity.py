@@ -47,7 +47,7 @@ class SimProximity(SimDevice[float]):
 
     def _measure(self, frame: Frame, bias: float) -> tuple[float, Quality, Cause]:
         true_m = float(frame.snapshot.distance_m[self._index])
-        noise_m = self._options.sigma_m * float(self._world.draws.at_tick(self._name, frame.snapshot.tick).standard_normal())
+        noise_m = self._options.sigma_m * float(self._world.draws.at_tick(self._name, frame.snapshot.distance_tick).standard_normal())
         distance_m = true_m + noise_m + bias
         if not MIN_RANGE_M <= distance_m <= PROXIMITY_RANGE_M:  # NaN is out of range too
             return math.nan, Quality.INVALID, Cause.OUT_OF_RANGE

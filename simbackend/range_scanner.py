@@ -55,7 +55,6 @@ class SimRangeScanner(SimDevice[RangeImage]):
             focal=(focal, focal),
             centre=((options.width - 1) / 2.0, (options.height - 1) / 2.0),
             near_m=0.05,
-            far_m=3.0,
         )
         self._newest: tuple[int, float, RangeImage] | None = None
 
@@ -83,7 +82,7 @@ class SimRangeScanner(SimDevice[RangeImage]):
     def _measure(self, frame: Frame, bias: float) -> tuple[RangeImage, Quality, Cause]:
         newest = self._newest
         if newest is None or newest[:2] != (frame.snapshot.tick, bias):
-            info, depth_m = self._world.depth_picture(self._view)
+            info, depth_m = self._world.depth_m(self._view)
             random = self._world.draws.at_tick(self._name, info.tick)
             newest = self._newest = (info.tick, bias, RangeImage(depth_m=corrupt(depth_m + np.float32(bias), self._options, random)))
         return newest[2], *VALID

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from hal.panel import Button, Display, Gauge, Lamp, Lever, Mushroom, Panel, PanelMeter, Rotary, Slider, Toggle
+from hal.panel import Button, Display, Gauge, Lamp, Lever, Mushroom, Panel, PanelMeter, Rotary, Slider, State, Toggle
 
 Pixels = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -118,18 +118,41 @@ def _print_round(canvas: Canvas, thing: object) -> None:
             _label(canvas, thing.position_m, 0.022, thing.label)
         case Rotary():
             for state in thing.states:
+                _name(canvas, thing.position_m, state, thing.radius_m)
+            _label(canvas, thing.position_m, thing.radius_m + 0.0025, thing.label)
+        case Button():
+            canvas.disc(thing.position_m, thing.radius_m + 0.003, RIM)
+            _label(canvas, thing.position_m, thing.radius_m + 0.003, thing.label)
+        case Mushroom():
+            canvas.disc(thing.position_m, thing.radius_m + 0.010, YELLOW)
+            _label(canvas, thing.position_m, thing.radius_m + 0.010, thing.label)
+        case Toggle():
+            canvas.box(thing.position_m, (0.026, 0.044), RIM, round_m=0.003)
+            x, y = thing.position_m
+            canvas.text((x + 0.021, y + 0.015), "ON", 0.0045)
+            canvas.text((x + 0.021, y - 0.015), "OFF", 0.0045)
+            _label(canvas, thing.position_m, 0.022, thing.label)
+        case Rotary():
+            for state in thing.states:
                 _mark(canvas, thing.position_m, state.angle_rad, thing.radius_m + 0.002, 0.005)
                 canvas.text(_polar(thing.position_m, state.angle_rad, thing.radius_m + 0.013), state.name.upper(), 0.0042)
             _label(canvas, thing.position_m, thing.radius_m + 0.002, thing.label)
         case Lever():
             for state in thing.states:
-                _mark(canvas, thing.position_m, state.angle_rad, thing.length_m + 0.003, 0.006)
-                canvas.text(_polar(thing.position_m, state.angle_rad, thing.length_m + 0.015), state.name.upper(), 0.0042)
+                _name(canvas, thing.position_m, state, thing.length_m)
             _label(canvas, thing.position_m, 0.020, thing.label)
         case Slider():
             _track(canvas, thing)
         case _:
             _label(canvas, thing.position_m, thing.radius_m + thing.rim_m, thing.label)  # type: ignore[attr-defined]
+
+
+def _name(canvas: Canvas, at_m: tuple[float, float], state: State, radius_m: float) -> None:
+    """The mark and the name of a resting place, the name pushed out by its own half width."""
+    _mark(canvas, at_m, state.angle_rad, radius_m + 0.002, 0.005)
+    text = state.name.upper()
+    out_m = radius_m + 0.011 + abs(math.sin(state.angle_rad)) * 0.0016 * len(text)
+    canvas.text(_polar(at_m, state.angle_rad, out_m), text, 0.0042)
 
 
 def _label(canvas: Canvas, at_m: tuple[float, float], below_m: float, text: str) -> None:
@@ -161,7 +184,7 @@ def _track(canvas: Canvas, thing: Slider) -> None:
         place_m = thing.scale.place_of(float(value))
         canvas.line(point(place_m, edge_m), point(place_m, edge_m + 0.005), 0.0009)
         canvas.text(point(place_m, edge_m + 0.010), f"{value:g}", 0.0042)
-    canvas.text(point(0.0, -edge_m - 0.006), f"{thing.label} {thing.scale.unit}".strip(), 0.0052)
+    canvas.text(point(0.0, -edge_m - 0.009), f"{thing.label} {thing.scale.unit}".strip(), 0.0052)
 
 
 def gauge_face(thing: Gauge) -> Pixels:

@@ -40,15 +40,16 @@ class Drive(IntFlag):
 # Request vector of a step: op, ticks, drive, 6 joints, gripper flag, width, force, speed, lights flag, 4 lights.
 REQUEST = 24
 JOINTS_AT, GRIPPER_AT, LIGHTS_AT = 3, 9, 13
-# Request vector of an image: op, width, height, near, far, fx, fy, cx, cy, kind, then flange_from_camera row by row (3 x 4).
-CAMERA_AT = 10
+# Request vector of an image: op, width, height, near, fx, fy, cx, cy, kind, then flange_from_camera row by row (3 x 4).
+CAMERA_AT = 9
 
 
 class Picture(IntEnum):
     """What an image request wants back in shared memory."""
 
-    COLOUR = 0  # uint8 RGBA, then int32 body ids
-    DEPTH = 1  # float32 metres along the view
+    DEPTH = 0  # float32 metres along the view, NaN where there is nothing
+    GREY = 1  # float32 radiance, one channel
+    COLOUR = 3  # float32 radiance, RGB
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,8 +123,13 @@ class Snapshot:
         """(4,) proximity sensors in the order of `WorldConfig.proximity`; NaN when nothing is in range."""
         return self.vector[44:48]
 
+    @property
+    def distance_tick(self) -> int:
+        """The tick that the distances were measured at."""
+        return int(self.vector[48])
 
-SNAPSHOT = 48
+
+SNAPSHOT = 49
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -138,9 +144,8 @@ class WorldConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Emitter:
-    """Something that shines: its body in the id image, colour (RGB, 0 to 1), place in base axes, radius."""
+    """Something that shines: colour (RGB, 0 to 1), place in base axes, radius."""
 
-    body: int
     colour: tuple[float, float, float]
     position_m: tuple[float, float, float]
     radius_m: float

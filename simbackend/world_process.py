@@ -6,7 +6,6 @@ import mmap
 import signal
 import sys
 from multiprocessing.connection import Connection
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,24 +46,24 @@ def serve(pipe: Connection, images: mmap.mmap) -> None:
 
 def picture(world: World, request: Array, images: mmap.mmap) -> PictureInfo:
     """Draw into the shared memory."""
-    width, height, near_m, far_m, fx, fy, cx, cy, kind = (float(x) for x in request[1:CAMERA_AT])
+    width, height, near_m, fx, fy, cx, cy, kind = (float(x) for x in request[1:CAMERA_AT])
     matrix = np.eye(4)
     matrix[:3] = request[CAMERA_AT : CAMERA_AT + 12].reshape(3, 4)
     base_from_camera = world.flange() * RigidTransform.from_matrix(matrix)
-    rgba, depth_m, ids = world.renderer.draw(
+    radiance, inverse_depth = world.scene.draw(
         base_from_camera,
         width=int(width),
         height=int(height),
         focal=(fx, fy),
         centre=(cx, cy),
         near_m=near_m,
-        far_m=far_m,
+        channels=int(kind),
     )
     if Picture(int(kind)) is Picture.DEPTH:
-        _put(images, 0, np.where(ids >= 0, depth_m, np.nan).astype(np.float32))
+        with np.errstate(divide="ignore"):
+            _put(images, np.where(inverse_depth > 0.0, 1.0 / inverse_depth, np.nan).astype(np.float32))
     else:
-        _put(images, 0, rgba)
-        _put(images, rgba.nbytes, ids)
+        _put(images, radiance)
     return PictureInfo(
         tick=world.tick,
         stamp_s=world.tick * world.dt_s,
@@ -74,8 +73,8 @@ def picture(world: World, request: Array, images: mmap.mmap) -> PictureInfo:
     )
 
 
-def _put(images: mmap.mmap, at: int, array: NDArray[Any]) -> None:
-    images[at : at + array.nbytes] = np.ascontiguousarray(array).data.cast("B")
+def _put(images: mmap.mmap, array: NDArray[np.float32]) -> None:
+    np.frombuffer(images, np.float32, array.size).reshape(array.shape)[:] = array
 
 
 def main() -> None:

@@ -1,0 +1,195 @@
+"""Everything there is to see, as triangles by moving part, and pictures of it.
+
+The shapes are read back from the engine, so what is drawn is what was loaded; printed faces are added beside them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from simbackend import meshes
+from simbackend.meshes import Mesh
+from simbackend.raster import rasterise
+from simbackend.textures import Pixels
+
+Array = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+TO_LIGHT = np.array([-0.50, 0.30, 0.81])  # base axes: the room's lamps hang above and behind the arm
+AMBIENT, DIFFUSE = 0.55, 0.50
+BACKGROUND = 0.16
+HALVINGS = 3
+LUMA = np.array([0.299, 0.587, 0.114])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Part:
+    """Triangles that move together: one link of one body (link -1: the base), or a printed face (body -1)."""
+
+    body: int
+    link: int
+    rows: slice
+
+
+class Scene:
+    """Collects triangles once and draws them where they are now."""
+
+    def __init__(self, engine: Any) -> None:
+        self._engine = engine
+        self._meshes: list[Mesh] = []
+        self._parts: list[_Part] = []
+        self._colours: list[Array] = []
+        self._surface: list[NDArray[np.int64]] = []
+        self._pictures: list[Pixels] = []
+        self._rows = 0
+        self._compiled: dict[int, _Compiled] = {}
+        self._fixed: dict[tuple[int, int], tuple[Array, Array]] = {}
+
+    def add_body(self, body: int) -> None:
+        """All visual shapes of a body of the engine."""
+        for entry in self._engine.getVisualShapeData(body):
+            _, link, kind, size, _, position, quaternion, rgba = entry[:8]
+            mesh = self._shape(kind, size)
+            turn = Rotation.from_quat(quaternion).as_matrix()
+            self._add(body, link, meshes.placed(mesh, turn, np.asarray(position)), np.asarray(rgba[:3]), -1)
+
+    def add_picture(self, pixels: Pixels, size_m: tuple[float, float], base_from_picture: RigidTransform, *, is_round: bool) -> None:
+        """A printed face that never moves."""
+        mesh = meshes.flat(size_m, is_round=is_round)
+        turn = np.asarray(base_from_picture.rotation.as_matrix())
+        self._pictures.append(pixels)
+        self._add(-1, -1, meshes.placed(mesh, turn, base_from_picture.translation), np.ones(3), len(self._pictures) - 1)
+
+    def _shape(self, kind: int, size: tuple[float, float, float]) -> Mesh:
+        engine = self._engine
+        if kind == engine.GEOM_BOX:
+            return meshes.box(np.asarray(size))
+        if kind == engine.GEOM_SPHERE:
+            return meshes.sphere(size[0])
+        if kind == engine.GEOM_CYLINDER:
+            return meshes.cylinder(size[1], size[0])
+        raise ValueError(f"no mesh for the engine's shape {kind}")
+
+    def _add(self, body: int, link: int, mesh: Mesh, colour: Array, surface: int) -> None:
+        count = len(mesh.points_m)
+        self._meshes.append(mesh)
+        self._colours.append(np.tile(colour, (count, 1)))
+        self._surface.append(np.full(count, surface, np.int64))
+        self._parts.append(_Part(body=body, link=link, rows=slice(self._rows, self._rows + count)))
+        self._rows += count
+
+    def compile(self) -> None:
+        """Freeze the shapes; call once, after the last `add_*`."""
+        self._mesh = meshes.merge(self._meshes)
+        self._albedo = np.concatenate(self._colours)
+        self._surfaces = np.concatenate(self._surface)
+        self._still = [part for part in self._parts if part.body < 0]
+        self._moving: dict[tuple[int, int], list[slice]] = {}
+        for part in self._parts:
+            if part.body >= 0:
+                self._moving.setdefault((part.body, part.link), []).append(part.rows)
+        for channels in (0, 1, 3):
+            self._compiled[channels] = _Compiled(self._albedo, self._pictures, channels)
+
+    def paint(self, body: int, colour: tuple[float, float, float]) -> None:
+        """Give a whole body another colour; more than 1 shines."""
+        for part in self._parts:
+            if part.body == body:
+                for compiled in self._compiled.values():
+                    compiled.albedo[part.rows] = compiled.mix(np.asarray(colour))
+
+    def shine(self, body: int, *, on: bool) -> None:
+        """A shining body looks alike from all sides."""
+        for part in self._parts:
+            if part.body == body:
+                self._glow[part.rows] = on
+
+    @property
+    def _glow(self) -> NDArray[np.bool_]:
+        if not hasattr(self, "_glowing"):
+            self._glowing = np.zeros(self._rows, bool)
+        return self._glowing
+
+    def draw(
+        self,
+        base_from_camera: RigidTransform,
+        *,
+        width: int,
+        height: int,
+        focal: tuple[float, float],
+        centre: tuple[float, float],
+        near_m: float,
+        channels: int,
+    ) -> tuple[Float32, Float32]:
+        """Radiance (H, W, channels), white = 1, and 1/depth (H, W) in 1/m, 0 where there is nothing.
+
+        `channels`: 3 for RGB, 1 for grey, 0 for depth alone.
+        """
+        points, normals = self._posed()
+        turn = np.asarray(base_from_camera.rotation.as_matrix())
+        seen = (points - base_from_camera.translation) @ turn
+        shade = AMBIENT + DIFFUSE * np.maximum(normals @ (TO_LIGHT / np.linalg.norm(TO_LIGHT)), 0.0)
+        shade[self._glow] = 1.0
+        attributes = np.concatenate([shade[:, :, None], self._mesh.uv], axis=2)
+        compiled = self._compiled[channels]
+        inverse_depth = np.zeros((height, width), np.float32)
+        image = np.full((height, width, channels), BACKGROUND, np.float32)
+        camera = np.array([*focal, *centre, near_m])
+        rasterise(
+            seen, attributes, self._surfaces, compiled.albedo, compiled.texels, compiled.table, camera, inverse_depth, image
+        )
+        return image, inverse_depth
+
+    def _posed(self) -> tuple[Array, Array]:
+        points, normals = self._mesh.points_m.copy(), self._mesh.normals.copy()
+        for (body, link), all_rows in self._moving.items():
+            turn, place = self._pose(body, link)
+            for rows in all_rows:
+                points[rows] = points[rows] @ turn.T + place
+                normals[rows] = normals[rows] @ turn.T
+        return points, normals
+
+    def _pose(self, body: int, link: int) -> tuple[Array, Array]:
+        engine = self._engine
+        if link >= 0:
+            state = engine.getLinkState(body, link, computeForwardKinematics=1)
+            position, quaternion = state[4], state[5]
+        elif (body, link) in self._fixed:
+            return self._fixed[body, link]
+        else:
+            position, quaternion = engine.getBasePositionAndOrientation(body)
+        pose = np.array(engine.getMatrixFromQuaternion(quaternion)).reshape(3, 3), np.asarray(position)
+        if link < 0:
+            self._fixed[body, link] = pose  # every base in the cell is bolted down
+        return pose
+
+
+class _Compiled:
+    """Colours and textures for a number of channels; each texture lies beside smaller copies of itself."""
+
+    def __init__(self, albedo: Array, pictures: list[Pixels], channels: int) -> None:
+        self._channels = channels
+        self.albedo = np.stack([self.mix(colour) for colour in albedo]) if channels else np.zeros((len(albedo), 0))
+        texels: list[NDArray[np.uint8]] = []
+        table: list[tuple[int, int, int, int]] = []
+        offset = 0
+        for picture in pictures if channels else []:
+            level = picture if channels == 3 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+            table.append((offset, level.shape[1], level.shape[0], HALVINGS))
+            for _ in range(HALVINGS + 1):
+                texels.append(np.ascontiguousarray(level).ravel())
+                offset += texels[-1].size
+                level = cv2.resize(level, (level.shape[1] // 2, level.shape[0] // 2), interpolation=cv2.INTER_AREA)
+        self.texels = np.concatenate(texels) if texels else np.zeros(1, np.uint8)
+        # A depth picture needs no texture, but the rows must exist that its triangles point to.
+        self.table = np.array(table or [(0, 2, 2, 0)] * max(1, len(pictures)), np.int64)
+
+    def mix(self, colour: Array) -> Array:
+        """RGB as this many channels."""
+        return colour if self._channels == 3 else np.array([float(colour @ LUMA)])[: self._channels]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, TypeVar
 
 from scipy.spatial.transform import RigidTransform
 
 from hal.calibration import ToolLoad
-from hal.clock import Clock
+from hal.clock import Clock, SimClock
 from hal.config import Cell
 from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, MotionRefused
@@ -27,9 +28,14 @@ class MotionPort:
     that a read takes, and the readers get the newest snapshot while a motion runs.
     """
 
-    def __init__(self, controller: Mover, *, close: Callable[[], None]) -> None:
+    def __init__(
+        self, controller: Mover, *, clock: Clock, is_latched: Callable[[], bool], close: Callable[[], None]
+    ) -> None:
         self._controller = controller
+        self._clock = clock
+        self._is_latched = is_latched
         self._close = close
+        self._newest: RobotState | None = None
         self._is_executing = threading.Lock()
         self._devices_in_use = threading.Lock()
 
@@ -46,7 +52,18 @@ class MotionPort:
         self._controller.cancel()
 
     def state(self) -> RobotState:
-        """Newest snapshot."""
+        """Newest snapshot.
+
+        While a simulated world stands still there is nothing new to read: a watcher who read again would only draw
+        from the sensors' noise, and the same seed would no longer give the same mission.
+        """
+        newest = self._newest
+        if newest is not None and isinstance(self._clock, SimClock) and newest.stamp_s == self._clock.now_s():
+            return replace(newest, is_stopped=self._is_latched())
+        self._newest = self._read()
+        return self._newest
+
+    def _read(self) -> RobotState:
         is_free = self._devices_in_use.acquire(blocking=False)
         try:
             return self._controller.state()
@@ -112,7 +129,7 @@ def start_controller(
     except CellError:
         controller.close()
         raise
-    return MotionPort(controller, close=controller.close)
+    return MotionPort(controller, clock=clock, is_latched=is_latched, close=controller.close)
 
 
 def _first(cell: Cell, devices: Mapping[str, Any], kind: DeviceKind) -> Any:

@@ -1,0 +1,37 @@
+// Puts the parts of the page together and tells the person when the service is out of reach.
+import { get, repeat } from "./api.js";
+import { startDevices } from "./devices.js";
+import { startLive } from "./live.js";
+import { startMission } from "./mission.js";
+import { startStop } from "./stop.js";
+import { startView } from "./view.js";
+
+const banner = document.querySelector("#banner");
+
+async function describe() {
+  const info = await get("/v1/info");
+  const where = info.mode === "sim" ? "simulated" : info.mode === "mixed" ? "partly simulated" : "real";
+  document.querySelector("#cell-line").textContent = `cell ${info.cell} · ${where} · panel ${info.panel} · seed ${info.seed}`;
+  return info;
+}
+
+async function watchService() {
+  try {
+    const response = await fetch("/readyz", { cache: "no-store" });
+    const ready = await response.json();
+    const sick = ready.processes.find((process) => process.detail) || {};
+    banner.hidden = ready.is_ready;
+    banner.textContent = `The cell is not ready. ${sick.detail || "It is starting."}`;
+  } catch {
+    banner.hidden = false;
+    banner.textContent = "The service does not answer. Is panelwright serve still running?";
+  }
+}
+
+const info = await describe();
+startStop(info.stop_url);
+startMission(info.verbs);
+startDevices();
+startView();
+startLive();
+repeat(watchService, () => 2000);

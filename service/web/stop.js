@@ -1,0 +1,41 @@
+// The software stop: the button talks to the stop process on its own port, and to the service as well, whichever is faster.
+import { get, post, repeat } from "./api.js";
+
+const box = document.querySelector("#stop-box");
+const line = document.querySelector("#stop-line");
+const reset = document.querySelector("#reset");
+let count = 0;
+
+export function startStop(stopUrl) {
+  const stop = () => {
+    line.textContent = "stopping …";
+    const asked = [fetch(stopUrl, { method: "POST" }).then((answer) => answer.json()), post("/v1/stop")];
+    Promise.any(asked).then(show).catch(() => (line.textContent = "NO ANSWER: use the hardware stop"));
+    Promise.allSettled(asked).then(look); // the slower of the two has raised the count again
+  };
+  document.querySelector("#stop").addEventListener("click", stop);
+  document.addEventListener("keydown", (event) => event.key === "Escape" && stop());
+  reset.addEventListener("click", async () => {
+    try {
+      show(await post("/v1/stop/reset", { seen_count: count }));
+    } catch (error) {
+      line.textContent = `${error.message}. ${error.hint || ""}`;
+    }
+  });
+  repeat(look, () => 1000);
+}
+
+export const isLatched = () => box.dataset.latched === "yes";
+
+async function look() {
+  show(await get("/v1/stop"));
+}
+
+function show(state) {
+  if (state.count < count) return; // an answer that was overtaken
+  count = state.count;
+  box.dataset.latched = state.is_latched ? "yes" : "no";
+  line.textContent = state.is_latched ? `STOPPED · ${state.source}` : "clear to move";
+  reset.hidden = !state.is_latched;
+  document.dispatchEvent(new CustomEvent("latch", { detail: state.is_latched }));
+}

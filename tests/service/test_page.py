@@ -1,0 +1,129 @@
+"""The web page in a real browser: it shows, starts, stops and resets. Skipped where there is no Chromium."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.operations.context import Operation
+from service.serve import Options, Panelwright
+from tests.service.conftest import WriteCell
+from tests.service.verbs import OPERATIONS, HoldRequest, hold
+from tests.service.waiting import eventually
+
+CHROMIUM = Path("/usr/bin/chromium")
+FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not CHROMIUM.exists(), reason="no Chromium: apt-get install chromium"),
+]
+
+
+@pytest.fixture(scope="module")
+def served_page(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Panelwright]:
+    """A cell of fakes whose mission stands still for a long time."""
+    from hal.config import load_cell
+
+    missions = Operation(name="missions", request_model=HoldRequest, run=hold, summary="Hold", moves=True)
+    runs = tmp_path_factory.mktemp("runs")
+    (runs / "2026-01-02T03-04-05").mkdir()
+    (runs / "2026-01-02T03-04-05" / "report.json").write_text("{}")
+    (runs / "2026-01-02T03-04-05" / "report.html").write_text("<h1>all done</h1>")
+    panelwright = Panelwright(
+        load_cell(write_module_cell(robot=True)),
+        Options(port=0, runs_dir=runs, inline=True),
+        operations={**OPERATIONS, "missions": missions},
+    )
+    panelwright.start()
+    yield panelwright
+    panelwright.close()
+
+
+@pytest.fixture(scope="module")
+def page(served_page: Panelwright) -> Iterator[Any]:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=str(CHROMIUM), args=FLAGS)
+        tab = browser.new_page(viewport={"width": 1400, "height": 1000})
+        faults: list[str] = []
+        tab.on("pageerror", lambda error: faults.append(str(error)))
+        tab.on("console", lambda line: faults.append(line.text) if "Content Security" in line.text else None)
+        tab.goto(served_page.url)
+        yield tab
+        assert not faults
+        browser.close()
+
+
+def _until(page: Any, claim: str) -> None:
+    """Wait until a JavaScript claim holds; asked from outside, because the page's own policy forbids `eval`."""
+    eventually(lambda: page.evaluate(f"() => Boolean({claim})"))
+
+
+def test_cell_devices_and_picture_show(page: Any) -> None:
+    _until(page, "document.querySelector('#cell-line').textContent.includes('cell fake')")
+    _until(page, "document.querySelectorAll('#devices li').length === 8")
+    assert page.text_content("#devices-line") == "8 of 8 good"
+    _until(page, "document.querySelector('#picture').naturalWidth === 64")
+    page.click("text=range scanner")
+    _until(page, "document.querySelector('#picture').naturalWidth === 16")
+
+
+def test_the_arm_shows_live(page: Any) -> None:
+    _until(page, "document.querySelectorAll('#joints .joint').length === 6")
+    assert "mm" in page.text_content("#live")
+
+
+def test_the_last_report_is_linked(page: Any) -> None:
+    page.wait_for_selector("#report:not([hidden])")
+    assert page.get_attribute("#report", "href") == "/v1/missions/2026-01-02T03-04-05/report.html"
+
+
+def test_a_mission_runs_with_progress_and_can_be_cancelled(page: Any) -> None:
+    page.click("#start:not([disabled])")
+    _until(page, "document.querySelector('#mission-state').textContent === 'running'")
+    _until(page, "document.querySelector('#steps').textContent.includes('holding')")
+    assert page.is_disabled("#start")
+    page.click("#cancel:not([hidden])")
+    _until(page, "document.querySelector('#mission-state').textContent === 'cancelled'")
+    _until(page, "document.querySelector('#tasks').textContent.includes('missions')")
+
+
+def test_stop_latches_visibly_and_only_a_reset_clears_it(page: Any, served_page: Panelwright) -> None:
+    page.click("#start:not([disabled])")
+    _until(page, "document.querySelector('#steps').textContent.includes('holding')")
+    page.click("#stop")
+    _until(page, "document.querySelector('#stop-box').dataset.latched === 'yes'")
+    assert served_page.service.supervisor.latch.is_set()
+    _until(page, "document.querySelector('#mission-state').textContent === 'failed'")
+    assert page.is_disabled("#start")
+    page.click("#reset:not([hidden])")
+    _until(page, "document.querySelector('#stop-box').dataset.latched === 'no'")
+    assert not served_page.service.supervisor.latch.is_set()
+    page.wait_for_selector("#start:not([disabled])")
+
+
+def test_the_escape_key_stops_and_a_narrow_screen_still_shows_the_button(page: Any, served_page: Panelwright) -> None:
+    page.set_viewport_size({"width": 420, "height": 800})
+    assert page.is_visible("#stop")
+    assert page.evaluate("document.documentElement.scrollWidth <= 420")
+    page.keyboard.press("Escape")
+    _until(page, "document.querySelector('#stop-box').dataset.latched === 'yes'")
+    assert served_page.service.supervisor.latch.is_set()
+
+
+def test_an_unreachable_service_is_said(page: Any, served_page: Panelwright) -> None:
+    page.route("**/readyz", lambda route: route.abort())
+    page.wait_for_selector("#banner:not([hidden])")
+    assert "does not answer" in page.text_content("#banner")

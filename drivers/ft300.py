@@ -31,7 +31,6 @@ COUNTS_PER_N, COUNTS_PER_NM = 100.0, 1000.0
 WRENCH_REGISTER, FIRMWARE_REGISTER, STREAM_REGISTER = 180, 500, 410
 START_STREAM = 0x0200
 STOP_S, STOP_BURST = 0.5, 50  # FF bytes for half a second end a stream
-BITS_PER_BYTE = 10
 ANSWER_S = 0.3
 
 
@@ -129,7 +128,7 @@ class Ft300Stream(StreamDevice[Wrench]):
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Publish each complete frame; those before the last ended a period earlier each."""
-        line_s = FRAME_BYTES * BITS_PER_BYTE / self._options.baud
+        line_s = FRAME_BYTES * self.byte_s
         frames = self._framer.feed(chunk)
         for back, frame in zip(range(len(frames) - 1, -1, -1), frames, strict=True):
             self._publish(frame, arrived_s - line_s - back / STREAM_RATE_HZ)

@@ -104,7 +104,7 @@ class Tfmini(StreamDevice[float]):
         """Publish each complete frame; the last ended just now, those before it one period earlier each."""
         frames = self._framer.feed(chunk)
         for back, frame in zip(range(len(frames) - 1, -1, -1), frames, strict=True):
-            self._publish(frame, arrived_s - back / self._options.rate_hz)
+            self._publish(frame, arrived_s - FRAME_BYTES * self.byte_s - back / self._options.rate_hz)
 
     def _publish(self, frame: bytes, valid_s: float) -> None:
         if frame == self._last[0] and valid_s - self._last[1] < 0.3 / self._options.rate_hz:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hal.clock import Clock, Deadline, WallClock
 from hal.devices import (
@@ -20,6 +21,8 @@ from hal.devices import (
     Health,
     LightsCapabilities,
     ProximityCapabilities,
+    RangeImage,
+    RangeScannerCapabilities,
     TouchCapabilities,
     Wrench,
 )
@@ -195,3 +198,40 @@ class ScriptedGripper(Scripted):
         way_m = self._goal_m - self._from_m
         moved_m = min(abs(way_m), self._speed_m_per_s * (now_s - self._since_s))
         return max(self.object_m, self._from_m + math.copysign(moved_m, way_m))
+
+
+class ScriptedScanner(Scripted):
+    """A full turn of 721 beams, half a degree apart: beam i of read k is 0.5 m + i / 2 mm + (k mod 100) mm away."""
+
+    kind = DeviceKind.RANGE_SCANNER
+
+    def __init__(self) -> None:
+        super().__init__("scripted_scanner")
+
+    def capabilities(self) -> RangeScannerCapabilities:
+        """-180 to 180 degrees."""
+        return RangeScannerCapabilities(
+            projection="polar",
+            width=721,
+            height=1,
+            fx=1.0,
+            fy=1.0,
+            cx=0.0,
+            cy=0.0,
+            min_range_m=0.02,
+            max_range_m=4.0,
+            sigma_m=0.001,
+            rate_hz=10.0,
+            first_angle_rad=-math.pi,
+            step_angle_rad=math.radians(0.5),
+        )
+
+    def read_range(self, *, deadline: Deadline) -> Stamped[RangeImage]:
+        """The next scan."""
+        index, now_s = self.count(deadline)
+        return Stamped(value=RangeImage(depth_m=scripted_scan(index)), host_time_s=now_s, sequence=index)
+
+
+def scripted_scan(index: int) -> NDArray[np.float32]:
+    """(1, 721) distances of read number `index`."""
+    return (0.5 + 0.0005 * np.arange(721) + 0.001 * (index % 100)).astype(np.float32)[np.newaxis, :]

@@ -246,6 +246,7 @@ class StreamDevice(WireDevice[T]):
         self._silence_s = silence_s
         self._heard_s = now_s()
         self.bytes_in = 0
+        self.byte_s = 0.0
         self.port = Port(context.name, open_link=open_link, tenant=self)
 
     @abstractmethod
@@ -267,6 +268,7 @@ class StreamDevice(WireDevice[T]):
 
     def set_up(self, link: Link) -> None:
         """Start the stream (owner thread)."""
+        self.byte_s = link.byte_s
         self.start(link)
         self._heard_s = now_s()
 

@@ -28,6 +28,11 @@ class FdLink:
         """What a person would call it."""
         return self._name
 
+    @property
+    def byte_s(self) -> float:
+        """Networks bring whole messages."""
+        return 0.0
+
     def read(self, until_s: float) -> bytes:
         """At least one byte, or `b""` at `until_s`."""
         try:

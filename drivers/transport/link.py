@@ -48,6 +48,11 @@ class Link(Protocol):
         """What a person would call it: `serial /dev/ttyUSB0, 115200 baud`."""
         ...
 
+    @property
+    def byte_s(self) -> float:
+        """Seconds a byte takes on the line; 0 where bytes arrive at once."""
+        ...
+
     def read(self, until_s: float) -> bytes:
         """What has arrived: at least one byte, or `b""` when `until_s` passes without one.
 
@@ -111,6 +116,11 @@ class CaptureLink:
         """Name of the link inside."""
         return self._inner.name
 
+    @property
+    def byte_s(self) -> float:
+        """As the link inside."""
+        return self._inner.byte_s
+
     def read(self, until_s: float) -> bytes:
         """As the link inside."""
         chunk = self._inner.read(until_s)
@@ -154,6 +164,11 @@ class ReplayLink:
     def name(self) -> str:
         """`replay of FILE`."""
         return self._name
+
+    @property
+    def byte_s(self) -> float:
+        """Not recorded."""
+        return 0.0
 
     def read(self, until_s: float) -> bytes:
         """The next recorded chunk."""

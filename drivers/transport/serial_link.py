@@ -12,6 +12,8 @@ import serial.tools.list_ports
 from drivers.transport.fd_link import FdLink
 from hal.errors import DeviceUnavailable
 
+PTY_MAJORS = range(136, 144)  # Linux devices.txt
+BITS_PER_BYTE = 10
 STABLE_NAMES = Path("/dev/serial/by-id")
 
 
@@ -31,6 +33,12 @@ class SerialLink(FdLink):
             return os.stat(self._path).st_rdev == self._device_id  # noqa: PTH116  # st_rdev of the link's end
         except OSError:
             return False
+
+    @property
+    def byte_s(self) -> float:
+        """Start bit, eight data bits, stop bit; a pseudo terminal has no line."""
+        is_pseudo = os.major(self._device_id) in PTY_MAJORS
+        return 0.0 if is_pseudo else BITS_PER_BYTE / float(self._port.baudrate)
 
     def set_baud(self, baud: int) -> None:
         """Change the speed of the open port."""

@@ -41,6 +41,7 @@ class ScriptLink:
     """A link whose far side is a list: each write moves the next answer into the receive buffer."""
 
     name = "script"
+    byte_s = 0.0
 
     def __init__(self, *answers: bytes) -> None:
         self.answers = list(answers)

@@ -1,0 +1,35 @@
+"""A line of distances out of any range scanner: what a 2-D scanner in its place would see."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.devices import RangeImage, RangeScannerCapabilities
+
+
+def line_m(image: RangeImage, c: RangeScannerCapabilities, angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance along each beam at `angle_rad` about the sensor's y axis, from the image's middle row; NaN outside it.
+
+    Pinhole: u = cx + fx tan(a), distance = z / cos(a). Orthographic images have no beams from one point: their columns
+    are taken where the beam meets the depth at that column's place, which is exact for a plane square to the view.
+    """
+    row = image.depth_m[c.height // 2].astype(np.float64)
+    if c.projection == "polar":
+        column = (angle_rad - c.first_angle_rad) / c.step_angle_rad
+        return _at(row, column)
+    is_ahead = np.abs(angle_rad) < 0.5 * np.pi - 1e-3
+    safe_rad = np.where(is_ahead, angle_rad, 0.0)
+    if c.projection == "pinhole":
+        range_m = _at(row, c.cx + c.fx * np.tan(safe_rad)) / np.cos(safe_rad)
+    else:
+        middle_m = float(np.nanmedian(row)) if np.any(np.isfinite(row)) else np.nan
+        range_m = _at(row, c.cx + c.fx * middle_m * np.tan(safe_rad)) / np.cos(safe_rad)
+    return np.where(is_ahead, range_m, np.nan)
+
+
+def _at(row: NDArray[np.float64], column: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The nearest pixel; NaN beyond the ends."""
+    nearest = np.round(column)
+    is_inside = np.isfinite(nearest) & (nearest >= 0) & (nearest < len(row))
+    return np.where(is_inside, row[np.where(is_inside, nearest, 0).astype(np.int64)], np.nan)

@@ -1,0 +1,84 @@
+"""What line scanners share: one row of beams in a plane, as a range image one pixel high."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.transport.device import StreamDevice
+from hal.clock import Deadline
+from hal.devices import DeviceKind, RangeImage, RangeScannerCapabilities
+from hal.errors import DeviceUnavailable
+from hal.readings import Cause, Quality, Stamped
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Beams:
+    """Geometry of a line scanner as it reports it itself."""
+
+    count: int
+    first_rad: float
+    step_rad: float
+    min_range_m: float
+    max_range_m: float
+    scan_s: float
+
+
+class LineScanner(StreamDevice[RangeImage]):
+    """A scanner that streams lines; the subclass parses them and knows its `beams` once it is set up."""
+
+    kind = DeviceKind.RANGE_SCANNER
+    beams: Beams | None = None
+    sigma_m = 0.01
+
+    def capabilities(self) -> RangeScannerCapabilities:
+        """As the device reported at its last set-up.
+
+        Raises:
+            DeviceUnavailable: it has not been set up yet.
+        """
+        b = self.beams
+        if b is None:
+            raise DeviceUnavailable(f"{self.name} is not set up yet", hint="wait until it connects", device=self.name)
+        return RangeScannerCapabilities(
+            projection="polar",
+            width=b.count,
+            height=1,
+            fx=1.0 / b.step_rad,
+            fy=1.0,
+            cx=-b.first_rad / b.step_rad,
+            cy=0.0,
+            min_range_m=b.min_range_m,
+            max_range_m=b.max_range_m,
+            sigma_m=self.sigma_m,
+            rate_hz=1.0 / b.scan_s,
+            first_angle_rad=b.first_rad,
+            step_angle_rad=b.step_rad,
+        )
+
+    def read_range(self, *, deadline: Deadline) -> Stamped[RangeImage]:
+        """A scan that began after this call: its end is at least one turn away."""
+        scan_s = self.beams.scan_s if self.beams is not None else 0.0
+        return self.newest(deadline, not_before_s=self.context.clock.now_s() + scan_s)
+
+    def publish_scan(
+        self, range_m: NDArray[np.float64], *, valid_s: float, device_time_s: float | None = None, missed: int = 0
+    ) -> None:
+        """Put one scan, beam by beam, NaN where nothing was seen; `valid_s` is its end."""
+        is_seen = bool(np.any(np.isfinite(range_m)))
+        self.publish(
+            RangeImage(depth_m=range_m.astype(np.float32)[np.newaxis, :]),
+            valid_s=valid_s,
+            device_time_s=device_time_s,
+            quality=Quality.VALID if is_seen else Quality.INVALID,
+            cause=Cause.NONE if is_seen else Cause.OUT_OF_RANGE,
+            missed=missed,
+        )
+
+
+def within(range_m: NDArray[np.float64], beams: Beams) -> NDArray[np.float64]:
+    """Ranges with everything outside the sensor's limits as NaN."""
+    return np.where((range_m >= beams.min_range_m) & (range_m <= beams.max_range_m), range_m, math.nan)

@@ -33,6 +33,7 @@ UPRIGHT = np.diag([1.0, -1.0, -1.0])  # camera x right, y down, z forward; panel
 CANDIDATES = 16
 LEAST_SCORE = 0.1
 FOCAL_TRIALS = (1.25, 0.95, 1.65)  # of the image width, when the camera is unknown; neighbours share a 4 px gate
+USUAL_RADIUS_M = 0.006
 TILT_SIGMA_RAD = 0.4
 ROLL_SIGMA_RAD = 0.35
 RIVAL_MARGIN = 2.0  # in log-odds: closer hypotheses with other blobs are a tie
@@ -73,6 +74,7 @@ def assign_lights(
     image_size_px: tuple[int, int],
     intrinsics: CameraIntrinsics | None = None,
     upright: ArrayLike = UPRIGHT,
+    radius_m: float = USUAL_RADIUS_M,
     least: int = 4,
 ) -> AssignedLights:
     """Choose the panel's lights among the blobs of `find_lights`.
@@ -84,6 +86,7 @@ def assign_lights(
         intrinsics: the camera; without it several focal lengths and an ideal lens are tried.
         upright: (3, 3) rotation camera_from_panel about which the camera stands, within some tens of degrees. A panel
             that looks the same upside down needs it; the default is an upright panel seen from the front.
+        radius_m: of the lamps, roughly.
         least: how many lights must be seen, 2 to 4; the pose needs 4.
 
     Raises:
@@ -101,7 +104,8 @@ def assign_lights(
             f"{len(usable)} lamp-like blobs became brighter, {least} lights are needed",
             hint="check that the panel's lights switch, and that the camera sees all of them",
         )
-    best, chosen = _hypotheses(blobs, usable, lights, (image_size_px, intrinsics, np.asarray(upright, float)))
+    view = (image_size_px, intrinsics, np.asarray(upright, float), radius_m)
+    best, chosen = _hypotheses(blobs, usable, lights, view)
     if not np.isfinite(best[0]):
         raise WrongLamp(
             f"{len(usable)} blobs became brighter, but no choice of them stands as the taught lights",
@@ -135,20 +139,20 @@ def _hypotheses(
     blobs: LightBlobs,
     usable: NDArray[np.intp],
     lights: Array,
-    view: tuple[tuple[int, int], CameraIntrinsics | None, Array],
+    view: tuple[tuple[int, int], CameraIntrinsics | None, Array, float],
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Best scores and their blobs; `view` is image size, camera if known, upright rotation."""
-    size, intrinsics, upright = view
+    """Best scores and their blobs; `view` is image size, camera if known, upright rotation, lamp radius."""
+    size, intrinsics, upright, radius_m = view
     centres = blobs.centres_px[usable]
     traits = np.stack([
-        6.0 + 2.0 * np.log(blobs.score[usable]), 0.5 * np.log(blobs.area_px[usable]), np.log(blobs.contrast[usable]),
+        4.0 + 2.0 * np.log(blobs.score[usable]), 0.5 * np.log(blobs.area_px[usable]), np.log(blobs.contrast[usable]),
         blobs.aspect[usable],
     ])  # fmt: skip
     best, chosen = np.full(8, -np.inf), np.full((8, 4), -1, np.int64)
     frame = np.array(size, float)
     X = lights - lights.mean(axis=0)
     for camera, ideal, gate_px in _cameras(centres, size, intrinsics):
-        prior = np.array([TILT_SIGMA_RAD, ROLL_SIGMA_RAD, gate_px])
+        prior = np.array([TILT_SIGMA_RAD, ROLL_SIGMA_RAD, gate_px, radius_m])
         for omit in (3, 2, 1, 0):
             search(ideal, traits, X, upright, camera, frame, prior, omit, best, chosen)
     _pairs(centres, traits, X @ upright.T, frame, (best, chosen))

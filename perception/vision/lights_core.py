@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-LEVELS = np.linspace(0.25, 0.9, 14)  # shares of the brightest part
+LEVELS = np.linspace(0.25, 0.9, 9)  # shares of the brightest part
 RAMP = 0.5
 RING_PX = 2  # the edge of a lamp is this wide on either side (blur and sampling)
 
@@ -74,8 +74,9 @@ def _steepest_level(rise: Image, seed: Mask, peak: float) -> float:
     alive = np.array(radii[1:]) > 1.0
     if not alive.any():
         return float(0.5 * peak)
-    # Two steps together: one step of a small lamp's radius is all sampling.
-    smooth = np.convolve(shrink, [0.5, 1.0, 0.5], mode="same") / np.convolve(np.ones_like(shrink), [0.5, 1.0, 0.5], "same")
+    # Neighbouring steps together: one step of a small lamp's radius is all sampling.
+    kernel = [0.5, 1.0, 0.5]
+    smooth = np.convolve(shrink, kernel, mode="same") / np.convolve(np.ones_like(shrink), kernel, mode="same")
     best = int(np.argmin(np.where(alive, smooth, np.inf)))
     return float(0.5 * (LEVELS[best] + LEVELS[best + 1]) * peak)
 

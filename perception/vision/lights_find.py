@@ -23,7 +23,7 @@ SEED_SIGMAS = 6.0  # a 640x480 image has 3e5 pixels: 6 sigma leaves no noise see
 GROW_SHARE = 0.5  # a region ends where the difference falls to half of its top: the lamp's rim at any blur
 LEAST_AREA_PX = 4.0
 CENTRE_FLOOR_PX = 0.04  # registration and lens blooming, measured on drawn pairs
-MOST_BLOBS = 24
+MOST_BLOBS = 16
 CLEAR_SIGMAS = 15.0  # a blob that stands out by this much is certain; glare that moved leaves 4 to 8
 CLEAR_BLOB_SIGMAS = 60.0  # of the whole blob; what noise and edges leave reaches about 20
 LEAST_ASPECT = 0.25  # a round lamp seen 75 degrees aslant
@@ -187,39 +187,56 @@ def _grow(rise: Image, sigma: Image, inside: NDArray[np.bool_], diameter: float)
     """Lamp-like parts of the connected regions that stand out of the noise."""
     regions = []
     margin = 8
-    for x, y, seed in _seeds(rise, (rise > SEED_SIGMAS * sigma) & inside, diameter):
+    seeds = _seeds(rise, (rise > SEED_SIGMAS * sigma) & inside, diameter)
+    seeds.sort(key=lambda seed: -seed.brightness)
+    for seed in seeds[: 2 * MOST_BLOBS]:
+        x, y, (h, w) = seed.left, seed.top, seed.mask.shape
         x0, y0 = max(x - margin, 0), max(y - margin, 0)
-        window = (slice(y0, y + seed.shape[0] + margin), slice(x0, x + seed.shape[1] + margin))
+        window = (slice(y0, y + h + margin), slice(x0, x + w + margin))
         padded = np.zeros(rise[window].shape, bool)
-        padded[y - y0 : y - y0 + seed.shape[0], x - x0 : x - x0 + seed.shape[1]] = seed
+        padded[y - y0 : y - y0 + h, x - x0 : x - x0 + w] = seed.mask
         region = _region(rise[window], sigma[window], padded, (x0, y0))
         if region is not None:
             regions.append(region)
     return regions
 
 
-def _seeds(rise: Image, lit: NDArray[np.bool_], diameter: float) -> list[tuple[int, int, NDArray[np.bool_]]]:
-    """Connected parts as (left, top, mask), largest first; what is too large for a lamp is split at half its height.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Seed:
+    """A connected part: its place in the image, its mask, the sum of its rise."""
+
+    left: int
+    top: int
+    mask: NDArray[np.bool_]
+    brightness: float
+
+
+def _seeds(rise: Image, lit: NDArray[np.bool_], diameter: float) -> list[_Seed]:
+    """Connected parts that are neither specks nor streaks; what is too large for a lamp is split at half its height.
 
     Glow that joins a lamp with its surroundings is lower than the lamp, so splitting frees the lamp and drops the glow.
     """
     import cv2
 
-    found = []
     _, labels, stats, _ = cv2.connectedComponentsWithStats(lit.astype(np.uint8), connectivity=8)
-    for k in np.argsort(-stats[1:, cv2.CC_STAT_AREA])[: 4 * MOST_BLOBS] + 1:
-        x, y, w, h, area = (int(v) for v in stats[k])
-        if area < 3:
+    wide, high, area = stats[1:, 2], stats[1:, 3], stats[1:, 4]
+    large = np.maximum(wide, high) > 1.5 * diameter
+    compact = (np.maximum(wide, high) <= 4 * np.minimum(wide, high) + 4) & (area >= 0.3 * wide * high)
+    usable = np.flatnonzero((area >= 3) & (large | compact))
+    found = []
+    for k in usable[np.argsort(-area[usable])][: 8 * MOST_BLOBS] + 1:
+        x, y, w, h = (int(v) for v in stats[k][:4])
+        part, inner = labels[y : y + h, x : x + w] == k, rise[y : y + h, x : x + w]
+        if not large[k - 1]:
+            found.append(_Seed(left=x, top=y, mask=part, brightness=float(inner[part].sum())))
             continue
-        part = labels[y : y + h, x : x + w] == k
-        if max(w, h) <= 1.5 * diameter:
-            found.append((x, y, part))
-            continue
-        inner = rise[y : y + h, x : x + w]
         level = 0.5 * (float(np.quantile(inner[part], 0.999)) + float(inner[part].min()))
         higher = part & (inner > level)
-        if 3 <= higher.sum() < area:
-            found += [(x + a, y + b, mask) for a, b, mask in _seeds(inner, higher, diameter)]
+        if 3 <= higher.sum() < part.sum():
+            found += [
+                _Seed(left=x + s.left, top=y + s.top, mask=s.mask, brightness=s.brightness)
+                for s in _seeds(inner, higher, diameter)
+            ]
     return found
 
 

@@ -15,7 +15,8 @@ Image = NDArray[np.float32]
 
 LEAST_AGREEMENT = 0.6  # gradient correlation after registration; 0.9 and more is usual, unrelated images give 0.1
 EDGE_PIXELS = 6_000  # 16 000 gave the same shift within 0.01 px
-ITERATIONS = 8
+ITERATIONS = 10
+SHIFT_FIRST = 3  # iterations with translation alone; turn and growth join when most edges overlap
 TONE_BINS = 16
 
 
@@ -28,7 +29,7 @@ class Registration:
     """How the first image lies on the second, and what remains of it there.
 
     Attributes:
-        second_from_first: (2, 3) affine map of pixels.
+        second_from_first: (2, 3) map of pixels (shift, turn and growth).
         gain, offset: grey levels, second = gain * first + offset.
         shift_px: (2,) motion of the image centre.
         warped: (H, W) the first image as the second camera would have seen it, in the second's grey levels.
@@ -46,10 +47,10 @@ class Registration:
 
 
 def register(first: Image, second: Image, *, noise: float) -> Registration:
-    """Affine motion and gain between two gray images, robust against what changed.
+    """Motion and gain between two gray images, robust against what changed.
 
-    Phase correlation of the half-size gradient images starts a Gauss-Newton fit of 6 motion and 2 brightness parameters
-    over the strongest edges with Tukey's weights.
+    Phase correlation of the half-size gradient images starts a Gauss-Newton fit of shift, turn, growth and brightness over
+    the strongest edges with Tukey's weights.
 
     Args:
         first, second: (H, W) grey levels.
@@ -95,22 +96,24 @@ def _refine(first: Image, second: Image, edges: _Edges, affine: Array, noise: fl
     target = second[rows, columns].astype(float)
     gain, offset = 1.0, 0.0
     one = np.ones_like(x)
-    for _ in range(ITERATIONS):
+    for iteration in range(ITERATIONS):
         source = _sample(first, affine, rows, columns)
         e = target - gain * source - offset
-        J = np.stack([gx, gy, gx * x, gx * y, gy * x, gy * y, source, one], axis=1)
+        motion = [gx, gy, gy * x - gx * y, gx * x + gy * y][: 2 if iteration < SHIFT_FIRST else 4]
+        J = np.stack([source, one, *motion], axis=1)
         known = np.isfinite(e)
         scale = max(1.4826 * float(np.median(np.abs(e[known]))), noise)
         w = np.where(known, np.clip(1.0 - (e / (4.685 * scale)) ** 2, 0.0, None) ** 2, 0.0)
-        Jw = np.where(known[:, None], J, 0.0) * w[:, None]
-        step = np.linalg.lstsq(Jw.T @ np.nan_to_num(J), Jw.T @ np.nan_to_num(e), rcond=1e-10)[0]
-        # Moving the first image's content by (a + B x) shows as -gradient . (a + B x) in the second.
-        move = np.array([[step[2] / width, step[3] / width, 0.0], [step[4] / width, step[5] / width, 0.0]])
-        move[:, 2] = step[:2] - move[:, :2] @ [width / 2.0, height / 2.0]
-        lifted = np.vstack([affine, [0.0, 0.0, 1.0]])
-        affine = (np.vstack([move, np.zeros(3)]) * -1.0 + np.eye(3))[:2] @ lifted
-        gain, offset = gain + step[6], offset + step[7]
-        if np.abs(step[:2]).max() < 0.01:
+        J, e = np.where(known[:, None], J, 0.0), np.where(known, e, 0.0)
+        step = np.linalg.lstsq((J * w[:, None]).T @ J, (J * w[:, None]).T @ e, rcond=1e-12)[0]
+        gain, offset = gain + step[0], offset + step[1]
+        # Moving the first image's content by a + B (p - centre) shows as -gradient . that in the second.
+        turn, growth = (step[4] / width, step[5] / width) if len(step) > 4 else (0.0, 0.0)
+        move = np.array([[1.0 - growth, turn, 0.0], [-turn, 1.0 - growth, 0.0], [0.0, 0.0, 1.0]])
+        centre = np.array([width / 2.0, height / 2.0])
+        move[:2, 2] = centre - move[:2, :2] @ centre - step[2:4]
+        affine = (move @ np.vstack([affine, [0.0, 0.0, 1.0]]))[:2]
+        if iteration >= SHIFT_FIRST and np.abs(step[2:4]).max() < 0.01:
             break
     return _result(first, second, edges, affine)
 

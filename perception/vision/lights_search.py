@@ -10,11 +10,12 @@ from perception.vision.quadrangle_p3p import three_point
 
 SIZE_SPREAD = 0.2  # standard deviation of log diameter among equal lamps
 CONTRAST_SPREAD = 0.6  # of log contrast: uneven light, ageing, angle
-MISSING_INSIDE = 3.0  # what a light inside the image costs that is not seen
+RADIUS_SPREAD = 0.5  # of the log of the lamps' radius about the taught or usual one
+MISSING_INSIDE = 2.0  # what a light inside the image costs that is not seen
 MISSING_OUTSIDE = 1.0  # ... and outside, plus the next figure for every image width that it is outside
 OUTSIDE_PER_WIDTH = 20.0
 ROUNDER = 0.2  # a disc tilted by t has aspect cos t; blur makes it rounder by this much
-UNCHECKED = 4.0  # three points fit always: what a hypothesis without a fourth light to check it costs
+UNCHECKED = 3.0  # three points fit always: what a hypothesis without a fourth light to check it costs
 
 
 @jit
@@ -39,7 +40,7 @@ def search(  # type: ignore[no-untyped-def]
         centres: (n, 2) ideal pixels. traits: (4, n) reward, log diameter, log contrast and aspect of the candidates.
         X: (4, 3) lights in the panel's frame. upright: (3, 3) expected camera_from_panel rotation.
         camera: fx, fy, cx, cy. frame: width, height.
-        prior: standard deviations of tilt (rad), roll (rad) and of the fourth light's place (px).
+        prior: standard deviations of tilt (rad), roll (rad) and of the fourth light's place (px); lamp radius (m).
         omit: the light that is predicted from the other three.
 
     Score = sum of rewards - sum of squares / 2 of size and contrast spread, tilt, roll, roundness and the fourth
@@ -104,6 +105,11 @@ def search(  # type: ignore[no-untyped-def]
                         seen -= MISSING_OUTSIDE + OUTSIDE_PER_WIDTH * beyond / frame[0]
                     else:
                         seen -= MISSING_INSIDE
+                    # A lamp of radius r shows sqrt(area) = sqrt(pi) r f / z.
+                    usual = np.log(1.7725 * prior[3] * camera[0])
+                    mean = (sizes[0] + sizes[1] + sizes[2]) / 3.0
+                    score -= 0.5 * ((mean - usual) / RADIUS_SPREAD) ** 2
+                    seen -= 0.5 * ((mean - usual) / RADIUS_SPREAD) ** 2
                     seen -= 0.5 * spread(sizes, 3) / SIZE_SPREAD**2 + 0.5 * spread(contrasts, 3) / CONTRAST_SPREAD**2
                     for fourth in range(n):
                         if fourth in (i, j, k):

@@ -1,7 +1,7 @@
 # ruff: noqa: PLR0915, PLR0917 - compiled loops take plain arrays and keep one equation in one place
 """Compiled inner loops of the four-light pose: reprojection chi-square, its derivatives and its local minimiser.
 
-Everything works on normalised image coordinates `m` (4, 2) with information matrices `A` (4, 3) = (a_uu, a_uv, a_vv) and
+Everything works on normalised image coordinates `m` (4, 2) with information `A` (4, 3) = (a_uu, a_uv, a_vv) each and
 on object points `X` (4, 3) whose centroid is the origin. A pose is `R` (3, 3) and `t` (3,), camera_from_object;
 perturbations are ordered translation then rotation: t <- t + d, R <- Exp(w) R. Costs are chi-squares.
 """

@@ -93,8 +93,8 @@ def three_point(P, f, Rs, ts):  # type: ignore[no-untyped-def]
     """Poses that carry three points (3, 3) onto three unit rays (3, 3); fills Rs, ts (4 of them), returns how many.
 
     The depths s solve three law-of-cosines equations. Two combinations without constant term are conics in s; the
-    pencil of both holds a pair of lines (a cubic), each of which meets a conic twice. Where noise makes a crossing complex its
-    real part is kept: close to a double root the truth is there.
+    pencil of both holds a pair of lines (a cubic), each of which meets a conic twice. Where noise makes a crossing
+    complex its real part is kept: close to a double root the truth is there.
     Source: Grunert 1841; the pencil of conics as in Finsterwalder, see Haralick et al., IJCV 13(3), 1994, Section 2.
     """
     d2 = np.empty(3)

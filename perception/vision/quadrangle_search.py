@@ -16,6 +16,7 @@ MIRROR_TURN_COS = 0.99619469809  # 5 degrees: normals nearer than this are one p
 RING_STEP_RAD = 0.10471975512  # 6 degrees; 2.5 degrees gave the same mass (correlation 0.999, 8000 problems)
 RING_COUNT = 12  # azimuths; 24 gave the same
 RING_END_RAD = 1.308996939  # 75 degrees
+WORTHLESS = 60.0  # chi-square above the best at which a minimum has odds of 1 in 1e13
 
 
 @jit
@@ -406,6 +407,8 @@ def solve(points, pixels, covariance, camera, near_sigmas2, Rs, ts, costs, Cs, m
     count = all_minima(X, m, A, normal, Rs[:-1], ts[:-1], costs[:-1], Ns[:-1])
     if count == 0:
         return 0, 0, 3
+    while costs[count - 1] - costs[0] > WORTHLESS:  # among them runs that fled to infinity, where everything is flat
+        count -= 1
     F = sight_frame(ts[0])
     best = F @ (Rs[0] @ normal)
     side = 1.0 if best[2] > 0.0 else -1.0

@@ -96,11 +96,11 @@ class Latch:
         self._memory.close()
 
     def _write(self, flag: int, source: str) -> LatchState:
-        if flag == LATCHED:
-            self._memory[BODY_AT] = LATCHED  # first of all: the control thread may look right now
         (sequence,) = SEQUENCE.unpack_from(self._memory, 0)
         sequence += 1 + sequence % 2  # odd, also after a writer died in the middle
         SEQUENCE.pack_into(self._memory, 0, sequence)
+        if flag == LATCHED:
+            self._memory[BODY_AT] = LATCHED  # before the rest: the control thread may look right now
         _, count, _, _ = BODY.unpack_from(self._memory, BODY_AT)
         text = source.encode("utf-8", "replace")[:80]
         BODY.pack_into(self._memory, BODY_AT, flag, count + 1, time.time(), text)

@@ -1,0 +1,126 @@
+"""The journal: acknowledged means on disk, the chain shows every change, a killed writer loses nothing acknowledged."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from service.errors import JournalError
+from service.journal import FIRST_HASH, Journal
+
+
+def test_what_was_appended_is_read_back_in_order(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j.sqlite")
+    for i in range(5):
+        journal.append("tick", {"i": i})
+    records = journal.records()
+    assert [record.data["i"] for record in records] == list(range(5))
+    assert records[0].previous_hash == FIRST_HASH
+    assert journal.records(kinds=("tock",)) == []
+    assert [r.data["i"] for r in journal.records(limit=2)] == [3, 4]
+    assert journal.verify() == 5
+    journal.close()
+
+
+def test_it_goes_on_after_a_restart(tmp_path: Path) -> None:
+    for i in range(3):
+        journal = Journal(tmp_path / "j.sqlite")
+        journal.append("run", {"i": i})
+        journal.close()
+    journal = Journal(tmp_path / "j.sqlite")
+    assert journal.verify() == 3
+    journal.close()
+
+
+def test_many_threads_share_commits_and_break_nothing(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j.sqlite")
+    threads = [
+        threading.Thread(target=lambda n=n: [journal.append("t", {"n": n, "i": i}) for i in range(20)])
+        for n in range(8)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert journal.verify() == 160
+    journal.close()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "UPDATE journal SET data = '{\"i\":99}' WHERE id = 3",
+        "UPDATE journal SET kind = 'x' WHERE id = 3",
+        "UPDATE journal SET wall_time_s = 0 WHERE id = 3",
+        "DELETE FROM journal WHERE id = 3",
+        "DELETE FROM journal WHERE id = 1",
+        "UPDATE journal SET previous_hash = 'y' WHERE id = 5",
+    ],
+)
+def test_every_change_breaks_the_chain(tmp_path: Path, change: str) -> None:
+    journal = Journal(tmp_path / "j.sqlite")
+    for i in range(5):
+        journal.append("tick", {"i": i})
+    journal.close()
+    with sqlite3.connect(tmp_path / "j.sqlite") as db:
+        db.execute(change)
+    with pytest.raises(JournalError, match="chain breaks at row"):
+        journal.verify()
+
+
+def test_a_closed_journal_refuses(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j.sqlite")
+    journal.close()
+    journal.close()
+    with pytest.raises(JournalError):
+        journal.append("late", {})
+    journal.note("late", {})
+
+
+def test_a_place_that_cannot_be_written_is_said_at_once(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(JournalError, match="cannot be written"):
+        Journal(tmp_path / "file" / "j.sqlite")
+
+
+def test_a_failed_commit_reaches_its_caller_and_the_chain_goes_on(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j.sqlite")
+    journal.append("good", {})
+    with sqlite3.connect(tmp_path / "j.sqlite") as db:
+        db.execute("CREATE TRIGGER full BEFORE INSERT ON journal BEGIN SELECT RAISE(ABORT, 'disk full'); END")
+    with pytest.raises(JournalError, match="disk full"):
+        journal.append("bad", {})
+    with sqlite3.connect(tmp_path / "j.sqlite") as db:
+        db.execute("DROP TRIGGER full")
+    journal.append("good again", {})
+    assert journal.verify() == 2
+    journal.close()
+
+
+def test_a_killed_writer_loses_nothing_that_it_acknowledged(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; from service.journal import Journal\n"
+        f"j = Journal(Path({str(tmp_path / 'j.sqlite')!r}))\n"
+        "i = 0\n"
+        "while True:\n"
+        "    j.append('tick', {'i': i}); print(i, flush=True); i += 1\n"
+    )
+    for _ in range(3):
+        writer = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+        assert writer.stdout is not None
+        acknowledged = [int(writer.stdout.readline()) for _ in range(20)][-1]
+        os.kill(writer.pid, signal.SIGKILL)
+        acknowledged = max([acknowledged, *(int(line) for line in writer.stdout if line.endswith("\n"))])
+        writer.wait()
+        writer.stdout.close()
+        journal = Journal(tmp_path / "j.sqlite")
+        journal.verify()
+        assert journal.records(limit=1)[-1].data["i"] >= acknowledged
+        journal.close()

@@ -58,7 +58,9 @@ class SimArm(SimDevice[JointState]):
         self._check(deadline)
         wanted = np.asarray(position_rad, float)
         if wanted.shape != self._lower.shape or not np.isfinite(wanted).all():
-            raise InvalidRequest(f"{self._name}: a set-point is six finite joint angles", hint="check the planner", device=self._name)
+            raise InvalidRequest(
+                f"{self._name}: a set-point is six finite joint angles", hint="check the planner", device=self._name
+            )
         if not self._world.is_enabled:
             raise MotionRefused(f"{self._name}: the drives are off", hint="call enable first", device=self._name)
         last = self._world.frame.snapshot.setpoint_rad

@@ -38,7 +38,11 @@ def t3() -> ArmModel:
     limits_rad = [(-2.97, 2.97), (-0.80, 2.80), (-2.60, 1.45), (-3.40, 3.40), (-2.30, 2.30), (-5.00, 5.00)]
     return ArmModel(
         capabilities=_capabilities(
-            "t3", links, limits_rad, velocity=(1.6, 1.6, 1.8, 3.2, 3.2, 4.0), radius=(0.09, 0.06, 0.06, 0.05, 0.045, 0.04)
+            "t3",
+            links,
+            limits_rad,
+            velocity=(1.6, 1.6, 1.8, 3.2, 3.2, 4.0),
+            radius=(0.09, 0.06, 0.06, 0.05, 0.045, 0.04),
         ),
         mass_kg=(20.0, 12.0, 3.0, 7.0, 1.5, 0.8),
         torque_nm=(600.0, 600.0, 350.0, 90.0, 80.0, 50.0),
@@ -108,7 +112,9 @@ def link_from_next(link: DhLink) -> RigidTransform:
     return RigidTransform.from_components([link.a_m, 0.0, link.d_m], Rotation.from_euler("x", link.alpha_rad))
 
 
-def arm_urdf(model: ArmModel, *, flange_from_sensor: RigidTransform, flange_from_grip: RigidTransform, load_kg: float) -> str:
+def arm_urdf(
+    model: ArmModel, *, flange_from_sensor: RigidTransform, flange_from_grip: RigidTransform, load_kg: float
+) -> str:
     """URDF of arm, force/torque sensor and gripper: primitives only, one tag a line (the parser cuts long lines).
 
     Link i turns about z at the end of link i - 1, so its frame is the DH frame i - 1 turned by q_i; the flange is fixed to link 6.
@@ -119,7 +125,9 @@ def arm_urdf(model: ArmModel, *, flange_from_sensor: RigidTransform, flange_from
     for i, dh in enumerate(caps.links):
         turn = RigidTransform.from_rotation(Rotation.from_euler("z", dh.offset_rad))
         name = f"link{i + 1}"
-        lines += _link(name, model.mass_kg[i], (dh.a_m, 0.0, dh.d_m), caps.link_radius_m[i], PAINT[i % 2])
+        lines += _link(
+            name, model.mass_kg[i], (dh.a_m, 0.0, dh.d_m), caps.link_radius_m[i], PAINT[i % 2], is_foot=i == 0
+        )
         lines += joint(name, "revolute", parent, name, parent_from_joint * turn)
         parent, parent_from_joint = name, link_from_next(dh)
     lines += link("flange", inertial(0.02, (0, 0, 0), (1e-5, 1e-5, 1e-5)))
@@ -131,14 +139,22 @@ def arm_urdf(model: ArmModel, *, flange_from_sensor: RigidTransform, flange_from
 PAINT: tuple[Colour, Colour] = ((0.85, 0.45, 0.10), (0.30, 0.32, 0.35))
 
 
-def _link(name: str, mass_kg: float, end_m: tuple[float, float, float], radius_m: float, paint: Colour) -> list[str]:
-    """A capsule from the joint to the next one: a cylinder and a ball, the shape that `link_radius_m` promises."""
+def _link(
+    name: str, mass_kg: float, end_m: tuple[float, float, float], radius_m: float, paint: Colour, *, is_foot: bool
+) -> list[str]:
+    """A capsule from the joint to the next one: a cylinder and a ball, the shape that `link_radius_m` promises.
+
+    The foot stands in the floor, so it is to be seen only: a contact for good would cost time in every tick.
+    """
     middle, length_m = along((0.0, 0.0, 0.0), end_m)
     across = mass_kg * (3.0 * radius_m**2 + length_m**2) / 12.0 + 1e-4
     lengthwise = mass_kg * radius_m**2 / 2.0 + 1e-4
     # Inertia is given along the link's own axes; a link lies along x or along z.
     inertia = (lengthwise, across, across) if abs(end_m[0]) > abs(end_m[2]) else (across, across, lengthwise)
-    parts = [inertial(mass_kg, tuple(middle.translation), inertia), shape(RigidTransform.identity(), sphere(radius_m), paint)]
+    parts = [
+        inertial(mass_kg, tuple(middle.translation), inertia),
+        shape(RigidTransform.identity(), sphere(radius_m), paint, collision=not is_foot),
+    ]
     if length_m > 0.0:
-        parts.append(shape(middle, cylinder(radius_m, length_m), paint))
+        parts.append(shape(middle, cylinder(radius_m, length_m), paint, collision=not is_foot))
     return link(name, *parts)

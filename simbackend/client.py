@@ -127,19 +127,25 @@ class WorldClient:
             self._images = mmap.mmap(file.fileno(), IMAGE_BYTES)
             fds = (theirs.fileno(), file.fileno())
             command = [sys.executable, "-m", "simbackend.world_process", *map(str, fds)]
-            self._process = subprocess.Popen(command, pass_fds=fds, env=_environment(), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)  # noqa: S603
+            self._process = subprocess.Popen(
+                command, pass_fds=fds, env=_environment(), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+            )
         theirs.close()
         self._pipe = Connection(ours.detach())
         try:
             self._pipe.send(config)
             complaint = self._pipe.recv() if self._pipe.poll(START_S) else f"no answer within {START_S:.0f} s"
             if complaint is not None:
-                raise DeviceUnavailable(f"the simulated world did not start: {complaint}", hint="run `panelwright doctor`", device="world")
+                raise DeviceUnavailable(
+                    f"the simulated world did not start: {complaint}", hint="run `panelwright doctor`", device="world"
+                )
             self._take(self._pipe.recv_bytes())
         except (EOFError, OSError) as error:
             self.close()
             raise DeviceUnavailable(
-                "the simulated world ended while starting", hint="run `panelwright doctor`; is pybullet installed?", device="world"
+                "the simulated world ended while starting",
+                hint="run `panelwright doctor`; is pybullet installed?",
+                device="world",
             ) from error
         except DeviceUnavailable:
             self.close()
@@ -301,7 +307,9 @@ def true_mount(cell: Cell, draws: Draws, device: str) -> RigidTransform:
     """
     record = cell.calibration_of(device).mount
     if record is None:
-        raise ConfigError(f"the calibration record of {device} has no [mount]", hint="add position_m and rpy_rad", device=device)
+        raise ConfigError(
+            f"the calibration record of {device} has no [mount]", hint="add position_m and rpy_rad", device=device
+        )
     return draws.mount(device, record)
 
 
@@ -326,4 +334,3 @@ def _environment() -> dict[str, str]:
     # The world finds its code where this process found it, and uses one core: the other belongs to the cell.
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     return {**os.environ, **threads, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-

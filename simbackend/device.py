@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-
 from typing import Any, Generic, TypeVar
-
 
 from hal.clock import Deadline
 from hal.devices import DeviceKind, Fault, Health
@@ -13,6 +11,7 @@ from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
 from hal.strict import Strict, validate
 from simbackend.client import Frame, WorldClient
+from simbackend.wire import Snapshot
 
 T = TypeVar("T")
 O = TypeVar("O", bound="SimOptions")
@@ -72,7 +71,9 @@ class SimDevice(Generic[T]):
 
     def health(self) -> Health:
         """State of the link and the newest sample."""
-        cause = {Fault.SILENT: Cause.TIMEOUT, Fault.DISCONNECTED: Cause.COMM}.get(self._fault or Fault.BIASED, Cause.NONE)
+        cause = {Fault.SILENT: Cause.TIMEOUT, Fault.DISCONNECTED: Cause.COMM}.get(
+            self._fault or Fault.BIASED, Cause.NONE
+        )
         connected = not self._is_closed and self._fault is not Fault.DISCONNECTED
         is_good = connected and cause is Cause.NONE
         return Health(
@@ -105,15 +106,7 @@ class SimDevice(Generic[T]):
         if kept is not None and self._fault is Fault.STALE:
             return kept
         if kept is not None and self._fault is Fault.FROZEN:
-            frame = self._world.frame
-            return Stamped(
-                value=kept.value,
-                host_time_s=frame.host_time_s,
-                device_time_s=frame.snapshot.stamp_s,
-                sequence=frame.snapshot.tick,
-                quality=kept.quality,
-                cause=kept.cause,
-            )
+            return self._stamp(self._world.frame, kept.value, kept.quality, kept.cause)
         sample = self._fresh(self._magnitude if self._fault is Fault.BIASED else 0.0)
         self._samples += 1
         self._last_s = sample.host_time_s
@@ -124,7 +117,9 @@ class SimDevice(Generic[T]):
         if self._is_closed or self._fault is Fault.DISCONNECTED:
             self._errors += 1
             what = "is closed" if self._is_closed else "is not connected"
-            raise DeviceUnavailable(f"{self._name} {what}", hint="check the cable, or end the injected fault", device=self._name)
+            raise DeviceUnavailable(
+                f"{self._name} {what}", hint="check the cable, or end the injected fault", device=self._name
+            )
         if self._fault is Fault.SILENT:
             self._errors += 1
             waited_s = deadline.remaining_s()
@@ -138,14 +133,23 @@ class SimDevice(Generic[T]):
     def _fresh(self, bias: float) -> Stamped[T]:
         frame = self._world.frame
         value, quality, cause = self._measure(frame, bias)
+        return self._stamp(frame, value, quality, cause)
+
+    def _stamp(self, frame: Frame, value: T, quality: Quality, cause: Cause) -> Stamped[T]:
+        tick = self._tick_of(frame.snapshot)
+        lag_s = (frame.snapshot.tick - tick) / self._world.rate_hz
         return Stamped(
             value=value,
-            host_time_s=frame.host_time_s,
-            device_time_s=frame.snapshot.stamp_s,
-            sequence=frame.snapshot.tick,
+            host_time_s=frame.host_time_s - lag_s,
+            device_time_s=frame.snapshot.stamp_s - lag_s,
+            sequence=tick,
             quality=quality,
             cause=cause,
         )
+
+    def _tick_of(self, snapshot: Snapshot) -> int:
+        """The tick at which this device took the sample that a snapshot holds."""
+        return snapshot.tick
 
     def _measure(self, frame: Frame, bias: float) -> tuple[T, Quality, Cause]:
         """Value at a frame, with the bias of an injected fault in the device's own unit."""

@@ -28,6 +28,7 @@ class ArmDrive:
         self._is_braking = False
         self.setpoint = np.asarray(position_rad, float).copy()
         self.speed = np.zeros_like(self.setpoint)
+        self._last_speed = self.speed
         self.is_enabled = False
 
     def aim(self, position_rad: Array) -> None:
@@ -50,8 +51,6 @@ class ArmDrive:
         """Brake and refuse set-points."""
         self.is_enabled, self._is_braking = False, True
 
-    _last_speed: Array = np.zeros(6)
-
     def tick(self) -> None:
         """Move on by one tick."""
         if self._is_braking:
@@ -60,8 +59,9 @@ class ArmDrive:
         if self._fresh:
             self._fresh, self._age_s = False, 0.0
             return
+        if self._age_s == 0.0:
+            self.speed = np.zeros_like(self.setpoint)
         self._age_s += self._dt_s
-        self.speed = np.zeros_like(self.setpoint)
         if self.is_enabled and self._age_s > self._watchdog_s and np.abs(self._last_speed).max() > MOVING_RAD_PER_S:
             self.is_enabled = False
 

@@ -40,9 +40,16 @@ class SimForceTorque(SimDevice[Wrench]):
         super().__init__(context, DeviceKind.FORCE_TORQUE, options)
         self._options = options
         draws = self._world.draws
-        record = self._world.cell.calibration_of(context.name).load if context.name in self._world.cell.file.devices else None
-        nominal = record.load() if record is not None else ToolLoad(mass_kg=0.0, centre_of_mass_m=(0, 0, 0), bias=(0,) * 6)
+        record = (
+            self._world.cell.calibration_of(context.name).load
+            if context.name in self._world.cell.file.devices
+            else None
+        )
+        nominal = (
+            record.load() if record is not None else ToolLoad(mass_kg=0.0, centre_of_mass_m=(0, 0, 0), bias=(0,) * 6)
+        )
         self._bias = np.asarray(draws.load(context.name, nominal).bias)
+        self._noise = draws.noise(context.name, 6)
         self._phase = draws.stream(f"drift/{context.name}").uniform(0.0, 2.0 * math.pi, 6)
         self._sigma = np.repeat([options.force_sigma_n, options.torque_sigma_nm], 3)
         self._drift = np.repeat([options.force_drift_n, options.torque_drift_nm], 3)
@@ -65,7 +72,7 @@ class SimForceTorque(SimDevice[Wrench]):
 
     def _measure(self, frame: Frame, bias: float) -> tuple[Wrench, Quality, Cause]:
         snapshot = frame.snapshot
-        noise = self._sigma * self._world.draws.at_tick(self._name, snapshot.tick).standard_normal(6)
+        noise = self._sigma * self._noise.at(snapshot.tick)
         drift = self._drift * np.sin(2.0 * math.pi * snapshot.stamp_s / DRIFT_PERIOD_S + self._phase)
         raw = snapshot.wrench + self._bias + drift + noise
         raw[:3] += bias

@@ -40,8 +40,16 @@ class SimGripper(SimDevice[GripperState]):
             InvalidRequest: not finite, or force or speed not positive.
         """
         self._check(deadline)
-        if not all(math.isfinite(x) for x in (width_m, force_n, speed_m_per_s)) or force_n <= 0.0 or speed_m_per_s <= 0.0:
-            raise InvalidRequest(f"{self._name}: width, force and speed must be finite and positive", hint="check the skill", device=self._name)
+        if (
+            not all(math.isfinite(x) for x in (width_m, force_n, speed_m_per_s))
+            or force_n <= 0.0
+            or speed_m_per_s <= 0.0
+        ):
+            raise InvalidRequest(
+                f"{self._name}: width, force and speed must be finite and positive",
+                hint="check the skill",
+                device=self._name,
+            )
         width_m = min(max(width_m, 0.0), MAX_WIDTH_M)
         self._world.aim_gripper(width_m, min(force_n, MAX_FORCE_N), min(speed_m_per_s, MAX_SPEED_M_PER_S))
         return width_m

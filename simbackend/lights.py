@@ -36,7 +36,9 @@ class SimLights(SimDevice[tuple[bool, ...]]):
         self._check(deadline)
         if len(on) != len(self._channels):
             raise InvalidRequest(
-                f"{self._name} has {len(self._channels)} channels, not {len(on)}", hint="give one value a channel", device=self._name
+                f"{self._name} has {len(self._channels)} channels, not {len(on)}",
+                hint="give one value a channel",
+                device=self._name,
             )
         wanted = tuple(bool(x) for x in on)
         self._world.switch_lights(wanted)

@@ -46,7 +46,9 @@ class Friction:
 
     def drive(self) -> None:
         """A velocity motor at rest with limited effort breaks away within 5 % of that effort."""
-        self.engine.setJointMotorControl2(self.body, JOINT, self.engine.VELOCITY_CONTROL, targetVelocity=0.0, force=self.effort)
+        self.engine.setJointMotorControl2(
+            self.body, JOINT, self.engine.VELOCITY_CONTROL, targetVelocity=0.0, force=self.effort
+        )
 
     def place(self) -> float:
         """Joint position."""
@@ -73,7 +75,9 @@ class Spring:
 
     def lock(self) -> None:
         """Hold the cap."""
-        self.engine.setJointMotorControl2(self.body, JOINT, self.engine.VELOCITY_CONTROL, targetVelocity=0.0, force=LOCK_EFFORT)
+        self.engine.setJointMotorControl2(
+            self.body, JOINT, self.engine.VELOCITY_CONTROL, targetVelocity=0.0, force=LOCK_EFFORT
+        )
 
     def free(self) -> None:
         """Let go of the cap, so that `drive` alone moves it."""
@@ -134,7 +138,9 @@ class Detent:
         x = self.place()
         error = self.nearest(x) - x
         speed = max(-self.max_speed, min(self.max_speed, SNAP_GAIN_PER_S * error))
-        self.engine.setJointMotorControl2(self.body, JOINT, self.engine.VELOCITY_CONTROL, targetVelocity=speed, force=self.effort)
+        self.engine.setJointMotorControl2(
+            self.body, JOINT, self.engine.VELOCITY_CONTROL, targetVelocity=speed, force=self.effort
+        )
 
     def nearest(self, x: float) -> float:
         """The resting place next to `x`."""

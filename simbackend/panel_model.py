@@ -129,7 +129,9 @@ def _moving(
     return lines + joint("part", kind, "base", "part", at(*pivot_m), axis=axis, limits=limits)
 
 
-def _needle(built: Built, *, length_m: float, tail_m: float, width_m: float, height_m: float, pivot_y_m: float) -> list[str]:
+def _needle(
+    built: Built, *, length_m: float, tail_m: float, width_m: float, height_m: float, pivot_y_m: float
+) -> list[str]:
     middle_m = (length_m - tail_m) / 2
     parts = [
         shape(at(0, middle_m, 0), box((width_m, length_m + tail_m, 0.0006)), INK, collision=False),
@@ -148,7 +150,9 @@ def _needle(built: Built, *, length_m: float, tail_m: float, width_m: float, hei
 
 def _gauge(thing: Gauge, built: Built) -> ObjectModel:
     r = thing.radius_m
-    needle = _needle(built, length_m=0.76 * r, tail_m=0.22 * r, width_m=0.055 * r, height_m=thing.depth_m, pivot_y_m=0.0)
+    needle = _needle(
+        built, length_m=0.76 * r, tail_m=0.22 * r, width_m=0.055 * r, height_m=thing.depth_m, pivot_y_m=0.0
+    )
     face = Quad(pixels=textures.gauge_face(thing), size_m=(2 * r, 2 * r), centre_m=(0, 0, FACE_HEIGHT_M), is_round=True)
     return ObjectModel(urdf=needle, quads=(face,), place=built.place)
 
@@ -162,13 +166,17 @@ def _meter(thing: PanelMeter, built: Built) -> ObjectModel:
         height_m=thing.depth_m,
         pivot_y_m=-thing.pivot_below_m,
     )
-    face = Quad(pixels=textures.meter_face(thing), size_m=(thing.width_m, thing.height_m), centre_m=(0, 0, FACE_HEIGHT_M))
+    face = Quad(
+        pixels=textures.meter_face(thing), size_m=(thing.width_m, thing.height_m), centre_m=(0, 0, FACE_HEIGHT_M)
+    )
     return ObjectModel(urdf=needle, quads=(face,), place=built.place)
 
 
 def _display(thing: Display, built: Built) -> ObjectModel:
     pixels = textures.display_face(thing, built.text or "")
-    return ObjectModel(quads=(Quad(pixels=pixels, size_m=(thing.width_m, thing.height_m), centre_m=(0, 0, FACE_HEIGHT_M)),))
+    return ObjectModel(
+        quads=(Quad(pixels=pixels, size_m=(thing.width_m, thing.height_m), centre_m=(0, 0, FACE_HEIGHT_M)),)
+    )
 
 
 def _button(thing: Button) -> ObjectModel:
@@ -185,7 +193,9 @@ def _mushroom(thing: Mushroom) -> ObjectModel:
         shape(at(0, 0, thing.height_m - head_m / 2), cylinder(thing.radius_m, head_m), RED),
         shape(at(0, 0, thing.height_m / 2 - 0.002), cylinder(0.5 * thing.radius_m, thing.height_m - 0.004), RED),
     ]
-    urdf = _moving(parts, kind="prismatic", axis=(0, 0, 1), limits=(-thing.travel_m, 0.0), mass_kg=0.08, inertia_kg_m2=1e-4)
+    urdf = _moving(
+        parts, kind="prismatic", axis=(0, 0, 1), limits=(-thing.travel_m, 0.0), mass_kg=0.08, inertia_kg_m2=1e-4
+    )
     return ObjectModel(urdf=urdf)
 
 

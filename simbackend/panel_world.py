@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from hal.config import Cell
@@ -81,9 +80,11 @@ class PanelWorld:
         for light in cell.panel.lights:
             self._paint(light.name, LIGHT_OFF, 1.0, on=False)
         self._presses = dict.fromkeys(self.mechanisms, 0)
-        points = {name: self._point(self.built[name]) for name in self.mechanisms}
-        self._names = list(points)
-        self._points = np.array([points[name] for name in self._names]).reshape(-1, 3)
+        self._points = {
+            name: tuple(self.object_pose(self.built[name]).translation.tolist())
+            for name, mechanism in self.mechanisms.items()
+            if not isinstance(mechanism, Friction)
+        }
         self._alive: set[str] = set()
         for mechanism in self.mechanisms.values():
             mechanism.lock()
@@ -101,7 +102,9 @@ class PanelWorld:
         engine, panel = self.engine, self.panel
         half = [panel.width_m / 2, panel.height_m / 2, panel.thickness_m / 2]
         solid = engine.createCollisionShape(engine.GEOM_BOX, halfExtents=half)
-        look = engine.createVisualShape(engine.GEOM_BOX, halfExtents=[half[0], half[1], half[2] - 2e-4], rgbaColor=[0.5, 0.5, 0.5, 1])
+        look = engine.createVisualShape(
+            engine.GEOM_BOX, halfExtents=[half[0], half[1], half[2] - 2e-4], rgbaColor=[0.5, 0.5, 0.5, 1]
+        )
         pose = self.base_from_panel * RigidTransform.from_translation([0, 0, -half[2]])
         self.bodies["plate"] = engine.createMultiBody(0, solid, look, *_pose(pose))
         picture = Quad(pixels=textures.plate(panel), size_m=(panel.width_m, panel.height_m), centre_m=(0, 0, 0))
@@ -151,6 +154,7 @@ class PanelWorld:
         if self.engine.getNumJoints(body):
             self.engine.resetJointState(body, JOINT, model.place)
             for link in (-1, JOINT):
+                # The pads' own friction factor multiplies this one.
                 self.engine.changeDynamics(body, link, lateralFriction=1.0, jointDamping=0.0)
             self.mechanisms[name] = self._mechanism(built, body)
 
@@ -177,7 +181,9 @@ class PanelWorld:
                 return Detent(engine=self.engine, body=body, places=places, effort=effort, max_speed=8.0)
             case Rotary():
                 places = tuple(state.angle_rad for state in thing.states)
-                return Detent(engine=self.engine, body=body, places=places, effort=thing.torque_nm * ratio, max_speed=6.0)
+                return Detent(
+                    engine=self.engine, body=body, places=places, effort=thing.torque_nm * ratio, max_speed=6.0
+                )
             case Slider():
                 return Friction(engine=self.engine, body=body, effort=thing.friction_n * ratio)
             case Lever() | Handwheel():
@@ -191,17 +197,18 @@ class PanelWorld:
         dx, dy = built.offset_m
         return self.base_from_panel * RigidTransform.from_translation([x + dx, y + dy, 0.0])
 
-    def _point(self, built: Built) -> Any:
-        return self.object_pose(built).translation
-
     # -- running --------------------------------------------------------------------------------------------------
 
     def drive(self, tip_m: tuple[float, float, float]) -> None:
         """One tick of the mechanisms round the finger tips; the others stay locked."""
-        away = self._points - tip_m
-        near = (away * away).sum(axis=1) < NEAR_M**2
-        if near.any() or self._alive:
-            self._wake({self._names[i] for i in np.flatnonzero(near)})
+        x, y, z = tip_m
+        near = {
+            name
+            for name, (px, py, pz) in self._points.items()
+            if (px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2 < NEAR_M**2
+        }
+        if near != self._alive:
+            self._wake(near)
         for name in sorted(self._alive):
             mechanism = self.mechanisms[name]
             if isinstance(mechanism, Spring):
@@ -287,7 +294,9 @@ class PanelWorld:
             case Button() | Mushroom():
                 assert isinstance(mechanism, Spring)  # noqa: S101
                 pressed = mechanism.is_latched or mechanism.is_in
-                return ObjectTruth(name=name, state="pressed" if pressed else "released", value=float(mechanism.presses))
+                return ObjectTruth(
+                    name=name, state="pressed" if pressed else "released", value=float(mechanism.presses)
+                )
             case Toggle():
                 return ObjectTruth(name=name, state="on" if place > 0.0 else "off", value=place)
             case Rotary() | Lever():

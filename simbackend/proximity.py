@@ -14,6 +14,7 @@ from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
 from simbackend.client import PROXIMITY_RANGE_M, Frame
 from simbackend.device import VALID, SimDevice, SimOptions, parse
+from simbackend.wire import PROXIMITY_TICKS, Snapshot
 
 MIN_RANGE_M = 0.02
 
@@ -31,23 +32,32 @@ class SimProximity(SimDevice[float]):
     def __init__(self, context: Context, options: ProximityOptions) -> None:
         super().__init__(context, DeviceKind.PROXIMITY, options)
         self._options = options
+        self._noise = self._world.draws.noise(context.name, 1)
         if context.name not in self._world.proximity:
-            raise ConfigError(f"{context.name} is not in the cell file", hint="add it under [devices]", device=context.name)
+            raise ConfigError(
+                f"{context.name} is not in the cell file", hint="add it under [devices]", device=context.name
+            )
         self._index = self._world.proximity.index(context.name)
 
     def capabilities(self) -> ProximityCapabilities:
         """Range, noise and rate."""
         return ProximityCapabilities(
-            min_range_m=MIN_RANGE_M, max_range_m=PROXIMITY_RANGE_M, sigma_m=self._options.sigma_m, rate_hz=self._world.rate_hz
+            min_range_m=MIN_RANGE_M,
+            max_range_m=PROXIMITY_RANGE_M,
+            sigma_m=self._options.sigma_m,
+            rate_hz=self._world.rate_hz / PROXIMITY_TICKS,
         )
 
     def read_distance_m(self, *, deadline: Deadline) -> Stamped[float]:
         """Newest distance."""
         return self._sample(deadline)
 
+    def _tick_of(self, snapshot: Snapshot) -> int:
+        return snapshot.distance_tick
+
     def _measure(self, frame: Frame, bias: float) -> tuple[float, Quality, Cause]:
         true_m = float(frame.snapshot.distance_m[self._index])
-        noise_m = self._options.sigma_m * float(self._world.draws.at_tick(self._name, frame.snapshot.distance_tick).standard_normal())
+        noise_m = self._options.sigma_m * float(self._noise.at(frame.snapshot.distance_tick)[0])
         distance_m = true_m + noise_m + bias
         if not MIN_RANGE_M <= distance_m <= PROXIMITY_RANGE_M:  # NaN is out of range too
             return math.nan, Quality.INVALID, Cause.OUT_OF_RANGE

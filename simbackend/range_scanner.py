@@ -84,7 +84,11 @@ class SimRangeScanner(SimDevice[RangeImage]):
         if newest is None or newest[:2] != (frame.snapshot.tick, bias):
             info, depth_m = self._world.depth_m(self._view)
             random = self._world.draws.at_tick(self._name, info.tick)
-            newest = self._newest = (info.tick, bias, RangeImage(depth_m=corrupt(depth_m + np.float32(bias), self._options, random)))
+            newest = self._newest = (
+                info.tick,
+                bias,
+                RangeImage(depth_m=corrupt(depth_m + np.float32(bias), self._options, random)),
+            )
         return newest[2], *VALID
 
 

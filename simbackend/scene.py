@@ -59,7 +59,9 @@ class Scene:
             turn = Rotation.from_quat(quaternion).as_matrix()
             self._add(body, link, meshes.placed(mesh, turn, np.asarray(position)), np.asarray(rgba[:3]), -1)
 
-    def add_picture(self, pixels: Pixels, size_m: tuple[float, float], base_from_picture: RigidTransform, *, is_round: bool) -> None:
+    def add_picture(
+        self, pixels: Pixels, size_m: tuple[float, float], base_from_picture: RigidTransform, *, is_round: bool
+    ) -> None:
         """A printed face that never moves."""
         mesh = meshes.flat(size_m, is_round=is_round)
         turn = np.asarray(base_from_picture.rotation.as_matrix())
@@ -142,7 +144,15 @@ class Scene:
         image = np.full((height, width, channels), BACKGROUND, np.float32)
         camera = np.array([*focal, *centre, near_m])
         rasterise(
-            seen, attributes, self._surfaces, compiled.albedo, compiled.texels, compiled.table, camera, inverse_depth, image
+            seen,
+            attributes,
+            self._surfaces,
+            compiled.albedo,
+            compiled.texels,
+            compiled.table,
+            camera,
+            inverse_depth,
+            image,
         )
         return image, inverse_depth
 

@@ -47,7 +47,9 @@ class Canvas:
 
     def __post_init__(self) -> None:
         self.scale = self.px_per_m * SMOOTH
-        self.image = Image.new("RGB", (round(self.width_m * self.scale), round(self.height_m * self.scale)), self.ground)
+        self.image = Image.new(
+            "RGB", (round(self.width_m * self.scale), round(self.height_m * self.scale)), self.ground
+        )
         self.draw = ImageDraw.Draw(self.image)
 
     def px(self, x_m: float, y_m: float) -> tuple[float, float]:
@@ -64,7 +66,9 @@ class Canvas:
         r = radius_m * self.scale
         self.draw.ellipse([x - r, y - r, x + r, y + r], fill=fill)
 
-    def box(self, centre_m: tuple[float, float], size_m: tuple[float, float], fill: Colour, *, round_m: float = 0.0) -> None:
+    def box(
+        self, centre_m: tuple[float, float], size_m: tuple[float, float], fill: Colour, *, round_m: float = 0.0
+    ) -> None:
         """A filled upright rectangle."""
         x, y = self.px(*centre_m)
         w, h = size_m[0] * self.scale / 2, size_m[1] * self.scale / 2
@@ -135,7 +139,9 @@ def _print_round(canvas: Canvas, thing: object) -> None:
         case Rotary():
             for state in thing.states:
                 _mark(canvas, thing.position_m, state.angle_rad, thing.radius_m + 0.002, 0.005)
-                canvas.text(_polar(thing.position_m, state.angle_rad, thing.radius_m + 0.013), state.name.upper(), 0.0042)
+                canvas.text(
+                    _polar(thing.position_m, state.angle_rad, thing.radius_m + 0.013), state.name.upper(), 0.0042
+                )
             _label(canvas, thing.position_m, thing.radius_m + 0.002, thing.label)
         case Lever():
             for state in thing.states:

@@ -31,7 +31,11 @@ def tool_urdf(*, flange_from_sensor: RigidTransform, flange_from_grip: RigidTran
     sensor_from_grip = flange_from_sensor.inv() * flange_from_grip
     body_kg = load_kg - SENSOR_MASS_KG - 2.0 * FINGER_MASS_KG
     # The sensor's own centre of mass lies in its origin: PyBullet reports the reaction there.
-    lines = link("sensor", inertial(SENSOR_MASS_KG, (0, 0, 0), (1e-5,) * 3), shape(at(0, 0, 0.018), cylinder(0.036, 0.036), STEEL))
+    lines = link(
+        "sensor",
+        inertial(SENSOR_MASS_KG, (0, 0, 0), (1e-5,) * 3),
+        shape(at(0, 0, 0.018), cylinder(0.036, 0.036), STEEL),
+    )
     lines += joint("sensor", "fixed", "flange", "sensor", flange_from_sensor)
     lines += link(
         "gripper",
@@ -47,5 +51,7 @@ def tool_urdf(*, flange_from_sensor: RigidTransform, flange_from_grip: RigidTran
             shape(middle, box((FINGER_THICKNESS_M, FINGER_WIDTH_M, FINGER_LENGTH_M)), STEEL),
         )
         limits = (-0.002, MAX_WIDTH_M / 2.0 + 0.002)
-        lines += joint(f"finger_{name}", "prismatic", "gripper", f"finger_{name}", at(0, 0, 0), axis=(side, 0, 0), limits=limits)
+        lines += joint(
+            f"finger_{name}", "prismatic", "gripper", f"finger_{name}", at(0, 0, 0), axis=(side, 0, 0), limits=limits
+        )
     return lines

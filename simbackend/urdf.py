@@ -46,7 +46,9 @@ def sphere(radius_m: float) -> str:
     return f'<sphere radius="{float(radius_m)!r}"/>'
 
 
-def shape(pose: RigidTransform, geometry: str, colour: Colour, *, visual: bool = True, collision: bool = True) -> list[str]:
+def shape(
+    pose: RigidTransform, geometry: str, colour: Colour, *, visual: bool = True, collision: bool = True
+) -> list[str]:
     """The same geometry as something to see and something to touch."""
     lines: list[str] = []
     if visual:

@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 DOF = 6
 LIGHTS = 4
 MAX_PROXIMITY = 4
+PROXIMITY_TICKS = 5  # 100 Hz at the usual tick; fourteen rays would cost a third of every tick
 IMAGE_BYTES = 128 * 2**20  # sparse: only what an image touches costs memory
 
 

@@ -17,12 +17,22 @@ from simbackend.draws import Draws
 from simbackend.drive import ArmDrive, GripperDrive
 from simbackend.panel_world import ARM_GROUP, PANEL_GROUP, PanelWorld
 from simbackend.tool_model import PAD_DAMPING_N_S_PER_M, PAD_FRICTION, PAD_STIFFNESS_N_PER_M
-from simbackend.wire import DOF, GRIPPER_AT, JOINTS_AT, LIGHTS, LIGHTS_AT, MAX_PROXIMITY, SNAPSHOT, Drive, WorldConfig
+from simbackend.wire import (
+    DOF,
+    GRIPPER_AT,
+    JOINTS_AT,
+    LIGHTS,
+    LIGHTS_AT,
+    MAX_PROXIMITY,
+    PROXIMITY_TICKS,
+    SNAPSHOT,
+    Drive,
+    WorldConfig,
+)
 
 Array = NDArray[np.float64]
 
 GRAVITY_M_PER_S2 = 9.81
-PROXIMITY_TICKS = 5  # 100 Hz at the usual tick
 CONE_RAYS = 4
 CONE_RAD = 0.0175
 CONE_DEPTH_M = 0.02
@@ -50,8 +60,12 @@ class World:
             self._load_arm(Path(folder))
             self.panel = PanelWorld(pybullet, self.cell, self.draws, Path(folder))
         self.scene = self.panel.scene
-        self._ray_starts = np.repeat([mount.translation for mount in config.proximity], len(RAYS), axis=0).reshape(-1, 3)
-        self._ray_directions = np.concatenate([np.empty((0, 3)), *(mount.rotation.apply(RAYS) for mount in config.proximity)])
+        self._ray_starts = np.repeat([mount.translation for mount in config.proximity], len(RAYS), axis=0).reshape(
+            -1, 3
+        )
+        self._ray_directions = np.concatenate(
+            [np.empty((0, 3)), *(mount.rotation.apply(RAYS) for mount in config.proximity)]
+        )
         self.initial = self.panel.truth()
         self._proximity = np.full(MAX_PROXIMITY + 1, np.nan)  # distances, then the tick they belong to
         self._settle()
@@ -78,8 +92,7 @@ class World:
         self.tool_links = frozenset((self.sensor, index["gripper"], *self.fingers))
         for i in range(-1, engine.getNumJoints(self.arm)):
             engine.changeDynamics(self.arm, i, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0)
-            meets = PANEL_GROUP if i > self.joints[0] else 0  # the foot of the arm stands on the floor for good
-            engine.setCollisionFilterGroupMask(self.arm, i, ARM_GROUP, meets)
+            engine.setCollisionFilterGroupMask(self.arm, i, ARM_GROUP, PANEL_GROUP)
         for finger in self.fingers:
             engine.changeDynamics(
                 self.arm,
@@ -265,7 +278,9 @@ def _nearest(depths_m: list[float]) -> float:
 
 def _cone() -> Array:
     turns = 2.0 * np.pi * np.arange(CONE_RAYS) / CONE_RAYS
-    around = np.column_stack([np.sin(CONE_RAD) * np.cos(turns), np.sin(CONE_RAD) * np.sin(turns), np.full(CONE_RAYS, np.cos(CONE_RAD))])
+    around = np.column_stack(
+        [np.sin(CONE_RAD) * np.cos(turns), np.sin(CONE_RAD) * np.sin(turns), np.full(CONE_RAYS, np.cos(CONE_RAD))]
+    )
     return np.vstack([[0.0, 0.0, 1.0], around])
 
 

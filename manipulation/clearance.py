@@ -173,3 +173,16 @@ def first_hit(
         if least_clearance(dh, q, tool_ends, radii, rotations, middles, halves, watched, pairs, margin) < margin:
             return (k - 1) / count
     return 1.0
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def overlap_counts(dh: Array, configurations: Array, tool_ends: Array, radii: Array, pairs: Index) -> Any:
+    """How many of the configurations (m, n) make each pair of capsules overlap, (k,)."""
+    out = np.zeros(pairs.shape[0])
+    for c in range(configurations.shape[0]):
+        ends = capsule_ends(dh, configurations[c], tool_ends)
+        for k in range(pairs.shape[0]):
+            i, j = pairs[k, 0], pairs[k, 1]
+            gap = segment_segment(ends[i, 0], ends[i, 1], ends[j, 0], ends[j, 1]) - radii[i] - radii[j]
+            out[k] += gap < 0.0
+    return out

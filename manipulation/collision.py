@@ -133,19 +133,16 @@ class CollisionModel:
         return min(gaps, key=lambda pair: gaps[pair]) if gaps else "nothing"
 
     def _separable_pairs(self) -> NDArray[np.int64]:
-        """Pairs of capsules, not neighbours, that do not touch in at least a twentieth of all configurations."""
+        """Pairs of capsules, not neighbours, that are apart in at least half of all configurations."""
         kin = self.kinematics
         rng = np.random.default_rng(0)  # which pairs can part is geometry; the seed only fixes the samples
         count, links = len(self.radii), len(kin.dh)
-        pairs = [(i, j) for i in range(count) for j in range(i + 2, count) if i < links - 1]
-        touching = np.zeros(len(pairs))
-        for q in rng.uniform(kin.lower_rad, kin.upper_rad, (SELF_SAMPLES, links)):
-            ends = clearance.capsule_ends(kin.dh, q, self.tool_ends)
-            for k, (i, j) in enumerate(pairs):
-                gap = clearance.segment_segment(ends[i, 0], ends[i, 1], ends[j, 0], ends[j, 1])
-                touching[k] += gap < self.radii[i] + self.radii[j]
-        part = [pair for pair, hits in zip(pairs, touching, strict=True) if hits < 0.5 * SELF_SAMPLES]
-        return np.array(part, np.int64).reshape(-1, 2)
+        pairs = np.array(
+            [(i, j) for i in range(count) for j in range(i + 2, count) if i < links - 1], np.int64
+        ).reshape(-1, 2)
+        samples = rng.uniform(kin.lower_rad, kin.upper_rad, (SELF_SAMPLES, links))
+        hits = clearance.overlap_counts(kin.dh, samples, self.tool_ends, self.radii, pairs)
+        return np.asarray(pairs[hits < 0.5 * SELF_SAMPLES])
 
 
 def placed(boxes: Iterable[Box], base_from_panel: RigidTransform) -> tuple[Box, ...]:

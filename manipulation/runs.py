@@ -17,6 +17,7 @@ from manipulation.sensing import Sample
 Array = NDArray[np.float64]
 
 BLEND_S = 0.25  # the gap between the declared and the measured start is closed over this time
+TURN_ARM_M = 0.1  # a turn of 1 rad counts as this much way
 DAMPING = 1e-3  # of the damped least squares; strokes are chosen clear of singularities beforehand
 GRIP_START_S = 0.08  # a gripper needs this long to report that it moves
 GRIP_REST_S = 0.05
@@ -65,6 +66,7 @@ class PathRun:
         self._r = np.array([pose.rotation.as_matrix() for pose in poses])
         turns = [(b.rotation * a.rotation.inv()).as_rotvec() for a, b in zip(poses, poses[1:], strict=False)]
         self._w = np.array(turns).reshape(-1, 3)
+        self._ways, self._speeds = smooth_ways(self._t, self._p, self._w)
         first = np.ascontiguousarray(poses[0].as_matrix())
         measured, _ = kernels.tool_and_jacobian(self._dh, start_rad, self._tool)
         self._gap = kernels.pose_error(measured, first)
@@ -74,7 +76,7 @@ class PathRun:
         """Joints whose tool pose is the path's, displaced by the admittance."""
         offset = np.zeros(6) if self._admittance is None else self._admittance.step(wrench, dt_s)
         q: Array = kernels.path_joints(
-            self._dh, self._tool, self._t, self._p, self._r, self._w, elapsed_s, self._gap * _fade(elapsed_s), offset,
+            self._dh, self._tool, self._t, self._ways, self._speeds, self._p, self._r, self._w, elapsed_s, self._gap * _fade(elapsed_s), offset,
             last_rad, DAMPING,
         )  # fmt: skip
         return q
@@ -82,6 +84,21 @@ class PathRun:
     def is_over(self, elapsed_s: float, sample: Sample) -> bool:
         """The declared time is over."""
         return bool(elapsed_s >= self._t[-1])
+
+
+def smooth_ways(times_s: Array, points: Array, turns: Array) -> tuple[Array, Array]:
+    """Way (N,) along a path of points (N, 3) and turns (N - 1, 3), and its speed (N,) at each point: rest at both ends.
+
+    Between, the harmonic mean of the neighbouring speeds, which keeps the cubic from running backwards.
+
+    Source: Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5(2), 1984.
+    """
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1) + TURN_ARM_M * np.linalg.norm(turns, axis=1)
+    rates = lengths / np.diff(times_s)
+    speeds = np.zeros(len(times_s))
+    before, after = rates[:-1], rates[1:]
+    speeds[1:-1] = 2.0 * before * after / np.maximum(before + after, 1e-12)
+    return np.concatenate([[0.0], np.cumsum(lengths)]), speeds
 
 
 class Admittance:

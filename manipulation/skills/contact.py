@@ -1,0 +1,72 @@
+"""Where a guarded move met something: the pads give way, so the place of first contact is read from the rise of the force."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from hal.motion import Guard, MotionReport, Quantity
+from manipulation.skills.steps import Attempt
+
+Array = NDArray[np.float64]
+
+ONSET_N = 1.0  # above noise, drift and inertia in a slow move
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Meeting:
+    """A guarded move that was to meet something.
+
+    Attributes:
+        way_m: from the start of the move to the place of first contact, along the move.
+        give_n_per_m: rise of the force per metre beyond it; 0 when too few samples tell.
+        is_met: did the guard trip?
+    """
+
+    way_m: float
+    give_n_per_m: float
+    is_met: bool
+    report: MotionReport
+
+
+def meet(
+    attempt: Attempt, goal: RigidTransform, *, name: str, speed_m_per_s: float, stop_n: float, ticks: int = 2
+) -> Meeting:
+    """Move straight to `goal` (base_from_grip, same rotation) until a force of `stop_n` against the motion."""
+    start = attempt.pose()
+    ahead = goal.translation - start.translation
+    length = float(np.linalg.norm(ahead))
+    unit = ahead / length
+    in_tool = start.rotation.inv().apply(-unit)
+    axis = (float(in_tool[0]), float(in_tool[1]), float(in_tool[2]))
+    guard = Guard(name="contact", quantity=Quantity.FORCE, limit=stop_n, axis=axis, ticks=ticks)
+    report = attempt.straight(goal, name=name, speed_m_per_s=speed_m_per_s, guards=(guard,))
+    depth = (report.log.tip_m - start.translation) @ unit
+    force = report.log.wrench[:, :3] @ in_tool
+    deepest = float((report.base_from_tool.translation - start.translation) @ unit)
+    way, give = onset(depth, force, deepest)
+    return Meeting(way_m=way, give_n_per_m=give, is_met=report.tripped is not None, report=report)
+
+
+def onset(depth_m: Array, force_n: Array, deepest_m: float) -> tuple[float, float]:
+    """Depth (m) at which the straight line through the rising force is zero, and its slope (N/m).
+
+    Args:
+        depth_m, force_n: (N,) in the order of time.
+        deepest_m: the answer when no sample shows a force.
+    """
+    # Only the last unbroken rise: while the arm speeds up, its own inertia can pass for a newton.
+    below = np.flatnonzero(force_n < ONSET_N)
+    first = 0 if len(below) == 0 else int(below[-1]) + 1
+    if first >= len(force_n):
+        return deepest_m, 0.0
+    d, f = depth_m[first:], force_n[first:]
+    if len(d) < 3 or np.ptp(d) < 1e-5:
+        return float(d[0]), 0.0
+    slope, offset = np.polyfit(d, f, 1)
+    if slope <= 0.0:
+        return float(d[0]), 0.0
+    return float(np.clip(-offset / slope, depth_m[0], d[0])), float(slope)

@@ -1,0 +1,201 @@
+"""Turn a lever valve: cage the bar between the fingers and carry it round its hub."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from hal.errors import InvalidRequest
+from hal.motion import Guard, Quantity
+from hal.panel import Lever
+from manipulation.skills.contact import meet
+from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
+from manipulation.skills.steps import STANDOFF_M, Attempt, perform
+from manipulation.stroke import arc, shifted
+from manipulation.workcell import Workcell, panel_from_grip
+
+Array = NDArray[np.float64]
+
+OVERLAP_M = 0.013  # how far the tips reach below the top of the bar
+FROM_END_M = 0.016  # the fingers hold the bar this far before its end: long lever arm, room for the pose error
+APPROACH_SIDE_M = 0.008  # free space on each side when coming down; more than the pose error
+CAGE_SIDE_M = 0.002  # free space on each side in the stroke: caged, not squeezed
+FEEL_N = 3.0
+FEEL_M_PER_S = 0.03
+STROKE_M_PER_S = 0.08
+LAST_RAD = np.radians(14.0)  # the prototype met the end stop at more than 300 N until it slowed down here
+OVERTRAVEL_RAD = np.radians(12.0)  # play of the cage and give of the pads
+LAST_M_PER_S = 0.025
+END_RISE_N = 20.0
+EFFORT_SPREAD = 1.6
+EFFORT_FLOOR_N = 25.0
+LARGEST_STOP_N = 92.0  # below the cell's protective limit, so that a stiff valve is told from a collision
+MOVED_RAD = np.radians(12.0)
+TOLERANCE_RAD = np.radians(8.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Turn:
+    """From where to where, clockwise seen from the front."""
+
+    start_rad: float
+    goal_rad: float
+
+    @property
+    def span_rad(self) -> float:
+        return self.goal_rad - self.start_rad
+
+
+def lever(
+    cell: Workcell, name: str, target: str, *, current: ObjectState | None = None, verify: Verify | None = None
+) -> SkillReport:
+    """Turn the lever to a state of the panel file.
+
+    Args:
+        current: what the last look said; with an angle the fingers come down where the bar is. Without it `verify` is asked.
+        verify: the caller's second look.
+
+    The mechanical estimate is the angle reached, rad clockwise from up.
+
+    Raises:
+        InvalidRequest: not a lever, no such state, or nobody knows where the bar is.
+        DeviceFault, Stopped, Cancelled: the cell cannot go on.
+    """
+    thing = cell.panel.object(name)
+    if not isinstance(thing, Lever):
+        raise InvalidRequest(f"{name} is a {thing.kind}, not a lever", hint="see the panel file")
+    angles = {state.name: state.angle_rad for state in thing.states}
+    if target not in angles:
+        raise InvalidRequest(f"{name} has no state {target!r}", hint=f"states: {', '.join(angles)}")
+    goal = angles[target]
+    known = current if current is not None else (verify() if verify is not None else None)
+    where = [_angle_of(known, angles)]
+
+    def stroke(attempt: Attempt) -> float:
+        if where[0] is None:
+            raise InvalidRequest(f"the angle of {name} is not known", hint="read it first, or give `current`")
+        turn = _Turn(start_rad=where[0], goal_rad=goal)
+        if abs(turn.span_rad) < np.radians(2.0):
+            return turn.start_rad
+        return _turn_lever(attempt, thing, turn)
+
+    def look() -> ObjectState | None:
+        seen = verify() if verify is not None else None
+        where[0] = _angle_of(seen, angles) if seen is not None else where[0]
+        return seen
+
+    return perform(
+        cell,
+        stroke,
+        skill="lever",
+        object_name=name,
+        target=target,
+        is_reached=lambda seen: _is_at(seen, target, goal),
+        verify=look if verify is not None else None,
+    )
+
+
+def _angle_of(seen: ObjectState | None, angles: dict[str, float]) -> float | None:
+    if seen is None:
+        return None
+    if seen.angle_rad is not None:
+        return seen.angle_rad
+    return angles.get(seen.state) if seen.state is not None else None
+
+
+def _is_at(seen: ObjectState, target: str, goal_rad: float) -> bool:
+    if seen.angle_rad is not None:
+        return abs(seen.angle_rad - goal_rad) <= TOLERANCE_RAD
+    return seen.state == target
+
+
+def _turn_lever(attempt: Attempt, thing: Lever, turn: _Turn) -> float:
+    """One stroke; returns the angle reached by the bar, as the tool tells it."""
+    open_m = thing.width_m + 2.0 * APPROACH_SIDE_M
+    radius = thing.length_m - FROM_END_M
+    ways = [_way(thing, turn, radius, flip) for flip in (0.0, np.pi)]
+    attempt.begin(ways, may_touch=(thing.name,), width_m=open_m, name=thing.name)
+    down = attempt.advance(STANDOFF_M + OVERLAP_M, name="approach")
+    if down.tripped is not None:
+        raise SkillFailure(Outcome.MISSED, "a finger landed on the bar")
+    _centre_on_bar(attempt)
+    hub = _hub(attempt, thing, turn.start_rad)
+    attempt.open_to(thing.width_m + 2.0 * CAGE_SIDE_M, name="cage")
+    turned = _carry(attempt, thing, turn.span_rad, hub)
+    attempt.open_to(open_m, name="let go")
+    attempt.leave(STANDOFF_M + OVERLAP_M)
+    return turn.start_rad + turned
+
+
+def _way(thing: Lever, turn: _Turn, radius: float, flip: float) -> list[RigidTransform]:
+    """Standoff, down, and round: grip poses in the panel frame with the closing direction across the bar."""
+
+    def at(angle: float, z: float) -> RigidTransform:
+        x, y = thing.position_m
+        return panel_from_grip((x + radius * np.sin(angle), y + radius * np.cos(angle), z), flip - angle)
+
+    low = thing.height_m - OVERLAP_M
+    over = OVERTRAVEL_RAD * np.sign(turn.span_rad)
+    steps = np.linspace(turn.start_rad, turn.goal_rad + over, max(8, int(abs(turn.span_rad) / 0.05)))
+    return [at(turn.start_rad, thing.height_m + STANDOFF_M), *(at(float(a), low) for a in steps)]
+
+
+def _centre_on_bar(attempt: Attempt) -> None:
+    """Local refinement where the cage is narrow: feel the bar on both sides and go to the middle."""
+    start = attempt.pose()
+    room = APPROACH_SIDE_M + 0.004
+    way = []
+    for side in (1.0, -1.0):
+        goal = shifted(start, (side * room, 0.0, 0.0))
+        met = meet(attempt, goal, name="feel the bar", speed_m_per_s=FEEL_M_PER_S, stop_n=FEEL_N)
+        if not met.is_met:
+            raise SkillFailure(Outcome.MISSED, "there is no bar between the fingers")
+        contact = met.report.log.tip_m[0] - start.translation
+        begun = float(contact @ start.rotation.apply([1.0, 0.0, 0.0]))
+        way.append(begun + side * met.way_m)
+    middle = shifted(start, (0.5 * (way[0] + way[1]), 0.0, 0.0))
+    attempt.straight(middle, name="centre", speed_m_per_s=FEEL_M_PER_S)
+
+
+def _hub(attempt: Attempt, thing: Lever, angle_rad: float) -> Array:
+    """The hub in the base frame: where the panel's pose says, moved across the bar by what the fingers found."""
+    panel = attempt.cell.panel_pose
+    tool = (panel.inv() * attempt.pose()).translation
+    across = np.array([np.cos(angle_rad), -np.sin(angle_rad), 0.0])
+    offset = (tool - np.array(thing.point_m)) @ across
+    return np.asarray(panel.apply(np.array(thing.point_m) + offset * across + [0.0, 0.0, tool[2]]))
+
+
+def _carry(attempt: Attempt, thing: Lever, span_rad: float, hub: Array) -> float:
+    """The stroke in two parts: fast to 14 degrees before the end, then slowly onto the end stop.
+
+    Returns the signed angle by which the bar turned: that of the tool less the play of the cage and the give of the pads.
+    """
+    cell, sign = attempt.cell, float(np.sign(span_rad))
+    axis = cell.panel_pose.rotation.apply([0.0, 0.0, -1.0])  # clockwise seen from the front
+    radius = thing.length_m - FROM_END_M
+    stop_n = min(LARGEST_STOP_N, EFFORT_SPREAD * thing.torque_nm / radius + EFFORT_FLOOR_N)
+    strong = Guard(name="effort", quantity=Quantity.FORCE, limit=stop_n)
+    start = attempt.pose()
+    fast_rad = max(0.0, abs(span_rad) - LAST_RAD)
+    if fast_rad > 0.0:
+        poses = arc(start, centre_m=hub, axis=axis, angle_rad=sign * fast_rad)
+        report = attempt.along(poses, name="turn", speed_m_per_s=STROKE_M_PER_S, guards=(strong,))
+        if report.tripped is not None:
+            turned = _between(start, report.base_from_tool)
+            outcome = Outcome.STIFF if turned < MOVED_RAD else Outcome.STALLED
+            raise SkillFailure(outcome, f"it did not give way at {report.peak_force_n:.0f} N", reached=sign * turned)
+    rest_rad = abs(span_rad) - fast_rad + OVERTRAVEL_RAD
+    poses = arc(attempt.pose(), centre_m=hub, axis=axis, angle_rad=sign * rest_rad)
+    rise = Guard(name="end stop", quantity=Quantity.FORCE_RISE, limit=END_RISE_N)
+    report = attempt.along(poses, name="turn to the stop", speed_m_per_s=LAST_M_PER_S, guards=(rise, strong))
+    force = float(np.linalg.norm(report.wrench[:3]))
+    lag_rad = (CAGE_SIDE_M + force / cell.hand.pad_stiffness_n_per_m) / radius
+    return sign * max(0.0, _between(start, report.base_from_tool) - lag_rad)
+
+
+def _between(start: RigidTransform, end: RigidTransform) -> float:
+    return float(np.linalg.norm((end.rotation * start.rotation.inv()).as_rotvec()))

@@ -1,0 +1,82 @@
+"""Pressing a cap with the closed fingertip: what button and mushroom share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from hal.motion import Guard, MotionReport, Quantity
+from hal.panel import Button, Mushroom
+from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
+from manipulation.skills.probe import TURNS_RAD
+from manipulation.skills.steps import STANDOFF_M, Attempt, perform
+from manipulation.stroke import shifted
+from manipulation.workcell import Workcell, panel_from_grip
+
+SEEK_N = 2.5  # a light contact ends the fast part, so that the slow part always begins above or on the cap
+SEEK_ABOVE_M = 0.004
+PRESS_M_PER_S = 0.025
+STOP_FLOOR_N = 20.0  # the prototype's buttons were pressed to 20 N without a miss
+EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
+BOTTOM_N = 6.0  # above the spring at full travel: the cap stands on its stop
+DEEP_ENOUGH_RATIO = 0.3  # a latched cap has only this much travel left
+LOST_M = 0.010  # how far behind its expected place the cap may be met
+
+
+def press(
+    cell: Workcell,
+    cap: Button | Mushroom,
+    *,
+    skill: str,
+    target: str,
+    is_reached: Callable[[ObjectState], bool],
+    verify: Verify | None,
+) -> SkillReport:
+    """Press a cap down to its stop and let go.
+
+    The mechanical estimate is the travel of the cap in metres.
+    """
+
+    def stroke(attempt: Attempt) -> float:
+        x, y = cap.position_m
+        top = cap.height_m
+        heights = (top + STANDOFF_M, top + SEEK_ABOVE_M, top - cap.travel_m - LOST_M)
+        ways = [[panel_from_grip((x, y, z), turn) for z in heights] for turn in TURNS_RAD]
+        attempt.begin(ways, may_touch=(cap.name,), width_m=0.0, name=cap.name)
+        attempt.advance(STANDOFF_M - SEEK_ABOVE_M, name="approach", stop_n=SEEK_N)
+        report = _push(attempt, cap)
+        attempt.leave()
+        travel = travelled_m(report, cell.hand.pad_stiffness_n_per_m)
+        if report.tripped is None:
+            raise SkillFailure(Outcome.MISSED, "no cap was met where it should be", reached=travel)
+        if travel < DEEP_ENOUGH_RATIO * cap.travel_m:
+            raise SkillFailure(Outcome.STALLED, f"it gave way by only {1e3 * travel:.1f} mm", reached=travel)
+        return travel
+
+    return perform(
+        cell, stroke, skill=skill, object_name=cap.name, target=target, is_reached=is_reached, verify=verify, repeats=False
+    )
+
+
+def stop_force_n(cap: Button | Mushroom) -> float:
+    """Force that tells the cap stands on its stop, N."""
+    full = cap.preload_n + cap.spring_n_per_m * cap.travel_m
+    return max(STOP_FLOOR_N, EFFORT_SPREAD * full + BOTTOM_N)
+
+
+def _push(attempt: Attempt, cap: Button | Mushroom) -> MotionReport:
+    guard = Guard(name="bottom", quantity=Quantity.FORCE, limit=stop_force_n(cap), axis=(0.0, 0.0, -1.0))
+    goal = shifted(attempt.pose(), (0.0, 0.0, SEEK_ABOVE_M + cap.travel_m + LOST_M))
+    return attempt.straight(goal, name="press", speed_m_per_s=PRESS_M_PER_S, guards=(guard,))
+
+
+def travelled_m(report: MotionReport, pad_stiffness_n_per_m: float) -> float:
+    """How far the cap moved: tip travel under force, less what the pads gave."""
+    axis = report.base_from_tool.rotation.apply([0.0, 0.0, 1.0])
+    depth, force = report.log.tip_m @ axis, -report.log.wrench[:, 2]
+    loaded = np.flatnonzero(force > 1.0)
+    if len(loaded) == 0:
+        return 0.0
+    give = float(force.max()) / pad_stiffness_n_per_m
+    return max(0.0, float(depth.max() - depth[loaded[0]]) - give)

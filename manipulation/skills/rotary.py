@@ -1,0 +1,127 @@
+"""Turn a rotary selector: hold its bar lightly and turn about the knob's axis."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from hal.errors import InvalidRequest
+from hal.motion import Compliance, Guard, Quantity
+from hal.panel import Rotary
+from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
+from manipulation.skills.steps import STANDOFF_M, Attempt, perform
+from manipulation.stroke import arc
+from manipulation.workcell import Workcell, panel_from_grip
+
+SIDE_M = 0.007
+BAR_RATIO = 0.45  # width of the bar over the knob's radius
+SEAT_N = 5.0
+LIFT_M = 0.0015
+GRIP_N = 12.0  # a low grip force: 40 N doubled the peaks of the prototype
+TURN_M_PER_S = 0.05
+STOP_N = 40.0
+TOLERANCE_RAD = np.radians(12.0)
+# Heavy virtual mass against chatter (15 to 28 N tick to tick with 8 kg, 4 to 6 N with 200 kg).
+YIELDING = Compliance(
+    stiffness=(400.0, 400.0, float("inf"), float("inf"), float("inf"), float("inf")),
+    damping=(1500.0, 1500.0, 1500.0, 10.0, 10.0, 10.0),
+    mass=(200.0, 200.0, 200.0, 1.0, 1.0, 1.0),
+    max_offset_m=0.01,
+)
+
+
+def rotary(
+    cell: Workcell, name: str, target: str, *, current: ObjectState | None = None, verify: Verify | None = None
+) -> SkillReport:
+    """Turn the selector to a state of the panel file.
+
+    Args:
+        current: what the last look said (angle or state); without it `verify` is asked.
+
+    The mechanical estimate is the angle reached, rad clockwise from up.
+
+    Raises:
+        InvalidRequest: not a selector, no such state, or nobody knows where it points.
+        DeviceFault, Stopped, Cancelled: the cell cannot go on.
+    """
+    thing = cell.panel.object(name)
+    if not isinstance(thing, Rotary):
+        raise InvalidRequest(f"{name} is a {thing.kind}, not a rotary selector", hint="see the panel file")
+    angles = {state.name: state.angle_rad for state in thing.states}
+    if target not in angles:
+        raise InvalidRequest(f"{name} has no state {target!r}", hint=f"states: {', '.join(angles)}")
+    known = current if current is not None else (verify() if verify is not None else None)
+    where = [_resting_angle(known, angles)]
+
+    def stroke(attempt: Attempt) -> float:
+        if where[0] is None:
+            raise InvalidRequest(f"the position of {name} is not known", hint="read it first, or give `current`")
+        return _turn(attempt, thing, where[0], angles[target])
+
+    def look() -> ObjectState | None:
+        seen = verify() if verify is not None else None
+        where[0] = _resting_angle(seen, angles) if seen is not None else where[0]
+        return seen
+
+    return perform(
+        cell,
+        stroke,
+        skill="rotary",
+        object_name=name,
+        target=target,
+        is_reached=lambda seen: _is_at(seen, target, angles[target]),
+        verify=look if verify is not None else None,
+    )
+
+
+def _resting_angle(seen: ObjectState | None, angles: dict[str, float]) -> float | None:
+    """A selector rests in a detent: the state's own angle is better than a measured one."""
+    if seen is None:
+        return None
+    if seen.state in angles:
+        return angles[str(seen.state)]
+    return seen.angle_rad
+
+
+def _is_at(seen: ObjectState, target: str, angle_rad: float) -> bool:
+    if seen.state is not None:
+        return seen.state == target
+    return seen.angle_rad is not None and abs(seen.angle_rad - angle_rad) <= TOLERANCE_RAD
+
+
+def _turn(attempt: Attempt, thing: Rotary, start_rad: float, goal_rad: float) -> float:
+    cell = attempt.cell
+    bar_m = BAR_RATIO * thing.radius_m
+    open_m = bar_m + 2.0 * SIDE_M
+    seat = thing.height_m / 2  # the shoulder under the bar
+    ways = [_way(thing, start_rad, goal_rad, seat, flip) for flip in (0.0, np.pi)]
+    attempt.begin(ways, may_touch=(thing.name,), width_m=open_m, name=thing.name)
+    down = attempt.advance(STANDOFF_M + thing.height_m - seat + 0.004, name="approach", speed_m_per_s=0.04, stop_n=SEAT_N)
+    height = float((cell.panel_pose.inv() * attempt.pose()).translation[2])
+    if down.tripped is not None and height > thing.height_m - 0.002:
+        raise SkillFailure(Outcome.MISSED, "a finger landed on the bar")
+    if down.tripped is not None:
+        attempt.advance(-LIFT_M, name="lift off the shoulder", speed_m_per_s=0.03)
+    attempt.open_to(0.0, force_n=GRIP_N, name="hold the bar")
+    width = cell.mover.state().gripper_width_m
+    if width < 0.5 * bar_m:
+        raise SkillFailure(Outcome.MISSED, f"the fingers closed to {1e3 * width:.1f} mm; no bar between them")
+    start = attempt.pose()
+    axis = cell.panel_pose.rotation.apply([0.0, 0.0, -1.0])
+    poses = arc(start, centre_m=start.translation, axis=axis, angle_rad=goal_rad - start_rad)
+    guard = Guard(name="effort", quantity=Quantity.FORCE, limit=STOP_N)
+    report = attempt.along(poses, name="turn", speed_m_per_s=TURN_M_PER_S, guards=(guard,), compliance=YIELDING)
+    turned = float(np.linalg.norm((report.base_from_tool.rotation * start.rotation.inv()).as_rotvec()))
+    attempt.open_to(open_m, name="let go")
+    attempt.leave(STANDOFF_M + thing.height_m - seat)
+    reached = start_rad + float(np.sign(goal_rad - start_rad)) * turned
+    if report.tripped is not None:
+        raise SkillFailure(Outcome.STALLED, f"it stopped against {report.peak_force_n:.0f} N", reached=reached)
+    return reached
+
+
+def _way(thing: Rotary, start_rad: float, goal_rad: float, seat_m: float, flip: float) -> list[RigidTransform]:
+    x, y = thing.position_m
+    steps = np.linspace(start_rad, goal_rad, max(3, int(abs(goal_rad - start_rad) / 0.1)))
+    down = [panel_from_grip((x, y, seat_m + LIFT_M), flip - float(a)) for a in steps]
+    return [panel_from_grip((x, y, thing.height_m + STANDOFF_M), flip - start_rad), *down]

@@ -1,0 +1,171 @@
+"""Move a slider: push its cap by a face that the finger has felt, by the distance that is missing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from hal.errors import InvalidRequest
+from hal.motion import Guard, Quantity
+from hal.panel import Slider
+from manipulation.skills.contact import meet
+from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
+from manipulation.skills.steps import STANDOFF_M, Attempt, perform
+from manipulation.stroke import shifted
+from manipulation.workcell import Workcell, panel_from_grip
+
+TIP_HEIGHT_M = 0.007  # of the fingertip over the plate: low on the cap, yet a pose error does not scrape
+SIDE_M = 0.009  # room between fingertip and cap when coming down
+SEEK_M = 0.022
+SEEK_M_PER_S = 0.02
+SEEK_N = 1.3  # below the friction of a light slider, above noise and inertia
+PUSH_M_PER_S = 0.05
+SHORT_M = 0.003  # the push pauses this far before the end to learn how far the pads give
+TOLERANCE_RATIO = 0.02
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Push:
+    """Places along the track from its middle, m."""
+
+    start_m: float
+    goal_m: float
+
+    @property
+    def sign(self) -> float:
+        return 1.0 if self.goal_m >= self.start_m else -1.0
+
+
+def slider(
+    cell: Workcell,
+    name: str,
+    target: float,
+    *,
+    current: ObjectState | None = None,
+    verify: Verify | None = None,
+    tolerance: float | None = None,
+) -> SkillReport:
+    """Push the slider to a value of its scale.
+
+    The distance to push is the difference of two values and the cap's face is found by touch, so an error of the panel's
+    pose does not enter the result.
+
+    Args:
+        current: what the last look said; without it `verify` is asked first.
+        tolerance: in units of the scale; 2 % of its span by default.
+
+    The mechanical estimate is the value reached.
+
+    Raises:
+        InvalidRequest: not a slider, a value off its scale, or nobody knows where the cap is.
+        DeviceFault, Stopped, Cancelled: the cell cannot go on.
+    """
+    thing = cell.panel.object(name)
+    if not isinstance(thing, Slider):
+        raise InvalidRequest(f"{name} is a {thing.kind}, not a slider", hint="see the panel file")
+    scale = thing.scale
+    if not scale.minimum <= target <= scale.maximum:
+        raise InvalidRequest(
+            f"{target} {scale.unit} is off the scale of {name}", hint=f"{scale.minimum} to {scale.maximum} {scale.unit}"
+        )
+    known = current if current is not None else (verify() if verify is not None else None)
+    where = [known.value if known is not None else None]
+    allowed = tolerance if tolerance is not None else TOLERANCE_RATIO * (scale.maximum - scale.minimum)
+
+    def stroke(attempt: Attempt) -> float:
+        if where[0] is None:
+            raise InvalidRequest(f"the value of {name} is not known", hint="read it first, or give `current`")
+        push = _Push(start_m=scale.place_of(where[0]), goal_m=scale.place_of(target))
+        moved = _push(attempt, thing, push)
+        where[0] = scale.value_at(push.start_m + moved)
+        return where[0]
+
+    def look() -> ObjectState | None:
+        seen = verify() if verify is not None else None
+        if seen is not None and seen.value is not None:
+            where[0] = seen.value
+        return seen
+
+    return perform(
+        cell,
+        stroke,
+        skill="slider",
+        object_name=name,
+        target=f"{target:g} {scale.unit}".strip(),
+        is_reached=lambda seen: seen.value is not None and abs(seen.value - target) <= allowed,
+        verify=look if verify is not None else None,
+    )
+
+
+def _push(attempt: Attempt, thing: Slider, push: _Push) -> float:
+    """One push; returns how far the cap moved along the track, m, signed."""
+    cell = attempt.cell
+    half_x, half_y = cell.hand.closed_half_m
+    turns = ((0.0, half_x), (np.pi, half_x), (np.pi / 2, half_y), (-np.pi / 2, half_y))
+    ways = [_way(thing, push, turn, half) for turn, half in turns]
+    attempt.begin(ways, may_touch=(thing.name,), width_m=0.0, name=thing.name)
+    top = thing.cap_size_m[2]
+    down = attempt.advance(STANDOFF_M + top - TIP_HEIGHT_M, name="approach")
+    if down.tripped is not None:
+        height = (cell.panel_pose.inv() * attempt.pose()).translation[2]
+        if height > 0.6 * top:
+            raise SkillFailure(Outcome.MISSED, "the fingertip landed on the cap")
+        attempt.advance(-0.002, name="lift off the plate", speed_m_per_s=0.03)
+    ahead = push.sign * cell.panel_pose.rotation.apply([np.cos(thing.angle_rad), np.sin(thing.angle_rad), 0.0])
+    met = meet(attempt, _moved(attempt, SEEK_M * ahead), name="feel the cap", speed_m_per_s=SEEK_M_PER_S, stop_n=SEEK_N, ticks=3)
+    if not met.is_met:
+        attempt.leave()
+        raise SkillFailure(Outcome.MISSED, "no cap was met")
+    begun = met.report.log.tip_m[0]
+    face = float(met.way_m - (attempt.pose().translation - begun) @ ahead)  # from here back to the face, not positive
+    length = abs(push.goal_m - push.start_m)
+    start = attempt.pose().translation
+    _go(attempt, thing, ahead, max(0.0, length + face - SHORT_M), "push")
+    give = _give_m(attempt, ahead)
+    so_far = float((attempt.pose().translation - start) @ ahead)
+    _go(attempt, thing, ahead, max(0.0, length + face + give - so_far), "push to the end")
+    moved = float((attempt.pose().translation - start) @ ahead) - face - _give_m(attempt, ahead)
+    _go(attempt, thing, -ahead, 0.004, "let go")
+    attempt.leave()
+    return push.sign * moved
+
+
+def _way(thing: Slider, push: _Push, turn: float, half: float) -> list[RigidTransform]:
+    along = np.array([np.cos(thing.angle_rad), np.sin(thing.angle_rad)])
+    beside = thing.cap_size_m[0] / 2 + half + SIDE_M
+    middle = np.array(thing.position_m)
+    start = middle + (push.start_m - push.sign * beside) * along
+    end = middle + (push.goal_m - push.sign * (beside - SIDE_M)) * along
+    top = thing.cap_size_m[2]
+    angle = thing.angle_rad + turn
+    return [
+        panel_from_grip((*start, top + STANDOFF_M), angle),
+        panel_from_grip((*start, TIP_HEIGHT_M), angle),
+        panel_from_grip((*(0.5 * (start + end)), TIP_HEIGHT_M), angle),
+        panel_from_grip((*end, TIP_HEIGHT_M), angle),
+    ]
+
+
+def _moved(attempt: Attempt, way_m: np.ndarray) -> RigidTransform:
+    pose = attempt.pose()
+    return shifted(pose, pose.rotation.inv().apply(way_m))
+
+
+def _go(attempt: Attempt, thing: Slider, ahead: np.ndarray, distance_m: float, name: str) -> None:
+    if distance_m < 1e-4:
+        return
+    limit = 3.0 * thing.friction_n + 15.0
+    guard = Guard(name="effort", quantity=Quantity.FORCE, limit=limit)
+    report = attempt.straight(_moved(attempt, distance_m * ahead), name=name, speed_m_per_s=PUSH_M_PER_S, guards=(guard,))
+    if report.tripped is not None:
+        raise SkillFailure(Outcome.STALLED, f"the cap stopped against {report.peak_force_n:.0f} N")
+
+
+def _give_m(attempt: Attempt, ahead: np.ndarray) -> float:
+    """How far the pads give under the push that friction holds now."""
+    report = attempt.reports[-1]
+    against = report.base_from_tool.rotation.inv().apply(-ahead)
+    force = max(0.0, float(report.wrench[:3] @ against))
+    return force / attempt.cell.hand.pad_stiffness_n_per_m

@@ -1,0 +1,83 @@
+"""Throw a toggle switch: sweep the closed fingertip across the bat until it snaps over."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hal.errors import InvalidRequest
+from hal.motion import Guard, Quantity
+from hal.panel import Toggle
+from manipulation.skills.outcome import Outcome, SkillFailure, SkillReport, Verify
+from manipulation.skills.steps import STANDOFF_M, Attempt, perform
+from manipulation.stroke import shifted
+from manipulation.workcell import Workcell, panel_from_grip
+
+PIVOT_M = 0.004  # the bat turns a little above the plate
+GRIP_RATIO = 0.55  # how far up the bat the fingertip pushes: high enough for a lever arm, low enough not to slip off
+SIDE_M = 0.008  # room between fingertip and bat when coming down; more than the pose error
+BEYOND_M = 0.008  # how far past the middle the fingertip's face goes if nothing stops it
+SWEEP_M_PER_S = 0.05
+SWEEP_N = 25.0  # stops on the bat's end stop; the prototype's peak was 26 N
+
+
+def toggle(cell: Workcell, name: str, target: str, *, verify: Verify | None = None) -> SkillReport:
+    """Throw the toggle to `on` (up) or `off` (down).
+
+    The mechanical estimate is how far past the pivot the fingertip's face came, in metres; more than 0 has thrown it.
+
+    Raises:
+        InvalidRequest: not a toggle, or no such state.
+        DeviceFault, Stopped, Cancelled: the cell cannot go on.
+    """
+    thing = cell.panel.object(name)
+    if not isinstance(thing, Toggle):
+        raise InvalidRequest(f"{name} is a {thing.kind}, not a toggle", hint="see the panel file")
+    if target not in ("on", "off"):
+        raise InvalidRequest(f"a toggle has no state {target!r}", hint="on (up) or off (down)")
+    up = 1.0 if target == "on" else -1.0
+
+    def stroke(attempt: Attempt) -> float:
+        half = max(cell.hand.closed_half_m)
+        reach = PIVOT_M + GRIP_RATIO * thing.bat_length_m
+        x, y = thing.position_m
+        # The bat leans away from the target; come down beyond it.
+        lean = thing.bat_length_m * np.sin(thing.tilt_rad) + thing.bat_radius_m
+        start, end = y - up * (lean + half + SIDE_M), y + up * (BEYOND_M - half)
+        ways = [
+            [
+                panel_from_grip((x, start, reach + thing.bat_length_m + STANDOFF_M), turn),
+                panel_from_grip((x, start, reach), turn),
+                panel_from_grip((x, end, reach), turn),
+            ]
+            for turn in (0.0, np.pi, np.pi / 2, -np.pi / 2)
+        ]
+        attempt.begin(ways, may_touch=(name,), width_m=0.0, name=name)
+        down = attempt.advance(thing.bat_length_m + STANDOFF_M, name="approach")
+        if down.tripped is not None and _left_m(attempt, reach) > 0.004:
+            raise SkillFailure(Outcome.MISSED, "the fingertip landed on something before it was beside the bat")
+        if down.tripped is not None:
+            attempt.advance(-0.002, name="lift off", speed_m_per_s=0.03)
+        sweep = cell.panel_pose.rotation.apply([0.0, end - start, 0.0])
+        here = attempt.pose()
+        goal = shifted(here, here.rotation.inv().apply(sweep))
+        guard = Guard(name="end stop", quantity=Quantity.FORCE, limit=SWEEP_N)
+        report = attempt.straight(goal, name="sweep", speed_m_per_s=SWEEP_M_PER_S, guards=(guard,))
+        moved = float((report.base_from_tool.translation - here.translation) @ sweep / np.linalg.norm(sweep))
+        past = moved - (abs(end - start) - BEYOND_M)
+        attempt.leave()
+        if past < -0.004:
+            raise SkillFailure(Outcome.STIFF, f"the bat did not give way at {SWEEP_N:.0f} N", reached=past)
+        return past
+
+    def _left_m(attempt: Attempt, reach: float) -> float:
+        return float((cell.panel_pose.inv() * attempt.pose()).translation[2]) - reach
+
+    return perform(
+        cell,
+        stroke,
+        skill="toggle",
+        object_name=name,
+        target=target,
+        is_reached=lambda seen: seen.state == target,
+        verify=verify,
+    )

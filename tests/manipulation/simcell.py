@@ -1,0 +1,116 @@
+"""The simulated bench with a controller over it and a panel pose that is wrong by a given amount: the skills' test rig.
+
+Only tests and benchmarks use this file: it reads the simulator's truth, which no skill may.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from hal.clock import SimClock
+from hal.config import Cell, load_cell
+from hal.devices import DeviceKind, ObjectTruth
+from hal.geometry import UncertainPose, perturbed
+from hal.registry import Context, Shared, connect
+from manipulation.control import Controller
+from manipulation.skills.outcome import ObjectState
+from manipulation.timing import SpeedLimits
+from manipulation.workcell import Workcell
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@dataclass
+class SimBench:
+    """A running simulated cell. `cell` is what skills get; `truth` is for the judge."""
+
+    file: Cell
+    clock: SimClock
+    shared: Shared
+    arm: object
+    controller: Controller
+    cell: Workcell
+    latched: list[bool]
+
+    def truth(self, name: str) -> ObjectTruth:
+        """What an object really shows now."""
+        return next(o for o in self.arm.truth().objects if o.name == name)  # type: ignore[attr-defined]
+
+    def true_panel(self) -> RigidTransform:
+        """Where the panel really is."""
+        return RigidTransform.from_matrix(self.arm.truth().base_from_panel_matrix)  # type: ignore[attr-defined]
+
+    def peak_force_n(self) -> float:
+        """Largest contact force that the engine saw on the arm."""
+        return float(self.arm.truth().peak_force_n)  # type: ignore[attr-defined]
+
+    def look(self, name: str) -> ObjectState:
+        """A perfect second look."""
+        truth = self.truth(name)
+        return ObjectState(name=name, state=truth.state, value=truth.value, angle_rad=truth.value)
+
+    def close(self) -> None:
+        """End controller and world."""
+        self.controller.close()
+        self.shared.close()
+
+
+def open_bench(seed: int, *, error_m: float = 0.003, error_rad: float = np.radians(1.0), speed: float = 0.25) -> SimBench:
+    """The bench of a seed, believed to stand `error_m` and `error_rad` away from where it does, in a random direction."""
+    file = load_cell(ROOT / "cells" / "bench.toml", seed=seed)
+    clock, shared = SimClock(), Shared()
+    made = {}
+    for name, section in file.file.devices.items():
+        if section.kind in (DeviceKind.CAMERA, DeviceKind.RANGE_SCANNER, DeviceKind.LIGHTS):
+            continue
+        context = Context(name=name, clock=clock, cell=file, shared=shared)
+        made[name] = connect(context, section.driver, dict(section.options))
+    latched = [False]
+    record = file.calibration_of("wrist_ft")
+    grip = file.calibration_of("gripper").mount.pose().parent_from_child
+    controller = Controller(
+        made["arm"],
+        made["gripper"],
+        made["wrist_ft"],
+        made["finger_touch"],
+        [made[name] for name in file.names_of(DeviceKind.PROXIMITY)],
+        clock=clock,
+        safety=file.file.safety,
+        load=record.load.load(),
+        flange_from_sensor=record.mount.pose().parent_from_child,
+        is_latched=lambda: latched[0],
+        flange_from_grip=grip,
+        rate_hz=file.file.cell.control_rate_hz,
+    )
+    controller.start()
+    rng = np.random.default_rng([seed, 1])
+    directions = rng.standard_normal((2, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    error = np.concatenate([error_m * directions[0], error_rad * directions[1]])
+    true = RigidTransform.from_matrix(made["arm"].truth().base_from_panel_matrix)
+    covariance = np.diag([error_m**2 / 3] * 3 + [error_rad**2 / 3] * 3) + 1e-12 * np.eye(6)
+    cell = Workcell(
+        mover=controller,
+        kinematics=controller.kinematics,
+        panel=file.panel,
+        base_from_panel=UncertainPose(parent_from_child=perturbed(true, error), covariance=covariance),
+        flange_from_grip=grip,
+        limits=SpeedLimits(tip_m_per_s=speed, joint_ratio=0.8, acceleration_ratio=0.6),
+        park_rad=np.asarray(file.file.workspace.park_rad),
+        floor_z_m=file.file.workspace.floor_z_m,
+        seed=seed,
+    )
+    bench = SimBench(file, clock, shared, made["arm"], controller, cell, latched)
+    angles = {o.name: o.value for o in file.panel.objects if o.kind == "lever" for o in [bench.truth(o.name)]}
+    bench.cell = replace(cell, angles_rad=angles)
+    return bench
+
+
+def wall_s() -> float:
+    """Seconds of the machine, for real-time factors."""
+    return time.perf_counter()

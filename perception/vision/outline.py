@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,10 +16,14 @@ PLATE_POINTS = 40
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Outline:
-    """Contour samples: `points_m` (N, 3) in the panel frame, `normals` (N, 2) unit, outward on the plate."""
+    """Contour samples: `points_m` (N, 3) in the panel frame, `normals` (N, 2) unit, outward on the plate.
+
+    `reach_m`: how far inside or outside of the contour a parallel edge of the same object may be the stronger one.
+    """
 
     points_m: Array
     normals: Array
+    reach_m: float = 0.0
 
 
 def edges_of(thing: PanelObject) -> Outline | None:  # noqa: PLR0911  (one branch a kind)
@@ -27,7 +31,8 @@ def edges_of(thing: PanelObject) -> Outline | None:  # noqa: PLR0911  (one branc
     x, y = thing.position_m
     match thing.kind:
         case "gauge":
-            return _circle(x, y, 0.0, thing.radius_m)  # the needle stands `depth_m` above the face, the rim does not
+            # The rim lies at the plate; only the needle stands `depth_m` above it. The face begins inside the rim.
+            return replace(_circle(x, y, 0.0, thing.radius_m), reach_m=0.12 * thing.radius_m)
         case "lamp":
             return _circle(x, y, 0.0, thing.radius_m)
         case "handwheel":

@@ -65,10 +65,13 @@ class Patch:
         return float(sample_at(good, u, v).mean())
 
 
-def sample_at(image: NDArray[Any], u: Array, v: Array) -> NDArray[np.float32]:
-    """Bilinear values of an image at coordinates of one or two dimensions."""
+def sample_at(image: NDArray[Any], u: Array, v: Array, *, outside: float | None = None) -> NDArray[np.float32]:
+    """Bilinear values of an image at coordinates of one or two dimensions; the border repeats unless `outside` is given."""
     u32, v32 = np.atleast_2d(u).astype(np.float32), np.atleast_2d(v).astype(np.float32)
-    values = cv2.remap(image.astype(np.float32), u32, v32, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    border = cv2.BORDER_REPLICATE if outside is None else cv2.BORDER_CONSTANT
+    values = cv2.remap(
+        image.astype(np.float32, copy=False), u32, v32, cv2.INTER_LINEAR, borderMode=border, borderValue=outside or 0.0
+    )
     return np.asarray(values.reshape(np.shape(u)), np.float32)
 
 

@@ -91,9 +91,10 @@ def probability(evidence: Sequence[tuple[float, float, float]]) -> float:
     """Confidence from independent pieces of evidence by a logistic sum.
 
     Args:
-        evidence: `(measured, half, scale)` triples: each adds `(measured - half) / scale`, limited to +-4.
+        evidence: `(measured, half, scale)` triples: each adds `(measured - half) / scale`. Doubt counts up to -6, assurance
+            up to +1: no strong point outweighs a weak one.
     """
-    total = sum(float(np.clip((measured - half) / scale, -4.0, 4.0)) for measured, half, scale in evidence)
+    total = sum(float(np.clip((measured - half) / scale, -6.0, 1.0)) for measured, half, scale in evidence)
     return float(1.0 / (1.0 + np.exp(-total)))
 
 

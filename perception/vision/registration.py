@@ -25,6 +25,8 @@ EDGE_TO_NOISE = 4.0  # an edge counts when its slope exceeds that many sigmas of
 NORMAL_STEP_M = 1e-3
 MEASUREMENT_SIGMA_PX = 0.5
 GROWTH_SIGMA_PX = 2.0
+EDGE_BIAS_SIGMA_PX = 0.8  # a drawn or real cast shadow moves a whole outline by about 1 px
+REGISTERED_SIGMA_PX = 0.15  # of the panel as a whole
 MIN_VISIBLE = 16  # fewer edge samples in the image say nothing about the panel
 
 
@@ -70,7 +72,8 @@ def register(gray: Image, view: View, panel: Panel) -> Registration:
     moved = reference.moved(delta)
     found = _look(smooth, slope_noise, moved, everything, 2.5)
     near = found.ok & (np.abs(found.offset_px) <= 2.0)
-    local = {name: _local_shift(smooth, slope_noise, moved, edges) for name, edges in own.items()}
+    built_m = panel.tolerances.position_m
+    local = {name: _local_shift(smooth, slope_noise, moved, edges, built_m) for name, edges in own.items()}
     return Registration(
         view=moved,
         covariance=covariance,
@@ -127,6 +130,12 @@ def _look(smooth: NDArray[np.float32], slope_noise: float, view: View, edges: Ou
     return _Found(offset_px=offset, normals_px=normals, visible=visible, ok=ok)
 
 
+def _ahead(view: View, edges: Outline) -> Array:
+    """(N, 2) what a step along every normal is in the image, px."""
+    step = NORMAL_STEP_M * np.column_stack([edges.normals, np.zeros(len(edges.normals))])
+    return view.project(edges.points_m + step) - view.project(edges.points_m)
+
+
 def _step(
     smooth: NDArray[np.float32], slope_noise: float, reference: View, delta: Array, *, edges: Outline, window_px: float
 ) -> tuple[Array, Array]:
@@ -155,18 +164,24 @@ def _step(
 
 
 def _local_shift(
-    smooth: NDArray[np.float32], slope_noise: float, view: View, edges: Outline
+    smooth: NDArray[np.float32], slope_noise: float, view: View, edges: Outline, built_m: float
 ) -> tuple[Array, float, float]:
-    """An object's own (2,) shift in px, its sigma, and the share of its edges found near the model."""
-    prior_px = 0.7  # building tolerance and what is left of the pose
-    found = _look(smooth, slope_noise, view, edges, 4.0)
+    """An object's own (2,) shift in px, its sigma, and the share of its edges found near the model.
+
+    `built_m` is one sigma of the object's place on the plate. The object's own edges carry a common error that more of
+    them do not average out: a cast shadow or a side wall moves all edges of one side.
+    """
+    scale_px_per_m = float(np.nanmedian(np.linalg.norm(_ahead(view, edges), axis=1))) / NORMAL_STEP_M
+    reach_px = edges.reach_m * scale_px_per_m
+    prior_px = float(np.hypot(REGISTERED_SIGMA_PX, built_m * scale_px_per_m))
+    found = _look(smooth, slope_noise, view, edges, float(np.clip(1.5 + reach_px, 4.0, 9.0)))
     visible = int(found.visible.sum())
     if found.ok.sum() < 6:
         return np.zeros(2), prior_px, 0.0 if visible >= 6 else float("nan")
     r = found.offset_px[found.ok]
     # The third unknown is growth: a bezel or a printed ring may be the stronger edge, all around the object.
     J = np.column_stack([found.normals_px[found.ok], np.ones(len(r))])
-    prior = np.diag([1 / prior_px**2, 1 / prior_px**2, 1 / GROWTH_SIGMA_PX**2])
+    prior = np.diag([1e-6, 1e-6, 1 / (GROWTH_SIGMA_PX + reach_px) ** 2])
     solution, N = np.array([0.0, 0.0, float(np.median(r))]), prior
     for _ in range(4):
         e = r - J @ solution
@@ -175,7 +190,9 @@ def _local_shift(
         N = J.T @ (w[:, None] * J) + prior
         solution = np.linalg.solve(N, J.T @ (w * r))
     share = float((np.abs(r - J @ solution) < 1.5).sum() / max(1, visible))
-    return solution[:2], float(np.sqrt(np.trace(np.linalg.inv(N)[:2, :2]) / 2)), share
+    measured = np.linalg.inv(N)[:2, :2] + np.eye(2) * EDGE_BIAS_SIGMA_PX**2
+    gain = np.linalg.inv(np.eye(2) / prior_px**2 + np.linalg.inv(measured))
+    return gain @ np.linalg.solve(measured, solution[:2]), float(np.sqrt(np.trace(gain) / 2)), share
 
 
 def _joined(outlines: list[Outline]) -> Outline:

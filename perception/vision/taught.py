@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -203,8 +204,9 @@ def _absence(patch: Patch, edge_share: float, noise: float) -> str | None:
     """Why the object is taken as not there; None when it is."""
     if patch.inside.mean() < 0.5:
         return "most of the object is outside the image: move the camera"
-    contrast = float(np.percentile(patch.gray, 95)) - float(np.percentile(patch.gray, 5))
-    if contrast < 4.0 * noise + 6.0:
+    smooth = cv2.GaussianBlur(patch.gray, (0, 0), 1.5)
+    contrast = float(np.percentile(smooth, 97)) - float(np.percentile(smooth, 3))
+    if contrast < 1.5 * noise + 6.0:
         return "nothing but bare plate where the object should be"
     if edge_share < MIN_EDGE_SHARE:
         return "the object's outline is not where it should be: check the panel file, or something covers it"

@@ -7,10 +7,10 @@ import numpy as np
 from hal.panel import Button, Mushroom
 from perception.vision.patch import Patch
 from perception.vision.reading import Status, gated, refused
-from perception.vision.status.press import cap_height, one_sided_shade
+from perception.vision.status.press import cap_height, one_sided_shade, sheen
 
-SHADE_HALF = 0.16  # first harmonic between a flush cap (below 0.1) and one that stands out (above 0.2)
-SHADE_SCALE = 0.04
+SHADE_HALF, SHADE_SCALE = 0.06, 0.015  # a flush cap stays below 0.05, one that stands out reaches 0.1
+SHEEN_HALF, SHEEN_SCALE = 0.08, 0.03
 
 
 def read_button(patch: Patch, spec: Button) -> Status:
@@ -46,5 +46,7 @@ def _by_height(patch: Patch, spec: Button | Mushroom) -> float | None:
 
 
 def _by_shade(patch: Patch, radius_m: float) -> float:
-    shade, _ = one_sided_shade(patch, radius_m=radius_m, ring=(0.80, 0.97), outside=(1.12, 1.3))
-    return (shade - SHADE_HALF) / SHADE_SCALE
+    """Log odds of `released` from a shadow on one side and a sheen on the other."""
+    shade, towards_rad = one_sided_shade(patch, radius_m=radius_m, ring=(0.90, 1.05), outside=(1.12, 1.3))
+    shine = sheen(patch, radius_m=radius_m, towards_rad=towards_rad)
+    return (shade - SHADE_HALF) / SHADE_SCALE + float(np.clip((shine - SHEEN_HALF) / SHEEN_SCALE, -2.0, 3.0))

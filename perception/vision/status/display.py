@@ -1,10 +1,9 @@
-"""Seven-segment displays by geometry: find the comb of digit cells, measure every segment, decode with a confidence.
+"""Seven-segment displays by geometry: ink, comb of digit cells, level of every segment, characters with a margin.
 
-1. Ink: white-hat for glowing segments, black-hat for dark ones: gradients and glare borders vanish.
-2. The slant is the one that makes the columns of upright segments sharpest.
-3. The comb (left edge, pitch, digit width) is searched on the profile of those rows that only upright segments cross.
-4. Every segment of every cell gets a mean; lit and unlit separate around one threshold; each cell takes the character
-   that explains its segments best, and the margin to the second best is the evidence.
+Ink is a white-hat for glowing segments and a black-hat for dark ones, so gradients and glare borders vanish. Lit and unlit
+segments separate around one threshold that follows the brightness from cell to cell; each cell takes the character that
+explains its segments best within what a number may look like (blanks lead, one sign). The decimal point is what is left
+at the foot of a gap when the lit segments have been taken away.
 """
 
 from __future__ import annotations
@@ -16,51 +15,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.panel import Display
+from perception.vision.image import Image
 from perception.vision.patch import Patch, sample_at
 from perception.vision.reading import Status, gated, probability, refused
+from perception.vision.status.comb import AXES, SEGMENTS, Comb, Float32, find_combs, segment_levels
 from perception.vision.view import Array
 
-#: Segments in the order a b c d e f g: top, upper right, lower right, bottom, lower left, upper left, middle.
-GLYPHS = {
-    "0": "abcdef",
-    "1": "bc",
-    "2": "abged",
-    "3": "abgcd",
-    "4": "fgbc",
-    "5": "afgcd",
-    "6": "afgedc",
-    "7": "abc",
-    "8": "abcdefg",
-    "9": "abcdfg",
-    "-": "g",
-    " ": "",
-}
-VARIANTS = (("7", "abcf"), ("6", "fgedc"), ("9", "abcfg"))
-SEGMENTS = "abcdefg"
+GLYPHS = (
+    ("0", "abcdef"), ("1", "bc"), ("2", "abged"), ("3", "abgcd"), ("4", "fgbc"), ("5", "afgcd"), ("6", "afgedc"),
+    ("7", "abc"), ("8", "abcdefg"), ("9", "abcdfg"), ("7", "abcf"), ("6", "fgedc"), ("9", "abcfg"), ("-", "g"), (" ", ""),
+)  # fmt: skip
+SIGNS = np.array([[1.0 if s in lit else -1.0 for s in SEGMENTS] for _, lit in GLYPHS])
+DIGIT_GLYPHS = [k for k, (c, _) in enumerate(GLYPHS) if c.isdigit()]
+MINUS, BLANK = len(GLYPHS) - 2, len(GLYPHS) - 1
 
 MARGIN = 0.09  # share of the smaller side that a frame may take
-PITCHES = np.geomspace(1.22, 2.8, 34)  # of the digit width
-SLANTS = np.tan(np.deg2rad(np.arange(-2.0, 16.1, 2.0)))
-
-Float32 = NDArray[np.float32]
+CELL_COST = 0.008  # a comb with one more cell must explain that much more
+DOT_RADIUS = 0.075  # of the digit height
+POINT_LEVEL = 0.45  # of a lit segment
+FREE_MIDDLE = 0.22  # how far digits may sit from the middle when their number is not known
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Comb:
-    """Digit cells in patch pixels, deslanted: `left_px` of the first, `pitch_px`, `width_px` between the axes of the
-    upright segments, and the rows of the top and bottom segments' axes."""
+class Decoded:
+    """Text of one comb, the share of ink that it explains, its weakest character's margin and a lit segment's level."""
 
-    left_px: float
-    pitch_px: float
-    width_px: float
-    top_px: float
-    bottom_px: float
-    count: int
-    slant: float
-
-    def column_px(self, cell: int) -> float:
-        """Axis of the left upright segments of a cell."""
-        return self.left_px + cell * self.pitch_px
+    text: str
+    explained: float
+    margin: float
+    comb: Comb
+    lit: float
 
 
 def read_display(patch: Patch, spec: Display, *, digits_taught: bool = True) -> Status:
@@ -68,275 +52,222 @@ def read_display(patch: Patch, spec: Display, *, digits_taught: bool = True) -> 
 
     `digits_taught` False: number of digits and decimals are to be found in the picture.
     """
-    window = _window(patch, spec)
-    seen = float(((window[1]) & (window[0] < 250)).mean())
-    if seen < 0.6:
+    gray, inside = _window(patch, spec)
+    seen = float((inside & (gray < 250)).mean()) if gray.size else 0.0
+    if seen < 0.5:
         return refused(
             "the display cannot be seen (glare, shadow or cover): change the angle or the light", unit=spec.unit
         )
     return read_window(
-        window[0],
-        digits=spec.digits if digits_taught else None,
-        decimals=spec.decimals if digits_taught else None,
-        dark=spec.style == "lcd",
-        unit=spec.unit,
-        limits=(spec.minimum, spec.maximum),
-        seen=seen,
-    )
+        gray, digits=spec.digits if digits_taught else None, decimals=spec.decimals if digits_taught else None,
+        dark=spec.style == "lcd", unit=spec.unit, limits=(spec.minimum, spec.maximum), seen=seen,
+    )  # fmt: skip
 
 
 def read_window(
-    gray: NDArray[np.uint8],
-    *,
-    digits: int | None,
-    decimals: int | None,
-    dark: bool | None,
-    unit: str = "",
-    limits: tuple[float, float] | None = None,
-    seen: float = 1.0,
-) -> Status:
+    gray: Image, *, digits: int | None, decimals: int | None, dark: bool | None, unit: str = "",
+    limits: tuple[float, float] | None = None, seen: float = 1.0,
+) -> Status:  # fmt: skip
     """Text of an upright window that shows nothing but the digits.
 
     Args:
         digits, decimals, dark: what is known; None lets the picture decide.
         limits: smallest and largest value possible.
     """
-    best: tuple[float, str, float] | None = None
-    for is_dark in (True, False) if dark is None else (dark,):
-        ink = segment_ink(gray, is_dark)
-        for count in range(1, 9) if digits is None else (digits,):
-            found = _decode(ink, count, decimals)
-            if found is not None and (best is None or found[0] > best[0]):
-                best = found
-    if best is None:
+    counts = range(1, 9) if digits is None else (digits,)
+    free = 0.06 if digits else FREE_MIDDLE
+    found = [
+        decoded
+        for is_dark in ((True, False) if dark is None else (dark,))
+        for ink in (segment_ink(gray, is_dark),)
+        for share, comb in find_combs(ink, counts, free=free)
+        if (decoded := decode(ink, comb, share, decimals)) is not None
+    ]
+    if not found:
         return refused("no digits stand out: come closer, or change the angle or the light", unit=unit)
-    _, text, margin = best
+    best = max(found, key=lambda d: d.explained - CELL_COST * d.comb.count + 0.1 * min(d.margin, 0.5))
+    if lies_across(gray, best):
+        return refused("something lies across the digits: move it or look past it", unit=unit)
     try:
-        value = float(text)
+        value = float(best.text)
     except ValueError:
         return refused("the segments make no number: come closer, or change the angle or the light", unit=unit)
     if limits is not None and not limits[0] <= value <= limits[1]:
-        return refused(f"the segments look like {text}, which is outside the display's range: look again", unit=unit)
-    half_digit = 0.5 * 10.0 ** -(len(text.split(".")[1]) if "." in text else 0)
-    confidence = probability([(margin, 0.12, 0.06), (seen, 0.75, 0.1)])
-    return gated(Status(value=value, unit=unit, uncertainty=half_digit, text=text, confidence=confidence))
+        return refused(
+            f"the segments look like {best.text}, which is outside the display's range: look again", unit=unit
+        )
+    half_digit = 0.5 * 10.0 ** -(len(best.text.split(".")[1]) if "." in best.text else 0)
+    confidence = probability([(best.margin, 0.25, 0.08), (best.explained, 0.6, 0.05), (seen, 0.6, 0.1)])
+    return gated(Status(value=value, unit=unit, uncertainty=half_digit, text=best.text, confidence=confidence))
 
 
-def segment_ink(gray: NDArray[np.uint8], is_dark: bool) -> Float32:
-    """Hat transform with a kernel wider than a segment's stroke, smoothed a little; zero at the typical background."""
-    size = max(5, round(0.28 * gray.shape[0])) | 1
-    kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (size, size))
-    smooth = cv2.GaussianBlur(gray, (3, 3), 0)
+def segment_ink(gray: Image, is_dark: bool) -> Float32:
+    """Hat transform with a kernel wider than a segment's stroke; zero at the typical background."""
+    size = max(5, round(0.30 * gray.shape[0])) | 1
+    kernel = np.ones((size, size), np.uint8)
+    smooth = cv2.GaussianBlur(gray, (0, 0), max(0.6, 0.012 * gray.shape[0]))
     ink = cv2.morphologyEx(smooth, cv2.MORPH_BLACKHAT if is_dark else cv2.MORPH_TOPHAT, kernel).astype(np.float32)
-    return np.asarray(np.maximum(ink - np.percentile(ink, 30), 0.0), np.float32)
+    return np.asarray(np.maximum(ink - np.percentile(ink, 35), 0.0), np.float32)
 
 
-def _window(patch: Patch, spec: Display) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+def decode(ink: Float32, comb: Comb, share: float, decimals: int | None) -> Decoded | None:
+    """The reading of a comb that explains `share` of the ink; None when lit and unlit do not separate."""
+    levels = segment_levels(ink, comb)
+    threshold, lit = _levels_of(levels)
+    if lit < 3.0:
+        return None
+    scaled = np.clip((levels - threshold) / np.maximum(lit - threshold, 0.5 * lit) * 0.5, -0.5, 0.5)
+    glyphs, margin = _number(scaled)
+    characters = "".join(GLYPHS[k][0] for k in glyphs)
+    text = _with_point(characters, ink, comb, np.where(SIGNS[glyphs] > 0, levels, 0.0), lit, decimals)
+    return Decoded(text=text, explained=share, margin=margin, comb=comb, lit=lit)
+
+
+def _window(patch: Patch, spec: Display) -> tuple[Image, NDArray[np.bool_]]:
     margin = MARGIN * min(spec.width_m, spec.height_m)
-    u, v = patch.pixel_of(
-        np.array([-1.0, 1.0]) * (spec.width_m / 2 - margin), np.array([1.0, -1.0]) * (spec.height_m / 2 - margin)
-    )
+    w, h = spec.width_m / 2 - margin, spec.height_m / 2 - margin
+    u, v = patch.pixel_of(np.array([-w, w]), np.array([h, -h]), 0.0)
     cols = slice(max(0, round(u[0])), round(u[1]) + 1)
     rows = slice(max(0, round(v[0])), round(v[1]) + 1)
     return patch.gray[rows, cols], patch.inside[rows, cols]
 
 
-def _decode(ink: Float32, count: int, decimals: int | None) -> tuple[float, str, float] | None:
-    """(quality, text, margin) of the best reading with `count` cells."""
-    rows = _digit_rows(ink)
-    if rows is None:
-        return None
-    slant = _slant(ink, rows)
-    upright = _deslanted(ink, slant, rows)
-    comb = _comb(upright, rows, count, slant)
-    if comb is None:
-        return None
-    levels = _segment_levels(upright, comb)
-    lit = float(np.percentile(levels, 92))
-    threshold = _threshold(levels)
-    if lit < 4.0 or threshold >= lit:
-        return None
-    scaled = (levels - threshold) / (lit - threshold) / 2.0  # +0.5 clearly lit, negative unlit
-    scaled = np.clip(scaled, -0.5, 0.5)
-    cells = [_character(cell) for cell in scaled]
-    text = _with_point("".join(c for c, _ in cells), upright, comb, lit, decimals)
-    margin = min(m for _, m in cells)
-    explained = _explained(upright, comb, scaled > 0)
-    return explained + 0.3 * margin, text, margin
-
-
-def _digit_rows(ink: Float32) -> tuple[float, float] | None:
-    """Rows of the top and bottom segments' axes: where the ink begins and ends."""
-    strong = np.percentile(ink, 99)
-    if strong < 4:
-        return None
-    lit = ink > 0.5 * strong
-    profile = lit.sum(axis=1).astype(float)
-    there = np.flatnonzero(profile >= max(2.0, 0.12 * profile.max()))
-    if len(there) < 6 or there[-1] - there[0] < 0.25 * ink.shape[0]:
-        return None
-    half_stroke = 0.05 * (there[-1] - there[0])
-    return float(there[0] + half_stroke), float(there[-1] - half_stroke)
-
-
-def _slant(ink: Float32, rows: tuple[float, float]) -> float:
-    """Tangent of the slant with the sharpest columns."""
-    scores = []
-    for slant in SLANTS:
-        profile = _upright_profile(_deslanted(ink, slant, rows), rows)
-        scores.append(float((profile**2).sum()))
-    return float(SLANTS[int(np.argmax(scores))])
-
-
-def _deslanted(ink: Float32, slant: float, rows: tuple[float, float]) -> Float32:
-    middle = (rows[0] + rows[1]) / 2
-    shear = np.array([[1.0, -slant, slant * middle], [0.0, 1.0, 0.0]])  # source x of target (x, y)
-    return np.asarray(
-        cv2.warpAffine(ink, shear, ink.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP), np.float32
-    )
-
-
-def _upright_profile(ink: Float32, rows: tuple[float, float]) -> Array:
-    """Column means over the rows that only upright segments cross."""
-    top, bottom = rows
-    height = bottom - top
-    take = np.concatenate(
-        [np.arange(top + 0.17 * height, top + 0.36 * height), np.arange(top + 0.64 * height, top + 0.83 * height)]
-    )
-    return np.asarray(ink[np.clip(np.round(take).astype(int), 0, len(ink) - 1)].mean(axis=0), float)
-
-
-def _comb(ink: Float32, rows: tuple[float, float], count: int, slant: float) -> Comb | None:
-    """The comb that explains most upright ink, near the middle of the window."""
-    profile = _upright_profile(ink, rows)
-    total = profile.sum()
-    if total <= 0:
-        return None
-    height = rows[1] - rows[0]
-    width = ink.shape[1]
-    x = np.arange(width)
-    sigma = max(0.055 * height, 1.0)
-    kernel = np.exp(-0.5 * (np.arange(-round(3 * sigma), round(3 * sigma) + 1) / sigma) ** 2)
-    blurred = np.convolve(profile, kernel / kernel.sum(), "same")
-    best: tuple[float, float, float, float] | None = None
-    for digit in np.linspace(0.40, 0.62, 6) * height:
-        for pitch in PITCHES * digit:
-            span = (count - 1) * pitch + digit
-            if span > width + 2:
-                continue
-            slack = max(0.10 * width, 0.2 * pitch)
-            lefts = np.arange((width - span) / 2 - slack, (width - span) / 2 + slack + 0.5, 1.0)
-            places = lefts[:, None] + np.concatenate([np.arange(count) * pitch, np.arange(count) * pitch + digit])
-            between = lefts[:, None] + np.concatenate(
-                [np.arange(count) * pitch + digit / 2, np.arange(count) * pitch + digit + (pitch - digit) / 2]
-            )
-            hit = np.interp(places, x, blurred, left=0, right=0).sum(axis=1)
-            miss = np.interp(between, x, blurred, left=0, right=0).sum(axis=1)
-            off = np.abs(lefts - (width - span) / 2) / width
-            score = (hit - 1.2 * miss) - 0.8 * off * hit
-            k = int(score.argmax())
-            if best is None or score[k] > best[0]:
-                best = (float(score[k]), float(lefts[k]), float(pitch), float(digit))
-    if best is None or best[0] <= 0:
-        return None
-    return Comb(
-        left_px=best[1], pitch_px=best[2], width_px=best[3], top_px=rows[0], bottom_px=rows[1], count=count, slant=slant
-    )
-
-
-def _segment_levels(ink: Float32, comb: Comb) -> Array:
-    """(cells, 7) mean ink of every segment, along the middle part of its axis and a little across."""
-    h, w = comb.bottom_px - comb.top_px, comb.width_px
-    s = np.linspace(0.28, 0.72, 7)
-    left, right = np.zeros(7), np.ones(7)
-    axes = {
-        "a": (s, 0 * s),
-        "d": (s, 0 * s + 1),
-        "g": (s, 0 * s + 0.5),
-        "f": (left, s / 2),
-        "b": (right, s / 2),
-        "e": (left, 0.5 + s / 2),
-        "c": (right, 0.5 + s / 2),
-    }
-    stroke = 0.045 * h
-    levels = np.zeros((comb.count, 7))
-    for k in range(comb.count):
-        for j, name in enumerate(SEGMENTS):
-            fx, fy = axes[name]
-            u, v = comb.column_px(k) + fx * w, comb.top_px + fy * h
-            across = np.array([-1.0, 0.0, 1.0])[:, None] * stroke
-            du, dv = (0 * across, across) if name in "adg" else (across, 0 * across)
-            levels[k, j] = float(np.median(sample_at(ink, u + du, v + dv).max(axis=0)))
-    return levels
-
-
-def _threshold(levels: Array) -> float:
-    """Otsu's threshold of the segment levels. Source: N. Otsu, IEEE Trans. SMC 9(1), 1979."""
+def _levels_of(levels: Array) -> tuple[Array, float]:
+    """(cells, 1) threshold of every cell and the level of a lit segment: Otsu over all, then drawn towards each cell."""
     values = np.sort(levels.ravel())
-    best, threshold = -1.0, float(values.mean())
-    for k in range(1, len(values)):
-        low, high = values[:k], values[k:]
-        between = len(low) * len(high) * (high.mean() - low.mean()) ** 2
-        if between > best:
-            best, threshold = float(between), float((low.mean() + high.mean()) / 2)
-    return threshold
+    n = np.arange(1, len(values))
+    low, high = np.cumsum(values)[:-1] / n, (values.sum() - np.cumsum(values)[:-1]) / (len(values) - n)
+    k = int((n * (len(values) - n) * (high - low) ** 2).argmax())
+    threshold, lit = (low[k] + high[k]) / 2, float(high[k])
+    strongest = np.sort(levels, axis=1)[:, -2:].mean(axis=1, keepdims=True)  # every digit has two lit segments
+    own = np.where(strongest > 0.5 * lit, strongest * threshold / max(lit, 1e-9), threshold)
+    return np.asarray(0.5 * (threshold + own)), lit
 
 
-def _character(scaled: Array) -> tuple[str, float]:
-    """Best character of a cell and its margin over the second best, per segment that differs."""
-    scores: dict[str, float] = {}
-    for character, lit in (*GLYPHS.items(), *VARIANTS):
-        sign = np.array([1.0 if s in lit else -1.0 for s in SEGMENTS])
-        scores[character] = max(scores.get(character, -9.0), float((sign * scaled).sum()))
-    ordered = sorted(scores, key=lambda c: scores[c], reverse=True)
-    return ordered[0], scores[ordered[0]] - scores[ordered[1]]
+def _number(scaled: Array) -> tuple[list[int], float]:
+    """Glyph indices of the best number and the margin of its weakest cell.
+
+    A number is blanks, then perhaps a sign, then digits.
+    """
+    scores = scaled @ SIGNS.T  # (cells, glyphs)
+    digit = scores[:, DIGIT_GLYPHS]
+    best_digit = digit.max(axis=1)
+    count = len(scaled)
+    forms: list[tuple[float, int, bool]] = []
+    for blanks in range(count):
+        lead = float(scores[:blanks, BLANK].sum())
+        forms.append((lead + float(best_digit[blanks:].sum()), blanks, False))
+        if blanks + 1 < count:
+            signed = lead + float(scores[blanks, MINUS]) + float(best_digit[blanks + 1 :].sum())
+            forms.append((signed, blanks, True))
+    forms.sort(reverse=True)
+    total, blanks, is_signed = forms[0]
+    glyphs = [BLANK] * blanks + [MINUS] * is_signed
+    glyphs += [DIGIT_GLYPHS[int(row.argmax())] for row in digit[len(glyphs) :]]
+    margins = [_margin(row, [GLYPHS[k][0] for k in DIGIT_GLYPHS]) for row in digit[blanks + is_signed :]]
+    if len(forms) > 1:
+        margins.append(total - forms[1][0])
+    return glyphs, float(min(margins))
 
 
-def _with_point(characters: str, ink: Float32, comb: Comb, lit: float, decimals: int | None) -> str:
-    """Text with its decimal point: where the panel file says, else where a dot is lit below the gap of two cells."""
+def _margin(scores: Array, names: list[str]) -> float:
+    """Best score less the best of another character."""
+    k = int(scores.argmax())
+    return float(scores[k] - max(s for s, name in zip(scores, names, strict=True) if name != names[k]))
+
+
+def _with_point(characters: str, ink: Float32, comb: Comb, lit_levels: Array, lit: float, decimals: int | None) -> str:
+    """Text with its decimal point: where the panel file says, else where a dot is lit at the foot of a gap."""
     taught = len(characters) - decimals if decimals else None
-    place = _point_place(ink, comb, lit) if decimals is None else taught
+    place = _point_place(ink, comb, lit_levels, lit) if decimals is None else taught
     text = characters if place is None else f"{characters[:place]}.{characters[place:]}"
     return text.strip()
 
 
-def _point_place(ink: Float32, comb: Comb, lit: float) -> int | None:
-    """Number of cells before the decimal point, or None."""
-    gap = comb.pitch_px - comb.width_px
-    best, place = 0.0, None
+def _point_place(ink: Float32, comb: Comb, lit_levels: Array, lit: float) -> int | None:
+    """Number of cells before the decimal point, or None.
+
+    The lit segments are taken away; what a dot template finds at the foot of a gap must reach a lit segment's level and
+    stand out from the other gaps.
+    """
+    drawn, sigma = _drawn(ink, comb, lit_levels)
     h = comb.bottom_px - comb.top_px
+    dot = _dot(DOT_RADIUS * h, sigma)
+    found = cv2.filter2D(ink - drawn, -1, dot / float((dot * dot).sum()), borderType=cv2.BORDER_REPLICATE)
+    gap = (comb.pitch_px - comb.width_px) / comb.width_px
+    x, y = np.meshgrid(np.linspace(0.25, 0.75, 6), np.linspace(-0.02, 0.06, 4))
+    amplitude = float(np.percentile(drawn, 99.0)) if drawn.any() else lit
+    peak = float(dot.max())
+    levels = []
     for k in range(comb.count - 1):
-        x = comb.column_px(k) + comb.width_px + gap * np.linspace(0.35, 0.65, 5)
-        y = comb.bottom_px + h * np.linspace(-0.02, 0.05, 4)
-        dot = float(np.percentile(sample_at(ink, x[None, :] + 0 * y[:, None], y[:, None] + 0 * x[None, :]), 70))
-        above = float(sample_at(ink, x, np.full(5, comb.bottom_px - 0.25 * h)).mean())
-        if dot - above > best:
-            best, place = dot - above, k + 1
-    return place if best > 0.45 * lit else None
+        u, v = comb.place(1.0 + gap * x, 1.0 + y, np.array(float(k)))
+        levels.append(float(sample_at(found, u, v).max()) * peak)
+    if not levels:
+        return None
+    k = int(np.argmax(levels))
+    others = sorted(levels[:k] + levels[k + 1 :])
+    typical = max(others[len(others) // 2], 0.0) if others else 0.0
+    return k + 1 if levels[k] - typical > POINT_LEVEL * amplitude * peak else None
 
 
-def _explained(ink: Float32, comb: Comb, lit: NDArray[np.bool_]) -> float:
-    """Share of the strong ink that lies on lit segments (a little around them)."""
-    canvas = np.zeros(ink.shape, np.uint8)
-    h, w = comb.bottom_px - comb.top_px, comb.width_px
-    corner = {
-        "a": (0, 0, 1, 0),
-        "d": (0, 1, 1, 1),
-        "g": (0, 0.5, 1, 0.5),
-        "f": (0, 0, 0, 0.5),
-        "b": (1, 0, 1, 0.5),
-        "e": (0, 0.5, 0, 1),
-        "c": (1, 0.5, 1, 1),
-    }
-    thick = max(2, round(0.2 * h))
-    for k in range(comb.count):
-        for j, name in enumerate(SEGMENTS):
-            if lit[k, j]:
-                x0, y0, x1, y1 = corner[name]
-                start = (round(comb.column_px(k) + x0 * w), round(comb.top_px + y0 * h))
-                end = (round(comb.column_px(k) + x1 * w), round(comb.top_px + y1 * h))
-                cv2.line(canvas, start, end, 1, thick)
-    strong = np.where(ink > 0.3 * np.percentile(ink, 98), ink, 0.0)
-    inside = float(strong[canvas > 0].sum())
-    area = float((canvas > 0).mean())
-    return inside / max(float(strong.sum()), 1e-6) - 0.5 * area
+def _dot(radius_px: float, sigma_px: float) -> Float32:
+    """A blurred disc of unit height before the blur."""
+    half = int(np.ceil(radius_px + 2.5 * sigma_px))
+    y, x = np.mgrid[-half : half + 1, -half : half + 1]
+    disc = np.clip(radius_px + 0.5 - np.hypot(x, y), 0.0, 1.0).astype(np.float32)
+    return np.asarray(cv2.GaussianBlur(disc, (0, 0), max(sigma_px, 0.3), borderType=cv2.BORDER_CONSTANT), np.float32)
+
+
+def _drawn(ink: Float32, comb: Comb, levels: Array) -> tuple[Float32, float]:
+    """The lit segments as drawn strokes with the width and blur that leave the least, and that blur in px."""
+    h = comb.bottom_px - comb.top_px
+    tried = []
+    for stroke in (0.09, 0.13):
+        canvas = _strokes(ink.shape, comb, levels, max(1, round(stroke * h)))
+        for sigma in (0.02 * h, 0.05 * h, 0.09 * h):
+            shape = cv2.GaussianBlur(canvas, (0, 0), max(sigma, 0.3))
+            fit = shape * float((shape * ink).sum() / max(float((shape * shape).sum()), 1e-6))
+            tried.append((float(((ink - fit) ** 2).sum()), fit, sigma))
+    _, fit, sigma = min(tried, key=lambda t: t[0])
+    return np.asarray(fit, np.float32), float(sigma)
+
+
+def _strokes(shape: tuple[int, ...], comb: Comb, levels: Array, thickness_px: int) -> Float32:
+    canvas = np.zeros(shape, np.float32)
+    for k, j in zip(*np.nonzero(levels > 0), strict=True):
+        start, end = AXES[j]
+        ends = start + np.array([[0.12], [0.88]]) * (end - start)
+        u, v = comb.place(ends[:, 0], ends[:, 1], np.array(float(k)))
+        (u0, u1), (v0, v1) = np.round(u * 16).astype(int), np.round(v * 16).astype(int)
+        cv2.line(canvas, (int(u0), int(v0)), (int(u1), int(v1)), float(levels[k, j]), thickness_px, cv2.LINE_AA, 4)
+    return canvas
+
+
+def lies_across(gray: Image, found: Decoded) -> bool:
+    """Whether something crosses the window above and below the digits: a cable or a hand, not a segment."""
+    comb = found.comb
+    h = comb.bottom_px - comb.top_px
+    above = gray[: max(0, round(comb.top_px - 0.14 * h))].astype(np.float32)
+    below = gray[round(comb.bottom_px + 0.18 * h) :].astype(np.float32)
+    crossed = [_differs(part, 0.4 * found.lit) for part in (above, below) if len(part) >= 2]
+    if len(crossed) < 2:
+        return False
+    reach = round(0.35 * h)  # a cable may lean
+    wide = [cv2.dilate(c.astype(np.uint8)[None], np.ones((1, 2 * reach + 1), np.uint8))[0] > 0 for c in crossed]
+    left, right = comb.left_px, comb.left_px + (comb.count - 1) * comb.pitch_px + comb.width_px
+    columns = np.arange(gray.shape[1])
+    between = (columns >= left - 0.1 * h) & (columns <= right + 0.1 * h)
+    return bool((wide[0] & wide[1] & between).any())
+
+
+def _differs(part: NDArray[np.float32], least: float) -> NDArray[np.bool_]:
+    """(W,) columns whose gray stands out from the neighbourhood."""
+    column = cv2.GaussianBlur(np.median(part, axis=0)[None], (0, 0), 1.0)[0]
+    broad = cv2.medianBlur(column[None], 5)[0]
+    size = max(5, len(column) // 3) | 1
+    kernel = np.ones((1, size), np.uint8)
+    hat = np.maximum(
+        cv2.morphologyEx(broad[None], cv2.MORPH_TOPHAT, kernel)[0],
+        cv2.morphologyEx(broad[None], cv2.MORPH_BLACKHAT, kernel)[0],
+    )
+    return np.asarray(hat > max(least, 6.0))

@@ -7,6 +7,7 @@ import numpy as np
 from hal.panel import Gauge, Scale
 from perception.vision.patch import Patch
 from perception.vision.reading import Status, gated, probability, refused
+from perception.vision.status.cover import covered
 from perception.vision.status.pointer import PointerFit, find_pointer, wrapped
 
 POINTER_FROM, POINTER_TO = 0.25, 0.60  # share of the radius over which every gauge pointer has ink and no numeral is
@@ -19,10 +20,11 @@ def read_gauge(patch: Patch, spec: Gauge) -> Status:
     """Value of a round gauge. `patch` shows the plane of the face, origin at its middle."""
     R = spec.radius_m
     seen = _seen(patch, R)
-    if seen < 0.5:
+    if seen < 0.25:
         return refused(UNREADABLE, unit=spec.scale.unit)
     fit = find_pointer(
         patch,
+        cover=covered(patch, half_width_m=R, half_height_m=R, is_round=True),
         pivot_m=(0.0, 0.0),
         inner_m=POINTER_FROM * R,
         outer_m=POINTER_TO * R,
@@ -59,10 +61,11 @@ def pointer_confidence(fit: PointerFit, seen: float) -> float:
     """Confidence of a pointer from contrast, rival, support and visibility."""
     return probability(
         [
-            (np.log(fit.strength), np.log(3.0), 0.25),
-            (0.75 - fit.rival_ratio, 0.0, 0.08),
-            (fit.supported, 0.6, 0.15),
-            (seen, 0.7, 0.15),
+            (np.log(fit.strength), np.log(9.0), 0.15),
+            (0.55 - fit.rival_ratio, 0.0, 0.03),
+            (fit.supported, 0.72, 0.03),
+            (seen, 0.35, 0.08),
+            (0.35 - fit.unknown, 0.0, 0.05),
         ]
     )
 

@@ -13,6 +13,7 @@ from perception.vision.status.pointer import unroll, wrapped
 from perception.vision.view import Array
 
 STEPS = 720
+BESIDE = 28  # steps: 14 degrees, beyond a spoke and its mark
 
 
 def read_handwheel(patch: Patch, spec: Handwheel) -> Status:
@@ -80,8 +81,9 @@ def _peak(folded: Array, top: int) -> float:
 
 def _at(mark: NDArray[np.float32], angle: float) -> Array:
     step = round(angle / (2 * np.pi) * STEPS)
-    near = (step + np.arange(-6, 7)) % STEPS
-    return np.asarray(mark[:, near].mean(axis=1), float)
+    near = mark[:, (step + np.arange(-6, 7)) % STEPS].mean(axis=1)
+    beside = [mark[:, (step + side * BESIDE + np.arange(-4, 5)) % STEPS].mean(axis=1) for side in (-1, 1)]
+    return np.asarray(near - (beside[0] + beside[1]) / 2, float)  # glare is on both sides, a mark is not
 
 
 def _mark_evidence(profile: Array, k: int) -> float:

@@ -7,6 +7,7 @@ import numpy as np
 from hal.panel import PanelMeter
 from perception.vision.patch import Patch
 from perception.vision.reading import Status, refused
+from perception.vision.status.cover import covered
 from perception.vision.status.gauge import STOP_RAD, UNREADABLE, status_of_pointer
 from perception.vision.status.pointer import find_pointer
 
@@ -18,11 +19,12 @@ def read_panel_meter(patch: Patch, spec: PanelMeter) -> Status:
     lo, hi = sorted((spec.scale.at_min, spec.scale.at_max))
     pivot = (0.0, -spec.pivot_below_m)
     seen = _seen(patch, spec, lo, hi)
-    if seen < 0.5:
+    if seen < 0.25:
         return refused(UNREADABLE, unit=spec.scale.unit)
     margin = 1.5 * STOP_RAD
     fit = find_pointer(
         patch,
+        cover=covered(patch, half_width_m=spec.width_m / 2, half_height_m=spec.height_m / 2, is_round=False),
         pivot_m=pivot,
         inner_m=POINTER_FROM * spec.needle_m,
         outer_m=POINTER_TO * spec.needle_m,

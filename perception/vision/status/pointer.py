@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.vision.patch import Patch
+from perception.vision.patch import Patch, sample_at
 from perception.vision.view import Array
 
 ANGLE_STEP_PX = 0.7  # at the outer radius
 RIVAL_APART_RAD = np.deg2rad(14.0)  # further than a pointer is wide
-PIVOT_SIGMA_PX = 1.2  # how far the true pivot may lie from the registered middle, image px
+PIVOT_SIGMA_PX = 0.5  # how far the true pivot may lie from the registered middle, image px
 REFINE_RAD = np.deg2rad(7.0)
 
 Float32 = NDArray[np.float32]
@@ -38,6 +38,7 @@ class PointerFit:
         rival_rad: where that is.
         supported: share of the radii with clear ink.
         is_dark: pointer darker than the face.
+        unknown: share of the directions that something lies across.
     """
 
     angle_rad: float
@@ -48,6 +49,7 @@ class PointerFit:
     rival_rad: float
     supported: float
     is_dark: bool
+    unknown: float
 
 
 def find_pointer(
@@ -61,6 +63,7 @@ def find_pointer(
     width_rad: float = np.deg2rad(30.0),
     plane_z_m: float | None = None,
     quantile: float = 0.3,
+    cover: NDArray[np.bool_] | None = None,
     dark: bool | None = None,
     prior_pivot_px: float = PIVOT_SIGMA_PX,
 ) -> PointerFit | None:
@@ -71,11 +74,19 @@ def find_pointer(
         fine_m: radii used to refine the angle, from where the pointer is to where it ends.
         limits_rad: smallest and largest angle, or None for a full turn.
         width_rad: what is wider than this is not a pointer.
+        cover: (H, W) mask of what lies across the face (see `cover`), or None.
         dark: polarity if it is known.
     """
     angles = _angles(patch, outer_m, limits_rad)
     radii = np.arange(min(inner_m, fine_m[0]), max(outer_m, fine_m[1]), 1.0 / patch.px_per_m)
     polar = unroll(patch, pivot_m, radii, angles, plane_z_m)
+    hidden = _hidden(patch, cover, pivot_m, radii, angles)
+    if hidden.any():
+        shown = np.where(hidden, np.nan, polar)
+        with np.errstate(all="ignore"):
+            polar = np.where(hidden, np.nan_to_num(np.nanmedian(shown, axis=1, keepdims=True)), polar).astype(
+                np.float32
+            )
     rows = (radii >= inner_m) & (radii <= outer_m)
     if rows.sum() < 4:
         return None
@@ -84,9 +95,10 @@ def find_pointer(
         ink = ink_along_angle(polar, width_rad / (angles[1] - angles[0]), is_dark, wraps=limits_rad is None)
         fit = _fit(
             ink,
+            hidden,
             rows,
             radii,
-            angles,
+            angles=angles,
             patch=patch,
             fine_m=fine_m,
             wraps=limits_rad is None,
@@ -122,6 +134,30 @@ def ink_along_angle(polar: Float32, width: float, is_dark: bool, *, wraps: bool)
     return np.asarray(np.maximum(ink - np.median(ink, axis=1, keepdims=True), 0.0), np.float32)
 
 
+def _hidden(
+    patch: Patch, cover: NDArray[np.bool_] | None, pivot_m: tuple[float, float], radii_m: Array, angles_rad: Array
+) -> NDArray[np.bool_]:
+    """(radii, angles) what something lies across."""
+    if cover is None:
+        return np.zeros((len(radii_m), len(angles_rad)), bool)
+    x = pivot_m[0] + radii_m[:, None] * np.sin(angles_rad)
+    y = pivot_m[1] + radii_m[:, None] * np.cos(angles_rad)
+    return np.asarray(sample_at(cover.astype(np.uint8), *patch.pixel_of(x, y)) > 0.2)
+
+
+def _low_mean(columns: Array, low: float, high: float) -> Array:
+    """Mean of every column between two quantiles; infinite entries are unknown, and a column half unknown scores 0."""
+    ordered = np.sort(columns, axis=0)
+    known = np.isfinite(ordered)
+    count = known.sum(axis=0)
+    total = np.vstack([np.zeros(columns.shape[1]), np.cumsum(np.where(known, ordered, 0.0), axis=0)])
+    first = (low * count).astype(int)
+    last = np.maximum(first + 2, np.round(high * count).astype(int)).clip(max=len(columns))
+    at = np.arange(columns.shape[1])
+    mean = (total[last, at] - total[first, at]) / (last - first)
+    return np.where(count >= 0.5 * len(columns), mean, 0.0)
+
+
 def _angles(patch: Patch, outer_m: float, limits_rad: tuple[float, float] | None) -> Array:
     step = ANGLE_STEP_PX / (outer_m * patch.px_per_m)
     if limits_rad is None:
@@ -133,10 +169,11 @@ def _angles(patch: Patch, outer_m: float, limits_rad: tuple[float, float] | None
 
 def _fit(
     ink: Float32,
+    hidden: NDArray[np.bool_],
     rows: NDArray[np.bool_],
     radii: Array,
-    angles: Array,
     *,
+    angles: Array,
     patch: Patch,
     fine_m: tuple[float, float],
     wraps: bool,
@@ -145,9 +182,9 @@ def _fit(
     prior_pivot_px: float,
 ) -> PointerFit | None:
     use = ink[rows]
-    kept = np.sort(use, axis=0)[: max(2, round(len(use) * (quantile + 0.25)))]
-    score = kept[int(len(use) * quantile * 0.5) :].mean(axis=0)
-    score = cv2.GaussianBlur(score[None], (0, 0), 1.0, borderType=cv2.BORDER_REPLICATE)[0]
+    score = _low_mean(np.where(hidden[rows], np.inf, use), 0.5 * quantile, quantile + 0.25)
+    unknown = float((hidden[rows].mean(axis=0) > 0.5).mean())
+    score = cv2.GaussianBlur(score[None].astype(np.float32), (0, 0), 1.0, borderType=cv2.BORDER_REPLICATE)[0]
     noise = 1.4826 * float(np.median(score)) + 0.5
     top = int(score.argmax())
     peak = float(score[top])
@@ -169,6 +206,7 @@ def _fit(
         rival_rad=float(angles[rival]),
         supported=float((column > 0.35 * np.median(column) + noise).mean()),
         is_dark=is_dark,
+        unknown=unknown,
     )
 
 
@@ -185,28 +223,48 @@ def _refine(
 ) -> tuple[float, float]:
     """Angle and sigma from the ink's centre at every radius: theta(r) = theta0 + e / r, e the pivot's offset across."""
     offset = wrapped(angles - start_rad) if wraps else angles - start_rad
-    near = np.abs(offset) < REFINE_RAD
     rows = (radii >= fine_m[0]) & (radii <= fine_m[1])
-    r = radii[rows]
-    part = ink[rows][:, near].astype(float)
-    part = np.maximum(part - 0.3 * part.max(axis=1, keepdims=True), 0.0)
-    mass = part.sum(axis=1)
-    if (mass > 0).sum() < 3:
-        return start_rad, float(np.deg2rad(3.0))
-    theta = (part * offset[near]).sum(axis=1) / np.where(mass > 0, mass, 1.0)
-    weight = np.minimum(mass / np.median(mass[mass > 0]), 2.0) * (mass > 0)
+    r, part = radii[rows], ink[rows].astype(float)
+    near = np.broadcast_to(np.abs(offset) < REFINE_RAD, part.shape)
     e_sigma = prior_pivot_px / patch.image_px_per_m
-    solution, N = np.array([0.0, 0.0]), np.eye(2)
-    for _ in range(4):
-        residual_m = (theta - solution[0] - solution[1] / r) * r
-        scale = max(1.4826 * float(np.median(np.abs(residual_m[mass > 0]))), 0.15 / patch.px_per_m)
-        w = weight / (1.0 + (residual_m / (1.5 * scale)) ** 2) * r**2 / scale**2
-        A = np.column_stack([np.ones_like(r), 1.0 / r])
-        N = A.T @ (w[:, None] * A) + np.diag([0.0, 1.0 / e_sigma**2])
-        solution = np.linalg.solve(N, A.T @ (w * theta))
+    solution, N = np.zeros(2), np.eye(2)
+    for _ in range(3):
+        theta, mass, width_rad = _row_centres(part, offset, near)
+        if (mass > 0).sum() < 3:
+            return start_rad, float(np.deg2rad(3.0))
+        solution, N = _fit_line(r, theta, mass, e_sigma, 0.15 / patch.px_per_m)
+        # What touches the pointer (a numeral, a tick) widens some rows: look again within the pointer's own width only.
+        half_m = 0.6 * float(np.percentile((width_rad * r)[mass > 0], 35)) + 0.6 / patch.px_per_m
+        middle = solution[0] + solution[1] / r
+        near = np.abs(offset[None, :] - middle[:, None]) < (half_m / r)[:, None]
     correlated = 2.0  # neighbouring rows of an oversampled patch share their noise
     sigma = float(np.sqrt(correlated * np.linalg.inv(N)[0, 0]))
     return float(start_rad + solution[0]), sigma
+
+
+def _row_centres(part: Array, offset: Array, near: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+    """Per radius: centre of the ink within `near` (rad), its mass, and its width (rad)."""
+    shown = np.where(near, part, 0.0)
+    top = shown.max(axis=1, keepdims=True)
+    shown = np.maximum(shown - 0.3 * top, 0.0)
+    mass = shown.sum(axis=1)
+    step = float(abs(offset[1] - offset[0]))
+    centre = (shown * offset).sum(axis=1) / np.where(mass > 0, mass, 1.0)
+    return centre, mass, mass * step / np.where(top[:, 0] > 0, 0.7 * top[:, 0], 1.0)
+
+
+def _fit_line(r: Array, theta: Array, mass: Array, e_sigma: float, least_m: float) -> tuple[Array, Array]:
+    """(theta0, e) of theta(r) = theta0 + e / r by Cauchy-weighted least squares, and the normal matrix."""
+    weight = np.minimum(mass / np.median(mass[mass > 0]), 2.0) * (mass > 0)
+    A = np.column_stack([np.ones_like(r), 1.0 / r])
+    solution, N = np.array([float(np.median(theta[mass > 0])), 0.0]), np.eye(2)
+    for _ in range(5):
+        residual_m = (theta - A @ solution) * r
+        scale = max(1.4826 * float(np.median(np.abs(residual_m[mass > 0]))), least_m)
+        w = weight / (1.0 + (residual_m / (1.5 * scale)) ** 2) * r**2 / scale**2
+        N = A.T @ (w[:, None] * A) + np.diag([0.0, 1.0 / e_sigma**2])
+        solution = np.linalg.solve(N, A.T @ (w * theta))
+    return solution, N
 
 
 def wrapped(angle_rad: Array) -> Array:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from perception.vision.patch import Patch
@@ -66,7 +67,7 @@ def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float) ->
 def one_sided_shade(
     patch: Patch, *, radius_m: float, ring: tuple[float, float], outside: tuple[float, float]
 ) -> tuple[float, float]:
-    """First harmonic of the brightness around a cap, relative to its surroundings, and its direction (rad).
+    """First harmonic of the brightness around a cap over its surroundings, and the direction of its bright side (rad).
 
     `ring` and `outside` are shares of `radius_m`; the harmonic outside (a glare's gradient) is taken off.
     """
@@ -76,6 +77,21 @@ def one_sided_shade(
     wave = np.exp(1j * a)
     harmonic = 2 * (inner * wave).mean() / level - 2 * (np.clip(outer, 0.6 * level, None) * wave).mean() / level
     return float(abs(harmonic)), float(np.angle(harmonic))
+
+
+def sheen(patch: Patch, *, radius_m: float, towards_rad: float) -> float:
+    """Brightest spot of a cap's face over the face's median, relative to the plate, if it lies on the side of the light.
+
+    Negative when the brightest spot lies on another side.
+    """
+    a = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    r = radius_m * np.linspace(0.1, 0.62, 7)
+    face = patch.sample(np.outer(r, np.sin(a)), np.outer(r, np.cos(a)))
+    level = max(float(np.median(_around(patch, radius_m * np.array([1.2, 1.3]), a))), 8.0)
+    smooth = cv2.blur(np.concatenate([face, face, face], axis=1), (7, 3))[:, len(a) : 2 * len(a)]
+    k = int(smooth.argmax()) % len(a)
+    height = float(smooth.max() - np.median(face)) / level
+    return height * float(np.cos(a[k] - towards_rad))
 
 
 def _around(patch: Patch, radii_m: Array, angles: Array) -> Array:

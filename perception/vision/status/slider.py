@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from hal.panel import Slider
-from perception.vision.patch import Patch
+from perception.vision.outline import footprint_m
+from perception.vision.patch import Patch, sample_at
 from perception.vision.reading import Status, gated, probability, refused
 from perception.vision.status.choice import contrast_noise
+from perception.vision.status.cover import covered
 from perception.vision.view import Array
 
 SIDE = (0.22, 0.32, 0.40)  # of the cap's width: beyond the slot, inside the cap
@@ -25,13 +29,16 @@ def read_slider(patch: Patch, spec: Slider) -> Status:
         return refused(
             "the slider cannot be seen (glare, shadow or cover): change the angle or the light", unit=spec.scale.unit
         )
+    footprint = footprint_m(spec)
     lean_m = _base_shift_m(patch, spec)  # the foot of the cap shows on that side of its top
     width = max(3, round((along + abs(lean_m)) / step))
     kernel = np.ones(width) / width
+    cover = covered(patch, half_width_m=footprint[0], half_height_m=footprint[1], is_round=False)
+    open_ = np.ones_like(s) if cover is None else _open(patch, cover, spec.angle_rad, s, 0.4 * across)
     best = (-1.0, 0, np.zeros_like(s))
-    for sign in (-1.0, 1.0):
-        both = np.minimum(sign * (left - np.median(left)), sign * (right - np.median(right)))
-        score = np.convolve(np.maximum(both, 0.0), kernel, "same")
+    for is_dark in (True, False):
+        both = np.minimum(_hat(left, width, is_dark), _hat(right, width, is_dark)) * open_
+        score = np.convolve(both, kernel, "same")
         score[(s - lean_m / 2 < lo - 2 * step) | (s - lean_m / 2 > hi + 2 * step)] = 0.0
         top = int(score.argmax())
         if score[top] > best[0]:
@@ -59,6 +66,21 @@ def read_slider(patch: Patch, spec: Slider) -> Status:
             confidence=confidence,
         )
     )
+
+
+def _hat(profile: Array, width: int, is_dark: bool) -> Array:
+    """What is narrower than twice the cap stands out; glare and shadow do not."""
+    size = round(2.0 * width) | 1
+    padded = np.pad(profile, size, mode="edge").astype(np.float32)[None]
+    operation = cv2.MORPH_BLACKHAT if is_dark else cv2.MORPH_TOPHAT
+    hat = cv2.morphologyEx(padded, operation, np.ones((1, size), np.uint8))[0, size:-size]
+    return np.asarray(np.maximum(hat - np.median(hat), 0.0), float)
+
+
+def _open(patch: Patch, cover: NDArray[np.bool_], angle_rad: float, s: Array, across_m: float) -> Array:
+    """1 where nothing lies across the track, else 0."""
+    u, v = patch.pixel_of(*_place(angle_rad, s, np.linspace(-1.0, 1.0, 5) * across_m))
+    return np.asarray(sample_at(cover.astype(np.uint8), u, v).max(axis=1) < 0.3, float)
 
 
 def _base_shift_m(patch: Patch, spec: Slider) -> float:

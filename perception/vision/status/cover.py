@@ -1,0 +1,98 @@
+"""What lies across an object: cables and fingers come in over the border, which nothing of the object itself does.
+
+A path around the object, just outside of it, is searched for places that stand out from the plate; from each, the same
+gray is followed. What reaches deep into the object from there covers it.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.vision.patch import Patch, sample_at
+from perception.vision.view import Array
+
+STANDS_OUT = 14.0  # gray levels, and four sigmas of the noise
+LARGEST_SHARE = 0.4  # of the object: what follows the gray of a cable and fills more has leaked into the object
+DEEP = 0.35  # of the object's smaller half size: labels and ticks do not reach that far in
+
+
+def covered(patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool) -> NDArray[np.bool_] | None:
+    """(H, W) mask of what lies across the object in the patch; None when nothing does.
+
+    Args:
+        half_width_m, half_height_m: of the object; the patch must reach beyond it.
+        is_round: whether the object is a disc (of `half_width_m`) and not a rectangle.
+    """
+    smooth = cv2.GaussianBlur(patch.gray, (0, 0), 1.0)
+    path_u, path_v = _path(patch, half_width_m, half_height_m, is_round)
+    inside = (path_u > 1) & (path_v > 1) & (path_u < patch.gray.shape[1] - 2) & (path_v < patch.gray.shape[0] - 2)
+    if inside.sum() < 16:
+        return None
+    values = sample_at(smooth, path_u, path_v)
+    size = max(9, len(values) // 5) | 1
+    around = np.pad(values, size // 2, mode="wrap")
+    typical = np.median(np.lib.stride_tricks.sliding_window_view(around, size), axis=1)
+    odd = inside & (np.abs(values - typical) > max(STANDS_OUT, 4.0 * _noise(patch)))
+    depth = _depth(patch, half_width_m, half_height_m, is_round)
+    least = DEEP * min(half_width_m, half_height_m) * patch.px_per_m
+    mask = np.zeros(patch.gray.shape, bool)
+    for first, last in _runs(odd):
+        middle = (first + last) // 2 % len(values)
+        seed = (round(float(path_u[middle])), round(float(path_v[middle])))
+        region = _followed(smooth, seed)
+        within = region & (depth > 0)
+        if within.sum() > LARGEST_SHARE * (depth > 0).sum() or not within.any():
+            continue
+        if float(depth[within].max()) >= least:
+            mask |= region
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0) if mask.any() else None
+
+
+def _path(patch: Patch, w: float, h: float, is_round: bool) -> tuple[Array, Array]:
+    beyond = 1.06
+    step = 0.8 / patch.px_per_m
+    if is_round:
+        a = np.linspace(0, 2 * np.pi, max(64, round(2 * np.pi * w * beyond / step)), endpoint=False)
+        return patch.pixel_of(beyond * w * np.sin(a), beyond * w * np.cos(a), 0.0)
+    extra = (beyond - 1.0) * max(w, h)
+    w, h = w + extra, h + extra
+    nx, ny = max(16, round(2 * w / step)), max(16, round(2 * h / step))
+    x, y = np.linspace(-w, w, nx), np.linspace(-h, h, ny)
+    xs = np.concatenate([x, np.full(ny, w), x[::-1], np.full(ny, -w)])
+    ys = np.concatenate([np.full(nx, h), y[::-1], np.full(nx, -h), y])
+    return patch.pixel_of(xs, ys, 0.0)
+
+
+def _depth(patch: Patch, w: float, h: float, is_round: bool) -> Array:
+    """(H, W) distance inside the object's border, px; negative outside."""
+    v, u = np.indices(patch.gray.shape)
+    u0, v0 = patch.pixel_of(0.0, 0.0, 0.0)
+    if is_round:
+        return np.asarray(w * patch.px_per_m - np.hypot(u - u0, v - v0))
+    return np.asarray(np.minimum(w * patch.px_per_m - np.abs(u - u0), h * patch.px_per_m - np.abs(v - v0)))
+
+
+def _runs(odd: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last index of every run of True around a closed path, neither single samples nor long stretches."""
+    n = len(odd)
+    if odd.all() or not odd.any():
+        return []
+    start = int(np.flatnonzero(~odd)[0])
+    rolled = np.roll(odd, -start)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], rolled.astype(np.int8), [0]])))
+    runs = [(int(a) + start, int(b) - 1 + start) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return [(a, b) for a, b in runs if 2 <= b - a + 1 <= n // 6]
+
+
+def _followed(smooth: NDArray[np.uint8], seed: tuple[int, int]) -> NDArray[np.bool_]:
+    mask = np.zeros((smooth.shape[0] + 2, smooth.shape[1] + 2), np.uint8)
+    flags = 4 | cv2.FLOODFILL_MASK_ONLY | cv2.FLOODFILL_FIXED_RANGE | (1 << 8)
+    cv2.floodFill(smooth.copy(), mask, seed, 1.0, 16.0, 16.0, flags)
+    return mask[1:-1, 1:-1] > 0
+
+
+def _noise(patch: Patch) -> float:
+    gray = patch.gray.astype(np.float32)
+    return float(np.median(np.abs(gray[:, 2:] - 2 * gray[:, 1:-1] + gray[:, :-2]))) / 1.65

@@ -2,8 +2,102 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
+from service.operations import requests
 from service.operations.context import CellMemory, Operation, OperationContext
 
-OPERATIONS: dict[str, Operation] = {}
-
 __all__ = ["OPERATIONS", "CellMemory", "Operation", "OperationContext"]
+
+MEASUREMENT_EXAMPLE = {
+    "sensing": "point-plane",
+    "x_m": [0.0, 0.0, 0.0],
+    "u": [0.0, 0.0, 1.0],
+    "mu_m": [0.95, 0.02, 0.55],
+    "c_m2": [[4e-8, 0.0, 0.0], [0.0, 4e-8, 0.0], [0.0, 0.0, 4e-8]],
+    "label": "touch 1",
+    "sensor": "finger_touch",
+}
+
+
+def _in_session(module: str, function: str) -> Callable[[OperationContext, Any], Any]:
+    """`service.operations.<module>.<function>(session, request)`, imported when first used: the service is up fast."""
+
+    def run(context: OperationContext, request: Any) -> Any:
+        from importlib import import_module
+
+        from service.operations.session import Session
+
+        return getattr(import_module(f"service.operations.{module}"), function)(Session(context=context), request)
+
+    return run
+
+
+def _mission(context: OperationContext, request: requests.MissionRequest) -> Any:
+    from service.operations.mission import run_mission
+
+    return run_mission(context, request)
+
+
+def _judge(context: OperationContext, request: requests.JudgeRequest) -> Any:
+    from service.operations.judge import judge
+
+    return judge(context.connection, context.runs_dir / request.mission)
+
+
+OPERATIONS: dict[str, Operation] = {
+    operation.name: operation
+    for operation in (
+        Operation(
+            name="panel-pose",
+            request_model=requests.PanelPoseRequest,
+            run=_in_session("locate", "run_panel_pose"),
+            summary="Locate the panel by its four lights; pose with covariance",
+            example={"move": True},
+        ),
+        Operation(
+            name="recognise",
+            request_model=requests.RecogniseRequest,
+            run=_in_session("recognise", "run_recognise"),
+            summary="Find the panel's objects in the camera's image or surfaces in the range image",
+            example={"use": ["vision"], "mode": "taught"},
+        ),
+        Operation(
+            name="inspect",
+            request_model=requests.InspectRequest,
+            run=_in_session("inspect", "run_inspect"),
+            summary="Read instruments, lamps, switches and valves from close up",
+            example={"objects": ["pressure", "main_valve"]},
+        ),
+        Operation(
+            name="fuse",
+            request_model=requests.FuseRequest,
+            run=_in_session("sense", "run_fuse"),
+            summary="Fuse measurements of nine kinds into one pose, or collect them first",
+            example={"measurements": [MEASUREMENT_EXAMPLE]},
+        ),
+        Operation(
+            name="manipulate",
+            request_model=requests.ManipulateRequest,
+            run=_in_session("manipulate", "run_manipulate"),
+            summary="Work one control and look whether it worked",
+            example={"object": "main_valve", "state": "open"},
+        ),
+        Operation(
+            name="missions",
+            request_model=requests.MissionRequest,
+            run=_mission,
+            summary="Run the whole mission and write its report",
+            example={"touches": 4},
+        ),
+        Operation(
+            name="judge",
+            request_model=requests.JudgeRequest,
+            run=_judge,
+            summary="Compare a finished mission with the simulator's truth (simulated cells only)",
+            example={"mission": "20261120T231502-a1b2c3"},
+            moves=False,
+        ),
+    )
+}

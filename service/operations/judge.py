@@ -117,7 +117,7 @@ def _action_claim(
     """A confirmed action must be true; an unconfirmed one must not claim anything."""
     name = action["object"]
     spec = panel.object(name)
-    reached = _reached(spec, action, before[name], after[name])
+    reached = _reached(spec, action, after)
     return {
         "name": name,
         "what": f"{action['skill']} to {action['target']}",
@@ -128,22 +128,16 @@ def _action_claim(
     }
 
 
-def _reached(
-    spec: PanelObject,
-    action: dict[str, Any],
-    before: ObjectTruth,
-    after: ObjectTruth,
-) -> bool:
-    target = action["target"]
-    if spec.kind == "button":
-        # A button springs back: what it worked is what counts, and the simulator counts its strokes.
-        return (after.value or 0.0) > (before.value or 0.0)
+def _reached(spec: PanelObject, action: dict[str, Any], after: dict[str, ObjectTruth]) -> bool:
+    target, now = action["target"], after[spec.name]
+    if spec.kind == "button" and spec.lights_lamp is not None:
+        return after[spec.lights_lamp].state == target  # a button springs back: what it works is what counts
     if spec.kind == "slider":
         span = spec.scale.maximum - spec.scale.minimum
-        return after.value is not None and bool(abs(after.value - float(target)) <= GAUGE_SHARE * span)
+        return now.value is not None and bool(abs(now.value - float(target)) <= GAUGE_SHARE * span)
     if spec.kind == "handwheel":
-        return after.value is not None and bool(abs(after.value - float(target)) <= WHEEL_RAD)
-    return bool(after.state == target)
+        return now.value is not None and bool(abs(now.value - float(target)) <= WHEEL_RAD)
+    return bool(now.state == target)
 
 
 def _shown(truth: ObjectTruth) -> str:

@@ -11,11 +11,38 @@ from hal.devices import DeviceKind
 from hal.errors import ConfigError, DeviceFault, InvalidRequest, MotionError, NotFound, Stopped
 from hal.frames import frame_tree
 from hal.geometry import UncertainPose, identity
-from hal.motion import DeclaredMotion, MotionOutcome, MotionReport, Mover
+from hal.motion import Array, DeclaredMotion, MotionOutcome, MotionReport, Mover, RobotState
 from hal.panel import Panel
 from service.connection import CellConnection
 from service.operations.context import CellMemory, OperationContext
 from service.report.record import MissionRecord
+
+
+class NotedMover:
+    """A motion port that keeps what went through it, and starts nothing for a cancelled task."""
+
+    def __init__(self, mover: Mover, session: Session) -> None:
+        self._mover = mover
+        self._session = session
+
+    def execute(self, motion: DeclaredMotion) -> MotionReport:
+        """As `hal.motion.Mover.execute`."""
+        self._session.context.task.check_cancelled()
+        report = self._mover.execute(motion)
+        self._session.note(report)
+        return report
+
+    def cancel(self) -> None:
+        """As `hal.motion.Mover.cancel`."""
+        self._mover.cancel()
+
+    def tare(self) -> Array:
+        """As `hal.motion.Mover.tare`."""
+        return self._mover.tare()
+
+    def state(self) -> RobotState:
+        """As `hal.motion.Mover.state`."""
+        return self._mover.state()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -48,9 +75,9 @@ class Session:
         return self.context.connection.cell.panel
 
     @property
-    def mover(self) -> Mover:
-        """The motion port; `run` is the usual way to it."""
-        return self.context.connection.mover
+    def mover(self) -> NotedMover:
+        """The motion port; every motion through it is kept in the record."""
+        return NotedMover(self.context.connection.mover, self)
 
     @property
     def memory(self) -> CellMemory:
@@ -85,15 +112,13 @@ class Session:
             Stopped, DeviceFault, MotionError: it ended in none of the expected ways.
             Cancelled: the task was cancelled meanwhile.
         """
-        self.context.task.check_cancelled()
         report = self.mover.execute(motion)
-        self.note(report)
         if report.outcome not in expect:
             raise self._failure(report)
         return report
 
     def note(self, report: MotionReport) -> None:
-        """Keep the report of a motion that somebody else executed."""
+        """Keep the report of a motion."""
         if self.record is not None:
             self.record.motions.append(report)
         for observe in self.observers:

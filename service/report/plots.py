@@ -47,7 +47,7 @@ def lights_picture(image_off: Pixels, image_on: Pixels, centres_px: NDArray[Any]
         panes[2].annotate(
             name, (u, v), xytext=(0, 10), textcoords="offset points", color="#ff9f1c", fontsize=6, ha="center"
         )
-    return _png(figure)
+    return figure_png(figure)
 
 
 def range_picture(depth_m: NDArray[Any], residual_m: NDArray[Any]) -> bytes:
@@ -62,7 +62,7 @@ def range_picture(depth_m: NDArray[Any], residual_m: NDArray[Any]) -> bytes:
     figure.colorbar(shown, ax=right, shrink=0.85)
     for pane in (left, right):
         pane.set_axis_off()
-    return _png(figure)
+    return figure_png(figure)
 
 
 def wrench_picture(motions: Sequence[MotionReport]) -> bytes:
@@ -97,7 +97,7 @@ def joints_picture(motions: Sequence[MotionReport]) -> bytes:
 
 
 def _joined(motions: Sequence[MotionReport], pick: Any) -> tuple[NDArray[Any], NDArray[Any]]:
-    pieces = [(m.log.times_s, pick(m)) for m in motions if len(m.log.times_s)]
+    pieces = [(m.started_s + m.log.times_s, pick(m)) for m in motions if len(m.log.times_s)]
     if not pieces:
         return np.zeros(1), np.zeros((1, 6))
     times = np.concatenate([t for t, _ in pieces])
@@ -111,10 +111,11 @@ def _finished(figure: Figure, panes: Sequence[Any]) -> bytes:
         pane.spines[["top", "right"]].set_visible(False)
         pane.tick_params(labelsize=8)
         pane.grid(alpha=0.25)
-    return _png(figure)
+    return figure_png(figure)
 
 
-def _png(figure: Figure) -> bytes:
+def figure_png(figure: Figure) -> bytes:
+    """A finished figure as PNG bytes."""
     stream = io.BytesIO()
     FigureCanvasAgg(figure).print_png(stream)  # type: ignore[no-untyped-call]  # matplotlib types it not
     return stream.getvalue()

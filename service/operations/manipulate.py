@@ -1,0 +1,197 @@
+"""Working one control: the skill for its kind, a second look, and what both say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from hal.errors import InvalidRequest, PerceptionError, Unreachable
+from hal.panel import Button, Handwheel, Lever, Mushroom, PanelObject, Rotary, Slider, Toggle
+from manipulation.skills.button import button
+from manipulation.skills.handwheel import handwheel
+from manipulation.skills.lever import lever
+from manipulation.skills.mushroom import mushroom
+from manipulation.skills.outcome import ObjectState, Outcome, SkillReport, Verify
+from manipulation.skills.rotary import rotary
+from manipulation.skills.slider import slider
+from manipulation.skills.toggle import toggle
+from perception.vision.annotate import said
+from perception.vision.reading import ObjectReading
+from service.operations.beliefs import forget_reading, known_readings
+from service.operations.inspect import ensure_located, look_close
+from service.operations.requests import ActionBody, ManipulateRequest
+from service.operations.session import Session
+from service.operations.travel import workcell
+from service.report.plots import png_of
+from service.report.record import Action, Picture
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Deed:
+    """A control that was worked: the skill's report and the looks before and after."""
+
+    action: Action
+    report: SkillReport
+    before: ObjectReading | None
+    after: ObjectReading | None
+    picture: Picture | None
+
+
+def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
+    """Work one control and look whether it worked.
+
+    Raises:
+        InvalidRequest: the object cannot be worked, or has no such state or value.
+        DeviceFault, Stopped, Cancelled: the cell cannot go on.
+    """
+    thing = session.panel.object(body.object)
+    target = _target(thing, body)
+    eye = _Eye(session, thing, verify)
+    before = eye.before()
+    report = _perform(session, thing, target, eye, before)
+    reached = report.outcome is Outcome.DONE
+    return Deed(
+        action=Action(
+            object=thing.name,
+            skill=report.skill,
+            target=target,
+            outcome=str(report.outcome),
+            detail="" if reached else report.cause,
+            before="not read" if before is None else said(before),
+            after="not read" if eye.last is None else said(eye.last),
+            confirmed=reached and verify,
+            attempts=report.attempts,
+            peak_force_n=report.peak_force_n,
+            cell_s=report.duration_s,
+        ),
+        report=report,
+        before=before,
+        after=eye.last,
+        picture=eye.picture,
+    )
+
+
+def run_manipulate(session: Session, request: ManipulateRequest) -> dict[str, Any]:
+    """The verb `manipulate`."""
+    ensure_located(session.part(0.0, 0.3))
+    deed = work(session.part(0.3, 1.0), request, verify=request.verify)
+    pictures = []
+    if deed.picture is not None:
+        pictures.append(session.context.task.artefact("after.png", deed.picture.png, "image/png"))
+    return {"action": deed.action, "pictures": pictures}
+
+
+class _Eye:
+    """The second look at one control; what it saw last is kept."""
+
+    def __init__(self, session: Session, thing: PanelObject, is_open: bool) -> None:
+        self._session = session
+        self._thing = thing
+        self._is_open = is_open
+        self._witness = _witness(session, thing)
+        self.last: ObjectReading | None = None
+        self.picture: Picture | None = None
+
+    def before(self) -> ObjectReading | None:
+        """What the witness showed before: the newest reading, or a look."""
+        known = known_readings(self._session).get(self._witness.name)
+        if known is not None or not self._is_open:
+            return known
+        return self._look()
+
+    def verify(self) -> Verify | None:
+        """The callback of the skill; None when nobody shall look."""
+        return self._verify if self._is_open else None
+
+    def _verify(self) -> ObjectState | None:
+        forget_reading(self._session, self._witness.name)
+        forget_reading(self._session, self._thing.name)
+        self.last = self._look()
+        return None if self.last is None else state_of(self.last, self._witness)
+
+    def _look(self) -> ObjectReading | None:
+        try:
+            found = look_close(self._session, self._witness.point_m, (self._witness.name,))
+        except (PerceptionError, Unreachable):
+            return None  # "cannot tell" is an answer; the outcome will be `unverified`
+        self.picture = Picture(
+            name=f"after-{self._thing.name}",
+            title=f"second look at {self._witness.name}",
+            png=png_of(found.pictures[0]),
+        )
+        reading = found.readings[self._witness.name]
+        return reading if reading.present and reading.answered else None
+
+
+def state_of(reading: ObjectReading, thing: PanelObject) -> ObjectState:
+    """A reading in the words of the skills."""
+    angle_rad = reading.value if isinstance(thing, Handwheel) else None
+    if isinstance(thing, Lever | Rotary) and reading.state is not None:
+        angle_rad = next((s.angle_rad for s in thing.states if s.name == reading.state), None)
+    return ObjectState(name=reading.name, state=reading.state, value=reading.value, angle_rad=angle_rad)
+
+
+def _perform(session: Session, thing: PanelObject, target: str, eye: _Eye, before: ObjectReading | None) -> SkillReport:
+    cell, verify = workcell(session), eye.verify()
+    current = None if before is None else state_of(before, thing)
+    match thing:
+        case Lever():
+            return lever(cell, thing.name, target, current=current, verify=verify)
+        case Slider():
+            return slider(cell, thing.name, float(target), current=current, verify=verify)
+        case Toggle():
+            return toggle(cell, thing.name, target, verify=verify)
+        case Rotary():
+            return rotary(cell, thing.name, target, current=current, verify=verify)
+        case Handwheel():
+            return handwheel(cell, thing.name, float(target), current=current, verify=verify)
+        case Mushroom():
+            return mushroom(cell, thing.name, verify=verify)
+        case Button():
+            return button(cell, thing.name, expected=target, verify=verify)
+    raise InvalidRequest(
+        f"{thing.name} is a {thing.kind}, which cannot be worked",
+        hint="levers, sliders, toggles, rotaries, wheels, buttons and mushrooms can",
+    )
+
+
+def _target(thing: PanelObject, body: ActionBody) -> str:
+    """What shall be reached, as text; the usual deed of its kind when nothing is asked."""
+    match thing:
+        case Slider():
+            if body.value is None or not thing.scale.minimum <= body.value <= thing.scale.maximum:
+                scale = thing.scale
+                raise InvalidRequest(
+                    f"{thing.name} needs a value from {scale.minimum:g} to {scale.maximum:g} {scale.unit}",
+                    hint="send {'object': ..., 'value': ...}",
+                )
+            return f"{body.value:g}"
+        case Handwheel():
+            if body.angle_rad is None:
+                raise InvalidRequest(f"{thing.name} needs angle_rad", hint="send {'object': ..., 'angle_rad': ...}")
+            return f"{body.angle_rad:g}"
+        case Lever() | Rotary():
+            return _one_of(thing.name, body.state, tuple(state.name for state in thing.states))
+        case Toggle():
+            return _one_of(thing.name, body.state, ("on", "off"))
+        case Mushroom():
+            return _one_of(thing.name, body.state or "pressed", ("pressed",))
+        case Button():
+            return _one_of(thing.name, body.state or "on", ("on", "off", "pressed", "released"))
+    raise InvalidRequest(
+        f"{thing.name} is a {thing.kind}, which cannot be worked",
+        hint="levers, sliders, toggles, rotaries, wheels, buttons and mushrooms can",
+    )
+
+
+def _one_of(name: str, state: str | None, states: tuple[str, ...]) -> str:
+    if state not in states:
+        raise InvalidRequest(f"{name} has no state {state!r}", hint=f"states: {', '.join(states)}")
+    return state
+
+
+def _witness(session: Session, thing: PanelObject) -> PanelObject:
+    """What shows that the deed worked: a button that springs back shows it by its lamp."""
+    if isinstance(thing, Button) and thing.lights_lamp is not None:
+        return session.panel.object(thing.lights_lamp)
+    return thing

@@ -1,0 +1,234 @@
+"""The whole mission: find the panel, look at everything, feel for it, work its controls, look again, and go home."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from hal.errors import CellError
+from hal.geometry import compose
+from hal.panel import Button, Lever, PanelObject, Slider, Toggle
+from perception.vision.reading import ObjectReading
+from service.operations.beliefs import known_readings
+from service.operations.context import OperationContext
+from service.operations.eyes import settle
+from service.operations.inspect import Inspection, inspect_close, inspect_here, need_all_present, reading_row
+from service.operations.judge import AFTER
+from service.operations.locate import Located, ScannedPlane, go_to_overview, locate, pose_json, scan_plate
+from service.operations.manipulate import work
+from service.operations.requests import ActionBody, MissionRequest
+from service.operations.sense import feel, fuse_and_remember, fused_json, light_evidence
+from service.operations.session import Session
+from service.operations.travel import park
+from service.problem import problem_of
+from service.report.drawing import panel_drawing
+from service.report.plots import joints_picture, lights_picture, png_of, range_picture, wrench_picture
+from service.report.record import MissionRecord, Picture
+from service.report.write import write_report
+
+BEFORE = "before the actions"
+
+
+def run_mission(context: OperationContext, request: MissionRequest) -> dict[str, Any]:
+    """The verb `missions`.
+
+    Whatever happens, the arm is parked if it still obeys, and the report tells what is known.
+
+    Raises:
+        CellError: what ended the mission early; the report is written first.
+    """
+    connection = context.connection
+    name = time.strftime("%Y%m%dT%H%M%S", time.gmtime()) + f"-{context.task.id}"
+    record = MissionRecord(
+        mission=name,
+        cell=connection.cell.name,
+        panel=connection.cell.panel.name,
+        mode=connection.cell.file.cell.mode,
+        seed=connection.cell.file.cell.seed,
+        now_s=connection.clock.now_s,
+    )
+    session = Session(context=context, record=record)
+    try:
+        _run(session, record, request)
+    except CellError as error:
+        record.problem = problem_of(error)
+        _park_after(session, record, error)
+        raise
+    finally:
+        _finish(record)
+        write_report(record, context.runs_dir / name)
+    return {
+        "mission": name,
+        "succeeded": record.succeeded,
+        "report": f"/v1/missions/{name}/report.html",
+        "actions": record.actions,
+        "fused": record.facts.get("fused"),
+        "cell_s": sum(step.cell_s for step in record.steps),
+        "wall_s": sum(step.wall_s for step in record.steps),
+    }
+
+
+def _run(session: Session, record: MissionRecord, request: MissionRequest) -> None:
+    session.memory.forget()  # another panel may stand there: a mission believes nothing that it has not seen
+    with _step(session, "overview", 0.0, 0.06) as part:
+        part.progress(0.0, "drive to the overview")
+        go_to_overview(part)
+    with _step(session, "lights", 0.06, 0.10) as part:
+        first = locate(part)
+    with _step(session, "square view", 0.10, 0.16) as part:
+        part.progress(0.0, "look squarely")
+        go_to_overview(part)
+        located = locate(part)
+        _note_lights(session, record, located)
+    with _step(session, "scan", 0.16, 0.19) as part:
+        part.progress(0.0, "scan the plate")
+        plane = scan_plate(part)
+        _note_plane(record, plane)
+    with _step(session, "recognise", 0.19, 0.22) as part:
+        part.progress(0.0, "recognise the objects")
+        found = inspect_here(part, [thing.name for thing in session.panel.objects])
+        _note_pictures(record, found, "recognised", "objects of the panel file in the image")
+        need_all_present(found, session)
+        record.facts["objects"] = _places(session, found)
+    with _step(session, "read", 0.22, 0.38) as part:
+        found = inspect_close(part, [thing.name for thing in session.panel.objects])
+        _note_pictures(record, found, "read", "close-up")
+        record.readings += [reading_row(reading, BEFORE) for reading in found.readings.values()]
+    with _step(session, "touch", 0.38, 0.55) as part:
+        felt = feel(part, request.touches)
+    with _step(session, "fuse", 0.55, 0.57) as part:
+        part.progress(0.0, "fuse light rays, range plane, distances and touches")
+        answer = fuse_and_remember(part, (*light_evidence([first, located]), plane.evidence, *felt.evidence))
+        record.facts["fused"] = fused_json(answer)
+        record.facts["by_lights"] = pose_json(located.base_from_panel)
+        record.pictures.append(_drawing(session, located))
+    _work_all(session, record, request)
+    with _step(session, "retreat", 0.96, 1.0) as part:
+        part.progress(0.0, "park")
+        park(part)
+
+
+def _work_all(session: Session, record: MissionRecord, request: MissionRequest) -> None:
+    actions = request.actions if request.actions is not None else usual_actions(session)
+    width = (0.96 - 0.57) / max(len(actions), 1)
+    for k, body in enumerate(actions):
+        with _step(session, f"work {body.object}", 0.57 + k * width, 0.57 + (k + 1) * width) as part:
+            part.progress(0.0, f"work {body.object}")
+            deed = work(part, body)
+            record.actions.append(deed.action)
+            if deed.after is not None:
+                record.readings.append(reading_row(deed.after, AFTER))
+            if deed.picture is not None:
+                record.pictures.append(deed.picture)
+
+
+def usual_actions(session: Session) -> tuple[ActionBody, ...]:
+    """The first lever by 90 degrees, the first slider to another value, a button with a lamp, the first toggle."""
+    readings = known_readings(session)
+    actions: list[ActionBody] = []
+    for kind in (Lever, Slider, Button, Toggle):
+        things = [thing for thing in session.panel.objects if isinstance(thing, kind)]
+        if kind is Button:
+            things = [t for t in things if isinstance(t, Button) and t.lights_lamp is not None] or things
+        if things:
+            actions.append(_other(things[0], readings))
+    return tuple(actions)
+
+
+def _other(thing: PanelObject, readings: dict[str, ObjectReading]) -> ActionBody:
+    """The deed that changes what the object shows now."""
+    reading = readings.get(thing.name)
+    state = reading.state if reading is not None else None
+    match thing:
+        case Lever():
+            return ActionBody(object=thing.name, state=next(s.name for s in thing.states if s.name != state))
+        case Slider():
+            low, high = thing.scale.minimum, thing.scale.maximum
+            near, far = low + 0.3 * (high - low), low + 0.7 * (high - low)
+            shown = reading.value if reading is not None and reading.value is not None else low
+            return ActionBody(object=thing.name, value=far if abs(far - shown) > abs(near - shown) else near)
+        case Button(lights_lamp=str(lamp)):
+            lit = lamp in readings and readings[lamp].state == "on"
+            return ActionBody(object=thing.name, state="off" if lit else "on")
+    return ActionBody(object=thing.name, state="off" if state == "on" else "on")
+
+
+@contextmanager
+def _step(session: Session, name: str, low: float, high: float) -> Iterator[Session]:
+    if session.record is None:
+        yield session.part(low, high)
+        return
+    with session.record.step(name):
+        yield session.part(low, high)
+
+
+def _park_after(session: Session, record: MissionRecord, error: CellError) -> None:
+    """Bring the arm home after an error, if the cell still obeys; a second error is told, not hidden."""
+    try:
+        with record.step("park after the error"):
+            settle(session)
+            park(session)
+    except CellError as second:
+        record.facts["not_parked"] = f"after {error.what!r}: {second.what}"
+
+
+def _finish(record: MissionRecord) -> None:
+    if record.motions:
+        record.pictures.append(
+            Picture(name="wrench", title="contact wrench over the mission", png=wrench_picture(record.motions))
+        )
+        record.pictures.append(
+            Picture(name="joints", title="joint angles over the mission", png=joints_picture(record.motions))
+        )
+
+
+def _note_lights(session: Session, record: MissionRecord, found: Located) -> None:
+    names = [light.name for light in session.panel.lights]
+    png = lights_picture(found.pair.off.pixels, found.pair.on.pixels, found.lights_px, names)
+    record.pictures.append(Picture(name="lights", title="lights off, lights on, and their difference", png=png))
+
+
+def _note_plane(record: MissionRecord, plane: ScannedPlane) -> None:
+    c, depth = plane.scan.capabilities, plane.scan.depth_m
+    v, u = np.mgrid[: c.height, : c.width]
+    points = np.stack([(u - c.cx) / c.fx * depth, (v - c.cy) / c.fy * depth, depth], axis=-1)
+    feature = plane.fit.feature
+    record.pictures.append(
+        Picture(
+            name="range",
+            title="range image and what stands out of the fitted plate",
+            png=range_picture(depth, -(points - feature.point_m) @ (-feature.direction)),
+        )
+    )
+    record.facts["plate_in_scanner"] = {
+        "point_m": list(feature.point_m),
+        "normal": list(feature.direction),
+        "rms_m": float(np.sqrt(np.trace(feature.point_covariance))),
+    }
+
+
+def _note_pictures(record: MissionRecord, found: Inspection, name: str, title: str) -> None:
+    for k, picture in enumerate(found.pictures):
+        record.pictures.append(Picture(name=f"{name}-{k}", title=title, png=png_of(picture)))
+
+
+def _places(session: Session, found: Inspection) -> list[dict[str, Any]]:
+    """Every object in 3-D: base frame, metres."""
+    pose = session.known_panel().parent_from_child
+    return [
+        {"name": r.name, "kind": r.kind, "centre_in_base_m": pose.apply(r.centre_m).tolist()}
+        for r in found.readings.values()
+        if r.centre_m is not None
+    ]
+
+
+def _drawing(session: Session, located: Located) -> Picture:
+    """The panel's outlines in the fused pose over the image, as in the paper's Fig. 13."""
+    look = located.pair.off
+    camera_from_panel = compose(look.base_from_camera.inverse(), session.known_panel())
+    png = panel_drawing(session.panel, camera_from_panel.parent_from_child, look.intrinsics, look.pixels)
+    return Picture(name="pose", title="line drawing of the panel in its fused pose over the camera's image", png=png)

@@ -1,0 +1,57 @@
+"""The verb `recognise`: objects by vision, surfaces by range."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hal.errors import Unsupported
+from perception.range import PinholeSensor, RangeScene, analyse
+from service.operations.eyes import look, scan, settle
+from service.operations.inspect import run_recognise_taught
+from service.operations.locate import go_to_overview
+from service.operations.requests import RecogniseRequest
+from service.operations.session import Session
+
+
+def run_recognise(session: Session, request: RecogniseRequest) -> dict[str, Any]:
+    """Objects of the panel file or of any panel in the image, and surfaces in the range image, as asked."""
+    answer: dict[str, Any] = {}
+    if "vision" in request.use:
+        answer |= run_recognise_taught(session, request) if request.mode == "taught" else _blind(session, request)
+    if "range" in request.use:
+        answer["surfaces"] = _surfaces(session, request)
+    return answer
+
+
+def _blind(session: Session, request: RecogniseRequest) -> dict[str, Any]:
+    """Which kinds of object are where in this image, without a panel file."""
+    from perception.vision.blind import recognise
+
+    from perception.vision.annotate import draw_candidates
+    from perception.vision.knowledge import shipped_knowledge
+    from service.report.plots import png_of
+
+    if request.move:
+        go_to_overview(session)
+        settle(session)
+    seen = look(session, request.camera)
+    candidates = recognise(seen.pixels, shipped_knowledge())
+    picture = session.context.task.artefact("blind.png", png_of(draw_candidates(seen.pixels, candidates)), "image/png")
+    return {"candidates": list(candidates), "pictures": [picture]}
+
+
+def _surfaces(session: Session, request: RecogniseRequest) -> list[dict[str, Any]]:
+    if request.move and "vision" not in request.use:
+        go_to_overview(session)
+        settle(session)
+    session.progress(0.9, "scan")
+    image = scan(session)
+    c = image.capabilities
+    if c.projection != "pinhole":
+        raise Unsupported(f"{image.scanner} has {c.projection} projection", hint="use a pinhole range scanner")
+    sensor = PinholeSensor(width_px=c.width, height_px=c.height, fx_px=c.fx, fy_px=c.fy, cx_px=c.cx, cy_px=c.cy)
+    scene: RangeScene = analyse(image.depth_m, sensor)
+    return [
+        {"label": s.label, "type": str(s.type), "primitive": s.primitive, "pixels": s.pixels, "rms_m": s.rms_m}
+        for s in scene.surfaces
+    ]

@@ -1,0 +1,215 @@
+"""Feeling for the panel with every sense, and fusing it all into one pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.features import Feature, Kind
+from fusion.measurement import Measurement, SensingClass
+from fusion.robust import FusedPose, fuse
+from hal.devices import DeviceKind
+from hal.errors import MotionError, NotFound
+from hal.geometry import UncertainPose
+from manipulation.skills.outcome import SkillFailure
+from manipulation.skills.probe import proximity_probe, touch_probe
+from service.operations.beliefs import believed_panel
+from service.operations.evidence import (
+    Evidence,
+    FusedEvidence,
+    LightEvidence,
+    ProximityEvidence,
+    TouchEvidence,
+    fuse_evidence,
+)
+from service.operations.inspect import ensure_located
+from service.operations.locate import Located, go_to_overview, locate, pose_json, scan_plate
+from service.operations.requests import FuseRequest, MeasurementBody
+from service.operations.session import Session
+from service.operations.spots import bare_spots
+from service.operations.travel import workcell
+
+Array = NDArray[np.float64]
+HOVER_M = 0.05  # of the finger tips above the plate while the proximity sensors look
+LEAST_TOUCHES = 3
+SPARE_SPOTS = 2  # a spot that the arm cannot reach is replaced
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Felt:
+    """What the fingers found: evidence, and the spots (panel frame, m) that gave it."""
+
+    evidence: tuple[Evidence, ...]
+    spots: tuple[Array, ...]
+    skipped: tuple[str, ...]
+
+
+def feel(session: Session, touches: int) -> Felt:
+    """Hover over and touch bare places of the plate.
+
+    Raises:
+        NotFound: fewer than three places could be touched; says why.
+    """
+    evidence: list[Evidence] = []
+    spots: list[Array] = []
+    skipped: list[str] = []
+    for spot in bare_spots(session.panel, touches + SPARE_SPOTS):
+        if len(spots) == touches:
+            break
+        session.progress(len(spots) / touches, "touch the plate", f"at ({spot[0]:.3f}, {spot[1]:.3f}) m")
+        try:
+            evidence += _feel_at(session, spot)
+            spots.append(spot)
+        except (SkillFailure, MotionError) as failure:
+            skipped.append(f"({spot[0]:.3f}, {spot[1]:.3f}) m: {failure}")
+    if len(spots) < LEAST_TOUCHES:
+        raise NotFound(
+            f"only {len(spots)} of {touches} places of the plate could be touched: {'; '.join(skipped)}",
+            hint="is the panel where the lights say? is something in the way?",
+        )
+    return Felt(evidence=tuple(evidence), spots=tuple(spots), skipped=tuple(skipped))
+
+
+def mounts_of(session: Session, evidence: Sequence[Evidence]) -> dict[str, UncertainPose]:
+    """`flange_from_sensor` of every sensor that gave evidence."""
+    return {sensor: session.mount(sensor) for sensor in sorted({e.sensor for e in evidence})}
+
+
+def fuse_and_remember(session: Session, evidence: Sequence[Evidence]) -> FusedEvidence:
+    """One pose from all evidence; the cell believes it from now on."""
+    fused = fuse_evidence(evidence, mounts_of(session, evidence), prior=believed_panel(session))
+    session.memory.remember("base_from_panel", fused.base_from_panel)
+    return fused
+
+
+def fused_json(answer: FusedEvidence) -> dict[str, Any]:
+    """The fused pose as reports and the API give it."""
+    fused = answer.fused
+    return {**pose_json(answer.base_from_panel), **_account(fused, answer.measurements)}
+
+
+def run_fuse(session: Session, request: FuseRequest) -> dict[str, Any]:
+    """The verb `fuse`: measurements that are given, or collected."""
+    if request.collect:
+        evidence = collect(session, request.touches)
+        return fused_json(fuse_and_remember(session, evidence))
+    measurements = [_measurement(body) for body in request.measurements]
+    prior = request.prior.pose() if request.prior is not None else None
+    fused = fuse(measurements, prior=prior, certify=request.certify)
+    return {**pose_json(fused.base_from_object), **_account(fused, measurements)}
+
+
+def collect(session: Session, touches: int) -> tuple[Evidence, ...]:
+    """Look, scan, hover and touch."""
+    ensure_located(session.part(0.0, 0.2))
+    go_to_overview(session)
+    found: Located = locate(session.part(0.2, 0.3))
+    session.progress(0.3, "scan the plate")
+    plane = scan_plate(session)
+    felt = feel(session.part(0.35, 1.0), touches)
+    return (*found.evidence, plane.evidence, *felt.evidence)
+
+
+def light_evidence(located: Sequence[Located]) -> tuple[LightEvidence, ...]:
+    """The rays of several looks together."""
+    return tuple(ray for found in located for ray in found.evidence)
+
+
+def _feel_at(session: Session, spot: Array) -> list[Evidence]:
+    cell = workcell(session)
+    place = (float(spot[0]), float(spot[1]), 0.0)
+    evidence: list[Evidence] = []
+    names = [name for name in session.cell.names_of(DeviceKind.PROXIMITY) if session.has_mount(name)]
+    sigmas = {name: session.connection.device(name).capabilities().sigma_m for name in names}
+    mounts = [session.mount(name).parent_from_child for name in names]
+    if names:
+        points = proximity_probe(
+            cell, place, flange_from_sensors=mounts, distance_m=HOVER_M, samples=5, sigma_m=max(sigmas.values())
+        )
+        flange = cell.mover.state().base_from_flange
+        for point in points:
+            name = _whose(names, mounts, flange, point.base_from_sensor)
+            evidence.append(
+                ProximityEvidence(
+                    sensor=name,
+                    base_from_flange=flange,
+                    distance_m=point.distance_m,
+                    sigma_m=point.sigma_m,
+                    label=f"{name} at ({spot[0]:.3f}, {spot[1]:.3f})",
+                )
+            )
+    touched = touch_probe(cell, place)
+    base_from_grip = touched.report.base_from_tool
+    tip = base_from_grip.inv().apply(touched.point_m)
+    normal_sigma = float(np.sqrt(touched.normal @ touched.covariance @ touched.normal))
+    evidence.append(
+        TouchEvidence(
+            sensor=session.first(DeviceKind.GRIPPER),
+            base_from_flange=base_from_grip * cell.flange_from_grip.inv(),
+            tip_m=tip,
+            sigma_m=normal_sigma,
+            label=f"touch at ({spot[0]:.3f}, {spot[1]:.3f})",
+        )
+    )
+    return evidence
+
+
+def _whose(names: Sequence[str], mounts: Sequence[Any], flange: Any, base_from_sensor: Any) -> str:
+    """Which sensor stood there: the probe leaves out sensors that saw nothing."""
+    gaps = [np.linalg.norm((flange * mount).translation - base_from_sensor.translation) for mount in mounts]
+    return names[int(np.argmin(gaps))]
+
+
+def _measurement(body: MeasurementBody) -> Measurement:
+    """What fusion takes, from a request's measurement."""
+    cls = SensingClass.named(body.sensing)
+    kinds = list(Kind)
+    feature = Feature(kind=kinds[(cls - 1) % 3], point_m=np.array(body.x_m), direction=np.array(body.u), name="")
+    return Measurement(
+        cls=cls,
+        x_m=feature.point_m,
+        u=feature.direction,
+        mu_m=np.array(body.mu_m),
+        C_m2=np.array(body.c_m2),
+        M=np.array(body.m_per_rad2),
+        label=body.label,
+        sensor=body.sensor,
+    )
+
+
+def _account(fused: FusedPose, measurements: Sequence[Measurement]) -> dict[str, Any]:
+    rejected = {r.index: r for r in fused.rejected}
+    return {
+        "chi_square": fused.chi_square,
+        "dof": fused.dof,
+        "ambiguous": fused.is_ambiguous,
+        "unobservable": [direction.words for direction in fused.unobservable],
+        "measurements": [
+            {
+                "label": m.label,
+                "sensor": m.sensor,
+                "sensing": m.cls.words,
+                "value": float(fused.values[i]),
+                "dof": m.dof,
+                "rejected": i in rejected,
+                "reason": rejected[i].reason if i in rejected else None,
+            }
+            for i, m in enumerate(measurements)
+        ],
+        "rejected": [
+            {"index": r.index, "label": r.label, "value": r.value, "reason": r.reason} for r in fused.rejected
+        ],
+        "alternatives": [
+            {
+                **pose_json(UncertainPose(parent_from_child=a.base_from_object, covariance=a.covariance)),
+                "odds": a.odds,
+                "rejected": list(a.rejected),
+            }
+            for a in fused.alternatives
+        ],
+        "certificate": fused.certificate,
+    }

@@ -1,0 +1,53 @@
+"""Line drawing of the panel in an estimated pose over the camera's image, as in the paper's Fig. 13."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from hal.calibration import CameraIntrinsics
+from hal.panel import Panel
+from perception.camera_model import project
+from perception.vision.outline import contour_m
+from service.report.plots import figure_png
+
+PLATE, OBJECT, LIGHT = "#2ec4b6", "#ff9f1c", "#ffe066"
+
+
+def panel_drawing(
+    panel: Panel, camera_from_panel: RigidTransform, intrinsics: CameraIntrinsics, pixels: NDArray[np.uint8]
+) -> bytes:
+    """PNG of the image with plate, objects, lights and the panel's axes drawn where the pose puts them."""
+    figure = Figure(figsize=(8.0, 8.0 * intrinsics.height_px / intrinsics.width_px), dpi=100)
+    pane = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    pane.imshow(pixels, cmap="gray", vmin=0, vmax=255, alpha=0.55)
+
+    def line(points_m: NDArray[np.float64], colour: str, width: float = 1.2) -> None:
+        u, v = project(camera_from_panel.apply(points_m), intrinsics).T
+        pane.plot(u, v, color=colour, lw=width)
+
+    x, y = panel.width_m / 2, panel.height_m / 2
+    line(_edges(np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0], [-x, -y, 0.0]])), PLATE, 1.8)
+    for thing in panel.objects:
+        contour = contour_m(thing)
+        line(np.vstack([contour, contour[:1]]), OBJECT)
+    turn = np.linspace(0.0, 2 * np.pi, 25)
+    for light in panel.lights:
+        ring = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1) * light.radius_m
+        line(np.array(light.position_m) + ring, LIGHT, 1.6)
+    for axis, colour in zip(np.eye(3) * 0.06, ("#e63946", "#57cc99", "#4895ef"), strict=True):
+        line(np.array([np.zeros(3), axis]), colour, 2.4)
+    pane.set_xlim(0, intrinsics.width_px - 1)
+    pane.set_ylim(intrinsics.height_px - 1, 0)
+    pane.set_axis_off()
+    return figure_png(figure)
+
+
+def _edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A polyline fine enough to follow the lens's distortion."""
+    pieces = [a + (b - a) * f for a, b in pairwise(corners) for f in np.linspace(0, 1, 20)]
+    return np.array(pieces)

@@ -64,7 +64,7 @@ class SimArm(SimDevice[JointState]):
         if not self._world.is_enabled:
             raise MotionRefused(f"{self._name}: the drives are off", hint="call enable first", device=self._name)
         last = self._world.frame.snapshot.setpoint_rad
-        sent = np.clip(np.clip(wanted, last - self._stride, last + self._stride), self._lower, self._upper)
+        sent: Array = np.clip(np.clip(wanted, last - self._stride, last + self._stride), self._lower, self._upper)
         self._world.aim_arm(sent)
         return sent
 

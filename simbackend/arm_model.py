@@ -25,7 +25,7 @@ class ArmModel:
 
 
 def t3() -> ArmModel:
-    """T3-726-like: 1.04 m from shoulder to flange, spherical wrist, tip at most 1.0 m/s. The link lengths are our own."""
+    """T3-726-like: 1.04 m from shoulder to flange, spherical wrist, tip at most 1.0 m/s; own link lengths."""
     quarter = math.pi / 2.0
     links = (
         DhLink(d_m=0.70, a_m=0.0, alpha_rad=quarter),
@@ -101,23 +101,24 @@ def _capabilities(
 def base_from_flange(links: tuple[DhLink, ...], position_rad: np.ndarray) -> RigidTransform:
     """Forward kinematics: the product of Rz(q + offset) Tz(d) Tx(a) Rx(alpha) over the joints."""
     pose = RigidTransform.identity()
-    for link, q in zip(links, position_rad, strict=True):
-        turn = RigidTransform.from_rotation(Rotation.from_euler("z", q + link.offset_rad))
-        pose = pose * turn * link_from_next(link)
+    for dh, q in zip(links, position_rad, strict=True):
+        turn = RigidTransform.from_rotation(Rotation.from_euler("z", q + dh.offset_rad))
+        pose = pose * turn * link_from_next(dh)
     return pose
 
 
-def link_from_next(link: DhLink) -> RigidTransform:
+def link_from_next(dh: DhLink) -> RigidTransform:
     """The fixed part of a standard DH link: Tz(d) Tx(a) Rx(alpha)."""
-    return RigidTransform.from_components([link.a_m, 0.0, link.d_m], Rotation.from_euler("x", link.alpha_rad))
+    return RigidTransform.from_components([dh.a_m, 0.0, dh.d_m], Rotation.from_euler("x", dh.alpha_rad))
 
 
 def arm_urdf(
     model: ArmModel, *, flange_from_sensor: RigidTransform, flange_from_grip: RigidTransform, load_kg: float
 ) -> str:
-    """URDF of arm, force/torque sensor and gripper: primitives only, one tag a line (the parser cuts long lines).
+    """URDF of arm, force/torque sensor and gripper, from primitives.
 
-    Link i turns about z at the end of link i - 1, so its frame is the DH frame i - 1 turned by q_i; the flange is fixed to link 6.
+    Link i turns about z at the end of link i - 1: its frame is DH frame i - 1 turned by q_i. The flange is
+    fixed to link 6.
     """
     caps = model.capabilities
     lines = ['<robot name="arm">', *link("base", inertial(10.0, (0, 0, 0), (1.0, 1.0, 1.0)))]

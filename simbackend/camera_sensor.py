@@ -1,7 +1,7 @@
 """From an ideal drawing to what a camera would have delivered: lens, glow, glare, vignette, blur, exposure, noise.
 
-The engine has neither anti-aliasing nor emission: the drawing is made larger and reduced, and whatever shines is added here.
-Without the glow round a lamp, subtracting lights-off from lights-on would be trivially perfect.
+The drawing has no anti-aliasing, so it is made larger and reduced. Without the glow round a lamp, subtracting
+lights-off from lights-on would be trivially perfect.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class CameraSensor:
         margin_px = 2.0
         size = np.ceil((high - low) * f + 2 * margin_px).astype(int)
         s = options.oversample
-        self.drawn = (int(round(size[0] * s)), int(round(size[1] * s)))
+        self.drawn = (round(float(size[0]) * s), round(float(size[1]) * s))
         scale = np.array(self.drawn) / size
         centre = -low * f + margin_px
         self.focal = (float(f[0] * scale[0]), float(f[1] * scale[1]))
@@ -59,19 +59,21 @@ class CameraSensor:
         drawn_centre = scale * (centre + 0.5) - 0.5
         self.centre = (float(drawn_centre[0]), float(drawn_centre[1]))
         self._reduced = (int(size[0]), int(size[1]))
-        self._maps = cv2.convertMaps((ideal * f + centre).astype(np.float32), None, cv2.CV_16SC2)
+        places = (ideal * f + centre).astype(np.float32)
+        self._maps = cv2.convertMaps(places[:, :, 0].copy(), places[:, :, 1].copy(), cv2.CV_16SC2)
         self._vignette = _vignette(lens, options.vignette)
 
     def expose(self, info: PictureInfo, radiance: Grey, random: np.random.Generator) -> Pixels:
         """The image, (H, W) or (H, W, 3) uint8, of an ideal drawing of size `drawn`."""
-        radiance = cv2.resize(radiance, self._reduced, interpolation=cv2.INTER_AREA)
-        radiance = cv2.remap(radiance, *self._maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        radiance = self._glow(info, radiance)
+        reduced = cv2.resize(radiance, self._reduced, interpolation=cv2.INTER_AREA)
+        places, fractions = self._maps
+        bent = cv2.remap(reduced, places, fractions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        seen = self._glow(info, np.asarray(bent, np.float32))
         if self._options.blur_px > 0.0:
-            radiance = cv2.GaussianBlur(radiance, (0, 0), self._options.blur_px)
+            seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), self._options.blur_px), np.float32)
         gain = np.float32(self._options.exposure_s / NOMINAL_EXPOSURE_S)
-        vignette = self._vignette if radiance.ndim == 2 else self._vignette[:, :, None]
-        return self._digitise(radiance * (vignette * gain), random)
+        vignette = self._vignette if seen.ndim == 2 else self._vignette[:, :, None]
+        return self._digitise(seen * (vignette * gain), random)
 
     def _glow(self, info: PictureInfo, radiance: Grey) -> Grey:
         """Light that a lamp throws on the plate round it (times what is there), and glare in the lens (beside it)."""
@@ -116,14 +118,16 @@ class CameraSensor:
         electrons = np.minimum(radiance, np.float32(1.2)) * well
         sigma = np.sqrt(electrons + np.float32(self._options.read_noise_electrons**2))
         electrons += sigma * random.standard_normal(electrons.shape, np.float32)
-        return np.clip(electrons * (np.float32(255.0) / well) + np.float32(0.5), 0, 255).astype(np.uint8)
+        levels = electrons * (np.float32(255.0) / well) + np.float32(0.5)
+        return np.asarray(np.clip(levels, 0, 255), np.uint8)
 
 
 def _enlarge(image: Grey, width: int, height: int) -> Grey:
     """Back to full size: coarse pixel i is at fine pixel i * step."""
     step = GLOW_STEP_PX
     matrix = np.array([[step, 0, 0], [0, step, 0]], np.float32)
-    return cv2.warpAffine(image, matrix, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    large = cv2.warpAffine(image, matrix, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(large, np.float32)
 
 
 def _ideal_grid(lens: CameraIntrinsics) -> NDArray[np.float64]:
@@ -132,7 +136,7 @@ def _ideal_grid(lens: CameraIntrinsics) -> NDArray[np.float64]:
     matrix = np.array([[lens.fx_px, 0, lens.cx_px], [0, lens.fy_px, lens.cy_px], [0, 0, 1.0]])
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-10)
     pixels = np.stack([u.ravel(), v.ravel()], axis=1)[:, None]
-    ideal = cv2.undistortPointsIter(pixels, matrix, np.asarray(lens.distortion), None, None, criteria)
+    ideal = cv2.undistortPointsIter(pixels, matrix, np.asarray(lens.distortion), np.eye(3), np.eye(3), criteria)
     return np.asarray(ideal, float).reshape(lens.height_px, lens.width_px, 2)
 
 

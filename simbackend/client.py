@@ -1,4 +1,4 @@
-"""The cell's side of the pipe: owns the world process, keeps the newest snapshot, and lets the clock drive the world."""
+"""The cell's side of the pipe: owns the world process, keeps the newest snapshot, lets the clock drive the world."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ class WorldClient:
             self._images = mmap.mmap(file.fileno(), IMAGE_BYTES)
             fds = (theirs.fileno(), file.fileno())
             command = [sys.executable, "-m", "simbackend.world_process", *map(str, fds)]
-            self._process = subprocess.Popen(
+            self._process = subprocess.Popen(  # noqa: S603  # our own interpreter and module
                 command, pass_fds=fds, env=_environment(), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
             )
         theirs.close()

@@ -14,7 +14,7 @@ from simbackend.client import Frame, WorldClient
 from simbackend.wire import Snapshot
 
 T = TypeVar("T")
-O = TypeVar("O", bound="SimOptions")
+Options = TypeVar("Options", bound="SimOptions")
 
 
 class FaultOption(Strict):
@@ -31,7 +31,7 @@ class SimOptions(Strict):
     fault: FaultOption | None = None
 
 
-def parse(options: dict[str, Any], model: type[O], context: Context) -> O:
+def parse(options: dict[str, Any], model: type[Options], context: Context) -> Options:
     """Options as their strict model.
 
     Raises:

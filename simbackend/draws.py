@@ -30,7 +30,7 @@ NOISE_BLOCK = 512
 
 
 class TickNoise:
-    """The same numbers as a function of the tick, made a block at a time: a generator for each tick costs ten times more."""
+    """Numbers as a function of the tick, made a block at a time: a generator for each tick costs ten times more."""
 
     def __init__(self, draws: Draws, name: str, width: int) -> None:
         self._draws, self._name, self._width = draws, name, width
@@ -43,7 +43,8 @@ class TickNoise:
         if held != number:
             block = self._draws.at_tick(self._name, number).standard_normal((NOISE_BLOCK, self._width))
             self._block = (number, block)  # one assignment, so that a second reader sees the old or the new pair
-        return block[row]
+        numbers: Array = block[row]
+        return numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +103,9 @@ class Draws:
         spread_m = min(PANEL_SPREAD_M, workspace.position_tolerance_m)
         spread_rad = min(PANEL_SPREAD_RAD, workspace.angle_tolerance_rad)
         u = self.stream("panel/pose").uniform(-1.0, 1.0, 6)
-        # The six are drawn in a cube; a norm over the file's tolerance would break its promise, so the corners are drawn in.
+        # Drawn in a cube; what lies beyond the file's promise (the corners) is drawn in to it.
         shift = spread_m * u[:3]
+        shift *= min(1.0, workspace.position_tolerance_m / max(float(np.linalg.norm(shift)), 1e-12))
         turn = spread_rad * u[3:] / max(1.0, float(np.linalg.norm(u[3:])))
         expected = transform_rpy(workspace.panel_position_m, workspace.panel_rpy_rad)
         return perturbed(expected, np.concatenate([shift, turn]))

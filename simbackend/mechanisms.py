@@ -1,4 +1,4 @@
-"""How the moving parts of a panel resist a finger: friction, springs, latches, detents. One joint each, stepped with the world.
+"""How the moving parts of a panel resist a finger: friction, springs, latches, detents. One joint each.
 
 A mechanism is `drive`n every tick while the tool is near; far away it is locked, which saves time and changes nothing.
 `engine` is a connected PyBullet client; this file never imports the module, so that only the world process loads it.
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 JOINT = 0
+DAMPING_N_S_PER_M = 4.0
 LOCK_EFFORT = 200.0
 SNAP_GAIN_PER_S = 40.0
 
@@ -46,9 +47,7 @@ class Friction:
 
     def drive(self) -> None:
         """A velocity motor at rest with limited effort breaks away within 5 % of that effort."""
-        self.engine.setJointMotorControl2(
-            self.body, JOINT, self.engine.VELOCITY_CONTROL, targetVelocity=0.0, force=self.effort
-        )
+        _hold(self.engine, self.body, speed=0.0, effort=self.effort)
 
     def place(self) -> float:
         """Joint position."""
@@ -57,7 +56,7 @@ class Friction:
 
 @dataclass(slots=True, eq=False)
 class Spring:
-    """Push button: spring, preload, travel and, when `latching`, a latch that a push sets and (`releases`) a push frees.
+    """Push button: spring, preload, travel; when `latching`, a push sets a latch and (`releases`) another frees it.
 
     The joint runs from 0 (out) to -travel (in).
     """
@@ -75,13 +74,11 @@ class Spring:
 
     def lock(self) -> None:
         """Hold the cap."""
-        self.engine.setJointMotorControl2(
-            self.body, JOINT, self.engine.VELOCITY_CONTROL, targetVelocity=0.0, force=LOCK_EFFORT
-        )
+        _hold(self.engine, self.body, speed=0.0, effort=LOCK_EFFORT)
 
     def free(self) -> None:
         """Let go of the cap, so that `drive` alone moves it."""
-        self.engine.setJointMotorControl2(self.body, JOINT, self.engine.VELOCITY_CONTROL, targetVelocity=0.0, force=0.0)
+        _hold(self.engine, self.body, speed=0.0, effort=0.0)
 
     def drive(self) -> None:
         """Spring force k x + preload outwards, viscous damping, and the switch."""
@@ -99,7 +96,7 @@ class Spring:
         return 0.6 * self.travel_m
 
     def _switch(self, x: float) -> None:
-        # Closing at 80 % and opening at 40 % of the travel (latched: back at its depth) is the hysteresis of a real switch.
+        # Closes at 80 % of the travel and opens at 70 %: a switch without hysteresis would chatter.
         if not self.is_in and x <= -0.8 * self.travel_m:
             self.is_in = True
             self.presses += 1
@@ -111,9 +108,6 @@ class Spring:
     def place(self) -> float:
         """Joint position."""
         return float(self.engine.getJointState(self.body, JOINT)[0])
-
-
-DAMPING_N_S_PER_M = 4.0
 
 
 @dataclass(slots=True, eq=False)
@@ -138,9 +132,7 @@ class Detent:
         x = self.place()
         error = self.nearest(x) - x
         speed = max(-self.max_speed, min(self.max_speed, SNAP_GAIN_PER_S * error))
-        self.engine.setJointMotorControl2(
-            self.body, JOINT, self.engine.VELOCITY_CONTROL, targetVelocity=speed, force=self.effort
-        )
+        _hold(self.engine, self.body, speed=speed, effort=self.effort)
 
     def nearest(self, x: float) -> float:
         """The resting place next to `x`."""
@@ -149,3 +141,8 @@ class Detent:
     def place(self) -> float:
         """Joint position."""
         return float(self.engine.getJointState(self.body, JOINT)[0])
+
+
+def _hold(engine: Any, body: int, *, speed: float, effort: float) -> None:
+    """A velocity motor with limited effort: friction, brake or snap, as its speed and effort say."""
+    engine.setJointMotorControl2(body, JOINT, engine.VELOCITY_CONTROL, targetVelocity=speed, force=effort)

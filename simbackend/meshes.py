@@ -16,7 +16,7 @@ DISC = 72
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Mesh:
-    """T triangles: `points_m` and `normals` (T, 3, 3), `uv` (T, 3, 2) with v upwards. Seen from outside they turn left."""
+    """T triangles: `points_m` and `normals` (T, 3, 3), `uv` (T, 3, 2) with v upwards; from outside they turn left."""
 
     points_m: Array
     normals: Array
@@ -55,7 +55,7 @@ def cylinder(radius_m: float, length_m: float) -> Mesh:
     count = _corners(radius_m)
     ring = _ring(count)
     low = np.column_stack([radius_m * ring, np.full(count, -length_m / 2)])
-    high = low + [0.0, 0.0, length_m]
+    high = low + np.array([0.0, 0.0, length_m])
     up = np.tile([0.0, 0.0, 1.0], (count, 1))
     normals = np.column_stack([ring, np.zeros(count)])
     after = np.roll(np.arange(count), -1)

@@ -1,14 +1,15 @@
 """The panel file as bodies: a plate, what is printed on it, and one small body for each light and object.
 
-Everything is in panel axes about the object's middle on the plate (z out of the plate). Joints count clockwise turns, metres
-along the track, or metres out of the plate as positive. Heights: instrument faces lie 1 mm above the plate and needles
-`depth_m` above it; a lever's bar is the uppermost 16 mm below `height_m`, from the hub to `length_m`.
+Everything is in panel axes about the object's middle on the plate (z out of the plate). Joints count clockwise turns,
+metres along the track, or metres out of the plate as positive. Heights: instrument faces lie 1 mm above the plate and
+needles `depth_m` above it; a lever's bar is the uppermost 16 mm below `height_m`, from the hub to `length_m`.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -68,7 +69,7 @@ class ObjectModel:
     place: float = 0.0
 
 
-def object_model(built: Built) -> ObjectModel:
+def object_model(built: Built) -> ObjectModel:  # noqa: PLR0911  # one a kind
     """The model of one built object."""
     match built.thing:
         case Gauge():
@@ -129,9 +130,7 @@ def _moving(
     return lines + joint("part", kind, "base", "part", at(*pivot_m), axis=axis, limits=limits)
 
 
-def _needle(
-    built: Built, *, length_m: float, tail_m: float, width_m: float, height_m: float, pivot_y_m: float
-) -> list[str]:
+def _needle(*, length_m: float, tail_m: float, width_m: float, height_m: float, pivot_y_m: float) -> list[str]:
     middle_m = (length_m - tail_m) / 2
     parts = [
         shape(at(0, middle_m, 0), box((width_m, length_m + tail_m, 0.0006)), INK, collision=False),
@@ -150,16 +149,13 @@ def _needle(
 
 def _gauge(thing: Gauge, built: Built) -> ObjectModel:
     r = thing.radius_m
-    needle = _needle(
-        built, length_m=0.76 * r, tail_m=0.22 * r, width_m=0.055 * r, height_m=thing.depth_m, pivot_y_m=0.0
-    )
+    needle = _needle(length_m=0.76 * r, tail_m=0.22 * r, width_m=0.055 * r, height_m=thing.depth_m, pivot_y_m=0.0)
     face = Quad(pixels=textures.gauge_face(thing), size_m=(2 * r, 2 * r), centre_m=(0, 0, FACE_HEIGHT_M), is_round=True)
     return ObjectModel(urdf=needle, quads=(face,), place=built.place)
 
 
 def _meter(thing: PanelMeter, built: Built) -> ObjectModel:
     needle = _needle(
-        built,
         length_m=thing.needle_m,
         tail_m=0.12 * thing.needle_m,
         width_m=0.0016,
@@ -268,7 +264,7 @@ def _handwheel(thing: Handwheel, built: Built) -> ObjectModel:
     angles = np.linspace(0.0, 2 * np.pi, WHEEL_SEGMENTS + 1)
     points = [(thing.radius_m * math.sin(a), thing.radius_m * math.cos(a), ring_m) for a in angles]
     parts = [shape(at(0, 0, thing.height_m / 2 - 0.001), cylinder(0.009, thing.height_m - 0.002), blue)]
-    for a_m, b_m in zip(points, points[1:], strict=False):
+    for a_m, b_m in pairwise(points):
         middle, length_m = along(a_m, b_m)
         parts.append(shape(middle, cylinder(thing.rim_m, length_m + 0.0015), blue))
     for i in range(thing.spokes):

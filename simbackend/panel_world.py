@@ -130,7 +130,7 @@ class PanelWorld:
     def _load_light(self, light: Any, jitter: Any) -> None:
         x, y, z = light.position_m
         pose = self.base_from_panel * RigidTransform.from_translation([x + jitter[0], y + jitter[1], jitter[2]])
-        body = self._load_urdf(light.name, light_urdf(light), pose)
+        self._load_urdf(light.name, light_urdf(light), pose)
         self._light_places.append(tuple(float(c) for c in pose.apply([0, 0, z])))  # type: ignore[arg-type]
 
     def _load_urdf(self, name: str, text: str, pose: RigidTransform) -> int:
@@ -176,9 +176,9 @@ class PanelWorld:
                     self.engine.resetJointState(body, JOINT, -spring.latched_depth_m)
                 return spring
             case Toggle():
-                places = (-thing.tilt_rad, thing.tilt_rad)
+                ends = (-thing.tilt_rad, thing.tilt_rad)
                 effort = thing.force_n * thing.bat_length_m * ratio
-                return Detent(engine=self.engine, body=body, places=places, effort=effort, max_speed=8.0)
+                return Detent(engine=self.engine, body=body, places=ends, effort=effort, max_speed=8.0)
             case Rotary():
                 places = tuple(state.angle_rad for state in thing.states)
                 return Detent(
@@ -281,7 +281,7 @@ class PanelWorld:
         """What each object shows at this tick."""
         return tuple(self._truth_of(built) for built in self.built.values())
 
-    def _truth_of(self, built: Built) -> ObjectTruth:
+    def _truth_of(self, built: Built) -> ObjectTruth:  # noqa: PLR0911  # one a kind
         thing = built.thing
         name = thing.name
         mechanism = self.mechanisms.get(name)

@@ -27,8 +27,8 @@ JUMP_M = 0.008  # neighbours further apart than this share a beam
 class RangeOptions(SimOptions):
     """Size, field of view and corruption.
 
-    `sigma_m` is the noise at 0.5 m and grows with the square of the distance; `bits` = 8 quantises the range from 0.10 to
-    1.50 m to 256 steps as the paper's scanner did; `mixed_ratio` of the pixels at a jump report a depth between the two
+    `sigma_m` is the noise at 0.5 m and grows with the square of the distance; `bits` = 8 quantises the range from 0.10
+    to 1.50 m to 256 steps as the paper's scanner did; `mixed_ratio` of the pixels at a jump report a depth between the two
     surfaces; `loss_ratio` of all pixels see nothing.
     """
 
@@ -93,7 +93,7 @@ class SimRangeScanner(SimDevice[RangeImage]):
 
 
 def corrupt(depth_m: Depth, options: RangeOptions, random: np.random.Generator) -> Depth:
-    """Mixed pixels at jumps, noise that grows with the square of the distance, lost pixels, range limits, last digit."""
+    """Mixed pixels at jumps, noise growing with the square of the distance, lost pixels, range limits, last digit."""
     seen = np.where(np.isfinite(depth_m), depth_m, np.float32(2.0 * MAX_RANGE_M))
     kernel = np.ones((3, 3), np.uint8)
     near, far = cv2.erode(seen, kernel), cv2.dilate(seen, kernel)

@@ -190,12 +190,13 @@ class _Compiled:
         table: list[tuple[int, int, int, int]] = []
         offset = 0
         for picture in pictures if channels else []:
-            level = picture if channels == 3 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+            level = picture if channels == 3 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
             table.append((offset, level.shape[1], level.shape[0], HALVINGS))
             for _ in range(HALVINGS + 1):
                 texels.append(np.ascontiguousarray(level).ravel())
                 offset += texels[-1].size
-                level = cv2.resize(level, (level.shape[1] // 2, level.shape[0] // 2), interpolation=cv2.INTER_AREA)
+                half = (level.shape[1] // 2, level.shape[0] // 2)
+                level = np.asarray(cv2.resize(level, half, interpolation=cv2.INTER_AREA), np.uint8)
         self.texels = np.concatenate(texels) if texels else np.zeros(1, np.uint8)
         # A depth picture needs no texture, but the rows must exist that its triangles point to.
         self.table = np.array(table or [(0, 2, 2, 0)] * max(1, len(pictures)), np.int64)

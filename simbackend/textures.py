@@ -1,4 +1,4 @@
-"""What is printed on the panel: plate with labels, instrument faces, seven-segment displays. Drawn with Pillow, uint8 RGB.
+"""What is printed on the panel: plate with labels, instrument faces, seven-segment displays; uint8 RGB, by Pillow.
 
 Every drawing is in pixels of its own image; `Canvas` turns panel metres (y up) into them.
 """
@@ -12,7 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from hal.panel import Button, Display, Gauge, Lamp, Lever, Mushroom, Panel, PanelMeter, Rotary, Slider, State, Toggle
+from hal.panel import (
+    Button,
+    Display,
+    Gauge,
+    Handwheel,
+    Lamp,
+    Lever,
+    Mushroom,
+    Panel,
+    PanelMeter,
+    PanelObject,
+    Rotary,
+    Scale,
+    Slider,
+    State,
+    Toggle,
+)
 
 Pixels = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -99,7 +115,7 @@ def plate(panel: Panel) -> Pixels:
     return canvas.pixels()
 
 
-def _print_round(canvas: Canvas, thing: object) -> None:
+def _print_round(canvas: Canvas, thing: PanelObject) -> None:  # noqa: PLR0912  # one a kind
     match thing:
         case Gauge():
             _label(canvas, thing.position_m, thing.radius_m, thing.label)
@@ -149,8 +165,8 @@ def _print_round(canvas: Canvas, thing: object) -> None:
             _label(canvas, thing.position_m, 0.020, thing.label)
         case Slider():
             _track(canvas, thing)
-        case _:
-            _label(canvas, thing.position_m, thing.radius_m + thing.rim_m, thing.label)  # type: ignore[attr-defined]
+        case Handwheel():
+            _label(canvas, thing.position_m, thing.radius_m + thing.rim_m, thing.label)
 
 
 def _name(canvas: Canvas, at_m: tuple[float, float], state: State, radius_m: float) -> None:
@@ -215,10 +231,10 @@ def meter_face(thing: PanelMeter) -> Pixels:
 
 
 def _scale(
-    canvas: Canvas, centre: tuple[float, float], scale: object, *, outer_m: float, text_m: float, tall_m: float
+    canvas: Canvas, centre: tuple[float, float], scale: Scale, *, outer_m: float, text_m: float, tall_m: float
 ) -> None:
-    majors = np.linspace(scale.minimum, scale.maximum, scale.major_ticks)  # type: ignore[attr-defined]
-    place_of = scale.place_of  # type: ignore[attr-defined]
+    majors = np.linspace(scale.minimum, scale.maximum, scale.major_ticks)
+    place_of = scale.place_of
     for i, value in enumerate(majors):
         angle = place_of(float(value))
         _mark(canvas, centre, angle, outer_m * 0.84, outer_m * 0.16)
@@ -246,11 +262,11 @@ def display_face(thing: Display, text: str) -> Pixels:
         column += 1
         centre_m = (column - (thing.digits - 1) / 2) * pitch
         for segment in SEGMENTS[char]:
-            _segment(canvas, centre_m, segment, wide, high, ink)
+            _segment(canvas, segment, x_m=centre_m, wide=wide, high=high, ink=ink)
     return canvas.pixels()
 
 
-def _segment(canvas: Canvas, x_m: float, segment: str, wide: float, high: float, ink: Colour) -> None:
+def _segment(canvas: Canvas, segment: str, *, x_m: float, wide: float, high: float, ink: Colour) -> None:
     t = 0.065 * high  # half thickness
     gap = 0.02 * high
     w, h = wide / 2, high / 2

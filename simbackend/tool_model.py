@@ -1,8 +1,8 @@
 """What hangs below the flange: force/torque sensor, parallel gripper, two slim fingers.
 
-Grip frame: origin between the finger tips at the tip end, z forward along the fingers, x the closing direction.
-Geometry: each finger is 7 mm thick (x), 12 mm wide (y) and 75 mm long, so closed fingers make a 14 x 12 mm fingertip that
-fits buttons and toggles, and an open finger fits between objects 20 mm apart.
+Grip frame: origin between the finger tips at the tip end, z forward along the fingers, x the closing direction. Each
+finger is 7 mm thick (x), 12 mm wide (y) and 75 mm long: closed, they make a 14 x 12 mm fingertip for buttons and
+toggles; open, each fits between objects 20 mm apart.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ STEEL = (0.55, 0.57, 0.60)
 
 
 def tool_urdf(*, flange_from_sensor: RigidTransform, flange_from_grip: RigidTransform, load_kg: float) -> list[str]:
-    """URDF lines of the tool. `load_kg`: all that hangs below the sensor; the gripper's body gets what the rest leaves."""
+    """URDF lines of the tool. `load_kg`: all below the sensor; the gripper's body gets what the rest leaves."""
     sensor_from_grip = flange_from_sensor.inv() * flange_from_grip
     body_kg = load_kg - SENSOR_MASS_KG - 2.0 * FINGER_MASS_KG
     # The sensor's own centre of mass lies in its origin: PyBullet reports the reaction there.

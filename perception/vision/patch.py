@@ -66,7 +66,7 @@ class Patch:
 
 
 def sample_at(image: NDArray[Any], u: Array, v: Array, *, outside: float | None = None) -> NDArray[np.float32]:
-    """Bilinear values of an image at coordinates of one or two dimensions; the border repeats unless `outside` is given."""
+    """Bilinear values at coordinates of one or two dimensions; the border repeats unless `outside` is given."""
     u32, v32 = np.atleast_2d(u).astype(np.float32), np.atleast_2d(v).astype(np.float32)
     border = cv2.BORDER_REPLICATE if outside is None else cv2.BORDER_CONSTANT
     values = cv2.remap(

@@ -91,8 +91,8 @@ def probability(evidence: Sequence[tuple[float, float, float]]) -> float:
     """Confidence from independent pieces of evidence by a logistic sum.
 
     Args:
-        evidence: `(measured, half, scale)` triples: each adds `(measured - half) / scale`. Doubt counts up to -6, assurance
-            up to +1: no strong point outweighs a weak one.
+        evidence: `(measured, half, scale)` triples: each adds `(measured - half) / scale`. Doubt counts up to -6,
+            assurance up to +1: no strong point outweighs a weak one.
     """
     total = sum(float(np.clip((measured - half) / scale, -6.0, 1.0)) for measured, half, scale in evidence)
     return float(1.0 / (1.0 + np.exp(-total)))

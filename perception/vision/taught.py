@@ -142,7 +142,7 @@ def patch_of(image: Image, gray: Image, view: View, spec: PanelObject, shift_px:
     half_width, half_height, height = footprint_m(spec)
     margin = LAMP_MARGIN if spec.kind in ("lamp", "button") else MARGIN
     plane = 0.0 if spec.kind == "toggle" else height
-    side = 0.003
+    side = 0.012 if spec.kind == "slider" else 0.003
     return rectify(
         image,
         view,

@@ -32,7 +32,7 @@ def choose(names: Sequence[str], evidence: Array, *, noise: float, seen: float, 
     confidence = probability(
         [
             (np.log(peak / noise), np.log(2.5), 0.3),
-            (np.log((rival + noise) / (peak + noise)), np.log(0.62), -0.12),
+            (np.log((rival + noise) / (peak + noise)), np.log(0.70), -0.12),
             (seen, 0.55, 0.1),
         ]
     )

@@ -151,7 +151,7 @@ def _refined(ink: Float32, comb: Comb, score: float, total: float) -> tuple[floa
             {"bottom_px": comb.bottom_px + s * d} for s in (-1, 1)] + [
             {"slant": comb.slant + s * step} for s in (-1, 1)]  # fmt: skip
         for _ in range(3):
-            tried = [replace(comb, **move) for move in moves]
+            tried = [_moved(comb, move) for move in moves]
             scores = np.where([_is_sound(c, ink.shape) for c in tried], explained(ink, tried) / total, -1.0)
             k = int(scores.argmax())
             if scores[k] <= score:
@@ -160,6 +160,10 @@ def _refined(ink: Float32, comb: Comb, score: float, total: float) -> tuple[floa
             comb, score = tried[k], float(scores[k])
             moves = [{key: value + change.get(key, 0.0) for key, value in move.items()} for move in moves]
     return score, comb
+
+
+def _moved(comb: Comb, move: dict[str, float]) -> Comb:
+    return replace(comb, **move)  # type: ignore[arg-type]  # only its float fields are moved
 
 
 def _is_sound(comb: Comb, shape: tuple[int, ...]) -> bool:

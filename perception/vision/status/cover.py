@@ -25,7 +25,7 @@ def covered(patch: Patch, *, half_width_m: float, half_height_m: float, is_round
         half_width_m, half_height_m: of the object; the patch must reach beyond it.
         is_round: whether the object is a disc (of `half_width_m`) and not a rectangle.
     """
-    smooth = cv2.GaussianBlur(patch.gray, (0, 0), 1.0)
+    smooth = np.asarray(cv2.GaussianBlur(patch.gray, (0, 0), 1.0), np.uint8)
     path_u, path_v = _path(patch, half_width_m, half_height_m, is_round)
     inside = (path_u > 1) & (path_v > 1) & (path_u < patch.gray.shape[1] - 2) & (path_v < patch.gray.shape[0] - 2)
     if inside.sum() < 16:

@@ -1,7 +1,7 @@
 """Seven-segment displays by geometry: ink, comb of digit cells, level of every segment, characters with a margin.
 
-Ink is a white-hat for glowing segments and a black-hat for dark ones, so gradients and glare borders vanish. Lit and unlit
-segments separate around one threshold that follows the brightness from cell to cell; each cell takes the character that
+Ink is a white-hat for glowing segments and a black-hat for dark ones, so gradients and glare borders vanish. Lit and
+unlit segments separate around one threshold that follows the brightness from cell to cell; each cell takes the character that
 explains its segments best within what a number may look like (blanks lead, one sign). The decimal point is what is left
 at the foot of a gap when the lit segments have been taken away.
 """
@@ -38,7 +38,7 @@ FREE_MIDDLE = 0.22  # how far digits may sit from the middle when their number i
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decoded:
-    """Text of one comb, the share of ink that it explains, its weakest character's margin and a lit segment's level."""
+    """Text of one comb, the share of ink it explains, its weakest character's margin, and a lit segment's level."""
 
     text: str
     explained: float

@@ -67,7 +67,7 @@ def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float) ->
 def one_sided_shade(
     patch: Patch, *, radius_m: float, ring: tuple[float, float], outside: tuple[float, float]
 ) -> tuple[float, float]:
-    """First harmonic of the brightness around a cap over its surroundings, and the direction of its bright side (rad).
+    """First harmonic of the brightness around a cap over its surroundings; direction of its bright side (rad).
 
     `ring` and `outside` are shares of `radius_m`; the harmonic outside (a glare's gradient) is taken off.
     """

@@ -33,7 +33,10 @@ def read_slider(patch: Patch, spec: Slider) -> Status:
     lean_m = _base_shift_m(patch, spec)  # the foot of the cap shows on that side of its top
     width = max(3, round((along + abs(lean_m)) / step))
     kernel = np.ones(width) / width
-    cover = covered(patch, half_width_m=footprint[0], half_height_m=footprint[1], is_round=False)
+    # The cap stands out and may lean over the footprint: look for what comes in from further away.
+    lean_px = float(np.linalg.norm(patch.parallax_px_per_m)) * spec.cap_size_m[2]
+    room_m = 0.004 + lean_px / patch.px_per_m
+    cover = covered(patch, half_width_m=footprint[0] + room_m, half_height_m=footprint[1] + room_m, is_round=False)
     open_ = np.ones_like(s) if cover is None else _open(patch, cover, spec.angle_rad, s, 0.4 * across)
     best = (-1.0, 0, np.zeros_like(s))
     for is_dark in (True, False):
@@ -70,7 +73,7 @@ def read_slider(patch: Patch, spec: Slider) -> Status:
 
 def _hat(profile: Array, width: int, is_dark: bool) -> Array:
     """What is narrower than twice the cap stands out; glare and shadow do not."""
-    size = round(2.0 * width) | 1
+    size = round(2.6 * width) | 1
     padded = np.pad(profile, size, mode="edge").astype(np.float32)[None]
     operation = cv2.MORPH_BLACKHAT if is_dark else cv2.MORPH_TOPHAT
     hat = cv2.morphologyEx(padded, operation, np.ones((1, size), np.uint8))[0, size:-size]

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from fusion.measurement import Batch
+from fusion.batch import Batch
 from fusion.solve import LocalSolution, middle_and_size
 from hal.errors import Unsupported
-from hal.geometry import Array, matrix_of
+from hal.geometry import Array
 
 SIZE = 16
 ROTATION, TRANSLATION, BACK = slice(1, 10), slice(10, 13), slice(13, 16)
@@ -60,8 +60,7 @@ def certificate(b: Batch, used: Array, local: LocalSolution) -> Certificate:
     Raises:
         Unsupported: clarabel is not installed.
     """
-    R = matrix_of(local.base_from_object)
-    t = np.array(local.base_from_object.translation)
+    R, t = local.rotation, local.translation_m
     lever, size = middle_and_size(b, np.asarray(used, bool), R)
     about, middle = R.T @ lever, t + lever  # features are taken from `about`, places from `middle`, in units of `size`
     Q = quadratic_form(b, np.asarray(used, bool), R, t, about, middle, size)

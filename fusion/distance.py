@@ -12,7 +12,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from fusion.exact import evaluate
-from fusion.measurement import Batch, Measurement, checked, pack
+from fusion.batch import Batch, pack
+from fusion.measurement import Measurement
 from hal.geometry import Array, matrix_of
 
 
@@ -20,7 +21,7 @@ def local_values(measurements: Sequence[Measurement], base_from_object: RigidTra
     """(N,) exact local pose functions f_i at a pose, without unit.
 
     Raises:
-        InvalidRequest: a measurement makes no sense; see `fusion.measurement.checked`.
+        InvalidRequest: a measurement makes no sense; see `fusion.batch.pack`.
     """
     return local_values_and_gradients(measurements, base_from_object)[0]
 
@@ -35,7 +36,7 @@ def local_values_and_gradients(
     Raises:
         InvalidRequest: a measurement makes no sense.
     """
-    b = pack(checked(measurements))
+    b = pack(measurements)
     f, gradients, _ = batch_values(b, matrix_of(base_from_object), np.array(base_from_object.translation))
     return f, gradients
 

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from fusion.measurement import Batch
+from fusion.batch import Batch
 from fusion.rows import log_volumes
 from fusion.solve import LocalSolution
-from hal.geometry import Array, matrix_of
+from hal.geometry import Array
 
 POSE_VOLUME = 8.0 * math.pi**2  # of all rotations (as rotation vectors spread evenly), times one cubic metre
 
@@ -27,8 +27,7 @@ def log_evidence(b: Batch, used: Array, local: LocalSolution) -> float:
     """
     n, k = len(b.cls), int(np.sum(used))
     volumes = np.zeros(n)
-    R = matrix_of(local.base_from_object)
-    log_volumes(b, R, np.array(local.base_from_object.translation), volumes)
+    log_volumes(b, local.rotation, local.translation_m, volumes)
     gains = -volumes[used] - 0.5 * local.values[used]
     spread = 0.5 * np.linalg.slogdet(2.0 * math.pi * local.covariance)[1]
     choices = math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from fusion.exact import evaluate
-from fusion.measurement import Batch
+from fusion.batch import Batch
 from fusion.rows import accumulate, descend, rows
 from fusion.vectors import cholesky, compiled, move, solve_lower, solve_upper
 from hal.geometry import Array

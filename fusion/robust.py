@@ -12,24 +12,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from fusion import search
+from fusion.batch import Batch, duplicates, pack
 from fusion.certify import Certificate, certificate
 from fusion.errors import Contradiction
 from fusion.evidence import log_evidence
-from fusion.measurement import Batch, Measurement, checked, duplicates, pack
+from fusion.measurement import Measurement
 from fusion.observability import FreeDirection
+from fusion.rows import values
 from fusion.solve import LocalSolution, local_solution
 from hal.errors import InvalidRequest
-from hal.geometry import Array, UncertainPose, matrix_of
+from hal.geometry import Array, UncertainPose
 
 MOST_SEARCHED = 96  # measurements that the search looks at; the finish uses all
 HYPOTHESES = 6000  # at most
-FIRST_ROUND = 48
+FIRST_ROUND = 32
 MISS_PROBABILITY = 1e-5  # of never drawing a clean subset that also converges
 CONVERGES = 0.25  # share of clean subsets that reach their pose from a random rotation (measured 0.35)
 SETTLED_PER_ROUND = 8
+LARGEST_ROUND = 512
 ALTERNATIVE_COST = 18.0  # a minimum this much worse has odds below 1e-4
 SAME_SIGMAS = 6.0  # minima closer than this are one
 EVIDENCE_NEEDED = math.log(1000.0)
@@ -59,14 +62,14 @@ class Alternative:
     """Another pose that the data allow, for example the mirror image.
 
     Attributes:
-        base_from_object: the pose.
+        pose: base_from_object.
         covariance: 6x6, translation then rotation, base axes.
         cost: its truncated error; the answer's is the least.
         odds: how probable it is relative to the answer, 0 to 1.
         rejected: indices that it calls mismatched.
     """
 
-    base_from_object: RigidTransform
+    pose: RigidTransform
     covariance: Array
     cost: float
     odds: float
@@ -134,13 +137,14 @@ def fuse(
     """
     if not len(measurements) and prior is None:
         raise InvalidRequest("no measurement to fuse", hint="give at least one measurement or a prior pose")
-    good = checked(measurements)
-    repeats = duplicates(good)
-    kept = [i for i in range(len(good)) if i not in repeats]
-    b = pack([good[i] for i in kept], prior)
-    index = np.array([*kept, *([-1] if prior is not None else [])])
+    repeats = duplicates(measurements)
+    index = np.array([*range(len(measurements)), *([-1] if prior is not None else [])])
+    b = pack(measurements, prior)
+    if repeats:
+        first = np.array([i not in repeats for i in index])
+        index, b = index[first], b.part(first)
     best, others = _minima(b, np.random.default_rng(seed))
-    return _judged(b, best, others, index, good, repeats, certify)
+    return _judged(b, best, others, index, measurements, repeats, certify)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -152,48 +156,70 @@ class _Minimum:
     local: LocalSolution
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Candidates:
+    """Settled poses, cheapest first: rotations (K, 3, 3), translations (K, 3), truncated errors (K,)."""
+
+    R: Array
+    t: Array
+    cost: Array
+
+
 def _minima(b: Batch, rng: np.random.Generator) -> tuple[_Minimum, list[_Minimum]]:
     """The best minimum and the other distinct ones within ALTERNATIVE_COST, best first."""
     n = len(b.cls)
-    small = b if n <= MOST_SEARCHED else _part(b, np.sort(rng.choice(n, MOST_SEARCHED, replace=False)))
+    small = b if n <= MOST_SEARCHED else b.part(np.sort(rng.choice(n, MOST_SEARCHED, replace=False)))
     poses = _search(small, rng)
-    poses += [(c, *p) for c, R, t in poses[:1] for p in _mirrored(small, R, t)]
     found: list[_Minimum] = []
-    least = np.inf
-    for _, R, t in sorted(poses, key=lambda pose: pose[0]):
-        f = np.empty(n)
-        cost = search.settle(b, R, t, f, False)
-        if cost > least + ALTERNATIVE_COST + 5.0 or any(_same(_pose(R, t), m.local) for m in found):
+    f, least = np.empty(n), np.inf
+    for k in range(len(poses.cost)):
+        R, t = poses.R[k], poses.t[k]
+        if any(_same(R, t, m.local) for m in found):
             continue
-        minimum = _finished(b, R, t, f < b.gate)
-        least = min(least, minimum.cost)
-        if not any(_same(minimum.local.base_from_object, m.local) for m in found):
+        if small is not b:
+            search.settle(b, R, t, f, False)
+        minimum = _finished(b, R, t)
+        if minimum.cost < least + ALTERNATIVE_COST and not any(
+            _same(minimum.local.rotation, minimum.local.translation_m, m.local) for m in found
+        ):
             found.append(minimum)
+            least = min(least, minimum.cost)
     found.sort(key=lambda m: m.cost)
     return found[0], [m for m in found[1:] if m.cost < found[0].cost + ALTERNATIVE_COST]
 
 
-def _search(b: Batch, rng: np.random.Generator) -> list[tuple[float, Array, Array]]:
-    """Settled candidates (cost, R, t), from rounds of subsets until a better pose is improbable."""
-    n = len(b.cls)
-    done, size = 0, FIRST_ROUND
-    found: list[tuple[float, Array, Array]] = []
-    inside = 0
+def _search(b: Batch, rng: np.random.Generator) -> _Candidates:
+    """Settled candidates from rounds of subsets, until a better pose is improbable; only those near the least cost."""
+    n, done, size = len(b.cls), 0, FIRST_ROUND
+    rounds: list[tuple[Array, Array, Array]] = []
+    least, agreeing = np.inf, 0
     while True:
         draws = rng.random((size, search.DRAWS))
         draws[:, search.SUBSET_MOST :] = rng.normal(size=(size, 4))
-        Rs, ts, costs = np.empty((size, 3, 3)), np.empty((size, 3)), np.empty(size)
-        search.hypotheses(b, draws, Rs, ts, costs)
-        for h in np.argsort(costs)[:SETTLED_PER_ROUND]:
-            f = np.empty(n)
-            cost = search.settle(b, Rs[h], ts[h], f, True)
-            if not found or cost < min(c for c, _, _ in found):
-                inside = int(np.sum(f < b.gate))
-            found.append((cost, Rs[h], ts[h]))
+        R, t, cost, inside = np.empty((size, 3, 3)), np.empty((size, 3)), np.empty(size), np.empty(size, np.int64)
+        kept = search.candidates(b, draws, SETTLED_PER_ROUND, R, t, cost, inside)
+        rounds.append((R[:kept], t[:kept], cost[:kept]))
+        if kept and cost[0] < least:
+            least, agreeing = float(cost[0]), int(inside[0])
         done += size
-        if done >= min(_enough(n, inside, float(b.dof.mean())), HYPOTHESES):
-            return sorted(found, key=lambda c: c[0])
-        size = min(2 * size, 512)
+        wanted = min(_enough(n, agreeing, float(b.dof.mean())), HYPOTHESES)
+        if done >= wanted:
+            break
+        size = int(min(max(wanted - done, FIRST_ROUND), LARGEST_ROUND, 3 * size))
+    R, t, cost = (np.concatenate(part) for part in zip(*rounds, strict=True))
+    if not len(cost):
+        raise Contradiction.among(0, n, [])
+    return _nearby(b, _Candidates(R=R, t=t, cost=cost))
+
+
+def _nearby(b: Batch, found: _Candidates) -> _Candidates:
+    """Candidates near the least cost, with the mirror images of the best one."""
+    best = int(np.argmin(found.cost))
+    R, t, cost = _mirrored(b, found.R[best], found.t[best])
+    R, t, cost = np.concatenate([found.R, R]), np.concatenate([found.t, t]), np.concatenate([found.cost, cost])
+    order = np.argsort(cost, kind="stable")
+    order = order[cost[order] < cost[order[0]] + ALTERNATIVE_COST + 5.0]
+    return _Candidates(R=R[order], t=t[order], cost=cost[order])
 
 
 def _enough(n: int, inside: int, mean_dof: float) -> float:
@@ -203,44 +229,43 @@ def _enough(n: int, inside: int, mean_dof: float) -> float:
     return math.log(MISS_PROBABILITY) / math.log1p(-CONVERGES * clean) if clean > 0 else np.inf
 
 
-def _mirrored(b: Batch, R: Array, t: Array) -> list[tuple[Array, Array]]:
-    """The pose turned by half a turn about each principal axis of the features, through their middle."""
+def _mirrored(b: Batch, R: Array, t: Array) -> tuple[Array, Array, Array]:
+    """Settled poses from half a turn about each principal axis of the features, through their middle; and their costs."""
     points = b.m[b.cls > 0]
     if not len(points):
-        return []
+        return np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0)
     middle = points.mean(axis=0)
     axes = np.linalg.svd(points - middle, full_matrices=True)[2]
-    turns = [2.0 * np.outer(a, a) - np.eye(3) for a in axes]
-    return [(R @ turn, t + R @ (middle - turn @ middle)) for turn in turns]
+    turns = 2.0 * axes[:, :, None] * axes[:, None, :] - np.eye(3)
+    Rs, ts = R @ turns, t + (middle - turns @ middle) @ R.T
+    f = np.empty(len(b.cls))
+    costs = np.array([search.settle(b, Rs[k], ts[k], f, True) for k in range(3)])
+    return Rs, ts, costs
 
 
-def _finished(b: Batch, R: Array, t: Array, used: Array) -> _Minimum:
-    """The exact minimum with the set of used measurements brought into agreement with the exact gate."""
+def _finished(b: Batch, R: Array, t: Array) -> _Minimum:
+    """The exact minimum near R, t with the set of used measurements brought into agreement with the exact gate."""
+    f = np.empty(len(b.cls))
+    values(b, R, t, False, f)
+    used = f < b.gate
     for _ in range(6):
         local = local_solution(b, used.astype(float), R, t, far=False)
         inside = local.values < b.gate
         if np.array_equal(inside, used) or not inside.any():
             break
-        used = inside
-        R, t = matrix_of(local.base_from_object), np.array(local.base_from_object.translation)
+        used, R, t = inside, local.rotation, local.translation_m
     return _Minimum(cost=float(np.minimum(local.values, b.gate).sum()), used=used, local=local)
 
 
-def _same(pose: RigidTransform, local: LocalSolution) -> bool:
-    """Is `pose` within a few standard deviations of a minimum (free directions do not count)?"""
-    other = local.base_from_object
-    turn = (pose.rotation * other.rotation.inv()).as_rotvec()
-    delta = np.concatenate([pose.translation - other.translation, turn])
-    return bool(delta @ np.linalg.solve(local.covariance, delta) < SAME_SIGMAS**2 + 1e-12)
-
-
-def _pose(R: Array, t: Array) -> RigidTransform:
-    return RigidTransform.from_components(t, Rotation.from_matrix(R))
-
-
-def _part(b: Batch, chosen: Array) -> Batch:
-    rows = {name: getattr(b, name)[chosen] for name in Batch._fields if not name.startswith("prior")}
-    return b._replace(**rows)
+def _same(R: Array, t: Array, local: LocalSolution) -> bool:
+    """Is R, t within a few standard deviations of a minimum? (Free directions do not count.)"""
+    W = R @ local.rotation.T
+    half = 0.5 * np.array([W[2, 1] - W[1, 2], W[0, 2] - W[2, 0], W[1, 0] - W[0, 1]])
+    cosine, sine = 0.5 * (np.trace(W) - 1.0), math.sqrt(half @ half)
+    if cosine < 0.0 and not local.unobservable:
+        return False
+    delta = np.concatenate([t - local.translation_m, half * (math.atan2(sine, cosine) / sine if sine > 1e-12 else 1.0)])
+    return bool(delta @ local.information @ delta < SAME_SIGMAS**2)
 
 
 def _judged(
@@ -252,13 +277,13 @@ def _judged(
     repeats: dict[int, int],
     certify: bool,
 ) -> FusedPose:
-    values = np.zeros(len(given))
+    f = np.zeros(len(given))
     own = index >= 0
-    values[index[own]] = best.local.values[own]
+    f[index[own]] = best.local.values[own]
     for repeat, first in repeats.items():
-        values[repeat] = values[first]
+        f[repeat] = f[first]
     rejected = _rejected(b, best, index, given) + [
-        Rejected(index=i, label=given[i].label, value=values[i], limit=0.0, reason=f"duplicate of measurement {first}")
+        Rejected(index=i, label=given[i].label, value=float(f[i]), limit=0.0, reason=f"duplicate of measurement {first}")
         for i, first in repeats.items()
     ]
     evidence = log_evidence(b, best.used, best.local)
@@ -271,7 +296,7 @@ def _judged(
         covariance=local.covariance,
         chi_square=local.chi_square,
         dof=local.dof,
-        values=values,
+        values=f,
         rejected=tuple(sorted(rejected, key=lambda r: r.index)),
         unobservable=local.unobservable,
         alternatives=() if local.unobservable else _alternatives(best, others, index),
@@ -296,7 +321,7 @@ def _rejected(b: Batch, best: _Minimum, index: Array, given: Sequence[Measuremen
 def _alternatives(best: _Minimum, others: Sequence[_Minimum], index: Array) -> tuple[Alternative, ...]:
     made = [
         Alternative(
-            base_from_object=m.local.base_from_object,
+            pose=m.local.base_from_object,
             covariance=m.local.covariance,
             cost=m.cost,
             odds=_odds(m, best),
@@ -312,3 +337,16 @@ def _odds(m: _Minimum, best: _Minimum) -> float:
     """exp(-delta/2) sqrt(det cov / det cov_best): share of the posterior around each (Laplace)."""
     size = np.linalg.slogdet(m.local.covariance)[1] - np.linalg.slogdet(best.local.covariance)[1]
     return float(np.exp(min(0.5 * (best.cost - m.cost) + 0.5 * size, 0.0)))
+
+
+def used_entries(measurements: Sequence[Measurement], answer: FusedPose) -> tuple[Batch, Array, LocalSolution]:
+    """An answer's measurements packed, which of them it used (N,), and the local solution there: for a certificate.
+
+    Raises:
+        InvalidRequest: a measurement makes no sense.
+    """
+    b = pack(measurements)
+    used = np.ones(len(measurements), bool)
+    used[[r.index for r in answer.rejected if r.index >= 0]] = False
+    R, t = answer.pose.rotation.as_matrix(), np.array(answer.pose.translation)
+    return b, used, local_solution(b, used.astype(float), R, t, far=False)

@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from fusion.measurement import Batch
+from fusion.batch import Batch
 from fusion.vectors import (
     Vec,
     across,

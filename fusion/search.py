@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from fusion.measurement import Batch
+from fusion.batch import Batch
 from fusion.rows import descend, rows, values
 from fusion.vectors import cholesky, compiled, inlined, solve_lower, solve_upper, turned, vec
 from hal.geometry import Array
@@ -116,6 +116,34 @@ def truncated(b: Batch, f: Array) -> float:
     for i in range(f.size):
         cost += min(f[i], b.gate[i])
     return cost
+
+
+@compiled
+def candidates(b: Batch, draws: Array, most: int, Rs: Array, ts: Array, costs: Array, inside: Array) -> int:
+    """One round: hypotheses from `draws` (H, DRAWS), of which the best `most` are settled.
+
+    The first so many rows of Rs (H, 3, 3), ts (H, 3), costs (H,) are the settled ones, cheapest first, with the number of
+    measurements inside their gates in `inside` (H,). Returns how many.
+    """
+    n, count = b.cls.size, draws.shape[0]
+    hypotheses(b, draws, Rs, ts, costs)
+    order = np.argsort(costs)
+    kept = 0
+    f = np.empty(n)
+    R, t, cost = np.empty((most, 3, 3)), np.empty((most, 3)), np.empty(most)
+    number = np.empty(most, np.int64)
+    for h in order[:most]:
+        if costs[h] < np.inf:
+            R[kept], t[kept] = Rs[h], ts[h]
+            cost[kept] = settle(b, R[kept], t[kept], f, True)
+            number[kept] = 0
+            for i in range(n):
+                number[kept] += f[i] < b.gate[i]
+            kept += 1
+    order = np.argsort(cost[:kept])
+    for k in range(kept):
+        Rs[k], ts[k], costs[k], inside[k] = R[order[k]], t[order[k]], cost[order[k]], number[order[k]]
+    return kept
 
 
 @compiled

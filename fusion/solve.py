@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from fusion.measurement import Batch, Measurement, checked, pack
+from fusion.batch import Batch, pack
+from fusion.measurement import Measurement
 from fusion.observability import FreeDirection, covariance_and_freedom
 from fusion.polish import solve_from
 from fusion.search import place
@@ -23,7 +24,7 @@ class LocalSolution:
     """A minimum of the error over all given measurements.
 
     Attributes:
-        base_from_object: the pose.
+        rotation, translation_m: the pose, base_from_object, (3, 3) and (3,).
         covariance: 6x6, translation then rotation, base axes, m and rad; free directions carry 10 object sizes or 10 rad.
         information: 6x6 in the same order.
         values: (N,) exact local pose functions, the prior's share last if there was one.
@@ -32,13 +33,19 @@ class LocalSolution:
         unobservable: motions that the measurements leave free.
     """
 
-    base_from_object: RigidTransform
+    rotation: Array
+    translation_m: Array
     covariance: Array
     information: Array
     values: Array
     chi_square: float
     dof: int
     unobservable: tuple[FreeDirection, ...]
+
+    @property
+    def base_from_object(self) -> RigidTransform:
+        """The pose."""
+        return RigidTransform.from_components(self.translation_m, Rotation.from_matrix(self.rotation))
 
 
 def solve(
@@ -51,7 +58,7 @@ def solve(
     """
     if not len(measurements) and prior is None:
         raise InvalidRequest("no measurement to fuse", hint="give at least one measurement or a prior pose")
-    b = pack(checked(measurements), prior)
+    b = pack(measurements, prior)
     return local_solution(b, np.ones(len(b.cls)), matrix_of(start), np.array(start.translation))
 
 
@@ -69,7 +76,7 @@ def solve_from_many(
     """
     if not len(measurements):
         raise InvalidRequest("no measurement to fuse", hint="give at least one measurement")
-    b = pack(checked(measurements), prior)
+    b = pack(measurements, prior)
     use = np.ones(len(b.cls))
     found = [_started(b, use, R) for R in Rotation.random(starts, rng=np.random.default_rng(seed)).as_matrix()]
     return min(found, key=lambda s: s.chi_square)
@@ -90,7 +97,8 @@ def local_solution(b: Batch, use: Array, rotation: Array, translation_m: Array, 
     chosen = use > 0
     covariance, free = covariance_and_freedom(H, *middle_and_size(b, chosen, R))
     return LocalSolution(
-        base_from_object=RigidTransform.from_components(t, Rotation.from_matrix(R)),
+        rotation=R,
+        translation_m=t,
         covariance=covariance,
         information=H,
         values=f,

@@ -1,0 +1,171 @@
+"""Measurements checked and laid out as arrays for the compiled loops."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from fusion.measurement import NULL_RATIO, Measurement, constraints_of
+from hal.errors import InvalidRequest
+from hal.geometry import Array, UncertainPose, matrix_of
+
+GATE_PROBABILITY = 0.999  # a good measurement passes its gate with this probability (notes/fusion.md, "Robust")
+GATES = np.array([np.inf, *chi2.ppf(GATE_PROBABILITY, np.arange(1, 7))])
+FAR_M = 100.0  # no panel is this far away: such a number is in millimetres
+WIDE_M = 10.0  # no sensor is this poor
+SHARP_M = 1e-9  # and none this good
+SHARP_RAD = 1e-9
+_DOF = np.array([[6] * 4] + [[constraints_of(c, rank) for rank in range(4)] for c in range(1, 10)])
+_FIELDS = (("x_m", (3,)), ("u", (3,)), ("mu_m", (3,)), ("C_m2", (3, 3)), ("M", (3, 3)))
+_UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+
+
+class Batch(NamedTuple):
+    """Measurements as arrays; symmetric matrices as (xx, xy, xz, yy, yz, zz).
+
+    cls, dof: (N,) integers; m, w: (N, 3) object point and direction; mu: (N, 3); C, A, M: (N, 6) covariance, its inverse and
+    direction information; d, a1, a2: (N, 3) null direction of M and the two others; p: (N, 2) their information,
+    1/rad^2; gate: (N,) chi-square limits; prior_*: pose (3, 3), (3,), whitening (6, 6) so that |W delta|^2 is chi-square.
+
+    A prior pose is one more entry with cls 0 at the end.
+    """
+
+    cls: NDArray[np.int64]
+    dof: NDArray[np.int64]
+    m: Array
+    w: Array
+    mu: Array
+    C: Array
+    A: Array
+    M: Array
+    d: Array
+    a1: Array
+    a2: Array
+    p: Array
+    gate: Array
+    prior_r: Array
+    prior_t: Array
+    prior_w: Array
+
+    def part(self, chosen: Array) -> Batch:
+        """The entries at the indices (or mask) `chosen`, with the same prior pose."""
+        return self._replace(**{k: getattr(self, k)[chosen] for k in self._fields if not k.startswith("prior")})
+
+
+def pack(measurements: Sequence[Measurement], prior: UncertainPose | None = None) -> Batch:
+    """Check measurements and lay them out; the prior, if any, becomes the last entry.
+
+    Raises:
+        InvalidRequest: wrong shape, NaN, zero direction, C not positive definite, M indefinite, or numbers that can only
+            be in another unit; `details` holds `index` and `reason`. Or the prior's covariance makes no sense.
+    """
+    for i, one in enumerate(measurements):
+        for name, shape in _FIELDS:
+            if np.shape(getattr(one, name)) != shape:
+                raise _bad(measurements, i, f"{name} has shape {np.shape(getattr(one, name))}, not {shape}",
+                           "see fusion.measurement.Measurement")  # fmt: skip
+    n, extra = len(measurements), int(prior is not None)
+    cls = np.array([m.cls for m in measurements] + [0] * extra, np.int64)
+    m, u, mu = (_stacked(measurements, name, np.zeros(3), extra) for name in ("x_m", "u", "mu_m"))
+    C, M = _stacked(measurements, "C_m2", np.eye(3), extra), _stacked(measurements, "M", np.zeros((3, 3)), extra)
+    _check_numbers(measurements, m[:n], u[:n], mu[:n], C[:n], M[:n])
+    length = np.linalg.norm(u, axis=1)
+    aimless = np.isin(cls, (0, 1, 4, 7))  # a point's direction means nothing
+    w = np.where(aimless[:, None], [0.0, 0.0, 1.0], u / np.maximum(length, 1e-300)[:, None])
+    C, M = (C + C.transpose(0, 2, 1)) / 2, (M + M.transpose(0, 2, 1)) / 2
+    values, vectors = np.linalg.eigh(M)
+    _check_matrices(measurements, cls[:n], np.where(aimless, 1.0, length)[:n], np.linalg.eigvalsh(C[:n]), values[:n])
+    p = np.where(values[:, 1:] > NULL_RATIO * np.maximum(values[:, 2:], 1e-300), values[:, 1:], 0.0)
+    dof = _DOF[cls, (p > 0).sum(axis=1)]
+    prior_r, prior_t, prior_w = np.eye(3), np.zeros(3), np.zeros((6, 6))
+    if prior is not None:
+        prior_r, prior_t = matrix_of(prior.parent_from_child), np.array(prior.parent_from_child.translation)
+        prior_w = _whitening(prior.covariance)
+    return Batch(
+        cls=cls, dof=dof, m=m, w=w, mu=mu,
+        C=_sym6(C), A=_sym6(np.linalg.inv(C)), M=_sym6(M),
+        d=np.ascontiguousarray(vectors[:, :, 0]),
+        a1=np.ascontiguousarray(vectors[:, :, 1]),
+        a2=np.ascontiguousarray(vectors[:, :, 2]),
+        p=p, gate=GATES[dof], prior_r=prior_r, prior_t=prior_t, prior_w=prior_w,
+    )  # fmt: skip
+
+
+def duplicates(measurements: Sequence[Measurement]) -> dict[int, int]:
+    """Index of each measurement that repeats an earlier one number by number, and which one it repeats."""
+    seen: dict[tuple[object, ...], int] = {}
+    found: dict[int, int] = {}
+    for i, m in enumerate(measurements):
+        key = (int(m.cls), *(np.asarray(a, float).tobytes() for a in (m.x_m, m.u, m.mu_m, m.C_m2, m.M)))
+        first = seen.setdefault(key, i)
+        if first != i:
+            found[i] = first
+    return found
+
+
+def _bad(measurements: Sequence[Measurement], i: int, what: str, hint: str) -> InvalidRequest:
+    label = measurements[i].label
+    name = f"measurement {i} ({label})" if label else f"measurement {i}"
+    return InvalidRequest(f"{name}: {what}", hint=hint, index=i, reason=what)
+
+
+def _stacked(measurements: Sequence[Measurement], name: str, filler: Array, extra: int) -> Array:
+    return np.array([getattr(m, name) for m in measurements] + [filler] * extra, float).reshape(-1, *filler.shape)
+
+
+def _check_numbers(given: Sequence[Measurement], m: Array, u: Array, mu: Array, C: Array, M: Array) -> None:
+    """Refuse what is not finite, not symmetric or not in metres."""
+    for (name, _), value in zip(_FIELDS, (m, u, mu, C, M), strict=True):
+        _refuse(given, ~_each(np.isfinite(value)), f"{name} holds a number that is not finite",
+                "leave out readings that the sensor did not make")  # fmt: skip
+    for name, value in (("x_m", m), ("mu_m", mu)):
+        _refuse(given, ~_each(np.abs(value) <= FAR_M), f"{name} lies beyond {FAR_M:.0f} m",
+                "lengths are in metres, not millimetres")  # fmt: skip
+    for name, value in (("C", C), ("M", M)):
+        largest = np.abs(value).max(axis=(1, 2), initial=0.0)[:, None, None]
+        _refuse(given, ~_each(np.abs(value - value.transpose(0, 2, 1)) <= 1e-6 * largest), f"{name} is not symmetric",
+                "C is a covariance in m^2, M an information matrix in 1/rad^2")  # fmt: skip
+
+
+def _check_matrices(given: Sequence[Measurement], cls: Array, length: Array, variances: Array, M: Array) -> None:
+    """Refuse impossible directions and matrices, by the (N, 3) eigenvalues of C and M in rising order."""
+    _refuse(given, length < 1e-9, "the object feature's direction is zero", "a line or plane needs a direction")
+    _refuse(given, (variances[:, 0] <= 1e-13 * variances[:, 2]) | (variances[:, 2] <= 0), "C is not positive definite",
+            "C is a covariance in m^2; nothing is known exactly in any direction")  # fmt: skip
+    _refuse(given, (variances[:, 2] > WIDE_M**2) | (variances[:, 2] < SHARP_M**2),
+            f"C means a standard deviation beyond {SHARP_M:g} .. {WIDE_M:g} m",
+            "C is a covariance in m^2, not in mm^2, and not its inverse")  # fmt: skip
+    _refuse(given, M[:, 0] < -1e-6 * np.maximum(np.abs(M[:, 2]), 1e-12), "M is indefinite",
+            "M is zero along the measured direction and positive across it")  # fmt: skip
+    _refuse(given, M[:, 2] > SHARP_RAD**-2, f"M means a direction better than {SHARP_RAD:g} rad", "M is in 1/rad^2")
+    _refuse(given, (cls >= 4) & (M[:, 2] <= 0), "a sensed line or plane needs M", "give M, or declare a sensed point")
+    _refuse(given, (cls >= 4) & (M[:, 0] > np.maximum(1e-3 * M[:, 2], 1e-3)), "M has no null direction",
+            "M must vanish along the measured direction")  # fmt: skip
+
+
+def _each(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return holds.reshape(len(holds), -1).all(axis=1)
+
+
+def _refuse(given: Sequence[Measurement], wrong: NDArray[np.bool_], what: str, hint: str) -> None:
+    if wrong.any():
+        raise _bad(given, int(np.argmax(wrong)), what, hint)
+
+
+def _sym6(S: Array) -> Array:
+    return np.ascontiguousarray(S[:, _UPPER[0], _UPPER[1]])
+
+
+def _whitening(covariance: Array) -> Array:
+    """W with W^T W = covariance^-1."""
+    if not np.isfinite(covariance).all():
+        raise InvalidRequest("the prior pose has a covariance that is not finite", hint="leave the prior out")
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    if values[0] < -1e-9 * max(values[5], 1e-12):
+        raise InvalidRequest("the prior pose's covariance is indefinite", hint="check its order and sign")
+    # A pose known better than 1 um or 1 urad is a claim, not knowledge; it would freeze the solution.
+    return np.asarray(vectors.T / np.sqrt(np.maximum(values, 1e-12))[:, None])

@@ -80,7 +80,9 @@ OPERATIONS = {
         Operation(name="echo", request_model=EchoRequest, run=echo, summary="Echo", example={"text": "a"}, moves=False),
         Operation(name="hold", request_model=HoldRequest, run=hold, summary="Hold", example={"seconds": 0.1}),
         Operation(name="wait", request_model=HoldRequest, run=wait, summary="Wait", example={"seconds": 0.1}),
-        Operation(name="fail", request_model=FailRequest, run=fail, summary="Fail", example={"defect": False}),
+        Operation(
+            name="fail", request_model=FailRequest, run=fail, summary="Fail", example={"defect": False}, moves=False
+        ),
         Operation(name="measure", request_model=EchoRequest, run=measure, summary="Measure", moves=False),
     )
 }

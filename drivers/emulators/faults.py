@@ -58,8 +58,10 @@ class FaultPlan:
         return self.options.fault
 
     def flip_bit(self, frame: bytes, protected: slice) -> bytes:
-        """One bit of the part that a check sum or header rule protects, flipped."""
+        """One bit of the part that a check sum or header rule protects, flipped; a frame without any is lost."""
         places = range(len(frame))[protected]
+        if not places:
+            return b""
         place = self._random.choice(places)
         return frame[:place] + bytes([frame[place] ^ 1 << self._random.randrange(8)]) + frame[place + 1 :]
 

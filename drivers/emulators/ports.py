@@ -9,6 +9,7 @@ import select
 import shutil
 import socket
 import tempfile
+import termios
 import time
 import tty
 from contextlib import suppress
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 LOOPBACK = "127.0.0.1"
+OUTPUT_SPEED = 5  # place in the list of `tcgetattr`
 Peer = Any  # whatever tells a port's peers apart: a connection, an address, nothing
 
 
@@ -100,6 +102,13 @@ class PtyPort:
             return
         with suppress(BlockingIOError):
             os.write(self._fds[0], data)
+
+    def speed(self) -> int:
+        """The speed that the driver has set, as a `termios` constant."""
+        if self._fds is None:
+            return 0
+        attributes = termios.tcgetattr(self._fds[1])
+        return int(attributes[OUTPUT_SPEED])
 
     def close(self) -> None:
         """Hang up and remove the folder."""
@@ -226,7 +235,7 @@ class UdpPort:
 
     def send(self, peer: Peer, data: bytes) -> None:
         """One datagram to `peer`."""
-        if self._sock is None or peer is None:
+        if self._sock is None or peer is None or not data:
             return
         try:
             self._sock.sendto(data, peer)

@@ -20,7 +20,7 @@ from hal.registry import Context
 T = TypeVar("T")
 SLICE_S = 0.02  # a stream reader looks up this often, so that close() is quick
 CONNECT_S = 2.0
-REFUSED_S = 0.4  # a port that cannot be opened for so long is not there
+REFUSED_S = 1.0  # a port that cannot be opened for so long is not there
 
 
 def wall_until(deadline: Deadline, cap_s: float = 3600.0) -> float:

@@ -1,0 +1,133 @@
+"""Bota SensONE over serial: binary frames with CRC and a microsecond clock (the maker's BotaForceTorqueSensorComm)."""
+
+from __future__ import annotations
+
+import struct
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from drivers.ft300 import RangeOptions, capabilities
+from drivers.transport.checks import crc_x25
+from drivers.transport.device import StreamDevice
+from drivers.transport.framing import Framer
+from drivers.transport.link import Link, NoAnswer, drain_until_quiet, now_s
+from drivers.transport.options import SerialOptions, read_options, serial_opener
+from drivers.transport.timebase import HostTime, Unwrapper
+from hal.clock import Deadline
+from hal.devices import DeviceKind, ForceTorqueCapabilities, Wrench
+from hal.readings import Cause, Quality, Stamped
+from hal.registry import Context
+
+FRAME_BYTES = 37
+BODY = struct.Struct("<H6fIf")
+SLOW, OVERRANGE, INVALID, RAW = 1, 2, 4, 8
+SINC_S = 19.53125e-6  # sampling period for one unit of filter length
+POWER_UP_TEXT = b"App Init"
+ANSWER_S = 0.25
+ATTEMPTS = 4
+
+
+class BotaOptions(SerialOptions, RangeOptions):
+    """Options of `serial:bota`; `sinc_length` sets the rate: 512 gives 100 Hz, 64 gives 800 Hz."""
+
+    baud: Annotated[int, Field(ge=300, le=4_500_000)] = 460_800
+    sinc_length: Annotated[int, Field(ge=51, le=512)] = 512
+    max_age_s: Annotated[float, Field(gt=0, le=1)] = 0.05
+
+
+def framer() -> Framer:
+    """AA, 34 bytes, CRC over them."""
+    return Framer(b"\xaa", FRAME_BYTES, lambda f: crc_x25(f[1:-2]) == f[-2] | f[-1] << 8)
+
+
+class Bota(StreamDevice[Wrench]):
+    """A wrist sensor on a serial line."""
+
+    kind = DeviceKind.FORCE_TORQUE
+
+    def __init__(self, context: Context, options: BotaOptions) -> None:
+        opener, name = serial_opener(options, context.name)
+        super().__init__(context, open_link=opener, link_name=name, max_age_s=options.max_age_s, silence_s=0.3)
+        self._options = options
+        self._framer = framer()
+        self._clock = Unwrapper(bits=32, tick_s=1e-6)
+        self._host = HostTime()
+        self._last_us: int | None = None
+        self._bad_before = 0
+
+    @property
+    def period_s(self) -> float:
+        """Time between samples."""
+        return self._options.sinc_length * SINC_S
+
+    def capabilities(self) -> ForceTorqueCapabilities:
+        """From the options."""
+        return capabilities(self._options, 1.0 / self.period_s)
+
+    def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:
+        """Newest raw wrench."""
+        return self.newest(deadline)
+
+    def start(self, link: Link) -> None:
+        """Into set-up mode, set the filter, run."""
+        self._command(link, "C")
+        self._command(link, f"f,{self._options.sinc_length},0,0,0", answer="f")
+        drain_until_quiet(link, quiet_s=0.01, until_s=now_s() + ANSWER_S)
+        self._command(link, "R")
+        self._framer.reset()
+        self._clock, self._last_us = Unwrapper(bits=32, tick_s=1e-6), None
+        self._host.reset()
+
+    def _command(self, link: Link, text: str, *, answer: str | None = None) -> None:
+        """Send until `r,0,X,0` stands among the data; `r` with another number is a refusal, which repeats too."""
+        wanted = f"r,0,{answer or text},0".encode()
+        for _ in range(ATTEMPTS):
+            link.write(text.encode() + b"\r\n", now_s() + ANSWER_S)
+            seen, until_s = b"", now_s() + ANSWER_S
+            while chunk := link.read(until_s):
+                seen = (seen + chunk)[-4096:]
+                if wanted in seen:
+                    return
+        raise NoAnswer(f"the sensor does not confirm {text!r}; wrong baud rate or another device?")
+
+    def receive(self, chunk: bytes, arrived_s: float) -> None:
+        """Publish each complete frame; the power-up text means that the sensor has forgotten its set-up."""
+        if POWER_UP_TEXT in chunk:
+            raise NoAnswer("the sensor has started anew")
+        for frame in self._framer.feed(chunk):
+            self._take(frame, arrived_s - FRAME_BYTES * self.byte_s)
+
+    def _take(self, frame: bytes, arrived_s: float) -> None:
+        status, fx, fy, fz, tx, ty, tz, stamp_us, _ = BODY.unpack(frame[1:-2])
+        if stamp_us == self._last_us:
+            return  # the same frame twice
+        self._last_us = stamp_us
+        device_s = self._clock.seconds(stamp_us)
+        value = Wrench(force_n=np.array([fx, fy, fz], dtype=float), torque_nm=np.array([tx, ty, tz], dtype=float))
+        quality, cause = _condition(status, value)
+        bad, self._bad_before = self._framer.counts.bad - self._bad_before, self._framer.counts.bad
+        self.publish(
+            value,
+            valid_s=self._host.host_s(device_s=device_s, arrived_s=arrived_s),
+            device_time_s=device_s,
+            quality=quality,
+            cause=cause,
+            missed=bad,
+        )
+
+
+def _condition(status: int, value: Wrench) -> tuple[Quality, Cause]:
+    if status & OVERRANGE:
+        return Quality.INVALID, Cause.SATURATED
+    if status & (INVALID | RAW) or not np.all(np.isfinite([*value.force_n, *value.torque_nm])):
+        return Quality.INVALID, Cause.DEVICE
+    return (Quality.DEGRADED, Cause.DEVICE) if status & SLOW else (Quality.VALID, Cause.NONE)
+
+
+def connect(context: Context, options: dict[str, Any]) -> Bota:
+    """Entry point `serial:bota`."""
+    device = Bota(context, read_options(context, options, BotaOptions))
+    device.join()
+    return device

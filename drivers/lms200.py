@@ -1,0 +1,176 @@
+"""SICK LMS 200 family over RS-232/422 (LMS 2xx telegram listing; frames as in MRPT's CSickLaserSerial).
+
+The scanner is found at any of its four baud rates, left at the wanted one, set to millimetres and told to stream.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from drivers.polar import Beams, LineScanner
+from drivers.transport.checks import crc_sick
+from drivers.transport.framing import Framer
+from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
+from drivers.transport.options import SerialOptions, read_options, serial_opener
+from drivers.transport.serial_link import SerialLink
+from hal.registry import Context
+
+BAUD_CODES = {9600: 0x42, 19_200: 0x41, 38_400: 0x40, 500_000: 0x48}
+ACK, NAK, NOT_ACCEPTED = 0x06, 0x15, 0x92
+MODE, SCAN, STATUS, VARIANT, READ_CONFIG, WRITE_CONFIG = 0x20, 0xB0, 0x31, 0x3B, 0x74, 0x77
+STREAM, ON_REQUEST, SET_UP = 0x24, 0x25, 0x00
+PASSWORD = b"SICK_LMS"
+UNIT_BYTE, MILLIMETRES = 6, 1
+FIRST_CODE = 0x1FF7
+LONGEST_PAYLOAD = 812
+FATAL = 4
+ANSWER_S = 0.15
+SET_UP_S = 3.0
+HEADER_BYTES = 4
+
+
+class Lms200Options(SerialOptions):
+    """Options of `serial:lms200`."""
+
+    baud: Literal[9600, 19200, 38400, 500000] = 38_400
+    field_deg: Literal[100, 180] = 180
+    step_hundredths_deg: Literal[25, 50, 100] = 100
+    max_range_m: Annotated[float, Field(gt=0, le=80)] = 8.0
+    sigma_m: Annotated[float, Field(gt=0)] = 0.015
+
+
+def telegram(payload: bytes, *, address: int = 0) -> bytes:
+    """`02 addr len16 payload crc16`."""
+    body = struct.pack("<BBH", 2, address, len(payload)) + payload
+    return body + struct.pack("<H", crc_sick(body))
+
+
+def framer(address: int = 0x80) -> Framer:
+    """Telegrams from one side."""
+    return Framer(bytes([2, address]), _length, lambda f: crc_sick(f[:-2]) == f[-2] | f[-1] << 8)
+
+
+def _length(data: bytes) -> int | None:
+    if len(data) < HEADER_BYTES:
+        return None
+    payload = data[2] | data[3] << 8
+    return HEADER_BYTES + payload + 2 if 1 <= payload <= LONGEST_PAYLOAD else 0
+
+
+class Lms200(LineScanner):
+    """A SICK scanner."""
+
+    def __init__(self, context: Context, options: Lms200Options) -> None:
+        opener, name = serial_opener(options, context.name)
+        step_deg = options.step_hundredths_deg / 100.0
+        beams = Beams(
+            count=round(options.field_deg / step_deg) + 1,
+            first_rad=-math.radians(options.field_deg) / 2.0,
+            step_rad=math.radians(step_deg),
+            min_range_m=0.0,
+            max_range_m=options.max_range_m,
+            scan_s=0.0133 / step_deg,  # 75 turns a second, interleaved for finer steps
+        )
+        line_s = (2 * beams.count + 10) * 10 / options.baud
+        super().__init__(context, open_link=opener, link_name=name, max_age_s=3 * max(beams.scan_s, line_s) + 0.1)
+        self.beams = beams
+        self.sigma_m = options.sigma_m
+        self._options = options
+        self._framer = framer()
+        self._bad_before = 0
+        self._last = (b"", 0.0)
+
+    def start(self, link: Link) -> None:
+        """Find it, stop it, change the baud rate, set angles and unit, stream."""
+        o = self._options
+        self._find(link)
+        self._ask(link, bytes([MODE, BAUD_CODES[o.baud]]), MODE | 0x80)
+        self._set_baud(link, o.baud)
+        answer = self._ask(link, struct.pack("<BHH", VARIANT, o.field_deg, o.step_hundredths_deg), VARIANT | 0x80)
+        if answer[1] != 1:
+            raise Refused(
+                f"{o.field_deg} deg in steps of {o.step_hundredths_deg / 100} deg are refused", code=answer[1]
+            )
+        self._ask(link, bytes([MODE, SET_UP]) + PASSWORD, MODE | 0x80)
+        config = bytearray(self._ask(link, bytes([READ_CONFIG]), READ_CONFIG | 0x80)[1:-1])
+        if config[UNIT_BYTE] != MILLIMETRES:
+            config[UNIT_BYTE] = MILLIMETRES
+            self._ask(link, bytes([WRITE_CONFIG]) + bytes(config), WRITE_CONFIG | 0x80, SET_UP_S)
+        self._ask(link, bytes([MODE, STREAM]), MODE | 0x80)
+        self._framer.reset()
+
+    def _find(self, link: Link) -> None:
+        """Try all baud rates, the wanted one first, until it agrees to stop streaming."""
+        rates = sorted(BAUD_CODES, key=lambda rate: rate != self._options.baud)
+        for rate in rates:
+            self._set_baud(link, rate)
+            try:
+                self._ask(link, bytes([MODE, ON_REQUEST]), MODE | 0x80)
+            except NoAnswer:
+                continue
+            drain_until_quiet(link, quiet_s=0.03, until_s=now_s() + ANSWER_S)
+            return
+        raise NoAnswer(f"no answer at {', '.join(map(str, sorted(rates)))} baud")
+
+    @staticmethod
+    def _set_baud(link: Link, baud: int) -> None:
+        if isinstance(link, SerialLink):
+            link.set_baud(baud)
+
+    def _ask(self, link: Link, payload: bytes, code: int, timeout_s: float = ANSWER_S) -> bytes:
+        """Payload of the answer with `code`; asked three times."""
+        for _ in range(3):
+            answers = framer()
+            link.write(telegram(payload), now_s() + ANSWER_S)
+            until_s = now_s() + timeout_s
+            while chunk := link.read(until_s):
+                for frame in answers.feed(chunk):
+                    answer = frame[HEADER_BYTES:-2]
+                    if answer[0] == NOT_ACCEPTED:
+                        raise Refused(f"command {payload[0]:02X}h is not accepted", code=NOT_ACCEPTED)
+                    if answer[0] == code:
+                        return answer
+        raise NoAnswer(f"no answer to command {payload[0]:02X}h")
+
+    def receive(self, chunk: bytes, arrived_s: float) -> None:
+        """Publish each complete scan."""
+        for frame in self._framer.feed(chunk):
+            if frame[HEADER_BYTES] == SCAN:
+                self._take(frame, arrived_s)
+
+    def _take(self, frame: bytes, arrived_s: float) -> None:
+        if frame == self._last[0] and arrived_s - self._last[1] < 0.3 * (self.beams.scan_s if self.beams else 0.0):
+            return  # the same telegram twice
+        self._last = (frame, arrived_s)
+        status = frame[-3]
+        if status & 7 == FATAL:
+            raise Refused("the scanner reports a fatal error", code=status)
+        range_m = decode_scan(frame[HEADER_BYTES:-2])
+        if self.beams is None or len(range_m) != self.beams.count:
+            self._framer.counts.bad += 1
+            return
+        bad, self._bad_before = self._framer.counts.bad - self._bad_before, self._framer.counts.bad
+        valid = np.where(range_m <= self.beams.max_range_m, range_m, math.nan)
+        self.publish_scan(valid, valid_s=arrived_s - len(frame) * self.byte_s, missed=bad)
+
+
+def decode_scan(payload: bytes) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Metres out of a B0 answer; codes from 1FF7h on and zero are NaN."""
+    word = payload[1] | payload[2] << 8
+    count, unit_m = word & 0x3FF, 0.001 if word >> 14 == MILLIMETRES else 0.01
+    if len(payload) < 3 + 2 * count:
+        return np.empty(0)
+    raw = np.frombuffer(payload, "<u2", count, 3) & 0x1FFF
+    return np.where((raw > 0) & (raw < FIRST_CODE), raw * unit_m, math.nan)
+
+
+def connect(context: Context, options: dict[str, Any]) -> Lms200:
+    """Entry point `serial:lms200`."""
+    device = Lms200(context, read_options(context, options, Lms200Options))
+    device.join()
+    return device

@@ -1,0 +1,113 @@
+"""ATI Net F/T and Axia80 over UDP, raw data transfer (ATI 9610-05, pp 75-76).
+
+A record has a sequence number, so lost, repeated and late ones are told apart; `status` other than 0 marks it invalid.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from drivers.ft300 import RangeOptions, capabilities
+from drivers.transport.device import StreamDevice
+from drivers.transport.link import Link, drain_until_quiet, now_s
+from drivers.transport.options import PortNumber, UdpOptions, read_options, udp_opener
+from hal.clock import Deadline
+from hal.devices import DeviceKind, ForceTorqueCapabilities, Wrench
+from hal.readings import Cause, Quality, Stamped
+from hal.registry import Context
+
+HEADER, STOP, STREAM = 0x1234, 0, 2
+RECORD = struct.Struct(">III6i")
+FIRST_SEQUENCE = 1
+SEND_S = 0.1
+
+
+class NetftOptions(UdpOptions, RangeOptions):
+    """Options of `udp:netft`; counts per newton and newton metre as the sensor's web page shows them."""
+
+    port: PortNumber = 49_152
+    rate_hz: Annotated[float, Field(gt=0, le=7000)] = 500.0
+    counts_per_n: Annotated[float, Field(gt=0)] = 1_000_000.0
+    counts_per_nm: Annotated[float, Field(gt=0)] = 1_000_000.0
+    max_age_s: Annotated[float, Field(gt=0, le=1)] = 0.05
+
+
+def request(command: int, count: int = 0) -> bytes:
+    """1234h, command, number of records (0: endless)."""
+    return struct.pack(">HHI", HEADER, command, count)
+
+
+class Netft(StreamDevice[Wrench]):
+    """A wrist sensor on the network."""
+
+    kind = DeviceKind.FORCE_TORQUE
+
+    def __init__(self, context: Context, options: NetftOptions) -> None:
+        opener, name = udp_opener(options, context.name)
+        super().__init__(context, open_link=opener, link_name=name, max_age_s=options.max_age_s, silence_s=0.3)
+        self._options = options
+        self._last: int | None = None
+
+    def capabilities(self) -> ForceTorqueCapabilities:
+        """From the options."""
+        return capabilities(self._options, self._options.rate_hz)
+
+    def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:
+        """Newest raw wrench."""
+        return self.newest(deadline)
+
+    def start(self, link: Link) -> None:
+        """Stop a stream that was left on, start a fresh one."""
+        link.write(request(STOP), now_s() + SEND_S)
+        drain_until_quiet(link, quiet_s=0.02, until_s=now_s() + SEND_S)
+        link.write(request(STREAM), now_s() + SEND_S)
+        self._last = None
+
+    def receive(self, chunk: bytes, arrived_s: float) -> None:
+        """One datagram is one record; other lengths are not ours."""
+        if len(chunk) != RECORD.size:
+            return
+        sequence, _, status, *counts = RECORD.unpack(chunk)
+        last = self._last
+        if last is not None and sequence <= last and sequence != FIRST_SEQUENCE:
+            return  # repeated or late
+        is_next = last is not None and sequence > last
+        self._last = sequence
+        o = self._options
+        value = Wrench(
+            force_n=np.array(counts[:3], dtype=float) / o.counts_per_n,
+            torque_nm=np.array(counts[3:], dtype=float) / o.counts_per_nm,
+        )
+        self.publish(
+            value,
+            valid_s=arrived_s,
+            quality=Quality.INVALID if status else Quality.VALID,
+            cause=Cause.DEVICE if status else Cause.NONE,
+            missed=sequence - last - 1 if is_next and last is not None else 0,
+        )
+
+    def release(self) -> None:
+        """Stop the stream: a talking sensor loads the network for ever."""
+        link = self.port.link
+        super().release()
+        if link is not None:
+            self._say_stop()
+
+    def _say_stop(self) -> None:
+        opener, _ = udp_opener(self._options, self.name)
+        link = opener()
+        try:
+            link.write(request(STOP), now_s() + SEND_S)
+        finally:
+            link.close()
+
+
+def connect(context: Context, options: dict[str, Any]) -> Netft:
+    """Entry point `udp:netft`."""
+    device = Netft(context, read_options(context, options, NetftOptions))
+    device.join()
+    return device

@@ -1,0 +1,188 @@
+"""Slamtec RPLIDAR A1/A2 over serial, standard scan (Slamtec interface protocol, LR001).
+
+A measurement has five bytes and no check sum: a start bit beside its inverse and a bit that is always 1. So nothing is
+believed until eight measurements after it are in step, and a turn with a misstep in it is thrown away whole.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from drivers.polar import Beams, LineScanner, within
+from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
+from drivers.transport.options import SerialOptions, read_options, serial_opener
+from hal.registry import Context
+
+STOP, RESET, START_SCAN, GET_INFO, GET_HEALTH = 0x25, 0x40, 0x20, 0x50, 0x52
+INFO_TYPE, HEALTH_TYPE, SCAN_TYPE = 0x04, 0x06, 0x81
+NODE_BYTES = 5
+IN_STEP = 8  # a shifted stream passes the test of one measurement with probability 1/4, of eight with 1/65536
+FULL_TURN_Q6 = 360 * 64
+WHOLE_TURN_RAD = math.radians(330)  # a turn that lost its beginning is not published as one
+ERROR = 2
+ANSWER_S = 0.3
+RESET_S = 0.5
+
+
+class RplidarOptions(SerialOptions):
+    """Options of `serial:rplidar`; a turn is sorted into `beams` equal sectors, the nearest measurement of each."""
+
+    beams: Annotated[int, Field(ge=90, le=3600)] = 360
+    scan_rate_hz: Annotated[float, Field(gt=0, le=20)] = 5.5
+    min_range_m: Annotated[float, Field(ge=0)] = 0.15
+    max_range_m: Annotated[float, Field(gt=0)] = 12.0
+    sigma_m: Annotated[float, Field(gt=0)] = 0.01
+
+
+def descriptor(length: int, mode: int, kind: int) -> bytes:
+    """`A5 5A`, 30 bits of length and 2 of mode, type."""
+    return struct.pack("<BBIB", 0xA5, 0x5A, length | mode << 30, kind)
+
+
+def in_step(nodes: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Which rows of (n, 5) look like measurements."""
+    start, check = nodes[:, 0] & 3, nodes[:, 1] & 1
+    angle_q6 = nodes[:, 1].astype(np.int32) >> 1 | nodes[:, 2].astype(np.int32) << 7
+    is_good: NDArray[np.bool_] = ((start == 1) | (start == 2)) & (check == 1) & (angle_q6 <= FULL_TURN_Q6)
+    return is_good
+
+
+def decode(nodes: NDArray[np.uint8]) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+    """Start flags, angles in radians, distances in metres (NaN for none) of (n, 5) measurements."""
+    n = nodes.astype(np.int32)
+    angle_rad = np.radians((n[:, 1] >> 1 | n[:, 2] << 7) / 64.0)
+    distance_m = (n[:, 3] | n[:, 4] << 8) / 4000.0
+    return (n[:, 0] & 1).astype(bool), angle_rad, np.where(distance_m > 0.0, distance_m, math.nan)
+
+
+class NodeParser:
+    """Measurements out of bytes in any chunks; `None` in the result stands for a misstep."""
+
+    def __init__(self) -> None:
+        self._buffer = b""
+        self._is_in_step = False
+        self.missteps = 0
+
+    def feed(self, chunk: bytes) -> list[NDArray[np.uint8] | None]:
+        """Runs of (n, 5) measurements that are trusted now, parted by missteps."""
+        self._buffer += chunk
+        runs: list[NDArray[np.uint8] | None] = []
+        while len(self._buffer) >= NODE_BYTES * (IN_STEP + 1):
+            nodes = np.frombuffer(self._buffer, np.uint8)[: len(self._buffer) // NODE_BYTES * NODE_BYTES].reshape(-1, 5)
+            good = in_step(nodes)
+            first_bad = int(np.argmin(good)) if not good.all() else len(nodes)
+            trusted = first_bad - IN_STEP
+            if trusted > 0:
+                self._is_in_step = True
+                runs.append(nodes[:trusted])
+                self._buffer = self._buffer[trusted * NODE_BYTES :]
+                continue
+            if first_bad == len(nodes):
+                break  # in step so far, but too few to trust
+            if self._is_in_step:
+                self.missteps += 1
+                runs.append(None)
+            self._is_in_step = False
+            self._buffer = self._buffer[1:]
+        return runs
+
+
+class Rplidar(LineScanner):
+    """A Slamtec scanner."""
+
+    def __init__(self, context: Context, options: RplidarOptions) -> None:
+        opener, name = serial_opener(options, context.name)
+        scan_s = 1.0 / options.scan_rate_hz
+        super().__init__(
+            context, open_link=opener, link_name=name, max_age_s=3 * scan_s, silence_s=max(1.0, 4 * scan_s)
+        )
+        self.beams = Beams(
+            count=options.beams,
+            first_rad=0.0,
+            step_rad=math.tau / options.beams,
+            min_range_m=options.min_range_m,
+            max_range_m=options.max_range_m,
+            scan_s=scan_s,
+        )
+        self.sigma_m = options.sigma_m
+        self._parser = NodeParser()
+        self._turn: list[NDArray[np.uint8]] | None = None
+        self._missed = 0
+
+    def start(self, link: Link) -> None:
+        """Stop, identify, ask for its health (one reset if it is ill), scan."""
+        link.write(bytes([0xA5, STOP]), now_s() + ANSWER_S)
+        drain_until_quiet(link, quiet_s=0.02, until_s=now_s() + ANSWER_S)
+        self._ask(link, GET_INFO, descriptor(20, 0, INFO_TYPE), 20)
+        if self._health(link) == ERROR:
+            link.write(bytes([0xA5, RESET]), now_s() + ANSWER_S)
+            drain_until_quiet(link, quiet_s=0.1, until_s=now_s() + RESET_S)
+            if self._health(link) == ERROR:
+                raise Refused("the scanner reports an error that a reset does not cure", code=ERROR)
+        self._parser, self._turn = NodeParser(), None
+        rest = self._ask(link, START_SCAN, descriptor(5, 1, SCAN_TYPE), 0)
+        self.receive(rest, now_s())
+
+    def _health(self, link: Link) -> int:
+        return self._ask(link, GET_HEALTH, descriptor(3, 0, HEALTH_TYPE), 3)[0]
+
+    def _ask(self, link: Link, command: int, head: bytes, length: int) -> bytes:
+        """What follows the descriptor `head`: at least `length` bytes."""
+        for _ in range(3):
+            link.write(bytes([0xA5, command]), now_s() + ANSWER_S)
+            seen, until_s = b"", now_s() + ANSWER_S
+            while chunk := link.read(until_s):
+                seen += chunk
+                at = seen.find(head)
+                if at >= 0 and len(seen) >= at + len(head) + length:
+                    return seen[at + len(head) :]
+        raise NoAnswer(f"no answer to command {command:02X}h")
+
+    def receive(self, chunk: bytes, arrived_s: float) -> None:
+        """Collect measurements; a start flag ends a turn."""
+        for run in self._parser.feed(chunk):
+            if run is None:
+                self._missed += self._turn is not None
+                self._turn = None
+                continue
+            starts = np.flatnonzero(run[:, 0] & 1)
+            for part in np.split(run, starts):
+                if len(part) and part[0, 0] & 1:
+                    self._finish(arrived_s)
+                    self._turn = []
+                if self._turn is not None and len(part):
+                    self._turn.append(part)
+
+    def _finish(self, arrived_s: float) -> None:
+        if not self._turn or self.beams is None:
+            return
+        _, angle_rad, distance_m = decode(np.concatenate(self._turn))
+        if np.ptp(angle_rad) < WHOLE_TURN_RAD:
+            self._missed += 1
+            return
+        missed, self._missed = self._missed, 0
+        self.publish_scan(
+            sectors(angle_rad, within(distance_m, self.beams), self.beams.count), valid_s=arrived_s, missed=missed
+        )
+
+
+def sectors(angle_rad: NDArray[np.float64], range_m: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """The nearest range in each of `count` sectors centred on multiples of the step; NaN in empty ones."""
+    seen = np.isfinite(range_m)
+    sector = np.round(angle_rad[seen] * (count / math.tau)).astype(np.int64) % count
+    nearest = np.full(count, math.inf)
+    np.minimum.at(nearest, sector, range_m[seen])
+    return np.where(np.isfinite(nearest), nearest, math.nan)
+
+
+def connect(context: Context, options: dict[str, Any]) -> Rplidar:
+    """Entry point `serial:rplidar`."""
+    device = Rplidar(context, read_options(context, options, RplidarOptions))
+    device.join()
+    return device

@@ -1,0 +1,116 @@
+"""Bota SensONE: conformance, clock wrap, status bits, restart, faults."""
+
+import math
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.bota import Bota, BotaOptions, framer
+from drivers.emulators import bota as emulator
+from drivers.emulators.scripted import ScriptedForceTorque, scripted_wrench
+from hal.conformance import ForceTorqueContract, Rig
+from hal.devices import Wrench
+from hal.errors import DeviceUnavailable
+from hal.readings import Cause, Quality
+from hal.registry import Context, connect
+from tests.drivers.rigs import count_good, soon, until, wired, wired_rig
+
+DRIVER = "serial:bota"
+
+
+class TestBota(ForceTorqueContract):
+    @pytest.fixture
+    def rig(self) -> Iterator[Rig[Any]]:
+        with wired_rig(emulator.start(ScriptedForceTorque(), {}), DRIVER, sample_period_s=0.05) as rig:
+            yield rig
+
+
+def is_true(value: Wrench, reads: int) -> bool:
+    index = round(value.force_n[0] / 0.01)
+    true = scripted_wrench(index)
+    same = np.allclose(value.force_n, true.force_n, rtol=1e-6) and np.allclose(
+        value.torque_nm, true.torque_nm, rtol=1e-6
+    )
+    return bool(reads - 60 <= index <= reads and same)
+
+
+@pytest.mark.parametrize(
+    "fault", ["crc", "drop", "dup", "split", "delay", "silent", "garbage", "echo", "status", "disconnect"]
+)
+def test_no_fault_of_the_wire_gives_a_wrong_wrench(fault: str) -> None:
+    backing = ScriptedForceTorque()
+    options = {
+        "fault": fault,
+        "every": 20 if fault == "disconnect" else 4,
+        "seed": 9,
+        "delay_s": 0.05,
+        "silent_s": 0.05,
+        "away_s": 0.02,
+    }
+    with wired(emulator.start(backing, options), DRIVER) as device:
+        assert count_good(device, lambda value: is_true(value, backing.reads)) >= 5
+
+
+@pytest.mark.parametrize(
+    ("status", "quality", "cause"),
+    [
+        (0, Quality.VALID, Cause.NONE),
+        (1, Quality.DEGRADED, Cause.DEVICE),
+        (2, Quality.INVALID, Cause.SATURATED),
+        (4, Quality.INVALID, Cause.DEVICE),
+        (8, Quality.INVALID, Cause.DEVICE),
+    ],
+)
+def test_status_bits(status: int, quality: Quality, cause: Cause) -> None:
+    device = Bota(Context(name="wrist"), BotaOptions(port="none"))
+    device.receive(emulator.frame(scripted_wrench(3), status, 1000), 0.0)
+    sample = device.mailbox.peek()
+    assert sample is not None
+    assert (sample.quality, sample.cause) == (quality, cause)
+
+
+def test_not_a_number_is_invalid() -> None:
+    device = Bota(Context(name="wrist"), BotaOptions(port="none"))
+    broken = Wrench(force_n=np.array([math.nan, 0.0, 0.0]), torque_nm=np.zeros(3))
+    device.receive(emulator.frame(broken, 0, 1000), 0.0)
+    sample = device.mailbox.peek()
+    assert sample is not None and sample.quality is Quality.INVALID
+
+
+def test_the_frame_is_37_bytes_with_the_crc_over_34() -> None:
+    frame = emulator.frame(scripted_wrench(1), 0, 5)
+    assert len(frame) == 37
+    assert framer().feed(b"\xaa\x00" + frame) == [frame]
+    assert struct.unpack("<I", frame[27:31]) == (5,)
+
+
+def test_the_microsecond_clock_wraps_unseen() -> None:
+    far_side = emulator.start(ScriptedForceTorque(), {"clock_start_us": (1 << 32) - 100_000})
+    with wired(far_side, DRIVER) as device:
+        first = device.read_wrench(deadline=soon())
+        until(lambda: far_side.stamp_us() < 10_000_000)
+        last = device.newest(soon(), not_before_s=soon(0.0).at_s + 0.05)
+    assert last.device_time_s - first.device_time_s == pytest.approx(last.host_time_s - first.host_time_s, abs=0.02)
+
+
+def test_a_sensor_that_restarts_is_set_up_again() -> None:
+    far_side = emulator.start(ScriptedForceTorque(), {})
+    with wired(far_side, DRIVER) as device:
+        far_side.restart()
+        until(lambda: device.health().reconnects >= 1 and device.health().quality is Quality.VALID)
+        assert far_side.is_running
+
+
+def test_another_device_on_the_port_is_told() -> None:
+    from drivers.emulators import tfmini
+    from drivers.emulators.scripted import ScriptedProximity
+
+    far_side = tfmini.start(ScriptedProximity(), {})
+    try:
+        with pytest.raises(DeviceUnavailable, match="does not confirm"):
+            connect(Context(name="wrist"), DRIVER, far_side.address)
+    finally:
+        far_side.close()

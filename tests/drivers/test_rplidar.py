@@ -1,0 +1,97 @@
+"""RPLIDAR: conformance, resynchronising without check sums, health, the vendor's frames."""
+
+import math
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.emulators import rplidar as emulator
+from drivers.emulators.beams import line_m
+from drivers.emulators.scripted import ScriptedScanner, scripted_scan
+from drivers.rplidar import NodeParser, decode, descriptor, sectors
+from hal.conformance import RangeScannerContract, Rig
+from hal.devices import RangeImage
+from hal.errors import DeviceUnavailable
+from hal.registry import Context, connect
+from tests.drivers.rigs import count_good, soon, wired, wired_rig
+
+DRIVER = "serial:rplidar"
+FAST = {"scan_rate_hz": 40.0}
+TURN_RAD = np.arange(360) * math.tau / 360
+
+
+class TestRplidar(RangeScannerContract):
+    @pytest.fixture
+    def rig(self) -> Iterator[Rig[Any]]:
+        far_side = emulator.start(ScriptedScanner(), FAST)
+        with wired_rig(far_side, DRIVER, {"scan_rate_hz": 20.0}, sample_period_s=0.1) as rig:
+            yield rig
+
+
+def test_descriptors_are_the_vendors() -> None:
+    assert descriptor(5, 1, 0x81).hex() == "a55a0500004081"
+    assert descriptor(20, 0, 4).hex() == "a55a1400000004"
+
+
+@given(st.integers(min_value=0), st.lists(st.integers(min_value=0), max_size=8), st.binary(max_size=30))
+def test_measurements_do_not_depend_on_chunks_and_survive_noise(seed: int, cuts: list[int], noise: bytes) -> None:
+    range_m = np.random.default_rng(seed).uniform(0.2, 8.0, 360)
+    turn = emulator.encode_turn(TURN_RAD, range_m)
+    data = noise + turn + turn
+    places = [0, *sorted(cut % (len(data) + 1) for cut in cuts), len(data)]
+    parser = NodeParser()
+    runs = [run for a, b in pairwise(places) for run in parser.feed(data[a:b])]
+    _, angle_rad, got_m = decode(np.concatenate([run for run in runs if run is not None])[-340:])
+    true_m = np.round(np.tile(range_m, 2) * 4000) / 4000
+    np.testing.assert_allclose(got_m, true_m[-348:-8])
+    np.testing.assert_allclose(angle_rad, np.tile(TURN_RAD, 2)[-348:-8], atol=math.radians(1 / 128) + 1e-9)
+
+
+def test_lost_bytes_are_noticed() -> None:
+    turn = emulator.encode_turn(TURN_RAD, np.full(360, 1.0))
+    parser = NodeParser()
+    runs = parser.feed(turn[:900] + turn[902:] + turn)
+    assert parser.missteps == 1
+    assert any(run is None for run in runs)
+
+
+def test_sectors_keep_the_nearest_and_leave_empty_ones_empty() -> None:
+    got = sectors(np.radians([0.0, 0.4, 359.8, 90.0]), np.array([2.0, 1.5, 3.0, 4.0]), 360)
+    assert (got[0], got[90]) == (1.5, 4.0)
+    assert np.isnan(got[1:90]).all()
+
+
+def is_a_true_turn(image: RangeImage, reads: int) -> bool:
+    c = ScriptedScanner().capabilities()
+    signed = (TURN_RAD + math.pi) % math.tau - math.pi
+    return any(
+        np.allclose(image.depth_m[0], line_m(RangeImage(depth_m=scripted_scan(i)), c, signed), atol=2e-4)
+        for i in range(max(1, reads - 60), reads + 1)
+    )
+
+
+@pytest.mark.parametrize("fault", [None, "drop", "dup", "split", "delay", "silent", "garbage", "echo", "disconnect"])
+def test_every_turn_is_whole_and_exact_whatever_the_wire_does(fault: str | None) -> None:
+    backing = ScriptedScanner()
+    options = {**FAST, "fault": fault, "every": 4, "seed": 6, "delay_s": 0.1, "silent_s": 0.1, "away_s": 0.02}
+    with wired(emulator.start(backing, options), DRIVER, {"scan_rate_hz": 20.0}) as device:
+        assert count_good(device, lambda image: is_a_true_turn(image, backing.reads)) >= 5
+
+
+def test_an_ill_scanner_is_reset_once() -> None:
+    with wired(emulator.start(ScriptedScanner(), {**FAST, "health": 2}), DRIVER) as device:
+        assert np.isfinite(device.read_range(deadline=soon()).value.depth_m).all()
+
+
+def test_an_incurable_scanner_is_told() -> None:
+    far_side = emulator.start(ScriptedScanner(), {"health": 2, "is_cured_by_reset": False})
+    try:
+        with pytest.raises(DeviceUnavailable, match="reset does not cure"):
+            connect(Context(name="scanner"), DRIVER, far_side.address)
+    finally:
+        far_side.close()

@@ -90,6 +90,7 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
         _note_plane(record, plane)
     with _step(session, "recognise", 0.19, 0.22) as part:
         part.progress(0.0, "recognise the objects")
+        settle(part)  # the border lights go out
         found = inspect_here(part, [thing.name for thing in session.panel.objects])
         _note_pictures(record, found, "recognised", "objects of the panel file in the image")
         need_all_present(found, session)

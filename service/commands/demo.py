@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import json
+import math
 import time
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
+from rich.table import Table
 
 from service.client import Client
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console, read_cell
 from service.commands.tasks import follow
 from service.serve import Options, Panelwright
-
-HEARTBEAT_RATIO = 0.25
 
 
 def demo(
@@ -52,26 +51,36 @@ def _mission(client: Client, runs: Path, *, judge: bool) -> bool:
     if stop["is_latched"]:  # a cell with real parts starts latched; to run the demo is to say that it is clear
         client.post("/v1/stop/reset", {"seen_count": stop["count"]})
     task = follow(client, client.post("/v1/missions", {})["id"])
-    if task["state"] != "succeeded":
-        _show_reports(client, runs)
-        return False
-    result = task["result"]
-    _show_actions(result)
-    if judge:
-        verdict = client.post("/v1/judge?wait_s=30", {"mission": result["mission"]})["result"]
-        console.print_json(json.dumps(verdict))
-    _show_reports(client, runs)
-    return bool(result.get("all_confirmed", False))
-
-
-def _show_actions(result: dict[str, Any]) -> None:
-    for action in result.get("actions", []):
-        style = "green" if action["outcome"] == "done" else "red"
-        words = f"{action['object']} {action.get('target', '')}"
-        console.print(f"  [{style}]{action['outcome']:<12}[/] {escape(words)}")
-
-
-def _show_reports(client: Client, runs: Path) -> None:
+    result = task["result"] or {"actions": [], "succeeded": False}
+    console.print(_actions(result["actions"]))
     missions = client.get("/v1/missions")["missions"]
+    if judge and missions:
+        verdict = client.post("/v1/judge?wait_s=30", {"mission": missions[0]["name"]})["result"]
+        console.print(_verdict(verdict))
     if missions:
-        console.print(f"report: {runs / missions[0]['name'] / 'report.html'}")
+        console.print(f"report: [bold]{runs / missions[0]['name'] / 'report.html'}[/]")
+    lag_s = client.get("/v1/info")["event_loop_lag_p99_s"]
+    console.print(f"event-loop lag of the last minute: {1e3 * lag_s:.1f} ms (p99)")
+    return bool(result["succeeded"])
+
+
+def _actions(actions: list[dict[str, Any]]) -> Table:
+    table = Table("object", "target", "outcome", "before", "after", "peak", box=None, pad_edge=False)
+    for action in actions:
+        style = "green" if action["confirmed"] else "red"
+        outcome = f"[{style}]{action['outcome']}{', confirmed' if action['confirmed'] else ''}[/]"
+        words = [escape(str(action[key])) for key in ("object", "target", "before", "after")]
+        table.add_row(*words[:2], outcome, *words[2:], f"{action['peak_force_n'] or 0.0:.0f} N")
+    return table
+
+
+def _verdict(verdict: dict[str, Any]) -> str:
+    style = "green" if verdict["agrees"] else "red"
+    words = "agrees with the report" if verdict["agrees"] else "CONTRADICTS the report"
+    pose = "no pose to judge"
+    if verdict["pose_error_m"] is not None:
+        error_mm, error_deg = 1e3 * verdict["pose_error_m"], math.degrees(verdict["pose_error_rad"])
+        inside = "inside" if verdict["inside_95"] else "outside"
+        pose = f"pose off by {error_mm:.2f} mm and {error_deg:.2f} deg, {inside} its 95 % ellipsoid"
+    right = f"{verdict['readings_right']} of {verdict['readings_given']} readings right"
+    return f"judge: [{style}]{words}[/]; {right}; {pose}"

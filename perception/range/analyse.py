@@ -77,7 +77,7 @@ def analyse(
     """
     depth = checked_depth(depth_m, sensor)
     law = noise or estimate_noise(depth, sensor)
-    labels, found = segment(depth, sensor, law)
+    labels, found, law = segment(depth, sensor, law)
     labels, surfaces = _finished(depth, sensor, law, labels, found)
     return RangeScene(
         labels=labels, surfaces=surfaces, noise=law, sensor=sensor, warnings=_warnings(depth, sensor, law, surfaces)

@@ -85,7 +85,7 @@ def refine_surface(
     kept = max(cost - (n - used) * fit.TRIM_SIGMAS**2, 0.0)
     misfit = float(np.sqrt(kept / max(used - FREEDOM[kind], 1)))
     depth = float(np.median(samples.z)) if n else np.nan
-    covariance = _covariance(H, kind, fixed) * max(1.0, misfit**2) * averaging_loss(noise, depth)
+    covariance = _covariance(H, kind, fixed) * max(misfit**2, 0.05) * averaging_loss(noise, depth)
     x, y = (float(np.median(a)) for a in (samples.x, samples.y))
     middle = np.array([x * depth, y * depth, depth] if perspective else [x, y, depth])
     surface = Surface(

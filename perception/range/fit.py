@@ -108,7 +108,7 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed):  #
                 A[a, b] = 0.0 if fixed[a] or fixed[b] else H[a, b]
             A[a, a] = A[a, a] * (1.0 + damping) + 1e-12 if not fixed[a] else 1.0
             step[a] = 0.0 if fixed[a] else g[a]
-        if not _solve_in_place(A, step, p):
+        if not solve_positive(A, step, p):
             damping *= 10.0
             if damping > 1e6:
                 break
@@ -137,7 +137,7 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed):  #
 
 
 @njit(cache=True)
-def _solve_in_place(A, b, p):  # type: ignore[no-untyped-def]
+def solve_positive(A, b, p):  # type: ignore[no-untyped-def]
     """Solve A x = b by Cholesky, overwriting both; False when A is not positive definite."""
     for i in range(p):
         top = A[i, i]
@@ -235,7 +235,7 @@ def start_sphere(P, N):  # type: ignore[no-untyped-def]
     for a in range(4):
         A[a, a] *= 1.0 + 1e-9
         A[a, a] += 1e-18
-    if not _solve_in_place(A, b, 4):
+    if not solve_positive(A, b, 4):
         return th, False
     th[:3] = c0 + b[:3]
     th[3] = np.sqrt(max(b[3] + b[:3] @ b[:3], 1e-12))
@@ -286,7 +286,7 @@ def start_cylinder(P, N, axis):  # type: ignore[no-untyped-def]
                 A[a, e] += row[a] * row[e]
     for a in range(3):
         A[a, a] = A[a, a] * (1.0 + 1e-9) + 1e-18
-    if not _solve_in_place(A, b, 3):
+    if not solve_positive(A, b, 3):
         return th, False
     th[:3] = c0 + b[0] * e1 + b[1] * e2
     th[3:6] = axis
@@ -329,7 +329,7 @@ def start_cone(P, N, axis):  # type: ignore[no-untyped-def]
     trace = A[0, 0] + A[1, 1] + A[2, 2]
     for a in range(3):
         A[a, a] += 1e-6 * trace
-    if not _solve_in_place(A, b, 3):
+    if not solve_positive(A, b, 3):
         return th, False
     th[:3] = c0 + b
     inward = axis if (c0 - th[:3]) @ axis > 0 else -axis

@@ -32,7 +32,8 @@ class Grid:
     """Blocks of an image, (h, w) arrays; NaN depth marks an empty block.
 
     `x`, `y` are coordinates on the plane z = 1 (pinhole) or metres (orthographic), `z` metres, `sigma` the standard
-    deviation of `z`, `normal` (h, w, 3) towards the sensor, `rms` what the tangent plane leaves over in sigmas.
+    deviation of `z`, `normal` (h, w, 3) towards the sensor, `rms` what the tangent plane leaves over in sigmas,
+    `slow_share` the part of the variance that neighbours share.
     """
 
     size_px: int
@@ -45,16 +46,29 @@ class Grid:
     normal: Array
     rms: Array
     normal_sigma_rad: float
+    slow_share: float
 
 
-def block_size(depth_shape: tuple[int, int], noise: NoiseModel, sensor: RangeSensorModel, depth_m: float) -> int:
-    """Pixels along a block: 2 for images from 192 rows on, more where noise exceeds what a pixel spans."""
-    if min(depth_shape) < 192:
+def block_size(shape: tuple[int, int], noise: NoiseModel, sensor: RangeSensorModel, depth_m: float) -> int:
+    """Pixels along a block: 1 below 192 rows, 2 below 384, then the least (2 to 4) that gives steady tangent planes."""
+    if min(shape) < 192:
         return 1
-    ratio = float(noise.sigma_m(depth_m)) / sensor.pitch_m(depth_m)
-    if ratio > 1.5 and min(depth_shape) >= 384:
-        return 4
-    return 3 if ratio > 0.9 and min(depth_shape) >= 384 else 2
+    if min(shape) < 384:
+        return 2
+    for size in (2, 3):
+        if slope_sigma_rad(noise, sensor, depth_m, side_px=5 * size) <= NORMAL_SIGMA_GOAL_RAD:
+            return size
+    return 4
+
+
+def slope_sigma_rad(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float, *, side_px: int) -> float:
+    """Standard deviation of the slope of a plane fitted to a square window: sigma / (pitch sqrt(sum u^2)) and more."""
+    pitch = sensor.pitch_m(depth_m)
+    slow = noise.correlated[0] + noise.correlated[1] * depth_m**2
+    step = noise.step[0] + noise.step[1] * depth_m**2
+    white = max(float(noise.sigma_m(depth_m)) ** 2 - slow**2, 0.0) ** 0.5 * np.sqrt(12.0) / (pitch * side_px**2)
+    # White noise averages out; slow noise and steps do not, they tilt a short window as a whole.
+    return float(np.hypot(white, np.hypot(0.7 * slow, 0.3 * step) / (pitch * side_px)))
 
 
 def build_grid(
@@ -73,22 +87,15 @@ def build_grid(
     normal, rms = _tangents(x, y, z, count, sigma, perspective, radius, jump_slope / packed[1], size_px)
     return Grid(
         size_px=size_px, radius=radius, perspective=perspective, x=x, y=y, z=z, sigma=sigma, normal=normal, rms=rms,
-        normal_sigma_rad=slope_sigma,
+        normal_sigma_rad=slope_sigma, slow_share=noise.slow_share(middle),
     )
 
 
 def _radius(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float, size_px: int) -> tuple[int, float]:
-    """Smallest window radius whose slope is known to the goal; slope sigma = sigma / (pitch sqrt(sum u^2))."""
-    pixel = float(noise.sigma_m(depth_m))
-    slow = noise.correlated[0] + noise.correlated[1] * depth_m**2
-    step = noise.step[0] + noise.step[1] * depth_m**2
-    pitch = sensor.pitch_m(depth_m)
+    """Smallest window radius whose slope is known to the goal, and the slope's sigma there."""
     sigma = np.inf
     for radius in range(1, WIDEST_RADIUS + 1):
-        side = (2 * radius + 1) * size_px
-        # White noise averages out; slow noise and steps do not, they tilt a short window as a whole.
-        white = pixel * np.sqrt(12.0) / (pitch * side**2)
-        sigma = float(np.hypot(white, np.hypot(0.7 * slow, 0.3 * step) / (pitch * side)))
+        sigma = slope_sigma_rad(noise, sensor, depth_m, side_px=(2 * radius + 1) * size_px)
         if sigma <= NORMAL_SIGMA_GOAL_RAD:
             return radius, sigma
     return WIDEST_RADIUS, sigma

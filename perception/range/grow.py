@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from perception.range.fit import solve_positive
 from perception.range.surfaces import PLANE, depth_on, normal_on
 
 GROW_SIGMAS = 3.0
@@ -101,18 +102,21 @@ def _quadratic_gain(idx, count, x, y, g, weight, x0, y0, scale):  # type: ignore
     for a in range(6):
         for e in range(a):
             A[e, a] = A[a, e]
-        A[a, a] *= 1.0 + 1e-10
-    plane = np.linalg.solve(A[:3, :3].copy(), b[:3].copy())
-    left_plane = total - plane @ b[:3]
-    full = np.linalg.solve(A, b)
-    return max(left_plane, 0.0), max(total - full @ b, 0.0)
+        A[a, a] *= 1.0 + 1e-9
+    plane, full = b[:3].copy(), b.copy()
+    if not solve_positive(A[:3, :3].copy(), plane, 3):
+        return max(total, 0.0), max(total, 0.0)
+    left = max(total - plane @ b[:3], 0.0)
+    if not solve_positive(A, full, 6):
+        return left, left
+    return left, max(total - full @ b, 0.0)
 
 
 @njit(cache=True)
 def grow_planes(  # type: ignore[no-untyped-def]
     x, y, z, sigma, normal, rms, free, label, first_label, perspective, order, least, cos_limit, tried
 ):
-    """Planes over the free blocks; writes labels and returns parameters (M, 16), sums (M, 9), mean squares (M,).
+    """Planes over the free blocks; writes labels and returns parameters (M, 16), block counts (M,), mean squares (M,).
 
     Blocks of supports that turned out curved are marked in `tried` so that they seed nothing again.
     """
@@ -129,7 +133,7 @@ def grow_planes(  # type: ignore[no-untyped-def]
         weight[i] = 1.0 / (s * s)
     mark = np.zeros(n_all, np.int32)
     queue = np.empty(n_all, np.int32)
-    ths, sums, mean2 = np.zeros((512, 16)), np.zeros((512, 9)), np.zeros(512)
+    ths, counts, mean2 = np.zeros((512, 16)), np.zeros(512, np.int64), np.zeros(512)
     found = 0
     stamp = 0
     m, S, th = np.zeros(3), np.zeros(9), np.zeros(16)
@@ -211,10 +215,10 @@ def grow_planes(  # type: ignore[no-untyped-def]
             ff[queue[k]] = False
             fl[queue[k]] = first_label + found
         ths[found] = th
-        sums[found] = S
+        counts[found] = count
         mean2[found] = flat / max(count - 3, 1)
         found += 1
-    return ths[:found].copy(), sums[:found].copy(), mean2[:found].copy()
+    return ths[:found].copy(), counts[:found].copy(), mean2[:found].copy()
 
 
 @njit(cache=True)

@@ -14,6 +14,8 @@ Array = NDArray[np.float64]
 PAIR_SAMPLES = 150
 JOINED_SHARE = 0.85
 JOINED_MEAN_SQUARE = 1.6
+SCRAP_SHARE = 0.1
+SCRAP_SIGMAS = 6.0
 LARGEST_TURN_RAD = 0.2
 SIGHT_SAMPLES = 40
 BEHIND_SHARE = 0.15  # more of the sight line than this seen behind the surface: a gap, not an occluder
@@ -35,6 +37,9 @@ def join_pieces(
         for small in order[position + 1 :]:
             if owner[small] != small + 1 or samples[small].x.size < 4:
                 continue
+            if _is_scrap(kinds, parameters, samples, big=big, small=small, perspective=bool(packed[0] > 0)):
+                owner[small] = big + 1
+                continue
             joined = _joint_fit(kinds, parameters, thin, big=big, small=small, perspective=bool(packed[0] > 0))
             if joined is None or _gap_between(depth_m, packed, (kinds[big], joined), thin[big], thin[small]):
                 continue
@@ -42,6 +47,22 @@ def join_pieces(
             parameters[big] = joined
             thin[big] = _together(thin[big], thin[small])
     return owner
+
+
+def _is_scrap(
+    kinds: list[int], parameters: list[Array], samples: list[Samples], *, big: int, small: int, perspective: bool
+) -> bool:
+    """Whether a small plane lies so close along a large one that it is only a dent in it."""
+    if kinds[big] != PLANE or kinds[small] != PLANE:
+        return False
+    if samples[small].x.size > SCRAP_SHARE * samples[big].x.size:
+        return False
+    if float(parameters[big][:3] @ parameters[small][:3]) < np.cos(LARGEST_TURN_RAD):
+        return False
+    s = thinned(samples[small], PAIR_SAMPLES)
+    e = np.empty(s.x.size)
+    fit.residuals(PLANE, parameters[big], s.x, s.y, s.z, s.sigma, perspective, e)
+    return bool(np.mean(np.abs(e) < SCRAP_SIGMAS) > JOINED_SHARE)
 
 
 def _joint_fit(

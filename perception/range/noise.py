@@ -7,7 +7,7 @@ Each grows with depth as `a + b z^2`, the law of triangulating sensors; laser sc
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -18,12 +18,12 @@ from perception.range.sensor import RangeSensorModel
 Array = NDArray[np.float64]
 
 WINDOW = 5  # samples across; a window of 25 samples rarely holds a gross error
-LARGE_SPACING_PX = 4  # the large window spreads its 25 samples over 17 pixels
+LARGE_SHARE = 1 / 60  # of the shorter side: spacing of the large window's samples, at least 2 pixels
 QUANTILE = 0.25  # windows on creases, jumps and gross errors lie above it in all but the busiest scenes
 NORMAL_QUANTILE = -0.6745
 DEPTH_BINS = 6
 STEPPED_SHARE = 0.25  # fewer distinct values than this share of the pixels: the depth comes in codes
-FLOOR_RATIO = 0.02  # of the pixel pitch: noise-free images keep finite weights
+FLOOR_RATIO = 0.15  # of the pixel pitch: real surfaces are no truer than this, and noise-free images keep weights
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,9 +40,21 @@ class NoiseModel:
         white, slow, step = (a + b * z2 for a, b in (self.white, self.correlated, self.step))
         return np.asarray(np.sqrt(np.maximum(white**2, step**2 / 12.0) + slow**2))
 
+    def slow_share(self, depth_m: float) -> float:
+        """Part of the variance at `depth_m` that neighbouring pixels share, 0 to 1."""
+        slow = self.correlated[0] + self.correlated[1] * depth_m**2
+        return float(slow**2 / max(float(self.sigma_m(depth_m)) ** 2, 1e-30))
+
     def packed(self) -> Array:
         """(6,) white, correlated and step pairs: what the compiled loops read."""
         return np.array([*self.white, *self.correlated, *self.step])
+
+    def widened(self, factor: float, depths_m: Array) -> NoiseModel:
+        """The model with `factor` times the total sigma at the given depths (N,); the excess counts as correlated."""
+        z2 = depths_m**2
+        total = factor * self.sigma_m(depths_m)
+        white = self.white[0] + self.white[1] * z2
+        return replace(self, correlated=_fit_law(z2, np.sqrt(np.maximum(total**2 - white**2, 0.0))))
 
     @property
     def is_stepped(self) -> bool:
@@ -59,14 +71,14 @@ def estimate_noise(depth_m: Array, sensor: RangeSensorModel) -> NoiseModel:
     packed = sensor.packed()
     perspective = packed[0] > 0
     g = 1.0 / depth_m if perspective else depth_m
-    floor = FLOOR_RATIO * sensor.pitch_m(1.0)
-    floor_pair = (0.0, floor) if perspective else (floor, 0.0)
+    z2 = typical_depths_m(depth_m) ** 2
+    floor = np.array([FLOOR_RATIO * sensor.pitch_m(float(z)) for z in np.sqrt(z2)])
     small = _window_law(g, perspective, spacing_px=1, stride_px=5)
-    large = _window_law(g, perspective, spacing_px=LARGE_SPACING_PX, stride_px=8)
+    spacing = max(2, round(LARGE_SHARE * min(g.shape)))
+    large = _window_law(g, perspective, spacing_px=spacing, stride_px=2 * spacing)
     step = coding_step(depth_m)
-    white = (max(small[0], floor_pair[0]), max(small[1], floor_pair[1]))
+    white = _fit_law(z2, np.maximum(small[0] + small[1] * z2, floor))
     # The slow part is what the large windows see beyond the small ones and beyond the code step itself.
-    z2 = _typical_depth_squared(depth_m)
     seen = np.maximum(white[0] + white[1] * z2, (step[0] + step[1] * z2) / np.sqrt(12.0))
     slow = np.sqrt(np.maximum((large[0] + large[1] * z2) ** 2 - 1.4 * seen**2, 0.0))
     return NoiseModel(white=white, correlated=_fit_law(z2, slow), step=step)
@@ -92,12 +104,13 @@ def coding_step(depth_m: Array) -> tuple[float, float]:
     return _fit_law(at**2, low)
 
 
-def _typical_depth_squared(depth_m: Array) -> Array:
+def typical_depths_m(depth_m: Array) -> Array:
+    """(5,) quantiles of the valid depths, metres: where a noise law is judged."""
     values = depth_m[np.isfinite(depth_m)]
     if values.size == 0:
         return np.array([1.0])
     sample = values[:: max(1, values.size // 4096)]
-    return np.asarray(np.quantile(sample, [0.1, 0.3, 0.5, 0.7, 0.9]) ** 2)
+    return np.asarray(np.quantile(sample, [0.1, 0.3, 0.5, 0.7, 0.9]))
 
 
 def _window_law(g: Array, perspective: bool, *, spacing_px: int, stride_px: int) -> tuple[float, float]:

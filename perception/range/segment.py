@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.range import fit, grow
-from perception.range.claim import claim_borders, claim_pixels
+from perception.range.claim import bucket, claim_borders, claim_pixels
+from perception.range.finish import SLOW_NOISE_AREA_PX
 from perception.range.grid import Grid, block_size, build_grid
-from perception.range.noise import NoiseModel
+from perception.range.noise import NoiseModel, typical_depths_m
 from perception.range.sensor import RangeSensorModel
 from perception.range.surfaces import CONE, CYLINDER, PLANE, QUADRIC, SIZE, SPHERE
 
@@ -31,6 +32,12 @@ FIT_SAMPLES = 120
 LEAST_FLAT_BLOCKS = 24  # a smaller flat patch may be a facet of something bent; whole components decide about it
 STEEP_SLOPE = 7.0  # what is left once the large surfaces are named may be seen as steep as 82 degrees
 LEAST_CURVED_BLOCKS = 16  # smaller things wait for the pixels themselves
+LARGE_PLANE_BLOCKS = 80
+SETTLED_MEAN_SQUARE = 1.25  # residuals cut at three sigmas; wider noise than modelled drives them to 1.5 and more
+WIDER = 1.5
+WIDENINGS = 5
+ROUNDS = 6
+MOST_COMPONENTS = 48  # a round; bounds the time that rubble can cost
 GOOD_MEAN_SQUARE = 2.0
 GOOD_SHARE = 0.75
 LOCAL_BLOCKS = 45
@@ -61,30 +68,67 @@ class Candidates:
         return kinds, table
 
 
-def segment(depth_m: Array, sensor: RangeSensorModel, noise: NoiseModel) -> tuple[Labels, Candidates]:
-    """Labels (H, W), 0 = none, and the surfaces behind them, of an (H, W) depth image in metres."""
-    packed, law = sensor.packed(), noise.packed()
-    finite = np.isfinite(depth_m)
-    middle = float(np.median(depth_m[finite][:: max(1, int(finite.sum()) // 4096)]))
-    size = block_size((depth_m.shape[0], depth_m.shape[1]), noise, sensor, middle)
+def segment(depth_m: Array, sensor: RangeSensorModel, noise: NoiseModel) -> tuple[Labels, Candidates, NoiseModel]:
+    """Segment an (H, W) depth image in metres.
+
+    Returns:
+        labels (H, W), 0 = none; the surfaces behind them; and the noise model, widened where the planes of the image
+        themselves scatter more than the given one says.
+    """
     least = LEAST_PIXELS_AT_256 * depth_m.size / 65536
-    found = Candidates()
-    grid = build_grid(depth_m, sensor, noise, size)
-    blocks = np.zeros(grid.z.shape, np.int32)
-    recover(grid, packed, blocks, found, least_blocks=max(6, round(least / size**2)))
+    found, grid, blocks, noise = _settled_planes(depth_m, sensor, noise, least)
+    packed, law, size = sensor.packed(), noise.packed(), grid.size_px
+    free = np.isfinite(grid.z) & (blocks == 0)
+    _recover_curved(grid, packed, free, blocks, found=found, least=_least_curved(size, least))
     labels = np.zeros(depth_m.shape, np.int32)
     kinds, table = found.arrays()
     claim_pixels(depth_m, packed, law, blocks, size, kinds, table, labels)
     if size > 1:
         labels = reclaimed(depth_m, packed, law, labels, found)
-        left = np.where(labels == 0, depth_m, np.nan)
-        fine = build_grid(left, sensor, noise, 1, jump_slope=STEEP_SLOPE)
-        pixels = labels.copy()
-        before = len(found.kinds)
-        recover(fine, packed, pixels, found, least_blocks=max(8, round(least)))
-        if len(found.kinds) > before:
-            labels = pixels
-    return reclaimed(depth_m, packed, law, labels, found), found
+        labels = _finer(depth_m, sensor, noise, labels, found=found, size=size // 2, least=least)
+    return reclaimed(depth_m, packed, law, labels, found), found, noise
+
+
+def _settled_planes(
+    depth_m: Array, sensor: RangeSensorModel, noise: NoiseModel, least: float
+) -> tuple[Candidates, Grid, Labels, NoiseModel]:
+    """Planes on the coarse grid, grown again under wider noise while large planes scatter more than it allows."""
+    depths = typical_depths_m(depth_m)
+    for attempt in range(WIDENINGS + 1):
+        size = block_size((depth_m.shape[0], depth_m.shape[1]), noise, sensor, float(depths[2]))
+        grid = build_grid(depth_m, sensor, noise, size)
+        blocks = np.zeros(grid.z.shape, np.int32)
+        found = Candidates()
+        scatter = _recover_planes(grid, blocks, found, max(LEAST_FLAT_BLOCKS, round(least / size**2)))
+        if scatter <= SETTLED_MEAN_SQUARE or attempt == WIDENINGS:
+            break
+        noise = noise.widened(WIDER, depths)
+    return found, grid, blocks, noise
+
+
+def _finer(
+    depth_m: Array, sensor: RangeSensorModel, noise: NoiseModel, labels: Labels, *, found: Candidates, size: int,
+    least: float,
+) -> Labels:
+    """Surfaces too small for the coarse blocks, from the pixels that nothing explains yet; returns new labels."""
+    left = np.where(labels == 0, depth_m, np.nan)
+    grid = build_grid(left, sensor, noise, size, jump_slope=STEEP_SLOPE)
+    blocks = np.zeros(grid.z.shape, np.int32)
+    before = len(found.kinds)
+    free = np.isfinite(grid.z)
+    _recover_planes(grid, blocks, found, max(LEAST_FLAT_BLOCKS, round(least / size**2)))
+    free &= blocks == 0
+    _recover_curved(grid, sensor.packed(), free, blocks, found=found, least=max(8, round(least / size**2)))
+    if len(found.kinds) == before:
+        return labels
+    fine = np.zeros_like(labels)
+    kinds, table = found.arrays()
+    claim_pixels(left, sensor.packed(), noise.packed(), blocks, size, kinds, table, fine)
+    return np.where(labels > 0, labels, fine)
+
+
+def _least_curved(size: int, least: float) -> int:
+    return max(LEAST_CURVED_BLOCKS if size > 1 else 6, round(least / size**2))
 
 
 def reclaimed(
@@ -99,20 +143,20 @@ def reclaimed(
     return labels
 
 
-def recover(grid: Grid, packed: Array, blocks: Labels, found: Candidates, *, least_blocks: int) -> None:
-    """Find surfaces on the unlabelled blocks of a grid; extends `blocks` and `found` in place."""
+def _recover_planes(grid: Grid, blocks: Labels, found: Candidates, least: int) -> float:
+    """Grow planes over the grid; extends `blocks` and `found`. Returns the mean squared residual of large planes."""
     free = np.isfinite(grid.z) & (blocks == 0)
     cos_limit = float(np.cos(max(0.26, 4.0 * grid.normal_sigma_rad)))
     tried = np.zeros(free.shape, np.bool_)
     order = grow.seed_order(grid.normal, grid.rms, free, grid.radius + 1)
-    planes, _, _ = grow.grow_planes(
+    planes, counts, mean2 = grow.grow_planes(
         grid.x, grid.y, grid.z, grid.sigma, grid.normal, grid.rms, free, blocks, len(found.kinds) + 1,
-        grid.perspective, order, max(LEAST_FLAT_BLOCKS, least_blocks), cos_limit, tried,
+        grid.perspective, order, least, cos_limit, tried,
     )
     for th in planes:
         found.add(PLANE, th)
-    least_curved = max(LEAST_CURVED_BLOCKS, least_blocks) if grid.size_px > 1 else least_blocks
-    _recover_curved(grid, packed, free, blocks, found=found, least=least_curved)
+    large = counts >= LARGE_PLANE_BLOCKS
+    return float(np.average(mean2[large], weights=counts[large])) if large.any() else 0.0
 
 
 def _recover_curved(
@@ -121,7 +165,7 @@ def _recover_curved(
     dead = np.zeros(free.shape, np.bool_)
     turn_limit = float(np.cos(max(0.7, 5.0 * grid.normal_sigma_rad)))
     step = STEEP_SLOPE * grid.size_px
-    for _ in range(6):
+    for _ in range(ROUNDS):
         label, sizes = grow.range_components(
             grid.z, grid.sigma, free & ~dead, step, 1.0 / packed[1], grid.perspective, grid.normal, grid.rms,
             turn_limit,
@@ -129,8 +173,10 @@ def _recover_curved(
         big = np.flatnonzero(sizes >= least)
         if big.size == 0:
             return
+        big = big[np.argsort(-sizes[big], kind="stable")][:MOST_COMPONENTS]
+        starts, indices = bucket(label, sizes.size - 1)
         for component in big:
-            members = np.flatnonzero(label.ravel() == component)
+            members = indices[starts[component] : starts[component + 1]].astype(np.int64)
             members = members[free.ravel()[members]]
             if members.size < least:
                 continue
@@ -181,13 +227,20 @@ def _fit_best(grid: Grid, members: NDArray[np.int64]) -> tuple[int, Array, float
     if known.sum() < 10:
         kinds[[SPHERE, CYLINDER, CONE]] = False
     ths, mean2, kept, score = fit.fit_kinds(
-        points, points[known], normals[pick[known]], x, y, z, sigma, grid.perspective, kinds, 1.0
+        points, points[known], normals[pick[known]], x, y, z, sigma, grid.perspective, kinds,
+        _correlated_samples(grid, pick.size, members.size),
     )
     score = np.where((mean2 < GOOD_MEAN_SQUARE) & (kept > GOOD_SHARE), score, np.inf)
     best = int(np.argmin(score))
     if not np.isfinite(score[best]):
         return None
     return best, ths[best], float(kept[best])
+
+
+def _correlated_samples(grid: Grid, samples: int, blocks: int) -> float:
+    """How many samples count as one, because slow noise covers them together."""
+    patches = max(blocks * grid.size_px**2 / SLOW_NOISE_AREA_PX, 1.0)
+    return 1.0 + grid.slow_share * max(samples / patches - 1.0, 0.0)
 
 
 def _spread(size: int, count: int) -> NDArray[np.int64]:
@@ -217,7 +270,7 @@ def _grown(
 ) -> tuple[NDArray[np.int32], float]:
     h, w = grid.z.shape
     queue = np.empty(h * w, np.int32)
-    mark = np.zeros(h * w, np.int32)
+    mark = np.zeros(h * w, np.uint8)
     cos_limit = float(np.cos(max(0.5, 4.0 * grid.normal_sigma_rad)))
     count, total = grow.grow_surface(
         kind, th, grid.x, grid.y, grid.z, grid.sigma, grid.normal, grid.rms, free, members, grid.perspective,

@@ -9,10 +9,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from hal.motion import Guard, MotionReport, Quantity
+from manipulation.skills.outcome import Outcome, SkillFailure
 from manipulation.skills.steps import Attempt
+from manipulation.stroke import shifted
 
 Array = NDArray[np.float64]
 
+FEEL_N = 3.0  # moves no lever, and no knob by its own side
+FEEL_M_PER_S = 0.03
 ONSET_N = 1.0  # above noise, drift and inertia in a slow move
 
 
@@ -70,3 +74,27 @@ def onset(depth_m: Array, force_n: Array, deepest_m: float) -> tuple[float, floa
     if slope <= 0.0:
         return float(d[0]), 0.0
     return float(np.clip(-offset / slope, depth_m[0], d[0])), float(slope)
+
+
+def centre_between(attempt: Attempt, *, room_m: float, what: str) -> None:
+    """Local refinement before a cage or a grasp: feel the thing between the open fingers on both sides, go to the middle.
+
+    Args:
+        room_m: how far each side may be.
+        what: its name, for the cause.
+
+    Raises:
+        SkillFailure: nothing on one of the sides (`missed`).
+    """
+    start = attempt.pose()
+    across = start.rotation.apply([1.0, 0.0, 0.0])
+    places = []
+    for side in (1.0, -1.0):
+        begun = float((attempt.pose().translation - start.translation) @ across)
+        goal = shifted(start, (side * room_m, 0.0, 0.0))
+        met = meet(attempt, goal, name="feel", speed_m_per_s=FEEL_M_PER_S, stop_n=FEEL_N)
+        if not met.is_met:
+            raise SkillFailure(Outcome.MISSED, f"there is no {what} between the fingers")
+        places.append(begun + side * met.way_m)
+    middle = shifted(start, (0.5 * (places[0] + places[1]), 0.0, 0.0))
+    attempt.straight(middle, name="centre", speed_m_per_s=FEEL_M_PER_S)

@@ -1,33 +1,41 @@
-"""Turn a handwheel: one finger inside the rim pushes a spoke round, the other stays outside."""
+"""Turn a handwheel: hold its rim lightly between two spokes and carry it round the hub."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from hal.errors import InvalidRequest
-from hal.motion import Guard, Quantity
+from hal.motion import Compliance, Guard, Quantity
 from hal.panel import Handwheel
-from manipulation.skills.contact import meet
+from manipulation.skills.contact import centre_between
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.steps import STANDOFF_M, Attempt, perform
-from manipulation.stroke import arc, turned_about
+from manipulation.stroke import arc
 from manipulation.workcell import Workcell, panel_from_grip
 
-HUB_M = 0.009
-OPENING_M = 0.034
-TIP_DEPTH_M = 0.012  # of the tips below the middle of the rim
-SPOKE_M = 0.0036
-ROOM_M = 0.006  # between finger and spoke when coming down
-SEEK_RAD = 0.9
-SEEK_N = 3.0
-SEEK_M_PER_S = 0.03
-TURN_M_PER_S = 0.06
-LONGEST_RAD = 1.8  # of one push; then the finger goes back for the next spoke
+Array = NDArray[np.float64]
+
+SIDE_M = 0.008  # room between each finger and the rim when coming down
+TIP_DEPTH_M = 0.008  # of the tips below the middle of the rim
+FRICTION = 0.6  # of pads on paint, low on purpose
+GRIP_FLOOR_N = 15.0
+LARGEST_GRIP_N = 45.0
+TURN_M_PER_S = 0.08
+LONGEST_RAD = 1.7  # of one hold; then the hand goes back for the next
 EFFORT_SPREAD = 1.6
-EFFORT_FLOOR_N = 20.0
+EFFORT_FLOOR_N = 30.0
 LARGEST_STOP_N = 92.0
 TOLERANCE_RAD = np.radians(6.0)
+INF = float("inf")
+# Hub and plate are known to a few millimetres: the hand yields along the radius and the axis, so that the rim leads it round.
+RADIAL = Compliance(
+    stiffness=(50.0, INF, 400.0, INF, INF, INF),
+    damping=(1000.0, 1000.0, 1500.0, 10.0, 10.0, 10.0),
+    mass=(100.0, 100.0, 100.0, 1.0, 1.0, 1.0),
+    max_offset_m=0.015,
+)
 
 
 def handwheel(
@@ -35,7 +43,7 @@ def handwheel(
 ) -> SkillReport:
     """Turn the wheel until its marked spoke has come from the present angle to `target_rad` (clockwise from up).
 
-    A turn of more than 100 degrees is made by several pushes.
+    A turn of more than about 100 degrees is made by several holds.
 
     Args:
         current: what the last look said (angle); without it `verify` is asked.
@@ -60,12 +68,10 @@ def handwheel(
     def stroke(attempt: Attempt) -> float:
         if where[0] is None:
             raise InvalidRequest(f"the angle of {name} is not known", hint="read it first, or give `current`")
-        angle = where[0]
-        while abs(target_rad - angle) > 0.5 * TOLERANCE_RAD:
-            part = float(np.clip(target_rad - angle, -LONGEST_RAD, LONGEST_RAD))
-            angle += _push_spoke(attempt, thing, angle, part)
-            where[0] = angle
-        return angle
+        while abs(target_rad - where[0]) > 0.3 * TOLERANCE_RAD:
+            part = float(np.clip(target_rad - where[0], -LONGEST_RAD, LONGEST_RAD))
+            where[0] += _carry(attempt, thing, where[0], part)
+        return where[0]
 
     def look() -> ObjectState | None:
         seen = verify() if verify is not None else None
@@ -84,53 +90,60 @@ def handwheel(
     )
 
 
-def _push_spoke(attempt: Attempt, thing: Handwheel, angle_rad: float, span_rad: float) -> float:
-    """One push by `span_rad`; returns the signed angle by which the wheel turned."""
+def grip_force_n(thing: Handwheel) -> float:
+    """Force of each pad so that friction carries the wheel: 2 mu F r = spread times torque."""
+    needed = EFFORT_SPREAD * thing.torque_nm / (2.0 * FRICTION * thing.radius_m)
+    return float(np.clip(needed, GRIP_FLOOR_N, LARGEST_GRIP_N))
+
+
+def _carry(attempt: Attempt, thing: Handwheel, angle_rad: float, span_rad: float) -> float:
+    """One hold and turn; returns the signed angle by which the wheel turned."""
     cell, sign = attempt.cell, float(np.sign(span_rad))
-    finger = 0.5 * (HUB_M + thing.radius_m - thing.rim_m)  # radius at which the inner finger works
-    grip = finger + cell.hand.finger_thickness_m / 2 + OPENING_M / 2  # and the middle between the fingers
-    behind = (SPOKE_M + cell.hand.finger_width_m / 2 + ROOM_M) / finger
-    spokes = [angle_rad + 2.0 * np.pi * k / thing.spokes for k in range(thing.spokes)]
-    ways = [_way(thing, spoke - sign * behind, span_rad + sign * behind, grip, flip) for spoke in spokes for flip in (0.0, np.pi)]
-    attempt.begin(ways, may_touch=(thing.name,), width_m=OPENING_M, name=thing.name)
-    low = thing.height_m - thing.rim_m - TIP_DEPTH_M
-    down = attempt.advance(thing.height_m + STANDOFF_M - low, name="approach")
+    open_m = 2.0 * (thing.rim_m + SIDE_M)
+    gap = np.pi / thing.spokes
+    between = [angle_rad + (2 * k + 1) * gap for k in range(thing.spokes)]
+    ways = [_way(thing, place, span_rad, flip) for place in between for flip in (0.0, np.pi)]
+    way = attempt.begin(ways, may_touch=(thing.name,), width_m=open_m, name=thing.name)
+    down = attempt.advance(STANDOFF_M + thing.rim_m + TIP_DEPTH_M, name="approach")
     if down.tripped is not None:
         raise SkillFailure(Outcome.MISSED, "a finger landed on the wheel")
-    panel = cell.panel_pose
-    hub = panel.apply(np.array(thing.point_m))
-    axis = panel.rotation.apply([0.0, 0.0, -1.0])  # clockwise seen from the front
+    centre_between(attempt, room_m=SIDE_M + 0.004, what="rim")
+    hub = _hub(attempt, thing, between[way // 2])
+    attempt.open_to(0.0, force_n=grip_force_n(thing), name="hold the rim")
     start = attempt.pose()
-    stop_n = min(LARGEST_STOP_N, EFFORT_SPREAD * thing.torque_nm / finger + EFFORT_FLOOR_N)
-    seek = Guard(name="spoke", quantity=Quantity.FORCE, limit=SEEK_N, ticks=3)
-    poses = arc(start, centre_m=hub, axis=axis, angle_rad=sign * SEEK_RAD)
-    found = attempt.along(poses, name="feel the spoke", speed_m_per_s=SEEK_M_PER_S, guards=(seek,))
-    if found.tripped is None:
-        raise SkillFailure(Outcome.MISSED, "no spoke was met")
-    met = attempt.pose()
-    give = (stop_n / EFFORT_SPREAD) / cell.hand.pad_stiffness_n_per_m / finger
-    del give
-    strong = Guard(name="effort", quantity=Quantity.FORCE, limit=stop_n)
-    poses = arc(met, centre_m=hub, axis=axis, angle_rad=span_rad)
-    report = attempt.along(poses, name="turn", speed_m_per_s=TURN_M_PER_S, guards=(strong,))
-    turned = sign * float(np.linalg.norm((report.base_from_tool.rotation * met.rotation.inv()).as_rotvec()))
-    back = turned_about(attempt.pose(), hub, axis, -sign * 0.15)
-    attempt.straight(back, name="let go", speed_m_per_s=SEEK_M_PER_S)
-    attempt.leave(thing.height_m + STANDOFF_M - low)
+    axis = cell.panel_pose.rotation.apply([0.0, 0.0, -1.0])  # clockwise seen from the front
+    stop_n = min(LARGEST_STOP_N, EFFORT_SPREAD * thing.torque_nm / thing.radius_m + EFFORT_FLOOR_N)
+    ahead = sign * start.rotation.inv().apply(np.cross(axis, start.translation - hub))
+    against = -ahead / np.linalg.norm(ahead)
+    direction = (float(against[0]), float(against[1]), float(against[2]))
+    guard = Guard(name="effort", quantity=Quantity.FORCE, limit=stop_n, axis=direction)
+    poses = arc(start, centre_m=hub, axis=axis, angle_rad=span_rad)
+    report = attempt.along(poses, name="turn", speed_m_per_s=TURN_M_PER_S, guards=(guard,), compliance=RADIAL)
+    turned = sign * float(np.linalg.norm((report.base_from_tool.rotation * start.rotation.inv()).as_rotvec()))
     if report.tripped is not None:
         outcome = Outcome.STIFF if abs(turned) < 0.2 else Outcome.STALLED
         raise SkillFailure(outcome, f"it did not give way at {report.peak_force_n:.0f} N", reached=angle_rad + turned)
+    attempt.open_to(open_m, name="let go")
+    attempt.leave(STANDOFF_M + thing.rim_m + TIP_DEPTH_M)
     return turned
 
 
-def _way(thing: Handwheel, start_rad: float, span_rad: float, grip_m: float, flip: float) -> list[RigidTransform]:
-    """Grip poses with the closing direction along the radius, from the standoff round the push."""
+def _hub(attempt: Attempt, thing: Handwheel, place_rad: float) -> Array:
+    """The hub in the base frame: the panel's pose, moved along the radius by what the fingers found of the rim."""
+    panel = attempt.cell.panel_pose
+    tool = (panel.inv() * attempt.pose()).translation
+    radial = np.array([np.sin(place_rad), np.cos(place_rad), 0.0])
+    offset = (tool - np.array(thing.point_m)) @ radial - thing.radius_m
+    return np.asarray(panel.apply(np.array(thing.point_m) + offset * radial + [0.0, 0.0, tool[2]]))
+
+
+def _way(thing: Handwheel, start_rad: float, span_rad: float, flip: float) -> list[RigidTransform]:
+    """Grip poses with the closing direction along the radius, from the standoff round the turn."""
 
     def at(angle: float, z: float) -> RigidTransform:
         x, y = thing.position_m
-        point = (x + grip_m * np.sin(angle), y + grip_m * np.cos(angle), z)
-        # The radius points at pi/2 - angle from the panel's x.
-        return panel_from_grip(point, np.pi / 2 - angle + flip)
+        point = (x + thing.radius_m * np.sin(angle), y + thing.radius_m * np.cos(angle), z)
+        return panel_from_grip(point, np.pi / 2 - angle + flip)  # the radius points at pi/2 - angle from the panel's x
 
     low = thing.height_m - thing.rim_m - TIP_DEPTH_M
     steps = np.linspace(start_rad, start_rad + span_rad, max(6, int(abs(span_rad) / 0.08)))

@@ -11,10 +11,10 @@ from scipy.spatial.transform import RigidTransform
 from hal.errors import InvalidRequest
 from hal.motion import Guard, Quantity
 from hal.panel import Lever
-from manipulation.skills.contact import meet
+from manipulation.skills.contact import centre_between
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.steps import STANDOFF_M, Attempt, perform
-from manipulation.stroke import arc, shifted
+from manipulation.stroke import arc
 from manipulation.workcell import Workcell, panel_from_grip
 
 Array = NDArray[np.float64]
@@ -23,8 +23,6 @@ OVERLAP_M = 0.013  # how far the tips reach below the top of the bar
 FROM_END_M = 0.016  # the fingers hold the bar this far before its end: long lever arm, room for the pose error
 APPROACH_SIDE_M = 0.008  # free space on each side when coming down; more than the pose error
 CAGE_SIDE_M = 0.002  # free space on each side in the stroke: caged, not squeezed
-FEEL_N = 3.0
-FEEL_M_PER_S = 0.03
 STROKE_M_PER_S = 0.08
 LAST_RAD = np.radians(14.0)  # the prototype met the end stop at more than 300 N until it slowed down here
 OVERTRAVEL_RAD = np.radians(12.0)  # play of the cage and give of the pads
@@ -121,7 +119,7 @@ def _turn_lever(attempt: Attempt, thing: Lever, turn: _Turn) -> float:
     down = attempt.advance(STANDOFF_M + OVERLAP_M, name="approach")
     if down.tripped is not None:
         raise SkillFailure(Outcome.MISSED, "a finger landed on the bar")
-    _centre_on_bar(attempt)
+    centre_between(attempt, room_m=APPROACH_SIDE_M + 0.004, what="bar")
     hub = _hub(attempt, thing, turn.start_rad)
     attempt.open_to(thing.width_m + 2.0 * CAGE_SIDE_M, name="cage")
     turned = _carry(attempt, thing, turn.span_rad, hub)
@@ -141,23 +139,6 @@ def _way(thing: Lever, turn: _Turn, radius: float, flip: float) -> list[RigidTra
     over = OVERTRAVEL_RAD * np.sign(turn.span_rad)
     steps = np.linspace(turn.start_rad, turn.goal_rad + over, max(8, int(abs(turn.span_rad) / 0.05)))
     return [at(turn.start_rad, thing.height_m + STANDOFF_M), *(at(float(a), low) for a in steps)]
-
-
-def _centre_on_bar(attempt: Attempt) -> None:
-    """Local refinement where the cage is narrow: feel the bar on both sides and go to the middle."""
-    start = attempt.pose()
-    room = APPROACH_SIDE_M + 0.004
-    way = []
-    for side in (1.0, -1.0):
-        goal = shifted(start, (side * room, 0.0, 0.0))
-        met = meet(attempt, goal, name="feel the bar", speed_m_per_s=FEEL_M_PER_S, stop_n=FEEL_N)
-        if not met.is_met:
-            raise SkillFailure(Outcome.MISSED, "there is no bar between the fingers")
-        contact = met.report.log.tip_m[0] - start.translation
-        begun = float(contact @ start.rotation.apply([1.0, 0.0, 0.0]))
-        way.append(begun + side * met.way_m)
-    middle = shifted(start, (0.5 * (way[0] + way[1]), 0.0, 0.0))
-    attempt.straight(middle, name="centre", speed_m_per_s=FEEL_M_PER_S)
 
 
 def _hub(attempt: Attempt, thing: Lever, angle_rad: float) -> Array:

@@ -16,8 +16,8 @@ from manipulation.workcell import Workcell, panel_from_grip
 
 SEEK_N = 2.5  # a light contact ends the fast part, so that the slow part always begins above or on the cap
 SEEK_ABOVE_M = 0.004
-PRESS_M_PER_S = 0.025
-STOP_FLOOR_N = 20.0  # the prototype's buttons were pressed to 20 N without a miss
+PRESS_M_PER_S = 0.012  # onto a hard stop the force overshoots by about 1 N per mm/s
+STOP_FLOOR_N = 15.0
 EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
 BOTTOM_N = 6.0  # above the spring at full travel: the cap stands on its stop
 DEEP_ENOUGH_RATIO = 0.3  # a latched cap has only this much travel left
@@ -46,12 +46,12 @@ def press(
         attempt.begin(ways, may_touch=(cap.name,), width_m=0.0, name=cap.name)
         attempt.advance(STANDOFF_M - SEEK_ABOVE_M, name="approach", stop_n=SEEK_N)
         report = _push(attempt, cap)
-        attempt.leave()
         travel = travelled_m(report, cell.hand.pad_stiffness_n_per_m)
         if report.tripped is None:
             raise SkillFailure(Outcome.MISSED, "no cap was met where it should be", reached=travel)
         if travel < DEEP_ENOUGH_RATIO * cap.travel_m:
             raise SkillFailure(Outcome.STALLED, f"it gave way by only {1e3 * travel:.1f} mm", reached=travel)
+        attempt.leave()
         return travel
 
     return perform(
@@ -66,7 +66,7 @@ def stop_force_n(cap: Button | Mushroom) -> float:
 
 
 def _push(attempt: Attempt, cap: Button | Mushroom) -> MotionReport:
-    guard = Guard(name="bottom", quantity=Quantity.FORCE, limit=stop_force_n(cap), axis=(0.0, 0.0, -1.0))
+    guard = Guard(name="bottom", quantity=Quantity.FORCE, limit=stop_force_n(cap), axis=(0.0, 0.0, -1.0), ticks=1)
     goal = shifted(attempt.pose(), (0.0, 0.0, SEEK_ABOVE_M + cap.travel_m + LOST_M))
     return attempt.straight(goal, name="press", speed_m_per_s=PRESS_M_PER_S, guards=(guard,))
 

@@ -8,6 +8,7 @@ from scipy.spatial.transform import RigidTransform
 from hal.errors import InvalidRequest
 from hal.motion import Compliance, Guard, Quantity
 from hal.panel import Rotary
+from manipulation.skills.contact import centre_between
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.steps import STANDOFF_M, Attempt, perform
 from manipulation.stroke import arc
@@ -19,6 +20,7 @@ SEAT_N = 5.0
 LIFT_M = 0.0015
 GRIP_N = 12.0  # a low grip force: 40 N doubled the peaks of the prototype
 TURN_M_PER_S = 0.05
+PLAY_RAD = 0.08
 STOP_N = 40.0
 TOLERANCE_RAD = np.radians(12.0)
 # Heavy virtual mass against chatter (15 to 28 N tick to tick with 8 kg, 4 to 6 N with 200 kg).
@@ -102,13 +104,15 @@ def _turn(attempt: Attempt, thing: Rotary, start_rad: float, goal_rad: float) ->
         raise SkillFailure(Outcome.MISSED, "a finger landed on the bar")
     if down.tripped is not None:
         attempt.advance(-LIFT_M, name="lift off the shoulder", speed_m_per_s=0.03)
+    centre_between(attempt, room_m=SIDE_M + 0.004, what="bar")
     attempt.open_to(0.0, force_n=GRIP_N, name="hold the bar")
     width = cell.mover.state().gripper_width_m
     if width < 0.5 * bar_m:
         raise SkillFailure(Outcome.MISSED, f"the fingers closed to {1e3 * width:.1f} mm; no bar between them")
     start = attempt.pose()
     axis = cell.panel_pose.rotation.apply([0.0, 0.0, -1.0])
-    poses = arc(start, centre_m=start.translation, axis=axis, angle_rad=goal_rad - start_rad)
+    over = PLAY_RAD * float(np.sign(goal_rad - start_rad))  # the detent pulls the knob back into place
+    poses = arc(start, centre_m=start.translation, axis=axis, angle_rad=goal_rad - start_rad + over)
     guard = Guard(name="effort", quantity=Quantity.FORCE, limit=STOP_N)
     report = attempt.along(poses, name="turn", speed_m_per_s=TURN_M_PER_S, guards=(guard,), compliance=YIELDING)
     turned = float(np.linalg.norm((report.base_from_tool.rotation * start.rotation.inv()).as_rotvec()))

@@ -116,7 +116,6 @@ def _push(attempt: Attempt, thing: Slider, push: _Push) -> float:
     ahead = push.sign * cell.panel_pose.rotation.apply([np.cos(thing.angle_rad), np.sin(thing.angle_rad), 0.0])
     met = meet(attempt, _moved(attempt, SEEK_M * ahead), name="feel the cap", speed_m_per_s=SEEK_M_PER_S, stop_n=SEEK_N, ticks=3)
     if not met.is_met:
-        attempt.leave()
         raise SkillFailure(Outcome.MISSED, "no cap was met")
     begun = met.report.log.tip_m[0]
     face = float(met.way_m - (attempt.pose().translation - begun) @ ahead)  # from here back to the face, not positive

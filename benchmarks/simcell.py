@@ -1,11 +1,10 @@
-"""The simulated bench with a controller over it and a panel pose that is wrong by a given amount: the skills' test rig.
+"""The simulated bench with a controller over it and a panel pose that is wrong by a given amount.
 
-Only tests and benchmarks use this file: it reads the simulator's truth, which no skill may.
+The rig of the skills' tests and benchmark. It reads the simulator's truth, which no skill may.
 """
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from manipulation.skills.outcome import ObjectState
 from manipulation.timing import SpeedLimits
 from manipulation.workcell import Workcell
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @dataclass
@@ -36,6 +35,7 @@ class SimBench:
     controller: Controller
     cell: Workcell
     latched: list[bool]
+    rng: np.random.Generator
 
     def truth(self, name: str) -> ObjectTruth:
         """What an object really shows now."""
@@ -49,10 +49,17 @@ class SimBench:
         """Largest contact force that the engine saw on the arm."""
         return float(self.arm.truth().peak_force_n)  # type: ignore[attr-defined]
 
-    def look(self, name: str) -> ObjectState:
-        """A perfect second look."""
+    def look(self, name: str, *, angle_sigma_rad: float = 0.0, value_sigma: float = 0.0) -> ObjectState:
+        """A second look: the truth with noise as a camera's reading has it."""
         truth = self.truth(name)
-        return ObjectState(name=name, state=truth.state, value=truth.value, angle_rad=truth.value)
+        if truth.value is None:
+            return ObjectState(name=name, state=truth.state)
+        return ObjectState(
+            name=name,
+            state=truth.state,
+            value=truth.value + value_sigma * float(self.rng.standard_normal()),
+            angle_rad=truth.value + angle_sigma_rad * float(self.rng.standard_normal()),
+        )
 
     def close(self) -> None:
         """End controller and world."""
@@ -105,12 +112,7 @@ def open_bench(seed: int, *, error_m: float = 0.003, error_rad: float = np.radia
         floor_z_m=file.file.workspace.floor_z_m,
         seed=seed,
     )
-    bench = SimBench(file, clock, shared, made["arm"], controller, cell, latched)
+    bench = SimBench(file, clock, shared, made["arm"], controller, cell, latched, rng)
     angles = {o.name: o.value for o in file.panel.objects if o.kind == "lever" for o in [bench.truth(o.name)]}
     bench.cell = replace(cell, angles_rad=angles)
     return bench
-
-
-def wall_s() -> float:
-    """Seconds of the machine, for real-time factors."""
-    return time.perf_counter()

@@ -1,0 +1,203 @@
+"""How well the hand works the simulated panel: every skill over many seeds, with a panel pose that is wrong.
+
+    python -m benchmarks.manipulation [--skills lever,slider,...] [--seeds 20] [--first 1] [--error-mm 3] [--error-deg 1]
+
+Success is judged by the simulator's truth after the skill has ended, not by what the skill says. A `done` that the truth
+does not bear out counts as false.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.simcell import SimBench, open_bench
+from hal.errors import CellError
+from manipulation.skills.button import button
+from manipulation.skills.handwheel import handwheel
+from manipulation.skills.lever import lever
+from manipulation.skills.mushroom import mushroom
+from manipulation.skills.outcome import Outcome, SkillReport
+from manipulation.skills.rotary import rotary
+from manipulation.skills.slider import slider
+from manipulation.skills.steps import park
+from manipulation.skills.toggle import toggle
+
+ANGLE_SIGMA_RAD = np.radians(1.0)  # of the looks that the skills are given
+SLIDER_SIGMA = 0.4  # per cent of the scale: 0.4 mm
+SLIDER_TOLERANCE_M = 0.0015
+LEVER_TOLERANCE_RAD = np.radians(5.0)
+WHEEL_TOLERANCE_RAD = np.radians(6.0)
+PASS_RATIO = 0.95
+PEAK_N = {"button": 25.0, "toggle": 25.0, "mushroom": 40.0, "slider": 40.0, "rotary": 40.0, "lever": 98.0, "handwheel": 83.0}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """One skill on one seed."""
+
+    skill: str
+    seed: int
+    is_right: bool
+    outcome: str
+    cause: str
+    attempts: int
+    peak_n: float
+    sim_s: float
+    wall_s: float
+    error: float
+
+
+Judged = tuple[SkillReport, bool, float]
+
+
+def _lever(bench: SimBench) -> Judged:
+    goal = "open" if bench.truth("main_valve").state == "closed" else "closed"
+    angle = {"open": 0.0, "closed": np.pi / 2}[goal]
+    look = lambda: bench.look("main_valve", angle_sigma_rad=ANGLE_SIGMA_RAD)  # noqa: E731
+    report = lever(bench.cell, "main_valve", goal, current=look(), verify=look)
+    error = float(bench.truth("main_valve").value or 0.0) - angle
+    return report, abs(error) <= LEVER_TOLERANCE_RAD, error
+
+
+def _slider(bench: SimBench) -> Judged:
+    before = float(bench.truth("setpoint").value or 0.0)
+    goal = float(bench.rng.uniform(10.0, 90.0))
+    goal = goal if abs(goal - before) > 10.0 else (before + 50.0) % 100.0
+    look = lambda: bench.look("setpoint", value_sigma=SLIDER_SIGMA)  # noqa: E731
+    report = slider(bench.cell, "setpoint", goal, current=look(), verify=look)
+    error_m = (float(bench.truth("setpoint").value or 0.0) - goal) * 1e-3
+    return report, abs(error_m) <= SLIDER_TOLERANCE_M, error_m
+
+
+def _button(bench: SimBench) -> Judged:
+    before = float(bench.truth("start").value or 0.0)
+    expected = "off" if bench.truth("run_lamp").state == "on" else "on"
+    report = button(bench.cell, "start", expected=expected, verify=lambda: bench.look("run_lamp"))
+    presses = float(bench.truth("start").value or 0.0) - before
+    return report, presses == 1.0, presses - 1.0
+
+
+def _toggle(bench: SimBench) -> Judged:
+    goal = "off" if bench.truth("pump").state == "on" else "on"
+    report = toggle(bench.cell, "pump", goal, verify=lambda: bench.look("pump"))
+    return report, bench.truth("pump").state == goal, 0.0
+
+
+def _rotary(bench: SimBench) -> Judged:
+    states = ["manual", "off", "auto"]
+    now = states.index(str(bench.truth("mode").state))
+    goal = states[now + 1 if now < 2 else now - 1]
+    look = lambda: bench.look("mode")  # noqa: E731
+    report = rotary(bench.cell, "mode", goal, current=look(), verify=look)
+    return report, bench.truth("mode").state == goal, 0.0
+
+
+def _handwheel(bench: SimBench) -> Judged:
+    before = float(bench.truth("bypass").value or 0.0)
+    goal = before + (np.pi / 2 if before < 0 else -np.pi / 2)
+    look = lambda: bench.look("bypass", angle_sigma_rad=ANGLE_SIGMA_RAD)  # noqa: E731
+    report = handwheel(bench.cell, "bypass", goal, current=look(), verify=look)
+    error = float(bench.truth("bypass").value or 0.0) - goal
+    return report, abs(error) <= WHEEL_TOLERANCE_RAD, error
+
+
+def _mushroom(bench: SimBench) -> Judged:
+    report = mushroom(bench.cell, "emergency", verify=lambda: bench.look("emergency"))
+    return report, bench.truth("emergency").state == "pressed", 0.0
+
+
+SKILLS: dict[str, Callable[[SimBench], Judged]] = {
+    "lever": _lever,
+    "slider": _slider,
+    "button": _button,
+    "toggle": _toggle,
+    "rotary": _rotary,
+    "handwheel": _handwheel,
+    "mushroom": _mushroom,
+}
+
+
+def trial(bench: SimBench, skill: str, seed: int) -> Trial:
+    """Run one skill and judge it."""
+    wall, sim = time.perf_counter(), bench.clock.now_s()
+    try:
+        report, is_right, error = SKILLS[skill](bench)
+        outcome, cause = str(report.outcome), report.cause
+        attempts, peak = report.attempts, report.peak_force_n
+    except CellError as fault:
+        is_right, error, outcome, cause, attempts, peak = False, 0.0, fault.type_name, fault.what, 0, 0.0
+    try:
+        park(bench.cell)
+    except CellError as fault:
+        cause = f"{cause}; park: {fault.what}"
+    return Trial(
+        skill=skill, seed=seed, is_right=is_right, outcome=outcome, cause=cause, attempts=attempts, peak_n=peak,
+        sim_s=bench.clock.now_s() - sim, wall_s=time.perf_counter() - wall, error=error,
+    )  # fmt: skip
+
+
+def wilson_lower(successes: int, trials: int, z: float = 1.96) -> float:
+    """Lower end of the 95 % interval of a proportion (Wilson, JASA 22, 1927)."""
+    if trials == 0:
+        return 0.0
+    p = successes / trials
+    centre = p + z * z / (2 * trials)
+    spread = z * np.sqrt(p * (1 - p) / trials + z * z / (4 * trials * trials))
+    return float((centre - spread) / (1 + z * z / trials))
+
+
+def table(trials: list[Trial]) -> str:
+    """One line a skill, pass line beside measured value."""
+    head = f"{'skill':10} {'right':>8} {'pass':>6} {'wilson':>7} {'first':>6} {'false':>6} {'peak med/max N':>16} {'limit':>6} {'sim s':>6} {'RTF':>5}  outcomes"
+    lines = [head]
+    for skill in dict.fromkeys(t.skill for t in trials):
+        rows = [t for t in trials if t.skill == skill]
+        right = sum(t.is_right for t in rows)
+        false = sum(t.outcome == Outcome.DONE and not t.is_right for t in rows)
+        first = sum(t.is_right and t.attempts == 1 for t in rows)
+        peaks = [t.peak_n for t in rows]
+        wall = sum(t.wall_s for t in rows)
+        verdict = "ok" if right >= PASS_RATIO * len(rows) else "FAIL"
+        lines.append(
+            f"{skill:10} {right:4}/{len(rows):<3} {verdict:>6} {wilson_lower(right, len(rows)):7.2f} {first:6} {false:6}"
+            f" {np.median(peaks):8.1f}/{max(peaks):5.1f}  {PEAK_N[skill]:6.0f} {np.median([t.sim_s for t in rows]):6.1f}"
+            f" {sum(t.sim_s for t in rows) / wall:5.2f}  {dict(Counter(t.outcome for t in rows))}"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--skills", default=",".join(SKILLS))
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--first", type=int, default=1)
+    parser.add_argument("--error-mm", type=float, default=3.0)
+    parser.add_argument("--error-deg", type=float, default=1.0)
+    options = parser.parse_args()
+    trials: list[Trial] = []
+    for seed in range(options.first, options.first + options.seeds):
+        bench = open_bench(seed, error_m=options.error_mm * 1e-3, error_rad=np.radians(options.error_deg))
+        try:
+            for skill in options.skills.split(","):
+                result = trial(bench, skill, seed)
+                trials.append(result)
+                mark = "right" if result.is_right else "WRONG"
+                print(
+                    f"{seed:4} {skill:10} {mark} {result.outcome:11} tries {result.attempts} peak {result.peak_n:5.1f} N "
+                    f"error {result.error:+.4f} sim {result.sim_s:5.1f} s  {result.cause}",
+                    flush=True,
+                )
+        finally:
+            bench.close()
+    print(table(trials))
+
+
+if __name__ == "__main__":
+    main()

@@ -11,6 +11,8 @@ from typing import Any, Protocol
 
 JOINT = 0
 DAMPING_N_S_PER_M = 4.0
+TURN_DAMPING_NM_S_PER_RAD = 0.05
+SLIDE_DAMPING_N_S_PER_M = 5.0
 LOCK_EFFORT = 200.0
 SNAP_GAIN_PER_S = 40.0
 
@@ -40,6 +42,11 @@ class Friction:
     engine: Any
     body: int
     effort: float  # N or N m
+    damping: float = 0.0  # N m s/rad or N s/m
+
+    def __post_init__(self) -> None:
+        # The engine's stop catches a part only after the tick in which it passed: a part that cannot race passes by little.
+        self.engine.changeDynamics(self.body, JOINT, jointDamping=self.damping)
 
     def lock(self) -> None:
         """Friction is its own lock."""

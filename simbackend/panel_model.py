@@ -69,7 +69,7 @@ class ObjectModel:
     place: float = 0.0
 
 
-def object_model(built: Built) -> ObjectModel:  # noqa: PLR0911  # one a kind
+def object_model(built: Built) -> ObjectModel:  # one a kind
     """The model of one built object."""
     match built.thing:
         case Gauge():

@@ -52,7 +52,7 @@ def build(panel: Panel, draws: Draws) -> tuple[Built, ...]:
     return tuple(_built(thing, panel, draws, button_lamps) for thing in panel.objects)
 
 
-def _built(thing: PanelObject, panel: Panel, draws: Draws, button_lamps: set[str]) -> Built:  # noqa: PLR0911  # one a kind
+def _built(thing: PanelObject, panel: Panel, draws: Draws, button_lamps: set[str]) -> Built:  # one a kind
     random = draws.stream(f"object/{thing.name}")
     dx, dy = panel.tolerances.position_m * random.standard_normal(2)
     # A tenth is the least: a part without any friction would never rest.

@@ -25,7 +25,15 @@ from hal.panel import (
 )
 from simbackend import textures
 from simbackend.draws import Draws
-from simbackend.mechanisms import JOINT, Detent, Friction, Mechanism, Spring
+from simbackend.mechanisms import (
+    JOINT,
+    SLIDE_DAMPING_N_S_PER_M,
+    TURN_DAMPING_NM_S_PER_RAD,
+    Detent,
+    Friction,
+    Mechanism,
+    Spring,
+)
 from simbackend.panel_model import PAINT, Quad, light_urdf, object_model, robot
 from simbackend.panel_state import Built, build
 from simbackend.scene import Scene
@@ -185,9 +193,11 @@ class PanelWorld:
                     engine=self.engine, body=body, places=places, effort=thing.torque_nm * ratio, max_speed=6.0
                 )
             case Slider():
-                return Friction(engine=self.engine, body=body, effort=thing.friction_n * ratio)
+                friction_n = thing.friction_n * ratio
+                return Friction(engine=self.engine, body=body, effort=friction_n, damping=SLIDE_DAMPING_N_S_PER_M)
             case Lever() | Handwheel():
-                return Friction(engine=self.engine, body=body, effort=thing.torque_nm * ratio)
+                torque_nm = thing.torque_nm * ratio
+                return Friction(engine=self.engine, body=body, effort=torque_nm, damping=TURN_DAMPING_NM_S_PER_RAD)
             case _:  # a needle: its movement holds it
                 return Friction(engine=self.engine, body=body, effort=1.0)
 
@@ -281,7 +291,7 @@ class PanelWorld:
         """What each object shows at this tick."""
         return tuple(self._truth_of(built) for built in self.built.values())
 
-    def _truth_of(self, built: Built) -> ObjectTruth:  # noqa: PLR0911  # one a kind
+    def _truth_of(self, built: Built) -> ObjectTruth:  # one a kind
         thing = built.thing
         name = thing.name
         mechanism = self.mechanisms.get(name)

@@ -27,9 +27,9 @@ JUMP_M = 0.008  # neighbours further apart than this share a beam
 class RangeOptions(SimOptions):
     """Size, field of view and corruption.
 
-    `sigma_m` is the noise at 0.5 m and grows with the square of the distance; `bits` = 8 quantises the range from 0.10
-    to 1.50 m to 256 steps as the paper's scanner did; `mixed_ratio` of the pixels at a jump report a depth between the two
-    surfaces; `loss_ratio` of all pixels see nothing.
+    `sigma_m`: noise at 0.5 m, growing with the square of the distance. `bits` = 8 quantises the range from 0.10 to
+    1.50 m to 256 steps as the paper's scanner did. `mixed_ratio` of the pixels at a jump report a depth between the
+    two surfaces, and `loss_ratio` of all pixels see nothing.
     """
 
     width: Annotated[int, Field(ge=16, le=512)] = 128

@@ -24,7 +24,7 @@ BYTE = 1.0 / 255.0
 
 
 @njit(cache=True, nogil=True)
-def rasterise(  # noqa: PLR0917  # a compiled kernel takes no keywords
+def rasterise(  # a compiled kernel takes no keywords
     points: Array,
     attributes: Array,
     surface: NDArray[np.int64],
@@ -91,7 +91,7 @@ def _clip(triangle: Array, values: Array, near: float, corner: Array, out: Array
 
 
 @njit(cache=True, nogil=True)
-def _triangle(  # noqa: PLR0912, PLR0915, PLR0917  # a compiled kernel: one loop, no calls inside it
+def _triangle(  # noqa: PLR0912, PLR0915  # a compiled kernel: one loop, no calls inside it
     corner: Array,
     values: Array,
     k: int,

@@ -56,7 +56,7 @@ class Evidence(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LightEvidence:
-    """A border light seen by the camera. `covariance_px` (2, 2); `light_sigma_m` is the panel's own tolerance."""
+    """A border light seen by the camera. `covariance_px` (2, 2) holds noise, lens and the light's own tolerance."""
 
     sensor: str
     base_from_flange: RigidTransform
@@ -65,14 +65,11 @@ class LightEvidence:
     pixel_px: Array
     covariance_px: Array
     intrinsics: CameraIntrinsics
-    distance_m: float
-    light_sigma_m: float
 
     @property
     def sigmas(self) -> Array:
         """Across and along the image, px."""
-        own = np.sqrt(np.trace(self.covariance_px) / 2.0)
-        return np.full(2, float(np.hypot(own, self.light_sigma_m * self.intrinsics.fx_px / self.distance_m)))
+        return np.full(2, float(np.sqrt(np.trace(self.covariance_px) / 2.0)))
 
     def measurement(self, base_from_sensor: UncertainPose, errors: Array) -> Measurement:
         """The ray through the light: line-point."""
@@ -256,5 +253,5 @@ def _mirror_resolved(fused: FusedPose, prior: UncertainPose | None) -> RigidTran
     """Of the answer and the alternatives that fit as well, the one nearest to the prior."""
     if prior is None or not fused.is_ambiguous:
         return fused.pose
-    poses = [fused.pose, *(a.base_from_object for a in fused.alternatives if a.odds > 0.01)]
+    poses = [fused.pose, *(a.pose for a in fused.alternatives if a.odds > 0.01)]
     return min(poses, key=lambda pose: float(np.linalg.norm(difference(pose, prior.parent_from_child))))

@@ -90,7 +90,8 @@ def locate_in(session: Session, pair: LightPair) -> Located:
         intrinsics=look.intrinsics,
         upright=upright,
     )
-    pose = estimate(lights_m, chosen.points_px, chosen.covariance_px, look.intrinsics)
+    covariance_px = chosen.covariance_px + model_sigma_px(session, look, expected) ** 2 * np.eye(2)
+    pose = estimate(lights_m, chosen.points_px, covariance_px, look.intrinsics)
     _check_fit(session, pose)
     camera_from_panel, covariance = _plausible(session, look, pose)
     seen = UncertainPose(parent_from_child=camera_from_panel, covariance=covariance)
@@ -99,8 +100,15 @@ def locate_in(session: Session, pair: LightPair) -> Located:
         pose=pose,
         pair=pair,
         lights_px=chosen.points_px,
-        evidence=_light_evidence(session, look, camera_from_panel, chosen.points_px, chosen.covariance_px),
+        evidence=_light_evidence(session, look, camera_from_panel, chosen.points_px, covariance_px),
     )
+
+
+def model_sigma_px(session: Session, look: Look, base_from_panel: RigidTransform) -> float:
+    """What the image of a light may be off beside noise: the lens as calibrated, and lights that sit off their places."""
+    distance_m = float((look.base_from_camera.parent_from_child.inv() * base_from_panel).translation[2])
+    lamp_px = session.panel.tolerances.light_m * look.intrinsics.fx_px / max(distance_m, 0.05)
+    return float(np.hypot(session.lens_rms_px(look.camera), lamp_px))
 
 
 def scan_plate(session: Session) -> ScannedPlane:
@@ -218,8 +226,6 @@ def _light_evidence(
             pixel_px=pixel,
             covariance_px=covariance,
             intrinsics=look.intrinsics,
-            distance_m=float(camera_from_panel.apply(np.array(light.position_m))[2]),
-            light_sigma_m=session.panel.tolerances.light_m,
         )
         for light, pixel, covariance in zip(session.panel.lights, pixels, covariances, strict=True)
     )

@@ -205,7 +205,7 @@ def _account(fused: FusedPose, measurements: Sequence[Measurement]) -> dict[str,
         ],
         "alternatives": [
             {
-                **pose_json(UncertainPose(parent_from_child=a.base_from_object, covariance=a.covariance)),
+                **pose_json(UncertainPose(parent_from_child=a.pose, covariance=a.covariance)),
                 "odds": a.odds,
                 "rejected": list(a.rejected),
             }

@@ -161,6 +161,11 @@ class Session:
             )
         return record.intrinsics.intrinsics()
 
+    def lens_rms_px(self, camera: str) -> float:
+        """How well the calibrated lens model fits, px."""
+        record = self.cell.calibration_of(camera).intrinsics
+        return 0.0 if record is None else record.rms_px
+
     def known_panel(self) -> UncertainPose:
         """Where the panel is believed to stand.
 

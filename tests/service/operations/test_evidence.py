@@ -66,9 +66,7 @@ def draw(rng: np.random.Generator) -> list[Evidence]:
                 pixel_px=pixel,
                 covariance_px=PIXEL_SIGMA**2 * np.eye(2),
                 intrinsics=LENS,
-                distance_m=0.66,
-                light_sigma_m=0.0,
-            )  # fmt: skip
+            )
         )
     for spot in SPOTS:
         flange = facing(spot, 0.0, "grip")

@@ -1,0 +1,112 @@
+"""The judge believes nothing: a false claim of any kind shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hal.devices import ObjectTruth, Truth
+from hal.geometry import perturbed, to_json, transform_rpy
+from hal.panel import load_panel
+from service.operations.judge import AFTER, agrees, compare
+
+PANEL = load_panel(Path(__file__).parents[3] / "panels/bench.toml")
+POSE = transform_rpy((0.95, 0.0, 0.55), (1.57, 0.0, -1.57))
+
+
+def truth(**after: Any) -> Truth:
+    def things(valve: str, slider: float, lamp: str) -> tuple[ObjectTruth, ...]:
+        return (
+            ObjectTruth(name="main_valve", state=valve),
+            ObjectTruth(name="setpoint", value=slider),
+            ObjectTruth(name="start", state="released", value=0.0),
+            ObjectTruth(name="run_lamp", state=lamp),
+            ObjectTruth(name="pressure", value=4.0),
+            ObjectTruth(name="temperature", text="21.5", value=21.5),
+        )
+
+    return Truth(
+        base_from_panel_matrix=POSE.as_matrix(),
+        initial=things("closed", 20.0, "off"),
+        objects=things(after.get("valve", "open"), after.get("slider", 70.0), after.get("lamp", "on")),
+        peak_force_n=30.0,
+        sim_time_s=50.0,
+    )
+
+
+def action(name: str, target: str, *, confirmed: bool = True) -> dict[str, Any]:
+    outcome = "done" if confirmed else "stalled"
+    return {"object": name, "skill": "skill", "target": target, "outcome": outcome, "confirmed": confirmed}
+
+
+def reading(name: str, when: str = "before the actions", **said: Any) -> dict[str, Any]:
+    shown = {"value": None, "state": None, "text": None, **said}
+    return {"name": name, "when": when, "present": True, "reason": None, "shows": str(said), **shown}
+
+
+def report(**parts: Any) -> dict[str, Any]:
+    covariance = np.diag([1e-3] * 3 + [2e-3] * 3) ** 2
+    fused = {**to_json(perturbed(POSE, [5e-4, 0, 0, 1e-3, 0, 0])), "covariance": covariance.tolist()}
+    return {"readings": [], "actions": [], "fused": fused, **parts}
+
+
+ALL_DONE = [action("main_valve", "open"), action("setpoint", "70"), action("start", "on")]
+
+
+def test_true_claims_are_agreed_with() -> None:
+    verdict = compare(report(actions=ALL_DONE, readings=[reading("pressure", value=4.1)]), truth(), PANEL)
+    assert verdict["agrees"]
+    assert (verdict["readings_right"], verdict["readings_given"]) == (1, 1)
+    assert verdict["pose_error_m"] == pytest.approx(5e-4)
+    assert verdict["pose_error_rad"] == pytest.approx(1e-3)
+    assert verdict["inside_95"]
+
+
+@pytest.mark.parametrize("lie", [{"valve": "closed"}, {"slider": 60.0}, {"lamp": "off"}])
+def test_one_false_done_is_disagreed_with(lie: dict[str, Any]) -> None:
+    assert not compare(report(actions=ALL_DONE), truth(**lie), PANEL)["agrees"]
+
+
+def test_a_failure_that_is_told_is_no_lie() -> None:
+    verdict = compare(report(actions=[action("main_valve", "open", confirmed=False)]), truth(valve="closed"), PANEL)
+    assert verdict["agrees"]
+    assert verdict["actions_confirmed"] == 0
+
+
+def test_a_pose_outside_its_ellipsoid_is_said_to_be() -> None:
+    covariance = (np.diag([1e-4] * 6) ** 2).tolist()
+    fused = {**to_json(perturbed(POSE, [5e-4, 0, 0, 0, 0, 0])), "covariance": covariance}
+    assert not compare(report(fused=fused), truth(), PANEL)["inside_95"]
+
+
+def test_a_mission_without_a_pose_is_judged_without_one() -> None:
+    assert compare(report(fused=None), truth(), PANEL)["pose_error_m"] is None
+
+
+def test_readings_are_held_against_their_own_time() -> None:
+    rows = [reading("main_valve", state="closed"), reading("main_valve", AFTER, state="open")]
+    assert compare(report(readings=rows), truth(), PANEL)["readings_right"] == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "is_right"),
+    [
+        ("pressure", {"value": 4.19}, True),
+        ("pressure", {"value": 4.21}, False),
+        ("temperature", {"text": "21.5"}, True),
+        ("temperature", {"text": "215"}, False),
+        ("main_valve", {"state": "open"}, True),
+        ("main_valve", {"state": None}, False),
+        ("setpoint", {"value": 71.9}, True),
+        ("setpoint", {"value": None}, False),
+    ],
+)
+def test_right_means_two_per_cent_of_the_scale_or_the_very_state(
+    name: str, said: dict[str, Any], is_right: bool
+) -> None:
+    now = {thing.name: thing for thing in truth().objects}[name]
+    answer = {"value": None, "state": None, "text": None, **said}
+    assert agrees(PANEL.object(name), now, **answer) is is_right

@@ -14,11 +14,14 @@ from numpy.typing import NDArray
 
 from hal.clock import Clock, Deadline, WallClock
 from hal.devices import (
+    ArmCapabilities,
     DeviceKind,
+    DhLink,
     ForceTorqueCapabilities,
     GripperCapabilities,
     GripperState,
     Health,
+    JointState,
     LightsCapabilities,
     ProximityCapabilities,
     RangeImage,
@@ -26,7 +29,7 @@ from hal.devices import (
     TouchCapabilities,
     Wrench,
 )
-from hal.errors import DeviceTimeout
+from hal.errors import DeviceTimeout, MotionRefused
 from hal.readings import Cause, Quality, Stamped
 
 LIGHT_NAMES = ("top_left", "top_right", "bottom_right", "bottom_left")
@@ -235,3 +238,58 @@ class ScriptedScanner(Scripted):
 def scripted_scan(index: int) -> NDArray[np.float32]:
     """(1, 721) distances of read number `index`."""
     return (0.5 + 0.0005 * np.arange(721) + 0.001 * (index % 100)).astype(np.float32)[np.newaxis, :]
+
+
+class ScriptedArm(Scripted):
+    """Six joints that are where they were last told to be, while enabled."""
+
+    kind = DeviceKind.ARM
+
+    def __init__(self) -> None:
+        super().__init__("scripted_arm")
+        self.position_rad = np.array([0.1, -1.2, 1.3, -0.4, 0.5, 0.6])
+        self.is_enabled = False
+        self.commands = 0
+        self.stops = 0
+
+    def capabilities(self) -> ArmCapabilities:
+        """A plain six-joint arm."""
+        return ArmCapabilities(
+            model="scripted",
+            links=tuple(DhLink(d_m=0.1, a_m=0.2, alpha_rad=0.5) for _ in range(6)),
+            lower_rad=(-3.0,) * 6,
+            upper_rad=(3.0,) * 6,
+            velocity_rad_per_s=(2.0,) * 6,
+            acceleration_rad_per_s2=(10.0,) * 6,
+            tip_speed_m_per_s=1.0,
+            command_rate_hz=125.0,
+            link_radius_m=(0.05,) * 6,
+        )
+
+    def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
+        """Where it is."""
+        index, now_s = self.count(deadline)
+        state = JointState(
+            position_rad=self.position_rad.copy(), velocity_rad_per_s=np.zeros(6), is_enabled=self.is_enabled
+        )
+        return Stamped(value=state, host_time_s=now_s, sequence=index)
+
+    def command_position(self, position_rad: NDArray[np.float64], *, deadline: Deadline) -> NDArray[np.float64]:
+        """Jump there."""
+        self.count(deadline)
+        if not self.is_enabled:
+            raise MotionRefused("the scripted arm is off", hint="call enable first", device=self.name)
+        self.commands += 1
+        self.position_rad = np.array(position_rad, dtype=float)
+        return self.position_rad
+
+    def enable(self, *, deadline: Deadline) -> None:
+        """Follow from now on."""
+        self.count(deadline)
+        self.is_enabled = True
+
+    def stop(self, *, deadline: Deadline) -> None:
+        """Follow no more."""
+        self.count(deadline)
+        self.stops += 1
+        self.is_enabled = False

@@ -1,0 +1,136 @@
+"""What wired arms share: kinematics from the options, and the checks that every set-point passes before it is sent."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from hal.devices import ArmCapabilities, DhLink
+from hal.errors import InvalidRequest, MotionRefused
+from hal.strict import Strict
+
+Array = NDArray[np.float64]
+Positive = Annotated[float, Field(gt=0)]
+STEP_MARGIN = 3.0  # set-points arrive in bunches on a busy host; a jump beyond this many periods is clipped
+
+
+class LinkOptions(Strict):
+    """One row of a standard Denavit-Hartenberg table."""
+
+    d_m: float
+    a_m: float
+    alpha_rad: float
+    offset_rad: float = 0.0
+
+
+class KinematicsOptions(Strict):
+    """`kinematics` of an arm's options; the sheet that comes with the arm has it."""
+
+    model: str
+    links: tuple[LinkOptions, ...]
+    lower_rad: tuple[float, ...]
+    upper_rad: tuple[float, ...]
+    velocity_rad_per_s: tuple[Positive, ...]
+    acceleration_rad_per_s2: tuple[Positive, ...]
+    tip_speed_m_per_s: Positive
+    link_radius_m: tuple[Positive, ...]
+
+
+def kinematics_of(c: ArmCapabilities) -> dict[str, Any]:
+    """The options that describe an arm of another backend; emulators hand them to the driver."""
+    return {
+        "model": c.model,
+        "links": [{"d_m": x.d_m, "a_m": x.a_m, "alpha_rad": x.alpha_rad, "offset_rad": x.offset_rad} for x in c.links],
+        "lower_rad": list(c.lower_rad),
+        "upper_rad": list(c.upper_rad),
+        "velocity_rad_per_s": list(c.velocity_rad_per_s),
+        "acceleration_rad_per_s2": list(c.acceleration_rad_per_s2),
+        "tip_speed_m_per_s": c.tip_speed_m_per_s,
+        "link_radius_m": list(c.link_radius_m),
+    }
+
+
+def ur10e() -> KinematicsOptions:
+    """The maker's published table of the UR10e; limits as delivered, radii rounded up."""
+    quarter = math.pi / 2.0
+    rows = (
+        (0.1807, 0.0, quarter),
+        (0.0, -0.6127, 0.0),
+        (0.0, -0.57155, 0.0),
+        (0.17415, 0.0, quarter),
+        (0.11985, 0.0, -quarter),
+        (0.11655, 0.0, 0.0),
+    )
+    return KinematicsOptions(
+        model="ur10e",
+        links=tuple(LinkOptions(d_m=d, a_m=a, alpha_rad=alpha) for d, a, alpha in rows),
+        lower_rad=(-math.tau,) * 6,
+        upper_rad=(math.tau,) * 6,
+        velocity_rad_per_s=(2.09, 2.09, 3.14, 3.14, 3.14, 3.14),
+        acceleration_rad_per_s2=(5.0,) * 6,
+        tip_speed_m_per_s=1.0,
+        link_radius_m=(0.10, 0.08, 0.07, 0.06, 0.06, 0.05),
+    )
+
+
+def capabilities(k: KinematicsOptions, *, command_rate_hz: float, watchdog_s: float | None) -> ArmCapabilities:
+    """From the options."""
+    return ArmCapabilities(
+        model=k.model,
+        links=tuple(DhLink(d_m=x.d_m, a_m=x.a_m, alpha_rad=x.alpha_rad, offset_rad=x.offset_rad) for x in k.links),
+        lower_rad=k.lower_rad,
+        upper_rad=k.upper_rad,
+        velocity_rad_per_s=k.velocity_rad_per_s,
+        acceleration_rad_per_s2=k.acceleration_rad_per_s2,
+        tip_speed_m_per_s=k.tip_speed_m_per_s,
+        command_rate_hz=command_rate_hz,
+        link_radius_m=k.link_radius_m,
+        watchdog_s=watchdog_s,
+    )
+
+
+class SetPointFilter:
+    """The last check before the drive: shape, finiteness, limits, and no jump from the last set-point."""
+
+    def __init__(self, name: str, k: KinematicsOptions, *, command_rate_hz: float) -> None:
+        self._name = name
+        self._lower, self._upper = np.array(k.lower_rad), np.array(k.upper_rad)
+        self._velocity = np.array(k.velocity_rad_per_s)
+        self._period_s = 1.0 / command_rate_hz
+        self._last: Array | None = None
+        self._last_s = 0.0
+
+    def begin(self, measured_rad: Array | None) -> None:
+        """Commands start from here; None refuses all commands."""
+        self._last = measured_rad
+
+    @property
+    def is_open(self) -> bool:
+        """May set-points pass?"""
+        return self._last is not None
+
+    def passed(self, wanted_rad: Array, now_s: float) -> Array:
+        """The set-point as it may be sent.
+
+        Raises:
+            InvalidRequest: wrong shape or not finite. MotionRefused: not enabled.
+        """
+        wanted = np.asarray(wanted_rad, dtype=float)
+        if wanted.shape != self._lower.shape or not np.all(np.isfinite(wanted)):
+            raise InvalidRequest(
+                f"{self._name}: a set-point is {len(self._lower)} finite joint angles",
+                hint="check the planner",
+                device=self._name,
+            )
+        if self._last is None:
+            raise MotionRefused(f"{self._name}: the drives are off", hint="call enable first", device=self._name)
+        elapsed_s = min(max(now_s - self._last_s, self._period_s), 10.0 * self._period_s)
+        step = self._velocity * elapsed_s * STEP_MARGIN
+        near = np.clip(wanted, self._last - step, self._last + step)
+        sent: Array = np.clip(near, self._lower, self._upper)
+        self._last, self._last_s = sent, now_s
+        return sent

@@ -1,0 +1,278 @@
+"""A Universal Robots controller on three TCP ports, moving an arm of any backend: RTDE, scripts, dashboard.
+
+Of URScript it understands what a host sends: a program that servos to RTDE registers and ends with its heartbeat, and
+`stopj`.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import time
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from drivers import rtde
+from drivers.arms import kinematics_of
+from drivers.emulators.base import WireEmulator
+from drivers.emulators.faults import FaultOptions
+from drivers.emulators.ports import Peer, TcpPort
+from hal.devices import Arm, Device
+from hal.errors import CellError, Unsupported
+from hal.strict import validate
+
+OUTPUT_TYPES = {
+    "timestamp": "DOUBLE",
+    "actual_q": "VECTOR6D",
+    "actual_qd": "VECTOR6D",
+    "target_q": "VECTOR6D",
+    "robot_mode": "INT32",
+    "safety_mode": "INT32",
+    "runtime_state": "UINT32",
+    "speed_scaling": "DOUBLE",
+}
+INPUT_TYPES = {
+    "speed_slider_mask": "UINT32",
+    "speed_slider_fraction": "DOUBLE",
+    "standard_digital_output_mask": "UINT8",
+    "standard_digital_output": "UINT8",
+    **{f"input_int_register_{i}": "INT32" for i in range(48)},
+}
+REGISTER = re.compile(r"read_input_integer_register\((\d+)\)")
+RUNNING, NORMAL, PROTECTIVE_STOP = 7, 1, 3
+STOPPED, PLAYING = 1, 2
+DEFAULT_WATCHDOG_S = 0.1
+
+
+class UrEmulatorOptions(FaultOptions):
+    """`[emulators.NAME.emulator_options]`"""
+
+    rate_hz: Annotated[float, Field(gt=0, le=500)] = 125.0
+
+
+class UrPorts:
+    """RTDE, script and dashboard ports; a peer is `(role, connection)`."""
+
+    def __init__(self) -> None:
+        self._ports = {"rtde": TcpPort(), "script": TcpPort(), "dashboard": TcpPort()}
+
+    @property
+    def address(self) -> dict[str, Any]:
+        """Host and the three ports."""
+        numbers = {role: port.address["port"] for role, port in self._ports.items()}
+        return {"host": "127.0.0.1", "port": numbers["rtde"], "script_port": numbers["script"]}
+
+    @property
+    def dashboard_port(self) -> int:
+        """Where the dashboard listens."""
+        return int(self._ports["dashboard"].address["port"])
+
+    def receive(self, timeout_s: float) -> list[tuple[Peer, bytes]]:
+        """From all three; only the first waits."""
+        waits = {"rtde": timeout_s, "script": 0.0, "dashboard": 0.0}
+        return [((role, sock), data) for role, port in self._ports.items() for sock, data in port.receive(waits[role])]
+
+    def send(self, peer: Peer, data: bytes) -> None:
+        """To one connection; None means every RTDE client."""
+        role, sock = ("rtde", None) if peer is None else peer
+        self._ports[role].send(sock, data)
+
+    def vanish(self) -> None:
+        """All three."""
+        for port in self._ports.values():
+            port.vanish()
+
+    def appear(self) -> None:
+        """All three, on the same numbers."""
+        for port in self._ports.values():
+            port.appear()
+
+    def close(self) -> None:
+        """All three, for good."""
+        self.vanish()
+
+
+class UrEmulator(WireEmulator):
+    """The controller, running."""
+
+    def __init__(self, backing: Arm, options: UrEmulatorOptions) -> None:
+        self.ports = UrPorts()
+        super().__init__(self.ports, options, name="ur")
+        self._backing = backing
+        self.period_s = 1.0 / options.rate_hz
+        self.robot_mode, self.safety_mode, self.runtime = RUNNING, NORMAL, STOPPED
+        self._start_s = time.monotonic()
+        self._cycle = 0
+        self._parsers: dict[Peer, rtde.PackageParser] = {}
+        self._outputs: dict[Peer, rtde.Recipe] = {}
+        self._inputs: dict[Peer, rtde.Recipe] = {}
+        self._streams: set[Peer] = set()
+        self._registers = [0] * 48
+        self._program: list[int] = []  # heartbeat register, then one a joint
+        self._beat: int | None = None
+        self._beat_s = 0.0
+        self._scripts: dict[Peer, bytes] = {}
+
+    @property
+    def address(self) -> dict[str, Any]:
+        """Ports and kinematics."""
+        return {**super().address, "kinematics": kinematics_of(self._backing.capabilities())}
+
+    def protective_stop(self) -> None:
+        """As a collision would: the arm brakes and the program ends."""
+        self.safety_mode = PROTECTIVE_STOP
+        self._end_program()
+
+    def on_bytes(self, peer: Peer, data: bytes) -> None:
+        """By port."""
+        role, _ = peer
+        if role == "rtde":
+            if not data:
+                self._forget(peer)
+            parser = self._parsers.setdefault(peer, rtde.PackageParser())
+            for kind, payload in parser.feed(data):
+                self._rtde(peer, kind, payload)
+        elif role == "script":
+            self._scripts[peer] = self._scripts.get(peer, b"") + data
+            self._read_scripts(peer)
+        elif not data:
+            self.reply(peer, b"Connected: Universal Robots Dashboard Server\n")
+        else:
+            for line in data.decode("ascii", "replace").splitlines():
+                self.reply(peer, self._dashboard(line.strip()).encode() + b"\n")
+
+    def _forget(self, peer: Peer) -> None:
+        self._parsers.pop(peer, None)
+        self._streams.discard(peer)
+
+    def _rtde(self, peer: Peer, kind: str, payload: bytes) -> None:
+        match kind:
+            case "V":
+                self.reply(peer, rtde.package("V", bytes([payload == b"\x00\x02"])))
+            case "v":
+                self.reply(peer, rtde.package("v", struct.pack(">4I", 5, 11, 0, 0)))
+            case "O":
+                self._confirm(peer, "O", rtde.split_names(payload[8:]), OUTPUT_TYPES, self._outputs)
+            case "I":
+                self._confirm(peer, "I", rtde.split_names(payload), INPUT_TYPES, self._inputs)
+            case "S" | "P":
+                (self._streams.add if kind == "S" else self._streams.discard)(peer)
+                self.reply(peer, rtde.package(kind, b"\x01"))
+            case "U" if peer in self._inputs and payload[0] == self._inputs[peer].id:
+                self._take_inputs(self._inputs[peer].unpack(payload))
+
+    def _confirm(
+        self, peer: Peer, kind: str, names: tuple[str, ...], known: dict[str, str], recipes: dict[Peer, rtde.Recipe]
+    ) -> None:
+        types = [known.get(name, "NOT_FOUND") for name in names]
+        if "NOT_FOUND" not in types:
+            recipes[peer] = rtde.recipe(1, names, types)
+        self.reply(peer, rtde.package(kind, bytes([1]) + ",".join(types).encode()))
+
+    def _take_inputs(self, values: dict[str, Any]) -> None:
+        for name, value in values.items():
+            if name.startswith("input_int_register_"):
+                self._registers[int(name.rsplit("_", 1)[1])] = value
+        if self.runtime != PLAYING or not self._program:
+            return
+        beat = self._registers[self._program[0]]
+        if beat == self._beat:
+            return
+        self._beat, self._beat_s = beat, time.monotonic()
+        goal = np.array([self._registers[i] for i in self._program[1:]]) * 1e-6
+        self._backing.command_position(goal, deadline=self.deadline())
+
+    def _read_scripts(self, peer: Peer) -> None:
+        text = self._scripts[peer].decode("ascii", "replace")
+        if text.startswith("def "):
+            if "\nend\n" not in text:
+                return
+            self._scripts[peer] = b""
+            self._start_program([int(number) for number in REGISTER.findall(text)])
+        elif text.endswith("\n"):
+            self._scripts[peer] = b""
+            if "stopj" in text:
+                self._end_program()
+
+    def _start_program(self, registers: list[int]) -> None:
+        """The first register read is the heartbeat; the joints are those after its last repetition."""
+        joints = [number for number in registers if number != registers[0]] if registers else []
+        if len(joints) != len(self._backing.capabilities().links) or self.safety_mode != NORMAL:
+            return
+        self._program = [registers[0], *joints]
+        self._beat, self._beat_s = self._registers[registers[0]], float("inf")
+        self._backing.enable(deadline=self.deadline())
+        self.runtime = PLAYING
+
+    def _end_program(self) -> None:
+        self._program, self.runtime = [], STOPPED
+        self._backing.stop(deadline=self.deadline())
+
+    def _dashboard(self, line: str) -> str:
+        match line:
+            case "robotmode":
+                return f"Robotmode: {'RUNNING' if self.robot_mode == RUNNING else 'POWER_OFF'}"
+            case "safetystatus":
+                return f"Safetystatus: {'NORMAL' if self.safety_mode == NORMAL else 'PROTECTIVE_STOP'}"
+            case "unlock protective stop":
+                self.safety_mode = NORMAL
+                return "Protective stop releasing"
+            case "power on" | "brake release":
+                self.robot_mode = RUNNING
+                return "Powering on" if line == "power on" else "Brake releasing"
+            case "stop":
+                self._end_program()
+                return "Stopped"
+            case "PolyscopeVersion":
+                return "URSoftware 5.11.0.0 (emulator)"
+            case _:
+                return f"could not understand: '{line}'"
+
+    def on_tick(self) -> None:
+        """The watchdog of the program, then one data package to each client."""
+        if self.runtime == PLAYING and time.monotonic() - self._beat_s > DEFAULT_WATCHDOG_S:
+            self._end_program()
+        self._cycle += 1
+        if not self._streams:
+            return
+        values = self._values()
+        for peer in list(self._streams):
+            self.send(peer, self._data(peer, values), protected=slice(0, 3))
+
+    def status_frame(self) -> bytes | None:
+        """A package that says: protective stop."""
+        peer = next(iter(self._streams))
+        return self._data(peer, {**self._values(), "safety_mode": [PROTECTIVE_STOP]})
+
+    def _values(self) -> dict[str, list[float]]:
+        try:
+            sample = self._backing.read_state(deadline=self.deadline())
+        except CellError:
+            self.robot_mode = 0
+            raise
+        position = [float(q) for q in sample.value.position_rad]
+        return {
+            "timestamp": [self._cycle * float(self.period_s or 0.0)],
+            "actual_q": position,
+            "actual_qd": [float(v) for v in sample.value.velocity_rad_per_s],
+            "target_q": position,
+            "robot_mode": [self.robot_mode],
+            "safety_mode": [self.safety_mode],
+            "runtime_state": [self.runtime],
+            "speed_scaling": [1.0],
+        }
+
+    def _data(self, peer: Peer, values: dict[str, list[float]]) -> bytes:
+        recipe = self._outputs[peer]
+        return recipe.pack([number for name in recipe.names for number in values[name]])
+
+
+def start(backing: Device, options: dict[str, Any]) -> UrEmulator:
+    """Entry point `ur`."""
+    if not isinstance(backing, Arm):
+        raise Unsupported(f"a robot arm cannot stand for a {backing.kind}", hint="back it with an arm")
+    emulator = UrEmulator(backing, validate(options, UrEmulatorOptions, source="emulators.ur"))
+    emulator.begin()
+    return emulator

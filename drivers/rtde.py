@@ -1,0 +1,120 @@
+"""Universal Robots RTDE, protocol version 2: packages in and out of bytes (UR RTDE guide)."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+HEADER = struct.Struct(">HB")
+TYPES = {
+    "BOOL": "?",
+    "UINT8": "B",
+    "UINT32": "I",
+    "UINT64": "Q",
+    "INT32": "i",
+    "DOUBLE": "d",
+    "VECTOR3D": "3d",
+    "VECTOR6D": "6d",
+    "VECTOR6INT32": "6i",
+}
+KNOWN = frozenset(b"VvOIUSPM")
+LONGEST = 4096
+REFUSALS = {"NOT_FOUND": "is not known to this controller", "IN_USE": "is taken by another client"}
+
+
+class RecipeRefused(ValueError):
+    """The controller does not have a variable, or another client owns it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """Variables of a data package and how they are packed (big-endian)."""
+
+    id: int
+    names: tuple[str, ...]
+    packing: struct.Struct
+    widths: tuple[int, ...]
+
+    def unpack(self, payload: bytes) -> dict[str, float | int | tuple[float, ...]]:
+        """Values by name from the payload of a `U` package."""
+        values = iter(self.packing.unpack(payload[1:]))
+        return {
+            name: next(values) if width == 1 else tuple(next(values) for _ in range(width))
+            for name, width in zip(self.names, self.widths, strict=True)
+        }
+
+    def pack(self, values: Sequence[float | int]) -> bytes:
+        """A `U` package of the flat values."""
+        return package("U", bytes([self.id]) + self.packing.pack(*values))
+
+
+def recipe(id_: int, names: Sequence[str], types: Sequence[str]) -> Recipe:
+    """A recipe as the controller confirmed it.
+
+    Raises:
+        RecipeRefused: a variable is NOT_FOUND or IN_USE.
+    """
+    for name, kind in zip(names, types, strict=True):
+        if kind not in TYPES:
+            raise RecipeRefused(f"{name} {REFUSALS.get(kind, f'has the unknown type {kind}')}")
+    codes = [TYPES[kind] for kind in types]
+    widths = tuple(int(code[:-1] or 1) for code in codes)
+    return Recipe(id_, tuple(names), struct.Struct(">" + "".join(codes)), widths)
+
+
+def package(kind: str, payload: bytes = b"") -> bytes:
+    """Size, type, payload."""
+    return HEADER.pack(HEADER.size + len(payload), ord(kind)) + payload
+
+
+def outputs_request(names: Sequence[str], rate_hz: float) -> bytes:
+    """Ask for variables at a rate."""
+    return package("O", struct.pack(">d", rate_hz) + ",".join(names).encode())
+
+
+def split_names(text: bytes) -> tuple[str, ...]:
+    """A comma list, which may end with a comma."""
+    return tuple(name for name in text.decode("ascii", "replace").split(",") if name)
+
+
+class PackageParser:
+    """Packages out of bytes in any chunks; steps over bytes that begin none.
+
+    Args:
+        data_size: total size of a `U` package once it is known; others of that type are noise then.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = b""
+        self.data_size: int | None = None
+        self.noise = 0
+
+    def feed(self, chunk: bytes) -> list[tuple[str, bytes]]:
+        """`(type, payload)` of each complete package."""
+        data = self._buffer + chunk
+        at, found = 0, []
+        while len(data) - at >= HEADER.size:
+            size = self._size_at(data, at)
+            if size is None or (at + size < len(data) and not self._begins_at(data, at + size)):
+                at += 1
+                self.noise += 1
+                continue
+            if at + size > len(data):
+                break
+            found.append((chr(data[at + 2]), data[at + HEADER.size : at + size]))
+            at += size
+        self._buffer = data[at:]
+        return found
+
+    def _size_at(self, data: bytes, at: int) -> int | None:
+        size, kind = HEADER.unpack_from(data, at)
+        if kind not in KNOWN or not HEADER.size <= size <= LONGEST:
+            return None
+        if kind == ord("U") and self.data_size is not None and size != self.data_size:
+            return None
+        return int(size)
+
+    def _begins_at(self, data: bytes, at: int) -> bool:
+        """Could a package begin here, as far as its bytes are known?"""
+        return len(data) - at < HEADER.size or self._size_at(data, at) is not None

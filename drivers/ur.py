@@ -1,0 +1,282 @@
+"""Universal Robots arm: state over RTDE, motion by a URScript program that servos to RTDE input registers.
+
+The program watches the host: when the heartbeat register stands still for `WATCHDOG_S` it brakes and ends, so a dead
+host leaves a standing arm. Nothing starts it but `enable`, and a lost connection does not start it again.
+"""
+
+from __future__ import annotations
+
+import threading
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from drivers import rtde
+from drivers.arms import Array, KinematicsOptions, SetPointFilter, capabilities, ur10e
+from drivers.transport.device import StreamDevice, wall_until
+from drivers.transport.link import Link, LinkLost, NoAnswer, Refused, WireError, drain, now_s
+from drivers.transport.options import CONNECT_TIMEOUT_S, PortNumber, TcpOptions, read_options, tcp_opener
+from drivers.transport.socket_link import open_tcp
+from drivers.transport.timebase import HostTime
+from hal.clock import Deadline
+from hal.devices import ArmCapabilities, DeviceKind, JointState
+from hal.errors import DeviceFault, MotionRefused
+from hal.readings import Stamped
+from hal.registry import Context
+
+OUTPUTS = ("timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "runtime_state")
+FIRST_REGISTER = 24  # 0-23 belong to fieldbuses
+JOINTS = 6
+INPUTS = tuple(f"input_int_register_{FIRST_REGISTER + i}" for i in range(JOINTS + 1))
+RAD_PER_COUNT = 1e-6
+RUNNING, PLAYING = 7, 2
+SAFE_MODES = (1, 2)  # normal, reduced
+WATCHDOG_S = 0.1
+PROGRAM_START_S = 1.0
+ANSWER_S = 0.5
+MOVING_RAD_PER_S = 1e-3
+
+
+class UrOptions(TcpOptions):
+    """Options of `ur:rtde`."""
+
+    port: PortNumber = 30_004
+    script_port: PortNumber = 30_003
+    rate_hz: Annotated[float, Field(gt=0, le=500)] = 500.0
+    kinematics: KinematicsOptions = Field(default_factory=ur10e)
+    brake_rad_per_s2: Annotated[float, Field(gt=0, le=40)] = 4.0
+    servo_gain: Annotated[int, Field(ge=100, le=2000)] = 500
+    lookahead_s: Annotated[float, Field(ge=0.03, le=0.2)] = 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Modes:
+    """What the controller says about itself."""
+
+    robot: int
+    safety: int
+    runtime: int
+
+
+def servo_program(options: UrOptions) -> str:
+    """URScript that follows the registers and brakes when the heartbeat stops."""
+    cycles = round(WATCHDOG_S * 500)
+    joints = ", ".join(f"read_input_integer_register({FIRST_REGISTER + 1 + i})*{RAD_PER_COUNT}" for i in range(JOINTS))
+    beat = f"read_input_integer_register({FIRST_REGISTER})"
+    return (
+        "def panelwright_servo():\n"
+        f"  last = {beat}\n"
+        f"  while {beat} == last:\n    sync()\n  end\n"
+        "  silent = 0\n"
+        f"  while silent < {cycles}:\n"
+        f"    beat = {beat}\n"
+        "    if beat == last:\n      silent = silent + 1\n    else:\n      silent = 0\n    end\n"
+        "    last = beat\n"
+        f"    servoj([{joints}], t=0.002, lookahead_time={options.lookahead_s}, gain={options.servo_gain})\n"
+        "  end\n"
+        f"  stopj({options.brake_rad_per_s2})\n"
+        "end\n"
+    )
+
+
+class Ur(StreamDevice[JointState]):
+    """A Universal Robots arm."""
+
+    kind = DeviceKind.ARM
+
+    def __init__(self, context: Context, options: UrOptions) -> None:
+        opener, name = tcp_opener(options, context.name)
+        super().__init__(context, open_link=opener, link_name=name, max_age_s=max(5.0 / options.rate_hz, 0.02))
+        self._options = options
+        self._filter = SetPointFilter(context.name, options.kinematics, command_rate_hz=options.rate_hz)
+        self._parser = rtde.PackageParser()
+        self._outputs: rtde.Recipe | None = None
+        self._inputs: rtde.Recipe | None = None
+        self._host = HostTime()
+        self._last_device_s = 0.0
+        self._modes = Modes(robot=0, safety=0, runtime=0)
+        self._was_playing = False
+        self._enabled_s = 0.0
+        self._beat = 0
+        self._script: Link | None = None
+        self._commands = threading.Lock()
+
+    def capabilities(self) -> ArmCapabilities:
+        """From the options."""
+        return capabilities(self._options.kinematics, command_rate_hz=self._options.rate_hz, watchdog_s=WATCHDOG_S)
+
+    def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
+        """Newest measured joints."""
+        return self.newest(deadline)
+
+    def enable(self, *, deadline: Deadline) -> None:
+        """Start the servo program at the measured position.
+
+        Raises:
+            DeviceFault: the robot is not running, or stopped by its safety system; a person must see to it.
+        """
+        measured = self.newest(deadline).value.position_rad
+        self._require_healthy()
+        with self._commands:
+            self._beat += 1
+            self._send_registers(measured, deadline)  # before the program: its first target is where the arm stands
+            self._run_script(servo_program(self._options), deadline)
+            self._was_playing, self._enabled_s = False, now_s()
+            self._filter.begin(measured)
+
+    def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:
+        """One set-point into the registers, with a beat of the heart."""
+        self.require_open()
+        with self._commands:
+            sent = self._filter.passed(position_rad, now_s())
+            self._require_healthy()
+            self._require_program()
+            self._beat += 1
+            self._send_registers(sent, deadline)
+            return sent
+
+    def stop(self, *, deadline: Deadline) -> None:
+        """Brake: `stopj` replaces the servo program."""
+        self.require_open()
+        self._filter.begin(None)
+        self._run_script(f"stopj({self._options.brake_rad_per_s2})\n", deadline)
+
+    def start(self, link: Link) -> None:
+        """Agree on version 2, set up both recipes, start the stream; motion stays off."""
+        self._filter.begin(None)
+        self._parser = rtde.PackageParser()
+        if self._ask(link, rtde.package("V", b"\x00\x02"), "V")[:1] != b"\x01":
+            raise Refused("the controller does not speak RTDE version 2", code=2)
+        self._outputs = self._recipe(link, rtde.outputs_request(OUTPUTS, self._options.rate_hz), "O", OUTPUTS)
+        self._inputs = self._recipe(link, rtde.package("I", ",".join(INPUTS).encode()), "I", INPUTS)
+        if self._ask(link, rtde.package("S"), "S")[:1] != b"\x01":
+            raise Refused("the controller does not start the stream", code=0)
+        self._parser.data_size = rtde.HEADER.size + 1 + self._outputs.packing.size
+        self._host.reset()
+        self._last_device_s = 0.0
+
+    def _recipe(self, link: Link, request: bytes, kind: str, names: tuple[str, ...]) -> rtde.Recipe:
+        answer = self._ask(link, request, kind)
+        try:
+            return rtde.recipe(answer[0], names, rtde.split_names(answer[1:]))
+        except (rtde.RecipeRefused, ValueError) as error:
+            raise Refused(f"recipe refused: {error}", code=0) from None
+
+    def _ask(self, link: Link, request: bytes, kind: str) -> bytes:
+        link.write(request, now_s() + ANSWER_S)
+        until_s = now_s() + ANSWER_S
+        while chunk := link.read(until_s):
+            for got, payload in self._parser.feed(chunk):
+                if got == kind:  # text messages may come in between
+                    return payload
+        raise NoAnswer(f"no answer to RTDE request {kind!r}")
+
+    def receive(self, chunk: bytes, arrived_s: float) -> None:
+        """Publish each data package; keep the script port from filling up."""
+        for kind, payload in self._parser.feed(chunk):
+            if kind == "U" and self._outputs is not None and payload[0] == self._outputs.id:
+                self._take(self._outputs.unpack(payload), arrived_s)
+        script = self._script
+        if script is not None:
+            with suppress(WireError):
+                drain(script)
+
+    def _take(self, values: dict[str, Any], arrived_s: float) -> None:
+        device_s = float(values["timestamp"])
+        period_s = 1.0 / self._options.rate_hz
+        steps = round((device_s - self._last_device_s) / period_s) if self._last_device_s else 1
+        if device_s == self._last_device_s:
+            return  # the same package twice
+        self._last_device_s = device_s
+        self._modes = Modes(robot=values["robot_mode"], safety=values["safety_mode"], runtime=values["runtime_state"])
+        self._was_playing = self._was_playing or self._modes.runtime == PLAYING
+        velocity = np.array(values["actual_qd"])
+        self.publish(
+            JointState(
+                position_rad=np.array(values["actual_q"]),
+                velocity_rad_per_s=velocity,
+                is_enabled=self._filter.is_open and self._is_healthy(),
+                is_moving=bool(np.any(np.abs(velocity) > MOVING_RAD_PER_S)),
+            ),
+            valid_s=self._host.host_s(device_s=device_s, arrived_s=arrived_s),
+            device_time_s=device_s,
+            missed=max(0, steps - 1) if steps < 100 else 0,
+        )
+
+    def lost(self, error: Exception) -> None:
+        """A lost link takes the motion with it."""
+        self._filter.begin(None)
+        super().lost(error)
+
+    def release(self) -> None:
+        """Brake if the arm was enabled, then let go."""
+        if self._filter.is_open:
+            self._filter.begin(None)
+            with suppress(Exception):
+                self._write_script(f"stopj({self._options.brake_rad_per_s2})\n", now_s() + 0.05)
+        super().release()
+        if self._script is not None:
+            self._script.close()
+
+    def _is_healthy(self) -> bool:
+        return self._modes.robot == RUNNING and self._modes.safety in SAFE_MODES
+
+    def _require_healthy(self) -> None:
+        if not self._is_healthy():
+            self._filter.begin(None)
+            raise DeviceFault(
+                f"{self.name} is not ready: robot mode {self._modes.robot}, safety mode {self._modes.safety}",
+                hint="look at the pendant: power on, release the brakes, unlock a protective stop",
+                device=self.name,
+            )
+
+    def _require_program(self) -> None:
+        if self._modes.runtime == PLAYING:
+            return
+        if self._was_playing:
+            what, hint = "has ended (watchdog or pendant)", "enable again"
+        elif now_s() - self._enabled_s > PROGRAM_START_S:
+            what, hint = "does not start", "set the robot to remote control"
+        else:
+            return
+        self._filter.begin(None)
+        raise MotionRefused(f"{self.name}: the servo program {what}", hint=hint, device=self.name)
+
+    def _send_registers(self, position_rad: Array, deadline: Deadline) -> None:
+        link, inputs = self.port.link, self._inputs
+        try:
+            if link is None or inputs is None:
+                raise LinkLost("RTDE is down")
+            counts = [round(q / RAD_PER_COUNT) for q in position_rad]
+            link.write(inputs.pack([self._beat % 2**31, *counts]), wall_until(deadline))
+        except WireError as error:
+            raise self.translate(error) from error
+
+    def _run_script(self, text: str, deadline: Deadline) -> None:
+        until_s = wall_until(deadline)
+        try:
+            self._write_script(text, until_s)
+        except WireError:
+            self._script = None  # the port hung up since the last program
+            try:
+                self._write_script(text, until_s)
+            except WireError as error:
+                raise self.translate(error) from error
+
+    def _write_script(self, text: str, until_s: float) -> None:
+        if self._script is None:
+            o = self._options
+            timeout_s = max(0.01, min(CONNECT_TIMEOUT_S, until_s - now_s()))
+            self._script = open_tcp(o.host, o.script_port, timeout_s=timeout_s, device=self.name)
+        drain(self._script)
+        self._script.write(text.encode(), until_s)
+
+
+def connect(context: Context, options: dict[str, Any]) -> Ur:
+    """Entry point `ur:rtde`."""
+    device = Ur(context, read_options(context, options, UrOptions))
+    device.join()
+    return device

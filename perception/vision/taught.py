@@ -110,7 +110,7 @@ def inspect_view(
     )
 
 
-def read_patch(patch: Patch, spec: PanelObject, *, digits_taught: bool = True) -> Status:  # noqa: PLR0911  (one a kind)
+def read_patch(patch: Patch, spec: PanelObject, *, digits_taught: bool = True) -> Status:
     """The status of one object by the reader of its kind."""
     match spec.kind:
         case "gauge":
@@ -142,7 +142,8 @@ def patch_of(image: Image, gray: Image, view: View, spec: PanelObject, shift_px:
     half_width, half_height, height = footprint_m(spec)
     margin = LAMP_MARGIN if spec.kind in ("lamp", "button") else MARGIN
     plane = 0.0 if spec.kind == "toggle" else height
-    side = 0.012 if spec.kind == "slider" else 0.003
+    # What stands out appears beside its foot: the patch must hold both.
+    side = (0.012 if spec.kind == "slider" else 0.003) + (_lean_m(view, spec, height) if spec.kind == "toggle" else 0.0)
     return rectify(
         image,
         view,
@@ -153,6 +154,14 @@ def patch_of(image: Image, gray: Image, view: View, spec: PanelObject, shift_px:
         shift_px=shift_px,
         gray=gray,
     )
+
+
+def _lean_m(view: View, spec: PanelObject, height_m: float) -> float:
+    """How far beside its foot a point at that height appears, in metres on the plate."""
+    x, y = spec.position_m
+    px = view.project([[x, y, 0.0], [x, y, height_m], [x + 0.01, y, 0.0], [x, y + 0.01, 0.0]])
+    scale = 0.5 * float(np.linalg.norm(px[2] - px[0]) + np.linalg.norm(px[3] - px[0])) / 0.01
+    return float(np.linalg.norm(px[1] - px[0])) / max(scale, 1e-9)
 
 
 def _inspect_one(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from perception.vision.patch import Patch
+from perception.vision.patch import Patch, sample_at
 from perception.vision.view import Array
 
 CORE = (-0.5, 0.0, 0.5)  # of the half width
@@ -31,16 +31,20 @@ def bar_contrast(
     Args:
         height_m: height above the plate of the bar's ends (inner, outer), or one height, or None for the patch's plane.
     """
-    angle = np.atleast_1d(np.asarray(angles_rad, float))[:, None, None]
-    count = max(6, round((along_m[1] - along_m[0]) * patch.px_per_m))
-    r = np.linspace(*along_m, count)[None, :, None]
-    offsets = np.array([*CORE, -flank[0], -flank[1], flank[0], flank[1]]) * half_width_m
-    o = offsets[None, None, :]
-    x = r * np.sin(angle) + o * np.cos(angle)
-    y = r * np.cos(angle) - o * np.sin(angle)
-    z = _heights(height_m, count, x.shape)
+    angle = np.atleast_1d(np.asarray(angles_rad, float))
+    ends_z = [None, None] if height_m is None else list(np.broadcast_to(np.asarray(height_m, float), (2,)))
+    ends = [np.column_stack(patch.pixel_of(r * np.sin(angle), r * np.cos(angle), z))
+            for r, z in zip(along_m, ends_z, strict=True)]  # fmt: skip
+    along = ends[1] - ends[0]
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(length, 1e-9)  # as it appears: bars may lean
+    count = max(6, round(float(length.max())))
+    share = np.linspace(0.0, 1.0, count)[None, :, None, None]
+    offsets = np.array([*CORE, -flank[0], -flank[1], flank[0], flank[1]]) * half_width_m * patch.px_per_m
+    place = ends[0][:, None, None, :] + share * along[:, None, None, :]
+    place = place + offsets[None, None, :, None] * across[:, None, None, :]
     shape = (len(angle) * count, len(offsets))
-    values = patch.sample(x.reshape(shape), y.reshape(shape), None if z is None else z.reshape(shape))
+    values = sample_at(patch.gray, place[..., 0].reshape(shape), place[..., 1].reshape(shape))
     values = values.reshape(len(angle), count, len(offsets)).astype(float)
     core = values[:, :, :3].mean(axis=2)
     left = core - values[:, :, 3:5].mean(axis=2)
@@ -56,10 +60,3 @@ def _low(stations: Array, quantile: float) -> Array:
     ordered = np.sort(stations, axis=1)
     top = max(2, round(stations.shape[1] * 2 * quantile))
     return np.asarray(ordered[:, :top].mean(axis=1))
-
-
-def _heights(height_m: ArrayLike | None, count: int, shape: tuple[int, ...]) -> Array | None:
-    if height_m is None:
-        return None
-    ends = np.broadcast_to(np.asarray(height_m, float), (2,))
-    return np.broadcast_to(np.linspace(ends[0], ends[1], count)[None, :, None], shape).copy()

@@ -10,6 +10,7 @@ from perception.vision.reading import Status, gated, refused
 from perception.vision.status.press import cap_height, one_sided_shade, sheen
 
 SHADE_HALF, SHADE_SCALE = 0.06, 0.015  # a flush cap stays below 0.05, one that stands out reaches 0.1
+MODEL_SHARE = 0.25
 SHEEN_HALF, SHEEN_SCALE = 0.08, 0.03
 
 
@@ -39,10 +40,12 @@ def read_cap(patch: Patch, spec: Button | Mushroom) -> Status:
 def _by_height(patch: Patch, spec: Button | Mushroom) -> float | None:
     """Log odds of `released` from the measured height."""
     low, high = spec.height_m - spec.travel_m, spec.height_m
-    cap = cap_height(patch, radius_m=spec.radius_m, low_m=low, high_m=high)
+    foot = 0.0 if spec.kind == "button" else None  # a mushroom's head moves as a whole
+    cap = cap_height(patch, radius_m=spec.radius_m, low_m=low, high_m=high, foot_m=foot)
     if cap is None:
         return None
-    return float((cap.height_m - (low + high) / 2) * (high - low) / cap.sigma_m**2)
+    sigma_m = np.hypot(cap.sigma_m, MODEL_SHARE * (high - low))  # neither cap nor travel is known better than that
+    return float((cap.height_m - (low + high) / 2) * (high - low) / sigma_m**2)
 
 
 def _by_shade(patch: Patch, radius_m: float) -> float:

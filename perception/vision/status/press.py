@@ -10,8 +10,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from perception.vision.patch import Patch
+from perception.vision.status.choice import contrast_noise
 from perception.vision.view import Array
 
 EDGE_SIGMA_PX = 0.25  # of one edge point, image px, model error of a rendered or real cap included
@@ -28,40 +30,65 @@ class CapHeight:
     found: float
 
 
-def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float) -> CapHeight | None:
-    """Height of a round cap by its edge, between the taught extremes; None when too little edge is found.
+def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, foot_m: float | None) -> CapHeight | None:
+    """Height of a round cap by its silhouette, between the taught extremes; None when too little of it is found.
 
-    The unknowns are height, shift and radius; the last two carry the building tolerance as a prior.
+    Where height moves the edge outward the silhouette is the cap's face; on the other side the wall shows and the
+    silhouette is the cap's foot, which does not move. The unknowns are height, shift and radius; shift and radius carry
+    the building tolerance as a prior.
+
+    Args:
+        foot_m: height of the foot's edge, None when it moves with the cap.
     """
     middle = (low_m + high_m) / 2
-    a = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    a = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     x, y = radius_m * np.sin(a), radius_m * np.cos(a)
-    u, v = patch.pixel_of(x, y, middle)
-    u2, v2 = patch.pixel_of(x, y, middle + 1e-3)
-    per_height = ((u2 - u) * np.sin(a) - (v2 - v) * np.cos(a)) / patch.px_per_m / 1e-3  # outward, m per m
-    reach = float(np.abs(per_height).max()) * (high_m - low_m) / 2 + 1.5 / patch.image_px_per_m
-    t = np.arange(-reach, reach + 1e-9, 0.4 / patch.px_per_m)
-    r = radius_m + t
-    values = patch.sample(np.outer(np.sin(a), r), np.outer(np.cos(a), r), middle)
-    slope = np.abs(np.gradient(values, axis=1))
-    best = slope.argmax(axis=1)
-    strength = slope[np.arange(len(a)), best]
-    ok = (best > 0) & (best < len(t) - 1) & (strength > max(2.0, 0.3 * float(np.median(strength))))
-    if ok.sum() < len(a) // 3:
+    (u, v), (u2, v2) = patch.pixel_of(x, y, middle), patch.pixel_of(x, y, middle + 1e-3)
+    outward = ((u2 - u) * np.sin(a) - (v2 - v) * np.cos(a)) / patch.px_per_m / 1e-3  # m per m
+    is_face = outward > 0
+    expected = np.zeros_like(a) if foot_m is None else np.where(is_face, 0.0, outward * (foot_m - middle))
+    use = is_face | (foot_m is not None)
+    slack = 1.2 / patch.image_px_per_m
+    reach = np.where(is_face, outward * (high_m - low_m) / 2, 0.0) + slack
+    offset, found = _edges(patch, radius_m, a, middle, expected, reach)
+    ok = found & use
+    if ok.sum() < 0.4 * use.sum() or (ok & is_face).sum() < 6:
         return None
-    offset = t[best]
-    J = np.column_stack([per_height, np.sin(a), np.cos(a), np.ones_like(a)])[ok]
+    if foot_m is not None and (~is_face).sum() > 8 and (ok & ~is_face).sum() < 0.4 * (~is_face).sum():
+        return None  # the foot is not where a cap of this size has it: something else was followed
+    J = np.column_stack([np.where(is_face, outward, 0.0), np.sin(a), np.cos(a), np.ones_like(a)])[ok]
     prior = np.diag([1 / (high_m - low_m) ** 2, *[1 / PLACE_SIGMA_M**2] * 2, 1 / RADIUS_SIGMA_M**2])
     sigma = EDGE_SIGMA_PX / patch.image_px_per_m
+    measured = (offset - expected)[ok]
     solution, N = np.zeros(4), prior
-    for _ in range(5):
-        residual = offset[ok] - J @ solution
+    for _ in range(6):
+        residual = measured - J @ solution
         w = 1.0 / (1.0 + (residual / (2 * sigma)) ** 2) / sigma**2 / 3.0  # neighbours share their error
         N = J.T @ (w[:, None] * J) + prior
-        solution = np.linalg.solve(N, J.T @ (w * offset[ok]))
+        solution = np.linalg.solve(N, J.T @ (w * measured))
+    if float(np.median(np.abs(measured - J @ solution))) > 2.0 * sigma:
+        return None  # some other edge, a printed ring perhaps, was followed
     return CapHeight(
         height_m=float(middle + solution[0]), sigma_m=float(np.sqrt(np.linalg.inv(N)[0, 0])), found=float(ok.mean())
     )
+
+
+def _edges(
+    patch: Patch, radius_m: float, a: Array, z_m: float, expected_m: Array, reach_m: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Radial offset of the strongest edge near each expected offset, and whether it is one."""
+    t = np.linspace(-1.0, 1.0, 25)
+    r = radius_m + expected_m[:, None] + reach_m[:, None] * t
+    values = patch.sample(np.sin(a)[:, None] * r, np.cos(a)[:, None] * r, z_m)
+    slope = np.abs(np.gradient(values, axis=1)) / np.maximum(reach_m[:, None] * patch.px_per_m * (t[1] - t[0]), 1e-6)
+    best = slope.argmax(axis=1)
+    strength = slope[np.arange(len(a)), best]
+    found = (
+        (best > 1)
+        & (best < len(t) - 2)
+        & (strength > max(2.0 * contrast_noise(patch), 0.3 * float(np.median(strength))))
+    )
+    return expected_m + reach_m * t[best], found
 
 
 def one_sided_shade(

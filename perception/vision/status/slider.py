@@ -25,6 +25,13 @@ def read_slider(patch: Patch, spec: Slider) -> Status:
     s = np.arange(lo - along, hi + along, step)
     left, right = (_profile(patch, spec.angle_rad, s, side * across * np.array(SIDE)) for side in (-1.0, 1.0))
     seen = float(np.mean([patch.seen(*_place(spec.angle_rad, s, np.array([o * across]))) for o in (-0.3, 0.3)]))
+    if (
+        float(
+            np.mean(sample_at(patch.inside.astype(np.uint8), *patch.pixel_of(*_place(spec.angle_rad, s, np.zeros(1)))))
+        )
+        < 0.97
+    ):
+        return refused("part of the track is outside the image: move the camera", unit=spec.scale.unit)
     if seen < 0.4:
         return refused(
             "the slider cannot be seen (glare, shadow or cover): change the angle or the light", unit=spec.scale.unit
@@ -38,21 +45,22 @@ def read_slider(patch: Patch, spec: Slider) -> Status:
     room_m = 0.004 + lean_px / patch.px_per_m
     cover = covered(patch, half_width_m=footprint[0] + room_m, half_height_m=footprint[1] + room_m, is_round=False)
     open_ = np.ones_like(s) if cover is None else _open(patch, cover, spec.angle_rad, s, 0.4 * across)
-    best = (-1.0, 0, np.zeros_like(s))
+    best, best_profile = (-1.0, 0, np.zeros_like(s)), np.zeros_like(s)
     for is_dark in (True, False):
         both = np.minimum(_hat(left, width, is_dark), _hat(right, width, is_dark)) * open_
+        both = _closed(both, 0.45 * along / step)  # a cap may carry a line across its middle
         score = np.convolve(both, kernel, "same")
         score[(s - lean_m / 2 < lo - 2 * step) | (s - lean_m / 2 > hi + 2 * step)] = 0.0
         top = int(score.argmax())
         if score[top] > best[0]:
-            best = (float(score[top]), top, score)
+            best, best_profile = (float(score[top]), top, score), both
     peak, top, score = best
     noise = contrast_noise(patch)
     apart = np.abs(s - s[top]) > 1.2 * along
     rival = float(score[apart].max()) if apart.any() else 0.0
     if peak < 2.0 * noise:
         return refused("no cap stands out on the track: come closer or add light", unit=spec.scale.unit)
-    place = float(np.clip(_centre(score, top, s) - lean_m / 2, lo, hi))
+    place = float(np.clip(_cap_middle(best_profile, top, s, along_m=along, lean_m=lean_m), lo, hi))
     slope = abs(spec.scale.value_at(place + 1e-4) - spec.scale.value_at(place - 1e-4)) / 2e-4
     confidence = probability(
         [
@@ -80,6 +88,11 @@ def _hat(profile: Array, width: int, is_dark: bool) -> Array:
     return np.asarray(np.maximum(hat - np.median(hat), 0.0), float)
 
 
+def _closed(profile: Array, width: float) -> Array:
+    kernel = np.ones((1, max(3, round(width)) | 1), np.uint8)
+    return np.asarray(cv2.morphologyEx(profile.astype(np.float32)[None], cv2.MORPH_CLOSE, kernel)[0], float)
+
+
 def _open(patch: Patch, cover: NDArray[np.bool_], angle_rad: float, s: Array, across_m: float) -> Array:
     """1 where nothing lies across the track, else 0."""
     u, v = patch.pixel_of(*_place(angle_rad, s, np.linspace(-1.0, 1.0, 5) * across_m))
@@ -101,14 +114,28 @@ def _profile(patch: Patch, angle_rad: float, s: Array, across: Array) -> Array:
     return np.asarray(patch.sample(*_place(angle_rad, s, across)).mean(axis=1), float)
 
 
-def _centre(score: Array, top: int, s: Array) -> float:
-    """Middle of the top of the matched filter's triangle."""
-    high = score > 0.6 * score[top]
+def _cap_middle(profile: Array, top: int, s: Array, *, along_m: float, lean_m: float) -> float:
+    """Middle of the cap's top from the edges of what stands out.
+
+    Where the cap leans towards one side its wall shows there, in a gray of its own: then only the other edge is the top's.
+    """
+    near = slice(max(0, top - 2), top + 3)
+    half = 0.5 * float(np.median(profile[near]) or profile[top])
     first, last = top, top
-    while first > 0 and high[first - 1]:
+    while first > 0 and profile[first - 1] > half:
         first -= 1
-    while last < len(score) - 1 and high[last + 1]:
+    while last < len(profile) - 1 and profile[last + 1] > half:
         last += 1
-    part = slice(first, last + 1)
-    weight = score[part] - 0.6 * score[top]
-    return float((weight * s[part]).sum() / max(weight.sum(), 1e-9))
+    low = s[first] - _part(profile, first, first - 1, half) * (s[1] - s[0])
+    high = s[last] + _part(profile, last, last + 1, half) * (s[1] - s[0])
+    if abs(lean_m) < 0.1 * along_m:
+        return float((low + high - lean_m) / 2)
+    return float(low + along_m / 2 if lean_m > 0 else high - along_m / 2)
+
+
+def _part(profile: Array, inside: int, outside: int, level: float) -> float:
+    """How far between two samples the profile crosses a level."""
+    if not 0 <= outside < len(profile):
+        return 0.0
+    drop = profile[inside] - profile[outside]
+    return float(np.clip((profile[inside] - level) / drop, 0.0, 1.0)) if drop > 0 else 0.5

@@ -10,7 +10,8 @@ from perception.vision.reading import Status
 from perception.vision.status.bar import bar_contrast
 from perception.vision.status.choice import choose, contrast_noise
 
-BAT_FROM, BAT_TO = 0.70, 1.08  # of the reach: the nut around the foot looks like a bar too
+BAT_FROM, BAT_TO = 0.62, 0.95  # of the length: the nut around the foot looks like a bar too
+BRIGHT_ODDS = 2.0  # bats are metal or white far more often than darker than their base
 PIVOT_M = 0.004  # a bat turns about a point that far above the plate
 
 
@@ -21,10 +22,15 @@ def read_toggle(patch: Patch, spec: Toggle) -> Status:
         patch,
         np.array([0.0, np.pi]),
         along_m=(BAT_FROM * reach, BAT_TO * reach),
-        half_width_m=spec.bat_radius_m,
+        half_width_m=0.8 * spec.bat_radius_m,
+        quantile=0.5,
         height_m=(PIVOT_M + BAT_FROM * height, PIVOT_M + BAT_TO * height),
         flank=(1.6, 1.9),
     )
     y = np.linspace(-1, 1, 12)[:, None] * reach
     seen = patch.seen(np.array([-1.0, 0.0, 1.0]) * spec.bat_radius_m + 0 * y, y + np.zeros(3))
-    return choose(["on", "off"], np.abs(contrast), noise=contrast_noise(patch), seen=seen, what="bat")
+    # A bat has one colour: what is dark on one side and bright on the other is the rest of the switch.
+    evidence = max(
+        (np.maximum(contrast, 0.0), BRIGHT_ODDS), (np.maximum(-contrast, 0.0), 1.0), key=lambda e: e[0].max() * e[1]
+    )
+    return choose(["on", "off"], evidence[0], noise=contrast_noise(patch), seen=seen, what="bat")

@@ -34,7 +34,7 @@ class RangeOptions(SimOptions):
 
     width: Annotated[int, Field(ge=16, le=512)] = 128
     height: Annotated[int, Field(ge=16, le=512)] = 128
-    field_of_view_rad: Annotated[float, Field(gt=0.1, lt=2.0)] = 1.05
+    field_of_view_rad: Annotated[float, Field(gt=0.1, lt=2.0)] = 0.96  # wider, and the finger tips come into view
     sigma_m: Annotated[float, Field(ge=0, le=0.1)] = 0.0006
     bits: Annotated[int, Field(ge=6, le=24)] = 16
     mixed_ratio: Annotated[float, Field(ge=0, le=1)] = 0.5

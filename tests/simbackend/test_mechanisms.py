@@ -67,7 +67,11 @@ def _external(engine: Engine, body: int, effort: float) -> None:
         # A couple: the engine's external torque on a fixed-base link is unreliable, two forces are not.
         axis = info[13]
         arm = (1.0, 0.0, 0.0) if abs(axis[0]) < 0.5 else (0.0, 1.0, 0.0)
-        cross = [axis[1] * arm[2] - axis[2] * arm[1], axis[2] * arm[0] - axis[0] * arm[2], axis[0] * arm[1] - axis[1] * arm[0]]
+        cross = [
+            axis[1] * arm[2] - axis[2] * arm[1],
+            axis[2] * arm[0] - axis[0] * arm[2],
+            axis[0] * arm[1] - axis[1] * arm[0],
+        ]
         half = [effort / 2.0 * c for c in cross]
         centre = engine.getLinkState(body, JOINT, computeForwardKinematics=1)[4]
         for sign in (1.0, -1.0):

@@ -18,7 +18,9 @@ CAMERA = np.array([60.0, 60.0, 31.5, 23.5, 0.05])
 NO_TEXTURE = (np.zeros(1, np.uint8), np.array([[0, 2, 2, 0]], np.int64))
 
 
-def draw(points: Array, colours: Array, uv: Array | None = None, textures: tuple[Array, Array] | None = None) -> tuple[Array, Array]:
+def draw(
+    points: Array, colours: Array, uv: Array | None = None, textures: tuple[Array, Array] | None = None
+) -> tuple[Array, Array]:
     """Image (H, W) and depth (H, W) of triangles in camera axes."""
     count = len(points)
     attributes = np.ones((count, 3, 3))

@@ -55,7 +55,7 @@ class CellRuntime:
         shared = Shared()
         closers: list[Callable[[], None]] = [shared.close]
         try:
-            addresses = _start_emulators(cell, clock, shared, closers)
+            addresses = start_emulators(cell, clock, shared, closers)
             devices = _connect_all(cell, clock, shared, addresses, closers)
             objects: dict[str, Any] = {**devices, PREFIX + CLOCK: clock}
             if cell.names_of(DeviceKind.ARM):
@@ -79,7 +79,7 @@ def clock_for(cell: Cell) -> Clock:
     return clocks[cell.file.cell.mode]()
 
 
-def _start_emulators(
+def start_emulators(
     cell: Cell, clock: Clock, shared: Shared, closers: list[Callable[[], None]]
 ) -> dict[str, dict[str, Any]]:
     """Start the far side of each emulated wire; returns the options that make each device find its own."""

@@ -33,6 +33,7 @@ def _app() -> Callable[[], None]:
 
     from service.commands import devices, tasks
     from service.commands.demo import demo
+    from service.commands.develop import conform, emulate, new_driver
     from service.commands.doctor import doctor
     from service.commands.serve import serve
 
@@ -48,6 +49,9 @@ def _app() -> Callable[[], None]:
     app.add_typer(devices.app, name="devices")
     app.add_typer(tasks.app, name="task")
     app.command()(tasks.stop)
+    app.command()(conform)
+    app.command()(emulate)
+    app.command("new-driver")(new_driver)
     return app
 
 

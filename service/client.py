@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 from hal.errors import CellError, DeviceUnavailable, Retry
 
-DEFAULT_URL = "http://127.0.0.1:8420"
+DEFAULT_URL = "http://127.0.0.1:8460"
 FINAL = ("succeeded", "failed", "cancelled")
 
 
@@ -38,7 +38,7 @@ class Client:
     """Talks to one service.
 
     Args:
-        url: where it answers, e.g. `http://127.0.0.1:8420`.
+        url: where it answers, e.g. `http://127.0.0.1:8460`.
         timeout_s: for one answer.
     """
 

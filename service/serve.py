@@ -28,7 +28,7 @@ class Options:
     """How to serve. `stop_port` None: the port after `port` (any free one when `port` is 0)."""
 
     host: str = "127.0.0.1"
-    port: int = 8420
+    port: int = 8460
     stop_port: int | None = None
     runs_dir: Path = Path("runs")
     inline: bool = False

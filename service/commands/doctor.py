@@ -26,7 +26,7 @@ READS = 20
 
 def doctor(
     cell: CellOption = DEFAULT_CELL,
-    port: Annotated[int, typer.Option(min=0, max=65534, help="Port that `serve` would use.")] = 8420,
+    port: Annotated[int, typer.Option(min=0, max=65534, help="Port that `serve` would use.")] = 8460,
     connect: Annotated[bool, typer.Option(help="Also start the cell and time its devices.")] = True,
 ) -> None:
     """Check Python, packages, ports, the cell file and its devices; exit code 1 when something is wrong."""

@@ -18,7 +18,7 @@ LOOPBACK = ("127.0.0.1", "localhost")
 def serve(
     *,
     cell: CellOption = DEFAULT_CELL,
-    port: Annotated[int, typer.Option(min=0, max=65534, help="HTTP port; 0 takes a free one.")] = 8420,
+    port: Annotated[int, typer.Option(min=0, max=65534, help="HTTP port; 0 takes a free one.")] = 8460,
     stop_port: Annotated[
         int | None, typer.Option(min=0, max=65535, help="Port of the stop process; default: the next one.")
     ] = None,

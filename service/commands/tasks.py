@@ -51,18 +51,34 @@ def cancel_task(task_id: TaskId, url: Url = UrlDefault) -> None:
 
 
 def follow(client: Client, task_id: str) -> dict[str, Any]:
-    """Show a task's progress until it ends; returns the task."""
-    columns = (SpinnerColumn(), TextColumn("{task.description:<34.34}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console) as progress:
-        bar = progress.add_task("queued", total=1.0)
-        for event in client.events(task_id):
-            words = " · ".join(escape(word) for word in (event["step"], event["detail"]) if word)
-            progress.update(bar, completed=event["fraction"], description=words or event["state"])
+    """Show a task's progress until it ends; returns the task. In a log, where nothing can move, a line a step."""
+    (_follow_on_terminal if console.is_terminal else _follow_in_log)(client, task_id)
     task: dict[str, Any] = client.get(f"/v1/tasks/{task_id}")
     console.print(f"task {task_id} [{state_style(task['state'])}]{task['state']}[/]")
     if task["problem"] is not None:
         console.print(f"  {escape(task['problem']['detail'])}\n  try    {escape(task['problem']['hint'])}")
     return task
+
+
+def _follow_on_terminal(client: Client, task_id: str) -> None:
+    columns = (SpinnerColumn(), TextColumn("{task.description:<44.44}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as progress:
+        bar = progress.add_task("queued", total=1.0)
+        for event in client.events(task_id):
+            progress.update(bar, completed=event["fraction"], description=escape(_words(event)))
+
+
+def _follow_in_log(client: Client, task_id: str) -> None:
+    begun_s = time.time()
+    for event in client.events(task_id):
+        if event["kind"] == "progress":
+            console.print(
+                f"{event['time_s'] - begun_s:6.1f} s {100 * event['fraction']:3.0f} %  {escape(_words(event))}"
+            )
+
+
+def _words(event: dict[str, Any]) -> str:
+    return " · ".join(word for word in (event["step"], event["detail"]) if word) or str(event["state"])
 
 
 def stop(

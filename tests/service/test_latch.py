@@ -156,8 +156,8 @@ def test_post_stops_whatever_else_the_request_says(tmp_path: Path) -> None:
 
 
 def test_only_our_own_page_may_read_the_answer(tmp_path: Path) -> None:
-    request = "GET /v1/stop HTTP/1.1\r\nOrigin: http://127.0.0.1:8420\r\n\r\n"
-    assert "Access-Control-Allow-Origin" in _answer(tmp_path, request, ("http://127.0.0.1:8420",))[2]
+    request = "GET /v1/stop HTTP/1.1\r\nOrigin: http://127.0.0.1:8460\r\n\r\n"
+    assert "Access-Control-Allow-Origin" in _answer(tmp_path, request, ("http://127.0.0.1:8460",))[2]
 
 
 @pytest.mark.parametrize(

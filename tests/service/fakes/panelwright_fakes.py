@@ -33,7 +33,7 @@ from hal.errors import ConfigError, DeviceTimeout, DeviceUnavailable
 from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
 
-OPTIONS = {"fail", "crash_at_connect", "child_pid_file"}
+OPTIONS = {"fail", "crash_at_connect", "child_pid_file", "immortal"}  # immortal: works on after `close`
 
 
 class FakeDevice:
@@ -53,6 +53,7 @@ class FakeDevice:
             raise ZeroDivisionError("planted defect")
         self.name = context.name
         self._clock = context.clock
+        self._is_immortal = bool(options.get("immortal"))
         self._sequence = 0
         self._fault: Fault | None = None
         self._closed = False
@@ -74,7 +75,7 @@ class FakeDevice:
         )
 
     def close(self) -> None:
-        self._closed = True
+        self._closed = not self._is_immortal
         if self._child is not None:
             self._child.kill()
             self._child.wait()

@@ -1,0 +1,99 @@
+"""`panelwright conform | emulate | new-driver`: for people who write drivers."""
+
+from __future__ import annotations
+
+import re
+import threading
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from hal.devices import DeviceKind
+from hal.errors import ConfigError
+from service.commands.common import DEFAULT_CELL, SeedOption, console, find_cell, read_cell
+from service.scaffold import driver_files
+
+Name = re.compile(r"[a-z][a-z0-9_]{1,40}")
+
+
+class LevelChoice(StrEnum):
+    """Levels of the conformance kit."""
+
+    STATIC = "static"
+    CONNECT = "connect"
+    READ = "read"
+    MOTION = "motion"
+
+
+def conform(
+    cell: Annotated[Path, typer.Argument(help="Cell file whose devices are tried.")] = DEFAULT_CELL,
+    *,
+    device: Annotated[list[str] | None, typer.Option(help="Only this device; may be given again.")] = None,
+    level: Annotated[
+        LevelChoice, typer.Option(help="How far to go; `motion` works arm, gripper and lights.")
+    ] = LevelChoice.READ,
+    seed: SeedOption = None,
+) -> None:
+    """Try the promises of every device kind on the devices of a cell."""
+    from service.conform import run
+
+    loaded = read_cell(cell, seed)
+    for name in device or ():
+        if name not in loaded.file.devices:
+            raise ConfigError(
+                f"{loaded.path} has no device {name!r}", hint=f"devices: {', '.join(loaded.file.devices)}"
+            )
+    raise typer.Exit(run(loaded, devices=device or (), level=str(level)))
+
+
+def emulate(
+    name: Annotated[str, typer.Argument(help="Device of the cell file whose wire is emulated.")],
+    *,
+    cell: Annotated[Path, typer.Option("--cell", help="Cell file with an [emulators.NAME] section.")] = Path(
+        "cells/mixed.toml"
+    ),
+) -> None:
+    """Start the far side of a device's wire and say how to reach it, until Ctrl-C."""
+    from hal.registry import Shared
+    from service.cell import clock_for, start_emulators
+
+    loaded = read_cell(cell, None)
+    section = loaded.file.emulators.get(name)
+    if section is None:
+        known = ", ".join(loaded.file.emulators) or "none"
+        raise ConfigError(f"{find_cell(cell)} emulates no {name!r}", hint=f"its emulators: {known}")
+    alone = loaded.model_copy(update={"file": loaded.file.model_copy(update={"emulators": {name: section}})})
+    shared = Shared()
+    closers = [shared.close]
+    try:
+        address = start_emulators(alone, clock_for(loaded), shared, closers)[name]
+        console.print(f"{section.emulator} for {name} is up; options for its driver: {address}")
+        threading.Event().wait()
+    finally:
+        for close in closers[::-1]:
+            close()
+
+
+def new_driver(
+    name: Annotated[str, typer.Argument(help="Module name, e.g. vl53l1x.")],
+    *,
+    kind: Annotated[DeviceKind, typer.Option(help="Which of the eight interfaces it implements.")],
+    folder: Annotated[Path, typer.Option(help="Project to write into.")] = Path(),
+) -> None:
+    """Write a driver, its conformance test and its entry point, ready to be filled in."""
+    if not Name.fullmatch(name):
+        raise ConfigError(f"{name!r} is no module name", hint="small letters, digits and underscores")
+    files = driver_files(name, kind)
+    taken = [path for path in files if (folder / path).exists()]
+    if taken:
+        raise ConfigError(f"{folder / taken[0]} exists already", hint="choose another name; nothing was written")
+    for path, text in files.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(text)
+        console.print(f"wrote {folder / path}")
+    table = escape('[project.entry-points."panelwright.devices"]')
+    console.print(f'add to pyproject.toml, {table}:\n  "{name}:{kind}" = "drivers.{name}:connect"')
+    console.print(f"then: pip install -e . && pytest {folder / next(reversed(files))}")

@@ -115,15 +115,16 @@ def _draw(rng: np.random.Generator, *, hard: float, stress: bool) -> LightPair:
     motion = np.zeros(3) if not stress else np.array([*rng.uniform(-3, 3, 2), rng.uniform(-0.0035, 0.0035)])
     motion[:2] += rng.uniform(-0.5, 0.5, 2)
     gains = 1.0 + rng.uniform(-0.04, 0.04, 2) + (rng.uniform(-0.25, 0.25) * hard)
-    glare = [_spot(rng) for _ in range(int(round(3 * hard)))]
-    cables = [rng.uniform(0, WIDTH, 2) for _ in range(int(round(2 * hard)))]
+    glare = [_spot(rng) for _ in range(round(3 * hard))]
+    cables = [rng.uniform(0, WIDTH, 2) for _ in range(round(2 * hard))]
     base = rng.uniform(90, 150)
     lit = rng.uniform(0.25, 0.4) if stress else rng.uniform(0.8, 1.2)
     blur = 0.4 + 1.2 * hard * rng.uniform(0.3, 1.0)
     levels = []
     for on in (False, True):
         scene = _scene(H if on else _shifted(H, motion), size, base, things, set(toggled) if on else set())
-        scene = _lamps(scene, H if on else _shifted(H, motion), lights, radius, base, lit if on else 0.0)
+        lamp = (radius, 0.35 * base, 0.7 * base + (150.0 * lit if on else 0.0))
+        scene = _lamps(scene, H if on else _shifted(H, motion), lights, lamp)
         moved = [(p + (rng.uniform(-25, 25, 2) if stress and on else 0.0), s, a) for p, s, a in glare]
         for place, spread, strength in moved:
             scene = scene + _bump(place, spread, strength)
@@ -197,12 +198,13 @@ def _scene(
 
 
 def _lamps(
-    scene: NDArray[np.float32], H: Array, lights: Array, radius: float, base: float, lit: float
+    scene: NDArray[np.float32], H: Array, lights: Array, lamp: tuple[float, float, float]
 ) -> NDArray[np.float32]:
-    canvas = np.asarray(cv2.resize(scene, (2 * WIDTH, 2 * HEIGHT), interpolation=cv2.INTER_NEAREST))
+    radius, rim_level, level = lamp
+    canvas = np.asarray(cv2.resize(scene, (2 * WIDTH, 2 * HEIGHT), interpolation=cv2.INTER_NEAREST), np.float32)
     for place in lights:
-        _fill(canvas, H, place + _ring(1.25 * radius), 0.35 * base)
-        _fill(canvas, H, place + _ring(radius), 0.7 * base + 150.0 * lit)
+        _fill(canvas, H, place + _ring(1.25 * radius), rim_level)
+        _fill(canvas, H, place + _ring(radius), level)
     return np.asarray(cv2.resize(canvas, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA))
 
 

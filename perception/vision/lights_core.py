@@ -17,23 +17,19 @@ RING_PX = 2  # the edge of a lamp is this wide on either side (blur and sampling
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Core:
-    """The lamp: its pixels with a share of 0 to 1 each, its level and that of the glow round it.
-
-    `rim`: width of the fall from 3/4 to 1/4 of the way between lamp and glow over the radius, as a difference of areas over
-    the area; 0.8 for a Gaussian bump, less for a lamp.
-    """
+    """The lamp: its pixels with a share of 0 to 1 each, its level and that of the glow round it."""
 
     weights: Image
     top: float
     glow: float
-    rim: float
 
 
 def lamp_core(rise: Image, seed: Mask) -> Core | None:
     """The part of a brighter region that has the steepest rim.
 
-    The region above a level shrinks as the level rises; where it shrinks least for most of a rise, there is an edge. Glow
-    falls off slowly, so its outlines are never that. Inside the rim, pixels count by how far they stand above the glow.
+    The region above a level shrinks as the level rises; where it shrinks least for most of a rise, there is an edge.
+    Glow falls off slowly, so its outlines are never that. Inside the rim, pixels count by how far they stand above the
+    glow.
 
     Args:
         rise: (H, W) on minus off about one region.
@@ -52,16 +48,11 @@ def lamp_core(rise: Image, seed: Mask) -> Core | None:
     reach = cv2.dilate(body, kernel, iterations=RING_PX)
     ring = (cv2.dilate(reach, kernel) > 0) & (reach == 0)
     glow = min(float(np.median(rise[ring])), 0.9 * top) if ring.any() else 0.0
-    # Half way between lamp and glow is the rim; a ramp across it counts split pixels by their share, while unevenness of
-    # glow or lamp, which is cut off at the plate's edge or has a highlight when off, stays without effect.
+    # Half way between lamp and glow is the rim; a ramp across it counts split pixels by their share, while unevenness
+    # of glow or lamp, which is cut off at the plate's edge or has a highlight when off, stays without effect.
     share = np.clip(0.5 + (rise - 0.5 * (top + glow)) / max(RAMP * (top - glow), 1e-3), 0.0, 1.0)
-    areas = [float(((rise > glow + f * (top - glow)) & (reach > 0)).sum()) for f in (0.25, 0.5, 0.75)]
-    return Core(
-        weights=np.where(reach > 0, share, 0.0).astype(np.float32),
-        top=top,
-        glow=glow,
-        rim=(areas[0] - areas[2]) / max(areas[1], 1.0),
-    )
+    weights = np.where(reach > 0, share, 0.0).astype(np.float32)
+    return Core(weights=weights, top=top, glow=glow)
 
 
 def _steepest_level(rise: Image, seed: Mask, peak: float) -> float:
@@ -91,4 +82,4 @@ def _component(rise: Image, seed: Mask, level: float) -> NDArray[np.uint8] | Non
     touched[0] = 0
     if not touched.any():
         return None
-    return (labels == int(np.argmax(touched))).astype(np.uint8)
+    return np.asarray(labels == int(np.argmax(touched)), np.uint8)

@@ -20,7 +20,6 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 SEED_SIGMAS = 6.0  # a 640x480 image has 3e5 pixels: 6 sigma leaves no noise seed
-GROW_SHARE = 0.5  # a region ends where the difference falls to half of its top: the lamp's rim at any blur
 LEAST_AREA_PX = 4.0
 CENTRE_FLOOR_PX = 0.04  # registration and lens blooming, measured on drawn pairs
 MOST_BLOBS = 16
@@ -121,7 +120,8 @@ def _rise(on: Image, registration: Registration, diameter: float) -> Image:
     small = cv2.resize(difference, half, interpolation=cv2.INTER_AREA)
     opened = cv2.morphologyEx(small, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
     wide = cv2.resize(cv2.blur(opened, (side, side)), difference.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return np.asarray(difference - np.maximum(wide, 0.0), np.float32)
+    rise: Image = (difference - np.maximum(wide, 0.0)).astype(np.float32)
+    return rise
 
 
 def _noise(rise: Image, registration: Registration) -> Image:
@@ -145,7 +145,8 @@ def _noise(rise: Image, registration: Registration) -> Image:
         excess = change[steep] ** 2 - (a + b * level[steep])
         # The lower quartile, 0.10 of chi-square 1, is the median of the clean half when glare moved over the other.
         c = max(float(np.quantile(excess / slope[steep], 0.25)) / 0.2, 0.0)
-    return np.sqrt(np.maximum(a + b * np.clip(base, 0.0, 255.0), 0.05) + max(c, 0.01) * slope2).astype(np.float32)
+    variance = np.maximum(a + b * np.clip(base, 0.0, 255.0), 0.05) + max(c, 0.01) * slope2
+    return np.asarray(np.sqrt(variance), np.float32)
 
 
 def _level_noise(level: NDArray[Any], change: NDArray[Any]) -> tuple[float, float]:
@@ -172,7 +173,7 @@ class _Region:
         pixels, weights: (n, 2) coordinates and (n,) coverage 0..1.
         top: rise in the middle. sigma: noise.
         rim: width of the fall from 3/4 to 1/4 of the top over the radius; 0.8 for a Gaussian bump, less for a lamp.
-        surround: unevenness of the rise just outside over the top; 0 for a lamp, more for a piece of glare.
+        surround: unevenness of the rise just outside, over the top; 0 for a lamp, more for a piece of glare.
     """
 
     pixels: Array
@@ -302,6 +303,6 @@ def _measure(region: _Region) -> tuple[Array, Array, float, float, float, float,
     round_ = min(aspect / 0.5, 1.0)
     full = float(np.exp(-0.5 * ((fill - 0.96) / 0.1) ** 2))
     sharp = float(np.exp(-0.5 * (max(region.rim - 0.4, 0.0) / 0.15) ** 2))
-    # A lamp lights the plate round it (measured: up to 0.55 of its own rise where the image saturates); glare has no plateau.
+    # A lamp lights the plate round it, up to 0.55 of its own rise where the image saturates; glare has no plateau.
     alone = float(np.exp(-0.5 * (max(region.surround - 0.55, 0.0) / 0.15) ** 2))
     return centre, covariance, area, region.top, aspect, fill, clear * round_ * full * sharp * alone

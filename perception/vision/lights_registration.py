@@ -18,6 +18,8 @@ EDGE_PIXELS = 6_000  # 16 000 gave the same shift within 0.01 px
 ITERATIONS = 10
 SHIFT_FIRST = 3  # iterations with translation alone; turn and growth join when most edges overlap
 TONE_BINS = 16
+COMMON_SHARE = 0.007  # of the pixels: a level that lamps alone could not fill
+FEW_EDGES = 200
 
 
 class CameraMoved(PerceptionError):
@@ -49,8 +51,8 @@ class Registration:
 def register(first: Image, second: Image, *, noise: float) -> Registration:
     """Motion and gain between two gray images, robust against what changed.
 
-    Phase correlation of the half-size gradient images starts a Gauss-Newton fit of shift, turn, growth and brightness over
-    the strongest edges with Tukey's weights.
+    Phase correlation of the half-size gradient images starts a Gauss-Newton fit of shift, turn, growth and brightness
+    over the strongest edges with Tukey's weights.
 
     Args:
         first, second: (H, W) grey levels.
@@ -64,8 +66,8 @@ def register(first: Image, second: Image, *, noise: float) -> Registration:
     gx, gy = _gradients(second)
     strength = np.hypot(gx, gy)
     rows, columns = _strong_edges(strength, least=3.0 * noise)
-    if len(rows) < 200:
-        return _unmoved(first, second)
+    if min(len(rows), len(_strong_edges(np.hypot(*_gradients(first)), least=3.0 * noise)[0])) < FEW_EDGES:
+        return _unmoved(first, second)  # in the dark the lights themselves are the only edges
     start = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     start[:, 2] = _coarse_shift(first, second)
     edges = _Edges(rows=rows, columns=columns, gradients=(gx, gy))
@@ -141,14 +143,14 @@ def _result(first: Image, second: Image, edges: _Edges, affine: Array) -> Regist
 
 
 def _tones(first: NDArray[Any], second: NDArray[Any]) -> tuple[float, float]:
-    """Gain and offset between grey levels, from the median change at each level that covers 2 % of the image.
+    """Gain and offset between grey levels, from the median change at each level that is common in the image.
 
     On edges alone the gain would come out wrong: resampling flattens them.
     """
     first, second = first[::7], second[::7]
     levels = np.clip(first / (256.0 / TONE_BINS), 0, TONE_BINS - 1).astype(np.intp)
     counts = np.bincount(levels, minlength=TONE_BINS)
-    common = np.flatnonzero(counts >= 0.02 * len(first))
+    common = np.flatnonzero(counts >= COMMON_SHARE * len(first))
     change = second - first
     x = np.array([float(np.median(first[levels == b])) for b in common])
     y = np.array([float(np.median(change[levels == b])) for b in common])

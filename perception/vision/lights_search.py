@@ -1,4 +1,4 @@
-# ruff: noqa: PLR0912, PLR0915, PLR0917 - a compiled loop takes plain arrays and keeps one sum in one place
+# ruff: noqa: PLR0912, PLR0915 - a compiled loop keeps one sum in one place
 """Compiled search for the taught quadrangle among blobs: every ordered triple, its poses, the fourth light."""
 
 from __future__ import annotations

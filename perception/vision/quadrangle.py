@@ -32,8 +32,8 @@ class AlternativePose:
 
     Attributes:
         rotation, translation_m: (3, 3) and (3,) of the pose; `camera_from_object` gives it as a `RigidTransform`.
-        covariance: 6x6 as in `QuadranglePose`; None when it is no minimum of its own but the best pose on the other
-            side of the line of sight, on the flank of the answer's minimum.
+        covariance: 6x6 as in `QuadranglePose`; None when it is no minimum of its own but the middle of what is likely
+            on the other side of the line of sight, on the flank of the answer's minimum.
         chi_square: of its fit, 2 degrees of freedom.
         odds: its posterior mass relative to the answer's (1 = equally likely).
     """

@@ -1,4 +1,4 @@
-# ruff: noqa: PLR0915, PLR0917 - compiled loops take plain arrays and keep one equation in one place
+# ruff: noqa: PLR0915 - a compiled loop keeps one equation in one place
 """Compiled inner loops of the four-light pose: reprojection chi-square, its derivatives and its local minimiser.
 
 Everything works on normalised image coordinates `m` (4, 2) with information `A` (4, 3) = (a_uu, a_uv, a_vv) each and

@@ -1,4 +1,4 @@
-# ruff: noqa: PLR0912, PLR0915 - compiled loops take plain arrays and keep one equation in one place
+# ruff: noqa: PLR0912, PLR0915 - a compiled loop keeps one equation in one place
 """Compiled three-point poses: the first half of the paper's direct route (Section II-B), and seeds for the refinement.
 
 The code reads from `real_cubic_root` down to `three_point`; conventions as in `quadrangle_core`.
@@ -29,8 +29,9 @@ def real_cubic_root(b, c, d):  # type: ignore[no-untyped-def]
     x -= b / 3.0
     for _ in range(2):
         slope = (3.0 * x + 2.0 * b) * x + c
-        if slope != 0.0:
-            x -= (((x + b) * x + c) * x + d) / slope
+        value = ((x + b) * x + c) * x + d
+        if abs(value) < 1e-3 * (1.0 + abs(x)) * abs(slope):  # never far: near a double root the slope means nothing
+            x -= value / slope
     return x
 
 

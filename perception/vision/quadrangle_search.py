@@ -1,4 +1,4 @@
-# ruff: noqa: PLR0912, PLR0917 - compiled loops take plain arrays and keep one equation in one place
+# ruff: noqa: PLR0912 - a compiled loop keeps one equation in one place
 """Compiled search of the four-light pose: every local minimum, the profile over the normal, the mirror's share.
 
 Conventions as in `quadrangle_cost`.
@@ -340,12 +340,13 @@ def sight_frame(t):  # type: ignore[no-untyped-def]
 
 @jit
 def ring_mass(R, t, cost, X, m, A, normal):  # type: ignore[no-untyped-def]
-    """Posterior mass of the normals on this and on the other side of the line of sight, and the best pose there.
+    """Posterior mass of the normals on this and on the other side of the line of sight, and the middle pose there.
 
     The posterior over the normal is exp(-chi2 / 2) det(information of position and roll)^(-1/2); beforehand all
     directions in space are equally likely. It is summed over rings of tilt about the line of sight to the centroid.
 
-    Returns: mass here, mass there (sr, in units of the density at the best pose), R, t, chi-square of the best there.
+    Returns: mass here, mass there (sr, in units of the density at the best pose), R, t, chi-square in the middle of
+    the mass there.
     """
     F = sight_frame(t)
     best = F @ (R @ normal)
@@ -355,8 +356,8 @@ def ring_mass(R, t, cost, X, m, A, normal):  # type: ignore[no-untyped-def]
     tilt_best = np.arccos(min(1.0, best[2]))
     azimuth_best = np.arctan2(best[1], best[0])
     here = there = 0.0
-    R_there, t_there, cost_there = R, t, np.inf
     g = np.empty(3)
+    middle = np.zeros(3)
     for a in range(RING_COUNT):
         azimuth = azimuth_best + 2.0 * np.pi * a / RING_COUNT
         Rw, tw = R, t
@@ -369,15 +370,19 @@ def ring_mass(R, t, cost, X, m, A, normal):  # type: ignore[no-untyped-def]
                 w = np.exp(-0.5 * (c - cost) - 0.5 * (log_det - reference)) * np.sin(tilt)
                 if opposite(g, best, MIRROR_TURN_COS):
                     there += w
-                    if c < cost_there:
-                        R_there, t_there, cost_there = Rn, tn, c
+                    for i in range(3):
+                        middle[i] += w * g[i]
                 else:
                     here += w
             if c - cost > 40.0 and tilt > 1.2 * tilt_best + RING_STEP_RAD:
                 break
             tilt += RING_STEP_RAD
     cell = RING_STEP_RAD * 2.0 * np.pi / RING_COUNT
-    return here * cell, there * cell, R_there, t_there, cost_there
+    size = np.sqrt(np.sum(middle * middle))
+    if not size > 0.0:
+        return here * cell, 0.0, R, t, np.inf
+    R, t, cost, _ = profile(R, t, side * (F.T @ (middle / size)), X, m, A, normal)
+    return here * cell, there * cell, R, t, cost
 
 
 @jit
@@ -387,7 +392,7 @@ def solve(points, pixels, covariance, camera, near_sigmas2, Rs, ts, costs, Cs, m
     Args:
         near_sigmas2: the rings are summed when the line of sight is nearer to the best normal (sigmas squared).
         Rs (M, 3, 3), ts (M, 3), costs (M,), Cs (M, 6, 6), masses (M,): filled. Poses are of the object's own origin.
-            When the other side of the line of sight has mass but no minimum, its best pose is appended, covariance 0.
+            When the other side of the line of sight has mass but no minimum, its middle is appended, covariance 0.
 
     Returns: number of poses, number of them that are minima, error code (0 fine, others in `quadrangle`).
     """

@@ -1,9 +1,10 @@
 """How well the hand works the simulated panel: every skill over many seeds, with a panel pose that is wrong.
 
-    python -m benchmarks.manipulation [--skills lever,slider,...] [--seeds 20] [--first 1] [--error-mm 3] [--error-deg 1]
+    python -m benchmarks.manipulation [--skills lever,slider,...] [--seeds 20] [--first 1] [--error-mm 3]
+    [--error-deg 1]
 
-Success is judged by the simulator's truth after the skill has ended, not by what the skill says. A `done` that the truth
-does not bear out counts as false.
+Success is judged by the simulator's truth after the skill has ended, not by what the skill says. A `done` that the
+truth does not bear out counts as false.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from manipulation.skills.button import button
 from manipulation.skills.handwheel import handwheel
 from manipulation.skills.lever import lever
 from manipulation.skills.mushroom import mushroom
-from manipulation.skills.outcome import Outcome, SkillReport
+from manipulation.skills.outcome import ObjectState, Outcome, SkillReport
 from manipulation.skills.rotary import rotary
 from manipulation.skills.slider import slider
 from manipulation.skills.steps import park
@@ -34,7 +35,15 @@ SLIDER_TOLERANCE_M = 0.0015
 LEVER_TOLERANCE_RAD = np.radians(5.0)
 WHEEL_TOLERANCE_RAD = np.radians(6.0)
 PASS_RATIO = 0.95
-PEAK_N = {"button": 25.0, "toggle": 25.0, "mushroom": 40.0, "slider": 40.0, "rotary": 40.0, "lever": 98.0, "handwheel": 83.0}
+PEAK_N = {
+    "button": 25.0,
+    "toggle": 25.0,
+    "mushroom": 40.0,
+    "slider": 40.0,
+    "rotary": 40.0,
+    "lever": 98.0,
+    "handwheel": 83.0,
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,7 +68,10 @@ Judged = tuple[SkillReport, bool, float]
 def _lever(bench: SimBench) -> Judged:
     goal = "open" if bench.truth("main_valve").state == "closed" else "closed"
     angle = {"open": 0.0, "closed": np.pi / 2}[goal]
-    look = lambda: bench.look("main_valve", angle_sigma_rad=ANGLE_SIGMA_RAD)  # noqa: E731
+
+    def look() -> ObjectState:
+        return bench.look("main_valve", angle_sigma_rad=ANGLE_SIGMA_RAD)
+
     report = lever(bench.cell, "main_valve", goal, current=look(), verify=look)
     error = float(bench.truth("main_valve").value or 0.0) - angle
     return report, abs(error) <= LEVER_TOLERANCE_RAD, error
@@ -69,7 +81,10 @@ def _slider(bench: SimBench) -> Judged:
     before = float(bench.truth("setpoint").value or 0.0)
     goal = float(bench.rng.uniform(10.0, 90.0))
     goal = goal if abs(goal - before) > 10.0 else (before + 50.0) % 100.0
-    look = lambda: bench.look("setpoint", value_sigma=SLIDER_SIGMA)  # noqa: E731
+
+    def look() -> ObjectState:
+        return bench.look("setpoint", value_sigma=SLIDER_SIGMA)
+
     report = slider(bench.cell, "setpoint", goal, current=look(), verify=look)
     error_m = (float(bench.truth("setpoint").value or 0.0) - goal) * 1e-3
     return report, abs(error_m) <= SLIDER_TOLERANCE_M, error_m
@@ -93,7 +108,10 @@ def _rotary(bench: SimBench) -> Judged:
     states = ["manual", "off", "auto"]
     now = states.index(str(bench.truth("mode").state))
     goal = states[now + 1 if now < 2 else now - 1]
-    look = lambda: bench.look("mode")  # noqa: E731
+
+    def look() -> ObjectState:
+        return bench.look("mode")
+
     report = rotary(bench.cell, "mode", goal, current=look(), verify=look)
     return report, bench.truth("mode").state == goal, 0.0
 
@@ -101,7 +119,10 @@ def _rotary(bench: SimBench) -> Judged:
 def _handwheel(bench: SimBench) -> Judged:
     before = float(bench.truth("bypass").value or 0.0)
     goal = before + (np.pi / 2 if before < 0 else -np.pi / 2)
-    look = lambda: bench.look("bypass", angle_sigma_rad=ANGLE_SIGMA_RAD)  # noqa: E731
+
+    def look() -> ObjectState:
+        return bench.look("bypass", angle_sigma_rad=ANGLE_SIGMA_RAD)
+
     report = handwheel(bench.cell, "bypass", goal, current=look(), verify=look)
     error = float(bench.truth("bypass").value or 0.0) - goal
     return report, abs(error) <= WHEEL_TOLERANCE_RAD, error
@@ -154,7 +175,10 @@ def wilson_lower(successes: int, trials: int, z: float = 1.96) -> float:
 
 def table(trials: list[Trial]) -> str:
     """One line a skill, pass line beside measured value."""
-    head = f"{'skill':10} {'right':>8} {'pass':>6} {'wilson':>7} {'first':>6} {'false':>6} {'peak med/max N':>16} {'limit':>6} {'sim s':>6} {'RTF':>5}  outcomes"
+    head = (
+        f"{'skill':10} {'right':>8} {'pass':>6} {'wilson':>7} {'first':>6} {'false':>6} {'peak med/max N':>16} "
+        f"{'limit':>6} {'sim s':>6} {'RTF':>5}  outcomes"
+    )
     lines = [head]
     for skill in dict.fromkeys(t.skill for t in trials):
         rows = [t for t in trials if t.skill == skill]
@@ -164,10 +188,12 @@ def table(trials: list[Trial]) -> str:
         peaks = [t.peak_n for t in rows]
         wall = sum(t.wall_s for t in rows)
         verdict = "ok" if right >= PASS_RATIO * len(rows) else "FAIL"
+        sim = [t.sim_s for t in rows]
+        counts = dict(Counter(t.outcome for t in rows))
         lines.append(
-            f"{skill:10} {right:4}/{len(rows):<3} {verdict:>6} {wilson_lower(right, len(rows)):7.2f} {first:6} {false:6}"
-            f" {np.median(peaks):8.1f}/{max(peaks):5.1f}  {PEAK_N[skill]:6.0f} {np.median([t.sim_s for t in rows]):6.1f}"
-            f" {sum(t.sim_s for t in rows) / wall:5.2f}  {dict(Counter(t.outcome for t in rows))}"
+            f"{skill:10} {right:4}/{len(rows):<3} {verdict:>6} {wilson_lower(right, len(rows)):7.2f} {first:6} "
+            f"{false:6} {np.median(peaks):8.1f}/{max(peaks):5.1f}   {PEAK_N[skill]:6.0f} {np.median(sim):6.1f} "
+            f"{sum(sim) / wall:5.2f}  {counts}"
         )
     return "\n".join(lines)
 
@@ -190,8 +216,8 @@ def main() -> None:
                 trials.append(result)
                 mark = "right" if result.is_right else "WRONG"
                 print(
-                    f"{seed:4} {skill:10} {mark} {result.outcome:11} tries {result.attempts} peak {result.peak_n:5.1f} N "
-                    f"error {result.error:+.4f} sim {result.sim_s:5.1f} s  {result.cause}",
+                    f"{seed:4} {skill:10} {mark} {result.outcome:11} tries {result.attempts} "
+                    f"peak {result.peak_n:5.1f} N error {result.error:+.4f} sim {result.sim_s:5.1f} s  {result.cause}",
                     flush=True,
                 )
         finally:

@@ -5,8 +5,10 @@ The rig of the skills' tests and benchmark. It reads the simulator's truth, whic
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -31,7 +33,7 @@ class SimBench:
     file: Cell
     clock: SimClock
     shared: Shared
-    arm: object
+    arm: Any
     controller: Controller
     cell: Workcell
     latched: list[bool]
@@ -39,15 +41,16 @@ class SimBench:
 
     def truth(self, name: str) -> ObjectTruth:
         """What an object really shows now."""
-        return next(o for o in self.arm.truth().objects if o.name == name)  # type: ignore[attr-defined]
+        found: ObjectTruth = next(o for o in self.arm.truth().objects if o.name == name)
+        return found
 
     def true_panel(self) -> RigidTransform:
         """Where the panel really is."""
-        return RigidTransform.from_matrix(self.arm.truth().base_from_panel_matrix)  # type: ignore[attr-defined]
+        return RigidTransform.from_matrix(self.arm.truth().base_from_panel_matrix)
 
     def peak_force_n(self) -> float:
         """Largest contact force that the engine saw on the arm."""
-        return float(self.arm.truth().peak_force_n)  # type: ignore[attr-defined]
+        return float(self.arm.truth().peak_force_n)
 
     def look(self, name: str, *, angle_sigma_rad: float = 0.0, value_sigma: float = 0.0) -> ObjectState:
         """A second look: the truth with noise as a camera's reading has it."""
@@ -67,19 +70,33 @@ class SimBench:
         self.shared.close()
 
 
-def open_bench(seed: int, *, error_m: float = 0.003, error_rad: float = np.radians(1.0), speed: float = 0.25) -> SimBench:
-    """The bench of a seed, believed to stand `error_m` and `error_rad` away from where it does, in a random direction."""
+def _silent(_fraction: float, _text: str) -> None:
+    return None
+
+
+def open_bench(
+    seed: int,
+    *,
+    error_m: float = 0.003,
+    error_rad: float = np.radians(1.0),
+    speed: float = 0.25,
+    progress: Callable[[float, str], None] = _silent,
+) -> SimBench:
+    """The bench of a seed, believed to stand `error_m` and `error_rad` away from where it does, in a random
+    direction.
+    """
     file = load_cell(ROOT / "cells" / "bench.toml", seed=seed)
     clock, shared = SimClock(), Shared()
-    made = {}
+    made: dict[str, Any] = {}
     for name, section in file.file.devices.items():
         if section.kind in (DeviceKind.CAMERA, DeviceKind.RANGE_SCANNER, DeviceKind.LIGHTS):
             continue
         context = Context(name=name, clock=clock, cell=file, shared=shared)
         made[name] = connect(context, section.driver, dict(section.options))
     latched = [False]
-    record = file.calibration_of("wrist_ft")
-    grip = file.calibration_of("gripper").mount.pose().parent_from_child
+    record, gripper = file.calibration_of("wrist_ft"), file.calibration_of("gripper")
+    assert record.mount is not None and record.load is not None and gripper.mount is not None
+    grip = gripper.mount.pose().parent_from_child
     controller = Controller(
         made["arm"],
         made["gripper"],
@@ -111,8 +128,10 @@ def open_bench(seed: int, *, error_m: float = 0.003, error_rad: float = np.radia
         park_rad=np.asarray(file.file.workspace.park_rad),
         floor_z_m=file.file.workspace.floor_z_m,
         seed=seed,
+        progress=progress,
     )
     bench = SimBench(file, clock, shared, made["arm"], controller, cell, latched, rng)
-    angles = {o.name: o.value for o in file.panel.objects if o.kind == "lever" for o in [bench.truth(o.name)]}
+    levers = [thing.name for thing in file.panel.objects if thing.kind == "lever"]
+    angles = {name: float(bench.truth(name).value or 0.0) for name in levers}
     bench.cell = replace(cell, angles_rad=angles)
     return bench

@@ -17,15 +17,15 @@ GOLDEN = 0.6180339887498949
 SEARCH_STEPS = 16  # 0.618^16 of a 0.5 m link: 0.2 mm of arc, far less in distance near the minimum
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]  # numba ships no types
+@njit(cache=True)
 def point_box(x: float, y: float, z: float, half: Array) -> float:
     """Signed distance from a point in box axes to the box: negative inside."""
     dx, dy, dz = abs(x) - half[0], abs(y) - half[1], abs(z) - half[2]
     ox, oy, oz = max(dx, 0.0), max(dy, 0.0), max(dz, 0.0)
-    return float(np.sqrt(ox * ox + oy * oy + oz * oz) + min(max(dx, max(dy, dz)), 0.0))
+    return float(np.sqrt(ox * ox + oy * oy + oz * oz) + min(max(dx, dy, dz), 0.0))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def segment_box(start: Array, end: Array, rotation: Array, middle: Array, half: Array) -> float:
     """Least signed distance between the segment and the box (rotation: base_from_box)."""
     a, b = np.empty(3), np.empty(3)
@@ -39,9 +39,7 @@ def segment_box(start: Array, end: Array, rotation: Array, middle: Array, half: 
     t1, t2 = high - GOLDEN, GOLDEN
     f1 = point_box(a[0] + t1 * d[0], a[1] + t1 * d[1], a[2] + t1 * d[2], half)
     f2 = point_box(a[0] + t2 * d[0], a[1] + t2 * d[1], a[2] + t2 * d[2], half)
-    best = min(
-        min(f1, f2), min(point_box(a[0], a[1], a[2], half), point_box(b[0], b[1], b[2], half))
-    )
+    best = min(f1, f2, point_box(a[0], a[1], a[2], half), point_box(b[0], b[1], b[2], half))
     for _ in range(SEARCH_STEPS):
         if f1 < f2:
             high, t2, f2 = t2, t1, f1
@@ -56,7 +54,7 @@ def segment_box(start: Array, end: Array, rotation: Array, middle: Array, half: 
     return best
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def segment_segment(p1: Array, q1: Array, p2: Array, q2: Array) -> float:
     """Least distance between two segments.
 
@@ -86,9 +84,11 @@ def segment_segment(p1: Array, q1: Array, p2: Array, q2: Array) -> float:
     return float(np.sqrt(np.dot(gap, gap)))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def capsule_ends(dh: Array, q: Array, tool_ends: Array) -> Any:
-    """Ends (n + m, 2, 3) in the base of all capsules: n links from joint to joint, then the m of the tool on the flange."""
+    """Ends (n + m, 2, 3) in the base of all capsules: n links from joint to joint, then the m of the tool on the
+    flange.
+    """
     n, m = dh.shape[0], tool_ends.shape[0]
     chain = frames(dh, q)
     out = np.empty((n + m, 2, 3))
@@ -105,7 +105,7 @@ def capsule_ends(dh: Array, q: Array, tool_ends: Array) -> Any:
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def least_clearance(
     dh: Array,
     q: Array,
@@ -114,14 +114,14 @@ def least_clearance(
     rotations: Array,
     middles: Array,
     halves: Array,
-    watched: Array,
+    watched: NDArray[np.bool_],
     pairs: Index,
     enough: float,
 ) -> float:
     """Least gap (m, negative when overlapping) over all watched capsule-box pairs and self pairs.
 
-    `watched`: (capsules, boxes) of bool. Gaps above `enough` may be answered by a lower bound of theirs, and the first gap
-    below it ends the search, so a validity check is cheap; with `enough` infinite the answer is exact.
+    `watched`: (capsules, boxes) of bool. Gaps above `enough` may be answered by a lower bound of theirs, and the
+    first gap below it ends the search, so a validity check is cheap; with `enough` infinite the answer is exact.
     """
     ends = capsule_ends(dh, q, tool_ends)
     least = np.inf
@@ -140,17 +140,17 @@ def least_clearance(
                 gap = segment_box(ends[i, 0], ends[i, 1], rotations[j], middles[j], halves[j]) - radii[i]
                 least = min(least, gap)
                 if least < enough < np.inf:
-                    return least
+                    return float(least)
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
         gap = segment_segment(ends[i, 0], ends[i, 1], ends[j, 0], ends[j, 1]) - radii[i] - radii[j]
         least = min(least, gap)
         if least < enough < np.inf:
-            return least
-    return least
+            return float(least)
+    return float(least)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def first_hit(
     dh: Array,
     start: Array,
@@ -161,11 +161,13 @@ def first_hit(
     rotations: Array,
     middles: Array,
     halves: Array,
-    watched: Array,
+    watched: NDArray[np.bool_],
     pairs: Index,
     margin: float,
 ) -> float:
-    """Fraction of the straight joint segment that is free: 1 when all of it is, checked every `step_rad` of the fastest joint."""
+    """Fraction of the straight joint segment that is free: 1 when all of it is, checked every `step_rad` of the
+    fastest joint.
+    """
     longest = np.max(np.abs(end - start))
     count = max(1, int(np.ceil(longest / step_rad)))
     for k in range(1, count + 1):
@@ -175,7 +177,7 @@ def first_hit(
     return 1.0
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def overlap_counts(dh: Array, configurations: Array, tool_ends: Array, radii: Array, pairs: Index) -> Any:
     """How many of the configurations (m, n) make each pair of capsules overlap, (k,)."""
     out = np.zeros(pairs.shape[0])

@@ -67,9 +67,9 @@ class CollisionModel:
         names = self.capsule_names
         watched = np.ones((len(names), len(boxes)), bool)
         watched[0] = False  # the first link stands on the floor and does not move
-        for capsule, box in ignored:
+        for capsule, touched in ignored:
             rows = [i for i, name in enumerate(names) if capsule in ("", name)]
-            columns = [j for j, other in enumerate(boxes) if other.name == box]
+            columns = [j for j, box in enumerate(boxes) if box.name == touched]
             watched[np.ix_(rows, columns)] = False
         for j, box in enumerate(boxes):
             if box.name == "floor":

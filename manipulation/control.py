@@ -1,8 +1,8 @@
 """The control thread: executes declared motions, one at a time, and reports what really happened.
 
 Every tick: read all devices, look at stop latch, cancel and guards, compute the set-point, filter it, send it, let one
-period pass. On a simulated clock the period steps the world in lockstep, and nothing ticks between motions; on a wall clock
-the thread always ticks and holds the arm.
+period pass. On a simulated clock the period steps the world in lockstep, and nothing ticks between motions; on a
+wall clock the thread always ticks and holds the arm.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from hal.geometry import identity
 from hal.motion import (
     CartesianPath,
     DeclaredMotion,
-    Guard,
     GripperMotion,
+    Guard,
     Hold,
     MotionOutcome,
     MotionReport,
@@ -41,7 +41,7 @@ from manipulation import kernels
 from manipulation.guards import GuardSet, Measured
 from manipulation.kinematics import Kinematics
 from manipulation.recorder import Recorder
-from manipulation.runs import Run, begin
+from manipulation.runs import Run, Tick, begin
 from manipulation.sensing import READ_WAIT_S, ContactWrench, DeviceFailure, Devices, Sample
 from manipulation.setpoint import SetPointFilter, check, flange_matrix
 
@@ -239,7 +239,7 @@ class Controller:
     def _do(self, job: _Job) -> None:
         try:
             job.result.set_result(job.call())
-        except BaseException as error:  # noqa: BLE001  # whatever went wrong belongs to the caller; the thread lives on
+        except BaseException as error:  # whatever went wrong belongs to the caller; the thread lives on
             self._is_moving = False
             job.result.set_exception(error)
 
@@ -300,17 +300,19 @@ class Controller:
         base_from_tool = recorder.pose_of(sample.position_rad)
         guards = GuardSet((*motion.guards, *self._standing_guards()), base_from_tool)
         tool_from_sensor = self._contact.tool_from_sensor(tool)
+        self._contact.restart()
         over_since_s: float | None = None
         while True:
             elapsed_s = sample.stamp_s - started_s
             flange, base_from_tool = recorder.poses_of(sample.position_rad)
-            wrench = kernels.wrench_at(self._contact.of(sample.raw_wrench, flange), tool_from_sensor)
+            wrench = kernels.wrench_at(self._contact.smoothed(sample.raw_wrench, flange), tool_from_sensor)
             recorder.note(elapsed_s, sample.position_rad, wrench, base_from_tool[:3, 3])
             end = self._why_end(guards, elapsed_s, sample, wrench, base_from_tool, recorder)
             try:
                 if end is None:
-                    wanted = run.wanted(elapsed_s, sample, wrench, self._filter.last_rad, self._dt_s)
-                    if run.is_over(elapsed_s, sample):
+                    tick = Tick(elapsed_s, sample, wrench, self._filter.last_rad, self._dt_s)
+                    wanted = run.wanted(tick)
+                    if run.is_over(tick):
                         over_since_s = elapsed_s if over_since_s is None else over_since_s
                         if self._has_settled(motion, wanted, sample, elapsed_s - over_since_s):
                             return _End(outcome=MotionOutcome.COMPLETED, cause="ran to its declared end")
@@ -320,7 +322,7 @@ class Controller:
                     continue
             except DeviceFailure as failure:
                 end = _End(outcome=MotionOutcome.FAULT, cause=str(failure), device=failure.device)
-            self._come_to_rest(end, recorder)
+            self._come_to_rest(end)
             return end
 
     def _why_end(
@@ -344,7 +346,9 @@ class Controller:
             return None
         outcome = MotionOutcome.FAULT if guard.reaction is Reaction.FAULT else MotionOutcome.GUARD
         side = "at most" if guard.below else "at least"
-        return _End(outcome=outcome, cause=f"guard {guard.name}: {guard.quantity} {side} {guard.limit:g}", tripped=guard.name)
+        return _End(
+            outcome=outcome, cause=f"guard {guard.name}: {guard.quantity} {side} {guard.limit:g}", tripped=guard.name
+        )
 
     def _standing_guards(self) -> tuple[Guard, ...]:
         force, tracking = self._safety.force_limit_n, TRACKING_LIMIT_M
@@ -359,7 +363,7 @@ class Controller:
         at_goal = np.abs(wanted - self._filter.last_rad).max() < SETTLED_RAD
         return bool(at_goal and np.abs(sample.velocity_rad_per_s).max() < SETTLED_RAD_PER_S)
 
-    def _come_to_rest(self, end: _End, recorder: Recorder) -> None:
+    def _come_to_rest(self, end: _End) -> None:
         """Decelerate at the limit, then hold; only the arm is listened to, since another device may be what failed."""
         if end.device is not None:
             self._faults = (f"{end.device}: {end.cause}",)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]  # numba ships no types
+@njit(cache=True)
 def frames(dh: Array, q: Array) -> Any:
     """Frames of the chain, (n + 1, 4, 4): the base, then the frame after each joint; the last is the flange."""
     n = dh.shape[0]
@@ -41,7 +41,7 @@ def frames(dh: Array, q: Array) -> Any:
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def tool_and_jacobian(dh: Array, q: Array, flange_from_tool: Array) -> Any:
     """`base_from_tool` (4, 4) and the Jacobian (6, n) of the tool's origin: rows v then omega, base axes."""
     n = dh.shape[0]
@@ -58,7 +58,7 @@ def tool_and_jacobian(dh: Array, q: Array, flange_from_tool: Array) -> Any:
     return tool, jacobian
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def rotation_exp(w: Array) -> Any:
     """Rodrigues: the (3, 3) rotation of a rotation vector (3,) rad."""
     angle = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
@@ -74,7 +74,7 @@ def rotation_exp(w: Array) -> Any:
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def rotation_log(r: Array) -> Any:
     """The rotation vector (3,) rad of a rotation matrix whose angle is below pi."""
     v = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
@@ -85,7 +85,7 @@ def rotation_log(r: Array) -> Any:
     return 0.5 * v
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def pose_error(goal: Array, pose: Array) -> Any:
     """The twist (6,) in base axes that carries `pose` onto `goal`: translation, then rotation vector."""
     out = np.empty(6)
@@ -95,15 +95,15 @@ def pose_error(goal: Array, pose: Array) -> Any:
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def pose_on_path(
     times_s: Array, ways: Array, speeds: Array, points: Array, rotations: Array, turns: Array, t_s: float
 ) -> Any:
     """The pose (4, 4) at `t_s` on a path: points (N, 3), rotations (N, 3, 3), turns (N - 1, 3) from one to the next.
 
-    Straight and with constant turn between neighbours, R(f) = Exp(f w) R_i, as `hal.geometry.interpolate`. The way along
-    the path (ways (N,), speeds (N,)) is a cubic Hermite in time, so that the speed has no steps: with constant speed
-    between samples 20 ms apart the tool's inertia made 6 N at every start.
+    Straight and with constant turn between neighbours, R(f) = Exp(f w) R_i, as `hal.geometry.interpolate`. The way
+    along the path (ways (N,), speeds (N,)) is a cubic Hermite in time, so that the speed has no steps: with constant
+    speed between samples 20 ms apart the tool's inertia made 6 N at every start.
     """
     out = np.eye(4)
     last = times_s.shape[0] - 1
@@ -123,11 +123,12 @@ def pose_on_path(
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def follow_pose(dh: Array, flange_from_tool: Array, q: Array, goal: Array, damping: float, steps: int) -> Any:
     """Joints (n,) near `q` whose tool pose is `goal`: damped least squares, dq = J^T (J J^T + damping^2 I)^-1 e.
 
-    Source: Wampler, IEEE SMC 16(1), 1986. One or two steps do, since a control tick moves the goal by under a millimetre.
+    Source: Wampler, IEEE SMC 16(1), 1986. One or two steps do, since a control tick moves the goal by under a
+    millimetre.
     """
     q = q.copy()
     for _ in range(steps):
@@ -139,7 +140,7 @@ def follow_pose(dh: Array, flange_from_tool: Array, q: Array, goal: Array, dampi
     return q
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def path_joints(
     dh: Array,
     flange_from_tool: Array,
@@ -155,7 +156,9 @@ def path_joints(
     q: Array,
     damping: float,
 ) -> Any:
-    """Joints (n,) near `q` for the path's pose at `t_s`, moved by `shift` (6,) in base axes and by `offset` (6,) in tool axes."""
+    """Joints (n,) near `q` for the path's pose at `t_s`, moved by `shift` (6,) in base axes and by `offset` (6,) in
+    tool axes.
+    """
     pose = pose_on_path(times_s, ways, speeds, points, rotations, turns, t_s)
     rotation = rotation_exp(shift[3:]) @ np.ascontiguousarray(pose[:3, :3])
     pose[:3, 3] += shift[:3] + rotation @ offset[:3]
@@ -163,7 +166,7 @@ def path_joints(
     return follow_pose(dh, flange_from_tool, q, pose, damping, 2)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def hermite(times_s: Array, positions: Array, velocities: Array, t_s: float) -> Any:
     """The cubic Hermite interpolant (n,) through (N, n) positions and velocities; constant beyond the ends."""
     last = times_s.shape[0] - 1
@@ -179,14 +182,14 @@ def hermite(times_s: Array, positions: Array, velocities: Array, t_s: float) -> 
     return h00 * positions[i] + h10 * h * velocities[i] + h01 * positions[i + 1] + h11 * h * velocities[i + 1]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def admittance_step(
     state: Array, wrench: Array, stiffness: Array, damping: Array, mass: Array, bound: Array, dt_s: float
 ) -> None:
     """One semi-implicit Euler step of m a + d v + k x = f per axis, in place; `state`: (2, 6) offset and velocity.
 
-    Damping and spring act implicitly, so that the step is stable for any gain. An axis with infinite stiffness stays at 0.
-    Beyond `bound` (6,) the offset stops.
+    Damping and spring act implicitly, so that the step is stable for any gain. An axis with infinite stiffness stays
+    at 0. Beyond `bound` (6,) the offset stops.
     """
     for k in range(6):
         if np.isinf(stiffness[k]):
@@ -202,8 +205,10 @@ def admittance_step(
         state[0, k], state[1, k] = x, v
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def limited_step(wanted: Array, last: Array, last_velocity: Array, velocity: Array, acceleration: Array, dt_s: float) -> Any:
+@njit(cache=True)
+def limited_step(
+    wanted: Array, last: Array, last_velocity: Array, velocity: Array, acceleration: Array, dt_s: float
+) -> Any:
     """The set-point (n,) nearest to `wanted` that respects speed and acceleration limits per joint."""
     out = np.empty_like(wanted)
     for i in range(wanted.shape[0]):
@@ -214,7 +219,7 @@ def limited_step(wanted: Array, last: Array, last_velocity: Array, velocity: Arr
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def wrench_at(wrench: Array, child_from_parent: Array) -> Any:
     """A wrench (6,) given in the parent about its origin, seen in the child about the child's origin.
 
@@ -230,7 +235,7 @@ def wrench_at(wrench: Array, child_from_parent: Array) -> Any:
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def safe_step(
     dh: Array,
     flange_from_tool: Array,
@@ -261,7 +266,9 @@ def warm(dh: Array) -> None:
     q, ones = np.full(n, 0.1), np.ones(n)
     times, points, rotations = np.array([0.0, 1.0]), np.zeros((2, 3)), np.array([np.eye(3), np.eye(3)])
     frames(dh, q)
-    path_joints(dh, eye, times, times, np.zeros(2), points, rotations, np.zeros((1, 3)), 0.5, np.zeros(6), np.zeros(6), q, 1.0)
+    path_joints(
+        dh, eye, times, times, np.zeros(2), points, rotations, np.zeros((1, 3)), 0.5, np.zeros(6), np.zeros(6), q, 1.0
+    )
     hermite(times, np.zeros((2, n)), np.zeros((2, n)), 0.5)
     admittance_step(np.zeros((2, 6)), np.zeros(6), np.ones(6), np.ones(6), np.ones(6), np.ones(6), 0.01)
     safe_step(dh, eye, q, q, np.zeros(n), ones, ones, -ones, ones, 1.0, 0.01)

@@ -68,7 +68,8 @@ class Kinematics:
         return np.asarray(kernels.tool_and_jacobian(self.dh, q_rad, matrix)[1])
 
     def inverse(self, base_from_flange: RigidTransform) -> Array:
-        """All joint vectors (k, n) rad inside the limits that reach the pose; whole turns count as branches of their own.
+        """All joint vectors (k, n) rad inside the limits that reach the pose; whole turns count as branches of their
+        own.
 
         Source: Elsner et al., EAIK, 2025 (subproblem decomposition); each answer is checked by forward kinematics.
         """
@@ -84,9 +85,11 @@ class Kinematics:
     def follow(
         self, base_from_flange: Sequence[RigidTransform], *, near_rad: Array, start_rad: Array | None = None
     ) -> tuple[Array, ...]:
-        """Joint paths (N, n), one for each branch that follows *all* poses without a jump, limit or singularity; best first.
+        """Joint paths (N, n), one for each branch that follows *all* poses without a jump, limit or singularity;
+        best first.
 
-        The branch is chosen over the whole stroke: one lever arc in five met a wrist limit when chosen by its first pose.
+        The branch is chosen over the whole stroke: one lever arc in five met a wrist limit when chosen by its first
+        pose.
 
         Args:
             near_rad: branches are ranked by how far the arm must move from here.

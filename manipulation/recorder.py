@@ -47,7 +47,10 @@ class Recorder:
         """The samples so far; empty arrays of the right shape when nothing ran."""
         if not self._rows:
             return MotionLog(
-                times_s=np.empty(0), positions_rad=np.empty((0, joints)), wrench=np.empty((0, 6)), tip_m=np.empty((0, 3))
+                times_s=np.empty(0),
+                positions_rad=np.empty((0, joints)),
+                wrench=np.empty((0, 6)),
+                tip_m=np.empty((0, 3)),
             )
         times, positions, wrenches, tips = zip(*self._rows, strict=True)
         return MotionLog(

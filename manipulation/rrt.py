@@ -40,7 +40,7 @@ class _Tree:
         return count
 
     def configuration(self, index: int) -> Array:
-        return self._q[index].copy()
+        return np.array(self._q[index])
 
     def branch(self, index: int) -> list[Array]:
         out = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -24,14 +26,27 @@ GRIP_REST_S = 0.05
 COMMAND_WAIT_S = 0.25  # a gripper's command crosses a slow bus once a motion, not every tick
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Tick:
+    """What a run may look at: time since its start, the sample, the contact wrench (6,) in tool axes, the last
+    set-point.
+    """
+
+    elapsed_s: float
+    sample: Sample
+    wrench: Array
+    last_rad: Array
+    dt_s: float
+
+
 class Run(Protocol):
     """A motion in execution."""
 
-    def wanted(self, elapsed_s: float, sample: Sample, wrench: Array, last_rad: Array, dt_s: float) -> Array:
-        """Joint set-point (n,) for this tick. `wrench`: contact wrench (6,) in tool axes."""
+    def wanted(self, tick: Tick) -> Array:
+        """Joint set-point (n,) for this tick."""
         ...
 
-    def is_over(self, elapsed_s: float, sample: Sample) -> bool:
+    def is_over(self, tick: Tick) -> bool:
         """Has the declared course been run?"""
         ...
 
@@ -44,14 +59,14 @@ class TrajectoryRun:
         self._q, self._v = motion.positions_rad, motion.velocities_rad_per_s
         self._gap = start_rad - motion.positions_rad[0]
 
-    def wanted(self, elapsed_s: float, sample: Sample, wrench: Array, last_rad: Array, dt_s: float) -> Array:
+    def wanted(self, tick: Tick) -> Array:
         """The point of the trajectory at this time."""
-        q: Array = kernels.hermite(self._t, self._q, self._v, elapsed_s)
-        return q + self._gap * _fade(elapsed_s)
+        q: Array = kernels.hermite(self._t, self._q, self._v, tick.elapsed_s)
+        return np.asarray(q + self._gap * _fade(tick.elapsed_s))
 
-    def is_over(self, elapsed_s: float, sample: Sample) -> bool:
+    def is_over(self, tick: Tick) -> bool:
         """The declared time is over."""
-        return bool(elapsed_s >= self._t[-1])
+        return bool(tick.elapsed_s >= self._t[-1])
 
 
 class PathRun:
@@ -64,7 +79,7 @@ class PathRun:
         self._t = np.ascontiguousarray(motion.times_s, float)
         self._p = np.array([pose.translation for pose in poses])
         self._r = np.array([pose.rotation.as_matrix() for pose in poses])
-        turns = [(b.rotation * a.rotation.inv()).as_rotvec() for a, b in zip(poses, poses[1:], strict=False)]
+        turns = [(b.rotation * a.rotation.inv()).as_rotvec() for a, b in itertools.pairwise(poses)]
         self._w = np.array(turns).reshape(-1, 3)
         self._ways, self._speeds = smooth_ways(self._t, self._p, self._w)
         first = np.ascontiguousarray(poses[0].as_matrix())
@@ -72,18 +87,30 @@ class PathRun:
         self._gap = kernels.pose_error(measured, first)
         self._admittance = None if motion.compliance is None else Admittance(motion.compliance)
 
-    def wanted(self, elapsed_s: float, sample: Sample, wrench: Array, last_rad: Array, dt_s: float) -> Array:
+    def wanted(self, tick: Tick) -> Array:
         """Joints whose tool pose is the path's, displaced by the admittance."""
-        offset = np.zeros(6) if self._admittance is None else self._admittance.step(wrench, dt_s)
+        offset = np.zeros(6) if self._admittance is None else self._admittance.step(tick.wrench, tick.dt_s)
+        shift = self._gap * _fade(tick.elapsed_s)
         q: Array = kernels.path_joints(
-            self._dh, self._tool, self._t, self._ways, self._speeds, self._p, self._r, self._w, elapsed_s, self._gap * _fade(elapsed_s), offset,
-            last_rad, DAMPING,
-        )  # fmt: skip
+            self._dh,
+            self._tool,
+            self._t,
+            self._ways,
+            self._speeds,
+            self._p,
+            self._r,
+            self._w,
+            tick.elapsed_s,
+            shift,
+            offset,
+            tick.last_rad,
+            DAMPING,
+        )
         return q
 
-    def is_over(self, elapsed_s: float, sample: Sample) -> bool:
+    def is_over(self, tick: Tick) -> bool:
         """The declared time is over."""
-        return bool(elapsed_s >= self._t[-1])
+        return bool(tick.elapsed_s >= self._t[-1])
 
 
 def smooth_ways(times_s: Array, points: Array, turns: Array) -> tuple[Array, Array]:
@@ -115,7 +142,7 @@ class Admittance:
     def step(self, wrench: Array, dt_s: float) -> Array:
         """Advance by one tick under the contact wrench; returns the offset (6,)."""
         kernels.admittance_step(self._state, wrench - self._target, self._k, self._d, self._m, self._bound, dt_s)
-        return self._state[0]
+        return np.array(self._state[0])
 
 
 class HoldRun:
@@ -124,13 +151,13 @@ class HoldRun:
     def __init__(self, motion: Hold) -> None:
         self._duration_s = motion.duration_s
 
-    def wanted(self, elapsed_s: float, sample: Sample, wrench: Array, last_rad: Array, dt_s: float) -> Array:
+    def wanted(self, tick: Tick) -> Array:
         """Where it is."""
-        return last_rad
+        return tick.last_rad
 
-    def is_over(self, elapsed_s: float, sample: Sample) -> bool:
+    def is_over(self, tick: Tick) -> bool:
         """The time is over."""
-        return elapsed_s >= self._duration_s
+        return tick.elapsed_s >= self._duration_s
 
 
 class GripperRun:
@@ -143,18 +170,18 @@ class GripperRun:
             width_m=motion.width_m, force_n=motion.force_n, speed_m_per_s=motion.speed_m_per_s, deadline=deadline
         )
 
-    def wanted(self, elapsed_s: float, sample: Sample, wrench: Array, last_rad: Array, dt_s: float) -> Array:
+    def wanted(self, tick: Tick) -> Array:
         """Where it is."""
-        return last_rad
+        return tick.last_rad
 
-    def is_over(self, elapsed_s: float, sample: Sample) -> bool:
+    def is_over(self, tick: Tick) -> bool:
         """The pads have rested for a moment, or the time is over."""
-        if sample.gripper_is_moving or elapsed_s < GRIP_START_S:
+        if tick.sample.gripper_is_moving or tick.elapsed_s < GRIP_START_S:
             self._resting_since_s = None
         elif self._resting_since_s is None:
-            self._resting_since_s = elapsed_s
-        rested = self._resting_since_s is not None and elapsed_s - self._resting_since_s >= GRIP_REST_S
-        return rested or elapsed_s >= self._timeout_s
+            self._resting_since_s = tick.elapsed_s
+        rested = self._resting_since_s is not None and tick.elapsed_s - self._resting_since_s >= GRIP_REST_S
+        return rested or tick.elapsed_s >= self._timeout_s
 
 
 def begin(

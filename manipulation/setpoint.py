@@ -87,7 +87,9 @@ def _check_trajectory(motion: JointTrajectory, kin: Kinematics, measured: Array)
     q, v = motion.positions_rad, motion.velocities_rad_per_s
     shape = (len(motion.times_s), len(kin.dh))
     if q.shape != shape or v.shape != shape:
-        raise _refused(motion, f"positions {q.shape} and velocities {v.shape} for times and joints {shape}", "same rows")
+        raise _refused(
+            motion, f"positions {q.shape} and velocities {v.shape} for times and joints {shape}", "same rows"
+        )
     _check_times(motion, motion.times_s)
     if not (np.isfinite(q).all() and np.isfinite(v).all()):
         raise _refused(motion, "a position or velocity is not finite", "plan again")
@@ -117,7 +119,9 @@ def _check_path(motion: CartesianPath, kin: Kinematics, measured: Array) -> None
 
 
 def _check_times(motion: JointTrajectory | CartesianPath, times_s: Array) -> None:
-    rising = np.isfinite(times_s).all() and len(times_s) >= 2 and abs(times_s[0]) < 1e-9 and (np.diff(times_s) > 0).all()
+    rising = (
+        np.isfinite(times_s).all() and len(times_s) >= 2 and abs(times_s[0]) < 1e-9 and (np.diff(times_s) > 0).all()
+    )
     if not rising:
         raise _refused(motion, "times must be finite, begin at 0 and rise", "plan again")
 

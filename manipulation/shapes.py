@@ -1,7 +1,7 @@
 """What can touch what: arm and tool as capsules, panel and surroundings as boxes.
 
-A capsule is a segment with a radius. The distance from a point to a box is convex, so along a segment its minimum is found
-by a golden-section search; that makes a whole check of arm against panel a matter of microseconds.
+A capsule is a segment with a radius. The distance from a point to a box is convex, so along a segment its minimum is
+found by a golden-section search; that makes a whole check of arm against panel a matter of microseconds.
 """
 
 from __future__ import annotations
@@ -122,4 +122,8 @@ def _half_sizes(thing: PanelObject) -> tuple[float, float, float]:
 
 def floor_box(z_m: float) -> Box:
     """The floor as a box whose top lies at `z_m` of the base; it leaves a hole for the arm's own foot to the caller."""
-    return Box(name="floor", parent_from_box=identity() * transform_rpy((0.0, 0.0, z_m - 0.5), (0.0, 0.0, 0.0)), half_m=(3.0, 3.0, 0.5))
+    return Box(
+        name="floor",
+        parent_from_box=identity() * transform_rpy((0.0, 0.0, z_m - 0.5), (0.0, 0.0, 0.0)),
+        half_m=(3.0, 3.0, 0.5),
+    )

@@ -1,11 +1,12 @@
 """Cartesian paths: lines, arcs and sequences of poses, each from rest to rest with ramped speed.
 
-A step of the speed alone makes more than 8 N of tool inertia at 60 mm/s, which looks like contact; so every path begins and
-ends with a ramp.
+A step of the speed alone makes more than 8 N of tool inertia at 60 mm/s, which looks like contact; so every path
+begins and ends with a ramp.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -59,7 +60,7 @@ def through(
     slow_ratio: float = 0.3,
 ) -> CartesianPath:
     """A path through dense poses; over the last `slow_last_m` the speed is `slow_ratio` of the rest."""
-    marks = np.concatenate([[0.0], np.cumsum([_way(a, b) for a, b in zip(poses, poses[1:], strict=False)])])
+    marks = np.concatenate([[0.0], np.cumsum([_way(a, b) for a, b in itertools.pairwise(poses)])])
 
     def pose_at(s: float) -> RigidTransform:
         k = int(np.clip(np.searchsorted(marks, s, side="right") - 1, 0, len(poses) - 2))
@@ -145,9 +146,7 @@ def arc(
 def turned_about(pose: RigidTransform, centre_m: Array, unit_axis: Array, angle_rad: float) -> RigidTransform:
     """The pose turned by `angle_rad` about the line through `centre_m`, all in the base frame."""
     turn = Rotation.from_rotvec(angle_rad * unit_axis)
-    return RigidTransform.from_components(
-        centre_m + turn.apply(pose.translation - centre_m), turn * pose.rotation
-    )
+    return RigidTransform.from_components(centre_m + turn.apply(pose.translation - centre_m), turn * pose.rotation)
 
 
 def shifted(pose: RigidTransform, offset_m: ArrayLike) -> RigidTransform:

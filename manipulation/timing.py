@@ -77,7 +77,10 @@ def _speed_profile(
     a_max = 0.5 * limits.acceleration_ratio * kinematics.acceleration_rad_per_s2
     tool = np.ascontiguousarray(flange_from_tool.as_matrix())
     tip = np.array(
-        [np.linalg.norm(kernels.tool_and_jacobian(kinematics.dh, qi, tool)[1][:3] @ di) for qi, di in zip(q, q_s, strict=True)]
+        [
+            np.linalg.norm(kernels.tool_and_jacobian(kinematics.dh, qi, tool)[1][:3] @ di)
+            for qi, di in zip(q, q_s, strict=True)
+        ]
     )
     tiny = 1e-9
     ceiling = np.minimum.reduce(

@@ -48,16 +48,23 @@ class Hand:
         # The body is wider than deep: two parallel capsules hold it with little waste.
         x = half_x - half_y
         body = [
-            _capsule(flange_from_grip, f"body_{name}", (side, 0.0, back - half_z + half_y), (side, 0.0, back + half_z - half_y), 1.15 * half_y)
+            _capsule(
+                flange_from_grip,
+                f"body_{name}",
+                (side, 0.0, back - half_z + half_y),
+                (side, 0.0, back + half_z - half_y),
+                1.15 * half_y,
+            )
             for name, side in (("left", -x), ("right", x))
         ]
         return (*fingers, *body)
 
 
-def _capsule(
-    flange_from_grip: RigidTransform, name: str, start: Vector3, end: Vector3, radius: float
-) -> Capsule:
+def _capsule(flange_from_grip: RigidTransform, name: str, start: Vector3, end: Vector3, radius: float) -> Capsule:
     a, b = (flange_from_grip.apply(np.asarray(p)) for p in (start, end))
     return Capsule(
-        name=name, start_m=(float(a[0]), float(a[1]), float(a[2])), end_m=(float(b[0]), float(b[1]), float(b[2])), radius_m=radius
+        name=name,
+        start_m=(float(a[0]), float(a[1]), float(a[2])),
+        end_m=(float(b[0]), float(b[1]), float(b[2])),
+        radius_m=radius,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,7 +92,7 @@ class TransferPlanner:
         """The path densely sampled with parabolic corners; corners are made tighter until all of it is free."""
         for corner in (CORNER_RAD, CORNER_RAD / 3, CORNER_RAD / 10, CORNER_RAD / 30):
             dense = round_corners(path, corner)
-            steps = zip(dense, dense[1:], strict=False)
+            steps = itertools.pairwise(dense)
             if all(self.model.free_fraction(a, b, margin_m=0.5 * margin) == 1.0 for a, b in steps):
                 return dense
         return None
@@ -117,7 +118,7 @@ def round_corners(path_rad: Array, corner_rad: float, *, spacing_rad: float = 0.
     out = [path_rad[0]]
     for before, at, after in zip(path_rad, path_rad[1:], path_rad[2:], strict=False):
         back, ahead = before - at, after - at
-        lengths = np.linalg.norm(back), np.linalg.norm(ahead)
+        lengths = float(np.linalg.norm(back)), float(np.linalg.norm(ahead))
         reach = min(corner_rad, 0.45 * lengths[0], 0.45 * lengths[1])
         a, b = at + back * (reach / lengths[0]), at + ahead * (reach / lengths[1])
         _append_line(out, a, spacing_rad)

@@ -26,7 +26,7 @@ STROKE_MARGIN_M = 0.001
 FINGERS = ("finger_left", "finger_right")
 
 
-def _no_progress(fraction: float, text: str) -> None:
+def _no_progress(_fraction: float, _text: str) -> None:
     return None
 
 
@@ -54,7 +54,7 @@ class Workcell:
     flange_from_grip: RigidTransform
     limits: SpeedLimits
     park_rad: Array
-    hand: Hand = Hand()
+    hand: Hand = field(default_factory=Hand)
     angles_rad: Mapping[str, float] = field(default_factory=dict)
     floor_z_m: float = 0.0
     obstacles: tuple[Box, ...] = ()

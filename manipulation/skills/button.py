@@ -13,8 +13,8 @@ def button(cell: Workcell, name: str, *, expected: str | None = None, verify: Ve
     """Press the button once.
 
     Args:
-        expected: the state that the read-back must show afterwards: `pressed` or `released` of a latching button, or the
-            state of the lamp that it works. None: any read-back will do that says something.
+        expected: the state that the read-back must show afterwards: `pressed` or `released` of a latching button, or
+        the state of the lamp that it works. None: any read-back will do that says something.
         verify: the caller's second look.
 
     Raises:

@@ -1,4 +1,6 @@
-"""Where a guarded move met something: the pads give way, so the place of first contact is read from the rise of the force."""
+"""Where a guarded move met something: the pads give way, so the place of first contact is read from the rise of the
+force.
+"""
 
 from __future__ import annotations
 
@@ -77,7 +79,8 @@ def onset(depth_m: Array, force_n: Array, deepest_m: float) -> tuple[float, floa
 
 
 def centre_between(attempt: Attempt, *, room_m: float, what: str) -> None:
-    """Local refinement before a cage or a grasp: feel the thing between the open fingers on both sides, go to the middle.
+    """Local refinement before a cage or a grasp: feel the thing between the open fingers on both sides, go to the
+    middle.
 
     Args:
         room_m: how far each side may be.

@@ -17,7 +17,7 @@ from manipulation.workcell import Workcell, panel_from_grip
 
 Array = NDArray[np.float64]
 
-SIDE_M = 0.008  # room between each finger and the rim when coming down
+SIDE_M = 0.009  # room between each finger and the rim when coming down
 TIP_DEPTH_M = 0.008  # of the tips below the middle of the rim
 FRICTION = 0.6  # of pads on paint, low on purpose
 GRIP_FLOOR_N = 15.0
@@ -29,7 +29,8 @@ EFFORT_FLOOR_N = 30.0
 LARGEST_STOP_N = 92.0
 TOLERANCE_RAD = np.radians(6.0)
 INF = float("inf")
-# Hub and plate are known to a few millimetres: the hand yields along the radius and the axis, so that the rim leads it round.
+# Hub and plate are known to a few millimetres: the hand yields along the radius and the axis, so that the rim leads
+# it round.
 RADIAL = Compliance(
     stiffness=(50.0, INF, 400.0, INF, INF, INF),
     damping=(1000.0, 1000.0, 1500.0, 10.0, 10.0, 10.0),
@@ -107,7 +108,7 @@ def _carry(attempt: Attempt, thing: Handwheel, angle_rad: float, span_rad: float
     down = attempt.advance(STANDOFF_M + thing.rim_m + TIP_DEPTH_M, name="approach")
     if down.tripped is not None:
         raise SkillFailure(Outcome.MISSED, "a finger landed on the wheel")
-    centre_between(attempt, room_m=SIDE_M + 0.004, what="rim")
+    centre_between(attempt, room_m=2.0 * SIDE_M, what="rim")
     hub = _hub(attempt, thing, between[way // 2])
     attempt.open_to(0.0, force_n=grip_force_n(thing), name="hold the rim")
     start = attempt.pose()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from hal.errors import InvalidRequest
-from hal.motion import Guard, Quantity
+from hal.motion import Compliance, Guard, Quantity
 from hal.panel import Lever
 from manipulation.skills.contact import centre_between
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
@@ -20,19 +20,28 @@ from manipulation.workcell import Workcell, panel_from_grip
 Array = NDArray[np.float64]
 
 OVERLAP_M = 0.013  # how far the tips reach below the top of the bar
-FROM_END_M = 0.016  # the fingers hold the bar this far before its end: long lever arm, room for the pose error
-APPROACH_SIDE_M = 0.008  # free space on each side when coming down; more than the pose error
+FROM_END_M = 0.013  # the fingers hold the bar this far before its end: long lever arm, room for the pose error
+APPROACH_SIDE_M = 0.010  # free space on each side when coming down; more than the pose error
 CAGE_SIDE_M = 0.002  # free space on each side in the stroke: caged, not squeezed
 STROKE_M_PER_S = 0.08
-LAST_RAD = np.radians(14.0)  # the prototype met the end stop at more than 300 N until it slowed down here
+LAST_RAD = np.radians(9.0)  # the prototype met the end stop at more than 300 N until it slowed down towards the end
 OVERTRAVEL_RAD = np.radians(12.0)  # play of the cage and give of the pads
-LAST_M_PER_S = 0.025
-END_RISE_N = 20.0
+LAST_M_PER_S = 0.018
+END_RISE_N = 15.0
 EFFORT_SPREAD = 1.6
 EFFORT_FLOOR_N = 25.0
 LARGEST_STOP_N = 92.0  # below the cell's protective limit, so that a stiff valve is told from a collision
 MOVED_RAD = np.radians(12.0)
 TOLERANCE_RAD = np.radians(8.0)
+INF = float("inf")
+# Stiff across the bar, where the work is done. Along the bar and along the fingers the hand yields, or a pose error
+# would build up friction there (25 N of 60) that lets go in jumps.
+YIELDING = Compliance(
+    stiffness=(INF, 1000.0, 2000.0, INF, INF, INF),
+    damping=(1500.0, 1500.0, 1500.0, 10.0, 10.0, 10.0),
+    mass=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0),
+    max_offset_m=0.006,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,8 +62,8 @@ def lever(
     """Turn the lever to a state of the panel file.
 
     Args:
-        current: what the last look said; with an angle the fingers come down where the bar is. Without it `verify` is asked.
-        verify: the caller's second look.
+        current: what the last look said; with an angle the fingers come down where the bar is. Without it `verify`
+        is asked. verify: the caller's second look.
 
     The mechanical estimate is the angle reached, rad clockwise from up.
 
@@ -106,7 +115,7 @@ def _angle_of(seen: ObjectState | None, angles: dict[str, float]) -> float | Non
 
 def _is_at(seen: ObjectState, target: str, goal_rad: float) -> bool:
     if seen.angle_rad is not None:
-        return abs(seen.angle_rad - goal_rad) <= TOLERANCE_RAD
+        return bool(abs(seen.angle_rad - goal_rad) <= TOLERANCE_RAD)
     return seen.state == target
 
 
@@ -119,7 +128,7 @@ def _turn_lever(attempt: Attempt, thing: Lever, turn: _Turn) -> float:
     down = attempt.advance(STANDOFF_M + OVERLAP_M, name="approach")
     if down.tripped is not None:
         raise SkillFailure(Outcome.MISSED, "a finger landed on the bar")
-    centre_between(attempt, room_m=APPROACH_SIDE_M + 0.004, what="bar")
+    centre_between(attempt, room_m=2.0 * APPROACH_SIDE_M, what="bar")
     hub = _hub(attempt, thing, turn.start_rad)
     attempt.open_to(thing.width_m + 2.0 * CAGE_SIDE_M, name="cage")
     turned = _carry(attempt, thing, turn.span_rad, hub)
@@ -153,7 +162,8 @@ def _hub(attempt: Attempt, thing: Lever, angle_rad: float) -> Array:
 def _carry(attempt: Attempt, thing: Lever, span_rad: float, hub: Array) -> float:
     """The stroke in two parts: fast to 14 degrees before the end, then slowly onto the end stop.
 
-    Returns the signed angle by which the bar turned: that of the tool less the play of the cage and the give of the pads.
+    Returns the signed angle by which the bar turned: that of the tool less the play of the cage and the give of the
+    pads.
     """
     cell, sign = attempt.cell, float(np.sign(span_rad))
     axis = cell.panel_pose.rotation.apply([0.0, 0.0, -1.0])  # clockwise seen from the front
@@ -164,7 +174,7 @@ def _carry(attempt: Attempt, thing: Lever, span_rad: float, hub: Array) -> float
     fast_rad = max(0.0, abs(span_rad) - LAST_RAD)
     if fast_rad > 0.0:
         poses = arc(start, centre_m=hub, axis=axis, angle_rad=sign * fast_rad)
-        report = attempt.along(poses, name="turn", speed_m_per_s=STROKE_M_PER_S, guards=(strong,))
+        report = attempt.along(poses, name="turn", speed_m_per_s=STROKE_M_PER_S, guards=(strong,), compliance=YIELDING)
         if report.tripped is not None:
             turned = _between(start, report.base_from_tool)
             outcome = Outcome.STIFF if turned < MOVED_RAD else Outcome.STALLED
@@ -172,7 +182,9 @@ def _carry(attempt: Attempt, thing: Lever, span_rad: float, hub: Array) -> float
     rest_rad = abs(span_rad) - fast_rad + OVERTRAVEL_RAD
     poses = arc(attempt.pose(), centre_m=hub, axis=axis, angle_rad=sign * rest_rad)
     rise = Guard(name="end stop", quantity=Quantity.FORCE_RISE, limit=END_RISE_N)
-    report = attempt.along(poses, name="turn to the stop", speed_m_per_s=LAST_M_PER_S, guards=(rise, strong))
+    report = attempt.along(
+        poses, name="turn to the stop", speed_m_per_s=LAST_M_PER_S, guards=(rise, strong), compliance=YIELDING
+    )
     force = float(np.linalg.norm(report.wrench[:3]))
     lag_rad = (CAGE_SIDE_M + force / cell.hand.pad_stiffness_n_per_m) / radius
     return sign * max(0.0, _between(start, report.base_from_tool) - lag_rad)

@@ -44,8 +44,8 @@ class SkillReport:
 
     Attributes:
         target: what was asked for, e.g. "open" or "62.0 %".
-        reached: the mechanical estimate from measured tool motion, in the object's own terms; None when it tells nothing.
-        seen: the last read-back.
+        reached: the mechanical estimate from measured tool motion, in the object's own terms; None when it tells
+        nothing. seen: the last read-back.
         attempts: how often the stroke was tried.
         peak_force_n: over all motions.
     """

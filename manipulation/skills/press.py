@@ -55,7 +55,14 @@ def press(
         return travel
 
     return perform(
-        cell, stroke, skill=skill, object_name=cap.name, target=target, is_reached=is_reached, verify=verify, repeats=False
+        cell,
+        stroke,
+        skill=skill,
+        object_name=cap.name,
+        target=target,
+        is_reached=is_reached,
+        verify=verify,
+        repeats=False,
     )
 
 

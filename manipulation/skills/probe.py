@@ -67,9 +67,7 @@ def touch_probe(
     """
     attempt = Attempt(cell)
     x, y, z = (float(v) for v in point_m)
-    ways = [
-        [panel_from_grip((x, y, z + up), turn) for up in (SLOW_FROM_M, 0.0, -BEYOND_M)] for turn in TURNS_RAD
-    ]
+    ways = [[panel_from_grip((x, y, z + up), turn) for up in (SLOW_FROM_M, 0.0, -BEYOND_M)] for turn in TURNS_RAD]
     attempt.begin(ways, may_touch=() if object_name is None else (object_name,), width_m=0.0, name="touch point")
     start = attempt.pose()
     guard = Guard(name="contact", quantity=Quantity.FORCE, limit=TOUCH_N, axis=(0.0, 0.0, -1.0))
@@ -84,8 +82,8 @@ def touch_probe(
 def contact_of(report: MotionReport, *, finger_half_m: tuple[float, float]) -> TouchPoint:
     """The point of first contact in a guarded approach along the fingers.
 
-    The pads give way, so the tip is past the surface when the guard trips; the force rises linearly with the depth, and the
-    straight line through the samples above the sensor's noise meets zero force at the surface.
+    The pads give way, so the tip is past the surface when the guard trips; the force rises linearly with the depth,
+    and the straight line through the samples above the sensor's noise meets zero force at the surface.
     """
     axis = report.base_from_tool.rotation.apply([0.0, 0.0, 1.0])
     depth = report.log.tip_m @ axis

@@ -14,7 +14,7 @@ from manipulation.skills.steps import STANDOFF_M, Attempt, perform
 from manipulation.stroke import arc
 from manipulation.workcell import Workcell, panel_from_grip
 
-SIDE_M = 0.007
+SIDE_M = 0.009
 BAR_RATIO = 0.45  # width of the bar over the knob's radius
 SEAT_N = 5.0
 LIFT_M = 0.0015
@@ -98,13 +98,15 @@ def _turn(attempt: Attempt, thing: Rotary, start_rad: float, goal_rad: float) ->
     seat = thing.height_m / 2  # the shoulder under the bar
     ways = [_way(thing, start_rad, goal_rad, seat, flip) for flip in (0.0, np.pi)]
     attempt.begin(ways, may_touch=(thing.name,), width_m=open_m, name=thing.name)
-    down = attempt.advance(STANDOFF_M + thing.height_m - seat + 0.004, name="approach", speed_m_per_s=0.04, stop_n=SEAT_N)
+    down = attempt.advance(
+        STANDOFF_M + thing.height_m - seat + 0.004, name="approach", speed_m_per_s=0.04, stop_n=SEAT_N
+    )
     height = float((cell.panel_pose.inv() * attempt.pose()).translation[2])
     if down.tripped is not None and height > thing.height_m - 0.002:
         raise SkillFailure(Outcome.MISSED, "a finger landed on the bar")
     if down.tripped is not None:
         attempt.advance(-LIFT_M, name="lift off the shoulder", speed_m_per_s=0.03)
-    centre_between(attempt, room_m=SIDE_M + 0.004, what="bar")
+    centre_between(attempt, room_m=2.0 * SIDE_M, what="bar")
     attempt.open_to(0.0, force_n=GRIP_N, name="hold the bar")
     width = cell.mover.state().gripper_width_m
     if width < 0.5 * bar_m:

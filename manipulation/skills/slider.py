@@ -49,8 +49,8 @@ def slider(
 ) -> SkillReport:
     """Push the slider to a value of its scale.
 
-    The distance to push is the difference of two values and the cap's face is found by touch, so an error of the panel's
-    pose does not enter the result.
+    The distance to push is the difference of two values and the cap's face is found by touch, so an error of the
+    panel's pose does not enter the result.
 
     Args:
         current: what the last look said; without it `verify` is asked first.
@@ -114,7 +114,14 @@ def _push(attempt: Attempt, thing: Slider, push: _Push) -> float:
             raise SkillFailure(Outcome.MISSED, "the fingertip landed on the cap")
         attempt.advance(-0.002, name="lift off the plate", speed_m_per_s=0.03)
     ahead = push.sign * cell.panel_pose.rotation.apply([np.cos(thing.angle_rad), np.sin(thing.angle_rad), 0.0])
-    met = meet(attempt, _moved(attempt, SEEK_M * ahead), name="feel the cap", speed_m_per_s=SEEK_M_PER_S, stop_n=SEEK_N, ticks=3)
+    met = meet(
+        attempt,
+        _moved(attempt, SEEK_M * ahead),
+        name="feel the cap",
+        speed_m_per_s=SEEK_M_PER_S,
+        stop_n=SEEK_N,
+        ticks=3,
+    )
     if not met.is_met:
         raise SkillFailure(Outcome.MISSED, "no cap was met")
     begun = met.report.log.tip_m[0]
@@ -157,7 +164,9 @@ def _go(attempt: Attempt, thing: Slider, ahead: np.ndarray, distance_m: float, n
         return
     limit = 3.0 * thing.friction_n + 15.0
     guard = Guard(name="effort", quantity=Quantity.FORCE, limit=limit)
-    report = attempt.straight(_moved(attempt, distance_m * ahead), name=name, speed_m_per_s=PUSH_M_PER_S, guards=(guard,))
+    report = attempt.straight(
+        _moved(attempt, distance_m * ahead), name=name, speed_m_per_s=PUSH_M_PER_S, guards=(guard,)
+    )
     if report.tripped is not None:
         raise SkillFailure(Outcome.STALLED, f"the cap stopped against {report.peak_force_n:.0f} N")
 

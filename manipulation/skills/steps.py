@@ -1,4 +1,6 @@
-"""The steps that skills share: run a motion, go to a standoff, touch down, retreat, park; and the frame of an attempt."""
+"""The steps that skills share: run a motion, go to a standoff, touch down, retreat, park; and the frame of an
+attempt.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,8 @@ from hal.errors import Cancelled, DeviceFault, MotionRefused, Stopped, Unreachab
 from hal.motion import (
     Compliance,
     DeclaredMotion,
-    Guard,
     GripperMotion,
+    Guard,
     MotionOutcome,
     MotionReport,
     Quantity,
@@ -178,6 +180,7 @@ def perform(
     for tries in range(1, attempts + 1):
         cell.progress((tries - 1) / attempts, f"{skill} {object_name}: attempt {tries}")
         outcome, cause, reached = _try(attempt, stroke)
+        cell.progress((tries - 0.5) / attempts, f"{skill} {object_name}: {outcome}: {cause}")
         if outcome is Outcome.UNREACHABLE:
             break
         seen = None if verify is None else verify()

@@ -16,7 +16,7 @@ PIVOT_M = 0.004  # the bat turns a little above the plate
 GRIP_RATIO = 0.55  # how far up the bat the fingertip pushes: high enough for a lever arm, low enough not to slip off
 SIDE_M = 0.008  # room between fingertip and bat when coming down; more than the pose error
 BEYOND_M = 0.008  # how far past the middle the fingertip's face goes if nothing stops it
-SWEEP_M_PER_S = 0.03
+SWEEP_M_PER_S = 0.02
 EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
 END_N = 4.0  # above what the detent needs: the bat stands on its stop
 
@@ -66,7 +66,7 @@ def toggle(cell: Workcell, name: str, target: str, *, verify: Verify | None = No
         guard = Guard(name="end stop", quantity=Quantity.FORCE, limit=stop_n, ticks=1)
         report = attempt.straight(goal, name="sweep", speed_m_per_s=SWEEP_M_PER_S, guards=(guard,))
         moved = float((report.base_from_tool.translation - here.translation) @ sweep / np.linalg.norm(sweep))
-        past = moved - (abs(end - start) - BEYOND_M)
+        past = float(moved - (abs(end - start) - BEYOND_M))
         if past < -0.004:
             raise SkillFailure(Outcome.STIFF, f"the bat did not give way at {stop_n:.0f} N", reached=past)
         attempt.leave()

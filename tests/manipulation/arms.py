@@ -9,7 +9,9 @@ from hal.devices import ArmCapabilities, DhLink
 PI = np.pi
 
 
-def _arm(model: str, rows: list[tuple[float, float, float, float]], limit: float, radii: tuple[float, ...]) -> ArmCapabilities:
+def _arm(
+    model: str, rows: list[tuple[float, float, float, float]], limit: float, radii: tuple[float, ...]
+) -> ArmCapabilities:
     return ArmCapabilities(
         model=model,
         links=tuple(DhLink(d_m=d, a_m=a, alpha_rad=alpha, offset_rad=offset) for d, a, alpha, offset in rows),

@@ -156,7 +156,9 @@ class FakeForceTorque(_Device):
     kind = DeviceKind.FORCE_TORQUE
 
     def capabilities(self) -> ForceTorqueCapabilities:
-        return ForceTorqueCapabilities(force_range_n=300, torque_range_nm=30, force_sigma_n=0.3, torque_sigma_nm=0.01, rate_hz=500)
+        return ForceTorqueCapabilities(
+            force_range_n=300, torque_range_nm=30, force_sigma_n=0.3, torque_sigma_nm=0.01, rate_hz=500
+        )
 
     def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:
         w = self.world.wrench()

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -92,7 +94,7 @@ def test_a_transfer_goes_round_a_divider_and_every_five_milliradians_are_free() 
     motion = planner.plan(start, goal)
     q = motion.positions_rad
     assert np.allclose(q[0], start) and np.allclose(q[-1], goal)
-    for a, b in zip(q, q[1:], strict=False):
+    for a, b in itertools.pairwise(q):
         assert planner.model.free_fraction(a, b, margin_m=0.0, step_rad=RECHECK_RAD) == 1.0
 
 
@@ -105,7 +107,11 @@ def test_the_same_seed_gives_the_same_path() -> None:
 
 def test_a_goal_inside_an_obstacle_is_unreachable_and_named() -> None:
     start, goal, _ = _obstacle()
-    box = Box(name="cupboard", parent_from_box=transform_rpy(KINEMATICS.flange(goal).translation, (0, 0, 0)), half_m=(0.1, 0.1, 0.1))
+    box = Box(
+        name="cupboard",
+        parent_from_box=transform_rpy(KINEMATICS.flange(goal).translation, (0, 0, 0)),
+        half_m=(0.1, 0.1, 0.1),
+    )
     with pytest.raises(Unreachable, match="cupboard"):
         _planner(box).plan(start, goal)
 
@@ -134,7 +140,10 @@ def test_rounded_corners_keep_the_ends_and_stay_near() -> None:
 
 
 def _panel() -> Panel:
-    lights = [{"name": f"l{k}", "position_m": [x, y, 0.0]} for k, (x, y) in enumerate([(-0.2, 0.1), (0.2, 0.1), (0.2, -0.1), (-0.2, -0.1)])]
+    lights = [
+        {"name": f"l{k}", "position_m": [x, y, 0.0]}
+        for k, (x, y) in enumerate([(-0.2, 0.1), (0.2, 0.1), (0.2, -0.1), (-0.2, -0.1)])
+    ]
     objects = [
         {
             "kind": "lever", "name": "valve", "position_m": [0.0, 0.0],

@@ -31,7 +31,14 @@ def rig() -> Iterator[Rig]:
     rig.controller.close()
 
 
-def forwards(distance_m: float, *, speed: float = 0.06, start: np.ndarray = HOME, guards: tuple[Guard, ...] = (), compliance: Compliance | None = None) -> CartesianPath:
+def forwards(
+    distance_m: float,
+    *,
+    speed: float = 0.06,
+    start: np.ndarray = HOME,
+    guards: tuple[Guard, ...] = (),
+    compliance: Compliance | None = None,
+) -> CartesianPath:
     pose = tool_pose(start)
     return line(
         pose,

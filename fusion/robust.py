@@ -29,8 +29,8 @@ from hal.geometry import Array, UncertainPose
 MOST_SEARCHED = 96  # measurements that the search looks at; the finish uses all
 HYPOTHESES = 6000  # at most
 FIRST_ROUND = 32
-MISS_PROBABILITY = 1e-5  # of never drawing a clean subset that also converges
-CONVERGES = 0.25  # share of clean subsets that reach their pose from a random rotation (measured 0.35)
+MISS_PROBABILITY = 1e-4  # of never drawing a clean subset that also converges
+CONVERGES = 0.25  # share of clean subsets that reach their pose from a random rotation (measured 0.27)
 SETTLED_PER_ROUND = 8
 LARGEST_ROUND = 512
 ALTERNATIVE_COST = 18.0  # a minimum this much worse has odds below 1e-4
@@ -195,14 +195,14 @@ def _search(b: Batch, rng: np.random.Generator) -> _Candidates:
     least, agreeing = np.inf, 0
     while True:
         draws = rng.random((size, search.DRAWS))
-        draws[:, search.SUBSET_MOST :] = rng.normal(size=(size, 4))
+        draws[:, search.SUBSET_MOST :] = rng.normal(size=(size, search.DRAWS - search.SUBSET_MOST))
         R, t, cost, inside = np.empty((size, 3, 3)), np.empty((size, 3)), np.empty(size), np.empty(size, np.int64)
         kept = search.candidates(b, draws, SETTLED_PER_ROUND, R, t, cost, inside)
         rounds.append((R[:kept], t[:kept], cost[:kept]))
         if kept and cost[0] < least:
             least, agreeing = float(cost[0]), int(inside[0])
         done += size
-        wanted = min(_enough(n, agreeing, float(b.dof.mean())), HYPOTHESES)
+        wanted = min(_enough(b, agreeing), HYPOTHESES)
         if done >= wanted:
             break
         size = int(min(max(wanted - done, FIRST_ROUND), LARGEST_ROUND, 3 * size))
@@ -222,11 +222,13 @@ def _nearby(b: Batch, found: _Candidates) -> _Candidates:
     return _Candidates(R=R[order], t=t[order], cost=cost[order])
 
 
-def _enough(n: int, inside: int, mean_dof: float) -> float:
-    """Subsets after which a clean, converging one has been missed with MISS_PROBABILITY, if `inside` of n are good."""
-    picks = min(math.ceil(search.SUBSET_DOF / max(mean_dof, 0.5)), search.SUBSET_MOST, n)
-    clean = math.prod(max(inside - k, 0) / (n - k) for k in range(picks))
-    return math.log(MISS_PROBABILITY) / math.log1p(-CONVERGES * clean) if clean > 0 else np.inf
+def _enough(b: Batch, agreeing: int) -> float:
+    """Subsets after which a clean, converging one has been missed with MISS_PROBABILITY, if `agreeing` dof are good."""
+    total = int(b.dof.sum())
+    typical = float(b.dof @ b.dof) / max(total, 1)  # of an entry picked in proportion to its dof
+    picks = min(math.ceil(search.SUBSET_DOF / max(typical, 1.0)), search.SUBSET_MOST, len(b.dof))
+    clean = math.prod(max(agreeing - k * typical, 0.0) / max(total - k * typical, 1.0) for k in range(picks))
+    return math.log(MISS_PROBABILITY) / math.log1p(-CONVERGES * min(clean, 1.0)) if clean > 0 else np.inf
 
 
 def _mirrored(b: Batch, R: Array, t: Array) -> tuple[Array, Array, Array]:

@@ -261,9 +261,9 @@ def descend(b: Batch, use: Array, R: Array, t: Array, far: bool, steps: int, tol
     Stops when the predicted fall is below `tolerance`.
     """
     H, L, g, step = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty(6)
-    work = np.empty((13, 6))
+    H1, g1, work = np.empty((6, 6)), np.empty(6), np.empty((13, 6))
     R1, t1 = np.empty((3, 3)), np.empty(3)
-    damping = 1e-3 if far else 1e-6
+    damping, swapped = (1e-3 if far else 1e-6), False
     cost = accumulate(b, use, R, t, far, H, g, work)
     for _ in range(steps):
         size = 0.0
@@ -286,13 +286,19 @@ def descend(b: Batch, use: Array, R: Array, t: Array, far: bool, steps: int, tol
         if turn > 1.0:  # beyond a radian the linearisation says nothing
             for j in range(6):
                 step[j] /= turn**0.5
-        R1[:], t1[:] = R, t
+        for p in range(3):
+            t1[p] = t[p]
+            for c in range(3):
+                R1[p, c] = R[p, c]
         move(R1, t1, step)
-        lower = cost_of(b, use, R1, t1, far, work)
+        # Most steps are taken, so the next system is built at once instead of the cost alone.
+        lower = accumulate(b, use, R1, t1, far, H1, g1, work)
         if lower < cost:
-            R[:], t[:] = R1, t1
+            R, R1, t, t1 = R1, R, t1, t
+            H, H1, g, g1 = H1, H, g1, g
+            swapped = not swapped
+            cost = lower
             damping = max(0.1 * damping, 1e-9)
-            cost = accumulate(b, use, R, t, far, H, g, work)
             if fall < tolerance:
                 break
         else:
@@ -301,5 +307,7 @@ def descend(b: Batch, use: Array, R: Array, t: Array, far: bool, steps: int, tol
             damping = max(8.0 * damping, 1e-6)
             if damping > 1e8:
                 break
+    if swapped:
+        R1[:], t1[:] = R, t
     return cost
 

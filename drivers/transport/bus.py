@@ -69,7 +69,7 @@ class Bus(Generic[C]):
         self._lock = threading.Lock()
         self._open_link = open_link
         self._rest = threading.Event()  # never set: a rest that needs no other clock
-        self._port: Port | None = None
+        self._port: Port[Link] | None = None
         self._members = threading.Lock()
 
     def attach(self, station: Station[C]) -> None:

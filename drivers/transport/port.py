@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
-from drivers.transport.link import Link, WireError
+from drivers.transport.link import WireError
 from hal.errors import CellError
 
 FIRST_RETRY_S = 0.05
@@ -14,10 +14,22 @@ LAST_RETRY_S = 0.25  # a port that returns is in use again within 0.5 s
 JOIN_S = 1.0
 
 
-class Tenant(Protocol):
+class Closable(Protocol):
+    """Anything that a port can hold: a link, a camera."""
+
+    def close(self) -> None:
+        """Release it."""
+        ...
+
+
+L = TypeVar("L", bound=Closable)
+L_contra = TypeVar("L_contra", bound=Closable, contravariant=True)
+
+
+class Tenant(Protocol[L_contra]):
     """What lives on a port. All three are called by the owner thread alone."""
 
-    def set_up(self, link: Link) -> None:
+    def set_up(self, link: L_contra) -> None:
         """Bring the far side to the state that `serve` needs; repeated after each loss.
 
         Raises:
@@ -25,7 +37,7 @@ class Tenant(Protocol):
         """
         ...
 
-    def serve(self, link: Link) -> None:
+    def serve(self, link: L_contra) -> None:
         """One piece of work of at most some 50 ms.
 
         Raises:
@@ -38,7 +50,7 @@ class Tenant(Protocol):
         ...
 
 
-class Port:
+class Port(Generic[L]):
     """Keeps a tenant on its wire.
 
     Args:
@@ -46,11 +58,11 @@ class Port:
         open_link: opens the port; raises `DeviceUnavailable`.
     """
 
-    def __init__(self, name: str, *, open_link: Callable[[], Link], tenant: Tenant) -> None:
+    def __init__(self, name: str, *, open_link: Callable[[], L], tenant: Tenant[L]) -> None:
         self._open_link = open_link
         self._tenant = tenant
         self._closing = threading.Event()
-        self._link: Link | None = None
+        self._link: L | None = None
         self._sessions = 0
         self._thread = threading.Thread(target=self._run, name=f"port {name}", daemon=True)
 
@@ -59,7 +71,7 @@ class Port:
         self._thread.start()
 
     @property
-    def link(self) -> Link | None:
+    def link(self) -> L | None:
         """The link while it is open and set up, else None."""
         return self._link
 

@@ -1,0 +1,188 @@
+"""A folder of pictures or a video file as a camera: recorded scenes through the same interface as a live one."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Annotated, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from drivers.transport.device import WireDevice
+from drivers.transport.link import now_s
+from drivers.transport.options import read_options
+from hal.calibration import CameraIntrinsics
+from hal.clock import Deadline
+from hal.devices import CameraCapabilities, DeviceKind, Image
+from hal.errors import DeviceFault, DeviceUnavailable
+from hal.readings import Stamped
+from hal.registry import Context
+from hal.strict import Strict
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
+Pixels = NDArray[np.uint8]
+
+
+class LensOptions(Strict):
+    """Nominal lens of a camera that does not know its own; the calibration record has the true one."""
+
+    fx_px: Annotated[float, Field(gt=0)] | None = None
+    fy_px: Annotated[float, Field(gt=0)] | None = None
+
+
+class CameraFilesOptions(LensOptions):
+    """Options of `files:camera`: `path` is a folder of pictures, in the order of their names, or a video."""
+
+    path: Path
+    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
+    is_colour: bool = True
+    repeat: bool = True
+    exposure_s: Annotated[float, Field(gt=0)] = 0.01
+
+
+def nominal(width_px: int, height_px: int, lens: LensOptions) -> CameraIntrinsics:
+    """The options' lens, or one of 53 degrees across, centred."""
+    fx_px = lens.fx_px or float(width_px)
+    return CameraIntrinsics(
+        width_px=width_px,
+        height_px=height_px,
+        fx_px=fx_px,
+        fy_px=lens.fy_px or fx_px,
+        cx_px=(width_px - 1) / 2.0,
+        cy_px=(height_px - 1) / 2.0,
+    )
+
+
+def to_pixels(bgr: NDArray[Any], *, is_colour: bool) -> Pixels:
+    """OpenCV's picture as RGB or gray bytes."""
+    if bgr.ndim == 2:
+        bgr = cv2.cvtColor(bgr, cv2.COLOR_GRAY2BGR)
+    code = cv2.COLOR_BGR2RGB if is_colour else cv2.COLOR_BGR2GRAY
+    return np.ascontiguousarray(cv2.cvtColor(bgr, code), dtype=np.uint8)
+
+
+class CameraFiles(WireDevice[Image]):
+    """Plays pictures, one a period, and holds its breath between them."""
+
+    kind = DeviceKind.CAMERA
+
+    def __init__(self, context: Context, options: CameraFilesOptions) -> None:
+        super().__init__(context, max_age_s=3.0 / options.rate_hz)
+        self._options = options
+        self._turn = threading.Lock()
+        self._closing = threading.Event()
+        self._next_s = 0.0
+        self._index = 0
+        self._frames = self._open()
+        first = self._load(0)
+        self._shape = first.shape
+        self._size = (first.shape[1], first.shape[0])
+
+    def capabilities(self) -> CameraCapabilities:
+        """Size of the first picture; all others must have it."""
+        width_px, height_px = self._size
+        return CameraCapabilities(
+            width_px=width_px,
+            height_px=height_px,
+            is_colour=self._options.is_colour,
+            rate_hz=self._options.rate_hz,
+            nominal=nominal(width_px, height_px, self._options),
+        )
+
+    def read_image(self, *, deadline: Deadline) -> Stamped[Image]:
+        """The next picture, not before its period has come.
+
+        Raises:
+            DeviceTimeout: the deadline ends before the period. DeviceUnavailable: the last picture has been shown.
+        """
+        self.require_open()
+        started_s = now_s()
+        until_s = started_s + deadline.remaining_s()
+        if not self._turn.acquire(timeout=max(0.0, until_s - now_s())):
+            raise self.timeout(now_s() - started_s)
+        try:
+            wait_s = self._next_s - now_s()
+            if now_s() + max(0.0, wait_s) > until_s:
+                self._closing.wait(max(0.0, until_s - now_s()))
+                raise self.timeout(now_s() - started_s)
+            self._closing.wait(max(0.0, wait_s))
+            self.require_open()
+            self._next_s = max(self._next_s, now_s()) + 1.0 / self._options.rate_hz
+            exposed_s = now_s()
+            pixels = self._load(self._index)
+            self._index += 1
+            self.publish(Image(pixels=pixels, exposure_s=self._options.exposure_s), valid_s=exposed_s)
+            return self.newest(deadline, not_before_s=-float("inf"))
+        finally:
+            self._turn.release()
+
+    def _open(self) -> list[Path] | list[Pixels]:
+        path = self._options.path
+        if path.is_dir():
+            pictures = sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURES)
+            if pictures:
+                return pictures
+            raise self._missing(f"folder {path} has no pictures", f"put {', '.join(PICTURES[:3])} files into it")
+        if not path.exists():
+            raise self._missing(f"{path} does not exist", "give a folder of pictures or a video")
+        return self._read_video(path)
+
+    def _read_video(self, path: Path) -> list[Pixels]:
+        video, frames = cv2.VideoCapture(str(path)), []
+        try:
+            while (grabbed := video.read())[0]:
+                frames.append(to_pixels(grabbed[1], is_colour=self._options.is_colour))
+        finally:
+            video.release()
+        if not frames:
+            raise self._missing(f"{path} is no video that can be read", "give a folder of pictures or a video")
+        return frames
+
+    def _load(self, index: int) -> Pixels:
+        if index >= len(self._frames) and not self._options.repeat:
+            raise self._missing(
+                f"all {len(self._frames)} pictures have been shown", "set repeat = true, or connect again"
+            )
+        frame = self._frames[index % len(self._frames)]
+        if isinstance(frame, Path):
+            raw = cv2.imread(str(frame), cv2.IMREAD_COLOR)
+            if raw is None:
+                self.errors += 1
+                raise DeviceFault(f"{self.name}: {frame} is no picture", hint="remove or replace it", device=self.name)
+            frame = to_pixels(raw, is_colour=self._options.is_colour)
+        if index > 0 and frame.shape != self._shape:
+            self.errors += 1
+            height_px, width_px = frame.shape[:2]
+            raise DeviceFault(
+                f"{self.name}: picture {index} is {width_px}x{height_px}, the first {self._size[0]}x{self._size[1]}",
+                hint="pictures of one camera have one size",
+                device=self.name,
+            )
+        return frame
+
+    def _missing(self, what: str, hint: str) -> DeviceUnavailable:
+        return DeviceUnavailable(f"{self.name}: {what}", hint=hint, device=self.name)
+
+    def release(self) -> None:
+        """End a wait."""
+        self._closing.set()
+
+    def is_up(self) -> bool:
+        """Files stay."""
+        return True
+
+    def reconnects(self) -> int:
+        """Never."""
+        return 0
+
+    def link_name(self) -> str:
+        """The path."""
+        return f"files {self._options.path}"
+
+
+def connect(context: Context, options: dict[str, Any]) -> CameraFiles:
+    """Entry point `files:camera`."""
+    return CameraFiles(context, read_options(context, options, CameraFilesOptions))

@@ -1,0 +1,48 @@
+"""States of a CiA-402 drive: how the status word tells them and which control word leads on (CiA 402-2, 6.3)."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class DriveState(StrEnum):
+    """The eight states."""
+
+    NOT_READY = "not_ready"
+    SWITCH_ON_DISABLED = "switch_on_disabled"
+    READY = "ready"
+    SWITCHED_ON = "switched_on"
+    OPERATION_ENABLED = "operation_enabled"
+    QUICK_STOP = "quick_stop"
+    FAULT_REACTION = "fault_reaction"
+    FAULT = "fault"
+
+
+_PATTERNS = (
+    (DriveState.NOT_READY, 0x4F, 0x00),
+    (DriveState.SWITCH_ON_DISABLED, 0x4F, 0x40),
+    (DriveState.READY, 0x6F, 0x21),
+    (DriveState.SWITCHED_ON, 0x6F, 0x23),
+    (DriveState.OPERATION_ENABLED, 0x6F, 0x27),
+    (DriveState.QUICK_STOP, 0x6F, 0x07),
+    (DriveState.FAULT_REACTION, 0x4F, 0x0F),
+    (DriveState.FAULT, 0x4F, 0x08),
+)
+SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP, DISABLE, FAULT_RESET = 0x06, 0x07, 0x0F, 0x02, 0x00, 0x80
+_TOWARDS_ENABLED = {
+    DriveState.SWITCH_ON_DISABLED: SHUTDOWN,
+    DriveState.READY: SWITCH_ON,
+    DriveState.SWITCHED_ON: ENABLE,
+    DriveState.OPERATION_ENABLED: ENABLE,
+    DriveState.QUICK_STOP: DISABLE,
+}
+
+
+def state_of(status_word: int) -> DriveState:
+    """The state that object 6041h tells; bits outside the masks do not matter."""
+    return next((state for state, mask, value in _PATTERNS if status_word & mask == value), DriveState.NOT_READY)
+
+
+def towards_enabled(state: DriveState) -> int:
+    """The control word for the next step to `operation_enabled`; a fault needs a reset, which must be asked for."""
+    return _TOWARDS_ENABLED.get(state, DISABLE)

@@ -1,0 +1,157 @@
+"""A folder of depth pictures as a range scanner: what the recorders of RGB-D and ToF cameras write.
+
+`.png` with 16 bits (`unit_m` a count, 0 is nothing), `.npy` and the first array of `.npz` in metres (0: nothing).
+"""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from drivers.transport.device import WireDevice
+from drivers.transport.link import now_s
+from drivers.transport.options import read_options
+from hal.clock import Deadline
+from hal.devices import DeviceKind, RangeImage, RangeScannerCapabilities
+from hal.errors import DeviceFault, DeviceUnavailable
+from hal.readings import Cause, Quality, Stamped
+from hal.registry import Context
+from hal.strict import Strict
+
+SUFFIXES = (".png", ".npy", ".npz")
+
+
+class DepthCameraOptions(Strict):
+    """Options of `files:depth`; the lens as the recorder's sheet gives it."""
+
+    path: Path
+    fx: Annotated[float, Field(gt=0)]
+    fy: Annotated[float, Field(gt=0)]
+    cx: float
+    cy: float
+    projection: Literal["pinhole", "orthographic"] = "pinhole"
+    unit_m: Annotated[float, Field(gt=0)] = 0.001
+    min_range_m: Annotated[float, Field(ge=0)] = 0.1
+    max_range_m: Annotated[float, Field(gt=0)] = 10.0
+    sigma_m: Annotated[float, Field(gt=0)] = 0.003
+    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
+
+
+class DepthCamera(WireDevice[RangeImage]):
+    """Plays depth pictures again and again, one a period."""
+
+    kind = DeviceKind.RANGE_SCANNER
+
+    def __init__(self, context: Context, options: DepthCameraOptions) -> None:
+        super().__init__(context, max_age_s=3.0 / options.rate_hz)
+        self._options = options
+        self._turn = threading.Lock()
+        self._closing = threading.Event()
+        self._next_s = 0.0
+        self._index = 0
+        folder = options.path
+        self._files = sorted(p for p in folder.iterdir() if p.suffix in SUFFIXES) if folder.is_dir() else []
+        if not self._files:
+            raise DeviceUnavailable(
+                f"{context.name}: {folder} holds no depth pictures",
+                hint=f"give a folder with {', '.join(SUFFIXES)} files",
+                device=context.name,
+            )
+        self._shape = self._load(0).shape
+
+    def capabilities(self) -> RangeScannerCapabilities:
+        """Size of the first picture, lens and limits of the options."""
+        o = self._options
+        return RangeScannerCapabilities(
+            projection=o.projection,
+            width=self._shape[1],
+            height=self._shape[0],
+            fx=o.fx,
+            fy=o.fy,
+            cx=o.cx,
+            cy=o.cy,
+            min_range_m=o.min_range_m,
+            max_range_m=o.max_range_m,
+            sigma_m=o.sigma_m,
+            rate_hz=o.rate_hz,
+        )
+
+    def read_range(self, *, deadline: Deadline) -> Stamped[RangeImage]:
+        """The next picture, not before its period has come."""
+        self.require_open()
+        started_s = now_s()
+        until_s = started_s + deadline.remaining_s()
+        if not self._turn.acquire(timeout=max(0.0, until_s - now_s())):
+            raise self.timeout(now_s() - started_s)
+        try:
+            self._closing.wait(max(0.0, min(self._next_s, until_s) - now_s()))
+            self.require_open()
+            if self._next_s > until_s:
+                raise self.timeout(now_s() - started_s)
+            scanned_s = now_s()
+            self._next_s = scanned_s + 1.0 / self._options.rate_hz
+            depth_m = self._load(self._index)
+            self._index += 1
+            is_seen = bool(np.isfinite(depth_m).any())
+            self.publish(
+                RangeImage(depth_m=depth_m),
+                valid_s=scanned_s,
+                quality=Quality.VALID if is_seen else Quality.INVALID,
+                cause=Cause.NONE if is_seen else Cause.OUT_OF_RANGE,
+            )
+            return self.newest(deadline, not_before_s=-float("inf"))
+        finally:
+            self._turn.release()
+
+    def _load(self, index: int) -> NDArray[np.float32]:
+        path, o = self._files[index % len(self._files)], self._options
+        try:
+            depth_m = _read(path, o.unit_m)
+        except (OSError, ValueError, IndexError) as error:
+            raise self._fault(f"{path} is no depth picture: {error}") from error
+        if depth_m.ndim != 2 or (index > 0 and depth_m.shape != self._shape):
+            raise self._fault(f"{path} has shape {depth_m.shape}")
+        is_seen = (depth_m >= o.min_range_m) & (depth_m <= o.max_range_m)
+        return np.where(is_seen, depth_m, np.nan).astype(np.float32)
+
+    def _fault(self, what: str) -> DeviceFault:
+        self.errors += 1
+        return DeviceFault(f"{self.name}: {what}", hint="remove or replace it", device=self.name)
+
+    def release(self) -> None:
+        """End a wait."""
+        self._closing.set()
+
+    def is_up(self) -> bool:
+        """Files stay."""
+        return True
+
+    def reconnects(self) -> int:
+        """Never."""
+        return 0
+
+    def link_name(self) -> str:
+        """The path."""
+        return f"files {self._options.path}"
+
+
+def _read(path: Path, unit_m: float) -> NDArray[np.float64]:
+    if path.suffix == ".png":
+        raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if raw is None or raw.dtype != np.uint16:
+            raise ValueError("not a PNG of 16 bits")
+        return np.asarray(raw, dtype=np.float64) * unit_m
+    loaded = np.load(path, allow_pickle=False)
+    array = loaded if isinstance(loaded, np.ndarray) else loaded[loaded.files[0]]
+    return np.asarray(array, dtype=np.float64)
+
+
+def connect(context: Context, options: dict[str, Any]) -> DepthCamera:
+    """Entry point `files:depth`."""
+    return DepthCamera(context, read_options(context, options, DepthCameraOptions))

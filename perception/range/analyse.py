@@ -149,7 +149,7 @@ def _finished(
         final.add(found.kinds[k], th)
         renamed[k + 1] = new
     labels = reclaimed(depth, sensor.packed(), noise.packed(), renamed[joined], final, sweeps=1)
-    fill_small_gaps(labels, np.isfinite(depth), 2)
+    fill_small_gaps(labels, depth, 2)
     return labels, tuple(surfaces)
 
 

@@ -61,38 +61,35 @@ def claim_pixels(depth, sen, noise, blocks, size, kinds, ths, out):  # type: ign
 def claim_borders(depth, sen, noise, labels, kinds, ths, out):  # type: ignore[no-untyped-def]
     """Judge again each pixel whose 3x3 neighbourhood holds another label; regions gain or lose at most one pixel.
 
-    Reads `labels` (H, W), writes all of `out` (H, W).
+    Reads `labels` (H, W), writes all of `out` (H, W). The outermost pixels keep their labels.
     """
     H, W = depth.shape
     perspective = sen[0] > 0
     near = np.empty(9, np.int32)
-    for v in range(H):
+    out[:] = labels
+    for v in range(1, H - 1):
         y = (v - sen[4]) / sen[2]
-        for u in range(W):
+        for u in range(1, W - 1):
             own = labels[v, u]
-            z = depth[v, u]
-            out[v, u] = own
-            if not np.isfinite(z):
-                out[v, u] = 0
+            if (
+                labels[v, u - 1] == own and labels[v, u + 1] == own and labels[v - 1, u] == own
+                and labels[v + 1, u] == own and labels[v - 1, u - 1] == own and labels[v - 1, u + 1] == own
+                and labels[v + 1, u - 1] == own and labels[v + 1, u + 1] == own
+            ):
                 continue
-            mixed = False
-            for i in range(max(0, v - 1), min(H, v + 2)):
-                for j in range(max(0, u - 1), min(W, u + 2)):
-                    if labels[i, j] != own:
-                        mixed = True
-            if not mixed:
+            z = depth[v, u]
+            if not np.isfinite(z):
                 continue
             n = 0
-            for i in range(max(0, v - 1), min(H, v + 2)):
-                for j in range(max(0, u - 1), min(W, u + 2)):
-                    k = labels[i, j]
-                    new = k > 0
-                    for m in range(n):
-                        if near[m] == k:
-                            new = False
-                    if new:
-                        near[n] = k
-                        n += 1
+            for i in range(9):
+                k = labels[v - 1 + i // 3, u - 1 + i % 3]
+                new = k > 0
+                for m in range(n):
+                    if near[m] == k:
+                        new = False
+                if new:
+                    near[n] = k
+                    n += 1
             x = (u - sen[3]) / sen[1]
             best, label = CLAIM_SIGMAS, 0
             sigma = sigma_at(noise, z)
@@ -119,30 +116,26 @@ def misfit(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def fill_small_gaps(label, finite, sweeps):  # type: ignore[no-untyped-def]
+def fill_small_gaps(label, depth, sweeps):  # type: ignore[no-untyped-def]
     """Give each unlabelled valid pixel the label that at least 5 of its 8 neighbours agree on; `sweeps` times."""
     H, W = label.shape
     for _ in range(sweeps):
         before = label.copy()
         for v in range(1, H - 1):
             for u in range(1, W - 1):
-                if before[v, u] or not finite[v, u]:
+                if before[v, u] or not np.isfinite(depth[v, u]):
                     continue
-                best, most = 0, 0
-                for i in range(v - 1, v + 2):
-                    for j in range(u - 1, u + 2):
-                        k = before[i, j]
-                        if k == 0 or k == best:
-                            continue
-                        n = 0
-                        for p in range(v - 1, v + 2):
-                            for q in range(u - 1, u + 2):
-                                if before[p, q] == k:
-                                    n += 1
-                        if n > most:
-                            best, most = k, n
-                if most >= 5:
-                    label[v, u] = best
+                for i in range(9):
+                    k = before[v - 1 + i // 3, u - 1 + i % 3]
+                    if k == 0:
+                        continue
+                    n = 0
+                    for j in range(9):
+                        if before[v - 1 + j // 3, u - 1 + j % 3] == k:
+                            n += 1
+                    if n >= 5:
+                        label[v, u] = k
+                        break
 
 
 @njit(cache=True)

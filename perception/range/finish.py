@@ -24,7 +24,8 @@ from perception.range.surfaces import FREEDOM, QUADRIC
 Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 
-COARSE_SAMPLES = 600  # a refined start on these leaves the full fit one or two steps
+COARSE_SAMPLES = 300  # a refined start on these leaves the full fit one step
+FULL_STEPS = 1
 SLOW_NOISE_AREA_PX = 150.0  # pixels that share one value of the slow noise; sets how little averaging gains on it
 STEP_AREA_PX = 16.0
 FREE = np.zeros(9, np.bool_)
@@ -77,9 +78,9 @@ def refine_surface(
     """The surface after the ray-depth fit to all its pixels, and its parameter vector."""
     perspective = bool(sensor.packed()[0] > 0)
     few = thinned(samples, COARSE_SAMPLES)
-    th, _, _, _, _ = fit.fit_robust(kind, th, few.x, few.y, few.z, few.sigma, perspective, fixed, 3)
+    th, _, _, _, _ = fit.fit_robust(kind, th, few.x, few.y, few.z, few.sigma, perspective, fixed, 1)
     th, H, cost, used = fit.refine(
-        kind, th, samples.x, samples.y, samples.z, samples.sigma, perspective, 2, 0.0, fit.TRIM_SIGMAS, fixed
+        kind, th, samples.x, samples.y, samples.z, samples.sigma, perspective, FULL_STEPS, 0.0, fit.TRIM_SIGMAS, fixed
     )
     n = samples.x.size
     kept = max(cost - (n - used) * fit.TRIM_SIGMAS**2, 0.0)

@@ -24,11 +24,16 @@ from perception.range.surfaces import (
     depth_and_jacobian,
     frame_of,
     stepped,
+    tangent_frame,
 )
 
 TRIM_SIGMAS = 3.0
 MISS_SIGMAS = 6.0  # a ray that misses the surface costs as much as a residual of this size
 CAUCHY_WIDTH = 2.0
+ROUGH_SAMPLES = 48
+ROUGH_LIMIT = 5.0
+LARGEST_RADIUS_M = 10.0
+QUADRIC_PER_SAMPLE = 1.15  # a simple surface under white noise costs about 0.95 a sample, and its price
 STEP_GOAL = 1e-3  # of a standard deviation of each parameter: a step that small changes nothing that matters
 
 
@@ -192,75 +197,104 @@ def fit_robust(kind, th, x, y, z, sigma, perspective, fixed, rounds):  # type: i
 
 
 @njit(cache=True)
+def centroid(P):  # type: ignore[no-untyped-def]
+    """Mean of points (N, 3)."""
+    c = np.zeros(3)
+    n = P.shape[0]
+    for i in range(n):
+        for a in range(3):
+            c[a] += P[i, a]
+    for a in range(3):
+        c[a] /= n
+    return c
+
+
+@njit(cache=True)
+def scatter(P, c):  # type: ignore[no-untyped-def]
+    """(3, 3) sum of (P_i - c)(P_i - c)'."""
+    S = np.zeros((3, 3))
+    for i in range(P.shape[0]):
+        x, y, z = P[i, 0] - c[0], P[i, 1] - c[1], P[i, 2] - c[2]
+        S[0, 0] += x * x
+        S[1, 1] += y * y
+        S[2, 2] += z * z
+        S[0, 1] += x * y
+        S[0, 2] += x * z
+        S[1, 2] += y * z
+    S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
+    return S
+
+
+@njit(cache=True)
 def start_plane(P):  # type: ignore[no-untyped-def]
     """Plane through points (N, 3) by principal axes."""
     th = np.zeros(SIZE)
-    c = np.zeros(3)
-    for i in range(P.shape[0]):
-        c += P[i]
-    c /= P.shape[0]
-    S = np.zeros((3, 3))
-    for i in range(P.shape[0]):
-        d = P[i] - c
-        for a in range(3):
-            for b in range(3):
-                S[a, b] += d[a] * d[b]
-    _, V = np.linalg.eigh(S)
-    n = V[:, 0].copy()
-    if n[2] > 0:  # towards the sensor, but for planes that the ray only grazes
-        n = -n
-    th[:3] = n
-    th[3] = n @ c
+    c = centroid(P)
+    _, V = np.linalg.eigh(scatter(P, c))
+    side = -1.0 if V[2, 0] > 0 else 1.0  # towards the sensor, but for planes that the ray only grazes
+    for a in range(3):
+        th[a] = side * V[a, 0]
+        th[3] += th[a] * c[a]
     return th
+
+
+@njit(cache=True)
+def _least_squares(rows, values):  # type: ignore[no-untyped-def]
+    """Solve rows (N, m) x = values (N,) by normal equations; (x, solved)."""
+    n, m = rows.shape
+    A, b = np.zeros((m, m)), np.zeros(m)
+    for i in range(n):
+        for j in range(m):
+            r = rows[i, j]
+            b[j] += r * values[i]
+            for k in range(j + 1):
+                A[j, k] += r * rows[i, k]
+    for j in range(m):
+        for k in range(j):
+            A[k, j] = A[j, k]
+        A[j, j] = A[j, j] * (1.0 + 1e-9) + 1e-18
+    return b, solve_positive(A, b, m)
+
+
+@njit(cache=True)
+def _side(P, N, th, axis):  # type: ignore[no-untyped-def]
+    """+1 when the normals point away from the centre or axis of `th`, -1 when towards it."""
+    outward = 0.0
+    for i in range(P.shape[0]):
+        x, y, z = P[i, 0] - th[0], P[i, 1] - th[1], P[i, 2] - th[2]
+        h = x * axis[0] + y * axis[1] + z * axis[2]
+        outward += N[i, 0] * (x - h * axis[0]) + N[i, 1] * (y - h * axis[1]) + N[i, 2] * (z - h * axis[2])
+    return 1.0 if outward >= 0 else -1.0
 
 
 @njit(cache=True)
 def start_sphere(P, N):  # type: ignore[no-untyped-def]
     """Algebraic sphere |X|^2 = 2 c . X + k about the centroid; side from the normals."""
     th = np.zeros(SIZE)
-    c0 = np.zeros(3)
-    for i in range(P.shape[0]):
-        c0 += P[i]
-    c0 /= P.shape[0]
-    A, b = np.zeros((4, 4)), np.zeros(4)
-    row = np.ones(4)
-    for i in range(P.shape[0]):
-        d = P[i] - c0
-        row[:3] = 2.0 * d
-        s = d @ d
-        for a in range(4):
-            b[a] += row[a] * s
-            for e in range(4):
-                A[a, e] += row[a] * row[e]
-    for a in range(4):
-        A[a, a] *= 1.0 + 1e-9
-        A[a, a] += 1e-18
-    if not solve_positive(A, b, 4):
+    c = centroid(P)
+    n = P.shape[0]
+    rows, values = np.ones((n, 4)), np.zeros(n)
+    for i in range(n):
+        for a in range(3):
+            d = P[i, a] - c[a]
+            rows[i, a] = 2.0 * d
+            values[i] += d * d
+    b, ok = _least_squares(rows, values)
+    if not ok:
         return th, False
-    th[:3] = c0 + b[:3]
-    th[3] = np.sqrt(max(b[3] + b[:3] @ b[:3], 1e-12))
-    outward = 0.0
-    for i in range(P.shape[0]):
-        outward += N[i] @ (P[i] - th[:3])
-    th[4] = 1.0 if outward >= 0 else -1.0
+    square = b[3]
+    for a in range(3):
+        th[a] = c[a] + b[a]
+        square += b[a] * b[a]
+    th[3] = np.sqrt(max(square, 1e-12))
+    th[4] = _side(P, N, th, np.zeros(3))
     return th, True
 
 
 @njit(cache=True)
-def _normal_axis(N, centred):  # type: ignore[no-untyped-def]
+def normal_axis(N, centred):  # type: ignore[no-untyped-def]
     """Direction that the normals avoid (cylinder), or along which they are constant (cone, centred)."""
-    m = np.zeros(3)
-    if centred:
-        for i in range(N.shape[0]):
-            m += N[i]
-        m /= N.shape[0]
-    S = np.zeros((3, 3))
-    for i in range(N.shape[0]):
-        d = N[i] - m
-        for a in range(3):
-            for b in range(3):
-                S[a, b] += d[a] * d[b]
-    _, V = np.linalg.eigh(S)
+    _, V = np.linalg.eigh(scatter(N, centroid(N) if centred else np.zeros(3)))
     return V[:, 0].copy()
 
 
@@ -268,78 +302,47 @@ def _normal_axis(N, centred):  # type: ignore[no-untyped-def]
 def start_cylinder(P, N, axis):  # type: ignore[no-untyped-def]
     """Circle (algebraic) of the points seen along `axis`."""
     th = np.zeros(SIZE)
-    e1x, e1y, e1z, e2x, e2y, e2z = tangent_frame_of(axis)
-    e1, e2 = np.array([e1x, e1y, e1z]), np.array([e2x, e2y, e2z])
-    c0 = np.zeros(3)
-    for i in range(P.shape[0]):
-        c0 += P[i]
-    c0 /= P.shape[0]
-    A, b, row = np.zeros((3, 3)), np.zeros(3), np.ones(3)
-    for i in range(P.shape[0]):
-        d = P[i] - c0
-        p, q = d @ e1, d @ e2
-        row[0], row[1] = 2.0 * p, 2.0 * q
-        s = p * p + q * q
-        for a in range(3):
-            b[a] += row[a] * s
-            for e in range(3):
-                A[a, e] += row[a] * row[e]
-    for a in range(3):
-        A[a, a] = A[a, a] * (1.0 + 1e-9) + 1e-18
-    if not solve_positive(A, b, 3):
+    e = tangent_frame(axis[0], axis[1], axis[2])
+    c = centroid(P)
+    n = P.shape[0]
+    rows, values = np.ones((n, 3)), np.zeros(n)
+    for i in range(n):
+        x, y, z = P[i, 0] - c[0], P[i, 1] - c[1], P[i, 2] - c[2]
+        p, q = x * e[0] + y * e[1] + z * e[2], x * e[3] + y * e[4] + z * e[5]
+        rows[i, 0], rows[i, 1] = 2.0 * p, 2.0 * q
+        values[i] = p * p + q * q
+    b, ok = _least_squares(rows, values)
+    if not ok:
         return th, False
-    th[:3] = c0 + b[0] * e1 + b[1] * e2
-    th[3:6] = axis
+    for a in range(3):
+        th[a] = c[a] + b[0] * e[a] + b[1] * e[3 + a]
+        th[3 + a] = axis[a]
     th[6] = np.sqrt(max(b[2] + b[0] * b[0] + b[1] * b[1], 1e-12))
-    outward = 0.0
-    for i in range(P.shape[0]):
-        outward += N[i] @ (P[i] - th[:3])
-    th[7] = 1.0 if outward >= 0 else -1.0
+    th[7] = _side(P, N, th, axis)
     return th, True
-
-
-@njit(cache=True)
-def tangent_frame_of(axis):  # type: ignore[no-untyped-def]
-    """`tangent_frame` of a (3,) array."""
-    frame = np.zeros(6)
-    th = np.zeros(SIZE)
-    th[:3] = axis
-    frame_of(PLANE, th, frame)
-    return frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
 
 
 @njit(cache=True)
 def start_cone(P, N, axis):  # type: ignore[no-untyped-def]
     """Apex from n . X = n . apex; the angle from n . axis = -sin(angle)."""
     th = np.zeros(SIZE)
-    c0 = np.zeros(3)
-    for i in range(P.shape[0]):
-        c0 += P[i]
-    c0 /= P.shape[0]
-    A, b = np.zeros((3, 3)), np.zeros(3)
+    c = centroid(P)
+    n = P.shape[0]
+    values = np.zeros(n)
     along = 0.0
-    for i in range(P.shape[0]):
-        s = N[i] @ (P[i] - c0)
+    for i in range(n):
         for a in range(3):
-            b[a] += N[i, a] * s
-            for e in range(3):
-                A[a, e] += N[i, a] * N[i, e]
-        along += N[i] @ axis
-    along /= P.shape[0]
-    trace = A[0, 0] + A[1, 1] + A[2, 2]
-    for a in range(3):
-        A[a, a] += 1e-6 * trace
-    if not solve_positive(A, b, 3):
+            values[i] += N[i, a] * (P[i, a] - c[a])
+            along += N[i, a] * axis[a] / n
+    b, ok = _least_squares(N, values)
+    if not ok:
         return th, False
-    th[:3] = c0 + b
-    inward = axis if (c0 - th[:3]) @ axis > 0 else -axis
-    outward = 0.0
-    for i in range(P.shape[0]):
-        d = P[i] - th[:3]
-        outward += N[i] @ (d - (d @ inward) * inward)
-    th[3:6] = inward
+    inward = 1.0 if b[0] * axis[0] + b[1] * axis[1] + b[2] * axis[2] < 0 else -1.0
+    for a in range(3):
+        th[a] = c[a] + b[a]
+        th[3 + a] = inward * axis[a]
     th[6] = min(max(np.arcsin(min(abs(along), 0.999)), 0.02), 1.5)
-    th[7] = 1.0 if outward >= 0 else -1.0
+    th[7] = _side(P, N, th, th[3:6])
     return th, True
 
 
@@ -369,51 +372,92 @@ def is_ellipsoid(th):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def trimmed_cost(kind, th, x, y, z, sigma, perspective, limit, stride):  # type: ignore[no-untyped-def]
+    """Sum of squared residuals, each at most limit^2, over every `stride`-th sample."""
+    frame, J = np.zeros(6), np.empty(9)
+    frame_of(kind, th, frame)
+    cost = 0.0
+    for i in range(0, x.shape[0], stride):
+        zm, cosine = depth_and_jacobian(kind, th, frame, x[i], y[i], perspective, J)
+        e = (z[i] - zm) / sigma[i] * min(1.0, cosine / GRAZING_COSINE)
+        cost += min(e * e, limit * limit) if np.isfinite(e) else limit * limit
+    return cost
+
+
+@njit(cache=True)
 def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_samples):  # type: ignore[no-untyped-def]
     """Fit every kind in the (5,) mask `kinds` to one set of samples, `points` (N, 3).
 
-    `P` and `N` (M, 3) are those points that have a tangent plane, and its normal; only starts use them.
+    `P` and `N` (M, 3) are those points that have a tangent plane, and its normal; only starts use them. All starts
+    run a few robust steps on a quarter of the samples; those that may still win are fitted to the end.
 
     Returns per kind: parameters (5, SIZE), mean squared residual, share kept, and the criterion
     `trimmed cost / correlated_samples + p ln n` by which kinds compete (Schwarz), infinite where a kind does not fit.
     """
     ths = np.zeros((5, SIZE))
     mean2, kept, score = np.full(5, np.inf), np.zeros(5), np.full(5, np.inf)
-    free = np.zeros(9, np.bool_)
     n = x.shape[0]
     price = np.log(max(n / correlated_samples, 2.0))
+    starts, start_kind, rough = np.zeros((6, SIZE)), np.full(6, -1), np.full(6, np.inf)
     if kinds[PLANE]:
-        th = start_plane(points)
-        ths[PLANE], _, mean2[PLANE], kept[PLANE], cost = fit_robust(PLANE, th, x, y, z, sigma, perspective, free, 4)
-        score[PLANE] = cost / correlated_samples + 3 * price
-    if P.shape[0] < 10:
-        return ths, mean2, kept, score
-    sphere, ok = start_sphere(P, N)
-    if ok and (kinds[SPHERE] or kinds[QUADRIC]):
-        sphere, _, m, k, cost = fit_robust(SPHERE, sphere, x, y, z, sigma, perspective, free, 4)
-        if kinds[SPHERE]:
-            ths[SPHERE], mean2[SPHERE], kept[SPHERE] = sphere, m, k
-            score[SPHERE] = cost / correlated_samples + 4 * price
-    if kinds[CYLINDER] or kinds[CONE]:
+        starts[0], start_kind[0] = start_plane(points), PLANE
+    if P.shape[0] >= 10:
+        if kinds[SPHERE] or kinds[QUADRIC]:
+            starts[1], ok = start_sphere(P, N)
+            start_kind[1] = SPHERE if ok else -1
         for attempt in range(2):
-            axis = _normal_axis(N, attempt == 1)
-            th, ok = start_cylinder(P, N, axis)
-            if ok and kinds[CYLINDER]:
-                th, _, m, k, cost = fit_robust(CYLINDER, th, x, y, z, sigma, perspective, free, 4)
-                s = cost / correlated_samples + 5 * price
-                if s < score[CYLINDER] and th[6] < 10.0:
-                    ths[CYLINDER], mean2[CYLINDER], kept[CYLINDER], score[CYLINDER] = th, m, k, s
+            axis = normal_axis(N, attempt == 1)
+            if kinds[CYLINDER]:
+                starts[2 + 2 * attempt], ok = start_cylinder(P, N, axis)
+                start_kind[2 + 2 * attempt] = CYLINDER if ok else -1
             if kinds[CONE]:
-                th, ok = start_cone(P, N, axis)
-                if ok:
-                    th, _, m, k, cost = fit_robust(CONE, th, x, y, z, sigma, perspective, free, 4)
-                    s = cost / correlated_samples + 6 * price
-                    if s < score[CONE] and 0.03 < th[6] < 1.45:
-                        ths[CONE], mean2[CONE], kept[CONE], score[CONE] = th, m, k, s
-    if kinds[QUADRIC] and ok and sphere[3] < 10.0:
-        th = quadric_of_sphere(sphere)
-        th, _, m, k, cost = fit_robust(QUADRIC, th, x, y, z, sigma, perspective, free, 4)
-        if is_ellipsoid(th):
-            ths[QUADRIC], mean2[QUADRIC], kept[QUADRIC] = th, m, k
-            score[QUADRIC] = cost / correlated_samples + 9 * price
+                starts[3 + 2 * attempt], ok = start_cone(P, N, axis)
+                start_kind[3 + 2 * attempt] = CONE if ok else -1
+    free = np.zeros(9, np.bool_)
+    stride = max(1, n // ROUGH_SAMPLES)
+    rx, ry, rz, rs = x[::stride].copy(), y[::stride].copy(), z[::stride].copy(), sigma[::stride].copy()
+    best_rough = np.inf
+    for k in range(6):
+        kind = start_kind[k]
+        if kind < 0:
+            continue
+        th = starts[k].copy()
+        for _ in range(2):
+            scale = _middle_scale(kind, th, rx, ry, rz, rs, perspective)
+            th, _, _, _ = refine(kind, th, rx, ry, rz, rs, perspective, 2, scale, TRIM_SIGMAS, free)
+            if scale < 1.2:
+                break
+        starts[k] = th
+        rough[k] = trimmed_cost(kind, th, rx, ry, rz, rs, perspective, ROUGH_LIMIT, 1) / correlated_samples
+        best_rough = min(best_rough, rough[k])
+    # A start that is clearly behind after the rough fit is not going to win.
+    allowed = 2.0 * best_rough + 0.5 * rx.shape[0] / correlated_samples
+    for k in range(6):
+        kind = start_kind[k]
+        if kind < 0 or rough[k] > allowed or not kinds[kind]:
+            continue
+        th, _, m, share, cost = fit_robust(kind, starts[k].copy(), x, y, z, sigma, perspective, free, 2)
+        s = cost / correlated_samples + FREEDOM[kind] * price
+        if s < score[kind] and _is_sane(kind, th):
+            ths[kind], mean2[kind], kept[kind], score[kind] = th, m, share, s
+    if kinds[QUADRIC] and start_kind[1] >= 0 and starts[1, 3] < LARGEST_RADIUS_M:
+        # Nine parameters explain most things: they are tried when nothing simpler does.
+        simple = np.min(score)
+        if simple > n / correlated_samples * QUADRIC_PER_SAMPLE:
+            th = quadric_of_sphere(starts[1])
+            th, _, m, share, cost = fit_robust(QUADRIC, th, x, y, z, sigma, perspective, free, 3)
+            if is_ellipsoid(th):
+                ths[QUADRIC], mean2[QUADRIC], kept[QUADRIC] = th, m, share
+                score[QUADRIC] = cost / correlated_samples + 9 * price
     return ths, mean2, kept, score
+
+
+@njit(cache=True)
+def _is_sane(kind, th):  # type: ignore[no-untyped-def]
+    if kind == CYLINDER:
+        return th[6] < LARGEST_RADIUS_M
+    if kind == SPHERE:
+        return th[3] < LARGEST_RADIUS_M
+    if kind == CONE:
+        return 0.03 < th[6] < 1.45
+    return True

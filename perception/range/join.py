@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from perception.range import fit
 from perception.range.finish import FREE, Samples, thinned
-from perception.range.surfaces import PLANE, depth_on
+from perception.range.surfaces import PLANE, depth_on, depths_on
 
 Array = NDArray[np.float64]
 
 PAIR_SAMPLES = 150
 JOINED_SHARE = 0.85
 JOINED_MEAN_SQUARE = 1.6
+NEAR_SAMPLES = 16
+NEAR_SIGMAS = 25.0
 SCRAP_SHARE = 0.1
 SCRAP_SIGMAS = 6.0
 LARGEST_TURN_RAD = 0.2
@@ -29,13 +32,16 @@ def join_pieces(
     Parameters of the surviving labels are updated in place.
     """
     owner = list(range(1, len(kinds) + 1))
+    if len(kinds) < 2:
+        return owner
     order = sorted(range(len(kinds)), key=lambda k: -samples[k].x.size)
     thin = [thinned(s, PAIR_SAMPLES) for s in samples]
+    near = _nearness(kinds, parameters, samples, bool(packed[0] > 0))
     for position, big in enumerate(order):
         if owner[big] != big + 1:
             continue
         for small in order[position + 1 :]:
-            if owner[small] != small + 1 or samples[small].x.size < 4:
+            if owner[small] != small + 1 or not near[big, small]:
                 continue
             if _is_scrap(kinds, parameters, samples, big=big, small=small, perspective=bool(packed[0] > 0)):
                 owner[small] = big + 1
@@ -74,8 +80,6 @@ def _joint_fit(
         turn = float(th[:3] @ parameters[small][:3])
         if turn < np.cos(LARGEST_TURN_RAD):
             return None
-    if not _near(kind, th, b, perspective):
-        return None
     both = _together(a, b)
     joint, _, _, _, _ = fit.fit_robust(
         kind, th, both.x, both.y, both.z, both.sigma, perspective, FREE, 3
@@ -89,11 +93,34 @@ def _joint_fit(
     return np.asarray(joint)
 
 
-def _near(kind: int, th: Array, s: Samples, perspective: bool) -> bool:
-    """Whether the surface, extended, passes near the piece: a cheap refusal before the joint fit."""
-    e = np.empty(s.x.size)
-    fit.residuals(kind, th, s.x, s.y, s.z, s.sigma, perspective, e)
-    return bool(np.nanmedian(np.abs(e)) < 25.0) if np.isfinite(e).mean() > 0.5 else False
+def _nearness(
+    kinds: list[int], parameters: list[Array], samples: list[Samples], perspective: bool
+) -> NDArray[np.bool_]:
+    """(n, n) whether surface i, extended, passes near most of piece j: a cheap refusal before the joint fits."""
+    few = [thinned(s, NEAR_SAMPLES) for s in samples]
+    starts = np.cumsum([0] + [s.x.size for s in few])
+    x, y, z, sigma = (np.concatenate([getattr(s, name) for s in few]) for name in ("x", "y", "z", "sigma"))
+    return np.asarray(
+        _near_matrix(np.array(kinds), np.stack(parameters), starts, x, y, z, sigma, perspective)
+    )
+
+
+@njit(cache=True)
+def _near_matrix(kinds, ths, starts, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def] # noqa: PLR0917
+    n = kinds.shape[0]
+    near = np.zeros((n, n), np.bool_)
+    for i in range(n):
+        for j in range(n):
+            size = starts[j + 1] - starts[j]
+            if i == j or size < 4:
+                continue
+            inside = 0
+            for k in range(starts[j], starts[j + 1]):
+                zm = depth_on(kinds[i], ths[i], x[k], y[k], perspective)
+                if abs(z[k] - zm) < NEAR_SIGMAS * sigma[k]:
+                    inside += 1
+            near[i, j] = 2 * inside > size
+    return near
 
 
 def _together(a: Samples, b: Samples) -> Samples:
@@ -113,7 +140,8 @@ def _gap_between(depth_m: Array, packed: Array, surface: tuple[int, Array], a: S
     v = np.clip(np.rint(y * packed[2] + packed[4]).astype(int), 0, depth_m.shape[0] - 1)
     seen = depth_m[v, u]
     perspective = bool(packed[0] > 0)
-    model = np.array([depth_on(*surface, p, q, perspective) for p, q in zip(x, y, strict=True)])
+    model = np.empty(x.size)
+    depths_on(*surface, x, y, perspective, model)
     slack = 6.0 * float(np.median(a.sigma))
     behind = seen > model + np.maximum(slack, 3.0 * np.abs(seen) / packed[1] if perspective else 3.0 / packed[1])
     return bool(np.mean(behind) > BEHIND_SHARE)

@@ -28,7 +28,7 @@ Labels = NDArray[np.int32]
 Flags = NDArray[np.bool_]
 
 LEAST_PIXELS_AT_256 = 24  # per 256 x 256 pixels of image
-FIT_SAMPLES = 120
+FIT_SAMPLES = 100
 LEAST_FLAT_BLOCKS = 24  # a smaller flat patch may be a facet of something bent; whole components decide about it
 STEEP_SLOPE = 7.0  # what is left once the large surfaces are named may be seen as steep as 82 degrees
 LEAST_CURVED_BLOCKS = 16  # smaller things wait for the pixels themselves
@@ -84,7 +84,7 @@ def segment(depth_m: Array, sensor: RangeSensorModel, noise: NoiseModel) -> tupl
     kinds, table = found.arrays()
     claim_pixels(depth_m, packed, law, blocks, size, kinds, table, labels)
     if size > 1:
-        labels = reclaimed(depth_m, packed, law, labels, found)
+        labels = reclaimed(depth_m, packed, law, labels, found, sweeps=1)
         labels = _finer(depth_m, sensor, noise, labels, found=found, size=size // 2, least=least)
     return reclaimed(depth_m, packed, law, labels, found), found, noise
 
@@ -202,9 +202,10 @@ def _explain(
     if best is None:
         return False
     kind, th = best
-    refit = _fit_best(grid, best_blocks.astype(np.int64))
-    if refit is not None:
-        kind, th = refit[0], refit[1]
+    if whole is None or best_blocks.size < 0.9 * members.size:
+        refit = _fit_best(grid, best_blocks.astype(np.int64))
+        if refit is not None:
+            kind, th = refit[0], refit[1]
     label = found.add(kind, th)
     blocks.ravel()[best_blocks] = label
     free.ravel()[best_blocks] = False

@@ -109,6 +109,13 @@ def depth_on(kind, th, x, y, perspective):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def depths_on(kind, th, x, y, perspective, out):  # type: ignore[no-untyped-def]
+    """`depth_on` for arrays x, y (N,) into `out` (N,)."""
+    for i in range(x.shape[0]):
+        out[i] = depth_on(kind, th, x[i], y[i], perspective)
+
+
+@njit(cache=True)
 def normal_on(kind, th, px, py, pz):  # type: ignore[no-untyped-def]
     """Unit gradient of the surface at a point on it (not oriented)."""
     if kind == PLANE:

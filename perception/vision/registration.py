@@ -7,6 +7,7 @@ known pose, and Cauchy weights (Huber, Robust Statistics, 1981) so that labels, 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -28,6 +29,9 @@ GROWTH_SIGMA_PX = 2.0
 EDGE_BIAS_SIGMA_PX = 0.8  # a drawn or real cast shadow moves a whole outline by about 1 px
 REGISTERED_SIGMA_PX = 0.15  # of the panel as a whole
 MIN_VISIBLE = 16  # fewer edge samples in the image say nothing about the panel
+
+
+V = TypeVar("V", bound=View)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -83,6 +87,16 @@ def register(gray: Image, view: View, panel: Panel) -> Registration:
         shift_sigma_px={name: sigma for name, (_, sigma, _) in local.items()},
         edge_share={name: share for name, (_, _, share) in local.items()},
     )
+
+
+def follow_edges(gray: Image, view: V, outline: Outline) -> V:
+    """`view` moved so that one outline lies on the image's edges; the view itself when too few are found."""
+    smooth = np.asarray(cv2.GaussianBlur(gray.astype(np.float32), (0, 0), SMOOTHING_SIGMA_PX), np.float32)
+    slope_noise = noise_sigma(gray) * 0.35
+    delta = np.zeros(len(view.prior_sigma))
+    for window in (12.0, *WINDOWS_PX):
+        delta, _ = _step(smooth, slope_noise, view, delta, edges=outline, window_px=window)
+    return view.moved(delta)
 
 
 def noise_sigma(gray: Image) -> float:

@@ -1,0 +1,162 @@
+"""The plate in an overview: four robust lines around what differs from the room, and the view straight onto it.
+
+Sides that the image cuts off are completed from the known proportions. What follows needs the scale to a few per cent
+only: objects are measured in the original image again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.vision.image import Image
+from perception.vision.outline import rectangle
+from perception.vision.registration import follow_edges
+from perception.vision.view import Array, PlaneView, homography
+
+COARSE_WIDTH_PX = 160
+TYPICAL_FOCAL = 1.25  # of the longer image side: a lens of 44 degrees; completes a side that is cut off
+LEAST_SHARE = 0.25  # of the image: a smaller plate is not an overview
+SIDE_POINTS = 40
+FOUND_SIGMA_PX = 5.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Plate:
+    """A plate found in an image.
+
+    Attributes:
+        view: plate metres (origin in the middle, y up) to pixels.
+        sides_seen: top, right, bottom, left: whether the image shows that side.
+    """
+
+    view: PlaneView
+    sides_seen: tuple[bool, bool, bool, bool]
+
+
+def find_plate(gray: Image, width_m: float, height_m: float, *, focal_px: float | None = None) -> Plate | None:
+    """The plate of known size that fills most of the image, upright within 45 degrees; None when there is none."""
+    shrink = max(1.0, gray.shape[1] / COARSE_WIDTH_PX)
+    small = cv2.resize(gray, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
+    mask = _plate_mask(small)
+    if mask.mean() < LEAST_SHARE:
+        return None
+    lines = [_side(mask, side) for side in range(4)]
+    focal = (focal_px or TYPICAL_FOCAL * max(gray.shape)) / shrink
+    corners = _corners(lines, mask.shape, width_m / height_m, focal)
+    if corners is None:
+        return None
+    corners_px = (corners + 0.5) * shrink - 0.5
+    w, h = width_m / 2, height_m / 2
+    corners_m = np.array([[-w, h], [w, h], [w, -h], [-w, -h]])
+    view = PlaneView(px_from_plate=homography(corners_m, corners_px), corners_m=corners_m, sigma_px=FOUND_SIGMA_PX)
+    outline = rectangle(0.0, 0.0, 0.0, width_m=width_m, height_m=height_m, count=SIDE_POINTS)
+    return Plate(view=follow_edges(gray, view, outline), sides_seen=tuple(line is not None for line in lines))  # type: ignore[arg-type]
+
+
+def _plate_mask(small: Image) -> NDArray[np.bool_]:
+    """Largest bright or dark region around the middle of the picture."""
+    smooth = cv2.GaussianBlur(small, (0, 0), 1.5)
+    # Logarithms: a plate keeps its ratio to the room where the light fades. Glare and white faces are held back.
+    level = np.log(smooth.astype(np.float32) + 4.0)
+    held = np.minimum(level, float(np.median(level)) + 0.2)
+    low, high = float(np.percentile(held, 1)), float(held.max())
+    coded = np.clip((held - low) / max(high - low, 1e-3) * 255.0, 0, 255).astype(np.uint8)
+    _, bright = cv2.threshold(coded, 0, 1, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    middle = bright[bright.shape[0] // 4: -bright.shape[0] // 4, bright.shape[1] // 4: -bright.shape[1] // 4]
+    mask = bright if middle.mean() >= 0.5 else 1 - bright
+    mask = cv2.morphologyEx(np.pad(mask, 12), cv2.MORPH_CLOSE, np.ones((13, 13), np.uint8))[12:-12, 12:-12]
+    mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((7, 7), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
+    if count < 2:
+        return np.zeros(mask.shape, bool)
+    return np.asarray(labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()))
+
+
+def _side(mask: NDArray[np.bool_], side: int) -> Array | None:
+    """(a, b, c) of the line a x + b y = c along the top, right, bottom or left border; None when the image cuts it off."""
+    turned = mask if side in (0, 2) else mask.T
+    columns = np.flatnonzero(turned.any(axis=0))
+    if len(columns) < 12:
+        return None
+    columns = columns[len(columns) // 12: -len(columns) // 12]
+    last = turned.shape[0] - 1
+    first = turned[:, columns].argmax(axis=0) if side in (0, 3) else last - turned[::-1, columns].argmax(axis=0)
+    free = (first > 1) & (first < last - 1)
+    if free.mean() < 0.35:
+        return None
+    x, y = columns[free].astype(float), first[free].astype(float) + (-0.5 if side in (0, 3) else 0.5)
+    slope, start = _robust_line(x, y)
+    line = np.array([-slope, 1.0, start])
+    return line if side in (0, 2) else line[[1, 0, 2]]
+
+
+def _robust_line(x: Array, y: Array) -> tuple[float, float]:
+    """Slope and intercept by least squares with Cauchy weights from a median start."""
+    half = len(x) // 2
+    pairs = (y[half:half * 2] - y[:half]) / np.maximum(x[half:half * 2] - x[:half], 1e-9)
+    slope = float(np.median(pairs))
+    start = float(np.median(y - slope * x))
+    for _ in range(8):
+        r = y - slope * x - start
+        w = 1.0 / (1.0 + (r / max(1.5 * float(np.median(np.abs(r))), 0.4)) ** 2)
+        A = np.column_stack([x, np.ones_like(x)])
+        slope, start = np.linalg.solve(A.T @ (w[:, None] * A), A.T @ (w * y))
+    return float(slope), float(start)
+
+
+def _corners(lines: list[Array | None], shape: tuple[int, ...], aspect: float, focal: float) -> Array | None:
+    """(4, 2) corners, upper left first and clockwise; a missing side is placed by the known proportions."""
+    seen = sum(line is not None for line in lines)
+    if seen < 2:
+        return None
+    top, right, bottom, left = lines
+    height, width = shape
+    border = [np.array([0.0, 1.0, -0.5]), np.array([1.0, 0.0, width - 0.5]), np.array([0.0, 1.0, height - 0.5]), np.array([1.0, 0.0, -0.5])]
+    full = [line if line is not None else edge for line, edge in zip(lines, border, strict=True)]
+    corners = np.array([_cut(full[3], full[0]), _cut(full[0], full[1]), _cut(full[1], full[2]), _cut(full[2], full[3])])
+    if not np.isfinite(corners).all():
+        return None
+    missing = [k for k, line in enumerate(lines) if line is None]
+    if len(missing) == 1:
+        return _completed(corners, missing[0], middle=np.array([width - 1.0, height - 1.0]) / 2, focal=focal, aspect=aspect)
+    return corners
+
+
+def _completed(corners: Array, missing: int, *, middle: Array, focal: float, aspect: float) -> Array | None:
+    """Corners of a rectangle of known proportions of which one side is cut off.
+
+    The two sides that meet the missing one meet in the vanishing point of their direction d; the opposite side lies in
+    the plane with normal m. The other direction is m x d, so the whole plane is known.
+    """
+    order = np.roll(np.arange(4), -missing)  # the missing side runs from order[0] to order[1]
+    far_a, far_b, near_b, near_a = corners[order]
+    ratio = aspect if missing in (1, 3) else 1.0 / aspect  # of the sides that meet the missing one over the opposite one
+    a, b = (np.append(p - middle, focal) for p in (near_a, near_b))
+    m = np.cross(a, b)
+    d = np.cross(np.cross(a, np.append(far_a - middle, focal)), np.cross(b, np.append(far_b - middle, focal)))
+    d = d / np.linalg.norm(d)
+    across = np.cross(m, d)
+    across = across / np.linalg.norm(across)
+    # b lies on the ray of near_b with b - a along `across`: a + length * across = t * ray_b, with a at depth 1.
+    solved = np.linalg.lstsq(np.column_stack([across, -b]), -a, rcond=None)[0]
+    length = abs(float(solved[0])) * ratio
+    towards = 1.0 if float(np.dot((a + 0.1 * length * d)[:2] / (a + 0.1 * length * d)[2] - a[:2] / a[2], far_a - near_a)) > 0 else -1.0
+    out = corners.copy()
+    for index, start in ((order[0], a), (order[1], b * float(solved[1]))):
+        point = start + towards * length * d
+        if point[2] <= 0:
+            return None
+        out[index] = middle + focal * point[:2] / point[2]
+    return out
+
+
+def _cut(first: Array, second: Array) -> Array:
+    """Crossing of two lines; NaN for parallel ones."""
+    A = np.array([first[:2], second[:2]])
+    if abs(float(np.linalg.det(A))) < 1e-9:
+        return np.full(2, np.nan)
+    return np.asarray(np.linalg.solve(A, [first[2], second[2]]))

@@ -36,6 +36,7 @@ def _app() -> Callable[[], None]:
     from service.commands.develop import conform, emulate, new_driver
     from service.commands.doctor import doctor
     from service.commands.serve import serve
+    from service.commands.warm import warm
 
     app = typer.Typer(
         help="A robot cell that inspects and works industrial control panels.",
@@ -50,6 +51,7 @@ def _app() -> Callable[[], None]:
     app.add_typer(tasks.app, name="task")
     app.command()(tasks.stop)
     app.command()(conform)
+    app.command()(warm)
     app.command()(emulate)
     app.command("new-driver")(new_driver)
     return app

@@ -161,6 +161,17 @@ class Panelwright:
         self._is_settled.set()
         if self._error is not None and self._server is not None:
             self._server.stop()
+        if self._error is None and not self.service.inline:
+            self._warm()
+
+    def _warm(self) -> None:
+        """Load the hot loops while nobody waits; a fault here will show when they are used."""
+        from service.warm import warm
+
+        try:
+            warm()
+        except Exception:  # the first user gets it with its context
+            log.warning("warming up failed", exc_info=True)
 
 
 def _exit(_signal: int, _frame: FrameType | None) -> None:

@@ -12,7 +12,7 @@ from hal.config import Cell, load_cell
 from service.client import DEFAULT_URL, Client
 
 ROOT = Path(__file__).parents[2]
-console = Console(highlight=False)
+console = Console(highlight=False, soft_wrap=True)
 
 Url = Annotated[str, typer.Option("--url", help="Address of a running service.", show_default=True)]
 CellOption = Annotated[

@@ -1,0 +1,28 @@
+"""Compiles or loads the hot loops before somebody waits for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+
+def _vision() -> None:
+    from perception.vision.quadrangle import warm_up
+
+    warm_up()
+
+
+def _fusion() -> None:
+    from fusion.warm import warm_up
+
+    warm_up()
+
+
+STAGES: Mapping[str, Callable[[], None]] = {"vision": _vision, "fusion": _fusion}
+"""What the service process computes with. The cell and world processes warm their own loops when they start."""
+
+
+def warm(report: Callable[[str], None] = lambda _stage: None) -> None:
+    """Run each stage once. The first time on a machine this compiles for a minute or two; the result stays on disk."""
+    for name, stage in STAGES.items():
+        report(name)
+        stage()

@@ -21,9 +21,9 @@ Pixels = NDArray[np.uint8]
 
 NOMINAL_EXPOSURE_S = 0.010
 GLOW_RADIUS_M = 0.035
-GLOW_GAIN = 0.9
+GLOW_GAIN = 0.4
 GLARE_RADIUS_M = 0.006
-GLARE_GAIN = 0.5
+GLARE_GAIN = 0.3
 GLOW_STEP_PX = 4  # the glow is smooth: computed on every fourth pixel
 
 

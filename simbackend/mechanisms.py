@@ -45,7 +45,7 @@ class Friction:
     damping: float = 0.0  # N m s/rad or N s/m
 
     def __post_init__(self) -> None:
-        # The engine's stop catches a part only after the tick in which it passed: a part that cannot race passes by little.
+        # The engine's stop catches a part only after the tick in which it passed: damping keeps it from racing.
         self.engine.changeDynamics(self.body, JOINT, jointDamping=self.damping)
 
     def lock(self) -> None:

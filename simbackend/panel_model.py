@@ -32,6 +32,7 @@ from simbackend import textures
 from simbackend.panel_state import Built
 from simbackend.urdf import Colour, along, at, box, cylinder, inertial, joint, link, shape, sphere
 
+LENS_M = 0.0004
 FACE_HEIGHT_M = 0.001
 BAR_THICKNESS_M = 0.016
 WHEEL_SEGMENTS = 20
@@ -97,8 +98,18 @@ def object_model(built: Built) -> ObjectModel:  # one a kind
 
 
 def light_urdf(light: Light) -> str:
-    """A border light: a disc whose face is at the light's place."""
-    return robot(_disc(light.radius_m, light.position_m[2], (0.5, 0.5, 0.5)))
+    """A border light: a dark holder (base) with a thin lens (link 0) whose face is at the light's place.
+
+    Were the whole body to shine, its flank would move the middle of the spot by half a pixel in a slanting view.
+    """
+    low_m = max(light.position_m[2] - LENS_M, 1e-4)
+    lines = _base(shape(at(0, 0, low_m / 2), cylinder(light.radius_m, low_m), INK))
+    lines += link(
+        "lens",
+        inertial(0.0, (0, 0, 0), (0.0, 0.0, 0.0)),
+        shape(at(0, 0, LENS_M / 2), cylinder(light.radius_m, LENS_M), STEEL),
+    )
+    return robot([*lines, *joint("lens", "fixed", "base", "lens", at(0, 0, low_m))])
 
 
 def robot(lines: list[str]) -> str:

@@ -44,6 +44,7 @@ NEAR_M = 0.14  # a mechanism is alive while the finger tips are nearer than this
 # Parts of the panel never collide with one another (a button sinks into its plate), only with the arm.
 ARM_GROUP, PANEL_GROUP = 1, 2
 STATE_SLACK_RAD = 0.2
+LENS = 0  # the link of a border light that shines
 LIGHT_GLOW = (1.0, 0.97, 0.88)
 LIGHT_OFF = (0.42, 0.42, 0.40)
 DIM = 0.35
@@ -71,6 +72,7 @@ class PanelWorld:
         self.mechanisms: dict[str, Mechanism] = {}
         self.lights_on = [0.0] * len(cell.panel.lights)
         self._first_body = engine.getNumBodies()
+        self._light_names = frozenset(light.name for light in cell.panel.lights)
         self._pictures: list[tuple[Quad, RigidTransform]] = []
         self._load_room(cell.file.workspace.floor_z_m)
         self._load_plate()
@@ -253,8 +255,10 @@ class PanelWorld:
 
     def _paint(self, name: str, colour: Colour, level: float, *, on: bool) -> None:
         r, g, b = colour
-        self.scene.paint(self.bodies[name], (level * r, level * g, level * b))
-        self.scene.shine(self.bodies[name], on=on)
+        body = self.bodies[name]
+        link = LENS if name in self._light_names else -1
+        self.scene.paint(body, link, (level * r, level * g, level * b))
+        self.scene.shine(body, link, on=on)
 
     def switch_lights(self, on: list[bool]) -> None:
         """Border lights, in the order of the panel file."""

@@ -91,7 +91,7 @@ class Scene:
         self._mesh = meshes.merge(self._meshes)
         self._albedo = np.concatenate(self._colours)
         self._surfaces = np.concatenate(self._surface)
-        self._still = [part for part in self._parts if part.body < 0]
+        self._glow = np.zeros(self._rows, bool)
         self._moving: dict[tuple[int, int], list[slice]] = {}
         for part in self._parts:
             if part.body >= 0:
@@ -99,24 +99,18 @@ class Scene:
         for channels in (0, 1, 3):
             self._compiled[channels] = _Compiled(self._albedo, self._pictures, channels)
 
-    def paint(self, body: int, colour: tuple[float, float, float]) -> None:
-        """Give a whole body another colour; more than 1 shines."""
+    def paint(self, body: int, link: int, colour: tuple[float, float, float]) -> None:
+        """Give a link (-1: the base) another colour; more than 1 shines."""
         for part in self._parts:
-            if part.body == body:
+            if (part.body, part.link) == (body, link):
                 for compiled in self._compiled.values():
                     compiled.albedo[part.rows] = compiled.mix(np.asarray(colour))
 
-    def shine(self, body: int, *, on: bool) -> None:
-        """A shining body looks alike from all sides."""
+    def shine(self, body: int, link: int, *, on: bool) -> None:
+        """What shines looks alike from all sides."""
         for part in self._parts:
-            if part.body == body:
+            if (part.body, part.link) == (body, link):
                 self._glow[part.rows] = on
-
-    @property
-    def _glow(self) -> NDArray[np.bool_]:
-        if not hasattr(self, "_glowing"):
-            self._glowing = np.zeros(self._rows, bool)
-        return self._glowing
 
     def draw(
         self,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from hal.calibration import CameraIntrinsics
-from simbackend.arm_model import t3, base_from_flange
+from simbackend.arm_model import base_from_flange, t3
 from simbackend.camera import scaled
 from simbackend.camera_sensor import CameraSensor, SensorOptions
 from simbackend.client import true_mount
@@ -97,17 +97,20 @@ def test_border_lights_appear_where_truth_lens_and_mount_put_them(bench: SimCell
     q = arm.read_state(deadline=bench.deadline()).value.position_rad
     base_from_camera = base_from_flange(t3().capabilities.links, q) * true_mount(bench.cell, draws, "wrist_camera")
     base_from_panel = RigidTransform.from_matrix(arm.truth().base_from_panel_matrix)
-    places = np.array([light.position_m for light in bench.cell.panel.lights])
+    panel = bench.cell.panel
+    built = [
+        panel.tolerances.light_m * draws.stream(f"light/{light.name}").standard_normal(3) for light in panel.lights
+    ]
+    places = np.array([light.position_m for light in panel.lights]) + built
     expected = project((base_from_camera.inv() * base_from_panel).apply(places), lens)
     seen = [p for p in expected if 15 < p[0] < 625 and 15 < p[1] < 465]
-    assert len(seen) >= 2
+    assert len(seen) >= 2, expected
     rows, columns = np.mgrid[0:480, 0:640]
     for u, v in seen:
-        near = (np.hypot(columns - u, rows - v) < 9) & (difference > 90)
-        weight = np.where(near, 1.0, 0.0)
+        near = np.hypot(columns - u, rows - v) < 14
+        weight = np.where(near, np.clip(difference - 80.0, 0.0, 40.0), 0.0)
         found = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
-        # 0.1 mm of light tolerance is a tenth of a pixel; the thresholded rim costs the rest.
-        np.testing.assert_allclose(found, [u, v], atol=0.4)
+        np.testing.assert_allclose(found, [u, v], atol=0.15)
 
 
 def test_grey_levels_follow_radiance_and_exposure() -> None:
@@ -136,7 +139,7 @@ def test_a_border_light_brightens_the_plate_round_it() -> None:
     lamp = Emitter(colour=(1.0, 1.0, 1.0), position_m=(0.0, 0.0, 0.5), radius_m=0.008, is_border_light=True)
     gain = exposed(flat(level=0.3), CLEAN, lamp).astype(int) - exposed(flat(level=0.3)).astype(int)
     near, far = gain[58, 84], gain[10, 20]
-    assert near > 30
+    assert near > 15
     assert 0 <= far < near / 3
 
 

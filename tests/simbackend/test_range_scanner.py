@@ -40,7 +40,7 @@ def test_a_clean_scan_lies_on_the_true_plate(bench: SimCell, size: int) -> None:
     inside = (np.abs(on_panel[:, 0]) < 0.30) & (np.abs(on_panel[:, 1]) < 0.22)
     heights = on_panel[inside, 2]
     assert len(heights) > 0.2 * size * size
-    # Most of what is seen is bare plate, to a hundredth of a millimetre; the rest stands out of it and nothing lies under it.
+    # Most of it is bare plate, to a hundredth of a millimetre; the rest stands out of it, and nothing lies under it.
     assert np.mean(np.abs(heights) < 1e-5) > 0.6
     assert heights.min() > -1e-5
     assert 0.01 < heights.max() < 0.04

@@ -84,7 +84,7 @@ def test_the_nearer_surface_hides_the_farther_in_any_order() -> None:
 
 
 def test_a_ball_has_the_depth_of_a_ball() -> None:
-    ball = meshes.sphere(0.03).points_m + [0.02, -0.01, 0.4]
+    ball = meshes.sphere(0.03).points_m + np.array([0.02, -0.01, 0.4])
     _, depth = draw(ball, np.ones(len(ball)))
     d = rays()
     centre = np.array([0.02, -0.01, 0.4])

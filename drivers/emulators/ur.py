@@ -20,7 +20,7 @@ from drivers.emulators.base import WireEmulator
 from drivers.emulators.faults import FaultOptions
 from drivers.emulators.ports import Peer, TcpPort
 from hal.devices import Arm, Device
-from hal.errors import CellError, Unsupported
+from hal.errors import Unsupported
 from hal.strict import validate
 
 OUTPUT_TYPES = {
@@ -104,7 +104,6 @@ class UrEmulator(WireEmulator):
         self.period_s = 1.0 / options.rate_hz
         self.robot_mode, self.safety_mode, self.runtime = RUNNING, NORMAL, STOPPED
         self._start_s = time.monotonic()
-        self._cycle = 0
         self._parsers: dict[Peer, rtde.PackageParser] = {}
         self._outputs: dict[Peer, rtde.Recipe] = {}
         self._inputs: dict[Peer, rtde.Recipe] = {}
@@ -234,7 +233,6 @@ class UrEmulator(WireEmulator):
         """The watchdog of the program, then one data package to each client."""
         if self.runtime == PLAYING and time.monotonic() - self._beat_s > DEFAULT_WATCHDOG_S:
             self._end_program()
-        self._cycle += 1
         if not self._streams:
             return
         values = self._values()
@@ -247,14 +245,10 @@ class UrEmulator(WireEmulator):
         return self._data(peer, {**self._values(), "safety_mode": [PROTECTIVE_STOP]})
 
     def _values(self) -> dict[str, list[float]]:
-        try:
-            sample = self._backing.read_state(deadline=self.deadline())
-        except CellError:
-            self.robot_mode = 0
-            raise
+        sample = self._backing.read_state(deadline=self.deadline())
         position = [float(q) for q in sample.value.position_rad]
         return {
-            "timestamp": [self._cycle * float(self.period_s or 0.0)],
+            "timestamp": [round(time.monotonic() - self._start_s, 4)],
             "actual_q": position,
             "actual_qd": [float(v) for v in sample.value.velocity_rad_per_s],
             "target_q": position,

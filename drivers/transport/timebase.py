@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-DRIFT = 200e-6  # two free quartz clocks; the estimate may rise this fast, so one early frame is not believed for ever
+import math
+
+WINDOW_S = 2.0  # quartz clocks drift 0.2 ms apart in this time at 100 ppm
 RESTART_S = 1.0  # a device clock this far behind itself has been restarted
 
 
@@ -33,23 +35,25 @@ class Unwrapper:
 class HostTime:
     """Host time of device stamps. A frame can arrive late but never early, so the smallest difference is the truest:
 
-    offset_k = min(arrived - device, offset_{k-1} + DRIFT dt)
+    offset = min(arrived - device) over the last one to two windows, which lets two clocks drift apart.
     """
 
     def __init__(self) -> None:
-        self._offset_s: float | None = None
-        self._device_s = 0.0
-
-    def host_s(self, *, device_s: float, arrived_s: float) -> float:
-        """When a sample stamped `device_s` was taken, on the clock of `arrived_s`."""
-        delay_s = arrived_s - device_s
-        if self._offset_s is None or device_s < self._device_s - RESTART_S:
-            self._offset_s = delay_s
-        else:
-            self._offset_s = min(delay_s, self._offset_s + DRIFT * max(0.0, device_s - self._device_s))
-        self._device_s = device_s
-        return device_s + self._offset_s
+        self.reset()
 
     def reset(self) -> None:
         """The device was opened anew: its clock may have started again."""
-        self._offset_s = None
+        self._before_s = self._now_s = math.inf
+        self._window_end_s = -math.inf
+        self._device_s = -math.inf
+
+    def host_s(self, *, device_s: float, arrived_s: float) -> float:
+        """When a sample stamped `device_s` was taken, on the clock of `arrived_s`."""
+        if device_s < self._device_s - RESTART_S:
+            self.reset()
+        self._device_s = device_s
+        if arrived_s > self._window_end_s:
+            self._before_s, self._now_s = self._now_s, math.inf
+            self._window_end_s = arrived_s + WINDOW_S
+        self._now_s = min(self._now_s, arrived_s - device_s)
+        return device_s + min(self._before_s, self._now_s)

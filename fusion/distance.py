@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from fusion.exact import evaluate
 from fusion.batch import Batch, pack
+from fusion.exact import evaluate
 from fusion.measurement import Measurement
 from hal.geometry import Array, matrix_of
 

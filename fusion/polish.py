@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusion.exact import evaluate
 from fusion.batch import Batch
+from fusion.exact import evaluate
 from fusion.rows import accumulate, descend, rows
 from fusion.vectors import cholesky, compiled, move, solve_lower, solve_upper
 from hal.geometry import Array

@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion.distance import local_values
 from fusion.features import Feature, Kind, box_features, plane, point
-from fusion.measurement import Measurement, SensingClass, measurement
+from fusion.measurement import Measurement, measurement
 from hal.geometry import Array, matrix_of, transform
 
 # Class and sense of each kind of sensing in Table I: v vision, t touch, p proximity, r range.

@@ -1,0 +1,182 @@
+"""What fusion answers: the pose, how well it is known, what was not believed, what else fits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from fusion.batch import Batch
+from fusion.certify import Certificate, certificate
+from fusion.errors import Contradiction
+from fusion.evidence import log_evidence
+from fusion.measurement import Measurement
+from fusion.minima import Minimum
+from fusion.observability import FreeDirection
+from hal.geometry import Array, UncertainPose
+
+EVIDENCE_NEEDED = math.log(1000.0)  # for agreement against chance, once something was rejected
+EVIDENCE_PER_MISMATCH = 0.5  # each rejected measurement is a surprise: fewer are bad than good
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rejected:
+    """A measurement that was not used.
+
+    Attributes:
+        index: its place in the sequence given; -1 for the prior pose.
+        label: its label.
+        value: its local pose function at the answer.
+        limit: what a good one stays below.
+        reason: `mismatch`, or `duplicate of measurement 3`.
+    """
+
+    index: int
+    label: str
+    value: float
+    limit: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Alternative:
+    """Another pose that the data allow, for example the mirror image.
+
+    Attributes:
+        pose: base_from_object.
+        covariance: 6x6, translation then rotation, base axes.
+        cost: its truncated error; the answer's is the least.
+        odds: how probable it is relative to the answer, 0 to 1.
+        rejected: indices that it calls mismatched.
+    """
+
+    pose: RigidTransform
+    covariance: Array
+    cost: float
+    odds: float
+    rejected: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FusedPose:
+    """Where the object stands, and how well that is known.
+
+    Attributes:
+        pose: base_from_object.
+        covariance: 6x6 over (dx, dy, dz, rx, ry, rz), m and rad, base axes; free directions carry 10 object sizes or 10 rad.
+        chi_square: sum of the local pose functions of the measurements used.
+        dof: its degrees of freedom.
+        values: (N,) local pose function of every measurement given, at `pose`.
+        rejected: measurements not used, and why.
+        unobservable: motions that the measurements leave free; empty for a full pose.
+        alternatives: other poses that fit, most probable first.
+        evidence: log odds that the measurements used agree because of the pose, against chance.
+        certificate: proof that no other pose fits those measurements better, when asked for.
+    """
+
+    pose: RigidTransform
+    covariance: Array
+    chi_square: float
+    dof: int
+    values: Array
+    rejected: tuple[Rejected, ...]
+    unobservable: tuple[FreeDirection, ...]
+    alternatives: tuple[Alternative, ...]
+    evidence: float
+    certificate: Certificate | None = None
+
+    @property
+    def base_from_object(self) -> UncertainPose:
+        """The pose with its covariance, as the rest of the cell takes it."""
+        return UncertainPose(parent_from_child=self.pose, covariance=self.covariance)
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """True when another pose is at least a hundredth as probable."""
+        return any(a.odds > 0.01 for a in self.alternatives)
+
+
+def judged(
+    b: Batch,
+    best: Minimum,
+    others: list[Minimum],
+    index: Array,
+    given: Sequence[Measurement],
+    repeats: dict[int, int],
+    certify: bool,
+) -> FusedPose:
+    """The answer that a best minimum and the `others` make.
+
+    Args:
+        b: packed measurements; `index` (N,) says which of `given` each entry is, -1 for the prior.
+        best, others: distinct minima of the truncated error.
+        given: all measurements of the caller.
+        repeats: index of each duplicate, and of the measurement that it repeats.
+        certify: also ask for the certificate.
+
+    Raises:
+        Contradiction: the best set could agree by chance.
+    """
+    f = np.zeros(len(given))
+    own = index >= 0
+    f[index[own]] = best.local.values[own]
+    for repeat, first in repeats.items():
+        f[repeat] = f[first]
+    rejected = _rejected(b, best, index, given) + [
+        Rejected(index=i, label=given[i].label, value=float(f[i]), limit=0.0, reason=f"duplicate of measurement {first}")
+        for i, first in repeats.items()
+    ]
+    evidence = log_evidence(b, best.used, best.local)
+    mismatched = [r for r in rejected if r.reason == "mismatch"]
+    if mismatched and evidence < EVIDENCE_NEEDED + EVIDENCE_PER_MISMATCH * len(mismatched):
+        raise Contradiction.among(int(best.used.sum()), len(b.cls), [(r.index, r.label, r.value) for r in mismatched])
+    local = best.local
+    return FusedPose(
+        pose=local.base_from_object,
+        covariance=local.covariance,
+        chi_square=local.chi_square,
+        dof=local.dof,
+        values=f,
+        rejected=tuple(sorted(rejected, key=lambda r: r.index)),
+        unobservable=local.unobservable,
+        alternatives=() if local.unobservable else _alternatives(best, others, index),
+        evidence=evidence,
+        certificate=certificate(b, best.used, local) if certify else None,
+    )
+
+
+def _rejected(b: Batch, best: Minimum, index: Array, given: Sequence[Measurement]) -> list[Rejected]:
+    return [
+        Rejected(
+            index=int(index[k]),
+            label=given[index[k]].label if index[k] >= 0 else "prior pose",
+            value=float(best.local.values[k]),
+            limit=float(b.gate[k]),
+            reason="mismatch",
+        )
+        for k in np.flatnonzero(~best.used)
+    ]
+
+
+def _alternatives(best: Minimum, others: Sequence[Minimum], index: Array) -> tuple[Alternative, ...]:
+    made = [
+        Alternative(
+            pose=m.local.base_from_object,
+            covariance=m.local.covariance,
+            cost=m.cost,
+            odds=_odds(m, best),
+            rejected=tuple(int(i) for i in index[~m.used]),
+        )
+        for m in others
+        if not m.local.unobservable
+    ]
+    return tuple(sorted(made, key=lambda a: -a.odds))
+
+
+def _odds(m: Minimum, best: Minimum) -> float:
+    """exp(-delta/2) sqrt(det cov / det cov_best): share of the posterior around each (Laplace)."""
+    size = np.linalg.slogdet(m.local.covariance)[1] - np.linalg.slogdet(best.local.covariance)[1]
+    return float(np.exp(min(0.5 * (best.cost - m.cost) + 0.5 * size, 0.0)))

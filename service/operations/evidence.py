@@ -224,16 +224,25 @@ def _one_sigma_changes(
     changes: list[dict[int, Measurement]] = []
     for k, e in enumerate(evidence):
         changes += [{k: _measure(e, mounts[e.sensor], error)} for error in np.diag(e.sigmas)]
+    nominal = [_measure(e, mounts[e.sensor], np.zeros(len(e.sigmas))) for e in evidence]
     for sensor in sorted({e.sensor for e in evidence}):
         mount = mounts[sensor]
         for error in _one_sigma(mount.covariance):
-            moved = UncertainPose(
-                parent_from_child=perturbed(mount.parent_from_child, error), covariance=mount.covariance
-            )
+            wrong = perturbed(mount.parent_from_child, error) * mount.parent_from_child.inv()
             changes.append(
-                {k: _measure(e, moved, np.zeros(len(e.sigmas))) for k, e in enumerate(evidence) if e.sensor == sensor}
+                {
+                    k: _carried(nominal[k], e.base_from_flange * wrong * e.base_from_flange.inv())
+                    for k, e in enumerate(evidence)
+                    if e.sensor == sensor
+                }
             )
     return changes
+
+
+def _carried(m: Measurement, motion: RigidTransform) -> Measurement:
+    """The measurement that a sensor would give if it stood moved by `motion` (base frame)."""
+    R = matrix_of(motion)
+    return replace(m, mu_m=motion.apply(m.mu_m), C_m2=R @ m.C_m2 @ R.T, M=R @ m.M @ R.T)
 
 
 def _one_sigma(covariance: Array) -> Array:

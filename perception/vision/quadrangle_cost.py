@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.vision.quadrangle_jit import jit, product3
+from perception.vision.quadrangle_jit import cross3, jit, mix3, product3
 
 CONVERGED = 1e-9  # predicted fall of chi-square: 3e-5 of a standard deviation
 MAX_STEPS = 60
@@ -40,7 +40,7 @@ def rotation_of(w):  # type: ignore[no-untyped-def]
 @jit
 def turn_onto(a, b):  # type: ignore[no-untyped-def]
     """The smallest rotation that carries unit vector a onto unit vector b (not its opposite)."""
-    v = np.cross(a, b)
+    v = cross3(a, b)
     c = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     k = 1.0 / (1.0 + c)
     R = np.empty((3, 3))
@@ -74,9 +74,10 @@ def chi_square(R, t, X, m, A):  # type: ignore[no-untyped-def]
 @jit
 def expand(R, t, X, m, A, g, N, H):  # type: ignore[no-untyped-def]
     """Chi-square; fills half its gradient g (6,), Gauss-Newton matrix N and half the exact Hessian H (6, 6)."""
-    g[:] = 0.0
-    N[:] = 0.0
-    H[:] = 0.0
+    for a in range(6):
+        g[a] = 0.0
+        for b in range(6):
+            N[a, b] = H[a, b] = 0.0
     Ju = np.empty(6)
     Jv = np.empty(6)
     total = 0.0
@@ -211,7 +212,7 @@ def minimise(R, t, X, m, A):  # type: ignore[no-untyped-def]
         for a in range(6):
             fall -= g[a] * x[a]
         R_new = product3(rotation_of(x[3:]), R)
-        t_new = t + x[:3]
+        t_new = mix3(1.0, t, 1.0, x)
         if fall < CONVERGED:
             cost_new = chi_square(R_new, t_new, X, m, A)
             if cost_new <= cost:

@@ -1,4 +1,7 @@
-"""The compiler settings of the four-light pose, and the one small product that all its loops share."""
+"""The compiler settings of the four-light pose, and the small vector arithmetic that its loops share.
+
+Array expressions, `np.cross` and `@` would read better, but each costs up to a second of compile time where it stands.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +19,77 @@ def jit(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @jit
 def product3(A, B):  # type: ignore[no-untyped-def]
-    """3x3 product without the call into BLAS, which costs more than the product."""
+    """A @ B, 3x3."""
     C = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
             C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
     return C
+
+
+@jit
+def times3(M, v):  # type: ignore[no-untyped-def]
+    """M @ v, 3x3 and (3,)."""
+    x = np.empty(3)
+    for i in range(3):
+        x[i] = M[i, 0] * v[0] + M[i, 1] * v[1] + M[i, 2] * v[2]
+    return x
+
+
+@jit
+def back3(M, v, factor):  # type: ignore[no-untyped-def]
+    """factor * M^T @ v, 3x3 and (3,)."""
+    x = np.empty(3)
+    for i in range(3):
+        x[i] = factor * (M[0, i] * v[0] + M[1, i] * v[1] + M[2, i] * v[2])
+    return x
+
+
+@jit
+def dot3(a, b):  # type: ignore[no-untyped-def]
+    """a . b, (3,) each."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@jit
+def cross3(a, b):  # type: ignore[no-untyped-def]
+    """a x b, (3,) each."""
+    x = np.empty(3)
+    x[0] = a[1] * b[2] - a[2] * b[1]
+    x[1] = a[2] * b[0] - a[0] * b[2]
+    x[2] = a[0] * b[1] - a[1] * b[0]
+    return x
+
+
+@jit
+def mix3(p, a, q, b):  # type: ignore[no-untyped-def]
+    """p a + q b for numbers p, q and (3,) a, b."""
+    x = np.empty(3)
+    for i in range(3):
+        x[i] = p * a[i] + q * b[i]
+    return x
+
+
+@jit
+def unit3(a):  # type: ignore[no-untyped-def]
+    """a / |a|, (3,)."""
+    norm = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+    x = np.empty(3)
+    for i in range(3):
+        x[i] = a[i] / norm
+    return x
+
+
+@jit
+def put1(into, values):  # type: ignore[no-untyped-def]
+    """Copy a vector."""
+    for i in range(values.shape[0]):
+        into[i] = values[i]
+
+
+@jit
+def put2(into, values):  # type: ignore[no-untyped-def]
+    """Copy a matrix."""
+    for i in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            into[i, j] = values[i, j]

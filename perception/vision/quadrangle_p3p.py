@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.vision.quadrangle_jit import jit, product3
+from perception.vision.quadrangle_jit import cross3, dot3, jit, mix3, product3, put2, unit3
 
 
 @jit
@@ -51,15 +51,12 @@ def cofactors(M):  # type: ignore[no-untyped-def]
 @jit
 def triad(p0, p1, p2):  # type: ignore[no-untyped-def]
     """Orthonormal frame (columns) of three points: along p1 - p0, in their plane, normal to it."""
-    a = p1 - p0
-    a = a / np.sqrt(np.sum(a * a))
-    n = np.cross(a, p2 - p0)
-    n = n / np.sqrt(np.sum(n * n))
-    b = np.cross(n, a)
+    a = unit3(mix3(1.0, p1, -1.0, p0))
+    n = unit3(cross3(a, mix3(1.0, p2, -1.0, p0)))
+    b = cross3(n, a)
     F = np.empty((3, 3))
-    F[:, 0] = a
-    F[:, 1] = b
-    F[:, 2] = n
+    for i in range(3):
+        F[i, 0], F[i, 1], F[i, 2] = a[i], b[i], n[i]
     return F
 
 
@@ -102,8 +99,9 @@ def three_point(P, f, Rs, ts):  # type: ignore[no-untyped-def]
     cosines = np.empty(3)
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
-        d2[k] = np.sum((P[i] - P[j]) ** 2)
-        cosines[k] = f[i, 0] * f[j, 0] + f[i, 1] * f[j, 1] + f[i, 2] * f[j, 2]
+        side = mix3(1.0, P[i], -1.0, P[j])
+        d2[k] = dot3(side, side)
+        cosines[k] = dot3(f[i], f[j])
     # Conics D1 = d2[1] M0 - d2[0] M1 and D2 = d2[2] M0 - d2[0] M2, with M_k the form of equation k.
     scale = 1.0 / d2[0]
     r1, r2 = d2[1] * scale, d2[2] * scale
@@ -131,9 +129,13 @@ def three_point(P, f, Rs, ts):  # type: ignore[no-untyped-def]
     if abs(c3) >= abs(c0):
         if c3 == 0.0:
             return 0
-        D = D1 + real_cubic_root(c2 / c3, c1 / c3, c0 / c3) * D2
+        w1, w2 = 1.0, real_cubic_root(c2 / c3, c1 / c3, c0 / c3)
     else:
-        D = D2 + real_cubic_root(c1 / c0, c2 / c0, c3 / c0) * D1
+        w1, w2 = real_cubic_root(c1 / c0, c2 / c0, c3 / c0), 1.0
+    D, E = np.empty((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            D[i, j] = E[i, j] = w1 * D1[i, j] + w2 * D2[i, j]
     B = cofactors(D)
     # A pair of lines l m^T + m l^T: -adj(D) = p p^T with p their crossing; D + [p]x has rank one.
     k = 0
@@ -141,8 +143,10 @@ def three_point(P, f, Rs, ts):  # type: ignore[no-untyped-def]
         if abs(B[i, i]) > abs(B[k, k]):
             k = i
     beta = np.sqrt(max(-B[k, k], 0.0))
-    p = B[:, k] / beta if beta > 0.0 else np.zeros(3)
-    E = D.copy()
+    p = np.zeros(3)
+    if beta > 0.0:
+        for i in range(3):
+            p[i] = B[i, k] / beta
     E[0, 1] += p[2]
     E[0, 2] -= p[1]
     E[1, 0] -= p[2]
@@ -155,11 +159,13 @@ def three_point(P, f, Rs, ts):  # type: ignore[no-untyped-def]
             if abs(E[i, j]) > abs(E[bi, bj]):
                 bi, bj = i, j
     lines = np.empty((2, 3))
-    lines[0] = E[bi, :]
-    lines[1] = E[:, bj]
+    for i in range(3):
+        lines[0, i] = E[bi, i]
+        lines[1, i] = E[i, bj]
     count = 0
-    for side in range(2):
-        line = lines[side]
+    frame = triad(P[0], P[1], P[2]).T
+    for which in range(2):
+        line = lines[which]
         k = 0
         for i in range(1, 3):
             if abs(line[i]) > abs(line[k]):
@@ -181,8 +187,9 @@ def three_point(P, f, Rs, ts):  # type: ignore[no-untyped-def]
             else:
                 s[i], s[j] = q0, w
             s[k] = e * s[i] + h * s[j]
-            if s[0] + s[1] + s[2] < 0.0:
-                s = -s
+            sign = -1.0 if s[0] + s[1] + s[2] < 0.0 else 1.0
+            for n in range(3):
+                s[n] *= sign
             if not (s[0] > 0.0 and s[1] > 0.0 and s[2] > 0.0):
                 continue
             total = 0.0
@@ -191,18 +198,22 @@ def three_point(P, f, Rs, ts):  # type: ignore[no-untyped-def]
                 total += s[a] * s[a] + s[b] * s[b] - 2.0 * s[a] * s[b] * cosines[n]
             if not total > 0.0:
                 continue
-            s = s * np.sqrt((d2[0] + d2[1] + d2[2]) / total)
-            refined = s.copy()
+            size = np.sqrt((d2[0] + d2[1] + d2[2]) / total)
+            refined = np.empty(3)
+            for n in range(3):
+                s[n] *= size
+                refined[n] = s[n]
             refine_depths(refined, d2, cosines)
             if refined[0] > 0.0 and refined[1] > 0.0 and refined[2] > 0.0 and np.isfinite(refined[0]):
                 s = refined
             Q = np.empty((3, 3))
             for n in range(3):
-                Q[n] = s[n] * f[n]
-            R = product3(triad(Q[0], Q[1], Q[2]), triad(P[0], P[1], P[2]).T)
+                for a in range(3):
+                    Q[n, a] = s[n] * f[n, a]
+            R = product3(triad(Q[0], Q[1], Q[2]), frame)
             if not np.isfinite(R[0, 0]):
                 continue
-            Rs[count] = R
+            put2(Rs[count], R)
             for a in range(3):
                 t = 0.0
                 for n in range(3):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from perception.vision.quadrangle_cost import chi_square, expand, minimise, rotation_of, solve_damped, turn_onto
-from perception.vision.quadrangle_jit import jit, product3
+from perception.vision.quadrangle_jit import back3, cross3, dot3, jit, mix3, product3, put1, put2, times3, unit3
 from perception.vision.quadrangle_p3p import cofactors, real_cubic_root, three_point
 
 MIRROR_TURN_COS = 0.99619469809  # 5 degrees: normals nearer than this are one pose, not two
@@ -31,7 +31,7 @@ def rotation_distance(A, B):  # type: ignore[no-untyped-def]
 
 @jit
 def ordered_seeds(X, f, m, A, Rs, ts, costs):  # type: ignore[no-untyped-def]
-    """Three-point poses of the four triples in order of their chi-square over all four points; returns how many.
+    """Three-point poses of the four triples with their chi-square over all four points; returns how many.
 
     Rs (16, 3, 3), ts (16, 3), costs (16,) are filled.
     """
@@ -41,34 +41,28 @@ def ordered_seeds(X, f, m, A, Rs, ts, costs):  # type: ignore[no-untyped-def]
         n = 0
         for i in range(4):
             if i != left_out:
-                P[n] = X[i]
-                F[n] = f[i]
+                put1(P[n], X[i])
+                put1(F[n], f[i])
                 n += 1
-        area = np.cross(P[1] - P[0], P[2] - P[0])
-        size = np.sum((P[1] - P[0]) ** 2) + np.sum((P[2] - P[0]) ** 2)
-        if np.sum(area * area) < 1e-8 * size * size:
+        side1, side2 = mix3(1.0, P[1], -1.0, P[0]), mix3(1.0, P[2], -1.0, P[0])
+        area = cross3(side1, side2)
+        size = dot3(side1, side1) + dot3(side2, side2)
+        if dot3(area, area) < 1e-8 * size * size:
             continue
         found = three_point(P, F, Rs[count:], ts[count:])
         for k in range(count, count + found):
             costs[k] = chi_square(Rs[k], ts[k], X, m, A)
         count += found
-    for i in range(1, count):  # insertion sort; at most 16
-        R, t, c = Rs[i].copy(), ts[i].copy(), costs[i]
-        k = i
-        while k > 0 and costs[k - 1] > c:
-            Rs[k], ts[k], costs[k] = Rs[k - 1], ts[k - 1], costs[k - 1]
-            k -= 1
-        Rs[k], ts[k], costs[k] = R, t, c
     return count
 
 
 @jit
 def mirrored(R, t, normal):  # type: ignore[no-untyped-def]
     """R with the normal (object axes) reflected about the line of sight through the centroid."""
-    n = R @ normal
-    k = t / np.sqrt(np.sum(t * t))
-    reflected = 2.0 * np.sum(n * k) * k - n
-    if np.sum(n * reflected) < -0.999999:
+    n = times3(R, normal)
+    k = unit3(t)
+    reflected = mix3(2.0 * dot3(n, k), k, -1.0, n)
+    if dot3(n, reflected) < -0.999999:
         return R
     return product3(turn_onto(n, reflected), R)
 
@@ -89,18 +83,19 @@ def all_minima(X, m, A, normal, Rs, ts, costs, Ns):  # type: ignore[no-untyped-d
     started = np.empty((8, 3, 3))
     runs = 0
     count = 0
-    seed = 0
     use_mirror = False
     while runs < 8:
         if use_mirror:
-            R0, t0 = mirrored(Rs[0], ts[0], normal), ts[0].copy()
+            R0, t0 = mirrored(Rs[0], ts[0], normal), mix3(1.0, ts[0], 0.0, ts[0])
         else:
-            if seed >= available:
+            seed = -1
+            for k in range(available):
+                if np.isfinite(c_seed[k]) and (seed < 0 or c_seed[k] < c_seed[seed]):
+                    seed = k
+            if seed < 0:
                 break
-            R0, t0 = R_seed[seed].copy(), t_seed[seed].copy()
-            seed += 1
-            if not np.isfinite(c_seed[seed - 1]):
-                break
+            c_seed[seed] = np.inf
+            R0, t0 = R_seed[seed], t_seed[seed]
             near = False
             for k in range(runs):
                 near = near or rotation_distance(R0, started[k]) < 0.05  # 13 deg
@@ -108,7 +103,7 @@ def all_minima(X, m, A, normal, Rs, ts, costs, Ns):  # type: ignore[no-untyped-d
                 near = near or rotation_distance(R0, Rs[k]) < 0.05
             if near:
                 continue
-        started[runs] = R0
+        put2(started[runs], R0)
         runs += 1
         R, t, cost, N, _ = minimise(R0, t0, X, m, A)
         use_mirror = not use_mirror and runs == 1
@@ -121,9 +116,15 @@ def all_minima(X, m, A, normal, Rs, ts, costs, Ns):  # type: ignore[no-untyped-d
             continue
         k = count
         while k > 0 and costs[k - 1] > cost:
-            Rs[k], ts[k], costs[k], Ns[k] = Rs[k - 1], ts[k - 1], costs[k - 1], Ns[k - 1]
+            put2(Rs[k], Rs[k - 1])
+            put1(ts[k], ts[k - 1])
+            put2(Ns[k], Ns[k - 1])
+            costs[k] = costs[k - 1]
             k -= 1
-        Rs[k], ts[k], costs[k], Ns[k] = R, t, cost, N
+        put2(Rs[k], R)
+        put1(ts[k], t)
+        put2(Ns[k], N)
+        costs[k] = cost
         count += 1
     return count
 
@@ -134,8 +135,8 @@ def profile(R, t, direction, X, m, A, normal):  # type: ignore[no-untyped-def]
 
     Returns: R, t, chi-square, log determinant of the remaining 4x4 information.
     """
-    n = R @ normal
-    if np.sum(n * direction) > -0.99:
+    n = times3(R, normal)
+    if dot3(n, direction) > -0.99:
         R = product3(turn_onto(n, direction), R)
     g, N, H = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     g4, x4, H4, N4, L4 = np.empty(4), np.empty(4), np.empty((4, 4)), np.empty((4, 4)), np.zeros((4, 4))
@@ -145,15 +146,16 @@ def profile(R, t, direction, X, m, A, normal):  # type: ignore[no-untyped-def]
             break
         _contract(N, direction, N4)
         _contract(H, direction, H4)
-        g4[:3] = g[:3]
-        g4[3] = np.sum(g[3:] * direction)
+        for i in range(3):
+            g4[i] = g[i]
+        g4[3] = g[3] * direction[0] + g[4] * direction[1] + g[5] * direction[2]
         if not solve_damped(H4, N4, 0.0, g4, x4, L4) and not solve_damped(N4, N4, 1e-6, g4, x4, L4):
             break
         step = 1.0
         improved = False
         for _try in range(4):
-            R_new = product3(rotation_of(step * x4[3] * direction), R)
-            t_new = t + step * x4[:3]
+            R_new = product3(rotation_of(mix3(step * x4[3], direction, 0.0, direction)), R)
+            t_new = mix3(1.0, t, step, x4)
             new = chi_square(R_new, t_new, X, m, A)
             if new <= cost:
                 improved = True
@@ -254,7 +256,9 @@ def plane_of(X):  # type: ignore[no-untyped-def]
     normal = np.zeros(3)
     if not trace > 0.0:
         return normal, 0.0
-    M = M / trace
+    for i in range(3):
+        for j in range(3):
+            M[i, j] /= trace
     C = cofactors(M)
     second = C[0, 0] + C[1, 1] + C[2, 2]
     det = M[0, 0] * C[0, 0] + M[0, 1] * C[0, 1] + M[0, 2] * C[0, 2]
@@ -278,11 +282,13 @@ def inverse6(N, out):  # type: ignore[no-untyped-def]
     """Inverse of a positive definite 6x6 matrix, column by column; False when it is not."""
     g, x, L = np.zeros(6), np.empty(6), np.zeros((6, 6))
     for k in range(6):
-        g[:] = 0.0
+        for i in range(6):
+            g[i] = 0.0
         g[k] = -1.0
         if not solve_damped(N, N, 0.0, g, x, L):
             return False
-        out[:, k] = x
+        for i in range(6):
+            out[i, k] = x[i]
     for i in range(6):
         for j in range(i):
             out[i, j] = out[j, i] = 0.5 * (out[i, j] + out[j, i])
@@ -292,20 +298,15 @@ def inverse6(N, out):  # type: ignore[no-untyped-def]
 @jit
 def normal_spread(R, t, C, normal):  # type: ignore[no-untyped-def]
     """Area sqrt(det) of the normal's covariance (sr), and the squared number of sigmas to the line of sight."""
-    n = R @ normal
-    k = t / np.sqrt(np.sum(t * t))
-    if np.sum(n * k) < 0.0:
-        k = -k
-    a = np.cross(n, k)
-    sine = np.sqrt(np.sum(a * a))
-    tilt = np.arctan2(sine, np.sum(n * k))
+    n = times3(R, normal)
+    k = unit3(t)
+    a = cross3(n, k)
+    sine = np.sqrt(dot3(a, a))
+    tilt = np.arctan2(sine, abs(dot3(n, k)))
     if sine < 1e-9:
-        a = np.cross(n, np.array([1.0, 0.0, 0.0]))
-        if np.sum(a * a) < 0.25:
-            a = np.cross(n, np.array([0.0, 1.0, 0.0]))
-        sine = np.sqrt(np.sum(a * a))
-    a = a / sine
-    b = np.cross(n, a)
+        a = sight_frame(n)[0]
+    a = unit3(a)
+    b = cross3(n, a)
     caa = cab = cbb = 0.0
     for i in range(3):
         for j in range(3):
@@ -328,13 +329,17 @@ def opposite(normal_camera, best, far):  # type: ignore[no-untyped-def]
 @jit
 def sight_frame(t):  # type: ignore[no-untyped-def]
     """Rows: two axes across the line of sight to t, then the line of sight."""
-    k = t / np.sqrt(np.sum(t * t))
-    a = np.cross(k, np.array([0.0, 1.0, 0.0]))
-    if np.sum(a * a) < 1e-6:
-        a = np.cross(k, np.array([1.0, 0.0, 0.0]))
-    a = a / np.sqrt(np.sum(a * a))
+    k = unit3(t)
+    a = np.empty(3)
+    if abs(k[1]) < 0.9:  # k x (0, 1, 0), or k x (1, 0, 0)
+        a[0], a[1], a[2] = -k[2], 0.0, k[0]
+    else:
+        a[0], a[1], a[2] = 0.0, k[2], -k[1]
+    a = unit3(a)
     F = np.empty((3, 3))
-    F[0], F[1], F[2] = a, np.cross(k, a), k
+    put1(F[0], a)
+    put1(F[1], cross3(k, a))
+    put1(F[2], k)
     return F
 
 
@@ -349,10 +354,10 @@ def ring_mass(R, t, cost, X, m, A, normal):  # type: ignore[no-untyped-def]
     the mass there.
     """
     F = sight_frame(t)
-    best = F @ (R @ normal)
+    best = times3(F, times3(R, normal))
     side = 1.0 if best[2] > 0.0 else -1.0
-    best = side * best
-    _, _, _, reference = profile(R, t, side * (F.T @ best), X, m, A, normal)
+    best = mix3(side, best, 0.0, best)
+    _, _, _, reference = profile(R, t, back3(F, best, side), X, m, A, normal)
     tilt_best = np.arccos(min(1.0, best[2]))
     azimuth_best = np.arctan2(best[1], best[0])
     here = there = 0.0
@@ -364,7 +369,7 @@ def ring_mass(R, t, cost, X, m, A, normal):  # type: ignore[no-untyped-def]
         tilt = 0.5 * RING_STEP_RAD
         while tilt < RING_END_RAD:
             g[0], g[1], g[2] = np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)
-            Rn, tn, c, log_det = profile(Rw, tw, side * (F.T @ g), X, m, A, normal)
+            Rn, tn, c, log_det = profile(Rw, tw, back3(F, g, side), X, m, A, normal)
             if np.isfinite(c):
                 Rw, tw = Rn, tn
                 w = np.exp(-0.5 * (c - cost) - 0.5 * (log_det - reference)) * np.sin(tilt)
@@ -378,10 +383,9 @@ def ring_mass(R, t, cost, X, m, A, normal):  # type: ignore[no-untyped-def]
                 break
             tilt += RING_STEP_RAD
     cell = RING_STEP_RAD * 2.0 * np.pi / RING_COUNT
-    size = np.sqrt(np.sum(middle * middle))
-    if not size > 0.0:
+    if not dot3(middle, middle) > 0.0:
         return here * cell, 0.0, R, t, np.inf
-    R, t, cost, _ = profile(R, t, side * (F.T @ (middle / size)), X, m, A, normal)
+    R, t, cost, _ = profile(R, t, back3(F, unit3(middle), side), X, m, A, normal)
     return here * cell, there * cell, R, t, cost
 
 
@@ -402,11 +406,15 @@ def solve(points, pixels, covariance, camera, near_sigmas2, Rs, ts, costs, Cs, m
         return bad, 0, 1
     c = np.zeros(3)
     for i in range(4):
-        c += 0.25 * points[i]
+        for j in range(3):
+            c[j] += 0.25 * points[i, j]
+    size = 0.0
     for i in range(4):
-        X[i] = points[i] - c
+        for j in range(3):
+            X[i, j] = points[i, j] - c[j]
+            size += X[i, j] ** 2
     normal, spread = plane_of(X)
-    if not spread > 1e-6 * np.sum(X * X):
+    if not spread > 1e-6 * size:
         return 0, 0, 2
     Ns = np.empty((Rs.shape[0], 6, 6))
     count = all_minima(X, m, A, normal, Rs[:-1], ts[:-1], costs[:-1], Ns[:-1])
@@ -415,11 +423,12 @@ def solve(points, pixels, covariance, camera, near_sigmas2, Rs, ts, costs, Cs, m
     while costs[count - 1] - costs[0] > WORTHLESS:  # among them runs that fled to infinity, where everything is flat
         count -= 1
     F = sight_frame(ts[0])
-    best = F @ (Rs[0] @ normal)
+    best = times3(F, times3(Rs[0], normal))
     side = 1.0 if best[2] > 0.0 else -1.0
-    best = side * best
+    best = mix3(side, best, 0.0, best)
     area0 = gate = 0.0
     over_there = 0.0
+    there_too = np.zeros(Rs.shape[0], np.bool_)
     for k in range(count):
         if not inverse6(Ns[k], Cs[k]):
             return 0, 0, 4
@@ -430,7 +439,10 @@ def solve(points, pixels, covariance, camera, near_sigmas2, Rs, ts, costs, Cs, m
         else:
             ratio = np.exp(-0.5 * (costs[k] - costs[0]) + 0.5 * (log_det6(Cs[k]) - log_det6(Cs[0])))
         masses[k] = ratio
-        if k > 0 and opposite(side * (F @ (Rs[k] @ normal)), best, MIRROR_TURN_COS):
+        there_too[k] = k > 0 and opposite(
+            mix3(side, times3(F, times3(Rs[k], normal)), 0.0, best), best, MIRROR_TURN_COS
+        )
+        if there_too[k]:
             over_there += ratio
     minima = count
     if gate < near_sigmas2:
@@ -439,16 +451,20 @@ def solve(points, pixels, covariance, camera, near_sigmas2, Rs, ts, costs, Cs, m
         ratio = there / max(here, laplace)
         if over_there > 0.0:  # share the better figure among the minima over there
             for k in range(1, count):
-                if opposite(side * (F @ (Rs[k] @ normal)), best, MIRROR_TURN_COS):
+                if there_too[k]:
                     masses[k] *= max(1.0, ratio / over_there)
         elif ratio > 1e-4 and np.isfinite(cost):
-            Rs[count], ts[count], costs[count], masses[count] = R, t, cost, ratio
-            Cs[count] = 0.0
+            put2(Rs[count], R)
+            put1(ts[count], t)
+            costs[count], masses[count] = cost, ratio
+            for i in range(6):
+                for j in range(6):
+                    Cs[count, i, j] = 0.0
             count += 1
     for k in range(count):
-        lever = Rs[k] @ c
+        lever = times3(Rs[k], c)
         move_origin(Cs[k], lever)
-        ts[k] -= lever
+        put1(ts[k], mix3(1.0, ts[k], -1.0, lever))
     return count, minima, 0
 
 
@@ -466,8 +482,12 @@ def log_det6(C):  # type: ignore[no-untyped-def]
 @jit
 def move_origin(C, lever):  # type: ignore[no-untyped-def]
     """Covariance for the origin at -lever (camera axes) of the point it was for: d <- d + [lever]x r, in place."""
-    J = np.eye(6)
-    J[0, 4], J[0, 5] = -lever[2], lever[1]
-    J[1, 3], J[1, 5] = lever[2], -lever[0]
-    J[2, 3], J[2, 4] = -lever[1], lever[0]
-    C[:] = J @ C @ J.T
+    for _ in range(2):  # J C, then (J (J C)^T)^T by the same loop on the transpose
+        for k in range(6):
+            r0, r1, r2 = C[3, k], C[4, k], C[5, k]
+            C[0, k] += lever[1] * r2 - lever[2] * r1
+            C[1, k] += lever[2] * r0 - lever[0] * r2
+            C[2, k] += lever[0] * r1 - lever[1] * r0
+        for i in range(6):
+            for j in range(i):
+                C[i, j], C[j, i] = C[j, i], C[i, j]

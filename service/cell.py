@@ -29,6 +29,7 @@ from service.motion import start_controller
 
 BEAT_S = 0.05
 CLOSE_TIMEOUT_S = 4.0
+SWITCH_S = 0.0005  # the control thread waits no longer than this for a thread that answers the service
 log = logging.getLogger(__name__)
 
 
@@ -187,6 +188,7 @@ def error_from_line(line: str) -> CellError:
 def main() -> None:
     """Entry point of the cell process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the supervisor's business; the pipe tells when it ends
+    sys.setswitchinterval(SWITCH_S)
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="cell: %(levelname)s %(name)s: %(message)s")
     lifeline = Lifeline()
     order = CellOrder.from_line(lifeline.read_line() or "{}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import sys
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from service.http.server import HttpServer
 
 log = logging.getLogger(__name__)
+SWITCH_S = 0.001  # a computing thread yields to the event loop five times sooner than by default
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +56,7 @@ class Panelwright:
         self.stop_port: int = stop_listener.getsockname()[1]
         self._error: CellError | None = None
         self._is_settled = threading.Event()
+        self._is_ending = threading.Event()
         self._server: HttpServer | None = None
         self._listener = listener
         from service.http.server import names_of
@@ -119,6 +122,7 @@ class Panelwright:
 
     def close(self) -> None:
         """Stop the arm, end server and processes; bounded, idempotent."""
+        self._is_ending.set()
         if self._server is not None:
             self._server.stop()
         self.service.close()
@@ -130,6 +134,7 @@ class Panelwright:
 
     def _begin(self) -> None:
         """Start the cell in the background: it needs seconds, while this process imports its web framework."""
+        sys.setswitchinterval(SWITCH_S)
         threading.Thread(target=self._start_service, name="start-cell", daemon=True).start()
         from service.http.app import create_app, state_of_app
         from service.http.guard import Allowed
@@ -141,6 +146,7 @@ class Panelwright:
 
         def on_exit(why: str) -> None:
             # The latch first, by the stop process: then every stream is told to end.
+            self._is_ending.set()
             self.service.stop_quietly(why)
             state_of_app(app).hub.close()
 
@@ -152,7 +158,7 @@ class Panelwright:
         try:
             self.service.start()
         except CellError as error:
-            self._error = error
+            self._error = None if self._is_ending.is_set() else error  # Ctrl-C while it starts is no fault
         except Exception as error:  # a defect must end the program with a message, not hang it
             log.exception("starting the cell")
             from service.errors import Defect
@@ -161,7 +167,7 @@ class Panelwright:
         self._is_settled.set()
         if self._error is not None and self._server is not None:
             self._server.stop()
-        if self._error is None and not self.service.inline:
+        if self._error is None and not self.service.inline and not self._is_ending.is_set():
             self._warm()
 
     def _warm(self) -> None:

@@ -42,7 +42,7 @@ from manipulation.guards import GuardSet, Measured
 from manipulation.kinematics import Kinematics
 from manipulation.recorder import Recorder
 from manipulation.runs import Run, Tick, begin
-from manipulation.sensing import READ_WAIT_S, ContactWrench, DeviceFailure, Devices, Sample
+from manipulation.sensing import READ_WAIT_S, ContactWrench, DeviceFailure, Devices, Look, Sample, ToolView
 from manipulation.setpoint import SetPointFilter, check, flange_matrix
 
 Array = NDArray[np.float64]
@@ -53,6 +53,7 @@ SETTLE_S = 0.3
 SETTLED_RAD = 2e-4
 SETTLED_RAD_PER_S = 0.02
 TARE_S = 0.1
+SLOW_TICKS = 4  # gripper and proximity are read every so many ticks
 COMMAND_WAIT_S = 0.25
 
 
@@ -269,7 +270,8 @@ class Controller:
             raise Stopped("the stop latch is set", hint="reset the stop, then command again")
         tool = flange_matrix(motion.flange_from_tool) if isinstance(motion, CartesianPath) else self._grip
         started_s = self._clock.now_s()
-        recorder = Recorder(self.kinematics.dh, tool, self._dt_s)
+        recorder = Recorder(self._dt_s)
+        view = ToolView(self.kinematics.dh, self._contact, tool)
         try:
             sample = self._read()
             check(motion, self.kinematics, sample.position_rad)
@@ -279,14 +281,14 @@ class Controller:
             run = self._begin(motion, sample)
         except DeviceFailure as failure:
             end = _End(outcome=MotionOutcome.FAULT, cause=f"{failure}; nothing moved", device=failure.device)
-            return self._report(motion, end, started_s, tool, recorder)
+            return self._report(motion, end, started_s, view, recorder)
         self._is_moving = True
         self._next_tick_s = self._clock.now_s()
         try:
-            end = self._run(motion, run, sample, tool, recorder)
+            end = self._run(motion, run, sample, view, recorder)
         finally:
             self._is_moving = False
-        return self._report(motion, end, started_s, tool, recorder)
+        return self._report(motion, end, started_s, view, recorder)
 
     def _begin(self, motion: DeclaredMotion, sample: Sample) -> Run:
         try:
@@ -295,22 +297,19 @@ class Controller:
             device = str(error.details.get("device", self._devices.gripper.name))
             raise DeviceFailure(device, error.what) from error
 
-    def _run(self, motion: DeclaredMotion, run: Run, sample: Sample, tool: Array, recorder: Recorder) -> _End:
+    def _run(self, motion: DeclaredMotion, run: Run, sample: Sample, view: ToolView, recorder: Recorder) -> _End:
         started_s = sample.stamp_s
-        base_from_tool = recorder.pose_of(sample.position_rad)
-        guards = GuardSet((*motion.guards, *self._standing_guards()), base_from_tool)
-        tool_from_sensor = self._contact.tool_from_sensor(tool)
-        self._contact.restart()
+        look = view.look(sample, self._filter.last_rad)
+        guards = GuardSet((*motion.guards, *self._standing_guards()), look.base_from_tool)
+        ticks = 0
         over_since_s: float | None = None
         while True:
             elapsed_s = sample.stamp_s - started_s
-            flange, base_from_tool = recorder.poses_of(sample.position_rad)
-            wrench = kernels.wrench_at(self._contact.smoothed(sample.raw_wrench, flange), tool_from_sensor)
-            recorder.note(elapsed_s, sample.position_rad, wrench, base_from_tool[:3, 3])
-            end = self._why_end(guards, elapsed_s, sample, wrench, base_from_tool, recorder)
+            recorder.note(elapsed_s, sample.position_rad, look.wrench, look.base_from_tool[:3, 3])
+            end = self._why_end(guards, elapsed_s, sample, look)
             try:
                 if end is None:
-                    tick = Tick(elapsed_s, sample, wrench, self._filter.last_rad, self._dt_s)
+                    tick = Tick(elapsed_s, sample, look.wrench, self._filter.last_rad, self._dt_s)
                     wanted = run.wanted(tick)
                     if run.is_over(tick):
                         over_since_s = elapsed_s if over_since_s is None else over_since_s
@@ -318,16 +317,16 @@ class Controller:
                             return _End(outcome=MotionOutcome.COMPLETED, cause="ran to its declared end")
                     self._send(self._filter.apply(wanted))
                     self._pass_tick()
-                    sample = self._newest = self._read()
+                    ticks += 1
+                    sample = self._newest = self._read(None if ticks % SLOW_TICKS == 0 else sample)
+                    look = view.look(sample, self._filter.last_rad)
                     continue
             except DeviceFailure as failure:
                 end = _End(outcome=MotionOutcome.FAULT, cause=str(failure), device=failure.device)
             self._come_to_rest(end)
             return end
 
-    def _why_end(
-        self, guards: GuardSet, elapsed_s: float, sample: Sample, wrench: Array, pose: Array, recorder: Recorder
-    ) -> _End | None:
+    def _why_end(self, guards: GuardSet, elapsed_s: float, sample: Sample, look: Look) -> _End | None:
         if self._is_latched():
             return _End(outcome=MotionOutcome.STOPPED, cause="the stop latch was set")
         if self._cancel.is_set():
@@ -335,9 +334,9 @@ class Controller:
         guard = guards.tripped(
             Measured(
                 elapsed_s=elapsed_s,
-                wrench=wrench,
-                base_from_tool=pose,
-                commanded_tip_m=recorder.pose_of(self._filter.last_rad)[:3, 3],
+                wrench=look.wrench,
+                base_from_tool=look.base_from_tool,
+                commanded_tip_m=look.commanded_tip_m,
                 contacts=sample.contacts,
                 proximity_m=sample.proximity_m,
             )
@@ -409,8 +408,8 @@ class Controller:
 
     # -- small steps -----------------------------------------------------------------------------------------------
 
-    def _read(self) -> Sample:
-        sample = self._devices.read()
+    def _read(self, before: Sample | None = None) -> Sample:
+        sample = self._devices.read(before)
         self._faults = ()
         return sample
 
@@ -438,16 +437,14 @@ class Controller:
         self._clock.sleep(self._next_tick_s - now_s)
 
     def _report(
-        self, motion: DeclaredMotion, end: _End, started_s: float, tool: Array, recorder: Recorder
+        self, motion: DeclaredMotion, end: _End, started_s: float, view: ToolView, recorder: Recorder
     ) -> MotionReport:
         sample = self._newest
         n = len(self.kinematics.dh)
-        q = np.zeros(n) if sample is None else sample.position_rad
-        flange, base_from_tool = recorder.poses_of(q)
-        wrench = np.zeros(6)
+        q, wrench, pose = np.zeros(n), np.zeros(6), identity()
         if sample is not None:
-            contact = self._contact.of(sample.raw_wrench, flange)
-            wrench = kernels.wrench_at(contact, self._contact.tool_from_sensor(tool))
+            look = view.look(sample, self._filter.last_rad)
+            q, wrench, pose = sample.position_rad, look.wrench, RigidTransform.from_matrix(look.base_from_tool)
         return MotionReport(
             name=motion.name,
             outcome=end.outcome,
@@ -456,7 +453,7 @@ class Controller:
             started_s=started_s,
             ended_s=self._clock.now_s(),
             position_rad=q,
-            base_from_tool=RigidTransform.from_matrix(base_from_tool),
+            base_from_tool=pose,
             wrench=wrench,
             peak_force_n=recorder.peak_force_n,
             gripper_width_m=None if sample is None else sample.gripper_width_m,
@@ -470,7 +467,7 @@ class Controller:
             position_rad=sample.position_rad,
             velocity_rad_per_s=sample.velocity_rad_per_s,
             base_from_flange=RigidTransform.from_matrix(flange),
-            wrench=self._contact.in_flange(self._contact.of(sample.raw_wrench, flange)),
+            wrench=self._contact.in_flange(sample.raw_wrench, flange),
             contacts=sample.contacts,
             proximity_m=sample.proximity_m,
             gripper_width_m=sample.gripper_width_m,

@@ -260,6 +260,54 @@ def safe_step(
     return out
 
 
+@njit(cache=True)
+def weight_at(up_m_per_s2: Array, mass_kg: float, centre_m: Array) -> Any:
+    """Wrench (6,) of gravity about the sensor: f = -m g up, t = c x f. `up_m_per_s2`: g times "up" in sensor axes."""
+    out = np.empty(6)
+    for k in range(3):
+        out[k] = -mass_kg * up_m_per_s2[k]
+    out[3] = centre_m[1] * out[2] - centre_m[2] * out[1]
+    out[4] = centre_m[2] * out[0] - centre_m[0] * out[2]
+    out[5] = centre_m[0] * out[1] - centre_m[1] * out[0]
+    return out
+
+
+@njit(cache=True)
+def tick_view(
+    dh: Array,
+    q: Array,
+    commanded: Array,
+    flange_from_tool: Array,
+    flange_from_sensor: Array,
+    tool_from_sensor: Array,
+    raw: Array,
+    bias: Array,
+    mass_kg: float,
+    centre_m: Array,
+    gravity_m_per_s2: float,
+) -> Any:
+    """All that a tick looks at: base_from_tool (4, 4), commanded tip (3,), contact wrench (6,) in tool axes.
+
+    contact = raw - bias - weight in sensor axes, carried over to the tool.
+    """
+    n = dh.shape[0]
+    flange = np.ascontiguousarray(frames(dh, q)[n])
+    tool = flange @ flange_from_tool
+    aimed = np.ascontiguousarray(frames(dh, commanded)[n])
+    tip = np.empty(3)
+    for k in range(3):
+        tip[k] = aimed[k, 3]
+        for m in range(3):
+            tip[k] += aimed[k, m] * flange_from_tool[m, 3]
+    up = np.zeros(3)
+    for k in range(3):
+        for m in range(3):
+            up[k] += flange[2, m] * flange_from_sensor[m, k]
+        up[k] *= gravity_m_per_s2
+    contact = raw - bias - weight_at(up, mass_kg, centre_m)
+    return tool, tip, wrench_at(contact, tool_from_sensor)
+
+
 def warm(dh: Array) -> None:
     """Compile (or load from the cache) every kernel of the control tick, so that no tick waits for a compiler."""
     n, eye = dh.shape[0], np.eye(4)
@@ -273,3 +321,4 @@ def warm(dh: Array) -> None:
     admittance_step(np.zeros((2, 6)), np.zeros(6), np.ones(6), np.ones(6), np.ones(6), np.ones(6), 0.01)
     safe_step(dh, eye, q, q, np.zeros(n), ones, ones, -ones, ones, 1.0, 0.01)
     wrench_at(np.zeros(6), eye)
+    tick_view(dh, q, q, eye, eye, eye, np.zeros(6), np.zeros(6), 1.0, np.zeros(3), 9.8)

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.motion import MotionLog
-from manipulation import kernels
 
 Array = NDArray[np.float64]
 
@@ -18,22 +17,11 @@ LOG_RATE_HZ = 125.0
 class Recorder:
     """Keeps every n-th tick and the peak of the contact force over all ticks."""
 
-    def __init__(self, dh: Array, flange_from_tool: Array, dt_s: float) -> None:
-        self._dh = dh
-        self._tool = flange_from_tool
+    def __init__(self, dt_s: float) -> None:
         self._stride = max(1, round(1.0 / (LOG_RATE_HZ * dt_s)))
         self._ticks = 0
         self._rows: list[tuple[float, Array, Array, Array]] = []
         self.peak_force_n = 0.0
-
-    def poses_of(self, q_rad: Array) -> tuple[Array, Array]:
-        """(4, 4) base_from_flange and base_from_tool."""
-        flange = np.ascontiguousarray(kernels.frames(self._dh, q_rad)[-1])
-        return flange, flange @ self._tool
-
-    def pose_of(self, q_rad: Array) -> Array:
-        """(4, 4) base_from_tool."""
-        return self.poses_of(q_rad)[1]
 
     def note(self, elapsed_s: float, q_rad: Array, wrench: Array, tip_m: Array) -> None:
         """Take one tick in."""

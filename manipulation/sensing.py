@@ -57,8 +57,10 @@ class Devices:
     clock: Clock
     max_age_s: float
 
-    def read(self) -> Sample:
-        """Read every device once.
+    def read(self, before: Sample | None = None) -> Sample:
+        """Read the devices once; with the sample `before`, gripper and proximity are taken over from it.
+
+        Those two are slow by nature: reading them every fourth tick leaves time for the others.
 
         Raises:
             DeviceFailure: the first device that is silent, broken, stale or invalid. "Nothing in range" is a
@@ -69,10 +71,6 @@ class Devices:
         device = self.arm.name
         try:
             joints = self.arm.read_state(deadline=deadline).usable(now_s=now_s, max_age_s=self.max_age_s, device=device)
-            device = self.gripper.name
-            grip = self.gripper.read_state(deadline=deadline).usable(
-                now_s=now_s, max_age_s=self.max_age_s, device=device
-            )
             raw = np.zeros(6)
             if self.force_torque is not None:
                 device = self.force_torque.name
@@ -86,10 +84,18 @@ class Devices:
                 contacts = self.touch.read_contacts(deadline=deadline).usable(
                     now_s=now_s, max_age_s=self.max_age_s, device=device
                 )
-            ranges = []
-            for sensor in self.proximities:
-                device = sensor.name
-                ranges.append(self._range(sensor, now_s, deadline))
+            if before is None:
+                device = self.gripper.name
+                grip = self.gripper.read_state(deadline=deadline).usable(
+                    now_s=now_s, max_age_s=self.max_age_s, device=device
+                )
+                width_m, is_moving, ranges = grip.width_m, grip.is_moving, []
+                for sensor in self.proximities:
+                    device = sensor.name
+                    ranges.append(self._range(sensor, now_s, deadline))
+                seen = tuple(ranges)
+            else:
+                width_m, is_moving, seen = before.gripper_width_m, before.gripper_is_moving, before.proximity_m
         except CellError as error:
             named = error.details.get("device") if isinstance(error, DeviceError) else None
             raise DeviceFailure(str(named or device), error.what) from error
@@ -101,9 +107,9 @@ class Devices:
             velocity_rad_per_s=joints.velocity_rad_per_s,
             raw_wrench=raw,
             contacts=contacts,
-            proximity_m=tuple(ranges),
-            gripper_width_m=grip.width_m,
-            gripper_is_moving=grip.is_moving,
+            proximity_m=seen,
+            gripper_width_m=width_m,
+            gripper_is_moving=is_moving,
         )
 
     def _range(self, sensor: Proximity, now_s: float, deadline: Deadline) -> float:
@@ -126,45 +132,61 @@ class ContactWrench:
     """
 
     def __init__(self, load: ToolLoad, flange_from_sensor: RigidTransform) -> None:
-        self._mass_kg = load.mass_kg
-        self._centre_m = np.asarray(load.centre_of_mass_m, float)
-        self._flange_from_sensor = np.ascontiguousarray(flange_from_sensor.as_matrix())
+        self.mass_kg = load.mass_kg
+        self.centre_m = np.asarray(load.centre_of_mass_m, float)
+        self.flange_from_sensor = np.ascontiguousarray(flange_from_sensor.as_matrix())
         self.bias = np.asarray(load.bias, float)
-        self._last: Array | None = None
-
-    def smoothed(self, raw_wrench: Array, base_from_flange: Array) -> Array:
-        """Like `of`, as the mean of this tick and the one before.
-
-        Rubbing contacts change the sign of their friction from tick to tick, in the engine by 30 N and in a stiff
-        wrist by ringing; the mean of two ticks cancels that at the price of half a tick of delay.
-        """
-        now = self.of(raw_wrench, base_from_flange)
-        before, self._last = self._last, now
-        return now if before is None else np.asarray(0.5 * (now + before))
-
-    def restart(self) -> None:
-        """Forget the tick before."""
-        self._last = None
-
-    def of(self, raw_wrench: Array, base_from_flange: Array) -> Array:
-        """(6,) contact wrench in sensor axes about the sensor's origin."""
-        return np.asarray(raw_wrench - self.bias - self.weight(base_from_flange))
 
     def weight(self, base_from_flange: Array) -> Array:
         """(6,) what gravity alone makes the sensor read."""
         # The third row of base_from_sensor is "up" seen by the sensor.
-        up = base_from_flange[2, :3] @ self._flange_from_sensor[:3, :3]
-        f = -self._mass_kg * GRAVITY_M_PER_S2 * up
-        c = self._centre_m
-        out: Array = np.array(
-            [f[0], f[1], f[2], c[1] * f[2] - c[2] * f[1], c[2] * f[0] - c[0] * f[2], c[0] * f[1] - c[1] * f[0]]
-        )
-        return out
+        up = base_from_flange[2, :3] @ self.flange_from_sensor[:3, :3]
+        return np.asarray(kernels.weight_at(GRAVITY_M_PER_S2 * up, self.mass_kg, self.centre_m))
 
-    def tool_from_sensor(self, flange_from_tool: Array) -> Array:
-        """(4, 4) pose of the sensor on a tool, for carrying wrenches over with `kernels.wrench_at`."""
-        return np.ascontiguousarray(np.linalg.inv(flange_from_tool) @ self._flange_from_sensor)
-
-    def in_flange(self, contact: Array) -> Array:
+    def in_flange(self, raw_wrench: Array, base_from_flange: Array) -> Array:
         """(6,) the contact wrench in flange axes about the flange."""
-        return np.asarray(kernels.wrench_at(contact, self._flange_from_sensor))
+        contact = raw_wrench - self.bias - self.weight(base_from_flange)
+        return np.asarray(kernels.wrench_at(contact, self.flange_from_sensor))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """One tick seen from a tool: measured pose (4, 4), commanded tip (3,) m, contact wrench (6,) in tool axes."""
+
+    base_from_tool: Array
+    commanded_tip_m: Array
+    wrench: Array
+
+
+class ToolView:
+    """Carries samples over to one tool, with the wrench as the mean of two ticks.
+
+    Rubbing contacts change the sign of their friction from tick to tick, in the engine by 30 N and in a stiff wrist by
+    ringing; the mean of two ticks cancels that at the price of half a tick of delay.
+    """
+
+    def __init__(self, dh: Array, contact: ContactWrench, flange_from_tool: Array) -> None:
+        self._dh = dh
+        self._contact = contact
+        self._tool = flange_from_tool
+        self._tool_from_sensor = np.ascontiguousarray(np.linalg.inv(flange_from_tool) @ contact.flange_from_sensor)
+        self._before: Array | None = None
+
+    def look(self, sample: Sample, commanded_rad: Array) -> Look:
+        """What the tool is and feels in this tick."""
+        contact = self._contact
+        pose, tip, now = kernels.tick_view(
+            self._dh,
+            sample.position_rad,
+            commanded_rad,
+            self._tool,
+            contact.flange_from_sensor,
+            self._tool_from_sensor,
+            sample.raw_wrench,
+            contact.bias,
+            contact.mass_kg,
+            contact.centre_m,
+            GRAVITY_M_PER_S2,
+        )
+        before, self._before = self._before, now
+        return Look(pose, tip, now if before is None else 0.5 * (now + before))

@@ -10,15 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from hal.motion import Guard, MotionReport, Quantity
+from hal.motion import Compliance, Guard, MotionReport, Quantity
 from manipulation.skills.outcome import Outcome, SkillFailure
 from manipulation.skills.steps import Attempt
 from manipulation.stroke import shifted
 
 Array = NDArray[np.float64]
 
+INF = float("inf")
 FEEL_N = 3.0  # moves no lever, and no knob by its own side
 FEEL_M_PER_S = 0.03
+# Onto a hard stop the force overshoots by stiffness x speed x reaction time; a soft push along the fingers or across
+# them makes the stiffness 4 kN/m, whatever is touched.
+SOFT_PUSH = Compliance(
+    stiffness=(4000.0, 4000.0, 4000.0, INF, INF, INF),
+    damping=(500.0, 500.0, 500.0, 10.0, 10.0, 10.0),
+    mass=(20.0, 20.0, 20.0, 1.0, 1.0, 1.0),
+    max_offset_m=0.015,
+)
 ONSET_N = 1.0  # above noise, drift and inertia in a slow move
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from hal.motion import Guard, MotionReport, Quantity
 from hal.panel import Button, Mushroom
+from manipulation.skills.contact import SOFT_PUSH
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.probe import TURNS_RAD
 from manipulation.skills.steps import STANDOFF_M, Attempt, perform
@@ -16,12 +17,12 @@ from manipulation.workcell import Workcell, panel_from_grip
 
 SEEK_N = 2.5  # a light contact ends the fast part, so that the slow part always begins above or on the cap
 SEEK_ABOVE_M = 0.004
-PRESS_M_PER_S = 0.012  # onto a hard stop the force overshoots by about 1 N per mm/s
+PRESS_M_PER_S = 0.020
 STOP_FLOOR_N = 15.0
 EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
 BOTTOM_N = 6.0  # above the spring at full travel: the cap stands on its stop
 DEEP_ENOUGH_RATIO = 0.3  # a latched cap has only this much travel left
-LOST_M = 0.010  # how far behind its expected place the cap may be met
+LOST_M = 0.018  # how far behind its expected place the cap may be met, and what the soft push yields
 
 
 def press(
@@ -41,7 +42,7 @@ def press(
     def stroke(attempt: Attempt) -> float:
         x, y = cap.position_m
         top = cap.height_m
-        heights = (top + STANDOFF_M, top + SEEK_ABOVE_M, top - cap.travel_m - LOST_M)
+        heights = (top + STANDOFF_M, top + SEEK_ABOVE_M, top - cap.travel_m)
         ways = [[panel_from_grip((x, y, z), turn) for z in heights] for turn in TURNS_RAD]
         attempt.begin(ways, may_touch=(cap.name,), width_m=0.0, name=cap.name)
         attempt.advance(STANDOFF_M - SEEK_ABOVE_M, name="approach", stop_n=SEEK_N)
@@ -75,7 +76,7 @@ def stop_force_n(cap: Button | Mushroom) -> float:
 def _push(attempt: Attempt, cap: Button | Mushroom) -> MotionReport:
     guard = Guard(name="bottom", quantity=Quantity.FORCE, limit=stop_force_n(cap), axis=(0.0, 0.0, -1.0), ticks=1)
     goal = shifted(attempt.pose(), (0.0, 0.0, SEEK_ABOVE_M + cap.travel_m + LOST_M))
-    return attempt.straight(goal, name="press", speed_m_per_s=PRESS_M_PER_S, guards=(guard,))
+    return attempt.straight(goal, name="press", speed_m_per_s=PRESS_M_PER_S, guards=(guard,), compliance=SOFT_PUSH)
 
 
 def travelled_m(report: MotionReport, pad_stiffness_n_per_m: float) -> float:

@@ -7,6 +7,7 @@ import numpy as np
 from hal.errors import InvalidRequest
 from hal.motion import Guard, Quantity
 from hal.panel import Toggle
+from manipulation.skills.contact import SOFT_PUSH
 from manipulation.skills.outcome import Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.steps import STANDOFF_M, Attempt, perform
 from manipulation.stroke import shifted
@@ -15,8 +16,8 @@ from manipulation.workcell import Workcell, panel_from_grip
 PIVOT_M = 0.004  # the bat turns a little above the plate
 GRIP_RATIO = 0.55  # how far up the bat the fingertip pushes: high enough for a lever arm, low enough not to slip off
 SIDE_M = 0.008  # room between fingertip and bat when coming down; more than the pose error
-BEYOND_M = 0.008  # how far past the middle the fingertip's face goes if nothing stops it
-SWEEP_M_PER_S = 0.02
+BEYOND_M = 0.013  # how far past the middle the fingertip's face goes if nothing stops it
+SWEEP_M_PER_S = 0.03
 EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
 END_N = 4.0  # above what the detent needs: the bat stands on its stop
 
@@ -64,7 +65,9 @@ def toggle(cell: Workcell, name: str, target: str, *, verify: Verify | None = No
         # The bat's own effort acts at its tip; the fingertip pushes lower down.
         stop_n = EFFORT_SPREAD * thing.force_n / GRIP_RATIO + END_N
         guard = Guard(name="end stop", quantity=Quantity.FORCE, limit=stop_n, ticks=1)
-        report = attempt.straight(goal, name="sweep", speed_m_per_s=SWEEP_M_PER_S, guards=(guard,))
+        report = attempt.straight(
+            goal, name="sweep", speed_m_per_s=SWEEP_M_PER_S, guards=(guard,), compliance=SOFT_PUSH
+        )
         moved = float((report.base_from_tool.translation - here.translation) @ sweep / np.linalg.norm(sweep))
         past = float(moved - (abs(end - start) - BEYOND_M))
         if past < -0.004:

@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from service.client import Client
+from service.client import ApiError, Client
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console, read_cell
 from service.commands.tasks import follow
 from service.serve import Options, Panelwright
@@ -55,8 +55,10 @@ def _mission(client: Client, runs: Path, *, judge: bool) -> bool:
     console.print(_actions(result["actions"]))
     missions = client.get("/v1/missions")["missions"]
     if judge and missions:
-        verdict = client.post("/v1/judge?wait_s=30", {"mission": missions[0]["name"]})["result"]
-        console.print(_verdict(verdict))
+        try:
+            console.print(_verdict(client.post("/v1/judge?wait_s=30", {"mission": missions[0]["name"]})["result"]))
+        except ApiError as error:  # the report is worth showing even when nobody can judge it
+            console.print(escape(error.for_people()))
     if missions:
         console.print(f"report: [bold]{runs / missions[0]['name'] / 'report.html'}[/]")
     lag_s = client.get("/v1/info")["event_loop_lag_p99_s"]

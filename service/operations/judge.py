@@ -131,7 +131,7 @@ def _action_claim(
 def _reached(spec: PanelObject, action: dict[str, Any], after: dict[str, ObjectTruth]) -> bool:
     target, now = action["target"], after[spec.name]
     if spec.kind == "button" and spec.lights_lamp is not None:
-        return after[spec.lights_lamp].state == target  # a button springs back: what it works is what counts
+        return bool(after[spec.lights_lamp].state == target)  # a button springs back: what it works is what counts
     if spec.kind == "slider":
         span = spec.scale.maximum - spec.scale.minimum
         return now.value is not None and bool(abs(now.value - float(target)) <= GAUGE_SHARE * span)

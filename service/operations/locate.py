@@ -100,12 +100,12 @@ def locate_in(session: Session, pair: LightPair) -> Located:
         pose=pose,
         pair=pair,
         lights_px=chosen.points_px,
-        evidence=_light_evidence(session, look, camera_from_panel, chosen.points_px, covariance_px),
+        evidence=_light_evidence(session, look, chosen.points_px, covariance_px),
     )
 
 
 def model_sigma_px(session: Session, look: Look, base_from_panel: RigidTransform) -> float:
-    """What the image of a light may be off beside noise: the lens as calibrated, and lights that sit off their places."""
+    """What a light in the image may be off beside noise: the lens as calibrated, and the place of the lamp."""
     distance_m = float((look.base_from_camera.parent_from_child.inv() * base_from_panel).translation[2])
     lamp_px = session.panel.tolerances.light_m * look.intrinsics.fx_px / max(distance_m, 0.05)
     return float(np.hypot(session.lens_rms_px(look.camera), lamp_px))
@@ -214,7 +214,7 @@ def _is_expected(session: Session, base_from_panel: RigidTransform) -> bool:
 
 
 def _light_evidence(
-    session: Session, look: Look, camera_from_panel: RigidTransform, pixels: Array, covariances: Array
+    session: Session, look: Look, pixels: Array, covariances: Array
 ) -> tuple[LightEvidence, ...]:
     flange = session.mover.state().base_from_flange
     return tuple(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from hal.errors import InvalidRequest, NotFound
 from perception.range import finish, join
 from perception.range.claim import fill_small_gaps
+from perception.range.compete import Candidates
 from perception.range.features import RangeFeature, features_of
 from perception.range.noise import NoiseModel, estimate_noise
 from perception.range.primitives import Plane, Surface, SurfaceType
-from perception.range.segment import Candidates, reclaimed, segment
+from perception.range.segment import Task, reclaimed, segment
 from perception.range.sensor import RangeSensorModel
 
 Array = NDArray[np.float64]
@@ -62,7 +64,12 @@ class RangeScene:
 
 
 def analyse(
-    depth_m: ArrayLike, sensor: RangeSensorModel, *, noise: NoiseModel | None = None
+    depth_m: ArrayLike,
+    sensor: RangeSensorModel,
+    *,
+    noise: NoiseModel | None = None,
+    tiles: int = 1,
+    pool: ThreadPoolExecutor | None = None,
 ) -> RangeScene:
     """Segment a range image into planes, spheres, cylinders, cones and ellipsoids, with parameters and covariance.
 
@@ -70,6 +77,8 @@ def analyse(
         depth_m: (H, W) depth along the sensor's z axis, metres; NaN, infinite or <= 0 (pinhole) = no reading.
         sensor: pinhole or orthographic model of that size.
         noise: used instead of the estimate from the image when given.
+        tiles: horizontal tiles that share the work on pixels; the result is the same for any number.
+        pool: threads to run the tiles on.
 
     Raises:
         InvalidRequest: wrong shape or type, a sensor of another size, or depth that cannot be metres.
@@ -77,8 +86,9 @@ def analyse(
     """
     depth = checked_depth(depth_m, sensor)
     law = noise or estimate_noise(depth, sensor)
-    labels, found, law = segment(depth, sensor, law)
-    labels, surfaces = _finished(depth, sensor, law, labels, found)
+    task = Task(depth_m=depth, sensor=sensor, tiles=tiles, pool=pool)
+    labels, found, law = segment(task, law)
+    labels, surfaces = _finished(task, law, labels, found)
     return RangeScene(
         labels=labels, surfaces=surfaces, noise=law, sensor=sensor, warnings=_warnings(depth, sensor, law, surfaces)
     )
@@ -129,8 +139,9 @@ def _check_scale(depth: Array, sensor: RangeSensorModel) -> None:
 
 
 def _finished(
-    depth: Array, sensor: RangeSensorModel, noise: NoiseModel, labels: Labels, found: Candidates
+    task: Task, noise: NoiseModel, labels: Labels, found: Candidates
 ) -> tuple[Labels, tuple[Surface, ...]]:
+    depth, sensor = task.depth_m, task.sensor
     count = len(found.kinds)
     samples = finish.samples_by_label(depth, sensor, noise, labels, count)
     owner = join.join_pieces(depth, sensor.packed(), found.kinds, found.parameters, samples)
@@ -148,7 +159,7 @@ def _finished(
         surfaces.append(surface)
         final.add(found.kinds[k], th)
         renamed[k + 1] = new
-    labels = reclaimed(depth, sensor.packed(), noise.packed(), renamed[joined], final, sweeps=1)
+    labels = reclaimed(task, noise, renamed[joined], final, sweeps=1)
     fill_small_gaps(labels, depth, 2)
     return labels, tuple(surfaces)
 

@@ -1,6 +1,6 @@
 """From blocks back to pixels: every pixel goes to the neighbouring surface that explains its depth best."""
 
-# ruff: noqa: PLR0912, PLR0917, PLR1714 - compiled loops take plain arrays, and long
+# ruff: noqa: PLR0912 - compiled loops take plain arrays, and long
 # bodies and plain comparisons are what compiles fast.
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ CLAIM_SIGMAS = 3.5
 MAX_CANDIDATES = 8
 
 
-@njit(cache=True)
-def claim_pixels(depth, sen, noise, blocks, size, kinds, ths, out):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True)
+def claim_pixels(depth, sen, noise, blocks, size, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]
     """Label each pixel of `depth` (H, W) with the best surface among those of the 3x3 blocks around it.
 
-    Writes `out` (H, W) int32: label, or 0 where nothing explains the depth within `CLAIM_SIGMAS`. Labels index
+    Writes the rows of blocks [top, bottom) of `out` (H, W) int32: label, or 0 beyond `CLAIM_SIGMAS`. Labels index
     `kinds` and `ths` from 1.
     """
     H, W = depth.shape
     h, w = blocks.shape
     perspective = sen[0] > 0
     near = np.empty(MAX_CANDIDATES, np.int32)
-    for r in range(h):
+    for r in range(top, bottom):
         for c in range(w):
             n = 0
             for i in range(max(0, r - 1), min(h, r + 2)):
@@ -57,17 +57,17 @@ def claim_pixels(depth, sen, noise, blocks, size, kinds, ths, out):  # type: ign
                     out[v, u] = label
 
 
-@njit(cache=True)
-def claim_borders(depth, sen, noise, labels, kinds, ths, out):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True)
+def claim_borders(depth, sen, noise, labels, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]
     """Judge again each pixel whose 3x3 neighbourhood holds another label; regions gain or lose at most one pixel.
 
-    Reads `labels` (H, W), writes all of `out` (H, W). The outermost pixels keep their labels.
+    Reads `labels` (H, W), writes rows [top, bottom) of `out` (H, W). The outermost pixels keep their labels.
     """
     H, W = depth.shape
     perspective = sen[0] > 0
     near = np.empty(9, np.int32)
-    out[:] = labels
-    for v in range(1, H - 1):
+    out[top:bottom] = labels[top:bottom]
+    for v in range(max(1, top), min(H - 1, bottom)):
         y = (v - sen[4]) / sen[2]
         for u in range(1, W - 1):
             own = labels[v, u]

@@ -5,7 +5,7 @@ the residual is `(z_measured - z_surface) / sigma(z)`. Robust start (Cauchy weig
 at `TRIM_SIGMAS` and plain least squares (Levenberg's damping, Marquardt's scaling).
 """
 
-# ruff: noqa: PLR0917 - compiled loops take plain arrays, and long
+
 # bodies and plain comparisons are what compiles fast.
 from __future__ import annotations
 

@@ -5,16 +5,18 @@ blocks that straddle a jump keep only the larger side. Planes are linear in the 
 depth of an orthographic sensor, so one linear fit serves both.
 """
 
-# ruff: noqa: PLR0915, PLR0917 - compiled loops take plain arrays, and long
+# ruff: noqa: PLR0915 - compiled loops take plain arrays, and long
 # bodies and plain comparisons are what compiles fast.
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from perception.range.components import for_each_tile
 from perception.range.noise import NoiseModel
 from perception.range.sensor import RangeSensorModel
 
@@ -72,19 +74,29 @@ def slope_sigma_rad(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float,
 
 
 def build_grid(
-    depth_m: Array, sensor: RangeSensorModel, noise: NoiseModel, size_px: int, *, jump_slope: float = JUMP_SLOPE
+    depth_m: Array, sensor: RangeSensorModel, noise: NoiseModel, size_px: int, *, jump_slope: float = JUMP_SLOPE,
+    tiles: int = 1, pool: ThreadPoolExecutor | None = None,
 ) -> Grid:
     """Blocks of `size_px` pixels of an (H, W) depth image and their tangent planes; the window radius follows noise.
 
     Neighbours steeper than `jump_slope` (metres of depth per metre across) are apart.
     """
     packed = sensor.packed()
-    x, y, z, count, sigma = _blocks(depth_m, packed, noise.packed(), size_px)
+    law = noise.packed()
+    h, w = (-(-n // size_px) for n in depth_m.shape)
+    x, y = np.empty((h, w)), np.empty((h, w))
+    z, sigma, rms = (np.full((h, w), np.nan) for _ in range(3))
+    normal, count = np.full((h, w, 3), np.nan), np.zeros((h, w), np.int32)
+    for_each_tile(lambda a, b: _blocks(depth_m, packed, law, size_px, x, y, z, sigma, count, a, b), h, tiles, pool=pool)
     perspective = bool(packed[0] > 0)
     middle = float(np.nanmedian(z[:: max(1, z.shape[0] // 32), :: max(1, z.shape[1] // 32)])) if z.size else 1.0
     middle = middle if np.isfinite(middle) else 1.0
     radius, slope_sigma = _radius(noise, sensor, middle, size_px)
-    normal, rms = _tangents(x, y, z, count, sigma, perspective, radius, jump_slope / packed[1], size_px)
+    slope = jump_slope / packed[1]
+    for_each_tile(
+        lambda a, b: _tangents(x, y, z, count, sigma, perspective, radius, slope, size_px, normal, rms, a, b),
+        h, tiles, pool=pool,
+    )
     return Grid(
         size_px=size_px, radius=radius, perspective=perspective, x=x, y=y, z=z, sigma=sigma, normal=normal, rms=rms,
         normal_sigma_rad=slope_sigma, slow_share=noise.slow_share(middle),
@@ -111,16 +123,13 @@ def sigma_at(noise, z):  # type: ignore[no-untyped-def]
     return np.sqrt(max(white * white, step * step / 12.0) + slow * slow)
 
 
-@njit(cache=True)
-def _blocks(depth, sen, noise, b):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True)
+def _blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: ignore[no-untyped-def]
     H, W = depth.shape
-    h, w = (H + b - 1) // b, (W + b - 1) // b
-    x, y = np.empty((h, w)), np.empty((h, w))
-    z, sigma = np.full((h, w), np.nan), np.full((h, w), np.nan)
-    count = np.zeros((h, w), np.int32)
+    w = x.shape[1]
     perspective = sen[0] > 0
     values = np.empty(b * b)
-    for r in range(h):
+    for r in range(top, bottom):
         for c in range(w):
             n = 0
             for v in range(r * b, min(r * b + b, H)):
@@ -163,16 +172,15 @@ def _blocks(depth, sen, noise, b):  # type: ignore[no-untyped-def]
             # Code steps are shared by neighbours, so averaging gains little on them.
             kept = max(fast / m, step * step / 24.0)
             sigma[r, c] = np.sqrt(kept + slow * slow)
-    return x, y, z, count, sigma
 
 
-@njit(cache=True)
-def _tangents(x, y, z, count, sigma, perspective, radius, slope_per_pixel, b):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True)
+def _tangents(  # type: ignore[no-untyped-def]
+    x, y, z, count, sigma, perspective, radius, slope_per_pixel, b, normal, rms, top, bottom
+):
     h, w = z.shape
-    normal = np.full((h, w, 3), np.nan)
-    rms = np.full((h, w), np.nan)
     least = max(5, ((2 * radius + 1) ** 2) * 2 // 5)
-    for r in range(h):
+    for r in range(top, bottom):
         for c in range(w):
             z0 = z[r, c]
             if not np.isfinite(z0):
@@ -231,4 +239,3 @@ def _tangents(x, y, z, count, sigma, perspective, radius, slope_per_pixel, b):  
             normal[r, c, 0] = nx / length
             normal[r, c, 1] = ny / length
             normal[r, c, 2] = nz / length
-    return normal, rms

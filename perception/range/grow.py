@@ -4,7 +4,7 @@ A region grows while its own model explains the next block, so it stops at a cre
 there. A plane that grew on a curved surface betrays itself: a quadratic explains its support clearly better.
 """
 
-# ruff: noqa: PLR0912, PLR0915, PLR0917 - compiled loops take plain arrays, and long
+# ruff: noqa: PLR0912, PLR0915 - compiled loops take plain arrays, and long
 # bodies and plain comparisons are what compiles fast.
 from __future__ import annotations
 
@@ -290,41 +290,27 @@ def _explained(kind, th, x, y, z, sigma, n, rms, perspective, cos_limit):  # typ
 
 
 @njit(cache=True)
-def range_components(z, sigma, free, slope, inverse_f, perspective, normal, rms, cos_limit):  # type: ignore[no-untyped-def]
-    """Components of the free blocks linked over small depth steps and turns; labels (h, w) from 1, and sizes."""
+def smooth_links(z, sigma, free, slope, inverse_f, perspective, normal, rms, cos_limit):  # type: ignore[no-untyped-def]
+    """Which free blocks belong with their right and lower neighbour: a small depth step and a small turn between."""
     h, w = z.shape
-    label = np.zeros((h, w), np.int32)
-    stack = np.empty(h * w, np.int32)
-    sizes = np.zeros(h * w + 1, np.int32)
-    found = 0
-    for r0 in range(h):
-        for c0 in range(w):
-            if label[r0, c0] or not free[r0, c0]:
+    right, down = np.zeros((h, w), np.bool_), np.zeros((h, w), np.bool_)
+    for r in range(h):
+        for c in range(w):
+            if not free[r, c]:
                 continue
-            found += 1
-            label[r0, c0] = found
-            stack[0] = r0 * w + c0
-            top = 1
-            while top > 0:
-                top -= 1
-                i = stack[top]
-                r, c = i // w, i % w
-                sizes[found] += 1
-                pitch = (z[r, c] if perspective else 1.0) * inverse_f
-                for s in range(4):
-                    rr = r + (1 if s == 0 else -1 if s == 1 else 0)
-                    cc = c + (1 if s == 2 else -1 if s == 3 else 0)
-                    if rr < 0 or cc < 0 or rr >= h or cc >= w or label[rr, cc] or not free[rr, cc]:
+            limit = slope * (z[r, c] if perspective else 1.0) * inverse_f + 4.0 * sigma[r, c]
+            for s in range(2):
+                i, j = r + s, c + 1 - s
+                if i >= h or j >= w or not free[i, j] or not abs(z[i, j] - z[r, c]) <= limit:
+                    continue
+                if rms[r, c] < 1.8 and rms[i, j] < 1.8:
+                    dot = 0.0
+                    for k in range(3):
+                        dot += normal[r, c, k] * normal[i, j, k]
+                    if dot < cos_limit:
                         continue
-                    if not abs(z[rr, cc] - z[r, c]) <= slope * pitch + 4.0 * sigma[r, c]:
-                        continue
-                    if rms[r, c] < 1.8 and rms[rr, cc] < 1.8:
-                        dot = 0.0
-                        for k in range(3):
-                            dot += normal[r, c, k] * normal[rr, cc, k]
-                        if dot < cos_limit:
-                            continue
-                    label[rr, cc] = found
-                    stack[top] = rr * w + cc
-                    top += 1
-    return label, sizes[: found + 1].copy()
+                if s == 0:
+                    right[r, c] = True
+                else:
+                    down[r, c] = True
+    return right, down

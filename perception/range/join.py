@@ -16,7 +16,7 @@ PAIR_SAMPLES = 150
 JOINED_SHARE = 0.85
 JOINED_MEAN_SQUARE = 1.6
 NEAR_SAMPLES = 16
-NEAR_SIGMAS = 25.0
+NEAR_SIGMAS = 12.0
 SCRAP_SHARE = 0.1
 SCRAP_SIGMAS = 6.0
 LARGEST_TURN_RAD = 0.2
@@ -106,7 +106,7 @@ def _nearness(
 
 
 @njit(cache=True)
-def _near_matrix(kinds, ths, starts, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def] # noqa: PLR0917
+def _near_matrix(kinds, ths, starts, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]
     n = kinds.shape[0]
     near = np.zeros((n, n), np.bool_)
     for i in range(n):

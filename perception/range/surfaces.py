@@ -12,7 +12,7 @@ A surface is a kind and a parameter vector of 16 numbers:
 Steps live in a tangent space: shifts across the axis and tilts of unit vectors in the frame of `tangent_frame`.
 """
 
-# ruff: noqa: PLR0911, PLR0912, PLR0917, PLR1714, SIM109 - compiled loops take plain arrays, and long
+# ruff: noqa: PLR0912, PLR1714, SIM109 - compiled loops take plain arrays, and long
 # bodies and plain comparisons are what compiles fast.
 from __future__ import annotations
 

@@ -56,9 +56,10 @@ def decode_number(text: bytes) -> int:
 
 def decode_ranges_mm(data: bytes) -> NDArray[np.int32]:
     """Distances of three characters each; the lines must have been joined, as values straddle them."""
-    c = np.frombuffer(data, np.uint8).reshape(-1, 3)
-    high, middle, low = (c[:, i].astype(np.int32) for i in range(3))
-    return (high << 12) + (middle << 6) + low - (0x30 << 12) - (0x30 << 6) - 0x30
+    packed = np.zeros((len(data) // 3, 4), np.uint8)
+    packed[:, 1:] = np.frombuffer(data, np.uint8).reshape(-1, 3)
+    bits = packed.view(">u4")[:, 0].astype(np.int32) - 0x303030  # 00hhhhhh 00mmmmmm 00llllll
+    return (bits >> 4 & 0x3F000) | (bits >> 2 & 0xFC0) | (bits & 0x3F)
 
 
 def is_encoded(data: bytes) -> bool:

@@ -44,15 +44,15 @@ class FaultPlan:
     def __init__(self, options: FaultOptions) -> None:
         self.options = options
         self.injected = 0
-        self._frames = 0
+        self.frames = 0
         self._random = random.Random(options.seed)
 
     def next(self) -> WireFault | None:
         """The fault of the next frame, or None."""
+        self.frames += 1
         if self.options.fault is None:
             return None
-        self._frames += 1
-        if self._frames % self.options.every:
+        if self.frames % self.options.every:
             return None
         self.injected += 1
         return self.options.fault

@@ -248,7 +248,7 @@ class UrEmulator(WireEmulator):
         sample = self._backing.read_state(deadline=self.deadline())
         position = [float(q) for q in sample.value.position_rad]
         return {
-            "timestamp": [round(time.monotonic() - self._start_s, 4)],
+            "timestamp": [time.monotonic() - self._start_s],
             "actual_q": position,
             "actual_qd": [float(v) for v in sample.value.velocity_rad_per_s],
             "target_q": position,

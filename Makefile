@@ -21,6 +21,7 @@ setup: .venv/ready  ## Make .venv with everything in it
 	@$(PYTHON) -m venv .venv
 	@$(BIN)/python -m pip install --progress-bar on --quiet -c constraints.txt -e '.[test]' 2>&1 | grep -v '^WARNING' || true
 	@$(BIN)/python -c 'import hal, numpy, cv2, pybullet' || { echo "error: the installation is not complete; the lines above say why"; exit 2; }
+	@$(BIN)/panelwright warm
 	@touch $@
 	@echo "setup: ready"
 

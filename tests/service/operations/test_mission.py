@@ -1,0 +1,106 @@
+"""The whole mission on the simulated cell, inline: what it does, that it repeats, and that no truth reaches it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hal.config import load_cell
+from hal.devices import Fault, ObjectTruth, Truth
+from hal.errors import CellError
+from service.cell import CellRuntime
+from service.connection import LocalConnection
+from service.operations.context import CellMemory, OperationContext
+from service.operations.judge import judge
+from service.operations.mission import run_mission
+from service.operations.requests import ActionBody, MissionRequest
+from service.task_model import Task
+from service.tasks import TaskContext
+
+ROOT = Path(__file__).parents[3]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+
+@contextmanager
+def mission_context(folder: Path, seed: int) -> Iterator[OperationContext]:
+    """An inline cell with a task of its own."""
+    cell = load_cell(ROOT / "cells/bench.toml", seed=seed)
+    runtime = CellRuntime.start(cell, is_latched=lambda: False)
+    try:
+        yield OperationContext(
+            connection=LocalConnection(cell, runtime.objects, close=runtime.close),
+            task=TaskContext(Task(id="test", verb="missions", request={}, moves=True), folder / "artefacts"),
+            runs_dir=folder / "runs",
+            state=CellMemory(),
+        )
+    finally:
+        runtime.close()
+
+
+def report_of(folder: Path) -> dict[str, Any]:
+    """The only report below a folder."""
+    (path,) = folder.glob("runs/*/report.json")
+    report: dict[str, Any] = json.loads(path.read_text())
+    return report
+
+
+def without_wall_time(report: dict[str, Any]) -> dict[str, Any]:
+    """What must repeat: everything but names and times of the wall."""
+    kept = {key: value for key, value in report.items() if key not in ("mission", "started", "wall_s", "judge")}
+    return {**kept, "steps": [{**step, "wall_s": 0.0} for step in report["steps"]]}
+
+
+def lie(truth: Truth) -> Truth:
+    """A truth in which everything is elsewhere and shows something else."""
+    matrix = truth.base_from_panel_matrix.copy()
+    matrix[:3, 3] += (0.05, -0.04, 0.03)
+    wrong = tuple(ObjectTruth(name=thing.name, value=-1.0, state="broken", text="8888") for thing in truth.objects)
+    return replace(truth, base_from_panel_matrix=matrix, objects=wrong, initial=wrong)
+
+
+def test_a_planted_wrong_truth_changes_nothing_but_the_judgement(tmp_path: Path) -> None:
+    request = MissionRequest(actions=(ActionBody(object="setpoint", value=65.0),), touches=3)
+    for name in ("honest", "planted"):
+        with mission_context(tmp_path / name, seed=3) as context:
+            arm = context.connection.device("arm")
+            if name == "planted":
+                true_truth = arm.truth
+                arm.truth = lambda ask=true_truth: lie(ask())
+            answer = run_mission(context, request)
+            judge(context.connection, tmp_path / name / "runs" / answer["mission"])
+    honest, planted = report_of(tmp_path / "honest"), report_of(tmp_path / "planted")
+    assert without_wall_time(honest) == without_wall_time(planted)
+    assert honest["judge"]["agrees"] and honest["judge"]["pose_error_m"] < 0.005
+    assert not planted["judge"]["agrees"] and planted["judge"]["pose_error_m"] > 0.02
+    assert honest["succeeded"]
+    pictures = [path.name for path in (tmp_path / "honest/runs").glob("*/*.png")]
+    assert {"lights.png", "range.png", "pose.png", "wrench.png", "joints.png"} <= set(pictures)
+
+
+@pytest.mark.parametrize("device", ["wrist_camera", "range_scanner"])
+def test_a_device_that_dies_ends_the_mission_by_name_and_nothing_is_lost(tmp_path: Path, device: str) -> None:
+    with mission_context(tmp_path, seed=4) as context:
+        context.connection.device(device).inject_fault(Fault.DISCONNECTED)
+        with pytest.raises(CellError) as caught:
+            run_mission(context, MissionRequest())
+        state = context.connection.mover.state()
+    assert device in str(caught.value)
+    report = report_of(tmp_path)
+    assert device in report["problem"]["detail"]
+    assert report["steps"] and not report["succeeded"]
+    park = load_cell(ROOT / "cells/bench.toml").file.workspace.park_rad
+    np.testing.assert_allclose(state.position_rad, park, atol=0.01)
+
+
+def test_a_frozen_camera_is_found_out(tmp_path: Path) -> None:
+    with mission_context(tmp_path, seed=4) as context:
+        context.connection.device("wrist_camera").inject_fault(Fault.FROZEN)
+        with pytest.raises(CellError, match="same frame"):
+            run_mission(context, MissionRequest())

@@ -161,13 +161,19 @@ class Service:
                     created_s=record.wall_time_s,
                 )
             elif data["task"] in tasks:
-                task = tasks[data["task"]]
-                task.state = TaskState(data["state"])
-                task.result, task.problem = data["result"], data["problem"]
-                task.artefacts = [Artefact(**item) for item in data["artefacts"]]
-                task.ended_s = record.wall_time_s
+                _bring_to_end(tasks[data["task"]], data, record.wall_time_s)
         for task in tasks.values():
             self.tasks.restore(task)
+
+
+def _bring_to_end(task: Task, data: dict[str, Any], ended_s: float) -> None:
+    """Give a restored task what its last record says."""
+    task.result, task.problem = data["result"], data["problem"]
+    task.artefacts = [Artefact(**item) for item in data["artefacts"]]
+    task.started_s, task.ended_s = data.get("started_s"), ended_s
+    task.state = TaskState(data["state"])
+    fraction = 1.0 if task.state is TaskState.SUCCEEDED else float(data.get("fraction", 0.0))
+    task.add_event("state", fraction=fraction, step=str(data.get("step", "")))
 
 
 def stopped(source: str) -> Stopped:

@@ -275,6 +275,7 @@ class TaskStore:
 
     def _record_end(self, task: Task, state: TaskState | None = None) -> None:
         ended = {"task": task.id, "state": str(state or task.state), "result": task.result, "problem": task.problem}
+        ended |= {"fraction": task.fraction, "step": task.step, "started_s": task.started_s}
         try:
             self._recorder.append("task-ended", {**ended, "artefacts": jsonable(task.artefacts)})
         except CellError as error:

@@ -63,7 +63,7 @@ function joint(angle, index) {
   const bar = document.createElement("span");
   bar.className = "bar";
   const mark = document.createElement("i");
-  mark.style.left = `${50 + (50 * Math.max(-Math.PI, Math.min(Math.PI, angle))) / Math.PI}%`;
+  mark.style.left = `${50 + 50 * Math.max(-1, Math.min(1, angle / (2 * Math.PI)))}%`;
   bar.append(mark);
   const value = document.createElement("b");
   value.textContent = `${((180 * angle) / Math.PI).toFixed(1)}°`;

@@ -1,0 +1,90 @@
+"""A service that starts again knows what the last one did, and takes nothing up by itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hal.config import load_cell
+from service.core import Service
+from service.task_model import TaskState
+from tests.service.conftest import WriteCell
+from tests.service.verbs import OPERATIONS, EchoRequest, FailRequest, HoldRequest
+from tests.service.waiting import eventually
+
+
+def _service(cell: Path, runs: Path) -> Service:
+    service = Service(load_cell(cell), OPERATIONS, runs_dir=runs, inline=True)
+    service.start()
+    return service
+
+
+def test_ended_tasks_come_back_with_result_problem_progress_and_artefacts(
+    write_cell: WriteCell, tmp_path: Path
+) -> None:
+    cell, runs = write_cell(), tmp_path / "runs"
+    first = _service(cell, runs)
+    good = first.submit("echo", EchoRequest(text="hello"))
+    bad = first.submit("fail", FailRequest())
+    assert good.wait(20.0) and bad.wait(20.0)
+    first.close()
+    second = _service(cell, runs)
+    try:
+        again = second.tasks.get(good.id)
+        assert (again.state, again.result["text"], again.fraction) == (TaskState.SUCCEEDED, "hello", 1.0)
+        assert again.step == "speaking"
+        path, _ = second.tasks.artefact_path(good.id, "said.txt")
+        assert path.read_text() == "hello"
+        failed = second.tasks.get(bad.id)
+        assert failed.state is TaskState.FAILED
+        assert failed.problem == bad.problem
+        assert second.journal.verify() > 0
+    finally:
+        second.close()
+
+
+def test_a_task_that_was_cut_off_is_aborted_and_not_taken_up(write_cell: WriteCell, tmp_path: Path) -> None:
+    cell, runs = write_cell(robot=True), tmp_path / "runs"
+    first = _service(cell, runs)
+    task = first.submit("hold", HoldRequest())
+    eventually(lambda: task.state is TaskState.RUNNING)
+    first.journal.close()  # as a power cut would: whatever comes after this is not recorded
+    first.close()
+    second = _service(cell, runs)
+    try:
+        again = second.tasks.get(task.id)
+        assert again.state is TaskState.FAILED
+        assert again.problem is not None
+        assert again.problem["type"] == "urn:panelwright:aborted"
+        assert second.tasks.moving() is None
+    finally:
+        second.close()
+
+
+def test_starts_stops_and_resets_are_on_record(write_cell: WriteCell, tmp_path: Path) -> None:
+    service = _service(write_cell(), tmp_path / "runs")
+    service.supervisor.stop("test")
+    service.supervisor.reset("test", seen_count=service.supervisor.latch.state().count)
+    service.close()
+    kinds = [record.kind for record in service.journal.records()]
+    assert kinds == ["service-start", "stop-reset", "stop", "stop-reset", "stop", "service-end"]
+
+
+def test_a_journal_that_cannot_be_written_lets_nothing_start_and_the_stop_works(
+    write_cell: WriteCell, tmp_path: Path
+) -> None:
+    import sqlite3
+
+    import pytest
+
+    from service.errors import JournalError
+
+    service = _service(write_cell(robot=True), tmp_path / "runs")
+    try:
+        with sqlite3.connect(service.journal.path) as db:
+            db.execute("CREATE TRIGGER full BEFORE INSERT ON journal BEGIN SELECT RAISE(ABORT, 'disk full'); END")
+        with pytest.raises(JournalError, match="disk full"):
+            service.submit("hold", HoldRequest(seconds=0.1))
+        assert service.tasks.all() == []
+        assert service.supervisor.stop("test").is_latched
+    finally:
+        service.close()

@@ -19,7 +19,7 @@ from simbackend.device import VALID, SimDevice, SimOptions, parse
 
 Array = NDArray[np.float64]
 
-RESOLUTION_RAD = 1e-6
+DIGITS = 6  # encoders resolve a microradian
 MOVING_RAD_PER_S = 0.002
 
 
@@ -84,12 +84,12 @@ class SimArm(SimDevice[JointState]):
 
     def _measure(self, frame: Frame, bias: float) -> tuple[JointState, Quality, Cause]:
         snapshot = frame.snapshot
-        position = np.round(snapshot.position_rad / RESOLUTION_RAD) * RESOLUTION_RAD + bias
+        velocity = snapshot.velocity_rad_per_s
         state = JointState(
-            position_rad=position,
-            velocity_rad_per_s=snapshot.velocity_rad_per_s.copy(),
+            position_rad=snapshot.position_rad.round(DIGITS) + bias,
+            velocity_rad_per_s=velocity.copy(),
             is_enabled=snapshot.is_enabled,
-            is_moving=bool(np.abs(snapshot.velocity_rad_per_s).max() > MOVING_RAD_PER_S),
+            is_moving=max(map(abs, velocity.tolist())) > MOVING_RAD_PER_S,
         )
         return state, *VALID
 

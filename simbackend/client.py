@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
@@ -29,17 +29,20 @@ from simbackend.arm_model import MODELS
 from simbackend.draws import Draws
 from simbackend.wire import (
     CAMERA_AT,
+    DOUBLE,
     GRIPPER_AT,
     IMAGE_BYTES,
     JOINTS_AT,
     LIGHTS_AT,
     REQUEST,
+    SNAPSHOT,
     Drive,
     Op,
     Picture,
     PictureInfo,
     Snapshot,
     WorldConfig,
+    read_exactly,
 )
 
 Array = NDArray[np.float64]
@@ -132,6 +135,7 @@ class WorldClient:
             )
         theirs.close()
         self._pipe = Connection(ours.detach())
+        self._stream = self._pipe.fileno()
         try:
             self._pipe.send(config)
             complaint = self._pipe.recv() if self._pipe.poll(START_S) else f"no answer within {START_S:.0f} s"
@@ -139,7 +143,7 @@ class WorldClient:
                 raise DeviceUnavailable(
                     f"the simulated world did not start: {complaint}", hint="run `panelwright doctor`", device="world"
                 )
-            self._take(self._pipe.recv_bytes())
+            self._take(read_exactly(self._stream, SNAPSHOT * DOUBLE))
         except (EOFError, OSError) as error:
             self.close()
             raise DeviceUnavailable(
@@ -180,22 +184,29 @@ class WorldClient:
         self.frame = Frame(snapshot, stamp_s)
 
     def _ask(self, message: bytes) -> bytes:
-        with self._guarded():
-            self._pipe.send_bytes(message)
-            return self._pipe.recv_bytes()
+        if self._is_closed:
+            raise _closed()
+        try:
+            os.write(self._stream, message)
+            return read_exactly(self._stream, SNAPSHOT * DOUBLE)
+        except (EOFError, OSError) as error:
+            raise self._ended() from error
 
     @contextlib.contextmanager
-    def _guarded(self):  # type: ignore[no-untyped-def]
+    def _guarded(self) -> Iterator[None]:
         if self._is_closed:
-            raise DeviceUnavailable("the simulated world is closed", hint="open the cell again", device="world")
+            raise _closed()
         try:
             yield
         except (EOFError, OSError) as error:
-            raise DeviceUnavailable(
-                f"the simulated world has ended (exit code {self._process.poll()})",
-                hint="start the cell again; its log says why the world ended",
-                device="world",
-            ) from error
+            raise self._ended() from error
+
+    def _ended(self) -> DeviceUnavailable:
+        return DeviceUnavailable(
+            f"the simulated world has ended (exit code {self._process.poll()})",
+            hint="start the cell again; its log says why the world ended",
+            device="world",
+        )
 
     def at(self, time_s: float, action: Callable[[], None]) -> None:
         """Run `action` when the world reaches a simulated time; at once when it has."""
@@ -267,17 +278,18 @@ class WorldClient:
     def _draw(self, view: CameraView, kind: Picture) -> PictureInfo:
         matrix = np.asarray(view.flange_from_camera.as_matrix())[:3]
         head = [Op.RENDER, view.width, view.height, view.near_m, *view.focal, *view.centre, kind]
-        request = np.concatenate([np.asarray(head, float), matrix.ravel()])
-        assert len(head) == CAMERA_AT  # noqa: S101  # the layout of the wire
+        request = np.zeros(REQUEST)
+        request[:CAMERA_AT] = head
+        request[CAMERA_AT : CAMERA_AT + 12] = matrix.ravel()
         with self._guarded():
-            self._pipe.send_bytes(request.tobytes())
+            os.write(self._stream, request.tobytes())
             info: PictureInfo = self._pipe.recv()
             return info
 
     def truth(self) -> Truth:
         """What the judge may ask for when a mission has ended."""
         with self._lock, self._guarded():
-            self._pipe.send_bytes(np.array([float(Op.TRUTH)]).tobytes())
+            os.write(self._stream, _plain(Op.TRUTH))
             truth = self._pipe.recv()
         if not isinstance(truth, Truth):
             raise DeviceFault("the simulated world gave no truth", hint="report this", device="world")
@@ -290,13 +302,24 @@ class WorldClient:
                 return
             self._is_closed = True
             with contextlib.suppress(OSError):
-                self._pipe.send_bytes(np.array([float(Op.CLOSE)]).tobytes())
+                os.write(self._stream, _plain(Op.CLOSE))
             self._pipe.close()
             try:
                 self._process.wait(CLOSE_S)
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait(CLOSE_S)
+
+
+def _closed() -> DeviceUnavailable:
+    return DeviceUnavailable("the simulated world is closed", hint="open the cell again", device="world")
+
+
+def _plain(op: Op) -> bytes:
+    """A request without arguments."""
+    request = np.zeros(REQUEST)
+    request[0] = op
+    return request.tobytes()
 
 
 def true_mount(cell: Cell, draws: Draws, device: str) -> RigidTransform:

@@ -58,7 +58,7 @@ class SimGripper(SimDevice[GripperState]):
         snapshot = frame.snapshot
         state = GripperState(
             width_m=round(snapshot.width_m / RESOLUTION_M) * RESOLUTION_M + bias,
-            force_n=float(snapshot.pad_force_n.mean()),
+            force_n=0.5 * float(snapshot.pad_force_n[0] + snapshot.pad_force_n[1]),
             is_moving=snapshot.is_gripper_moving,
             is_holding=snapshot.is_holding,
         )

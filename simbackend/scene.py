@@ -20,6 +20,7 @@ from simbackend.textures import Pixels
 
 Array = NDArray[np.float64]
 Float32 = NDArray[np.float32]
+Pose = tuple[tuple[float, ...], tuple[float, ...]]  # position and quaternion, as the engine gives them
 
 TO_LIGHT = np.array([-0.50, 0.30, 0.81])  # base axes: the room's lamps hang above and behind the arm
 AMBIENT, DIFFUSE = 0.55, 0.50
@@ -49,7 +50,6 @@ class Scene:
         self._pictures: list[Pixels] = []
         self._rows = 0
         self._compiled: dict[int, _Compiled] = {}
-        self._fixed: dict[tuple[int, int], tuple[Array, Array]] = {}
 
     def add_body(self, body: int) -> None:
         """All visual shapes of a body of the engine."""
@@ -92,10 +92,13 @@ class Scene:
         self._albedo = np.concatenate(self._colours)
         self._surfaces = np.concatenate(self._surface)
         self._glow = np.zeros(self._rows, bool)
-        self._moving: dict[tuple[int, int], list[slice]] = {}
+        self._points = self._mesh.points_m.copy()
+        self._shade = _shade(self._mesh.normals)
+        self._links: dict[tuple[int, int], list[slice]] = {}
         for part in self._parts:
             if part.body >= 0:
-                self._moving.setdefault((part.body, part.link), []).append(part.rows)
+                self._links.setdefault((part.body, part.link), []).append(part.rows)
+        self._last: dict[tuple[int, int], Pose] = {}
         for channels in (0, 1, 3):
             self._compiled[channels] = _Compiled(self._albedo, self._pictures, channels)
 
@@ -111,6 +114,7 @@ class Scene:
         for part in self._parts:
             if (part.body, part.link) == (body, link):
                 self._glow[part.rows] = on
+                self._last.pop((body, link), None)
 
     def draw(
         self,
@@ -127,12 +131,9 @@ class Scene:
 
         `channels`: 3 for RGB, 1 for grey, 0 for depth alone.
         """
-        points, normals = self._posed()
-        turn = np.asarray(base_from_camera.rotation.as_matrix())
-        seen = (points - base_from_camera.translation) @ turn
-        shade = AMBIENT + DIFFUSE * np.maximum(normals @ (TO_LIGHT / np.linalg.norm(TO_LIGHT)), 0.0)
-        shade[self._glow] = 1.0
-        attributes = np.concatenate([shade[:, :, None], self._mesh.uv], axis=2)
+        self._follow()
+        seen = (self._points - base_from_camera.translation) @ np.asarray(base_from_camera.rotation.as_matrix())
+        attributes = np.concatenate([self._shade[:, :, None], self._mesh.uv], axis=2)
         compiled = self._compiled[channels]
         inverse_depth = np.zeros((height, width), np.float32)
         image = np.full((height, width, channels), BACKGROUND, np.float32)
@@ -150,28 +151,32 @@ class Scene:
         )
         return image, inverse_depth
 
-    def _posed(self) -> tuple[Array, Array]:
-        points, normals = self._mesh.points_m.copy(), self._mesh.normals.copy()
-        for (body, link), all_rows in self._moving.items():
-            turn, place = self._pose(body, link)
+    def _follow(self) -> None:
+        """Move the triangles of every link that has moved since the last picture."""
+        for key, all_rows in self._links.items():
+            pose = self._pose(*key)
+            if self._last.get(key) == pose:
+                continue
+            self._last[key] = pose
+            position, quaternion = pose
+            turn = np.array(self._engine.getMatrixFromQuaternion(quaternion)).reshape(3, 3).T
             for rows in all_rows:
-                points[rows] = points[rows] @ turn.T + place
-                normals[rows] = normals[rows] @ turn.T
-        return points, normals
+                self._points[rows] = self._mesh.points_m[rows] @ turn + position
+                shade = _shade(self._mesh.normals[rows] @ turn)
+                self._shade[rows] = np.where(self._glow[rows, None], 1.0, shade)
 
-    def _pose(self, body: int, link: int) -> tuple[Array, Array]:
-        engine = self._engine
-        if link >= 0:
-            state = engine.getLinkState(body, link, computeForwardKinematics=1)
-            position, quaternion = state[4], state[5]
-        elif (body, link) in self._fixed:
-            return self._fixed[body, link]
-        else:
-            position, quaternion = engine.getBasePositionAndOrientation(body)
-        pose = np.array(engine.getMatrixFromQuaternion(quaternion)).reshape(3, 3), np.asarray(position)
+    def _pose(self, body: int, link: int) -> Pose:
         if link < 0:
-            self._fixed[body, link] = pose  # every base in the cell is bolted down
-        return pose
+            position, quaternion = self._engine.getBasePositionAndOrientation(body)
+        else:
+            position, quaternion = self._engine.getLinkState(body, link, computeForwardKinematics=1)[4:6]
+        return position, quaternion
+
+
+def _shade(normals: Array) -> Array:
+    """(T, 3) light on each corner: the room's, and what a distant lamp adds by the cosine."""
+    towards = TO_LIGHT / np.linalg.norm(TO_LIGHT)
+    return np.asarray(AMBIENT + DIFFUSE * np.maximum(normals @ towards, 0.0))
 
 
 class _Compiled:

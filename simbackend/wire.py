@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 
@@ -16,6 +17,7 @@ Array = NDArray[np.float64]
 DOF = 6
 LIGHTS = 4
 MAX_PROXIMITY = 4
+DOUBLE = 8  # bytes
 PROXIMITY_TICKS = 5  # 100 Hz at the usual tick; fourteen rays would cost a third of every tick
 IMAGE_BYTES = 128 * 2**20  # sparse: only what an image touches costs memory
 
@@ -39,7 +41,7 @@ class Drive(IntFlag):
 
 
 # Request vector of a step: op, ticks, drive, 6 joints, gripper flag, width, force, speed, lights flag, 4 lights.
-REQUEST = 24
+REQUEST = 24  # doubles; every request has this length and no frame, so that a step costs one write and one read
 JOINTS_AT, GRIPPER_AT, LIGHTS_AT = 3, 9, 13
 # Request vector of an image: op, width, height, near, fx, fy, cx, cy, kind, then flange_from_camera row by row (3 x 4).
 CAMERA_AT = 9
@@ -162,3 +164,18 @@ class PictureInfo:
     camera_from_base: RigidTransform
     base_from_panel: RigidTransform
     lit: tuple[Emitter, ...]
+
+
+def read_exactly(descriptor: int, count: int) -> bytes:
+    """`count` bytes from a stream.
+
+    Raises:
+        EOFError: the other side has gone.
+    """
+    data = os.read(descriptor, count)
+    while len(data) < count:
+        more = os.read(descriptor, count - len(data))
+        if not more:
+            raise EOFError("the other side of the pipe has gone")
+        data += more
+    return data

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import os
 import signal
 import sys
 from multiprocessing.connection import Connection
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from simbackend.wire import CAMERA_AT, IMAGE_BYTES, Op, Picture, PictureInfo
+from simbackend.wire import CAMERA_AT, DOUBLE, IMAGE_BYTES, REQUEST, Op, Picture, PictureInfo, read_exactly
 from simbackend.world import World
 
 Array = NDArray[np.float64]
@@ -25,16 +26,17 @@ def serve(pipe: Connection, images: mmap.mmap) -> None:
         pipe.send(f"{type(error).__name__}: {error}")
         return
     pipe.send(None)
-    pipe.send_bytes(world.snapshot().tobytes())
+    stream = pipe.fileno()
+    os.write(stream, world.snapshot().tobytes())
     while True:
         try:
-            message = pipe.recv_bytes()
+            message = read_exactly(stream, REQUEST * DOUBLE)
         except (EOFError, OSError):
             break
         request = np.frombuffer(message)
         match Op(int(request[0])):
             case Op.STEP:
-                pipe.send_bytes(world.step(request).tobytes())
+                os.write(stream, world.step(request).tobytes())
             case Op.RENDER:
                 pipe.send(picture(world, request, images))
             case Op.TRUTH:

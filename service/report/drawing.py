@@ -24,7 +24,7 @@ def panel_drawing(
     """PNG of the image with plate, objects, lights and the panel's axes drawn where the pose puts them."""
     figure = Figure(figsize=(8.0, 8.0 * intrinsics.height_px / intrinsics.width_px), dpi=100)
     pane = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    pane.imshow(pixels, cmap="gray", vmin=0, vmax=255, alpha=0.55)
+    pane.imshow(pixels, cmap="gray", vmin=0, vmax=255, alpha=0.8)
 
     def line(points_m: NDArray[np.float64], colour: str, width: float = 1.2) -> None:
         u, v = project(camera_from_panel.apply(points_m), intrinsics).T

@@ -144,7 +144,7 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
         until_s = now_s() + o.activation_s
         deadline = Deadline.after(self.context.clock, o.activation_s)
         self.call(begin, deadline)
-        while self.call(self._status, Deadline.after(self.context.clock, 5 * o.timeout_s)).state != READY:
+        while self.call(self._status, Deadline.after(self.context.clock, 10 * o.timeout_s)).state != READY:
             if now_s() > until_s:
                 raise self._inactive()
             self.bus.rest(self.period_s)

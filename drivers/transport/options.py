@@ -69,14 +69,14 @@ def read_options(context: Context, options: dict[str, Any], model: type[M]) -> M
 
 def serial_opener(options: SerialOptions, device: str) -> tuple[Callable[[], Link], str]:
     """What opens the port, and the link's name."""
-    return _with_files(options, lambda: open_serial(options.port, baud=options.baud, device=device)), (
+    return opener_with_files(options, lambda: open_serial(options.port, baud=options.baud, device=device)), (
         f"serial {options.port}, {options.baud} baud"
     )
 
 
 def tcp_opener(options: TcpOptions, device: str) -> tuple[Callable[[], Link], str]:
     """What connects, and the link's name."""
-    opener = _with_files(
+    opener = opener_with_files(
         options, lambda: open_tcp(options.host, options.port, timeout_s=CONNECT_TIMEOUT_S, device=device)
     )
     return opener, f"tcp {options.host}:{options.port}"
@@ -84,7 +84,7 @@ def tcp_opener(options: TcpOptions, device: str) -> tuple[Callable[[], Link], st
 
 def udp_opener(options: UdpOptions, device: str) -> tuple[Callable[[], Link], str]:
     """What makes the socket, and the link's name."""
-    opener = _with_files(options, lambda: open_udp(options.host, options.port, device=device))
+    opener = opener_with_files(options, lambda: open_udp(options.host, options.port, device=device))
     return opener, f"udp {options.host}:{options.port}"
 
 
@@ -92,14 +92,14 @@ def either_opener(options: EitherOptions, device: str) -> tuple[Callable[[], Lin
     """Serial or TCP."""
     if isinstance(options.port, int):
         host, number = options.host or "127.0.0.1", options.port
-        opener = _with_files(options, lambda: open_tcp(host, number, timeout_s=CONNECT_TIMEOUT_S, device=device))
+        opener = opener_with_files(options, lambda: open_tcp(host, number, timeout_s=CONNECT_TIMEOUT_S, device=device))
         return opener, f"tcp {host}:{number}"
     path = options.port
-    opener = _with_files(options, lambda: open_serial(path, baud=options.baud, device=device))
+    opener = opener_with_files(options, lambda: open_serial(path, baud=options.baud, device=device))
     return opener, f"serial {path}, {options.baud} baud"
 
 
-def _with_files(options: Captured, opener: Callable[[], Link]) -> Callable[[], Link]:
+def opener_with_files(options: Captured, opener: Callable[[], Link]) -> Callable[[], Link]:
     """The opener itself, or one that captures or replays."""
     capture, replay = options.capture, options.replay
     if replay is not None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
 
-from drivers.transport.link import WireError
+from drivers.transport.link import LinkLost, WireError
 from hal.errors import CellError
+
+log = logging.getLogger(__name__)
 
 FIRST_RETRY_S = 0.05
 LAST_RETRY_S = 0.25  # a port that returns is in use again within 0.5 s
@@ -92,10 +95,18 @@ class Port(Generic[L]):
             try:
                 self._session()
             except (WireError, CellError) as error:
-                retry_s = FIRST_RETRY_S if self._link is not None else min(2.0 * retry_s, LAST_RETRY_S)
-                self._link = None
-                self._tenant.lost(error)
-                self._closing.wait(retry_s)
+                retry_s = self._rest(error, retry_s)
+            except Exception as error:  # a defect in a driver must not leave a device silent for ever
+                log.exception("%s failed", self._thread.name)
+                retry_s = self._rest(LinkLost(f"its driver failed: {error!r}"), retry_s)
+
+    def _rest(self, error: Exception, retry_s: float) -> float:
+        """Tell the tenant, wait, and say how long the next wait is."""
+        retry_s = FIRST_RETRY_S if self._link is not None else min(2.0 * retry_s, LAST_RETRY_S)
+        self._link = None
+        self._tenant.lost(error)
+        self._closing.wait(retry_s)
+        return retry_s
 
     def _session(self) -> None:
         link = self._open_link()

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import errno
 import os
+import termios
 from pathlib import Path
 
 import serial
 import serial.tools.list_ports
 
 from drivers.transport.fd_link import FdLink
+from drivers.transport.link import LinkLost
 from hal.errors import DeviceUnavailable
 
 PTY_MAJORS = range(136, 144)  # Linux devices.txt
@@ -42,7 +44,10 @@ class SerialLink(FdLink):
 
     def set_baud(self, baud: int) -> None:
         """Change the speed of the open port."""
-        self._port.baudrate = baud
+        try:
+            self._port.baudrate = baud
+        except (serial.SerialException, OSError, termios.error) as error:
+            raise LinkLost(f"{self._name}: {error}") from error
         self._name = f"serial {self._path}, {baud} baud"
 
     def _release(self, fd: int) -> None:  # noqa: ARG002  # pyserial closes it
@@ -65,7 +70,7 @@ def open_serial(path: str, *, baud: int, device: str, parity: str = "N", stop_bi
     """
     try:
         port = serial.Serial(path, baud, parity=parity, stopbits=stop_bits, timeout=0, write_timeout=0, exclusive=True)
-    except (serial.SerialException, OSError, ValueError) as error:
+    except (serial.SerialException, OSError, ValueError, termios.error) as error:  # termios.error is no OSError
         raise _unavailable(path, device, error) from error
     return SerialLink(port, path=path, baud=baud)
 

@@ -1,0 +1,309 @@
+"""A six-axis arm of CiA-402 drives on CANopen: cyclic synchronous position, everything on SYNC (CiA 301, CiA 402-2).
+
+The owner thread sends all targets and then SYNC at a fixed rate; states come back on that SYNC, which stamps them. Each
+drive watches the host's heartbeat (1016h): when the host dies, they fault and brake by themselves. Nothing but `enable`
+switches them on.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from drivers.arms import Array, KinematicsOptions, SetPointFilter, capabilities
+from drivers.cia402_states import DISABLE, FAULT_RESET, QUICK_STOP, DriveState, state_of, towards_enabled
+from drivers.transport.canbus import CanCodec, CanFrame, CanOptions, can_opener
+from drivers.transport.device import StreamDevice, wall_until
+from drivers.transport.link import Link, NoAnswer, Refused, drain, now_s
+from drivers.transport.options import read_options
+from hal.clock import Deadline
+from hal.devices import ArmCapabilities, DeviceKind, JointState
+from hal.errors import DeviceFault, DeviceTimeout
+from hal.readings import Stamped
+from hal.registry import Context
+
+NMT, SYNC, EMCY, TPDO1, TPDO2, RPDO1, SDO_ANSWER, SDO_REQUEST, HEARTBEAT = (
+    0x000, 0x080, 0x080, 0x180, 0x280, 0x200, 0x580, 0x600, 0x700
+)  # fmt: skip
+START, PRE_OPERATIONAL = 0x01, 0x80
+OPERATIONAL = 5
+CSP = 8
+MAPPINGS = {0x1600: (0x60400010, 0x607A0020), 0x1A00: (0x60410010, 0x60640020)}
+SDO_S = 0.25
+MOVING_RAD_PER_S = 1e-3
+ABORTS = {
+    0x05030000: "toggle bit",
+    0x05040001: "command",
+    0x06010002: "read-only",
+    0x06020000: "no such object",
+    0x06070010: "length",
+    0x06090011: "no such sub-index",
+    0x06090030: "value",
+    0x08000000: "general error",
+}
+
+
+class Cia402Options(CanOptions):
+    """Options of `can:cia402`; `host_node` is the id of our own heartbeat."""
+
+    nodes: tuple[Annotated[int, Field(ge=1, le=126)], ...] = (1, 2, 3, 4, 5, 6)
+    host_node: Annotated[int, Field(ge=1, le=127)] = 127
+    rate_hz: Annotated[float, Field(ge=10, le=500)] = 100.0
+    heartbeat_s: Annotated[float, Field(ge=0.02, le=1)] = 0.1
+    degrees_per_increment: Annotated[float, Field(gt=0)] = 0.001
+    kinematics: KinematicsOptions
+
+
+@dataclass(slots=True)
+class Axis:
+    """What is known of one drive; written by the owner thread alone."""
+
+    status: int | None = None
+    increments: int = 0
+    velocity: int = 0
+    is_fresh: bool = False
+
+    @property
+    def state(self) -> DriveState:
+        """By its status word."""
+        return DriveState.NOT_READY if self.status is None else state_of(self.status)
+
+
+class Cia402(StreamDevice[JointState]):
+    """The arm."""
+
+    kind = DeviceKind.ARM
+
+    def __init__(self, context: Context, options: Cia402Options) -> None:
+        opener, codec, name = can_opener(options, context.name)
+        super().__init__(context, open_link=opener, link_name=name, max_age_s=max(4.0 / options.rate_hz, 0.04))
+        self._options = options
+        self._make_codec: Callable[[], CanCodec] = codec
+        self._codec = codec()
+        self._rad = np.radians(options.degrees_per_increment)
+        self._filter = SetPointFilter(context.name, options.kinematics, command_rate_hz=options.rate_hz)
+        self._axes = {node: Axis() for node in options.nodes}
+        self._targets = dict.fromkeys(options.nodes, 0)
+        self._is_wanted = False  # operation enabled is wanted
+        self._is_reset = False  # a fault reset was asked for
+        self._commands = threading.Lock()
+        self._next_sync_s = 0.0
+        self._sync_s = 0.0
+        self._next_beat_s = 0.0
+        self.missed_syncs = 0
+
+    def capabilities(self) -> ArmCapabilities:
+        """From the options."""
+        o = self._options
+        return capabilities(o.kinematics, command_rate_hz=o.rate_hz, watchdog_s=o.heartbeat_s)
+
+    def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
+        """Newest measured joints, all of one SYNC."""
+        return self.newest(deadline)
+
+    def enable(self, *, deadline: Deadline) -> None:
+        """Reset faults and lead all drives to operation enabled, with the measured position as target: no jump.
+
+        Raises:
+            DeviceFault: a drive stays in fault. DeviceTimeout: it does not get there in time.
+        """
+        measured = self.newest(deadline).value.position_rad
+        with self._commands:
+            self._targets = {node: axis.increments for node, axis in self._axes.items()}
+            self._is_reset = self._is_wanted = True
+        rest, until_s = threading.Event(), wall_until(deadline)
+        while not self._all_in(DriveState.OPERATION_ENABLED):
+            if now_s() >= until_s:
+                self._is_wanted = False
+                raise self._not_enabled()
+            rest.wait(0.5 / self._options.rate_hz)
+        self._filter.begin(measured)
+
+    def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:  # noqa: ARG002  # nothing waits
+        """The targets of the next SYNC."""
+        self.require_open()
+        with self._commands:
+            if self._filter.is_open and not self._all_in(DriveState.OPERATION_ENABLED):
+                self._switch_off()
+                raise self._not_enabled()
+            sent = self._filter.passed(position_rad, now_s())
+            increments = np.round(sent / self._rad).astype(int)
+            self._targets = dict(zip(self._options.nodes, (int(i) for i in increments), strict=True))
+            return sent
+
+    def stop(self, *, deadline: Deadline) -> None:  # noqa: ARG002  # nothing waits
+        """Quick stop of all drives with the next SYNC."""
+        self.require_open()
+        self._switch_off()
+
+    def start(self, link: Link) -> None:
+        """Open the channel, check and configure each drive, start them; motion stays off."""
+        o = self._options
+        self._switch_off()
+        self._codec = self._make_codec()
+        link.write(self._codec.opening(o.bitrate), now_s() + SDO_S)
+        drain(link)
+        self._send(link, NMT, bytes([PRE_OPERATIONAL, 0]))
+        for node in o.nodes:
+            self._configure(link, node)
+        self._axes = {node: Axis() for node in o.nodes}
+        self._send(link, NMT, bytes([START, 0]))
+        self._next_sync_s = self._next_beat_s = now_s()
+
+    def _configure(self, link: Link, node: int) -> None:
+        o = self._options
+        for index, wanted in MAPPINGS.items():
+            mapped = tuple(self._upload(link, node, index, sub) for sub in (1, 2))
+            if mapped != wanted:
+                shown = ", ".join(f"{entry:08X}" for entry in mapped)
+                raise Refused(f"node {node}: object {index:04X}h maps {shown}", code=index)
+        consumer = o.host_node << 16 | round(1000 * o.heartbeat_s)
+        self._download(link, node, 0x1016, 1, struct.pack("<I", consumer))
+        self._download(link, node, 0x1017, 0, struct.pack("<H", round(500 * o.heartbeat_s)))
+        self._download(link, node, 0x6060, 0, struct.pack("<b", CSP))
+
+    def _upload(self, link: Link, node: int, index: int, sub: int) -> int:
+        """Expedited SDO read."""
+        answer = self._sdo(link, node, struct.pack("<BHB4x", 0x40, index, sub))
+        size = 4 - (answer[0] >> 2 & 3)
+        return int.from_bytes(answer[4 : 4 + size], "little")
+
+    def _download(self, link: Link, node: int, index: int, sub: int, data: bytes) -> None:
+        """Expedited SDO write."""
+        command = 0x23 | (4 - len(data)) << 2
+        self._sdo(link, node, struct.pack("<BHB", command, index, sub) + data.ljust(4, b"\0"))
+
+    def _sdo(self, link: Link, node: int, request: bytes) -> bytes:
+        for _ in range(3):
+            self._send(link, SDO_REQUEST + node, request)
+            until_s = now_s() + SDO_S
+            while chunk := link.read(until_s):
+                for frame in self._codec.feed(chunk):
+                    is_answer = frame.id == SDO_ANSWER + node and len(frame.data) == 8
+                    if is_answer and frame.data[1:4] == request[1:4]:
+                        return self._checked(node, frame.data)
+        raise NoAnswer(f"node {node} does not answer; is it powered, and is the bit rate right?")
+
+    @staticmethod
+    def _checked(node: int, answer: bytes) -> bytes:
+        if answer[0] != 0x80:
+            return answer
+        code = int.from_bytes(answer[4:], "little")
+        index = int.from_bytes(answer[1:3], "little")
+        text = ABORTS.get(code, "see CiA 301")
+        raise Refused(f"node {node}: object {index:04X}h: SDO abort {code:08X}h ({text})", code=code)
+
+    def _send(self, link: Link, id_: int, data: bytes = b"") -> None:
+        link.write(self._codec.encode(CanFrame(id_, data)), now_s() + SDO_S)
+
+    def keep_going(self, link: Link) -> float:
+        """Heartbeat, targets and SYNC when they are due."""
+        now = now_s()
+        if now >= self._next_beat_s:
+            self._next_beat_s = now + self._options.heartbeat_s / 4.0
+            self._send(link, HEARTBEAT + self._options.host_node, bytes([OPERATIONAL]))
+        if now >= self._next_sync_s:
+            period_s = 1.0 / self._options.rate_hz
+            late = int((now - self._next_sync_s) / period_s)
+            self.missed_syncs += late
+            self._next_sync_s += (late + 1) * period_s
+            self._cycle(link)
+        return max(0.0, min(self._next_sync_s, self._next_beat_s) - now_s())
+
+    def _cycle(self, link: Link) -> None:
+        with self._commands:
+            words = {node: self._control_word(axis) for node, axis in self._axes.items()}
+            targets = self._targets
+            self._is_reset = self._is_reset and any(axis.state is DriveState.FAULT for axis in self._axes.values())
+        frames = [CanFrame(RPDO1 + n, struct.pack("<Hi", words[n], targets[n])) for n in self._options.nodes]
+        self._sync_s = now_s()
+        batch = b"".join(self._codec.encode(frame) for frame in (*frames, CanFrame(SYNC, b"")))
+        link.write(batch, self._sync_s + SDO_S)
+
+    def _control_word(self, axis: Axis) -> int:
+        if not self._is_wanted:
+            return QUICK_STOP
+        if axis.state is DriveState.FAULT:
+            return FAULT_RESET if self._is_reset else DISABLE
+        return towards_enabled(axis.state)
+
+    def receive(self, chunk: bytes, arrived_s: float) -> None:  # noqa: ARG002  # the SYNC stamps the states
+        """Collect the states of one SYNC; mind emergencies and restarts."""
+        for frame in self._codec.feed(chunk):
+            node = frame.id & 0x7F
+            axis = self._axes.get(node)
+            if axis is None:
+                continue
+            match frame.id & 0x780:
+                case 0x180 if len(frame.data) == 6:
+                    axis.status, axis.increments = struct.unpack("<Hi", frame.data)
+                    axis.is_fresh = True
+                case 0x280 if len(frame.data) == 6:
+                    axis.velocity, _ = struct.unpack("<ih", frame.data)
+                    self._publish_when_complete()
+                case 0x080 if len(frame.data) == 8:
+                    self._emergency(node, frame.data)
+                case 0x700 if frame.data == b"\x00":
+                    raise NoAnswer(f"node {node} has restarted")
+
+    def _emergency(self, node: int, data: bytes) -> None:
+        code = data[0] | data[1] << 8
+        if code:  # 0000 says: error gone
+            self._switch_off()
+            self.fail(Refused(f"node {node} reports emergency {code:04X}h", code=code))
+
+    def _publish_when_complete(self) -> None:
+        axes = [self._axes[node] for node in self._options.nodes]
+        if not all(axis.is_fresh for axis in axes):
+            return
+        for axis in axes:
+            axis.is_fresh = False
+        velocity = np.array([axis.velocity for axis in axes]) * self._rad
+        self.publish(
+            JointState(
+                position_rad=np.array([axis.increments for axis in axes]) * self._rad,
+                velocity_rad_per_s=velocity,
+                is_enabled=self._filter.is_open and self._all_in(DriveState.OPERATION_ENABLED),
+                is_moving=bool(np.any(np.abs(velocity) > MOVING_RAD_PER_S)),
+            ),
+            valid_s=self._sync_s,
+        )
+
+    def _all_in(self, state: DriveState) -> bool:
+        return all(axis.state is state for axis in self._axes.values())
+
+    def _switch_off(self) -> None:
+        self._is_wanted = self._is_reset = False
+        self._filter.begin(None)
+
+    def _not_enabled(self) -> DeviceFault | DeviceTimeout:
+        states = ", ".join(f"{node}: {axis.state}" for node, axis in self._axes.items())
+        if any(axis.state is DriveState.FAULT for axis in self._axes.values()):
+            hint = "read object 603Fh; enable again resets the fault"
+            return DeviceFault(f"{self.name}: a drive is in fault ({states})", hint=hint, device=self.name)
+        hint = "check power stage and enable inputs of the drives"
+        return DeviceTimeout(f"{self.name}: the drives do not follow ({states})", hint=hint, device=self.name)
+
+    def lost(self, error: Exception) -> None:
+        """A lost bus takes the motion with it."""
+        self._switch_off()
+        super().lost(error)
+
+    def release(self) -> None:
+        """Quick stop for a cycle or two, then silence."""
+        self._switch_off()
+        threading.Event().wait(2.0 / self._options.rate_hz)
+        super().release()
+
+
+def connect(context: Context, options: dict[str, Any]) -> Cia402:
+    """Entry point `can:cia402`."""
+    device = Cia402(context, read_options(context, options, Cia402Options))
+    device.join()
+    return device

@@ -1,0 +1,163 @@
+"""CiA-402 arm over slcan: conformance, no jump, watchdog, emergencies, restarts, faults; python-can opposite."""
+
+import struct
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import can
+import canopen
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.cia402_states import DriveState
+from drivers.emulators import cia402 as emulator
+from drivers.emulators.scripted import ScriptedArm
+from drivers.transport.canbus import CanFrame, RawCan, Slcan
+from hal.conformance import ArmContract, Rig
+from hal.errors import CellError, DeviceFault, DeviceUnavailable, MotionRefused
+from hal.registry import Context, connect
+from tests.drivers.rigs import count_good, soon, until, wired, wired_rig
+
+DRIVER = "can:cia402"
+
+
+class TestCia402(ArmContract):
+    @pytest.fixture
+    def rig(self) -> Iterator[Rig[Any]]:
+        with wired_rig(emulator.start(ScriptedArm(), {}), DRIVER, sample_period_s=0.05) as rig:
+            yield rig
+
+
+frames = st.builds(CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8))
+
+
+@given(st.lists(frames, max_size=6), st.integers(min_value=0))
+def test_slcan_lines_survive_any_chunking(sent: list[CanFrame], cut: int) -> None:
+    codec = Slcan()
+    data = b"z\r" + b"".join(codec.encode(frame) for frame in sent)
+    at = cut % (len(data) + 1)
+    assert codec.feed(data[:at]) + codec.feed(data[at:]) == sent
+
+
+@given(st.lists(frames, max_size=6))
+def test_kernel_frames_round_trip(sent: list[CanFrame]) -> None:
+    codec = RawCan()
+    assert codec.feed(b"".join(codec.encode(frame) for frame in sent)) == sent
+
+
+def test_a_line_that_lost_characters_is_no_frame() -> None:
+    codec = Slcan()
+    assert codec.feed(b"t1816270023\rt18162700230000\rt1G12AABB\r") == []
+    assert codec.bad == 3
+
+
+@pytest.mark.parametrize("fault", ["crc", "drop", "dup", "split", "delay", "silent", "garbage", "disconnect"])
+def test_no_fault_of_the_bus_gives_wrong_joints(fault: str) -> None:
+    arm = ScriptedArm()
+    options = {
+        "fault": fault,
+        "every": 50,
+        "seed": 8,
+        "delay_s": 0.05,
+        "silent_s": 0.05,
+        "away_s": 0.02,
+        "split_s": 0.01,
+    }
+    with wired(emulator.start(arm, options), DRIVER, {"rate_hz": 50.0}) as device:
+        assert count_good(device, lambda s: np.allclose(s.position_rad, arm.position_rad, atol=1e-5), wanted=3) >= 3
+
+
+def test_enabling_takes_the_measured_position_as_target() -> None:
+    arm = ScriptedArm()
+    before = arm.position_rad.copy()
+    with wired(emulator.start(arm, {}), DRIVER) as device:
+        device.enable(deadline=soon())
+        until(lambda: arm.commands > 3)
+        np.testing.assert_allclose(arm.position_rad, before, atol=1e-5)
+
+
+def test_a_dead_host_faults_the_drives_by_their_own_watchdog() -> None:
+    arm = ScriptedArm()
+    with wired(far_side := emulator.start(arm, {}), DRIVER) as device:
+        device.enable(deadline=soon())
+        until(lambda: arm.is_enabled)
+        device._next_beat_s = float("inf")  # the heartbeat thread of a dead host
+        until(lambda: not arm.is_enabled)
+        assert far_side.drives[1].state is DriveState.FAULT
+
+
+def test_an_emergency_is_a_fault_and_only_enable_resets_it() -> None:
+    arm = ScriptedArm()
+    with wired(far_side := emulator.start(arm, {}), DRIVER) as device:
+        device.enable(deadline=soon())
+        until(lambda: arm.is_enabled)
+        far_side.fault(0x2310)
+        with pytest.raises((DeviceFault, MotionRefused)):
+            until(lambda: device.command_position(arm.position_rad, deadline=soon()) is None)
+        until(lambda: not arm.is_enabled)
+        threading.Event().wait(0.1)
+        assert far_side.drives[1].state is DriveState.FAULT
+        until(lambda: device.mailbox.error() is None)
+        device.enable(deadline=soon())
+        until(lambda: arm.is_enabled)
+
+
+def test_a_drive_that_restarts_is_set_up_again_and_stays_off() -> None:
+    arm = ScriptedArm()
+    with wired(far_side := emulator.start(arm, {}), DRIVER) as device:
+        device.enable(deadline=soon())
+        until(lambda: arm.is_enabled)
+        far_side.restart(3)
+        until(lambda: device.health().reconnects == 1 and device.mailbox.error() is None)
+        assert not arm.is_enabled
+        assert far_side.drives[3].objects[(0x6060, 0)] == b"\x08"
+        with pytest.raises(MotionRefused):
+            device.command_position(arm.position_rad, deadline=soon())
+
+
+def test_a_wrong_pdo_mapping_is_refused() -> None:
+    far_side = emulator.start(ScriptedArm(), {})
+    far_side.drives[2].objects[(0x1A00, 2)] = struct.pack("<I", 0x606C0020)
+    with pytest.raises(CellError, match="node 2: object 1A00h"), wired(far_side, DRIVER):
+        raise AssertionError("it connected")
+
+
+def test_a_missing_node_is_named() -> None:
+    far_side = emulator.start(ScriptedArm(), {})
+    try:
+        with pytest.raises(DeviceUnavailable, match="node 9"):
+            connect(Context(name="arm"), DRIVER, {**far_side.address, "nodes": [1, 2, 3, 4, 5, 9]})
+    finally:
+        far_side.close()
+
+
+def test_python_can_and_canopen_drive_the_emulator() -> None:
+    """Other people's stack: NMT, SDO read, write and abort, the 402 states by control words, PDOs on SYNC."""
+    arm = ScriptedArm()
+    far_side = emulator.start(arm, {})
+    bus = can.Bus(interface="slcan", channel=far_side.port.address["port"], bitrate=1_000_000, sleep_after_open=0)
+    network = canopen.Network(bus)
+    try:
+        network.connect()
+        node = network.add_node(1, canopen.ObjectDictionary())
+        assert node.sdo.upload(0x1000, 0) == struct.pack("<I", 0x20192)
+        node.sdo.download(0x6060, 0, b"\x08")
+        assert node.sdo.upload(0x6060, 0) == b"\x08"
+        with pytest.raises(canopen.SdoAbortedError) as caught:
+            node.sdo.upload(0x5555, 0)
+        assert caught.value.code == 0x06020000
+        seen: dict[int, bytes] = {}
+        network.subscribe(0x181, lambda cob, data, stamp: seen.update({cob: bytes(data)}))
+        network.send_message(0, bytes([1, 0]))
+        for word, status in ((0x06, 0x21), (0x07, 0x23), (0x0F, 0x27), (0x0B, 0x07)):
+            seen.clear()
+            network.send_message(0x201, struct.pack("<Hi", word, 5730))
+            network.send_message(0x80, b"")
+            until(lambda: 0x181 in seen)
+            assert struct.unpack("<Hi", seen[0x181]) == (status, round(np.degrees(0.1) * 1000))
+    finally:
+        network.disconnect()
+        far_side.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import heapq
+import itertools
 import math
 import mmap
 import os
@@ -47,7 +48,7 @@ from simbackend.wire import (
 
 Array = NDArray[np.float64]
 
-START_S = 60.0
+START_S = 180.0  # the first start on a machine compiles the rasteriser; later ones take two seconds
 CLOSE_S = 2.0
 PROXIMITY_RANGE_M = 0.6
 
@@ -85,6 +86,7 @@ class WorldClient:
         self._request = np.zeros(REQUEST)
         self._owed_ticks = 0.0
         self._events: list[tuple[int, int, Callable[[], None]]] = []
+        self._order = itertools.count()  # of two events at one tick the first comes first
         self._is_closed = False
         self._launch(config)
         clock.attach(self.advance)  # type: ignore[attr-defined]  # checked by `start`
@@ -215,7 +217,7 @@ class WorldClient:
             if tick <= self.frame.snapshot.tick:
                 action()
                 return
-            heapq.heappush(self._events, (tick, len(self._events), action))
+            heapq.heappush(self._events, (tick, next(self._order), action))
 
     def _run_events(self) -> None:
         while self._events and self._events[0][0] <= self.frame.snapshot.tick:

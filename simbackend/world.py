@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -42,8 +44,7 @@ class World:
     """One simulated cell. Deterministic: the same config and the same commands give the same bits."""
 
     def __init__(self, config: WorldConfig) -> None:
-        import pybullet
-
+        pybullet = _quiet_pybullet()
         self.config = config
         self.cell = config.cell
         self.dt_s = 1.0 / self.cell.file.cell.control_rate_hz
@@ -265,6 +266,21 @@ class World:
     def close(self) -> None:
         """Let the engine go."""
         self.engine.disconnect()
+
+
+def _quiet_pybullet() -> Any:
+    """PyBullet, without the build time that its import writes past Python to the terminal."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        import pybullet
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+    return pybullet
 
 
 def _nearest(depths_m: list[float]) -> float:

@@ -1,0 +1,111 @@
+"""Calibration boards: what they look like and where their points are in an image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.errors import NotFound
+
+Array = NDArray[np.float64]
+CORNER_SIGMA_PX = 0.1  # of a refined ChArUco corner; calibrations on sharp images leave 0.05 to 0.2 px rms
+DOT_SIGMA_PX = 0.05
+FEWEST_POINTS = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BoardView:
+    """Known points seen in one image.
+
+    Attributes:
+        points_m: (N, 3) in the board's (or panel's) frame.
+        pixels_px: (N, 2) as measured.
+        sigma_px: noise of each coordinate.
+    """
+
+    points_m: Array
+    pixels_px: Array
+    sigma_px: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Charuco:
+    """A chessboard with ArUco markers in its white squares: may be seen in part.
+
+    `columns` x `rows` squares of `square_m` with markers of `marker_m` from OpenCV's dictionary `dictionary`.
+    Frame: origin at the outer corner of the first square, x along the columns, y along the rows, z into the board.
+    """
+
+    columns: int = 9
+    rows: int = 6
+    square_m: float = 0.03
+    marker_m: float = 0.022
+    dictionary: str = "DICT_5X5_100"
+
+    def _board(self) -> Any:
+        import cv2
+
+        words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_m, self.marker_m, words)
+
+    def draw(self, square_px: int) -> NDArray[np.uint8]:
+        """The board to print: (rows * square_px, columns * square_px) gray, without a margin."""
+        size = (self.columns * square_px, self.rows * square_px)
+        return np.asarray(self._board().generateImage(size, marginSize=0, borderBits=1), np.uint8)
+
+    def find(self, image: NDArray[np.uint8]) -> BoardView:
+        """The inner corners that are visible in a gray image (H, W).
+
+        Raises:
+            NotFound: fewer than six corners.
+        """
+        import cv2
+
+        board = self._board()
+        corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(image)
+        if ids is None or len(ids) < FEWEST_POINTS:
+            raise NotFound(
+                f"{0 if ids is None else len(ids)} corners of the ChArUco board are visible",
+                hint="check dictionary and squares, come nearer, or light the board evenly",
+            )
+        points = np.asarray(board.getChessboardCorners(), float)[np.asarray(ids).ravel()]
+        return BoardView(
+            points_m=points, pixels_px=np.asarray(corners, float).reshape(-1, 2), sigma_px=CORNER_SIGMA_PX
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dots:
+    """A grid of `columns` x `rows` black dots, `spacing_m` apart, seen whole. Origin: first dot; z into the board.
+
+    A grid that looks the same upside down has two readings; the pose of the board absorbs that.
+    """
+
+    columns: int = 8
+    rows: int = 6
+    spacing_m: float = 0.03
+
+    def points_m(self) -> Array:
+        """(columns * rows, 3), row by row."""
+        y, x = np.mgrid[: self.rows, : self.columns]
+        return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * self.spacing_m
+
+    def find(self, image: NDArray[np.uint8]) -> BoardView:
+        """The dots in a gray image (H, W).
+
+        Raises:
+            NotFound: not the whole grid is visible.
+        """
+        import cv2
+
+        found, centres = cv2.findCirclesGrid(image, (self.columns, self.rows), flags=cv2.CALIB_CB_SYMMETRIC_GRID)
+        if not found:
+            raise NotFound(
+                f"the grid of {self.columns}x{self.rows} dots is not visible as a whole",
+                hint="show every dot, with a bright margin round the grid, and light it evenly",
+            )
+        pixels = np.asarray(centres, float).reshape(-1, 2)
+        return BoardView(points_m=self.points_m(), pixels_px=pixels, sigma_px=DOT_SIGMA_PX)

@@ -1,0 +1,306 @@
+"""Where the camera sits in the hand, and the target in the world, from views of one target: A_i X B_i = Z.
+
+A_i = base_from_flange, X = flange_from_camera, B_i = camera_from_target, Z = base_from_target. The closed form of the
+rotations starts a maximum-likelihood fit of X and Z together, weighted by the covariance of every B_i (and of the arm).
+Covariances are over translation then rotation in the parent's axes, as everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from hal.errors import InvalidRequest, NotObservable
+from hal.geometry import UncertainPose, matrix_of, perturbed, skew, transform
+from perception.calibration.newton import Minimum, descend
+
+Array = NDArray[np.float64]
+
+LEAST_AXIS_SPREAD = 0.02  # of sin^2 between the turns' axes: 8 degrees; with less, one coordinate of X is mostly noise
+LEAST_TURN_RAD = 0.05
+LIMIT_M = 0.002
+LIMIT_RAD = 0.01
+OUTLIER_CHI_SQUARE = 22.5  # chi-square 6 leaves 0.1 % above it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class HandEyeView:
+    """One station: where the arm says its flange is, and where the camera sees the target."""
+
+    base_from_flange: RigidTransform
+    camera_from_target: UncertainPose
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class HandEye:
+    """The calibration.
+
+    Attributes:
+        flange_from_camera, base_from_target: X and Z with their 6x6 covariances.
+        covariance: 12x12 of X and Z together.
+        chi_square, degrees: of the fit; their ratio is near 1 when the stated noise is right.
+        residuals: (N, 6) base axes, m and rad, of A_i X B_i against Z.
+        used: views kept; the others disagree with the rest by more than chance (`OUTLIER_CHI_SQUARE`).
+    """
+
+    flange_from_camera: UncertainPose
+    base_from_target: UncertainPose
+    covariance: Array
+    chi_square: float
+    degrees: int
+    residuals: Array
+    used: tuple[int, ...]
+
+
+def calibrate_hand_eye(
+    views: Sequence[HandEyeView], *, arm_sigma_m: float = 1e-4, arm_sigma_rad: float = 1e-4
+) -> HandEye:
+    """X and Z from three views or more whose turns have different axes.
+
+    Args:
+        views: stations; the covariance of `camera_from_target` weighs them.
+        arm_sigma_m, arm_sigma_rad: repeatability of the arm, added to every station.
+
+    Raises:
+        InvalidRequest: fewer than three views.
+        NotObservable: the hand turned about one axis only (or not at all), or too little for `LIMIT_M`, `LIMIT_RAD`;
+            the message says what to do and `details["next_axis"]` names the axis (flange frame) to turn about next.
+
+    Source: Park, Martin, IEEE TRA 10(5), 1994 (closed form); Dornaika, Horaud, IEEE TRA 14(4), 1998 (A X B = Z).
+    """
+    if len(views) < 3:
+        raise InvalidRequest(f"{len(views)} views; three are the least", hint="take twelve, turned about several axes")
+    check_turns(views)
+    arm = np.diag([arm_sigma_m**2] * 3 + [arm_sigma_rad**2] * 3)
+    used = list(range(len(views)))
+    while True:
+        kept = [views[k] for k in used]
+        stack = _Stack.of(kept)
+        (x, z), minimum = _fit(stack, _closed_form(stack), arm)
+        errors = _chi_squares(stack, x, z, arm)
+        worst = int(np.argmax(errors))
+        if errors[worst] < OUTLIER_CHI_SQUARE or len(used) <= 4:
+            break
+        del used[worst]
+        check_turns([views[k] for k in used])
+    _check_accuracy(minimum, len(kept))
+    return HandEye(
+        flange_from_camera=UncertainPose(parent_from_child=x, covariance=minimum.covariance[:6, :6]),
+        base_from_target=UncertainPose(parent_from_child=z, covariance=minimum.covariance[6:, 6:]),
+        covariance=minimum.covariance, chi_square=minimum.chi_square, degrees=6 * len(used) - 12,
+        residuals=_residuals(_Stack.of(views), x, z), used=tuple(used),
+    )  # fmt: skip
+
+
+def check_turns(views: Sequence[HandEyeView]) -> None:
+    """Refuse stations whose relative turns share one axis.
+
+    Raises:
+        NotObservable: X's shift along that axis stays free; `details["next_axis"]` is the axis to turn about.
+    """
+    spread, axis = _axis_spread([view.base_from_flange for view in views])
+    if spread < LEAST_AXIS_SPREAD:
+        next_axis = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+        next_axis /= np.linalg.norm(next_axis)
+        words = np.round(next_axis, 2).tolist()
+        raise NotObservable(
+            "the hand turned about one axis only, so the camera's place along that axis stays free",
+            hint=f"turn the flange by 20 degrees or more about {words} (flange axes) and look at the target again",
+            next_axis=words, axis_spread=round(spread, 4),
+        )  # fmt: skip
+
+
+def _axis_spread(flanges: Sequence[RigidTransform]) -> tuple[float, Array]:
+    """How far the turns' axes differ (mean sin^2 in the second direction, 0..0.5) and their main axis, flange frame."""
+    R = np.array([matrix_of(flange) for flange in flanges])
+    turns, _ = _relative_turns(R)
+    angles = np.linalg.norm(turns, axis=1)
+    large = angles > LEAST_TURN_RAD
+    if not large.any():
+        return 0.0, np.array([0.0, 0.0, 1.0])
+    # A small turn tells less about its axis.
+    axes = turns[large] / angles[large, None] * np.minimum(angles[large, None] / 0.3, 1.0)
+    values, vectors = np.linalg.eigh(axes.T @ axes / len(axes))
+    return float(values[1]), vectors[:, 2]
+
+
+def _relative_turns(R: Array) -> tuple[Array, Array]:
+    """Rotation vectors of R_i^T R_j for every pair, and the pairs (P, 2)."""
+    pairs = np.array(list(combinations(range(len(R)), 2)))
+    relative = R[pairs[:, 0]].swapaxes(1, 2) @ R[pairs[:, 1]]
+    return np.asarray(Rotation.from_matrix(relative).as_rotvec()), pairs
+
+
+def _closed_form(stack: _Stack) -> tuple[RigidTransform, RigidTransform]:
+    """Park and Martin: rotation vectors of A_ij and B_ij are turned onto each other; the translations are linear."""
+    turns_a, pairs = _relative_turns(stack.Ra)
+    turns_b, _ = _relative_turns(stack.Rb.swapaxes(1, 2))
+    rx = Rotation.align_vectors(turns_a, turns_b)[0]
+    i, j = pairs.T
+    Rij = stack.Ra[i].swapaxes(1, 2) @ stack.Ra[j]
+    tij = np.einsum("nji,nj->ni", stack.Ra[i], stack.ta[j] - stack.ta[i])
+    back = stack.Rb[i] @ stack.Rb[j].swapaxes(1, 2)
+    t_b = stack.tb[i] - np.einsum("nij,nj->ni", back, stack.tb[j])
+    rows = (Rij - np.eye(3)).reshape(-1, 3)  # (R_a - I) t_x = R_x t_b - t_a
+    tx = np.linalg.lstsq(rows, (rx.apply(t_b) - tij).ravel(), rcond=None)[0]
+    x = RigidTransform.from_components(tx, rx)
+    shift = np.einsum("nij,nj->ni", stack.Ra, rx.apply(stack.tb) + tx) + stack.ta
+    mean = Rotation.from_matrix(stack.Ra @ rx.as_matrix() @ stack.Rb).mean()
+    return x, RigidTransform.from_components(shift.mean(axis=0), mean)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Stack:
+    """The stations as arrays: rotations (N, 3, 3), translations (N, 3) and covariances (N, 6, 6)."""
+
+    Ra: Array
+    ta: Array
+    Rb: Array
+    tb: Array
+    cov_b: Array
+
+    @classmethod
+    def of(cls, views: Sequence[HandEyeView]) -> _Stack:
+        a = [view.base_from_flange for view in views]
+        b = [view.camera_from_target.parent_from_child for view in views]
+        return cls(
+            Ra=np.array([matrix_of(pose) for pose in a]), ta=np.array([pose.translation for pose in a]),
+            Rb=np.array([matrix_of(pose) for pose in b]), tb=np.array([pose.translation for pose in b]),
+            cov_b=np.array([view.camera_from_target.covariance for view in views]),
+        )  # fmt: skip
+
+
+def _residuals(stack: _Stack, x: RigidTransform, z: RigidTransform) -> Array:
+    """(N, 6) translation and rotation by which A X B misses Z, base axes."""
+    Rx, Rz = matrix_of(x), matrix_of(z)
+    shift = np.einsum("nij,nj->ni", stack.Ra, stack.tb @ Rx.T + x.translation) + stack.ta - z.translation
+    turn = Rotation.from_matrix(stack.Ra @ Rx @ stack.Rb @ Rz.T).as_rotvec()
+    return np.hstack([shift, turn])
+
+
+def _jacobians(stack: _Stack, x: RigidTransform) -> tuple[Array, Array, Array]:
+    """(N, 6, 6) derivatives of A X B by perturbations of A, X and B."""
+    Rx = matrix_of(x)
+    lever_b = stack.tb @ Rx.T
+    lever_x = np.einsum("nij,nj->ni", stack.Ra, x.translation + lever_b)
+    by_a, by_x, by_b = (np.zeros((len(lever_b), 6, 6)) for _ in range(3))
+    by_a[:, range(6), range(6)] = 1.0
+    by_a[:, :3, 3:] = [-skew(lever) for lever in lever_x]
+    by_x[:, :3, :3] = by_x[:, 3:, 3:] = stack.Ra
+    by_x[:, :3, 3:] = stack.Ra @ np.array([-skew(lever) for lever in lever_b])
+    by_b[:, :3, :3] = by_b[:, 3:, 3:] = stack.Ra @ Rx
+    return by_a, by_x, by_b
+
+
+def _noise(stack: _Stack, x: RigidTransform, arm: Array) -> Array:
+    """(N, 6, 6) covariance of the residuals at the truth."""
+    by_a, _, by_b = _jacobians(stack, x)
+    return np.asarray(by_a @ arm @ by_a.swapaxes(1, 2) + by_b @ stack.cov_b @ by_b.swapaxes(1, 2))
+
+
+def _chi_squares(stack: _Stack, x: RigidTransform, z: RigidTransform, arm: Array) -> Array:
+    e = _residuals(stack, x, z)
+    return np.asarray(np.einsum("ni,ni->n", e, np.linalg.solve(_noise(stack, x, arm), e[:, :, None])[:, :, 0]))
+
+
+def _fit(
+    stack: _Stack, start: tuple[RigidTransform, RigidTransform], arm: Array
+) -> tuple[tuple[RigidTransform, RigidTransform], Minimum]:
+    # The weights depend on X through levers only; frozen at the start and then once more, they are exact enough.
+    state = start
+    by_z = -np.tile(np.eye(6), (len(stack.ta), 1, 1))
+    for _ in range(2):
+        W = np.linalg.inv(np.linalg.cholesky(_noise(stack, state[0], arm)))
+
+        def linearise(poses: tuple[RigidTransform, RigidTransform], W: Array = W) -> tuple[Array, Array]:
+            x, z = poses
+            e = np.einsum("nij,nj->ni", W, _residuals(stack, x, z))
+            J = W @ np.concatenate([_jacobians(stack, x)[1], by_z], axis=2)
+            return e.ravel(), J.reshape(-1, 12)
+
+        state, minimum = descend(
+            state, linearise, lambda poses, d: (perturbed(poses[0], d[:6]), perturbed(poses[1], d[6:]))
+        )
+    return state, minimum
+
+
+def _check_accuracy(minimum: Minimum, count: int) -> None:
+    values, vectors = np.linalg.eigh(minimum.covariance[:3, :3])
+    turn = np.linalg.eigvalsh(minimum.covariance[3:6, 3:6])
+    if np.sqrt(values[2]) <= LIMIT_M and np.sqrt(turn[2]) <= LIMIT_RAD:
+        return
+    weak = vectors[:, 2]
+    next_axis = np.cross(weak, np.eye(3)[int(np.argmin(np.abs(weak)))])
+    words = np.round(next_axis / np.linalg.norm(next_axis), 2).tolist()
+    raise NotObservable(
+        f"{count} views leave the camera uncertain by {1e3 * np.sqrt(values[2]):.1f} mm along "
+        f"{np.round(weak, 2).tolist()} (flange axes)",
+        hint=f"add views turned by 20 degrees or more about {words} (flange axes), or nearer to the target",
+        next_axis=words, sigma_mm=round(1e3 * float(np.sqrt(values[2])), 2),
+    )  # fmt: skip
+
+
+def propose_next(
+    done: Sequence[HandEyeView], result: tuple[RigidTransform, RigidTransform], candidates: Sequence[RigidTransform],
+    *, view_covariance: Array, arm_sigma_m: float = 1e-4, arm_sigma_rad: float = 1e-4,
+) -> tuple[int, float]:  # fmt: skip
+    """Which flange pose to go to next: the one that shrinks the covariance of X most.
+
+    Args:
+        done: the stations so far (one or more).
+        result: X and Z as far as known (nominal values will do).
+        candidates: base_from_flange poses from which the target is in view.
+        view_covariance: 6x6 of a camera_from_target, as expected.
+
+    Returns: index into `candidates`, and log det of X's covariance after it (lower is better).
+
+    Raises:
+        InvalidRequest: no candidates.
+    """
+    if not candidates:
+        raise InvalidRequest("no candidate poses", hint="give flange poses from which the target is in view")
+    x, z = result
+    arm = np.diag([arm_sigma_m**2] * 3 + [arm_sigma_rad**2] * 3)
+
+    def information(flange: RigidTransform) -> Array:
+        seen = UncertainPose(parent_from_child=(flange * x).inv() * z, covariance=view_covariance)
+        stack = _Stack.of([HandEyeView(base_from_flange=flange, camera_from_target=seen)])
+        J = np.hstack([_jacobians(stack, x)[1][0], -np.eye(6)])
+        return np.asarray(J.T @ np.linalg.solve(_noise(stack, x, arm)[0], J))
+
+    # A weak prior (0.1 m, 0.3 rad) keeps the first few stations comparable.
+    known = np.diag([1e2] * 3 + [1e1] * 3 + [1e2] * 3 + [1e1] * 3)
+    known = known + sum((information(view.base_from_flange) for view in done), np.zeros((12, 12)))
+    scores = []
+    for flange in candidates:
+        covariance = np.linalg.inv(known + information(flange))
+        scores.append(float(np.linalg.slogdet(covariance[:6, :6])[1]))
+    best = int(np.argmin(scores))
+    return best, scores[best]
+
+
+def stations(
+    base_from_target: RigidTransform, flange_from_camera: RigidTransform, *, distance_m: float, count: int = 40,
+    cone_rad: float = 0.7,
+) -> list[RigidTransform]:  # fmt: skip
+    """Candidate flange poses that look at the target's middle from a cone about its normal (z), with different rolls.
+
+    They lie on a spiral (golden angle), so that any number of them covers the cone evenly.
+    """
+    found = []
+    for k in range(count):
+        tilt = cone_rad * np.sqrt((k + 0.5) / count)
+        azimuth = k * np.pi * (3.0 - np.sqrt(5.0))
+        away = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
+        z = -away
+        x = np.array([1.0, 0.0, 0.0]) - z[0] * z
+        x /= np.linalg.norm(x)
+        looking = transform(np.column_stack([x, np.cross(z, x), z]), distance_m * away)
+        roll = transform(Rotation.from_rotvec([0.0, 0.0, cone_rad * np.sin(2.4 * k)]).as_matrix(), np.zeros(3))
+        found.append(base_from_target * looking * roll * flange_from_camera.inv())
+    return found

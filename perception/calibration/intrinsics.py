@@ -1,0 +1,305 @@
+"""Camera intrinsics from views of known points: a board, or the panel's own lights.
+
+One function fits both lens models: the radial-tangential one by maximum likelihood over intrinsics and board poses,
+and, on top of it, the paper's bivariate cubic from measured to ideal pixel, which reports its bias.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from hal.calibration import CameraIntrinsics
+from hal.errors import InvalidRequest, NotObservable
+from hal.geometry import matrix_of, perturbed, transform
+from perception.calibration.boards import BoardView
+from perception.calibration.newton import Minimum, descend
+from perception.camera_model import CubicLens, cubic_monomials, distort, distortion_jacobian, project, undistort_pixels
+
+Array = NDArray[np.float64]
+
+NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+BOARD_FREE = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")  # k3 needs points in the corners of a wide lens
+LIGHTS_FREE = ("fx", "fy", "cx", "cy", "k1")  # four points a view
+FOCAL_LIMIT = 0.01  # of the focal length
+CENTRE_LIMIT = 0.02  # of the image width
+GRID = 24
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CameraCalibration:
+    """The fit.
+
+    Attributes:
+        intrinsics: pinhole and radial-tangential lens.
+        names, covariance: the parameters that were fitted, and their (n, n) covariance (px, or 1 for the lens).
+        rms_px: of all residuals (both coordinates together); residuals_px: one (N, 2) a view.
+        chi_square, degrees: with the stated noise of the points.
+        board_poses: camera_from_board of every view.
+        cubic: the paper's correction, fitted to the same points; its bias is what it cannot follow over the frame.
+        cubic_covariance: (10, 10) of one column of its coefficients, px^2.
+    """
+
+    intrinsics: CameraIntrinsics
+    names: tuple[str, ...]
+    covariance: Array
+    rms_px: float
+    residuals_px: tuple[Array, ...]
+    chi_square: float
+    degrees: int
+    board_poses: tuple[RigidTransform, ...]
+    cubic: CubicLens
+    cubic_covariance: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _State:
+    intrinsics: CameraIntrinsics
+    poses: tuple[RigidTransform, ...]
+
+
+def calibrate_camera(
+    views: Sequence[BoardView], image_size_px: tuple[int, int], *, free: Sequence[str] = BOARD_FREE,
+    start: CameraIntrinsics | None = None,
+) -> CameraCalibration:  # fmt: skip
+    """Intrinsics, lens and board poses from three views or more.
+
+    Args:
+        views: known points in images; the boards must be flat unless `start` is given. `LIGHTS_FREE` suits four lights.
+        image_size_px: (width, height).
+        free: which of `NAMES` to fit; the others stay at `start`, or 0 for the lens.
+        start: rough intrinsics; from the views themselves (Zhang) when None.
+
+    Raises:
+        InvalidRequest: too few views or points, unknown names, not finite.
+        NotObservable: the views are too alike, so that focal length or centre stays uncertain; tells how to add views.
+
+    Source: Zhang, IEEE PAMI 22(11), 2000.
+    """
+    _check(views, free)
+    guess = start if start is not None else _zhang(views, image_size_px)
+    poses = tuple(_first_pose(view, guess) for view in views)
+    index = [NAMES.index(name) for name in NAMES if name in free]
+    # The lens starts straight; focal lengths and poses settle first, then everything moves.
+    state = _State(intrinsics=guess, poses=poses)
+    stages = [[i for i in index if i < 2], index] if start is None else [index]
+    for stage in stages:
+        state, minimum = _fit(views, state, stage)
+    n = len(index)
+    covariance = minimum.covariance[:n, :n]
+    _check_accuracy(covariance, [NAMES[i] for i in index], state.intrinsics)
+    residuals = tuple(
+        view.pixels_px - project(pose.apply(view.points_m), state.intrinsics)
+        for view, pose in zip(views, state.poses, strict=True)
+    )
+    stacked = np.concatenate(residuals)
+    cubic, cubic_covariance = fit_cubic(views, state.intrinsics, state.poses)
+    return CameraCalibration(
+        intrinsics=state.intrinsics, names=tuple(NAMES[i] for i in index), covariance=covariance,
+        rms_px=float(np.sqrt(np.mean(stacked**2))), residuals_px=residuals, chi_square=minimum.chi_square,
+        degrees=2 * len(stacked) - n - 6 * len(views), board_poses=state.poses, cubic=cubic,
+        cubic_covariance=cubic_covariance,
+    )  # fmt: skip
+
+
+def fit_cubic(
+    views: Sequence[BoardView], intrinsics: CameraIntrinsics, poses: Sequence[RigidTransform]
+) -> tuple[CubicLens, Array]:
+    """The paper's correction: least squares of the ideal pixels of the points over cubics of the measured ones.
+
+    Returns: the correction, and the (10, 10) covariance of the coefficients of one axis (px^2).
+    """
+    width, height = intrinsics.width_px, intrinsics.height_px
+    centre, scale = ((width - 1) / 2.0, (height - 1) / 2.0), width / 2.0
+    straight = CameraIntrinsics(
+        width_px=width, height_px=height, fx_px=intrinsics.fx_px, fy_px=intrinsics.fy_px, cx_px=intrinsics.cx_px,
+        cy_px=intrinsics.cy_px,
+    )  # fmt: skip
+    measured = np.concatenate([view.pixels_px for view in views])
+    ideal = np.concatenate([
+        project(pose.apply(view.points_m), straight) for view, pose in zip(views, poses, strict=True)
+    ])
+    rows = cubic_monomials(measured, centre, scale)
+    coefficients = np.linalg.lstsq(rows, ideal, rcond=None)[0]
+    lens = CubicLens(coefficients=coefficients, centre_px=centre, scale_px=scale, bias_px=0.0)
+    grid = np.stack(np.meshgrid(np.linspace(0, width - 1, GRID), np.linspace(0, height - 1, GRID)), axis=-1)
+    grid = grid.reshape(-1, 2)
+    miss = lens.ideal(grid) - undistort_pixels(grid, intrinsics)
+    bias = float(np.sqrt(np.nanmean(np.sum(miss**2, axis=1))))
+    sigma = float(np.mean([view.sigma_px for view in views]))
+    covariance = sigma**2 * np.linalg.pinv(rows.T @ rows)
+    lens = CubicLens(coefficients=coefficients, centre_px=centre, scale_px=scale, bias_px=bias)
+    return lens, np.asarray(covariance)
+
+
+def _check(views: Sequence[BoardView], free: Sequence[str]) -> None:
+    unknown = set(free) - set(NAMES)
+    if unknown:
+        raise InvalidRequest(f"no parameter called {sorted(unknown)[0]!r}", hint=f"known: {', '.join(NAMES)}")
+    if len(views) < 3:
+        raise InvalidRequest(f"{len(views)} views; three are the least", hint="take twelve from different sides")
+    for k, view in enumerate(views):
+        if len(view.points_m) < 4 or view.pixels_px.shape != (len(view.points_m), 2):
+            raise InvalidRequest(f"views[{k}] needs four points or more with a pixel each", hint="leave that view out")
+        if not (np.isfinite(view.points_m).all() and np.isfinite(view.pixels_px).all()):
+            raise InvalidRequest(f"views[{k}] is not finite", hint="leave that view out")
+    if sum(2 * len(view.points_m) - 6 for view in views) < len(free):
+        raise InvalidRequest("fewer measurements than unknowns", hint="add views, or fit fewer parameters")
+
+
+def _homography(view: BoardView) -> Array:
+    """Direct linear transform from board x, y to pixels, with Hartley's scaling."""
+    plane, pixels = view.points_m[:, :2], view.pixels_px
+    Ta, Tb = _scaling(plane), _scaling(pixels)
+    a = np.column_stack([plane, np.ones(len(plane))]) @ Ta.T
+    b = np.column_stack([pixels, np.ones(len(pixels))]) @ Tb.T
+    zero = np.zeros_like(a)
+    rows = np.vstack([np.hstack([a, zero, -b[:, :1] * a]), np.hstack([zero, a, -b[:, 1:2] * a])])
+    H = np.linalg.svd(rows)[2][-1].reshape(3, 3)
+    return np.asarray(np.linalg.inv(Tb) @ H @ Ta)
+
+
+def _scaling(points: Array) -> Array:
+    centre = points.mean(axis=0)
+    size = float(np.sqrt(np.mean((points - centre) ** 2))) or 1.0
+    return np.array([[1 / size, 0, -centre[0] / size], [0, 1 / size, -centre[1] / size], [0, 0, 1]])
+
+
+def _zhang(views: Sequence[BoardView], size: tuple[int, int]) -> CameraIntrinsics:
+    """Focal lengths from the homographies with the centre in the middle of the image.
+
+    With K^-1 H = (h1 h2 h3): h1 . h2 = 0 and |h1| = |h2| are linear in 1/fx^2 and 1/fy^2.
+    """
+    width, height = size
+    centre = np.array([[1, 0, -(width - 1) / 2.0], [0, 1, -(height - 1) / 2.0], [0, 0, 1]])
+    rows, values = [], []
+    for view in views:
+        H = centre @ _homography(view)
+        H = H / np.linalg.norm(H[:, :2])
+        (a1, b1, c1), (a2, b2, c2) = H[:, 0], H[:, 1]
+        rows += [[a1 * a2, b1 * b2], [a1**2 - a2**2, b1**2 - b2**2]]
+        values += [-c1 * c2, c2**2 - c1**2]
+    inverse = np.linalg.lstsq(np.array(rows) * width**-2, np.array(values), rcond=None)[0] * width**-2
+    focal = 1.2 * width * np.ones(2)  # a usual lens, where all views are frontal and the rows say nothing
+    if (inverse > 0).all():
+        found = 1.0 / np.sqrt(inverse)
+        focal = np.where((found > 0.3 * width) & (found < 8.0 * width), found, focal)
+    return CameraIntrinsics(
+        width_px=width, height_px=height, fx_px=float(focal[0]), fy_px=float(focal[1]), cx_px=(width - 1) / 2.0,
+        cy_px=(height - 1) / 2.0,
+    )  # fmt: skip
+
+
+def _first_pose(view: BoardView, intrinsics: CameraIntrinsics) -> RigidTransform:
+    """camera_from_board from the homography of the undistorted pixels (flat), or by OpenCV's SQPNP (not flat)."""
+    ideal = undistort_pixels(view.pixels_px, intrinsics)
+    K = np.array([
+        [intrinsics.fx_px, 0, intrinsics.cx_px], [0, intrinsics.fy_px, intrinsics.cy_px], [0, 0, 1.0]
+    ])  # fmt: skip
+    if np.ptp(view.points_m[:, 2]) > 1e-9:
+        import cv2
+
+        _, turn, shift = cv2.solvePnP(view.points_m, ideal, K, None, flags=cv2.SOLVEPNP_SQPNP)
+        return transform(Rotation.from_rotvec(np.asarray(turn).ravel()).as_matrix(), np.asarray(shift).ravel())
+    h = np.linalg.inv(K) @ _homography(BoardView(points_m=view.points_m, pixels_px=ideal, sigma_px=view.sigma_px))
+    h = h / np.sqrt(np.linalg.norm(h[:, 0]) * np.linalg.norm(h[:, 1]))
+    t = h[:, 2]
+    if t[2] < 0:
+        h, t = -h, -t
+    u, _, vt = np.linalg.svd(np.column_stack([h[:, 0], h[:, 1], np.cross(h[:, 0], h[:, 1])]))
+    R = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    height = float(view.points_m[0, 2])
+    return transform(R, t - R @ [0.0, 0.0, height])
+
+
+def _parameters(intrinsics: CameraIntrinsics) -> Array:
+    return np.array([
+        intrinsics.fx_px, intrinsics.fy_px, intrinsics.cx_px, intrinsics.cy_px, *intrinsics.distortion
+    ])  # fmt: skip
+
+
+def _with_parameters(intrinsics: CameraIntrinsics, values: Array) -> CameraIntrinsics:
+    fx, fy, cx, cy, *lens = (float(v) for v in values)
+    return CameraIntrinsics(
+        width_px=intrinsics.width_px, height_px=intrinsics.height_px, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy,
+        distortion=(lens[0], lens[1], lens[2], lens[3], lens[4]),
+    )  # fmt: skip
+
+
+def _projection(
+    view: BoardView, pose: RigidTransform, intrinsics: CameraIntrinsics
+) -> tuple[Array, Array, Array]:
+    """Pixels (N, 2), and derivatives (2N, 9) by the intrinsics and (2N, 6) by the pose."""
+    turned = view.points_m @ matrix_of(pose).T
+    q = turned + pose.translation
+    z = np.maximum(q[:, 2], 1e-6)
+    n = q[:, :2] / z[:, None]
+    d = distort(n, intrinsics)
+    focal = np.array([intrinsics.fx_px, intrinsics.fy_px])
+    x, y = n.T
+    r2 = x * x + y * y
+    by_lens = np.zeros((len(n), 2, 9))
+    by_lens[:, 0, 0], by_lens[:, 1, 1] = d[:, 0], d[:, 1]
+    by_lens[:, 0, 2] = by_lens[:, 1, 3] = 1.0
+    bend = np.stack([
+        np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3], axis=1),
+        np.stack([y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3], axis=1),
+    ], axis=1)  # fmt: skip
+    by_lens[:, :, 4:] = focal[:, None] * bend
+    by_point = np.zeros((len(n), 2, 3))
+    by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0 / z
+    by_point[:, :, 2] = -n / z[:, None]
+    by_point = focal[:, None] * (distortion_jacobian(n, intrinsics) @ by_point)
+    by_turn = np.cross(turned[:, None, :], by_point)  # a . (r x y) = r . (y x a)
+    by_pose = np.concatenate([by_point, by_turn], axis=2)
+    pixels = d * focal + [intrinsics.cx_px, intrinsics.cy_px]
+    return np.asarray(pixels), by_lens.reshape(-1, 9), by_pose.reshape(-1, 6)
+
+
+def _fit(views: Sequence[BoardView], start: _State, index: list[int]) -> tuple[_State, Minimum]:
+    n = len(index)
+
+    def linearise(state: _State) -> tuple[Array, Array]:
+        residuals, rows = [], []
+        for k, (view, pose) in enumerate(zip(views, state.poses, strict=True)):
+            pixels, by_lens, by_pose = _projection(view, pose, state.intrinsics)
+            row = np.zeros((2 * len(pixels), n + 6 * len(views)))
+            row[:, :n] = by_lens[:, index]
+            row[:, n + 6 * k : n + 6 * k + 6] = by_pose
+            residuals.append((pixels - view.pixels_px).ravel() / view.sigma_px)
+            rows.append(row / view.sigma_px)
+        return np.concatenate(residuals), np.vstack(rows)
+
+    def move(state: _State, step: Array) -> _State:
+        values = _parameters(state.intrinsics)
+        values[index] += step[:n]
+        poses = tuple(perturbed(pose, step[n + 6 * k : n + 6 * k + 6]) for k, pose in enumerate(state.poses))
+        return _State(intrinsics=_with_parameters(state.intrinsics, values), poses=poses)
+
+    try:
+        return descend(start, linearise, move)
+    except NotObservable as error:
+        raise NotObservable(
+            "the views are too alike to tell the focal length from the distance", hint=HINT, **error.details
+        ) from error
+
+
+HINT = "tilt the board (or the hand) by 20 to 40 degrees in several directions, at two distances, up to the corners"
+
+
+def _check_accuracy(covariance: Array, names: list[str], intrinsics: CameraIntrinsics) -> None:
+    limits = {"fx": FOCAL_LIMIT * intrinsics.fx_px, "fy": FOCAL_LIMIT * intrinsics.fy_px,
+              "cx": CENTRE_LIMIT * intrinsics.width_px, "cy": CENTRE_LIMIT * intrinsics.width_px}  # fmt: skip
+    sigma = dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
+    for name, limit in limits.items():
+        if name in sigma and sigma[name] > limit:
+            raise NotObservable(
+                f"the views leave {name} uncertain by {sigma[name]:.1f} px (at most {limit:.1f})", hint=HINT,
+                parameter=name, sigma_px=round(float(sigma[name]), 2),
+            )  # fmt: skip
+
+

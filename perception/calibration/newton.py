@@ -1,0 +1,89 @@
+"""Damped Gauss-Newton for the calibrations: residuals whitened by their covariance, then an observability gate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.errors import NotObservable
+
+Array = NDArray[np.float64]
+S = TypeVar("S")
+
+STEPS = 60
+CONVERGED = 1e-10  # predicted fall of chi-square
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Minimum:
+    """Where the descent ended: chi-square there, the information matrix (n, n) and its inverse."""
+
+    chi_square: float
+    information: Array
+    covariance: Array
+
+
+def descend(
+    state: S, linearise: Callable[[S], tuple[Array, Array]], move: Callable[[S, Array], S]
+) -> tuple[S, Minimum]:
+    """The state that minimises |residual|^2.
+
+    Args:
+        state: where to start.
+        linearise: whitened residual (m,) and Jacobian (m, n) at a state.
+        move: the state after a step (n,).
+
+    Raises:
+        NotObservable: some direction of the state does not show in the residuals at all.
+    """
+    residual, jacobian = linearise(state)
+    damping = 1e-6
+    for _ in range(STEPS):
+        information, gradient = jacobian.T @ jacobian, jacobian.T @ residual
+        scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+        scaled = information / np.outer(scale, scale) + damping * np.eye(len(scale))
+        step = -np.linalg.lstsq(scaled, gradient / scale, rcond=None)[0] / scale
+        candidate = move(state, step)
+        new_residual, new_jacobian = linearise(candidate)
+        if new_residual @ new_residual <= residual @ residual:
+            fall = float(residual @ residual - new_residual @ new_residual)
+            state, residual, jacobian = candidate, new_residual, new_jacobian
+            damping = max(damping / 10.0, 1e-12)
+            if fall < CONVERGED * (1.0 + float(residual @ residual)):
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e8:
+                break
+    information = jacobian.T @ jacobian
+    return state, Minimum(
+        chi_square=float(residual @ residual), information=information, covariance=invert(information)
+    )
+
+
+def invert(information: Array) -> Array:
+    """Inverse of an information matrix, computed after scaling its diagonal to 1.
+
+    Raises:
+        NotObservable: it is singular; `details["direction"]` holds the free direction.
+    """
+    diagonal = np.diag(information)
+    if not (np.isfinite(information).all() and (diagonal > 0).all()):
+        raise NotObservable(
+            "a parameter does not show in the data at all", hint="add views that differ more",
+            direction=[float(d <= 0) for d in diagonal],
+        )  # fmt: skip
+    scale = np.sqrt(diagonal)
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    if values[0] < 1e-12 * values[-1]:
+        direction = vectors[:, 0] / scale
+        raise NotObservable(
+            "the data leave a combination of the parameters free", hint="add views that differ more",
+            direction=(direction / np.abs(direction).max()).round(3).tolist(),
+        )  # fmt: skip
+    return np.asarray((vectors / values) @ vectors.T / np.outer(scale, scale))
+

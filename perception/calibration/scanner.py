@@ -1,0 +1,145 @@
+"""Where the range scanner sits in the hand: its points on one flat plate, from several poses, must lie in one plane.
+
+Works for a scanner that sweeps a line and for one that gives an image: only points are used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from hal.errors import InvalidRequest, NotObservable
+from hal.geometry import UncertainPose, matrix_of, perturbed
+from perception.calibration.newton import descend
+
+Array = NDArray[np.float64]
+
+LIMIT_M = 0.003
+LIMIT_RAD = 0.02
+NAMES = ("shift along x", "shift along y", "shift along z", "turn about x", "turn about y", "turn about z")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScannerView:
+    """One scan of the plate: the flange pose, points (N, 3) in scanner axes (m), noise of a point along its ray (m)."""
+
+    base_from_flange: RigidTransform
+    points_m: Array
+    sigma_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScannerCalibration:
+    """`flange_from_scanner` with covariance, chi-square and degrees of freedom, residual rms over all points (m)."""
+
+    flange_from_scanner: UncertainPose
+    plane_base: tuple[Array, float]
+    chi_square: float
+    degrees: int
+    rms_m: float
+
+
+def calibrate_scanner(
+    views: Sequence[ScannerView], start: RigidTransform, base_from_plate: UncertainPose
+) -> ScannerCalibration:
+    """The scanner's mount, and the plate's plane (its z axis, through its origin) refined along with it.
+
+    Minimises sum (n . (A_i Y p) - d)^2 / sigma^2 over Y = flange_from_scanner and the plane (n, d), the plane held by
+    the covariance of `base_from_plate`.
+
+    Args:
+        views: scans from several distances and tilts.
+        start: nominal flange_from_scanner.
+        base_from_plate: the plate, from the hand-eye calibration; its normal is z.
+
+    Raises:
+        InvalidRequest: no views, wrong shapes or not finite.
+        NotObservable: the poses leave a direction of the mount free or too uncertain; the message names it.
+    """
+    points = [_checked(k, view) for k, view in enumerate(views)]
+    if not points:
+        raise InvalidRequest("no scans", hint="take six or more, tilted about both axes of the plate")
+    frame = matrix_of(base_from_plate.parent_from_child)
+    n0, e1, e2 = frame[:, 2], frame[:, 0], frame[:, 1]
+    d0 = float(n0 @ base_from_plate.parent_from_child.translation)
+    prior = _plane_prior(base_from_plate)
+
+    def plane(bend: Array) -> tuple[Array, float]:
+        n = n0 + bend[0] * e1 + bend[1] * e2
+        return n / np.linalg.norm(n), d0 + float(bend[2])
+
+    sigmas = [_across(view, p, matrix_of(start), n0) for view, p in zip(views, points, strict=True)]
+
+    def linearise(state: tuple[RigidTransform, Array]) -> tuple[Array, Array]:
+        pose, bend = state
+        n, d = plane(bend)
+        Ry = matrix_of(pose)
+        residuals, rows = [prior @ bend], [np.hstack([np.zeros((3, 6)), prior])]
+        for view, p, sigma in zip(views, points, sigmas, strict=True):
+            Ra = matrix_of(view.base_from_flange)
+            turned = p @ Ry.T
+            world = (turned + pose.translation) @ Ra.T + view.base_from_flange.translation
+            nf = Ra.T @ n
+            row = np.hstack([np.tile(nf, (len(p), 1)), np.cross(turned, nf), world @ np.column_stack([e1, e2]),
+                             -np.ones((len(p), 1))])  # fmt: skip
+            residuals.append((world @ n - d) / sigma)
+            rows.append(row / sigma[:, None])
+        return np.concatenate(residuals), np.vstack(rows)
+
+    (pose, bend), minimum = descend(
+        (start, np.zeros(3)), linearise, lambda s, step: (perturbed(s[0], step[:6]), s[1] + step[6:])
+    )
+    covariance = minimum.covariance[:6, :6]
+    _check(covariance)
+    count = sum(len(p) for p in points)
+    rest_m = linearise((pose, bend))[0][3:] * np.concatenate(sigmas)
+    return ScannerCalibration(
+        flange_from_scanner=UncertainPose(parent_from_child=pose, covariance=covariance), plane_base=plane(bend),
+        chi_square=minimum.chi_square, degrees=count - 6, rms_m=float(np.sqrt(np.mean(rest_m**2))),
+    )  # fmt: skip
+
+
+def _checked(index: int, view: ScannerView) -> Array:
+    points = np.asarray(view.points_m, float)
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all() or view.sigma_m <= 0:
+        raise InvalidRequest(
+            f"views[{index}]: points must be finite (N, 3) with a positive sigma, not {points.shape}",
+            hint="drop the readings without an echo",
+        )
+    return points
+
+
+def _across(view: ScannerView, points: Array, R: Array, normal: Array) -> Array:
+    """(N,) noise of the points across the plate: along the ray it is sigma, across it sigma times the cosine."""
+    world = points @ (matrix_of(view.base_from_flange) @ R).T
+    cosine = np.abs(world @ normal) / np.maximum(np.linalg.norm(points, axis=1), 1e-9)
+    return np.asarray(view.sigma_m * np.maximum(cosine, 0.1))
+
+
+def _plane_prior(plate: UncertainPose) -> Array:
+    """Square root information of (bend 1, bend 2, offset), from the plate's 6x6 covariance."""
+    R, t = matrix_of(plate.parent_from_child), plate.parent_from_child.translation
+    n, e1, e2 = R[:, 2], R[:, 0], R[:, 1]
+    # A turn r moves n by r x n: bend1 = e1 . (r x n) = r . (n x e1) = r . e2, bend2 = -r . e1, and d = n . t.
+    J = np.zeros((3, 6))
+    J[0, 3:], J[1, 3:] = e2, -e1
+    J[2, :3], J[2, 3:] = n, np.cross(n, t)
+    covariance = J @ plate.covariance @ J.T + 1e-12 * np.eye(3)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+
+
+def _check(covariance: Array) -> None:
+    sigma = np.sqrt(np.diag(covariance))
+    limits = np.array([LIMIT_M] * 3 + [LIMIT_RAD] * 3)
+    worst = int(np.argmax(sigma / limits))
+    if sigma[worst] > limits[worst]:
+        unit = "mm" if worst < 3 else "mrad"
+        raise NotObservable(
+            f"the scans leave the scanner's {NAMES[worst]} (flange axes) uncertain by {1e3 * sigma[worst]:.1f} {unit}",
+            hint="add scans tilted by 20 degrees or more about both axes of the plate, and turned about its normal",
+            parameter=NAMES[worst],
+        )

@@ -7,6 +7,8 @@ at `TRIM_SIGMAS` and plain least squares (Levenberg's damping, Marquardt's scali
 
 
 # bodies and plain comparisons are what compiles fast.
+# ruff: noqa: PLR0912 - compiled loops are long
+
 from __future__ import annotations
 
 import numpy as np

@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 WINDOW = 5  # samples across; a window of 25 samples rarely holds a gross error
 LARGE_SHARE = 1 / 60  # of the shorter side: spacing of the large window's samples, at least 2 pixels
 QUANTILE = 0.25  # windows on creases, jumps and gross errors lie above it in all but the busiest scenes
+WORST_SHARE = 0.03  # of the depth: an image that scatters more shows no surface, and no model may explain it as one
 NORMAL_QUANTILE = -0.6745
 DEPTH_BINS = 6
 STEPPED_SHARE = 0.25  # fewer distinct values than this share of the pixels: the depth comes in codes
@@ -48,6 +49,14 @@ class NoiseModel:
     def packed(self) -> Array:
         """(6,) white, correlated and step pairs: what the compiled loops read."""
         return np.array([*self.white, *self.correlated, *self.step])
+
+    def scaled(self, factor: float) -> NoiseModel:
+        """The model with every part times `factor`."""
+        if factor == 1.0:
+            return self
+        parts = ((factor * a, factor * b) for a, b in (self.white, self.correlated, self.step))
+        white, correlated, step = parts
+        return NoiseModel(white=white, correlated=correlated, step=step)
 
     def widened(self, factor: float, depths_m: Array) -> NoiseModel:
         """The model with `factor` times the total sigma at the given depths (N,); the excess counts as correlated."""
@@ -81,7 +90,9 @@ def estimate_noise(depth_m: Array, sensor: RangeSensorModel) -> NoiseModel:
     # The slow part is what the large windows see beyond the small ones and beyond the code step itself.
     seen = np.maximum(white[0] + white[1] * z2, (step[0] + step[1] * z2) / np.sqrt(12.0))
     slow = np.sqrt(np.maximum((large[0] + large[1] * z2) ** 2 - 1.4 * seen**2, 0.0))
-    return NoiseModel(white=white, correlated=_fit_law(z2, slow), step=step)
+    law = NoiseModel(white=white, correlated=_fit_law(z2, slow), step=step)
+    share = float(np.median(law.sigma_m(np.sqrt(z2)) / np.maximum(np.sqrt(z2), 1e-9)))
+    return law.scaled(min(1.0, WORST_SHARE / max(share, 1e-12)))
 
 
 def coding_step(depth_m: Array) -> tuple[float, float]:

@@ -21,7 +21,7 @@ from perception.range.claim import bucket, claim_borders, claim_pixels
 from perception.range.compete import Candidates, explain
 from perception.range.components import for_each_tile, label_components
 from perception.range.grid import Grid, block_size, build_grid
-from perception.range.noise import NoiseModel, typical_depths_m
+from perception.range.noise import WORST_SHARE, NoiseModel, typical_depths_m
 from perception.range.sensor import RangeSensorModel
 from perception.range.surfaces import PLANE
 
@@ -88,7 +88,8 @@ def _settled_planes(task: Task, noise: NoiseModel) -> tuple[Candidates, Grid, La
         blocks = np.zeros(grid.z.shape, np.int32)
         found = Candidates()
         scatter = _recover_planes(task, grid, blocks, found)
-        if scatter <= SETTLED_MEAN_SQUARE or attempt == WIDENINGS:
+        worst = float(noise.sigma_m(depths[2])) * WIDER > WORST_SHARE * abs(float(depths[2]))
+        if scatter <= SETTLED_MEAN_SQUARE or attempt == WIDENINGS or worst:
             break
         noise = noise.widened(WIDER, depths)
     return found, grid, blocks, noise

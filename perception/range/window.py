@@ -57,7 +57,8 @@ class Window:
     def encode(self, depth_m: ArrayLike) -> NDArray[np.int64]:
         """Codes of depths in metres, clipped to the window; NaN becomes the farthest code."""
         depth = np.nan_to_num(np.asarray(depth_m, float), nan=self.far_m)
-        return np.clip(np.rint((depth - self.near_m) / self.step_m), 0, self.levels).astype(np.int64)
+        codes = np.clip(np.rint((depth - self.near_m) / self.step_m), 0, self.levels)
+        return np.asarray(codes, np.int64)
 
     def share_used(self, depth_m: ArrayLike) -> float:
         """Share of the window that the depths fill, gross errors aside: the paper's 0.1, 0.25 ... 1."""

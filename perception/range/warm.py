@@ -1,0 +1,29 @@
+"""Compile everything once, so that no caller waits for it later."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perception.range.analyse import analyse
+from perception.range.geometry import local_geometry
+from perception.range.plane import fit_plane_near
+from perception.range.sensor import OrthographicSensor, PinholeSensor, RangeSensorModel
+
+SIDE_PX = 200  # large enough that the coarse and the fine grid both run
+
+
+def warm_up() -> None:
+    """Run the whole chain on small made-up scenes; compiled code is cached on disk for the next process."""
+    pinhole = PinholeSensor(width_px=SIDE_PX, height_px=SIDE_PX, fx_px=200.0, fy_px=200.0, cx_px=99.5, cy_px=99.5)
+    parallel = OrthographicSensor(width_px=SIDE_PX, height_px=SIDE_PX, pixel_pitch_m=0.001)
+    v, u = np.mgrid[:SIDE_PX, :SIDE_PX] * 0.001
+    bump = np.sqrt(np.maximum(0.03**2 - (u - 0.05) ** 2 - (v - 0.1) ** 2, 0.0))
+    ridge = np.sqrt(np.maximum(0.02**2 - (u - 0.15) ** 2, 0.0))
+    small = np.where(np.hypot(u - 0.1, v - 0.03) < 0.006, 0.01, 0.0)
+    noise = np.random.default_rng(0).normal(0.0, 0.0003, u.shape)
+    depth = 0.6 + 0.1 * v - np.maximum(np.maximum(bump, ridge), small) + noise
+    sensors: tuple[RangeSensorModel, ...] = (pinhole, parallel)
+    for sensor in sensors:
+        analyse(depth, sensor)
+        local_geometry(depth, sensor)
+    fit_plane_near(depth, pinhole, point_m=[0.0, 0.0, 0.61], normal=[0.0, 0.0, -1.0])

@@ -170,7 +170,7 @@ class Ur(StreamDevice[JointState]):
         until_s = now_s() + ANSWER_S
         while chunk := link.read(until_s):
             for got, payload in self._parser.feed(chunk):
-                if got == kind:  # text messages may come in between
+                if got == kind and rtde.package(got, payload) != request:  # texts may come in between; echoes are ours
                     return payload
         raise NoAnswer(f"no answer to RTDE request {kind!r}")
 

@@ -152,7 +152,7 @@ class WireEmulator:
     def _run(self) -> None:
         next_s = time.monotonic()
         while not self._closing.is_set():
-            self._obey()
+            self._take_orders()
             wait_s = LOOK_UP_S if self.period_s is None else min(LOOK_UP_S, next_s - time.monotonic())
             received = self.port.receive(wait_s)
             for peer, data in received:
@@ -161,7 +161,7 @@ class WireEmulator:
                 next_s = max(next_s + self.period_s, time.monotonic() - self.period_s)
                 self._guarded_tick()
 
-    def _obey(self) -> None:
+    def _take_orders(self) -> None:
         with suppress(queue.Empty):
             order, done = self._orders.get_nowait()
             order()

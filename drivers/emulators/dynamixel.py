@@ -1,0 +1,200 @@
+"""Dynamixel servos on a pty: tables, sync reads and writes, watchdog, shutdown, moving any arm."""
+
+from __future__ import annotations
+
+import math
+import struct
+import time
+from typing import Any
+
+import numpy as np
+
+from drivers import dxl2
+from drivers.arms import kinematics_of
+from drivers.emulators.base import WireEmulator
+from drivers.emulators.faults import FaultOptions
+from drivers.emulators.ports import Peer, PtyPort
+from drivers.transport.checks import crc_dynamixel
+from hal.devices import Arm, Device
+from hal.errors import CellError, Unsupported
+from hal.strict import validate
+
+TABLE_BYTES = 147
+EEPROM_BYTES = 64
+TORQUE, HARDWARE_ERROR, WATCHDOG, GOAL, STATE, TICK = 64, 70, 98, 116, 126, 120
+RAD_PER_COUNT = math.tau / 4096
+VELOCITY_UNIT = 0.229 * math.tau / 60.0
+ACCESS, RANGE, INSTRUCTION = 7, 4, 2
+OVERLOAD = 0x20
+
+
+class Servo:
+    """One control table."""
+
+    def __init__(self, id_: int) -> None:
+        self.table = bytearray(TABLE_BYTES)
+        self.table[0:2] = (1020).to_bytes(2, "little")
+        self.table[6], self.table[7], self.table[11], self.table[68] = 45, id_, 3, 2
+        self.heard_s = time.monotonic()
+
+    def write(self, address: int, data: bytes) -> int:
+        """The error number of a write: 0 when it is done."""
+        if address + len(data) > TABLE_BYTES:
+            return RANGE
+        if address < EEPROM_BYTES and self.table[TORQUE]:
+            return ACCESS
+        if address == GOAL and self.table[WATCHDOG] == 0xFF:
+            return RANGE
+        self.table[address : address + len(data)] = data
+        return 0
+
+    @property
+    def goal(self) -> int:
+        """Goal position in counts."""
+        return int.from_bytes(self.table[GOAL : GOAL + 4], "little", signed=True)
+
+    @property
+    def alert(self) -> int:
+        """The alert bit while a hardware error stands."""
+        return dxl2.ALERT if self.table[HARDWARE_ERROR] else 0
+
+
+class DynamixelEmulator(WireEmulator):
+    """The servos, running."""
+
+    def __init__(self, backing: Arm, options: FaultOptions) -> None:
+        super().__init__(PtyPort("dynamixel"), options, name="dynamixel")
+        self._backing = backing
+        self.servos = {i + 1: Servo(i + 1) for i in range(len(backing.capabilities().links))}
+        self._framer = dxl2.framer()
+        self._is_enabled = False
+        self._is_new_goal = False
+        self.period_s = 0.01
+
+    @property
+    def address(self) -> dict[str, Any]:
+        """Port, ids and kinematics."""
+        return {**super().address, "ids": list(self.servos), "kinematics": kinematics_of(self._backing.capabilities())}
+
+    def overload(self, id_: int) -> None:
+        """The servo shuts down."""
+        self.servos[id_].table[HARDWARE_ERROR] = OVERLOAD
+        self.servos[id_].table[TORQUE] = 0
+        self._settle()
+
+    def on_bytes(self, peer: Peer, data: bytes) -> None:  # noqa: ARG002  # a line has one peer
+        """Instructions; every packet feeds the watchdogs."""
+        for frame in self._framer.feed(data):
+            packet = dxl2.decode(frame)
+            if packet.instruction == dxl2.STATUS:
+                continue
+            for servo in self.servos.values():
+                servo.heard_s = time.monotonic()
+            self._obey(packet)
+        self._settle()
+
+    def on_tick(self) -> None:
+        """The bus watchdogs."""
+        for servo in self.servos.values():
+            limit = servo.table[WATCHDOG]
+            if 0 < limit < 0xFF and time.monotonic() - servo.heard_s > limit * 0.02:
+                servo.table[WATCHDOG] = 0xFF
+        self._settle()
+
+    def status_frame(self) -> bytes | None:
+        """Instruction error of the first servo."""
+        return dxl2.encode(next(iter(self.servos)), dxl2.STATUS, bytes([INSTRUCTION]))
+
+    def _obey(self, packet: dxl2.Packet) -> None:
+        p = packet.parameters
+        match packet.instruction:
+            case dxl2.PING:
+                for id_ in self._addressed(packet.id):
+                    self._answer(id_, 0, bytes(self.servos[id_].table[0:2]) + bytes([self.servos[id_].table[6]]))
+            case dxl2.READ if packet.id in self.servos:
+                address, length = struct.unpack("<HH", p)
+                self._answer(packet.id, 0, self._block(packet.id, address, length))
+            case dxl2.WRITE if packet.id in self.servos:
+                error = self.servos[packet.id].write(int.from_bytes(p[:2], "little"), p[2:])
+                self._is_new_goal |= p[:2] == GOAL.to_bytes(2, "little") and not error
+                self._answer(packet.id, error)
+            case dxl2.SYNC_READ:
+                address, length = struct.unpack_from("<HH", p)
+                for id_ in p[4:]:
+                    if id_ in self.servos:
+                        self._answer(id_, 0, self._block(id_, address, length))
+            case dxl2.FAST_SYNC_READ:
+                self._fast_answer(p)
+            case dxl2.SYNC_WRITE:
+                self._sync_write(p)
+            case dxl2.REBOOT if packet.id in self.servos:
+                self.servos[packet.id] = Servo(packet.id)
+                self._answer(packet.id, 0)
+            case _ if packet.id in self.servos:
+                self._answer(packet.id, INSTRUCTION)
+
+    def _addressed(self, id_: int) -> list[int]:
+        return list(self.servos) if id_ == dxl2.BROADCAST else [id_] if id_ in self.servos else []
+
+    def _answer(self, id_: int, error: int, data: bytes = b"") -> None:
+        error |= self.servos[id_].alert
+        self.send(None, dxl2.encode(id_, dxl2.STATUS, bytes([error]) + data), protected=slice(4, None))
+
+    def _fast_answer(self, parameters: bytes) -> None:
+        """One packet for all, unstuffed, with a running CRC after each servo's block."""
+        address, length = struct.unpack_from("<HH", parameters)
+        ids = [id_ for id_ in parameters[4:] if id_ in self.servos]
+        if len(ids) != len(parameters) - 4:
+            return
+        frame = dxl2.HEADER + bytes([dxl2.BROADCAST]) + struct.pack("<HB", 1 + len(ids) * (4 + length), dxl2.STATUS)
+        for id_ in ids:
+            frame += bytes([self.servos[id_].alert, id_]) + self._block(id_, address, length)
+            frame += struct.pack("<H", crc_dynamixel(frame))
+        self.send(None, frame, protected=slice(4, None))
+
+    def _sync_write(self, parameters: bytes) -> None:
+        address, length = struct.unpack_from("<HH", parameters)
+        for at in range(4, len(parameters), 1 + length):
+            servo = self.servos.get(parameters[at])
+            if servo is not None:
+                error = servo.write(address, parameters[at + 1 : at + 1 + length])
+                self._is_new_goal |= address == GOAL and not error
+
+    def _block(self, id_: int, address: int, length: int) -> bytes:
+        self._refresh()
+        return bytes(self.servos[id_].table[address : address + length])
+
+    def _refresh(self) -> None:
+        """Present values from the arm behind."""
+        try:
+            state = self._backing.read_state(deadline=self.deadline()).value
+        except CellError:
+            return
+        tick = int(time.monotonic() * 1000) % 32_768
+        for i, servo in enumerate(self.servos.values()):
+            position = round(float(state.position_rad[i]) / RAD_PER_COUNT) + 2048
+            velocity = round(float(state.velocity_rad_per_s[i]) / VELOCITY_UNIT)
+            servo.table[STATE : STATE + 10] = struct.pack("<hii", 0, velocity, position)
+            servo.table[TICK : TICK + 2] = tick.to_bytes(2, "little")
+
+    def _settle(self) -> None:
+        """The arm behind follows while all servos have torque and no watchdog has tripped."""
+        is_on = all(s.table[TORQUE] and s.table[WATCHDOG] != 0xFF for s in self.servos.values())
+        if is_on and not self._is_enabled:
+            self._backing.enable(deadline=self.deadline())
+        if self._is_enabled and not is_on:
+            self._backing.stop(deadline=self.deadline())
+        self._is_enabled = is_on
+        if is_on and self._is_new_goal:
+            goal = np.array([(servo.goal - 2048) * RAD_PER_COUNT for servo in self.servos.values()])
+            self._backing.command_position(goal, deadline=self.deadline())
+        self._is_new_goal = False
+
+
+def start(backing: Device, options: dict[str, Any]) -> DynamixelEmulator:
+    """Entry point `dynamixel`."""
+    if not isinstance(backing, Arm):
+        raise Unsupported(f"servos cannot stand for a {backing.kind}", hint="back them with an arm")
+    emulator = DynamixelEmulator(backing, validate(options, FaultOptions, source="emulators.dynamixel"))
+    emulator.begin()
+    return emulator

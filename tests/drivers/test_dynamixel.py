@@ -1,0 +1,135 @@
+"""Dynamixel arm: conformance, stuffing, fast sync read, watchdog, shutdown, faults."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers import dxl2
+from drivers.dynamixel import RAD_PER_COUNT
+from drivers.emulators import dynamixel as emulator
+from drivers.emulators.scripted import ScriptedArm
+from hal.conformance import ArmContract, Rig
+from hal.errors import CellError, DeviceFault, DeviceUnavailable, MotionRefused
+from hal.registry import Context, connect
+from tests.drivers.rigs import count_good, soon, until, wired, wired_rig
+
+DRIVER = "serial:dynamixel"
+
+
+class TestDynamixel(ArmContract):
+    @pytest.fixture
+    def rig(self) -> Iterator[Rig[Any]]:
+        far_side = emulator.start(ScriptedArm(), {})
+        with wired_rig(far_side, DRIVER, {"watchdog_s": 1.0}, sample_period_s=0.06) as rig:
+            yield rig
+
+
+@given(
+    st.integers(0, 252), st.integers(1, 0x92), st.binary(max_size=60), st.lists(st.integers(min_value=0), max_size=6)
+)
+def test_packets_survive_stuffing_and_any_chunking(id_: int, inst: int, data: bytes, cuts: list[int]) -> None:
+    data = data.replace(b"\x00\x00", dxl2.STUFF)  # more headers inside than chance would bring
+    frame = dxl2.encode(id_, inst, data)
+    assert dxl2.HEADER not in frame[4:]
+    places = [0, *sorted(cut % (len(frame) + 1) for cut in cuts), len(frame)]
+    framer = dxl2.framer()
+    found = [f for a, b in pairwise(places) for f in framer.feed(frame[a:b])]
+    assert [dxl2.decode(f) for f in found] == [dxl2.Packet(id_, inst, data)]
+
+
+@pytest.mark.parametrize("is_fast", [True, False])
+@pytest.mark.parametrize("fault", ["crc", "drop", "dup", "split", "delay", "silent", "garbage", "echo", "status"])
+def test_no_fault_of_the_bus_gives_wrong_joints(fault: str, is_fast: bool) -> None:
+    arm = ScriptedArm()
+    options = {"fault": fault, "every": 20, "seed": 8, "delay_s": 0.05, "silent_s": 0.05, "split_s": 0.01}
+    with wired(emulator.start(arm, options), DRIVER, {"is_fast": is_fast}) as device:
+        half_count = 0.5 * RAD_PER_COUNT + 1e-9
+        assert count_good(device, lambda s: np.allclose(s.position_rad, arm.position_rad, atol=half_count)) >= 5
+
+
+def test_a_mirrored_joint_with_its_own_zero_reads_and_goes_where_it_is_told() -> None:
+    arm = ScriptedArm()
+    options = {"directions": [1, -1, 1, 1, 1, 1], "zero_counts": [2048, 1000, 2048, 2048, 2048, 2048]}
+    with wired(emulator.start(arm, {}), DRIVER, options) as device:
+        raw = round(arm.position_rad[1] / RAD_PER_COUNT) + 2048
+        measured = device.read_state(deadline=soon()).value.position_rad
+        assert measured[1] == pytest.approx(-(raw - 1000) * RAD_PER_COUNT)
+        device.enable(deadline=soon())
+        device.command_position(measured, deadline=soon())
+        until(lambda: arm.commands > 0)
+        assert arm.position_rad[1] == pytest.approx((raw - 2048) * RAD_PER_COUNT)
+
+
+def test_enabling_sets_the_goal_to_where_the_arm_is_before_torque() -> None:
+    arm = ScriptedArm()
+    before = arm.position_rad.copy()
+    with wired(far_side := emulator.start(arm, {}), DRIVER) as device:
+        far_side.servos[2].table[emulator.GOAL : emulator.GOAL + 4] = (100).to_bytes(4, "little")
+        device.enable(deadline=soon())
+        until(lambda: arm.is_enabled)
+        assert abs(far_side.servos[2].goal - 2048 - before[1] / RAD_PER_COUNT) <= 0.5
+        np.testing.assert_allclose(arm.position_rad, before, atol=RAD_PER_COUNT)
+
+
+def test_the_servos_watchdogs_are_armed_and_stop_the_arm_of_a_dead_host() -> None:
+    arm = ScriptedArm()
+    with wired(far_side := emulator.start(arm, {}), DRIVER, {"watchdog_s": 0.5}) as device:
+        device.enable(deadline=soon())
+        until(lambda: arm.is_enabled)
+        assert far_side.servos[1].table[emulator.WATCHDOG] == 25
+        device.bus.close()
+        until(lambda: not arm.is_enabled)
+        assert far_side.servos[1].table[emulator.WATCHDOG] == 0xFF
+
+
+def test_a_tripped_watchdog_is_told_and_motion_is_off() -> None:
+    arm = ScriptedArm()
+    with wired(far_side := emulator.start(arm, {}), DRIVER, {"watchdog_s": 0.5}) as device:
+        device.enable(deadline=soon())
+        far_side.servos[4].table[emulator.WATCHDOG] = 0xFF
+        with pytest.raises(DeviceFault, match="watchdog of servo 4"):
+            until(lambda: device.read_state(deadline=soon()) is None)
+        with pytest.raises(MotionRefused):
+            device.command_position(arm.position_rad, deadline=soon())
+
+
+def test_an_overload_is_a_fault_that_enable_does_not_paper_over() -> None:
+    arm = ScriptedArm()
+    with wired(far_side := emulator.start(arm, {}), DRIVER) as device:
+        device.enable(deadline=soon())
+        far_side.overload(3)
+        until(lambda: not arm.is_enabled)
+        with pytest.raises(DeviceFault, match="servo 3"):
+            until(lambda: device.read_state(deadline=soon()) is None)
+        with pytest.raises(CellError, match="servo 3"):
+            device.enable(deadline=soon())
+
+
+def test_torque_stays_off_after_unplugging() -> None:
+    arm = ScriptedArm()
+    with wired(far_side := emulator.start(arm, {}), DRIVER) as device:
+        far_side.unplug(away_s=0.05)
+        until(lambda: device.health().reconnects >= 1 and device.mailbox.error() is None)
+        assert not far_side.servos[1].table[emulator.TORQUE]
+        with pytest.raises(MotionRefused):
+            device.command_position(arm.position_rad, deadline=soon())
+
+
+def test_a_missing_servo_is_told() -> None:
+    far_side = emulator.start(ScriptedArm(), {})
+    try:
+        with pytest.raises(DeviceUnavailable, match="do not answer"):
+            connect(Context(name="arm"), DRIVER, {**far_side.address, "ids": [1, 2, 3, 4, 5, 9]})
+    finally:
+        far_side.close()
+
+
+def test_eeprom_is_locked_under_torque() -> None:
+    servo = emulator.Servo(1)
+    assert servo.write(emulator.TORQUE, b"\x01") == 0
+    assert servo.write(11, b"\x01") == emulator.ACCESS

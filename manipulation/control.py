@@ -49,6 +49,7 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 TRACKING_LIMIT_M = 0.02
+LOADED_START_RATIO = 1.2  # otherwise a jammed hand could never be taken away
 SETTLE_S = 0.3
 SETTLED_RAD = 2e-4
 SETTLED_RAD_PER_S = 0.02
@@ -300,7 +301,7 @@ class Controller:
     def _run(self, motion: DeclaredMotion, run: Run, sample: Sample, view: ToolView, recorder: Recorder) -> _End:
         started_s = sample.stamp_s
         look = view.look(sample, self._filter.last_rad)
-        guards = GuardSet((*motion.guards, *self._standing_guards()), look.base_from_tool)
+        guards = GuardSet((*motion.guards, *self._standing_guards(look.wrench)), look.base_from_tool)
         ticks = 0
         over_since_s: float | None = None
         while True:
@@ -349,11 +350,15 @@ class Controller:
             outcome=outcome, cause=f"guard {guard.name}: {guard.quantity} {side} {guard.limit:g}", tripped=guard.name
         )
 
-    def _standing_guards(self) -> tuple[Guard, ...]:
-        force, tracking = self._safety.force_limit_n, TRACKING_LIMIT_M
+    def _standing_guards(self, wrench: Array) -> tuple[Guard, ...]:
+        """Force and tracking hold in every motion; one that begins under load may go on while that does not grow."""
+        loaded = LOADED_START_RATIO * float(np.linalg.norm(wrench[:3]))
+        force = max(self._safety.force_limit_n, loaded)
         return (
             Guard(name="force_limit", quantity=Quantity.FORCE, limit=force, reaction=Reaction.FAULT),
-            Guard(name="tracking", quantity=Quantity.TRACKING, limit=tracking, ticks=5, reaction=Reaction.FAULT),
+            Guard(
+                name="tracking", quantity=Quantity.TRACKING, limit=TRACKING_LIMIT_M, ticks=5, reaction=Reaction.FAULT
+            ),
         )
 
     def _has_settled(self, motion: DeclaredMotion, wanted: Array, sample: Sample, over_s: float) -> bool:

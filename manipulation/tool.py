@@ -28,7 +28,7 @@ class Hand:
     body_half_m: Vector3 = (0.0475, 0.030, 0.045)
     body_back_m: float = 0.125
     max_width_m: float = 0.080
-    pad_stiffness_n_per_m: float = 12_000.0
+    pad_stiffness_n_per_m: float = 7_000.0
 
     @property
     def closed_half_m(self) -> tuple[float, float]:

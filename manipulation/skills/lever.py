@@ -20,14 +20,14 @@ from manipulation.workcell import Workcell, panel_from_grip
 Array = NDArray[np.float64]
 
 OVERLAP_M = 0.013  # how far the tips reach below the top of the bar
-FROM_END_M = 0.013  # the fingers hold the bar this far before its end: long lever arm, room for the pose error
+FROM_END_M = 0.008  # the fingers hold the bar this far before its end: a long lever arm spares the soft pads
 APPROACH_SIDE_M = 0.010  # free space on each side when coming down; more than the pose error
 CAGE_SIDE_M = 0.002  # free space on each side in the stroke: caged, not squeezed
 STROKE_M_PER_S = 0.08
 LAST_RAD = np.radians(9.0)  # the prototype met the end stop at more than 300 N until it slowed down towards the end
 OVERTRAVEL_RAD = np.radians(12.0)  # play of the cage and give of the pads
 LAST_M_PER_S = 0.018
-END_RISE_N = 15.0
+END_RISE_N = 8.0
 EFFORT_SPREAD = 1.6
 EFFORT_FLOOR_N = 25.0
 LARGEST_STOP_N = 92.0  # below the cell's protective limit, so that a stiff valve is told from a collision

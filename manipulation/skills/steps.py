@@ -5,6 +5,7 @@ attempt.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -231,13 +232,15 @@ def retreat(cell: Workcell, attempt: Attempt | None = None, *, distance_m: float
         DeviceFault, Stopped, Cancelled: the cell does not obey.
     """
     attempt = attempt or Attempt(cell)
-    width = cell.mover.state().gripper_width_m
-    attempt.open_to(min(cell.hand.max_width_m, width + 0.02), name="let go")
-    try:
-        attempt.leave(distance_m)
-    except (SkillFailure, MotionRefused):
-        # Something holds the hand: half the way at least, if that is free.
-        attempt.leave(distance_m / 2)
+    width = min(cell.hand.max_width_m, cell.mover.state().gripper_width_m + 0.02)
+    ways: tuple[Callable[[], object], ...] = (
+        lambda: attempt.open_to(width, name="let go"),
+        lambda: attempt.leave(distance_m),
+    )
+    for way in ways:
+        # Something may hold the hand; what can be done is done, and `park` sees whether the hand is free.
+        with suppress(SkillFailure, MotionRefused):
+            way()
 
 
 def park(cell: Workcell) -> None:

@@ -40,7 +40,8 @@ def test_the_jacobian_is_the_derivative_of_the_tool_pose(arm: ArmCapabilities, q
 @ARMS
 def test_every_branch_of_the_inverse_reaches_the_pose_and_one_is_the_start(arm: ArmCapabilities) -> None:
     kinematics, rng = Kinematics.of(arm), np.random.default_rng(3)
-    for q in rng.uniform(kinematics.lower_rad, kinematics.upper_rad, (200, 6)):
+    count = 100 if arm is T3 else 8  # two turns in each joint make some 500 branches of the second arm
+    for q in rng.uniform(kinematics.lower_rad, kinematics.upper_rad, (count, 6)):
         pose = kinematics.flange(q)
         found = kinematics.inverse(pose)
         assert np.min(np.max(np.abs(found - q), axis=1)) < 1e-6

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -70,10 +70,27 @@ class IntrinsicsRecord(Strict):
     cy_px: float
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     rms_px: Annotated[float, Field(ge=0)] = 0.0
+    sigma_focal_ratio: Annotated[float, Field(ge=0, lt=0.1)] = 0.0
+    sigma_centre_px: Annotated[float, Field(ge=0)] = 0.0
+    sigma_k1: Annotated[float, Field(ge=0)] = 0.0
+
+    def one_sigma_lenses(self) -> tuple[CameraIntrinsics, ...]:
+        """The lens with each of its independent errors one sigma large: focal length, centre x, centre y, k1."""
+        lens = self.intrinsics()
+        k1, k2, p1, p2, k3 = lens.distortion
+        longer = 1.0 + self.sigma_focal_ratio
+        return (
+            replace(lens, fx_px=lens.fx_px * longer, fy_px=lens.fy_px * longer),
+            replace(lens, cx_px=lens.cx_px + self.sigma_centre_px),
+            replace(lens, cy_px=lens.cy_px + self.sigma_centre_px),
+            replace(lens, distortion=(k1 + self.sigma_k1, k2, p1, p2, k3)),
+        )
 
     def intrinsics(self) -> CameraIntrinsics:
         """The value type that perception computes with."""
-        return CameraIntrinsics(**self.model_dump(exclude={"rms_px"}))
+        return CameraIntrinsics(
+            **self.model_dump(exclude={"rms_px", "sigma_focal_ratio", "sigma_centre_px", "sigma_k1"})
+        )
 
 
 class LoadRecord(Strict):

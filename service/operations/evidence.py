@@ -182,13 +182,18 @@ class FusedEvidence:
 
 
 def fuse_evidence(
-    evidence: Sequence[Evidence], mounts: Mapping[str, UncertainPose], *, prior: UncertainPose | None = None
+    evidence: Sequence[Evidence],
+    mounts: Mapping[str, UncertainPose],
+    *,
+    lenses: Mapping[str, Sequence[CameraIntrinsics]] | None = None,
+    prior: UncertainPose | None = None,
 ) -> FusedEvidence:
     """The pose that the evidence points to.
 
     Args:
         evidence: readings of any sensors.
         mounts: `flange_from_sensor` of every sensor in `evidence`.
+        lenses: for each camera, its lens with one independent error one sigma large at a time.
         prior: a pose believed beforehand; it only helps the search and is not part of the answer's covariance.
 
     Raises:
@@ -201,7 +206,8 @@ def fuse_evidence(
     good = [i for i in range(len(evidence)) if i not in rejected]
     pose = _solve([measurements[i] for i in good], start)
     covariance = np.zeros((6, 6))
-    for changed in _one_sigma_changes([evidence[i] for i in good], mounts):
+    used = [evidence[i] for i in good]
+    for changed in (*_one_sigma_changes(used, mounts), *_lens_changes(used, mounts, lenses or {})):
         moved = [changed.get(k, measurements[i]) for k, i in enumerate(good)]
         delta = difference(_solve(moved, pose), pose)
         covariance += np.outer(delta, delta)
@@ -237,6 +243,21 @@ def _one_sigma_changes(
                 }
             )
     return changes
+
+
+def _lens_changes(
+    evidence: Sequence[Evidence], mounts: Mapping[str, UncertainPose], lenses: Mapping[str, Sequence[CameraIntrinsics]]
+) -> list[dict[int, Measurement]]:
+    """For each independent error of each lens, the rays that it turns."""
+    return [
+        {
+            k: _measure(replace(e, intrinsics=wrong), mounts[e.sensor], np.zeros(2))
+            for k, e in enumerate(evidence)
+            if isinstance(e, LightEvidence) and e.sensor == camera
+        }
+        for camera, wrong_lenses in lenses.items()
+        for wrong in wrong_lenses
+    ]
 
 
 def _carried(m: Measurement, motion: RigidTransform) -> Measurement:

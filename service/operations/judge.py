@@ -77,6 +77,7 @@ def _pose_verdict(fused: dict[str, Any] | None, truth: Truth) -> dict[str, Any]:
     return {
         "pose_error_m": float(np.linalg.norm(delta[:3])),
         "pose_error_rad": float(np.linalg.norm(delta[3:])),
+        "pose_error": delta.tolist(),
         "mahalanobis": distance,
         "inside_95": bool(distance <= chi2.ppf(0.95, 6)),
     }

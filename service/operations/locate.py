@@ -213,9 +213,7 @@ def _is_expected(session: Session, base_from_panel: RigidTransform) -> bool:
     )
 
 
-def _light_evidence(
-    session: Session, look: Look, pixels: Array, covariances: Array
-) -> tuple[LightEvidence, ...]:
+def _light_evidence(session: Session, look: Look, pixels: Array, covariances: Array) -> tuple[LightEvidence, ...]:
     flange = session.mover.state().base_from_flange
     return tuple(
         LightEvidence(

@@ -81,7 +81,12 @@ def mounts_of(session: Session, evidence: Sequence[Evidence]) -> dict[str, Uncer
 
 def fuse_and_remember(session: Session, evidence: Sequence[Evidence]) -> FusedEvidence:
     """One pose from all evidence; the cell believes it from now on."""
-    fused = fuse_evidence(evidence, mounts_of(session, evidence), prior=believed_panel(session))
+    lenses = {
+        camera: record.one_sigma_lenses()
+        for camera in session.cell.names_of(DeviceKind.CAMERA)
+        if (record := session.cell.calibration_of(camera).intrinsics) is not None
+    }
+    fused = fuse_evidence(evidence, mounts_of(session, evidence), lenses=lenses, prior=believed_panel(session))
     session.memory.remember("base_from_panel", fused.base_from_panel)
     return fused
 

@@ -45,6 +45,8 @@ def read_slider(patch: Patch, spec: Slider) -> Status:
     room_m = 0.004 + lean_px / patch.px_per_m
     cover = covered(patch, half_width_m=footprint[0] + room_m, half_height_m=footprint[1] + room_m, is_round=False)
     open_ = np.ones_like(s) if cover is None else _open(patch, cover, spec.angle_rad, s, 0.4 * across)
+    if _is_cap(np.minimum(left, right), s, open_, along + abs(lean_m)):
+        open_ = np.ones_like(s)
     best, best_profile = (-1.0, 0, np.zeros_like(s)), np.zeros_like(s)
     for is_dark in (True, False):
         both = np.minimum(_hat(left, width, is_dark), _hat(right, width, is_dark)) * open_
@@ -77,6 +79,26 @@ def read_slider(patch: Patch, spec: Slider) -> Status:
             confidence=confidence,
         )
     )
+
+
+def _is_cap(profile: Array, s: Array, open_: Array, width_m: float) -> bool:
+    """Is what seems to lie across the track the cap itself? A dark cap runs into printed ticks of the same gray.
+
+    The cap is as long as the panel file says, and it is the only thing that stands out there.
+    """
+    shut = open_ < 0.5
+    if not shut.any():
+        return False
+    level = 0.5 * (float(np.median(profile)) + float(profile.min()))
+    dark = _closed((profile < level).astype(float), 0.3 * width_m / (s[1] - s[0])) > 0.5
+    places = np.flatnonzero(dark)
+    runs = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)
+    touched = [run for run in runs if len(run) > 2 and shut[run].any()]
+    others = [run for run in runs if len(run) > 2 and not shut[run].any()]
+    if len(touched) != 1 or others:
+        return False
+    length_m = float(s[touched[0][-1]] - s[touched[0][0]])
+    return abs(length_m - width_m) < 0.3 * width_m
 
 
 def _hat(profile: Array, width: int, is_dark: bool) -> Array:
@@ -117,7 +139,7 @@ def _profile(patch: Patch, angle_rad: float, s: Array, across: Array) -> Array:
 def _cap_middle(profile: Array, top: int, s: Array, *, along_m: float, lean_m: float) -> float:
     """Middle of the cap's top from the edges of what stands out.
 
-    Where the cap leans towards one side its wall shows there, in a gray of its own: then only the other edge is the top's.
+    Where the cap leans towards one side its wall shows there, in its own gray: then only the other edge is the top's.
     """
     near = slice(max(0, top - 2), top + 3)
     half = 0.5 * float(np.median(profile[near]) or profile[top])

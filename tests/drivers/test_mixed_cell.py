@@ -1,17 +1,32 @@
-"""The mixed cell is the bench cell with two devices on real wires."""
+"""Cells on the wire differ from the simulated ones in backends alone, and their wired devices find their emulators."""
 
 import tomllib
 from pathlib import Path
 from typing import Any
 
-from drivers.emulators import modbus_io, tfmini
-from drivers.emulators.scripted import ScriptedLights, ScriptedProximity
+import pytest
+
+from drivers.emulators import modbus_io, scripted, tfmini
 from hal.config import load_cell
 from hal.devices import DeviceKind
 from hal.registry import Context, connect, emulator_factory
 from tests.drivers.rigs import soon
 
 CELLS = Path(__file__).parents[2] / "cells"
+WIRED = {
+    "mixed.toml": "bench.toml",
+    "wire-ur.toml": "ur10e.toml",
+    "wire-cia402.toml": "bench.toml",
+    "wire-dynamixel.toml": "bench.toml",
+}
+STAND_INS: dict[DeviceKind, Any] = {
+    DeviceKind.ARM: scripted.ScriptedArm,
+    DeviceKind.GRIPPER: scripted.ScriptedGripper,
+    DeviceKind.LIGHTS: scripted.ScriptedLights,
+    DeviceKind.PROXIMITY: scripted.ScriptedProximity,
+    DeviceKind.TOUCH: scripted.ScriptedTouch,
+    DeviceKind.FORCE_TORQUE: scripted.ScriptedForceTorque,
+}
 
 
 def table(name: str) -> dict[str, Any]:
@@ -29,30 +44,34 @@ def without_backend(cell: dict[str, Any]) -> dict[str, Any]:
     return cell
 
 
-def test_only_mode_drivers_options_and_emulators_differ_from_the_bench() -> None:
-    mixed, bench = table("mixed.toml"), table("bench.toml")
+@pytest.mark.parametrize("name", WIRED)
+def test_only_mode_drivers_options_and_emulators_differ(name: str) -> None:
+    mixed, simulated = table(name), table(WIRED[name])
     assert mixed["cell"]["mode"] == "mixed"
     wired = {name for name, device in mixed["devices"].items() if not device["driver"].startswith("sim:")}
     assert wired == set(mixed["emulators"])
-    assert without_backend(mixed) == without_backend(bench)
+    assert without_backend(mixed) == without_backend(simulated)
 
 
-def test_its_wired_devices_connect_to_its_emulators() -> None:
+@pytest.mark.parametrize("name", WIRED)
+def test_wired_devices_connect_to_their_emulators(name: str) -> None:
     """As the cell process does it, with scripted devices in the simulator's place."""
-    cell = load_cell(CELLS / "mixed.toml")
-    stand_ins = {DeviceKind.LIGHTS: ScriptedLights, DeviceKind.PROXIMITY: ScriptedProximity}
-    for name, section in cell.file.emulators.items():
-        device_section = cell.file.devices[name]
-        far_side = emulator_factory(section.emulator)(stand_ins[device_section.kind](), section.emulator_options)
-        context = Context(name=name, cell=cell)
-        device = connect(context, device_section.driver, {**device_section.options, **far_side.address})
+    cell = load_cell(CELLS / name)
+    for device_name, section in cell.file.emulators.items():
+        wanted = cell.file.devices[device_name]
+        far_side = emulator_factory(section.emulator)(STAND_INS[wanted.kind](), section.emulator_options)
+        device: Any = None
         try:
+            context = Context(name=device_name, cell=cell)
+            device = connect(context, wanted.driver, {**wanted.options, **far_side.address})
+            assert device.kind is wanted.kind
             assert device.health().connected
-            if device_section.kind is DeviceKind.LIGHTS:
+            if wanted.kind is DeviceKind.LIGHTS:
                 assert device.capabilities().channels == tuple(light.name for light in cell.panel.lights)
                 assert device.set_on([True] * 4, deadline=soon()) == (True,) * 4
         finally:
-            device.close()
+            if device is not None:
+                device.close()
             far_side.close()
 
 

@@ -61,6 +61,30 @@ class Alternative:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ShapeEstimate:
+    """Measures of an object that were estimated with its pose.
+
+    Attributes:
+        names: of the measures, with their units.
+        values: (P,) estimates.
+        covariance: (P, P) of them, the pose unknown.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+
+    def sigma_of(self, name: str) -> float:
+        """Standard deviation of one measure."""
+        k = self.names.index(name)
+        return math.sqrt(self.covariance[k, k])
+
+    def value_of(self, name: str) -> float:
+        """One measure."""
+        return float(self.values[self.names.index(name)])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FusedPose:
     """Where the object stands, and how well that is known.
 
@@ -75,6 +99,7 @@ class FusedPose:
         alternatives: other poses that fit, most probable first.
         evidence: log odds that the measurements used agree because of the pose, against chance.
         certificate: proof that no other pose fits those measurements better, when asked for.
+        shape: the object's own measures, when it was given as a shape with unknown ones.
     """
 
     pose: RigidTransform
@@ -87,6 +112,7 @@ class FusedPose:
     alternatives: tuple[Alternative, ...]
     evidence: float
     certificate: Certificate | None = None
+    shape: ShapeEstimate | None = None
 
     @property
     def base_from_object(self) -> UncertainPose:
@@ -102,7 +128,7 @@ class FusedPose:
 def judged(
     b: Batch,
     best: Minimum,
-    others: list[Minimum],
+    others: Sequence[Minimum],
     index: Array,
     given: Sequence[Measurement],
     repeats: dict[int, int],

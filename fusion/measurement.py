@@ -66,6 +66,7 @@ class Measurement:
             one. Zero when a point was sensed.
         label: how reports call it.
         sensor: which device or sense it came from.
+        part: which part of a shape with unknown measures it belongs to (`fusion.shapes`); empty for a fixed feature.
     """
 
     cls: SensingClass
@@ -76,6 +77,7 @@ class Measurement:
     M: Array
     label: str = ""
     sensor: str = ""
+    part: str = ""
 
     @property
     def dof(self) -> int:

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion import search
 from fusion.batch import Batch
@@ -17,6 +18,7 @@ from fusion.rows import values
 from fusion.solve import LocalSolution, local_solution
 from hal.geometry import Array
 
+Flags = NDArray[np.bool_]
 MOST_SEARCHED = 96  # measurements that the search looks at; the finish uses all
 HYPOTHESES = 6000  # at most
 FIRST_ROUND = 32
@@ -33,8 +35,13 @@ class Minimum:
     """A minimum of the truncated error: `used` (N,) marks what lies inside its gate."""
 
     cost: float
-    used: Array
+    used: Flags
     local: LocalSolution
+
+    def near(self, other: Minimum) -> bool:
+        """Is `other` another pose, and good enough to be mentioned?"""
+        apart = not _same(other.local.rotation, other.local.translation_m, self.local)
+        return apart and other.cost < self.cost + ALTERNATIVE_COST
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

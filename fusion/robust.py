@@ -10,6 +10,8 @@ from fusion.answer import Alternative, FusedPose, Rejected, judged
 from fusion.batch import Batch, duplicates, pack
 from fusion.measurement import Measurement
 from fusion.minima import minima
+from fusion.parameters import fuse_shape
+from fusion.shapes import Shape
 from fusion.solve import LocalSolution, local_solution
 from hal.errors import InvalidRequest
 from hal.geometry import Array, UncertainPose
@@ -21,6 +23,7 @@ def fuse(
     measurements: Sequence[Measurement],
     *,
     prior: UncertainPose | None = None,
+    shape: Shape | None = None,
     certify: bool = False,
     seed: int = 0,
 ) -> FusedPose:
@@ -30,6 +33,8 @@ def fuse(
         measurements: any mixture of the nine classes, in any order.
         prior: a pose believed beforehand (say from the four lights) with its covariance; it can be outvoted, and is then
             listed in `rejected` with index -1.
+        shape: the object's family when its own measures (a radius, a size) are to be estimated too; measurements with a
+            `part` follow it, and a prior pose is needed to start from.
         certify: also bound the error from below by a semidefinite relaxation (needs clarabel).
         seed: of the random subsets; the same input and seed give the same answer.
 
@@ -39,6 +44,10 @@ def fuse(
     """
     if not len(measurements) and prior is None:
         raise InvalidRequest("no measurement to fuse", hint="give at least one measurement or a prior pose")
+    if shape is not None:
+        if prior is None:
+            raise InvalidRequest("a shape needs a believed pose", hint="give `prior`, for example from the camera")
+        return fuse_shape(measurements, shape, prior)
     repeats = duplicates(measurements)
     index = np.array([*range(len(measurements)), *([-1] if prior is not None else [])])
     b = pack(measurements, prior)

@@ -210,6 +210,33 @@ def log_volumes(b: Batch, R: Array, t: Array, out: Array) -> None:
                 out[i] += min(0.0, math.log(V[j, j]) + HALF_LOG_2PI)
 
 
+@compiled
+def whitened_all(b: Batch, R: Array, t: Array, r: Array, J: Array) -> None:
+    """Whitened residuals r (N, 6) and Jacobians J (N, 6, 6) of every entry, zero beyond its own rows."""
+    own_r, own_j, V = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
+    r[:], J[:] = 0.0, 0.0
+    for i in range(b.cls.size):
+        n = whitened(b, i, R, t, False, own_r, own_j, V)
+        for k in range(n):
+            r[i, k] = own_r[k]
+            for c in range(6):
+                J[i, k, c] = own_j[k, c]
+
+
+@compiled
+def informations(b: Batch, R: Array, t: Array, out: Array) -> None:
+    """out (N, 6, 6) = J^T J of each entry alone."""
+    r, J, V = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
+    for i in range(b.cls.size):
+        n = whitened(b, i, R, t, False, r, J, V)
+        for p in range(6):
+            for c in range(6):
+                s = 0.0
+                for k in range(n):
+                    s += J[k, p] * J[k, c]
+                out[i, p, c] = s
+
+
 @inlined
 def accumulate(b: Batch, use: Array, R: Array, t: Array, far: bool, H: Array, g: Array, work: Array) -> float:
     """H (6, 6) lower = sum J^T J, g (6,) = sum J^T r over entries with use > 0; returns sum |r|^2.

@@ -1,0 +1,191 @@
+"""Pose and measures of an object together: Gauss-Newton over 6 + P unknowns on the same rows (paper section IV: "applicable to
+problems in which parameterized information is required", such as feature size).
+
+The features of a shape move with its parameters and with the place sensed. At each step they are set anew, the rows' derivatives
+over the pose are those of `fusion.rows` (moving along a tangent changes a distance to second order only), and those over the
+parameters are differences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from fusion.answer import FusedPose, Rejected, ShapeEstimate
+from fusion.batch import Batch, pack
+from fusion.evidence import log_evidence
+from fusion.measurement import Measurement, SensingClass
+from fusion.observability import covariance_and_freedom
+from fusion.rows import whitened_all
+from fusion.shapes import Shape
+from fusion.solve import LocalSolution, middle_and_size
+from hal.errors import InvalidRequest
+from hal.geometry import Array, UncertainPose, matrix_of, perturbed
+
+CONVERGENCE = 2.0  # factor by which the forgiving weights narrow in each step
+FINAL_STEPS = 8
+RESTARTS = 6
+LARGEST_TURN_RAD = 0.3
+DIFFERENCE = 1e-6  # share of a parameter's sigma
+
+
+def fuse_shape(measurements: Sequence[Measurement], shape: Shape, prior: UncertainPose) -> FusedPose:
+    """Pose and parameters of a shape from measurements of its parts, some of them perhaps wrong.
+
+    Args:
+        measurements: those with a `part` follow the shape; others keep their feature.
+        shape: the family, with what is believed of its parameters.
+        prior: a believed pose, good enough to say which side of the object was sensed.
+
+    Raises:
+        InvalidRequest: a measurement makes no sense or names no part of the shape.
+    """
+    everything = np.ones(len(measurements) + 1)
+    found = [_descended(measurements, shape, prior, weigh, everything) for weigh in (_level, _forgiving)]
+    if not all(made[2].all() for made in found):
+        # A precise mismatch can bend the measures until it fits; a random half of the measurements often is without it.
+        rng = np.random.default_rng(0)
+        for _ in range(RESTARTS):
+            half = 1.0 * (rng.random(len(everything)) < 0.5)
+            half[-1] = 1.0
+            found.append(_descended(measurements, shape, prior, _forgiving, half))
+    pose, values, used, _ = min(found, key=lambda made: made[3])
+    return _answer(measurements, shape, prior, pose, values, used)
+
+
+def _level(f: Array, gate: Array, scale: float) -> Array:
+    """Huber's weights: a large misfit counts by its size, not by its square; good where many misfits are the start's."""
+    return np.minimum(1.0, np.sqrt(scale**0.5 * gate / np.maximum(f, 1e-9)))
+
+
+def _forgiving(f: Array, gate: Array, scale: float) -> Array:
+    """Geman and McClure's weights, narrowing: a misfit far beyond the others stops counting; good where few are wrong."""
+    return np.asarray((scale * gate / (scale * gate + f)) ** 2)
+
+
+def _descended(
+    measurements: Sequence[Measurement],
+    shape: Shape,
+    prior: UncertainPose,
+    weigh: Callable[[Array, Array, float], Array],
+    start_with: Array,
+) -> tuple[RigidTransform, Array, Array, float]:
+    """Pose, parameters, which measurements (N,) lie inside their gates, and the truncated error, by narrowing weights.
+
+    `start_with` (N,): 0 for those that count only at the end.
+    """
+    pose, values = prior.parent_from_child, np.array(shape.start, float)
+    b, f, _, _ = _system(measurements, shape, prior, pose, values, np.zeros(len(measurements) + 1))
+    scale = max(float(np.max(f / b.gate)), 1.0)
+    weights = start_with * weigh(f, b.gate, scale)
+    last = FINAL_STEPS
+    while last > 0:
+        b, f, H, g = _system(measurements, shape, prior, pose, values, weights)
+        step = -np.linalg.solve(H, g)
+        step *= min(1.0, LARGEST_TURN_RAD / max(float(np.linalg.norm(step[3:6])), 1e-12))
+        pose, values = perturbed(pose, step[:6]), values + step[6:]
+        if scale > 1.0:
+            scale = max(scale / CONVERGENCE, 1.0)
+            weights = start_with * weigh(f, b.gate, scale)
+            continue
+        last = 0 if step @ H @ step < 1e-8 else last - 1
+        weights = 1.0 * (f < b.gate)
+        weights[-1] = 1.0  # the believed pose says which side was sensed; without it nothing holds
+    return pose, values, weights > 0, float(np.minimum(f, b.gate).sum())
+
+
+def _system(
+    measurements: Sequence[Measurement],
+    shape: Shape,
+    prior: UncertainPose,
+    pose: RigidTransform,
+    values: Array,
+    weights: Array,
+) -> tuple[Batch, Array, Array, Array]:
+    """The batch at these features, f (N,), and the weighted normal equations H (6 + P, 6 + P), g over pose and parameters."""
+    R, t = matrix_of(pose), np.array(pose.translation)
+    spread = np.asarray(shape.sigma, float)
+    b = pack(_placed(measurements, shape, pose, values), prior)
+    r, J = _rows(b, R, t)
+    slopes = []
+    for k, h in enumerate(DIFFERENCE * spread):
+        ahead, behind = (
+            _rows(pack(_placed(measurements, shape, pose, values + s * h * np.eye(len(values))[k]), prior), R, t)[0]
+            for s in (1.0, -1.0)
+        )
+        slopes.append((ahead - behind) / (2 * h))
+    J = np.concatenate([J, np.stack(slopes, axis=2)], axis=2)
+    H = np.einsum("i,ikp,ikq->pq", weights, J, J)
+    g = np.einsum("i,ikp,ik->p", weights, J, r)
+    H[6:, 6:] += np.diag(spread**-2)
+    g[6:] += (values - shape.start) / spread**2
+    return b, np.sum(r**2, axis=1), H, g
+
+
+def _placed(
+    measurements: Sequence[Measurement], shape: Shape, pose: RigidTransform, values: Array
+) -> list[Measurement]:
+    """The measurements with the features that the shape has at these parameters, next to where they were made."""
+    object_from_base = pose.inv()
+    made = []
+    for i, m in enumerate(measurements):
+        if not m.part:
+            made.append(m)
+            continue
+        feature = shape.feature(m.part, values, object_from_base.apply(m.mu_m))
+        sensed = (int(m.cls) - 1) // 3
+        cls = SensingClass(3 * sensed + ["point", "line", "plane"].index(feature.kind) + 1)
+        if cls != m.cls:
+            raise InvalidRequest(
+                f"measurement {i} is {m.cls.words}, but part {m.part!r} is a {feature.kind}",
+                hint="make it with the part's own feature", index=i, reason="wrong class",
+            )  # fmt: skip
+        made.append(replace(m, x_m=feature.point_m, u=feature.direction))
+    return made
+
+
+def _rows(b: Batch, R: Array, t: Array) -> tuple[Array, Array]:
+    """Whitened residuals (N, 6) and Jacobians (N, 6, 6) of a batch."""
+    n = len(b.cls)
+    r, J = np.zeros((n, 6)), np.zeros((n, 6, 6))
+    whitened_all(b, R, t, r, J)
+    return r, J
+
+
+def _answer(
+    measurements: Sequence[Measurement],
+    shape: Shape,
+    prior: UncertainPose,
+    pose: RigidTransform,
+    values: Array,
+    used: Array,
+) -> FusedPose:
+    b, f, H, _ = _system(measurements, shape, prior, pose, values, 1.0 * used)
+    joint = np.linalg.inv(H)
+    information = np.linalg.inv(joint[:6, :6])
+    R = matrix_of(pose)
+    covariance, free = covariance_and_freedom(information, *middle_and_size(b, used, R))
+    local = LocalSolution(
+        rotation=R, translation_m=np.array(pose.translation), covariance=covariance, information=information, values=f,
+        chi_square=float(f[used].sum()), dof=int(b.dof[used].sum()) - 6, unobservable=free,
+    )  # fmt: skip
+    labels = [*(m.label for m in measurements), "prior pose"]
+    index = [*range(len(measurements)), -1]
+    return FusedPose(
+        pose=pose,
+        covariance=covariance,
+        chi_square=local.chi_square,
+        dof=local.dof,
+        values=f[:-1],
+        rejected=tuple(
+            Rejected(index=index[k], label=labels[k], value=float(f[k]), limit=float(b.gate[k]), reason="mismatch")
+            for k in np.flatnonzero(~used)
+        ),
+        unobservable=free,
+        alternatives=(),
+        evidence=log_evidence(b, used, local),
+        shape=ShapeEstimate(names=shape.names, values=values, covariance=joint[6:, 6:]),
+    )

@@ -1,0 +1,136 @@
+"""Objects with unknown measures: their features depend on parameters, and on where they were touched.
+
+A curved surface is no point, line or plane, but near a sensed place it is as good as its tangent plane there, and that is a
+feature like any other. So a cylinder's radius or a box's size come out of the same measurements as the pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from fusion.features import Feature, line, plane
+from hal.errors import InvalidRequest
+from hal.geometry import Array
+
+
+class Shape(Protocol):
+    """A family of objects.
+
+    Attributes:
+        names: of the parameters, with units.
+        start: (P,) values believed beforehand.
+        sigma: (P,) standard deviations of that belief; make them wide to let the measurements speak.
+        parts: names of its surfaces and edges.
+    """
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def start(self) -> Array: ...
+
+    @property
+    def sigma(self) -> Array: ...
+
+    @property
+    def parts(self) -> tuple[str, ...]: ...
+
+    def feature(self, part: str, values: Array, place_m: Array) -> Feature:
+        """The feature that `part` is near `place_m` (3,), object frame, when the parameters are `values` (P,)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cylinder:
+    """A round post along z that stands on z = 0: parts `wall` (the mantle) and `top` (the flat end at z = length)."""
+
+    radius_m: float
+    length_m: float
+    sigma_m: float = 0.02
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Radius and length."""
+        return ("radius_m", "length_m")
+
+    @property
+    def start(self) -> Array:
+        """(2,) believed beforehand, m."""
+        return np.array([self.radius_m, self.length_m])
+
+    @property
+    def sigma(self) -> Array:
+        """(2,) of that belief, m."""
+        return np.full(2, self.sigma_m)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of its surfaces."""
+        return ("wall", "top")
+
+    def feature(self, part: str, values: Array, place_m: Array) -> Feature:
+        """Tangent plane of the wall next to `place_m`, or the plane of the top.
+
+        Raises:
+            InvalidRequest: no such part.
+        """
+        radius, length = values
+        if part == "top":
+            return plane((0.0, 0.0, length), (0.0, 0.0, 1.0), name=part)
+        if part != "wall":
+            raise _no_part(part, self.parts)
+        around = np.array([place_m[0], place_m[1], 0.0])
+        distance = float(np.linalg.norm(around))
+        normal = around / distance if distance > 1e-9 else np.array([1.0, 0.0, 0.0])
+        return plane(radius * normal + (0.0, 0.0, place_m[2]), normal, name=part)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Box:
+    """A box about the origin: parts are its faces `+x` to `-z` and the edges between them, for example `+x+z`."""
+
+    size_m: tuple[float, float, float]
+    sigma_m: float = 0.02
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Length along each axis."""
+        return ("size_x_m", "size_y_m", "size_z_m")
+
+    @property
+    def start(self) -> Array:
+        """(3,) believed beforehand, m."""
+        return np.array(self.size_m)
+
+    @property
+    def sigma(self) -> Array:
+        """(3,) of that belief, m."""
+        return np.full(3, self.sigma_m)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of its faces and edges."""
+        faces = [sign + axis for axis in "xyz" for sign in "+-"]
+        return (*faces, *(a + b for a in faces for b in faces if a[1] < b[1]))
+
+    def feature(self, part: str, values: Array, place_m: Array) -> Feature:  # noqa: ARG002 - flat faces are flat everywhere
+        """A face's plane or an edge's line.
+
+        Raises:
+            InvalidRequest: no such part.
+        """
+        if part not in self.parts:
+            raise _no_part(part, self.parts)
+        point, axes = np.zeros(3), []
+        for sign, axis in zip(part[::2], part[1::2], strict=True):
+            k = "xyz".index(axis)
+            point[k] = values[k] / 2 if sign == "+" else -values[k] / 2
+            axes.append(np.eye(3)[k] if sign == "+" else -np.eye(3)[k])
+        return plane(point, axes[0], name=part) if len(axes) == 1 else line(point, np.cross(*axes), name=part)
+
+
+def _no_part(part: str, parts: tuple[str, ...]) -> InvalidRequest:
+    return InvalidRequest(f"the shape has no part {part!r}", hint=f"one of {', '.join(parts)}")

@@ -1,0 +1,175 @@
+"""Line drawings of an object at one or more poses, as a camera would see it (paper, Fig. 13): SVG text or matplotlib axes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform
+
+from fusion.sensing import Pinhole
+from hal.geometry import Array, transform
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from hal.panel import Panel
+
+NEAREST_M = 0.02  # what comes closer to the lens is cut off
+CIRCLE_POINTS = 24
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Drawing:
+    """One object at one pose in one style.
+
+    Attributes:
+        base_from_object: the pose.
+        outlines_m: polylines, each (K, 3) in the object frame.
+        colour: any name or code that both SVG and matplotlib know, for example `#1f77b4`.
+        label: for the legend.
+        dashed: broken lines, for example for the true pose.
+    """
+
+    base_from_object: RigidTransform
+    outlines_m: Sequence[Array]
+    colour: str = "black"
+    label: str = ""
+    dashed: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sight:
+    """From where the drawing is seen: camera axes x right, y down, z forward."""
+
+    base_from_camera: RigidTransform
+    camera: Pinhole
+    width_px: int = 640
+    height_px: int = 480
+
+
+def sight_of(
+    base_from_object: RigidTransform, middle_m: ArrayLike, *, distance_m: float, width_px: int = 640, height_px: int = 480
+) -> Sight:
+    """A camera before the object's +z side, a little from above and from the right, that looks at its middle.
+
+    Args:
+        base_from_object: where the object stands.
+        middle_m: (3,) what to look at, object frame.
+        distance_m: how far the lens is from there.
+    """
+    focal = 1.1 * width_px
+    toward = np.array([0.25, 0.3, 1.0]) / np.linalg.norm([0.25, 0.3, 1.0])
+    z = -toward
+    x = np.cross([0.0, -1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    lens = transform(np.column_stack([x, np.cross(z, x), z]), np.asarray(middle_m, float) + distance_m * toward)
+    camera = Pinhole(fx_px=focal, fy_px=focal, cx_px=width_px / 2, cy_px=height_px / 2)
+    return Sight(base_from_camera=base_from_object * lens, camera=camera, width_px=width_px, height_px=height_px)
+
+
+def box_outlines(low_m: ArrayLike, high_m: ArrayLike) -> list[Array]:
+    """The edges of an axis-aligned box as 6 polylines: bottom, top, four uprights."""
+    (x0, y0, z0), (x1, y1, z1) = np.asarray(low_m, float), np.asarray(high_m, float)
+    ring = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
+    bottom, top = (np.column_stack([ring, np.full(5, z)]) for z in (z0, z1))
+    return [bottom, top, *(np.array([bottom[k], top[k]]) for k in range(4))]
+
+
+def circle_outline(centre_m: ArrayLike, radius_m: float) -> Array:
+    """A circle in a plane z = constant, (K, 3)."""
+    angle = np.linspace(0.0, 2.0 * math.pi, CIRCLE_POINTS + 1)
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
+    return np.asarray(np.asarray(centre_m, float) + radius_m * ring)
+
+
+def panel_outlines(panel: Panel) -> list[Array]:
+    """A panel file's plate, lights and objects: rectangles where it gives width and height, circles where a radius."""
+    half = np.array([panel.width_m, panel.height_m]) / 2
+    found = box_outlines([*-half, -panel.thickness_m], [*half, 0.0])
+    found += [circle_outline(light.position_m, light.radius_m) for light in panel.lights]
+    for thing in panel.objects:
+        x, y = thing.position_m
+        size = [getattr(thing, name, None) for name in ("width_m", "height_m")]
+        if None not in size and not hasattr(thing, "radius_m") and not hasattr(thing, "length_m"):
+            w, h = size[0] / 2, size[1] / 2
+            corners = [[x - w, y - h], [x + w, y - h], [x + w, y + h], [x - w, y + h], [x - w, y - h]]
+            found.append(np.column_stack([corners, np.zeros(5)]))
+            continue
+        length = getattr(thing, "length_m", getattr(thing, "travel_m", 0.02))
+        found.append(circle_outline((x, y, 0.0), getattr(thing, "radius_m", length / 2)))
+    return found
+
+
+def seen(drawing: Drawing, sight: Sight) -> list[Array]:
+    """The visible polylines of a drawing in the image, each (K, 2) px; parts behind the lens are cut off."""
+    camera_from_object = sight.base_from_camera.inv() * drawing.base_from_object
+    lines: list[Array] = []
+    for outline in drawing.outlines_m:
+        points = np.atleast_2d(camera_from_object.apply(outline))
+        lines += [_projected(piece, sight.camera) for piece in _before_lens(points)]
+    return lines
+
+
+def _before_lens(points: Array) -> list[Array]:
+    """A polyline (K, 3) cut at the plane z = NEAREST_M: the pieces before the lens."""
+    pieces: list[list[Array]] = [[]]
+    for a, b in zip(points[:-1], points[1:], strict=True):
+        depths = np.array([a[2], b[2]]) - NEAREST_M
+        if (depths < 0).all():
+            continue
+        cut = a + (b - a) * np.clip(-depths[0] / (b[2] - a[2]), 0.0, 1.0) if (depths < 0).any() else a
+        first, last = (cut, b) if depths[0] < 0 else (a, cut if depths[1] < 0 else b)
+        if not pieces[-1] or not np.array_equal(pieces[-1][-1], first):
+            pieces.append([first])
+        pieces[-1].append(last)
+    return [np.array(piece) for piece in pieces if len(piece) > 1]
+
+
+def _projected(points: Array, camera: Pinhole) -> Array:
+    z = np.maximum(points[:, 2], NEAREST_M)
+    return np.column_stack([
+        camera.cx_px + camera.fx_px * points[:, 0] / z, camera.cy_px + camera.fy_px * points[:, 1] / z
+    ])  # fmt: skip
+
+
+def svg(drawings: Sequence[Drawing], sight: Sight, *, title: str = "") -> str:
+    """The drawings as one SVG document (text), with a legend of their labels."""
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {sight.width_px} {sight.height_px}" '
+        f'width="{sight.width_px}" height="{sight.height_px}" role="img" font-family="sans-serif" font-size="13">',
+        f"<title>{escape(title or 'object outlines')}</title>",
+        '<rect width="100%" height="100%" fill="white"/>',
+    ]
+    for row, drawing in enumerate(drawings):
+        dashes = ' stroke-dasharray="5 4"' if drawing.dashed else ""
+        style = f'fill="none" stroke="{escape(drawing.colour)}" stroke-width="1.4"{dashes}'
+        parts += [
+            f'<polyline points="{" ".join(f"{u:.1f},{v:.1f}" for u, v in line)}" {style}/>' for line in seen(drawing, sight)
+        ]
+        if drawing.label:
+            place = f'x="10" y="{20 + 17 * row}"'
+            parts.append(f'<text {place} fill="{escape(drawing.colour)}">{escape(drawing.label)}</text>')
+    return "\n".join([*parts, "</svg>"])
+
+
+def axes(ax: Axes, drawings: Sequence[Drawing], sight: Sight, *, title: str = "") -> None:
+    """The same on matplotlib axes, in pixels with y down."""
+    for drawing in drawings:
+        for k, line in enumerate(seen(drawing, sight)):
+            ax.plot(
+                line[:, 0], line[:, 1], color=drawing.colour, linewidth=1.0,
+                linestyle="--" if drawing.dashed else "-", label=drawing.label if k == 0 else None,
+            )  # fmt: skip
+    ax.set_xlim(0, sight.width_px)
+    ax.set_ylim(sight.height_px, 0)
+    ax.set_aspect("equal")
+    ax.set_xticks([])
+    ax.set_yticks([])
+    if title:
+        ax.set_title(title, fontsize=9)

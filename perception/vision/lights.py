@@ -14,10 +14,11 @@ from perception.vision.lights_assign import UPRIGHT, AssignedLights, LightMissin
 from perception.vision.lights_find import LightBlobs, find_lights, gray_of
 from perception.vision.lights_registration import CameraMoved
 from perception.vision.quadrangle import QuadranglePose, estimate
+from perception.vision.quadrangle import warm_up as warm_up_quadrangle
 
 __all__ = [
     "UPRIGHT", "AssignedLights", "CameraMoved", "LightBlobs", "LightMissing", "PanelView", "WrongLamp", "assign_lights",
-    "find_lights", "gray_of", "panel_pose",
+    "find_lights", "gray_of", "panel_pose", "warm_up",
 ]  # fmt: skip
 
 MODEL_SIGMA_PX = 0.15  # what the lens model and the lamps' own centres add to each coordinate of a light
@@ -31,6 +32,19 @@ class PanelView:
     pose: QuadranglePose
     lights: AssignedLights
     blobs: LightBlobs
+
+
+def warm_up() -> None:
+    """Compile (or load from the cache) what `panel_pose` needs, so that the first real call is as fast as any."""
+    warm_up_quadrangle()
+    lights = np.array([[-0.2, 0.1, 0.0], [0.2, 0.1, 0.0], [0.2, -0.1, 0.0], [-0.2, -0.1, 0.0]])
+    centres = np.array([[120.0, 140.0], [520.0, 140.0], [520.0, 340.0], [120.0, 340.0]])
+    one = np.ones(4)
+    blobs = LightBlobs(
+        centres_px=centres, covariance_px=np.tile(np.eye(2), (4, 1, 1)), area_px=80.0 * one, aspect=one, fill=one,
+        contrast=100.0 * one, score=one, threshold=1.0, shift_px=(0.0, 0.0),
+    )  # fmt: skip
+    assign_lights(blobs, lights, image_size_px=(640, 480))
 
 
 def panel_pose(

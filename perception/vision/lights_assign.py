@@ -36,6 +36,7 @@ FOCAL_TRIALS = (1.25, 0.95, 1.65)  # of the image width, when the camera is unkn
 USUAL_RADIUS_M = 0.006
 TILT_SIGMA_RAD = 0.4
 ROLL_SIGMA_RAD = 0.35
+PLAIN_SCORE = 8.0  # four lamp-like blobs where they belong reach 15
 RIVAL_MARGIN = 2.0  # in log-odds: closer hypotheses with other blobs are a tie
 
 
@@ -151,10 +152,13 @@ def _hypotheses(
     best, chosen = np.full(8, -np.inf), np.full((8, 4), -1, np.int64)
     frame = np.array(size, float)
     X = lights - lights.mean(axis=0)
-    for camera, ideal, gate_px in _cameras(centres, size, intrinsics):
-        prior = np.array([TILT_SIGMA_RAD, ROLL_SIGMA_RAD, gate_px, radius_m])
-        for omit in (3, 2, 1, 0):
+    cameras = _cameras(centres, size, intrinsics)
+    for omit in (3, 2, 1, 0):
+        for camera, ideal, gate_px in cameras:
+            prior = np.array([TILT_SIGMA_RAD, ROLL_SIGMA_RAD, gate_px, radius_m])
             search(ideal, traits, X, upright, camera, frame, prior, omit, best, chosen)
+        if best[0] > PLAIN_SCORE and (chosen[0] >= 0).all():
+            break  # all four in their places: leaving out another one first would find the same
     _pairs(centres, traits, X @ upright.T, frame, (best, chosen))
     return best, chosen
 

@@ -48,6 +48,9 @@ def search(  # type: ignore[no-untyped-def]
     """
     n = centres.shape[0]
     reward, log_size, log_contrast, aspect = traits[0], traits[1], traits[2], traits[3]
+    most = 0.0
+    for i in range(n):
+        most = max(most, reward[i])
     names = np.empty(3, np.int64)
     at = 0
     for o in range(4):
@@ -80,6 +83,8 @@ def search(  # type: ignore[no-untyped-def]
                 if cross * turn <= 0.0:
                     continue
                 base = reward[i] + reward[j] + reward[k]
+                if base + most <= best[best.shape[0] - 1]:
+                    continue  # everything else only costs
                 roundness = (aspect[i] + aspect[j] + aspect[k]) / 3.0
                 f[0], f[1], f[2] = rays[i], rays[j], rays[k]
                 found = three_point(P, f, Rs, ts)

@@ -1,0 +1,104 @@
+"""Calibration results as records: versioned, dated, with their quality; written as TOML that `hal` reads back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from hal.calibration import CalibrationRecord, IntrinsicsRecord, LoadRecord, MountRecord, Vector3, load_calibration
+from hal.geometry import UncertainPose
+from perception.calibration.hand_eye import HandEye
+from perception.calibration.intrinsics import CameraCalibration
+from perception.calibration.scanner import ScannerCalibration
+from perception.calibration.wrench import WrenchCalibration
+
+
+def mount_of(parent_from_device: UncertainPose) -> MountRecord:
+    """Position, fixed-axis roll pitch yaw, and one sigma an axis; correlations are not kept by a record."""
+    pose, sigma = parent_from_device.parent_from_child, np.sqrt(np.diag(parent_from_device.covariance))
+    return MountRecord(
+        position_m=_three(pose.translation), rpy_rad=_three(pose.rotation.as_euler("xyz")), sigma_m=_three(sigma[:3]),
+        sigma_rad=_three(sigma[3:]),
+    )  # fmt: skip
+
+
+def record_of(
+    device: str, result: HandEye | CameraCalibration | ScannerCalibration | WrenchCalibration, *, date: str
+) -> CalibrationRecord:
+    """The record of one result, version 1.
+
+    Args:
+        device: its name in the cell file.
+        date: ISO 8601, from the caller's clock.
+    """
+    if isinstance(result, HandEye):
+        quality = {"chi_square_ratio": result.chi_square / max(result.degrees, 1), "views": float(len(result.used))}
+        return CalibrationRecord(
+            device=device, date=date, method="hand-eye", mount=mount_of(result.flange_from_camera), quality=quality
+        )
+    if isinstance(result, ScannerCalibration):
+        quality = {"chi_square_ratio": result.chi_square / max(result.degrees, 1), "rms_m": result.rms_m}
+        return CalibrationRecord(
+            device=device, date=date, method="plate-scans", mount=mount_of(result.flange_from_scanner), quality=quality
+        )
+    if isinstance(result, WrenchCalibration):
+        load = result.load
+        sigma = np.sqrt(np.diag(result.covariance))
+        return CalibrationRecord(
+            device=device, date=date, method="tool-weight",
+            load=LoadRecord(mass_kg=load.mass_kg, centre_of_mass_m=load.centre_of_mass_m,
+                            bias_force_n=_three(load.bias[:3]), bias_torque_nm=_three(load.bias[3:])),
+            quality={"rms_n": result.rms_n, "rms_nm": result.rms_nm, "mass_sigma_kg": float(sigma[3])},
+        )  # fmt: skip
+    return _camera_record(device, result, date)
+
+
+def save(record: CalibrationRecord, path: Path) -> CalibrationRecord:
+    """Write the record as TOML with a version one above the file's, and return it as written.
+
+    Raises:
+        ConfigError: the file that is there is no calibration record.
+    """
+    if path.exists():
+        record = record.model_copy(update={"version": load_calibration(path).version + 1})
+    path.write_text(_toml(record), encoding="utf-8")
+    return record
+
+
+def _camera_record(device: str, result: CameraCalibration, date: str) -> CalibrationRecord:
+    i = result.intrinsics
+    sigma = dict(zip(result.names, np.sqrt(np.diag(result.covariance)).tolist(), strict=True))
+    quality = {f"sigma_{name}": value for name, value in sigma.items()}
+    return CalibrationRecord(
+        device=device, date=date, method="intrinsics",
+        intrinsics=IntrinsicsRecord(
+            width_px=i.width_px, height_px=i.height_px, fx_px=i.fx_px, fy_px=i.fy_px, cx_px=i.cx_px, cy_px=i.cy_px,
+            distortion=i.distortion, rms_px=result.rms_px,
+        ),
+        quality=quality | {"chi_square_ratio": result.chi_square / max(result.degrees, 1),
+                           "cubic_bias_px": result.cubic.bias_px},
+    )  # fmt: skip
+
+
+def _three(values: object) -> Vector3:
+    x, y, z = (float(v) for v in np.asarray(values, float))
+    return (x, y, z)
+
+
+def _toml(record: CalibrationRecord) -> str:
+    """TOML of the record: scalars first, then one table a part."""
+    data = record.model_dump(by_alias=True, exclude_none=True)
+    lines = [f"{key} = {_value(value)}" for key, value in data.items() if not isinstance(value, dict)]
+    for key, table in data.items():
+        if isinstance(table, dict):
+            lines += ["", f"[{key}]", *(f"{name} = {_value(value)}" for name, value in table.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _value(value: object) -> str:
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(_value(v) for v in value) + "]"
+    return repr(value)

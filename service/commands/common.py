@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
-from hal.config import Cell, load_cell
 from service.client import DEFAULT_URL, Client
+
+if TYPE_CHECKING:
+    from hal.config import Cell  # imports scipy: a client's command shall not wait for that
 
 ROOT = Path(__file__).parents[2]
 console = Console(highlight=False, soft_wrap=True)
@@ -40,6 +42,7 @@ def read_cell(path: Path, seed: int | None) -> Cell:
     Raises:
         ConfigError: file, panel, calibration or machine is not in order.
     """
+    from hal.config import load_cell
     from service.preflight import check_machine
 
     cell = load_cell(find_cell(path), seed=seed)

@@ -14,7 +14,6 @@ from rich.table import Table
 from service.client import ApiError, Client
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console, read_cell
 from service.commands.tasks import follow
-from service.serve import Options, Panelwright
 
 
 def demo(
@@ -29,6 +28,8 @@ def demo(
     inline: Annotated[bool, typer.Option("--inline", help="Cell and stop port in this process (debugging).")] = False,
 ) -> None:
     """Run the whole mission and leave a report; exit code 1 when an action was not confirmed."""
+    from service.serve import Options, Panelwright
+
     started_s = time.monotonic()
     loaded = read_cell(cell, seed)
     panelwright = Panelwright(loaded, Options(port=port, runs_dir=runs, inline=inline))

@@ -11,10 +11,8 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from hal.devices import DeviceKind
 from hal.errors import ConfigError
 from service.commands.common import DEFAULT_CELL, SeedOption, console, find_cell, read_cell
-from service.scaffold import driver_files
 
 Name = re.compile(r"[a-z][a-z0-9_]{1,40}")
 
@@ -80,13 +78,18 @@ def emulate(
 def new_driver(
     name: Annotated[str, typer.Argument(help="Module name, e.g. vl53l1x.")],
     *,
-    kind: Annotated[DeviceKind, typer.Option(help="Which of the eight interfaces it implements.")],
+    kind: Annotated[str, typer.Option(help="Which of the eight interfaces it implements, e.g. proximity.")],
     folder: Annotated[Path, typer.Option(help="Project to write into.")] = Path(),
 ) -> None:
     """Write a driver, its conformance test and its entry point, ready to be filled in."""
     if not Name.fullmatch(name):
         raise ConfigError(f"{name!r} is no module name", hint="small letters, digits and underscores")
-    files = driver_files(name, kind)
+    from hal.devices import DeviceKind
+    from service.scaffold import driver_files
+
+    if kind not in list(DeviceKind):
+        raise ConfigError(f"there is no kind {kind!r}", hint=f"kinds: {', '.join(DeviceKind)}")
+    files = driver_files(name, DeviceKind(kind))
     taken = [path for path in files if (folder / path).exists()]
     if taken:
         raise ConfigError(f"{folder / taken[0]} exists already", hint="choose another name; nothing was written")

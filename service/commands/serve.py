@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console, read_cell
-from service.serve import Options, Panelwright
+
+if TYPE_CHECKING:
+    from service.serve import Panelwright
 
 START_PATIENCE_S = 120.0
 LOOPBACK = ("127.0.0.1", "localhost")
@@ -30,6 +32,8 @@ def serve(
     inline: Annotated[bool, typer.Option("--inline", help="Cell and stop port in this process (debugging).")] = False,
 ) -> None:
     """Start the cell and serve it until Ctrl-C."""
+    from service.serve import Options, Panelwright
+
     check_host(host)
     loaded = read_cell(cell, seed)
     options = Options(host=host, port=port, stop_port=stop_port, runs_dir=runs, inline=inline)

@@ -220,7 +220,7 @@ def test_wrong_methods_are_405(client: httpx2.Client, method: str) -> None:
 
 
 @given(body=st.binary(max_size=300))
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_bytes_are_4xx(client: httpx2.Client, body: bytes) -> None:
     """Random bytes are hardly ever a valid body; `{}` with spaces is, and reads nothing but the default."""
     answer = client.post("/v1/measure", content=body, headers=JSON)
@@ -238,7 +238,7 @@ KEYS = st.sampled_from(["text", "number", "point_m", "fault", "magnitude", "hold
 
 
 @given(path=st.sampled_from(["measure", "echo", "devices/arm/fault", "lease"]), body=st.dictionaries(KEYS, ANY_JSON))
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_json_is_never_5xx(client: httpx2.Client, path: str, body: dict[str, object]) -> None:
     answer = client.post(f"/v1/{path}", content=json.dumps(body).encode(), headers=JSON)
     assert answer.status_code < 500, answer.text
@@ -256,7 +256,7 @@ def test_the_api_document_keeps_its_word(client: httpx2.Client, served: Panelwri
             continue
 
         @given(case=operation.as_strategy())
-        @settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck), database=None)
+        @settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck), database=None)
         def check(case: schemathesis.Case) -> None:
             if case.query and "wait_s" in case.query:
                 case.query.pop("wait_s")  # waiting is what it would do, 30 s at a time

@@ -32,6 +32,7 @@ CONTACT_N = 8.0
 STANDOFF_M = 0.030  # of the tips above the object's highest place
 RETREAT_M = 0.050
 RETREAT_M_PER_S = 0.15
+PADS_M_PER_S = 0.1
 FREE_N = 40.0  # more than this in a move that should be free is a collision
 MAX_ATTEMPTS = 3
 
@@ -76,7 +77,7 @@ class Attempt:
     def open_to(self, width_m: float, *, force_n: float = 15.0, name: str = "set opening") -> MotionReport:
         """Move the pads to an opening while the arm holds; skipped when they are there."""
         width = min(width_m, self.cell.hand.max_width_m)
-        return self.run(GripperMotion(name=name, width_m=width, force_n=force_n))
+        return self.run(GripperMotion(name=name, width_m=width, force_n=force_n, speed_m_per_s=PADS_M_PER_S))
 
     def go_to(self, goal_rad: Array, *, width_m: float, name: str) -> None:
         """A collision-free transfer; any strong contact on the way ends the attempt."""
@@ -181,7 +182,8 @@ def perform(
     for tries in range(1, attempts + 1):
         cell.progress((tries - 1) / attempts, f"{skill} {object_name}: attempt {tries}")
         outcome, cause, reached = _try(attempt, stroke)
-        cell.progress((tries - 0.5) / attempts, f"{skill} {object_name}: {outcome}: {cause}")
+        looks = outcome is Outcome.UNVERIFIED and verify is not None
+        cell.progress((tries - 0.5) / attempts, f"{skill} {object_name}: {'look again' if looks else cause}")
         if outcome is Outcome.UNREACHABLE:
             break
         seen = None if verify is None else verify()

@@ -1,0 +1,65 @@
+"""What the pages say is there: links lead somewhere, commands exist, shipped files load, no machine's paths."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from hal.config import load_cell
+from hal.panel import load_panel
+from service.cli import _app
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+LINK = re.compile(r"\[[^\]]*\]\(([^)#]+)(?:#[^)]*)?\)")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_leads_somewhere(page: Path) -> None:
+    targets = [target for target in LINK.findall(page.read_text(encoding="utf-8")) if "://" not in target]
+    missing = [target for target in targets if not (page.parent / target).exists()]
+    assert not missing
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "cells").glob("*.toml")), ids=lambda path: path.name)
+def test_every_shipped_cell_loads(path: Path) -> None:
+    cell = load_cell(path)
+    assert cell.panel.objects
+    assert len(cell.file.workspace.park_rad) == 6
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "panels").glob("*.toml")), ids=lambda path: path.name)
+def test_every_shipped_panel_loads(path: Path) -> None:
+    assert len(load_panel(path).lights) == 4
+
+
+def test_every_command_that_the_pages_name_exists() -> None:
+    known = CliRunner().invoke(_app(), ["--help"]).output  # type: ignore[arg-type]
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    commands = set(re.findall(r"(?:`|bin/|^)panelwright ([a-z][a-z-]+)", text, flags=re.MULTILINE))
+    assert {"serve", "demo", "doctor"} <= commands
+    assert not {command for command in commands if f" {command} " not in known}
+
+
+def test_python_in_the_pages_is_python() -> None:
+    for page in PAGES:
+        for block in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL):
+            compile(block, str(page), "exec")
+
+
+def test_nothing_in_the_tree_names_a_machine_or_a_registry() -> None:
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False).stdout.split()
+    if not tracked:
+        pytest.skip("not a git checkout: which files belong to the tree is not known")
+    forbidden = re.compile("/work/" + "main|/root/" + "|py" + r"pi\.org|files\.python" + "hosted")
+    guilty = [
+        name
+        for name in tracked
+        if Path(name).suffix in {".py", ".md", ".toml", ".txt", ".html", ".js", ".css"} or name == "Makefile"
+        if forbidden.search((ROOT / name).read_text(encoding="utf-8", errors="replace"))
+    ]
+    assert not guilty

@@ -64,7 +64,10 @@ class SimArm(SimDevice[JointState]):
         if not self._world.is_enabled:
             raise MotionRefused(f"{self._name}: the drives are off", hint="call enable first", device=self._name)
         last = self._world.frame.snapshot.setpoint_rad
-        sent: Array = np.clip(np.clip(wanted, last - self._stride, last + self._stride), self._lower, self._upper)
+        low = np.maximum(last - self._stride, self._lower)
+        high = np.minimum(last + self._stride, self._upper)
+        # A drive that woke beyond a limit may come back but go no further out.
+        sent: Array = np.minimum(np.maximum(wanted, np.minimum(low, high)), np.maximum(low, high))
         self._world.aim_arm(sent)
         return sent
 

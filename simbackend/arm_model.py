@@ -129,7 +129,7 @@ def arm_urdf(
         lines += _link(
             name, model.mass_kg[i], (dh.a_m, 0.0, dh.d_m), caps.link_radius_m[i], PAINT[i % 2], is_foot=i == 0
         )
-        lines += joint(name, "revolute", parent, name, parent_from_joint * turn)
+        lines += joint(name, "continuous", parent, name, parent_from_joint * turn)
         parent, parent_from_joint = name, link_from_next(dh)
     lines += link("flange", inertial(0.02, (0, 0, 0), (1e-5, 1e-5, 1e-5)))
     lines += joint("flange", "fixed", parent, "flange", parent_from_joint)

@@ -15,7 +15,7 @@ from hal.devices import DeviceKind, ForceTorqueCapabilities, Wrench
 from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
 from simbackend.client import Frame
-from simbackend.device import SimDevice, SimOptions, parse
+from simbackend.device import VALID, SimDevice, SimOptions, parse
 
 Array = NDArray[np.float64]
 
@@ -76,11 +76,11 @@ class SimForceTorque(SimDevice[Wrench]):
         drift = self._drift * np.sin(2.0 * math.pi * snapshot.stamp_s / DRIFT_PERIOD_S + self._phase)
         raw = snapshot.wrench + self._bias + drift + noise
         raw[:3] += bias
-        raw = np.round(raw / self._digit) * self._digit
-        is_over = bool((np.abs(raw) > self._range).any())
+        raw = (raw / self._digit).round() * self._digit
+        if np.abs(raw / self._range).max() <= 1.0:
+            return Wrench(force_n=raw[:3], torque_nm=raw[3:]), *VALID
         raw = np.clip(raw, -self._range, self._range)
-        quality, cause = (Quality.DEGRADED, Cause.SATURATED) if is_over else (Quality.VALID, Cause.NONE)
-        return Wrench(force_n=raw[:3], torque_nm=raw[3:]), quality, cause
+        return Wrench(force_n=raw[:3], torque_nm=raw[3:]), Quality.DEGRADED, Cause.SATURATED
 
 
 def connect(context: Context, options: dict[str, Any]) -> SimForceTorque:

@@ -96,6 +96,7 @@ class PanelWorld:
             if not isinstance(mechanism, Friction)
         }
         self._alive: set[str] = set()
+        self._order: list[str] = []
         for mechanism in self.mechanisms.values():
             mechanism.lock()
 
@@ -211,8 +212,8 @@ class PanelWorld:
 
     # -- running --------------------------------------------------------------------------------------------------
 
-    def drive(self, tip_m: tuple[float, float, float]) -> None:
-        """One tick of the mechanisms round the finger tips; the others stay locked."""
+    def wake(self, tip_m: tuple[float, float, float]) -> None:
+        """Let the mechanisms round the finger tips live; the others stay locked."""
         x, y, z = tip_m
         near = {
             name
@@ -221,7 +222,10 @@ class PanelWorld:
         }
         if near != self._alive:
             self._wake(near)
-        for name in sorted(self._alive):
+
+    def drive(self) -> None:
+        """One tick of the mechanisms that are alive."""
+        for name in self._order:
             mechanism = self.mechanisms[name]
             if isinstance(mechanism, Spring):
                 mechanism.drive()
@@ -237,6 +241,7 @@ class PanelWorld:
         for name in sorted(self._alive - near):
             self.mechanisms[name].lock()
         self._alive = near
+        self._order = sorted(near)
 
     def _work_lamp(self, name: str, button: Spring) -> None:
         """Each press of a button turns its lamp over."""

@@ -35,6 +35,7 @@ from simbackend.wire import (
 Array = NDArray[np.float64]
 
 GRAVITY_M_PER_S2 = 9.81
+TIP_TICKS = 4  # how often to look which mechanisms are near; the tip goes 8 mm meanwhile
 CONE_RAYS = 4
 CONE_RAD = 0.0175
 CONE_DEPTH_M = 0.02
@@ -51,6 +52,7 @@ class World:
         self.draws = Draws(self.cell.file.cell.seed)
         self.tick = 0
         self.peak_force_n = 0.0
+        self.pad_force_n = (0.0, 0.0)
         self.engine: Any = pybullet
         pybullet.connect(pybullet.DIRECT)
         pybullet.setPhysicsEngineParameter(
@@ -90,7 +92,7 @@ class World:
         self.moving = [*self.joints, *self.fingers]
         self.sensor, self.flange_link = index["sensor"], index["flange"]
         self.flange_from_grip = mounts["gripper"]
-        self.tool_links = frozenset((self.sensor, index["gripper"], *self.fingers))
+        self.gripper_link = index["gripper"]
         for i in range(-1, engine.getNumJoints(self.arm)):
             engine.changeDynamics(self.arm, i, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0)
             engine.setCollisionFilterGroupMask(self.arm, i, ARM_GROUP, PANEL_GROUP)
@@ -172,7 +174,7 @@ class World:
         engine = self.engine
         self.drive.tick()
         self.gripper.tick(self.pad_force_n)
-        half = self.gripper.width_m / 2
+        half, pad_speed = self.gripper.width_m / 2, self.gripper.speed / 2
         # Gravity torque beside the position motor: the servo sags by 2 to 12 mrad without it and by 1e-16 with it.
         gravity = engine.calculateInverseDynamics(self.arm, self.q, self._zeros, self._zeros)
         engine.setJointMotorControlArray(self.arm, self.moving, engine.TORQUE_CONTROL, forces=gravity)
@@ -180,13 +182,15 @@ class World:
             self.arm,
             self.moving,
             engine.POSITION_CONTROL,
-            targetPositions=[*self.drive.setpoint, half, half],
-            targetVelocities=[*self.drive.speed, *([self.gripper.speed / 2] * 2)],
+            targetPositions=[*self.drive.setpoint.tolist(), half, half],
+            targetVelocities=[*self.drive.speed.tolist(), pad_speed, pad_speed],
             forces=self._forces,
             positionGains=self._gains,
             velocityGains=self._damps,
         )
-        self.panel.drive(self.tip_m)
+        if self.tick % TIP_TICKS == 0:
+            self.panel.wake(self.tip_m)
+        self.panel.drive()
         engine.stepSimulation()
         self.tick += 1
         self._read_joints()
@@ -198,10 +202,8 @@ class World:
         self.q = [state[0] for state in states[:-1]]
         self.v = [state[1] for state in states[:-1]]
         self.reaction = states[-1][2]
-        tip = engine.getLinkState(self.arm, self.fingers[0] - 1, computeForwardKinematics=1)
-        self.tip_m = tip[4]
-        if not hasattr(self, "pad_force_n"):
-            self.pad_force_n = (0.0, 0.0)
+        if self.tick % TIP_TICKS == 0:
+            self.tip_m = engine.getLinkState(self.arm, self.gripper_link)[4]
 
     def _read_contacts(self) -> None:
         contacts = self.engine.getContactPoints(bodyA=self.arm)

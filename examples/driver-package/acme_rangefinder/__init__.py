@@ -1,0 +1,1 @@
+"""An example: a driver that lives outside panelwright's tree."""

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.pose_cases import Problem, error, is_flipped, problems
+from benchmarks.pose_hand_eye import rows as hand_eye_rows
 from benchmarks.pose_lights import drawn_pairs, score_pairs, stored_pairs
 from hal.calibration import CameraIntrinsics
 from perception.vision.quadrangle import QuadranglePose, estimate, warm_up
@@ -183,7 +184,7 @@ def table(*, quick: bool) -> list[tuple[str, str, str]]:
         ))  # fmt: skip
     rows.append(("time for minima, covariance, flag (median of mixed)", "<= 0.6 ms", f"{mine['ms']:.3f} ms"))
     rows += _peer_rows(mixed[: n // 3], efficiency(mixed[: n // 3], ours))
-    return rows + _light_rows(quick=quick)
+    return rows + _light_rows(quick=quick) + hand_eye_rows(5 if quick else 40)
 
 
 def _peer_rows(cases: list[Problem], mine: dict[str, float]) -> list[tuple[str, str, str]]:

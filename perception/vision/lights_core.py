@@ -15,6 +15,12 @@ RAMP = 0.5
 RING_PX = 2  # the edge of a lamp is this wide on either side (blur and sampling)
 
 
+def level_at(values: NDArray[np.float32], share: float) -> float:
+    """The value below which `share` of (n,) values lie; numpy's own quantile takes 20 times as long on so few."""
+    place = round(share * (len(values) - 1))
+    return float(np.partition(values, place)[place])
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Core:
     """The lamp: its pixels with a share of 0 to 1 each, its level and that of the glow round it."""
@@ -37,17 +43,17 @@ def lamp_core(rise: Image, seed: Mask) -> Core | None:
     """
     import cv2
 
-    peak = float(np.quantile(rise[seed], 0.99))
+    peak = level_at(rise[seed], 0.99)
     level = _steepest_level(rise, seed, peak)
     body = _component(rise, seed, level)
     if body is None:
         return None
     kernel = np.ones((3, 3), np.uint8)
     inside = cv2.erode(body, kernel) > 0
-    top = float(np.median(rise[inside if inside.any() else body > 0]))
+    top = level_at(rise[inside if inside.any() else body > 0], 0.5)
     reach = cv2.dilate(body, kernel, iterations=RING_PX)
     ring = (cv2.dilate(reach, kernel) > 0) & (reach == 0)
-    glow = min(float(np.median(rise[ring])), 0.9 * top) if ring.any() else 0.0
+    glow = min(level_at(rise[ring], 0.5), 0.9 * top) if ring.any() else 0.0
     # Half way between lamp and glow is the rim; a ramp across it counts split pixels by their share, while unevenness
     # of glow or lamp, which is cut off at the plate's edge or has a highlight when off, stays without effect.
     share = np.clip(0.5 + (rise - 0.5 * (top + glow)) / max(RAMP * (top - glow), 1e-3), 0.0, 1.0)

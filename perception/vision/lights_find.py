@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.errors import InvalidRequest
-from perception.vision.lights_core import Core, lamp_core
+from perception.vision.lights_core import Core, lamp_core, level_at
 from perception.vision.lights_registration import Registration, register
 
 Array = NDArray[np.float64]
@@ -245,7 +245,7 @@ def _region(rise: Image, sigma: Image, seed: NDArray[np.bool_], corner: tuple[in
     core = lamp_core(rise, seed)
     if core is None or core.weights.sum() < LEAST_AREA_PX:
         return None
-    if core.top > 1.3 * float(np.quantile(rise[seed], 0.99)):
+    if core.top > 1.3 * level_at(rise[seed], 0.99):
         return None  # a rim of something brighter, which has a seed of its own
     rows, columns = np.nonzero(core.weights > 0.05)
     rim, surround = _edge_quality(rise, core)
@@ -270,7 +270,7 @@ def _edge_quality(rise: Image, core: Core) -> tuple[float, float]:
     outer, middle, inner = (
         np.sqrt(float((rise[reach > 0] > core.glow + share * step).sum())) for share in (0.25, 0.5, 0.75)
     )
-    uneven = float(np.median(np.abs(rise[ring] - core.glow))) / step if ring.any() else 0.0
+    uneven = level_at(np.abs(rise[ring] - core.glow), 0.5) / step if ring.any() else 0.0
     return (outer - inner) / max(middle, 1.0), uneven
 
 

@@ -47,3 +47,12 @@ def batch_values(b: Batch, R: Array, t: Array) -> tuple[Array, Array, Array]:
     f, gradients, directions = np.zeros(n), np.zeros((n, 6)), np.zeros((n, 3))
     evaluate(b, R, t, True, f, gradients, directions)
     return f, gradients, directions
+
+
+def local_value(measurement: Measurement, base_from_object: RigidTransform) -> float:
+    """`local_values` of one measurement.
+
+    Raises:
+        InvalidRequest: the measurement makes no sense.
+    """
+    return float(local_values([measurement], base_from_object)[0])

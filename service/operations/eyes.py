@@ -21,6 +21,7 @@ from hal.readings import Cause, Stamped
 from service.operations.session import Session
 
 READ_S = 5.0  # wall seconds for one device call; a software renderer on a busy machine takes up to 0.5 s
+OLDEST_S = 0.2  # before the call: a frame must be of the present, however long it takes to arrive
 SETTLE_S = 0.06  # lamps and arm come to rest
 
 
@@ -85,8 +86,9 @@ def look(session: Session, camera: str | None = None) -> Look:
         DeviceError: the camera does not deliver.
     """
     name, device = only_device(session, DeviceKind.CAMERA, camera)
+    asked_s = session.connection.clock.now_s()
     sample = device.read_image(deadline=deadline())
-    pixels = sample.usable(now_s=session.connection.clock.now_s(), max_age_s=1.0, device=name).pixels
+    pixels = sample.usable(now_s=asked_s, max_age_s=OLDEST_S, device=name).pixels
     _refuse_frozen(session, name, sample, pixels)
     return Look(
         pixels=pixels,
@@ -115,8 +117,9 @@ def look_with_lights(session: Session) -> LightPair:
 def scan(session: Session) -> Scan:
     """One range image from where the arm stands now; the arm must be at rest."""
     name, device = only_device(session, DeviceKind.RANGE_SCANNER)
+    asked_s = session.connection.clock.now_s()
     sample = device.read_range(deadline=deadline())
-    depth_m = sample.usable(now_s=session.connection.clock.now_s(), max_age_s=1.0, device=name).depth_m
+    depth_m = sample.usable(now_s=asked_s, max_age_s=OLDEST_S, device=name).depth_m
     _refuse_frozen(session, name, sample, depth_m)
     return Scan(
         depth_m=depth_m,

@@ -48,7 +48,6 @@ class Service:
         inline: bool = False,
     ) -> None:
         self.cell = cell
-        self.inline = inline
         self.operations = operations
         self.runs_dir = runs_dir
         self.memory = CellMemory()

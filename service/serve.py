@@ -27,13 +27,14 @@ SWITCH_S = 0.001  # a computing thread yields to the event loop five times soone
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """How to serve. `stop_port` None: the port after `port` (any free one when `port` is 0)."""
+    """How to serve. `stop_port` None: the port after `port` (any free one when that is 0). `warm`: load hot loops early."""
 
     host: str = "127.0.0.1"
     port: int = 8460
     stop_port: int | None = None
     runs_dir: Path = Path("runs")
     inline: bool = False
+    warm: bool = True
 
 
 class Panelwright:
@@ -57,6 +58,7 @@ class Panelwright:
         self._error: CellError | None = None
         self._is_settled = threading.Event()
         self._is_ending = threading.Event()
+        self._wants_warmth = options.warm and not options.inline
         self._server: HttpServer | None = None
         self._listener = listener
         from service.http.server import names_of
@@ -167,7 +169,7 @@ class Panelwright:
         self._is_settled.set()
         if self._error is not None and self._server is not None:
             self._server.stop()
-        if self._error is None and not self.service.inline and not self._is_ending.is_set():
+        if self._wants_warmth and self._error is None and not self._is_ending.is_set():
             self._warm()
 
     def _warm(self) -> None:

@@ -29,6 +29,7 @@ def serve(
     ] = "127.0.0.1",
     runs: Annotated[Path, typer.Option(help="Folder for reports, journal and artefacts.")] = Path("runs"),
     seed: SeedOption = None,
+    warm: Annotated[bool, typer.Option(help="Load the hot loops right after the start.")] = True,
     inline: Annotated[bool, typer.Option("--inline", help="Cell and stop port in this process (debugging).")] = False,
 ) -> None:
     """Start the cell and serve it until Ctrl-C."""
@@ -36,7 +37,7 @@ def serve(
 
     check_host(host)
     loaded = read_cell(cell, seed)
-    options = Options(host=host, port=port, stop_port=stop_port, runs_dir=runs, inline=inline)
+    options = Options(host=host, port=port, stop_port=stop_port, runs_dir=runs, inline=inline, warm=warm)
     panelwright = Panelwright(loaded, options)
     threading.Thread(target=_announce, args=(panelwright,), daemon=True).start()
     console.print(f"panelwright: cell [bold]{loaded.name}[/] ({loaded.file.cell.mode}) is starting")

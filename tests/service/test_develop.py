@@ -62,7 +62,7 @@ def test_the_kit_runs_on_a_cell_file(write_cell: WriteCell) -> None:
     path = write_cell()
     command = ["conform", str(path), "--device", "finger_proximity", "--level", "connect"]
     done = subprocess.run(
-        [sys.executable, "-m", "service.cli", *command], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-m", "service.cli", *command], capture_output=True, text=True, timeout=240, check=False
     )
     assert "Test_finger_proximity" in done.stdout
     assert "test_close_twice_is_once PASSED" in done.stdout
@@ -73,7 +73,7 @@ def test_the_kit_finds_a_broken_promise(write_cell: WriteCell) -> None:
     path = write_cell(options={"panel_lights": {"immortal": True}})
     command = ["conform", str(path), "--device", "panel_lights", "--level", "connect"]
     done = subprocess.run(
-        [sys.executable, "-m", "service.cli", *command], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-m", "service.cli", *command], capture_output=True, text=True, timeout=240, check=False
     )
     assert done.returncode == 1
     assert "test_after_close_every_read_says_unavailable FAILED" in done.stdout

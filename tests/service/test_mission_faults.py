@@ -113,7 +113,7 @@ def test_ctrl_c_in_the_middle_leaves_nothing(bench: Bench) -> None:
     family = bench.process.children(recursive=True)
     assert len(family) >= 3, "cell, stop and world"
     os.kill(bench.process.pid, signal.SIGINT)
-    bench.process.wait(30)
+    bench.process.wait(90)
     eventually(lambda: not [process for process in family if _runs(process)])
     assert "Traceback" not in bench.log.read_text()
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
-def eventually(probe: Callable[[], T], *, timeout_s: float = 30.0) -> T:
+def eventually(probe: Callable[[], T], *, timeout_s: float = 150.0) -> T:
     """The first true answer of `probe`; fails when none comes in time. Missing files count as no answer."""
     end_s = time.monotonic() + timeout_s
     pause = threading.Event()

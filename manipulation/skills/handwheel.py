@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
@@ -17,10 +19,13 @@ from manipulation.workcell import Workcell, panel_from_grip
 
 Array = NDArray[np.float64]
 
-SIDE_M = 0.009  # room between each finger and the rim when coming down
+HUB_M = 0.009  # the panel file does not say how thick the hub is; this is generous
+SIDE_M = 0.009  # most room between each finger and the rim when coming down
+SPARE_M = 0.001
 TIP_DEPTH_M = 0.008  # of the tips below the middle of the rim
 FRICTION = 0.6  # of pads on paint, low on purpose
-GRIP_FLOOR_N = 15.0
+FIRMER_RATIO = 1.4  # a light grasp first: a firm one made 97 N of friction along the fingers
+GRIP_FLOOR_N = 12.0
 LARGEST_GRIP_N = 45.0
 TURN_M_PER_S = 0.08
 LONGEST_RAD = 1.7  # of one hold; then the hand goes back for the next
@@ -65,13 +70,15 @@ def handwheel(
         )
     known = current if current is not None else (verify() if verify is not None else None)
     where = [known.angle_rad if known is not None else None]
+    tries = itertools.count()
 
     def stroke(attempt: Attempt) -> float:
+        grip_n = grip_force_n(thing, tries=next(tries))
         if where[0] is None:
             raise InvalidRequest(f"the angle of {name} is not known", hint="read it first, or give `current`")
         while abs(target_rad - where[0]) > 0.3 * TOLERANCE_RAD:
             part = float(np.clip(target_rad - where[0], -LONGEST_RAD, LONGEST_RAD))
-            where[0] += _carry(attempt, thing, where[0], part)
+            where[0] += _carry(attempt, thing, where[0], part, grip_n)
         return where[0]
 
     def look() -> ObjectState | None:
@@ -91,16 +98,26 @@ def handwheel(
     )
 
 
-def grip_force_n(thing: Handwheel) -> float:
-    """Force of each pad so that friction carries the wheel: 2 mu F r = spread times torque."""
-    needed = EFFORT_SPREAD * thing.torque_nm / (2.0 * FRICTION * thing.radius_m)
-    return float(np.clip(needed, GRIP_FLOOR_N, LARGEST_GRIP_N))
+def grip_force_n(thing: Handwheel, *, tries: int = 0) -> float:
+    """Force of each pad so that friction carries the wheel, 2 mu F r = torque; firmer after each try that slipped."""
+    needed = thing.torque_nm / (2.0 * FRICTION * thing.radius_m)
+    return float(np.clip(needed * FIRMER_RATIO**tries, GRIP_FLOOR_N, LARGEST_GRIP_N))
 
 
-def _carry(attempt: Attempt, thing: Handwheel, angle_rad: float, span_rad: float) -> float:
+def free_side_m(thing: Handwheel, finger_m: float) -> float:
+    """Room on each side of the rim, such that a hand moved inwards meets the rim before its inner finger meets the hub.
+
+    The outer finger meets the rim at radius R - side, the inner one the hub at hub + finger + rim + side.
+    """
+    most = 0.5 * (thing.radius_m - thing.rim_m - HUB_M - finger_m - SPARE_M)
+    return float(np.clip(most, 0.003, SIDE_M))
+
+
+def _carry(attempt: Attempt, thing: Handwheel, angle_rad: float, span_rad: float, grip_n: float) -> float:
     """One hold and turn; returns the signed angle by which the wheel turned."""
     cell, sign = attempt.cell, float(np.sign(span_rad))
-    open_m = 2.0 * (thing.rim_m + SIDE_M)
+    side_m = free_side_m(thing, cell.hand.finger_thickness_m)
+    open_m = 2.0 * (thing.rim_m + side_m)
     gap = np.pi / thing.spokes
     between = [angle_rad + (2 * k + 1) * gap for k in range(thing.spokes)]
     ways = [_way(thing, place, span_rad, flip) for place in between for flip in (0.0, np.pi)]
@@ -108,9 +125,11 @@ def _carry(attempt: Attempt, thing: Handwheel, angle_rad: float, span_rad: float
     down = attempt.advance(STANDOFF_M + thing.rim_m + TIP_DEPTH_M, name="approach")
     if down.tripped is not None:
         raise SkillFailure(Outcome.MISSED, "a finger landed on the wheel")
-    centre_between(attempt, room_m=2.0 * SIDE_M, what="rim")
+    centre_between(attempt, room_m=2.0 * side_m, what="rim")
     hub = _hub(attempt, thing, between[way // 2])
-    attempt.open_to(0.0, force_n=grip_force_n(thing), name="hold the rim")
+    width = attempt.grasp(grip_n, name="hold the rim")
+    if width < thing.rim_m:
+        raise SkillFailure(Outcome.MISSED, f"the fingers closed to {1e3 * width:.1f} mm; no rim between them")
     start = attempt.pose()
     axis = cell.panel_pose.rotation.apply([0.0, 0.0, -1.0])  # clockwise seen from the front
     stop_n = min(LARGEST_STOP_N, EFFORT_SPREAD * thing.torque_nm / thing.radius_m + EFFORT_FLOOR_N)
@@ -118,7 +137,8 @@ def _carry(attempt: Attempt, thing: Handwheel, angle_rad: float, span_rad: float
     against = -ahead / np.linalg.norm(ahead)
     direction = (float(against[0]), float(against[1]), float(against[2]))
     guard = Guard(name="effort", quantity=Quantity.FORCE, limit=stop_n, axis=direction)
-    poses = arc(start, centre_m=hub, axis=axis, angle_rad=span_rad)
+    lag = thing.torque_nm / (2.0 * cell.hand.pad_stiffness_n_per_m * thing.radius_m**2)  # what both pads give
+    poses = arc(start, centre_m=hub, axis=axis, angle_rad=span_rad + sign * lag)
     report = attempt.along(poses, name="turn", speed_m_per_s=TURN_M_PER_S, guards=(guard,), compliance=RADIAL)
     turned = sign * float(np.linalg.norm((report.base_from_tool.rotation * start.rotation.inv()).as_rotvec()))
     if report.tripped is not None:
@@ -126,7 +146,7 @@ def _carry(attempt: Attempt, thing: Handwheel, angle_rad: float, span_rad: float
         raise SkillFailure(outcome, f"it did not give way at {report.peak_force_n:.0f} N", reached=angle_rad + turned)
     attempt.open_to(open_m, name="let go")
     attempt.leave(STANDOFF_M + thing.rim_m + TIP_DEPTH_M)
-    return turned
+    return turned - sign * lag
 
 
 def _hub(attempt: Attempt, thing: Handwheel, place_rad: float) -> Array:

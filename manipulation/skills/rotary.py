@@ -107,8 +107,7 @@ def _turn(attempt: Attempt, thing: Rotary, start_rad: float, goal_rad: float) ->
     if down.tripped is not None:
         attempt.advance(-LIFT_M, name="lift off the shoulder", speed_m_per_s=0.03)
     centre_between(attempt, room_m=2.0 * SIDE_M, what="bar")
-    attempt.open_to(0.0, force_n=GRIP_N, name="hold the bar")
-    width = cell.mover.state().gripper_width_m
+    width = attempt.grasp(GRIP_N, name="hold the bar")
     if width < 0.5 * bar_m:
         raise SkillFailure(Outcome.MISSED, f"the fingers closed to {1e3 * width:.1f} mm; no bar between them")
     start = attempt.pose()

@@ -33,6 +33,7 @@ STANDOFF_M = 0.030  # of the tips above the object's highest place
 RETREAT_M = 0.050
 RETREAT_M_PER_S = 0.15
 PADS_M_PER_S = 0.1
+GRASP_M_PER_S = 0.03
 FREE_N = 40.0  # more than this in a move that should be free is a collision
 MAX_ATTEMPTS = 3
 
@@ -78,6 +79,14 @@ class Attempt:
         """Move the pads to an opening while the arm holds; skipped when they are there."""
         width = min(width_m, self.cell.hand.max_width_m)
         return self.run(GripperMotion(name=name, width_m=width, force_n=force_n, speed_m_per_s=PADS_M_PER_S))
+
+    def grasp(self, force_n: float, *, name: str) -> float:
+        """Close slowly until the pads press with `force_n`; returns the opening left, m.
+
+        Fast pads stop on the peak of their own impact and hold nothing.
+        """
+        self.run(GripperMotion(name=name, width_m=0.0, force_n=force_n, speed_m_per_s=GRASP_M_PER_S))
+        return self.cell.mover.state().gripper_width_m
 
     def go_to(self, goal_rad: Array, *, width_m: float, name: str) -> None:
         """A collision-free transfer; any strong contact on the way ends the attempt."""

@@ -27,7 +27,7 @@ SWITCH_S = 0.001  # a computing thread yields to the event loop five times soone
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """How to serve. `stop_port` None: the port after `port` (any free one when that is 0). `warm`: load hot loops early."""
+    """How to serve. `stop_port` None: the port after `port`, or any free one. `warm`: load hot loops early."""
 
     host: str = "127.0.0.1"
     port: int = 8460

@@ -2,20 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import heapq
 import itertools
-import math
-import mmap
-import os
-import socket
-import subprocess
-import sys
-import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,32 +15,26 @@ from scipy.spatial.transform import RigidTransform
 from hal.clock import Clock, SimClock
 from hal.config import Cell
 from hal.devices import Truth
-from hal.errors import ConfigError, DeviceFault, DeviceUnavailable
+from hal.errors import ConfigError, DeviceFault
 from hal.registry import Context
 from simbackend.arm_model import MODELS
 from simbackend.draws import Draws
+from simbackend.link import WorldLink
 from simbackend.wire import (
-    CAMERA_AT,
-    DOUBLE,
     GRIPPER_AT,
-    IMAGE_BYTES,
     JOINTS_AT,
     LIGHTS_AT,
     REQUEST,
-    SNAPSHOT,
     Drive,
     Op,
     Picture,
     PictureInfo,
     Snapshot,
     WorldConfig,
-    read_exactly,
 )
 
 Array = NDArray[np.float64]
 
-START_S = 180.0  # the first start on a machine compiles the rasteriser; later ones take two seconds
-CLOSE_S = 2.0
 PROXIMITY_RANGE_M = 0.6
 
 
@@ -87,8 +72,8 @@ class WorldClient:
         self._owed_ticks = 0.0
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._order = itertools.count()  # of two events at one tick the first comes first
-        self._is_closed = False
-        self._launch(config)
+        self._link = WorldLink(config)
+        self._take(self._link.first)
         clock.attach(self.advance)  # type: ignore[attr-defined]  # checked by `start`
 
     @classmethod
@@ -125,38 +110,6 @@ class WorldClient:
         client.proximity = tuple(names)
         return client
 
-    def _launch(self, config: WorldConfig) -> None:
-        ours, theirs = socket.socketpair()
-        with tempfile.TemporaryFile(prefix="panelwright-images-") as file:
-            file.truncate(IMAGE_BYTES)
-            self._images = mmap.mmap(file.fileno(), IMAGE_BYTES)
-            fds = (theirs.fileno(), file.fileno())
-            command = [sys.executable, "-m", "simbackend.world_process", *map(str, fds)]
-            self._process = subprocess.Popen(  # noqa: S603  # our own interpreter and module
-                command, pass_fds=fds, env=_environment(), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
-            )
-        theirs.close()
-        self._pipe = Connection(ours.detach())
-        self._stream = self._pipe.fileno()
-        try:
-            self._pipe.send(config)
-            complaint = self._pipe.recv() if self._pipe.poll(START_S) else f"no answer within {START_S:.0f} s"
-            if complaint is not None:
-                raise DeviceUnavailable(
-                    f"the simulated world did not start: {complaint}", hint="run `panelwright doctor`", device="world"
-                )
-            self._take(read_exactly(self._stream, SNAPSHOT * DOUBLE))
-        except (EOFError, OSError) as error:
-            self.close()
-            raise DeviceUnavailable(
-                "the simulated world ended while starting",
-                hint="run `panelwright doctor`; is pybullet installed?",
-                device="world",
-            ) from error
-        except DeviceUnavailable:
-            self.close()
-            raise
-
     # -- time -----------------------------------------------------------------------------------------------------
 
     def advance(self, duration_s: float) -> float:
@@ -178,37 +131,12 @@ class WorldClient:
         request[0], request[1] = Op.STEP, ticks
         message = request.tobytes()
         request[:] = 0.0
-        self._take(self._ask(message))
+        self._take(self._link.step(message))
 
     def _take(self, message: bytes) -> None:
         snapshot = Snapshot(np.frombuffer(message))
         stamp_s = snapshot.stamp_s if isinstance(self._clock, SimClock) else self._clock.now_s()
         self.frame = Frame(snapshot, stamp_s)
-
-    def _ask(self, message: bytes) -> bytes:
-        if self._is_closed:
-            raise _closed()
-        try:
-            os.write(self._stream, message)
-            return read_exactly(self._stream, SNAPSHOT * DOUBLE)
-        except (EOFError, OSError) as error:
-            raise self._ended() from error
-
-    @contextlib.contextmanager
-    def _guarded(self) -> Iterator[None]:
-        if self._is_closed:
-            raise _closed()
-        try:
-            yield
-        except (EOFError, OSError) as error:
-            raise self._ended() from error
-
-    def _ended(self) -> DeviceUnavailable:
-        return DeviceUnavailable(
-            f"the simulated world has ended (exit code {self._process.poll()})",
-            hint="start the cell again; its log says why the world ended",
-            device="world",
-        )
 
     def at(self, time_s: float, action: Callable[[], None]) -> None:
         """Run `action` when the world reaches a simulated time; at once when it has."""
@@ -273,55 +201,23 @@ class WorldClient:
     def _picture(
         self, view: CameraView, kind: Picture, shape: tuple[int, ...]
     ) -> tuple[PictureInfo, NDArray[np.float32]]:
-        with self._lock:
-            info = self._draw(view, kind)
-            return info, np.frombuffer(self._images, np.float32, math.prod(shape)).reshape(shape).copy()
-
-    def _draw(self, view: CameraView, kind: Picture) -> PictureInfo:
         matrix = np.asarray(view.flange_from_camera.as_matrix())[:3]
-        head = [Op.RENDER, view.width, view.height, view.near_m, *view.focal, *view.centre, kind]
-        request = np.zeros(REQUEST)
-        request[:CAMERA_AT] = head
-        request[CAMERA_AT : CAMERA_AT + 12] = matrix.ravel()
-        with self._guarded():
-            os.write(self._stream, request.tobytes())
-            info: PictureInfo = self._pipe.recv()
-            return info
+        lens = [view.width, view.height, view.near_m, *view.focal, *view.centre]
+        # With the lock of the steps: a picture belongs to one tick.
+        with self._lock:
+            return self._link.picture([*lens, float(kind), *matrix.ravel().tolist()], shape)
 
     def truth(self) -> Truth:
         """What the judge may ask for when a mission has ended."""
-        with self._lock, self._guarded():
-            os.write(self._stream, _plain(Op.TRUTH))
-            truth = self._pipe.recv()
+        with self._lock:
+            truth = self._link.ask(Op.TRUTH)
         if not isinstance(truth, Truth):
             raise DeviceFault("the simulated world gave no truth", hint="report this", device="world")
         return truth
 
     def close(self) -> None:
-        """End the process; a second call does nothing."""
-        with self._lock:
-            if self._is_closed:
-                return
-            self._is_closed = True
-            with contextlib.suppress(OSError):
-                os.write(self._stream, _plain(Op.CLOSE))
-            self._pipe.close()
-            try:
-                self._process.wait(CLOSE_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait(CLOSE_S)
-
-
-def _closed() -> DeviceUnavailable:
-    return DeviceUnavailable("the simulated world is closed", hint="open the cell again", device="world")
-
-
-def _plain(op: Op) -> bytes:
-    """A request without arguments."""
-    request = np.zeros(REQUEST)
-    request[0] = op
-    return request.tobytes()
+        """End the world; a second call does nothing."""
+        self._link.close()
 
 
 def true_mount(cell: Cell, draws: Draws, device: str) -> RigidTransform:
@@ -353,9 +249,3 @@ def _arm_model(cell: Cell) -> str:
                 raise ConfigError(f"no arm model called {model!r}", hint=f"models: {', '.join(MODELS)}", model=model)
             return model
     return "t3"
-
-
-def _environment() -> dict[str, str]:
-    # The world finds its code where this process found it, and uses one core: the other belongs to the cell.
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    return {**os.environ, **threads, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}

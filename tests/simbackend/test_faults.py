@@ -145,8 +145,8 @@ def test_a_dead_world_is_an_unavailable_device() -> None:
         arm = cell.connect("arm")
         world = cell.shared.peek("world")
         assert world is not None
-        world._process.kill()
-        world._process.wait(5.0)
+        world._link.process.kill()
+        world._link.process.wait(5.0)
         with pytest.raises(DeviceUnavailable) as caught:
             cell.clock.sleep(0.1)
         assert "world" in str(caught.value)

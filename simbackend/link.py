@@ -1,0 +1,123 @@
+"""The world process seen from outside: starting it, talking to it, ending it."""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.errors import DeviceUnavailable
+from simbackend.wire import DOUBLE, IMAGE_BYTES, REQUEST, SNAPSHOT, Op, WorldConfig, read_exactly
+
+START_S = 180.0  # the first start on a machine compiles the rasteriser; later ones take two seconds
+CLOSE_S = 2.0
+
+
+class WorldLink:
+    """One world process and the pipe to it. Requests are fixed vectors; pictures come back through shared memory."""
+
+    def __init__(self, config: WorldConfig) -> None:
+        self._lock = threading.RLock()
+        self._is_closed = False
+        ours, theirs = socket.socketpair()
+        with tempfile.TemporaryFile(prefix="panelwright-images-") as file:
+            file.truncate(IMAGE_BYTES)
+            self._images = mmap.mmap(file.fileno(), IMAGE_BYTES)
+            fds = (theirs.fileno(), file.fileno())
+            command = [sys.executable, "-m", "simbackend.world_process", *map(str, fds)]
+            self.process = subprocess.Popen(  # noqa: S603  # our own interpreter and module
+                command, pass_fds=fds, env=_environment(), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+            )
+        theirs.close()
+        self._pipe = Connection(ours.detach())
+        self._stream = self._pipe.fileno()
+        try:
+            self.first = self._greet(config)
+        except DeviceUnavailable:
+            self.close()
+            raise
+
+    def _greet(self, config: WorldConfig) -> bytes:
+        """Send the config; returns the first snapshot."""
+        try:
+            self._pipe.send(config)
+            complaint = self._pipe.recv() if self._pipe.poll(START_S) else f"no answer within {START_S:.0f} s"
+            if complaint is None:
+                return read_exactly(self._stream, SNAPSHOT * DOUBLE)
+        except (EOFError, OSError):
+            complaint = "it ended while starting"
+        raise DeviceUnavailable(
+            f"the simulated world did not start: {complaint}",
+            hint="run `panelwright doctor`; is pybullet installed?",
+            device="world",
+        )
+
+    def step(self, request: bytes) -> bytes:
+        """Obey a step request; returns the snapshot's bytes."""
+        with self._lock, self._guarded():
+            os.write(self._stream, request)
+            return read_exactly(self._stream, SNAPSHOT * DOUBLE)
+
+    def ask(self, op: Op, *arguments: float) -> Any:
+        """Any other request; returns the object that comes back."""
+        with self._lock, self._guarded():
+            os.write(self._stream, _vector(op, *arguments))
+            return self._pipe.recv()
+
+    def picture(self, arguments: list[float], shape: tuple[int, ...]) -> tuple[Any, NDArray[np.float32]]:
+        """What a picture request says and draws."""
+        with self._lock:
+            info = self.ask(Op.RENDER, *arguments)
+            return info, np.frombuffer(self._images, np.float32, int(np.prod(shape))).reshape(shape).copy()
+
+    @contextlib.contextmanager
+    def _guarded(self) -> Iterator[None]:
+        if self._is_closed:
+            raise DeviceUnavailable("the simulated world is closed", hint="open the cell again", device="world")
+        try:
+            yield
+        except (EOFError, OSError) as error:
+            raise DeviceUnavailable(
+                f"the simulated world has ended (exit code {self.process.poll()})",
+                hint="start the cell again; its log says why the world ended",
+                device="world",
+            ) from error
+
+    def close(self) -> None:
+        """End the process; a second call does nothing."""
+        with self._lock:
+            if self._is_closed:
+                return
+            self._is_closed = True
+            with contextlib.suppress(OSError):
+                os.write(self._stream, _vector(Op.CLOSE))
+            self._pipe.close()
+        try:
+            self.process.wait(CLOSE_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait(CLOSE_S)
+
+
+def _vector(op: Op, *arguments: float) -> bytes:
+    request = np.zeros(REQUEST)
+    request[0] = op
+    request[1 : 1 + len(arguments)] = arguments
+    return request.tobytes()
+
+
+def _environment() -> dict[str, str]:
+    # The world finds its code where this process found it, and uses one core: the other belongs to the cell.
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    return {**os.environ, **threads, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}

@@ -19,7 +19,10 @@ setup: .venv/ready  ## Make .venv with everything in it
 	    echo "  try    make PYTHON=/path/to/python3.11"; exit 2; }
 	@echo "setup: making .venv (about 130 packages, 2 GB, a minute or two)"
 	@$(PYTHON) -m venv .venv
-	@$(BIN)/python -m pip install --progress-bar on --quiet -c constraints.txt -e '.[test]' 2>&1 | grep -v '^WARNING' || true
+	@$(BIN)/python -m pip install --progress-bar off -c constraints.txt -e '.[test]' 2>&1 | awk ' \
+	    /^Collecting/ { n++; if (n % 10 == 0) { print "setup: " n " packages found"; fflush() } } \
+	    /^Installing collected/ { print "setup: installing " n " packages"; fflush() } \
+	    /^ERROR|^error/ { print }'
 	@$(BIN)/python -c 'import hal, numpy, cv2, pybullet' || { echo "error: the installation is not complete; the lines above say why"; exit 2; }
 	@$(BIN)/panelwright warm
 	@touch $@

@@ -131,7 +131,7 @@ def _turn_lever(attempt: Attempt, thing: Lever, turn: _Turn) -> float:
     centre_between(attempt, room_m=2.0 * APPROACH_SIDE_M, what="bar")
     hub = _hub(attempt, thing, turn.start_rad)
     attempt.open_to(thing.width_m + 2.0 * CAGE_SIDE_M, name="cage")
-    turned = _carry(attempt, thing, turn.span_rad, hub)
+    turned = _carry(attempt, thing, turn, hub)
     attempt.open_to(open_m, name="let go")
     attempt.leave(STANDOFF_M + OVERLAP_M)
     return turn.start_rad + turned
@@ -159,13 +159,14 @@ def _hub(attempt: Attempt, thing: Lever, angle_rad: float) -> Array:
     return np.asarray(panel.apply(np.array(thing.point_m) + offset * across + [0.0, 0.0, tool[2]]))
 
 
-def _carry(attempt: Attempt, thing: Lever, span_rad: float, hub: Array) -> float:
+def _carry(attempt: Attempt, thing: Lever, turn: _Turn, hub: Array) -> float:
     """The stroke in two parts: fast to 14 degrees before the end, then slowly onto the end stop.
 
     Returns the signed angle by which the bar turned: that of the tool less the play of the cage and the give of the
     pads.
     """
-    cell, sign = attempt.cell, float(np.sign(span_rad))
+    cell, span_rad = attempt.cell, turn.span_rad
+    sign = float(np.sign(span_rad))
     axis = cell.panel_pose.rotation.apply([0.0, 0.0, -1.0])  # clockwise seen from the front
     radius = thing.length_m - FROM_END_M
     stop_n = min(LARGEST_STOP_N, EFFORT_SPREAD * thing.torque_nm / radius + EFFORT_FLOOR_N)
@@ -178,7 +179,9 @@ def _carry(attempt: Attempt, thing: Lever, span_rad: float, hub: Array) -> float
         if report.tripped is not None:
             turned = _between(start, report.base_from_tool)
             outcome = Outcome.STIFF if turned < MOVED_RAD else Outcome.STALLED
-            raise SkillFailure(outcome, f"it did not give way at {report.peak_force_n:.0f} N", reached=sign * turned)
+            raise SkillFailure(
+                outcome, f"it did not give way at {report.peak_force_n:.0f} N", reached=turn.start_rad + sign * turned
+            )
     rest_rad = abs(span_rad) - fast_rad + OVERTRAVEL_RAD
     poses = arc(attempt.pose(), centre_m=hub, axis=axis, angle_rad=sign * rest_rad)
     rise = Guard(name="end stop", quantity=Quantity.FORCE_RISE, limit=END_RISE_N)

@@ -139,7 +139,7 @@ def test_rounded_corners_keep_the_ends_and_stay_near() -> None:
     assert np.linalg.norm(dense - path[1], axis=1).min() == pytest.approx(0.2 * np.sqrt(2) / 4, abs=0.02)
 
 
-def _panel() -> Panel:
+def make_panel() -> Panel:
     lights = [
         {"name": f"l{k}", "position_m": [x, y, 0.0]}
         for k, (x, y) in enumerate([(-0.2, 0.1), (0.2, 0.1), (0.2, -0.1), (-0.2, -0.1)])
@@ -159,7 +159,7 @@ def _panel() -> Panel:
 
 
 def test_the_envelope_of_a_lever_follows_its_angle() -> None:
-    panel = _panel()
+    panel = make_panel()
     lever = panel.object("valve")
     assert isinstance(lever, Lever)
     sideways = envelope(lever, angle_rad=np.pi / 2)
@@ -171,7 +171,7 @@ def test_the_envelope_of_a_lever_follows_its_angle() -> None:
 
 
 def test_the_envelope_of_a_slider_covers_its_track() -> None:
-    slider = _panel().object("fader")
+    slider = make_panel().object("fader")
     assert isinstance(slider, Slider)
     box = envelope(slider)
     along = box.parent_from_box.rotation.apply([1, 0, 0])
@@ -180,7 +180,7 @@ def test_the_envelope_of_a_slider_covers_its_track() -> None:
 
 
 def test_the_boxes_of_a_panel_move_with_it_and_the_plate_lies_behind_its_face() -> None:
-    boxes = {box.name: box for box in placed(panel_boxes(_panel()), transform_rpy((1.0, 0.0, 0.5), (0, 0, 0)))}
+    boxes = {box.name: box for box in placed(panel_boxes(make_panel()), transform_rpy((1.0, 0.0, 0.5), (0, 0, 0)))}
     assert set(boxes) == {"plate", "valve", "fader"}
     plate = boxes["plate"]
     assert plate.parent_from_box.translation[2] + plate.half_m[2] == pytest.approx(0.5)

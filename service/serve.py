@@ -155,6 +155,8 @@ class Panelwright:
         self._server = HttpServer(app, self._listener, on_exit=on_exit)
         if self._error is not None:
             self._server.stop()  # the cell failed before there was a server to end
+        if self._wants_warmth:  # beside the cell's start, which waits for another process
+            threading.Thread(target=_warm, name="warm", daemon=True).start()
 
     def _start_service(self) -> None:
         try:
@@ -169,17 +171,16 @@ class Panelwright:
         self._is_settled.set()
         if self._error is not None and self._server is not None:
             self._server.stop()
-        if self._wants_warmth and self._error is None and not self._is_ending.is_set():
-            self._warm()
 
-    def _warm(self) -> None:
-        """Load the hot loops while nobody waits; a fault here will show when they are used."""
-        from service.warm import warm
 
-        try:
-            warm()
-        except Exception:  # the first user gets it with its context
-            log.warning("warming up failed", exc_info=True)
+def _warm() -> None:
+    """Load the hot loops while nobody waits; a fault here will show when they are used."""
+    from service.warm import warm
+
+    try:
+        warm()
+    except Exception:  # the first user gets it with its context
+        log.warning("warming up failed", exc_info=True)
 
 
 def _exit(_signal: int, _frame: FrameType | None) -> None:

@@ -5,6 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 
+def _imports() -> None:
+    from importlib import import_module
+
+    import_module("service.operations.mission")  # everything that a mission computes, plans and draws with
+
+
 def _vision() -> None:
     from perception.vision.quadrangle import warm_up
 
@@ -17,7 +23,7 @@ def _fusion() -> None:
     warm_up()
 
 
-STAGES: Mapping[str, Callable[[], None]] = {"vision": _vision, "fusion": _fusion}
+STAGES: Mapping[str, Callable[[], None]] = {"imports": _imports, "vision": _vision, "fusion": _fusion}
 """What the service process computes with. The cell and world processes warm their own loops when they start."""
 
 

@@ -11,16 +11,13 @@ from hal.config import Cell
 from hal.devices import ObjectTruth
 from hal.panel import (
     Button,
-    Gauge,
     Handwheel,
     Lamp,
     Lever,
     Mushroom,
     Panel,
-    PanelMeter,
     Rotary,
     Slider,
-    State,
     Toggle,
 )
 from simbackend import textures
@@ -36,6 +33,7 @@ from simbackend.mechanisms import (
 )
 from simbackend.panel_model import PAINT, Quad, light_urdf, object_model, robot
 from simbackend.panel_state import Built, build
+from simbackend.panel_truth import truth_of
 from simbackend.scene import Scene
 from simbackend.urdf import Colour
 from simbackend.wire import Emitter
@@ -43,7 +41,6 @@ from simbackend.wire import Emitter
 NEAR_M = 0.14  # a mechanism is alive while the finger tips are nearer than this
 # Parts of the panel never collide with one another (a button sinks into its plate), only with the arm.
 ARM_GROUP, PANEL_GROUP = 1, 2
-STATE_SLACK_RAD = 0.2
 LENS = 0  # the link of a border light that shines
 LIGHT_GLOW = (1.0, 0.97, 0.88)
 LIGHT_OFF = (0.42, 0.42, 0.40)
@@ -294,41 +291,12 @@ class PanelWorld:
                 )
         return tuple(lit)
 
-    # -- judging --------------------------------------------------------------------------------------------------
-
     def truth(self) -> tuple[ObjectTruth, ...]:
-        """What each object shows at this tick."""
-        return tuple(self._truth_of(built) for built in self.built.values())
-
-    def _truth_of(self, built: Built) -> ObjectTruth:  # one a kind
-        thing = built.thing
-        name = thing.name
-        mechanism = self.mechanisms.get(name)
-        place = mechanism.place() if mechanism is not None else 0.0
-        match thing:
-            case Gauge() | PanelMeter() | Slider():
-                return ObjectTruth(name=name, value=thing.scale.value_at(place))
-            case Lamp():
-                return ObjectTruth(name=name, state="on" if self.lamps_on[name] else "off")
-            case Button() | Mushroom():
-                assert isinstance(mechanism, Spring)  # noqa: S101
-                pressed = mechanism.is_latched or mechanism.is_in
-                return ObjectTruth(
-                    name=name, state="pressed" if pressed else "released", value=float(mechanism.presses)
-                )
-            case Toggle():
-                return ObjectTruth(name=name, state="on" if place > 0.0 else "off", value=place)
-            case Rotary() | Lever():
-                return ObjectTruth(name=name, state=_nearest(thing.states, place), value=place)
-            case Handwheel():
-                return ObjectTruth(name=name, value=place)
-            case _:
-                return ObjectTruth(name=name, value=built.value, text=built.text)
-
-
-def _nearest(states: tuple[State, ...], angle_rad: float) -> str | None:
-    state = min(states, key=lambda s: abs(s.angle_rad - angle_rad))
-    return state.name if abs(state.angle_rad - angle_rad) <= STATE_SLACK_RAD else None
+        """What each object shows at this tick: for the judge."""
+        return tuple(
+            truth_of(built, self.mechanisms.get(name), lamp_is_on=self.lamps_on.get(name, False))
+            for name, built in self.built.items()
+        )
 
 
 def _pose(pose: RigidTransform) -> tuple[list[float], list[float]]:

@@ -5,7 +5,7 @@ PACKAGES := hal drivers simbackend perception fusion manipulation service benchm
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup demo serve test test-fast lint format bench-cell bench-fusion bench-range bench-vision bench-drivers clean
+.PHONY: help setup demo serve test test-fast lint format bench-cell bench-missions bench-pose bench-fusion bench-range bench-vision bench-drivers clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 16
@@ -48,7 +48,7 @@ lint: setup  ## Style, types and layering
 format: setup  ## Put the code into shape
 	@$(BIN)/ruff format . && $(BIN)/ruff check --fix .
 
-bench-cell bench-fusion bench-pose bench-range bench-vision bench-drivers: bench-%: setup  ## Measure, pass line beside figure
+bench-cell bench-missions bench-fusion bench-pose bench-range bench-vision bench-drivers: bench-%: setup  ## Measure, pass line beside figure
 	@$(BIN)/python -m benchmarks.$*
 
 clean:  ## Remove what was made

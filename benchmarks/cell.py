@@ -86,9 +86,9 @@ def measure_mission(seed: int) -> list[Line]:
         ready_s = time.monotonic() - started_s
         try:
             client = Client(url=panelwright.url, timeout_s=120.0)
-            _clear(client)
+            clear_stop(client)
             with _Memory() as memory:
-                mission = _run(client, "/v1/missions", {})
+                mission = run_to_end(client, "/v1/missions", {})
             lag_s = float(client.get("/v1/info")["event_loop_lag_p99_s"])
             stops_s = _stops_while_rendering(client, panelwright.stop_url)
         finally:
@@ -140,13 +140,15 @@ def _floor() -> Line:
     return Line(what="plain loop of 2 million steps", measured=f"{1e3 * took_s:.0f} ms", wanted="(floor)", is_met=None)
 
 
-def _clear(client: Client) -> None:
+def clear_stop(client: Client) -> None:
+    """Reset a latched stop."""
     stop = client.get("/v1/stop")
     if stop["is_latched"]:
         client.post("/v1/stop/reset", {"seen_count": stop["count"]})
 
 
-def _run(client: Client, path: str, body: Any) -> dict[str, Any]:
+def run_to_end(client: Client, path: str, body: Any) -> dict[str, Any]:
+    """Start a task and wait for its end."""
     task = client.post(path, body)
     while task["state"] not in ("succeeded", "failed", "cancelled"):
         time.sleep(0.2)

@@ -18,7 +18,7 @@ from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
 from drivers.transport.options import read_options
 from hal.clock import Deadline
 from hal.devices import DeviceKind, GripperCapabilities, GripperState
-from hal.errors import DeviceFault, InvalidRequest
+from hal.errors import DeviceFault, DeviceTimeout, InvalidRequest
 from hal.readings import Stamped
 from hal.registry import Context
 
@@ -142,12 +142,20 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
                     client.write_registers(unit=o.unit, address=OUTPUT, values=words, until_s=until_s)
 
         until_s = now_s() + o.activation_s
-        deadline = Deadline.after(self.context.clock, o.activation_s)
-        self.call(begin, deadline)
-        while self.call(self._status, Deadline.after(self.context.clock, 10 * o.timeout_s)).state != READY:
+        self.call(begin, Deadline.after(self.context.clock, o.activation_s))
+        while not self._is_ready():
             if now_s() > until_s:
                 raise self._inactive()
             self.bus.rest(self.period_s)
+
+    def _is_ready(self) -> bool:
+        """Have the jaws found their ends? A lost answer is no answer yet."""
+        try:
+            return (
+                self.call(self._status, Deadline.after(self.context.clock, 4 * self._options.timeout_s)).state == READY
+            )
+        except DeviceTimeout:
+            return False
 
     def set_up(self, client: ModbusMaster) -> None:
         """Nothing that moves: the poll tells what state it is in."""

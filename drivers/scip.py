@@ -121,7 +121,7 @@ class Scip(LineScanner):
 
     def __init__(self, context: Context, options: ScipOptions) -> None:
         opener, name = either_opener(options, context.name)
-        super().__init__(context, open_link=opener, link_name=name, max_age_s=1.0, silence_s=1.0)
+        super().__init__(context, open_link=opener, link_name=name, max_age_s=0.05, silence_s=1.0)
         self.sigma_m = options.sigma_m
         self._options = options
         self._parser = ScipParser()
@@ -138,7 +138,7 @@ class Scip(LineScanner):
         drain_until_quiet(link, quiet_s=0.05, until_s=now_s() + ANSWER_S)
         parameters = parse_parameters(self._ask(link, "PP", OK).lines)
         self.beams = self._geometry(parameters)
-        self.max_age_s = 3.0 * self.beams.scan_s
+        self.max_age_s = max(self.max_age_s, 3.0 * self.beams.scan_s)
         self._ask(link, "BM", OK, LASER_ALREADY_ON)
         first, last = int(parameters["AMIN"]), int(parameters["AMAX"])
         self._request = f"MD{first:04d}{last:04d}{self._options.cluster:02d}{self._options.skip_scans}"

@@ -31,7 +31,7 @@ def run_pytest(folder: Path, *paths: Path) -> subprocess.CompletedProcess[str]:
         str(folder),
     ]
     return subprocess.run(
-        [*command, str(folder / "tests")], env=environment, capture_output=True, text=True, timeout=120
+        [*command, str(folder / "tests")], check=False, env=environment, capture_output=True, text=True, timeout=120
     )
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from fusion.batch import Batch
@@ -129,7 +130,7 @@ def judged(
     b: Batch,
     best: Minimum,
     others: Sequence[Minimum],
-    index: Array,
+    index: NDArray[np.int64],
     given: Sequence[Measurement],
     repeats: dict[int, int],
     certify: bool,
@@ -174,7 +175,7 @@ def judged(
     )
 
 
-def _rejected(b: Batch, best: Minimum, index: Array, given: Sequence[Measurement]) -> list[Rejected]:
+def _rejected(b: Batch, best: Minimum, index: NDArray[np.int64], given: Sequence[Measurement]) -> list[Rejected]:
     return [
         Rejected(
             index=int(index[k]),
@@ -187,7 +188,7 @@ def _rejected(b: Batch, best: Minimum, index: Array, given: Sequence[Measurement
     ]
 
 
-def _alternatives(best: Minimum, others: Sequence[Minimum], index: Array) -> tuple[Alternative, ...]:
+def _alternatives(best: Minimum, others: Sequence[Minimum], index: NDArray[np.int64]) -> tuple[Alternative, ...]:
     made = [
         Alternative(
             pose=m.local.base_from_object,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,7 @@ class Batch(NamedTuple):
     prior_t: Array
     prior_w: Array
 
-    def part(self, chosen: Array) -> Batch:
+    def part(self, chosen: NDArray[Any]) -> Batch:
         """The entries at the indices (or mask) `chosen`, with the same prior pose."""
         return self._replace(**{k: getattr(self, k)[chosen] for k in self._fields if not k.startswith("prior")})
 
@@ -131,7 +131,9 @@ def _check_numbers(given: Sequence[Measurement], m: Array, u: Array, mu: Array, 
                 "C is a covariance in m^2, M an information matrix in 1/rad^2")  # fmt: skip
 
 
-def _check_matrices(given: Sequence[Measurement], cls: Array, length: Array, variances: Array, M: Array) -> None:
+def _check_matrices(
+    given: Sequence[Measurement], cls: NDArray[np.int64], length: Array, variances: NDArray[Any], M: NDArray[Any]
+) -> None:
     """Refuse impossible directions and matrices, by the (N, 3) eigenvalues of C and M in rising order."""
     _refuse(given, length < 1e-9, "the object feature's direction is zero", "a line or plane needs a direction")
     _refuse(given, (variances[:, 0] <= 1e-13 * variances[:, 2]) | (variances[:, 2] <= 0), "C is not positive definite",
@@ -148,7 +150,7 @@ def _check_matrices(given: Sequence[Measurement], cls: Array, length: Array, var
 
 
 def _each(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    return holds.reshape(len(holds), -1).all(axis=1)
+    return np.asarray(holds.reshape(len(holds), -1).all(axis=1))
 
 
 def _refuse(given: Sequence[Measurement], wrong: NDArray[np.bool_], what: str, hint: str) -> None:
@@ -156,7 +158,7 @@ def _refuse(given: Sequence[Measurement], wrong: NDArray[np.bool_], what: str, h
         raise _bad(given, int(np.argmax(wrong)), what, hint)
 
 
-def _sym6(S: Array) -> Array:
+def _sym6(S: NDArray[Any]) -> Array:
     return np.ascontiguousarray(S[:, _UPPER[0], _UPPER[1]])
 
 

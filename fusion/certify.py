@@ -16,6 +16,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion.batch import Batch
@@ -54,16 +55,16 @@ class Certificate:
     base_from_object: RigidTransform
 
 
-def certificate(b: Batch, used: Array, local: LocalSolution) -> Certificate:
+def certificate(b: Batch, used: NDArray[np.bool_], local: LocalSolution) -> Certificate:
     """Bound the error of the used entries of `b` (N,) from below, and compare with the solution `local`.
 
     Raises:
         Unsupported: clarabel is not installed.
     """
     R, t = local.rotation, local.translation_m
-    lever, size = middle_and_size(b, np.asarray(used, bool), R)
+    lever, size = middle_and_size(b, used, R)
     about, middle = R.T @ lever, t + lever  # features are taken from `about`, places from `middle`, in units of `size`
-    Q = quadratic_form(b, np.asarray(used, bool), R, t, about, middle, size)
+    Q = quadratic_form(b, used, R, t, about, middle, size)
     z = _monomials(R, (t + R @ about - middle) / size)
     Z, bound = _relaxed(Q)
     values, vectors = np.linalg.eigh(Z)
@@ -83,10 +84,10 @@ def certificate(b: Batch, used: Array, local: LocalSolution) -> Certificate:
     )
 
 
-def quadratic_form(b: Batch, used: Array, R: Array, t: Array, about: Array, middle: Array, size: float) -> Array:
+def quadratic_form(b: Batch, used: NDArray[np.bool_], R: Array, t: Array, about: Array, middle: Array, size: float) -> Array:
     """Q (16, 16) with z^T Q z = the error of the used entries, their covariances frozen at the pose R, t."""
     Q = np.zeros((SIZE, SIZE))
-    for i in np.flatnonzero(used):
+    for i in map(int, np.flatnonzero(used)):
         rows, V = _prior_rows(b, about, middle, size) if b.cls[i] == 0 else _rows(b, i, R, t, about, middle, size)
         white = np.linalg.solve(np.linalg.cholesky(V), rows)
         Q += white.T @ white
@@ -195,24 +196,24 @@ def constraints() -> tuple[Array, Array]:
     1 homogenisation, 6 of R^T R = I, 6 of R R^T = I, 9 cross products of columns, 3 of s + R^T t = 0, 3 of t + R s = 0, 1 of
     |t| = |s|. (The two orthogonality sets share their trace; one of it is left out.)
     """
-    r = lambda i, j: 1 + 3 * i + j  # noqa: E731 - index of R_ij in z
-    t, s = lambda i: 10 + i, lambda i: 13 + i
+    r = [[1 + 3 * i + j for j in range(3)] for i in range(3)]  # places of R_ij, t_i and s_i in z
+    t, s = range(10, 13), range(13, 16)
     found: list[tuple[list[tuple[int, int, float]], float]] = [([(0, 0, 1.0)], 1.0)]
     for p in range(3):
         for q in range(p, 3):
             same = [(0, 0, -1.0)] if p == q else []
-            found.append(([(r(i, p), r(i, q), 1.0) for i in range(3)] + same, 0.0))
+            found.append(([(r[i][p], r[i][q], 1.0) for i in range(3)] + same, 0.0))
             if (p, q) != (2, 2):
-                found.append(([(r(p, i), r(q, i), 1.0) for i in range(3)] + same, 0.0))
+                found.append(([(r[p][i], r[q][i], 1.0) for i in range(3)] + same, 0.0))
     for k in range(3):
         p, q = (k + 1) % 3, (k + 2) % 3
         for i in range(3):
             j, l = (i + 1) % 3, (i + 2) % 3  # noqa: E741
-            found.append(([(r(j, p), r(l, q), 1.0), (r(l, p), r(j, q), -1.0), (0, r(i, k), -1.0)], 0.0))
+            found.append(([(r[j][p], r[l][q], 1.0), (r[l][p], r[j][q], -1.0), (0, r[i][k], -1.0)], 0.0))
     for k in range(3):
-        found.append(([(0, s(k), 1.0)] + [(r(i, k), t(i), 1.0) for i in range(3)], 0.0))
-        found.append(([(0, t(k), 1.0)] + [(r(k, i), s(i), 1.0) for i in range(3)], 0.0))
-    found.append(([(t(i), t(i), 1.0) for i in range(3)] + [(s(i), s(i), -1.0) for i in range(3)], 0.0))
+        found.append(([(0, s[k], 1.0)] + [(r[i][k], t[i], 1.0) for i in range(3)], 0.0))
+        found.append(([(0, t[k], 1.0)] + [(r[k][i], s[i], 1.0) for i in range(3)], 0.0))
+    found.append(([(t[i], t[i], 1.0) for i in range(3)] + [(s[i], s[i], -1.0) for i in range(3)], 0.0))
     A = np.zeros((len(found), SIZE, SIZE))
     for k, (terms, _) in enumerate(found):
         for i, j, value in terms:

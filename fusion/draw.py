@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -95,9 +96,9 @@ def panel_outlines(panel: Panel) -> list[Array]:
     found += [circle_outline(light.position_m, light.radius_m) for light in panel.lights]
     for thing in panel.objects:
         x, y = thing.position_m
-        size = [getattr(thing, name, None) for name in ("width_m", "height_m")]
-        if None not in size and not hasattr(thing, "radius_m") and not hasattr(thing, "length_m"):
-            w, h = size[0] / 2, size[1] / 2
+        flat = hasattr(thing, "width_m") and hasattr(thing, "height_m")
+        if flat and not hasattr(thing, "radius_m") and not hasattr(thing, "length_m"):
+            w, h = getattr(thing, "width_m", 0.0) / 2, getattr(thing, "height_m", 0.0) / 2
             corners = [[x - w, y - h], [x + w, y - h], [x + w, y + h], [x - w, y + h], [x - w, y - h]]
             found.append(np.column_stack([corners, np.zeros(5)]))
             continue
@@ -119,7 +120,7 @@ def seen(drawing: Drawing, sight: Sight) -> list[Array]:
 def _before_lens(points: Array) -> list[Array]:
     """A polyline (K, 3) cut at the plane z = NEAREST_M: the pieces before the lens."""
     pieces: list[list[Array]] = [[]]
-    for a, b in zip(points[:-1], points[1:], strict=True):
+    for a, b in pairwise(points):
         depths = np.array([a[2], b[2]]) - NEAREST_M
         if (depths < 0).all():
             continue

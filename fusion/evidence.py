@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion.batch import Batch
 from fusion.rows import log_volumes
 from fusion.solve import LocalSolution
-from hal.geometry import Array
 
 POSE_VOLUME = 8.0 * math.pi**2  # of all rotations (as rotation vectors spread evenly), times one cubic metre
 
 
-def log_evidence(b: Batch, used: Array, local: LocalSolution) -> float:
+def log_evidence(b: Batch, used: NDArray[np.bool_], local: LocalSolution) -> float:
     """Log odds of the used measurements stemming from one pose, against all N being strays; natural logarithm.
 
     A stray hits anywhere within a metre and any direction cosine; a good one falls near its place with its own covariance.

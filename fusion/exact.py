@@ -112,7 +112,9 @@ def _newton(line: bool, e: Vec, A: Sym, M: Sym, v: Vec, steps: int) -> Vec:
 
 
 @inlined
-def _sphere(line: bool, e: Vec, A: Sym, M: Sym, d: Vec, a1: Vec, a2: Vec) -> Vec:
+def _sphere(  # noqa: PLR0912 - one flat loop, for the compiler
+    line: bool, e: Vec, A: Sym, M: Sym, d: Vec, a1: Vec, a2: Vec
+) -> Vec:
     """Where F is least on the whole sphere: starts by value, the best ones refined."""
     starts, cost = np.empty((40, 3)), np.empty(40)
     n = 0
@@ -249,7 +251,7 @@ def _least_across(M: Sym, u: Vec) -> Vec:
 
 
 @inlined
-def local(b: Batch, i: int, q: Vec, u: Vec, e: Vec, v: Vec, search: bool) -> tuple[float, Vec, Vec, Vec]:
+def local(b: Batch, i: int, u: Vec, e: Vec, v: Vec, search: bool) -> tuple[float, Vec, Vec, Vec]:
     """f, df/dx, df/du and v* of entry i. `search`: over the whole sphere; else by Newton's method from v (classes 4, 7)."""
     c = b.cls[i]
     C, A, M = sym(b.C, i), sym(b.A, i), sym(b.M, i)
@@ -257,7 +259,7 @@ def local(b: Batch, i: int, q: Vec, u: Vec, e: Vec, v: Vec, search: bool) -> tup
     if c == 1:
         Ae = times(A, e)
         return dot(e, Ae), blend(2.0, Ae, 0.0, Ae), zero, v
-    if c == 2 or c == 5:
+    if c in (2, 5):
         s = -form(u, A, e) / form(u, A, u)
         y = blend(1.0, e, s, u)
         Ay = times(A, y)
@@ -266,7 +268,7 @@ def local(b: Batch, i: int, q: Vec, u: Vec, e: Vec, v: Vec, search: bool) -> tup
             Mu = times(M, u)
             f, gu = f + dot(u, Mu), blend(1.0, gu, 2.0, Mu)
         return f, gx, gu, u
-    if c == 3 or c == 6 or c == 9:
+    if c in (3, 6, 9):
         Cu = times(C, u)
         ue = dot(u, e)
         tau = ue / dot(u, Cu)
@@ -315,7 +317,7 @@ def evaluate(b: Batch, R: Array, t: Array, search: bool, f: Array, grad: Array, 
             continue
         q, u, mu = turned(R, vec(b.m, i)), turned(R, vec(b.w, i)), vec(b.mu, i)
         e = (q[0] + t[0] - mu[0], q[1] + t[1] - mu[1], q[2] + t[2] - mu[2])
-        f[i], gx, gu, v = local(b, i, q, u, e, vec(direction, i), search)
+        f[i], gx, gu, v = local(b, i, u, e, vec(direction, i), search)
         turn, tilt = cross(q, gx), cross(u, gu)
         for k in range(3):
             grad[i, k], grad[i, 3 + k], direction[i, k] = gx[k], turn[k] + tilt[k], v[k]

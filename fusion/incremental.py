@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion.answer import FusedPose, judged
 from fusion.batch import Batch, duplicates, pack
@@ -91,7 +92,7 @@ def remove(fusion: Fusion, index: int) -> Fusion:
     return _stepped(fusion, given, fusion.batch.part(keep), fusion.best.used[keep])
 
 
-def _stepped(fusion: Fusion, given: tuple[Measurement, ...], b: Batch, believed: np.ndarray) -> Fusion:
+def _stepped(fusion: Fusion, given: tuple[Measurement, ...], b: Batch, believed: NDArray[np.bool_]) -> Fusion:
     old = fusion.best.local
     best = finished(b, old.rotation, old.translation_m)
     if old.unobservable or not np.array_equal(best.used, believed):

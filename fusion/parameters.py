@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from fusion.answer import FusedPose, Rejected, ShapeEstimate
@@ -49,7 +50,7 @@ def fuse_shape(measurements: Sequence[Measurement], shape: Shape, prior: Uncerta
         # A precise mismatch can bend the measures until it fits; a random half of the measurements often is without it.
         rng = np.random.default_rng(0)
         for _ in range(RESTARTS):
-            half = 1.0 * (rng.random(len(everything)) < 0.5)
+            half = np.asarray(rng.random(len(everything)) < 0.5, float)
             half[-1] = 1.0
             found.append(_descended(measurements, shape, prior, _forgiving, half))
     pose, values, used, _ = min(found, key=lambda made: made[3])
@@ -58,7 +59,7 @@ def fuse_shape(measurements: Sequence[Measurement], shape: Shape, prior: Uncerta
 
 def _level(f: Array, gate: Array, scale: float) -> Array:
     """Huber's weights: a large misfit counts by its size, not by its square; good where many misfits are the start's."""
-    return np.minimum(1.0, np.sqrt(scale**0.5 * gate / np.maximum(f, 1e-9)))
+    return np.asarray(np.minimum(1.0, np.sqrt(scale**0.5 * gate / np.maximum(f, 1e-9))))
 
 
 def _forgiving(f: Array, gate: Array, scale: float) -> Array:
@@ -72,7 +73,7 @@ def _descended(
     prior: UncertainPose,
     weigh: Callable[[Array, Array, float], Array],
     start_with: Array,
-) -> tuple[RigidTransform, Array, Array, float]:
+) -> tuple[RigidTransform, Array, NDArray[np.bool_], float]:
     """Pose, parameters, which measurements (N,) lie inside their gates, and the truncated error, by narrowing weights.
 
     `start_with` (N,): 0 for those that count only at the end.
@@ -92,7 +93,7 @@ def _descended(
             weights = start_with * weigh(f, b.gate, scale)
             continue
         last = 0 if step @ H @ step < 1e-8 else last - 1
-        weights = 1.0 * (f < b.gate)
+        weights = np.asarray(f < b.gate, float)
         weights[-1] = 1.0  # the believed pose says which side was sensed; without it nothing holds
     return pose, values, weights > 0, float(np.minimum(f, b.gate).sum())
 
@@ -161,9 +162,9 @@ def _answer(
     prior: UncertainPose,
     pose: RigidTransform,
     values: Array,
-    used: Array,
+    used: NDArray[np.bool_],
 ) -> FusedPose:
-    b, f, H, _ = _system(measurements, shape, prior, pose, values, 1.0 * used)
+    b, f, H, _ = _system(measurements, shape, prior, pose, values, np.asarray(used, float))
     joint = np.linalg.inv(H)
     information = np.linalg.inv(joint[:6, :6])
     R = matrix_of(pose)
@@ -187,5 +188,5 @@ def _answer(
         unobservable=free,
         alternatives=(),
         evidence=log_evidence(b, used, local),
-        shape=ShapeEstimate(names=shape.names, values=values, covariance=joint[6:, 6:]),
+        shape=ShapeEstimate(names=shape.names, values=values, covariance=np.asarray(joint[6:, 6:], float)),
     )

@@ -16,7 +16,7 @@ from hal.geometry import Array
 
 
 @compiled
-def polish(
+def polish(  # noqa: PLR0912 - one flat loop, for the compiler
     b: Batch, use: Array, R: Array, t: Array, steps: int, H: Array, f: Array, grad: Array, direction: Array
 ) -> float:
     """Move R, t in place to the minimum of the exact E over used entries; returns the last step's predicted fall.

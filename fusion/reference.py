@@ -39,13 +39,13 @@ def brute_force(m: Measurement, base_from_object: RigidTransform) -> float:
             return np.full(len(v), fixed)
         if m.cls == SensingClass.LINE_POINT:
             y = e - ((v @ A @ e) / np.einsum("ki,ij,kj->k", v, A, v))[:, None] * v
-            return np.einsum("ki,ij,kj->k", y, A, y)
-        return (v @ e) ** 2 / np.einsum("ki,ij,kj->k", v, m.C_m2, v)
+            return np.asarray(np.einsum("ki,ij,kj->k", y, A, y))
+        return np.asarray((v @ e) ** 2 / np.einsum("ki,ij,kj->k", v, m.C_m2, v))
 
     def f(x: Array) -> Array:
         v = np.atleast_2d(x) @ basis.T
         v = v / np.linalg.norm(v, axis=1)[:, None]
-        return share(v) + np.einsum("ki,ij,kj->k", v, m.M, v)
+        return np.asarray(share(v) + np.einsum("ki,ij,kj->k", v, m.M, v))
 
     looks = _directions(basis.shape[1])
     best = looks[np.argsort(f(looks))[:REFINED]]
@@ -71,8 +71,9 @@ def _nearest(m: Measurement, e: Array, u: Array) -> float:
     """min over y of (y - mu)^T C^-1 (y - mu), with x - mu = e, for the classes whose places do not depend on v."""
     A = np.linalg.inv(m.C_m2)
     free = {1: np.empty((3, 0)), 2: u[:, None], 5: u[:, None], 3: _across(u), 6: _across(u), 9: _across(u)}[int(m.cls)]
-    step = np.linalg.solve(free.T @ A @ free, -free.T @ A @ e) if free.shape[1] else np.empty(0)
-    y = e + free @ step
+    y = e
+    if free.shape[1]:
+        y = np.asarray(e - free @ np.linalg.solve(free.T @ A @ free, free.T @ A @ e), float)
     return float(y @ A @ y)
 
 

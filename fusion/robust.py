@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion.answer import Alternative, FusedPose, Rejected, judged
 from fusion.batch import Batch, duplicates, pack
@@ -14,7 +15,7 @@ from fusion.parameters import fuse_shape
 from fusion.shapes import Shape
 from fusion.solve import LocalSolution, local_solution
 from hal.errors import InvalidRequest
-from hal.geometry import Array, UncertainPose
+from hal.geometry import UncertainPose
 
 __all__ = ["Alternative", "FusedPose", "Rejected", "fuse", "used_entries"]
 
@@ -58,7 +59,7 @@ def fuse(
     return judged(b, best, others, index, measurements, repeats, certify)
 
 
-def used_entries(measurements: Sequence[Measurement], answer: FusedPose) -> tuple[Batch, Array, LocalSolution]:
+def used_entries(measurements: Sequence[Measurement], answer: FusedPose) -> tuple[Batch, NDArray[np.bool_], LocalSolution]:
     """An answer's measurements packed, which of them it used (N,), and the local solution there: for a certificate.
 
     Raises:

@@ -114,7 +114,7 @@ def rows(b: Batch, i: int, R: Array, t: Array, far: bool, r: Array, J: Array, V:
         else:
             V[1, 0], V[1, 1] = v1 * e1 * u1 + v2 * e2 * u2, v1 * u1 * u1 + v2 * u2 * u2 + FLOOR * (v1 + v2)
         return 2
-    if c == 2 or c == 5:
+    if c in (2, 5):
         n1 = across(u)
         n2 = cross(u, n1)
         _row_a(r, J, 0, n1, e, q)
@@ -281,7 +281,7 @@ def cost_of(b: Batch, use: Array, R: Array, t: Array, far: bool, work: Array) ->
 
 
 @compiled
-def descend(b: Batch, use: Array, R: Array, t: Array, far: bool, steps: int, tolerance: float) -> float:
+def descend(b: Batch, use: Array, R: Array, t: Array, far: bool, steps: int, tolerance: float) -> float:  # noqa: PLR0912 - one flat loop, for the compiler
     """Levenberg-Marquardt on sum |r|^2 over entries with use > 0; moves R (3, 3) and t (3,) in place, returns the cost.
 
     The step is damped in proportion to the diagonal of J^T J (Marquardt), so metres and radians need no common scale.

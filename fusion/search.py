@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion.batch import Batch
 from fusion.rows import cost_of, descend, rows, values
@@ -34,7 +35,7 @@ def _rotation(R: Array, x: float, y: float, z: float, w: float) -> None:
 
 
 @inlined
-def place(b: Batch, use: Array, R: Array, t: Array) -> None:
+def place(b: Batch, use: Array, R: Array, t: Array) -> None:  # noqa: PLR0912 - one flat loop, for the compiler
     """t (3,) in place: the translation that fits the used entries best at rotation R, every row weighing the same.
 
     At a fixed rotation all rows are linear in t. What they leave free is taken from the centroids; lines and planes that a
@@ -48,7 +49,7 @@ def place(b: Batch, use: Array, R: Array, t: Array) -> None:
     for camera in (False, True):
         for i in range(b.cls.size):
             c = b.cls[i]
-            if use[i] <= 0.0 or c == 0 or ((c == 4 or c == 8) != camera):
+            if use[i] <= 0.0 or c == 0 or ((c in (4, 8)) != camera):
                 continue
             q = turned(R, vec(b.m, i))
             t[0] += b.mu[i, 0] - q[0]
@@ -143,13 +144,15 @@ def truncated(b: Batch, f: Array) -> float:
 
 
 @compiled
-def candidates(b: Batch, draws: Array, most: int, Rs: Array, ts: Array, costs: Array, inside: Array) -> int:
+def candidates(
+    b: Batch, draws: Array, most: int, Rs: Array, ts: Array, costs: Array, inside: NDArray[np.int64]
+) -> int:
     """One round: hypotheses from `draws` (H, DRAWS), of which the best `most` are settled.
 
     The first so many rows of Rs (H, 3, 3), ts (H, 3), costs (H,) are the settled ones, cheapest first, with the degrees
     of freedom inside their gates in `inside` (H,). Returns how many.
     """
-    n, count = b.cls.size, draws.shape[0]
+    n = b.cls.size
     hypotheses(b, draws, Rs, ts, costs)
     order = np.argsort(costs)
     kept = 0

@@ -465,7 +465,7 @@ def _closest(points: Sequence[Array], directions: Sequence[Array]) -> Array:
     A = np.sum(across, axis=0)
     if np.linalg.cond(A) > 1e8:
         raise NotObservable("the rays are parallel", hint="move the camera sideways between the views")
-    return np.asarray(np.linalg.solve(A, sum(P @ p for P, p in zip(across, points, strict=True))))
+    return np.asarray(np.linalg.solve(A, np.sum([P @ p for P, p in zip(across, points, strict=True)], axis=0)))
 
 
 def _meet(
@@ -484,5 +484,5 @@ def _meet(
     on_line = np.linalg.solve(A, [normals[0] @ points[0], normals[1] @ points[1], 0.0])
     lens, ray = toward
     across = np.eye(3) - np.outer(ray, ray)
-    s = d @ across @ (lens - on_line) / max(d @ across @ d, 1e-12)
+    s = float(d @ across @ (lens - on_line)) / max(float(d @ across @ d), 1e-12)
     return on_line + s * d, d

@@ -162,20 +162,20 @@ def _by_camera(cls: str, x: Array, u: Array, rng: np.random.Generator) -> tuple[
         return eye, C_eye, _tilted(ray, (sigma, sigma), rng)[1]
     if cls == "5":
         toward = _unit(ray - u * (u @ ray))
-        seen, axes = _tilted_about(u, toward, STEREO_LINE_RAD, rng)
-        return x + rng.uniform(-0.1, 0.1) * u, C_stereo, _information_of(seen, axes, STEREO_LINE_RAD)
+        _, axes = _tilted_about(u, toward, STEREO_LINE_RAD, rng)
+        return x + rng.uniform(-0.1, 0.1) * u, C_stereo, _information_of(axes, STEREO_LINE_RAD)
     # Plane through eye and edge: it turns about the edge's image end to end, and about the line across it.
     normal = _unit(np.cross(ray, u))
     length_px = rng.uniform(100, 250)
     sigmas = (PIXEL_SIGMA_PX / FOCAL_PX / math.sqrt(2), PIXEL_SIGMA_PX * math.sqrt(2) / length_px)
-    seen, axes = _tilted_about(normal, ray, sigmas, rng)
-    return eye, C_eye, _information_of(seen, axes, sigmas)
+    _, axes = _tilted_about(normal, ray, sigmas, rng)
+    return eye, C_eye, _information_of(axes, sigmas)
 
 
 def _tilted(direction: Array, sigmas: tuple[float, float], rng: np.random.Generator) -> tuple[Array, Array]:
     """The direction with noise, and its information matrix."""
     seen, axes = _tilted_about(direction, _unit(np.cross(direction, rng.normal(size=3))), sigmas, rng)
-    return seen, _information_of(seen, axes, sigmas)
+    return seen, _information_of(axes, sigmas)
 
 
 def _tilted_about(
@@ -189,7 +189,7 @@ def _tilted_about(
     return seen, np.array([first, np.cross(seen, first)])
 
 
-def _information_of(seen: Array, axes: Array, sigmas: tuple[float, float]) -> Array:
+def _information_of(axes: Array, sigmas: tuple[float, float]) -> Array:
     return np.asarray(sum(np.outer(a, a) / s**2 for a, s in zip(axes, sigmas, strict=True)))
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion.batch import Batch, pack
@@ -108,7 +109,7 @@ def local_solution(b: Batch, use: Array, rotation: Array, translation_m: Array, 
     )
 
 
-def middle_and_size(b: Batch, chosen: Array, R: Array) -> tuple[Array, float]:
+def middle_and_size(b: Batch, chosen: NDArray[np.bool_], R: Array) -> tuple[Array, float]:
     """Middle of the chosen features (3,), from the object's origin in base axes, and their spread, m."""
     points = b.m[chosen & (b.cls > 0)]
     if not len(points):

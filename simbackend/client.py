@@ -21,9 +21,11 @@ from simbackend.arm_model import MODELS
 from simbackend.draws import Draws
 from simbackend.link import WorldLink
 from simbackend.wire import (
+    DOF,
     GRIPPER_AT,
     JOINTS_AT,
     LIGHTS_AT,
+    MAX_PROXIMITY,
     REQUEST,
     Drive,
     Op,
@@ -98,7 +100,10 @@ class WorldClient:
                 hint='set cell.mode = "sim" or "mixed"',
                 key="cell.mode",
             )
+        _check_park(cell)
         names = [name for name, driver, _ in _sim_devices(cell) if driver == "sim:proximity"]
+        if len(names) > MAX_PROXIMITY:
+            raise ConfigError(f"a simulated cell has at most {MAX_PROXIMITY} proximity sensors", hint="remove some")
         draws = Draws(cell.file.cell.seed)
         config = WorldConfig(
             cell=cell,
@@ -239,6 +244,19 @@ def _sim_devices(cell: Cell) -> list[tuple[str, str, dict[str, object]]]:
     direct = [(name, device.driver, device.options) for name, device in cell.file.devices.items()]
     behind = [(name, emulator.driver, emulator.options) for name, emulator in cell.file.emulators.items()]
     return [entry for entry in direct + behind if entry[1].startswith("sim:")]
+
+
+def _check_park(cell: Cell) -> None:
+    """The arm begins in its parking place, so that has to be one."""
+    limits = MODELS[_arm_model(cell)]().capabilities
+    park = cell.file.workspace.park_rad
+    if len(park) == DOF and all(a < q < b for a, q, b in zip(limits.lower_rad, park, limits.upper_rad, strict=True)):
+        return
+    raise ConfigError(
+        f"workspace.park_rad is no place for the arm {limits.model!r}: {list(park)}",
+        hint=f"give {DOF} joint angles within {list(limits.lower_rad)} and {list(limits.upper_rad)} rad",
+        key="workspace.park_rad",
+    )
 
 
 def _arm_model(cell: Cell) -> str:

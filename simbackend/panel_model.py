@@ -80,7 +80,9 @@ def object_model(built: Built) -> ObjectModel:  # one a kind
         case Display():
             return _display(built.thing, built)
         case Lamp():
-            return ObjectModel(urdf=_disc(built.thing.radius_m, built.thing.height_m, PAINT[built.thing.colour]))
+            return ObjectModel(
+                urdf=_disc(built.thing.radius_m, max(built.thing.height_m, LENS_M), PAINT[built.thing.colour])
+            )
         case Button():
             return _button(built.thing)
         case Mushroom():
@@ -158,9 +160,16 @@ def _needle(*, length_m: float, tail_m: float, width_m: float, height_m: float, 
     )
 
 
+def _needle_height_m(depth_m: float) -> float:
+    """A needle hovers over its face even where the file says that it lies in it."""
+    return max(depth_m, FACE_HEIGHT_M + 0.001)
+
+
 def _gauge(thing: Gauge, built: Built) -> ObjectModel:
     r = thing.radius_m
-    needle = _needle(length_m=0.76 * r, tail_m=0.22 * r, width_m=0.055 * r, height_m=thing.depth_m, pivot_y_m=0.0)
+    needle = _needle(
+        length_m=0.76 * r, tail_m=0.22 * r, width_m=0.055 * r, height_m=_needle_height_m(thing.depth_m), pivot_y_m=0.0
+    )
     face = Quad(pixels=textures.gauge_face(thing), size_m=(2 * r, 2 * r), centre_m=(0, 0, FACE_HEIGHT_M), is_round=True)
     return ObjectModel(urdf=needle, quads=(face,), place=built.place)
 
@@ -170,7 +179,7 @@ def _meter(thing: PanelMeter, built: Built) -> ObjectModel:
         length_m=thing.needle_m,
         tail_m=0.12 * thing.needle_m,
         width_m=0.0016,
-        height_m=thing.depth_m,
+        height_m=_needle_height_m(thing.depth_m),
         pivot_y_m=-thing.pivot_below_m,
     )
     face = Quad(

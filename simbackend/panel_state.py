@@ -64,7 +64,8 @@ def _built(thing: PanelObject, panel: Panel, draws: Draws, button_lamps: set[str
             value = thing.scale.minimum + (0.05 + 0.9 * u) * (thing.scale.maximum - thing.scale.minimum)
             return Built(**common, place=thing.scale.place_of(value), value=value)  # type: ignore[arg-type]
         case Display():
-            value = round(thing.minimum + (0.02 + 0.96 * u) * (thing.maximum - thing.minimum), thing.decimals)
+            low, high = _displayable(thing)
+            value = round(low + (0.02 + 0.96 * u) * (high - low), thing.decimals)
             return Built(**common, text=display_text(thing, value), value=value)  # type: ignore[arg-type]
         case Lamp():
             return Built(**common, is_on=thing.name not in button_lamps and u < 0.5)  # type: ignore[arg-type]
@@ -83,6 +84,14 @@ def _built(thing: PanelObject, panel: Panel, draws: Draws, button_lamps: set[str
             low = max(thing.minimum_rad, -WHEEL_SPREAD_RAD)
             high = min(thing.maximum_rad, WHEEL_SPREAD_RAD)
             return Built(**common, place=low + u * (high - low))  # type: ignore[arg-type]
+
+
+def _displayable(thing: Display) -> tuple[float, float]:
+    """The file's range, cut to what its digits can show; a minus sign takes one of them."""
+    unit = 10.0**-thing.decimals
+    highest = (10**thing.digits - 1) * unit
+    lowest = -(10 ** (thing.digits - 1) - 1) * unit
+    return min(max(thing.minimum, lowest), highest), max(min(thing.maximum, highest), lowest)
 
 
 def display_text(thing: Display, value: float) -> str:

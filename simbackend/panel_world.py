@@ -104,7 +104,7 @@ class PanelWorld:
         engine = self.engine
         floor = engine.createCollisionShape(engine.GEOM_BOX, halfExtents=[2, 2, 0.05])
         look = engine.createVisualShape(engine.GEOM_BOX, halfExtents=[2, 2, 0.05], rgbaColor=[0.28, 0.29, 0.30, 1])
-        self.bodies["floor"] = engine.createMultiBody(0, floor, look, basePosition=[0, 0, floor_z_m - 0.05])
+        self.bodies["_floor"] = engine.createMultiBody(0, floor, look, basePosition=[0, 0, floor_z_m - 0.05])
 
     def _load_plate(self) -> None:
         engine, panel = self.engine, self.panel
@@ -114,7 +114,7 @@ class PanelWorld:
             engine.GEOM_BOX, halfExtents=[half[0], half[1], half[2] - 2e-4], rgbaColor=[0.5, 0.5, 0.5, 1]
         )
         pose = self.base_from_panel * RigidTransform.from_translation([0, 0, -half[2]])
-        self.bodies["plate"] = engine.createMultiBody(0, solid, look, *_pose(pose))
+        self.bodies["_plate"] = engine.createMultiBody(0, solid, look, *_pose(pose))
         picture = Quad(pixels=textures.plate(panel), size_m=(panel.width_m, panel.height_m), centre_m=(0, 0, 0))
         self._pictures.append((picture, self.base_from_panel))
 

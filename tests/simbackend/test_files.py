@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hal.config import load_cell
+from hal.errors import ConfigError
 from hal.panel import OBJECT_KINDS, Gauge, Lever, load_panel
-from tests.simbackend.rig import ROOT, sim_cell
+from tests.simbackend.rig import ROOT, SimCell, sim_cell
 
 PANEL = load_panel(ROOT / "panels" / "bench.toml")
 WORKED = {"button", "toggle", "rotary", "slider", "lever", "handwheel", "mushroom"}
@@ -63,3 +65,60 @@ def test_the_ur10e_cell_comes_up_and_sees_its_panel() -> None:
         assert np.abs(arm.read_state(deadline=cell.deadline()).value.position_rad - start).max() < 1e-5
         image = cell.connect("wrist_camera").read_image(deadline=cell.deadline()).value.pixels
         assert np.mean(image > 110) > 0.15  # the light plate fills a good part of the view
+
+
+# ruff: noqa: E501
+ODD_PANEL = """
+schema = 1
+name = "odd"
+width_m = 0.5
+height_m = 0.4
+lights = [
+  { name = "a", position_m = [-0.2, 0.15, 0.0] },
+  { name = "b", position_m = [0.2, 0.15, 0.02] },
+  { name = "c", position_m = [0.2, -0.15, 0.0], radius_m = 0.004 },
+  { name = "d", position_m = [-0.2, -0.15, 0.0] },
+]
+objects = [
+  { kind = "gauge", name = "arm", position_m = [-0.15, 0.1], radius_m = 0.01, depth_m = 0.0, scale = { minimum = -1.0, maximum = 0.0, unit = "", at_min = 3.0, at_max = -3.0, major_ticks = 2 } },
+  { kind = "panel_meter", name = "plate", position_m = [-0.05, 0.1], width_m = 0.03, height_m = 0.02, pivot_below_m = 0.0, needle_m = 0.01, depth_m = 0.0, scale = { minimum = 0.0, maximum = 1.0, unit = "V", at_min = -0.5, at_max = 0.5 } },
+  { kind = "display", name = "floor", position_m = [0.05, 0.1], width_m = 0.03, height_m = 0.01, digits = 1, style = "lcd", minimum = -900.0, maximum = 900.0 },
+  { kind = "lamp", name = "lamp", position_m = [0.1, 0.1], radius_m = 0.004, height_m = 0.0, colour = "white" },
+  { kind = "button", name = "button", position_m = [-0.15, 0.0], radius_m = 0.005, preload_n = 0.0, latching = true, lights_lamp = "lamp" },
+  { kind = "toggle", name = "toggle", position_m = [-0.1, 0.0], tilt_rad = 0.1 },
+  { kind = "rotary", name = "rotary", position_m = [0.0, 0.0], radius_m = 0.01, states = [{ name = "x", angle_rad = -3.0 }, { name = "y", angle_rad = 3.0 }] },
+  { kind = "slider", name = "slider", position_m = [0.1, 0.0], angle_rad = 1.57, travel_m = 0.02, scale = { minimum = 5.0, maximum = 6.0, unit = "", at_min = 0.01, at_max = -0.01 } },
+  { kind = "lever", name = "lever", position_m = [-0.1, -0.1], length_m = 0.03, states = [{ name = "l", angle_rad = -1.0 }, { name = "m", angle_rad = 0.0 }, { name = "r", angle_rad = 1.0 }] },
+  { kind = "handwheel", name = "wheel", position_m = [0.0, -0.1], spokes = 8, minimum_rad = 0.0, maximum_rad = 20.0 },
+  { kind = "mushroom", name = "mushroom", position_m = [0.1, -0.1], preload_n = 0.0 },
+]
+"""
+
+
+@pytest.mark.parametrize("text", [ODD_PANEL, ODD_PANEL[: ODD_PANEL.index("objects")]])
+def test_a_panel_at_the_edges_of_the_file_format_is_built_and_seen(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "odd.toml"
+    path.write_text(text, encoding="utf-8")
+    panel = load_panel(path)
+    cell = SimCell(cell=load_cell(ROOT / "cells" / "bench.toml", seed=9).model_copy(update={"panel": panel}))
+    try:
+        truth = cell.connect("arm").truth()
+        assert [thing.name for thing in truth.objects] == [thing.name for thing in panel.objects]
+        assert truth.objects == truth.initial
+        cell.clock.sleep(0.2)
+        after = {thing.name: thing.value for thing in cell.connect("arm").truth().objects}
+        for thing in truth.initial:
+            assert after[thing.name] == pytest.approx(thing.value, abs=2e-3), thing.name
+        assert cell.connect("wrist_camera").read_image(deadline=cell.deadline()).value.pixels.std() > 10.0
+    finally:
+        cell.shared.close()
+
+
+@pytest.mark.parametrize("park", [(0.0,) * 5, (9.0, 0.0, 0.0, 0.0, 0.0, 0.0)])
+def test_a_parking_place_that_is_none_is_named(park: tuple[float, ...]) -> None:
+    cell = load_cell(ROOT / "cells" / "bench.toml")
+    workspace = cell.file.workspace.model_copy(update={"park_rad": park})
+    wrong = cell.model_copy(update={"file": cell.file.model_copy(update={"workspace": workspace})})
+    with pytest.raises(ConfigError) as caught:
+        SimCell(cell=wrong).connect("arm")
+    assert "workspace.park_rad" in str(caught.value)

@@ -1,16 +1,19 @@
 """Drivers on bad and good wires: `python -m benchmarks.drivers [--seconds S] [--only PART,...]`.
 
 Parts: faults (device x fault x every 3rd and 20th frame), latency (over a bare port), rtu (ratio to pymodbus), decode,
-stamps, reconnect, ur, fuzz. Each line: what, pass line, measured, PASS or FAIL.
+stamps, reconnect, ur, csp, kill, fuzz. Each line: what, pass line, measured, PASS or FAIL.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import json
 import os
 import random
 import statistics
 import struct
+import subprocess
 import sys
 import threading
 import time
@@ -24,7 +27,21 @@ import psutil
 
 from drivers import dxl2, rtde
 from drivers.bota import framer as bota_framer
-from drivers.emulators import bota, ft300, lms200, modbus_io, netft, robotiq_2f, rplidar, scip, scripted, tfmini, ur
+from drivers.emulators import (
+    bota,
+    cia402,
+    dynamixel,
+    ft300,
+    lms200,
+    modbus_io,
+    netft,
+    robotiq_2f,
+    rplidar,
+    scip,
+    scripted,
+    tfmini,
+    ur,
+)
 from drivers.emulators.base import WireEmulator
 from drivers.emulators.beams import line_m
 from drivers.emulators.faults import WireFault
@@ -115,6 +132,11 @@ def turn_angles(count: int) -> Any:
 def true_joints(value: Any, backing: Any) -> bool:
     """Where the arm stands."""
     return bool(np.array_equal(value.position_rad, backing.position_rad))
+
+
+def near_joints(value: Any, backing: Any) -> bool:
+    """Where the arm stands, to the last count of the servos."""
+    return bool(np.allclose(value.position_rad, backing.position_rad, atol=0.0008))
 
 
 def true_width(value: Any, backing: Any) -> bool:
@@ -248,11 +270,29 @@ BENCHES = (
         options={"rate_hz": 125.0},
         far_options={},
     ),
+    Bench(
+        name="cia402",
+        start=cia402.start,
+        backing=scripted.ScriptedArm,
+        driver="can:cia402",
+        is_true=near_joints,
+        options={},
+        far_options={},
+    ),
+    Bench(
+        name="dynamixel",
+        start=dynamixel.start,
+        backing=scripted.ScriptedArm,
+        driver="serial:dynamixel",
+        is_true=near_joints,
+        options={},
+        far_options={},
+    ),
 )
 
 
 @contextmanager
-def running(bench: Bench, far_options: dict[str, Any]) -> Iterator[tuple[Any, WireEmulator, Any]]:
+def running(bench: Bench, far_options: dict[str, Any]) -> Iterator[tuple[Any, Any, Any]]:
     """Driver, far side and the device behind it."""
     backing = bench.backing()
     far_side = bench.start(backing, {**bench.far_options, **far_options})
@@ -504,7 +544,7 @@ def part_reconnect(seconds: float) -> None:
 
 def part_ur(seconds: float) -> None:
     """500 Hz state stream: dropped packages."""
-    with running(BENCHES[-1], {"rate_hz": 500.0}) as (device, far_side, _):
+    with running(next(b for b in BENCHES if b.name == "ur"), {"rate_hz": 500.0}) as (device, far_side, _):
         rest = threading.Event()
         rest.wait(0.5)
         first, sent_before = device.mailbox.published, far_side.plan.frames
@@ -516,6 +556,71 @@ def part_ur(seconds: float) -> None:
         f"{sent} sent, {max(0, sent - got)} dropped",
         sent - got <= 1,
     )
+
+
+def part_csp(seconds: float) -> None:
+    """Six axes in cyclic synchronous position at 250 Hz: SYNCs sent more than a period late."""
+    bench = next(b for b in BENCHES if b.name == "cia402")
+    fast = dataclasses.replace(bench, options={"rate_hz": 250.0})
+    with running(fast, {}) as (device, far_side, backing):
+        device.enable(deadline=deadline(2.0))
+        rest, start, end_s = threading.Event(), backing.position_rad.copy(), time.monotonic() + seconds
+        missed, syncs = device.missed_syncs, far_side.syncs
+        while time.monotonic() < end_s:
+            device.command_position(start, deadline=deadline())
+            rest.wait(0.004)
+        missed, syncs = device.missed_syncs - missed, far_side.syncs - syncs
+    share = missed / max(1, missed + syncs)
+    line(f"CiA-402, six axes CSP at 250 Hz, {syncs} SYNCs: missed", "1e-3", f"{missed} ({share:.1e})", share <= 1e-3)
+
+
+def part_kill(seconds: float) -> None:
+    """Host process killed in motion: how long until the device's own watchdog stops the arm behind it."""
+    for name in ("ur", "cia402", "dynamixel"):
+        bench = next(b for b in BENCHES if b.name == name)
+        stops_s = [_kill_once(bench) for _ in range(max(3, int(seconds / 2)))]
+        measured = f"{1e3 * max(stops_s):.0f} ms of {len(stops_s)}"
+        line(f"{name}: host killed, arm stopped, worst", "300 ms", measured, max(stops_s) <= 0.3)
+
+
+HOST = """
+import json, sys, time
+from hal.clock import Deadline, WallClock
+from hal.registry import Context, connect
+driver, options = json.loads(sys.argv[1])
+clock = WallClock()
+arm = connect(Context(name="arm"), driver, options)
+arm.enable(deadline=Deadline.after(clock, 2.0))
+here = arm.read_state(deadline=Deadline.after(clock, 1.0)).value.position_rad
+while True:
+    arm.command_position(here, deadline=Deadline.after(clock, 1.0))
+    print("moving", flush=True)
+    time.sleep(0.01)
+"""
+
+
+def _kill_once(bench: Bench) -> float:
+    backing = bench.backing()
+    far_side = bench.start(backing, bench.far_options)
+    options = {**far_side.address, **bench.options}
+    host = subprocess.Popen(
+        [sys.executable, "-c", HOST, json.dumps([bench.driver, options])], stdout=subprocess.PIPE, text=True
+    )
+    rest = threading.Event()
+    try:
+        while backing.commands < 5:
+            assert host.stdout is not None
+            if not host.stdout.readline():
+                raise RuntimeError("the host process ended before it moved the arm")
+        host.kill()
+        killed_s = time.monotonic()
+        while backing.is_enabled and time.monotonic() < killed_s + 5.0:
+            rest.wait(0.001)
+        return time.monotonic() - killed_s
+    finally:
+        host.kill()
+        host.wait()
+        far_side.close()
 
 
 def _accepts(frame: bytes) -> bool:
@@ -565,6 +670,8 @@ PARTS: dict[str, Callable[[float], None]] = {
     "stamps": part_stamps,
     "reconnect": part_reconnect,
     "ur": part_ur,
+    "csp": part_csp,
+    "kill": part_kill,
     "fuzz": part_fuzz,
     "faults": part_faults,
 }

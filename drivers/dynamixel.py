@@ -102,6 +102,15 @@ class DynamixelClient:
         return {packet.id: packet.parameters[1:] for packet in packets}
 
     def _exchange(self, request: bytes, count: int, until_s: float) -> list[dxl2.Packet]:
+        """Ask again after a lost answer while there is time."""
+        while True:
+            try:
+                return self._attempt(request, count, until_s)
+            except NoAnswer:
+                if until_s - now_s() < 0.5 * self._timeout_s:
+                    raise
+
+    def _attempt(self, request: bytes, count: int, until_s: float) -> list[dxl2.Packet]:
         if self._is_late:
             quarantine_s = min(now_s() + self._timeout_s, until_s)
             while now_s() < quarantine_s:

@@ -163,14 +163,14 @@ class Ft300Registers(PolledDevice[Wrench, ModbusMaster]):
 
     def set_up(self, client: ModbusMaster) -> None:
         """The firmware registers tell a sensor from another slave."""
-        until_s = now_s() + self._options.timeout_s
+        until_s = now_s() + client.attempt_s
         client.read_registers(unit=self._options.unit, address=FIRMWARE_REGISTER, count=3, until_s=until_s)
 
     def poll(self, client: ModbusMaster) -> None:
         """Six registers."""
         asked_s = now_s()
         words = client.read_registers(
-            unit=self._options.unit, address=WRENCH_REGISTER, count=6, until_s=asked_s + self._options.timeout_s
+            unit=self._options.unit, address=WRENCH_REGISTER, count=6, until_s=asked_s + client.attempt_s
         )
         value = wrench(struct.unpack(">6h", struct.pack(">6H", *words)))
         quality, cause = condition(value, self._options)

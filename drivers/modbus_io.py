@@ -115,7 +115,7 @@ class IoDevice(PolledDevice[T, ModbusMaster]):
         """All inputs in one request, stamped in the middle of the exchange."""
         asked_s = now_s()
         io = self._io
-        inputs = client.read_bits(unit=io.unit, address=0, count=io.inputs, until_s=asked_s + io.timeout_s)
+        inputs = client.read_bits(unit=io.unit, address=0, count=io.inputs, until_s=asked_s + client.attempt_s)
         self.take(inputs, 0.5 * (asked_s + now_s()))
 
     @abstractmethod
@@ -161,7 +161,7 @@ class IoLights(IoDevice[tuple[bool, ...]]):
     def set_up(self, client: ModbusMaster) -> None:
         """After a loss the lights return to what was last commanded."""
         if self._wanted is not None:
-            self._write(client, self._wanted, now_s() + self._options.timeout_s)
+            self._write(client, self._wanted, now_s() + client.attempt_s)
 
     def take(self, inputs: tuple[bool, ...], valid_s: float) -> None:
         """Feedback; degraded while the stop circuit is open."""

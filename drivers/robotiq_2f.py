@@ -163,7 +163,7 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
     def poll(self, client: ModbusMaster) -> None:
         """Three registers to width and grip."""
         asked_s = now_s()
-        status = self._status(client, asked_s + self._options.timeout_s)
+        status = self._status(client, asked_s + client.attempt_s)
         if status.fault > ACTIVATION_PENDING:
             text = FAULTS.get(status.fault, "fault not in the manual")
             raise Refused(f"gripper fault {status.fault:X}h: {text}", code=status.fault)

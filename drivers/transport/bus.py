@@ -207,22 +207,17 @@ class PolledDevice(WireDevice[T], Generic[T, C]):
         super().fail(error)
 
     def call(self, work: Callable[[C, float], R], deadline: Deadline) -> R:
-        """Talk with the device in the caller's thread, again after a lost answer while the deadline lasts.
-
-        `work` must do the same thing when it is done twice.
+        """Talk with the device in the caller's thread.
 
         Raises:
             DeviceTimeout, DeviceFault, DeviceUnavailable: with the device's name.
         """
         self.require_open()
-        until_s = now_s() + deadline.remaining_s()
-        while True:
-            try:
-                return self.bus.call(work, until_s)
-            except WireError as error:
-                self.errors += 1
-                if not isinstance(error, NoAnswer) or now_s() >= until_s:
-                    raise self.translate(error) from error
+        try:
+            return self.bus.call(work, now_s() + deadline.remaining_s())
+        except WireError as error:
+            self.errors += 1
+            raise self.translate(error) from error
 
     def join(self) -> None:
         """Enter the bus and wait for the first sample.

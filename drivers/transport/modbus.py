@@ -72,12 +72,27 @@ class ModbusMaster(ABC):
         self._ask(unit, echoed + bytes([len(data)]) + data, echoed, 0, until_s)
 
     def _ask(self, unit: int, request: bytes, answer_head: bytes, rest: int, until_s: float) -> bytes:
-        """What follows `answer_head` in the answer.
+        """What follows `answer_head` in the answer; asked again after a lost answer while there is time.
+
+        Each exchange is repeated by itself, so that a work of several does not begin anew with every lost frame.
 
         Raises:
             NoAnswer: nothing that fits came in time. Refused: the device answered with an exception. LinkLost.
         """
-        return self._exchange(unit, request, answer_head, rest, min(until_s, now_s() + self._timeout_s))
+        while True:
+            try:
+                return self._exchange(unit, request, answer_head, rest, until_s)
+            except NoAnswer:
+                if until_s - now_s() < 0.5 * self._timeout_s:
+                    raise
+
+    @property
+    def attempt_s(self) -> float:
+        """Time that a poll should give one attempt, with what it takes to clean the line before."""
+        return self._timeout_s
+
+    def _answer_until(self, until_s: float) -> float:
+        return min(until_s, now_s() + self._timeout_s)
 
     @abstractmethod
     def _exchange(self, unit: int, request: bytes, head: bytes, rest: int, until_s: float) -> bytes: ...
@@ -103,8 +118,8 @@ class ModbusTcp(ModbusMaster):
         self._tid = self._tid % 0xFFFF + 1
         self.late_bytes += len(drain(self._link))
         self._link.write(struct.pack(">HHHB", self._tid, 0, len(request) + 1, unit) + request, until_s)
-        buffer = b""
-        while chunk := self._link.read(until_s):
+        buffer, answer_until_s = b"", self._answer_until(until_s)
+        while chunk := self._link.read(answer_until_s):
             buffer += chunk
             found = self._find(buffer, unit, head, rest)
             if found is not None:
@@ -142,6 +157,11 @@ class ModbusRtu(ModbusMaster):
         self._asked_s = 0.0
         self._unanswered: set[tuple[int, int]] = set()  # (unit, function)
 
+    @property
+    def attempt_s(self) -> float:
+        """Quarantine, probe and the attempt itself."""
+        return 2.0 * self._timeout_s + self._quarantine_s
+
     def _exchange(self, unit: int, request: bytes, head: bytes, rest: int, until_s: float) -> bytes:
         if self._unanswered:
             self._clean(unit, head[0], until_s)
@@ -167,7 +187,7 @@ class ModbusRtu(ModbusMaster):
         size = 2 if function >= READ_HOLDING else 1
         with contextlib.suppress(Refused):  # an exception is an answer too
             request = struct.pack(">BHH", function, 0, 1)
-            self._transact(unit, request, bytes([function, size]), size, min(until_s, now_s() + self._timeout_s))
+            self._transact(unit, request, bytes([function, size]), size, until_s)
 
     def _transact(self, unit: int, request: bytes, head: bytes, rest: int, until_s: float) -> bytes:
         frame = bytes([unit]) + request
@@ -176,8 +196,8 @@ class ModbusRtu(ModbusMaster):
         self._asked_s = now_s()
         self._link.write(frame + struct.pack("<H", crc_modbus(frame)), until_s)
         self._unanswered.add((unit, head[0]))
-        buffer = b""
-        while chunk := self._link.read(until_s):
+        buffer, answer_until_s = b"", self._answer_until(until_s)
+        while chunk := self._link.read(answer_until_s):
             buffer += chunk
             found = self._find(buffer, unit, head, rest)
             if found is not None:

@@ -262,7 +262,7 @@ def test_rtu_never_takes_a_late_answer_for_the_next() -> None:
     link = ScriptLink(b"", old + probe, young)
     master = ModbusRtu(link, timeout_s=0.01, gap_s=0.0, quarantine_s=0.0)
     with pytest.raises(NoAnswer):
-        master.read_bits(unit=9, address=0, count=8, until_s=later())
+        master.read_bits(unit=9, address=0, count=8, until_s=later(0.0))
     bits = master.read_bits(unit=9, address=0, count=8, until_s=later())
     assert sum(1 << i for i, bit in enumerate(bits) if bit) == 0xAA
     assert [frame[1] for frame in link.written] == [2, 3, 2]
@@ -280,7 +280,7 @@ def test_rtu_refuses_damaged_and_foreign_answers() -> None:
     for wrong in (b"\x09\x02\x01\xaa\x00\x00", rtu("0802 01 aa"), rtu("0902 02 aaaa"), rtu("0901 01 aa")):
         master = ModbusRtu(ScriptLink(wrong), timeout_s=0.01, gap_s=0.0)
         with pytest.raises(NoAnswer):
-            master.read_bits(unit=9, address=0, count=8, until_s=later())
+            master.read_bits(unit=9, address=0, count=8, until_s=later(0.0))
 
 
 def test_tcp_matches_transaction_unit_and_function() -> None:
@@ -292,7 +292,7 @@ def test_tcp_matches_transaction_unit_and_function() -> None:
     assert bits == tuple(bool(0xAA >> i & 1) for i in range(8))
     master = ModbusTcp(ScriptLink(late), timeout_s=0.01)
     with pytest.raises(NoAnswer, match="do not fit"):
-        master.read_bits(unit=1, address=0, count=8, until_s=later())
+        master.read_bits(unit=1, address=0, count=8, until_s=later(0.0))
 
 
 def test_exceptions_say_what_they_mean() -> None:

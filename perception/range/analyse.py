@@ -13,7 +13,7 @@ from perception.range import finish, join
 from perception.range.claim import fill_small_gaps
 from perception.range.compete import Candidates
 from perception.range.features import RangeFeature, features_of
-from perception.range.noise import NoiseModel, estimate_noise
+from perception.range.noise import NoiseModel, estimate_noise, typical_depths_m
 from perception.range.primitives import Plane, Surface, SurfaceType
 from perception.range.segment import Task, reclaimed, segment
 from perception.range.sensor import RangeSensorModel
@@ -124,9 +124,7 @@ def checked_depth(depth_m: ArrayLike, sensor: RangeSensorModel) -> Array:
 
 
 def _check_scale(depth: Array, sensor: RangeSensorModel) -> None:
-    middle = float(np.nanmedian(depth[:: max(1, depth.shape[0] // 64), :: max(1, depth.shape[1] // 64)]))
-    if not np.isfinite(middle):
-        middle = float(np.nanmedian(depth))
+    middle = float(typical_depths_m(depth)[2])
     if abs(middle) > 200.0:
         raise InvalidRequest(
             f"median depth is {middle:.0f} m: the image is probably in millimetres",
@@ -168,7 +166,7 @@ def _warnings(
     depth: Array, sensor: RangeSensorModel, noise: NoiseModel, surfaces: tuple[Surface, ...]
 ) -> tuple[str, ...]:
     out = []
-    middle = float(np.nanmedian(depth))
+    middle = float(typical_depths_m(depth)[2])
     sigma = float(noise.sigma_m(middle))
     if sigma > 2.0 * sensor.pitch_m(middle):
         out.append(f"noise of {1e3 * sigma:.1f} mm exceeds two pixels: small surfaces are lost")

@@ -10,6 +10,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -105,33 +106,31 @@ def write_results(path: Path, results: Sequence[BatchResult]) -> None:
 
 
 def _watch(futures: list[Any], groups: list[list[str]], progress: Callable[[int, int], None], total: int) -> None:
-    from distributed import as_completed
-
+    distributed: Any = import_module("distributed")
     sizes = {future.key: len(group) for future, group in zip(futures, groups, strict=True)}
     done = 0
-    for future in as_completed(futures):
+    for future in distributed.as_completed(futures):
         done += sizes[future.key]
         progress(done, total)
 
 
 @contextmanager
 def _client(scheduler: str, workers: int) -> Iterator[Any]:
-    from distributed import Client, LocalCluster
-
+    distributed: Any = import_module("distributed")
     if scheduler == "local":
         # One thread a worker: the compiled loops hold no lock, but Python between them does.
         with (
-            LocalCluster(
+            distributed.LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1"
             ) as cluster,
-            Client(cluster) as client,
+            distributed.Client(cluster) as client,
         ):
             yield client
         return
     if not scheduler.startswith("tcp://"):
         raise ConfigError(f"scheduler is {scheduler!r}", hint='use "local" or "tcp://host:port"')
     try:
-        client = Client(scheduler, timeout="10s")
+        client = distributed.Client(scheduler, timeout="10s")
     except OSError as error:
         raise ConfigError(f"no dask scheduler answers at {scheduler}", hint="start one: dask scheduler") from error
     with client:

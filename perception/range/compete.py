@@ -16,12 +16,12 @@ Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 Flags = NDArray[np.bool_]
 
-FIT_SAMPLES = 100
+FIT_SAMPLES = 90
 GOOD_MEAN_SQUARE = 2.0
 GOOD_SHARE = 0.75
 WHOLE_SHARE = 0.85  # a fit to the whole component that explains less has rivals grown from parts of it
 LOCAL_BLOCKS = 45
-LOCAL_TRIES = 6
+LOCAL_TRIES = 5
 ALL_KINDS = np.ones(5, np.bool_)
 FEW_BLOCKS_FOR_QUADRIC = 60
 LEAST_NORMALS = 10

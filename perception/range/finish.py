@@ -19,7 +19,7 @@ from perception.range.primitives import (
     primitive_of,
 )
 from perception.range.sensor import RangeSensorModel
-from perception.range.surfaces import FREEDOM, QUADRIC
+from perception.range.surfaces import FREEDOM, PLANE, QUADRIC
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
@@ -79,21 +79,25 @@ def refine_surface(
     perspective = bool(sensor.packed()[0] > 0)
     few = thinned(samples, COARSE_SAMPLES)
     th, _, _, _, _ = fit.fit_robust(kind, th, few.x, few.y, few.z, few.sigma, perspective, fixed, 1)
-    th, H, cost, used = fit.refine(
-        kind, th, samples.x, samples.y, samples.z, samples.sigma, perspective, FULL_STEPS, 0.0, fit.TRIM_SIGMAS, fixed
-    )
-    n = samples.x.size
+    s = samples
+    if kind == PLANE and not fixed.any():
+        th, H, cost, used = fit.refine_plane(th, s.x, s.y, s.z, s.sigma, perspective, fit.TRIM_SIGMAS)
+    else:
+        th, H, cost, used = fit.refine(
+            kind, th, s.x, s.y, s.z, s.sigma, perspective, FULL_STEPS, 0.0, fit.TRIM_SIGMAS, fixed
+        )
+    n = s.x.size
     kept = max(cost - (n - used) * fit.TRIM_SIGMAS**2, 0.0)
     misfit = float(np.sqrt(kept / max(used - FREEDOM[kind], 1)))
-    depth = float(np.median(samples.z)) if n else np.nan
+    depth = float(np.median(few.z)) if n else np.nan
     covariance = _covariance(H, kind, fixed) * max(misfit**2, 0.05) * averaging_loss(noise, depth)
-    x, y = (float(np.median(a)) for a in (samples.x, samples.y))
+    x, y = (float(np.median(a)) for a in (few.x, few.y))
     middle = np.array([x * depth, y * depth, depth] if perspective else [x, y, depth])
     surface = Surface(
         label=label, type=TYPE_OF_KIND[kind], primitive=primitive_of(kind, th, middle),
         covariance=named_covariance(kind, th, covariance), covariance_over=COVARIANCE_OVER[kind],
         frame=frame_vectors(kind, th) if kind != QUADRIC else np.eye(3)[:2], pixels=n,
-        rms_m=misfit * float(np.median(samples.sigma)) if n else 0.0, misfit=misfit, middle_m=middle,
+        rms_m=misfit * float(np.median(few.sigma)) if n else 0.0, misfit=misfit, middle_m=middle,
     )
     return surface, th
 
@@ -114,6 +118,10 @@ def _covariance(H: Array, kind: int, fixed: NDArray[np.bool_]) -> Array:
     free = np.flatnonzero(~fixed[:p])
     out = np.zeros((p, p))
     scale = 1.0 / np.sqrt(np.maximum(np.diag(H)[free], 1e-300))
-    inner = np.linalg.pinv(H[np.ix_(free, free)] * np.outer(scale, scale), rcond=1e-12, hermitian=True)
+    A = H[np.ix_(free, free)] * np.outer(scale, scale)
+    try:
+        inner = np.linalg.inv(A)
+    except np.linalg.LinAlgError:
+        inner = np.linalg.pinv(A, rcond=1e-12, hermitian=True)
     out[np.ix_(free, free)] = inner * np.outer(scale, scale)
     return out

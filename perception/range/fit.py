@@ -7,7 +7,7 @@ at `TRIM_SIGMAS` and plain least squares (Levenberg's damping, Marquardt's scali
 
 
 # bodies and plain comparisons are what compiles fast.
-# ruff: noqa: PLR0912 - compiled loops are long
+# ruff: noqa: PLR0912, PLR0915 - compiled loops are long
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from perception.range.surfaces import (
 TRIM_SIGMAS = 3.0
 MISS_SIGMAS = 6.0  # a ray that misses the surface costs as much as a residual of this size
 CAUCHY_WIDTH = 2.0
-ROUGH_SAMPLES = 48
+ROUGH_SAMPLES = 36
 ROUGH_LIMIT = 5.0
 LARGEST_RADIUS_M = 10.0
 QUADRIC_PER_SAMPLE = 1.15  # a simple surface under white noise costs about 0.95 a sample, and its price
@@ -141,6 +141,76 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed):  #
             if damping > 1e6 or small < STEP_GOAL:
                 break
     return th, H, cost, used
+
+
+@njit(cache=True, nogil=True)
+def refine_plane(th, x, y, z, sigma, perspective, trim):  # type: ignore[no-untyped-def]
+    """One trimmed Gauss-Newton step of a plane in two passes over the samples; returns as `refine` does.
+
+    The ray depth of the plane (a, b, c) is 1 / (a x + b y + c) or a x + b y + c, so the step is linear in them:
+    dz = -z^2 (x, y, 1) dm or (x, y, 1) dm. The information matrix is carried over to tilts and offset.
+    """
+    m = np.zeros(3)
+    if perspective:
+        m[0], m[1], m[2] = th[0] / th[3], th[1] / th[3], th[2] / th[3]
+    else:
+        m[0], m[1], m[2] = -th[0] / th[2], -th[1] / th[2], th[3] / th[2]
+    S = np.zeros((3, 3))
+    cost, used = 0.0, 0
+    for sweep in range(2):
+        S[:] = 0.0
+        b = np.zeros(3)
+        cost, used = 0.0, 0
+        for i in range(x.shape[0]):
+            g = m[0] * x[i] + m[1] * y[i] + m[2]
+            zm = 1.0 / g if perspective else g
+            e = (z[i] - zm) / sigma[i]
+            if not abs(e) <= trim:
+                cost += trim * trim
+                continue
+            cost += e * e
+            used += 1
+            w = -zm * zm / sigma[i] if perspective else 1.0 / sigma[i]
+            wx, wy = w * x[i], w * y[i]
+            S[0, 0] += wx * wx
+            S[0, 1] += wx * wy
+            S[0, 2] += wx * w
+            S[1, 1] += wy * wy
+            S[1, 2] += wy * w
+            S[2, 2] += w * w
+            b[0] += wx * e
+            b[1] += wy * e
+            b[2] += w * e
+        S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
+        if sweep == 0 and used > 3 and solve_positive(S.copy(), b, 3):
+            for k in range(3):
+                m[k] += b[k]
+    out = th.copy()
+    if perspective:
+        length = np.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+        side = 1.0 if th[3] >= 0.0 else -1.0
+        out[0], out[1], out[2], out[3] = side * m[0] / length, side * m[1] / length, side * m[2] / length, side / length
+    else:
+        length = np.sqrt(m[0] * m[0] + m[1] * m[1] + 1.0)
+        side = 1.0 if th[2] >= 0.0 else -1.0
+        side /= length
+        out[0], out[1], out[2], out[3] = -side * m[0], -side * m[1], side, side * m[2]
+    frame, B = np.zeros(6), np.zeros((3, 3))
+    frame_of(PLANE, out, frame)
+    n2, d = out[2], out[3]
+    for k in range(2):
+        for a in range(3):
+            if perspective:
+                B[a, k] = frame[3 * k + a] / d
+            elif a < 2:
+                B[a, k] = -(frame[3 * k + a] * n2 - out[a] * frame[3 * k + 2]) / (n2 * n2)
+            else:
+                B[a, k] = -d * frame[3 * k + 2] / (n2 * n2)
+    for a in range(3):
+        B[a, 2] = -out[a] / (d * d) if perspective else (1.0 / n2 if a == 2 else 0.0)
+    H = np.zeros((9, 9))
+    H[:3, :3] = B.T @ S @ B
+    return out, H, cost, used
 
 
 @njit(cache=True)
@@ -421,13 +491,13 @@ def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_sampl
     best_rough = np.inf
     for k in range(6):
         kind = start_kind[k]
-        if kind < 0:
-            continue
+        if kind < 0 or (k >= 4 and best_rough < 1.3 * rx.shape[0] / correlated_samples):
+            continue  # the second axis is for components that the first cannot explain
         th = starts[k].copy()
         for _ in range(2):
             scale = _middle_scale(kind, th, rx, ry, rz, rs, perspective)
             th, _, _, _ = refine(kind, th, rx, ry, rz, rs, perspective, 2, scale, TRIM_SIGMAS, free)
-            if scale < 1.2:
+            if scale < 1.5:
                 break
         starts[k] = th
         rough[k] = trimmed_cost(kind, th, rx, ry, rz, rs, perspective, ROUGH_LIMIT, 1) / correlated_samples

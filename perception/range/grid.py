@@ -89,8 +89,8 @@ def build_grid(
     normal, count = np.full((h, w, 3), np.nan), np.zeros((h, w), np.int32)
     for_each_tile(lambda a, b: _blocks(depth_m, packed, law, size_px, x, y, z, sigma, count, a, b), h, tiles, pool=pool)
     perspective = bool(packed[0] > 0)
-    middle = float(np.nanmedian(z[:: max(1, z.shape[0] // 32), :: max(1, z.shape[1] // 32)])) if z.size else 1.0
-    middle = middle if np.isfinite(middle) else 1.0
+    known = z[np.isfinite(z)]
+    middle = float(np.median(known[:: max(1, known.size // 1024)])) if known.size else 1.0
     radius, slope_sigma = _radius(noise, sensor, middle, size_px)
     slope = jump_slope / packed[1]
     for_each_tile(

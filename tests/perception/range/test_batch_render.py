@@ -1,0 +1,167 @@
+"""Recordings, batches, pictures, polar sweeps and features."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from hal.errors import ConfigError, InvalidRequest, NotFound
+from perception.range import FeatureKind, SurfaceType, analyse
+from perception.range.batch import analyse_files, batch_range, recordings_in, tasks_of, write_results
+from perception.range.features import corner_point, crease_line
+from perception.range.polar import PolarScan, depth_image, fitting_view, sweep_points
+from perception.range.recordings import load_recording
+from perception.range.render import picture, scene_json, write_ply, write_png
+from tests.perception.range.scenes import PINHOLE, ball_on_table, nearest, noisy, plane_depth
+
+META = {"unit": "m", "sensor": {"kind": "pinhole", "shape": [120, 160], "f": 180.0, "cx": 79.5, "cy": 59.5}}
+
+
+def save(path, depth, meta=None):
+    np.savez(path, depth=depth.astype(np.float32), meta=np.array(json.dumps(meta or META)))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for k in range(5):
+        save(tmp_path / f"scan_{k}.npz", noisy(ball_on_table().depth_m, 0.0005, seed=k))
+    save(tmp_path / "scan_9_empty.npz", np.full((120, 160), np.nan))
+    return tmp_path
+
+
+def test_recordings_read_back(tmp_path):
+    depth = ball_on_table().depth_m
+    save(tmp_path / "a.npz", depth)
+    read, sensor = load_recording(tmp_path / "a.npz")
+    np.testing.assert_allclose(read, depth, rtol=1e-6)
+    assert sensor == PINHOLE
+    raw = np.where(np.arange(160) < 5, 0, np.rint(depth * 1000)).astype(np.uint16)
+    (tmp_path / "b.png").write_bytes(cv2.imencode(".png", raw)[1].tobytes())
+    read, _ = load_recording(tmp_path / "b.png")
+    assert np.isnan(read[:, :5]).all() and np.nanmax(np.abs(read - depth)) < 0.00051
+
+
+def test_what_is_no_recording_is_refused(tmp_path):
+    (tmp_path / "x.npz").write_bytes(b"nothing")
+    (tmp_path / "x.png").write_bytes(b"nothing")
+    for name in ("x.npz", "x.png", "missing.npz"):
+        with pytest.raises(InvalidRequest):
+            load_recording(tmp_path / name)
+
+
+def test_tasks_hold_at_least_the_wanted_number(tmp_path):
+    paths = [tmp_path / f"{k}.npz" for k in range(57)]
+    groups = tasks_of(paths)
+    assert min(len(g) for g in groups) >= 20
+    assert [p for g in groups for p in g] == [str(p) for p in paths]
+
+
+def test_a_bad_recording_costs_only_itself(folder):
+    results = analyse_files([str(p) for p in recordings_in(folder)])
+    assert [r.error is None for r in results] == [True] * 5 + [False]
+    assert "NotFound" in results[-1].error
+    write_results(folder / "out.jsonl", results)
+    assert len((folder / "out.jsonl").read_text(encoding="utf-8").splitlines()) == 6
+
+
+@pytest.mark.slow
+def test_the_batch_is_the_same_for_one_and_two_workers(folder):
+    plain = analyse_files([str(p) for p in recordings_in(folder)])
+    seen = []
+    for workers in (1, 2):
+        assert batch_range(folder, workers=workers, progress=lambda done, total: seen.append((done, total))) == plain
+    assert seen[-1] == (6, 6)
+
+
+def test_empty_folders_and_wrong_schedulers_are_refused(tmp_path, folder):
+    with pytest.raises(InvalidRequest):
+        recordings_in(tmp_path / "missing")
+    with pytest.raises(ConfigError):
+        batch_range(folder, scheduler="somewhere")
+
+
+def test_json_picture_and_point_cloud(tmp_path):
+    depth = noisy(ball_on_table().depth_m, 0.0005, seed=1)
+    depth[:4] = np.nan
+    scene = analyse(depth, PINHOLE)
+    document = json.loads(json.dumps(scene_json(scene)))
+    assert {s["type"] for s in document["surfaces"]} == {"plane", "sphere", "cylinder"}
+    assert picture(scene).shape == (120, 160, 3)
+    write_png(tmp_path / "a.png", scene)
+    assert cv2.imread(str(tmp_path / "a.png")).shape == (120, 160, 3)
+    write_ply(tmp_path / "a.ply", scene, depth)
+    head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    assert f"element vertex {116 * 160}".encode() in head and len(body) == 116 * 160 * 15
+
+
+def test_a_polar_sweep_becomes_a_plane_in_the_base_frame():
+    """A scanner on the wrist slides along y and looks down on a slab; every scan has its own arm pose."""
+    rng = np.random.default_rng(0)
+    angles = np.linspace(-0.4, 0.4, 181)
+    down = Rotation.from_matrix(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]))
+    scans = []
+    for k, y in enumerate(np.linspace(-0.2, 0.2, 161)):
+        height = 0.6 + 0.02 * np.sin(k / 10)
+        ranges = (height - 0.1) / np.cos(angles) + rng.normal(0, 0.0004, angles.shape)
+        pose = RigidTransform.from_components([0.3, y, height], down)
+        scans.append(PolarScan(ranges_m=ranges, angles_rad=angles, base_from_scanner=pose))
+    points = sweep_points(scans)
+    assert points.shape == (181 * 161, 3)
+    view = RigidTransform.from_components([0.3, 0.0, 0.6], down)
+    sensor = fitting_view(points, view, width_px=120, height_px=110)
+    plane = analyse(depth_image(points, view, sensor), sensor).largest_plane()
+    normal = view.rotation.apply(plane.primitive.normal)
+    assert np.degrees(np.arccos(normal @ [0, 0, 1])) < 0.1
+    assert view.apply(plane.primitive.point_m)[2] == pytest.approx(0.1, abs=0.0005)
+
+
+def test_sweeps_without_sense_are_refused():
+    pose = RigidTransform.identity()
+    with pytest.raises(InvalidRequest):
+        sweep_points([])
+    with pytest.raises(InvalidRequest):
+        sweep_points([PolarScan(ranges_m=np.ones(3), angles_rad=np.ones(4), base_from_scanner=pose)])
+    none = sweep_points([PolarScan(ranges_m=np.full(3, np.nan), angles_rad=np.zeros(3), base_from_scanner=pose)])
+    with pytest.raises(NotFound):
+        depth_image(none, pose, PINHOLE)
+
+
+def three_walls(seed):
+    point = np.array([0.01, -0.02, 0.7])
+    normals = [np.array(n) / np.linalg.norm(n) for n in ([-0.8, 0.0, -0.6], [0.8, 0.1, -0.6], [0.0, -0.8, -0.6])]
+    depth = np.max([plane_depth(PINHOLE, n, point) for n in normals], axis=0)
+    return noisy(depth, 0.0006, seed), normals, point
+
+
+def test_creases_and_corners_match_their_covariance():
+    squares_line, squares_point = [], []
+    for seed in range(25):
+        depth, normals, point = three_walls(seed)
+        planes = analyse(depth, PINHOLE).of_type(SurfaceType.PLANE)
+        assert len(planes) == 3
+        ordered = [max(planes, key=lambda s, n=n: s.primitive.normal @ n) for n in normals]
+        line = crease_line(ordered[0], ordered[1])
+        true = np.cross(normals[0], normals[1])
+        true /= np.linalg.norm(true)
+        turn = np.cross(line.direction, true * np.sign(true @ line.direction))
+        away = (line.point_m - point) - true * (true @ (line.point_m - point))
+        assert line.kind == FeatureKind.LINE
+        squares_line.append([
+            turn @ turn / np.trace(line.direction_covariance), away @ away / np.trace(line.point_covariance)
+        ])
+        corner = corner_point(*ordered)
+        e = corner.point_m - point
+        squares_point.append(e @ np.linalg.solve(corner.point_covariance, e) / 3)
+    assert (np.mean(squares_line, axis=0) < 2.0).all() and (np.mean(squares_line, axis=0) > 0.4).all()
+    assert 0.4 < np.mean(squares_point) < 2.0
+
+
+def test_parallel_planes_meet_nowhere():
+    low, high = (plane_depth(PINHOLE, np.array([0.0, 0.0, -1.0]), np.array([0, 0, z])) for z in (0.6, 0.5))
+    high[:, 80:] = np.inf
+    planes = analyse(noisy(nearest(low, high).depth_m, 0.0005, 0), PINHOLE).of_type(SurfaceType.PLANE)
+    assert len(planes) == 2 and crease_line(*planes) is None

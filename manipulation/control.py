@@ -42,7 +42,7 @@ from manipulation.guards import GuardSet, Measured
 from manipulation.kinematics import Kinematics
 from manipulation.recorder import Recorder
 from manipulation.runs import Run, Tick, begin
-from manipulation.sensing import READ_WAIT_S, ContactWrench, DeviceFailure, Devices, Look, Sample, ToolView
+from manipulation.sensing import READ_WAIT_S, ContactWrench, DeviceFailure, Devices, Look, RangeReader, Sample, ToolView
 from manipulation.setpoint import SetPointFilter, check, flange_matrix
 
 Array = NDArray[np.float64]
@@ -103,12 +103,17 @@ class Controller:
         flange_from_grip: RigidTransform | None = None,
         rate_hz: float | None = None,
     ) -> None:
+        # In lockstep no reading is late by chance.
+        patience_s = (1.0 if isinstance(clock, SimClock) else 3.0) * safety.max_reading_age_s
         self._devices = Devices(
             arm=arm,
             gripper=gripper,
             force_torque=force_torque,
             touch=touch,
-            proximities=tuple(proximities),
+            proximities=tuple(
+                RangeReader(sensor, clock, max_age_s=safety.max_reading_age_s, patience_s=patience_s)
+                for sensor in proximities
+            ),
             clock=clock,
             max_age_s=safety.max_reading_age_s,
         )

@@ -12,13 +12,14 @@ from scipy.spatial.transform import RigidTransform
 from hal.calibration import ToolLoad
 from hal.clock import Clock, Deadline
 from hal.devices import Arm, ForceTorque, Gripper, Proximity, Touch
-from hal.errors import CellError, DeviceError, StaleReading
+from hal.errors import CellError, DeviceError, DeviceTimeout, StaleReading
 from hal.readings import Cause, Quality
 from manipulation import kernels
 
 Array = NDArray[np.float64]
 
 GRAVITY_M_PER_S2 = 9.80665
+RANGE_WAIT_S = 0.004
 READ_WAIT_S = 0.02  # longest that one tick waits for a device; a tick itself lasts 2 to 8 ms
 
 
@@ -45,6 +46,47 @@ class DeviceFailure(Exception):
         self.cause = cause
 
 
+class RangeReader:
+    """A proximity sensor in the control loop: its newest distance, NaN when nothing is within range.
+
+    A range sensor on a slow wire misses a beat now and then. It stops the arm only when nothing has come for `patience_s`.
+    """
+
+    def __init__(self, sensor: Proximity, clock: Clock, *, max_age_s: float, patience_s: float) -> None:
+        self._sensor = sensor
+        self._clock = clock
+        self._max_age_s = max_age_s
+        self._patience_s = patience_s
+        self._value_m = float("nan")
+        self._good_s: float | None = None
+
+    @property
+    def name(self) -> str:
+        """Name in the cell file."""
+        return self._sensor.name
+
+    def read(self, now_s: float) -> float:
+        """The distance, m.
+
+        Raises:
+            CellError: silent or stale for longer than the patience, or broken.
+        """
+        try:
+            self._value_m = self._fresh(now_s)
+            self._good_s = now_s
+        except (DeviceTimeout, StaleReading):
+            if self._good_s is None or now_s - self._good_s > self._patience_s:
+                raise
+        return self._value_m
+
+    def _fresh(self, now_s: float) -> float:
+        reading = self._sensor.read_distance_m(deadline=Deadline(now_s + RANGE_WAIT_S, self._clock))
+        is_empty = reading.quality is Quality.INVALID and reading.cause is Cause.OUT_OF_RANGE
+        if is_empty and reading.age_s(now_s) <= self._max_age_s:
+            return float("nan")
+        return reading.usable(now_s=now_s, max_age_s=self._max_age_s, device=self.name)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Devices:
     """The devices of the control loop. All but the arm and its gripper may be absent."""
@@ -53,7 +95,7 @@ class Devices:
     gripper: Gripper
     force_torque: ForceTorque | None
     touch: Touch | None
-    proximities: Sequence[Proximity]
+    proximities: Sequence[RangeReader]
     clock: Clock
     max_age_s: float
 
@@ -90,9 +132,9 @@ class Devices:
                     now_s=now_s, max_age_s=self.max_age_s, device=device
                 )
                 width_m, is_moving, ranges = grip.width_m, grip.is_moving, []
-                for sensor in self.proximities:
-                    device = sensor.name
-                    ranges.append(self._range(sensor, now_s, deadline))
+                for reader in self.proximities:
+                    device = reader.name
+                    ranges.append(reader.read(now_s))
                 seen = tuple(ranges)
             else:
                 width_m, is_moving, seen = before.gripper_width_m, before.gripper_is_moving, before.proximity_m
@@ -111,18 +153,6 @@ class Devices:
             gripper_width_m=width_m,
             gripper_is_moving=is_moving,
         )
-
-    def _range(self, sensor: Proximity, now_s: float, deadline: Deadline) -> float:
-        reading = sensor.read_distance_m(deadline=deadline)
-        if reading.quality is Quality.INVALID and reading.cause is Cause.OUT_OF_RANGE:
-            if reading.age_s(now_s) > self.max_age_s:
-                raise StaleReading(
-                    f"{sensor.name} reading is {reading.age_s(now_s):.3f} s old",
-                    hint="check the device's rate and cable",
-                    device=sensor.name,
-                )
-            return float("nan")
-        return reading.usable(now_s=now_s, max_age_s=self.max_age_s, device=sensor.name)
 
 
 class ContactWrench:

@@ -24,7 +24,7 @@ FROM_END_M = 0.008  # the fingers hold the bar this far before its end: a long l
 APPROACH_SIDE_M = 0.010  # free space on each side when coming down; more than the pose error
 CAGE_SIDE_M = 0.002  # free space on each side in the stroke: caged, not squeezed
 STROKE_M_PER_S = 0.08
-LAST_RAD = np.radians(9.0)  # the prototype met the end stop at more than 300 N until it slowed down towards the end
+LAST_RAD = np.radians(9.0)  # the prototype met the end stop at more than 300 N before it slowed down
 OVERTRAVEL_RAD = np.radians(12.0)  # play of the cage and give of the pads
 LAST_M_PER_S = 0.018
 END_RISE_N = 8.0
@@ -160,7 +160,7 @@ def _hub(attempt: Attempt, thing: Lever, angle_rad: float) -> Array:
 
 
 def _carry(attempt: Attempt, thing: Lever, turn: _Turn, hub: Array) -> float:
-    """The stroke in two parts: fast to 14 degrees before the end, then slowly onto the end stop.
+    """The stroke in two parts: fast to 9 degrees before the end, then slowly onto the end stop.
 
     Returns the signed angle by which the bar turned: that of the tool less the play of the cage and the give of the
     pads.

@@ -20,7 +20,7 @@ from hal.clock import Clock, PacedClock, SimClock, WallClock
 from hal.config import Cell, DeviceSection, load_cell
 from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, DeviceUnavailable
-from hal.registry import Context, Shared, emulator_factory
+from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
 from service.child import Lifeline, kill_own_group
 from service.connection import CLOCK, MOVER, PREFIX
@@ -52,6 +52,7 @@ class CellRuntime:
         Raises:
             CellError: what could not be connected, all of it in one error; everything else is closed again.
         """
+        _import_drivers(cell)
         clock = clock_for(cell)
         shared = Shared()
         closers: list[Callable[[], None]] = [shared.close]
@@ -72,6 +73,18 @@ class CellRuntime:
         """Stop the arm, then close devices, emulators and world; one that fails holds up nobody. Idempotent."""
         closers, self._closers = self._closers, []
         _close_all(closers)
+
+
+def _import_drivers(cell: Cell) -> None:
+    """Import every driver now, in one thread.
+
+    Some libraries (OpenCV) bend `sys.path` while they are imported; a process that a driver starts meanwhile in another
+    thread would inherit the bent path and not even find `typing`.
+    """
+    drivers = [section.driver for section in cell.file.devices.values()]
+    for driver in [*drivers, *(section.driver for section in cell.file.emulators.values())]:
+        with contextlib.suppress(ConfigError):  # it comes again, with its key, when the device is connected
+            device_factory(driver)
 
 
 def clock_for(cell: Cell) -> Clock:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import IO
 
 GRACE_S = 3.0
+LAST_WORDS_S = 1.0
 
 
 class Child:
@@ -49,8 +50,9 @@ class Child:
         self._lock = threading.Lock()
         self._is_killed = False
         # Two threads: a grandchild may hold standard output open after the child's death, which must not hide it.
-        for work, argument in ((self._read, on_line), (self._wait, on_exit)):
-            threading.Thread(target=work, args=(argument,), name=f"{work.__name__}-{module}", daemon=True).start()
+        self._reader = threading.Thread(target=self._read, args=(on_line,), name=f"read-{module}", daemon=True)
+        self._reader.start()
+        threading.Thread(target=self._wait, args=(on_exit,), name=f"wait-{module}", daemon=True).start()
 
     @property
     def pid(self) -> int:
@@ -95,7 +97,9 @@ class Child:
             on_line(line.decode("utf-8", "replace").rstrip("\n"))
 
     def _wait(self, on_exit: Callable[[int], None]) -> None:
-        on_exit(self._process.wait())
+        code = self._process.wait()
+        self._reader.join(LAST_WORDS_S)  # what it said before it died comes first
+        on_exit(code)
 
 
 def _opened(stream: IO[bytes] | None) -> IO[bytes]:

@@ -15,12 +15,13 @@ def main() -> None:
         )
         raise SystemExit(2)
     from hal.errors import CellError
+    from service.commands.leaving import leave
 
     try:
         _app()()
     except CellError as error:
         sys.stderr.write(error.for_people() + "\n")
-        raise SystemExit(2) from None
+        leave(2)
     except KeyboardInterrupt:
         raise SystemExit(130) from None
     except ModuleNotFoundError as error:

@@ -111,8 +111,7 @@ class Panelwright:
         Raises:
             CellError: the cell could not start.
         """
-        # uvicorn raises a caught signal again when it is done; SIGTERM's default would skip all cleaning up.
-        signal.signal(signal.SIGTERM, _exit)
+        exit_on_sigterm()
         try:
             self._begin()
             assert self._server is not None  # noqa: S101 - narrowing: `_begin` made it
@@ -183,8 +182,13 @@ def _warm() -> None:
         log.warning("warming up failed", exc_info=True)
 
 
-def _exit(_signal: int, _frame: FrameType | None) -> None:
-    raise SystemExit(128 + signal.SIGTERM)
+def exit_on_sigterm() -> None:
+    """Let SIGTERM unwind like Ctrl-C: its default would skip all cleaning up, also when uvicorn raises it again."""
+
+    def leave(_signal: int, _frame: FrameType | None) -> None:
+        raise SystemExit(128 + signal.SIGTERM)
+
+    signal.signal(signal.SIGTERM, leave)
 
 
 def _shipped() -> Mapping[str, Operation]:

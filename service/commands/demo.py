@@ -13,6 +13,7 @@ from rich.table import Table
 
 from service.client import ApiError, Client
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console, read_cell
+from service.commands.leaving import leave
 from service.commands.tasks import follow
 
 
@@ -28,23 +29,25 @@ def demo(
     inline: Annotated[bool, typer.Option("--inline", help="Cell and stop port in this process (debugging).")] = False,
 ) -> None:
     """Run the whole mission and leave a report; exit code 1 when an action was not confirmed."""
-    from service.serve import Options, Panelwright
+    from service.serve import Options, Panelwright, exit_on_sigterm
 
     started_s = time.monotonic()
     loaded = read_cell(cell, seed)
+    exit_on_sigterm()
     panelwright = Panelwright(loaded, Options(port=port, runs_dir=runs, inline=inline))
     console.print(f"cell [bold]{loaded.name}[/], seed {loaded.file.cell.seed}: starting")
+    code = 1
     try:
         panelwright.start()
         console.print(f"ready after {time.monotonic() - started_s:.1f} s at {panelwright.url}")
-        is_done = _mission(Client(url=panelwright.url), runs, judge=judge)
+        code = 0 if _mission(Client(url=panelwright.url), runs, judge=judge) else 1
     except KeyboardInterrupt:
         console.print("stopped by Ctrl-C: arm stopped, processes ended")
-        raise typer.Exit(130) from None
+        code = 130
     finally:
         panelwright.close()
     console.print(f"{time.monotonic() - started_s:.1f} s in all")
-    raise typer.Exit(0 if is_done else 1)
+    leave(code)
 
 
 def _mission(client: Client, runs: Path, *, judge: bool) -> bool:

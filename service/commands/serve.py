@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console, read_cell
+from service.commands.leaving import leave
 
 if TYPE_CHECKING:
     from service.serve import Panelwright
@@ -41,10 +42,23 @@ def serve(
     panelwright = Panelwright(loaded, options)
     threading.Thread(target=_announce, args=(panelwright,), daemon=True).start()
     console.print(f"panelwright: cell [bold]{loaded.name}[/] ({loaded.file.cell.mode}) is starting")
+    run_to_end(panelwright)
+
+
+def run_to_end(panelwright: Panelwright) -> NoReturn:
+    """Serve until Ctrl-C or SIGTERM, close everything, and leave in bounded time.
+
+    Raises:
+        CellError: the cell could not start.
+    """
+    code = 0
     try:
         panelwright.run()
     except KeyboardInterrupt:
         console.print("panelwright: stopped by Ctrl-C; arm stopped, processes ended")
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
+    leave(code)
 
 
 def check_host(host: str) -> None:

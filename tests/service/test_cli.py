@@ -166,3 +166,53 @@ def _runs(process: psutil.Process) -> bool:
         return bool(process.is_running() and process.status() != psutil.STATUS_ZOMBIE)
     except psutil.NoSuchProcess:
         return False
+
+
+STUBBORN = """
+import sys, time
+from pathlib import Path
+from hal.config import load_cell
+from service.commands.serve import run_to_end
+from service.operations.context import Operation
+from service.serve import Options, Panelwright
+from tests.service.verbs import EchoRequest
+
+def stubborn(context, request):
+    while True:  # computes, and never asks whether it was cancelled
+        sum(range(10_000))
+
+operation = Operation(name="stubborn", request_model=EchoRequest, run=stubborn, summary="Never ends")
+options = Options(port=int(sys.argv[2]), stop_port=0, runs_dir=Path(sys.argv[3]), warm=False)
+run_to_end(Panelwright(load_cell(Path(sys.argv[1])), options, operations={"stubborn": operation}))
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_a_task_that_never_looks_up_does_not_keep_the_service_alive(
+    write_cell: WriteCell, tmp_path: Path, how: signal.Signals
+) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    arguments = [str(write_cell(robot=True)), str(port), str(tmp_path / "runs")]
+    process = psutil.Popen([sys.executable, "-c", STUBBORN, *arguments], cwd=Path(__file__).parents[2])
+    url = f"http://127.0.0.1:{port}"
+
+    def is_ready() -> bool:
+        try:
+            return httpx2.get(f"{url}/readyz", trust_env=False, timeout=30).status_code == 200
+        except httpx2.TransportError:
+            return False
+
+    try:
+        eventually(is_ready)
+        httpx2.post(f"{url}/v1/stubborn", trust_env=False, timeout=30)
+        tasks = lambda: httpx2.get(f"{url}/v1/tasks", trust_env=False, timeout=30).json()["tasks"]  # noqa: E731
+        eventually(lambda: tasks()[0]["state"] == "running")
+        family = process.children(recursive=True)
+        os.kill(process.pid, how)
+        process.wait(60)
+        eventually(lambda: not [child for child in family if _runs(child)])
+    finally:
+        if _runs(process):
+            process.kill()

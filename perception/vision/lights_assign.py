@@ -36,6 +36,7 @@ FOCAL_TRIALS = (1.25, 0.95, 1.65)  # of the image width, when the camera is unkn
 USUAL_RADIUS_M = 0.006
 TILT_SIGMA_RAD = 0.4
 ROLL_SIGMA_RAD = 0.35
+LEAST_TOTAL = -2.0  # two dim lights in a tilted view reach 0; what is upside down or skewed beyond belief stays below
 PLAIN_SCORE = 8.0  # four lamp-like blobs where they belong reach 15
 RIVAL_MARGIN = 2.0  # in log-odds: closer hypotheses with other blobs are a tie
 
@@ -107,7 +108,7 @@ def assign_lights(
         )
     view = (image_size_px, intrinsics, np.asarray(upright, float), radius_m)
     best, chosen = _hypotheses(blobs, usable, lights, view)
-    if not np.isfinite(best[0]):
+    if best[0] < LEAST_TOTAL:
         raise WrongLamp(
             f"{len(usable)} blobs became brighter, but no choice of them stands as the taught lights",
             hint="check the panel file's lights and the camera calibration",

@@ -98,7 +98,7 @@ def gray_of(image: NDArray[Any]) -> Image:
     if min(array.shape[:2]) < 16:
         raise InvalidRequest(f"image is only {array.shape[1]}x{array.shape[0]}", hint="16x16 is the least")
     if array.ndim == 3:
-        return (array @ np.array([0.299, 0.587, 0.114], np.float32)).astype(np.float32)
+        return np.asarray(array.mean(axis=2), np.float32)  # not luma: a blue lamp is as good as a green one
     return array.astype(np.float32)
 
 

@@ -1,4 +1,5 @@
 # ruff: noqa: PLR0912, PLR0915 - a compiled loop keeps one sum in one place
+# mypy: disallow-untyped-defs=False
 """Compiled search for the taught quadrangle among blobs: every ordered triple, its poses, the fourth light."""
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ UNCHECKED = 3.0  # three points fit always: what a hypothesis without a fourth l
 
 
 @jit
-def spread(values, n):  # type: ignore[no-untyped-def]
+def spread(values, n):
     """Sum of squared deviations of the first n values from their mean."""
     mean = 0.0
     for i in range(n):
@@ -31,9 +32,7 @@ def spread(values, n):  # type: ignore[no-untyped-def]
 
 
 @jit
-def search(  # type: ignore[no-untyped-def]
-    centres, traits, X, upright, camera, frame, prior, omit, best, chosen
-):
+def search(centres, traits, X, upright, camera, frame, prior, omit, best, chosen):
     """The best hypotheses, highest score first, into best (M,) and chosen (M, 4) (-1 = not seen).
 
     Args:
@@ -134,7 +133,7 @@ def search(  # type: ignore[no-untyped-def]
 
 
 @jit
-def insert(score, order, best, chosen):  # type: ignore[no-untyped-def]
+def insert(score, order, best, chosen):
     """Put a hypothesis into the list of the best ones, each set of blobs once."""
     m = best.shape[0]
     if score <= best[m - 1]:

@@ -19,8 +19,8 @@ from perception.vision.quadrangle_search import solve
 
 Array = NDArray[np.float64]
 
-# 300x200 mm, 1 px, 2 m, 5-60 deg: flags 13.4 % and leaves 0.4 % unflagged; 0.02 would flag 20.5 % and leave 0.09 %.
-AMBIGUOUS_SHARE = 0.1
+# 300x200 mm, 1 px, 2 m, 5-60 deg: flags 13 % and leaves 0.4 % unflagged; 0.02 would flag 20.5 % and leave 0.09 %.
+AMBIGUOUS_SHARE = 0.11
 NEAR_SIGMAS2 = 60.0  # the double well's wall is 4 times lower than its Gaussian: chi-square 15 at the line of sight
 LISTED_CHI_SQUARE = 16.0  # minima further above the best than this are not alternatives (odds below 1 in 3000)
 MOST_POSES = 7
@@ -61,7 +61,7 @@ class QuadranglePose:
             It is the Cramer-Rao bound at the pose; near fronto-parallel the truth is wider, see `ambiguous`.
         chi_square: weighted squared reprojection error, 2 degrees of freedom.
         probability: posterior probability that the truth is near this pose and not near one of `alternatives`.
-        ambiguous: another pose cannot be ruled out (`probability` below 0.9): one more view or touch decides.
+        ambiguous: another pose cannot be ruled out (`probability` below 0.89): one more view or touch decides.
         alternatives: the other poses, most likely first.
     """
 

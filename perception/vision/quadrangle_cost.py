@@ -1,4 +1,5 @@
 # ruff: noqa: PLR0915 - a compiled loop keeps one equation in one place
+# mypy: disallow-untyped-defs=False
 """Compiled inner loops of the four-light pose: reprojection chi-square, its derivatives and its local minimiser.
 
 Everything works on normalised image coordinates `m` (4, 2) with information `A` (4, 3) = (a_uu, a_uv, a_vv) each and
@@ -17,7 +18,7 @@ MAX_STEPS = 60
 
 
 @jit
-def rotation_of(w):  # type: ignore[no-untyped-def]
+def rotation_of(w):
     """Exp of a rotation vector (Rodrigues)."""
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     angle = np.sqrt(angle2)
@@ -38,7 +39,7 @@ def rotation_of(w):  # type: ignore[no-untyped-def]
 
 
 @jit
-def turn_onto(a, b):  # type: ignore[no-untyped-def]
+def turn_onto(a, b):
     """The smallest rotation that carries unit vector a onto unit vector b (not its opposite)."""
     v = cross3(a, b)
     c = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
@@ -58,7 +59,7 @@ def turn_onto(a, b):  # type: ignore[no-untyped-def]
 
 
 @jit
-def chi_square(R, t, X, m, A):  # type: ignore[no-untyped-def]
+def chi_square(R, t, X, m, A):
     """Reprojection chi-square of a pose; infinite when a point is behind the camera."""
     total = 0.0
     for i in range(X.shape[0]):
@@ -72,7 +73,7 @@ def chi_square(R, t, X, m, A):  # type: ignore[no-untyped-def]
 
 
 @jit
-def expand(R, t, X, m, A, g, N, H):  # type: ignore[no-untyped-def]
+def expand(R, t, X, m, A, g, N, H):
     """Chi-square; fills half its gradient g (6,), Gauss-Newton matrix N and half the exact Hessian H (6, 6)."""
     for a in range(6):
         g[a] = 0.0
@@ -159,7 +160,7 @@ def expand(R, t, X, m, A, g, N, H):  # type: ignore[no-untyped-def]
 
 
 @jit
-def solve_damped(M, D, damping, g, x, L):  # type: ignore[no-untyped-def]
+def solve_damped(M, D, damping, g, x, L):
     """x = -(M + damping diag(D))^-1 g by Cholesky; False when that matrix is not positive definite."""
     n = g.shape[0]
     for i in range(n):
@@ -189,7 +190,7 @@ def solve_damped(M, D, damping, g, x, L):  # type: ignore[no-untyped-def]
 
 
 @jit
-def minimise(R, t, X, m, A):  # type: ignore[no-untyped-def]
+def minimise(R, t, X, m, A):
     """The local minimum of chi-square below a start: damped Newton, Gauss-Newton where the Hessian is indefinite.
 
     Gauss-Newton alone crawls near fronto-parallel, where two minima merge.

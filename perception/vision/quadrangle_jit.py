@@ -1,3 +1,4 @@
+# mypy: disallow-untyped-defs=False
 """The compiler settings of the four-light pose, and the small vector arithmetic that its loops share.
 
 Array expressions, `np.cross` and `@` would read better, but each costs up to a second of compile time where it stands.
@@ -18,7 +19,7 @@ def jit(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @jit
-def product3(A, B):  # type: ignore[no-untyped-def]
+def product3(A, B):
     """A @ B, 3x3."""
     C = np.empty((3, 3))
     for i in range(3):
@@ -28,7 +29,7 @@ def product3(A, B):  # type: ignore[no-untyped-def]
 
 
 @jit
-def times3(M, v):  # type: ignore[no-untyped-def]
+def times3(M, v):
     """M @ v, 3x3 and (3,)."""
     x = np.empty(3)
     for i in range(3):
@@ -37,7 +38,7 @@ def times3(M, v):  # type: ignore[no-untyped-def]
 
 
 @jit
-def back3(M, v, factor):  # type: ignore[no-untyped-def]
+def back3(M, v, factor):
     """factor * M^T @ v, 3x3 and (3,)."""
     x = np.empty(3)
     for i in range(3):
@@ -46,13 +47,13 @@ def back3(M, v, factor):  # type: ignore[no-untyped-def]
 
 
 @jit
-def dot3(a, b):  # type: ignore[no-untyped-def]
+def dot3(a, b):
     """a . b, (3,) each."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @jit
-def cross3(a, b):  # type: ignore[no-untyped-def]
+def cross3(a, b):
     """a x b, (3,) each."""
     x = np.empty(3)
     x[0] = a[1] * b[2] - a[2] * b[1]
@@ -62,7 +63,7 @@ def cross3(a, b):  # type: ignore[no-untyped-def]
 
 
 @jit
-def mix3(p, a, q, b):  # type: ignore[no-untyped-def]
+def mix3(p, a, q, b):
     """p a + q b for numbers p, q and (3,) a, b."""
     x = np.empty(3)
     for i in range(3):
@@ -71,7 +72,7 @@ def mix3(p, a, q, b):  # type: ignore[no-untyped-def]
 
 
 @jit
-def unit3(a):  # type: ignore[no-untyped-def]
+def unit3(a):
     """a / |a|, (3,)."""
     norm = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
     x = np.empty(3)
@@ -81,14 +82,14 @@ def unit3(a):  # type: ignore[no-untyped-def]
 
 
 @jit
-def put1(into, values):  # type: ignore[no-untyped-def]
+def put1(into, values):
     """Copy a vector."""
     for i in range(values.shape[0]):
         into[i] = values[i]
 
 
 @jit
-def put2(into, values):  # type: ignore[no-untyped-def]
+def put2(into, values):
     """Copy a matrix."""
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):

@@ -1,4 +1,5 @@
 # ruff: noqa: PLR0912, PLR0915 - a compiled loop keeps one equation in one place
+# mypy: disallow-untyped-defs=False
 """Compiled three-point poses: the first half of the paper's direct route (Section II-B), and seeds for the refinement.
 
 The code reads from `real_cubic_root` down to `three_point`; conventions as in `quadrangle_core`.
@@ -12,7 +13,7 @@ from perception.vision.quadrangle_jit import cross3, dot3, jit, mix3, product3, 
 
 
 @jit
-def real_cubic_root(b, c, d):  # type: ignore[no-untyped-def]
+def real_cubic_root(b, c, d):
     """The largest real root of x^3 + b x^2 + c x + d (Viete and Cardano, then two Newton steps)."""
     p = c - b * b / 3.0
     q = 2.0 * b * b * b / 27.0 - b * c / 3.0 + d
@@ -36,7 +37,7 @@ def real_cubic_root(b, c, d):  # type: ignore[no-untyped-def]
 
 
 @jit
-def cofactors(M):  # type: ignore[no-untyped-def]
+def cofactors(M):
     """Adjugate of a symmetric 3x3 matrix."""
     B = np.empty((3, 3))
     B[0, 0] = M[1, 1] * M[2, 2] - M[1, 2] * M[1, 2]
@@ -49,7 +50,7 @@ def cofactors(M):  # type: ignore[no-untyped-def]
 
 
 @jit
-def triad(p0, p1, p2):  # type: ignore[no-untyped-def]
+def triad(p0, p1, p2):
     """Orthonormal frame (columns) of three points: along p1 - p0, in their plane, normal to it."""
     a = unit3(mix3(1.0, p1, -1.0, p0))
     n = unit3(cross3(a, mix3(1.0, p2, -1.0, p0)))
@@ -61,7 +62,7 @@ def triad(p0, p1, p2):  # type: ignore[no-untyped-def]
 
 
 @jit
-def refine_depths(s, d2, cosines):  # type: ignore[no-untyped-def]
+def refine_depths(s, d2, cosines):
     """Newton on the three law-of-cosines equations; leaves s where it does not help."""
     for _ in range(3):
         e0 = s[1] * s[1] + s[2] * s[2] - 2.0 * s[1] * s[2] * cosines[0] - d2[0]
@@ -87,7 +88,7 @@ def refine_depths(s, d2, cosines):  # type: ignore[no-untyped-def]
 
 
 @jit
-def three_point(P, f, Rs, ts):  # type: ignore[no-untyped-def]
+def three_point(P, f, Rs, ts):
     """Poses that carry three points (3, 3) onto three unit rays (3, 3); fills Rs, ts (4 of them), returns how many.
 
     The depths s solve three law-of-cosines equations. Two combinations without constant term are conics in s; the

@@ -1,4 +1,5 @@
 # ruff: noqa: PLR0912 - a compiled loop keeps one equation in one place
+# mypy: disallow-untyped-defs=False
 """Compiled search of the four-light pose: every local minimum, the profile over the normal, the mirror's share.
 
 Conventions as in `quadrangle_cost`.
@@ -20,7 +21,7 @@ WORTHLESS = 60.0  # chi-square above the best at which a minimum has odds of 1 i
 
 
 @jit
-def rotation_distance(A, B):  # type: ignore[no-untyped-def]
+def rotation_distance(A, B):
     """1 - cos of the angle between two rotations, doubled: 3 - trace(A^T B)."""
     s = 3.0
     for i in range(3):
@@ -30,7 +31,7 @@ def rotation_distance(A, B):  # type: ignore[no-untyped-def]
 
 
 @jit
-def ordered_seeds(X, f, m, A, Rs, ts, costs):  # type: ignore[no-untyped-def]
+def ordered_seeds(X, f, m, A, Rs, ts, costs):
     """Three-point poses of the four triples with their chi-square over all four points; returns how many.
 
     Rs (16, 3, 3), ts (16, 3), costs (16,) are filled.
@@ -57,7 +58,7 @@ def ordered_seeds(X, f, m, A, Rs, ts, costs):  # type: ignore[no-untyped-def]
 
 
 @jit
-def mirrored(R, t, normal):  # type: ignore[no-untyped-def]
+def mirrored(R, t, normal):
     """R with the normal (object axes) reflected about the line of sight through the centroid."""
     n = times3(R, normal)
     k = unit3(t)
@@ -68,7 +69,7 @@ def mirrored(R, t, normal):  # type: ignore[no-untyped-def]
 
 
 @jit
-def all_minima(X, m, A, normal, Rs, ts, costs, Ns):  # type: ignore[no-untyped-def]
+def all_minima(X, m, A, normal, Rs, ts, costs, Ns):
     """Distinct local minima of chi-square, lowest first, into Rs (M,3,3), ts, costs, Ns (M,6,6); returns how many.
 
     Starts: the best three-point pose, the mirror of its minimum, then every three-point pose far from these.
@@ -130,7 +131,7 @@ def all_minima(X, m, A, normal, Rs, ts, costs, Ns):  # type: ignore[no-untyped-d
 
 
 @jit
-def profile(R, t, direction, X, m, A, normal):  # type: ignore[no-untyped-def]
+def profile(R, t, direction, X, m, A, normal):
     """Chi-square minimised over position and roll while the object's normal points along `direction` (camera axes).
 
     Returns: R, t, chi-square, log determinant of the remaining 4x4 information.
@@ -176,7 +177,7 @@ def profile(R, t, direction, X, m, A, normal):  # type: ignore[no-untyped-def]
 
 
 @jit
-def _contract(M, direction, out):  # type: ignore[no-untyped-def]
+def _contract(M, direction, out):
     """The 4x4 block of M over position and roll about `direction`."""
     for i in range(3):
         for j in range(3):
@@ -193,7 +194,7 @@ def _contract(M, direction, out):  # type: ignore[no-untyped-def]
 
 
 @jit
-def prepare(pixels, covariance, camera, m, A):  # type: ignore[no-untyped-def]
+def prepare(pixels, covariance, camera, m, A):
     """Pixels (N, 2) with covariance (N, 2, 2) to ideal normalised coordinates m and information A (N, 3).
 
     `camera`: fx, fy, cx, cy, k1, k2, p1, p2, k3. The lens is inverted by Newton's method, see `camera_model`.
@@ -245,7 +246,7 @@ def prepare(pixels, covariance, camera, m, A):  # type: ignore[no-untyped-def]
 
 
 @jit
-def plane_of(X):  # type: ignore[no-untyped-def]
+def plane_of(X):
     """Unit normal of the plane nearest to centred points X (N, 3), and their spread across their main line (m^2)."""
     M = np.zeros((3, 3))
     for n in range(X.shape[0]):
@@ -278,7 +279,7 @@ def plane_of(X):  # type: ignore[no-untyped-def]
 
 
 @jit
-def inverse6(N, out):  # type: ignore[no-untyped-def]
+def inverse6(N, out):
     """Inverse of a positive definite 6x6 matrix, column by column; False when it is not."""
     g, x, L = np.zeros(6), np.empty(6), np.zeros((6, 6))
     for k in range(6):
@@ -296,7 +297,7 @@ def inverse6(N, out):  # type: ignore[no-untyped-def]
 
 
 @jit
-def normal_spread(R, t, C, normal):  # type: ignore[no-untyped-def]
+def normal_spread(R, t, C, normal):
     """Area sqrt(det) of the normal's covariance (sr), and the squared number of sigmas to the line of sight."""
     n = times3(R, normal)
     k = unit3(t)
@@ -317,7 +318,7 @@ def normal_spread(R, t, C, normal):  # type: ignore[no-untyped-def]
 
 
 @jit
-def opposite(normal_camera, best, far):  # type: ignore[no-untyped-def]
+def opposite(normal_camera, best, far):
     """Is this normal nearer to the mirror of the best one than to itself, and more than `far` (cosine) off it?
 
     Both face the camera (n . k > 0), in axes whose third is the line of sight k. The mirror of n is 2 (n.k) k - n.
@@ -327,7 +328,7 @@ def opposite(normal_camera, best, far):  # type: ignore[no-untyped-def]
 
 
 @jit
-def sight_frame(t):  # type: ignore[no-untyped-def]
+def sight_frame(t):
     """Rows: two axes across the line of sight to t, then the line of sight."""
     k = unit3(t)
     a = np.empty(3)
@@ -344,7 +345,7 @@ def sight_frame(t):  # type: ignore[no-untyped-def]
 
 
 @jit
-def ring_mass(R, t, cost, X, m, A, normal):  # type: ignore[no-untyped-def]
+def ring_mass(R, t, cost, X, m, A, normal):
     """Posterior mass of the normals on this and on the other side of the line of sight, and the middle pose there.
 
     The posterior over the normal is exp(-chi2 / 2) det(information of position and roll)^(-1/2); beforehand all
@@ -390,7 +391,7 @@ def ring_mass(R, t, cost, X, m, A, normal):  # type: ignore[no-untyped-def]
 
 
 @jit
-def solve(points, pixels, covariance, camera, near_sigmas2, Rs, ts, costs, Cs, masses):  # type: ignore[no-untyped-def]
+def solve(points, pixels, covariance, camera, near_sigmas2, Rs, ts, costs, Cs, masses):
     """Everything about one view: minima with covariance and posterior mass, lowest chi-square first.
 
     Args:
@@ -469,7 +470,7 @@ def solve(points, pixels, covariance, camera, near_sigmas2, Rs, ts, costs, Cs, m
 
 
 @jit
-def log_det6(C):  # type: ignore[no-untyped-def]
+def log_det6(C):
     """Log determinant of a positive definite 6x6 matrix."""
     g, x, L = np.zeros(6), np.empty(6), np.zeros((6, 6))
     solve_damped(C, C, 0.0, g, x, L)
@@ -480,7 +481,7 @@ def log_det6(C):  # type: ignore[no-untyped-def]
 
 
 @jit
-def move_origin(C, lever):  # type: ignore[no-untyped-def]
+def move_origin(C, lever):
     """Covariance for the origin at -lever (camera axes) of the point it was for: d <- d + [lever]x r, in place."""
     for _ in range(2):  # J C, then (J (J C)^T)^T by the same loop on the transpose
         for k in range(6):

@@ -225,3 +225,26 @@ def test_refusals_are_perception_errors_with_a_hint() -> None:
     for kind in (CameraMoved, LightMissing, WrongLamp):
         assert issubclass(kind, PerceptionError)
         assert kind("what", hint="do this").for_people().count("do this") == 1
+
+
+def test_blue_lamps_are_as_good_as_white_ones() -> None:
+    off, on = (np.repeat(image[:, :, None], 3, axis=2) for image in pair(leave_out=(0, 1, 2, 3)))
+    blue = on.astype(np.float32)
+    lamps = np.zeros((480, 640), np.float32)
+    for place in light_pixels():
+        disc(lamps, place, 5.5, 110.0)
+    blue[:, :, 2] += lamps
+    seen = panel_pose(off, np.clip(blue, 0, 255).astype(np.uint8), LIGHTS, CAMERA)
+    np.testing.assert_allclose(seen.lights.points_px, light_pixels(), atol=0.3)
+
+
+def test_an_upside_down_trapezium_is_not_taken_for_an_upright_one() -> None:
+    trapezium = np.array([[-0.1, 0.12, 0.0], [0.1, 0.12, 0.0], [0.2, -0.12, 0.0], [-0.2, -0.12, 0.0]])
+    upside_down = np.diag([-1.0, -1.0, 1.0]) @ FRONT
+    off, on = scene(3), scene(3)
+    for place in project(trapezium @ upside_down.T + [0.0, 0.0, 0.62], CAMERA):
+        disc(on, place, 5.5, 80.0)
+    with pytest.raises((WrongLamp, LightMissing)):
+        panel_pose(shot(off, 1), shot(on, 2), trapezium, CAMERA)
+    turned = panel_pose(shot(off, 1), shot(on, 2), trapezium, CAMERA, upright=upside_down)
+    assert np.degrees(Rotation.from_matrix(turned.pose.rotation @ upside_down.T).magnitude()) < 2.0

@@ -70,9 +70,7 @@ class Brush:
         a = np.linspace(0, 2 * np.pi, 60, endpoint=False)
         self.fill(np.column_stack([x + radius_m * np.sin(a), y + radius_m * np.cos(a), np.full(60, z)]), gray)
 
-    def box(  # noqa: PLR0917  (place, size, paint)
-        self, x: float, y: float, z: float, size: tuple[float, float], gray: float, turn_rad: float = 0.0
-    ) -> None:
+    def box(self, x: float, y: float, z: float, size: tuple[float, float], gray: float, turn_rad: float = 0.0) -> None:
         """A filled rectangle parallel to the plate, turned counter-clockwise."""
         w, h = size[0] / 2, size[1] / 2
         c, s = np.cos(turn_rad), np.sin(turn_rad)

@@ -66,7 +66,7 @@ def _plate_mask(small: Image) -> NDArray[np.bool_]:
     low, high = float(np.percentile(held, 1)), float(held.max())
     coded = np.clip((held - low) / max(high - low, 1e-3) * 255.0, 0, 255).astype(np.uint8)
     _, bright = cv2.threshold(coded, 0, 1, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    middle = bright[bright.shape[0] // 4: -bright.shape[0] // 4, bright.shape[1] // 4: -bright.shape[1] // 4]
+    middle = bright[bright.shape[0] // 4 : -bright.shape[0] // 4, bright.shape[1] // 4 : -bright.shape[1] // 4]
     mask = bright if middle.mean() >= 0.5 else 1 - bright
     mask = cv2.morphologyEx(np.pad(mask, 12), cv2.MORPH_CLOSE, np.ones((13, 13), np.uint8))[12:-12, 12:-12]
     mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((7, 7), np.uint8))
@@ -82,7 +82,7 @@ def _side(mask: NDArray[np.bool_], side: int) -> Array | None:
     columns = np.flatnonzero(turned.any(axis=0))
     if len(columns) < 12:
         return None
-    columns = columns[len(columns) // 12: -len(columns) // 12]
+    columns = columns[len(columns) // 12 : -len(columns) // 12]
     last = turned.shape[0] - 1
     first = turned[:, columns].argmax(axis=0) if side in (0, 3) else last - turned[::-1, columns].argmax(axis=0)
     free = (first > 1) & (first < last - 1)
@@ -97,7 +97,7 @@ def _side(mask: NDArray[np.bool_], side: int) -> Array | None:
 def _robust_line(x: Array, y: Array) -> tuple[float, float]:
     """Slope and intercept by least squares with Cauchy weights from a median start."""
     half = len(x) // 2
-    pairs = (y[half:half * 2] - y[:half]) / np.maximum(x[half:half * 2] - x[:half], 1e-9)
+    pairs = (y[half : half * 2] - y[:half]) / np.maximum(x[half : half * 2] - x[:half], 1e-9)
     slope = float(np.median(pairs))
     start = float(np.median(y - slope * x))
     for _ in range(8):
@@ -115,14 +115,21 @@ def _corners(lines: list[Array | None], shape: tuple[int, ...], aspect: float, f
         return None
     top, right, bottom, left = lines
     height, width = shape
-    border = [np.array([0.0, 1.0, -0.5]), np.array([1.0, 0.0, width - 0.5]), np.array([0.0, 1.0, height - 0.5]), np.array([1.0, 0.0, -0.5])]
+    border = [
+        np.array([0.0, 1.0, -0.5]),
+        np.array([1.0, 0.0, width - 0.5]),
+        np.array([0.0, 1.0, height - 0.5]),
+        np.array([1.0, 0.0, -0.5]),
+    ]
     full = [line if line is not None else edge for line, edge in zip(lines, border, strict=True)]
     corners = np.array([_cut(full[3], full[0]), _cut(full[0], full[1]), _cut(full[1], full[2]), _cut(full[2], full[3])])
     if not np.isfinite(corners).all():
         return None
     missing = [k for k, line in enumerate(lines) if line is None]
     if len(missing) == 1:
-        return _completed(corners, missing[0], middle=np.array([width - 1.0, height - 1.0]) / 2, focal=focal, aspect=aspect)
+        return _completed(
+            corners, missing[0], middle=np.array([width - 1.0, height - 1.0]) / 2, focal=focal, aspect=aspect
+        )
     return corners
 
 
@@ -134,7 +141,9 @@ def _completed(corners: Array, missing: int, *, middle: Array, focal: float, asp
     """
     order = np.roll(np.arange(4), -missing)  # the missing side runs from order[0] to order[1]
     far_a, far_b, near_b, near_a = corners[order]
-    ratio = aspect if missing in (1, 3) else 1.0 / aspect  # of the sides that meet the missing one over the opposite one
+    ratio = (
+        aspect if missing in (1, 3) else 1.0 / aspect
+    )  # of the sides that meet the missing one over the opposite one
     a, b = (np.append(p - middle, focal) for p in (near_a, near_b))
     m = np.cross(a, b)
     d = np.cross(np.cross(a, np.append(far_a - middle, focal)), np.cross(b, np.append(far_b - middle, focal)))
@@ -144,7 +153,11 @@ def _completed(corners: Array, missing: int, *, middle: Array, focal: float, asp
     # b lies on the ray of near_b with b - a along `across`: a + length * across = t * ray_b, with a at depth 1.
     solved = np.linalg.lstsq(np.column_stack([across, -b]), -a, rcond=None)[0]
     length = abs(float(solved[0])) * ratio
-    towards = 1.0 if float(np.dot((a + 0.1 * length * d)[:2] / (a + 0.1 * length * d)[2] - a[:2] / a[2], far_a - near_a)) > 0 else -1.0
+    towards = (
+        1.0
+        if float(np.dot((a + 0.1 * length * d)[:2] / (a + 0.1 * length * d)[2] - a[:2] / a[2], far_a - near_a)) > 0
+        else -1.0
+    )
     out = corners.copy()
     for index, start in ((order[0], a), (order[1], b * float(solved[1]))):
         point = start + towards * length * d

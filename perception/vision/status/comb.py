@@ -107,6 +107,13 @@ def segment_levels(ink: Float32, comb: Comb) -> Array:
     return np.asarray(np.median(values.max(axis=3), axis=2), float)
 
 
+def loop_levels(ink: Float32, comb: Comb) -> Array:
+    """(cells, 2) ink in the middle of the upper and the lower loop of every cell, where no segment is."""
+    cell = np.repeat(np.arange(comb.count, dtype=float), 2)
+    u, v = comb.place(np.full(2 * comb.count, 0.5), np.tile([0.25, 0.75], comb.count), cell)
+    return np.asarray(sample_at(ink, u, v, outside=0.0), float).reshape(comb.count, 2)
+
+
 def explained(ink: Float32, combs: Sequence[Comb]) -> Array:
     """(N,) squared ink that flat segment templates explain."""
     width, height = np.array([(c.width_px, c.bottom_px - c.top_px) for c in combs]).T[:, :, None, None]

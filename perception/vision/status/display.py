@@ -18,7 +18,7 @@ from hal.panel import Display
 from perception.vision.image import Image
 from perception.vision.patch import Patch, sample_at
 from perception.vision.reading import Status, gated, probability, refused
-from perception.vision.status.comb import AXES, SEGMENTS, Comb, Float32, find_combs, segment_levels
+from perception.vision.status.comb import AXES, SEGMENTS, Comb, Float32, find_combs, loop_levels, segment_levels
 from perception.vision.view import Array
 
 GLYPHS = (
@@ -113,7 +113,7 @@ def segment_ink(gray: Image, is_dark: bool) -> Float32:
 def decode(ink: Float32, comb: Comb, share: float, decimals: int | None) -> Decoded | None:
     """The reading of a comb that explains `share` of the ink; None when lit and unlit do not separate."""
     levels = segment_levels(ink, comb)
-    threshold, lit = _levels_of(levels)
+    threshold, lit = _levels_of(levels, loop_levels(ink, comb))
     if lit < 3.0:
         return None
     scaled = np.clip((levels - threshold) / np.maximum(lit - threshold, 0.5 * lit) * 0.5, -0.5, 0.5)
@@ -132,9 +132,9 @@ def _window(patch: Patch, spec: Display) -> tuple[Image, NDArray[np.bool_]]:
     return patch.gray[rows, cols], patch.inside[rows, cols]
 
 
-def _levels_of(levels: Array) -> tuple[Array, float]:
+def _levels_of(levels: Array, loops: Array) -> tuple[Array, float]:
     """(cells, 1) threshold of every cell and the level of a lit segment: Otsu over all, then drawn towards each cell."""
-    values = np.sort(levels.ravel())
+    values = np.sort(np.concatenate([levels.ravel(), loops.ravel()]))  # so that "888" has something unlit
     n = np.arange(1, len(values))
     low, high = np.cumsum(values)[:-1] / n, (values.sum() - np.cumsum(values)[:-1]) / (len(values) - n)
     k = int((n * (len(values) - n) * (high - low) ** 2).argmax())

@@ -1,0 +1,218 @@
+"""Which kinds of object are where in an overview, with nothing known but the kinds and the plate's size.
+
+Bottom-up as in the paper: plate, then sub-objects (circles, rectangles, slots, closed groups of edges), whose middles are
+the candidates; every candidate's look is matched with the taught looks of all kinds and of nothing; what is likest and
+overlaps nothing likelier stands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.errors import NotFound
+from perception.vision.features import PLATE_PX_PER_M, Ground, look_at, plate_gray
+from perception.vision.image import Image, as_gray
+from perception.vision.knowledge import NOTHING, Kind, Knowledge
+from perception.vision.match import distances, nothing_column
+from perception.vision.plate import find_plate
+from perception.vision.shapes import Edges, find_circles, find_edges, find_rectangles, find_slots
+from perception.vision.view import Array, View
+
+PLATE_M = (0.40, 0.30)
+FURTHEST = 0.8  # a place further from every look is unlike anything taught
+MARGIN = 0.01  # by which an object must be liker than nothing
+SECOND_LOOK = 0.05  # a candidate this much liker to nothing still gets a look from its best middle
+SCALE = 0.02  # of the confidence
+CIRCLE_RADII_M = (0.004, 0.042)
+SIDES_M = (0.016, 0.095)
+SLOT_M = (0.034, 0.085)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Candidate:
+    """A place where an object may be.
+
+    Attributes:
+        kind: the likest kind.
+        confidence: 0 to 1.
+        centre_px, centre_m: (2,) middle in the image, and on the plate (origin in its middle, y up).
+        box_px: (4, 2) a typical object's outline there.
+        distance: to the likest look; `rival`: the next kind and its distance.
+        reason: why it is refused; None for an object.
+    """
+
+    kind: str
+    confidence: float
+    centre_px: Array
+    centre_m: Array
+    box_px: Array
+    distance: float
+    rival: tuple[str, float]
+    reason: str | None = None
+
+
+def recognise(
+    image: NDArray[Any],
+    knowledge: Knowledge,
+    *,
+    plate_m: tuple[float, float] = PLATE_M,
+    view: View | None = None,
+    focal_px: float | None = None,
+) -> tuple[Candidate, ...]:
+    """Objects of known kinds, best first; then the refused candidates with their reasons.
+
+    Args:
+        image: overview, gray or RGB uint8; the plate fills most of it.
+        plate_m: width and height of the plate.
+        view: where the plate is, if that is known; else its border is looked for.
+        focal_px: of the camera, if known; completes a plate that the image cuts off.
+
+    Raises:
+        InvalidRequest, NotObservable: bad image.
+        NotFound: no plate in the image.
+    """
+    gray = as_gray(image)
+    if view is None:
+        plate = find_plate(gray, *plate_m, focal_px=focal_px)
+        if plate is None:
+            raise NotFound(
+                "no plate fills the image", hint="take an overview of one panel, upright, with its border in view"
+            )
+        view = plate.view
+    ground = lay_out(gray, view, plate_m)
+    places = candidate_places(ground.edges)
+    if not len(places):
+        return ()
+    return chosen(ground, places, look_at(ground, places), knowledge, view, plate_m)
+
+
+def lay_out(gray: Image, view: View, plate_m: tuple[float, float]) -> Ground:
+    """The plate seen straight on, with its edges."""
+    w, h = plate_m
+    size = (round(w * PLATE_PX_PER_M), round(h * PLATE_PX_PER_M))
+    corners = np.array([[-w / 2, h / 2, 0], [w / 2, h / 2, 0], [w / 2, -h / 2, 0], [-w / 2, -h / 2, 0]])
+    target = np.array([[0, 0], [size[0], 0], [size[0], size[1]], [0, size[1]]], np.float32)
+    turn = cv2.getPerspectiveTransform(view.project(corners).astype(np.float32), target)
+    picture = cv2.warpPerspective(gray, turn, size, flags=cv2.INTER_LINEAR)
+    return Ground(picture=picture, edges=find_edges(picture), plate_gray=plate_gray(picture))
+
+
+def candidate_places(edges: Edges) -> Array:
+    """(N, 2) middles of sub-objects on the rectified plate, px."""
+    s = PLATE_PX_PER_M
+    places = [(c.u, c.v) for c in find_circles(edges, least_px=CIRCLE_RADII_M[0] * s, most_px=CIRCLE_RADII_M[1] * s)]
+    places += [(r.u, r.v) for r in find_rectangles(edges, least_px=SIDES_M[0] * s, most_px=SIDES_M[1] * s)]
+    places += find_slots(edges, least_px=SLOT_M[0] * s, most_px=SLOT_M[1] * s)
+    places += _groups(edges)
+    found = np.array(places, float).reshape(-1, 2)
+    close = np.abs(found[:, None] - found[None]).max(axis=2) < 1.5
+    distinct: list[int] = []
+    for k in range(len(found)):
+        if not close[k, distinct].any():
+            distinct.append(k)
+    return found[distinct]
+
+
+def _groups(edges: Edges) -> list[tuple[float, float]]:
+    """Middles of the boxes of edges that lie close together, at two reaches."""
+    places = []
+    for reach in (2, 5):
+        joined = cv2.morphologyEx(edges.thin.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((2 * reach + 1,) * 2, np.uint8))
+        count, _, stats, _ = cv2.connectedComponentsWithStats(joined, connectivity=8)
+        for x, y, width, height in stats[1:count, :4]:
+            if 18 <= max(width, height) < 150:
+                places.append((float(x + (width - 1) / 2), float(y + (height - 1) / 2)))
+    return places
+
+
+def chosen(
+    ground: Ground, places: Array, looks: Array, knowledge: Knowledge, view: View, plate_m: tuple[float, float]
+) -> tuple[Candidate, ...]:
+    """The candidates that stand, likest first, then the refused ones; see the module's text."""
+    distance = distances(looks, knowledge)
+    names = [kind.name for kind in knowledge.kinds]
+    nothing = nothing_column(knowledge)
+    to_nothing = distance[:, nothing] if nothing is not None else np.full(len(places), np.inf)
+    kinds = distance.copy()
+    if nothing is not None:
+        kinds[:, nothing] = np.inf
+    best = kinds.argmin(axis=1)
+    near = kinds.min(axis=1)
+    order = np.argsort(near - np.minimum(to_nothing, near + 0.3))
+    taken: list[tuple[float, float, float]] = []
+    accepted, refused = [], []
+    for i in order:
+        if near[i] > to_nothing[i] + SECOND_LOOK:
+            break  # sorted: nothing better follows
+        if near[i] > FURTHEST:
+            continue
+        u, v = places[i]
+        reach = max(knowledge.kinds[best[i]].size_m) * PLATE_PX_PER_M
+        if any(max(abs(u - a), abs(v - b)) < 0.475 * max(reach, c) for a, b, c in taken):
+            continue
+        middle = _centred(ground, places[i], knowledge.kinds[best[i]], knowledge)
+        seen = distances(look_at(ground, middle[None]), knowledge)[0]
+        to_other = float(seen[nothing]) if nothing is not None else np.inf
+        if nothing is not None:
+            seen[nothing] = np.inf
+        kind = knowledge.kinds[int(seen.argmin())]
+        reason = _refusal(float(seen.min()), to_other)
+        candidate = _candidate(middle, names, seen, to_other, kind.size_m, view, plate_m, reason)
+        if reason is None:
+            taken.append((middle[0], middle[1], max(kind.size_m) * PLATE_PX_PER_M))
+            accepted.append(candidate)
+        else:
+            refused.append(candidate)
+    return (*accepted, *refused)
+
+
+def _refusal(near: float, to_nothing: float) -> str | None:
+    if near > FURTHEST:
+        return "unlike everything taught: teach it, or come closer"
+    if near > to_nothing - MARGIN:
+        return "as much like something that is no object: come closer, or change the angle or the light"
+    return None
+
+
+def _centred(ground: Ground, place: Array, kind: Kind, knowledge: Knowledge) -> Array:
+    """The place near by that is likest to the kind's looks, which were taught at the true middles.
+
+    The middle of a sub-object may be off by a shadow or a wall; the look as a whole is not. The minimum of a quadratic
+    through the distances on a 3 x 3 grid, weighted towards the small ones, three times finer.
+    """
+    only = Knowledge(kinds=(kind,), spread=knowledge.spread)
+    for step in (1.6, 0.8, 0.4):
+        du, dv = np.meshgrid(np.arange(-1, 2) * step, np.arange(-1, 2) * step)
+        tried = place + np.column_stack([du.ravel(), dv.ravel()])
+        d = distances(look_at(ground, tried), only)[:, 0]
+        w = np.exp(-(d - d.min()) / max(0.25 * float(d.max() - d.min()), 1e-6))
+        place = (w[:, None] * tried).sum(axis=0) / w.sum()
+    return np.asarray(place)
+
+
+def _candidate(
+    place: Array, names: list[str], kinds: Array, to_nothing: float, size: tuple[float, float], view: View,
+    plate_m: tuple[float, float], reason: str | None,
+) -> Candidate:  # fmt: skip
+    order = np.argsort(kinds)
+    first, second = int(order[0]), int(order[1]) if len(order) > 1 and np.isfinite(kinds[order[1]]) else int(order[0])
+    lead = min(to_nothing, float(kinds[second]) if second != first else np.inf) - float(kinds[first])
+    x, y = place[0] / PLATE_PX_PER_M - plate_m[0] / 2, plate_m[1] / 2 - place[1] / PLATE_PX_PER_M
+    w, h = size[0] / 2, size[1] / 2
+    box = np.array([[x - w, y + h, 0], [x + w, y + h, 0], [x + w, y - h, 0], [x - w, y - h, 0], [x, y, 0]])
+    px = view.project(box)
+    return Candidate(
+        kind=names[first],
+        confidence=float(1.0 / (1.0 + np.exp(-np.clip((lead - 0.5 * MARGIN) / SCALE, -8.0, 8.0)))),
+        centre_px=px[4],
+        centre_m=np.array([x, y]),
+        box_px=px[:4],
+        distance=float(kinds[first]),
+        rival=(names[second] if second != first else NOTHING, float(min(kinds[second], to_nothing))),
+        reason=reason,
+    )

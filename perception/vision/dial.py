@@ -1,0 +1,176 @@
+"""One dial that fills the picture, with nothing taught but the ends of its scale: photographs of meters and gauges.
+
+The pointer may differ from the face in colour rather than in brightness, so it is looked for in several channels of the
+picture and the clearest one is believed.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.panel import Scale
+from perception.vision.image import Image, as_gray
+from perception.vision.patch import Patch
+from perception.vision.reading import Status, gated, refused
+from perception.vision.shapes import find_circles, find_edges
+from perception.vision.status.gauge import pointer_confidence, status_of_pointer
+from perception.vision.status.pointer import PointerFit, find_pointer
+
+SIDE_PX = 220
+NUMERALS_FROM, TIP_AT = 0.45, 0.72  # share of the radius: beyond any round hub, within every pointer
+SCALE_END_RAD = np.deg2rad(135.0)  # three quarters of a turn is what almost all round gauges use
+
+
+def read_dial(
+    image: NDArray[Any], *, minimum: float, maximum: float, circular: bool, ends_rad: tuple[float, float] | None = None
+) -> Status:
+    """Value of the dial that fills the picture.
+
+    Args:
+        image: gray or RGB uint8, cropped to the dial.
+        circular: the scale is a full turn that begins straight up.
+        ends_rad: pointer angles at minimum and maximum of a scale that is not; three quarters of a turn by default.
+
+    Raises:
+        InvalidRequest, NotObservable: bad image.
+    """
+    as_gray(image)
+    scale = SIDE_PX / max(image.shape[:2])
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    gray = as_gray(np.asarray(small, np.uint8))
+    u, v, radius = _dial_circle(gray)
+    drop = _coloured_pointer(np.asarray(small, np.uint8), u, v, radius)
+    fits = [] if drop is None else [drop]
+    for channel, dark in _channels(np.asarray(small, np.uint8), gray) if drop is None else []:
+        fit = find_pointer(
+            _patch(channel, u, v), pivot_m=(0.0, 0.0), inner_m=NUMERALS_FROM * radius, outer_m=TIP_AT * radius,
+            fine_m=(0.35 * radius, 0.78 * radius), width_rad=np.deg2rad(50.0), quantile=0.4, dark=dark,
+            prior_pivot_px=0.02 * radius,
+        )  # fmt: skip
+        if fit is not None:
+            fits.append(fit)
+    if not fits:
+        return refused("no pointer stands out on the dial: come closer or add light")
+    fit = max(fits, key=_clearness)
+    if circular:
+        value = minimum + (fit.angle_rad % (2 * np.pi)) / (2 * np.pi) * (maximum - minimum)
+        sigma = fit.sigma_rad / (2 * np.pi) * (maximum - minimum)
+        return gated(Status(value=float(value), uncertainty=float(sigma), confidence=pointer_confidence(fit, 1.0)))
+    low, high = ends_rad or (-SCALE_END_RAD, SCALE_END_RAD)
+    return status_of_pointer(fit, Scale(minimum=minimum, maximum=maximum, unit="", at_min=low, at_max=high), 1.0)
+
+
+def _coloured_pointer(image: Image, u: float, v: float, radius: float) -> PointerFit | None:
+    """A pointer of a colour of its own: its region is a hub with a tip, and its axis runs from the one to the other.
+
+    The axis does not need the dial's middle, so a pointer seen from the side is read right.
+    """
+    if image.ndim == 2:
+        return None
+    lab = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_RGB2LAB).astype(np.float32)
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    disc = np.hypot(x - u, y - v) < 0.86 * radius
+    best: tuple[float, NDArray[np.bool_]] | None = None
+    for k in (1, 2):
+        part = cv2.GaussianBlur(lab[:, :, k], (0, 0), 1.5)
+        for sign in (1.0, -1.0):
+            region, separation = _region(sign * part, disc, (round(u), round(v)))
+            if region is not None and (best is None or separation > best[0]):
+                best = separation, region
+    return None if best is None else _axis(best[1], radius, best[0])
+
+
+def _region(
+    channel: NDArray[np.float32], disc: NDArray[np.bool_], middle: tuple[int, int]
+) -> tuple[NDArray[np.bool_] | None, float]:
+    """The coloured region about the middle and how many spreads of the face it stands out by; None if it is no pointer."""
+    values = channel[disc]
+    low, high = float(np.percentile(values, 1)), float(np.percentile(values, 99))
+    if high - low < 12.0:
+        return None, 0.0
+    coded = np.clip((channel - low) / (high - low) * 255, 0, 255).astype(np.uint8)
+    threshold, _ = cv2.threshold(coded[disc][None], 0, 1, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    mask = ((coded > threshold) & disc).astype(np.uint8)
+    mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
+    if count < 2:
+        return None, 0.0
+    biggest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
+    region = labels == biggest
+    share = float(region.sum() / disc.sum())
+    near = region[max(0, middle[1] - 12) : middle[1] + 13, max(0, middle[0] - 12) : middle[0] + 13].any()
+    face = channel[disc & ~region]
+    spread = 1.4826 * float(np.median(np.abs(face - np.median(face)))) + 1.0
+    separation = (float(np.median(channel[region])) - float(np.median(face))) / spread
+    return (region, separation) if 0.03 < share < 0.4 and near and separation > 4.0 else (None, 0.0)
+
+
+def _axis(region: NDArray[np.bool_], radius: float, separation: float) -> PointerFit | None:
+    inner = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
+    core = np.argwhere(inner > 0.93 * inner.max())
+    hub = core.mean(axis=0)[::-1]
+    points = np.argwhere(region)[:, ::-1] - hub
+    away = np.hypot(points[:, 0], points[:, 1])
+    hub_radius, reach = float(inner.max()), float(np.percentile(away, 99.7))
+    if reach < 1.4 * hub_radius or reach < 0.4 * radius:
+        return None  # a disc points nowhere
+    far = points[away > max(1.15 * hub_radius, 0.55 * reach)]
+    direction = far.mean(axis=0)
+    angle = float(np.arctan2(direction[0], -direction[1]))
+    spread = np.abs((np.arctan2(far[:, 0], -far[:, 1]) - angle + np.pi) % (2 * np.pi) - np.pi)
+    stray = float((spread > np.deg2rad(35.0)).mean())
+    return PointerFit(
+        angle_rad=angle,
+        sigma_rad=float(np.arctan(1.0 / reach)),
+        strength=3.0 * separation,
+        contrast=separation,
+        rival_ratio=min(1.0, stray * 2),
+        rival_rad=angle + np.pi,
+        supported=1.0 - stray,
+        is_dark=False,
+        unknown=0.0,
+    )
+
+
+def _clearness(fit: PointerFit) -> float:
+    return float(np.log(fit.strength) + 3.0 * (1.0 - fit.rival_ratio) + 2.0 * fit.supported)
+
+
+def _dial_circle(gray: Image) -> tuple[float, float, float]:
+    """Middle and radius of the dial: the largest round outline about the picture's middle, else the picture itself."""
+    height, width = gray.shape
+    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+    most = 0.52 * max(width, height)
+    circles = [
+        c
+        for c in find_circles(find_edges(gray, sigma_px=1.5), least_px=0.55 * most, most_px=most)
+        if np.hypot(c.u - middle[0], c.v - middle[1]) < 0.12 * most
+    ]
+    if not circles:
+        return float(middle[0]), float(middle[1]), 0.5 * min(width, height)
+    best = max(circles, key=lambda c: c.coverage * c.radius)
+    return best.u, best.v, best.radius
+
+
+def _channels(image: Image, gray: Image) -> list[tuple[Image, bool | None]]:
+    """Pictures in which a pointer may stand out, and whether it is dark in them (None: either)."""
+    channels: list[tuple[Image, bool | None]] = [(gray, None)]
+    if image.ndim == 3:
+        lab = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_RGB2LAB).astype(np.float32)
+        for k in (1, 2):
+            part = cv2.GaussianBlur(lab[:, :, k], (0, 0), 1.0)
+            low, high = np.percentile(part, [2, 99.5])
+            if high - low >= 12.0:
+                channels.append((np.clip((part - low) * (220.0 / (high - low)) + 10, 0, 255).astype(np.uint8), None))
+    return channels
+
+
+def _patch(channel: Image, u: float, v: float) -> Patch:
+    return Patch(
+        gray=channel, colour=None, inside=np.ones(channel.shape, bool), px_per_m=1.0, image_px_per_m=1.0,
+        origin_px=np.array([u, v]), parallax_px_per_m=np.zeros(2), growth_per_m=0.0, plane_z_m=0.0,
+    )  # fmt: skip

@@ -1,0 +1,150 @@
+"""What the system knows of kinds of objects: readable TOML, one file a kind, written by teaching or by hand.
+
+A kind has a size and looks. A look is what one taught example looked like (see `features`): four rows of numbers over the
+distance from the middle, in hundredths. The file `nothing.toml` holds looks of what is *not* an object: screws, labels,
+parts of objects. Adding a look to one kind changes no other kind's looks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from hal.errors import ConfigError
+from hal.strict import Strict, load_toml
+from perception.vision.features import GROUPS, LENGTH, RADII_M
+from perception.vision.view import Array
+
+NOTHING = "nothing"
+UNIT = 100.0  # looks are stored in hundredths
+
+Row = Annotated[tuple[int, ...], Field(min_length=len(RADII_M), max_length=len(RADII_M))]
+
+
+class LookRecord(Strict):
+    """One example: relative gray, unevenness, edges and strong edges over the distance from the middle, hundredths."""
+
+    gray: Row
+    uneven: Row
+    edge: Row
+    strong_edge: Row
+
+
+class KindRecord(Strict):
+    """A kind's file."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}$")]
+    width_m: Annotated[float, Field(gt=0, le=1.0)]
+    height_m: Annotated[float, Field(gt=0, le=1.0)]
+    taught_by: str = ""
+    looks: tuple[LookRecord, ...] = ()
+
+    @model_validator(mode="after")
+    def _has_looks(self) -> KindRecord:
+        if not self.looks:
+            raise ValueError("a kind needs at least one look")
+        return self
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Kind:
+    """A kind of object.
+
+    Attributes:
+        name: as in the panel file where readers exist, else free.
+        size_m: (width, height) of a typical one, m.
+        looks: (N, LENGTH), one row an example.
+    """
+
+    name: str
+    size_m: tuple[float, float]
+    looks: Array
+    taught_by: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Knowledge:
+    """All kinds, and `spread` (LENGTH,): how much every number varies between things at all, the unit of likeness."""
+
+    kinds: tuple[Kind, ...]
+    spread: Array
+
+    def kind(self, name: str) -> Kind | None:
+        """The kind of that name, or None."""
+        return next((kind for kind in self.kinds if kind.name == name), None)
+
+    def with_look(self, name: str, size_m: tuple[float, float], look: Array, *, taught_by: str = "") -> Knowledge:
+        """The knowledge with one more look; a new name makes a new kind."""
+        known = self.kind(name)
+        if known is None:
+            kind = Kind(name=name, size_m=size_m, looks=look[None], taught_by=taught_by)
+            return replace(self, kinds=(*self.kinds, kind))
+        grown = replace(known, looks=np.vstack([known.looks, look]))
+        return replace(self, kinds=tuple(grown if kind is known else kind for kind in self.kinds))
+
+
+def shipped_knowledge() -> Knowledge:
+    """The kinds that come with the system."""
+    return load_knowledge(Path(__file__).parent / "knowledge")
+
+
+def load_knowledge(folder: Path) -> Knowledge:
+    """All kinds of a folder: `*.toml` with looks.
+
+    Raises:
+        ConfigError: a file is malformed, or the folder holds no kind.
+    """
+    records = [
+        load_toml(path, KindRecord, "knowledge file") for path in sorted(folder.glob("*.toml")) if not _is_other(path)
+    ]
+    if not records:
+        raise ConfigError(f"no kinds in {folder}", hint="teach one: panelwright teach IMAGE", file=str(folder))
+    kinds = tuple(_kind(record) for record in records)
+    return Knowledge(kinds=kinds, spread=spread_of(kinds))
+
+
+def spread_of(kinds: Iterable[Kind]) -> Array:
+    """(LENGTH,) standard deviation of every number over the kinds' looks, each kind counting the same."""
+    kinds = [kind for kind in kinds if kind.name != NOTHING]
+    means = np.array([kind.looks.mean(axis=0) for kind in kinds])
+    within = np.array([kind.looks.var(axis=0) for kind in kinds]).mean(axis=0)
+    return np.asarray(np.maximum(np.sqrt(within + means.var(axis=0)), 0.05))
+
+
+def write_kind(kind: Kind, folder: Path) -> Path:
+    """Write one kind's file and return its path."""
+    path = folder / f"{kind.name}.toml"
+    lines = [
+        f"# What a {kind.name.replace('_', ' ')} looks like: rows over the distance from its middle, "
+        f"{RADII_M[0] * 1e3:g} to {RADII_M[-1] * 1e3:g} mm, in hundredths.",
+        f'name = "{kind.name}"',
+        f"width_m = {kind.size_m[0]:.4f}",
+        f"height_m = {kind.size_m[1]:.4f}",
+    ]
+    if kind.taught_by:
+        lines.append(f'taught_by = "{kind.taught_by}"')
+    for look in kind.looks:
+        lines.append("\n[[looks]]")
+        for name, row in zip(GROUPS, look.reshape(len(GROUPS), -1), strict=True):
+            lines.append(f"{name} = [{', '.join(str(round(float(v) * UNIT)) for v in row)}]")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def _is_other(path: Path) -> bool:
+    return path.stem == "proportions"
+
+
+def _kind(record: KindRecord) -> Kind:
+    looks = np.array([[*look.gray, *look.uneven, *look.edge, *look.strong_edge] for look in record.looks], float) / UNIT
+    return Kind(
+        name=record.name,
+        size_m=(record.width_m, record.height_m),
+        looks=looks.reshape(-1, LENGTH),
+        taught_by=record.taught_by,
+    )

@@ -1,0 +1,201 @@
+"""Blind recognition and teaching on drawn scenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.vision_drawing import Disturbance
+from hal.errors import Ambiguous, InvalidRequest, NotFound
+from hal.panel import load_panel
+from perception.vision.blind import recognise
+from perception.vision.features import LENGTH, region_shape
+from perception.vision.knowledge import (
+    NOTHING,
+    Kind,
+    Knowledge,
+    load_knowledge,
+    shipped_knowledge,
+    spread_of,
+    write_kind,
+)
+from perception.vision.match import distances, distances_reference
+from perception.vision.plate import find_plate
+from perception.vision.teach import check, panel_text, plate_points, questions, teach
+from perception.vision.view import CameraView
+from tests.perception.vision.bench_panel import panel, scene
+
+PLATE = (0.60, 0.40)
+
+
+def overview(**options: object) -> tuple[np.ndarray, CameraView]:
+    image, intrinsics, pose = scene(tilt_deg=5.0, distance_m=0.66, pose_error=0.0, **options)  # type: ignore[arg-type]
+    return image, CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+
+
+def pixel_of(view: CameraView, name: str) -> tuple[float, float]:
+    u, v = view.project([panel().object(name).point_m])[0]
+    return float(u), float(v)
+
+
+def test_the_plate_is_found_to_a_pixel_or_two() -> None:
+    image, view = overview()
+    plate = find_plate(image, *PLATE)
+    assert plate is not None and all(plate.sides_seen)
+    corners = np.column_stack([plate.view.corners_m, np.zeros(4)])
+    assert np.linalg.norm(plate.view.project(corners) - view.project(corners), axis=1).max() < 2.0
+
+
+def test_a_plate_that_the_image_cuts_off_is_completed() -> None:
+    image, view = overview()
+    cut = np.ascontiguousarray(image[:, :1060])
+    plate = find_plate(cut, *PLATE, focal_px=1280.0)
+    assert plate is not None and not plate.sides_seen[1]
+    corners = np.column_stack([plate.view.corners_m, np.zeros(4)])
+    assert np.linalg.norm(plate.view.project(corners) - view.project(corners), axis=1).max() < 60.0
+
+
+def test_a_picture_without_a_plate_is_refused() -> None:
+    noise = np.random.default_rng(3).integers(0, 40, (240, 320), dtype=np.uint8)
+    noise[100:110, 100:110] = 200
+    with pytest.raises(NotFound):
+        recognise(noise, shipped_knowledge())
+
+
+def test_a_kind_that_did_not_exist_is_taught_by_two_clicks_and_found_again() -> None:
+    knowledge = shipped_knowledge()
+    assert knowledge.kind("mushroom") is None
+    image, view = overview()
+    (u, v), radius_px = pixel_of(view, "emergency"), 46.0
+    clicks = [(u - radius_px, v - radius_px), (u + radius_px, v + radius_px)]
+    lesson = teach(image, knowledge, kind="mushroom", clicks_px=clicks, plate_m=PLATE)
+    assert lesson.is_new_kind and lesson.added
+    other, other_view = overview(disturbance=Disturbance(exposure=0.8, slope_ratio=1.5, seed=9), seed=4)
+    found = [c for c in check(other, lesson.knowledge, plate_m=PLATE) if c.kind == "mushroom" and c.reason is None]
+    assert len(found) == 1
+    assert np.linalg.norm(found[0].centre_px - pixel_of(other_view, "emergency")) < 12.0
+
+
+def test_teaching_the_same_look_again_teaches_nothing() -> None:
+    image, view = overview()
+    first = teach(
+        image,
+        shipped_knowledge(),
+        kind="mushroom",
+        clicks_px=[pixel_of(view, "emergency")],
+        size_m=(0.04, 0.04),
+        plate_m=PLATE,
+    )
+    again = teach(image, first.knowledge, kind="mushroom", clicks_px=[pixel_of(view, "emergency")], plate_m=PLATE)
+    assert not again.added and again.knowledge is first.knowledge
+
+
+def test_a_look_that_would_rob_another_kind_is_refused() -> None:
+    knowledge = shipped_knowledge()
+    gauge = knowledge.kind("gauge")
+    assert gauge is not None
+    image, view = overview()
+    twin = teach(
+        image,
+        knowledge,
+        kind="pressure_dial",
+        clicks_px=[pixel_of(view, "pressure")],
+        size_m=(0.08, 0.08),
+        plate_m=PLATE,
+    )
+    look = twin.kind.looks[0]
+    filled = Kind(name="gauge", size_m=gauge.size_m, looks=np.vstack([gauge.looks, look + 0.01]))
+    crowded = Knowledge(
+        kinds=tuple(filled if k.name == "gauge" else k for k in knowledge.kinds), spread=knowledge.spread
+    )
+    with pytest.raises(Ambiguous):
+        teach(
+            image,
+            crowded,
+            kind="pressure_dial",
+            clicks_px=[pixel_of(view, "pressure")],
+            size_m=(0.08, 0.08),
+            plate_m=PLATE,
+        )
+
+
+def test_clicks_are_checked() -> None:
+    image, view = overview()
+    with pytest.raises(InvalidRequest):
+        teach(image, shipped_knowledge(), kind="new_thing", clicks_px=[pixel_of(view, "emergency")], plate_m=PLATE)
+    with pytest.raises(InvalidRequest):
+        teach(image, shipped_knowledge(), kind="gauge", clicks_px=[], plate_m=PLATE)
+    with pytest.raises(NotFound):
+        plate_points(view, [(2.0, 2.0)], PLATE)
+
+
+def test_knowledge_survives_its_files(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    kinds = tuple(
+        Kind(name=name, size_m=(0.05, 0.04), looks=np.round(rng.normal(0, 1, (3, LENGTH)), 2))
+        for name in ("a", NOTHING)
+    )
+    for kind in kinds:
+        write_kind(kind, tmp_path)
+    loaded = load_knowledge(tmp_path)
+    for kind in kinds:
+        again = loaded.kind(kind.name)
+        assert again is not None and again.size_m == kind.size_m
+        assert np.allclose(again.looks, kind.looks)
+
+
+def test_the_fast_match_agrees_with_the_plain_one() -> None:
+    rng = np.random.default_rng(1)
+    kinds = tuple(
+        Kind(name=name, size_m=(0.05, 0.04), looks=rng.normal(0, 1, (n, LENGTH))) for name, n in (("a", 4), ("b", 7))
+    )
+    knowledge = Knowledge(kinds=kinds, spread=spread_of(kinds))
+    looks = rng.normal(0, 1, (9, LENGTH))
+    assert np.allclose(distances(looks, knowledge), distances_reference(looks, knowledge))
+
+
+def test_shape_features_do_not_change_with_turn_and_size() -> None:
+    v, u = np.mgrid[:200, :200]
+    small = (np.abs(u - 100) < 30) & (np.abs(v - 100) < 15)
+    c, s = np.cos(0.6), np.sin(0.6)
+    x, y = c * (u - 100) + s * (v - 100), -s * (u - 100) + c * (v - 100)
+    turned = (np.abs(x) < 60) & (np.abs(y) < 30)
+    disc = np.hypot(u - 100, v - 100) < 40
+    a, b, d = region_shape(small), region_shape(turned), region_shape(disc)
+    assert a is not None and b is not None and d is not None
+    assert a.aspect == pytest.approx(b.aspect, rel=0.06) and d.aspect == pytest.approx(1.0, abs=0.03)
+    assert np.allclose(a.descriptors, b.descriptors, atol=0.04)
+    assert max(d.descriptors) < 0.02 < max(a.descriptors)
+
+
+def test_a_dialogue_and_clicks_make_a_panel_file(tmp_path: Path) -> None:
+    image, view = overview()
+    lesson = teach(
+        image,
+        shipped_knowledge(),
+        kind="mushroom",
+        clicks_px=[pixel_of(view, "emergency")],
+        size_m=(0.04, 0.04),
+        plate_m=PLATE,
+    )
+    found = next(c for c in check(image, lesson.knowledge, plate_m=PLATE) if c.kind == "mushroom")
+    keys = [q.key for q in questions("gauge", lesson.knowledge)]
+    assert keys[:2] == ["kind", "name"] and "at_max" in keys
+    dial = {
+        "kind": "gauge",
+        "name": "inlet",
+        "minimum": "0",
+        "maximum": "10",
+        "unit": "bar",
+        "at_min": "-2.3",
+        "at_max": "2.3",
+    }
+    text = panel_text("taught", PLATE, [(found, {"name": "stop"}), (found, dial)])
+    path = tmp_path / "taught.toml"
+    path.write_text(text, encoding="utf-8")
+    made = load_panel(path)
+    assert {thing.name for thing in made.objects} == {"stop", "inlet"}
+    with pytest.raises(InvalidRequest):
+        panel_text("taught", PLATE, [(found, {**dial, "minimum": "low"})])

@@ -98,7 +98,7 @@ def lay_out(gray: Image, view: View, plate_m: tuple[float, float]) -> Ground:
     corners = np.array([[-w / 2, h / 2, 0], [w / 2, h / 2, 0], [w / 2, -h / 2, 0], [-w / 2, -h / 2, 0]])
     target = np.array([[0, 0], [size[0], 0], [size[0], size[1]], [0, size[1]]], np.float32)
     turn = cv2.getPerspectiveTransform(view.project(corners).astype(np.float32), target)
-    picture = cv2.warpPerspective(gray, turn, size, flags=cv2.INTER_LINEAR)
+    picture = np.asarray(cv2.warpPerspective(gray, turn, size, flags=cv2.INTER_LINEAR), np.uint8)
     return Ground(picture=picture, edges=find_edges(picture), plate_gray=plate_gray(picture))
 
 

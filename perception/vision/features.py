@@ -88,7 +88,7 @@ def region_shape(mask: NDArray[np.bool_]) -> RegionShape | None:
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
         return None
-    contour = max(contours, key=cv2.contourArea).reshape(-1, 2)
+    contour = max(contours, key=cv2.contourArea).reshape(-1, 2).astype(np.int32)
     area = float(cv2.contourArea(contour))
     if area < 8.0:
         return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from perception.vision.knowledge import NOTHING, Knowledge
 from perception.vision.view import Array
@@ -17,7 +18,7 @@ def distances(looks: Array, knowledge: Knowledge) -> Array:
     The distance is the mean of the absolute differences over the spread, each limited to `CLIP`.
     """
     known = np.vstack([kind.looks for kind in knowledge.kinds]) / knowledge.spread
-    owner = np.repeat(np.arange(len(knowledge.kinds)), [len(kind.looks) for kind in knowledge.kinds])
+    owner = np.repeat(np.arange(len(knowledge.kinds)), [len(kind.looks) for kind in knowledge.kinds]).astype(np.int64)
     return np.asarray(_nearest(looks / knowledge.spread, known, owner, len(knowledge.kinds)))
 
 
@@ -37,7 +38,7 @@ def nothing_column(knowledge: Knowledge) -> int | None:
 
 
 @njit(cache=True)
-def _nearest(looks: Array, known: Array, owner: Array, kinds: int) -> Array:  # pragma: no cover
+def _nearest(looks: Array, known: Array, owner: NDArray[np.int64], kinds: int) -> Array:  # pragma: no cover
     """Branch and bound: a look is given up as soon as it is further than the best of its kind."""
     n, length = looks.shape
     out = np.full((n, kinds), CLIP * 1.0)

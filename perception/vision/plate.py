@@ -40,7 +40,7 @@ class Plate:
 def find_plate(gray: Image, width_m: float, height_m: float, *, focal_px: float | None = None) -> Plate | None:
     """The plate of known size that fills most of the image, upright within 45 degrees; None when there is none."""
     shrink = max(1.0, gray.shape[1] / COARSE_WIDTH_PX)
-    small = cv2.resize(gray, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
+    small = np.asarray(cv2.resize(gray, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA), np.uint8)
     mask = _plate_mask(small)
     if mask.mean() < LEAST_SHARE:
         return None
@@ -113,7 +113,6 @@ def _corners(lines: list[Array | None], shape: tuple[int, ...], aspect: float, f
     seen = sum(line is not None for line in lines)
     if seen < 2:
         return None
-    top, right, bottom, left = lines
     height, width = shape
     border = [
         np.array([0.0, 1.0, -0.5]),

@@ -68,11 +68,13 @@ def _fits(sums: Array, k: int, value: float, tolerance: float, spreads: float) -
         return True
     if d > 3.0 * tolerance * n:
         return False
-    return d * d <= spreads * spreads * (sums[k, 2] * n - total * total)
+    return bool(d * d <= spreads * spreads * (sums[k, 2] * n - total * total))
 
 
 @njit(cache=True)
-def _grow(gray: Image, tolerance: float, spreads: float) -> tuple[NDArray[np.int32], Array]:  # pragma: no cover
+def _grow(  # noqa: PLR0912, PLR0915  (one pass: calls would cost more than what they do)
+    gray: Image, tolerance: float, spreads: float
+) -> tuple[NDArray[np.int32], Array]:  # pragma: no cover
     height, width = gray.shape
     labels = np.empty((height, width), np.int32)
     capacity = height * width // 4 + 16

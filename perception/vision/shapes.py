@@ -64,10 +64,10 @@ class Rectangle:
 
 def find_edges(picture: Image, *, sigma_px: float = 1.0) -> Edges:
     """Edges of a picture; a slope counts when it exceeds four sigmas of its noise and a share of the gray level."""
-    smooth = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), sigma_px)
-    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.125)
-    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.125)
-    strength = cv2.magnitude(gx, gy)
+    smooth = np.asarray(cv2.GaussianBlur(picture.astype(np.float32), (0, 0), sigma_px), np.float32)
+    gx = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.125), np.float32)
+    gy = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.125), np.float32)
+    strength = np.asarray(cv2.magnitude(gx, gy), np.float32)
     least = 2.0 + 0.5 * noise_sigma(picture) / sigma_px
     strong = strength > np.maximum(least, 0.022 * smooth)
     return Edges(along_x=gx, along_y=gy, strength=strength, strong=strong, thin=_thinned(gx, gy, strength, strong))
@@ -169,7 +169,6 @@ def _thinned(gx: Float32, gy: Float32, s: Float32, strong: NDArray[np.bool_]) ->
 def _peaks(votes: Float32, radii: Array, cell: int) -> list[tuple[float, float, float]]:
     """The strongest local maxima over place and radius."""
     best = votes.max(axis=0)
-    which = votes.argmax(axis=0)
     local = (best >= cv2.dilate(best, np.ones((3, 3), np.uint8))) & (best > 0.5)
     v, u = np.nonzero(local)
     order = np.argsort(best[v, u])[::-1][:CIRCLES_TRIED]

@@ -232,11 +232,8 @@ def _object_text(candidate: Candidate, answers: Mapping[str, str]) -> str:
         f'name = "{_answer(answers, "name", kind)}"',
         f"position_m = [{x:.4f}, {y:.4f}]",
     ]
-    size = (
-        np.linalg.norm(candidate.box_px[1] - candidate.box_px[0]),
-        np.linalg.norm(candidate.box_px[2] - candidate.box_px[1]),
-    )
-    ratio = float(size[1] / max(size[0], 1e-9))
+    across, along = (float(np.linalg.norm(candidate.box_px[k + 1] - candidate.box_px[k])) for k in (0, 1))
+    ratio = along / max(across, 1e-9)
     width = float(answers.get("width_m", "0") or 0) or 0.06
     if kind in ("gauge", "lamp", "button", "rotary", "handwheel", "mushroom"):
         out.append(f"radius_m = {width / 2:.4f}")

@@ -36,6 +36,7 @@ OPERATIONAL = 5
 CSP = 8
 MAPPINGS = {0x1600: (0x60400010, 0x607A0020), 0x1A00: (0x60410010, 0x60640020)}
 SDO_S = 0.25
+CONNECT_S = 6.0  # seven objects of each of six drives
 MOVING_RAD_PER_S = 1e-3
 ABORTS = {
     0x05030000: "toggle bit",
@@ -305,5 +306,5 @@ class Cia402(StreamDevice[JointState]):
 def connect(context: Context, options: dict[str, Any]) -> Cia402:
     """Entry point `can:cia402`."""
     device = Cia402(context, read_options(context, options, Cia402Options))
-    device.join()
+    device.join(CONNECT_S)
     return device

@@ -32,6 +32,7 @@ RAD_PER_COUNT = math.tau / COUNTS_PER_TURN
 RAD_PER_S_PER_COUNT = 0.229 * math.tau / 60.0
 WATCHDOG_TICK_S, WATCHDOG_TRIPPED = 0.02, 0xFF
 WATCHDOG_EVERY = 10  # polls
+CONNECT_S = 4.0
 MOVING_RAD_PER_S = 0.03
 HARDWARE_BITS = {0: "supply voltage", 2: "overheating", 3: "encoder", 4: "electrical shock", 5: "overload"}
 
@@ -269,5 +270,5 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
 def connect(context: Context, options: dict[str, Any]) -> DynamixelArm:
     """Entry point `serial:dynamixel`."""
     device = DynamixelArm(context, read_options(context, options, DynamixelOptions))
-    device.join()
+    device.join(CONNECT_S)
     return device

@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
 
-from drivers.transport.device import WireDevice
+from drivers.transport.device import CONNECT_S, WireDevice
 from drivers.transport.link import BadAnswer, Link, LinkLost, NoAnswer, WireError, now_s
 from drivers.transport.port import Port
 from hal.clock import Deadline
@@ -219,14 +219,14 @@ class PolledDevice(WireDevice[T], Generic[T, C]):
             self.errors += 1
             raise self.translate(error) from error
 
-    def join(self) -> None:
+    def join(self, timeout_s: float = CONNECT_S) -> None:
         """Enter the bus and wait for the first sample.
 
         Raises:
             DeviceUnavailable: none came.
         """
         self.bus.attach(self)
-        self.await_first()
+        self.await_first(timeout_s)
 
     def release(self) -> None:
         """Leave the bus."""

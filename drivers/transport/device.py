@@ -259,14 +259,14 @@ class StreamDevice(WireDevice[T]):
     def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Parse bytes and `publish` what is complete; never raises on bad data, may raise `WireError` to start anew."""
 
-    def join(self) -> None:
+    def join(self, timeout_s: float = CONNECT_S) -> None:
         """Start the owner thread and wait for the first sample.
 
         Raises:
             DeviceUnavailable: none came.
         """
         self.port.start()
-        self.await_first()
+        self.await_first(timeout_s)
 
     def set_up(self, link: Link) -> None:
         """Start the stream (owner thread)."""

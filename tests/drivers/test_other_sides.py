@@ -1,0 +1,93 @@
+"""Other people's clients against our emulators: no protocol may rest on this project's code alone.
+
+They are not among the requirements: `pip install dynamixel-sdk minimalmodbus libscrc NetFT` to run all of these.
+pymodbus, python-can and canopen, which are, prove the rest in test_modbus_io, test_ft300 and test_cia402.
+"""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.emulators import dynamixel, ft300, netft, robotiq_2f
+from drivers.emulators.scripted import ScriptedArm, ScriptedForceTorque, ScriptedGripper, scripted_wrench
+from drivers.transport.checks import crc_dynamixel, crc_modbus, crc_x25
+from tests.drivers.rigs import until
+
+
+@given(st.binary(max_size=64))
+def test_libscrc_agrees(data: bytes) -> None:
+    libscrc = pytest.importorskip("libscrc")
+    assert crc_modbus(data) == libscrc.modbus(data)
+    assert crc_x25(data) == libscrc.x25(data)
+    assert crc_dynamixel(data) == libscrc.buypass(data)
+
+
+def test_dynamixel_sdk_reads_writes_and_sync_reads() -> None:
+    sdk: Any = pytest.importorskip("dynamixel_sdk")
+    sdk.port_handler.LATENCY_TIMER = 500  # ms; its 16 are too few on a busy machine
+    arm = ScriptedArm()
+    far_side = dynamixel.start(arm, {})
+    port, packet = sdk.PortHandler(far_side.address["port"]), sdk.PacketHandler(2.0)
+    try:
+        assert port.openPort() and port.setBaudRate(1_000_000)
+        assert packet.ping(port, 3) == (1020, sdk.COMM_SUCCESS, 0)
+        counts, result, error = packet.read4ByteTxRx(port, 2, 132)
+        assert (result, error) == (sdk.COMM_SUCCESS, 0)
+        assert np.int32(np.uint32(counts)) == round(arm.position_rad[1] / (2 * np.pi / 4096)) + 2048
+        for id_ in range(1, 7):
+            assert packet.write1ByteTxRx(port, id_, 64, 1) == (sdk.COMM_SUCCESS, 0)
+        until(lambda: arm.is_enabled)
+        assert packet.write1ByteTxRx(port, 1, 11, 1)[1] == dynamixel.ACCESS
+        group = sdk.GroupSyncRead(port, packet, 132, 4)
+        for id_ in range(1, 7):
+            group.addParam(id_)
+        assert group.txRxPacket() == sdk.COMM_SUCCESS
+        assert group.fastSyncRead() == sdk.COMM_SUCCESS
+        for id_, angle in zip(range(1, 7), arm.position_rad, strict=True):
+            assert group.isAvailable(id_, 132, 4)
+            assert np.int32(np.uint32(group.getData(id_, 132, 4))) == round(angle / (2 * np.pi / 4096)) + 2048
+        write = sdk.GroupSyncWrite(port, packet, 116, 4)
+        for id_ in range(1, 7):
+            write.addParam(id_, list((2048 + 10 * id_).to_bytes(4, "little")))
+        assert write.txPacket() == sdk.COMM_SUCCESS
+        until(lambda: bool(np.allclose(arm.position_rad, np.arange(1, 7) * 10 * 2 * np.pi / 4096)))
+    finally:
+        port.closePort()
+        far_side.close()
+
+
+def test_minimalmodbus_reads_the_sensor_and_works_the_gripper() -> None:
+    minimalmodbus: Any = pytest.importorskip("minimalmodbus")
+    sensor, gripper = ft300.start(ScriptedForceTorque(), {}), robotiq_2f.start(ScriptedGripper(), {})
+    try:
+        instrument = minimalmodbus.Instrument(sensor.address["port"], 9, close_port_after_each_call=True)
+        instrument.serial.timeout = 1.0
+        instrument.serial.baudrate = 19_200
+        words = instrument.read_registers(180, 6, functioncode=4)
+        assert np.int16(np.uint16(words[1])) == pytest.approx(100 * scripted_wrench(1).force_n[1], abs=0.6)
+        instrument = minimalmodbus.Instrument(gripper.address["port"], 9, close_port_after_each_call=True)
+        instrument.serial.timeout = 1.0
+        instrument.serial.baudrate = 115_200
+        instrument.write_registers(1000, [0, 0, 0])
+        instrument.write_registers(1000, [0x0100, 0, 0])
+        until(lambda: instrument.read_register(2000) >> 12 & 3 == 3)
+        instrument.write_registers(1000, [0x0900, 255, 0xFFFF])
+        until(lambda: instrument.read_register(2000) >> 14 == 3)
+        assert instrument.read_registers(2000, 3)[2] >> 8 >= 228
+    finally:
+        sensor.close()
+        gripper.close()
+
+
+def test_netft_reads_a_record() -> None:
+    module: Any = pytest.importorskip("NetFT")
+    far_side = netft.start(ScriptedForceTorque(), {"udp_port": 49_152})
+    try:
+        counts = module.Sensor("127.0.0.1").getMeasurement()
+        true = scripted_wrench(1)
+        np.testing.assert_allclose(np.array(counts) / 1e6, [*true.force_n, *true.torque_nm], atol=1e-6)
+    finally:
+        far_side.close()

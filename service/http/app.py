@@ -95,7 +95,8 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     yield
     probe.cancel()
     state.hub.close()
-    state.pool.shutdown(wait=False, cancel_futures=True)
+    for pool in (state.pool, state.control_pool):
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _document(app: FastAPI, bodies: list[type[BaseModel]]) -> dict[str, Any]:

@@ -53,7 +53,7 @@ async def release_lease(state: State, lease_token: OwnToken) -> LeaseView:
     openapi_extra=HOLDER_SCHEMA,
 )
 async def take_over_lease(state: State, request: HolderBody) -> GrantView:
-    return _grant(await state.in_thread(functools.partial(state.service.lease.take_over, request.holder)))
+    return _grant(await state.act(functools.partial(state.service.lease.take_over, request.holder)))
 
 
 @router.get("/stop", summary="Is the software stop latched?", operation_id="show_stop", tags=["stop"])
@@ -65,7 +65,7 @@ async def show_stop(state: State) -> StopView:
 async def stop(state: State, request: Request) -> StopView:
     """Latches. The same on the port of the stop process (`stop_url`) is faster and works when this service hangs."""
     peer = request.client.host if request.client is not None else "local"
-    return _stop(state, await state.in_thread(lambda: state.service.supervisor.stop(f"POST /v1/stop from {peer}")))
+    return _stop(state, await state.act(lambda: state.service.supervisor.stop(f"POST /v1/stop from {peer}")))
 
 
 @router.post(
@@ -84,7 +84,7 @@ async def reset_stop(
     supervisor = state.service.supervisor
     seen = supervisor.latch.state().count if request.seen_count is None else request.seen_count
     source = f"POST /v1/stop/reset by {holder or 'nobody in particular'}"
-    return _stop(state, await state.in_thread(functools.partial(supervisor.reset, source, seen_count=seen)))
+    return _stop(state, await state.act(functools.partial(supervisor.reset, source, seen_count=seen)))
 
 
 def _lease(state: AppState) -> LeaseView:

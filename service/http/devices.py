@@ -88,7 +88,7 @@ async def inject_fault(
 ) -> DeviceView:
     check_name(state.service.cell, name)
     state.service.lease.check(lease_token)
-    return await state.in_thread(functools.partial(_inject, state.service, name, request))
+    return await state.act(functools.partial(_inject, state.service, name, request))
 
 
 def _inject(service: Service, name: str, request: FaultRequest) -> DeviceView:

@@ -12,12 +12,15 @@ from typing import Annotated, TypeVar
 from fastapi import Depends, Header, Request, WebSocket
 
 from service.core import Service
+from service.errors import Busy
 from service.http.hub import Hub
 from service.http.metrics import Metrics
 from service.http.readings import ReadingDesk
 
 T = TypeVar("T")
 DEVICE_THREADS = 6
+CONTROL_THREADS = 4
+MAX_READING = 40
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -26,7 +29,8 @@ class AppState:
 
     Attributes:
         stop_url: where the stop process listens; shown to clients.
-        pool: threads for device reads, few and apart from the server's, so that slow devices fill no other queue.
+        pool: threads for device reads; a silent device can fill it, and then further reads are refused.
+        control_pool: threads for stop, cancel, reset and starting tasks, which no device read may hold up.
     """
 
     service: Service
@@ -36,10 +40,26 @@ class AppState:
     readings: ReadingDesk
     started_s: float = field(default_factory=time.monotonic)
     pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(DEVICE_THREADS, "device-read"))
+    control_pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(CONTROL_THREADS, "control"))
+    _reading: int = 0
 
     async def in_thread(self, work: Callable[[], T]) -> T:
-        """Run blocking work outside the event loop."""
-        return await asyncio.get_running_loop().run_in_executor(self.pool, work)
+        """Run work that asks devices or the disk outside the event loop.
+
+        Raises:
+            Busy: too many such calls wait already.
+        """
+        if self._reading >= MAX_READING:
+            raise Busy(f"{self._reading} reads wait already", hint="a device may be silent: see GET /v1/devices")
+        self._reading += 1  # only the event loop counts, so no lock is needed
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self.pool, work)
+        finally:
+            self._reading -= 1
+
+    async def act(self, work: Callable[[], T]) -> T:
+        """Run work that starts, stops, cancels or resets outside the event loop; no device read holds it up."""
+        return await asyncio.get_running_loop().run_in_executor(self.control_pool, work)
 
 
 def state_of(request: Request) -> AppState:

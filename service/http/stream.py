@@ -48,12 +48,18 @@ class Sampler:
         loop = asyncio.get_running_loop()
         while self._listeners:
             next_s = loop.time() + 1.0 / RATE_HZ
-            text = json.dumps(await self._state.in_thread(self._sample))
+            text = await self._text()
             for mailbox in self._listeners:
                 if mailbox.full():
                     mailbox.get_nowait()
                 mailbox.put_nowait(text)
             await asyncio.sleep(max(0.0, next_s - loop.time()))
+
+    async def _text(self) -> str:
+        try:
+            return json.dumps(await self._state.in_thread(self._sample))
+        except CellError as error:  # too many reads wait: say so and go on
+            return json.dumps({"problem": error.what})
 
     def _sample(self) -> dict[str, Any]:
         service = self._state.service

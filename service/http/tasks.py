@@ -45,7 +45,7 @@ async def show_task(state: State, task_id: TaskId, wait_s: Wait = 0.0) -> TaskVi
 async def cancel_task(state: State, task_id: TaskId, lease_token: LeaseToken = None, wait_s: Wait = 0.0) -> TaskView:
     """Anybody may cancel: ending a motion is always allowed. Answers with the task as it is after `wait_s`."""
     del lease_token  # accepted so that clients may send it with everything
-    task = await state.in_thread(functools.partial(state.service.tasks.cancel, task_id, reason="asked for over HTTP"))
+    task = await state.act(functools.partial(state.service.tasks.cancel, task_id, reason="asked for over HTTP"))
     if wait_s > 0.0:
         await state.hub.wait_for(task, wait_s)
     return TaskView.of(task)

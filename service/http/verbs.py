@@ -42,7 +42,7 @@ def _add(routes: APIRouter, operation: Operation) -> None:
         submit = functools.partial(
             state.service.submit, operation.name, request, lease_token=lease_token, key=idempotency_key
         )
-        task = await state.in_thread(submit)
+        task = await state.act(submit)
         if wait_s > 0.0:
             await state.hub.wait_for(task, wait_s)
         return answer(task)

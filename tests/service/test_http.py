@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import httpx2
 import numpy as np
@@ -248,3 +249,22 @@ def test_the_page_is_served_with_a_content_policy(client: httpx2.Client) -> None
     page = client.get("/")
     assert page.headers["content-type"].startswith("text/html")
     assert "default-src 'self'" in page.headers["content-security-policy"]
+
+
+def test_a_device_that_hangs_holds_up_neither_stop_nor_tasks(client: httpx2.Client, served: Panelwright) -> None:
+    """More readers hang than there are threads for them; further ones are refused, everything else goes on."""
+    client.post("/v1/devices/wrist_camera/fault", json={"fault": "frozen"})
+    limits = httpx2.Limits(max_connections=100)
+    with (
+        httpx2.Client(base_url=served.url, timeout=60.0, trust_env=False, limits=limits) as crowd,
+        ThreadPoolExecutor(45) as pool,
+    ):
+        reads = [pool.submit(crowd.get, "/v1/devices/wrist_camera/reading") for _ in range(45)]
+        eventually(lambda: sum(read.done() for read in reads) >= 5)
+        assert client.post("/v1/stop").json()["is_latched"]
+        assert client.post("/v1/stop/reset").status_code == 200
+        assert client.post("/v1/echo?wait_s=10", json={}).status_code == 200
+        refused = [read.result() for read in reads if read.done()]
+        assert {(answer.status_code, answer.json()["type"]) for answer in refused} == {(503, "urn:panelwright:busy")}
+        assert client.post("/v1/devices/wrist_camera/fault", json={"fault": None}).status_code == 200
+        assert sum(read.result().status_code == 200 for read in reads) == 45 - len(refused)

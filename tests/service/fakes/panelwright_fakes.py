@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,7 @@ class FakeDevice:
         self._is_immortal = bool(options.get("immortal"))
         self._sequence = 0
         self._fault: Fault | None = None
+        self._thawed = threading.Event()
         self._closed = False
         self._child = self._world(options["child_pid_file"]) if "child_pid_file" in options else None
 
@@ -82,12 +84,15 @@ class FakeDevice:
 
     def inject_fault(self, fault: Fault | None, *, magnitude: float = 0.0) -> None:
         self._fault = fault
+        self._thawed.clear() if fault is Fault.FROZEN else self._thawed.set()
 
     def _stamped(self, value: Any) -> Stamped[Any]:
         if self._closed or self._fault is Fault.DISCONNECTED:
             raise DeviceUnavailable(f"{self.name} is disconnected", hint="plug it in", device=self.name)
         if self._fault is Fault.SILENT:
             raise DeviceTimeout(f"{self.name} is silent", hint="check power and cable", device=self.name)
+        if self._fault is Fault.FROZEN:
+            self._thawed.wait(60.0)  # hangs in spite of every deadline, as a bad SDK does
         self._sequence += 1
         return Stamped(value=value, host_time_s=self._clock.now_s(), sequence=self._sequence)
 

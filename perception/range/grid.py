@@ -27,6 +27,8 @@ JUMP_SLOPE = 2.5  # a surface seen steeper than 68 degrees counts as a jump betw
 JUMP_SIGMAS = 4.0
 NORMAL_SIGMA_GOAL_RAD = 0.06  # tangent planes noisier than this are fitted over a wider window
 WIDEST_RADIUS = 3
+LARGE_SIDE_PX = 1024
+BLOCK_SAMPLES = 4  # along a block; larger blocks are sampled
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,15 +54,19 @@ class Grid:
 
 
 def block_size(shape: tuple[int, int], noise: NoiseModel, sensor: RangeSensorModel, depth_m: float) -> int:
-    """Pixels along a block: 1 below 192 rows, 2 below 384, then the least (2 to 4) that gives steady tangent planes."""
+    """Pixels along a block: 1 below 192 rows, 2 below 384, then the least (2 to 4) that gives steady tangent planes.
+
+    Above 1024 rows blocks grow with the image, so that the number of blocks, and with it memory, stays bounded.
+    """
     if min(shape) < 192:
         return 1
     if min(shape) < 384:
         return 2
-    for size in (2, 3):
+    coarse = -(-min(shape) // LARGE_SIDE_PX)
+    for size in (2 * coarse, 3 * coarse):
         if slope_sigma_rad(noise, sensor, depth_m, side_px=5 * size) <= NORMAL_SIGMA_GOAL_RAD:
             return size
-    return 4
+    return 4 * coarse
 
 
 def slope_sigma_rad(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float, *, side_px: int) -> float:
@@ -128,12 +134,14 @@ def _blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: 
     H, W = depth.shape
     w = x.shape[1]
     perspective = sen[0] > 0
-    values = np.empty(b * b)
+    hop = (b + BLOCK_SAMPLES - 1) // BLOCK_SAMPLES
+    full = ((b + hop - 1) // hop) ** 2
+    values = np.empty(full)
     for r in range(top, bottom):
         for c in range(w):
             n = 0
-            for v in range(r * b, min(r * b + b, H)):
-                for u in range(c * b, min(c * b + b, W)):
+            for v in range(r * b, min(r * b + b, H), hop):
+                for u in range(c * b, min(c * b + b, W), hop):
                     d = depth[v, u]
                     if np.isfinite(d):
                         k = n  # insertion sort: at most 16 values
@@ -142,7 +150,7 @@ def _blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: 
                             k -= 1
                         values[k] = d
                         n += 1
-            if 2 * n < b * b or n == 0:
+            if 2 * n < full or n == 0:
                 x[r, c] = (c * b + 0.5 * (b - 1) - sen[3]) / sen[1]
                 y[r, c] = (r * b + 0.5 * (b - 1) - sen[4]) / sen[2]
                 continue
@@ -151,8 +159,8 @@ def _blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: 
             sig = sigma_at(noise, median)
             tol = JUMP_SLOPE * pitch * b * 0.7 + 3.0 * sig
             su, sv, sg, m = 0.0, 0.0, 0.0, 0
-            for v in range(r * b, min(r * b + b, H)):
-                for u in range(c * b, min(c * b + b, W)):
+            for v in range(r * b, min(r * b + b, H), hop):
+                for u in range(c * b, min(c * b + b, W), hop):
                     d = depth[v, u]
                     if abs(d - median) <= tol:
                         su += u
@@ -161,7 +169,7 @@ def _blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: 
                         m += 1
             x[r, c] = (su / m - sen[3]) / sen[1]
             y[r, c] = (sv / m - sen[4]) / sen[2]
-            if 2 * m < b * b:
+            if 2 * m < full:
                 continue
             z[r, c] = m / sg if perspective else sg / m
             count[r, c] = m

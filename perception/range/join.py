@@ -16,7 +16,7 @@ PAIR_SAMPLES = 150
 JOINED_SHARE = 0.85
 JOINED_MEAN_SQUARE = 1.6
 NEAR_SAMPLES = 16
-NEAR_SIGMAS = 12.0
+NEAR_SIGMAS = 20.0
 SCRAP_SHARE = 0.1
 SCRAP_SIGMAS = 6.0
 LARGEST_TURN_RAD = 0.2
@@ -68,7 +68,9 @@ def _is_scrap(
     s = thinned(samples[small], PAIR_SAMPLES)
     e = np.empty(s.x.size)
     fit.residuals(kinds[big], parameters[big], s.x, s.y, s.z, s.sigma, perspective, e)
-    return bool(np.mean(np.abs(e) < SCRAP_SIGMAS) > JOINED_SHARE)
+    # Rays just outside the outline miss; those that hit decide, when they are the larger part.
+    hit = np.isfinite(e)
+    return bool(hit.mean() > 0.5 and np.mean(np.abs(e[hit]) < SCRAP_SIGMAS) > JOINED_SHARE)
 
 
 def _joint_fit(

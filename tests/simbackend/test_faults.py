@@ -146,7 +146,7 @@ def test_a_dead_world_is_an_unavailable_device() -> None:
         world = cell.shared.peek("world")
         assert world is not None
         world._link.process.kill()
-        world._link.process.wait(5.0)
+        world._link.process.wait(60.0)
         with pytest.raises(DeviceUnavailable) as caught:
             cell.clock.sleep(0.1)
         assert "world" in str(caught.value)

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from fusion.features import Feature, Kind, unit
 from fusion.measurement import Measurement, measurement
 from hal.errors import InvalidRequest, NotObservable
-from hal.geometry import Array, UncertainPose, matrix_of, perturbed, point_covariance
+from hal.geometry import Array, UncertainPose, matrix_of, point_covariance, skew
 
 SMALLEST_SIGMA_M = 1e-6  # nothing is placed better than a micrometre
 SMALLEST_SIGMA_RAD = 1e-6
@@ -422,8 +422,10 @@ def _block(blocks: Sequence[Array]) -> Array:
 
 def _moved(pose: UncertainPose, delta: Array) -> tuple[Array, Array]:
     """Origin (3,) and axes (3, 3) of a pose with error `delta` (6,)."""
-    moved = perturbed(pose.parent_from_child, delta)
-    return np.asarray(moved.translation), matrix_of(moved)
+    child = pose.parent_from_child
+    W, angle = skew(delta[3:]), float(np.linalg.norm(delta[3:]))
+    turn = np.eye(3) + np.sinc(angle / np.pi) * W + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * W @ W  # Rodrigues
+    return np.asarray(child.translation + delta[:3]), turn @ matrix_of(child)
 
 
 def _ends(ends_px: ArrayLike) -> Array:
@@ -481,7 +483,7 @@ def _meet(
         raise NotObservable("the two planes through the lenses are one", hint="look from a place off this line's plane")
     d = unit(direction)
     A = np.array([normals[0], normals[1], d])
-    on_line = np.linalg.solve(A, [normals[0] @ points[0], normals[1] @ points[1], 0.0])
+    on_line = np.linalg.solve(A, np.array([normals[0] @ points[0], normals[1] @ points[1], 0.0]))
     lens, ray = toward
     across = np.eye(3) - np.outer(ray, ray)
     s = float(d @ across @ (lens - on_line)) / max(float(d @ across @ d), 1e-12)

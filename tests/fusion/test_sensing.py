@@ -125,7 +125,7 @@ def test_without_noise_the_true_pose_fits_exactly(sense: Callable[[Scene], Measu
 
 @pytest.mark.parametrize("sense", SENSES, ids=lambda f: f.__name__)
 def test_sensor_and_pose_noise_together_give_the_chi_square(sense: Callable[[Scene], Measurement]) -> None:
-    scenes = [Scene(seed, 1.0) for seed in range(80)]
+    scenes = [Scene(seed, 1.0) for seed in range(40)]
     made = [sense(s) for s in scenes]
     f = np.array([local_value(m, s.pose) for m, s in zip(made, scenes, strict=True)])
     dof = made[0].dof

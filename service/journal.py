@@ -21,7 +21,7 @@ from service.errors import JournalError
 
 FIRST_HASH = "0" * 64
 MAX_GROUP = 200
-APPEND_TIMEOUT_S = 5.0
+APPEND_TIMEOUT_S = 10.0
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS journal (
     id INTEGER PRIMARY KEY,
@@ -82,7 +82,13 @@ class Journal:
         Raises:
             JournalError: the disk is full or read-only, or the journal is closed.
         """
-        self._put(kind, data).result(APPEND_TIMEOUT_S)
+        try:
+            self._put(kind, data).result(APPEND_TIMEOUT_S)
+        except TimeoutError as error:
+            raise JournalError(
+                f"the journal {self.path} did not take a record in {APPEND_TIMEOUT_S:.0f} s",
+                hint="the disk is too slow or hangs; nothing may move without a record",
+            ) from error
 
     def note(self, kind: str, data: dict[str, Any]) -> None:
         """Record soon, without waiting; for what nobody's permission hangs on."""

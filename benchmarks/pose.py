@@ -21,6 +21,7 @@ from benchmarks.pose_cases import Problem, error, is_flipped, problems
 from benchmarks.pose_hand_eye import rows as hand_eye_rows
 from benchmarks.pose_lights import drawn_pairs, score_pairs, stored_pairs
 from hal.calibration import CameraIntrinsics
+from hal.errors import CellError
 from perception.vision.quadrangle import QuadranglePose, estimate, warm_up
 
 Array = NDArray[np.float64]
@@ -263,9 +264,15 @@ def main() -> None:
         parser.error("give OUT.json too")
     warm_up()
     cases = json.loads(arguments.cases.read_text())["problems"]
-    answers = {case["id"]: solution(case, timed=arguments.time) for case in cases}
+    answers, refused = {}, 0
+    for case in cases:
+        try:
+            answers[case["id"]] = solution(case, timed=arguments.time)
+        except CellError as error:
+            refused += 1
+            print(f"{case['id']}: {error.what}")
     arguments.out.write_text(json.dumps(answers))
-    print(f"{len(answers)} problems solved")
+    print(f"{len(answers)} problems solved, {refused} refused")
 
 
 if __name__ == "__main__":

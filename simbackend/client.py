@@ -38,6 +38,7 @@ from simbackend.wire import (
 Array = NDArray[np.float64]
 
 PROXIMITY_RANGE_M = 0.6
+MOST_TICKS_BEHIND = 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,6 +77,7 @@ class WorldClient:
         self._order = itertools.count()  # of two events at one tick the first comes first
         self._link = WorldLink(config)
         self._take(self._link.first)
+        self._begun_s = clock.now_s()
         clock.attach(self.advance)  # type: ignore[attr-defined]  # checked by `start`
 
     @classmethod
@@ -120,7 +122,7 @@ class WorldClient:
     def advance(self, duration_s: float) -> float:
         """Send what is pending, step the world, take its snapshot; returns the new simulated time."""
         with self._lock:
-            self._owed_ticks += duration_s * self.rate_hz
+            self._owed_ticks += duration_s * self.rate_hz + self._missed_ticks()
             ticks = max(1, int(self._owed_ticks + 0.5))
             self._owed_ticks -= ticks
             while ticks > 0:
@@ -130,6 +132,20 @@ class WorldClient:
                 ticks -= part
                 self._run_events()
             return self.frame.snapshot.stamp_s
+
+    def _missed_ticks(self) -> float:
+        """Ticks by which a world at the wall's pace has fallen behind the wall.
+
+        Were they lost, a controller that goes by the wall would hurry through a world that lags, and the arm would leap.
+        After a pause in which nobody let time pass, the world takes up from where it stood.
+        """
+        if isinstance(self._clock, SimClock):
+            return 0.0
+        now_s = self._clock.now_s()
+        behind = (now_s - self._begun_s) * self.rate_hz - self.frame.snapshot.tick - self._owed_ticks
+        lost = max(0.0, behind - MOST_TICKS_BEHIND)
+        self._begun_s += lost / self.rate_hz
+        return max(0.0, behind - lost)
 
     def _step(self, ticks: int) -> None:
         request = self._request

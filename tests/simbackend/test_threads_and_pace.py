@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
+
+import pytest
 
 from hal.clock import Deadline, PacedClock
 from hal.config import load_cell
@@ -57,6 +60,45 @@ def test_in_mixed_mode_stamps_are_the_walls_and_sleep_takes_its_time() -> None:
         sample = arm.read_state(deadline=Deadline.after(clock, 1.0))
         assert began_s < sample.host_time_s <= time.monotonic()
         assert sample.device_time_s is not None
-        assert abs(sample.device_time_s - 0.1) < 1e-9
+        # The world has come as far as the sleeps asked, and on a slow machine as far as the wall, but never farther.
+        assert 0.1 - 1e-9 <= sample.device_time_s <= time.monotonic() - began_s + 0.012
+    finally:
+        shared.close()
+
+
+def test_a_world_at_the_walls_pace_catches_up_and_forgets_a_pause() -> None:
+    """The wall is a number here: a sleep that took 60 ms lets 60 ms pass in the world, a pause of an hour 200 ms."""
+
+    class Wall:
+        def __init__(self) -> None:
+            self.time_s, self.advance = 50.0, lambda _: 0.0
+
+        def now_s(self) -> float:
+            return self.time_s
+
+        def attach(self, advance: Callable[[float], float]) -> None:
+            self.advance = advance
+
+        def sleep(self, duration_s: float) -> None:
+            self.advance(duration_s)
+            self.time_s += max(duration_s, 0.060)
+
+    wall, shared = Wall(), Shared()
+    try:
+        context = Context(name="arm", clock=wall, cell=load_cell(BENCH, seed=4), shared=shared)
+        arm = connect(context, "sim:arm", {"model": "t3"})
+
+        def world_s() -> float:
+            stamp_s = arm.read_state(deadline=Deadline.after(wall, 1.0)).device_time_s
+            assert stamp_s is not None
+            return float(stamp_s)
+
+        for _ in range(10):
+            wall.sleep(0.002)
+        assert world_s() == pytest.approx(9 * 0.060 + 0.002, abs=0.0021)
+        before_s = world_s()
+        wall.time_s += 3600.0
+        wall.sleep(0.002)
+        assert world_s() - before_s == pytest.approx(0.2, abs=0.005)
     finally:
         shared.close()

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+IDLE_S = 0.05  # a paced world that nobody has ticked for this long stands still; time passes without it
+
 
 class Clock(Protocol):
     """Monotonic seconds. `sleep` returns when that much of *this* clock's time has passed."""
@@ -68,25 +70,50 @@ class SimClock:
 
 
 class PacedClock:
-    """The wall's time beside a simulated world (mode `mixed`): `sleep` steps the world, never ahead of the wall."""
+    """The time of a simulated world that never runs ahead of the wall (mode `mixed`).
+
+    While somebody ticks, this is the world's time: a machine that is too slow makes time slow, and does not make set-points
+    run away from a world that lags behind. When nobody ticks, time passes with the wall, so that deadlines end.
+    """
 
     def __init__(self, advance: Callable[[float], float] | None = None) -> None:
         self._advance = advance
+        self._lock = threading.Lock()
+        self._now_s = time.monotonic()
+        self._ticked_at_s = self._now_s  # on the wall
+        self._ticking = 0
 
     def attach(self, advance: Callable[[float], float]) -> None:
         """Let this clock drive a world."""
         self._advance = advance
 
     def now_s(self) -> float:
-        """Seconds of `time.monotonic`."""
-        return time.monotonic()
+        """Seconds; never goes back."""
+        with self._lock:
+            return self._present_s()
 
     def sleep(self, duration_s: float) -> None:
         """Step the world by `duration_s`, then wait for the wall to catch up."""
+        if duration_s <= 0.0:
+            return
+        with self._lock:
+            self._now_s = self._present_s()
+            self._ticking += 1
         end_s = time.monotonic() + duration_s
-        if duration_s > 0.0 and self._advance is not None:
-            self._advance(duration_s)
-        time.sleep(max(0.0, end_s - time.monotonic()))
+        try:
+            if self._advance is not None:
+                self._advance(duration_s)
+            time.sleep(max(0.0, end_s - time.monotonic()))
+        finally:
+            with self._lock:
+                self._now_s += duration_s
+                self._ticking -= 1
+                self._ticked_at_s = time.monotonic()
+
+    def _present_s(self) -> float:
+        if self._ticking:
+            return self._now_s
+        return self._now_s + max(0.0, time.monotonic() - self._ticked_at_s - IDLE_S)
 
 
 class ReplayClock:

@@ -64,7 +64,9 @@ def validate(data: dict[str, Any], model: type[M], *, source: str) -> M:
         # JSON mode is strict about types, but takes a list for a tuple and a string for an enum.
         return model.model_validate_json(json.dumps(data, default=str), strict=True)
     except ValidationError as error:
-        faults = [_fault(item, model) for item in error.errors()]
+        # A misspelt key leaves its right one missing: the misspelling is what to mend, so it comes first.
+        items = sorted(error.errors(), key=lambda item: item["type"] != "extra_forbidden")
+        faults = [_fault(item, model) for item in items]
         first_key, first_text, first_hint = faults[0]
         more = f" (and {len(faults) - 1} more faults)" if len(faults) > 1 else ""
         raise ConfigError(

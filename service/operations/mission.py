@@ -58,6 +58,16 @@ def run_mission(context: OperationContext, request: MissionRequest) -> dict[str,
         record.problem = problem_of(error)
         _park_after(session, record, error)
         raise
+    except Exception as defect:
+        # A defect of ours must not leave the arm at the panel; it goes on to the task, which reports it as one.
+        record.problem = {
+            "title": "Defect",
+            "detail": f"{type(defect).__name__}: {defect}",
+            "hint": "the log has the traceback; please report it",
+            "retry": "never",
+        }
+        _park_after(session, record, defect)
+        raise
     finally:
         _finish(record)
         write_report(record, context.runs_dir / name)
@@ -167,14 +177,14 @@ def _step(session: Session, name: str, low: float, high: float) -> Iterator[Sess
         yield session.part(low, high)
 
 
-def _park_after(session: Session, record: MissionRecord, error: CellError) -> None:
+def _park_after(session: Session, record: MissionRecord, error: Exception) -> None:
     """Bring the arm home after an error, if the cell still obeys; a second error is told, not hidden."""
     try:
         with record.step("park after the error"):
             settle(session)
             park(session)
     except CellError as second:
-        record.facts["not_parked"] = f"after {error.what!r}: {second.what}"
+        record.facts["not_parked"] = f"after {error}: {second.what}"
 
 
 def _finish(record: MissionRecord) -> None:

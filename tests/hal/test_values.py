@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import time
 
 import numpy as np
 import pytest
@@ -47,6 +48,28 @@ def test_a_paced_clock_steps_its_world_and_waits_for_the_wall() -> None:
     clock.sleep(0.002)
     assert steps == [0.002]
     assert clock.now_s() - before >= 0.002
+
+
+def test_a_slow_world_makes_a_paced_clock_slow() -> None:
+    def slow_world(_: float) -> float:
+        end_s = time.monotonic() + 0.02
+        while time.monotonic() < end_s:
+            pass
+        return 0.0
+
+    clock = PacedClock(slow_world)
+    before = clock.now_s()
+    for _ in range(3):
+        clock.sleep(0.002)
+    assert clock.now_s() - before < 0.06
+
+
+def test_a_paced_clock_that_nobody_ticks_goes_on() -> None:
+    clock = PacedClock()
+    deadline = Deadline.after(clock, 0.01)
+    give_up_s = time.monotonic() + 5.0
+    while not deadline.is_past():
+        assert time.monotonic() < give_up_s
 
 
 def test_a_replay_clock_never_goes_back() -> None:

@@ -586,6 +586,7 @@ def part_kill(seconds: float) -> None:
 HOST = """
 import json, sys, time
 from hal.clock import Deadline, WallClock
+from hal.errors import CellError
 from hal.registry import Context, connect
 driver, options = json.loads(sys.argv[1])
 clock = WallClock()
@@ -593,7 +594,10 @@ arm = connect(Context(name="arm"), driver, options)
 arm.enable(deadline=Deadline.after(clock, 2.0))
 here = arm.read_state(deadline=Deadline.after(clock, 1.0)).value.position_rad
 while True:
-    arm.command_position(here, deadline=Deadline.after(clock, 1.0))
+    try:
+        arm.command_position(here, deadline=Deadline.after(clock, 1.0))
+    except CellError:  # a busy machine: the watchdog was quicker than this process
+        arm.enable(deadline=Deadline.after(clock, 2.0))
     print("moving", flush=True)
     time.sleep(0.01)
 """

@@ -1,6 +1,6 @@
 """Universal Robots arm: state over RTDE, motion by a URScript program that servos to RTDE input registers.
 
-The program watches the host: when the heartbeat register stands still for `WATCHDOG_S` it brakes and ends, so a dead
+The program watches the host: when the heartbeat register stands still for `watchdog_s` it brakes and ends, so a dead
 host leaves a standing arm. Nothing starts it but `enable`, and a lost connection does not start it again.
 """
 
@@ -34,7 +34,7 @@ INPUTS = tuple(f"input_int_register_{FIRST_REGISTER + i}" for i in range(JOINTS 
 RAD_PER_COUNT = 1e-6
 RUNNING, PLAYING = 7, 2
 SAFE_MODES = (1, 2)  # normal, reduced
-WATCHDOG_S = 0.1
+CONTROL_RATE_HZ = 500  # of the controller, whatever rate RTDE has
 PROGRAM_START_S = 1.0
 ANSWER_S = 0.5
 MOVING_RAD_PER_S = 1e-3
@@ -50,6 +50,7 @@ class UrOptions(TcpOptions):
     brake_rad_per_s2: Annotated[float, Field(gt=0, le=40)] = 4.0
     servo_gain: Annotated[int, Field(ge=100, le=2000)] = 500
     lookahead_s: Annotated[float, Field(ge=0.03, le=0.2)] = 0.05
+    watchdog_s: Annotated[float, Field(ge=0.02, le=2)] = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +64,7 @@ class Modes:
 
 def servo_program(options: UrOptions) -> str:
     """URScript that follows the registers and brakes when the heartbeat stops."""
-    cycles = round(WATCHDOG_S * 500)
+    cycles = round(options.watchdog_s * CONTROL_RATE_HZ)
     joints = ", ".join(f"read_input_integer_register({FIRST_REGISTER + 1 + i})*{RAD_PER_COUNT}" for i in range(JOINTS))
     beat = f"read_input_integer_register({FIRST_REGISTER})"
     return (
@@ -106,7 +107,9 @@ class Ur(StreamDevice[JointState]):
 
     def capabilities(self) -> ArmCapabilities:
         """From the options."""
-        return capabilities(self._options.kinematics, command_rate_hz=self._options.rate_hz, watchdog_s=WATCHDOG_S)
+        return capabilities(
+            self._options.kinematics, command_rate_hz=self._options.rate_hz, watchdog_s=self._options.watchdog_s
+        )
 
     def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
         """Newest measured joints."""

@@ -6,6 +6,7 @@ Of URScript it understands what a host sends: a program that servos to RTDE regi
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 import time
@@ -43,7 +44,8 @@ INPUT_TYPES = {
 REGISTER = re.compile(r"read_input_integer_register\((\d+)\)")
 RUNNING, NORMAL, PROTECTIVE_STOP = 7, 1, 3
 STOPPED, PLAYING = 1, 2
-DEFAULT_WATCHDOG_S = 0.1
+SILENT_CYCLES = re.compile(r"while silent < (\d+):")
+CYCLE_S = 0.002
 
 
 class UrEmulatorOptions(FaultOptions):
@@ -112,6 +114,7 @@ class UrEmulator(WireEmulator):
         self._program: list[int] = []  # heartbeat register, then one a joint
         self._beat: int | None = None
         self._beat_s = 0.0
+        self._watchdog_s = math.inf
         self._scripts: dict[Peer, bytes] = {}
 
     @property
@@ -189,6 +192,8 @@ class UrEmulator(WireEmulator):
             if "\nend\n" not in text:
                 return
             self._scripts[peer] = b""
+            cycles = SILENT_CYCLES.search(text)
+            self._watchdog_s = int(cycles.group(1)) * CYCLE_S if cycles else math.inf
             self._start_program([int(number) for number in REGISTER.findall(text)])
         elif text.endswith("\n"):
             self._scripts[peer] = b""
@@ -231,7 +236,7 @@ class UrEmulator(WireEmulator):
 
     def on_tick(self) -> None:
         """The watchdog of the program, then one data package to each client."""
-        if self.runtime == PLAYING and time.monotonic() - self._beat_s > DEFAULT_WATCHDOG_S:
+        if self.runtime == PLAYING and time.monotonic() - self._beat_s > self._watchdog_s:
             self._end_program()
         if not self._streams:
             return

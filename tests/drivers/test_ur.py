@@ -25,7 +25,9 @@ NO_LIMITS = {"away_s": 0.05, "delay_s": 0.05, "silent_s": 0.05}
 class TestUr(ArmContract):
     @pytest.fixture
     def rig(self) -> Iterator[Rig[Any]]:
-        with wired_rig(emulator.start(ScriptedArm(), {}), DRIVER, {"rate_hz": 125.0}, sample_period_s=0.05) as rig:
+        with wired_rig(
+            emulator.start(ScriptedArm(), {}), DRIVER, {"rate_hz": 125.0, "watchdog_s": 1.0}, sample_period_s=0.1
+        ) as rig:
             yield rig
 
 
@@ -84,7 +86,7 @@ def follow(device: Any, arm: ScriptedArm, goal: Any) -> None:
 
 def test_set_points_arrive_to_a_microradian() -> None:
     arm = ScriptedArm()
-    with wired(emulator.start(arm, {}), DRIVER) as device:
+    with wired(emulator.start(arm, {}), DRIVER, {"watchdog_s": 1.0}) as device:
         device.enable(deadline=soon())
         goal = arm.position_rad + 0.01
         follow(device, arm, goal)

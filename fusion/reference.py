@@ -71,9 +71,9 @@ def _nearest(m: Measurement, e: Array, u: Array) -> float:
     """min over y of (y - mu)^T C^-1 (y - mu), with x - mu = e, for the classes whose places do not depend on v."""
     A = np.linalg.inv(m.C_m2)
     free = {1: np.empty((3, 0)), 2: u[:, None], 5: u[:, None], 3: _across(u), 6: _across(u), 9: _across(u)}[int(m.cls)]
-    y = e
+    y: Array = e
     if free.shape[1]:
-        y = np.asarray(e - free @ np.linalg.solve(free.T @ A @ free, free.T @ A @ e), float)
+        y = np.asarray(e - free @ np.linalg.solve(free.T @ A @ free, free.T @ A @ e), np.float64)
     return float(y @ A @ y)
 
 
@@ -88,9 +88,9 @@ def _directions(dimension: int) -> Array:
     if dimension == 2:
         angle = np.pi * k / SPHERE
         return np.column_stack([np.cos(angle), np.sin(angle)])
-    z, angle = k / SPHERE, np.pi * (1 + 5**0.5) * k
+    z, spiral = k / SPHERE, np.pi * (1 + 5**0.5) * k
     rho = np.sqrt(1 - z**2)
-    return np.column_stack([rho * np.cos(angle), rho * np.sin(angle), z])
+    return np.column_stack([rho * np.cos(spiral), rho * np.sin(spiral), z])
 
 
 def residual(m: Measurement, R: Array, t: Array) -> Array:

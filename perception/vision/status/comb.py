@@ -82,7 +82,20 @@ def find_combs(ink: Float32, counts: Sequence[int], *, free: float = 0.12) -> li
         return []
     rough = [found for count in counts if (found := _rough(ink, rows, count, free, total)) is not None]
     rough.sort(key=lambda found: found[0], reverse=True)
-    return [_refined(ink, comb, score, total) for score, comb in rough[:REFINED]]
+    refined = [_refined(ink, comb, score, total) for score, comb in rough[:REFINED]]
+    return refined + _extended(ink, refined, counts, total)
+
+
+def _extended(
+    ink: Float32, found: list[tuple[float, Comb]], counts: Sequence[int], total: float
+) -> list[tuple[float, Comb]]:
+    """The combs with one more cell on either side: a sign or a one says little about where its cell is."""
+    longer = [
+        replace(comb, count=comb.count + 1, left_px=comb.left_px - shift * comb.pitch_px)
+        for _, comb in found for shift in (0, 1) if comb.count + 1 in counts
+    ]  # fmt: skip
+    longer = [comb for comb in longer if _is_sound(comb, ink.shape)]
+    return [(float(explained(ink, [comb])[0]) / total, comb) for comb in longer]
 
 
 def _rough(ink: Float32, rows: tuple[float, float], count: int, free: float, total: float) -> tuple[float, Comb] | None:

@@ -38,7 +38,8 @@ SETTLED_MEAN_SQUARE = 1.25  # residuals cut at three sigmas; wider noise than mo
 WIDER = 1.5
 WIDENINGS = 5
 ROUNDS = 6
-MOST_COMPONENTS = 48  # a round; bounds the time that rubble can cost
+MOST_COMPONENTS = 48  # a round
+MOST_ATTEMPTS = 120  # on one grid: bounds the time that rubble can cost
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -161,6 +162,7 @@ def _recover_curved(task: Task, grid: Grid, blocks: Labels, found: Candidates, l
     free: Flags = np.isfinite(grid.z) & (blocks == 0)
     packed = task.sensor.packed()
     turn_limit = float(np.cos(max(0.7, 5.0 * grid.normal_sigma_rad)))
+    attempts = 0
     for _ in range(ROUNDS):
         right, down = grow.smooth_links(
             grid.z, grid.sigma, free, STEEP_SLOPE * grid.size_px, 1.0 / packed[1], grid.perspective, grid.normal,
@@ -172,6 +174,9 @@ def _recover_curved(task: Task, grid: Grid, blocks: Labels, found: Candidates, l
             return
         big = big[np.argsort(-sizes[big], kind="stable")][:MOST_COMPONENTS]
         starts, indices = bucket(label, sizes.size - 1)
+        if attempts >= MOST_ATTEMPTS:
+            return
+        attempts += big.size
         for component in big:
             members = indices[starts[component] : starts[component + 1]].astype(np.int64)
             members = members[free.ravel()[members]]

@@ -83,8 +83,10 @@ def pack(measurements: Sequence[Measurement], prior: UncertainPose | None = None
     dof = _DOF[cls, (p > 0).sum(axis=1)]
     prior_r, prior_t, prior_w = np.eye(3), np.zeros(3), np.zeros((6, 6))
     if prior is not None:
-        prior_r, prior_t = matrix_of(prior.parent_from_child), np.array(prior.parent_from_child.translation)
-        prior_w = _whitening(prior.covariance)
+        # C order and writable like the arrays above: numba compiles everything anew for any other layout.
+        prior_r = np.array(matrix_of(prior.parent_from_child), order="C")
+        prior_t = np.array(prior.parent_from_child.translation, order="C")
+        prior_w = np.array(_whitening(prior.covariance), order="C")
     return Batch(
         cls=cls, dof=dof, m=m, w=w, mu=mu,
         C=_sym6(C), A=_sym6(np.linalg.inv(C)), M=_sym6(M),

@@ -45,7 +45,7 @@ def batch_values(b: Batch, R: Array, t: Array) -> tuple[Array, Array, Array]:
     """f (N,), gradients (N, 6) and best sensed directions (N, 3) of packed measurements; zero for a prior entry."""
     n = len(b.cls)
     f, gradients, directions = np.zeros(n), np.zeros((n, 6)), np.zeros((n, 3))
-    evaluate(b, R, t, True, f, gradients, directions)
+    evaluate(b, np.array(R, order="C"), np.array(t, order="C"), True, f, gradients, directions)
     return f, gradients, directions
 
 

@@ -107,7 +107,7 @@ def _system(
     weights: Array,
 ) -> tuple[Batch, Array, Array, Array]:
     """The batch at these features, f (N,), and the weighted normal equations H (6 + P, 6 + P), g over pose and parameters."""
-    R, t = matrix_of(pose), np.array(pose.translation)
+    R, t = np.array(matrix_of(pose), order="C"), np.array(pose.translation, order="C")
     spread = np.asarray(shape.sigma, float)
     b = pack(_placed(measurements, shape, pose, values), prior)
     r, J = _rows(b, R, t)

@@ -152,7 +152,8 @@ def plan(
 def _informations(measurements: Sequence[Measurement], pose: RigidTransform) -> Array:
     """(N, 6, 6) information of each measurement alone, at a pose."""
     found = np.zeros((len(measurements), 6, 6))
-    informations(pack(measurements), matrix_of(pose), np.array(pose.translation), found)
+    R, t = np.array(matrix_of(pose), order="C"), np.array(pose.translation, order="C")
+    informations(pack(measurements), R, t, found)
     return found
 
 

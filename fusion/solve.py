@@ -92,7 +92,8 @@ def _started(b: Batch, use: Array, rotation: Array) -> LocalSolution:
 def local_solution(b: Batch, use: Array, rotation: Array, translation_m: Array, *, far: bool = True) -> LocalSolution:
     """As `solve`, on packed measurements of which `use` (N,) > 0 count; the arguments stay untouched."""
     n = len(b.cls)
-    R, t = np.array(rotation, float), np.array(translation_m, float)
+    # C order: numba compiles everything anew for any other layout.
+    R, t = np.array(rotation, float, order="C"), np.array(translation_m, float, order="C")
     H, f, gradient, direction = np.zeros((6, 6)), np.zeros(n), np.zeros((n, 6)), np.zeros((n, 3))
     solve_from(b, use, R, t, far, H, f, gradient, direction)
     chosen = use > 0

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba as nb
 
@@ -21,14 +21,12 @@ Sym = tuple[float, float, float, float, float, float]
 
 def compiled(function: F) -> F:
     """`function` compiled by numba on first use and kept on disk."""
-    made: F = nb.njit(cache=True, error_model="numpy", nogil=True)(function)
-    return made
+    return cast(F, nb.njit(cache=True, error_model="numpy", nogil=True)(function))
 
 
 def inlined(function: F) -> F:
     """A small helper that is compiled into its callers."""
-    made: F = nb.njit(cache=True, error_model="numpy", inline="never")(function)
-    return made
+    return cast(F, nb.njit(cache=True, error_model="numpy", inline="never")(function))
 
 
 @inlined

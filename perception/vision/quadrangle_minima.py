@@ -1,0 +1,121 @@
+# ruff: noqa: PLR0912 - a compiled loop keeps one equation in one place
+# mypy: disallow-untyped-defs=False
+"""Compiled search for every local minimum of the four-light reprojection error. Conventions as in `quadrangle_cost`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perception.vision.quadrangle_cost import chi_square, minimise, turn_onto
+from perception.vision.quadrangle_jit import cross3, dot3, jit, mix3, product3, put1, put2, times3, unit3
+from perception.vision.quadrangle_p3p import three_point
+
+
+@jit
+def rotation_distance(A, B):
+    """1 - cos of the angle between two rotations, doubled: 3 - trace(A^T B)."""
+    s = 3.0
+    for i in range(3):
+        for j in range(3):
+            s -= A[i, j] * B[i, j]
+    return s
+
+
+@jit
+def ordered_seeds(X, f, m, A, Rs, ts, costs):
+    """Three-point poses of the four triples with their chi-square over all four points; returns how many.
+
+    Rs (16, 3, 3), ts (16, 3), costs (16,) are filled.
+    """
+    P, F = np.empty((3, 3)), np.empty((3, 3))
+    count = 0
+    for left_out in range(4):
+        n = 0
+        for i in range(4):
+            if i != left_out:
+                put1(P[n], X[i])
+                put1(F[n], f[i])
+                n += 1
+        side1, side2 = mix3(1.0, P[1], -1.0, P[0]), mix3(1.0, P[2], -1.0, P[0])
+        area = cross3(side1, side2)
+        size = dot3(side1, side1) + dot3(side2, side2)
+        if dot3(area, area) < 1e-8 * size * size:
+            continue
+        found = three_point(P, F, Rs[count:], ts[count:])
+        for k in range(count, count + found):
+            costs[k] = chi_square(Rs[k], ts[k], X, m, A)
+        count += found
+    return count
+
+
+@jit
+def mirrored(R, t, normal):
+    """R with the normal (object axes) reflected about the line of sight through the centroid."""
+    n = times3(R, normal)
+    k = unit3(t)
+    reflected = mix3(2.0 * dot3(n, k), k, -1.0, n)
+    if dot3(n, reflected) < -0.999999:
+        return R
+    return product3(turn_onto(n, reflected), R)
+
+
+@jit
+def all_minima(X, m, A, normal, Rs, ts, costs, Ns):
+    """Distinct local minima of chi-square, lowest first, into Rs (M,3,3), ts, costs, Ns (M,6,6); returns how many.
+
+    Starts: the best three-point pose, the mirror of its minimum, then every three-point pose far from these.
+    """
+    f = np.empty((4, 3))
+    for i in range(4):
+        norm = np.sqrt(m[i, 0] ** 2 + m[i, 1] ** 2 + 1.0)
+        f[i, 0], f[i, 1], f[i, 2] = m[i, 0] / norm, m[i, 1] / norm, 1.0 / norm
+    R_seed, t_seed, c_seed = np.empty((16, 3, 3)), np.empty((16, 3)), np.empty(16)
+    available = ordered_seeds(X, f, m, A, R_seed, t_seed, c_seed)
+    limit = Rs.shape[0]
+    started = np.empty((8, 3, 3))
+    runs = 0
+    count = 0
+    use_mirror = False
+    while runs < 8:
+        if use_mirror:
+            R0, t0 = mirrored(Rs[0], ts[0], normal), mix3(1.0, ts[0], 0.0, ts[0])
+        else:
+            seed = -1
+            for k in range(available):
+                if np.isfinite(c_seed[k]) and (seed < 0 or c_seed[k] < c_seed[seed]):
+                    seed = k
+            if seed < 0:
+                break
+            c_seed[seed] = np.inf
+            R0, t0 = R_seed[seed], t_seed[seed]
+            near = False
+            for k in range(runs):
+                near = near or rotation_distance(R0, started[k]) < 0.05  # 13 deg
+            for k in range(count):
+                near = near or rotation_distance(R0, Rs[k]) < 0.05
+            if near:
+                continue
+        put2(started[runs], R0)
+        runs += 1
+        R, t, cost, N, _ = minimise(R0, t0, X, m, A)
+        use_mirror = not use_mirror and runs == 1
+        if not np.isfinite(cost):
+            continue
+        known = False
+        for k in range(count):
+            known = known or (rotation_distance(R, Rs[k]) < 1e-5 and abs(cost - costs[k]) < 1e-3 * (1.0 + cost))
+        if known or count == limit:
+            continue
+        k = count
+        while k > 0 and costs[k - 1] > cost:
+            put2(Rs[k], Rs[k - 1])
+            put1(ts[k], ts[k - 1])
+            put2(Ns[k], Ns[k - 1])
+            costs[k] = costs[k - 1]
+            k -= 1
+        put2(Rs[k], R)
+        put1(ts[k], t)
+        put2(Ns[k], N)
+        costs[k] = cost
+        count += 1
+    return count

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-IDLE_S = 0.05  # a paced world that nobody has ticked for this long stands still; time passes without it
+IDLE_S = 0.5  # a paced world that nobody has ticked for this long stands still; time passes without it
 
 
 class Clock(Protocol):

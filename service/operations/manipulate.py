@@ -125,8 +125,8 @@ class _Eye:
 
 def state_of(reading: ObjectReading, thing: PanelObject) -> ObjectState:
     """A reading in the words of the skills."""
-    angle_rad = reading.value if isinstance(thing, Handwheel) else None
-    if isinstance(thing, Lever | Rotary) and reading.state is not None:
+    angle_rad = reading.value if isinstance(thing, Handwheel | Lever) else None
+    if angle_rad is None and isinstance(thing, Lever | Rotary) and reading.state is not None:
         angle_rad = next((s.angle_rad for s in thing.states if s.name == reading.state), None)
     return ObjectState(name=reading.name, state=reading.state, value=reading.value, angle_rad=angle_rad)
 

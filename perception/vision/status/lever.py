@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from hal.panel import Lever
 from perception.vision.patch import Patch
-from perception.vision.reading import Status
+from perception.vision.reading import Status, refused
 from perception.vision.status.bar import bar_contrast
 from perception.vision.status.choice import choose, contrast_noise
 
 BAR_FROM, BAR_TO = 0.40, 0.92  # share of the length: outside the hub, inside the tip
+SWEEP_RAD = np.deg2rad(np.arange(-30.0, 30.5, 1.0))
+BETWEEN_RAD = (
+    0.20  # a quarter-turn valve this far off its stop is neither open nor closed; walls of the bar cost 8 degrees
+)
+ANGLE_SIGMA_RAD = 0.02
 WOBBLE_RAD = np.deg2rad(np.linspace(-10, 10, 9))
 
 
@@ -25,4 +32,22 @@ def read_lever(patch: Patch, spec: Lever) -> Status:
     evidence = np.abs(contrast).reshape(len(angles), -1).max(axis=1)
     r = np.linspace(BAR_FROM, BAR_TO, 8)[:, None] * L
     seen = patch.seen(r * np.sin(angles), r * np.cos(angles))
-    return choose([s.name for s in spec.states], evidence, noise=contrast_noise(patch), seen=seen, what="lever")
+    status = choose([s.name for s in spec.states], evidence, noise=contrast_noise(patch), seen=seen, what="lever")
+    if not status.answered:
+        return status
+    nominal = float(angles[int(np.argmax(evidence))])
+    angle = _bar_angle(patch, spec, nominal)
+    if abs(angle - nominal) > BETWEEN_RAD:
+        return refused(f"the lever stands between its states, at {angle:.2f} rad: turn it to its stop", unit="rad")
+    return replace(status, value=angle, unit="rad", uncertainty=ANGLE_SIGMA_RAD)
+
+
+def _bar_angle(patch: Patch, spec: Lever, nominal: float) -> float:
+    """Where the bar really points, near a state: the direction that shows it best."""
+    L = spec.length_m
+    tried = nominal + SWEEP_RAD
+    contrast = np.abs(
+        bar_contrast(patch, tried, along_m=(BAR_FROM * L, BAR_TO * L), half_width_m=spec.width_m / 2, flank=(1.35, 1.6))
+    )
+    smooth = np.convolve(contrast, np.ones(5) / 5.0, "same")
+    return float(tried[2 + int(np.argmax(smooth[2:-2]))])

@@ -152,7 +152,7 @@ def _check_matrices(
 
 
 def _each(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    return np.asarray(holds.reshape(len(holds), -1).all(axis=1))
+    return np.asarray(holds.all(axis=tuple(range(1, holds.ndim))))
 
 
 def _refuse(given: Sequence[Measurement], wrong: NDArray[np.bool_], what: str, hint: str) -> None:

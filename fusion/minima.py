@@ -62,7 +62,8 @@ def minima(b: Batch, rng: np.random.Generator) -> tuple[Minimum, list[Minimum]]:
     f, least = np.empty(n), np.inf
     for k in range(len(poses.cost)):
         R, t = poses.R[k], poses.t[k]
-        if any(_same(R, t, m.local) for m in found):
+        # A pose from part of the measurements is only as exact as those are.
+        if any(_same(R, t, m.local, share=len(small.cls) / n) for m in found):
             continue
         if small is not b:
             search.settle(b, R, t, f, False)
@@ -147,12 +148,12 @@ def finished(b: Batch, R: Array, t: Array) -> Minimum:
     return Minimum(cost=float(np.minimum(local.values, b.gate).sum()), used=used, local=local)
 
 
-def _same(R: Array, t: Array, local: LocalSolution) -> bool:
-    """Is R, t within a few standard deviations of a minimum? (Free directions do not count.)"""
+def _same(R: Array, t: Array, local: LocalSolution, *, share: float = 1.0) -> bool:
+    """Is R, t within a few standard deviations of a minimum, when it rests on a `share` of its information?"""
     W = R @ local.rotation.T
     half = 0.5 * np.array([W[2, 1] - W[1, 2], W[0, 2] - W[2, 0], W[1, 0] - W[0, 1]])
     cosine, sine = 0.5 * (np.trace(W) - 1.0), math.sqrt(half @ half)
     if cosine < 0.0 and not local.unobservable:
         return False
     delta = np.concatenate([t - local.translation_m, half * (math.atan2(sine, cosine) / sine if sine > 1e-12 else 1.0)])
-    return bool(delta @ local.information @ delta < SAME_SIGMAS**2)
+    return bool(share * (delta @ local.information @ delta) < SAME_SIGMAS**2)

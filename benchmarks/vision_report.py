@@ -20,12 +20,12 @@ from benchmarks.vision_drawing import Disturbance, Shown, camera, draw_panel, lo
 from hal.config import load_cell
 from hal.errors import CellError
 from hal.geometry import certain
-from hal.panel import Panel
+from hal.panel import Panel, PanelObject
 from perception.vision.blind import recognise
 from perception.vision.image import Image
 from perception.vision.knowledge import shipped_knowledge
 from perception.vision.segment import grow_regions
-from perception.vision.taught import inspect
+from perception.vision.taught import inspect, patch_of, read_patch
 from perception.vision.view import CameraView
 
 LEVELS = ("easy", "medium", "hard")
@@ -48,7 +48,7 @@ def report(data: Path) -> int:
         _table(truth, answers, score)
         real = json.loads((data / "real" / "truth.json").read_text(encoding="utf-8"))
         _real(real, run(inputs.jobs(real), data / "real", timed=True), score)
-        _speed(data / "synth_dev", answers)
+        _speed(data / "synth_dev")
     _axes()
     return 0 if data.exists() else 1
 
@@ -147,7 +147,7 @@ def _real(truth: dict[str, Any], answers: dict[str, Any], score: ModuleType) -> 
     print("photographs of displays cannot be given out: that line is unmeasured")
 
 
-def _speed(folder: Path, answers: dict[str, Any]) -> None:
+def _speed(folder: Path) -> None:
     images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted(folder.glob("p24_0*.png"))[:6]]
     pictures: list[Image] = [np.asarray(image, np.uint8) for image in images if image is not None]
     knowledge = shipped_knowledge()
@@ -156,24 +156,30 @@ def _speed(folder: Path, answers: dict[str, Any]) -> None:
     _line("segmentation with sums, blurs", [regions / blur], (30,), at_most=True)
     overview = _best([partial(_quiet, partial(recognise, g, knowledge)) for g in pictures], 3)
     _line("blind overview, blurs", [overview / blur], (400,), at_most=True)
-    each = [
-        a["ms"] / len(a["objects"])
-        for key, a in answers.items()
-        if key.endswith("/taught") and len(a.get("objects", [])) > 6
-    ]
-    _line("one taught reading with its share of registration, ms", [float(np.median(each))], (3.0,), at_most=True)
+    panel = load_cell(Path(__file__).resolve().parent.parent / "cells" / "bench.toml").panel
+    intrinsics = camera(1280, 960, focal_px=1200.0)
+    pose = certain(RigidTransform.from_matrix(looking_at(distance_m=0.62)))
+    view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+    image = draw_panel(panel, view, (960, 1280), _random_state(panel, 0))
+    readings = [_best([partial(_read_one, image, view, thing)], 5) for thing in panel.objects]
+    _line("one taught reading (patch and reader), ms: median", [1e3 * float(np.median(readings))], (3.0,), at_most=True)
+    _line("  the slowest kind", [1e3 * max(readings)], (3.0,), at_most=True)
+
+
+def _read_one(image: Image, view: CameraView, thing: PanelObject) -> object:
+    return read_patch(patch_of(image, image, view, thing, np.zeros(2)), thing)
 
 
 def _best(tasks: list[Callable[[], object]], repeats: int) -> float:
-    """Median over the tasks of each one's best time, s: what a busy machine adds is left out."""
+    """Median over the tasks of each one's best processor time, s: what a busy machine adds is left out."""
     best = []
     for task in tasks:
         task()
         times = []
         for _ in range(repeats):
-            started = time.perf_counter()
+            started = time.process_time()
             task()
-            times.append(time.perf_counter() - started)
+            times.append(time.process_time() - started)
         best.append(min(times))
     return float(np.median(best))
 

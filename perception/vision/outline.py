@@ -26,7 +26,7 @@ class Outline:
     reach_m: float = 0.0
 
 
-def edges_of(thing: PanelObject) -> Outline | None:  # noqa: PLR0911  (one branch a kind)
+def edges_of(thing: PanelObject) -> Outline | None:
     """The edges that every state shows; None for kinds whose fixed parts the panel file leaves open."""
     x, y = thing.position_m
     match thing.kind:
@@ -52,7 +52,7 @@ def plate_edges(panel: Panel) -> Outline:
     return rectangle(0.0, 0.0, 0.0, width_m=panel.width_m, height_m=panel.height_m, count=PLATE_POINTS)
 
 
-def footprint_m(thing: PanelObject) -> tuple[float, float, float]:  # noqa: PLR0911  (one branch a kind)
+def footprint_m(thing: PanelObject) -> tuple[float, float, float]:
     """Half width, half height and the height above the plate of the box that holds the object, metres."""
     match thing.kind:
         case "gauge":

@@ -12,7 +12,14 @@ def _imports() -> None:
 
 
 def _vision() -> None:
-    from perception.vision.quadrangle import warm_up
+    from perception.vision import lights, quadrangle
+
+    quadrangle.warm_up()
+    lights.warm_up()
+
+
+def _range() -> None:
+    from perception.range.warm import warm_up
 
     warm_up()
 
@@ -23,7 +30,7 @@ def _fusion() -> None:
     warm_up()
 
 
-STAGES: Mapping[str, Callable[[], None]] = {"imports": _imports, "vision": _vision, "fusion": _fusion}
+STAGES: Mapping[str, Callable[[], None]] = {"imports": _imports, "vision": _vision, "range": _range, "fusion": _fusion}
 """What the service process computes with. The cell and world processes warm their own loops when they start."""
 
 

@@ -38,6 +38,7 @@ class SimBench:
     cell: Workcell
     latched: list[bool]
     rng: np.random.Generator
+    devices: dict[str, Any]
 
     def truth(self, name: str) -> ObjectTruth:
         """What an object really shows now."""
@@ -130,7 +131,7 @@ def open_bench(
         seed=seed,
         progress=progress,
     )
-    bench = SimBench(file, clock, shared, made["arm"], controller, cell, latched, rng)
+    bench = SimBench(file, clock, shared, made["arm"], controller, cell, latched, rng, made)
     levers = [thing.name for thing in file.panel.objects if thing.kind == "lever"]
     angles = {name: float(bench.truth(name).value or 0.0) for name in levers}
     bench.cell = replace(cell, angles_rad=angles)

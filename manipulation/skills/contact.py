@@ -87,6 +87,17 @@ def onset(depth_m: Array, force_n: Array, deepest_m: float) -> tuple[float, floa
     return float(np.clip(-offset / slope, depth_m[0], d[0])), float(slope)
 
 
+def against_turn(start: RigidTransform, hub_m: Array, axis: Array) -> tuple[float, float, float]:
+    """Unit vector in tool axes against a turn of the tool about `axis` through `hub_m` (base frame).
+
+    The tool turns with the object, so the direction stays the same in its axes; friction along the others, which has
+    nothing to do with the effort, does not count.
+    """
+    ahead = start.rotation.inv().apply(np.cross(axis, start.translation - hub_m))
+    against = -ahead / np.linalg.norm(ahead)
+    return float(against[0]), float(against[1]), float(against[2])
+
+
 def centre_between(attempt: Attempt, *, room_m: float, what: str) -> None:
     """Local refinement before a cage or a grasp: feel the thing between the open fingers on both sides, go to the
     middle.

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 from hal.errors import InvalidRequest
 from hal.motion import Compliance, Guard, Quantity
 from hal.panel import Handwheel
-from manipulation.skills.contact import centre_between
+from manipulation.skills.contact import against_turn, centre_between
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.steps import STANDOFF_M, Attempt, perform
 from manipulation.stroke import arc
@@ -133,10 +133,8 @@ def _carry(attempt: Attempt, thing: Handwheel, angle_rad: float, span_rad: float
     start = attempt.pose()
     axis = cell.panel_pose.rotation.apply([0.0, 0.0, -1.0])  # clockwise seen from the front
     stop_n = min(LARGEST_STOP_N, EFFORT_SPREAD * thing.torque_nm / thing.radius_m + EFFORT_FLOOR_N)
-    ahead = sign * start.rotation.inv().apply(np.cross(axis, start.translation - hub))
-    against = -ahead / np.linalg.norm(ahead)
-    direction = (float(against[0]), float(against[1]), float(against[2]))
-    guard = Guard(name="effort", quantity=Quantity.FORCE, limit=stop_n, axis=direction)
+    against = against_turn(start, hub, sign * axis)
+    guard = Guard(name="effort", quantity=Quantity.FORCE, limit=stop_n, axis=against)
     lag = thing.torque_nm / (2.0 * cell.hand.pad_stiffness_n_per_m * thing.radius_m**2)  # what both pads give
     poses = arc(start, centre_m=hub, axis=axis, angle_rad=span_rad + sign * lag)
     report = attempt.along(poses, name="turn", speed_m_per_s=TURN_M_PER_S, guards=(guard,), compliance=RADIAL)

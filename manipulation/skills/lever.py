@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 from hal.errors import InvalidRequest
 from hal.motion import Compliance, Guard, Quantity
 from hal.panel import Lever
-from manipulation.skills.contact import centre_between
+from manipulation.skills.contact import against_turn, centre_between
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.steps import STANDOFF_M, Attempt, perform
 from manipulation.stroke import arc
@@ -29,7 +29,7 @@ OVERTRAVEL_RAD = np.radians(12.0)  # play of the cage and give of the pads
 LAST_M_PER_S = 0.018
 END_RISE_N = 8.0
 EFFORT_SPREAD = 1.6
-EFFORT_FLOOR_N = 25.0
+EFFORT_FLOOR_N = 35.0
 LARGEST_STOP_N = 92.0  # below the cell's protective limit, so that a stiff valve is told from a collision
 MOVED_RAD = np.radians(12.0)
 TOLERANCE_RAD = np.radians(8.0)
@@ -170,8 +170,9 @@ def _carry(attempt: Attempt, thing: Lever, turn: _Turn, hub: Array) -> float:
     axis = cell.panel_pose.rotation.apply([0.0, 0.0, -1.0])  # clockwise seen from the front
     radius = thing.length_m - FROM_END_M
     stop_n = min(LARGEST_STOP_N, EFFORT_SPREAD * thing.torque_nm / radius + EFFORT_FLOOR_N)
-    strong = Guard(name="effort", quantity=Quantity.FORCE, limit=stop_n)
     start = attempt.pose()
+    against = against_turn(start, hub, sign * axis)
+    strong = Guard(name="effort", quantity=Quantity.FORCE, limit=stop_n, axis=against)
     fast_rad = max(0.0, abs(span_rad) - LAST_RAD)
     if fast_rad > 0.0:
         poses = arc(start, centre_m=hub, axis=axis, angle_rad=sign * fast_rad)
@@ -184,7 +185,7 @@ def _carry(attempt: Attempt, thing: Lever, turn: _Turn, hub: Array) -> float:
             )
     rest_rad = abs(span_rad) - fast_rad + OVERTRAVEL_RAD
     poses = arc(attempt.pose(), centre_m=hub, axis=axis, angle_rad=sign * rest_rad)
-    rise = Guard(name="end stop", quantity=Quantity.FORCE_RISE, limit=END_RISE_N)
+    rise = Guard(name="end stop", quantity=Quantity.FORCE_RISE, limit=END_RISE_N, axis=against)
     report = attempt.along(
         poses, name="turn to the stop", speed_m_per_s=LAST_M_PER_S, guards=(rise, strong), compliance=YIELDING
     )

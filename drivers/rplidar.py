@@ -45,10 +45,10 @@ def descriptor(length: int, mode: int, kind: int) -> bytes:
     return struct.pack("<BBIB", 0xA5, 0x5A, length | mode << 30, kind)
 
 
-def in_step(nodes: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Which rows of (n, 5) look like measurements."""
-    start, check = nodes[:, 0] & 3, nodes[:, 1] & 1
-    angle_q6 = nodes[:, 1].astype(np.int32) >> 1 | nodes[:, 2].astype(np.int32) << 7
+def begins_node(data: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """For every place in `data` but the last four: does what stands there look like a measurement?"""
+    start, check = data[:-4] & 3, data[1:-3] & 1
+    angle_q6 = data[1:-3].astype(np.int32) >> 1 | data[2:-2].astype(np.int32) << 7
     is_good: NDArray[np.bool_] = ((start == 1) | (start == 2)) & (check == 1) & (angle_q6 <= FULL_TURN_Q6)
     return is_good
 
@@ -73,24 +73,39 @@ class NodeParser:
         """Runs of (n, 5) measurements that are trusted now, parted by missteps."""
         self._buffer += chunk
         runs: list[NDArray[np.uint8] | None] = []
-        while len(self._buffer) >= NODE_BYTES * (IN_STEP + 1):
-            nodes = np.frombuffer(self._buffer, np.uint8)[: len(self._buffer) // NODE_BYTES * NODE_BYTES].reshape(-1, 5)
-            good = in_step(nodes)
-            first_bad = int(np.argmin(good)) if not good.all() else len(nodes)
-            trusted = first_bad - IN_STEP
+        if len(self._buffer) < NODE_BYTES * (IN_STEP + 1):
+            return runs
+        data = np.frombuffer(self._buffer, np.uint8)
+        good = begins_node(data)
+        at = 0
+        while True:
+            steps = good[at::NODE_BYTES]
+            length = len(steps) if steps.all() else int(np.argmin(steps))
+            trusted = length - IN_STEP
             if trusted > 0:
                 self._is_in_step = True
-                runs.append(nodes[:trusted])
-                self._buffer = self._buffer[trusted * NODE_BYTES :]
-                continue
-            if first_bad == len(nodes):
-                break  # in step so far, but too few to trust
+                runs.append(data[at : at + trusted * NODE_BYTES].reshape(-1, NODE_BYTES))
+                at += trusted * NODE_BYTES
+            if length == len(steps):
+                break  # in step up to the end, but the last few cannot be trusted yet
             if self._is_in_step:
                 self.missteps += 1
                 runs.append(None)
             self._is_in_step = False
-            self._buffer = self._buffer[1:]
+            at = _next_in_step(good, at + 1)
+        self._buffer = self._buffer[at:]
         return runs
+
+
+def _next_in_step(good: NDArray[np.bool_], at: int) -> int:
+    """The first place from `at` on from where everything known is in step for as long as it takes to trust it."""
+    span = NODE_BYTES * IN_STEP
+    padded = np.concatenate((good[at:], np.ones(span, np.bool_)))  # what has not come yet may still be good
+    ok = padded[: len(good) - at].copy()
+    for k in range(1, IN_STEP + 1):
+        ok &= padded[k * NODE_BYTES : k * NODE_BYTES + len(ok)]
+    places = np.flatnonzero(ok)
+    return at + int(places[0]) if len(places) else len(good)
 
 
 class Rplidar(LineScanner):

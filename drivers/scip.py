@@ -24,7 +24,7 @@ from hal.registry import Context
 FIRST_DISTANCE_MM = 20  # below are error codes
 STAMP_BITS, STAMP_S = 24, 0.001
 ANSWER_S = 0.5
-MESSAGE_LIMIT = 100_000  # no scanner's message is longer
+MESSAGE_LIMIT = 20_000  # no scanner's message is longer
 OK, LASER_ALREADY_ON, DATA, RESUMED = "00", "02", "99", "98"
 
 
@@ -86,8 +86,11 @@ class ScipParser:
 
     def feed(self, chunk: bytes, echo: str) -> list[Message]:
         """Whole answers whose echo begins with `echo`; damaged ones are counted."""
-        *blocks, self._buffer = (self._buffer + chunk).split(b"\n\n")
-        self._buffer = self._buffer[-MESSAGE_LIMIT:]
+        self._buffer += chunk
+        if b"\n\n" not in self._buffer[-len(chunk) - 1 :]:  # only the new part can have ended an answer
+            self._buffer = self._buffer[-MESSAGE_LIMIT:]
+            return []
+        *blocks, self._buffer = self._buffer.split(b"\n\n")
         found = [self._message(block, echo.encode()) for block in blocks]
         return [message for message in found if message is not None]
 

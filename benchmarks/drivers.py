@@ -561,7 +561,7 @@ def part_ur(seconds: float) -> None:
 def part_csp(seconds: float) -> None:
     """Six axes in cyclic synchronous position at 250 Hz: SYNCs sent more than a period late."""
     bench = next(b for b in BENCHES if b.name == "cia402")
-    fast = dataclasses.replace(bench, options={"rate_hz": 250.0})
+    fast = dataclasses.replace(bench, options={"rate_hz": 250.0, "heartbeat_s": 1.0})
     with running(fast, {}) as (device, far_side, backing):
         device.enable(deadline=deadline(2.0))
         rest, start, end_s = threading.Event(), backing.position_rad.copy(), time.monotonic() + seconds

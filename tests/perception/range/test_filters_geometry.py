@@ -127,7 +127,7 @@ def test_steps_and_slow_noise_are_told_apart():
     stepped = np.round(wall / 0.004) * 0.004
     law = estimate_noise(stepped, PINHOLE)
     assert law.step[0] + law.step[1] * 0.36 == pytest.approx(0.004, rel=0.1)
-    slow = cv2.GaussianBlur(np.random.default_rng(0).normal(0, 1, wall.shape), (0, 0), 2.0)
-    slow *= 0.002 / slow.std()
-    law = estimate_noise(wall + slow, PINHOLE)
+    large = OrthographicSensor(width_px=400, height_px=400, pixel_pitch_m=0.001)
+    slow = cv2.GaussianBlur(np.random.default_rng(0).normal(0, 1, (400, 400)), (0, 0), 3.0)
+    law = estimate_noise(0.6 + slow * 0.002 / slow.std(), large)
     assert law.slow_share(0.6) > 0.5

@@ -84,9 +84,7 @@ def seen_lights(pair: LightPair) -> Array:
     """(N, 2) lights that the library finds without a calibrated camera; none when it refuses."""
     try:
         blobs = find_lights(pair.off, pair.on)
-        lights = assign_lights(
-            blobs, pair.lights_m, image_size_px=(pair.on.shape[1], pair.on.shape[0]), least=2
-        )
+        lights = assign_lights(blobs, pair.lights_m, image_size_px=(pair.on.shape[1], pair.on.shape[0]), least=2)
     except PerceptionError:
         return np.empty((0, 2))
     return np.asarray(lights.points_px[lights.seen])

@@ -1,7 +1,7 @@
 """Range benchmark: predictions for given cases, or the whole table of issue goals on development scenes.
 
-    python -m benchmarks.range CASES_DIR OUT_DIR [--time] [--codes]   predictions in the scorer's format, mm
-    python -m benchmarks.range [--seeds N]                            the table: pass line beside measured value
+python -m benchmarks.range CASES_DIR OUT_DIR [--time] [--codes]   predictions in the scorer's format, mm
+python -m benchmarks.range [--seeds N]                            the table: pass line beside measured value
 """
 
 from __future__ import annotations
@@ -219,7 +219,8 @@ def _real_lines(score: ModuleType) -> list[Line]:
     case["meta"] = json.loads(str(case["meta"]))
     summary, _ = _scored(score, [case])
     return [
-        _correct("real: living room, T 0.8", 0.70, summary), _correct("real: living room, T 0.9", 0.50, summary, "0.9")
+        _correct("real: living room, T 0.8", 0.70, summary),
+        _correct("real: living room, T 0.9", 0.50, summary, "0.9"),
     ]
 
 

@@ -76,9 +76,7 @@ def made_up_scene(side: int, seed: int) -> tuple[Array, PinholeSensor]:
     """A tilted wall with balls and pipes in front, noise of half a millimetre: depth (side, side) and its sensor."""
     rng = np.random.default_rng(seed)
     f = 1.2 * side
-    sensor = PinholeSensor(
-        width_px=side, height_px=side, fx_px=f, fy_px=f, cx_px=(side - 1) / 2, cy_px=(side - 1) / 2
-    )
+    sensor = PinholeSensor(width_px=side, height_px=side, fx_px=f, fy_px=f, cx_px=(side - 1) / 2, cy_px=(side - 1) / 2)
     v, u = np.mgrid[:side, :side]
     x, y = (u - sensor.cx_px) / f, (v - sensor.cy_px) / f
     depth = 0.7 / (1.0 + 0.2 * x + 0.3 * y)

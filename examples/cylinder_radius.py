@@ -27,12 +27,19 @@ PRIOR_SIGMA = np.array([0.005] * 3 + [0.02] * 3)  # what the camera knew: 5 mm, 
 
 
 def sensed_point(
-    shape: Shape, part: str, on_object_m: Array, base_from_object: RigidTransform, sigma_m: float, rng: np.random.Generator
+    shape: Shape,
+    part: str,
+    on_object_m: Array,
+    base_from_object: RigidTransform,
+    sigma_m: float,
+    rng: np.random.Generator,
 ) -> Measurement:
     """A noisy point of `part`, as touch or range gives it: point-plane."""
     feature = shape.feature(part, shape.start, on_object_m)
     seen = base_from_object.apply(on_object_m) + rng.normal(0.0, sigma_m, 3)
-    made = measurement(feature, Kind.POINT, mu_m=seen, C_m2=sigma_m**2 * np.eye(3), label=f"{part} {1e3 * sigma_m:.1f} mm")
+    made = measurement(
+        feature, Kind.POINT, mu_m=seen, C_m2=sigma_m**2 * np.eye(3), label=f"{part} {1e3 * sigma_m:.1f} mm"
+    )
     return replace(made, part=part)
 
 
@@ -55,10 +62,12 @@ def cylinder_case(seed: int = 0) -> tuple[FusedPose, Cylinder]:
         return np.array([r * np.cos(angle), r * np.sin(angle), true.length_m if part == "top" else height])
 
     touches = [
-        sensed_point(guess, part, place(part), base_from_post, TOUCH_SIGMA_M, rng) for part in ["wall"] * 8 + ["top"] * 4
+        sensed_point(guess, part, place(part), base_from_post, TOUCH_SIGMA_M, rng)
+        for part in ["wall"] * 8 + ["top"] * 4
     ]
     ranged = [
-        sensed_point(guess, part, place(part), base_from_post, RANGE_SIGMA_M, rng) for part in ["wall"] * 14 + ["top"] * 6
+        sensed_point(guess, part, place(part), base_from_post, RANGE_SIGMA_M, rng)
+        for part in ["wall"] * 14 + ["top"] * 6
     ]
     table = plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), name="table")  # a fixed feature: the length is counted from here
     foot = [
@@ -99,7 +108,9 @@ def report(title: str, answer: FusedPose, true: Shape) -> str:
         value, sigma = answer.shape.value_of(name), answer.shape.sigma_of(name)
         lines.append(f"  {name:<10} {1e3 * value:8.3f} mm +- {1e3 * sigma:.3f}   true {1e3 * truth:8.3f}")
     lines.append(f"  chi-square {answer.chi_square:.1f} on {answer.dof}; not believed:")
-    lines += [f"    {r.index:2d} {r.label}: {r.value:.0f}, limit {r.limit:.1f}" for r in answer.rejected] or ["    none"]
+    lines += [f"    {r.index:2d} {r.label}: {r.value:.0f}, limit {r.limit:.1f}" for r in answer.rejected] or [
+        "    none"
+    ]
     return "\n".join(lines)
 
 

@@ -100,7 +100,9 @@ def poses_after(made: Problem, n: int) -> list[Drawing]:
     lines = outlines()
     plain = solve_from_many(made.measurements[:n], starts=32).base_from_object
     drawings = [
-        Drawing(base_from_object=made.base_from_object, outlines_m=lines, colour="#444444", label="actual", dashed=True),
+        Drawing(
+            base_from_object=made.base_from_object, outlines_m=lines, colour="#444444", label="actual", dashed=True
+        ),
         Drawing(base_from_object=plain, outlines_m=lines, colour="#d62728", label="least squares"),
     ]
     answer = robust(made, n)

@@ -153,7 +153,9 @@ def judged(
     for repeat, first in repeats.items():
         f[repeat] = f[first]
     rejected = _rejected(b, best, index, given) + [
-        Rejected(index=i, label=given[i].label, value=float(f[i]), limit=0.0, reason=f"duplicate of measurement {first}")
+        Rejected(
+            index=i, label=given[i].label, value=float(f[i]), limit=0.0, reason=f"duplicate of measurement {first}"
+        )
         for i, first in repeats.items()
     ]
     evidence = log_evidence(b, best.used, best.local)

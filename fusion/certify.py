@@ -84,7 +84,9 @@ def certificate(b: Batch, used: NDArray[np.bool_], local: LocalSolution) -> Cert
     )
 
 
-def quadratic_form(b: Batch, used: NDArray[np.bool_], R: Array, t: Array, about: Array, middle: Array, size: float) -> Array:
+def quadratic_form(
+    b: Batch, used: NDArray[np.bool_], R: Array, t: Array, about: Array, middle: Array, size: float
+) -> Array:
     """Q (16, 16) with z^T Q z = the error of the used entries, their covariances frozen at the pose R, t."""
     Q = np.zeros((SIZE, SIZE))
     for i in map(int, np.flatnonzero(used)):
@@ -94,9 +96,7 @@ def quadratic_form(b: Batch, used: NDArray[np.bool_], R: Array, t: Array, about:
     return Q
 
 
-def _rows(
-    b: Batch, i: int, R: Array, t: Array, about: Array, middle: Array, size: float
-) -> tuple[Array, Array]:
+def _rows(b: Batch, i: int, R: Array, t: Array, about: Array, middle: Array, size: float) -> tuple[Array, Array]:
     """Rows (k, 16) of entry i over z, and their covariance (k, k) at R, t; the table of notes/fusion.md."""
     c, m, w = b.cls[i], b.m[i] - about, b.w[i]
     mu, C = b.mu[i] - middle, _full(b.C[i])

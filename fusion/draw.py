@@ -55,7 +55,12 @@ class Sight:
 
 
 def sight_of(
-    base_from_object: RigidTransform, middle_m: ArrayLike, *, distance_m: float, width_px: int = 640, height_px: int = 480
+    base_from_object: RigidTransform,
+    middle_m: ArrayLike,
+    *,
+    distance_m: float,
+    width_px: int = 640,
+    height_px: int = 480,
 ) -> Sight:
     """A camera before the object's +z side, a little from above and from the right, that looks at its middle.
 
@@ -151,7 +156,8 @@ def svg(drawings: Sequence[Drawing], sight: Sight, *, title: str = "") -> str:
         dashes = ' stroke-dasharray="5 4"' if drawing.dashed else ""
         style = f'fill="none" stroke="{escape(drawing.colour)}" stroke-width="1.4"{dashes}'
         parts += [
-            f'<polyline points="{" ".join(f"{u:.1f},{v:.1f}" for u, v in line)}" {style}/>' for line in seen(drawing, sight)
+            f'<polyline points="{" ".join(f"{u:.1f},{v:.1f}" for u, v in line)}" {style}/>'
+            for line in seen(drawing, sight)
         ]
         if drawing.label:
             place = f'x="10" y="{20 + 17 * row}"'

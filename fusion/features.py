@@ -80,7 +80,9 @@ def box_features(low_m: ArrayLike, high_m: ArrayLike, *, name: str = "box") -> t
     middle, axes = (low + high) / 2, np.eye(3)
     found = [
         point([(low, high)[a][0], (low, high)[b][1], (low, high)[c][2]], name=f"{name} vertex {a}{b}{c}")
-        for a in (0, 1) for b in (0, 1) for c in (0, 1)
+        for a in (0, 1)
+        for b in (0, 1)
+        for c in (0, 1)
     ]
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3

@@ -50,7 +50,10 @@ def start(measurements: Sequence[Measurement], *, prior: UncertainPose | None = 
         raise InvalidRequest("no measurement to fuse", hint="give at least one measurement or a prior pose")
     for i, first in duplicates(measurements).items():
         raise InvalidRequest(
-            f"measurement {i} repeats measurement {first}", hint="give each measurement once", index=i, reason="duplicate"
+            f"measurement {i} repeats measurement {first}",
+            hint="give each measurement once",
+            index=i,
+            reason="duplicate",
         )
     return _searched(tuple(measurements), pack(measurements, prior), prior, seed)
 

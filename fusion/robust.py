@@ -59,7 +59,9 @@ def fuse(
     return judged(b, best, others, index, measurements, repeats, certify)
 
 
-def used_entries(measurements: Sequence[Measurement], answer: FusedPose) -> tuple[Batch, NDArray[np.bool_], LocalSolution]:
+def used_entries(
+    measurements: Sequence[Measurement], answer: FusedPose
+) -> tuple[Batch, NDArray[np.bool_], LocalSolution]:
     """An answer's measurements packed, which of them it used (N,), and the local solution there: for a certificate.
 
     Raises:

@@ -337,4 +337,3 @@ def descend(b: Batch, use: Array, R: Array, t: Array, far: bool, steps: int, tol
     if swapped:
         R1[:], t1[:] = R, t
     return cost
-

@@ -144,9 +144,7 @@ def truncated(b: Batch, f: Array) -> float:
 
 
 @compiled
-def candidates(
-    b: Batch, draws: Array, most: int, Rs: Array, ts: Array, costs: Array, inside: NDArray[np.int64]
-) -> int:
+def candidates(b: Batch, draws: Array, most: int, Rs: Array, ts: Array, costs: Array, inside: NDArray[np.int64]) -> int:
     """One round: hypotheses from `draws` (H, DRAWS), of which the best `most` are settled.
 
     The first so many rows of Rs (H, 3, 3), ts (H, 3), costs (H,) are the settled ones, cheapest first, with the degrees

@@ -470,9 +470,7 @@ def _closest(points: Sequence[Array], directions: Sequence[Array]) -> Array:
     return np.asarray(np.linalg.solve(A, np.sum([P @ p for P, p in zip(across, points, strict=True)], axis=0)))
 
 
-def _meet(
-    points: Sequence[Array], normals: Sequence[Array], toward: tuple[Array, Array]
-) -> tuple[Array, Array]:
+def _meet(points: Sequence[Array], normals: Sequence[Array], toward: tuple[Array, Array]) -> tuple[Array, Array]:
     """A point and the direction of the line in which two planes meet; the point is the nearest one to the ray `toward`.
 
     Raises:

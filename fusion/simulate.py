@@ -25,7 +25,9 @@ FOCAL_PX, PIXEL_SIGMA_PX, CAMERA_SIGMA_M = 800.0, 0.5, 0.0003
 STEREO_DEPTH_M, STEREO_LATERAL_M = 0.002, 0.0007
 STEREO_LINE_RAD = (math.radians(0.5), math.radians(0.2))
 POINT_SIGMA_M = {"t": 0.0002, "p": 0.001, "r": 0.002}
-LINE_SIGMA_RAD = {sense: math.sqrt(2) * sigma / 0.1 for sense, sigma in POINT_SIGMA_M.items()}  # two touches 100 mm apart
+LINE_SIGMA_RAD = {
+    sense: math.sqrt(2) * sigma / 0.1 for sense, sigma in POINT_SIGMA_M.items()
+}  # two touches 100 mm apart
 PLANE_SIGMA_RAD = {"t": 0.002, "p": 0.010, "r": math.radians(0.3)}
 SENSED = {"1": Kind.POINT, "2": Kind.POINT, "3": Kind.POINT, "4": Kind.LINE, "5": Kind.LINE, "6": Kind.LINE,
           "7": Kind.PLANE, "8": Kind.PLANE, "9": Kind.PLANE}  # fmt: skip

@@ -79,10 +79,13 @@ def distort(normalised: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
     k1, k2, p1, p2, k3 = intrinsics.distortion
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack([
-        x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-    ], axis=1)
+    return np.stack(
+        [
+            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+        ],
+        axis=1,
+    )
 
 
 def distortion_jacobian(normalised: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
@@ -116,10 +119,16 @@ def undistort_normalised(distorted: ArrayLike, intrinsics: CameraIntrinsics) -> 
         jacobian = distortion_jacobian(ideal, intrinsics)
         determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
         with np.errstate(divide="ignore", invalid="ignore"):
-            step = np.stack([
-                jacobian[:, 1, 1] * error[:, 0] - jacobian[:, 0, 1] * error[:, 1],
-                jacobian[:, 0, 0] * error[:, 1] - jacobian[:, 1, 0] * error[:, 0],
-            ], axis=1) / np.where(determinant > 0, determinant, np.nan)[:, None]
+            step = (
+                np.stack(
+                    [
+                        jacobian[:, 1, 1] * error[:, 0] - jacobian[:, 0, 1] * error[:, 1],
+                        jacobian[:, 0, 0] * error[:, 1] - jacobian[:, 1, 0] * error[:, 0],
+                    ],
+                    axis=1,
+                )
+                / np.where(determinant > 0, determinant, np.nan)[:, None]
+            )
         ideal = ideal + step
     residual = np.abs(target - distort(ideal, intrinsics)).max(axis=1)
     return np.where((residual < 1e-9)[:, None], ideal, np.nan)

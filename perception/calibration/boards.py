@@ -72,9 +72,7 @@ class Charuco:
                 hint="check dictionary and squares, come nearer, or light the board evenly",
             )
         points = np.asarray(board.getChessboardCorners(), float)[np.asarray(ids).ravel()]
-        return BoardView(
-            points_m=points, pixels_px=np.asarray(corners, float).reshape(-1, 2), sigma_px=CORNER_SIGMA_PX
-        )
+        return BoardView(points_m=points, pixels_px=np.asarray(corners, float).reshape(-1, 2), sigma_px=CORNER_SIGMA_PX)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -120,9 +120,9 @@ def fit_cubic(
         cy_px=intrinsics.cy_px,
     )  # fmt: skip
     measured = np.concatenate([view.pixels_px for view in views])
-    ideal = np.concatenate([
-        project(pose.apply(view.points_m), straight) for view, pose in zip(views, poses, strict=True)
-    ])
+    ideal = np.concatenate(
+        [project(pose.apply(view.points_m), straight) for view, pose in zip(views, poses, strict=True)]
+    )
     rows = cubic_monomials(measured, centre, scale)
     coefficients = np.linalg.lstsq(rows, ideal, rcond=None)[0]
     lens = CubicLens(coefficients=coefficients, centre_px=centre, scale_px=scale, bias_px=0.0)
@@ -230,9 +230,7 @@ def _with_parameters(intrinsics: CameraIntrinsics, values: Array) -> CameraIntri
     )  # fmt: skip
 
 
-def _projection(
-    view: BoardView, pose: RigidTransform, intrinsics: CameraIntrinsics
-) -> tuple[Array, Array, Array]:
+def _projection(view: BoardView, pose: RigidTransform, intrinsics: CameraIntrinsics) -> tuple[Array, Array, Array]:
     """Pixels (N, 2), and derivatives (2N, 9) by the intrinsics and (2N, 6) by the pose."""
     turned = view.points_m @ matrix_of(pose).T
     q = turned + pose.translation
@@ -301,5 +299,3 @@ def _check_accuracy(covariance: Array, names: list[str], intrinsics: CameraIntri
                 f"the views leave {name} uncertain by {sigma[name]:.1f} px (at most {limit:.1f})", hint=HINT,
                 parameter=name, sigma_px=round(float(sigma[name]), 2),
             )  # fmt: skip
-
-

@@ -86,4 +86,3 @@ def invert(information: Array) -> Array:
             direction=(direction / np.abs(direction).max()).round(3).tolist(),
         )  # fmt: skip
     return np.asarray((vectors / values) @ vectors.T / np.outer(scale, scale))
-

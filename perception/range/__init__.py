@@ -8,7 +8,22 @@ from perception.range.primitives import Cone, Cylinder, Ellipsoid, Plane, Sphere
 from perception.range.sensor import OrthographicSensor, PinholeSensor, RangeSensorModel
 
 __all__ = [
-    "Cone", "Cylinder", "Ellipsoid", "FeatureKind", "NoiseModel", "OrthographicSensor", "PinholeSensor", "Plane",
-    "PlaneFit", "RangeFeature", "RangeScene", "RangeSensorModel", "Sphere", "Surface", "SurfaceType", "analyse",
-    "estimate_noise", "fit_plane_near",
+    "Cone",
+    "Cylinder",
+    "Ellipsoid",
+    "FeatureKind",
+    "NoiseModel",
+    "OrthographicSensor",
+    "PinholeSensor",
+    "Plane",
+    "PlaneFit",
+    "RangeFeature",
+    "RangeScene",
+    "RangeSensorModel",
+    "Sphere",
+    "Surface",
+    "SurfaceType",
+    "analyse",
+    "estimate_noise",
+    "fit_plane_near",
 ]

@@ -128,7 +128,8 @@ def _check_scale(depth: Array, sensor: RangeSensorModel) -> None:
     if abs(middle) > 200.0:
         raise InvalidRequest(
             f"median depth is {middle:.0f} m: the image is probably in millimetres",
-            hint="divide by 1000, or decode codes with their scale", median_depth_m=middle,
+            hint="divide by 1000, or decode codes with their scale",
+            median_depth_m=middle,
         )
     if sensor.packed()[0] > 0 and middle < 1e-3:
         raise InvalidRequest(
@@ -136,9 +137,7 @@ def _check_scale(depth: Array, sensor: RangeSensorModel) -> None:
         )
 
 
-def _finished(
-    task: Task, noise: NoiseModel, labels: Labels, found: Candidates
-) -> tuple[Labels, tuple[Surface, ...]]:
+def _finished(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) -> tuple[Labels, tuple[Surface, ...]]:
     depth, sensor = task.depth_m, task.sensor
     count = len(found.kinds)
     samples = finish.samples_by_label(depth, sensor, noise, labels, count)

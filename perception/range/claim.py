@@ -72,9 +72,14 @@ def claim_borders(depth, sen, noise, labels, kinds, ths, out, top, bottom):  # t
         for u in range(1, W - 1):
             own = labels[v, u]
             if (
-                labels[v, u - 1] == own and labels[v, u + 1] == own and labels[v - 1, u] == own
-                and labels[v + 1, u] == own and labels[v - 1, u - 1] == own and labels[v - 1, u + 1] == own
-                and labels[v + 1, u - 1] == own and labels[v + 1, u + 1] == own
+                labels[v, u - 1] == own
+                and labels[v, u + 1] == own
+                and labels[v - 1, u] == own
+                and labels[v + 1, u] == own
+                and labels[v - 1, u - 1] == own
+                and labels[v - 1, u + 1] == own
+                and labels[v + 1, u - 1] == own
+                and labels[v + 1, u + 1] == own
             ):
                 continue
             z = depth[v, u]

@@ -100,7 +100,15 @@ def fit_best(grid: Grid, members: NDArray[np.int64]) -> Fit | None:
     known = np.isfinite(normals[pick, 0])
     kinds[[SPHERE, CYLINDER, CONE]] = int(np.count_nonzero(known)) >= LEAST_NORMALS
     ths, mean2, kept, score = fit.fit_kinds(
-        points, points[known], normals[pick[known]], x, y, z, sigma, grid.perspective, kinds,
+        points,
+        points[known],
+        normals[pick[known]],
+        x,
+        y,
+        z,
+        sigma,
+        grid.perspective,
+        kinds,
         _correlated_samples(grid, pick.size, members.size),
     )
     score = np.where((mean2 < GOOD_MEAN_SQUARE) & (kept > GOOD_SHARE), score, np.inf)
@@ -142,7 +150,20 @@ def _grown(grid: Grid, option: Fit, free: Flags, members: NDArray[np.int64]) -> 
     queue, mark = np.empty(h * w, np.int32), np.zeros(h * w, np.uint8)
     cos_limit = float(np.cos(max(0.5, 4.0 * grid.normal_sigma_rad)))
     count, total = grow.grow_surface(
-        option.kind, option.parameters, grid.x, grid.y, grid.z, grid.sigma, grid.normal, grid.rms, free, members,
-        grid.perspective, cos_limit, mark, 1, queue,
+        option.kind,
+        option.parameters,
+        grid.x,
+        grid.y,
+        grid.z,
+        grid.sigma,
+        grid.normal,
+        grid.rms,
+        free,
+        members,
+        grid.perspective,
+        cos_limit,
+        mark,
+        1,
+        queue,
     )
     return queue[:count].copy(), float(total)

@@ -5,7 +5,6 @@ relabelling. Here the exchange is a union-find over the seam rows, neighbours fi
 rounds. Labels follow the raster order of each component's first pixel, so they are the same for any number of tiles.
 """
 
-
 from __future__ import annotations
 
 from collections.abc import Callable

@@ -67,8 +67,12 @@ def plane_feature(surface: Surface) -> RangeFeature:
     # n . X = d: the offset of the plane at `point` is d(d) - point . d(n).
     row = np.array([-frame[0] @ plane.point_m, -frame[1] @ plane.point_m, 1.0])
     return RangeFeature(
-        kind=FeatureKind.PLANE, point_m=plane.point_m, point_covariance=float(row @ C @ row) * np.outer(n, n),
-        direction=n, direction_covariance=frame.T @ C[:2, :2] @ frame, labels=(surface.label,),
+        kind=FeatureKind.PLANE,
+        point_m=plane.point_m,
+        point_covariance=float(row @ C @ row) * np.outer(n, n),
+        direction=n,
+        direction_covariance=frame.T @ C[:2, :2] @ frame,
+        labels=(surface.label,),
     )
 
 
@@ -78,14 +82,22 @@ def axis_feature(surface: Surface) -> RangeFeature:
     if isinstance(shape, Cylinder):
         # The fit shifts the axis at its own anchor; the anchor kept by `primitive_of` moves the tilt's lever to zero.
         return RangeFeature(
-            kind=FeatureKind.LINE, point_m=shape.point_m, point_covariance=frame.T @ C[:2, :2] @ frame,
-            direction=shape.axis, direction_covariance=frame.T @ C[2:4, 2:4] @ frame, labels=(surface.label,),
+            kind=FeatureKind.LINE,
+            point_m=shape.point_m,
+            point_covariance=frame.T @ C[:2, :2] @ frame,
+            direction=shape.axis,
+            direction_covariance=frame.T @ C[2:4, 2:4] @ frame,
+            labels=(surface.label,),
         )
     if isinstance(shape, Cone):
         across = np.eye(3) - np.outer(shape.axis, shape.axis)
         return RangeFeature(
-            kind=FeatureKind.LINE, point_m=shape.apex_m, point_covariance=across @ C[:3, :3] @ across,
-            direction=shape.axis, direction_covariance=frame.T @ C[3:5, 3:5] @ frame, labels=(surface.label,),
+            kind=FeatureKind.LINE,
+            point_m=shape.apex_m,
+            point_covariance=across @ C[:3, :3] @ across,
+            direction=shape.axis,
+            direction_covariance=frame.T @ C[3:5, 3:5] @ frame,
+            labels=(surface.label,),
         )
     raise TypeError(f"surface {surface.label} is a {surface.type}: it has no axis")
 
@@ -100,8 +112,12 @@ def point_feature(surface: Surface) -> RangeFeature:
     else:
         raise TypeError(f"surface {surface.label} is a {surface.type}: it has no point of its own")
     return RangeFeature(
-        kind=FeatureKind.POINT, point_m=point, point_covariance=C[:3, :3].copy(), direction=np.zeros(3),
-        direction_covariance=np.zeros((3, 3)), labels=(surface.label,),
+        kind=FeatureKind.POINT,
+        point_m=point,
+        point_covariance=C[:3, :3].copy(),
+        direction=np.zeros(3),
+        direction_covariance=np.zeros((3, 3)),
+        labels=(surface.label,),
     )
 
 
@@ -134,8 +150,12 @@ def crease_line(a: Surface, b: Surface, near_m: Array | None = None) -> RangeFea
     C = J @ S @ J.T
     across = np.eye(3) - np.outer(direction, direction)
     return RangeFeature(
-        kind=FeatureKind.LINE, point_m=line(np.zeros(8))[:3], point_covariance=across @ C[:3, :3] @ across,
-        direction=direction, direction_covariance=across @ C[3:, 3:] @ across, labels=(a.label, b.label),
+        kind=FeatureKind.LINE,
+        point_m=line(np.zeros(8))[:3],
+        point_covariance=across @ C[:3, :3] @ across,
+        direction=direction,
+        direction_covariance=across @ C[3:, 3:] @ across,
+        labels=(a.label, b.label),
     )
 
 
@@ -149,13 +169,19 @@ def corner_point(a: Surface, b: Surface, c: Surface) -> RangeFeature | None:
     point = np.linalg.solve(N, offsets)
     inverse = np.linalg.inv(N)
     # n_i . X = n_i . p_i + o_i: dX = N^-1 (do_i - dn_i . (X - p_i))
-    variance = np.array([
-        np.trace(p.point_covariance) + (point - p.point_m) @ p.direction_covariance @ (point - p.point_m)
-        for p in planes
-    ])
+    variance = np.array(
+        [
+            np.trace(p.point_covariance) + (point - p.point_m) @ p.direction_covariance @ (point - p.point_m)
+            for p in planes
+        ]
+    )
     return RangeFeature(
-        kind=FeatureKind.POINT, point_m=point, point_covariance=inverse @ np.diag(variance) @ inverse.T,
-        direction=np.zeros(3), direction_covariance=np.zeros((3, 3)), labels=(a.label, b.label, c.label),
+        kind=FeatureKind.POINT,
+        point_m=point,
+        point_covariance=inverse @ np.diag(variance) @ inverse.T,
+        direction=np.zeros(3),
+        direction_covariance=np.zeros((3, 3)),
+        labels=(a.label, b.label, c.label),
     )
 
 

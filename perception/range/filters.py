@@ -1,6 +1,5 @@
 """Filters that keep holes and edges: median for gross errors, gaussian for measurement errors (paper, Section III)."""
 
-
 from __future__ import annotations
 
 import cv2

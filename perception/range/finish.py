@@ -94,10 +94,16 @@ def refine_surface(
     x, y = (float(np.median(a)) for a in (few.x, few.y))
     middle = np.array([x * depth, y * depth, depth] if perspective else [x, y, depth])
     surface = Surface(
-        label=label, type=TYPE_OF_KIND[kind], primitive=primitive_of(kind, th, middle),
-        covariance=named_covariance(kind, th, covariance), covariance_over=COVARIANCE_OVER[kind],
-        frame=frame_vectors(kind, th) if kind != QUADRIC else np.eye(3)[:2], pixels=n,
-        rms_m=misfit * float(np.median(few.sigma)) if n else 0.0, misfit=misfit, middle_m=middle,
+        label=label,
+        type=TYPE_OF_KIND[kind],
+        primitive=primitive_of(kind, th, middle),
+        covariance=named_covariance(kind, th, covariance),
+        covariance_over=COVARIANCE_OVER[kind],
+        frame=frame_vectors(kind, th) if kind != QUADRIC else np.eye(3)[:2],
+        pixels=n,
+        rms_m=misfit * float(np.median(few.sigma)) if n else 0.0,
+        misfit=misfit,
+        middle_m=middle,
     )
     return surface, th
 

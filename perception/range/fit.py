@@ -125,9 +125,7 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed):  #
             small = max(small, abs(step[a]) * np.sqrt(H[a, a]))
         trial = stepped(kind, th, frame, step)
         frame_of(kind, trial, new_frame)
-        new_cost, new_used = _normal_equations(
-            kind, trial, new_frame, x, y, z, sigma, perspective, scale, trim, H2, g2
-        )
+        new_cost, new_used = _normal_equations(kind, trial, new_frame, x, y, z, sigma, perspective, scale, trim, H2, g2)
         if new_cost <= cost and new_used >= p:
             th, cost, used = trial, new_cost, new_used
             frame[:] = new_frame
@@ -431,9 +429,9 @@ def quadric_of_sphere(th):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def is_ellipsoid(th):  # type: ignore[no-untyped-def]
     """Whether the quadric is a real ellipsoid of sane proportions (longest radius at most 8 times the shortest)."""
-    A = np.array([
-        [th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]
-    ])
+    A = np.array(
+        [[th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]]
+    )
     b = 0.5 * th[10:13]
     w, V = np.linalg.eigh(A)
     if w[0] <= 1e-3:

@@ -8,7 +8,6 @@ the surface X(u, v) = O + z D, of which the graph is a special case. Both are he
 Curvature is positive for a surface that bulges towards the sensor.
 """
 
-
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -75,8 +74,13 @@ def geometry_of(depth_m: Array, sensor: RangeSensorModel, *, scale_px: float) ->
     """Geometry by central differences of an already smoothed (H, W) depth image."""
     gu, gv, normal, mean, gauss = _fused(np.ascontiguousarray(depth_m), sensor.packed())
     return LocalGeometry(
-        gu=gu, gv=gv, normal=normal, orientation_rad=np.arctan2(gu, gv), mean_curvature_per_m=mean,
-        gaussian_curvature_per_m2=gauss, scale_px=scale_px,
+        gu=gu,
+        gv=gv,
+        normal=normal,
+        orientation_rad=np.arctan2(gu, gv),
+        mean_curvature_per_m=mean,
+        gaussian_curvature_per_m2=gauss,
+        scale_px=scale_px,
     )
 
 
@@ -94,8 +98,8 @@ def curvature_class(geometry: LocalGeometry, *, flat_per_m: float) -> NDArray[np
 def graph_curvature(g: Array) -> tuple[Array, Array]:
     """H and K of a graph surface g(u, v) with unit pixel pitch, exactly as printed in the paper (interior pixels).
 
-        H = ((1 + gv^2) guu + (1 + gu^2) gvv - 2 gu gv guv) / (2 (1 + gu^2 + gv^2)^(3/2))
-        K = (guu gvv - guv^2) / (1 + gu^2 + gv^2)^2
+    H = ((1 + gv^2) guu + (1 + gu^2) gvv - 2 gu gv guv) / (2 (1 + gu^2 + gv^2)^(3/2))
+    K = (guu gvv - guv^2) / (1 + gu^2 + gv^2)^2
     """
     gu, gv = (g[1:-1, 2:] - g[1:-1, :-2]) / 2, (g[2:, 1:-1] - g[:-2, 1:-1]) / 2
     guu = g[1:-1, 2:] - 2 * g[1:-1, 1:-1] + g[1:-1, :-2]

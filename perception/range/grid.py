@@ -80,8 +80,14 @@ def slope_sigma_rad(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float,
 
 
 def build_grid(
-    depth_m: Array, sensor: RangeSensorModel, noise: NoiseModel, size_px: int, *, jump_slope: float = JUMP_SLOPE,
-    tiles: int = 1, pool: ThreadPoolExecutor | None = None,
+    depth_m: Array,
+    sensor: RangeSensorModel,
+    noise: NoiseModel,
+    size_px: int,
+    *,
+    jump_slope: float = JUMP_SLOPE,
+    tiles: int = 1,
+    pool: ThreadPoolExecutor | None = None,
 ) -> Grid:
     """Blocks of `size_px` pixels of an (H, W) depth image and their tangent planes; the window radius follows noise.
 
@@ -101,11 +107,22 @@ def build_grid(
     slope = jump_slope / packed[1]
     for_each_tile(
         lambda a, b: _tangents(x, y, z, count, sigma, perspective, radius, slope, size_px, normal, rms, a, b),
-        h, tiles, pool=pool,
+        h,
+        tiles,
+        pool=pool,
     )
     return Grid(
-        size_px=size_px, radius=radius, perspective=perspective, x=x, y=y, z=z, sigma=sigma, normal=normal, rms=rms,
-        normal_sigma_rad=slope_sigma, slow_share=noise.slow_share(middle),
+        size_px=size_px,
+        radius=radius,
+        perspective=perspective,
+        x=x,
+        y=y,
+        z=z,
+        sigma=sigma,
+        normal=normal,
+        rms=rms,
+        normal_sigma_rad=slope_sigma,
+        slow_share=noise.slow_share(middle),
     )
 
 

@@ -83,9 +83,7 @@ def _joint_fit(
         if turn < np.cos(LARGEST_TURN_RAD):
             return None
     both = _together(a, b)
-    joint, _, _, _, _ = fit.fit_robust(
-        kind, th, both.x, both.y, both.z, both.sigma, perspective, FREE, 3
-    )
+    joint, _, _, _, _ = fit.fit_robust(kind, th, both.x, both.y, both.z, both.sigma, perspective, FREE, 3)
     for s in (a, b):
         e = np.empty(s.x.size)
         fit.residuals(kind, joint, s.x, s.y, s.z, s.sigma, perspective, e)
@@ -102,9 +100,7 @@ def _nearness(
     few = [thinned(s, NEAR_SAMPLES) for s in samples]
     starts = np.cumsum([0] + [s.x.size for s in few])
     x, y, z, sigma = (np.concatenate([getattr(s, name) for s in few]) for name in ("x", "y", "z", "sigma"))
-    return np.asarray(
-        _near_matrix(np.array(kinds), np.stack(parameters), starts, x, y, z, sigma, perspective)
-    )
+    return np.asarray(_near_matrix(np.array(kinds), np.stack(parameters), starts, x, y, z, sigma, perspective))
 
 
 @njit(cache=True)
@@ -127,7 +123,9 @@ def _near_matrix(kinds, ths, starts, x, y, z, sigma, perspective):  # type: igno
 
 def _together(a: Samples, b: Samples) -> Samples:
     return Samples(
-        x=np.concatenate([a.x, b.x]), y=np.concatenate([a.y, b.y]), z=np.concatenate([a.z, b.z]),
+        x=np.concatenate([a.x, b.x]),
+        y=np.concatenate([a.y, b.y]),
+        z=np.concatenate([a.z, b.z]),
         sigma=np.concatenate([a.sigma, b.sigma]),
     )
 

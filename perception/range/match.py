@@ -134,8 +134,12 @@ def _item(surface: Surface, shape: RegionShape, sensor_from_panel: RigidTransfor
     size_sigma = float(np.sqrt(np.max(np.diag(C)[3:]))) if round_one else 0.0
     height_sigma = float(np.sqrt(up @ C[:3, :3] @ up)) if round_one else 0.0
     return _Item(
-        surface=surface, shape=shape, point=panel_from_sensor.apply(point),
-        direction=panel_from_sensor.rotation.apply(direction), size=size, size_sigma=size_sigma,
+        surface=surface,
+        shape=shape,
+        point=panel_from_sensor.apply(point),
+        direction=panel_from_sensor.rotation.apply(direction),
+        size=size,
+        size_sigma=size_sigma,
         height_sigma=height_sigma,
     )
 
@@ -252,7 +256,12 @@ def _completed(
         used.add(item.surface.label)
         score += gain
     return _Proposal(
-        model=model, origin=origin, yaw=yaw, yaw_sigma=yaw_sigma, pairs=tuple(pairs), score=score,
+        model=model,
+        origin=origin,
+        yaw=yaw,
+        yaw_sigma=yaw_sigma,
+        pairs=tuple(pairs),
+        score=score,
         state=_state(model, pairs, origin, turn, yaw),
     )
 
@@ -314,16 +323,19 @@ def _finished(proposal: _Proposal, scene: RangeScene, base: Surface, sensor_from
         if model.motion == MotionKind.SLIDE and abs(model.motion_axis[2]) > 0.5:
             state_sigma = float(np.hypot(0.0002, plane_feature(base).sigma_point_m))
     return Match(
-        model=model.name, sensor_from_object=UncertainPose(
+        model=model.name,
+        sensor_from_object=UncertainPose(
             parent_from_child=pose, covariance=_covariance(base, pose, sigma_place, proposal.yaw_sigma)
         ),
-        labels=labels, state=proposal.state, state_sigma=state_sigma, free=free, score=proposal.score,
+        labels=labels,
+        state=proposal.state,
+        state_sigma=state_sigma,
+        free=free,
+        score=proposal.score,
     )
 
 
-def _placed(
-    proposal: _Proposal, scene: RangeScene, sensor_from_panel: RigidTransform
-) -> tuple[RigidTransform, float]:
+def _placed(proposal: _Proposal, scene: RangeScene, sensor_from_panel: RigidTransform) -> tuple[RigidTransform, float]:
     """Pose with the in-plane place averaged over all pairs that fix it, and the standard deviation of that place."""
     pitch = scene.sensor.pitch_m(float(sensor_from_panel.translation[2]))
     turn = Rotation.from_euler("z", proposal.yaw)

@@ -83,7 +83,15 @@ class ComponentModel:
 
 
 SURFACE_KEYS = {
-    "name", "type", "point_m", "direction", "size_m", "half_angle_rad", "tolerance_m", "required", "moves",
+    "name",
+    "type",
+    "point_m",
+    "direction",
+    "size_m",
+    "half_angle_rad",
+    "tolerance_m",
+    "required",
+    "moves",
 }
 MODEL_KEYS = {"surfaces", "symmetric", "motion", "motion_axis", "low", "high"}
 
@@ -128,8 +136,13 @@ def _model(name: str, table: Mapping[str, Any], *, where: str) -> ComponentModel
     if motion != MotionKind.NONE and not low < high:
         raise ConfigError(f"{where}: low {low} is not below high {high}", hint="give the travel of the moving part")
     return ComponentModel(
-        name=name, surfaces=surfaces, symmetric=bool(table.get("symmetric", False)), motion=MotionKind(motion),
-        motion_axis=_unit(_vector(table, "motion_axis", (0.0, 0.0, 1.0), where), where), low=low, high=high,
+        name=name,
+        surfaces=surfaces,
+        symmetric=bool(table.get("symmetric", False)),
+        motion=MotionKind(motion),
+        motion_axis=_unit(_vector(table, "motion_axis", (0.0, 0.0, 1.0), where), where),
+        low=low,
+        high=high,
     )
 
 
@@ -149,7 +162,8 @@ def _surface(row: Mapping[str, Any], *, where: str) -> ModelSurface:
         size_m=_number(row, "size_m", 0.0, where),
         half_angle_rad=_number(row, "half_angle_rad", 0.0, where),
         tolerance_m=_number(row, "tolerance_m", 0.002, where),
-        required=bool(row.get("required", False)), moves=bool(row.get("moves", False)),
+        required=bool(row.get("required", False)),
+        moves=bool(row.get("moves", False)),
     )
 
 

@@ -75,8 +75,12 @@ def fit_plane_near(
     if near.sum() < LEAST_BLOCKS:
         raise _nothing_near(sigma_offset_m, sigma_angle_rad)
     plane = _most_supported(
-        points[near], sigma[near], normals[near], expected,
-        sigma_angle_rad=sigma_angle_rad, normal_sigma_rad=grid.normal_sigma_rad,
+        points[near],
+        sigma[near],
+        normals[near],
+        expected,
+        sigma_angle_rad=sigma_angle_rad,
+        normal_sigma_rad=grid.normal_sigma_rad,
     )
     if plane is None:
         raise _nothing_near(sigma_offset_m, sigma_angle_rad)
@@ -171,9 +175,7 @@ def _fitted(depth: Array, sensor: RangeSensorModel, noise: NoiseModel, plane: Ar
         z = depth[inliers]
         packed = sensor.packed()
         v, u = np.nonzero(inliers)
-        samples = Samples(
-            x=(u - packed[3]) / packed[1], y=(v - packed[4]) / packed[2], z=z, sigma=sigma[inliers]
-        )
+        samples = Samples(x=(u - packed[3]) / packed[1], y=(v - packed[4]) / packed[2], z=z, sigma=sigma[inliers])
         surface, th = refine_surface(1, PLANE, th, samples, sensor=sensor, noise=noise)
     valid = int(np.isfinite(depth).sum())
     share = float(inliers.sum()) / valid
@@ -182,9 +184,7 @@ def _fitted(depth: Array, sensor: RangeSensorModel, noise: NoiseModel, plane: Ar
             f"the plane near the expected place holds only {100 * share:.1f} % of the image",
             hint="point the scanner at the panel, or widen the expectation",
         )
-    return PlaneFit(
-        surface=surface, feature=plane_feature(surface), inliers=inliers, sight_share=share, noise=noise
-    )
+    return PlaneFit(surface=surface, feature=plane_feature(surface), inliers=inliers, sight_share=share, noise=noise)
 
 
 def _nothing_near(sigma_offset_m: float, sigma_angle_rad: float) -> NotFound:

@@ -91,7 +91,11 @@ def fitting_view(
     f = 0.95 * min(width_px / span[0], height_px / span[1])
     middle = 0.5 * (low + high)
     return PinholeSensor(
-        width_px=width_px, height_px=height_px, fx_px=f, fy_px=f, cx_px=(width_px - 1) / 2 - f * middle[0],
+        width_px=width_px,
+        height_px=height_px,
+        fx_px=f,
+        fy_px=f,
+        cx_px=(width_px - 1) / 2 - f * middle[0],
         cy_px=(height_px - 1) / 2 - f * middle[1],
     )
 
@@ -99,9 +103,9 @@ def fitting_view(
 def _filled_once(depth: Array, tolerance_m: float) -> Array:
     padded = np.pad(depth, 1, constant_values=np.nan)
     h, w = depth.shape
-    around = np.stack([
-        padded[1 + i : 1 + i + h, 1 + j : 1 + j + w] for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)
-    ])
+    around = np.stack(
+        [padded[1 + i : 1 + i + h, 1 + j : 1 + j + w] for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+    )
     known = np.isfinite(around).sum(axis=0)
     spread = np.nan_to_num(around, nan=-np.inf).max(axis=0) - np.nan_to_num(around, nan=np.inf).min(axis=0)
     fill = np.isnan(depth) & (known >= FILL_NEIGHBOURS) & (spread < tolerance_m)

@@ -142,9 +142,9 @@ def ellipsoid_of(th: Array) -> Ellipsoid:
 
     With X = centre + s Y and Y' A Y + 2 b' Y + c = 0: Y0 = -A^-1 b, radii_i = s sqrt((b' A^-1 b - c) / lambda_i).
     """
-    A = np.array([
-        [th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]
-    ])
+    A = np.array(
+        [[th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]]
+    )
     b = 0.5 * th[10:13]
     values, vectors = np.linalg.eigh(A)
     y0 = -np.linalg.solve(A, b)

@@ -83,16 +83,16 @@ class Moments:
         if not (np.array_equal(self.centre_m, other.centre_m) and self.scale_m == other.scale_m):
             raise ValueError("moments about different centres do not add")
         return Moments(
-            total=self.total + other.total, centre_m=self.centre_m, scale_m=self.scale_m,
+            total=self.total + other.total,
+            centre_m=self.centre_m,
+            scale_m=self.scale_m,
             count=self.count + other.count,
         )
 
     def fit(self) -> Quadric:
         """Quadric of these points; see `fit_qr` for errors. Accurate to about 4e-8 rad when centred and scaled."""
         values, vectors = np.linalg.eigh(self.total)
-        return _named(
-            np.sqrt(np.maximum(values[::-1], 0.0)), vectors[:, 0], self.centre_m, self.scale_m, self.count
-        )
+        return _named(np.sqrt(np.maximum(values[::-1], 0.0)), vectors[:, 0], self.centre_m, self.scale_m, self.count)
 
 
 def moments(points_m: Array, *, centre_m: Array, scale_m: float) -> Moments:

@@ -86,6 +86,10 @@ def sensor_from_meta(meta: dict[str, Any], unit_m: float) -> RangeSensorModel:
         raise ValueError(f"unknown sensor kind {meta['kind']!r}")
     f = float(meta["f"])
     return PinholeSensor(
-        width_px=w, height_px=h, fx_px=f, fy_px=float(meta.get("fy", f)), cx_px=float(meta["cx"]),
+        width_px=w,
+        height_px=h,
+        fx_px=f,
+        fy_px=float(meta.get("fy", f)),
+        cx_px=float(meta["cx"]),
         cy_px=float(meta["cy"]),
     )

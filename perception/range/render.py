@@ -32,9 +32,15 @@ def surface_json(surface: Surface) -> dict[str, Any]:
         field.name: _plain(getattr(surface.primitive, field.name)) for field in dataclasses.fields(surface.primitive)
     }
     return {
-        "label": surface.label, "type": str(surface.type), "pixels": surface.pixels, "rms_m": surface.rms_m,
-        "misfit": surface.misfit, "middle_m": _plain(surface.middle_m), "parameters": parameters,
-        "covariance_over": list(surface.covariance_over), "covariance": _plain(surface.covariance),
+        "label": surface.label,
+        "type": str(surface.type),
+        "pixels": surface.pixels,
+        "rms_m": surface.rms_m,
+        "misfit": surface.misfit,
+        "middle_m": _plain(surface.middle_m),
+        "parameters": parameters,
+        "covariance_over": list(surface.covariance_over),
+        "covariance": _plain(surface.covariance),
     }
 
 

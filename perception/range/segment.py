@@ -116,7 +116,9 @@ def _claimed(task: Task, noise: NoiseModel, blocks: Labels, found: Candidates, *
     packed, law = task.sensor.packed(), noise.packed()
     for_each_tile(
         lambda top, bottom: claim_pixels(task.depth_m, packed, law, blocks, size, kinds, table, labels, top, bottom),
-        blocks.shape[0], task.tiles, pool=task.pool,
+        blocks.shape[0],
+        task.tiles,
+        pool=task.pool,
     )
     return labels
 
@@ -135,7 +137,9 @@ def _border_sweep(task: Task, constants: tuple[Array, Array, NDArray[np.int64], 
     after = np.empty_like(before)
     for_each_tile(
         lambda top, bottom: claim_borders(task.depth_m, packed, law, before, kinds, table, after, top, bottom),
-        before.shape[0], task.tiles, pool=task.pool,
+        before.shape[0],
+        task.tiles,
+        pool=task.pool,
     )
     return after
 
@@ -148,8 +152,20 @@ def _recover_planes(task: Task, grid: Grid, blocks: Labels, found: Candidates) -
     tried = np.zeros(free.shape, np.bool_)
     order = grow.seed_order(grid.normal, grid.rms, free, grid.radius + 1)
     planes, counts, mean2 = grow.grow_planes(
-        grid.x, grid.y, grid.z, grid.sigma, grid.normal, grid.rms, free, blocks, len(found.kinds) + 1,
-        grid.perspective, order, least, cos_limit, tried,
+        grid.x,
+        grid.y,
+        grid.z,
+        grid.sigma,
+        grid.normal,
+        grid.rms,
+        free,
+        blocks,
+        len(found.kinds) + 1,
+        grid.perspective,
+        order,
+        least,
+        cos_limit,
+        tried,
     )
     for th in planes:
         found.add(PLANE, th)
@@ -165,8 +181,15 @@ def _recover_curved(task: Task, grid: Grid, blocks: Labels, found: Candidates, l
     attempts = 0
     for _ in range(ROUNDS):
         right, down = grow.smooth_links(
-            grid.z, grid.sigma, free, STEEP_SLOPE * grid.size_px, 1.0 / packed[1], grid.perspective, grid.normal,
-            grid.rms, turn_limit,
+            grid.z,
+            grid.sigma,
+            free,
+            STEEP_SLOPE * grid.size_px,
+            1.0 / packed[1],
+            grid.perspective,
+            grid.normal,
+            grid.rms,
+            turn_limit,
         )
         label, sizes = label_components(free, right, down, tiles=task.tiles, pool=task.pool)
         big = np.flatnonzero(sizes >= least)

@@ -60,7 +60,11 @@ def shapes_of(scene: RangeScene, depth_m: Array) -> dict[int, RegionShape]:
 
 
 def _shape(
-    primitive: object, points: Array, mine: NDArray[np.int32], rim: NDArray[np.bool_], hidden: NDArray[np.bool_],
+    primitive: object,
+    points: Array,
+    mine: NDArray[np.int32],
+    rim: NDArray[np.bool_],
+    hidden: NDArray[np.bool_],
     scene: RangeScene,
 ) -> RegionShape:
     P = points.reshape(-1, 3)[mine]
@@ -74,13 +78,18 @@ def _shape(
     if isinstance(primitive, Plane):
         ray = centre / np.linalg.norm(centre) if scene.sensor.packed()[0] > 0 else np.array([0.0, 0.0, 1.0])
         facing = max(abs(float(primitive.normal @ ray)), 0.1)
-        centre = primitive.point_m + (centre - primitive.point_m) - primitive.normal * (
-            primitive.normal @ (centre - primitive.point_m)
+        centre = (
+            primitive.point_m
+            + (centre - primitive.point_m)
+            - primitive.normal * (primitive.normal @ (centre - primitive.point_m))
         )
     return RegionShape(
-        centre_m=centre, area_m2=len(mine) * pitch**2 / facing, long_axis=vectors[:, 2],
+        centre_m=centre,
+        area_m2=len(mine) * pitch**2 / facing,
+        long_axis=vectors[:, 2],
         elongation=float(np.sqrt(max(values[2], 1e-18) / max(values[1], 1e-18))),
-        rim_m=points.reshape(-1, 3)[own], occluded=len(own) < (1.0 - OCCLUDED_SHARE) * rim_count,
+        rim_m=points.reshape(-1, 3)[own],
+        occluded=len(own) < (1.0 - OCCLUDED_SHARE) * rim_count,
     )
 
 

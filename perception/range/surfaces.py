@@ -99,12 +99,32 @@ def depth_on(kind, th, x, y, perspective):  # type: ignore[no-untyped-def]
     wx, wy, wz = wx * inverse, wy * inverse, wz * inverse
     dx, dy, dz = dx * inverse, dy * inverse, inverse
     a = th[4] * dx * dx + th[5] * dy * dy + th[6] * dz * dz + th[7] * dx * dy + th[8] * dx * dz + th[9] * dy * dz
-    b = th[4] * dx * wx + th[5] * dy * wy + th[6] * dz * wz + 0.5 * (
-        th[7] * (dx * wy + dy * wx) + th[8] * (dx * wz + dz * wx) + th[9] * (dy * wz + dz * wy)
-        + th[10] * dx + th[11] * dy + th[12] * dz
+    b = (
+        th[4] * dx * wx
+        + th[5] * dy * wy
+        + th[6] * dz * wz
+        + 0.5
+        * (
+            th[7] * (dx * wy + dy * wx)
+            + th[8] * (dx * wz + dz * wx)
+            + th[9] * (dy * wz + dz * wy)
+            + th[10] * dx
+            + th[11] * dy
+            + th[12] * dz
+        )
     )
-    c = (th[4] * wx * wx + th[5] * wy * wy + th[6] * wz * wz + th[7] * wx * wy + th[8] * wx * wz + th[9] * wy * wz
-         + th[10] * wx + th[11] * wy + th[12] * wz + th[13])
+    c = (
+        th[4] * wx * wx
+        + th[5] * wy * wy
+        + th[6] * wz * wz
+        + th[7] * wx * wy
+        + th[8] * wx * wz
+        + th[9] * wy * wz
+        + th[10] * wx
+        + th[11] * wy
+        + th[12] * wz
+        + th[13]
+    )
     return _roots(a, b, c, 1.0)
 
 

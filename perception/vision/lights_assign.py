@@ -176,9 +176,7 @@ def _cameras(
     return [(np.array([k * width, k * width, *centre]), centres, 4.0) for k in FOCAL_TRIALS]
 
 
-def _pairs(
-    centres: Array, traits: Array, model: Array, frame: Array, into: tuple[Array, NDArray[np.int64]]
-) -> None:
+def _pairs(centres: Array, traits: Array, model: Array, frame: Array, into: tuple[Array, NDArray[np.int64]]) -> None:
     """Hypotheses with two lights only: nearly frontal, so a similarity of the plane predicts the other two."""
     reward, log_size, log_contrast, _ = traits
     flat = model[:, :2]
@@ -225,8 +223,11 @@ def _accept(
             hint="look for something in front of it, or move until all four are in view",
             missing=missing,
         )
-    rivals = [r for r in range(1, len(best)) if np.isfinite(best[r]) and set(chosen[r]) - {-1} != set(first) - {-1}
-              and (chosen[r] >= 0).sum() >= seen.sum()]
+    rivals = [
+        r
+        for r in range(1, len(best))
+        if np.isfinite(best[r]) and set(chosen[r]) - {-1} != set(first) - {-1} and (chosen[r] >= 0).sum() >= seen.sum()
+    ]
     margin = float(best[0] - best[rivals[0]]) if rivals else float(best[0])
     if margin < RIVAL_MARGIN and seen.all():
         raise Ambiguous(

@@ -104,8 +104,16 @@ def gray_of(image: NDArray[Any]) -> Image:
 
 def _raw_noise(off: Image, on: Image) -> float:
     """Noise of one pixel from second differences, which smooth shading and most of the edges do not reach."""
-    rough = [np.median(np.abs(i[1::3, 2::3] - 2.0 * i[1::3, 1:-1:3][:, : i[1::3, 2::3].shape[1]]
-                              + i[1::3, :-2:3][:, : i[1::3, 2::3].shape[1]])) for i in (off, on)]
+    rough = [
+        np.median(
+            np.abs(
+                i[1::3, 2::3]
+                - 2.0 * i[1::3, 1:-1:3][:, : i[1::3, 2::3].shape[1]]
+                + i[1::3, :-2:3][:, : i[1::3, 2::3].shape[1]]
+            )
+        )
+        for i in (off, on)
+    ]
     return max(1.4826 * float(np.mean(rough)) / float(np.sqrt(6.0)), 0.5)
 
 

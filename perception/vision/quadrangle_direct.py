@@ -64,9 +64,7 @@ def _misses_px(points: Array, pixels: Array, pose: tuple[Array, Array], intrinsi
     return float(miss) if np.isfinite(miss) else np.inf
 
 
-def direct_poses(
-    points_object_m: ArrayLike, points_px: ArrayLike, intrinsics: CameraIntrinsics
-) -> list[DirectPose]:
+def direct_poses(points_object_m: ArrayLike, points_px: ArrayLike, intrinsics: CameraIntrinsics) -> list[DirectPose]:
     """The poses of the first three lights, the one that fits the fourth best first.
 
     Args:

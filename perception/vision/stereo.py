@@ -178,9 +178,7 @@ def stereo_line(seen: Sequence[SeenLine]) -> StereoLine:
     lift = np.zeros((6, 4))
     lift[:3, :2] = lift[3:, 2:] = basis.T
     covariance = lift @ np.linalg.inv(information) @ lift.T
-    return StereoLine(
-        point_m=point, direction=direction, covariance=covariance, chi_square=chi_square, degrees=degrees
-    )
+    return StereoLine(point_m=point, direction=direction, covariance=covariance, chi_square=chi_square, degrees=degrees)
 
 
 def _ideal(index: int, station: Station, pixels_px: Array) -> tuple[Array, Array]:
@@ -227,9 +225,7 @@ def _reprojection(station: Station, point: Array, m: Array) -> tuple[Array, Arra
     return q[:2] / q[2] - m, by_point, by_pose
 
 
-def _line_residual(
-    seen: SeenLine, m: Array, J: Array, line: tuple[Array, Array, Array]
-) -> tuple[Array, Array, Array]:
+def _line_residual(seen: SeenLine, m: Array, J: Array, line: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
     """How far the two image points are from the projected line (2,), its derivative (2, 4), and its noise (2, 2).
 
     With N = p x v in camera axes (the plane's normal), the error of ray x is N . x / |N_xy|.
@@ -244,9 +240,9 @@ def _line_residual(
     rays = np.column_stack([m, np.ones(2)])
     e = rays @ N / scale
     by_N = (rays - np.outer(e, [N[0] / scale, N[1] / scale, 0.0])) / scale @ R.T
-    by_line = by_N @ np.column_stack([
-        np.cross(basis[0], direction), np.cross(basis[1], direction), np.cross(y, basis[0]), np.cross(y, basis[1])
-    ])
+    by_line = by_N @ np.column_stack(
+        [np.cross(basis[0], direction), np.cross(basis[1], direction), np.cross(y, basis[0]), np.cross(y, basis[1])]
+    )
     # Pose: d moves y by -d; a turn r moves N (camera axes) by R^T (N_base x r).
     by_pose = by_N @ np.hstack([skew(direction), skew(N_base)])
     cuts = [N[:2] / scale @ J[k] for k in range(2)]

@@ -55,7 +55,9 @@ def test_gradient_is_that_of_finite_differences(seed: int, cls: SensingClass) ->
         if np.max(np.abs(np.diff(near))) > 0.2 * (f[0] + 1e-3):
             return
     h = 1e-7
-    slope = [(local_value(m, perturbed(pose, h * d)) - local_value(m, perturbed(pose, -h * d))) / (2 * h) for d in np.eye(6)]
+    slope = [
+        (local_value(m, perturbed(pose, h * d)) - local_value(m, perturbed(pose, -h * d))) / (2 * h) for d in np.eye(6)
+    ]
     assert gradient[0] == pytest.approx(slope, rel=2e-3, abs=2e-3 * (np.abs(slope).max() + f[0] + 1.0))
 
 

@@ -149,7 +149,9 @@ def test_the_feature_decides_the_class() -> None:
 
 
 def test_a_known_turn_of_the_arm_is_a_lever_on_far_points() -> None:
-    turned = UncertainPose(parent_from_child=transform(np.eye(3), np.zeros(3)), covariance=np.diag([0, 0, 0, 0, 0, 1e-6]))
+    turned = UncertainPose(
+        parent_from_child=transform(np.eye(3), np.zeros(3)), covariance=np.diag([0, 0, 0, 0, 0, 1e-6])
+    )
     made = sensing.range_point(PLANE, turned, point_m=(1.0, 0, 0), covariance_m2=1e-8 * np.eye(3))
     assert made.C_m2[1, 1] == pytest.approx(1e-6 + 1e-8, rel=1e-3)
     assert made.C_m2[0, 0] == pytest.approx(1e-8, rel=0.2)
@@ -163,7 +165,9 @@ def test_parallel_rays_are_refused() -> None:
 
 
 def test_one_plane_seen_twice_is_refused() -> None:
-    views = [sensing.View(base_from_camera=certain(transform(np.eye(3), p)), camera=CAMERA) for p in ((0, 0, 0), (0.1, 0, 0))]
+    views = [
+        sensing.View(base_from_camera=certain(transform(np.eye(3), p)), camera=CAMERA) for p in ((0, 0, 0), (0.1, 0, 0))
+    ]
     with pytest.raises(NotObservable):
         sensing.stereo_line(LINE, views, ends_px=[[[100, 240], [500, 240]]] * 2, sigma_px=0.5)
 

@@ -54,10 +54,12 @@ def test_errors_match_the_covariance() -> None:
     nees, ratio = [], []
     for seed in range(25):
         result = calibrate_hand_eye(station_views(good_flanges(), 1000 + seed))
-        e = np.concatenate([
-            difference(X_TRUE, result.flange_from_camera.parent_from_child),
-            difference(Z_TRUE, result.base_from_target.parent_from_child),
-        ])
+        e = np.concatenate(
+            [
+                difference(X_TRUE, result.flange_from_camera.parent_from_child),
+                difference(Z_TRUE, result.base_from_target.parent_from_child),
+            ]
+        )
         nees.append(e @ np.linalg.solve(result.covariance, e) / 12.0)
         ratio.append(result.chi_square / result.degrees)
     assert 0.75 < np.mean(nees) < 1.25

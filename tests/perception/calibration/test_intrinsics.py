@@ -39,9 +39,7 @@ def views(
 
 
 def errors(result: CameraCalibration) -> np.ndarray:
-    found, true = (
-        np.array([c.fx_px, c.fy_px, c.cx_px, c.cy_px, *c.distortion]) for c in (result.intrinsics, TRUE)
-    )
+    found, true = (np.array([c.fx_px, c.fy_px, c.cx_px, c.cy_px, *c.distortion]) for c in (result.intrinsics, TRUE))
     return np.asarray((found - true)[[NAMES.index(name) for name in result.names]])
 
 
@@ -85,9 +83,7 @@ def test_the_cubic_correction_reports_its_bias() -> None:
 
 
 def test_the_panels_own_lights_are_a_board() -> None:
-    result = calibrate_camera(
-        views(LIGHTS, 25, seed=5, sigma_px=0.1, range_m=(0.5, 0.9)), (640, 480), free=LIGHTS_FREE
-    )
+    result = calibrate_camera(views(LIGHTS, 25, seed=5, sigma_px=0.1, range_m=(0.5, 0.9)), (640, 480), free=LIGHTS_FREE)
     assert abs(result.intrinsics.fx_px - TRUE.fx_px) < 4.0 * np.sqrt(result.covariance[0, 0]) + 2.0
     assert result.names == LIGHTS_FREE
 

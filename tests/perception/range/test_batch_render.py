@@ -150,9 +150,9 @@ def test_creases_and_corners_match_their_covariance():
         turn = np.cross(line.direction, true * np.sign(true @ line.direction))
         away = (line.point_m - point) - true * (true @ (line.point_m - point))
         assert line.kind == FeatureKind.LINE
-        squares_line.append([
-            turn @ turn / np.trace(line.direction_covariance), away @ away / np.trace(line.point_covariance)
-        ])
+        squares_line.append(
+            [turn @ turn / np.trace(line.direction_covariance), away @ away / np.trace(line.point_covariance)]
+        )
         corner = corner_point(*ordered)
         e = corner.point_m - point
         squares_point.append(e @ np.linalg.solve(corner.point_covariance, e) / 3)

@@ -35,7 +35,7 @@ def test_a_thin_bar_survives_the_filter_but_not_a_plain_median():
     depth = np.full((120, 160), 0.6)
     depth[:, 70:72] = 0.5
     assert (remove_gross_errors(depth, PINHOLE, NOISE)[:, 70:72] == 0.5).all()
-    assert (median(depth)[10:-10, 70:72] == pytest.approx(0.6))
+    assert median(depth)[10:-10, 70:72] == pytest.approx(0.6)
 
 
 @pytest.mark.parametrize("scale", [1.0, 2.0])

@@ -23,9 +23,12 @@ def panel_with_a_lamp(seed: int) -> np.ndarray:
 
 def test_the_panel_is_found_from_a_rough_expectation():
     fit = fit_plane_near(
-        panel_with_a_lamp(0), PINHOLE, point_m=POINT + np.array([0, 0, 0.02]),
+        panel_with_a_lamp(0),
+        PINHOLE,
+        point_m=POINT + np.array([0, 0, 0.02]),
         normal=-(NORMAL + np.array([0.08, -0.05, 0.0])),
-        sigma_offset_m=0.02, sigma_angle_rad=0.1,
+        sigma_offset_m=0.02,
+        sigma_angle_rad=0.1,
     )
     assert np.degrees(np.arccos(fit.feature.direction @ NORMAL)) < 0.05
     assert abs((fit.feature.point_m - POINT) @ NORMAL) < 0.0002

@@ -120,8 +120,6 @@ def test_a_coloured_pointer_is_read_from_its_own_shape(value: float) -> None:
     side = 18 * np.array([np.cos(angle), np.sin(angle)])
     foot = np.array([80.0, 80.0])
     cv2.circle(image, (80, 80), 19, (150, 50, 50), -1, cv2.LINE_AA)
-    cv2.fillPoly(
-        image, [np.round([tip, foot + side, foot - side]).astype(np.int32)], (150, 50, 50), cv2.LINE_AA
-    )
+    cv2.fillPoly(image, [np.round([tip, foot + side, foot - side]).astype(np.int32)], (150, 50, 50), cv2.LINE_AA)
     status = read_dial(image, minimum=0.0, maximum=10.0, circular=True)
     assert status.value == pytest.approx(value, abs=0.1)

@@ -21,7 +21,7 @@ setup: .venv/ready  ## Make .venv with everything in it
 	@$(PYTHON) -m venv .venv
 	@$(BIN)/python -m pip install --progress-bar off -c constraints.txt -e '.[test]' 2>&1 | awk ' \
 	    /^Collecting/ { n++; if (n % 10 == 0) { print "setup: " n " packages found"; fflush() } } \
-	    /^Installing collected/ { print "setup: installing " n " packages"; fflush() } \
+	    /^Installing collected/ { print "setup: installing " (n + 0) " packages"; fflush() } \
 	    /^ERROR|^error/ { print }'
 	@$(BIN)/python -c 'import hal, numpy, cv2, pybullet' || { echo "error: the installation is not complete; the lines above say why"; exit 2; }
 	@$(BIN)/panelwright warm

@@ -34,6 +34,8 @@ RETREAT_M = 0.050
 RETREAT_M_PER_S = 0.15
 PADS_M_PER_S = 0.1
 GRASP_M_PER_S = 0.03
+PULLS = 3
+PULL_N = 90.0  # after a failure the hand may be jammed; just below the cell's protective limit
 FREE_N = 40.0  # more than this in a move that should be free is a collision
 MAX_ATTEMPTS = 3
 
@@ -244,14 +246,14 @@ def retreat(cell: Workcell, attempt: Attempt | None = None, *, distance_m: float
     """
     attempt = attempt or Attempt(cell)
     width = min(cell.hand.max_width_m, cell.mover.state().gripper_width_m + 0.02)
-    ways: tuple[Callable[[], object], ...] = (
-        lambda: attempt.open_to(width, name="let go"),
-        lambda: attempt.leave(distance_m),
-    )
-    for way in ways:
-        # Something may hold the hand; what can be done is done, and `park` sees whether the hand is free.
+    with suppress(SkillFailure, MotionRefused):
+        attempt.open_to(width, name="let go")
+    # Something may hold the hand: it is pulled several times, and `park` sees whether it came free.
+    for _ in range(PULLS):
         with suppress(SkillFailure, MotionRefused):
-            way()
+            pulled = attempt.advance(-distance_m, name="retreat", speed_m_per_s=RETREAT_M_PER_S, stop_n=PULL_N)
+            if pulled.tripped is None:
+                return
 
 
 def park(cell: Workcell) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -49,15 +49,18 @@ def test_gradient_is_that_of_finite_differences(seed: int, cls: SensingClass) ->
     rng = np.random.default_rng(seed)
     m, pose = random_measurement(cls, rng), random_pose(rng)
     f, gradient = local_values_and_gradients([m], pose)
-    if m.cls in (4, 7, 8):
-        # Two minima over v can be equally deep; there f has a kink and no derivative.
-        near = [local_value(m, perturbed(pose, 1e-4 * d)) for d in np.eye(6)]
-        if np.max(np.abs(np.diff(near))) > 0.2 * (f[0] + 1e-3):
-            return
-    h = 1e-7
-    slope = [
-        (local_value(m, perturbed(pose, h * d)) - local_value(m, perturbed(pose, -h * d))) / (2 * h) for d in np.eye(6)
-    ]
+    slope, wider = (
+        np.array(
+            [
+                (local_value(m, perturbed(pose, h * d)) - local_value(m, perturbed(pose, -h * d))) / (2 * h)
+                for d in np.eye(6)
+            ]
+        )
+        for h in (1e-7, 1e-5)
+    )
+    scale = np.abs(slope).max() + f[0] + 1.0
+    # Two minima over v can be equally deep (classes 4, 7, 8): there f has a kink, and no derivative to agree on.
+    assume(m.cls not in (4, 7, 8) or np.abs(slope - wider).max() < 1e-2 * scale)
     assert gradient[0] == pytest.approx(slope, rel=2e-3, abs=2e-3 * (np.abs(slope).max() + f[0] + 1.0))
 
 

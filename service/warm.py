@@ -34,8 +34,13 @@ STAGES: Mapping[str, Callable[[], None]] = {"imports": _imports, "vision": _visi
 """What the service process computes with. The cell and world processes warm their own loops when they start."""
 
 
-def warm(report: Callable[[str], None] = lambda _stage: None) -> None:
-    """Run each stage once. The first time on a machine this compiles for a minute or two; the result stays on disk."""
-    for name, stage in STAGES.items():
-        report(name)
-        stage()
+def warm() -> None:
+    """Run each stage in this process. The first time on a machine this compiles for minutes; the result stays on disk."""
+    for name in STAGES:
+        run_stage(name)
+
+
+def run_stage(name: str) -> str:
+    """Run one stage of `STAGES`; returns its name, so that a pool can tell which one has ended."""
+    STAGES[name]()
+    return name

@@ -1,4 +1,4 @@
-"""`panelwright devices …`: look at the devices of a running service."""
+"""`panelwright devices …`: look at the devices of a running service, or at one device of a cell file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from service.client import ApiError, Client
-from service.commands.common import Url, UrlDefault, client_of, console
+from service.commands.common import Url, UrlDefault, client_of, console, find_cell
 
 app = typer.Typer(help="Look at the devices of a running service.", invoke_without_command=True)
 Name = Annotated[str, typer.Argument(help="Name of the device in the cell file.")]
@@ -40,9 +40,16 @@ def read_device(
     samples: Annotated[int, typer.Option(min=1, max=1_000_000, help="How many readings.")] = 1,
     jsonl: Annotated[bool, typer.Option("--jsonl", help="One JSON object a line.")] = False,
     save: Annotated[Path | None, typer.Option(help="Write a picture (.png) or array (.npz) instead.")] = None,
+    cell: Annotated[
+        Path | None, typer.Option("--cell", help="Connect the device of this cell file here, without a service.")
+    ] = None,
+    timeout_s: Annotated[float, typer.Option(min=0.01, max=60, help="Deadline of each reading, with --cell.")] = 0.5,
     url: Url = UrlDefault,
 ) -> None:
-    """Read a device."""
+    """Read a device of the running service or, with --cell, connect it in this process."""
+    if cell is not None:
+        _read_directly(cell, name, samples=samples, jsonl=jsonl, timeout_s=timeout_s)
+        return
     client = client_of(url)
     if save is not None:
         form = "npz" if save.suffix == ".npz" else "png"
@@ -55,6 +62,23 @@ def read_device(
             sys.stdout.write(json.dumps(reading) + "\n")
         else:
             console.print_json(json.dumps(reading))
+
+
+def _read_directly(cell: Path, name: str, *, samples: int, jsonl: bool, timeout_s: float) -> None:
+    """Print samples and errors of one device; exit code 1 when there was no sample at all."""
+    from hal.config import load_cell
+    from service.direct_read import as_line, read_lines
+
+    good = 0
+    for item in read_lines(load_cell(find_cell(cell)), name, samples=samples, timeout_s=timeout_s):
+        good += "error" not in item
+        if jsonl:
+            sys.stdout.write(as_line(item))
+            sys.stdout.flush()
+        else:
+            console.print_json(as_line(item))
+    if not good:
+        raise typer.Exit(1)
 
 
 @app.command("watch")

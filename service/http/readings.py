@@ -101,7 +101,7 @@ def as_json(name: str, kind: DeviceKind, snapshot: Snapshot) -> dict[str, Any]:
     return {
         "device": name,
         "kind": str(kind),
-        "value": _described(stamped.value),
+        "value": described(stamped.value),
         "host_time_s": stamped.host_time_s,
         "device_time_s": stamped.device_time_s,
         "age_s": jsonable(snapshot.age_s),
@@ -111,7 +111,8 @@ def as_json(name: str, kind: DeviceKind, snapshot: Snapshot) -> dict[str, Any]:
     }
 
 
-def _described(value: Any) -> Any:
+def described(value: Any) -> Any:
+    """A value as JSON; pictures are described, not listed."""
     if isinstance(value, Image):
         height, width = value.pixels.shape[:2]
         mean = float(value.pixels.mean())

@@ -1,0 +1,129 @@
+"""Reads one device of a cell in this process, without a service: for whoever wires it up or judges it.
+
+Only this device is connected, and of the cell's emulators only its own, so a cell whose other devices are absent will do.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from hal.clock import Clock, Deadline
+from hal.config import Cell
+from hal.devices import DeviceKind, RangeImage
+from hal.errors import CellError, ConfigError
+from hal.readings import Stamped
+from hal.registry import Context, Shared
+from hal.registry import connect as connect_device
+from service.cell import clock_for, start_emulators
+from service.http.readings import READS, described
+from service.jsonable import jsonable
+
+CONNECT_ATTEMPTS = 3  # a device that gives nothing three times in a row is not there
+LOOK_AGAIN_S = 0.0005
+
+
+@contextmanager
+def only_device(cell: Cell, name: str) -> Iterator[tuple[Callable[[], Any], Clock]]:
+    """What connects the device `name` anew, and its clock; its emulator runs meanwhile if the cell has one.
+
+    Raises:
+        ConfigError: the cell has no such device, or its options are wrong.
+    """
+    section = cell.file.devices.get(name)
+    if section is None:
+        raise ConfigError(f"{cell.path} has no device {name!r}", hint=f"devices: {', '.join(cell.file.devices)}")
+    own = {key: emulator for key, emulator in cell.file.emulators.items() if key == name}
+    alone = cell.model_copy(update={"file": cell.file.model_copy(update={"emulators": own})})
+    shared, clock = Shared(), clock_for(cell)
+    closers: list[Callable[[], None]] = [shared.close]
+    try:
+        address = start_emulators(alone, clock, shared, closers).get(name, {})
+
+        def connect() -> Any:
+            context = Context(name=name, clock=clock, cell=cell, shared=shared)
+            return connect_device(context, section.driver, {**section.options, **address})
+
+        yield connect, clock
+    finally:
+        for close in closers[::-1]:
+            close()
+
+
+def read_lines(cell: Cell, name: str, *, samples: int, timeout_s: float) -> Iterator[dict[str, Any]]:
+    """One JSON object for each new sample, and one for each call or connection that ended in an error.
+
+    A sample has `value`, `sequence`, `host_time_s` (monotonic), `host_unix_s`, `device_time_s`, `age_s`, `quality`,
+    `cause` and `took_s`, the length of the call. An error has `error` with `type`, `what`, `hint` and `details`.
+
+    Args:
+        timeout_s: deadline of each call.
+    """
+    kind = cell.file.devices[name].kind if name in cell.file.devices else DeviceKind.ARM
+    with only_device(cell, name) as (connect, clock):
+        left = samples
+        for _ in range(CONNECT_ATTEMPTS):
+            started_s = time.monotonic()
+            try:
+                device = connect()
+            except ConfigError:
+                raise
+            except CellError as error:
+                left -= 1
+                yield _error(name, kind, error, time.monotonic() - started_s)
+                if left <= 0:
+                    return
+                continue
+            try:
+                yield from _samples(device, name, kind, clock, left, timeout_s)
+            finally:
+                device.close()
+            return
+
+
+def _samples(
+    device: Any, name: str, kind: DeviceKind, clock: Clock, count: int, timeout_s: float
+) -> Iterator[dict[str, Any]]:
+    read, last = getattr(device, READS[kind]), -1
+    for _ in range(count):
+        started_s = time.monotonic()
+        deadline = Deadline.after(clock, timeout_s)
+        try:
+            while (stamped := read(deadline=deadline)).sequence == last and not deadline.is_past():
+                clock.sleep(LOOK_AGAIN_S)
+        except CellError as error:
+            yield _error(name, kind, error, time.monotonic() - started_s)
+            continue
+        last = stamped.sequence
+        yield _sample(name, kind, stamped, clock, time.monotonic() - started_s)
+
+
+def _sample(name: str, kind: DeviceKind, stamped: Stamped[Any], clock: Clock, took_s: float) -> dict[str, Any]:
+    age_s = stamped.age_s(clock.now_s())
+    value = stamped.value
+    return {
+        "device": name,
+        "kind": str(kind),
+        "value": {"depth_m": jsonable(value.depth_m)} if isinstance(value, RangeImage) else described(value),
+        "sequence": stamped.sequence,
+        "host_time_s": stamped.host_time_s,
+        "host_unix_s": time.time() - age_s,
+        "device_time_s": jsonable(stamped.device_time_s),
+        "age_s": jsonable(age_s),
+        "quality": str(stamped.quality),
+        "cause": str(stamped.cause),
+        "took_s": took_s,
+    }
+
+
+def _error(name: str, kind: DeviceKind, error: CellError, took_s: float) -> dict[str, Any]:
+    told = {"type": error.type_name, "what": error.what, "hint": error.hint, "details": jsonable(error.details)}
+    return {"device": name, "kind": str(kind), "error": told, "took_s": took_s}
+
+
+def as_line(item: dict[str, Any]) -> str:
+    """One line of JSON."""
+    return json.dumps(item, allow_nan=False) + "\n"

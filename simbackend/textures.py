@@ -140,25 +140,6 @@ def _print_round(canvas: Canvas, thing: PanelObject) -> None:  # noqa: PLR0912  
             for state in thing.states:
                 _name(canvas, thing.position_m, state, thing.radius_m)
             _label(canvas, thing.position_m, thing.radius_m + 0.0025, thing.label)
-        case Button():
-            canvas.disc(thing.position_m, thing.radius_m + 0.003, RIM)
-            _label(canvas, thing.position_m, thing.radius_m + 0.003, thing.label)
-        case Mushroom():
-            canvas.disc(thing.position_m, thing.radius_m + 0.010, YELLOW)
-            _label(canvas, thing.position_m, thing.radius_m + 0.010, thing.label)
-        case Toggle():
-            canvas.box(thing.position_m, (0.026, 0.044), RIM, round_m=0.003)
-            x, y = thing.position_m
-            canvas.text((x + 0.021, y + 0.015), "ON", 0.0045)
-            canvas.text((x + 0.021, y - 0.015), "OFF", 0.0045)
-            _label(canvas, thing.position_m, 0.022, thing.label)
-        case Rotary():
-            for state in thing.states:
-                _mark(canvas, thing.position_m, state.angle_rad, thing.radius_m + 0.002, 0.005)
-                canvas.text(
-                    _polar(thing.position_m, state.angle_rad, thing.radius_m + 0.013), state.name.upper(), 0.0042
-                )
-            _label(canvas, thing.position_m, thing.radius_m + 0.002, thing.label)
         case Lever():
             for state in thing.states:
                 _name(canvas, thing.position_m, state, thing.length_m)

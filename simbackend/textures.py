@@ -115,7 +115,7 @@ def plate(panel: Panel) -> Pixels:
     return canvas.pixels()
 
 
-def _print_round(canvas: Canvas, thing: PanelObject) -> None:  # noqa: PLR0912  # one a kind
+def _print_round(canvas: Canvas, thing: PanelObject) -> None:  # one case a kind
     match thing:
         case Gauge():
             _label(canvas, thing.position_m, thing.radius_m, thing.label)

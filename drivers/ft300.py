@@ -15,10 +15,11 @@ from drivers.transport.bus import PolledDevice
 from drivers.transport.checks import crc_modbus
 from drivers.transport.device import StreamDevice
 from drivers.transport.framing import Framer
-from drivers.transport.link import Link, drain_until_quiet, now_s
+from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.modbus import ModbusMaster, ModbusRtu
 from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
 from drivers.transport.options import SerialOptions, read_options, serial_opener
+from drivers.transport.timebase import FrameTimes
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ForceTorqueCapabilities, Wrench
 from hal.readings import Cause, Quality, Stamped
@@ -30,7 +31,9 @@ STREAM_RATE_HZ = 100.0
 COUNTS_PER_N, COUNTS_PER_NM = 100.0, 1000.0
 WRENCH_REGISTER, FIRMWARE_REGISTER, STREAM_REGISTER = 180, 500, 410
 START_STREAM = 0x0200
-STOP_S, STOP_BURST = 0.5, 50  # FF bytes for half a second end a stream
+STOP_S, STOP_BURST = 0.6, 50  # FF bytes for about half a second end a stream
+LISTEN_S = 0.08  # the maker's code takes a line that was silent for so long as no stream
+STREAMING_FRAMES = 2
 ANSWER_S = 0.3
 
 
@@ -92,6 +95,27 @@ def condition(value: Wrench, options: RangeOptions) -> tuple[Quality, Cause]:
     return (Quality.INVALID, Cause.SATURATED) if is_over else (Quality.VALID, Cause.NONE)
 
 
+def identify(master: ModbusMaster, unit: int) -> None:
+    """The firmware registers tell the sensor from another slave; a table without them must hold a wrench.
+
+    Raises:
+        NoAnswer, Refused, LinkLost: it is not the sensor, or not there.
+    """
+    until_s = now_s() + max(ANSWER_S, master.attempt_s)
+    try:
+        master.read_registers(unit=unit, address=FIRMWARE_REGISTER, count=3, until_s=until_s)
+    except Refused:
+        master.read_registers(unit=unit, address=WRENCH_REGISTER, count=6, until_s=until_s)
+
+
+def _end_stream(link: Link) -> None:
+    until_s = now_s() + STOP_S
+    while now_s() < until_s:
+        link.write(b"\xff" * STOP_BURST, until_s + ANSWER_S)
+        drain_until_quiet(link, quiet_s=0.025, until_s=now_s() + 0.025)
+    drain_until_quiet(link, quiet_s=0.05, until_s=now_s() + ANSWER_S)
+
+
 class Ft300Stream(StreamDevice[Wrench]):
     """The sensor as a talker: 100 frames a second."""
 
@@ -103,7 +127,7 @@ class Ft300Stream(StreamDevice[Wrench]):
         self._options = options
         self._framer = stream_framer()
         self._bad_before = 0
-        self._last = (b"", 0.0)
+        self._times = FrameTimes(period_s=1.0 / STREAM_RATE_HZ, frame_bytes=FRAME_BYTES)
 
     def capabilities(self) -> ForceTorqueCapabilities:
         """From the options."""
@@ -114,29 +138,33 @@ class Ft300Stream(StreamDevice[Wrench]):
         return self.newest(deadline)
 
     def start(self, link: Link) -> None:
-        """End a running stream, see that it is the sensor, start the stream."""
-        until_s = now_s() + STOP_S
-        while now_s() < until_s:
-            link.write(b"\xff" * STOP_BURST, until_s + ANSWER_S)
-            drain_until_quiet(link, quiet_s=0.025, until_s=now_s() + 0.025)
-        drain_until_quiet(link, quiet_s=0.05, until_s=now_s() + ANSWER_S)
+        """Take over a stream that runs; else end whatever comes, see that it is the sensor, start the stream."""
+        self._framer.reset()
+        self._times.reset()
+        heard, frames, until_s = 0, 0, now_s() + LISTEN_S
+        while chunk := link.read(until_s):
+            heard += len(chunk)
+            frames += len(self._framer.feed(chunk))
+            if frames >= STREAMING_FRAMES:
+                return
+        if heard:
+            _end_stream(link)
         master, unit = ModbusRtu(link, timeout_s=ANSWER_S), self._options.unit
-        master.read_registers(unit=unit, address=FIRMWARE_REGISTER, count=3, until_s=now_s() + ANSWER_S)
+        try:
+            identify(master, unit)
+        except NoAnswer:
+            _end_stream(link)  # it may have been in the pause of a stream
+            identify(master, unit)
         start = [START_STREAM]
         master.write_registers(unit=unit, address=STREAM_REGISTER, values=start, until_s=now_s() + ANSWER_S)
         self._framer.reset()
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
-        """Publish each complete frame; those before the last ended a period earlier each."""
-        line_s = FRAME_BYTES * self.byte_s
-        frames = self._framer.feed(chunk)
-        for back, frame in zip(range(len(frames) - 1, -1, -1), frames, strict=True):
-            self._publish(frame, arrived_s - line_s - back / STREAM_RATE_HZ)
+        """Publish each complete frame."""
+        for frame, valid_s in self._times.stamped(self._framer.feed(chunk), arrived_s=arrived_s, byte_s=self.byte_s):
+            self._publish(frame, valid_s)
 
     def _publish(self, frame: bytes, valid_s: float) -> None:
-        if frame == self._last[0] and valid_s - self._last[1] < 0.3 / STREAM_RATE_HZ:
-            return  # the same bytes at the same moment are a repeated frame
-        self._last = (frame, valid_s)
         value = wrench(struct.unpack("<6h", frame[2:14]))
         quality, cause = condition(value, self._options)
         bad, self._bad_before = self._framer.counts.bad - self._bad_before, self._framer.counts.bad
@@ -162,9 +190,8 @@ class Ft300Registers(PolledDevice[Wrench, ModbusMaster]):
         return self.newest(deadline)
 
     def set_up(self, client: ModbusMaster) -> None:
-        """The firmware registers tell a sensor from another slave."""
-        until_s = now_s() + client.attempt_s
-        client.read_registers(unit=self._options.unit, address=FIRMWARE_REGISTER, count=3, until_s=until_s)
+        """See that it is the sensor."""
+        identify(client, self._options.unit)
 
     def poll(self, client: ModbusMaster) -> None:
         """Six registers."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -16,32 +17,64 @@ from drivers.transport.device import StreamDevice
 from drivers.transport.framing import Framer
 from drivers.transport.link import Link, NoAnswer, now_s
 from drivers.transport.options import SerialOptions, read_options, serial_opener
+from drivers.transport.timebase import FrameTimes
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ProximityCapabilities
 from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
+from hal.strict import Strict
 
 FRAME_BYTES = 9
 STRENGTH_SATURATED = 65_535
-SET_RATE, SET_UNIT = 0x03, 0x05
+GET_VERSION, SET_RATE, SET_UNIT = 0x01, 0x03, 0x05
+VERSION_ANSWER = b"\x5a\x07\x01"
 UNIT_CODES = {"cm": 1, "mm": 6}
 METRES = {"cm": 0.01, "mm": 0.001}
 ANSWER_S = 0.15
 ATTEMPTS = 3
 
 
-class TfminiOptions(SerialOptions):
-    """Options of `serial:tfmini`.
+def _exchange(link: Link, request: bytes, is_answered: Callable[[bytes], bool]) -> bytes:
+    """What is heard after a request, until it is answered or the time is over."""
+    link.write(request, now_s() + ANSWER_S)
+    heard, until_s = b"", now_s() + ANSWER_S
+    while not is_answered(heard) and (chunk := link.read(until_s)):
+        heard += chunk
+    return heard
 
-    `unit` is what the sensor is told to send; a sensor that takes no commands must be left at its factory unit, cm.
-    """
 
-    rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
-    unit: Literal["cm", "mm"] = "mm"
+class EchoOptions(Strict):
+    """Keys of all sensors of the family: what counts as seen."""
+
     min_strength: Annotated[int, Field(ge=0, le=65_535)] = 100
     min_range_m: Annotated[float, Field(ge=0)] = 0.0
     max_range_m: Annotated[float, Field(gt=0, le=12)] = 12.0
     sigma_m: Annotated[float, Field(gt=0)] = 0.005
+
+    def capabilities(self, rate_hz: float) -> ProximityCapabilities:
+        """From the options: the maker's figures are for big, bright targets."""
+        return ProximityCapabilities(
+            min_range_m=self.min_range_m, max_range_m=self.max_range_m, sigma_m=self.sigma_m, rate_hz=rate_hz
+        )
+
+    def judge(self, distance_m: float, strength: int) -> tuple[float, Quality, Cause]:
+        """The distance, or NaN and invalid when the echo is too weak, too strong, or from outside the range."""
+        is_seen = (
+            self.min_strength <= strength < STRENGTH_SATURATED
+            and distance_m > 0.0
+            and self.min_range_m <= distance_m <= self.max_range_m
+        )
+        return (distance_m, Quality.VALID, Cause.NONE) if is_seen else (math.nan, Quality.INVALID, Cause.OUT_OF_RANGE)
+
+
+class TfminiOptions(SerialOptions, EchoOptions):
+    """Options of `serial:tfmini`.
+
+    `unit` is what the sensor is told to send. One that takes no commands at all keeps its factory unit, cm.
+    """
+
+    rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
+    unit: Literal["cm", "mm"] = "mm"
 
 
 def command(code: int, payload: bytes = b"") -> bytes:
@@ -67,64 +100,58 @@ class Tfmini(StreamDevice[float]):
         self._options = options
         self._framer = data_framer()
         self._bad_before = 0
-        self._last = (b"", 0.0)
+        self._times = FrameTimes(period_s=period_s, frame_bytes=FRAME_BYTES)
+        self._unit_m = METRES[options.unit]
 
     def capabilities(self) -> ProximityCapabilities:
-        """From the options: the maker's figures are for big, bright targets."""
-        o = self._options
-        return ProximityCapabilities(
-            min_range_m=o.min_range_m, max_range_m=o.max_range_m, sigma_m=o.sigma_m, rate_hz=o.rate_hz
-        )
+        """From the options."""
+        return self._options.capabilities(self._options.rate_hz)
 
     def read_distance_m(self, *, deadline: Deadline) -> Stamped[float]:
         """Newest distance; invalid and NaN when the echo is too weak or outside the range."""
         return self.newest(deadline)
 
     def start(self, link: Link) -> None:
-        """Set unit and rate; without an answer only the factory unit may be trusted."""
+        """Set unit and rate. A sensor that confirms neither unit was told cm last, which also is its factory unit."""
         self._framer.reset()
-        confirmed = self._tell(link, SET_UNIT, bytes([UNIT_CODES[self._options.unit]]))
-        if not confirmed and self._options.unit != "cm":
-            raise NoAnswer("the sensor does not confirm its unit; for one that takes no commands set unit = 'cm'")
-        self._tell(link, SET_RATE, struct.pack("<H", round(self._options.rate_hz)))
+        self._times.reset()
+        asked = command(GET_VERSION)  # its answer is another, so if it comes back the line echoes
+        seen = _exchange(link, asked, lambda data: VERSION_ANSWER in data)
+        is_echoing = asked in seen
+        for unit in dict.fromkeys((self._options.unit, "cm")):
+            is_confirmed, heard = self._tell(link, SET_UNIT, bytes([UNIT_CODES[unit]]), is_echoing=is_echoing)
+            self._unit_m = METRES[unit]
+            seen += heard
+            if is_confirmed:
+                break
+        if not data_framer().feed(seen) and not is_confirmed:
+            raise NoAnswer(f"no data frame of a TFmini in {len(seen)} bytes")
+        self._tell(link, SET_RATE, struct.pack("<H", round(self._options.rate_hz)), is_echoing=is_echoing)
 
-    def _tell(self, link: Link, code: int, payload: bytes) -> bool:
-        """Send a command until its answer stands between the data frames."""
+    def _tell(self, link: Link, code: int, payload: bytes, *, is_echoing: bool) -> tuple[bool, bytes]:
+        """Send a command until its answer stands between the data frames; is it there, and all that was heard.
+
+        The answer repeats the command, as the echo of a two-wire line does; where the line echoes, it must come twice.
+        """
         wanted = command(code, payload)
+        seen = b""
         for _ in range(ATTEMPTS):
-            link.write(wanted, now_s() + ANSWER_S)
-            seen, until_s = b"", now_s() + ANSWER_S
-            while chunk := link.read(until_s):
-                seen += chunk
-                if wanted in seen:  # the sensor repeats the command; two of them where the line echoes
-                    return True
-        return False
+            heard = _exchange(link, wanted, lambda data: data.count(wanted) > is_echoing)
+            seen += heard
+            if heard.count(wanted) > is_echoing:
+                return True, seen
+        return False, seen
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
-        """Publish each complete frame; the last ended just now, those before it one period earlier each."""
-        frames = self._framer.feed(chunk)
-        for back, frame in zip(range(len(frames) - 1, -1, -1), frames, strict=True):
-            self._publish(frame, arrived_s - FRAME_BYTES * self.byte_s - back / self._options.rate_hz)
+        """Publish each complete frame."""
+        for frame, valid_s in self._times.stamped(self._framer.feed(chunk), arrived_s=arrived_s, byte_s=self.byte_s):
+            self._publish(frame, valid_s)
 
     def _publish(self, frame: bytes, valid_s: float) -> None:
-        if frame == self._last[0] and valid_s - self._last[1] < 0.3 / self._options.rate_hz:
-            return  # the same bytes at the same moment are a repeated frame
-        self._last = (frame, valid_s)
         raw, strength = struct.unpack_from("<HH", frame, 2)
-        distance_m = raw * METRES[self._options.unit]
-        is_seen = (
-            self._options.min_strength <= strength < STRENGTH_SATURATED
-            and raw > 0
-            and self._options.min_range_m <= distance_m <= self._options.max_range_m
-        )
+        value, quality, cause = self._options.judge(raw * self._unit_m, strength)
         bad, self._bad_before = self._framer.counts.bad - self._bad_before, self._framer.counts.bad
-        self.publish(
-            distance_m if is_seen else math.nan,
-            valid_s=valid_s,
-            quality=Quality.VALID if is_seen else Quality.INVALID,
-            cause=Cause.NONE if is_seen else Cause.OUT_OF_RANGE,
-            missed=bad,
-        )
+        self.publish(value, valid_s=valid_s, quality=quality, cause=cause, missed=bad)
 
 
 def connect(context: Context, options: dict[str, Any]) -> Tfmini:

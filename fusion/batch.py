@@ -27,9 +27,10 @@ _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 class Batch(NamedTuple):
     """Measurements as arrays; symmetric matrices as (xx, xy, xz, yy, yz, zz).
 
-    cls, dof: (N,) integers; m, w: (N, 3) object point and direction; mu: (N, 3); C, A, M: (N, 6) covariance, its inverse and
-    direction information; d, a1, a2: (N, 3) null direction of M and the two others; p: (N, 2) their information,
-    1/rad^2; gate: (N,) chi-square limits; prior_*: pose (3, 3), (3,), whitening (6, 6) so that |W delta|^2 is chi-square.
+    cls, dof: (N,) integers; m, w: (N, 3) object point and direction; mu: (N, 3); C: (N, 6) covariance; variance, axes:
+    (N, 3), (N, 3, 3) its eigenvalues, rising, and unit eigenvectors as rows; d, a1, a2: (N, 3) eigenvectors of M, its null
+    direction first; p0: (N,) and p: (N, 2) their information, 1/rad^2, p0 being (almost) zero; gate: (N,) chi-square
+    limits; prior_*: pose (3, 3), (3,), whitening (6, 6) so that |W delta|^2 is chi-square.
 
     A prior pose is one more entry with cls 0 at the end.
     """
@@ -40,11 +41,12 @@ class Batch(NamedTuple):
     w: Array
     mu: Array
     C: Array
-    A: Array
-    M: Array
+    variance: Array
+    axes: Array
     d: Array
     a1: Array
     a2: Array
+    p0: Array
     p: Array
     gate: Array
     prior_r: Array
@@ -77,9 +79,11 @@ def pack(measurements: Sequence[Measurement], prior: UncertainPose | None = None
     aimless = np.isin(cls, (0, 1, 4, 7))  # a point's direction means nothing
     w = np.where(aimless[:, None], [0.0, 0.0, 1.0], u / np.maximum(length, 1e-300)[:, None])
     C, M = (C + C.transpose(0, 2, 1)) / 2, (M + M.transpose(0, 2, 1)) / 2
+    variance, axes = np.linalg.eigh(C)
     values, vectors = np.linalg.eigh(M)
-    _check_matrices(measurements, cls[:n], np.where(aimless, 1.0, length)[:n], np.linalg.eigvalsh(C[:n]), values[:n])
-    p = np.where(values[:, 1:] > NULL_RATIO * np.maximum(values[:, 2:], 1e-300), values[:, 1:], 0.0)
+    _check_matrices(measurements, cls[:n], np.where(aimless, 1.0, length)[:n], variance[:n], values[:n])
+    known = np.where(values > NULL_RATIO * np.maximum(values[:, 2:], 1e-300), values, 0.0)
+    p0, p = np.ascontiguousarray(known[:, 0]), np.ascontiguousarray(known[:, 1:])
     dof = _DOF[cls, (p > 0).sum(axis=1)]
     prior_r, prior_t, prior_w = np.eye(3), np.zeros(3), np.zeros((6, 6))
     if prior is not None:
@@ -89,11 +93,11 @@ def pack(measurements: Sequence[Measurement], prior: UncertainPose | None = None
         prior_w = np.array(_whitening(prior.covariance), order="C")
     return Batch(
         cls=cls, dof=dof, m=m, w=w, mu=mu,
-        C=_sym6(C), A=_sym6(np.linalg.inv(C)), M=_sym6(M),
+        C=_sym6(C), variance=variance, axes=np.ascontiguousarray(axes.transpose(0, 2, 1)),
         d=np.ascontiguousarray(vectors[:, :, 0]),
         a1=np.ascontiguousarray(vectors[:, :, 1]),
         a2=np.ascontiguousarray(vectors[:, :, 2]),
-        p=p, gate=GATES[dof], prior_r=prior_r, prior_t=prior_t, prior_w=prior_w,
+        p0=p0, p=p, gate=GATES[dof], prior_r=prior_r, prior_t=prior_t, prior_w=prior_w,
     )  # fmt: skip
 
 

@@ -17,24 +17,23 @@ import numpy as np
 
 from fusion.batch import Batch
 from fusion.vectors import (
-    Sym,
     Vec,
     across,
     blend,
     compiled,
     cross,
     dot,
-    form,
     inlined,
     normalised,
-    sym,
-    times,
     turned,
     vec,
 )
 from hal.geometry import Array
 
-REFINED = 5  # starts that Newton's method follows, best first
+# A symmetric matrix by its eigenvalues and unit eigenvectors: v.S v then is a sum of squares, not a difference of large numbers.
+Spectral = tuple[float, float, float, Vec, Vec, Vec]
+REFINED = 6  # starts that Newton's method follows, best first
+LONGEST = 0.7  # step on the sphere, rad (as a tangent)
 CIRCLE = 24  # starts on the half circle of plane-line
 
 # Half of the 26 neighbours of a cube's centre: any direction is within 23 degrees of one of them or its opposite.
@@ -45,57 +44,90 @@ _GRID = np.array([
 
 
 @inlined
-def _line_value(e: Vec, A: Sym, M: Sym, v: Vec) -> float:
+def _place(b: Batch, i: int, inverse: bool) -> Spectral:
+    """C of entry i, or C^-1."""
+    X = b.axes[i]
+    v1, v2, v3 = b.variance[i, 0], b.variance[i, 1], b.variance[i, 2]
+    if inverse:
+        v1, v2, v3 = 1.0 / v1, 1.0 / v2, 1.0 / v3
+    return (v1, v2, v3, vec(X, 0), vec(X, 1), vec(X, 2))
+
+
+@inlined
+def _direction(b: Batch, i: int) -> Spectral:
+    """M of entry i."""
+    return (b.p0[i], b.p[i, 0], b.p[i, 1], vec(b.d, i), vec(b.a1, i), vec(b.a2, i))
+
+
+@inlined
+def weighted(a: Vec, M: Spectral, b: Vec) -> float:
+    """a . M b"""
+    return M[0] * dot(a, M[3]) * dot(b, M[3]) + M[1] * dot(a, M[4]) * dot(b, M[4]) + M[2] * dot(a, M[5]) * dot(b, M[5])
+
+
+@inlined
+def pulled(M: Spectral, a: Vec) -> Vec:
+    """M a"""
+    return blend(1.0, blend(M[0] * dot(a, M[3]), M[3], M[1] * dot(a, M[4]), M[4]), M[2] * dot(a, M[5]), M[5])
+
+
+@inlined
+def _line_value(e: Vec, A: Spectral, M: Spectral, v: Vec) -> float:
     """Line-point: distance of the nearest point of the line plus the direction's share; subtracts before it squares."""
-    k = form(v, A, e) / form(v, A, v)
+    k = weighted(v, A, e) / weighted(v, A, v)
     y = blend(1.0, e, -k, v)
-    return form(y, A, y) + form(v, M, v)
+    return weighted(y, A, y) + weighted(v, M, v)
 
 
 @inlined
-def _plane_value(e: Vec, C: Sym, M: Sym, v: Vec) -> float:
+def _plane_value(e: Vec, C: Spectral, M: Spectral, v: Vec) -> float:
     p = dot(v, e)
-    return p * p / form(v, C, v) + form(v, M, v)
+    return p * p / weighted(v, C, v) + weighted(v, M, v)
 
 
 @inlined
-def _value(line: bool, e: Vec, A: Sym, M: Sym, v: Vec) -> float:
+def _value(line: bool, e: Vec, A: Spectral, M: Spectral, v: Vec) -> float:
     return _line_value(e, A, M, v) if line else _plane_value(e, A, M, v)
 
 
 @inlined
-def _newton(line: bool, e: Vec, A: Sym, M: Sym, v: Vec, steps: int) -> Vec:
+def _step_on_sphere(h11: float, h12: float, h22: float, g1: float, g2: float) -> tuple[float, float]:
+    """-|H|^-1 g for a 2x2 tangent Hessian H: Newton's step where F curves upwards, and downhill where it does not.
+
+    Each eigenvector goes its own way and at most LONGEST far. A common shift of an indefinite H would be as large as its
+    stiffest direction allows, and the other one would hardly move: in the long valleys of line-point that ends on a slope.
+    """
+    angle = 0.5 * math.atan2(2.0 * h12, h11 - h22)
+    c, s = math.cos(angle), math.sin(angle)
+    middle, radius = 0.5 * (h11 + h22), math.hypot(0.5 * (h11 - h22), h12)
+    least = 1e-12 * (abs(middle) + radius) + 1e-300
+    along = -(c * g1 + s * g2) / max(abs(middle + radius), least)
+    across_it = -(c * g2 - s * g1) / max(abs(middle - radius), least)
+    along, across_it = max(-LONGEST, min(LONGEST, along)), max(-LONGEST, min(LONGEST, across_it))
+    return c * along - s * across_it, s * along + c * across_it
+
+
+@inlined
+def _newton(line: bool, e: Vec, A: Spectral, M: Spectral, v: Vec, steps: int) -> Vec:
     """A minimum of F near v. Written for v of any length, F is of degree 0, so its tangent Hessian is the plain one."""
-    h = times(A, e) if line else e
+    h = pulled(A, e) if line else e
     s = -1.0 if line else 1.0
     best = _value(line, e, A, M, v)
     for _ in range(steps):
         b1 = across(v)
         b2 = cross(v, b1)
-        q = form(v, A, v)
+        q = weighted(v, A, v)
         tau = dot(h, v) / q
-        c = blend(1.0, h, -2.0 * tau, times(A, v))
-        pull = blend(2.0 * s * tau, blend(1.0, h, -tau, times(A, v)), 2.0, times(M, v))
-        m = form(v, M, v)
+        c = blend(1.0, h, -2.0 * tau, pulled(A, v))
+        pull = blend(2.0 * s * tau, blend(1.0, h, -tau, pulled(A, v)), 2.0, pulled(M, v))
+        m = weighted(v, M, v)
         g1, g2 = dot(b1, pull), dot(b2, pull)
         c1, c2 = dot(b1, c), dot(b2, c)
-        h11 = 2.0 * (s * (c1 * c1 / q - tau * tau * form(b1, A, b1)) + form(b1, M, b1) - m)
-        h12 = 2.0 * (s * (c1 * c2 / q - tau * tau * form(b1, A, b2)) + form(b1, M, b2))
-        h22 = 2.0 * (s * (c2 * c2 / q - tau * tau * form(b2, A, b2)) + form(b2, M, b2) - m)
-        middle, radius = 0.5 * (h11 + h22), math.hypot(0.5 * (h11 - h22), h12)
-        top = abs(middle) + radius
-        if top <= 0.0:
-            break
-        # Shift an indefinite Hessian to the size of its own curvature, so that the step leaves a saddle downhill.
-        shift = max(0.0, 1e-12 * top - (middle - radius))
-        if shift > 1e-11 * top:
-            shift += radius
-        a, d = h11 + shift, h22 + shift
-        det = a * d - h12 * h12
-        x1, x2 = -(d * g1 - h12 * g2) / det, -(a * g2 - h12 * g1) / det
+        h11 = 2.0 * (s * (c1 * c1 / q - tau * tau * weighted(b1, A, b1)) + weighted(b1, M, b1) - m)
+        h12 = 2.0 * (s * (c1 * c2 / q - tau * tau * weighted(b1, A, b2)) + weighted(b1, M, b2))
+        h22 = 2.0 * (s * (c2 * c2 / q - tau * tau * weighted(b2, A, b2)) + weighted(b2, M, b2) - m)
+        x1, x2 = _step_on_sphere(h11, h12, h22, g1, g2)
         size = math.hypot(x1, x2)
-        if size > 1.0:
-            x1, x2 = x1 / size, x2 / size
         scale, accepted = 1.0, False
         for _ in range(30):
             w = normalised(blend(1.0, v, scale, blend(x1, b1, x2, b2)))
@@ -113,10 +145,10 @@ def _newton(line: bool, e: Vec, A: Sym, M: Sym, v: Vec, steps: int) -> Vec:
 
 @inlined
 def _sphere(  # noqa: PLR0912 - one flat loop, for the compiler
-    line: bool, e: Vec, A: Sym, M: Sym, d: Vec, a1: Vec, a2: Vec
+    line: bool, e: Vec, A: Spectral, M: Spectral, d: Vec, a1: Vec, a2: Vec
 ) -> Vec:
     """Where F is least on the whole sphere: starts by value, the best ones refined."""
-    starts, cost = np.empty((40, 3)), np.empty(40)
+    starts, cost = np.empty((80, 3)), np.empty(80)
     n = 0
     for k in range(13):
         n = _start(starts, n, normalised(vec(_GRID, k)))
@@ -128,18 +160,21 @@ def _sphere(  # noqa: PLR0912 - one flat loop, for the compiler
         n1 = across(toward)
         n2 = cross(toward, n1)
         if line:
-            # The minimum moves from d (direction known well) towards e (point known well) as |e| grows.
+            # The minimum moves from d (direction known well) towards e (point known well) as |e| grows. Either share hardly
+            # grows along one great circle: the point's from e to the axis that C leaves widest, the direction's from d to a1.
+            long = A[5]
             for k in range(1, 9):
-                n = _start(starts, n, normalised(blend(1.0 - k / 8.0, d, k / 8.0, toward)))
-                n = _start(starts, n, normalised(blend(1.0 - k / 8.0, d, -k / 8.0, toward)))
+                n = _arc(starts, n, d, toward, k / 8.0)
+                n = _arc(starts, n, toward, long, (k - 0.5) / 8.0)
+                n = _arc(starts, n, d, a1, (k - 0.5) / 8.0)
+            n = _start(starts, n, normalised(cross(cross(toward, long), a2)))
         else:
             # e-perp is where the first term vanishes; the second is least there at one of two directions.
-            m11, m12, m22 = form(n1, M, n1), form(n1, M, n2), form(n2, M, n2)
+            m11, m12, m22 = weighted(n1, M, n1), weighted(n1, M, n2), weighted(n2, M, n2)
             angle = 0.5 * math.atan2(2.0 * m12, m11 - m22)
             low = blend(-math.sin(angle), n1, math.cos(angle), n2)
             for k in range(1, 9):
-                n = _start(starts, n, normalised(blend(1.0 - k / 8.0, d, k / 8.0, low)))
-                n = _start(starts, n, normalised(blend(1.0 - k / 8.0, d, -k / 8.0, low)))
+                n = _arc(starts, n, d, low, k / 8.0)
             n = _start(starts, n, blend(math.cos(angle), n1, math.sin(angle), n2))
     for k in range(n):
         cost[k] = _value(line, e, A, M, vec(starts, k))
@@ -153,7 +188,7 @@ def _sphere(  # noqa: PLR0912 - one flat loop, for the compiler
         if value < least:
             best, least = v, value
         for j in range(n):  # what lies close to this minimum would lead here again
-            if abs(dot(v, vec(starts, j))) > 0.98:
+            if abs(dot(v, vec(starts, j))) > 0.99:
                 cost[j] = np.inf
         cost[k] = np.inf
     return best
@@ -166,13 +201,20 @@ def _start(starts: Array, n: int, v: Vec) -> int:
 
 
 @inlined
-def _circle(e: Vec, C: Sym, M: Sym, u: Vec, d: Vec) -> Vec:
+def _arc(starts: Array, n: int, a: Vec, b: Vec, share: float) -> int:
+    """Two starts between a and b, and between a and -b."""
+    n = _start(starts, n, normalised(blend(1.0 - share, a, share, b)))
+    return _start(starts, n, normalised(blend(1.0 - share, a, -share, b)))
+
+
+@inlined
+def _circle(e: Vec, C: Spectral, M: Spectral, u: Vec, d: Vec) -> Vec:
     """Where F of plane-line is least: v across u, one angle; stationary points of degree 6, so at most 6 in half a turn."""
     n1 = across(u)
     n2 = cross(u, n1)
     h1, h2 = dot(n1, e), dot(n2, e)
-    c11, c12, c22 = form(n1, C, n1), form(n1, C, n2), form(n2, C, n2)
-    m11, m12, m22 = form(n1, M, n1), form(n1, M, n2), form(n2, M, n2)
+    c11, c12, c22 = weighted(n1, C, n1), weighted(n1, C, n2), weighted(n2, C, n2)
+    m11, m12, m22 = weighted(n1, M, n1), weighted(n1, M, n2), weighted(n2, M, n2)
     # Numerators over t = tan(angle): F' = 2 (h1 + h2 t)(k0 + k1 t) / Q^2 + 2 (m12 + (m22 - m11) t - m12 t^2) / P^2
     k0, k1 = h2 * c11 - h1 * c12, h2 * c12 - h1 * c22
     n_0, n_1, n_2 = h1 * k0, h1 * k1 + h2 * k0, h2 * k1
@@ -241,11 +283,11 @@ def _polish_angle(
 
 
 @inlined
-def _least_across(M: Sym, u: Vec) -> Vec:
+def _least_across(M: Spectral, u: Vec) -> Vec:
     """The unit v across u with least v.M v: class 6."""
     n1 = across(u)
     n2 = cross(u, n1)
-    m11, m12, m22 = form(n1, M, n1), form(n1, M, n2), form(n2, M, n2)
+    m11, m12, m22 = weighted(n1, M, n1), weighted(n1, M, n2), weighted(n2, M, n2)
     angle = 0.5 * math.atan2(2.0 * m12, m11 - m22)  # of the larger one
     return blend(-math.sin(angle), n1, math.cos(angle), n2)
 
@@ -254,41 +296,41 @@ def _least_across(M: Sym, u: Vec) -> Vec:
 def local(b: Batch, i: int, u: Vec, e: Vec, v: Vec, search: bool) -> tuple[float, Vec, Vec, Vec]:
     """f, df/dx, df/du and v* of entry i. `search`: over the whole sphere; else by Newton's method from v (classes 4, 7)."""
     c = b.cls[i]
-    C, A, M = sym(b.C, i), sym(b.A, i), sym(b.M, i)
+    C, A, M = _place(b, i, False), _place(b, i, True), _direction(b, i)
     zero = (0.0, 0.0, 0.0)
     if c == 1:
-        Ae = times(A, e)
+        Ae = pulled(A, e)
         return dot(e, Ae), blend(2.0, Ae, 0.0, Ae), zero, v
     if c in (2, 5):
-        s = -form(u, A, e) / form(u, A, u)
+        s = -weighted(u, A, e) / weighted(u, A, u)
         y = blend(1.0, e, s, u)
-        Ay = times(A, y)
+        Ay = pulled(A, y)
         f, gx, gu = dot(y, Ay), blend(2.0, Ay, 0.0, Ay), blend(2.0 * s, Ay, 0.0, Ay)
         if c == 5:
-            Mu = times(M, u)
+            Mu = pulled(M, u)
             f, gu = f + dot(u, Mu), blend(1.0, gu, 2.0, Mu)
         return f, gx, gu, u
     if c in (3, 6, 9):
-        Cu = times(C, u)
+        Cu = pulled(C, u)
         ue = dot(u, e)
         tau = ue / dot(u, Cu)
         f, gx, gu = ue * tau, blend(2.0 * tau, u, 0.0, u), blend(2.0 * tau, e, -2.0 * tau * tau, Cu)
         if c == 9:
-            Mu = times(M, u)
+            Mu = pulled(M, u)
             return f + dot(u, Mu), gx, blend(1.0, gu, 2.0, Mu), u
         if c == 6:
             v = _least_across(M, u)
-            return f + form(v, M, v), gx, blend(1.0, gu, -2.0 * form(u, M, v), v), v
+            return f + weighted(v, M, v), gx, blend(1.0, gu, -2.0 * weighted(u, M, v), v), v
         return f, gx, gu, u
     d, a1, a2 = vec(b.d, i), vec(b.a1, i), vec(b.a2, i)
     if c == 4:
         v = _sphere(True, e, A, M, d, a1, a2) if search else _newton(True, e, A, M, v, 6)
-        y = blend(1.0, e, -form(v, A, e) / form(v, A, v), v)
-        Ay = times(A, y)
+        y = blend(1.0, e, -weighted(v, A, e) / weighted(v, A, v), v)
+        Ay = pulled(A, y)
         return _line_value(e, A, M, v), blend(2.0, Ay, 0.0, Ay), zero, v
     if c == 7:
         v = _sphere(False, e, C, M, d, a1, a2) if search else _newton(False, e, C, M, v, 6)
-        tau = dot(v, e) / form(v, C, v)
+        tau = dot(v, e) / weighted(v, C, v)
         return _plane_value(e, C, M, v), blend(2.0 * tau, v, 0.0, v), zero, v
     if search:
         v = _circle(e, C, M, u, d)
@@ -296,13 +338,13 @@ def local(b: Batch, i: int, u: Vec, e: Vec, v: Vec, search: bool) -> tuple[float
         n1 = across(u)
         n2 = cross(u, n1)
         x = _polish_angle(
-            dot(n1, e), dot(n2, e), form(n1, C, n1), form(n1, C, n2), form(n2, C, n2),
-            form(n1, M, n1), form(n1, M, n2), form(n2, M, n2), math.atan2(dot(n2, v), dot(n1, v)),
+            dot(n1, e), dot(n2, e), weighted(n1, C, n1), weighted(n1, C, n2), weighted(n2, C, n2),
+            weighted(n1, M, n1), weighted(n1, M, n2), weighted(n2, M, n2), math.atan2(dot(n2, v), dot(n1, v)),
         )  # fmt: skip
         v = blend(math.cos(x), n1, math.sin(x), n2)
-    Cv = times(C, v)
+    Cv = pulled(C, v)
     tau = dot(v, e) / dot(v, Cv)
-    held = tau * dot(u, e) - tau * tau * dot(u, Cv) + form(u, M, v)
+    held = tau * dot(u, e) - tau * tau * dot(u, Cv) + weighted(u, M, v)
     return _plane_value(e, C, M, v), blend(2.0 * tau, v, 0.0, v), blend(-2.0 * held, v, 0.0, v), v
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -43,25 +45,50 @@ def test_agrees_with_brute_force_to_nine_digits(cls: SensingClass) -> None:
         assert local_value(m, pose) == pytest.approx(brute_force(m, pose), rel=1e-9, abs=1e-12)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(CLASSES))
 def test_gradient_is_that_of_finite_differences(seed: int, cls: SensingClass) -> None:
+    """f is the least of smooth functions, one per minimum over v: its slope may fall at a kink but never rise.
+
+    So in every direction the forward slope is at most the gradient and the backward slope at least: equal where f is smooth.
+    """
     rng = np.random.default_rng(seed)
     m, pose = random_measurement(cls, rng), random_pose(rng)
     f, gradient = local_values_and_gradients([m], pose)
-    slope, wider = (
-        np.array(
-            [
-                (local_value(m, perturbed(pose, h * d)) - local_value(m, perturbed(pose, -h * d))) / (2 * h)
-                for d in np.eye(6)
-            ]
-        )
-        for h in (1e-7, 1e-5)
-    )
-    scale = np.abs(slope).max() + f[0] + 1.0
-    # Two minima over v can be equally deep (classes 4, 7, 8): there f has a kink, and no derivative to agree on.
-    assume(m.cls not in (4, 7, 8) or np.abs(slope - wider).max() < 1e-2 * scale)
-    assert gradient[0] == pytest.approx(slope, rel=2e-3, abs=2e-3 * (np.abs(slope).max() + f[0] + 1.0))
+    h = 1e-6
+    ahead, behind = (np.array([local_value(m, perturbed(pose, s * h * d)) for d in np.eye(6)]) for s in (1, -1))
+    forward, backward = (ahead - f[0]) / h, (f[0] - behind) / h
+    tolerance = 2e-3 * (np.abs(gradient[0]).max() + f[0] + 1.0)
+    assert (forward <= gradient[0] + tolerance).all()
+    assert (backward >= gradient[0] - tolerance).all()
+
+
+def test_the_long_valleys_of_line_point_are_followed_to_their_end() -> None:
+    """A poorly known point and a direction that is sharp one way only: Newton's method once stopped on the slope.
+
+    Seeds of a search for gradients that disagree with finite differences; 27 of 1500 random problems did.
+    """
+    for seed in (69, 95, 169, 202):
+        rng = np.random.default_rng(seed)
+        m, pose = random_measurement(SensingClass.LINE_POINT, rng), random_pose(rng)
+        assert local_value(m, pose) == pytest.approx(brute_force(m, pose), rel=1e-9)
+
+
+@pytest.mark.parametrize("cls", [c for c in CLASSES if c >= 4], ids=lambda c: c.words)
+@pytest.mark.parametrize("kind", ["ill-conditioned", "one direction error unknown", "equal eigenvalues", "near"])
+def test_extreme_matrices_agree_with_brute_force(cls: SensingClass, kind: str) -> None:
+    rng = np.random.default_rng(int(cls))
+    m, pose = random_measurement(cls, rng), random_pose(rng)
+    A, B = Rotation.random(2, rng=rng).as_matrix()
+    if kind == "ill-conditioned":
+        m = replace(m, C_m2=A @ np.diag([1e-6, 1e-4, 0.1]) @ A.T, M=B @ np.diag([0.0, 10.0, 1e6]) @ B.T)
+    elif kind == "one direction error unknown":
+        m = replace(m, M=B @ np.diag([0.0, 0.0, 1e4]) @ B.T)
+    elif kind == "equal eigenvalues":
+        m = replace(m, C_m2=A @ np.diag([1e-4, 1e-4, 0.01]) @ A.T, M=A @ np.diag([0.0, 1e4, 1e4]) @ A.T)
+    else:
+        m = replace(m, mu_m=pose.apply(m.x_m) + rng.normal(0, 1e-4, 3))
+    assert local_value(m, pose) == pytest.approx(brute_force(m, pose), rel=1e-9, abs=1e-12)
 
 
 @pytest.mark.parametrize("code", CODES)

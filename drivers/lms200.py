@@ -31,6 +31,7 @@ LONGEST_PAYLOAD = 812
 FATAL = 4
 ANSWER_S = 0.15
 SET_UP_S = 3.0
+CONNECT_S = 6.0  # four baud rates, three requests at each
 HEADER_BYTES = 4
 
 
@@ -89,20 +90,25 @@ class Lms200(LineScanner):
         """Find it, stop it, change the baud rate, set angles and unit, stream."""
         o = self._options
         self._find(link)
-        self._ask(link, bytes([MODE, BAUD_CODES[o.baud]]), MODE | 0x80)
+        self._set_mode(link, bytes([BAUD_CODES[o.baud]]))
         self._set_baud(link, o.baud)
         answer = self._ask(link, struct.pack("<BHH", VARIANT, o.field_deg, o.step_hundredths_deg), VARIANT | 0x80)
         if answer[1] != 1:
             raise Refused(
                 f"{o.field_deg} deg in steps of {o.step_hundredths_deg / 100} deg are refused", code=answer[1]
             )
-        self._ask(link, bytes([MODE, SET_UP]) + PASSWORD, MODE | 0x80)
+        self._set_mode(link, bytes([SET_UP]) + PASSWORD)
         config = bytearray(self._ask(link, bytes([READ_CONFIG]), READ_CONFIG | 0x80)[1:-1])
         if config[UNIT_BYTE] != MILLIMETRES:
             config[UNIT_BYTE] = MILLIMETRES
             self._ask(link, bytes([WRITE_CONFIG]) + bytes(config), WRITE_CONFIG | 0x80, SET_UP_S)
-        self._ask(link, bytes([MODE, STREAM]), MODE | 0x80)
+        self._set_mode(link, bytes([STREAM]))
         self._framer.reset()
+
+    def _set_mode(self, link: Link, mode: bytes) -> None:
+        answer = self._ask(link, bytes([MODE]) + mode, MODE | 0x80)
+        if len(answer) > 1 and answer[1] != 0:
+            raise Refused(f"operating mode {mode[0]:02X}h is refused", code=answer[1])
 
     def _find(self, link: Link) -> None:
         """Try all baud rates, the wanted one first, until it agrees to stop streaming."""
@@ -172,5 +178,5 @@ def decode_scan(payload: bytes) -> np.ndarray[Any, np.dtype[np.float64]]:
 def connect(context: Context, options: dict[str, Any]) -> Lms200:
     """Entry point `serial:lms200`."""
     device = Lms200(context, read_options(context, options, Lms200Options))
-    device.join()
+    device.join(CONNECT_S)
     return device

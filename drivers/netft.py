@@ -51,6 +51,8 @@ class Netft(StreamDevice[Wrench]):
         super().__init__(context, open_link=opener, link_name=name, max_age_s=options.max_age_s, silence_s=0.3)
         self._options = options
         self._last: int | None = None
+        self._last_sample = 0
+        self._may_be_new = False
 
     def capabilities(self) -> ForceTorqueCapabilities:
         """From the options."""
@@ -71,12 +73,12 @@ class Netft(StreamDevice[Wrench]):
         """One datagram is one record; other lengths are not ours."""
         if len(chunk) != RECORD.size:
             return
-        sequence, _, status, *counts = RECORD.unpack(chunk)
-        last = self._last
-        if last is not None and sequence <= last and sequence != FIRST_SEQUENCE:
+        sequence, samples, status, *counts = RECORD.unpack(chunk)
+        is_new_stream = self._begins_stream(sequence, samples)
+        last = None if is_new_stream else self._last
+        if last is not None and sequence <= last:
             return  # repeated or late
-        is_next = last is not None and sequence > last
-        self._last = sequence
+        self._last, self._last_sample = sequence, samples
         o = self._options
         value = Wrench(
             force_n=np.array(counts[:3], dtype=float) / o.counts_per_n,
@@ -87,8 +89,19 @@ class Netft(StreamDevice[Wrench]):
             valid_s=arrived_s,
             quality=Quality.INVALID if status else Quality.VALID,
             cause=Cause.DEVICE if status else Cause.NONE,
-            missed=sequence - last - 1 if is_next and last is not None else 0,
+            missed=sequence - last - 1 if last is not None else 0,
         )
+
+    def _begins_stream(self, sequence: int, samples: int) -> bool:
+        """Has the sensor begun to count anew? A late first record has an old sample count; a restarted sensor has too,
+        but then the second record follows."""
+        if self._last is None or sequence > self._last:
+            self._may_be_new = False
+            return False
+        if sequence == FIRST_SEQUENCE < self._last:
+            self._may_be_new = True
+            return samples > self._last_sample
+        return self._may_be_new and sequence == FIRST_SEQUENCE + 1
 
     def release(self) -> None:
         """Stop the stream: a talking sensor loads the network for ever."""

@@ -19,7 +19,7 @@ from drivers.transport.options import read_options
 from hal.clock import Deadline
 from hal.devices import DeviceKind, GripperCapabilities, GripperState
 from hal.errors import DeviceFault, DeviceTimeout, InvalidRequest
-from hal.readings import Stamped
+from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
 
 OUTPUT, INPUT = 0x03E8, 0x07D0
@@ -38,6 +38,10 @@ FAULTS = {
     14: "too much current",
     15: "automatic release done",
 }
+
+
+PASSING_FAULTS = (7, 9)  # end with activation and with the next command: no reason to refuse a connection to do so
+VALID = (Quality.VALID, Cause.NONE)
 
 
 class GripperOptions(ModbusOptions):
@@ -164,9 +168,10 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
         """Three registers to width and grip."""
         asked_s = now_s()
         status = self._status(client, asked_s + client.attempt_s)
-        if status.fault > ACTIVATION_PENDING:
+        if status.fault > ACTIVATION_PENDING and status.fault not in PASSING_FAULTS:
             text = FAULTS.get(status.fault, "fault not in the manual")
             raise Refused(f"gripper fault {status.fault:X}h: {text}", code=status.fault)
+        quality, cause = (Quality.INVALID, Cause.DEVICE) if status.fault in PASSING_FAULTS else VALID
         is_current = self._goal is None or status.echo == self._goal
         is_holding = is_current and status.object in (OPENED_ON, CLOSED_ON)
         self.publish(
@@ -177,6 +182,8 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
                 is_holding=is_holding,
             ),
             valid_s=0.5 * (asked_s + now_s()),
+            quality=quality,
+            cause=cause,
         )
 
     def _status(self, client: ModbusMaster, until_s: float) -> Status:

@@ -25,6 +25,7 @@ NODE_BYTES = 5
 IN_STEP = 8  # a shifted stream passes the test of one measurement with probability 1/4, of eight with 1/65536
 FULL_TURN_Q6 = 360 * 64
 WHOLE_TURN_RAD = math.radians(330)  # a turn that lost its beginning is not published as one
+JITTER_RAD = math.radians(2.0)
 ERROR = 2
 ANSWER_S = 0.3
 RESET_S = 0.5
@@ -178,13 +179,19 @@ class Rplidar(LineScanner):
         if not self._turn or self.beams is None:
             return
         _, angle_rad, distance_m = decode(np.concatenate(self._turn))
-        if np.ptp(angle_rad) < WHOLE_TURN_RAD:
+        if np.ptp(angle_rad) < WHOLE_TURN_RAD or turns_back(angle_rad):
             self._missed += 1
             return
         missed, self._missed = self._missed, 0
         self.publish_scan(
             sectors(angle_rad, within(distance_m, self.beams), self.beams.count), valid_s=arrived_s, missed=missed
         )
+
+
+def turns_back(angle_rad: NDArray[np.float64]) -> bool:
+    """Does an angle go back by more than the motor's jitter? Noise that looks like a measurement makes it."""
+    step_rad = (np.diff(angle_rad) + np.pi) % math.tau - np.pi
+    return bool(np.any(step_rad < -JITTER_RAD))
 
 
 def sectors(angle_rad: NDArray[np.float64], range_m: NDArray[np.float64], count: int) -> NDArray[np.float64]:

@@ -69,8 +69,12 @@ def is_encoded(data: bytes) -> bool:
 
 
 def checked(line: bytes) -> bytes | None:
-    """The line without its sum; None when the sum is wrong."""
-    return line[:-1] if line and sum_scip(line[:-1]) == line[-1] else None
+    """The line without its sum; None when the sum is wrong. Of `KEY:value;` lines makers sum with or without the `;`."""
+    if not line:
+        return None
+    body, sum_ = line[:-1], line[-1]
+    is_right = sum_scip(body) == sum_ or (body[-1:] == b";" and sum_scip(body[:-1]) == sum_)
+    return body if is_right else None
 
 
 class ScipParser:

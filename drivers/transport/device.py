@@ -19,7 +19,7 @@ from hal.registry import Context
 
 T = TypeVar("T")
 SLICE_S = 0.02  # a stream reader looks up this often, so that close() is quick
-CONNECT_S = 2.0
+CONNECT_S = 3.0  # a set-up whose first answers are lost needs several attempts
 REFUSED_S = 1.0  # a port that cannot be opened for so long is not there
 
 

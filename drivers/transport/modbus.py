@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 from drivers.transport.checks import crc_modbus
-from drivers.transport.link import Link, NoAnswer, Refused, drain, now_s
+from drivers.transport.link import Link, NoAnswer, Refused, drain, drain_until_quiet, now_s
 
 READ_COILS, READ_INPUTS, READ_HOLDING, READ_INPUT_REGISTERS = 1, 2, 3, 4
 WRITE_COILS, WRITE_REGISTERS = 15, 16
@@ -181,7 +181,30 @@ class ModbusRtu(ModbusMaster):
             if (unit, other) not in self._unanswered:
                 self._probe(unit, other, until_s)
                 return
-        self._unanswered.clear()  # everything has been asked in vain: the device is off
+        self._await_life(unit, until_s)
+
+    def _await_life(self, unit: int, until_s: float) -> None:
+        """Every function has been asked in vain. The device is off, or so slow that any of those answers may yet come:
+        ask once more, take what comes as a sign of life alone, and let it finish.
+
+        Raises:
+            NoAnswer: no sign of life.
+        """
+        frame = bytes([unit]) + struct.pack(">BHH", READ_HOLDING, 0, 1)
+        frame += struct.pack("<H", crc_modbus(frame))
+        self._asked_s = now_s()
+        self._link.write(frame, until_s)
+        heard, answer_until_s = b"", self._answer_until(until_s)
+        while not heard.removeprefix(frame) and (chunk := self._link.read(answer_until_s)):
+            heard += chunk
+        heard = heard.removeprefix(frame)
+        self.late_bytes += len(heard)
+        if not heard:
+            raise self._silence(b"", unit)
+        self.late_bytes += drain_until_quiet(self._link, quiet_s=self._timeout_s, until_s=until_s)
+        if now_s() >= until_s:
+            raise NoAnswer(f"{self._link.name}, unit {unit}: answers that are too late still come")
+        self._unanswered = {lost for lost in self._unanswered if lost[0] != unit}
 
     def _probe(self, unit: int, function: int, until_s: float) -> None:
         size = 2 if function >= READ_HOLDING else 1

@@ -54,10 +54,19 @@ def test_gaps_are_counted_and_late_and_repeated_records_dropped() -> None:
 
 def test_a_sensor_that_starts_anew_is_followed() -> None:
     device = lonely()
-    for sequence in (900, 1, 2):
-        device.receive(record(sequence, 0), 0.0)
-    assert device.mailbox.published == 3
+    for sequence in (900, 1, 2, 3):
+        device.receive(record(sequence, sequence * 1_000_000), 0.0)
+    samples, _ = device.mailbox.since(0)
+    assert [sample.value.force_n[0] for sample in samples] == [900.0, 2.0, 3.0]
     assert device.health().errors == 0
+
+
+def test_a_first_record_that_comes_late_or_twice_starts_nothing() -> None:
+    device = lonely()
+    for sequence in (1, 1, 2, 3, 1, 4):
+        device.receive(record(sequence, sequence * 1_000_000), 0.0)
+    samples, _ = device.mailbox.since(0)
+    assert [sample.value.force_n[0] for sample in samples] == [1.0, 2.0, 3.0, 4.0]
 
 
 def test_a_status_makes_the_sample_invalid_and_other_lengths_are_ignored() -> None:

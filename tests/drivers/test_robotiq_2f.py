@@ -10,6 +10,7 @@ from drivers.emulators.scripted import ScriptedGripper
 from drivers.robotiq_2f import decode_status, encode_command
 from hal.conformance import GripperContract, Rig
 from hal.errors import CellError, DeviceFault, InvalidRequest
+from hal.readings import Quality
 from hal.registry import Context, connect
 from tests.drivers.rigs import soon, until, wired, wired_rig
 
@@ -70,6 +71,17 @@ def test_the_grippers_faults_are_named(code: int, text: str) -> None:
         assert caught.value.details["code"] == code
         far_side.table.fault = 0
         assert device.newest(soon(), not_before_s=soon(0.0).at_s)
+
+
+@pytest.mark.parametrize("code", [7, 9])
+def test_a_gripper_that_complains_of_no_activation_or_no_host_is_connected_and_its_readings_are_not_valid(
+    code: int,
+) -> None:
+    far_side = emulator.start(ScriptedGripper(), {"fault_code": code})
+    with wired(far_side, DRIVER) as device:
+        assert device.read_state(deadline=soon()).quality is Quality.INVALID
+        far_side.table.fault = 0
+        assert device.newest(soon(), not_before_s=soon(0.0).at_s + 0.05).quality is Quality.VALID
 
 
 def test_a_lost_activation_is_said_and_nothing_moves_by_itself() -> None:

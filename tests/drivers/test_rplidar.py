@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from drivers.emulators import rplidar as emulator
 from drivers.emulators.beams import line_m
 from drivers.emulators.scripted import ScriptedScanner, scripted_scan
-from drivers.rplidar import NodeParser, decode, descriptor, sectors
+from drivers.rplidar import NodeParser, decode, descriptor, sectors, turns_back
 from hal.conformance import RangeScannerContract, Rig
 from hal.devices import RangeImage
 from hal.errors import DeviceUnavailable
@@ -95,3 +95,12 @@ def test_an_incurable_scanner_is_told() -> None:
             connect(Context(name="scanner"), DRIVER, far_side.address)
     finally:
         far_side.close()
+
+
+def test_a_turn_with_a_stray_angle_in_it_turns_back_and_one_with_lost_measurements_does_not() -> None:
+    angle_rad = np.radians(np.arange(0.0, 360.0, 1.0))
+    assert not turns_back(angle_rad)
+    assert not turns_back(np.delete(angle_rad, slice(40, 60)))
+    assert not turns_back((angle_rad + 3.0) % (2 * np.pi))
+    for stray_deg in (200.0, 350.0, 90.0):
+        assert turns_back(np.insert(angle_rad, 100, np.radians(stray_deg)))

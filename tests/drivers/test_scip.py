@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from drivers.emulators import scip as emulator
 from drivers.emulators.beams import line_m
 from drivers.emulators.scripted import ScriptedScanner, scripted_scan
-from drivers.scip import ScipParser, decode_number, decode_ranges_mm
+from drivers.scip import ScipParser, checked, decode_number, decode_ranges_mm
+from drivers.transport.checks import sum_scip
 from hal.conformance import RangeScannerContract, Rig
 from hal.devices import RangeImage, RangeScannerCapabilities
 from hal.errors import DeviceFault
@@ -145,3 +146,9 @@ def test_a_pinhole_scanner_gives_its_middle_row() -> None:
     got = line_m(wall, c, angles)
     np.testing.assert_allclose(got[:3], 2.0 / np.cos(angles[:3]))
     assert np.isnan(got[3:]).all()
+
+
+@pytest.mark.parametrize("summed", [b"DMIN:20;", b"DMIN:20"])
+def test_parameter_lines_are_summed_with_or_without_their_semicolon(summed: bytes) -> None:
+    assert checked(b"DMIN:20;" + bytes([sum_scip(summed)])) == b"DMIN:20;"
+    assert checked(b"DMIN:21;" + bytes([sum_scip(summed)])) is None

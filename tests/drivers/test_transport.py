@@ -203,6 +203,18 @@ def test_a_waiting_reader_wakes_with_the_sample() -> None:
     assert got[0] is not None and got[0].value == 7
 
 
+def test_a_device_that_was_slow_to_every_question_is_not_believed_until_it_has_finished() -> None:
+    stale, fresh = rtu("09 04 02 00 01"), rtu("09 04 02 00 02")
+    link = ScriptLink()
+    master = ModbusRtu(link, timeout_s=0.01, gap_s=0.0, quarantine_s=0.01)
+    while {written[1] for written in link.written} != {1, 2, 3, 4}:
+        with pytest.raises(NoAnswer):
+            master.read_registers(unit=9, address=0, count=1, until_s=later(0.05), function=4)
+    link.answers = [stale, fresh]
+    assert master.read_registers(unit=9, address=0, count=1, until_s=later(), function=4) == (2,)
+    assert master.late_bytes >= len(stale)
+
+
 class Tenant:
     """Counts its calls; serves until told to lose the link."""
 

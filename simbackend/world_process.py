@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 import os
 import signal
@@ -83,7 +84,8 @@ def main() -> None:
     """Entry of the process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which closes the pipe
     pipe_fd, image_fd = int(sys.argv[1]), int(sys.argv[2])
-    with mmap.mmap(image_fd, IMAGE_BYTES) as images, Connection(pipe_fd) as pipe:
+    gone = contextlib.suppress(BrokenPipeError, ConnectionResetError)  # who asked has died: nobody waits for the answer
+    with mmap.mmap(image_fd, IMAGE_BYTES) as images, Connection(pipe_fd) as pipe, gone:
         serve(pipe, images)
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import signal
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +14,7 @@ import pytest
 from hal.devices import Fault, FaultInjection
 from hal.errors import ConfigError, DeviceTimeout, DeviceUnavailable
 from hal.readings import Quality, Stamped
+from simbackend.wire import REQUEST, Op
 from tests.simbackend.rig import SimCell
 
 READS: dict[str, Callable[[Any, Any], Stamped[Any]]] = {
@@ -151,3 +154,21 @@ def test_a_dead_world_is_an_unavailable_device() -> None:
             cell.clock.sleep(0.1)
         assert "world" in str(caught.value)
         assert arm.health() is not None
+
+
+def test_a_world_whose_cell_dies_while_it_works_ends_without_a_word(capfd: pytest.CaptureFixture[str]) -> None:
+    from tests.simbackend.rig import sim_cell
+
+    with sim_cell() as cell:
+        cell.connect("arm")
+        world = cell.shared.peek("world")
+        assert world is not None
+        process = world._link.process
+        process.send_signal(signal.SIGSTOP)  # it will find the request and the closed pipe at once
+        request = np.zeros(REQUEST)
+        request[:2] = Op.STEP, 1
+        os.write(world._link._stream, request.tobytes())
+        world._link._pipe.close()
+        process.send_signal(signal.SIGCONT)
+        assert process.wait(60.0) == 0
+        assert "Traceback" not in capfd.readouterr().err

@@ -1,0 +1,46 @@
+"""`python -m benchmarks.drivers [--seconds S] [--only PART,...]`; each line: what, pass line, measured, PASS or FAIL."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable
+
+from benchmarks.drivers.faults import part_faults
+from benchmarks.drivers.fuzz import part_fuzz
+from benchmarks.drivers.life import part_isolation, part_reconnect
+from benchmarks.drivers.motion import part_csp, part_kill, part_ur
+from benchmarks.drivers.stamps import part_stamps
+from benchmarks.drivers.wire import part_decode, part_latency, part_rtu
+
+PARTS: dict[str, Callable[[float], None]] = {
+    "latency": part_latency,
+    "rtu": part_rtu,
+    "decode": part_decode,
+    "stamps": part_stamps,
+    "reconnect": part_reconnect,
+    "isolation": part_isolation,
+    "ur": part_ur,
+    "csp": part_csp,
+    "kill": part_kill,
+    "fuzz": part_fuzz,
+    "faults": part_faults,
+}
+
+
+def main() -> None:
+    """Run the parts that were asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=20.0, help="for each cell and figure")
+    parser.add_argument("--only", default=",".join(PARTS), help="comma list of parts")
+    arguments = parser.parse_args()
+    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; {arguments.seconds:.0f} s a figure")
+    for name in arguments.only.split(","):
+        if name not in PARTS:
+            sys.exit(f"unknown part {name!r}; there are: {', '.join(PARTS)}")
+        PARTS[name](arguments.seconds)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,272 @@
+"""Every driver with a far side: how it is started, and whether a value is one of the last true ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drivers.emulators import (
+    bota,
+    cia402,
+    dynamixel,
+    ft300,
+    lms200,
+    modbus_io,
+    netft,
+    robotiq_2f,
+    rplidar,
+    scip,
+    scripted,
+    tfmini,
+    ur,
+)
+from drivers.emulators.base import WireEmulator
+from drivers.emulators.beams import line_m
+from drivers.emulators.faults import WireFault
+from hal.devices import RangeImage
+from hal.registry import Context, connect
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bench:
+    """One device to try: far side, driver, options, and whether a value is one of the last true ones."""
+
+    name: str
+    start: Callable[[Any, dict[str, Any]], WireEmulator]
+    backing: Callable[[], Any]
+    driver: str
+    is_true: Callable[[Any, Any], bool]
+    options: dict[str, Any]
+    far_options: dict[str, Any]
+    faults: tuple[WireFault, ...] = tuple(WireFault)
+
+
+def true_wrench(value: Any, backing: Any) -> bool:
+    """All six components of one of the last 100 readings."""
+    index = round(value.force_n[0] / 0.01)
+    true = scripted.scripted_wrench(index)
+    got, want = [*value.force_n, *value.torque_nm], [*true.force_n, *true.torque_nm]
+    return backing.reads - 100 <= index <= backing.reads and bool(np.allclose(got, want, atol=0.0052))
+
+
+def true_distance(value: float, backing: Any) -> bool:
+    """A whole millimetre step of one of the last 100 readings."""
+    steps = (value - backing.first_m) / 0.001
+    index = backing.reads % 1000
+    return bool(abs(steps - round(steps)) < 1e-6 and (index - round(steps)) % 1000 <= 100)
+
+
+def true_scan(angles: Callable[[int], Any]) -> Callable[[RangeImage, Any], bool]:
+    """Beam for beam one of the last 60 scans."""
+
+    def is_true(value: RangeImage, backing: Any) -> bool:
+        angle_rad = angles(value.depth_m.shape[1])
+        c = backing.capabilities()
+        for index in range(max(1, backing.reads - 60), backing.reads + 1):
+            true = line_m(RangeImage(depth_m=scripted.scripted_scan(index)), c, angle_rad)
+            if np.allclose(value.depth_m[0], true, atol=6e-4):
+                return True
+        return False
+
+    return is_true
+
+
+def scip_angles(count: int) -> Any:
+    """URG-04LX."""
+    return (np.arange(count) + 44.0 - 384.0) * (2 * np.pi / 1024)
+
+
+def sick_angles(count: int) -> Any:
+    """180 degrees."""
+    return np.radians(np.linspace(-90.0, 90.0, count))
+
+
+def turn_angles(count: int) -> Any:
+    """A turn, signed."""
+    return (np.arange(count) * (2 * np.pi / count) + np.pi) % (2 * np.pi) - np.pi
+
+
+def true_joints(value: Any, backing: Any) -> bool:
+    """Where the arm stands."""
+    return bool(np.array_equal(value.position_rad, backing.position_rad))
+
+
+def near_joints(value: Any, backing: Any) -> bool:
+    """Where the arm stands, to the last count of the servos."""
+    return bool(np.allclose(value.position_rad, backing.position_rad, atol=0.0008))
+
+
+def true_width(value: Any, backing: Any) -> bool:
+    """The jaws rest on a thing of 40 mm."""
+    return bool(abs(value.width_m - 0.04) < 4e-4 and backing.reads > 0)
+
+
+def true_lights(value: Any, backing: Any) -> bool:
+    """What is lit."""
+    return bool(value == backing.on)
+
+
+WITHOUT_CRC = tuple(f for f in WireFault if f is not WireFault.CRC)
+FAST_SCAN = {"scans_per_minute": 2400}
+BENCHES = (
+    Bench(
+        name="tfmini",
+        start=tfmini.start,
+        backing=scripted.ScriptedProximity,
+        driver="serial:tfmini",
+        is_true=true_distance,
+        options={},
+        far_options={},
+    ),
+    Bench(
+        name="ft300 stream",
+        start=ft300.start,
+        backing=scripted.ScriptedForceTorque,
+        driver="serial:ft300",
+        is_true=true_wrench,
+        options={},
+        far_options={},
+    ),
+    Bench(
+        name="ft300 modbus",
+        start=ft300.start,
+        backing=scripted.ScriptedForceTorque,
+        driver="modbus:ft300",
+        is_true=true_wrench,
+        options={},
+        far_options={},
+    ),
+    Bench(
+        name="robotiq_2f",
+        start=robotiq_2f.start,
+        backing=lambda: scripted.ScriptedGripper(object_m=0.04),
+        driver="modbus:robotiq_2f",
+        is_true=true_width,
+        options={},
+        far_options={},
+    ),
+    Bench(
+        name="modbus_io tcp",
+        start=modbus_io.start,
+        backing=scripted.ScriptedLights,
+        driver="modbus:lights",
+        is_true=true_lights,
+        options={},
+        far_options={"transport": "tcp"},
+    ),
+    Bench(
+        name="modbus_io rtu",
+        start=modbus_io.start,
+        backing=scripted.ScriptedLights,
+        driver="modbus:lights",
+        is_true=true_lights,
+        options={},
+        far_options={"transport": "rtu"},
+    ),
+    Bench(
+        name="netft",
+        start=netft.start,
+        backing=scripted.ScriptedForceTorque,
+        driver="udp:netft",
+        is_true=true_wrench,
+        options={},
+        far_options={},
+    ),
+    Bench(
+        name="bota",
+        start=bota.start,
+        backing=scripted.ScriptedForceTorque,
+        driver="serial:bota",
+        is_true=true_wrench,
+        options={},
+        far_options={},
+    ),
+    Bench(
+        name="scip serial",
+        start=scip.start,
+        backing=scripted.ScriptedScanner,
+        driver="scip:scanner",
+        is_true=true_scan(scip_angles),
+        options={},
+        far_options={**FAST_SCAN, "transport": "serial"},
+    ),
+    Bench(
+        name="scip tcp",
+        start=scip.start,
+        backing=scripted.ScriptedScanner,
+        driver="scip:scanner",
+        is_true=true_scan(scip_angles),
+        options={},
+        far_options=FAST_SCAN,
+    ),
+    Bench(
+        name="lms200",
+        start=lms200.start,
+        backing=scripted.ScriptedScanner,
+        driver="serial:lms200",
+        is_true=true_scan(sick_angles),
+        options={},
+        far_options={},
+    ),
+    Bench(
+        name="rplidar",
+        start=rplidar.start,
+        backing=scripted.ScriptedScanner,
+        driver="serial:rplidar",
+        is_true=true_scan(turn_angles),
+        options={"scan_rate_hz": 20.0},
+        far_options={"scan_rate_hz": 40.0},
+        faults=WITHOUT_CRC,
+    ),
+    Bench(
+        name="ur",
+        start=ur.start,
+        backing=scripted.ScriptedArm,
+        driver="ur:rtde",
+        is_true=true_joints,
+        options={"rate_hz": 125.0},
+        far_options={},
+    ),
+    Bench(
+        name="cia402",
+        start=cia402.start,
+        backing=scripted.ScriptedArm,
+        driver="can:cia402",
+        is_true=near_joints,
+        options={},
+        far_options={},
+    ),
+    Bench(
+        name="dynamixel",
+        start=dynamixel.start,
+        backing=scripted.ScriptedArm,
+        driver="serial:dynamixel",
+        is_true=near_joints,
+        options={},
+        far_options={},
+    ),
+)
+
+
+@contextmanager
+def running(bench: Bench, far_options: dict[str, Any]) -> Iterator[tuple[Any, Any, Any]]:
+    """Driver, far side and the device behind it."""
+    backing = bench.backing()
+    far_side = bench.start(backing, {**bench.far_options, **far_options})
+    device = None
+    try:
+        device = connect(Context(name="dut"), bench.driver, {**far_side.address, **bench.options})
+        yield device, far_side, backing
+    finally:
+        if device is not None:
+            device.close()
+        far_side.close()
+
+
+def bench(name: str) -> Bench:
+    """The bench of that name."""
+    return next(item for item in BENCHES if item.name == name)

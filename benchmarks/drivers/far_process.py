@@ -1,0 +1,76 @@
+"""Far sides in a process of their own, so that their work does not count as the drivers'.
+
+`python -m benchmarks.drivers.far_process NAME..` prints a line of addresses; then each line on its input is an order:
+`inject silent|disconnected|none`, `log NAME` (prints when its frames left), `end`.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from benchmarks.drivers.benches import bench
+from hal.devices import Fault
+
+
+class FarProcess:
+    """The orders to the process, from here."""
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        command = [sys.executable, "-m", "benchmarks.drivers.far_process", *names]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.addresses: dict[str, dict[str, Any]] = self._answer()
+
+    def _answer(self) -> Any:
+        assert self._process.stdout is not None
+        return json.loads(self._process.stdout.readline())
+
+    def order(self, text: str) -> Any:
+        """Give one order and wait for its answer."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(text + "\n")
+        self._process.stdin.flush()
+        return self._answer()
+
+    def close(self) -> None:
+        """End it."""
+        self.order("end")
+        self._process.wait(10.0)
+
+
+@contextmanager
+def far_process(*names: str) -> Iterator[FarProcess]:
+    """The far sides of these benches, running elsewhere."""
+    far = FarProcess(names)
+    try:
+        yield far
+    finally:
+        far.close()
+
+
+def main() -> None:
+    """Run the far sides named on the command line."""
+    items = [bench(name) for name in sys.argv[1:]]
+    sides = {item.name: item.start(item.backing(), item.far_options) for item in items}
+    print(json.dumps({name: side.address for name, side in sides.items()}), flush=True)
+    for text in sys.stdin:
+        what, _, rest = text.strip().partition(" ")
+        answer: Any = None
+        if what == "inject":
+            for side in sides.values():
+                side.inject(None if rest == "none" else Fault(rest))
+        elif what == "log":
+            answer = [sent_s for sent_s, _ in list(sides[rest].sent)]
+        print(json.dumps(answer), flush=True)
+        if what == "end":
+            break
+    for side in sides.values():
+        side.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,147 @@
+"""The fault matrix: device x fault x every 3rd and 20th frame, many cells at the same time, since most only wait."""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+import threading
+import time
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from typing import Any
+
+from benchmarks.drivers.benches import BENCHES, Bench, bench, running
+from benchmarks.drivers.report import CLOCK, READ_S, deadline, line
+from drivers.emulators.faults import WireFault
+from hal.errors import CellError
+from hal.readings import Quality, Stamped
+
+SLACK_S = 0.05
+STALL_S = 0.03  # this process was not run for so long: no driver can answer in time then
+REST_S = 0.005
+PROCESSES = 2
+AT_ONCE = 7  # cells a process
+
+
+@dataclass(slots=True)
+class Cell:
+    """Counts of one cell of the matrix; `stalled` are late calls during which the machine did not run this process."""
+
+    good: int = 0
+    errors: int = 0
+    wrong: int = 0
+    stale: int = 0
+    late_calls: int = 0
+    stalled: int = 0
+    untyped: int = 0
+
+    def add(self, other: Cell) -> None:
+        """Sum up."""
+        for field in fields(Cell):
+            setattr(self, field.name, getattr(self, field.name) + getattr(other, field.name))
+
+
+class StallProbe:
+    """A thread that does nothing but wake: where it is late, so is everybody."""
+
+    def __init__(self) -> None:
+        self._stalls: list[tuple[float, float]] = []
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        before_s = time.monotonic()
+        while not self._ending.wait(0.005):
+            now_s = time.monotonic()
+            if now_s - before_s > STALL_S:
+                self._stalls.append((before_s, now_s))
+            before_s = now_s
+
+    def stalled_s(self, start_s: float, end_s: float) -> float:
+        """How much of that time this process stood still."""
+        return sum(max(0.0, min(end_s, b) - max(start_s, a)) for a, b in list(self._stalls))
+
+    def close(self) -> None:
+        """End the thread."""
+        self._ending.set()
+        self._thread.join()
+
+
+def part_faults(seconds: float) -> None:
+    """Every cell, then one line a device and frequency, and the cells without any good sample by name."""
+    keys = [(item.name, fault, every) for item in BENCHES for every in (3, 20) for fault in item.faults]
+    order = sorted(keys, key=lambda key: (key[1], key[2], key[0]))  # a batch mixes light and heavy devices
+    batches = [order[i : i + AT_ONCE] for i in range(0, len(order), AT_ONCE)]
+    cells: dict[tuple[str, WireFault, int], Cell] = {}
+    started_s = time.monotonic()
+    with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("spawn")) as pool:
+        for batch, found in zip(batches, pool.map(run_batch, batches, [seconds] * len(batches)), strict=True):
+            cells.update(zip(batch, found, strict=True))
+    for item in BENCHES:
+        for every in (3, 20):
+            _row(item, every, {fault: cells[item.name, fault, every] for fault in item.faults})
+    print(f"    {len(cells)} cells of {seconds:.0f} s in {time.monotonic() - started_s:.0f} s of wall time")
+
+
+def _row(item: Bench, every: int, cells: dict[WireFault, Cell]) -> None:
+    total = Cell()
+    for cell in cells.values():
+        total.add(cell)
+    is_good = total.wrong == total.stale == total.late_calls == total.untyped == 0
+    measured = f"{total.wrong} / {total.stale} / {total.late_calls} of {total.good} + {total.errors} err"
+    line(f"{item.name}, every {every}: wrong / stale / late", "0 / 0 / 0", measured, is_good)
+    for fault, cell in cells.items():
+        if cell.wrong or cell.stale or cell.late_calls or cell.untyped or not cell.good:
+            print(f"    {fault}: {cell}")
+    if total.stalled:
+        print(f"    {total.stalled} more calls were late while the machine did not run this process")
+
+
+def run_batch(batch: list[tuple[str, WireFault, int]], seconds: float) -> list[Cell]:
+    """Some cells at the same time (in a worker process)."""
+    sys.setswitchinterval(0.001)
+    probe = StallProbe()
+    with ThreadPoolExecutor(len(batch)) as pool:
+        found = list(pool.map(lambda key: fault_cell(bench(key[0]), key[1], key[2], seconds, probe), batch))
+    probe.close()
+    return found
+
+
+def fault_cell(item: Bench, fault: WireFault, every: int, seconds: float, probe: StallProbe) -> Cell:
+    """Read over a bad wire for some time; a device that could not be connected is tried again."""
+    cell = Cell()
+    options = {"fault": str(fault), "every": every, "seed": every, "delay_s": 0.15, "silent_s": 0.15, "away_s": 0.05}
+    rest, end_s = threading.Event(), time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        try:
+            with running(item, options) as (device, _, backing):
+                while time.monotonic() < end_s:
+                    _one_read(item, device, backing, cell, probe)
+                    rest.wait(REST_S)
+        except CellError:
+            cell.errors += 1  # it could not be connected, and said so
+    return cell
+
+
+def _one_read(item: Bench, device: Any, backing: Any, cell: Cell, probe: StallProbe) -> None:
+    started_s = time.monotonic()
+    sample: Stamped[Any] | None = None
+    try:
+        sample = device.newest(deadline())
+    except CellError:
+        cell.errors += 1
+    except Exception as error:
+        cell.untyped += 1
+        print(f"    untyped: {error!r}")
+    ended_s = time.monotonic()
+    over_s = ended_s - started_s - READ_S - SLACK_S
+    if over_s > 0.0:
+        is_stall = probe.stalled_s(started_s, ended_s) >= over_s
+        cell.stalled += is_stall
+        cell.late_calls += not is_stall
+    if sample is None or sample.quality is Quality.INVALID:
+        return
+    cell.good += 1
+    cell.stale += sample.age_s(CLOCK.now_s()) > device.max_age_s + SLACK_S + (ended_s - started_s)
+    cell.wrong += not item.is_true(sample.value, backing)

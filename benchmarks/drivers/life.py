@@ -1,0 +1,94 @@
+"""Unplugging again and again, and what all devices together do to loops that share their process."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from contextlib import ExitStack, closing, suppress
+
+import numpy as np
+import psutil
+
+from benchmarks.drivers.benches import BENCHES, bench, running
+from benchmarks.drivers.far_process import far_process
+from benchmarks.drivers.report import deadline, line
+from hal.errors import CellError
+from hal.registry import Context, connect
+
+UNPLUGS = 100
+CONTROL_S, EVENT_S = 0.002, 0.005
+
+
+def part_reconnect(seconds: float) -> None:  # noqa: ARG001  # a number of unplugs, however long they take
+    """Time to the first valid sample after the port has returned; descriptors and threads before and after."""
+    process = psutil.Process()
+    for name in ("tfmini", "modbus_io rtu", "scip tcp", "bota"):
+        back_s: list[float] = []
+        with running(bench(name), {}) as (device, far_side, _):
+            device.newest(deadline(2.0))
+            before = (process.num_fds(), threading.active_count())
+            for _ in range(UNPLUGS):
+                far_side.unplug(away_s=0.02)
+                back_s.append(_back_after(device, time.monotonic()))
+            after = (process.num_fds(), threading.active_count())
+        leaked = (after[0] - before[0], after[1] - before[1])
+        measured = f"{max(back_s):.2f} s of {UNPLUGS}; leak {leaked}"
+        is_good = max(back_s) <= 1 and leaked == (0, 0)
+        line(f"{name}: back after unplugging, worst; leaks", "1 s; (0, 0)", measured, is_good)
+
+
+def _back_after(device: object, returned_s: float) -> float:
+    rest = threading.Event()
+    while True:
+        with suppress(CellError):
+            device.newest(deadline(0.2), not_before_s=returned_s)  # type: ignore[attr-defined]
+            return time.monotonic() - returned_s
+        rest.wait(0.001)
+
+
+def part_isolation(seconds: float) -> None:
+    """A control loop of 500 Hz and an event loop beside all drivers: idle, all silent, all hung up."""
+    names = tuple(item.name for item in BENCHES)
+    floor = _lateness(seconds / 2)
+    with far_process(*names) as far, ExitStack() as stack:
+        for name in names:
+            item = bench(name)
+            options = {**far.addresses[name], **item.options}
+            stack.enter_context(closing(connect(Context(name=name.replace(" ", "_")), item.driver, options)))
+        for fault in ("none", "silent", "disconnected"):
+            far.order(f"inject {fault}")
+            control_ms, event_ms = _lateness(seconds / 2)
+            what = "running" if fault == "none" else fault
+            measured = f"{control_ms:.1f} / {event_ms:.1f} ms (floor {floor[0]:.1f} / {floor[1]:.1f})"
+            is_good = max(control_ms, event_ms) <= 5.0
+            line(f"{len(names)} devices {what}: control / event loop p99.9", "5 ms", measured, is_good)
+        far.order("inject none")
+
+
+def _lateness(seconds: float) -> tuple[float, float]:
+    """p99.9 in ms of how late a control loop and an event loop wake."""
+    control_s: list[float] = []
+    thread = threading.Thread(target=lambda: _control(seconds, control_s))
+    thread.start()
+    event_s = asyncio.run(_event(seconds))
+    thread.join()
+    return 1e3 * float(np.quantile(control_s, 0.999)), 1e3 * float(np.quantile(event_s, 0.999))
+
+
+def _control(seconds: float, late_s: list[float]) -> None:
+    due_s = time.monotonic()
+    end_s = due_s + seconds
+    while due_s < end_s:
+        due_s += CONTROL_S
+        time.sleep(max(0.0, due_s - time.monotonic()))
+        late_s.append(max(0.0, time.monotonic() - due_s))
+        due_s = max(due_s, time.monotonic() - CONTROL_S)
+
+
+async def _event(seconds: float) -> list[float]:
+    late_s, end_s = [], time.monotonic() + seconds
+    while (started_s := time.monotonic()) < end_s:
+        await asyncio.sleep(EVENT_S)
+        late_s.append(max(0.0, time.monotonic() - started_s - EVENT_S))
+    return late_s

@@ -1,0 +1,48 @@
+"""What the parts share: the table's rows, deadlines, percentiles, rates."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+from hal.clock import Deadline, WallClock
+
+CLOCK = WallClock()
+READ_S = 0.3
+
+
+def deadline(duration_s: float = READ_S) -> Deadline:
+    """From now."""
+    return Deadline.after(CLOCK, duration_s)
+
+
+def line(what: str, limit: str, measured: str, is_good: bool) -> None:
+    """One row of the table."""
+    print(f"{what:<52} {limit:>22} {measured:>34}  {'PASS' if is_good else 'FAIL'}", flush=True)
+
+
+def percentiles(samples_s: list[float]) -> tuple[float, float]:
+    """p50 and p99 in microseconds."""
+    ordered = sorted(samples_s)
+    return 1e6 * statistics.median(ordered), 1e6 * ordered[int(0.99 * len(ordered))]
+
+
+def rate(work: Callable[[], Any], seconds: float) -> float:
+    """Calls a second."""
+    count, end_s = 0, time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        work()
+        count += 1
+    return count / seconds
+
+
+def cpu_rate(work: Callable[[], Any], seconds: float) -> float:
+    """Calls a second of this process's own time: what an idle machine would give."""
+    count, start_s = 0, time.process_time()
+    while time.process_time() - start_s < seconds:
+        for _ in range(10):
+            work()
+        count += 10
+    return count / (time.process_time() - start_s)

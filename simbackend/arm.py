@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from hal.clock import Deadline
 from hal.devices import ArmCapabilities, DeviceKind, JointState, Truth
@@ -24,9 +25,10 @@ MOVING_RAD_PER_S = 0.002
 
 
 class ArmOptions(SimOptions):
-    """`model`: which arm."""
+    """`model`: which arm. `lookahead_s`: of its drives, for an arm behind a wire (see `ArmDrive`)."""
 
     model: Literal["t3", "ur10e"] = "t3"
+    lookahead_s: Annotated[float, Field(ge=0, le=0.2)] = 0.0
 
 
 class SimArm(SimDevice[JointState]):
@@ -38,7 +40,9 @@ class SimArm(SimDevice[JointState]):
         self._lower = np.asarray(self._capabilities.lower_rad)
         self._upper = np.asarray(self._capabilities.upper_rad)
         # One tick late is two ticks of way, so a single missed tick is no clipped set-point.
-        self._stride = 2.0 * np.asarray(self._capabilities.velocity_rad_per_s) / self._world.rate_hz
+        # Behind a wire the drives trail the set-points by their lookahead, and those come in bunches.
+        ticks_s = 2.0 / self._world.rate_hz + 2.0 * options.lookahead_s
+        self._stride = ticks_s * np.asarray(self._capabilities.velocity_rad_per_s)
 
     def capabilities(self) -> ArmCapabilities:
         """Kinematics and limits."""

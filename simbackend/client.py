@@ -112,6 +112,7 @@ class WorldClient:
             model=_arm_model(cell),
             proximity=tuple(true_mount(cell, draws, name) for name in names),
             proximity_range_m=PROXIMITY_RANGE_M,
+            lookahead_s=_lookahead_s(cell),
         )
         client = cls(config, context.clock)
         client.proximity = tuple(names)
@@ -273,6 +274,13 @@ def _check_park(cell: Cell) -> None:
         hint=f"give {DOF} joint angles within {list(limits.lower_rad)} and {list(limits.upper_rad)} rad",
         key="workspace.park_rad",
     )
+
+
+def _lookahead_s(cell: Cell) -> float:
+    for _, driver, options in _sim_devices(cell):
+        if driver == "sim:arm":
+            return float(str(options.get("lookahead_s", 0.0)))
+    return 0.0
 
 
 def _arm_model(cell: Cell) -> str:

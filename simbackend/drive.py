@@ -17,16 +17,26 @@ START_WIDTH_M = 0.040
 
 
 class ArmDrive:
-    """Follows set-points, brakes at the acceleration limit on `stop`, and gives up when a moving stream breaks off."""
+    """Follows set-points, brakes at the acceleration limit on `stop`, and gives up when a moving stream breaks off.
 
-    def __init__(self, capabilities: ArmCapabilities, position_rad: Array, dt_s: float) -> None:
+    Args:
+        lookahead_s: what comes over a wire comes in bunches and gaps; the drives then smooth the set-points as a
+            critically damped follower, x'' = w^2 (goal - x) - 2 w x' with w = 2 / lookahead, which trails a steady
+            stream by `lookahead_s`. With 0 each set-point is for the next tick.
+    """
+
+    def __init__(
+        self, capabilities: ArmCapabilities, position_rad: Array, dt_s: float, *, lookahead_s: float = 0.0
+    ) -> None:
         self._limit = np.asarray(capabilities.acceleration_rad_per_s2)
         self._watchdog_s = capabilities.watchdog_s or np.inf
         self._dt_s = dt_s
+        self._omega = 2.0 / lookahead_s if lookahead_s > 0.0 else 0.0
         self._age_s = 0.0
         self._fresh = False
         self._is_braking = False
         self.setpoint = np.asarray(position_rad, float).copy()
+        self._goal = self.setpoint
         self.speed = np.zeros_like(self.setpoint)
         self._last_speed = self.speed
         self.is_enabled = False
@@ -35,14 +45,18 @@ class ArmDrive:
         """A new set-point for the next tick; ignored while disabled."""
         if not self.is_enabled:
             return
-        self._last_speed = (position_rad - self.setpoint) / self._dt_s
-        self.setpoint = position_rad.copy()
-        self.speed = self._last_speed
         self._fresh = True
+        self._goal = position_rad.copy()
+        if self._omega:
+            return
+        self._last_speed = (position_rad - self.setpoint) / self._dt_s
+        self.setpoint = self._goal
+        self.speed = self._last_speed
 
     def enable(self, measured_rad: list[float]) -> None:
         """Begin to follow; the set-point is where the arm is."""
         self.setpoint = np.asarray(measured_rad, float).copy()
+        self._goal = self.setpoint
         self.speed = np.zeros_like(self.setpoint)
         self.is_enabled, self._is_braking, self._age_s = True, False, 0.0
         self._last_speed = self.speed
@@ -56,14 +70,24 @@ class ArmDrive:
         if self._is_braking:
             self._brake()
             return
+        if self._omega:
+            self._follow()
         if self._fresh:
             self._fresh, self._age_s = False, 0.0
             return
-        if self._age_s == 0.0:
+        if self._age_s == 0.0 and not self._omega:
             self.speed = np.zeros_like(self.setpoint)
         self._age_s += self._dt_s
         if self.is_enabled and self._age_s > self._watchdog_s and np.abs(self._last_speed).max() > MOVING_RAD_PER_S:
             self.is_enabled = False
+
+    def _follow(self) -> None:
+        """One tick of the follower; implicit in its damping, so stable for any lookahead."""
+        w, dt_s = self._omega, self._dt_s
+        pull = self.speed + w * w * dt_s * (self._goal - self.setpoint)
+        self.speed = pull / (1.0 + 2.0 * w * dt_s + w * w * dt_s * dt_s)
+        self.setpoint = self.setpoint + self.speed * dt_s
+        self._last_speed = self.speed
 
     def _brake(self) -> None:
         step = self._limit * self._dt_s

@@ -143,6 +143,7 @@ class WorldConfig:
     model: str
     proximity: tuple[RigidTransform, ...]  # flange_from_sensor, true
     proximity_range_m: float
+    lookahead_s: float = 0.0  # of the arm's drives
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

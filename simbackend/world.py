@@ -106,7 +106,7 @@ class World:
             )
         engine.enableJointForceTorqueSensor(self.arm, self.sensor, 1)
         park = np.asarray(self.cell.file.workspace.park_rad, float)
-        self.drive = ArmDrive(self.model.capabilities, park, self.dt_s)
+        self.drive = ArmDrive(self.model.capabilities, park, self.dt_s, lookahead_s=self.config.lookahead_s)
         self.gripper = GripperDrive(self.dt_s)
         places = [*park, self.gripper.width_m / 2, self.gripper.width_m / 2]
         for joint, place in zip(self.moving, places, strict=True):

@@ -48,6 +48,57 @@ def test_stop_brakes_at_the_acceleration_limit_and_stays() -> None:
     assert drive.setpoint[1] == 0.0
 
 
+def bunched(speed: float, ticks: int, *, every: int) -> np.ndarray:
+    """Set-point of joint 1 for each tick, all of `every` ticks arriving at once: what a wire does to a steady stream."""
+    return speed * DT_S * (np.arange(ticks) // every + 1) * every
+
+
+def followed(goals: np.ndarray, lookahead_s: float) -> np.ndarray:
+    """What the drive makes of the goals of joint 1."""
+    drive = ArmDrive(t3().capabilities, REST, DT_S, lookahead_s=lookahead_s)
+    drive.enable(REST.tolist())
+    out = []
+    for goal in goals:
+        drive.aim(np.array([goal, 0, 0, 0, 0, 0]))
+        drive.tick()
+        out.append(drive.setpoint[0])
+    return np.array(out)
+
+
+def test_a_lookahead_takes_the_jerks_out_of_a_bunched_stream() -> None:
+    goals = bunched(0.5, 400, every=4)
+    raw, calm = (np.diff(followed(goals, lookahead_s), 2)[100:] / DT_S**2 for lookahead_s in (0.0, 0.03))
+    assert np.abs(raw).max() > 200.0
+    assert np.abs(calm).max() < 8.0
+
+
+@pytest.mark.parametrize("lookahead_s", [0.004, 0.03, 0.2])
+def test_a_lookahead_trails_a_steady_stream_by_its_own_length(lookahead_s: float) -> None:
+    goals = bunched(0.5, 2000, every=1)
+    late_s = (goals[-1] - followed(goals, lookahead_s)[-1]) / 0.5
+    assert late_s == pytest.approx(lookahead_s, abs=DT_S)
+
+
+@pytest.mark.parametrize("lookahead_s", [0.001, 0.01, 0.2])
+def test_a_lookahead_comes_to_a_step_without_passing_it(lookahead_s: float) -> None:
+    out = followed(np.full(1500, 0.1), lookahead_s)
+    assert out.max() <= 0.1 + 1e-12
+    assert out[-1] == pytest.approx(0.1, abs=1e-5)
+
+
+def test_braking_begins_with_the_speed_that_the_drive_really_has() -> None:
+    drive = ArmDrive(t3().capabilities, REST, DT_S, lookahead_s=0.03)
+    drive.enable(REST.tolist())
+    for goal in bunched(0.5, 200, every=1):
+        drive.aim(np.array([goal, 0, 0, 0, 0, 0]))
+        drive.tick()
+    speed = drive.speed[0]
+    drive.stop()
+    drive.tick()
+    limit = t3().capabilities.acceleration_rad_per_s2[0]
+    assert speed - drive.speed[0] == pytest.approx(limit * DT_S)
+
+
 def test_a_stream_that_breaks_off_in_motion_trips_the_watchdog_after_100_ms() -> None:
     drive = moving_drive()
     for _ in range(49):

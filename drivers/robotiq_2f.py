@@ -18,7 +18,7 @@ from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
 from drivers.transport.options import read_options
 from hal.clock import Deadline
 from hal.devices import DeviceKind, GripperCapabilities, GripperState
-from hal.errors import DeviceFault, DeviceTimeout, InvalidRequest
+from hal.errors import CellError, DeviceFault, DeviceTimeout, DeviceUnavailable, InvalidRequest
 from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
 
@@ -136,30 +136,41 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
         return self._width_m(goal)
 
     def activate(self) -> None:
-        """Clear and set rACT, then wait for the jaws to have found their ends."""
-        o = self._options
+        """Clear and set rACT unless the gripper is active, then wait for the jaws to have found their ends.
 
-        def begin(client: ModbusMaster, until_s: float) -> None:
-            if self._status(client, until_s).state != READY:
-                for action in (0, ACTIVATE):
-                    words = encode_command(action=action)
-                    client.write_registers(unit=o.unit, address=OUTPUT, values=words, until_s=until_s)
+        Each exchange is repeated by itself until it succeeds, so that a bad wire only makes it slower.
 
-        until_s = now_s() + o.activation_s
-        self.call(begin, Deadline.after(self.context.clock, o.activation_s))
-        while not self._is_ready():
-            if now_s() > until_s:
-                raise self._inactive()
-            self.bus.rest(self.period_s)
+        Raises:
+            DeviceFault, DeviceTimeout, DeviceUnavailable: not active within `activation_s`.
+        """
+        until_s = now_s() + self._options.activation_s
+        actions: list[int] | None = None
+        last: CellError | None = None
+        while now_s() < until_s:
+            try:
+                if actions:
+                    self._act(actions[0])
+                    actions = actions[1:]
+                elif self.call(self._status, self._soon()).state == READY:
+                    return
+                elif actions is None:
+                    actions = [0, ACTIVATE]
+                else:
+                    self.bus.rest(self.period_s)
+            except (DeviceTimeout, DeviceUnavailable, DeviceFault) as error:
+                last = error
+                self.bus.rest(self.period_s)
+        raise self._inactive() if last is None else last
 
-    def _is_ready(self) -> bool:
-        """Have the jaws found their ends? A lost answer is no answer yet."""
-        try:
-            return (
-                self.call(self._status, Deadline.after(self.context.clock, 4 * self._options.timeout_s)).state == READY
-            )
-        except DeviceTimeout:
-            return False
+    def _act(self, action: int) -> None:
+        words, unit = encode_command(action=action), self._options.unit
+        self.call(
+            lambda client, until_s: client.write_registers(unit=unit, address=OUTPUT, values=words, until_s=until_s),
+            self._soon(),
+        )
+
+    def _soon(self) -> Deadline:
+        return Deadline.after(self.context.clock, 6 * self._options.timeout_s)
 
     def set_up(self, client: ModbusMaster) -> None:
         """Nothing that moves: the poll tells what state it is in."""

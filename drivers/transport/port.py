@@ -12,8 +12,8 @@ from hal.errors import CellError
 
 log = logging.getLogger(__name__)
 
-FIRST_RETRY_S = 0.05
-LAST_RETRY_S = 0.25  # a port that returns is in use again within 0.5 s
+FIRST_RETRY_S = 0.02
+LAST_RETRY_S = 0.15  # a port that returns is in use again within 0.5 s
 JOIN_S = 1.0
 
 

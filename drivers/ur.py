@@ -21,7 +21,7 @@ from drivers.transport.link import Link, LinkLost, NoAnswer, Refused, WireError,
 from drivers.transport.options import CONNECT_TIMEOUT_S, PortNumber, TcpOptions, read_options, tcp_opener
 from drivers.transport.socket_link import open_tcp
 from drivers.transport.timebase import HostTime
-from hal.clock import Deadline
+from hal.clock import Deadline, WallClock
 from hal.devices import ArmCapabilities, DeviceKind, JointState
 from hal.errors import DeviceFault, MotionRefused
 from hal.readings import Stamped
@@ -103,6 +103,7 @@ class Ur(StreamDevice[JointState]):
         self._enabled_s = 0.0
         self._beat = 0
         self._script: Link | None = None
+        self._scripting = threading.Lock()  # one thread at a time on the script port
         self._commands = threading.Lock()
 
     def capabilities(self) -> ArmCapabilities:
@@ -182,10 +183,16 @@ class Ur(StreamDevice[JointState]):
         for kind, payload in self._parser.feed(chunk):
             if kind == "U" and self._outputs is not None and payload[0] == self._outputs.id:
                 self._take(self._outputs.unpack(payload), arrived_s)
-        script = self._script
-        if script is not None:
+        if self._scripting.acquire(blocking=False):  # whoever writes a script drains the port himself
+            try:
+                self._drain_script()
+            finally:
+                self._scripting.release()
+
+    def _drain_script(self) -> None:
+        if self._script is not None:
             with suppress(WireError):
-                drain(script)
+                drain(self._script)
 
     def _take(self, values: dict[str, Any], arrived_s: float) -> None:
         device_s = float(values["timestamp"])
@@ -219,7 +226,7 @@ class Ur(StreamDevice[JointState]):
         if self._filter.is_open:
             self._filter.begin(None)
             with suppress(Exception):
-                self._write_script(f"stopj({self._options.brake_rad_per_s2})\n", now_s() + 0.05)
+                self._run_script(f"stopj({self._options.brake_rad_per_s2})\n", Deadline.after(WallClock(), 0.05))
         super().release()
         if self._script is not None:
             self._script.close()
@@ -260,14 +267,15 @@ class Ur(StreamDevice[JointState]):
 
     def _run_script(self, text: str, deadline: Deadline) -> None:
         until_s = wall_until(deadline)
-        try:
-            self._write_script(text, until_s)
-        except WireError:
-            self._script = None  # the port hung up since the last program
+        with self._scripting:
             try:
                 self._write_script(text, until_s)
-            except WireError as error:
-                raise self.translate(error) from error
+            except WireError:
+                self._script = None  # the port hung up since the last program
+                try:
+                    self._write_script(text, until_s)
+                except WireError as error:
+                    raise self.translate(error) from error
 
     def _write_script(self, text: str, until_s: float) -> None:
         if self._script is None:

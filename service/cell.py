@@ -23,7 +23,7 @@ from hal.errors import CellError, ConfigError, DeviceUnavailable
 from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
 from service.child import Lifeline, kill_own_group
-from service.connection import CLOCK, MOVER, PREFIX
+from service.connection import BEHIND, CLOCK, MOVER, PREFIX
 from service.latch import Beat, Latch
 from service.motion import start_controller
 
@@ -57,9 +57,11 @@ class CellRuntime:
         shared = Shared()
         closers: list[Callable[[], None]] = [shared.close]
         try:
-            addresses = start_emulators(cell, clock, shared, closers)
+            far_sides = start_emulators(cell, clock, shared, closers)
+            addresses = {name: far_side.address for name, far_side in far_sides.items()}
             devices = _connect_all(cell, clock, shared, addresses, closers)
             objects: dict[str, Any] = {**devices, PREFIX + CLOCK: clock}
+            objects |= {PREFIX + BEHIND + name: far_side.backing for name, far_side in far_sides.items()}
             if cell.names_of(DeviceKind.ARM):
                 controller = start_controller(cell, devices, clock=clock, is_latched=is_latched)
                 closers.append(controller.close)
@@ -93,11 +95,17 @@ def clock_for(cell: Cell) -> Clock:
     return clocks[cell.file.cell.mode]()
 
 
-def start_emulators(
-    cell: Cell, clock: Clock, shared: Shared, closers: list[Callable[[], None]]
-) -> dict[str, dict[str, Any]]:
-    """Start the far side of each emulated wire; returns the options that make each device find its own."""
-    addresses: dict[str, dict[str, Any]] = {}
+@dataclass(frozen=True, slots=True, eq=False)
+class FarSide:
+    """An emulated wire: the options that make a driver find it, and the device that answers behind it."""
+
+    address: dict[str, Any]
+    backing: Any
+
+
+def start_emulators(cell: Cell, clock: Clock, shared: Shared, closers: list[Callable[[], None]]) -> dict[str, FarSide]:
+    """Start the far side of each emulated wire."""
+    far_sides: dict[str, FarSide] = {}
     for name, section in cell.file.emulators.items():
         key = f"emulators.{name}"
         context = Context(name=name, clock=clock, cell=cell, shared=shared)
@@ -108,8 +116,8 @@ def start_emulators(
         except ConfigError as error:
             raise ConfigError(f"{cell.path}: {key}: {error.what}", hint=error.hint, **error.details) from error
         closers.append(emulator.close)
-        addresses[name] = emulator.address
-    return addresses
+        far_sides[name] = FarSide(emulator.address, backing)
+    return far_sides
 
 
 def _connect_all(

@@ -26,13 +26,15 @@ class Bench:
         self._shared = Shared()
         self._closers: list[Callable[[], None]] = [self._shared.close]
         self.clock: Clock = clock_for(cell)
-        self._addresses = start_emulators(cell, self.clock, self._shared, self._closers)
+        self._far_sides = start_emulators(cell, self.clock, self._shared, self._closers)
 
     def connect(self, name: str) -> Any:
         """The device, connected anew."""
         section = self._cell.file.devices[name]
         context = Context(name=name, clock=self.clock, cell=self._cell, shared=self._shared)
-        return connect_device(context, section.driver, {**section.options, **self._addresses.get(name, {})})
+        far_side = self._far_sides.get(name)
+        address = {} if far_side is None else far_side.address
+        return connect_device(context, section.driver, {**section.options, **address})
 
     def close(self) -> None:
         """End emulators and world."""

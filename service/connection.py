@@ -16,6 +16,7 @@ from hal.motion import Mover
 CLOCK = "clock"  # names of the served objects that are no devices; `Name` in the cell file cannot contain a dot
 MOVER = "mover"
 PREFIX = "cell."
+BEHIND = "behind."  # the device behind the emulated wire of the device with this name
 
 
 class CellConnection(Protocol):
@@ -53,6 +54,10 @@ class CellConnection(Protocol):
         """All devices of a kind by name, in the order of the cell file."""
         ...
 
+    def behind_wires_of(self, kind: DeviceKind) -> dict[str, Any]:
+        """What answers behind the emulated wires of the devices of a kind; only the judge may look there."""
+        ...
+
     def close(self) -> None:
         """Let go of the cell; a second call does nothing."""
         ...
@@ -68,6 +73,11 @@ def check_name(cell: Cell, name: str) -> None:
         f"cell {cell.name!r} has no device called {name!r}",
         hint=f"did you mean {near[0]!r}?" if near else f"devices: {', '.join(names)}",
     )
+
+
+def emulated(cell: Cell, kind: DeviceKind) -> list[str]:
+    """Names of the devices of a kind whose wires the cell emulates."""
+    return [name for name in cell.names_of(kind) if name in cell.file.emulators]
 
 
 class LocalConnection:
@@ -96,6 +106,10 @@ class LocalConnection:
     def devices_of(self, kind: DeviceKind) -> dict[str, Any]:
         """The devices themselves."""
         return {name: self._objects[name] for name in self.cell.names_of(kind)}
+
+    def behind_wires_of(self, kind: DeviceKind) -> dict[str, Any]:
+        """The backing devices themselves."""
+        return {name: self._objects[PREFIX + BEHIND + name] for name in emulated(self.cell, kind)}
 
     def close(self) -> None:
         """Close the cell."""
@@ -144,6 +158,10 @@ class RemoteConnection:
     def devices_of(self, kind: DeviceKind) -> dict[str, Any]:
         """Proxies of the devices."""
         return {name: self._proxy(name) for name in self.cell.names_of(kind)}
+
+    def behind_wires_of(self, kind: DeviceKind) -> dict[str, Any]:
+        """Proxies of the backing devices."""
+        return {name: self._proxy(PREFIX + BEHIND + name) for name in emulated(self.cell, kind)}
 
     def close(self) -> None:
         """Close all proxies."""

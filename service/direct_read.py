@@ -41,7 +41,8 @@ def only_device(cell: Cell, name: str) -> Iterator[tuple[Callable[[], Any], Cloc
     shared, clock = Shared(), clock_for(cell)
     closers: list[Callable[[], None]] = [shared.close]
     try:
-        address = start_emulators(alone, clock, shared, closers).get(name, {})
+        far_side = start_emulators(alone, clock, shared, closers).get(name)
+        address = {} if far_side is None else far_side.address
 
         def connect() -> Any:
             context = Context(name=name, clock=clock, cell=cell, shared=shared)

@@ -73,5 +73,9 @@ class GatedConnection:
         """Devices of a kind."""
         return self._connection.devices_of(kind)
 
+    def behind_wires_of(self, kind: DeviceKind) -> dict[str, Any]:
+        """What answers behind emulated wires."""
+        return self._connection.behind_wires_of(kind)
+
     def close(self) -> None:
         """Nothing: the connection belongs to the service, not to the task."""

@@ -15,9 +15,18 @@ from drivers.emulators.ports import FarPort, Peer
 from hal.clock import Deadline, WallClock
 from hal.devices import Fault
 from hal.errors import CellError, Unsupported
+from hal.readings import Stamped
 
 LOOK_UP_S = 0.02
 BACKING_S = 0.2
+
+
+def time_of(sample: Stamped[Any]) -> float:
+    """Seconds on the clock of the device behind; the machine's when it has none.
+
+    A simulated world stands still while it draws a picture. Its arm does too, so that its watchdogs must not count on.
+    """
+    return time.monotonic() if sample.device_time_s is None else sample.device_time_s
 
 
 class WireEmulator:

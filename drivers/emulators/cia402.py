@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import struct
-import time
 from typing import Annotated, Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from pydantic import Field
 
 from drivers.arms import kinematics_of
 from drivers.cia402_states import DriveState
-from drivers.emulators.base import WireEmulator
+from drivers.emulators.base import WireEmulator, time_of
 from drivers.emulators.faults import FaultOptions
 from drivers.emulators.ports import Peer, PtyPort
 from drivers.transport.canbus import CanFrame, Slcan
@@ -102,6 +101,7 @@ class Cia402Emulator(WireEmulator):
         self.nodes = tuple(range(options.first_node, options.first_node + len(backing.capabilities().links)))
         self.drives = {node: Drive() for node in self.nodes}
         self._codec = Slcan()
+        self._device_s = 0.0
         self._host_s: float | None = None
         self._consumer_s = 0.0
         self._is_moving_allowed = False
@@ -123,7 +123,8 @@ class Cia402Emulator(WireEmulator):
 
     def on_tick(self) -> None:
         """The drives' watch over the host's heartbeat."""
-        is_late = self._host_s is not None and time.monotonic() - self._host_s > self._consumer_s
+        self._device_s = time_of(self._backing.read_state(deadline=self.deadline()))
+        is_late = self._host_s is not None and self._device_s - self._host_s > self._consumer_s
         if is_late and self._consumer_s > 0.0:
             self._host_s = None
             self.fault(HOST_LOST)
@@ -153,7 +154,7 @@ class Cia402Emulator(WireEmulator):
         elif frame.id == 0x080:
             self._on_sync()
         elif function == 0x700 and node not in self.drives:
-            self._host_s = time.monotonic()
+            self._host_s = self._device_s
         elif function == 0x600 and node in self.drives and len(frame.data) == 8:
             self._out(0x580 + node, self._sdo(self.drives[node], frame.data))
         elif function == 0x200 and node in self.drives and len(frame.data) == 6:

@@ -11,7 +11,7 @@ import numpy as np
 
 from drivers import dxl2
 from drivers.arms import kinematics_of
-from drivers.emulators.base import WireEmulator
+from drivers.emulators.base import WireEmulator, time_of
 from drivers.emulators.faults import FaultOptions
 from drivers.emulators.ports import Peer, PtyPort
 from drivers.transport.checks import crc_dynamixel
@@ -35,7 +35,7 @@ class Servo:
         self.table = bytearray(TABLE_BYTES)
         self.table[0:2] = (1020).to_bytes(2, "little")
         self.table[6], self.table[7], self.table[11], self.table[68] = 45, id_, 3, 2
-        self.heard_s = time.monotonic()
+        self.heard_s = -math.inf  # on the clock of the arm behind
 
     def write(self, address: int, data: bytes) -> int:
         """The error number of a write: 0 when it is done."""
@@ -69,6 +69,7 @@ class DynamixelEmulator(WireEmulator):
         self._framer = dxl2.framer()
         self._is_enabled = False
         self._is_new_goal = False
+        self._device_s = 0.0
         self.period_s = 0.01
 
     @property
@@ -89,15 +90,16 @@ class DynamixelEmulator(WireEmulator):
             if packet.instruction == dxl2.STATUS:
                 continue
             for servo in self.servos.values():
-                servo.heard_s = time.monotonic()
+                servo.heard_s = self._device_s
             self._obey(packet)
         self._settle()
 
     def on_tick(self) -> None:
         """The bus watchdogs."""
+        self._device_s = time_of(self._backing.read_state(deadline=self.deadline()))
         for servo in self.servos.values():
             limit = servo.table[WATCHDOG]
-            if 0 < limit < 0xFF and time.monotonic() - servo.heard_s > limit * 0.02:
+            if 0 < limit < 0xFF and self._device_s - servo.heard_s > limit * 0.02:
                 servo.table[WATCHDOG] = 0xFF
         self._settle()
 

@@ -19,6 +19,8 @@ from hal.strict import validate
 OUTPUT, INPUT = 1000, 2000
 OPEN_COUNT, CLOSED_COUNT = 3, 230
 BACKING_S = 0.2
+MIN_FORCE_N = 20.0
+MIN_SPEED_M_PER_S = 0.02
 
 
 class Robotiq2FEmulatorOptions(FaultOptions):
@@ -27,6 +29,11 @@ class Robotiq2FEmulatorOptions(FaultOptions):
     unit: Annotated[int, Field(ge=1, le=247)] = 9
     activation_s: Annotated[float, Field(ge=0, le=10)] = 0.1
     fault_code: Annotated[int, Field(ge=0, le=15)] = 0
+
+
+def min_force_n(backing: Gripper) -> float:
+    """What force count 0 means; no gripper of the family closes with less."""
+    return min(MIN_FORCE_N, backing.capabilities().max_force_n)
 
 
 class Robotiq2FTable(RegistersOnly):
@@ -70,8 +77,8 @@ class Robotiq2FTable(RegistersOnly):
         speed, force = divmod(self.output[2], 256)
         self.backing.command(
             width_m=width_m,
-            force_n=force / 255 * c.max_force_n,
-            speed_m_per_s=max(0.1, speed / 255) * c.max_speed_m_per_s,
+            force_n=min_force_n(self.backing) + force / 255 * (c.max_force_n - min_force_n(self.backing)),
+            speed_m_per_s=MIN_SPEED_M_PER_S + speed / 255 * (c.max_speed_m_per_s - MIN_SPEED_M_PER_S),
             deadline=Deadline.after(self._clock, BACKING_S),
         )
 
@@ -97,8 +104,10 @@ class Robotiq2FEmulator(ModbusFarSide):
 
     @property
     def address(self) -> dict[str, Any]:
-        """Port, and the stroke of the gripper behind."""
-        return {**super().address, "stroke_m": self.table.backing.capabilities().max_width_m}
+        """Port, and the range of the gripper behind."""
+        c = self.table.backing.capabilities()
+        forces = {"min_force_n": min_force_n(self.table.backing), "max_force_n": c.max_force_n}
+        return {**super().address, "stroke_m": c.max_width_m, "max_speed_m_per_s": c.max_speed_m_per_s, **forces}
 
 
 def start(backing: Device, options: dict[str, Any]) -> Robotiq2FEmulator:

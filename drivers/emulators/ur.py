@@ -17,10 +17,10 @@ from pydantic import Field
 
 from drivers import rtde
 from drivers.arms import kinematics_of
-from drivers.emulators.base import WireEmulator
+from drivers.emulators.base import WireEmulator, time_of
 from drivers.emulators.faults import FaultOptions
 from drivers.emulators.ports import Peer, TcpPort
-from hal.devices import Arm, Device
+from hal.devices import Arm, Device, JointState
 from hal.errors import Unsupported
 from hal.strict import validate
 
@@ -113,7 +113,7 @@ class UrEmulator(WireEmulator):
         self._registers = [0] * 48
         self._program: list[int] = []  # heartbeat register, then one a joint
         self._beat: int | None = None
-        self._beat_s = 0.0
+        self._beat_s = self._device_s = 0.0
         self._watchdog_s = math.inf
         self._scripts: dict[Peer, bytes] = {}
 
@@ -182,7 +182,7 @@ class UrEmulator(WireEmulator):
         beat = self._registers[self._program[0]]
         if beat == self._beat:
             return
-        self._beat, self._beat_s = beat, time.monotonic()
+        self._beat, self._beat_s = beat, self._device_s
         goal = np.array([self._registers[i] for i in self._program[1:]]) * 1e-6
         self._backing.command_position(goal, deadline=self.deadline())
 
@@ -236,26 +236,26 @@ class UrEmulator(WireEmulator):
 
     def on_tick(self) -> None:
         """The watchdog of the program, then one data package to each client."""
-        if self.runtime == PLAYING and time.monotonic() - self._beat_s > self._watchdog_s:
+        sample = self._backing.read_state(deadline=self.deadline())
+        self._device_s = time_of(sample)
+        if self.runtime == PLAYING and self._device_s - self._beat_s > self._watchdog_s:
             self._end_program()
-        if not self._streams:
-            return
-        values = self._values()
+        values = self._values(sample.value)
         for peer in list(self._streams):
             self.send(peer, self._data(peer, values), protected=slice(0, 3))
 
     def status_frame(self) -> bytes | None:
         """A package that says: protective stop."""
         peer = next(iter(self._streams))
-        return self._data(peer, {**self._values(), "safety_mode": [PROTECTIVE_STOP]})
+        state = self._backing.read_state(deadline=self.deadline()).value
+        return self._data(peer, {**self._values(state), "safety_mode": [PROTECTIVE_STOP]})
 
-    def _values(self) -> dict[str, list[float]]:
-        sample = self._backing.read_state(deadline=self.deadline())
-        position = [float(q) for q in sample.value.position_rad]
+    def _values(self, state: JointState) -> dict[str, list[float]]:
+        position = [float(q) for q in state.position_rad]
         return {
             "timestamp": [time.monotonic() - self._start_s],
             "actual_q": position,
-            "actual_qd": [float(v) for v in sample.value.velocity_rad_per_s],
+            "actual_qd": [float(v) for v in state.velocity_rad_per_s],
             "target_q": position,
             "robot_mode": [self.robot_mode],
             "safety_mode": [self.safety_mode],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import threading
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -67,9 +66,11 @@ def emulate(
     shared = Shared()
     closers = [shared.close]
     try:
-        address = start_emulators(alone, clock_for(loaded), shared, closers)[name]
+        clock = clock_for(loaded)
+        address = start_emulators(alone, clock, shared, closers)[name].address
         console.print(f"{section.emulator} for {name} is up; options for its driver: {address}")
-        threading.Event().wait()
+        while True:  # a simulated device lives in a world that somebody must let pass
+            clock.sleep(1.0 / loaded.file.cell.control_rate_hz)
     finally:
         for close in closers[::-1]:
             close()

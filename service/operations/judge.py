@@ -37,12 +37,14 @@ def judge(connection: CellConnection, folder: Path) -> dict[str, Any]:
 
 def truth_of(connection: CellConnection) -> Truth:
     """The truth of a simulated cell; ask only when the mission is over."""
-    for arm in connection.devices_of(DeviceKind.ARM).values():
+    arms = connection.devices_of(DeviceKind.ARM) | connection.behind_wires_of(DeviceKind.ARM)
+    for arm in arms.values():
         if hasattr(arm, "truth"):
             truth: Truth = arm.truth()
             return truth
     raise Unsupported(
-        "this cell has no simulated arm, so there is no truth to judge by", hint="use a cell with sim:arm"
+        "this cell has no simulated arm, so there is no truth to judge by",
+        hint="use a cell with sim:arm, on its own or behind an emulator",
     )
 
 

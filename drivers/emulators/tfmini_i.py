@@ -1,0 +1,137 @@
+"""Benewake TFmini-i on a pty, as a Modbus slave or behind an slcan adapter, measuring as a proximity device does."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from drivers.emulators.base import WireEmulator
+from drivers.emulators.faults import FaultOptions
+from drivers.emulators.modbus_server import ModbusFarSide, RegistersOnly, no_such
+from drivers.emulators.ports import Peer, PtyPort
+from drivers.transport.canbus import CanFrame, Slcan
+from hal.clock import Deadline, WallClock
+from hal.devices import Device, Proximity
+from hal.errors import Unsupported
+from hal.readings import Quality
+from hal.strict import validate
+
+UNIT, CAN_ID = 1, 3
+STRONG, WEAK = 2000, 0
+FIRMWARE = (0x0001, 0x0203)
+ADDRESS_SAVE, ADDRESS_LAST_SETTING = 0x80, 0x86
+BACKING_S = 0.2
+
+
+class TfminiIOptions(FaultOptions):
+    """`[emulators.NAME.emulator_options]`"""
+
+    rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
+    clock_start_ms: Annotated[int, Field(ge=0, lt=1 << 32)] = 0
+
+
+class Measurement:
+    """What the sensor knows, renewed `rate_hz` times a second: distance in cm, strength, its clock in ms."""
+
+    def __init__(self, backing: Proximity, options: TfminiIOptions) -> None:
+        self._backing = backing
+        self._period_s = 1.0 / options.rate_hz
+        self._clock_start_ms = options.clock_start_ms
+        self._start_s = time.monotonic()
+        self._index = -1
+        self._newest = (0, WEAK, 0)
+        self._clock = WallClock()
+
+    def newest(self) -> tuple[int, int, int]:
+        """The measurement of this period."""
+        index = int((time.monotonic() - self._start_s) / self._period_s)
+        if index != self._index:
+            self._index = index
+            sample = self._backing.read_distance_m(deadline=Deadline.after(self._clock, BACKING_S))
+            is_seen = sample.quality is not Quality.INVALID
+            stamp_ms = (self._clock_start_ms + round(index * self._period_s * 1000.0)) & 0xFFFFFFFF
+            self._newest = (round(sample.value * 100.0) if is_seen else 0, STRONG if is_seen else WEAK, stamp_ms)
+        return self._newest
+
+
+class TfminiITable(RegistersOnly):
+    """Registers 0-4 measurement and clock, 6-7 firmware; 80h-86h settings are taken and forgotten."""
+
+    def __init__(self, measurement: Measurement) -> None:
+        self._measurement = measurement
+
+    def registers(self, address: int, count: int) -> Sequence[int]:
+        """What stands there."""
+        raw, strength, stamp_ms = self._measurement.newest()
+        words = (raw, strength, 0, stamp_ms >> 16, stamp_ms & 0xFFFF, 0, *FIRMWARE)
+        if address + count > len(words):
+            raise no_such(address, count)
+        return words[address : address + count]
+
+    def write_registers(self, address: int, values: Sequence[int]) -> None:
+        """Save, restart, baud rate, unit, rate."""
+        if not ADDRESS_SAVE <= address <= ADDRESS_LAST_SETTING:
+            raise no_such(address, *values)
+
+
+class CanTfminiEmulator(WireEmulator):
+    """The sensor on a CAN bus behind an slcan adapter."""
+
+    def __init__(self, measurement: Measurement, options: TfminiIOptions) -> None:
+        super().__init__(PtyPort("slcan"), options, name="tfmini_can")
+        self._measurement = measurement
+        self._codec = Slcan()
+        self.is_open = False
+        self.period_s = 1.0 / options.rate_hz
+
+    @property
+    def address(self) -> dict[str, Any]:
+        """`{"channel": PATH}`"""
+        return {"channel": super().address["port"]}
+
+    def on_bytes(self, peer: Peer, data: bytes) -> None:
+        """Adapter commands: open and close the channel."""
+        for line in data.split(b"\r"):
+            if line[:1] in (b"O", b"C"):
+                self.is_open = line[:1] == b"O"
+            if line:
+                self.reply(peer, b"\r")
+
+    def on_tick(self) -> None:
+        """One measurement."""
+        if self.is_open:
+            self.send(None, self._frame(*self._measurement.newest()), protected=slice(0, 0))
+
+    def status_frame(self) -> bytes | None:
+        """Too weak a signal."""
+        return self._frame(0, WEAK, self._measurement.newest()[2])
+
+    def _frame(self, raw: int, strength: int, stamp_ms: int) -> bytes:
+        return self._codec.encode(CanFrame(CAN_ID, struct.pack("<HHI", raw, strength, stamp_ms)))
+
+
+def _measurement(backing: Device, options: dict[str, Any]) -> tuple[Measurement, TfminiIOptions]:
+    if not isinstance(backing, Proximity):
+        raise Unsupported(f"a tfmini cannot stand for a {backing.kind}", hint="back it with a proximity device")
+    parsed = validate(options, TfminiIOptions, source="emulators.tfmini_i")
+    return Measurement(backing, parsed), parsed
+
+
+def start_modbus(backing: Device, options: dict[str, Any]) -> ModbusFarSide:
+    """Entry point `tfmini_modbus`."""
+    measurement, parsed = _measurement(backing, options)
+    emulator = ModbusFarSide(PtyPort("tfmini"), parsed, TfminiITable(measurement), unit=UNIT, name="tfmini_modbus")
+    emulator.begin()
+    return emulator
+
+
+def start_can(backing: Device, options: dict[str, Any]) -> CanTfminiEmulator:
+    """Entry point `tfmini_can`."""
+    measurement, parsed = _measurement(backing, options)
+    emulator = CanTfminiEmulator(measurement, parsed)
+    emulator.begin()
+    return emulator

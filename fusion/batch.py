@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from fusion.measurement import NULL_RATIO, Measurement, constraints_of
 from hal.errors import InvalidRequest
-from hal.geometry import Array, UncertainPose, matrix_of
+from hal.geometry import Array, UncertainPose
 
 GATE_PROBABILITY = 0.999  # a good measurement passes its gate with this probability (notes/fusion.md, "Robust")
 GATES = np.array([np.inf, *chi2.ppf(GATE_PROBABILITY, np.arange(1, 7))])
@@ -20,7 +20,15 @@ WIDE_M = 10.0  # no sensor is this poor
 SHARP_M = 1e-9  # and none this good
 SHARP_RAD = 1e-9
 _DOF = np.array([[6] * 4] + [[constraints_of(c, rank) for rank in range(4)] for c in range(1, 10)])
-_FIELDS = (("x_m", (3,)), ("u", (3,)), ("mu_m", (3,)), ("C_m2", (3, 3)), ("M", (3, 3)))
+_FIELDS: tuple[tuple[str, tuple[int, ...]], ...] = (
+    ("x_m", (3,)),
+    ("u", (3,)),
+    ("mu_m", (3,)),
+    ("C_m2", (3, 3)),
+    ("M", (3, 3)),
+)
+_AIMLESS = np.isin(np.arange(10), (0, 1, 4, 7))
+_UP = np.array([0.0, 0.0, 1.0])
 _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 
 
@@ -65,40 +73,38 @@ def pack(measurements: Sequence[Measurement], prior: UncertainPose | None = None
         InvalidRequest: wrong shape, NaN, zero direction, C not positive definite, M indefinite, or numbers that can only
             be in another unit; `details` holds `index` and `reason`. Or the prior's covariance makes no sense.
     """
-    for i, one in enumerate(measurements):
-        for name, shape in _FIELDS:
-            if np.shape(getattr(one, name)) != shape:
-                raise _bad(measurements, i, f"{name} has shape {np.shape(getattr(one, name))}, not {shape}",
-                           "see fusion.measurement.Measurement")  # fmt: skip
     n, extra = len(measurements), int(prior is not None)
     cls = np.array([m.cls for m in measurements] + [0] * extra, np.int64)
-    m, u, mu = (_stacked(measurements, name, np.zeros(3), extra) for name in ("x_m", "u", "mu_m"))
-    C, M = _stacked(measurements, "C_m2", np.eye(3), extra), _stacked(measurements, "M", np.zeros((3, 3)), extra)
-    _check_numbers(measurements, m[:n], u[:n], mu[:n], C[:n], M[:n])
-    length = np.linalg.norm(u, axis=1)
-    aimless = np.isin(cls, (0, 1, 4, 7))  # a point's direction means nothing
-    w = np.where(aimless[:, None], [0.0, 0.0, 1.0], u / np.maximum(length, 1e-300)[:, None])
-    C, M = (C + C.transpose(0, 2, 1)) / 2, (M + M.transpose(0, 2, 1)) / 2
-    variance, axes = np.linalg.eigh(C)
-    values, vectors = np.linalg.eigh(M)
-    _check_matrices(measurements, cls[:n], np.where(aimless, 1.0, length)[:n], variance[:n], values[:n])
+    m, u, mu, C, M = (_stacked(measurements, name, shape, extra) for name, shape in _FIELDS)
+    if not _plain(m, u, mu, C, M):
+        _check_numbers(measurements, m[:n], u[:n], mu[:n], C[:n], M[:n])
+        C, M = (C + C.transpose(0, 2, 1)) / 2, (M + M.transpose(0, 2, 1)) / 2
+    if extra:
+        C[n] = np.eye(3)
+    length = np.where(_AIMLESS[cls], 1.0, np.sqrt(np.einsum("ik,ik->i", u, u)))  # a point's direction means nothing
+    w = np.where(_AIMLESS[cls][:, None], _UP, u / np.maximum(length, 1e-300)[:, None])
+    values, vectors = np.linalg.eigh(np.concatenate([C, M]))
+    columns = np.ascontiguousarray(vectors.transpose(0, 2, 1))  # eigenvectors as rows
+    variance, values = values[: n + extra], values[n + extra :]
+    _check_matrices(measurements, cls[:n], length[:n], variance[:n], values[:n])
     known = np.where(values > NULL_RATIO * np.maximum(values[:, 2:], 1e-300), values, 0.0)
-    p0, p = np.ascontiguousarray(known[:, 0]), np.ascontiguousarray(known[:, 1:])
-    dof = _DOF[cls, (p > 0).sum(axis=1)]
-    prior_r, prior_t, prior_w = np.eye(3), np.zeros(3), np.zeros((6, 6))
-    if prior is not None:
-        # C order and writable like the arrays above: numba compiles everything anew for any other layout.
-        prior_r = np.array(matrix_of(prior.parent_from_child), order="C")
-        prior_t = np.array(prior.parent_from_child.translation, order="C")
-        prior_w = np.array(_whitening(prior.covariance), order="C")
+    dof = _DOF[cls, np.count_nonzero(known[:, 1:], axis=1)]
+    prior_r, prior_t, prior_w = _prior_arrays(prior)
     return Batch(
-        cls=cls, dof=dof, m=m, w=w, mu=mu,
-        C=_sym6(C), variance=variance, axes=np.ascontiguousarray(axes.transpose(0, 2, 1)),
-        d=np.ascontiguousarray(vectors[:, :, 0]),
-        a1=np.ascontiguousarray(vectors[:, :, 1]),
-        a2=np.ascontiguousarray(vectors[:, :, 2]),
-        p0=p0, p=p, gate=GATES[dof], prior_r=prior_r, prior_t=prior_t, prior_w=prior_w,
+        cls=cls, dof=dof, m=m, w=w, mu=mu, C=_sym6(C), variance=variance, axes=columns[: n + extra],
+        **{name: np.ascontiguousarray(columns[n + extra :, k]) for k, name in enumerate(("d", "a1", "a2"))},
+        p0=np.ascontiguousarray(known[:, 0]), p=np.ascontiguousarray(known[:, 1:]),
+        gate=GATES[dof], prior_r=prior_r, prior_t=prior_t, prior_w=prior_w,
     )  # fmt: skip
+
+
+def _prior_arrays(prior: UncertainPose | None) -> tuple[Array, Array, Array]:
+    """Rotation, translation and whitening of a prior pose; fillers when there is none."""
+    if prior is None:
+        return np.eye(3), np.zeros(3), np.zeros((6, 6))
+    # C order and writable like the arrays of the measurements: numba compiles everything anew for any other layout.
+    pose, white = prior.parent_from_child.as_matrix(), _whitening(prior.covariance)
+    return np.array(pose[:3, :3], order="C"), np.array(pose[:3, 3]), np.array(white, order="C")
 
 
 def duplicates(measurements: Sequence[Measurement]) -> dict[int, int]:
@@ -119,8 +125,32 @@ def _bad(measurements: Sequence[Measurement], i: int, what: str, hint: str) -> I
     return InvalidRequest(f"{name}: {what}", hint=hint, index=i, reason=what)
 
 
-def _stacked(measurements: Sequence[Measurement], name: str, filler: Array, extra: int) -> Array:
-    return np.array([getattr(m, name) for m in measurements] + [filler] * extra, float).reshape(-1, *filler.shape)
+def _stacked(measurements: Sequence[Measurement], name: str, shape: tuple[int, ...], extra: int) -> Array:
+    """One field of all measurements, (N + extra, *shape); zero for the prior.
+
+    Raises:
+        InvalidRequest: one has another shape.
+    """
+    given = [getattr(m, name) for m in measurements]
+    try:
+        found = np.array(given + [np.zeros(shape)] * extra, float)
+        if found.shape[1:] == shape:
+            return found
+    except ValueError:  # of different shapes
+        pass
+    for i, one in enumerate(given):
+        if np.shape(one) != shape:
+            raise _bad(measurements, i, f"{name} has shape {np.shape(one)}, not {shape}",
+                       "see fusion.measurement.Measurement")  # fmt: skip
+    return np.empty((0, *shape))
+
+
+def _plain(m: Array, u: Array, mu: Array, C: Array, M: Array) -> bool:
+    """Is every number finite, every place near and every matrix exactly symmetric? The rule, and quick to see."""
+    sizes = (np.abs(m).max(initial=0.0), np.abs(mu).max(initial=0.0), np.abs(u).max(initial=0.0))
+    near = sizes[0] <= FAR_M and sizes[1] <= FAR_M and sizes[2] < np.inf  # no comparison holds for NaN
+    sums = np.sum(C) + np.sum(M)
+    return bool(near and np.isfinite(sums) and (C.transpose(0, 2, 1) == C).all() and (M.transpose(0, 2, 1) == M).all())
 
 
 def _check_numbers(given: Sequence[Measurement], m: Array, u: Array, mu: Array, C: Array, M: Array) -> None:

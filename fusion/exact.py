@@ -32,7 +32,7 @@ from hal.geometry import Array
 
 # A symmetric matrix by its eigenvalues and unit eigenvectors: v.S v then is a sum of squares, not a difference of large numbers.
 Spectral = tuple[float, float, float, Vec, Vec, Vec]
-REFINED = 6  # starts that Newton's method follows, best first
+REFINED = 8  # starts that Newton's method follows, best first
 LONGEST = 0.7  # step on the sphere, rad (as a tangent)
 CIRCLE = 24  # starts on the half circle of plane-line
 
@@ -148,7 +148,7 @@ def _sphere(  # noqa: PLR0912 - one flat loop, for the compiler
     line: bool, e: Vec, A: Spectral, M: Spectral, d: Vec, a1: Vec, a2: Vec
 ) -> Vec:
     """Where F is least on the whole sphere: starts by value, the best ones refined."""
-    starts, cost = np.empty((80, 3)), np.empty(80)
+    starts, cost = np.empty((100, 3)), np.empty(100)
     n = 0
     for k in range(13):
         n = _start(starts, n, normalised(vec(_GRID, k)))
@@ -163,10 +163,10 @@ def _sphere(  # noqa: PLR0912 - one flat loop, for the compiler
             # The minimum moves from d (direction known well) towards e (point known well) as |e| grows. Either share hardly
             # grows along one great circle: the point's from e to the axis that C leaves widest, the direction's from d to a1.
             long = A[5]
-            for k in range(1, 9):
-                n = _arc(starts, n, d, toward, k / 8.0)
-                n = _arc(starts, n, toward, long, (k - 0.5) / 8.0)
-                n = _arc(starts, n, d, a1, (k - 0.5) / 8.0)
+            for k in range(1, 13):
+                n = _arc(starts, n, d, toward, k / 12.0)
+                n = _arc(starts, n, toward, long, (k - 0.5) / 12.0)
+                n = _arc(starts, n, d, a1, (k - 0.5) / 12.0)
             n = _start(starts, n, normalised(cross(cross(toward, long), a2)))
         else:
             # e-perp is where the first term vanishes; the second is least there at one of two directions.
@@ -183,12 +183,13 @@ def _sphere(  # noqa: PLR0912 - one flat loop, for the compiler
         k = int(np.argmin(cost[:n]))
         if not np.isfinite(cost[k]):
             break
-        v = _newton(line, e, A, M, vec(starts, k), 40)
+        start = vec(starts, k)
+        v = _newton(line, e, A, M, start, 40)
         value = _value(line, e, A, M, v)
         if value < least:
             best, least = v, value
-        for j in range(n):  # what lies close to this minimum would lead here again
-            if abs(dot(v, vec(starts, j))) > 0.99:
+        for j in range(n):  # what lies close to this minimum, or to where it was reached from, would lead here again
+            if abs(dot(v, vec(starts, j))) > 0.995 or abs(dot(start, vec(starts, j))) > 0.98:
                 cost[j] = np.inf
         cost[k] = np.inf
     return best

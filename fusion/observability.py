@@ -38,11 +38,14 @@ def covariance_and_freedom(
         size_m: how far those features spread; it makes metres and radians comparable.
     """
     # A motion (c, r) of the middle moves the origin by c - r x centre = c + [centre]x r.
-    origin_from_centre = np.block([[size_m * np.eye(3), skew(centre_m)], [np.zeros((3, 3)), np.eye(3)]])
+    origin_from_centre = np.diag([size_m, size_m, size_m, 1.0, 1.0, 1.0])
+    origin_from_centre[:3, 3:] = skew(centre_m)
     values, vectors = np.linalg.eigh(origin_from_centre.T @ information @ origin_from_centre)
     free = values < max(FREE_SIGMA**-2, 1e-13 * values[-1])
     variances = np.where(free, PRIOR_SIGMA**2, 1.0 / np.where(free, 1.0, values))
     half = origin_from_centre @ vectors * np.sqrt(variances)
+    if not free.any():
+        return half @ half.T, ()
     basis = _simple_basis(vectors[:, free])
     return half @ half.T, tuple(_described(c, origin_from_centre, centre_m) for c in basis.T)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,7 +16,7 @@ from fusion.observability import FreeDirection, covariance_and_freedom
 from fusion.polish import solve_from
 from fusion.search import place
 from hal.errors import InvalidRequest
-from hal.geometry import Array, UncertainPose, matrix_of
+from hal.geometry import Array, UncertainPose
 
 MIN_SIZE_M = 0.05  # features closer together than this still make an object of this size
 
@@ -59,8 +60,8 @@ def solve(
     """
     if not len(measurements) and prior is None:
         raise InvalidRequest("no measurement to fuse", hint="give at least one measurement or a prior pose")
-    b = pack(measurements, prior)
-    return local_solution(b, np.ones(len(b.cls)), matrix_of(start), np.array(start.translation))
+    b, pose = pack(measurements, prior), start.as_matrix()
+    return local_solution(b, np.ones(len(b.cls)), pose[:3, :3], pose[:3, 3])
 
 
 def solve_from_many(
@@ -115,6 +116,6 @@ def middle_and_size(b: Batch, chosen: NDArray[np.bool_], R: Array) -> tuple[Arra
     points = b.m[chosen & (b.cls > 0)]
     if not len(points):
         return np.zeros(3), 1.0
-    middle = points.mean(axis=0)
-    size = float(np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1))))
-    return R @ middle, max(size, MIN_SIZE_M)
+    middle = np.add.reduce(points) / len(points)
+    apart = (points - middle).ravel()
+    return R @ middle, max(math.sqrt(apart @ apart / len(points)), MIN_SIZE_M)

@@ -1,0 +1,172 @@
+"""Benewake TFmini-i over Modbus RTU and over CAN, TF03 over CAN (SJ-PM-TFmini-i A01; TF02-i BP-UM-22 A03, p 7).
+
+What a reading means is decided as for the TFmini-Plus; both ways bring the sensor's millisecond clock, the TF03 none.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from drivers.tfmini import EchoOptions
+from drivers.transport.bus import PolledDevice
+from drivers.transport.canbus import CanCodec, CanFrame, CanOptions, can_opener
+from drivers.transport.device import StreamDevice
+from drivers.transport.link import Link, now_s
+from drivers.transport.modbus import ModbusMaster
+from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
+from drivers.transport.options import read_options
+from drivers.transport.timebase import HostTime, Unwrapper
+from hal.clock import Deadline
+from hal.devices import DeviceKind, ProximityCapabilities
+from hal.readings import Stamped
+from hal.registry import Context
+
+READING_REGISTER, FIRMWARE_REGISTER = 0, 6
+CM = 0.01
+STAMP_BITS, STAMP_S = 32, 0.001
+WITH_CLOCK_BYTES, WITHOUT_CLOCK_BYTES = 8, 6
+OPEN_S = 0.2
+
+
+class ModbusTfminiOptions(ModbusOptions, EchoOptions):
+    """Options of `modbus:tfmini`."""
+
+
+class CanTfminiOptions(CanOptions, EchoOptions):
+    """Options of `can:tfmini`. The manual leaves the order of bytes open; `id` is the sensor's own."""
+
+    bitrate: Literal[10000, 20000, 50000, 100000, 125000, 250000, 500000, 800000, 1000000] = 250_000
+    id: Annotated[int, Field(ge=0, le=0x7FF)] = 3
+    byte_order: Literal["little", "big"] = "little"
+    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 100.0
+
+
+class SensorClock:
+    """The sensor's clock on the host's, and whether a stamp is a new one."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """The wire was opened anew."""
+        self._device = Unwrapper(bits=STAMP_BITS, tick_s=STAMP_S)
+        self._host = HostTime()
+        self._last_ms: int | None = None
+
+    def is_new(self, stamp_ms: int) -> bool:
+        """Has this measurement not been seen before?"""
+        is_new = stamp_ms != self._last_ms
+        self._last_ms = stamp_ms
+        return is_new
+
+    def times_s(self, stamp_ms: int, arrived_s: float) -> tuple[float, float]:
+        """The measurement's time on the sensor's clock and on the host's."""
+        device_s = self._device.seconds(stamp_ms)
+        return device_s, self._host.host_s(device_s=device_s, arrived_s=arrived_s)
+
+
+class ModbusTfmini(PolledDevice[float, ModbusMaster]):
+    """A finger's distance sensor on a shared two-wire bus."""
+
+    kind = DeviceKind.PROXIMITY
+
+    def __init__(self, context: Context, options: ModbusTfminiOptions) -> None:
+        bus = modbus_bus(context, options)
+        super().__init__(context, bus, rate_hz=options.rate_hz, max_age_s=options.max_age_s)
+        self._options = options
+        self._clock = SensorClock()
+
+    def capabilities(self) -> ProximityCapabilities:
+        """From the options."""
+        return self._options.capabilities(self._options.rate_hz)
+
+    def read_distance_m(self, *, deadline: Deadline) -> Stamped[float]:
+        """Newest distance; invalid and NaN when the echo is too weak or outside the range."""
+        return self.newest(deadline)
+
+    def set_up(self, client: ModbusMaster) -> None:
+        """The firmware registers tell a sensor from another slave."""
+        self._clock.reset()
+        until_s = now_s() + client.attempt_s
+        client.read_registers(unit=self._options.unit, address=FIRMWARE_REGISTER, count=2, until_s=until_s)
+
+    def poll(self, client: ModbusMaster) -> None:
+        """Distance, strength and clock in one request; a measurement that was read before is none."""
+        asked_s = now_s()
+        raw, strength, _, high, low = client.read_registers(
+            unit=self._options.unit, address=READING_REGISTER, count=5, until_s=asked_s + client.attempt_s
+        )
+        stamp_ms = high << 16 | low
+        if not self._clock.is_new(stamp_ms):
+            return
+        device_s, valid_s = self._clock.times_s(stamp_ms, 0.5 * (asked_s + now_s()))
+        value, quality, cause = self._options.judge(raw * CM, strength)
+        self.publish(value, valid_s=valid_s, device_time_s=device_s, quality=quality, cause=cause)
+
+
+class CanTfmini(StreamDevice[float]):
+    """A finger's distance sensor that talks on a CAN bus."""
+
+    kind = DeviceKind.PROXIMITY
+
+    def __init__(self, context: Context, options: CanTfminiOptions) -> None:
+        opener, codec, name = can_opener(options, context.name)
+        super().__init__(context, open_link=opener, link_name=name, max_age_s=max(3.0 / options.rate_hz, 0.05))
+        self._options = options
+        self._make_codec = codec
+        self._codec: CanCodec = codec()
+        self._clock = SensorClock()
+        order = "<" if options.byte_order == "little" else ">"
+        self._with_clock, self._without_clock = struct.Struct(order + "HHI"), struct.Struct(order + "HH")
+
+    def capabilities(self) -> ProximityCapabilities:
+        """From the options."""
+        return self._options.capabilities(self._options.rate_hz)
+
+    def read_distance_m(self, *, deadline: Deadline) -> Stamped[float]:
+        """Newest distance; invalid and NaN when the echo is too weak or outside the range."""
+        return self.newest(deadline)
+
+    def start(self, link: Link) -> None:
+        """Open the channel; the sensor talks by itself."""
+        self._codec = self._make_codec()
+        self._clock.reset()
+        link.write(self._codec.opening(self._options.bitrate), now_s() + OPEN_S)
+
+    def receive(self, chunk: bytes, arrived_s: float) -> None:
+        """Publish each of the sensor's frames; other nodes' and those of another length are not its."""
+        for frame in self._codec.feed(chunk):
+            if frame.id == self._options.id:
+                self._take(frame, arrived_s)
+
+    def _take(self, frame: CanFrame, arrived_s: float) -> None:
+        device_s: float | None = None
+        if len(frame.data) == WITH_CLOCK_BYTES:
+            raw, strength, stamp_ms = self._with_clock.unpack(frame.data)
+            if not self._clock.is_new(stamp_ms):
+                return
+            device_s, arrived_s = self._clock.times_s(stamp_ms, arrived_s)
+        elif len(frame.data) == WITHOUT_CLOCK_BYTES:
+            raw, strength = self._without_clock.unpack_from(frame.data)
+        else:
+            self.errors += 1
+            return
+        value, quality, cause = self._options.judge(raw * CM, strength)
+        self.publish(value, valid_s=arrived_s, device_time_s=device_s, quality=quality, cause=cause)
+
+
+def connect_modbus(context: Context, options: dict[str, Any]) -> ModbusTfmini:
+    """Entry point `modbus:tfmini`."""
+    device = ModbusTfmini(context, read_options(context, options, ModbusTfminiOptions))
+    device.join()
+    return device
+
+
+def connect_can(context: Context, options: dict[str, Any]) -> CanTfmini:
+    """Entry point `can:tfmini`."""
+    device = CanTfmini(context, read_options(context, options, CanTfminiOptions))
+    device.join()
+    return device

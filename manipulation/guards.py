@@ -16,6 +16,7 @@ from manipulation import kernels
 Array = NDArray[np.float64]
 
 RISE_WINDOW_S = 0.4
+RISE_AFTER_S = 0.15  # a motion that begins under load takes it up again first; an arm behind a wire is 50 ms later
 RISE_SAMPLE_S = 0.016  # the running median is refreshed at 62 Hz; a contact rises within a few of these
 
 
@@ -54,7 +55,7 @@ class _Watch:
         self._held = 0
         self._axis = None if guard.axis is None else np.asarray(guard.axis, float)
         self._recent: deque[float] = deque(maxlen=round(RISE_WINDOW_S / RISE_SAMPLE_S))
-        self._next_s = 0.0
+        self._next_s = RISE_AFTER_S
         self._median: float | None = None
 
     def holds(self, now: Measured) -> bool:

@@ -1,22 +1,25 @@
-"""Slamtec RPLIDAR A1/A2 over serial, standard scan (Slamtec interface protocol, LR001).
+"""Slamtec RPLIDAR A1/A2 over serial, standard and express scans (Slamtec interface protocol, LR001).
 
-A measurement has five bytes and no check sum: a start bit beside its inverse and a bit that is always 1. So nothing is
-believed until eight measurements after it are in step, and a turn with a misstep in it is thrown away whole.
+In a standard scan a measurement has five bytes and no check sum: a start bit beside its inverse and a bit that is always
+1. So nothing is believed until eight measurements after it are in step, and a turn with a misstep in it is thrown away
+whole.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.polar import Beams, LineScanner, within
+from drivers.rplidar_express import CAPSULE_BYTES, EXPRESS_TYPE, REQUEST, CapsuleParser, Points, split_turns
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.options import SerialOptions, read_options, serial_opener
+from drivers.transport.serial_link import SerialLink
 from hal.registry import Context
 
 STOP, RESET, START_SCAN, GET_INFO, GET_HEALTH = 0x25, 0x40, 0x20, 0x50, 0x52
@@ -32,8 +35,12 @@ RESET_S = 0.5
 
 
 class RplidarOptions(SerialOptions):
-    """Options of `serial:rplidar`; a turn is sorted into `beams` equal sectors, the nearest measurement of each."""
+    """Options of `serial:rplidar`; a turn is sorted into `beams` equal sectors, the nearest measurement of each.
 
+    `express` scans are protected by a check; the first A1 models do not know them.
+    """
+
+    mode: Literal["standard", "express"] = "standard"
     beams: Annotated[int, Field(ge=90, le=3600)] = 360
     scan_rate_hz: Annotated[float, Field(gt=0, le=20)] = 5.5
     min_range_m: Annotated[float, Field(ge=0)] = 0.15
@@ -127,58 +134,70 @@ class Rplidar(LineScanner):
             scan_s=scan_s,
         )
         self.sigma_m = options.sigma_m
-        self._parser = NodeParser()
-        self._turn: list[NDArray[np.uint8]] | None = None
+        self._is_express = options.mode == "express"
+        self._nodes, self._capsules = NodeParser(), CapsuleParser()
+        self._turn: list[Points] | None = None
+        self._last_rad = 0.0
         self._missed = 0
 
     def start(self, link: Link) -> None:
-        """Stop, identify, ask for its health (one reset if it is ill), scan."""
+        """Start the motor, stop, identify, ask for its health (one reset if it is ill), scan."""
+        if isinstance(link, SerialLink):
+            link.set_dtr(False)  # an A1's motor turns while DTR is low
         link.write(bytes([0xA5, STOP]), now_s() + ANSWER_S)
         drain_until_quiet(link, quiet_s=0.02, until_s=now_s() + ANSWER_S)
-        self._ask(link, GET_INFO, descriptor(20, 0, INFO_TYPE), 20)
+        self._ask(link, bytes([0xA5, GET_INFO]), descriptor(20, 0, INFO_TYPE), 20)
         if self._health(link) == ERROR:
             link.write(bytes([0xA5, RESET]), now_s() + ANSWER_S)
             drain_until_quiet(link, quiet_s=0.1, until_s=now_s() + RESET_S)
             if self._health(link) == ERROR:
                 raise Refused("the scanner reports an error that a reset does not cure", code=ERROR)
-        self._parser, self._turn = NodeParser(), None
-        rest = self._ask(link, START_SCAN, descriptor(5, 1, SCAN_TYPE), 0)
+        self._nodes, self._capsules, self._turn = NodeParser(), CapsuleParser(), None
+        if self._is_express:
+            rest = self._ask(link, REQUEST, descriptor(CAPSULE_BYTES, 1, EXPRESS_TYPE), 0)
+        else:
+            rest = self._ask(link, bytes([0xA5, START_SCAN]), descriptor(5, 1, SCAN_TYPE), 0)
         self.receive(rest, now_s())
 
     def _health(self, link: Link) -> int:
-        return self._ask(link, GET_HEALTH, descriptor(3, 0, HEALTH_TYPE), 3)[0]
+        return self._ask(link, bytes([0xA5, GET_HEALTH]), descriptor(3, 0, HEALTH_TYPE), 3)[0]
 
-    def _ask(self, link: Link, command: int, head: bytes, length: int) -> bytes:
+    def _ask(self, link: Link, request: bytes, head: bytes, length: int) -> bytes:
         """What follows the descriptor `head`: at least `length` bytes."""
         for _ in range(3):
-            link.write(bytes([0xA5, command]), now_s() + ANSWER_S)
+            link.write(request, now_s() + ANSWER_S)
             seen, until_s = b"", now_s() + ANSWER_S
             while chunk := link.read(until_s):
                 seen += chunk
                 at = seen.find(head)
                 if at >= 0 and len(seen) >= at + len(head) + length:
                     return seen[at + len(head) :]
-        raise NoAnswer(f"no answer to command {command:02X}h")
+        raise NoAnswer(f"no answer to command {request[1]:02X}h")
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
-        """Collect measurements; a start flag ends a turn."""
-        for run in self._parser.feed(chunk):
-            if run is None:
+        """Collect measurements; a start flag, or an angle that falls back to nought, ends a turn."""
+        for points in self._capsules.feed(chunk) if self._is_express else map(_points, self._nodes.feed(chunk)):
+            if points is None:
                 self._missed += self._turn is not None
                 self._turn = None
                 continue
-            starts = np.flatnonzero(run[:, 0] & 1)
-            for part in np.split(run, starts):
-                if len(part) and part[0, 0] & 1:
+            starts, angle_rad, distance_m = points if len(points) == 3 else (self._starts(points[0]), *points)
+            for place, part in enumerate(np.split(np.arange(len(angle_rad)), starts)):
+                if place:
                     self._finish(arrived_s)
                     self._turn = []
                 if self._turn is not None and len(part):
-                    self._turn.append(part)
+                    self._turn.append((angle_rad[part], distance_m[part]))
+
+    def _starts(self, angle_rad: NDArray[np.float64]) -> list[int]:
+        starts = split_turns(angle_rad, self._last_rad)
+        self._last_rad = float(angle_rad[-1])
+        return starts
 
     def _finish(self, arrived_s: float) -> None:
         if not self._turn or self.beams is None:
             return
-        _, angle_rad, distance_m = decode(np.concatenate(self._turn))
+        angle_rad, distance_m = (np.concatenate(arrays) for arrays in zip(*self._turn, strict=True))
         if np.ptp(angle_rad) < WHOLE_TURN_RAD or turns_back(angle_rad):
             self._missed += 1
             return
@@ -186,6 +205,16 @@ class Rplidar(LineScanner):
         self.publish_scan(
             sectors(angle_rad, within(distance_m, self.beams), self.beams.count), valid_s=arrived_s, missed=missed
         )
+
+
+def _points(
+    run: NDArray[np.uint8] | None,
+) -> tuple[list[int], NDArray[np.float64], NDArray[np.float64]] | None:
+    """Places of start flags, angles and distances of a run of measurements."""
+    if run is None:
+        return None
+    is_start, angle_rad, distance_m = decode(run)
+    return [int(place) for place in np.flatnonzero(is_start)], angle_rad, distance_m
 
 
 def turns_back(angle_rad: NDArray[np.float64]) -> bool:

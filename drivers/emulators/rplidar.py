@@ -12,11 +12,14 @@ from drivers.emulators.beams import line_m
 from drivers.emulators.faults import FaultOptions
 from drivers.emulators.ports import Peer, PtyPort
 from drivers.rplidar import descriptor
+from drivers.rplidar_express import CABIN, CAPSULE_BYTES, POINTS
+from drivers.transport.checks import xor_byte
 from hal.devices import Device, RangeScanner
 from hal.errors import Unsupported
 from hal.strict import validate
 
 QUALITY = 15
+WITH_PAYLOAD = 0x80
 
 
 class RplidarEmulatorOptions(FaultOptions):
@@ -37,14 +40,18 @@ class RplidarEmulator(WireEmulator):
         self._o = options
         self.health = options.health
         self.period_s = 1.0 / options.scan_rate_hz
-        self.is_scanning = False
+        self.is_scanning = self.is_express = self._is_first = False
         self._buffer = b""
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
         """Requests `A5 command`."""
         self._buffer += data
         while (at := self._buffer.find(b"\xa5")) >= 0 and len(self._buffer) > at + 1:
-            command, self._buffer = self._buffer[at + 1], self._buffer[at + 2 :]
+            command, rest = self._buffer[at + 1], self._buffer[at + 2 :]
+            payload = 1 + rest[0] + 1 if command >= WITH_PAYLOAD and rest else 0  # its length, it, the check
+            if len(rest) < payload or (command >= WITH_PAYLOAD and not rest):
+                return
+            self._buffer = rest[payload:]
             self._request(peer, command)
 
     def _request(self, peer: Peer, command: int) -> None:
@@ -59,23 +66,32 @@ class RplidarEmulator(WireEmulator):
                 self.reply(peer, descriptor(20, 0, 4) + bytes([24, 29, 1, 7]) + bytes(range(16)))
             case 0x52:
                 self.reply(peer, descriptor(3, 0, 6) + bytes([self.health, 0, 0]))
+            case 0x82 if self.health != 2:
+                self.is_scanning, self.is_express, self._is_first = True, True, True
+                self.reply(peer, descriptor(CAPSULE_BYTES, 1, 0x82))
             case 0x20 | 0x21 if self.health != 2:
-                self.is_scanning = True
+                self.is_scanning, self.is_express = True, False
                 self.reply(peer, descriptor(5, 1, 0x81))
             case _:
                 return
 
     def on_tick(self) -> None:
         """One turn."""
-        if self.is_scanning:
+        if self.is_scanning and self.is_express:
+            self.send(None, self._turn())
+        elif self.is_scanning:
             self.send(None, self._turn(), protected=slice(0, 0))
 
     def _turn(self) -> bytes:
-        angle_rad = np.arange(self._o.nodes, dtype=np.float64) * (2.0 * np.pi / self._o.nodes)
+        count = self._o.nodes if not self.is_express else -(-self._o.nodes // POINTS) * POINTS
+        angle_rad = np.arange(count, dtype=np.float64) * (2.0 * np.pi / count)
         seen = self._backing.read_range(deadline=self.deadline()).value
         signed_rad = (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
         range_m = line_m(seen, self._backing.capabilities(), signed_rad)
-        return encode_turn(angle_rad, range_m)
+        if not self.is_express:
+            return encode_turn(angle_rad, range_m)
+        is_first, self._is_first = self._is_first, False
+        return encode_capsules(range_m, is_first=is_first)
 
 
 def encode_turn(angle_rad: np.ndarray[Any, Any], range_m: np.ndarray[Any, Any]) -> bytes:
@@ -94,6 +110,20 @@ def encode_turn(angle_rad: np.ndarray[Any, Any], range_m: np.ndarray[Any, Any]) 
         axis=1,
     )
     return nodes.astype(np.uint8).tobytes()
+
+
+def encode_capsules(range_m: np.ndarray[Any, Any], *, is_first: bool) -> bytes:
+    """A turn of evenly spaced measurements, a multiple of 32, without offsets."""
+    raw = np.round(np.nan_to_num(range_m) * 1000.0).astype(np.int64) << 2
+    capsules = b""
+    for at in range(0, len(raw), POINTS):
+        start_q6 = round(360.0 * at / len(raw) * 64.0) | (0x8000 if is_first and at == 0 else 0)
+        cabins = np.zeros(POINTS // 2, CABIN)
+        cabins["d1"], cabins["d2"] = raw[at : at + POINTS : 2], raw[at + 1 : at + POINTS : 2]
+        body = start_q6.to_bytes(2, "little") + cabins.tobytes()
+        check = xor_byte(body)
+        capsules += bytes([0xA0 | check & 15, 0x50 | check >> 4]) + body
+    return capsules
 
 
 def start(backing: Device, options: dict[str, Any]) -> RplidarEmulator:

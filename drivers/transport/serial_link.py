@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import termios
+from contextlib import suppress
 from pathlib import Path
 
 import serial
@@ -49,6 +50,11 @@ class SerialLink(FdLink):
         except (serial.SerialException, OSError, termios.error) as error:
             raise LinkLost(f"{self._name}: {error}") from error
         self._name = f"serial {self._path}, {baud} baud"
+
+    def set_dtr(self, is_on: bool) -> None:
+        """Work the DTR line; a pseudo terminal and some adapters have none, which is no error."""
+        with suppress(serial.SerialException, OSError):
+            self._port.dtr = is_on
 
     def _release(self, fd: int) -> None:  # noqa: ARG002  # pyserial closes it
         try:

@@ -14,6 +14,8 @@ from drivers.emulators import rplidar as emulator
 from drivers.emulators.beams import line_m
 from drivers.emulators.scripted import ScriptedScanner, scripted_scan
 from drivers.rplidar import NodeParser, decode, descriptor, sectors, turns_back
+from drivers.rplidar_express import CAPSULE_BYTES, REQUEST, CapsuleParser, decode_capsule, is_capsule, is_first
+from drivers.transport.checks import xor_byte
 from hal.conformance import RangeScannerContract, Rig
 from hal.devices import RangeImage
 from hal.errors import DeviceUnavailable
@@ -104,3 +106,80 @@ def test_a_turn_with_a_stray_angle_in_it_turns_back_and_one_with_lost_measuremen
     assert not turns_back((angle_rad + 3.0) % (2 * np.pi))
     for stray_deg in (200.0, 350.0, 90.0):
         assert turns_back(np.insert(angle_rad, 100, np.radians(stray_deg)))
+
+
+class TestExpress(RangeScannerContract):
+    @pytest.fixture
+    def rig(self) -> Iterator[Rig[Any]]:
+        far_side = emulator.start(ScriptedScanner(), {"scan_rate_hz": 20.0})
+        options = {"mode": "express", "scan_rate_hz": 10.0}
+        with wired_rig(far_side, "serial:rplidar", options, sample_period_s=0.2) as rig:
+            yield rig
+
+
+def test_the_request_of_an_express_scan_is_the_manuals() -> None:
+    assert REQUEST.hex() == "a58205000000000022"
+
+
+def test_a_capsule_by_hand() -> None:
+    body = bytearray(82)
+    body[0:2] = (10 * 64).to_bytes(2, "little")
+    body[2:4] = (1500 << 2 | 0b01).to_bytes(2, "little")  # 1.5 m, bit 4 of the offset
+    body[4:6] = (2500 << 2).to_bytes(2, "little")
+    body[6] = 0x52  # offsets: 1|2 -> 18/8 degrees, and 5/8
+    check = xor_byte(bytes(body))
+    capsule = bytes([0xA0 | check & 15, 0x50 | check >> 4]) + bytes(body)
+    assert is_capsule(capsule) and not is_first(capsule)
+    angle_rad, distance_m = decode_capsule(capsule, np.radians(42.0))
+    assert np.degrees(angle_rad[:2]) == pytest.approx([10.0 - 18 / 8, 11.0 - 5 / 8])
+    assert distance_m[:2] == pytest.approx([1.5, 2.5])
+    assert np.all(np.isnan(distance_m[2:]))
+    assert not is_capsule(capsule[:50] + b"\x01" + capsule[51:])
+
+
+@given(st.lists(st.integers(1, 200), max_size=20), st.binary(max_size=100))
+def test_express_measurements_do_not_depend_on_the_chunks(sizes: list[int], noise: bytes) -> None:
+    turn = emulator.encode_capsules(np.linspace(1.0, 2.0, 384), is_first=False)
+    data = turn + noise + turn
+    whole = CapsuleParser().feed(data)
+    parser, parts, at = CapsuleParser(), list[Any](), 0
+    for size in [*sizes, len(data)]:
+        parts += parser.feed(data[at : at + size])
+        at += size
+    assert [part is None for part in parts] == [part is None for part in whole]
+    for part, same in zip(parts, whole, strict=True):
+        if part is not None and same is not None:
+            np.testing.assert_array_equal(part, same)
+    assert sum(part is not None for part in whole) >= 20
+
+
+def test_a_lost_capsule_does_not_stretch_its_neighbour() -> None:
+    turn = emulator.encode_capsules(np.linspace(1.0, 2.0, 384), is_first=False)
+    parts = CapsuleParser().feed(turn[: 5 * CAPSULE_BYTES] + turn[6 * CAPSULE_BYTES :])
+    assert [part is None for part in parts] == [False] * 3 + [True] * 2 + [False] * 4
+
+
+@pytest.mark.parametrize("fault", ["crc", "drop", "dup", "split", "garbage", "delay"])
+def test_no_fault_of_the_wire_gives_a_wrong_express_scan(fault: str) -> None:
+    backing = ScriptedScanner()
+    angle_rad = (np.arange(360) * (2 * np.pi / 360) + np.pi) % (2 * np.pi) - np.pi
+
+    def is_true(value: RangeImage) -> bool:
+        c = backing.capabilities()
+        lines = (
+            line_m(RangeImage(depth_m=scripted_scan(index)), c, angle_rad)
+            for index in range(max(1, backing.reads - 40), backing.reads + 1)
+        )
+        return any(_is_within(value.depth_m[0], line) for line in lines)
+
+    far_side = emulator.start(backing, {"fault": fault, "every": 3, "scan_rate_hz": 20.0, "nodes": 384})
+    with wired(far_side, "serial:rplidar", {"mode": "express", "scan_rate_hz": 10.0}) as device:
+        assert count_good(device, is_true, wanted=3) >= 1
+
+
+def _is_within(seen_m: Any, line: Any) -> bool:
+    """Each beam that was seen is near some true beam beside it: 384 measurements fall into 360 sectors."""
+    near = np.stack([np.roll(line, shift) for shift in (-2, -1, 0, 1, 2)])
+    seen = np.isfinite(seen_m)
+    low, high = np.nanmin(near, axis=0), np.nanmax(near, axis=0)
+    return bool(np.all((seen_m[seen] >= low[seen] - 0.01) & (seen_m[seen] <= high[seen] + 0.01)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections import deque
 from typing import Annotated, Any
 
 import numpy as np
@@ -16,7 +17,8 @@ from pydantic import Field
 from drivers import dxl2
 from drivers.arms import Array, KinematicsOptions, SetPointFilter, capabilities
 from drivers.transport.bus import Bus, PolledDevice
-from drivers.transport.link import BadAnswer, Link, NoAnswer, Refused, drain, now_s
+from drivers.transport.device import wall_until
+from drivers.transport.link import BadAnswer, Link, NoAnswer, Refused, WireError, drain, now_s
 from drivers.transport.options import SerialOptions, read_options, serial_opener
 from hal.clock import Deadline
 from hal.devices import ArmCapabilities, DeviceKind, JointState
@@ -166,6 +168,7 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
         self._zero = np.array(options.zero_counts or (CENTRE,) * n, dtype=float)
         self._filter = SetPointFilter(context.name, options.kinematics, command_rate_hz=options.rate_hz)
         self._polls = 0
+        self._pending: deque[dict[int, bytes]] = deque(maxlen=1)  # the newest goals, not yet sent
 
     def capabilities(self) -> ArmCapabilities:
         """From the options."""
@@ -179,22 +182,35 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
     def enable(self, *, deadline: Deadline) -> None:
         """Torque on with the measured position as goal; arms the bus watchdogs."""
         measured = self.newest(deadline).value.position_rad
+        self._pending.clear()
         self.call(lambda client, until_s: self._torque_on(client, measured, until_s), deadline)
         self._filter.begin(measured)
 
     def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:
-        """One goal for all servos in one packet."""
+        """One goal for all servos in one packet: now when the bus is free, else before the next poll."""
         self.require_open()
         sent = self._filter.passed(position_rad, now_s())
-        goals = self._goals(sent)
-        self.call(lambda client, until_s: client.sync_write(GOAL, 4, goals, until_s), deadline)
+        self._pending.append(self._goals(sent))
+        until_s = wall_until(deadline)
+        try:
+            self.bus.call(lambda client, _: self._send_pending(client, until_s), now_s())
+        except NoAnswer:
+            return sent  # a servo that answers late must not hold up the control loop
+        except WireError as error:
+            self.errors += 1
+            raise self.translate(error) from error
         return sent
+
+    def _send_pending(self, client: DynamixelClient, until_s: float) -> None:
+        if self._pending and self._filter.is_open:
+            client.sync_write(GOAL, 4, self._pending.pop(), until_s)
 
     def stop(self, *, deadline: Deadline) -> None:
         """Hold where the arm is: torque stays on, so that it does not fall; goals are refused until `enable`."""
         self.require_open()
         was_open = self._filter.is_open
         self._filter.begin(None)
+        self._pending.clear()
         if was_open:
             here = self._goals(self.newest(deadline).value.position_rad)
             self.call(lambda client, until_s: client.sync_write(GOAL, 4, here, until_s), deadline)
@@ -211,7 +227,9 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
 
     def poll(self, client: DynamixelClient) -> None:
         """Current, velocity and position of all servos, stamped in the middle of the exchange."""
-        asked_s, o = now_s(), self._options
+        o = self._options
+        self._send_pending(client, now_s() + o.timeout_s)
+        asked_s = now_s()
         until_s = asked_s + 2 * o.timeout_s
         ask = client.fast_sync_read if o.is_fast else client.sync_read
         blocks = ask(o.ids, STATE, STATE_BYTES, until_s)

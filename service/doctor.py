@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, entry_points, version
 from pathlib import Path
 
 from rich.markup import escape
@@ -36,6 +36,8 @@ def examine(cell: Path, port: int, *, connect: bool) -> bool:
     ]
     results = [_check(name, check) for name, check in checks]
     if connect and all(results):
+        results.append(_wires(load_cell(find_cell(cell))))
+    if connect and all(results):
         results.append(_check("devices", lambda: _devices(load_cell(find_cell(cell)))))
     return all(results)
 
@@ -50,6 +52,19 @@ def _check(name: str, check: Callable[[], str]) -> bool:
         return False
     console.print(f"[green]good[/]   {name:<24} {escape(words)}")
     return True
+
+
+def _wires(cell: Cell) -> bool:
+    """What the installed drivers find out about ports and wires; they are found by name, as the drivers are."""
+    is_good = True
+    for point in entry_points(group="panelwright.doctor"):
+        for finding in point.load()(cell):
+            word = "[green]good[/] " if finding.is_good else "[red]wrong[/]"
+            console.print(f"{word}  {escape(finding.subject):<24} {escape(finding.what)}")
+            if finding.hint:
+                console.print(f"{'':<31} try: {escape(finding.hint)}")
+            is_good &= finding.is_good or finding.subject not in cell.file.devices
+    return is_good
 
 
 def _python() -> str:

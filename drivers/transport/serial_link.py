@@ -29,6 +29,9 @@ class SerialLink(FdLink):
         self._path = path
         self._device_id = os.fstat(port.fileno()).st_rdev
         self.is_low_latency = _ask_for_low_latency(port)
+        timer_ms = latency_timer_ms(path)
+        self.latency = "" if timer_ms is None else f", latency timer {timer_ms} ms"
+        self._name += self.latency
 
     def is_present(self) -> bool:
         """Does the name still lead to the character device that is open? A re-plugged adapter is another one."""
@@ -49,7 +52,7 @@ class SerialLink(FdLink):
             self._port.baudrate = baud
         except (serial.SerialException, OSError, termios.error) as error:
             raise LinkLost(f"{self._name}: {error}") from error
-        self._name = f"serial {self._path}, {baud} baud"
+        self._name = f"serial {self._path}, {baud} baud{self.latency}"
 
     def set_dtr(self, is_on: bool) -> None:
         """Work the DTR line; a pseudo terminal and some adapters have none, which is no error."""
@@ -88,6 +91,15 @@ def _ask_for_low_latency(port: serial.Serial) -> bool:
     except (OSError, ValueError, NotImplementedError):
         return False
     return True
+
+
+def latency_timer_ms(path: str) -> int | None:
+    """How long the USB adapter behind `path` holds bytes back, in ms; None when its driver does not say."""
+    file = Path("/sys/class/tty") / Path(os.path.realpath(path)).name / "device" / "latency_timer"
+    try:
+        return int(file.read_text())
+    except (OSError, ValueError):
+        return None
 
 
 def _unavailable(path: str, device: str, error: Exception) -> DeviceUnavailable:

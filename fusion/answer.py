@@ -14,6 +14,7 @@ from fusion.batch import Batch
 from fusion.certify import Certificate, certificate
 from fusion.errors import Contradiction
 from fusion.evidence import log_evidence
+from fusion.inliers import ProvenSet, best_set
 from fusion.measurement import Measurement
 from fusion.minima import Minimum
 from fusion.observability import FreeDirection
@@ -21,6 +22,14 @@ from hal.geometry import Array, UncertainPose
 
 EVIDENCE_NEEDED = math.log(1000.0)  # for agreement against chance, once something was rejected
 EVIDENCE_PER_MISMATCH = 0.5  # each rejected measurement is a surprise: fewer are bad than good
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Proofs:
+    """What to prove beside the answer: the certificate, and the best set within so many seconds (None: not)."""
+
+    certificate: bool = False
+    set_within_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -100,6 +109,7 @@ class FusedPose:
         alternatives: other poses that fit, most probable first.
         evidence: log odds that the measurements used agree because of the pose, against chance.
         certificate: proof that no other pose fits those measurements better, when asked for.
+        proven_set: the set of measurements with the least truncated error, with proof, when asked for.
         shape: the object's own measures, when it was given as a shape with unknown ones.
     """
 
@@ -113,6 +123,7 @@ class FusedPose:
     alternatives: tuple[Alternative, ...]
     evidence: float
     certificate: Certificate | None = None
+    proven_set: ProvenSet | None = None
     shape: ShapeEstimate | None = None
 
     @property
@@ -133,7 +144,7 @@ def judged(
     index: NDArray[np.int64],
     given: Sequence[Measurement],
     repeats: dict[int, int],
-    certify: bool,
+    proofs: Proofs,
 ) -> FusedPose:
     """The answer that a best minimum and the `others` make.
 
@@ -142,7 +153,7 @@ def judged(
         best, others: distinct minima of the truncated error.
         given: all measurements of the caller.
         repeats: index of each duplicate, and of the measurement that it repeats.
-        certify: also ask for the certificate.
+        proofs: what else to prove.
 
     Raises:
         Contradiction: the best set could agree by chance.
@@ -173,7 +184,10 @@ def judged(
         unobservable=local.unobservable,
         alternatives=() if local.unobservable else _alternatives(best, others, index),
         evidence=evidence,
-        certificate=certificate(b, best.used, local) if certify else None,
+        certificate=certificate(b, best.used, local) if proofs.certificate else None,
+        proven_set=best_set(b, best.used, local, index, deadline_s=proofs.set_within_s)
+        if proofs.set_within_s is not None
+        else None,
     )
 
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import RigidTransform
 from fusion.batch import Batch
 from fusion.dual import minimiser
 from fusion.lifted import lift
-from fusion.relaxation import ROTATION, SIZE, TRANSLATION, relaxed
+from fusion.relaxation import SIZE, nearest_pose, relaxed
 from fusion.solve import LocalSolution, middle_and_size
 from hal.geometry import Array, difference, transform
 
@@ -58,14 +58,14 @@ def certificate(b: Batch, used: NDArray[np.bool_], local: LocalSolution) -> Cert
     about, middle = R.T @ lever, t + lever  # features are taken from `about`, places from `middle`, in units of `size`
     Q = quadratic_forms(b, R, t, about, middle, size)[used].sum(axis=0)
     scaled_t = (t + R @ about - middle) / size
-    z = _monomials(R, scaled_t)
+    z = monomials(R, scaled_t)
     found = minimiser(Q, R, scaled_t)
     rotation, shift, gap, bound = found.rotation, found.translation, 0.0, found.value
     if not found.proven:
         Z, bound = relaxed(Q)
         values, vectors = np.linalg.eigh(Z)
         gap = float(abs(values[-2]) / values[-1])
-        rotation, shift = _pose(vectors[:, -1])
+        rotation, shift = nearest_pose(vectors[:, -1])
     pose = transform(rotation, size * shift + middle - rotation @ about)
     delta = difference(pose, local.base_from_object)
     distance = math.sqrt(max(float(delta @ local.information @ delta), 0.0))
@@ -86,12 +86,6 @@ def quadratic_forms(b: Batch, R: Array, t: Array, about: Array, middle: Array, s
     return forms
 
 
-def _monomials(R: Array, t: Array) -> Array:
+def monomials(R: Array, t: Array) -> Array:
+    """z (16,) of a pose: 1, R row by row, t, -R^T t."""
     return np.concatenate([[1.0], R.ravel(), t, -R.T @ t])
-
-
-def _pose(z: Array) -> tuple[Array, Array]:
-    """Rotation (3, 3) and (scaled) translation nearest to the leading eigenvector."""
-    z = z / z[0]
-    U, _, Vt = np.linalg.svd(z[ROTATION].reshape(3, 3))
-    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt, z[TRANSLATION]

@@ -60,16 +60,17 @@ class _Identity:
     free: Array
 
 
-def minimiser(Q: Array, rotation: Array, translation: Array) -> Minimiser:
+def minimiser(Q: Array, rotation: Array, translation: Array, *, prove: bool = True) -> Minimiser:
     """The minimum of z^T Q z next to a pose, and whether it is proven to be the global one.
 
     Args:
         Q: (16, 16) positive semidefinite, over z = (1, vec R, t, -R^T t).
         rotation, translation: (3, 3), (3,) where to start, in the units of Q.
+        prove: also look for multipliers.
     """
     R, t, seen = _descended(Q, rotation, translation)
     at = _identity()
-    return Minimiser(rotation=R, translation=t, value=float(at.z @ seen @ at.z), proven=_is_proven(seen))
+    return Minimiser(rotation=R, translation=t, value=float(at.z @ seen @ at.z), proven=prove and _is_proven(seen))
 
 
 def _descended(Q: Array, rotation: Array, translation: Array) -> tuple[Array, Array, Array]:
@@ -81,7 +82,7 @@ def _descended(Q: Array, rotation: Array, translation: Array) -> tuple[Array, Ar
         T = seen_from(R, t)
         seen = T.T @ Q @ T
         slope, bend = at.tangent.T @ seen @ at.z, at.tangent.T @ seen @ at.tangent
-        step = -np.linalg.solve(bend + 1e-14 * np.trace(bend) * np.eye(6), slope)
+        step = -np.linalg.solve(bend + (1e-13 * np.trace(bend) + 1e-300) * np.eye(6), slope)
         if -float(slope @ step) < STILL * scale:
             break
         step *= min(1.0, 1.0 / max(float(np.linalg.norm(step[3:])), 1e-12))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.answer import FusedPose, judged
+from fusion.answer import FusedPose, Proofs, judged
 from fusion.batch import Batch, duplicates, pack
 from fusion.measurement import Measurement
 from fusion.minima import Minimum, finished, minima
@@ -116,5 +116,5 @@ def _made(
     given: tuple[Measurement, ...], b: Batch, best: Minimum, others: tuple[Minimum, ...], prior: UncertainPose | None
 ) -> Fusion:
     index = np.array([*range(len(given)), *([-1] if prior is not None else [])])
-    answer = judged(b, best, others, index, given, {}, False)
+    answer = judged(b, best, others, index, given, {}, Proofs())
     return Fusion(measurements=given, answer=answer, batch=b, best=best, others=others, prior=prior)

@@ -88,3 +88,10 @@ def relaxed(Q: Array) -> tuple[Array, float]:
     Z = np.zeros((SIZE, SIZE))
     Z[_ROWS, _COLUMNS] = np.asarray(solution.z) / _WEIGHT
     return Z + Z.T - np.diag(np.diag(Z)), float(-solution.obj_val * scale)
+
+
+def nearest_pose(z: Array) -> tuple[Array, Array]:
+    """Rotation (3, 3) and (scaled) translation nearest to the leading eigenvector."""
+    z = z / z[0]
+    U, _, Vt = np.linalg.svd(z[ROTATION].reshape(3, 3))
+    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt, z[TRANSLATION]

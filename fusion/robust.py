@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.answer import Alternative, FusedPose, Rejected, judged
+from fusion.answer import Alternative, FusedPose, Proofs, Rejected, judged
 from fusion.batch import Batch, duplicates, pack
+from fusion.inliers import MOST, too_many
 from fusion.measurement import Measurement
 from fusion.minima import minima
 from fusion.parameters import fuse_shape
@@ -26,6 +27,7 @@ def fuse(
     prior: UncertainPose | None = None,
     shape: Shape | None = None,
     certify: bool = False,
+    prove_set_within_s: float | None = None,
     seed: int = 0,
 ) -> FusedPose:
     """The pose that the largest agreeing part of the measurements points to.
@@ -37,10 +39,13 @@ def fuse(
         shape: the object's family when its own measures (a radius, a size) are to be estimated too; measurements with a
             `part` follow it, and a prior pose is needed to start from.
         certify: also bound the error from below by a semidefinite relaxation (needs clarabel).
+        prove_set_within_s: also prove which set of measurements is best, by branch and bound, for at most 16 of them; after
+            so many seconds the gap that is left is stated instead.
         seed: of the random subsets; the same input and seed give the same answer.
 
     Raises:
-        InvalidRequest: a measurement makes no sense (`details["index"]`, `details["reason"]`), or there is none.
+        InvalidRequest: a measurement makes no sense (`details["index"]`, `details["reason"]`), there is none, or there are
+            too many for branch and bound.
         Contradiction: no set of measurements agrees by more than chance; `details` names those outside the best set.
     """
     if not len(measurements) and prior is None:
@@ -55,8 +60,11 @@ def fuse(
     if repeats:
         first = np.array([i not in repeats for i in index])
         index, b = index[first], b.part(first)
+    proofs = Proofs(certificate=certify, set_within_s=prove_set_within_s)
+    if prove_set_within_s is not None and len(b.cls) > MOST:
+        raise too_many(len(b.cls))
     best, others = minima(b, np.random.default_rng(seed))
-    return judged(b, best, others, index, measurements, repeats, certify)
+    return judged(b, best, others, index, measurements, repeats, proofs)
 
 
 def used_entries(

@@ -6,7 +6,7 @@ feature like any other. So a cylinder's radius or a box's size come out of the s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -130,6 +130,50 @@ class Box:
             point[k] = values[k] / 2 if sign == "+" else -values[k] / 2
             axes.append(np.eye(3)[k] if sign == "+" else -np.eye(3)[k])
         return plane(point, axes[0], name=part) if len(axes) == 1 else line(point, np.cross(*axes), name=part)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MovingPart:
+    """A feature whose place depends on the parameters: point_m + slopes^T values.
+
+    Attributes:
+        feature: where it is when all parameters are zero.
+        slopes: (P, 3) by how much its point moves for each unit of each parameter, object frame.
+    """
+
+    feature: Feature
+    slopes: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FeatureSet:
+    """Any points, lines and planes whose places depend linearly on parameters: a hinge's gap, a slider's travel, a pitch.
+
+    Attributes:
+        names, start, sigma: as `Shape`.
+        moving: the parts by name.
+    """
+
+    names: tuple[str, ...]
+    start: Array
+    sigma: Array
+    moving: dict[str, MovingPart]
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of its features."""
+        return tuple(self.moving)
+
+    def feature(self, part: str, values: Array, place_m: Array) -> Feature:  # noqa: ARG002 - these features are flat everywhere
+        """The part's feature at these parameters.
+
+        Raises:
+            InvalidRequest: no such part.
+        """
+        if part not in self.moving:
+            raise _no_part(part, self.parts)
+        found = self.moving[part]
+        return replace(found.feature, point_m=found.feature.point_m + np.asarray(values) @ found.slopes)
 
 
 def _no_part(part: str, parts: tuple[str, ...]) -> InvalidRequest:

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.features import Feature, Kind
+from fusion.answer import ShapeEstimate
+from fusion.features import Feature, Kind, unit
 from fusion.measurement import Measurement, SensingClass
 from fusion.robust import FusedPose, fuse
+from fusion.shapes import Box, Cylinder, FeatureSet, MovingPart, Shape
 from hal.devices import DeviceKind
 from hal.errors import MotionError, NotFound
 from hal.geometry import UncertainPose
@@ -28,7 +30,7 @@ from service.operations.evidence import (
 )
 from service.operations.inspect import ensure_located
 from service.operations.locate import Located, go_to_overview, locate, pose_json, scan_plate
-from service.operations.requests import FuseRequest, MeasurementBody
+from service.operations.requests import BoxBody, CylinderBody, FeatureSetBody, FuseRequest, MeasurementBody
 from service.operations.session import Session
 from service.operations.spots import bare_spots
 from service.operations.travel import workcell
@@ -104,7 +106,13 @@ def run_fuse(session: Session, request: FuseRequest) -> dict[str, Any]:
         return fused_json(fuse_and_remember(session, evidence))
     measurements = [_measurement(body) for body in request.measurements]
     prior = request.prior.pose() if request.prior is not None else None
-    fused = fuse(measurements, prior=prior, certify=request.certify)
+    fused = fuse(
+        measurements,
+        prior=prior,
+        shape=shape_of(request.shape) if request.shape is not None else None,
+        certify=request.certify,
+        prove_set_within_s=request.prove_set_within_s,
+    )
     return {**pose_json(fused.base_from_object), **_account(fused, measurements)}
 
 
@@ -183,6 +191,38 @@ def _measurement(body: MeasurementBody) -> Measurement:
         M=np.array(body.m_per_rad2),
         label=body.label,
         sensor=body.sensor,
+        part=body.part,
+    )
+
+
+def shape_of(body: CylinderBody | BoxBody | FeatureSetBody) -> Shape:
+    """The family of objects that a request describes.
+
+    Raises:
+        InvalidRequest: a line or plane without direction.
+    """
+    match body:
+        case CylinderBody():
+            return Cylinder(radius_m=body.radius_m, length_m=body.length_m, sigma_m=body.sigma_m)
+        case BoxBody():
+            return Box(size_m=body.size_m, sigma_m=body.sigma_m)
+    names = tuple(p.name for p in body.parameters)
+    return FeatureSet(
+        names=names,
+        start=np.array([p.start_m for p in body.parameters]),
+        sigma=np.array([p.sigma_m for p in body.parameters]),
+        moving={
+            part.name: MovingPart(
+                feature=Feature(
+                    kind=Kind(part.feature),
+                    point_m=np.array(part.point_m),
+                    direction=unit(part.direction),
+                    name=part.name,
+                ),
+                slopes=np.array([part.slopes.get(name, (0.0, 0.0, 0.0)) for name in names]),
+            )
+            for part in body.parts
+        },
     )
 
 
@@ -217,4 +257,17 @@ def _account(fused: FusedPose, measurements: Sequence[Measurement]) -> dict[str,
             for a in fused.alternatives
         ],
         "certificate": fused.certificate,
+        "proven_set": fused.proven_set,
+        "shape": _shape_json(fused.shape),
+    }
+
+
+def _shape_json(shape: ShapeEstimate | None) -> dict[str, Any] | None:
+    if shape is None:
+        return None
+    return {
+        "names": list(shape.names),
+        "values": shape.values.tolist(),
+        "sigma": np.sqrt(np.diag(shape.covariance)).tolist(),
+        "covariance": shape.covariance.tolist(),
     }

@@ -22,6 +22,7 @@ from drivers.emulators import (
     scip,
     scripted,
     tfmini,
+    tfmini_i,
     ur,
 )
 from drivers.emulators.base import WireEmulator
@@ -58,6 +59,25 @@ def true_distance(value: float, backing: Any) -> bool:
     steps = (value - backing.first_m) / 0.001
     index = backing.reads % 1000
     return bool(abs(steps - round(steps)) < 1e-6 and (index - round(steps)) % 1000 <= 100)
+
+
+def true_centimetres(value: float, backing: Any) -> bool:
+    """One of the last 100 readings, to the centimetre."""
+    true_m = backing.first_m + 0.001 * (np.arange(backing.reads - 100, backing.reads + 1) % 1000)
+    return bool(np.min(np.abs(np.round(true_m, 2) - value)) < 1e-6)
+
+
+def true_express(value: RangeImage, backing: Any) -> bool:
+    """One of the last 60 scans; its 384 measurements fall into 360 sectors, so each beam may be its neighbour's."""
+    c, seen_m = backing.capabilities(), value.depth_m[0]
+    seen = np.isfinite(seen_m)
+    for index in range(max(1, backing.reads - 60), backing.reads + 1):
+        line = line_m(RangeImage(depth_m=scripted.scripted_scan(index)), c, turn_angles(len(seen_m)))
+        near = np.stack([np.roll(line, shift) for shift in (-2, -1, 0, 1, 2)])[:, seen]
+        low, high = np.fmin.reduce(near), np.fmax.reduce(near)
+        if np.all((seen_m[seen] >= low - 1e-3) & (seen_m[seen] <= high + 1e-3)):
+            return True
+    return False
 
 
 def true_scan(angles: Callable[[int], Any]) -> Callable[[RangeImage, Any], bool]:
@@ -121,6 +141,25 @@ BENCHES = (
         is_true=true_distance,
         options={},
         far_options={},
+    ),
+    Bench(
+        name="tfmini modbus",
+        start=tfmini_i.start_modbus,
+        backing=scripted.ScriptedProximity,
+        driver="modbus:tfmini",
+        is_true=true_centimetres,
+        options={},
+        far_options={},
+    ),
+    Bench(
+        name="tfmini can",
+        start=tfmini_i.start_can,
+        backing=scripted.ScriptedProximity,
+        driver="can:tfmini",
+        is_true=true_centimetres,
+        options={},
+        far_options={},
+        faults=WITHOUT_CRC,
     ),
     Bench(
         name="ft300 stream",
@@ -221,6 +260,15 @@ BENCHES = (
         options={"scan_rate_hz": 20.0},
         far_options={"scan_rate_hz": 40.0},
         faults=WITHOUT_CRC,
+    ),
+    Bench(
+        name="rplidar express",
+        start=rplidar.start,
+        backing=scripted.ScriptedScanner,
+        driver="serial:rplidar",
+        is_true=true_express,
+        options={"scan_rate_hz": 20.0, "mode": "express"},
+        far_options={"scan_rate_hz": 40.0, "nodes": 384},
     ),
     Bench(
         name="ur",

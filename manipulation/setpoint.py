@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
@@ -43,7 +45,7 @@ class SetPointFilter:
         Raises:
             DeviceFailure: the wanted one is not finite.
         """
-        if not np.isfinite(wanted_rad).all():
+        if not math.isfinite(wanted_rad @ wanted_rad):
             raise DeviceFailure("controller", "a set-point was not finite")
         kin = self._kinematics
         out: Array = kernels.safe_step(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
@@ -14,6 +15,7 @@ from hal.devices import ArmCapabilities, DeviceKind, JointState, Truth
 from hal.errors import InvalidRequest, MotionRefused
 from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
+from simbackend import kernels
 from simbackend.arm_model import MODELS
 from simbackend.client import Frame
 from simbackend.device import VALID, SimDevice, SimOptions, parse
@@ -36,6 +38,7 @@ class SimArm(SimDevice[JointState]):
 
     def __init__(self, context: Context, options: ArmOptions) -> None:
         super().__init__(context, DeviceKind.ARM, options)
+        kernels.warm_up()
         self._capabilities = replace(MODELS[options.model]().capabilities, command_rate_hz=self._world.rate_hz)
         self._lower = np.asarray(self._capabilities.lower_rad)
         self._upper = np.asarray(self._capabilities.upper_rad)
@@ -61,17 +64,14 @@ class SimArm(SimDevice[JointState]):
         """
         self._check(deadline)
         wanted = np.asarray(position_rad, float)
-        if wanted.shape != self._lower.shape or not np.isfinite(wanted).all():
+        if wanted.shape != self._lower.shape or not math.isfinite(wanted @ wanted):
             raise InvalidRequest(
                 f"{self._name}: a set-point is six finite joint angles", hint="check the planner", device=self._name
             )
         if not self._world.is_enabled:
             raise MotionRefused(f"{self._name}: the drives are off", hint="call enable first", device=self._name)
         last = self._world.frame.snapshot.setpoint_rad
-        low = np.maximum(last - self._stride, self._lower)
-        high = np.minimum(last + self._stride, self._upper)
-        # A drive that woke beyond a limit may come back but go no further out.
-        sent: Array = np.minimum(np.maximum(wanted, np.minimum(low, high)), np.maximum(low, high))
+        sent: Array = kernels.reachable(wanted, last, self._stride, self._lower, self._upper)
         self._world.aim_arm(sent)
         return sent
 

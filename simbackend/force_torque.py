@@ -14,6 +14,7 @@ from hal.clock import Deadline
 from hal.devices import DeviceKind, ForceTorqueCapabilities, Wrench
 from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
+from simbackend import kernels
 from simbackend.client import Frame
 from simbackend.device import VALID, SimDevice, SimOptions, parse
 
@@ -22,6 +23,7 @@ Array = NDArray[np.float64]
 FORCE_RANGE_N, TORQUE_RANGE_NM = 300.0, 30.0
 FORCE_DIGIT_N, TORQUE_DIGIT_NM = 0.02, 0.0005
 DRIFT_PERIOD_S = 180.0
+FORCES = np.repeat([1.0, 0.0], 3)  # an injected bias is one of force
 
 
 class ForceTorqueOptions(SimOptions):
@@ -38,6 +40,7 @@ class SimForceTorque(SimDevice[Wrench]):
 
     def __init__(self, context: Context, options: ForceTorqueOptions) -> None:
         super().__init__(context, DeviceKind.FORCE_TORQUE, options)
+        kernels.warm_up()
         self._options = options
         draws = self._world.draws
         record = (
@@ -72,12 +75,13 @@ class SimForceTorque(SimDevice[Wrench]):
 
     def _measure(self, frame: Frame, bias: float) -> tuple[Wrench, Quality, Cause]:
         snapshot = frame.snapshot
-        noise = self._sigma * self._noise.at(snapshot.tick)
-        drift = self._drift * np.sin(2.0 * math.pi * snapshot.stamp_s / DRIFT_PERIOD_S + self._phase)
-        raw = snapshot.wrench + self._bias + drift + noise
-        raw[:3] += bias
-        raw = (raw / self._digit).round() * self._digit
-        if np.abs(raw / self._range).max() <= 1.0:
+        angle_rad = 2.0 * math.pi * snapshot.stamp_s / DRIFT_PERIOD_S
+        noise = self._noise.at(snapshot.tick)
+        raw = kernels.raw_wrench(
+            snapshot.wrench, self._bias + bias * FORCES, self._drift, self._phase, angle_rad, noise, self._sigma,
+            self._digit,
+        )  # fmt: skip
+        if (np.abs(raw) <= self._range).all():
             return Wrench(force_n=raw[:3], torque_nm=raw[3:]), *VALID
         raw = np.clip(raw, -self._range, self._range)
         return Wrench(force_n=raw[:3], torque_nm=raw[3:]), Quality.DEGRADED, Cause.SATURATED

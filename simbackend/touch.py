@@ -38,7 +38,7 @@ class SimTouch(SimDevice[Contacts]):
         return self._sample(deadline)
 
     def _measure(self, frame: Frame, bias: float) -> tuple[Contacts, Quality, Cause]:
-        return tuple(bool(force + bias >= self._threshold_n) for force in frame.snapshot.pad_force_n), *VALID
+        return tuple(force + bias >= self._threshold_n for force in frame.snapshot.pad_force_n.tolist()), *VALID
 
 
 def connect(context: Context, options: dict[str, Any]) -> SimTouch:

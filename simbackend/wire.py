@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from enum import IntEnum, IntFlag
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +31,8 @@ class Op(IntEnum):
     TRUTH = 3
 
 
-class Drive(IntFlag):
-    """What a step says to the arm's drives; obeyed in this order."""
+class Drive(IntEnum):
+    """What a step says to the arm's drives, a bit each; obeyed in this order. (An `IntFlag` costs 3 us a look.)"""
 
     NONE = 0
     STOP = 1

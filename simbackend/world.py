@@ -27,7 +27,6 @@ from simbackend.wire import (
     LIGHTS_AT,
     MAX_PROXIMITY,
     PROXIMITY_TICKS,
-    SNAPSHOT,
     Drive,
     WorldConfig,
 )
@@ -36,6 +35,7 @@ Array = NDArray[np.float64]
 
 GRAVITY_M_PER_S2 = 9.81
 TIP_TICKS = 4  # how often to look which mechanisms are near; the tip goes 8 mm meanwhile
+UNUSED_7 = (0.0,) * 7  # numbers that the snapshot keeps free
 CONE_RAYS = 4
 CONE_RAD = 0.0175
 CONE_DEPTH_M = 0.02
@@ -223,17 +223,20 @@ class World:
 
     def snapshot(self) -> Array:
         """The vector that `Snapshot` names."""
-        out = np.zeros(SNAPSHOT)
-        out[0], out[1], out[2] = self.tick, self.tick * self.dt_s, self.drive.is_enabled
-        out[10:16], out[16:22], out[22:28] = self.q[:DOF], self.v[:DOF], self.drive.setpoint
-        out[28:34] = self.reaction
-        out[28:34] *= -1.0  # the engine reports the sensor on the tool's mount; we want the world on the tool
-        out[34:36] = self.pad_force_n
-        out[36] = self.q[DOF] + self.q[DOF + 1]
-        out[37], out[38] = self.gripper.is_moving, self.gripper.is_holding
-        out[40:44] = self.panel.lights_on
-        out[44:49] = self._proximity
-        return out
+        reaction = [-x for x in self.reaction]  # of the sensor on the tool's mount; we want the world on the tool
+        return np.array(
+            [
+                *(self.tick, self.tick * self.dt_s, self.drive.is_enabled, *UNUSED_7),
+                *self.q[:DOF],
+                *self.v[:DOF],
+                *self.drive.setpoint.tolist(),
+                *reaction,
+                *self.pad_force_n,
+                *(self.q[DOF] + self.q[DOF + 1], self.gripper.is_moving, self.gripper.is_holding, 0.0),
+                *self.panel.lights_on,
+                *self._proximity,
+            ]
+        )
 
     def flange(self) -> RigidTransform:
         """True base_from_flange."""

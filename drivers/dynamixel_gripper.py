@@ -1,0 +1,181 @@
+"""A two-finger gripper on a Dynamixel XM430 servo, beside an arm on the same bus or alone (XM430-W350 e-Manual).
+
+The servo works in current-based position mode: it goes to a position with at most the goal current, so the current is
+the grip. Torque comes on when the device is connected, and never again by itself.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from drivers.dynamixel import DynamixelClient
+from drivers.transport.bus import Bus, PolledDevice
+from drivers.transport.link import Refused, now_s
+from drivers.transport.options import SerialOptions, read_options, serial_opener
+from hal.clock import Deadline
+from hal.devices import DeviceKind, GripperCapabilities, GripperState
+from hal.errors import DeviceFault, InvalidRequest
+from hal.readings import Stamped
+from hal.registry import Context
+
+MODEL, MODE, TORQUE, WATCHDOG, GOAL_CURRENT, PROFILE_VELOCITY, GOAL, STATE = 0, 11, 64, 98, 102, 112, 116, 126
+STATE_BYTES = 10  # current16 velocity32 position32
+GRIP_MODE = 5
+A_PER_COUNT = 0.00269
+TURNS_PER_S_PER_COUNT = 0.229 / 60.0
+COUNTS_PER_TURN = 4096
+WATCHDOG_TICK_S = 0.02
+MOVING_COUNTS = 3  # of velocity: 0.7 rpm
+AT_GOAL_COUNTS = 12
+HOLDING_PART = 0.5  # of the goal current, at rest and short of the goal
+LIMIT_CURRENT = 1193
+CONNECT_S = 4.0
+
+
+class GripperOptions(SerialOptions):
+    """Options of `serial:dynamixel_gripper`; the counts at the ends of the stroke and the force of an ampere are
+    those of the built gripper: measure them."""
+
+    baud: Annotated[int, Field(ge=9600, le=4_500_000)] = 1_000_000
+    id: Annotated[int, Field(ge=0, le=252)] = 7
+    rate_hz: Annotated[float, Field(gt=0, le=200)] = 50.0
+    timeout_s: Annotated[float, Field(gt=0, le=1)] = 0.03
+    watchdog_s: Annotated[float, Field(ge=0.02, le=2.5)] = 0.5
+    stroke_m: Annotated[float, Field(gt=0, le=0.3)] = 0.08
+    closed_count: Annotated[int, Field(ge=-(2**20), le=2**20)] = 2048
+    open_count: Annotated[int, Field(ge=-(2**20), le=2**20)] = 3072
+    newtons_per_ampere: Annotated[float, Field(gt=0)] = 60.0
+    max_force_n: Annotated[float, Field(gt=0)] = 60.0
+    activate: bool = True
+
+
+class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
+    """The gripper."""
+
+    kind = DeviceKind.GRIPPER
+
+    def __init__(self, context: Context, options: GripperOptions) -> None:
+        opener, name = serial_opener(options, context.name)
+
+        def make() -> Bus[DynamixelClient]:
+            return Bus(name, open_link=opener, client=lambda link: DynamixelClient(link, timeout_s=options.timeout_s))
+
+        bus: Bus[DynamixelClient] = context.shared.get(f"dynamixel {name}", make)
+        super().__init__(context, bus, rate_hz=options.rate_hz, max_age_s=max(4.0 / options.rate_hz, 0.04))
+        self._options = options
+        self._goal: int | None = None
+        self._goal_current = LIMIT_CURRENT
+
+    def capabilities(self) -> GripperCapabilities:
+        """From the options; the speed is the servo's own limit at 12 V."""
+        o = self._options
+        return GripperCapabilities(
+            min_width_m=0.0, max_width_m=o.stroke_m, max_force_n=o.max_force_n, max_speed_m_per_s=self._speed(200)
+        )
+
+    def read_state(self, *, deadline: Deadline) -> Stamped[GripperState]:
+        """Newest width, and the grip as the motor's current tells it."""
+        return self.newest(deadline)
+
+    def command(self, *, width_m: float, force_n: float, speed_m_per_s: float, deadline: Deadline) -> float:
+        """Start to move; returns the width that the nearest count stands for.
+
+        Raises:
+            InvalidRequest: not finite. DeviceFault: torque is off.
+        """
+        if not all(math.isfinite(v) for v in (width_m, force_n, speed_m_per_s)):
+            raise InvalidRequest(f"{self.name}: width, force and speed must be finite", hint="send numbers")
+        o = self._options
+        goal = self._count(min(max(width_m, 0.0), o.stroke_m))
+        force_n = min(max(force_n, 0.0), o.max_force_n)
+        current = min(max(round(force_n / o.newtons_per_ampere / A_PER_COUNT), 1), LIMIT_CURRENT)
+        velocity = max(1, round(speed_m_per_s / self._speed(1)))
+        ticks = bytes([max(1, min(127, round(o.watchdog_s / WATCHDOG_TICK_S)))])
+
+        def work(client: DynamixelClient, until_s: float) -> None:
+            if not client.read(o.id, TORQUE, 1, until_s)[0]:
+                raise DeviceFault(
+                    f"{self.name} has no torque", hint="connect it again: that switches it on", device=self.name
+                )
+            client.write(o.id, WATCHDOG, b"\x00", until_s)  # a tripped one refuses goals
+            client.write(o.id, GOAL_CURRENT, struct.pack("<h", current), until_s)
+            client.write(o.id, PROFILE_VELOCITY, struct.pack("<I", velocity), until_s)
+            client.write(o.id, GOAL, struct.pack("<i", goal), until_s)
+            client.write(o.id, WATCHDOG, ticks, until_s)
+
+        self.call(work, deadline)
+        self._goal, self._goal_current = goal, current
+        return self._width_m(goal)
+
+    def activate(self, deadline: Deadline) -> None:
+        """Torque on, with the measured position as goal: nothing moves."""
+        o = self._options
+
+        def work(client: DynamixelClient, until_s: float) -> None:
+            position = client.read(o.id, STATE, STATE_BYTES, until_s)[6:]
+            client.write(o.id, WATCHDOG, b"\x00", until_s)
+            client.write(o.id, TORQUE, b"\x01", until_s)
+            client.write(o.id, GOAL, position, until_s)
+
+        self.call(work, deadline)
+
+    def set_up(self, client: DynamixelClient) -> None:
+        """The servo must answer, and be in the mode that limits its current; torque stays as it is."""
+        o, until_s = self._options, now_s() + 6 * self._options.timeout_s
+        client.read(o.id, MODEL, 2, until_s)
+        mode = client.read(o.id, MODE, 1, until_s)[0]
+        if mode == GRIP_MODE:
+            return
+        if client.read(o.id, TORQUE, 1, until_s)[0]:
+            raise Refused(f"servo {o.id} is in mode {mode} under torque, not {GRIP_MODE} (grip)", code=mode)
+        client.write(o.id, MODE, bytes([GRIP_MODE]), until_s)
+
+    def poll(self, client: DynamixelClient) -> None:
+        """Current, velocity and position in one block."""
+        asked_s, o = now_s(), self._options
+        block = client.read(o.id, STATE, STATE_BYTES, asked_s + 2 * o.timeout_s)
+        current, velocity, position = struct.unpack("<hii", block)
+        is_moving = abs(velocity) >= MOVING_COUNTS
+        is_short = self._goal is not None and abs(position - self._goal) > AT_GOAL_COUNTS
+        is_holding = is_short and not is_moving and abs(current) >= HOLDING_PART * self._goal_current
+        self.publish(
+            GripperState(
+                width_m=self._width_m(position),
+                force_n=abs(current) * A_PER_COUNT * o.newtons_per_ampere if is_holding else 0.0,
+                is_moving=is_moving,
+                is_holding=is_holding,
+            ),
+            valid_s=0.5 * (asked_s + now_s()),
+        )
+
+    def _speed(self, velocity: int) -> float:
+        """Metres a second of a profile velocity."""
+        o = self._options
+        return velocity * TURNS_PER_S_PER_COUNT * COUNTS_PER_TURN * o.stroke_m / abs(o.open_count - o.closed_count)
+
+    def _count(self, width_m: float) -> int:
+        o = self._options
+        return round(o.closed_count + width_m / o.stroke_m * (o.open_count - o.closed_count))
+
+    def _width_m(self, count: int) -> float:
+        o = self._options
+        return min(max((count - o.closed_count) / (o.open_count - o.closed_count), 0.0), 1.0) * o.stroke_m
+
+
+def connect(context: Context, options: dict[str, Any]) -> DynamixelGripper:
+    """Entry point `serial:dynamixel_gripper`; switches torque on unless told not to."""
+    parsed = read_options(context, options, GripperOptions)
+    device = DynamixelGripper(context, parsed)
+    device.join(CONNECT_S)
+    if not parsed.activate:
+        return device
+    try:
+        device.activate(Deadline.after(context.clock, CONNECT_S))
+    except BaseException:
+        device.close()
+        raise
+    return device

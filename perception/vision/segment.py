@@ -41,7 +41,7 @@ class Regions:
 
 def grow_regions(gray: Image, *, tolerance: float = TOLERANCE) -> Regions:
     """Segment a gray image (H, W) uint8."""
-    labels, sums = _grow(np.ascontiguousarray(gray), tolerance, SPREADS)
+    labels, sums = _grow(np.ascontiguousarray(gray), tolerance)
     count = sums[:, 0]
     mean = sums[:, 1] / count
     box = np.column_stack([sums[:, 5], sums[:, 7], sums[:, 6] - sums[:, 5] + 1, sums[:, 8] - sums[:, 7] + 1])
@@ -60,93 +60,119 @@ def _root(parent: NDArray[np.int32], k: int) -> int:  # pragma: no cover
 
 
 @njit(cache=True, inline="always")
-def _fits(sums: Array, k: int, value: float, tolerance: float, spreads: float) -> bool:  # pragma: no cover
-    """Whether a gray value belongs to a region: |I - mean| <= max(tolerance, spreads * sigma), no roots."""
-    n, total = sums[k, 0], sums[k, 1]
+def _fits(n: float, total: float, squares: float, value: float, tolerance: float) -> bool:  # pragma: no cover
+    """Whether a gray value belongs to a region: |I - mean| <= max(tolerance, SPREADS * sigma), no roots."""
     d = abs(value * n - total)  # n |I - mean|: no division on the common path
     if d <= tolerance * n:
         return True
     if d > 3.0 * tolerance * n:
         return False
-    return bool(d * d <= spreads * spreads * (sums[k, 2] * n - total * total))
+    return bool(d * d <= SPREADS * SPREADS * (squares * n - total * total))
+
+
+@njit(cache=True, inline="always")
+def _joined(sums: Array, parent: NDArray[np.int32], a: int, b: int) -> int:  # pragma: no cover
+    """One region of two roots; the older one's number stays."""
+    low, high = (a, b) if a < b else (b, a)
+    parent[high] = low
+    for j in range(5):
+        sums[low, j] += sums[high, j]
+    sums[low, 5] = min(sums[low, 5], sums[high, 5])
+    sums[low, 6] = max(sums[low, 6], sums[high, 6])
+    sums[low, 7] = min(sums[low, 7], sums[high, 7])
+    sums[low, 8] = max(sums[low, 8], sums[high, 8])
+    return low
+
+
+@njit(cache=True, inline="always")
+def _flush(
+    sums: Array, k: int, moments: tuple[float, float, float], row: int, first: int, end: int
+) -> None:  # pragma: no cover
+    """Write back the gray moments of region `k`, and add the places of its run [first, end) in a row."""
+    count = end - first
+    region = sums[k]
+    region[0], region[1], region[2] = moments
+    region[3] += 0.5 * count * (first + end - 1)
+    region[4] += count * row
+    region[5] = min(region[5], first)
+    region[6] = max(region[6], end - 1)
+    region[8] = row
 
 
 @njit(cache=True)
-def _grow(  # noqa: PLR0912, PLR0915  (one pass: calls would cost more than what they do)
-    gray: Image, tolerance: float, spreads: float
-) -> tuple[NDArray[np.int32], Array]:  # pragma: no cover
+def _grow(gray: Image, tolerance: float) -> tuple[NDArray[np.int32], Array]:  # noqa: PLR0912  # pragma: no cover
+    """One raster pass. The region of the current run has its gray moments in registers (n, total, squares): most
+    pixels have the same region above and to the left, and cost one comparison."""
     height, width = gray.shape
     labels = np.empty((height, width), np.int32)
-    capacity = height * width // 4 + 16
-    parent = np.empty(capacity, np.int32)
-    sums = np.zeros((capacity, 9))
+    parent = np.empty(height * width // 16 + 16, np.int32)
+    sums = np.empty((len(parent), 9))
     made = 0
     for v in range(height):
         left = -1
+        above = up_root = -1  # raw label above and its root: looked up again only when the label changes
+        n = total = squares = 0.0
+        first = 0
         for u in range(width):
             value = float(gray[v, u])
-            up = _root(parent, labels[v - 1, u]) if v > 0 else -1
-            if up == left:
-                if up >= 0 and not _fits(sums, up, value, tolerance, spreads):
-                    up = left = -1
-            else:
-                if up >= 0 and not _fits(sums, up, value, tolerance, spreads):
-                    up = -1
-                if left >= 0 and not _fits(sums, left, value, tolerance, spreads):
-                    left = -1
-            if up >= 0 and left >= 0 and up != left:
-                difference = sums[up, 1] / sums[up, 0] - sums[left, 1] / sums[left, 0]
-                if -tolerance <= difference <= tolerance:
-                    low, high = (up, left) if up < left else (left, up)
-                    parent[high] = low
-                    for j in range(5):
-                        sums[low, j] += sums[high, j]
-                    sums[low, 5] = min(sums[low, 5], sums[high, 5])
-                    sums[low, 6] = max(sums[low, 6], sums[high, 6])
-                    sums[low, 7] = min(sums[low, 7], sums[high, 7])
-                    sums[low, 8] = max(sums[low, 8], sums[high, 8])
-                    k = low
+            if v > 0 and labels[v - 1, u] != above:
+                above = labels[v - 1, u]
+                up_root = _root(parent, above)
+            if up_root == left and left >= 0 and _fits(n, total, squares, value, tolerance):
+                n, total, squares = n + 1.0, total + value, squares + value * value
+                labels[v, u] = left
+                continue
+            up = up_root if up_root != left else -1
+            if up >= 0 and not _fits(sums[up, 0], sums[up, 1], sums[up, 2], value, tolerance):
+                up = -1
+            goes_on = left >= 0 and up_root != left and _fits(n, total, squares, value, tolerance)
+            if goes_on and up >= 0:
+                mean_up, mean_left = sums[up, 1] / sums[up, 0], total / n
+                if -tolerance <= mean_up - mean_left <= tolerance:
+                    _flush(sums, left, (n, total, squares), v, first, u)
+                    left = up_root = _joined(sums, parent, up, left)
+                    n, total, squares, first = sums[left, 0], sums[left, 1], sums[left, 2], u
+                elif abs(value - mean_up) <= abs(value - mean_left):
+                    goes_on = False
+            if not goes_on:
+                if left >= 0:
+                    _flush(sums, left, (n, total, squares), v, first, u)
+                if up >= 0:
+                    left = up
+                    n, total, squares = sums[up, 0], sums[up, 1], sums[up, 2]
                 else:
-                    k = (
-                        up
-                        if abs(value - sums[up, 1] / sums[up, 0]) <= abs(value - sums[left, 1] / sums[left, 0])
-                        else left
-                    )
-            elif up >= 0:
-                k = up
-            elif left >= 0:
-                k = left
-            else:
-                if made == capacity:
-                    parent, sums = _enlarged(parent, sums)
-                    capacity = len(parent)
-                k = made
-                made += 1
-                parent[k] = k
-                sums[k, 5], sums[k, 6], sums[k, 7], sums[k, 8] = u, u, v, v
-            row = sums[k]
-            row[0] += 1.0
-            row[1] += value
-            row[2] += value * value
-            row[3] += u
-            row[4] += v
-            row[5] = min(row[5], u)
-            row[6] = max(row[6], u)
-            row[8] = v
-            labels[v, u] = k
-            left = k
-    number = np.full(made, -1, np.int32)
+                    if made == len(parent):
+                        parent, sums = _enlarged(parent, sums)
+                    left = made
+                    made += 1
+                    parent[left] = left
+                    sums[left] = 0.0
+                    sums[left, 5], sums[left, 6], sums[left, 7] = u, u, v
+                    n = total = squares = 0.0
+                first = u
+            n, total, squares = n + 1.0, total + value, squares + value * value
+            labels[v, u] = left
+        _flush(sums, left, (n, total, squares), v, first, width)
+    return _numbered(labels, parent[:made], sums)
+
+
+@njit(cache=True)
+def _numbered(
+    labels: NDArray[np.int32], parent: NDArray[np.int32], sums: Array
+) -> tuple[NDArray[np.int32], Array]:  # pragma: no cover
+    """Labels 0 to N - 1 in the order of the roots, in place, and the roots' sums."""
+    number = np.full(len(parent), -1, np.int32)
+    out = np.empty((len(parent), 9))
     count = 0
-    out = np.empty((made, 9))
-    for k in range(made):
+    for k in range(len(parent)):
         if parent[k] == k:
             number[k] = count
             out[count] = sums[k]
             count += 1
-    for k in range(made):
+    for k in range(len(parent)):
         number[k] = number[_root(parent, k)]
-    for v in range(height):
-        for u in range(width):
+    for v in range(labels.shape[0]):
+        for u in range(labels.shape[1]):
             labels[v, u] = number[labels[v, u]]
     return labels, out[:count].copy()
 
@@ -155,6 +181,6 @@ def _grow(  # noqa: PLR0912, PLR0915  (one pass: calls would cost more than what
 def _enlarged(parent: NDArray[np.int32], sums: Array) -> tuple[NDArray[np.int32], Array]:  # pragma: no cover
     more_parent = np.empty(2 * len(parent), np.int32)
     more_parent[: len(parent)] = parent
-    more_sums = np.zeros((2 * len(sums), sums.shape[1]))
+    more_sums = np.empty((2 * len(sums), sums.shape[1]))
     more_sums[: len(sums)] = sums
     return more_parent, more_sums

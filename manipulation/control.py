@@ -42,7 +42,7 @@ from manipulation.guards import GuardSet, Measured
 from manipulation.kinematics import Kinematics
 from manipulation.recorder import Recorder
 from manipulation.runs import Run, Tick, begin
-from manipulation.sensing import READ_WAIT_S, ContactWrench, DeviceFailure, Devices, Look, RangeReader, Sample, ToolView
+from manipulation.sensing import ContactWrench, DeviceFailure, Devices, Look, RangeReader, Sample, ToolView, read_wait_s
 from manipulation.setpoint import SetPointFilter, check, flange_matrix
 
 Array = NDArray[np.float64]
@@ -432,7 +432,7 @@ class Controller:
 
     def _send(self, position_rad: Array) -> None:
         try:
-            deadline = Deadline(self._clock.now_s() + READ_WAIT_S, self._clock)
+            deadline = Deadline(self._clock.now_s() + read_wait_s(self._clock), self._clock)
             self._filter.sent(self._devices.arm.command_position(position_rad, deadline=deadline))
         except CellError as error:
             raise DeviceFailure(self._devices.arm.name, error.what) from error

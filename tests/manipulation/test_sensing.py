@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from hal.clock import SimClock
+from hal.clock import PacedClock, SimClock, WallClock
 from hal.errors import DeviceTimeout, StaleReading
-from manipulation.sensing import ContactWrench, RangeReader
+from manipulation.sensing import ContactWrench, RangeReader, read_wait_s
 from tests.manipulation.rig import LOAD, SENSOR, FakeProximity, World
 
 PATIENCE_S = 0.3
@@ -51,6 +51,12 @@ def test_an_old_stamp_counts_as_silence() -> None:
     assert sensor.read(0.2) == pytest.approx(0.05)
     with pytest.raises(StaleReading):
         sensor.read(0.31)
+
+
+def test_a_tick_waits_long_for_a_device_only_where_the_world_waits_too() -> None:
+    picture_s, watchdog_s = 0.15, 0.1
+    assert read_wait_s(PacedClock()) > picture_s
+    assert read_wait_s(WallClock()) < watchdog_s
 
 
 def test_nothing_in_range_is_an_answer() -> None:

@@ -25,7 +25,7 @@ class TestDynamixel(ArmContract):
     @pytest.fixture
     def rig(self) -> Iterator[Rig[Any]]:
         far_side = emulator.start(ScriptedArm(), {})
-        with wired_rig(far_side, DRIVER, {"watchdog_s": 1.0}, sample_period_s=0.06) as rig:
+        with wired_rig(far_side, DRIVER, {"watchdog_s": 0.3}, sample_period_s=0.06) as rig:
             yield rig
 
 

@@ -26,7 +26,7 @@ class TestUr(ArmContract):
     @pytest.fixture
     def rig(self) -> Iterator[Rig[Any]]:
         with wired_rig(
-            emulator.start(ScriptedArm(), {}), DRIVER, {"rate_hz": 125.0, "watchdog_s": 1.0}, sample_period_s=0.1
+            emulator.start(ScriptedArm(), {}), DRIVER, {"rate_hz": 125.0, "watchdog_s": 0.2}, sample_period_s=0.1
         ) as rig:
             yield rig
 

@@ -34,11 +34,11 @@ demo: setup  ## Run the whole mission on the simulated cell and leave a report i
 serve: setup  ## Start the service on http://127.0.0.1:8460
 	@$(BIN)/panelwright serve
 
-test: setup  ## Run all tests
-	@$(BIN)/python -m pytest
+test: setup  ## Run all tests, two files at a time
+	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope
 
 test-fast: setup  ## Run the tests without missions and browsers
-	@$(BIN)/python -m pytest -m 'not slow'
+	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope -m 'not slow'
 
 lint: setup  ## Style, types and layering
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .

@@ -1,0 +1,105 @@
+"""The digital inputs and outputs of a UR controller on loopback RTDE, worked by lights or touch pads of any kind."""
+
+from __future__ import annotations
+
+import struct
+import time
+from typing import Any
+
+from drivers import rtde
+from drivers.emulators.base import WireEmulator
+from drivers.emulators.faults import FaultOptions
+from drivers.emulators.ports import Peer, TcpPort
+from hal.devices import Device, Lights, Touch
+from hal.errors import Unsupported
+from hal.strict import validate
+
+TYPES = {
+    "timestamp": "DOUBLE",
+    "actual_digital_input_bits": "UINT64",
+    "actual_digital_output_bits": "UINT64",
+    "standard_digital_output_mask": "UINT8",
+    "standard_digital_output": "UINT8",
+}
+PERIOD_S = 0.008
+FIRST_TOOL_INPUT = 16
+
+
+class UrIoEmulator(WireEmulator):
+    """The controller, running."""
+
+    def __init__(self, backing: Lights | Touch, options: FaultOptions) -> None:
+        super().__init__(TcpPort(), options, name="ur_io")
+        self._backing = backing
+        self.period_s = PERIOD_S
+        self._start_s = time.monotonic()
+        self._parsers: dict[Peer, rtde.PackageParser] = {}
+        self._recipes: dict[tuple[Peer, str], rtde.Recipe] = {}
+        self._streams: set[Peer] = set()
+        self.outputs = 0
+
+    def on_bytes(self, peer: Peer, data: bytes) -> None:
+        """RTDE packages."""
+        if not data:
+            self._parsers[peer] = rtde.PackageParser()
+            self._streams.discard(peer)
+        for kind, payload in self._parsers.setdefault(peer, rtde.PackageParser()).feed(data):
+            self._obey(peer, kind, payload)
+
+    def _obey(self, peer: Peer, kind: str, payload: bytes) -> None:
+        match kind:
+            case "V":
+                self.reply(peer, rtde.package("V", bytes([payload == b"\x00\x02"])))
+            case "O" | "I":
+                names = rtde.split_names(payload[8:] if kind == "O" else payload)
+                types = [TYPES.get(name, "NOT_FOUND") for name in names]
+                if "NOT_FOUND" not in types:
+                    self._recipes[peer, kind] = rtde.recipe(1, names, types)
+                self.reply(peer, rtde.package(kind, b"\x01" + ",".join(types).encode() + b","))
+            case "S" | "P":
+                (self._streams.add if kind == "S" else self._streams.discard)(peer)
+                self.reply(peer, rtde.package(kind, b"\x01"))
+            case "U" if (peer, "I") in self._recipes:
+                self._switch(self._recipes[peer, "I"].unpack(payload))
+
+    def _switch(self, values: dict[str, Any]) -> None:
+        mask, word = values["standard_digital_output_mask"], values["standard_digital_output"]
+        self.outputs = self.outputs & ~mask | word & mask
+        if isinstance(self._backing, Lights):
+            count = len(self._backing.capabilities().channels)
+            lit = [bool(self.outputs >> i & 1) for i in range(count)]
+            self._backing.set_on(lit, deadline=self.deadline())
+
+    def on_tick(self) -> None:
+        """One package to each client."""
+        for peer in list(self._streams):
+            self.send(peer, self._package(peer), protected=slice(0, 3))
+
+    def status_frame(self) -> bytes | None:
+        """A text for people, which may come at any time."""
+        return rtde.package("M", struct.pack(">B5sB3s", 5, b"joint", 3, b"rtc") + b"\x00")
+
+    def _package(self, peer: Peer) -> bytes:
+        values: dict[str, float | int] = {
+            "timestamp": time.monotonic() - self._start_s,
+            "actual_digital_input_bits": self._inputs(),
+            "actual_digital_output_bits": self.outputs,
+        }
+        recipe = self._recipes[peer, "O"]
+        return recipe.pack([values[name] for name in recipe.names])
+
+    def _inputs(self) -> int:
+        if isinstance(self._backing, Lights):
+            bits, first = self._backing.read_on(deadline=self.deadline()).value, 0
+        else:
+            bits, first = self._backing.read_contacts(deadline=self.deadline()).value, FIRST_TOOL_INPUT
+        return sum(1 << first + i for i, is_on in enumerate(bits) if is_on)
+
+
+def start(backing: Device, options: dict[str, Any]) -> UrIoEmulator:
+    """Entry point `ur_io`."""
+    if not isinstance(backing, Lights | Touch):
+        raise Unsupported(f"digital points cannot stand for a {backing.kind}", hint="back them with lights or touch")
+    emulator = UrIoEmulator(backing, validate(options, FaultOptions, source="emulators.ur_io"))
+    emulator.begin()
+    return emulator

@@ -1,0 +1,252 @@
+"""Lights and touch on the digital inputs and outputs of a Universal Robots controller, over RTDE (UR RTDE guide).
+
+The controller serves several RTDE clients, so these run beside the arm's own. Only one client may own
+`standard_digital_output`; another one that wants it is refused with IN_USE.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from abc import abstractmethod
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Annotated, Any, Self
+
+from pydantic import Field, model_validator
+
+from drivers import rtde
+from drivers.transport.device import StreamDevice, wall_until
+from drivers.transport.link import Link, LinkLost, NoAnswer, Refused, WireError, now_s
+from drivers.transport.options import PortNumber, Seconds, TcpOptions, read_options, tcp_opener
+from drivers.transport.timebase import HostTime
+from hal.clock import Deadline
+from hal.devices import DeviceKind, LightsCapabilities, TouchCapabilities
+from hal.errors import InvalidRequest
+from hal.readings import Stamped
+from hal.registry import Context
+
+OUTPUTS = ("timestamp", "actual_digital_input_bits", "actual_digital_output_bits")
+INPUTS = ("standard_digital_output_mask", "standard_digital_output")
+ANSWER_S = 0.5
+CLOSE_S = 0.08
+Bits = tuple[bool, ...]
+Output = Annotated[int, Field(ge=0, le=7)]
+Point = Annotated[int, Field(ge=0, le=63)]
+
+
+class UrIoOptions(TcpOptions):
+    """Keys that both share."""
+
+    port: PortNumber = 30_004
+    rate_hz: Annotated[float, Field(gt=0, le=500)] = 125.0
+
+
+class UrLightsOptions(UrIoOptions):
+    """Options of `ur:lights`: an output for each light; `feedback` inputs tell whether it burns, where they are wired,
+    else the output's own state is given."""
+
+    channels: tuple[str, ...] = ("top_left", "top_right", "bottom_right", "bottom_left")
+    outputs: tuple[Output, ...] = (0, 1, 2, 3)
+    feedback: tuple[Point, ...] | None = None
+    settle_s: Seconds = 0.05
+
+    @model_validator(mode="after")
+    def _one_point_a_light(self) -> Self:
+        if not len(self.channels) == len(self.outputs) == len(self.feedback or self.outputs) >= 1:
+            raise ValueError("channels, outputs and feedback need the same number of entries, at least one")
+        return self
+
+
+class UrTouchOptions(UrIoOptions):
+    """Options of `ur:touch`: an input for each pad; 16 and 17 are the tool's."""
+
+    channels: tuple[str, ...] = ("left", "right")
+    contacts: tuple[Point, ...] = (16, 17)
+    threshold_n: Annotated[float, Field(gt=0)] = 1.0
+
+    @model_validator(mode="after")
+    def _one_point_a_pad(self) -> Self:
+        if not len(self.channels) == len(self.contacts) >= 1:
+            raise ValueError("channels and contacts need the same number of entries, at least one")
+        return self
+
+
+class UrIo(StreamDevice[Bits]):
+    """A stream of all digital bits of a controller; the subclass says what they mean."""
+
+    inputs: tuple[str, ...] = ()
+
+    def __init__(self, context: Context, options: UrIoOptions) -> None:
+        opener, name = tcp_opener(options, context.name)
+        super().__init__(context, open_link=opener, link_name=name, max_age_s=max(5.0 / options.rate_hz, 0.05))
+        self._rate_hz = options.rate_hz
+        self._parser = rtde.PackageParser()
+        self._points: rtde.Recipe | None = None
+        self._orders: rtde.Recipe | None = None
+        self._host = HostTime()
+        self._last_s = -math.inf
+
+    def start(self, link: Link) -> None:
+        """Agree on version 2, set up the recipes, start the stream."""
+        self._parser = rtde.PackageParser()
+        if self._ask(link, rtde.package("V", b"\x00\x02"), "V")[:1] != b"\x01":
+            raise Refused("the controller does not speak RTDE version 2", code=2)
+        self._points = self._recipe(link, rtde.outputs_request(OUTPUTS, self._rate_hz), "O", OUTPUTS)
+        if self.inputs:
+            self._orders = self._recipe(link, rtde.package("I", ",".join(self.inputs).encode()), "I", self.inputs)
+        if self._ask(link, rtde.package("S"), "S")[:1] != b"\x01":
+            raise Refused("the controller does not start the stream", code=0)
+        self._parser.data_size = rtde.HEADER.size + 1 + self._points.packing.size
+        self._host.reset()
+        self._last_s = -math.inf
+
+    def _recipe(self, link: Link, request: bytes, kind: str, names: tuple[str, ...]) -> rtde.Recipe:
+        answer = self._ask(link, request, kind)
+        try:
+            return rtde.recipe(answer[0], names, rtde.split_names(answer[1:]))
+        except (rtde.RecipeRefused, ValueError, IndexError) as error:
+            raise Refused(f"recipe refused: {error}", code=0) from None
+
+    def _ask(self, link: Link, request: bytes, kind: str) -> bytes:
+        link.write(request, now_s() + ANSWER_S)
+        until_s = now_s() + ANSWER_S
+        while chunk := link.read(until_s):
+            for got, payload in self._parser.feed(chunk):
+                if got == kind and rtde.package(got, payload) != request:  # texts may come between; echoes are ours
+                    return payload
+        raise NoAnswer(f"no answer to RTDE request {kind!r}")
+
+    def receive(self, chunk: bytes, arrived_s: float) -> None:
+        """Publish each package that is newer than the last."""
+        for kind, payload in self._parser.feed(chunk):
+            if kind != "U" or self._points is None or payload[0] != self._points.id:
+                continue
+            values: dict[str, Any] = self._points.unpack(payload)
+            device_s = float(values["timestamp"])
+            if not math.isfinite(device_s) or device_s == self._last_s:
+                continue  # the same package twice
+            self._last_s = device_s
+            self.publish(
+                self.meaning(values["actual_digital_input_bits"], values["actual_digital_output_bits"]),
+                valid_s=self._host.host_s(device_s=device_s, arrived_s=arrived_s),
+                device_time_s=device_s,
+            )
+
+    @abstractmethod
+    def meaning(self, inputs: int, outputs: int) -> Bits:
+        """What these bits say."""
+
+
+class UrLights(UrIo):
+    """The panel's border lights on a controller's outputs."""
+
+    kind = DeviceKind.LIGHTS
+    inputs = INPUTS
+
+    def __init__(self, context: Context, options: UrLightsOptions) -> None:
+        super().__init__(context, options)
+        self._options = options
+        self._wanted: Bits | None = None
+        self._commanded_s = -math.inf
+        self._writing = threading.Lock()
+
+    def capabilities(self) -> LightsCapabilities:
+        """Channel names from the options."""
+        return LightsCapabilities(channels=self._options.channels, settle_s=self._options.settle_s)
+
+    def set_on(self, on: Sequence[bool], *, deadline: Deadline) -> Bits:
+        """Switch all lights; what they do is told by `read_on`.
+
+        Raises:
+            InvalidRequest: another number of lights. DeviceUnavailable, DeviceTimeout: it could not be sent.
+        """
+        self.require_open()
+        wanted, channels = tuple(bool(value) for value in on), self._options.channels
+        if len(wanted) != len(channels):
+            raise InvalidRequest(
+                f"{self.name} has {len(channels)} lights, not {len(wanted)}",
+                hint=f"give one value for each of {', '.join(channels)}",
+                device=self.name,
+            )
+        link = self.port.link
+        try:
+            if link is None:
+                raise LinkLost("the link is down")
+            self._switch(link, wanted, wall_until(deadline))
+        except WireError as error:
+            self.errors += 1
+            raise self.translate(error) from error
+        self._wanted, self._commanded_s = wanted, self.context.clock.now_s()
+        return wanted
+
+    def read_on(self, *, deadline: Deadline) -> Stamped[Bits]:
+        """Newest feedback, never from before the last command."""
+        oldest_s = self.context.clock.now_s() - self.max_age_s
+        return self.newest(deadline, not_before_s=max(oldest_s, self._commanded_s))
+
+    def start(self, link: Link) -> None:
+        """After a loss the lights return to what was last commanded."""
+        super().start(link)
+        if self._wanted is not None:
+            self._switch(link, self._wanted, now_s() + ANSWER_S)
+
+    def meaning(self, inputs: int, outputs: int) -> Bits:
+        """Feedback inputs, or the outputs themselves."""
+        o = self._options
+        if o.feedback is None:
+            return tuple(bool(outputs >> point & 1) for point in o.outputs)
+        return tuple(bool(inputs >> point & 1) for point in o.feedback)
+
+    def release(self) -> None:
+        """Leave the lights off, if the wire still takes it."""
+        link = self.port.link
+        if link is not None:
+            with suppress(WireError):
+                self._switch(link, (False,) * len(self._options.outputs), now_s() + CLOSE_S)
+        super().release()
+
+    def _switch(self, link: Link, wanted: Bits, until_s: float) -> None:
+        if self._orders is None:
+            raise LinkLost("the controller is not set up")
+        mask = sum(1 << output for output in self._options.outputs)
+        word = sum(1 << output for output, is_on in zip(self._options.outputs, wanted, strict=True) if is_on)
+        with self._writing:
+            link.write(self._orders.pack([mask, word]), until_s)
+
+
+class UrTouch(UrIo):
+    """Contact switches on a controller's inputs."""
+
+    kind = DeviceKind.TOUCH
+
+    def __init__(self, context: Context, options: UrTouchOptions) -> None:
+        super().__init__(context, options)
+        self._options = options
+
+    def capabilities(self) -> TouchCapabilities:
+        """Channel names and threshold from the options."""
+        o = self._options
+        return TouchCapabilities(channels=o.channels, threshold_n=o.threshold_n, rate_hz=o.rate_hz)
+
+    def read_contacts(self, *, deadline: Deadline) -> Stamped[Bits]:
+        """Newest state of the pads."""
+        return self.newest(deadline)
+
+    def meaning(self, inputs: int, outputs: int) -> Bits:  # noqa: ARG002  # pads are inputs
+        """The pads' inputs."""
+        return tuple(bool(inputs >> point & 1) for point in self._options.contacts)
+
+
+def connect_lights(context: Context, options: dict[str, Any]) -> UrLights:
+    """Entry point `ur:lights`."""
+    device = UrLights(context, read_options(context, options, UrLightsOptions))
+    device.join()
+    return device
+
+
+def connect_touch(context: Context, options: dict[str, Any]) -> UrTouch:
+    """Entry point `ur:touch`."""
+    device = UrTouch(context, read_options(context, options, UrTouchOptions))
+    device.join()
+    return device

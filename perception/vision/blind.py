@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.errors import NotFound
+from perception.vision.circles import find_circles
 from perception.vision.features import PLATE_PX_PER_M, Ground, look_at, plate_gray
 from perception.vision.image import Image, as_gray
 from perception.vision.knowledge import NOTHING, Kind, Knowledge
-from perception.vision.match import distances, nothing_column
+from perception.vision.match import nearest, nothing_column, prepared
 from perception.vision.plate import find_plate
-from perception.vision.shapes import Edges, find_circles, find_edges, find_rectangles, find_slots
+from perception.vision.shapes import Edges, find_edges, find_rectangles, find_slots
 from perception.vision.view import Array, View
 
 PLATE_M = (0.40, 0.30)
@@ -99,7 +100,7 @@ def lay_out(gray: Image, view: View, plate_m: tuple[float, float]) -> Ground:
     target = np.array([[0, 0], [size[0], 0], [size[0], size[1]], [0, size[1]]], np.float32)
     turn = cv2.getPerspectiveTransform(view.project(corners).astype(np.float32), target)
     picture = np.asarray(cv2.warpPerspective(gray, turn, size, flags=cv2.INTER_LINEAR), np.uint8)
-    return Ground(picture=picture, edges=find_edges(picture), plate_gray=plate_gray(picture))
+    return Ground(picture=picture.astype(np.float32), edges=find_edges(picture), plate_gray=plate_gray(picture))
 
 
 def candidate_places(edges: Edges) -> Array:
@@ -134,7 +135,8 @@ def chosen(
     ground: Ground, places: Array, looks: Array, knowledge: Knowledge, view: View, plate_m: tuple[float, float]
 ) -> tuple[Candidate, ...]:
     """The candidates that stand, likest first, then the refused ones; see the module's text."""
-    distance = distances(looks, knowledge)
+    known = prepared(knowledge)
+    distance = nearest(looks, known)
     names = [kind.name for kind in knowledge.kinds]
     nothing = nothing_column(knowledge)
     to_nothing = distance[:, nothing] if nothing is not None else np.full(len(places), np.inf)
@@ -156,7 +158,7 @@ def chosen(
         if any(max(abs(u - a), abs(v - b)) < 0.475 * max(reach, c) for a, b, c in taken):
             continue
         middle = _centred(ground, places[i], knowledge.kinds[best[i]], knowledge)
-        seen = distances(look_at(ground, middle[None]), knowledge)[0]
+        seen = nearest(look_at(ground, middle[None]), known)[0]
         to_other = float(seen[nothing]) if nothing is not None else np.inf
         if nothing is not None:
             seen[nothing] = np.inf
@@ -185,11 +187,11 @@ def _centred(ground: Ground, place: Array, kind: Kind, knowledge: Knowledge) -> 
     The middle of a sub-object may be off by a shadow or a wall; the look as a whole is not. The minimum of a quadratic
     through the distances on a 3 x 3 grid, weighted towards the small ones, three times finer.
     """
-    only = Knowledge(kinds=(kind,), spread=knowledge.spread)
+    only = prepared(Knowledge(kinds=(kind,), spread=knowledge.spread))
     for step in (1.6, 0.8, 0.4):
         du, dv = np.meshgrid(np.arange(-1, 2) * step, np.arange(-1, 2) * step)
         tried = place + np.column_stack([du.ravel(), dv.ravel()])
-        d = distances(look_at(ground, tried), only)[:, 0]
+        d = nearest(look_at(ground, tried), only)[:, 0]
         w = np.exp(-(d - d.min()) / max(0.25 * float(d.max() - d.min()), 1e-6))
         place = (w[:, None] * tried).sum(axis=0) / w.sum()
     return np.asarray(place)

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.panel import Scale
+from perception.vision.circles import find_circles
 from perception.vision.image import Image, as_gray
 from perception.vision.patch import Patch
 from perception.vision.reading import Status, gated, refused
-from perception.vision.shapes import find_circles, find_edges
+from perception.vision.shapes import find_edges
 from perception.vision.status.gauge import pointer_confidence, status_of_pointer
 from perception.vision.status.pointer import PointerFit, find_pointer
 

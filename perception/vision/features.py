@@ -33,7 +33,7 @@ DESCRIPTORS = 12
 class Ground:
     """The rectified plate, its edges and the gray that it would have without objects."""
 
-    picture: Image
+    picture: NDArray[np.float32]
     edges: Edges
     plate_gray: NDArray[np.float32]
 

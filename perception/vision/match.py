@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -12,14 +14,38 @@ from perception.vision.view import Array
 CLIP = 3.0  # one number counts for three spreads at most: glare or a cable spoils some numbers, whatever is there
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Prepared:
+    """Taught looks over their spread, one below the other, with the column of each one's kind: made once an image."""
+
+    looks: Array
+    owner: NDArray[np.int64]
+    kinds: int
+    spread: Array
+
+
+def prepared(knowledge: Knowledge) -> Prepared:
+    """The looks of all kinds as `nearest` wants them."""
+    counts = [len(kind.looks) for kind in knowledge.kinds]
+    return Prepared(
+        looks=np.vstack([kind.looks for kind in knowledge.kinds]) / knowledge.spread,
+        owner=np.repeat(np.arange(len(counts)), counts).astype(np.int64),
+        kinds=len(counts),
+        spread=knowledge.spread,
+    )
+
+
 def distances(looks: Array, knowledge: Knowledge) -> Array:
     """(N, kinds) distance of (N, LENGTH) looks to the nearest look of every kind, in spreads a number.
 
     The distance is the mean of the absolute differences over the spread, each limited to `CLIP`.
     """
-    known = np.vstack([kind.looks for kind in knowledge.kinds]) / knowledge.spread
-    owner = np.repeat(np.arange(len(knowledge.kinds)), [len(kind.looks) for kind in knowledge.kinds]).astype(np.int64)
-    return np.asarray(_nearest(looks / knowledge.spread, known, owner, len(knowledge.kinds)))
+    return nearest(looks, prepared(knowledge))
+
+
+def nearest(looks: Array, known: Prepared) -> Array:
+    """`distances` to looks that are prepared."""
+    return np.asarray(_nearest(looks / known.spread, known.looks, known.owner, known.kinds))
 
 
 def distances_reference(looks: Array, knowledge: Knowledge) -> Array:

@@ -1,8 +1,7 @@
-"""Sub-objects with straight or round outlines in the plate's rectified picture: circles by votes, rectangles by runs.
+"""Edges of the plate's rectified picture, and the sub-objects with straight outlines: rectangles and slots by runs.
 
-Votes: every edge pixel names the centres that its gradient points at, for every radius (D. H. Ballard, Pattern
-Recognition 13(2), 1981). A candidate is then verified on the outline itself: the share of it that has an edge of the
-right direction. Both are insensitive to what a region method fails on: glare, shadow, cables, low contrast inside.
+A candidate is verified on the outline itself: the share of it that has an edge of the right direction. That is
+insensitive to what a region method fails on: glare, shadow, cables, low contrast inside.
 """
 
 from __future__ import annotations
@@ -11,20 +10,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from perception.vision.image import Image
 from perception.vision.registration import noise_sigma
-from perception.vision.view import Array
 
 Float32 = NDArray[np.float32]
 
-SMALL_PX = 24.0
-CIRCLE_SAMPLES = 40
-CIRCLES_TRIED = 90
-LEAST_COVERAGE = 0.45
-ALIGNED = 0.8  # cosine between an edge's gradient and the outline's normal
 MAX_SIDES = 90
 SLOT_MOST_PX = 12  # across
 
@@ -39,16 +31,6 @@ class Edges:
     strength: Float32
     strong: NDArray[np.bool_]
     thin: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Circle:
-    """A circle in picture pixels; `coverage` is the share of its outline that is an edge."""
-
-    u: float
-    v: float
-    radius: float
-    coverage: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,35 +53,6 @@ def find_edges(picture: Image, *, sigma_px: float = 1.0) -> Edges:
     least = 2.0 + 0.5 * noise_sigma(picture) / sigma_px
     strong = strength > np.maximum(least, 0.022 * smooth)
     return Edges(along_x=gx, along_y=gy, strength=strength, strong=strong, thin=_thinned(gx, gy, strength, strong))
-
-
-def find_circles(edges: Edges, *, least_px: float, most_px: float) -> list[Circle]:
-    """Verified circles with radii between `least_px` and `most_px`, best first, near-duplicates removed."""
-    v, u = np.nonzero(edges.thin)
-    gx, gy = edges.along_x[v, u], edges.along_y[v, u]
-    length = np.hypot(gx, gy)
-    points = (u.astype(np.float64), v.astype(np.float64), gx / length, gy / length)
-    found = []
-    # The direction of an edge errs by a few degrees, so the votes of large circles spread: count them in larger cells.
-    for low, high, step, cell in ((least_px, SMALL_PX, 1.0, 2), (max(least_px, SMALL_PX), most_px, 2.0, 4)):
-        radii = np.arange(round(low), round(high) + 1, step)
-        if len(radii) < 3:
-            continue
-        height, width = edges.strong.shape
-        votes = np.zeros((len(radii), height // cell + 2, width // cell + 2), np.float32)
-        _vote(votes, *points, radii, cell)
-        for u0, v0, r0 in _peaks(_pooled(votes, radii), radii, cell):
-            circle = _verified_circle(edges, u0, v0, r0)
-            if circle is not None:
-                found.append(circle)
-    return _distinct(found)
-
-
-def _pooled(votes: Float32, radii: Array) -> Float32:
-    """Votes summed over neighbouring places and radii, over the circumference."""
-    blurred = np.stack([cv2.GaussianBlur(plane, (0, 0), 0.9) for plane in votes])
-    blurred[1:-1] = (blurred[:-2] + blurred[1:-1] + blurred[2:]) / 3.0
-    return np.asarray(blurred / radii[:, None, None].astype(np.float32), np.float32)
 
 
 def find_rectangles(edges: Edges, *, least_px: float, most_px: float) -> list[Rectangle]:
@@ -140,21 +93,6 @@ def find_slots(edges: Edges, *, least_px: float, most_px: float) -> list[tuple[f
     return found
 
 
-@njit(cache=True)
-def _vote(
-    votes: Float32, u: Array, v: Array, nx: Array, ny: Array, radii: Array, cell: int
-) -> None:  # pragma: no cover
-    """One vote a radius on either side of every edge pixel."""
-    _, height, width = votes.shape
-    for i in range(len(u)):
-        for k in range(len(radii)):
-            for sign in (-1.0, 1.0):
-                x = int((u[i] + sign * radii[k] * nx[i]) / cell + 0.5)
-                y = int((v[i] + sign * radii[k] * ny[i]) / cell + 0.5)
-                if 0 <= x < width and 0 <= y < height:
-                    votes[k, y, x] += 1.0
-
-
 def _thinned(gx: Float32, gy: Float32, s: Float32, strong: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Edge pixels that are not weaker than both neighbours along the gradient (to the nearest axis)."""
     out = np.zeros(strong.shape, bool)
@@ -164,65 +102,6 @@ def _thinned(gx: Float32, gy: Float32, s: Float32, strong: NDArray[np.bool_]) ->
     upright = (middle >= s[:-2, 1:-1]) & (middle > s[2:, 1:-1])
     out[1:-1, 1:-1] = strong[1:-1, 1:-1] & np.where(across_x, flat, upright)
     return out
-
-
-def _peaks(votes: Float32, radii: Array, cell: int) -> list[tuple[float, float, float]]:
-    """The strongest local maxima over place and radius."""
-    best = votes.max(axis=0)
-    local = (best >= cv2.dilate(best, np.ones((3, 3), np.uint8))) & (best > 0.5)
-    v, u = np.nonzero(local)
-    order = np.argsort(best[v, u])[::-1][:CIRCLES_TRIED]
-    out = []
-    for i in order:
-        profile = votes[:, v[i], u[i]].copy()
-        for _ in range(2):  # a second radius about the same middle: rims and rings are concentric
-            k = int(profile.argmax())
-            if profile[k] < 0.5:
-                break
-            out.append((float(u[i] * cell), float(v[i] * cell), float(radii[k])))
-            profile[max(0, k - 3) : k + 4] = 0.0
-    return out
-
-
-def _verified_circle(edges: Edges, u0: float, v0: float, r0: float) -> Circle | None:
-    """Best circle near a guess, if enough of its outline is an edge."""
-    place = np.array([u0, v0, r0])
-    score = -1.0
-    for step in (3.0, 1.5, 0.7) if r0 >= SMALL_PX else (1.5, 0.7):
-        du, dv, dr = np.meshgrid(*[np.array([-1.0, 0.0, 1.0]) * step] * 3, indexing="ij")
-        tried = place + np.column_stack([du.ravel(), dv.ravel(), dr.ravel()])
-        scores = circle_coverage(edges, tried)
-        k = int(scores.argmax())
-        if scores[k] <= score:
-            break
-        place, score = tried[k], float(scores[k])
-        if score < 0.25:
-            return None
-    if score < LEAST_COVERAGE:
-        return None
-    return Circle(u=float(place[0]), v=float(place[1]), radius=float(place[2]), coverage=score)
-
-
-def circle_coverage(edges: Edges, circles: Array) -> Array:
-    """(N,) share of the outline of (N, 3) circles (u, v, r) that has an edge along the normal."""
-    a = np.linspace(0, 2 * np.pi, CIRCLE_SAMPLES, endpoint=False)
-    nx, ny = np.sin(a), -np.cos(a)
-    u = np.round(circles[:, :1] + circles[:, 2:] * nx).astype(int)
-    v = np.round(circles[:, 1:2] + circles[:, 2:] * ny).astype(int)
-    height, width = edges.strong.shape
-    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    u, v = np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)
-    s = edges.strength[v, u]
-    aligned = np.abs(edges.along_x[v, u] * nx + edges.along_y[v, u] * ny) > ALIGNED * s
-    return np.asarray((inside & edges.strong[v, u] & aligned).mean(axis=1))
-
-
-def _distinct(circles: list[Circle]) -> list[Circle]:
-    kept: list[Circle] = []
-    for c in sorted(circles, key=lambda c: c.coverage, reverse=True):
-        if not any(np.hypot(c.u - k.u, c.v - k.v) < 4 and abs(c.radius - k.radius) < 2 for k in kept):
-            kept.append(c)
-    return kept
 
 
 def _direction_maps(edges: Edges) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

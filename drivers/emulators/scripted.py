@@ -245,8 +245,9 @@ class ScriptedArm(Scripted):
 
     kind = DeviceKind.ARM
 
-    def __init__(self) -> None:
+    def __init__(self, *, device_s: float | None = None) -> None:
         super().__init__("scripted_arm")
+        self.device_s = device_s  # the time on its own clock, which tests let pass; None: it has none
         self.position_rad = np.array([0.1, -1.2, 1.3, -0.4, 0.5, 0.6])
         self.is_enabled = False
         self.commands = 0
@@ -272,7 +273,7 @@ class ScriptedArm(Scripted):
         state = JointState(
             position_rad=self.position_rad.copy(), velocity_rad_per_s=np.zeros(6), is_enabled=self.is_enabled
         )
-        return Stamped(value=state, host_time_s=now_s, sequence=index)
+        return Stamped(value=state, host_time_s=now_s, sequence=index, device_time_s=self.device_s)
 
     def command_position(self, position_rad: NDArray[np.float64], *, deadline: Deadline) -> NDArray[np.float64]:
         """Jump there."""

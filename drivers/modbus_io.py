@@ -14,6 +14,7 @@ from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import Field, model_validator
 
+from drivers.points import require_same_number, wanted_lights
 from drivers.transport.bus import PolledDevice
 from drivers.transport.link import WireError, now_s
 from drivers.transport.modbus import ModbusMaster
@@ -21,7 +22,6 @@ from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
 from drivers.transport.options import Seconds, read_options
 from hal.clock import Deadline
 from hal.devices import DeviceKind, LightsCapabilities, ProximityCapabilities, TouchCapabilities
-from hal.errors import InvalidRequest
 from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
 
@@ -61,9 +61,7 @@ class LightsOptions(IoOptions):
 
     @model_validator(mode="after")
     def _one_point_a_light(self) -> Self:
-        count = len(self.outputs) if self.channels is None else len(self.channels)
-        if not count == len(self.outputs) == len(self.feedback) >= 1:
-            raise ValueError("channels, outputs and feedback need the same number of entries, at least one")
+        require_same_number("channels, outputs and feedback", self.channels, self.outputs, self.feedback)
         return self
 
     def wired(self) -> tuple[int, ...]:
@@ -80,8 +78,7 @@ class TouchOptions(IoOptions):
 
     @model_validator(mode="after")
     def _one_point_a_pad(self) -> Self:
-        if not len(self.channels) == len(self.contacts) >= 1:
-            raise ValueError("channels and contacts need the same number of entries, at least one")
+        require_same_number("channels and contacts", self.channels, self.contacts)
         return self
 
     def wired(self) -> tuple[int, ...]:
@@ -141,13 +138,7 @@ class IoLights(IoDevice[tuple[bool, ...]]):
 
     def set_on(self, on: Sequence[bool], *, deadline: Deadline) -> tuple[bool, ...]:
         """Switch all lights; the device's acknowledgement is awaited."""
-        wanted = tuple(bool(value) for value in on)
-        if len(wanted) != len(self._channels):
-            raise InvalidRequest(
-                f"{self.name} has {len(self._channels)} lights, not {len(wanted)}",
-                hint=f"give one value for each of {', '.join(self._channels)}",
-                device=self.name,
-            )
+        wanted = wanted_lights(self.name, self._channels, on)
         self.call(lambda client, until_s: self._write(client, wanted, until_s), deadline)
         self._wanted = wanted
         self._commanded_s = self.context.clock.now_s()

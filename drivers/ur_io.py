@@ -16,13 +16,13 @@ from typing import Annotated, Any, Self
 from pydantic import Field, model_validator
 
 from drivers import rtde
+from drivers.points import require_same_number, wanted_lights
 from drivers.transport.device import StreamDevice, wall_until
 from drivers.transport.link import Link, LinkLost, NoAnswer, Refused, WireError, now_s
 from drivers.transport.options import PortNumber, Seconds, TcpOptions, read_options, tcp_opener
 from drivers.transport.timebase import HostTime
 from hal.clock import Deadline
 from hal.devices import DeviceKind, LightsCapabilities, TouchCapabilities
-from hal.errors import InvalidRequest
 from hal.readings import Stamped
 from hal.registry import Context
 
@@ -53,8 +53,7 @@ class UrLightsOptions(UrIoOptions):
 
     @model_validator(mode="after")
     def _one_point_a_light(self) -> Self:
-        if not len(self.channels) == len(self.outputs) == len(self.feedback or self.outputs) >= 1:
-            raise ValueError("channels, outputs and feedback need the same number of entries, at least one")
+        require_same_number("channels, outputs and feedback", self.channels, self.outputs, self.feedback)
         return self
 
 
@@ -67,8 +66,7 @@ class UrTouchOptions(UrIoOptions):
 
     @model_validator(mode="after")
     def _one_point_a_pad(self) -> Self:
-        if not len(self.channels) == len(self.contacts) >= 1:
-            raise ValueError("channels and contacts need the same number of entries, at least one")
+        require_same_number("channels and contacts", self.channels, self.contacts)
         return self
 
 
@@ -162,13 +160,7 @@ class UrLights(UrIo):
             InvalidRequest: another number of lights. DeviceUnavailable, DeviceTimeout: it could not be sent.
         """
         self.require_open()
-        wanted, channels = tuple(bool(value) for value in on), self._options.channels
-        if len(wanted) != len(channels):
-            raise InvalidRequest(
-                f"{self.name} has {len(channels)} lights, not {len(wanted)}",
-                hint=f"give one value for each of {', '.join(channels)}",
-                device=self.name,
-            )
+        wanted = wanted_lights(self.name, self._options.channels, on)
         link = self.port.link
         try:
             if link is None:

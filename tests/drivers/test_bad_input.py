@@ -1,0 +1,76 @@
+"""Wrong devices, wrong ids, vanishing ports: typed errors that name the device, the port and what to do."""
+
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+
+from drivers.emulators import ft300, modbus_io, robotiq_2f, rplidar, scripted, tfmini
+from hal.errors import CellError, ConfigError, DeviceUnavailable
+from hal.registry import Context, connect
+from tests.drivers.rigs import soon, wired
+
+
+def refusal(name: str, driver: str, options: dict[str, Any]) -> DeviceUnavailable:
+    """The error of a connection that must fail."""
+    with pytest.raises(DeviceUnavailable) as caught:
+        connect(Context(name=name), driver, options)
+    return caught.value
+
+
+def test_another_device_on_the_port_or_a_wrong_id_is_said_with_device_port_and_remedy() -> None:
+    with ExitStack() as stack, ThreadPoolExecutor(8) as pool:
+        sides = {
+            "tfmini": tfmini.start(scripted.ScriptedProximity(), {}),
+            "rplidar": rplidar.start(scripted.ScriptedScanner(), {}),
+            "ft300": ft300.start(scripted.ScriptedForceTorque(), {}),
+            "gripper": robotiq_2f.start(scripted.ScriptedGripper(), {}),
+        }
+        for side in sides.values():
+            stack.callback(side.close)
+        tried = {
+            "bota_here": ("serial:bota", {"port": sides["tfmini"].address["port"]}),
+            "rplidar_here": ("serial:rplidar", {"port": sides["ft300"].address["port"]}),
+            "ft300_here": ("serial:ft300", {"port": sides["rplidar"].address["port"]}),
+            "unit_5": ("modbus:robotiq_2f", {**sides["gripper"].address, "unit": 5}),
+        }
+        waiting = {name: pool.submit(refusal, name, *what) for name, what in tried.items()}
+        for name, future in waiting.items():
+            error = future.result()
+            assert name in error.what and error.hint
+            assert error.details["device"] == name
+            assert tried[name][1]["port"] in str(error.details["link"])
+
+
+@pytest.mark.parametrize("call", ["read", "write", "close"])
+def test_a_port_that_vanishes_in_a_call_is_an_error_of_the_device_or_none(call: str) -> None:
+    far_side = modbus_io.start(scripted.ScriptedLights(), {"transport": "rtu"})
+    with wired(far_side, "modbus:lights") as device:
+        device.read_on(deadline=soon())
+        far_side.port.vanish()
+        if call == "close":
+            device.close()
+            return
+        with pytest.raises(CellError) as caught:
+            if call == "write":
+                device.set_on((True,) * 4, deadline=soon(0.3))
+            else:
+                device.newest(soon(0.3), not_before_s=soon(0.0).at_s)
+    assert "wired" in caught.value.what and caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("driver", "options", "key"),
+    [
+        ("serial:tfmini", {"port": "x", "rate_hz": float("nan")}, "rate_hz"),
+        ("udp:netft", {"host": "127.0.0.1", "counts_per_n": 0.0}, "counts_per_n"),
+        ("serial:rplidar", {"port": "x", "mode": "dense"}, "mode"),
+        ("modbus:tfmini", {"port": "x", "unit": 0}, "unit"),
+        ("can:tfmini", {"channel": "x", "bitrate": 123}, "bitrate"),
+        ("serial:dynamixel_gripper", {"port": "x", "stroke_m": float("inf")}, "stroke_m"),
+    ],
+)
+def test_options_out_of_range_are_answered_with_their_key(driver: str, options: dict[str, Any], key: str) -> None:
+    with pytest.raises(ConfigError, match=rf"devices\.dut\.options.*{key}"):
+        connect(Context(name="dut"), driver, options)

@@ -187,15 +187,15 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
         self._filter.begin(measured)
 
     def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:
-        """One goal for all servos in one packet: now when the bus is free, else before the next poll."""
+        """One goal for all servos in one packet; on a bus that stays busy it goes out before the next poll."""
         self.require_open()
         sent = self._filter.passed(position_rad, now_s())
         self._pending.append(self._goals(sent))
         until_s = wall_until(deadline)
         try:
-            self.bus.call(lambda client, _: self._send_pending(client, until_s), now_s())
+            self.bus.call(self._send_pending, until_s)
         except NoAnswer:
-            return sent  # a servo that answers late must not hold up the control loop
+            return sent  # a servo that answers late must not end a motion
         except WireError as error:
             self.errors += 1
             raise self.translate(error) from error

@@ -62,9 +62,9 @@ def find_circles(edges: Edges, *, least_px: float, most_px: float) -> list[Circl
 
 def _pooled(votes: Float32, radii: Array) -> Float32:
     """Votes summed over neighbouring places and radii, over the circumference."""
-    blurred = np.stack([cv2.GaussianBlur(plane, (0, 0), 0.9) for plane in votes])
-    blurred[1:-1] = (blurred[:-2] + blurred[1:-1] + blurred[2:]) / 3.0
-    return np.asarray(blurred / radii[:, None, None].astype(np.float32), np.float32)
+    for plane in votes:
+        cv2.GaussianBlur(plane, (0, 0), 0.9, dst=plane)
+    return np.asarray(_averaged(votes, radii.astype(np.float32)), np.float32)
 
 
 def _peaks(votes: Float32, radii: Array, cell: int) -> list[tuple[float, float, float]]:
@@ -115,18 +115,34 @@ def _distinct(circles: list[Circle]) -> list[Circle]:
 
 
 @njit(cache=True)
+def _averaged(planes: Float32, radii: Float32) -> Float32:  # pragma: no cover
+    """Mean of every plane and its two neighbours, the outermost as they are, over the radius."""
+    count, height, width = planes.shape
+    out = np.empty_like(planes)
+    for k in range(count):
+        below, above = (k - 1, k + 1) if 0 < k < count - 1 else (k, k)
+        share = np.float32(1.0 / (3.0 * radii[k]))
+        for y in range(height):
+            for x in range(width):
+                out[k, y, x] = (planes[below, y, x] + planes[k, y, x] + planes[above, y, x]) * share
+    return out
+
+
+@njit(cache=True)
 def _vote(
     votes: Float32, u: Array, v: Array, nx: Array, ny: Array, radii: Array, cell: int
 ) -> None:  # pragma: no cover
-    """One vote a radius on either side of every edge pixel."""
+    """One vote a radius on either side of every edge pixel; radius by radius, so that one plane stays in the cache."""
     _, height, width = votes.shape
-    for i in range(len(u)):
-        for k in range(len(radii)):
+    for k in range(len(radii)):
+        plane = votes[k]
+        for i in range(len(u)):
+            dx, dy = radii[k] * nx[i], radii[k] * ny[i]
             for sign in (-1.0, 1.0):
-                x = int((u[i] + sign * radii[k] * nx[i]) / cell + 0.5)
-                y = int((v[i] + sign * radii[k] * ny[i]) / cell + 0.5)
+                x = int((u[i] + sign * dx) / cell + 0.5)
+                y = int((v[i] + sign * dy) / cell + 0.5)
                 if 0 <= x < width and 0 <= y < height:
-                    votes[k, y, x] += 1.0
+                    plane[y, x] += 1.0
 
 
 @njit(cache=True)

@@ -22,6 +22,9 @@ from perception.vision.view import Array
 PLATE_PX_PER_M = 1500.0  # resolution of the rectified plate
 RADII_M = np.arange(0.0015, 0.045, 0.003)
 ANGLES = np.linspace(0.0, 2 * np.pi, 48, endpoint=False)
+AROUND_PX = (
+    np.stack([np.outer(RADII_M, np.sin(ANGLES)), -np.outer(RADII_M, np.cos(ANGLES))]).reshape(2, -1) * PLATE_PX_PER_M
+)
 RANKS = (7, 24, 40)  # of 48: 15, 50 and 85 %
 GROUPS = ("gray", "uneven", "edge", "strong_edge")
 LENGTH = len(GROUPS) * len(RADII_M)
@@ -66,9 +69,7 @@ def plate_gray(picture: Image) -> NDArray[np.float32]:
 def look_at(ground: Ground, places_px: ArrayLike) -> Array:
     """(N, LENGTH) looks of (N, 2) places (u, v) of the rectified plate, in the order of `GROUPS`."""
     places = np.asarray(places_px, float)
-    r = RADII_M[:, None] * PLATE_PX_PER_M
-    u = (places[:, 0, None, None] + r * np.sin(ANGLES)).reshape(len(places), -1)
-    v = (places[:, 1, None, None] - r * np.cos(ANGLES)).reshape(len(places), -1)
+    u, v = places[:, :1] + AROUND_PX[0], places[:, 1:] + AROUND_PX[1]
     shape = (len(places), len(RADII_M), len(ANGLES))
     gray = np.sort(sample_at(ground.picture, u, v).reshape(shape), axis=2)
     edge = np.sort(sample_at(ground.edges.strength, u, v).reshape(shape), axis=2)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from perception.vision.image import Image, as_gray
 from perception.vision.reading import Status, refused
-from perception.vision.shapes import find_edges, find_rectangles
+from perception.vision.shapes import direction_maps, find_edges, find_rectangles
 from perception.vision.status.display import read_window
 
 DIGIT_WINDOW_PX = 64
@@ -54,7 +54,7 @@ def _windows(gray: Image, scene: bool) -> list[Image]:
     found = [
         r
         for r in find_rectangles(
-            find_edges(np.asarray(small, np.uint8)), least_px=18.0, most_px=0.95 * max(small.shape)
+            direction_maps(find_edges(np.asarray(small, np.uint8))), least_px=18.0, most_px=0.95 * max(small.shape)
         )
         if LEAST_ASPECT <= r.width / max(r.height, 1.0) <= MOST_ASPECT
     ]

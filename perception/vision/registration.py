@@ -11,6 +11,7 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from hal.panel import Panel
@@ -21,6 +22,8 @@ from perception.vision.view import Array, View
 
 WINDOWS_PX = (8.0, 5.0, 3.0, 2.0)  # search to either side; the pose is known to a few pixels
 STEP_PX = 0.5
+PLATE_WINDOWS_PX = (12.0, 5.0, 2.0)  # a plate without objects: its scale is wanted to a few per cent only
+LEAST_NOISE = 0.3  # gray levels: the rounding
 SMOOTHING_SIGMA_PX = 0.8
 EDGE_TO_NOISE = 4.0  # an edge counts when its slope exceeds that many sigmas of the slope's noise
 NORMAL_STEP_M = 1e-3
@@ -94,17 +97,32 @@ def follow_edges(gray: Image, view: V, outline: Outline) -> V:
     smooth = np.asarray(cv2.GaussianBlur(gray.astype(np.float32), (0, 0), SMOOTHING_SIGMA_PX), np.float32)
     slope_noise = noise_sigma(gray) * 0.35
     delta = np.zeros(len(view.prior_sigma))
-    for window in (12.0, *WINDOWS_PX):
+    for window in PLATE_WINDOWS_PX:
         delta, _ = _step(smooth, slope_noise, view, delta, edges=outline, window_px=window)
     return view.moved(delta)
 
 
 def noise_sigma(gray: Image) -> float:
     """Standard deviation of the pixel noise: J. Immerkaer, CVIU 64(2), 1996, with the median for the mean."""
-    part = gray[::2].astype(np.float32) if gray.size > 1_000_000 else gray.astype(np.float32)
-    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
-    response = np.abs(cv2.filter2D(part, -1, kernel))
-    return float(max(np.median(response) / 0.6745 / 6.0, 0.3))
+    if min(gray.shape) < 3:
+        return LEAST_NOISE
+    counts = _response_counts(gray[::2] if gray.size > 1_000_000 else gray)
+    median = int(np.searchsorted(np.cumsum(counts), (counts.sum() + 1) // 2))
+    return float(max(median / 0.6745 / 6.0, LEAST_NOISE))
+
+
+@njit(cache=True)
+def _response_counts(gray: Image) -> NDArray[np.int64]:  # pragma: no cover
+    """How often every magnitude of the response to [1 -2 1; -2 4 -2; 1 -2 1] occurs inside the image."""
+    height, width = gray.shape
+    counts = np.zeros(8 * 255 + 1, np.int64)
+    for v in range(1, height - 1):
+        for u in range(1, width - 1):
+            before = np.int32(gray[v - 1, u - 1]) - 2 * np.int32(gray[v, u - 1]) + np.int32(gray[v + 1, u - 1])
+            here = np.int32(gray[v - 1, u]) - 2 * np.int32(gray[v, u]) + np.int32(gray[v + 1, u])
+            after = np.int32(gray[v - 1, u + 1]) - 2 * np.int32(gray[v, u + 1]) + np.int32(gray[v + 1, u + 1])
+            counts[abs(before - 2 * here + after)] += 1
+    return counts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -156,25 +174,31 @@ def _step(
     """Two Gauss-Newton steps on the edges found in one window."""
     sigma = reference.prior_sigma
     information = np.diag(1.0 / sigma**2)
+    motion = _motion(reference, delta, edges.points_m)  # hardly changes within the window
     for _ in range(2):
         view = reference.moved(delta)
         found = _look(smooth, slope_noise, view, edges, window_px)
         if found.ok.sum() < len(delta):
             return delta, np.diag(sigma**2)
         n = found.normals_px[found.ok]
-        points = edges.points_m[found.ok]
-        base = view.project(points)
-        J = np.empty((len(points), len(delta)))
-        for k in range(len(delta)):
-            bump = np.zeros(len(delta))
-            bump[k] = 1e-3 * sigma[k]
-            J[:, k] = ((reference.moved(delta + bump).project(points) - base) * n).sum(axis=1) / bump[k]
+        J = (motion[found.ok] * n[:, :, None]).sum(axis=1)
         r = found.offset_px[found.ok]
         scale = max(1.4826 * float(np.median(np.abs(r))), MEASUREMENT_SIGMA_PX)
         w = 1.0 / (1.0 + (r / (1.5 * scale)) ** 2) / scale**2
         N = J.T @ (w[:, None] * J) + information
         delta = delta + np.linalg.solve(N, J.T @ (w * r) - information @ delta)
     return delta, np.asarray(np.linalg.inv(N), float)
+
+
+def _motion(reference: View, delta: Array, points_m: Array) -> Array:
+    """(N, 2, P) what the projected points do per unit of every motion parameter, by differences."""
+    base = reference.moved(delta).project(points_m)
+    out = np.empty((len(points_m), 2, len(delta)))
+    for k, sigma in enumerate(reference.prior_sigma):
+        bump = np.zeros(len(delta))
+        bump[k] = 1e-3 * sigma
+        out[:, :, k] = (reference.moved(delta + bump).project(points_m) - base) / bump[k]
+    return out
 
 
 def _local_shift(

@@ -12,10 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.vision.components import components
 from perception.vision.image import Image
 from perception.vision.registration import noise_sigma
 
 Float32 = NDArray[np.float32]
+DirectionMaps = tuple[NDArray[np.bool_], NDArray[np.bool_]]  # flat edges, upright edges
 
 MAX_SIDES = 90
 SLOT_MOST_PX = 12  # across
@@ -55,9 +57,9 @@ def find_edges(picture: Image, *, sigma_px: float = 1.0) -> Edges:
     return Edges(along_x=gx, along_y=gy, strength=strength, strong=strong, thin=_thinned(gx, gy, strength, strong))
 
 
-def find_rectangles(edges: Edges, *, least_px: float, most_px: float) -> list[Rectangle]:
+def find_rectangles(maps: DirectionMaps, *, least_px: float, most_px: float) -> list[Rectangle]:
     """Upright rectangles with sides between `least_px` and `most_px`, verified on all four sides."""
-    flat, upright = _direction_maps(edges)
+    flat, upright = maps
     rows, columns = _runs(flat, least_px), _runs(upright.T, least_px)
     flat_sum, upright_sum = _sums(flat, 1), _sums(upright, 0)
     found: list[Rectangle] = []
@@ -78,18 +80,17 @@ def find_rectangles(edges: Edges, *, least_px: float, most_px: float) -> list[Re
     return kept
 
 
-def find_slots(edges: Edges, *, least_px: float, most_px: float) -> list[tuple[float, float]]:
+def find_slots(maps: DirectionMaps, *, least_px: float, most_px: float) -> list[tuple[float, float]]:
     """Middles of long thin things, flat or upright: slots and tracks, whatever covers part of them."""
     found = []
-    flat, upright = _direction_maps(edges)
+    flat, upright = maps
     for mask, is_flat in ((flat, True), (upright.T, False)):
         bridged = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((1, 25), np.uint8))
         bridged = cv2.morphologyEx(bridged, cv2.MORPH_OPEN, np.ones((1, round(least_px)), np.uint8))
-        count, _, stats, middle = cv2.connectedComponentsWithStats(bridged, connectivity=8)
-        for k in range(1, count):
-            if least_px <= stats[k, 2] <= most_px and stats[k, 3] <= SLOT_MOST_PX:
-                along, across = float(stats[k, 0] + (stats[k, 2] - 1) / 2), float(middle[k][1])
-                found.append((along, across) if is_flat else (across, along))
+        for left, _, width, height, _, across in components(np.asarray(bridged, np.uint8), diagonal=True):
+            if least_px <= width <= most_px and height <= SLOT_MOST_PX:
+                along = float(left + (width - 1) / 2)
+                found.append((along, float(across)) if is_flat else (float(across), along))
     return found
 
 
@@ -104,7 +105,7 @@ def _thinned(gx: Float32, gy: Float32, s: Float32, strong: NDArray[np.bool_]) ->
     return out
 
 
-def _direction_maps(edges: Edges) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def direction_maps(edges: Edges) -> DirectionMaps:
     """Where there is a flat edge, and where an upright one; each widened by one pixel across."""
     ax, ay = np.abs(edges.along_x), np.abs(edges.along_y)
     ones = np.ones(3, np.uint8)
@@ -117,11 +118,10 @@ def _runs(flat: NDArray[np.bool_], least_px: float) -> list[tuple[float, float, 
     """(start, end, row) of flat edges longer than `least_px`, short gaps bridged."""
     bridged = cv2.morphologyEx(flat.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((1, 9), np.uint8))
     bridged = cv2.morphologyEx(bridged, cv2.MORPH_OPEN, np.ones((1, max(5, round(0.8 * least_px))), np.uint8))
-    count, _, stats, middle = cv2.connectedComponentsWithStats(bridged, connectivity=4)
     runs = [
-        (float(stats[k, 0]), float(stats[k, 0] + stats[k, 2] - 1), float(middle[k][1]))
-        for k in range(1, count)
-        if stats[k, 2] >= least_px and stats[k, 3] <= 6
+        (float(left), float(left + width - 1), float(row))
+        for left, _, width, height, _, row in components(np.asarray(bridged, np.uint8), diagonal=False)
+        if width >= least_px and height <= 6
     ]
     runs.sort(key=lambda run: run[0] - run[1])
     return runs[:MAX_SIDES]

@@ -33,7 +33,8 @@ def covered(patch: Patch, *, half_width_m: float, half_height_m: float, is_round
     values = sample_at(smooth, path_u, path_v)
     size = max(9, len(values) // 5) | 1
     around = np.pad(values, size // 2, mode="wrap")
-    typical = np.median(np.lib.stride_tricks.sliding_window_view(around, size), axis=1)
+    # every fourth sample of a window tells its median as well
+    typical = np.median(np.lib.stride_tricks.sliding_window_view(around, size)[:, ::4], axis=1)
     odd = inside & (np.abs(values - typical) > max(STANDS_OUT, 4.0 * _noise(patch)))
     depth = _depth(patch, half_width_m, half_height_m, is_round)
     least = DEEP * min(half_width_m, half_height_m) * patch.px_per_m
@@ -94,5 +95,5 @@ def _followed(smooth: NDArray[np.uint8], seed: tuple[int, int]) -> NDArray[np.bo
 
 
 def _noise(patch: Patch) -> float:
-    gray = patch.gray.astype(np.float32)
+    gray = patch.gray[::2].astype(np.float32)
     return float(np.median(np.abs(gray[:, 2:] - 2 * gray[:, 1:-1] + gray[:, :-2]))) / 1.65

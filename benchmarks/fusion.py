@@ -1,7 +1,9 @@
 """Nine-class fusion against its bound, mismatches, brute force, the clock and its peers.
 
 python -m benchmarks.fusion CASES.json OUT.json [--time]    solve a file of cases (schema of data/fusion)
-python -m benchmarks.fusion [--quick]                       print the table, pass line beside measured value
+python -m benchmarks.fusion [--quick] [--no-pose]           print the table, pass line beside measured value
+
+Four-light rows and their peers (cv2, poselib, gtsam) come last; `python -m benchmarks.pose` has them with more problems.
 """
 
 from __future__ import annotations
@@ -9,28 +11,29 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
-from fusion import FusedPose, Measurement, SensingClass, fuse, warm_up
+from benchmarks.fusion_peers import Row, peers
+from benchmarks.fusion_problems import Tally, codes, mismatched, mixed, random_measurement, rotation
+from benchmarks.pose import table as pose_table
+from fusion import Measurement, SensingClass, fuse, warm_up
 from fusion.certify import certificate
 from fusion.distance import local_value, local_values
 from fusion.errors import Contradiction
-from fusion.reference import brute_force, residual
+from fusion.reference import brute_force
 from fusion.robust import used_entries
-from fusion.simulate import CODES, TABLE_II, Problem, problem
-from fusion.solve import solve, solve_from_many
+from fusion.simulate import TABLE_II, problem
+from fusion.solve import solve
 from hal.geometry import Array, difference, matrix_of, perturbed, transform
 
 ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])  # the case files put rotation first, the cell translation
-NEAR_M, NEAR_RAD = 0.005, np.radians(1.0)
-Row = tuple[str, str, str]
 
 
 # --- case files ------------------------------------------------------------------------------------------------------
@@ -59,17 +62,17 @@ def _symmetric(upper: Sequence[float]) -> Array:
 def solution(case: dict[str, Any], *, timed: bool) -> dict[str, Any] | None:
     """The answer to one case in the scorer's schema (rotation first), or None where fusion refuses."""
     measurements = [measurement_of(m) for m in case["measurements"]]
-    started_s = time.perf_counter()
+    started_s = time.process_time()
     try:
         answer = fuse(measurements)
     except Contradiction:
         return None
-    ms = (time.perf_counter() - started_s) * 1e3
+    ms = (time.process_time() - started_s) * 1e3
     made: dict[str, Any] = {
         "R": matrix_of(answer.pose).tolist(),
         "t": answer.pose.translation.tolist(),
         "cov": answer.covariance[np.ix_(ROTATION_FIRST, ROTATION_FIRST)].ravel().tolist(),
-        "outliers": _mismatched(answer),
+        "outliers": mismatched(answer),
         "alternatives": [
             {"R": matrix_of(a.pose).tolist(), "t": a.pose.translation.tolist(), "odds": a.odds}
             for a in answer.alternatives
@@ -82,10 +85,6 @@ def solution(case: dict[str, Any], *, timed: bool) -> dict[str, Any] | None:
     return made | {"ms": ms} if timed else made
 
 
-def _mismatched(answer: FusedPose) -> list[int]:
-    return [r.index for r in answer.rejected if r.reason == "mismatch" and r.index >= 0]
-
-
 def solve_file(cases_file: Path, out_file: Path, *, timed: bool) -> None:
     """Write the solutions of a case file; refused cases are left out."""
     warm_up()
@@ -96,92 +95,20 @@ def solve_file(cases_file: Path, out_file: Path, *, timed: bool) -> None:
     print(f"{len(answers) - len(refused)} solved, {len(refused)} refused{': ' if refused else ''}{', '.join(refused)}")
 
 
-# --- figures ---------------------------------------------------------------------------------------------------------
+# --- figures -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(kw_only=True)
-class Tally:
-    """What a family of simulated problems came to."""
-
-    count: int = 0
-    near: int = 0
-    refused: int = 0
-    bad: int = 0
-    named: int = 0
-    good: int = 0
-    dropped: int = 0
-    nees: list[float] = field(default_factory=list)
-    position: list[float] = field(default_factory=list)
-    rotation: list[float] = field(default_factory=list)
-    ms: list[float] = field(default_factory=list)
-
-    def add(self, made: Problem) -> FusedPose | None:
-        """Solve one problem and count."""
-        self.count += 1
-        started_s = time.perf_counter()
-        try:
-            answer = fuse(made.measurements)
-        except Contradiction:
-            self.refused += 1
-            return None
-        self.ms.append((time.perf_counter() - started_s) * 1e3)
-        delta = difference(made.base_from_object, answer.pose)
-        self.near += is_near(delta)
-        named = set(_mismatched(answer))
-        self.bad, self.named = self.bad + len(made.bad), self.named + len(named & made.bad)
-        self.good += len(made.measurements) - len(made.bad)
-        self.dropped += len(named - made.bad)
-        if not made.bad and not answer.unobservable:
-            self.nees.append(float(delta @ np.linalg.solve(answer.covariance, delta)))
-            bound = solve(made.measurements, made.base_from_object).covariance
-            self.position.append(float(delta[:3] @ delta[:3] / np.trace(bound[:3, :3])))
-            self.rotation.append(float(delta[3:] @ delta[3:] / np.trace(bound[3:, 3:])))
-        return answer
-
-
-def is_near(delta: Array) -> bool:
-    """Success as the scorer counts it: 5 mm and 1 degree. `delta`: (6,) m and rad."""
-    return bool(np.linalg.norm(delta[:3]) < NEAR_M and np.linalg.norm(delta[3:]) < NEAR_RAD)
-
-
-def codes(rng: np.random.Generator, count: int) -> list[str]:
-    """Random kinds of sensing."""
-    return [CODES[k] for k in rng.integers(len(CODES), size=count)]
-
-
-def mixed(count: int, bad: int, problems: int, rng: np.random.Generator, *, anisotropy: float = 1.0) -> Tally:
-    """Fuse `problems` random mixtures of `count` measurements of which `bad` are mismatched."""
-    tally = Tally()
-    for _ in range(problems):
-        tally.add(problem(codes(rng, count), rng, bad=bad, anisotropy=anisotropy))
-    return tally
-
-
-def exactness(per_class: int, rng: np.random.Generator) -> list[Row]:
-    """Largest relative difference from brute force for random SPD C (condition up to 1e4) and PSD M, by class."""
-    worst = 0.0
-    for cls in SensingClass:
-        for _ in range(per_class):
-            m, pose = random_measurement(cls, rng), transform(_rotation(rng), rng.normal(0, 0.3, 3))
-            f = brute_force(m, pose)
-            worst = max(worst, abs(local_value(m, pose) - f) / (1e-3 + f))
-    return [("nine local pose functions against brute force, relative", "<= 1e-6", f"{worst:.1e}")]
-
-
-def random_measurement(cls: SensingClass, rng: np.random.Generator) -> Measurement:
-    """Any feature, place, SPD C and rank-two M, all over three decades."""
-    A, B = _rotation(rng), _rotation(rng)
-    C = A @ np.diag(np.exp(rng.uniform(-11.5, -2.3, 3))) @ A.T
-    M = B @ np.diag([0.0, *np.exp(rng.uniform(0.0, 13.8, 2))]) @ B.T
-    u = rng.normal(size=3)
-    return Measurement(
-        cls=cls, x_m=rng.normal(0, 0.3, 3), u=u / np.linalg.norm(u), mu_m=rng.normal(0, 0.3, 3),
-        C_m2=C, M=M if cls >= 4 else np.zeros((3, 3)),
-    )  # fmt: skip
-
-
-def _rotation(rng: np.random.Generator) -> Array:
-    return np.asarray(Rotation.random(rng=rng).as_matrix())
+def exactness(per_class: int, rng: np.random.Generator) -> Iterator[Row]:
+    """Largest relative difference from brute force for random SPD C and PSD M, over all nine classes."""
+    kinds = {"plain": "condition up to 1e3", "wide": "condition up to 1e6", "flat": "rank-one M"}
+    for kind, words in kinds.items():
+        worst = 0.0
+        for cls in SensingClass:
+            for _ in range(per_class):
+                m, pose = random_measurement(cls, rng, kind=kind), transform(rotation(rng), rng.normal(0, 0.3, 3))
+                f = brute_force(m, pose)
+                worst = max(worst, (local_value(m, pose) - f) / (1e-3 + f))  # below it, brute force is the poorer one
+        yield f"nine local pose functions above brute force, {words}", "<= 1e-6", f"{worst:.1e}"
 
 
 def consistency(problems: int, rng: np.random.Generator) -> list[Row]:
@@ -232,7 +159,7 @@ def table_ii(runs: int, rng: np.random.Generator) -> list[Row]:
             except Contradiction:
                 named.append(False)
                 continue
-            named.append(_mismatched(answer) == [0])
+            named.append(mismatched(answer) == [0])
             if n == 16:
                 last.append(difference(made.base_from_object, answer.pose))
         named_from.append(5 + (12 - int(np.cumprod(named[::-1]).sum())))
@@ -253,9 +180,9 @@ def certificates(problems: int, rng: np.random.Generator) -> list[Row]:
         made = problem(codes(rng, 16), rng)
         answer = fuse(made.measurements)
         b, used, local = used_entries(made.measurements, answer)
-        started_s = time.perf_counter()
+        started_s = time.process_time()
         tight += certificate(b, used, local).tight
-        ms.append((time.perf_counter() - started_s) * 1e3)
+        ms.append((time.process_time() - started_s) * 1e3)
     return [
         ("certificate tight without mismatches", ">= 99 %", f"{tight / problems:.1%} of {problems}"),
         ("certificate, time", "<= 8 ms", f"{np.median(ms):.2f} ms (best {np.min(ms):.2f})"),
@@ -280,84 +207,47 @@ def clock(rng: np.random.Generator) -> list[Row]:
 def _times_ms(run: Callable[[int], object], count: int) -> list[float]:
     times = []
     for k in range(count):
-        started_s = time.perf_counter()
+        started_s = time.process_time()
         run(k)
-        times.append((time.perf_counter() - started_s) * 1e3)
+        times.append((time.process_time() - started_s) * 1e3)
     return times
 
 
-# --- peers -----------------------------------------------------------------------------------------------------------
+def large_and_proven(rng: np.random.Generator, problems: int) -> Iterator[Row]:
+    """Ten thousand measurements, and branch and bound over which of 16 to believe."""
+    many = problem(codes(rng, 10_000), rng, bad=1000)
+    answer, s = _timed_s(partial(fuse, many.measurements))
+    delta = difference(many.base_from_object, answer.pose)
+    yield "10 000 measurements, 1000 bad", "-", f"{s:.2f} s, {1e3 * np.linalg.norm(delta[:3]):.3f} mm off"
+    for bad in (0, 4, 8):
+        times, proven, agrees = [], 0, 0
+        for _ in range(problems):
+            made = problem(codes(rng, 16), rng, bad=bad)
+            answer, s = _timed_s(partial(fuse, made.measurements, prove_set_within_s=60.0))
+            found = answer.proven_set
+            times.append(s)
+            proven, agrees = proven + found.proven, agrees + found.agrees
+        yield (f"best set proven by branch and bound, N=16, {bad} bad", "-",
+               f"{proven} of {problems}, the answer's in {agrees}; median {np.median(times):.1f} s")  # fmt: skip
 
 
-def peers(problems: int, rng: np.random.Generator) -> list[Row]:
-    """Plain least squares with one bad measurement (the 1990 objective), and gtsam on the same rows."""
-    near = sum(
-        is_near(difference(p.base_from_object, solve_from_many(p.measurements, starts=32).base_from_object))
-        for p in (problem(codes(rng, 16), rng, bad=1) for _ in range(problems))
-    )
-    rows: list[Row] = [("peer: least squares over all, N=16 with 1 bad", "-", f"success {near / problems:.0%}")]
-    try:
-        import gtsam  # noqa: F401
-    except ImportError:
-        return [*rows, ("peer: gtsam", "-", "not installed")]
-    apart, ratio = [], []
-    for _ in range(problems):
-        made = problem([c for c in codes(rng, 40) if c[0] in "12359"][:16], rng)
-        start = perturbed(made.base_from_object, rng.normal(0, 0.01, 6))
-        started_s = time.perf_counter()
-        mine = solve(made.measurements, start)
-        middle_s = time.perf_counter()
-        theirs = _gtsam(made.measurements, start)
-        ratio.append((time.perf_counter() - middle_s) / (middle_s - started_s))
-        apart.append(float(np.linalg.norm(difference(theirs, mine.base_from_object)[:3])))
-    return [*rows, ("peer: gtsam, Python factors of the exact classes", "-",
-                    f"same place within {np.max(apart):.1e} m, time x{np.median(ratio):.0f}")]  # fmt: skip
+def _timed_s(run: Callable[[], Any]) -> tuple[Any, float]:
+    started_s = time.process_time()
+    return run(), time.process_time() - started_s
 
 
-def _gtsam(measurements: Sequence[Measurement], start: RigidTransform) -> RigidTransform:
-    import gtsam
-
-    graph, key = gtsam.NonlinearFactorGraph(), 0
-
-    def factor(m: Measurement) -> Any:
-        def error(_: Any, values: Any, jacobians: list[Array] | None) -> Array:
-            pose = values.atPose3(key)
-            r = residual(m, pose.rotation().matrix(), pose.translation())
-            if jacobians is not None:
-                jacobians[0] = np.column_stack([_slope(m, pose, axis) for axis in np.eye(6)])
-            return r
-
-        rows = m.dof
-        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), [key], error)
-
-    for m in measurements:
-        graph.add(factor(m))
-    initial = gtsam.Values()
-    initial.insert(key, gtsam.Pose3(gtsam.Rot3(matrix_of(start)), start.translation))
-    pose = gtsam.LevenbergMarquardtOptimizer(graph, initial).optimize().atPose3(key)
-    return transform(pose.rotation().matrix(), pose.translation())
-
-
-def _slope(m: Measurement, pose: Any, axis: Array) -> Array:
-    forward, back = pose.retract(1e-6 * axis), pose.retract(-1e-6 * axis)
-    ahead = residual(m, forward.rotation().matrix(), forward.translation())
-    return np.asarray((ahead - residual(m, back.rotation().matrix(), back.translation())) / 2e-6)
-
-
-def table(*, quick: bool) -> list[Row]:
-    """Rows of (what, pass line, measured)."""
+def table(*, quick: bool) -> Iterator[Row]:
+    """Rows of (what, pass line, measured), as they come; times are the processor's."""
     rng = np.random.default_rng(20)
     warm_up()
-    n = 60 if quick else 250
-    return [
-        *exactness(1 if quick else 4, rng),
-        *consistency(n if quick else 400, rng),
-        *mismatches(30 if quick else 150, rng),
-        *table_ii(6 if quick else 20, rng),
-        *certificates(30 if quick else 200, rng),
-        *clock(rng),
-        *peers(10 if quick else 25, rng),
-    ]
+    yield from exactness(1 if quick else 2, rng)
+    yield from consistency(60 if quick else 400, rng)
+    yield from mismatches(30 if quick else 300, rng)
+    yield from table_ii(6 if quick else 20, rng)
+    yield from certificates(30 if quick else 200, rng)
+    yield from clock(rng)
+    yield from large_and_proven(rng, 1 if quick else 3)
+    yield from peers(10 if quick else 25, rng)
 
 
 def main() -> None:
@@ -367,6 +257,7 @@ def main() -> None:
     parser.add_argument("out", type=Path, nargs="?")
     parser.add_argument("--time", action="store_true", help="add milliseconds to each solution")
     parser.add_argument("--quick", action="store_true", help="fewer problems in the table")
+    parser.add_argument("--no-pose", action="store_true", help="leave out the four-light pose and its peers")
     args = parser.parse_args()
     if args.cases is not None:
         if args.out is None:
@@ -374,9 +265,10 @@ def main() -> None:
         solve_file(args.cases, args.out, timed=args.time)
         return
     rows = table(quick=args.quick)
-    widths = [max(len(row[k]) for row in rows) for k in range(2)]
+    if not args.no_pose:
+        rows = chain(rows, pose_table(quick=True))
     for what, limit, measured in rows:
-        print(f"{what:<{widths[0]}}  {limit:<{widths[1]}}  {measured}")
+        print(f"{what:<66} {limit:<20} {measured}", flush=True)
 
 
 if __name__ == "__main__":

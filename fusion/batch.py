@@ -36,9 +36,10 @@ class Batch(NamedTuple):
     """Measurements as arrays; symmetric matrices as (xx, xy, xz, yy, yz, zz).
 
     cls, dof: (N,) integers; m, w: (N, 3) object point and direction; mu: (N, 3); C: (N, 6) covariance; variance, axes:
-    (N, 3), (N, 3, 3) its eigenvalues, rising, and unit eigenvectors as rows; d, a1, a2: (N, 3) eigenvectors of M, its null
-    direction first; p0: (N,) and p: (N, 2) their information, 1/rad^2, p0 being (almost) zero; gate: (N,) chi-square
-    limits; prior_*: pose (3, 3), (3,), whitening (6, 6) so that |W delta|^2 is chi-square.
+    (N, 3), (N, 3, 3) its eigenvalues, rising, and unit eigenvectors as rows; d, a1, a2: (N, 3) unit eigenvectors of M, its null
+    direction first; p: (N, 2) information of the others, 1/rad^2, 0 where rounding; tilt: (N, 3) all eigenvalues as they are
+    (a null one of 1e-4 is rounding, but it is part of f); gate: (N,) chi-square limits; prior_*: pose (3, 3), (3,),
+    whitening (6, 6) so that |W delta|^2 is chi-square.
 
     A prior pose is one more entry with cls 0 at the end.
     """
@@ -54,8 +55,8 @@ class Batch(NamedTuple):
     d: Array
     a1: Array
     a2: Array
-    p0: Array
     p: Array
+    tilt: Array
     gate: Array
     prior_r: Array
     prior_t: Array
@@ -93,7 +94,7 @@ def pack(measurements: Sequence[Measurement], prior: UncertainPose | None = None
     return Batch(
         cls=cls, dof=dof, m=m, w=w, mu=mu, C=_sym6(C), variance=variance, axes=columns[: n + extra],
         **{name: np.ascontiguousarray(columns[n + extra :, k]) for k, name in enumerate(("d", "a1", "a2"))},
-        p0=np.ascontiguousarray(known[:, 0]), p=np.ascontiguousarray(known[:, 1:]),
+        p=np.ascontiguousarray(known[:, 1:]), tilt=np.ascontiguousarray(values),
         gate=GATES[dof], prior_r=prior_r, prior_t=prior_t, prior_w=prior_w,
     )  # fmt: skip
 

@@ -56,7 +56,7 @@ def _place(b: Batch, i: int, inverse: bool) -> Spectral:
 @inlined
 def _direction(b: Batch, i: int) -> Spectral:
     """M of entry i."""
-    return (b.p0[i], b.p[i, 0], b.p[i, 1], vec(b.d, i), vec(b.a1, i), vec(b.a2, i))
+    return (b.tilt[i, 0], b.tilt[i, 1], b.tilt[i, 2], vec(b.d, i), vec(b.a1, i), vec(b.a2, i))
 
 
 @inlined

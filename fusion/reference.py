@@ -59,8 +59,7 @@ def brute_force(m: Measurement, base_from_object: RigidTransform) -> float:
 def tilt(M: Array, v: Array) -> Array:
     """v^T M v for rows of v (k, 3), as a sum of squares: the plain product loses what is below 1e-16 of M's largest entry."""
     values, vectors = np.linalg.eigh(M)
-    known = np.where(values > 1e-9 * values[-1], values, 0.0)
-    return np.asarray((v @ vectors) ** 2 @ known)
+    return np.asarray((v @ vectors) ** 2 @ values)
 
 
 def _descended(f: Callable[[Array], float], start: Array) -> float:

@@ -11,13 +11,14 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import Any, Literal
 
 SIZE = 128
 CLEAR = 0x5A  # every other byte, zeroed memory too, means latched: damage must not start an arm
 LATCHED = 0x01
-SEQUENCE = struct.Struct("<Q")
+WORD = 8  # bytes
 BODY = struct.Struct("<BQd80s")  # flag, count, wall time, source
-BODY_AT = SEQUENCE.size
+BODY_AT = WORD
 TRIES = 100
 
 
@@ -44,6 +45,7 @@ class Latch:
     def __init__(self, path: Path) -> None:
         with path.open("r+b") as file:
             self._memory = mmap.mmap(file.fileno(), SIZE)
+        self._sequence = _word(self._memory, "Q")
 
     @classmethod
     def create(cls, path: Path) -> Latch:
@@ -70,9 +72,9 @@ class Latch:
         """The whole record; latched when no consistent one can be read."""
         for _ in range(TRIES):
             try:
-                (before,) = SEQUENCE.unpack_from(self._memory, 0)
+                before = self._sequence[0]
                 flag, count, time_s, source = BODY.unpack_from(self._memory, BODY_AT)
-                (after,) = SEQUENCE.unpack_from(self._memory, 0)
+                after = self._sequence[0]
             except ValueError:
                 break
             if before == after and before % 2 == 0:
@@ -93,18 +95,19 @@ class Latch:
 
     def close(self) -> None:
         """Unmap; a second call does nothing."""
+        self._sequence.release()
         self._memory.close()
 
     def _write(self, flag: int, source: str) -> LatchState:
-        (sequence,) = SEQUENCE.unpack_from(self._memory, 0)
+        sequence = self._sequence[0]
         sequence += 1 + sequence % 2  # odd, also after a writer died in the middle
-        SEQUENCE.pack_into(self._memory, 0, sequence)
+        self._sequence[0] = sequence
         if flag == LATCHED:
             self._memory[BODY_AT] = LATCHED  # before the rest: the control thread may look right now
         _, count, _, _ = BODY.unpack_from(self._memory, BODY_AT)
         text = source.encode("utf-8", "replace")[:80]
         BODY.pack_into(self._memory, BODY_AT, flag, count + 1, time.time(), text)
-        SEQUENCE.pack_into(self._memory, 0, sequence + 1)
+        self._sequence[0] = sequence + 1
         return self.state()
 
 
@@ -113,19 +116,28 @@ class Beat:
 
     def __init__(self, path: Path) -> None:
         if not path.exists():
-            path.write_bytes(b"\0" * 8)
+            path.write_bytes(b"\0" * WORD)
         with path.open("r+b") as file:
-            self._memory = mmap.mmap(file.fileno(), 8)
+            self._memory = mmap.mmap(file.fileno(), WORD)
+        self._at_s = _word(self._memory, "d")
 
     def beat(self) -> None:
         """I live."""
-        struct.pack_into("<d", self._memory, 0, time.monotonic())
+        self._at_s[0] = time.monotonic()
 
     def age_s(self) -> float:
         """Seconds since the last beat; both processes share the machine's monotonic clock."""
-        (at_s,) = struct.unpack_from("<d", self._memory, 0)
-        return time.monotonic() - float(at_s)
+        return time.monotonic() - float(self._at_s[0])
 
     def close(self) -> None:
         """Unmap; a second call does nothing."""
+        self._at_s.release()
         self._memory.close()
+
+
+def _word(memory: mmap.mmap, kind: Literal["Q", "d"]) -> memoryview[Any]:
+    """The first eight bytes as one number, read and written in one piece.
+
+    `struct.pack_into` clears its bytes before it fills them: another process then sees a zero, now and then.
+    """
+    return memoryview(memory)[:WORD].cast(kind)

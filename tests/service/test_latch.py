@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -138,6 +140,18 @@ def test_a_beat_grows_old(tmp_path: Path) -> None:
     assert beat.age_s() > 1.0, "never beaten"
     beat.beat()
     assert beat.age_s() < 1.0
+
+
+def test_no_reader_in_another_process_ever_sees_half_a_beat(tmp_path: Path) -> None:
+    beat = Beat(tmp_path / "beat")
+    beat.beat()
+    writer = (
+        "import sys, pathlib; from service.latch import Beat; b = Beat(pathlib.Path(sys.argv[1]))\nwhile True: b.beat()"
+    )
+    with subprocess.Popen([sys.executable, "-c", writer, str(tmp_path / "beat")]) as process:
+        oldest_s = max(beat.age_s() for _ in range(2_000_000))
+        process.kill()
+    assert oldest_s < 600.0, "a torn number looks hours old"
 
 
 def _answer(tmp_path: Path, request: str, origins: tuple[str, ...] = ()) -> tuple[int, dict[str, object], str, Latch]:

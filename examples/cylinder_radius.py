@@ -4,7 +4,7 @@
 
 A post of unknown radius and length is touched and ranged at places spread over its wall and top; two touches hit something
 else. `fuse` is called with a shape instead of fixed features, and gives pose, radius and length with their deviations. Then a
-box is measured the same way.
+post of which only a third of the wall can be reached, with a quarter of its points wrong, and a box.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from fusion.shapes import Box, Cylinder, Shape
 from hal.geometry import UncertainPose, perturbed, transform_rpy
 
 Array = NDArray[np.float64]
-TOUCH_SIGMA_M, RANGE_SIGMA_M = 0.0002, 0.002
+TOUCH_SIGMA_M, RANGE_SIGMA_M, ARC_SIGMA_M = 0.0002, 0.002, 0.0008
 PRIOR_SIGMA = np.array([0.005] * 3 + [0.02] * 3)  # what the camera knew: 5 mm, 1.1 degrees
 
 
@@ -84,6 +84,26 @@ def cylinder_case(seed: int = 0) -> tuple[FusedPose, Cylinder]:
     return fuse([*touches, *ranged, *foot], prior=believed(base_from_post, rng), shape=guess), true
 
 
+def arc_case(seed: int = 0) -> tuple[FusedPose, Cylinder]:
+    """Fuse 40 range points from one side of a post, ten of them on something else; the true post comes second.
+
+    They cover 120 degrees of the wall: over a part of a circle, radius and place of the axis nearly trade against each other.
+    """
+    rng = np.random.default_rng(seed)
+    true, guess = Cylinder(radius_m=0.0405, length_m=0.15), Cylinder(radius_m=0.03, length_m=0.15, sigma_m=0.03)
+    base_from_post = transform_rpy((0.6, -0.1, 0.3), (0.2, 0.1, -0.5))
+    points = []
+    for k in range(40):
+        angle, height = rng.uniform(-np.pi / 3, np.pi / 3), rng.uniform(0.01, 0.14)
+        on_wall = np.array([true.radius_m * np.cos(angle), true.radius_m * np.sin(angle), height])
+        point = sensed_point(guess, "wall", on_wall, base_from_post, ARC_SIGMA_M, rng)
+        if k % 4 == 0:  # a cable before the post, or the wall behind its edge
+            stray = base_from_post.rotation.apply([rng.choice([0.015, 0.025, -0.02]), 0.0, 0.0])
+            point = replace(point, mu_m=point.mu_m + stray, label="cable")
+        points.append(point)
+    return fuse(points, prior=believed(base_from_post, rng), shape=guess), true
+
+
 def box_case(seed: int = 0) -> tuple[FusedPose, Box]:
     """Fuse three touches on each face of a box that is 10 mm larger than believed; the true box comes second."""
     rng = np.random.default_rng(seed)
@@ -116,4 +136,5 @@ def report(title: str, answer: FusedPose, true: Shape) -> str:
 
 if __name__ == "__main__":
     print(report("post", *cylinder_case()))
+    print(report("post from one side", *arc_case()))
     print(report("box", *box_case()))

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from examples.cylinder_radius import box_case, cylinder_case
+from examples.cylinder_radius import arc_case, box_case, cylinder_case
 from examples.table2 import outlines, remark
 from fusion import fuse, incremental, warm_up
 from fusion.batch import pack
@@ -230,6 +230,18 @@ def test_a_radius_comes_out_of_touches_and_the_bad_ones_are_named() -> None:
     sigmas = np.sqrt(np.diag(answer.shape.covariance))
     assert np.abs((answer.shape.values - true.start) / sigmas).max() < 4.0
     assert answer.shape.sigma_of("radius_m") < 0.0005
+
+
+def test_a_third_of_a_wall_gives_the_radius_although_a_quarter_of_the_points_is_wrong() -> None:
+    for seed in range(3):
+        answer, true = arc_case(seed)
+        assert answer.shape is not None
+        named = {r.index for r in answer.rejected}
+        assert len(named & set(range(0, 40, 4))) >= 9
+        assert len(named - set(range(0, 40, 4))) <= 2
+        error, sigma = answer.shape.value_of("radius_m") - true.radius_m, answer.shape.sigma_of("radius_m")
+        assert abs(error) < 4 * sigma
+        assert 0.0003 < sigma < 0.004
 
 
 def test_a_box_is_measured_with_its_pose() -> None:

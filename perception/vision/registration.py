@@ -22,7 +22,7 @@ from perception.vision.view import Array, View
 
 WINDOWS_PX = (8.0, 5.0, 3.0, 2.0)  # search to either side; the pose is known to a few pixels
 STEP_PX = 0.5
-PLATE_WINDOWS_PX = (12.0, 5.0, 2.0)  # a plate without objects: its scale is wanted to a few per cent only
+PLATE_WINDOWS_PX = (12.0, *WINDOWS_PX)  # a plate is less well known at first
 LEAST_NOISE = 0.3  # gray levels: the rounding
 SMOOTHING_SIGMA_PX = 0.8
 EDGE_TO_NOISE = 4.0  # an edge counts when its slope exceeds that many sigmas of the slope's noise

@@ -16,14 +16,16 @@ from drivers.dynamixel import DynamixelClient
 from drivers.transport.bus import Bus, PolledDevice
 from drivers.transport.link import Refused, now_s
 from drivers.transport.options import SerialOptions, read_options, serial_opener
+from drivers.transport.timebase import HostTime, Unwrapper
 from hal.clock import Deadline
 from hal.devices import DeviceKind, GripperCapabilities, GripperState
-from hal.errors import DeviceFault, InvalidRequest
+from hal.errors import DeviceFault, DeviceTimeout, DeviceUnavailable, InvalidRequest
 from hal.readings import Stamped
 from hal.registry import Context
 
-MODEL, MODE, TORQUE, WATCHDOG, GOAL_CURRENT, PROFILE_VELOCITY, GOAL, STATE = 0, 11, 64, 98, 102, 112, 116, 126
-STATE_BYTES = 10  # current16 velocity32 position32
+MODEL, MODE, TORQUE, WATCHDOG, GOAL_CURRENT, PROFILE_VELOCITY, GOAL, STATE = 0, 11, 64, 98, 102, 112, 116, 120
+BLOCK = struct.Struct("<H4xhii")  # tick, moving, PWM, current, velocity, position
+TICK_BITS, TICK_S = 15, 0.001
 GRIP_MODE = 5
 A_PER_COUNT = 0.00269
 TURNS_PER_S_PER_COUNT = 0.229 / 60.0
@@ -69,6 +71,7 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
         self._options = options
         self._goal: int | None = None
         self._goal_current = LIMIT_CURRENT
+        self._clock = (Unwrapper(bits=TICK_BITS, tick_s=TICK_S), HostTime())
 
     def capabilities(self) -> GripperCapabilities:
         """From the options; the speed is the servo's own limit at 12 V."""
@@ -116,16 +119,24 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
         o = self._options
 
         def work(client: DynamixelClient, until_s: float) -> None:
-            position = client.read(o.id, STATE, STATE_BYTES, until_s)[6:]
+            position = client.read(o.id, STATE, BLOCK.size, until_s)[-4:]
             client.write(o.id, WATCHDOG, b"\x00", until_s)
             client.write(o.id, TORQUE, b"\x01", until_s)
             client.write(o.id, GOAL, position, until_s)
 
-        self.call(work, deadline)
+        while True:
+            try:
+                self.call(work, deadline)
+                return
+            except (DeviceTimeout, DeviceUnavailable):  # a bad wire only makes it slower
+                if deadline.is_past():
+                    raise
+                self.bus.rest(self.period_s)
 
     def set_up(self, client: DynamixelClient) -> None:
         """The servo must answer, and be in the mode that limits its current; torque stays as it is."""
-        o, until_s = self._options, now_s() + 6 * self._options.timeout_s
+        self._clock, o = (Unwrapper(bits=TICK_BITS, tick_s=TICK_S), HostTime()), self._options
+        until_s = now_s() + 6 * o.timeout_s
         client.read(o.id, MODEL, 2, until_s)
         mode = client.read(o.id, MODE, 1, until_s)[0]
         if mode == GRIP_MODE:
@@ -135,10 +146,13 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
         client.write(o.id, MODE, bytes([GRIP_MODE]), until_s)
 
     def poll(self, client: DynamixelClient) -> None:
-        """Current, velocity and position in one block."""
+        """Clock, current, velocity and position in one block; the clock tells a late answer from a young one."""
         asked_s, o = now_s(), self._options
-        block = client.read(o.id, STATE, STATE_BYTES, asked_s + 2 * o.timeout_s)
-        current, velocity, position = struct.unpack("<hii", block)
+        block = client.read(o.id, STATE, BLOCK.size, asked_s + 2 * o.timeout_s)
+        tick, current, velocity, position = BLOCK.unpack(block)
+        ticks, host = self._clock
+        device_s = ticks.seconds(tick)
+        valid_s = host.host_s(device_s=device_s, arrived_s=0.5 * (asked_s + now_s()))
         is_moving = abs(velocity) >= MOVING_COUNTS
         is_short = self._goal is not None and abs(position - self._goal) > AT_GOAL_COUNTS
         is_holding = is_short and not is_moving and abs(current) >= HOLDING_PART * self._goal_current
@@ -149,7 +163,8 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
                 is_moving=is_moving,
                 is_holding=is_holding,
             ),
-            valid_s=0.5 * (asked_s + now_s()),
+            valid_s=valid_s,
+            device_time_s=device_s,
         )
 
     def _speed(self, velocity: int) -> float:

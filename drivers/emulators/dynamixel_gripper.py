@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import struct
+import time
 from typing import Any
 
 from drivers import dxl2
 from drivers.emulators.base import WireEmulator
-from drivers.emulators.dynamixel import GOAL, INSTRUCTION, STATE, TORQUE, Servo
+from drivers.emulators.dynamixel import GOAL, INSTRUCTION, STATE, TICK, TORQUE, Servo
 from drivers.emulators.faults import FaultOptions
 from drivers.emulators.ports import Peer, PtyPort
 from hal.devices import Device, Gripper
@@ -20,6 +21,7 @@ GOAL_CURRENT, PROFILE_VELOCITY = 102, 112
 A_PER_COUNT, NEWTONS_PER_AMPERE = 0.00269, 60.0
 MOVING_VELOCITY = 50
 SLOWEST_M_PER_S = 0.01
+TICKS = 32_768
 
 
 class DynamixelGripperEmulator(WireEmulator):
@@ -88,6 +90,8 @@ class DynamixelGripperEmulator(WireEmulator):
         current = -int.from_bytes(self.servo.table[GOAL_CURRENT : GOAL_CURRENT + 2], "little") if held.is_holding else 0
         block = struct.pack("<hii", current, MOVING_VELOCITY if held.is_moving else 0, position)
         self.servo.table[STATE : STATE + len(block)] = block
+        tick = int(time.monotonic() * 1000.0) % TICKS
+        self.servo.table[TICK : TICK + 2] = tick.to_bytes(2, "little")
 
 
 def start(backing: Device, options: dict[str, Any]) -> DynamixelGripperEmulator:

@@ -75,7 +75,10 @@ def register(gray: Image, view: View, panel: Panel) -> Registration:
     reference = view
     delta = np.zeros(len(view.prior_sigma))
     for window in WINDOWS_PX:
-        delta, covariance = _step(smooth, slope_noise, reference, delta, edges=everything, window_px=window)
+        motion = _motion(reference, delta, everything.points_m)
+        delta, covariance = _step(
+            smooth, slope_noise, reference, delta, edges=everything, window_px=window, motion=motion
+        )
     moved = reference.moved(delta)
     found = _look(smooth, slope_noise, moved, everything, 2.5)
     near = found.ok & (np.abs(found.offset_px) <= 2.0)
@@ -97,8 +100,9 @@ def follow_edges(gray: Image, view: V, outline: Outline) -> V:
     smooth = np.asarray(cv2.GaussianBlur(gray.astype(np.float32), (0, 0), SMOOTHING_SIGMA_PX), np.float32)
     slope_noise = noise_sigma(gray) * 0.35
     delta = np.zeros(len(view.prior_sigma))
+    motion = _motion(view, delta, outline.points_m)  # of a plane: hardly changes within a dozen pixels
     for window in PLATE_WINDOWS_PX:
-        delta, _ = _step(smooth, slope_noise, view, delta, edges=outline, window_px=window)
+        delta, _ = _step(smooth, slope_noise, view, delta, edges=outline, window_px=window, motion=motion)
     return view.moved(delta)
 
 
@@ -169,12 +173,12 @@ def _ahead(view: View, edges: Outline) -> Array:
 
 
 def _step(
-    smooth: NDArray[np.float32], slope_noise: float, reference: View, delta: Array, *, edges: Outline, window_px: float
-) -> tuple[Array, Array]:
-    """Two Gauss-Newton steps on the edges found in one window."""
+    smooth: NDArray[np.float32], slope_noise: float, reference: View, delta: Array, *, edges: Outline, window_px: float,
+    motion: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Two Gauss-Newton steps on the edges found in one window; `motion` (N, 2, P) is what `_motion` gives."""
     sigma = reference.prior_sigma
     information = np.diag(1.0 / sigma**2)
-    motion = _motion(reference, delta, edges.points_m)  # hardly changes within the window
     for _ in range(2):
         view = reference.moved(delta)
         found = _look(smooth, slope_noise, view, edges, window_px)

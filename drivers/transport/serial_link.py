@@ -9,7 +9,6 @@ from contextlib import suppress
 from pathlib import Path
 
 import serial
-import serial.tools.list_ports
 
 from drivers.transport.fd_link import FdLink
 from drivers.transport.link import LinkLost
@@ -17,6 +16,7 @@ from hal.errors import DeviceUnavailable
 
 PTY_MAJORS = range(136, 144)  # Linux devices.txt
 BITS_PER_BYTE = 10
+USUAL_PORTS = ("ttyUSB*", "ttyACM*", "ttyAMA*")  # a look at /sys by pyserial costs a millisecond at every attempt
 STABLE_NAMES = Path("/dev/serial/by-id")
 
 
@@ -121,7 +121,7 @@ def _diagnose(path: str, error: Exception) -> tuple[str, str]:
 
 def _ports_now() -> str:
     stable = sorted(str(p) for p in STABLE_NAMES.glob("*")) if STABLE_NAMES.is_dir() else []
-    ports = stable or sorted(p.device for p in serial.tools.list_ports.comports())
+    ports = stable or sorted(str(p) for pattern in USUAL_PORTS for p in Path("/dev").glob(pattern))
     return ", ".join(ports) or "none"
 
 

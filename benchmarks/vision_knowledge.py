@@ -1,0 +1,194 @@
+"""Teach the shipped kinds from labelled overviews, and try what was taught on overviews that it has not seen.
+
+`python -m benchmarks.vision_knowledge FOLDER` prints recall, precision and calibration of three folds of the overviews
+beside the repository, then writes one TOML a kind, taught on all of them, into FOLDER. The shipped files were made this
+way: one look an object at its true middle, the looks of places that are no object, and of both only those that the ones
+kept so far do not tell with a margin (P. E. Hart, the condensed nearest neighbour rule, IEEE Trans. Inf. Theory 14(3),
+1968).
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.vision.blind import PLATE_M, Candidate, candidate_places, chosen, lay_out
+from perception.vision.features import PLATE_PX_PER_M, Ground, look_at
+from perception.vision.knowledge import NOTHING, Kind, Knowledge, spread_of, write_kind
+from perception.vision.match import CLIP
+from perception.vision.plate import find_plate
+from perception.vision.view import Array, PlaneView
+
+DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "vision" / "synth_dev"
+FOLDS = 3
+LEVELS = 3  # come in turn in the folder: folds of every third overview would each hold out one level entirely
+ELSEWHERE_PX = 7.0  # a place further from every object's middle is none
+OBJECT_MARGIN, NOTHING_MARGIN = 0.2, 0.03  # by which a look must be nearer to its own kind than to others
+PASSES = 3
+STEP = 0.01  # looks are written with two decimals
+NO_SIZE_M = (0.01, 0.01)
+SLIDER_M = (0.05, 0.05)  # flat and upright ones share a kind
+BINS = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Lesson:
+    """One overview with its truth: the rectified plate, places with their looks, and the objects' looks and kinds."""
+
+    level: str
+    truth: list[dict[str, Any]]
+    view: PlaneView
+    ground: Ground
+    places: Array
+    looks: Array
+    middles: Array
+    object_looks: Array
+
+
+def lessons(folder: Path) -> Iterator[Lesson]:
+    """The overviews of a folder in which the plate is found."""
+    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+    for name, entry in truth.items():
+        gray = cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE) if entry["kind"] == "overview" else None
+        if gray is None or "lights_on" in entry or name.endswith("_off.png"):
+            continue
+        plate = find_plate(np.asarray(gray, np.uint8), *PLATE_M)
+        if plate is None:
+            continue
+        ground = lay_out(np.asarray(gray, np.uint8), plate.view, PLATE_M)
+        pixels = np.array([[*o["center_px"], 1.0] for o in entry["objects"]])
+        on_plate = pixels @ np.linalg.inv(plate.view.px_from_plate).T
+        xy = on_plate[:, :2] / on_plate[:, 2:]
+        middles = np.column_stack([xy[:, 0] + PLATE_M[0] / 2, PLATE_M[1] / 2 - xy[:, 1]]) * PLATE_PX_PER_M
+        places = candidate_places(ground.edges)
+        yield Lesson(
+            level=entry["level"], truth=entry["objects"], view=plate.view, ground=ground, places=places,
+            looks=look_at(ground, places), middles=middles, object_looks=look_at(ground, middles),
+        )  # fmt: skip
+
+
+def knowledge_of(taught: Sequence[Lesson]) -> Knowledge:
+    """Condensed looks of every kind, and of nothing."""
+    looks, names = _examples(taught)
+    kinds = [
+        Kind(
+            name=name, size_m=_size_m(taught, name), looks=looks[names == name], taught_by="benchmarks/vision_knowledge"
+        )
+        for name in sorted(set(names.tolist()))
+    ]
+    kept = _condensed(looks / spread_of(kinds), names)
+    rounded = np.round(looks[kept] / STEP) * STEP
+    short = tuple(replace(kind, looks=rounded[names[kept] == kind.name]) for kind in kinds)
+    return Knowledge(kinds=short, spread=spread_of(short))
+
+
+def _examples(taught: Sequence[Lesson]) -> tuple[Array, NDArray[np.str_]]:
+    """(N, LENGTH) looks and (N,) kinds of everything that is at least half visible, and of what is no object."""
+    looks, names = [], []
+    for lesson in taught:
+        for thing, look in zip(lesson.truth, lesson.object_looks, strict=True):
+            if thing["visible"] >= 0.5:
+                looks.append(look)
+                names.append(str(thing["cls"]))
+        away = np.linalg.norm(lesson.places[:, None] - lesson.middles[None], axis=2).min(axis=1) > ELSEWHERE_PX
+        looks += list(lesson.looks[away])
+        names += [NOTHING] * int(away.sum())
+    return np.array(looks), np.array(names)
+
+
+def _size_m(taught: Sequence[Lesson], name: str) -> tuple[float, float]:
+    sizes = [thing["size"] for lesson in taught for thing in lesson.truth if thing["cls"] == name]
+    if name == "slider":
+        return SLIDER_M
+    width, height = np.median(np.array(sizes), axis=0) / 1000 if sizes else NO_SIZE_M
+    return float(width), float(height)
+
+
+def _condensed(scaled: Array, names: NDArray[np.str_]) -> NDArray[np.int64]:
+    """Indices of the looks to keep: those that the others kept do not name with the margin of their kind."""
+    own, other = np.full(len(scaled), np.inf), np.full(len(scaled), np.inf)
+    margin = np.where(names == NOTHING, NOTHING_MARGIN, OBJECT_MARGIN)
+    kept: list[int] = []
+
+    def keep(i: int) -> None:
+        distance = np.minimum(np.abs(scaled - scaled[i]), CLIP).mean(axis=1)
+        same = names == names[i]
+        own[same] = np.minimum(own[same], distance[same])
+        other[~same] = np.minimum(other[~same], distance[~same])
+        kept.append(i)
+
+    for name in sorted(set(names.tolist())):
+        keep(int(np.flatnonzero(names == name)[0]))
+    order = np.random.default_rng(0).permutation(len(scaled))
+    for _ in range(PASSES):
+        before = len(kept)
+        for i in order:
+            if own[i] > 0 and own[i] > other[i] - margin[i]:
+                keep(int(i))
+        if len(kept) == before:
+            break
+    return np.array(kept)
+
+
+def judged(lesson: Lesson, knowledge: Knowledge) -> tuple[list[tuple[float, bool]], int]:
+    """(confidence, right) of every accepted candidate, and how many objects are at least half visible."""
+    found = chosen(lesson.ground, lesson.places, lesson.looks, knowledge, lesson.view, PLATE_M)
+    rows = [(c.confidence, right) for c in found if c.reason is None and (right := _right(lesson, c)) is not None]
+    return rows, sum(thing["visible"] >= 0.5 for thing in lesson.truth)
+
+
+def _right(lesson: Lesson, candidate: Candidate) -> bool | None:
+    """Whether the nearest object is of that kind and near enough; None for one that is hidden for the most part."""
+    off = [float(np.linalg.norm(candidate.centre_px - thing["center_px"])) for thing in lesson.truth]
+    thing = lesson.truth[int(np.argmin(off))]
+    near = min(off) < 0.5 * max(thing["bbox_px"][2:])
+    return None if near and thing["visible"] < 0.5 else bool(near and thing["cls"] == candidate.kind)
+
+
+def _print_folds(all_lessons: Sequence[Lesson]) -> None:
+    rows: dict[str, list[tuple[float, bool]]] = {}
+    there: dict[str, int] = {}
+    for fold in range(FOLDS):
+        knowledge = knowledge_of([lesson for k, lesson in enumerate(all_lessons) if k // LEVELS % FOLDS != fold])
+        for lesson in (x for k, x in enumerate(all_lessons) if k // LEVELS % FOLDS == fold):
+            found, count = judged(lesson, knowledge)
+            rows.setdefault(lesson.level, []).extend(found)
+            there[lesson.level] = there.get(lesson.level, 0) + count
+    for level, found in rows.items():
+        right = sum(ok for _, ok in found)
+        print(f"held out, {level:8s} recall {right / there[level]:.3f}  precision {right / len(found):.3f}")
+    pairs = np.array(sorted(pair for found in rows.values() for pair in found), float)
+    error = 0.0
+    print("reliability: mean confidence, share right, candidates")
+    for part in np.array_split(pairs, BINS):
+        error += len(part) / len(pairs) * abs(float(part[:, 0].mean() - part[:, 1].mean()))
+        print(f"  {part[:, 0].mean():.3f} {part[:, 1].mean():.3f} {len(part)}")
+    print(f"expected calibration error {error:.3f}")
+
+
+def main() -> int:
+    """Print what held-out overviews say, and write what all of them teach."""
+    if len(sys.argv) != 2 or not DATA.exists():
+        print(__doc__ if DATA.exists() else "no labelled overviews beside the repository")
+        return 2
+    cv2.setNumThreads(1)
+    everything = list(lessons(DATA))
+    _print_folds(everything)
+    folder = Path(sys.argv[1])
+    folder.mkdir(parents=True, exist_ok=True)
+    for kind in knowledge_of(everything).kinds:
+        write_kind(kind, folder)
+        print(f"{kind.name}: {len(kind.looks)} looks")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

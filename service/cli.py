@@ -37,6 +37,7 @@ def _app() -> Callable[[], None]:
     from service.commands.develop import conform, emulate, new_driver
     from service.commands.doctor import doctor
     from service.commands.serve import serve
+    from service.commands.teach import teach
     from service.commands.warm import warm
 
     app = typer.Typer(
@@ -53,6 +54,7 @@ def _app() -> Callable[[], None]:
     app.command()(tasks.stop)
     app.command()(conform)
     app.command()(warm)
+    app.command()(teach)
     app.command()(emulate)
     app.command("new-driver")(new_driver)
     return app

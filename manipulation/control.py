@@ -7,6 +7,7 @@ wall clock the thread always ticks and holds the arm.
 
 from __future__ import annotations
 
+import os
 import queue
 import threading
 from collections.abc import Callable, Sequence
@@ -25,6 +26,7 @@ from hal.config import SafetySection
 from hal.devices import Arm, ForceTorque, Gripper, Proximity, Touch
 from hal.errors import CellError, DeviceFault, MotionRefused, Stopped
 from hal.geometry import identity
+from hal.lockstep import share_core
 from hal.motion import (
     CartesianPath,
     DeclaredMotion,
@@ -221,6 +223,8 @@ class Controller:
         return result.result()
 
     def _loop(self) -> None:
+        if self._ticks_only_in_motion:
+            share_core(os.getpid())
         while not self._closing.is_set():
             try:
                 job = self._jobs.get(block=self._ticks_only_in_motion)

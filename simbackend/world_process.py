@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.lockstep import share_core
 from simbackend.wire import CAMERA_AT, DOUBLE, IMAGE_BYTES, REQUEST, Op, Picture, PictureInfo, read_exactly
 from simbackend.world import World
 
@@ -22,7 +23,10 @@ Array = NDArray[np.float64]
 def serve(pipe: Connection, images: mmap.mmap) -> None:
     """Build the world that the first message describes, then answer requests until the other side goes."""
     try:
-        world = World(pipe.recv())
+        config = pipe.recv()
+        if config.cell.file.cell.mode == "sim":
+            share_core(os.getppid())
+        world = World(config)
     except Exception as error:  # whatever keeps a world from being built must reach the person who asked for it
         pipe.send(f"{type(error).__name__}: {error}")
         return

@@ -31,6 +31,11 @@ Array = NDArray[np.float64]
 Vector3 = tuple[float, float, float]
 
 
+# A panel is set in a wall or a cabinet that nobody has measured: no way leads round its edge, where a hand would hook on.
+WALL_BEYOND_M = 0.3
+WALL_DEPTH_M = 0.1
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Capsule:
     """A capsule fixed to the flange: both ends in flange axes, m."""
@@ -55,16 +60,17 @@ class Box:
 
 
 def panel_boxes(panel: Panel, angles_rad: Mapping[str, float] | None = None) -> tuple[Box, ...]:
-    """Plate and objects of a panel as boxes in the panel frame.
+    """Plate and objects of a panel as boxes in the panel frame; the plate with the wall that it is set in.
 
     Args:
         angles_rad: present angle (clockwise from up) of levers by name; one whose angle is unknown gets the box of its
             whole sweep.
     """
+    half_depth_m = max(panel.thickness_m, WALL_DEPTH_M) / 2
     plate = Box(
         name="plate",
-        parent_from_box=transform_rpy((0.0, 0.0, -panel.thickness_m / 2), (0.0, 0.0, 0.0)),
-        half_m=(panel.width_m / 2, panel.height_m / 2, panel.thickness_m / 2),
+        parent_from_box=transform_rpy((0.0, 0.0, -half_depth_m), (0.0, 0.0, 0.0)),
+        half_m=(panel.width_m / 2 + WALL_BEYOND_M, panel.height_m / 2 + WALL_BEYOND_M, half_depth_m),
     )
     known = angles_rad or {}
     return (plate, *(envelope(thing, angle_rad=known.get(thing.name)) for thing in panel.objects))

@@ -186,6 +186,15 @@ def test_the_boxes_of_a_panel_move_with_it_and_the_plate_lies_behind_its_face() 
     assert plate.parent_from_box.translation[2] + plate.half_m[2] == pytest.approx(0.5)
 
 
+def test_no_hand_fits_round_the_edge_of_the_plate() -> None:
+    panel = make_panel()
+    plate = next(box for box in panel_boxes(panel) if box.name == "plate")
+    for side in (-1.0, 1.0):
+        for beside in ((side * (panel.width_m / 2 + 0.1), 0.0, -0.03), (0.0, side * (panel.height_m / 2 + 0.1), -0.03)):
+            local = plate.parent_from_box.inv().apply(np.array(beside))
+            assert (np.abs(local) < plate.half_m).all(), "a finger tip beside the plate and behind its face"
+
+
 def test_the_floor_stops_the_hand_but_not_the_foot() -> None:
     model = CollisionModel.build(KINEMATICS, TOOL, [floor_box(0.0)])
     assert model.is_clear(np.array([0.0, 0.2, 0.5, 0.0, 0.9, 0.0]), margin_m=0.01)

@@ -81,6 +81,9 @@ class DynamixelClient:
         packets = self._exchange(dxl2.sync_read(address, length, ids, fast=True), 1, until_s)
         data = packets[0].parameters
         step = length + 4  # error, id, data, and a CRC over everything so far
+        least = len(ids) * step - 2  # the last CRC is the packet's own
+        if len(data) < least:
+            raise BadAnswer(f"{len(ids)} servos answer {len(data)} bytes instead of {least}")
         blocks = {}
         for i, id_ in enumerate(ids):
             error, got = data[i * step], data[i * step + 1]

@@ -5,7 +5,7 @@ PACKAGES := hal drivers simbackend perception fusion manipulation service benchm
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup demo serve test test-fast lint format bench-cell bench-missions bench-pose bench-fusion bench-range bench-vision bench-drivers clean
+.PHONY: help setup demo serve test test-wire test-fast lint format bench-cell bench-missions bench-pose bench-fusion bench-range bench-vision bench-drivers clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 16
@@ -35,10 +35,13 @@ serve: setup  ## Start the service on http://127.0.0.1:8460
 	@$(BIN)/panelwright serve
 
 test: setup  ## Run all tests, two files at a time
-	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope
+	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope -m 'not wire'
+
+test-wire: setup  ## Run whole missions over emulated wires, in real time: on a busy machine one may be late and end
+	@$(BIN)/python -m pytest -m wire
 
 test-fast: setup  ## Run the tests without missions and browsers
-	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope -m 'not slow'
+	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope -m 'not slow and not wire'
 
 lint: setup  ## Style, types and layering
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .

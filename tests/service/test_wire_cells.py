@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 LONGEST_S = 500  # a busy machine compiles for a minute and lets time pass at half its pace
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(LONGEST_S + 60)]
+pytestmark = [pytest.mark.wire, pytest.mark.timeout(LONGEST_S + 60)]
 
 
 def report_of(runs: Path, log: str) -> dict[str, Any]:

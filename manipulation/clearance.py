@@ -17,7 +17,7 @@ GOLDEN = 0.6180339887498949
 SEARCH_STEPS = 16  # 0.618^16 of a 0.5 m link: 0.2 mm of arc, far less in distance near the minimum
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def point_box(x: float, y: float, z: float, half: Array) -> float:
     """Signed distance from a point in box axes to the box: negative inside."""
     dx, dy, dz = abs(x) - half[0], abs(y) - half[1], abs(z) - half[2]
@@ -25,7 +25,7 @@ def point_box(x: float, y: float, z: float, half: Array) -> float:
     return float(np.sqrt(ox * ox + oy * oy + oz * oz) + min(max(dx, dy, dz), 0.0))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def segment_box(start: Array, end: Array, rotation: Array, middle: Array, half: Array) -> float:
     """Least signed distance between the segment and the box (rotation: base_from_box)."""
     a, b = np.empty(3), np.empty(3)
@@ -54,7 +54,7 @@ def segment_box(start: Array, end: Array, rotation: Array, middle: Array, half: 
     return best
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def segment_segment(p1: Array, q1: Array, p2: Array, q2: Array) -> float:
     """Least distance between two segments.
 
@@ -84,7 +84,7 @@ def segment_segment(p1: Array, q1: Array, p2: Array, q2: Array) -> float:
     return float(np.sqrt(np.dot(gap, gap)))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def capsule_ends(dh: Array, q: Array, tool_ends: Array) -> Any:
     """Ends (n + m, 2, 3) in the base of all capsules: n links from joint to joint, then the m of the tool on the
     flange.
@@ -105,7 +105,7 @@ def capsule_ends(dh: Array, q: Array, tool_ends: Array) -> Any:
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def least_clearance(
     dh: Array,
     q: Array,
@@ -150,7 +150,7 @@ def least_clearance(
     return float(least)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def first_hit(
     dh: Array,
     start: Array,
@@ -177,7 +177,7 @@ def first_hit(
     return 1.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def overlap_counts(dh: Array, configurations: Array, tool_ends: Array, radii: Array, pairs: Index) -> Any:
     """How many of the configurations (m, n) make each pair of capsules overlap, (k,)."""
     out = np.zeros(pairs.shape[0])

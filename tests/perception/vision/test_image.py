@@ -35,10 +35,27 @@ def test_damaged_bytes_are_an_invalid_request(data: bytes) -> None:
 def test_sixteen_bits_and_huge_sizes_are_refused_before_decoding() -> None:
     with pytest.raises(InvalidRequest, match="8 bits"):
         decode(png(np.zeros((40, 40), np.uint16)))
+    import cv2
+
+    deep_colour = cv2.imencode(".png", np.zeros((40, 40, 3), np.uint16))[1].tobytes()
+    with pytest.raises(InvalidRequest, match="8 bits"):
+        decode(deep_colour)
     buffer = io.BytesIO()
     Pillow.new("1", (12_000, 9_000)).save(buffer, "PNG")
     with pytest.raises(InvalidRequest, match="large"):
         decode(buffer.getvalue())
+
+
+def test_a_photograph_is_turned_as_its_camera_was_held() -> None:
+    image = np.zeros((40, 60), np.uint8)
+    image[:20] = 200
+    exif = Pillow.Exif()
+    exif[0x0112] = 6  # the camera was held turned by 90 degrees
+    buffer = io.BytesIO()
+    Pillow.fromarray(image).save(buffer, "JPEG", exif=exif)
+    turned = decode(buffer.getvalue())
+    assert turned.shape == (60, 40)
+    assert turned[30, 35] > 150 > turned[30, 5]
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ MISS_PROBABILITY = 1e-4  # of never drawing a clean subset that also converges
 CONVERGES = 0.25  # share of clean subsets that reach their pose from a random rotation (measured 0.27)
 SETTLED_PER_ROUND = 8
 LARGEST_ROUND = 512
+READMITTED = 3  # cheapest candidates whose rejected measurements are tried again
 ALTERNATIVE_COST = 18.0  # a minimum this much worse has odds below 1e-4
 SAME_SIGMAS = 6.0  # minima closer than this are one
 
@@ -62,6 +63,8 @@ def minima(b: Batch, rng: np.random.Generator) -> tuple[Minimum, list[Minimum]]:
     f, least = np.empty(n), np.inf
     for k in range(len(poses.cost)):
         R, t = poses.R[k], poses.t[k]
+        if k < READMITTED:
+            search.readmit(small, R, t, poses.cost[k])
         # A pose from part of the measurements is only as exact as those are.
         if any(_same(R, t, m.local, share=len(small.cls) / n) for m in found):
             continue

@@ -63,6 +63,17 @@ def test_covariance_is_honest() -> None:
     assert low < sum(nees) < high
 
 
+@pytest.mark.parametrize("seed", [74, 140, 153, 198, 199, 216, 223])
+def test_no_good_measurement_is_given_up_for_a_worse_sum(seed: int) -> None:
+    """Elongated covariances: all agree near the truth, yet a set one short has a minimum of its own close by."""
+    rng = np.random.default_rng(seed)
+    p = problem([CODES[k] for k in rng.integers(len(CODES), size=12)], rng, anisotropy=100.0)
+    believing_all = solve(p.measurements, p.base_from_object)
+    answer = fuse(p.measurements)
+    assert not answer.rejected
+    assert answer.chi_square <= believing_all.chi_square + 1e-6
+
+
 def test_the_same_input_gives_the_same_answer() -> None:
     p = mixture(16, 5, 4)
     a, b = fuse(p.measurements), fuse(p.measurements)

@@ -1,7 +1,8 @@
 """The plate in an overview: four robust lines around what differs from the room, and the view straight onto it.
 
-Sides that the image cuts off are completed from the known proportions. What follows needs the scale to a few per cent
-only: objects are measured in the original image again.
+A rigid plate before a typical camera is laid through the lines and follows the image's edges, so a side that the image
+cuts off is where the other three put it. Where the edges do not confirm a visible side (glare or shadow misled its line),
+the plate is laid again without that line, and from further off; what is confirmed best stands.
 """
 
 from __future__ import annotations
@@ -13,15 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.vision.image import Image
-from perception.vision.outline import rectangle
-from perception.vision.registration import follow_edges
-from perception.vision.view import Array, PlaneView, homography
+from perception.vision.outline import Outline, rectangle
+from perception.vision.plate_pose import rigid_plate
+from perception.vision.registration import EdgeImage, confirmed, edge_image, follow_edges
+from perception.vision.view import Array, PlaneView
 
 COARSE_WIDTH_PX = 160
 TYPICAL_FOCAL = 1.25  # of the longer image side: a lens of 44 degrees; completes a side that is cut off
 LEAST_SHARE = 0.25  # of the image: a smaller plate is not an overview
 SIDE_POINTS = 40
-FOUND_SIGMA_PX = 5.0
+WINDOWS_PX = (12.0, 8.0, 5.0, 3.0, 2.0)
+FAR_WINDOWS_PX = (30.0, 20.0, *WINDOWS_PX)  # for a plate whose lines were misled
+START_SIGMA_PX, FAR_SIGMA_PX = 6.0, 15.0
+FREE_WINDOWS_PX = (3.0, 2.0)  # of the last step, which allows for a lens and a focal length that are not typical
+FREE_SIGMA_PX = 2.0
+CONFIRMED = 0.7  # share of a side's visible edge
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -45,16 +52,64 @@ def find_plate(gray: Image, width_m: float, height_m: float, *, focal_px: float 
     if mask.mean() < LEAST_SHARE:
         return None
     lines = [_side(mask, side) for side in range(4)]
-    focal = (focal_px or TYPICAL_FOCAL * max(gray.shape)) / shrink
-    corners = _corners(lines, mask.shape, width_m / height_m, focal)
-    if corners is None:
-        return None
-    corners_px = (corners + 0.5) * shrink - 0.5
     w, h = width_m / 2, height_m / 2
-    corners_m = np.array([[-w, h], [w, h], [w, -h], [-w, -h]])
-    view = PlaneView(px_from_plate=homography(corners_m, corners_px), corners_m=corners_m, sigma_px=FOUND_SIGMA_PX)
-    outline = rectangle(0.0, 0.0, 0.0, width_m=width_m, height_m=height_m, count=SIDE_POINTS)
-    return Plate(view=follow_edges(gray, view, outline), sides_seen=tuple(line is not None for line in lines))  # type: ignore[arg-type]
+    search = _Search(
+        image=edge_image(gray), outline=rectangle(0.0, 0.0, 0.0, width_m=width_m, height_m=height_m, count=SIDE_POINTS),
+        corners_m=np.array([[-w, h], [w, h], [w, -h], [-w, -h]]), coarse_shape=mask.shape, shrink=shrink,
+        focal_px=focal_px or TYPICAL_FOCAL * max(gray.shape),
+    )  # fmt: skip
+    found = search.best(lines)
+    return None if found is None else Plate(view=found, sides_seen=tuple(line is not None for line in lines))  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Search:
+    """What every attempt to lay the plate through coarse lines needs."""
+
+    image: EdgeImage
+    outline: Outline
+    corners_m: Array
+    coarse_shape: tuple[int, ...]
+    shrink: float
+    focal_px: float
+
+    def best(self, lines: list[Array | None]) -> PlaneView | None:
+        """The plate that the image's edges confirm best; None when the lines make none."""
+        view = self._laid(lines, WINDOWS_PX, START_SIGMA_PX)
+        found = [] if view is None else [(self._score(view), view)]
+        if view is None or self._least_confirmed(view) < CONFIRMED:
+            attempts = [(lines, FAR_WINDOWS_PX, FAR_SIGMA_PX)]
+            for side in range(4):
+                fewer = [None if k == side else line for k, line in enumerate(lines)]
+                attempts.append((fewer, WINDOWS_PX, START_SIGMA_PX))
+            views = [view for attempt in attempts if (view := self._laid(*attempt)) is not None]
+            found += [(self._score(view), view) for view in views]
+        return max(found, key=lambda f: f[0])[1] if found else None
+
+    def _laid(self, lines: list[Array | None], windows_px: tuple[float, ...], sigma_px: float) -> PlaneView | None:
+        """The plate through the lines, moved onto the image's edges: first as a rigid one, then freely."""
+        width, height = self.corners_m.max(axis=0) * 2
+        corners = _corners(lines, self.coarse_shape, float(width / height), self.focal_px / self.shrink)
+        if corners is None:
+            return None
+        rows, columns = self.image.smooth.shape
+        rigid = rigid_plate(
+            self.corners_m, (corners + 0.5) * self.shrink - 0.5, focal_px=self.focal_px, sigma_px=sigma_px,
+            middle_px=np.array([columns - 1.0, rows - 1.0]) / 2,
+        )  # fmt: skip
+        rigid = follow_edges(self.image, rigid, self.outline, windows_px)
+        free = PlaneView(px_from_plate=rigid.px_from_plate, corners_m=self.corners_m, sigma_px=FREE_SIGMA_PX)
+        return follow_edges(self.image, free, self.outline, FREE_WINDOWS_PX)
+
+    def _score(self, view: PlaneView) -> int:
+        """Samples of the border that an edge confirms, less visible ones that none does."""
+        visible, near = confirmed(self.image, view, self.outline)
+        return 2 * int(near.sum()) - int(visible.sum())
+
+    def _least_confirmed(self, view: PlaneView) -> float:
+        """Share of the visible samples with an edge, on the worst side of which enough is visible."""
+        visible, near = (mask.reshape(4, -1).sum(axis=1) for mask in confirmed(self.image, view, self.outline))
+        return float(np.where(visible >= SIDE_POINTS // 5, near / np.maximum(visible, 1), 1.0).min())
 
 
 def _plate_mask(small: Image) -> NDArray[np.bool_]:

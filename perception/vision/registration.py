@@ -6,6 +6,7 @@ known pose, and Cauchy weights (Huber, Robust Statistics, 1981) so that labels, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -22,9 +23,10 @@ from perception.vision.view import Array, View
 
 WINDOWS_PX = (8.0, 5.0, 3.0, 2.0)  # search to either side; the pose is known to a few pixels
 STEP_PX = 0.5
-PLATE_WINDOWS_PX = (12.0, *WINDOWS_PX)  # a plate is less well known at first
+LAST_LOOK_PX, NEAR_PX = 2.5, 2.0  # search at the end, and how near an edge confirms the model
 LEAST_NOISE = 0.3  # gray levels: the rounding
 SMOOTHING_SIGMA_PX = 0.8
+SLOPE_NOISE = 0.35  # of the central difference after that smoothing, over the image's noise
 EDGE_TO_NOISE = 4.0  # an edge counts when its slope exceeds that many sigmas of the slope's noise
 NORMAL_STEP_M = 1e-3
 MEASUREMENT_SIGMA_PX = 0.5
@@ -67,8 +69,8 @@ def register(gray: Image, view: View, panel: Panel) -> Registration:
         gray: (H, W) uint8, as the camera saw it (distorted).
         view: prediction, good to a few pixels.
     """
-    smooth = np.asarray(cv2.GaussianBlur(gray.astype(np.float32), (0, 0), SMOOTHING_SIGMA_PX), np.float32)
-    slope_noise = noise_sigma(gray) * 0.35  # of the central difference after that smoothing
+    image = edge_image(gray)
+    smooth, slope_noise = image.smooth, image.slope_noise
     own = {thing.name: edges for thing in panel.objects if (edges := edges_of(thing)) is not None}
     everything = _joined([plate_edges(panel), *own.values()])
     covariance = np.diag(view.prior_sigma**2)
@@ -80,8 +82,8 @@ def register(gray: Image, view: View, panel: Panel) -> Registration:
             smooth, slope_noise, reference, delta, edges=everything, window_px=window, motion=motion
         )
     moved = reference.moved(delta)
-    found = _look(smooth, slope_noise, moved, everything, 2.5)
-    near = found.ok & (np.abs(found.offset_px) <= 2.0)
+    found = _look(smooth, slope_noise, moved, everything, LAST_LOOK_PX)
+    near = found.ok & (np.abs(found.offset_px) <= NEAR_PX)
     built_m = panel.tolerances.position_m
     local = {name: _local_shift(smooth, slope_noise, moved, edges, built_m) for name, edges in own.items()}
     return Registration(
@@ -95,15 +97,36 @@ def register(gray: Image, view: View, panel: Panel) -> Registration:
     )
 
 
-def follow_edges(gray: Image, view: V, outline: Outline) -> V:
-    """`view` moved so that one outline lies on the image's edges; the view itself when too few are found."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EdgeImage:
+    """An image as edges are looked for in it: `smooth` (H, W) gray, and one sigma of a slope's noise."""
+
+    smooth: NDArray[np.float32]
+    slope_noise: float
+
+
+def edge_image(gray: Image) -> EdgeImage:
+    """Made once an image; `follow_edges` and `confirmed` may then be called often."""
     smooth = np.asarray(cv2.GaussianBlur(gray.astype(np.float32), (0, 0), SMOOTHING_SIGMA_PX), np.float32)
-    slope_noise = noise_sigma(gray) * 0.35
+    slope_noise = SLOPE_NOISE * noise_sigma(gray)
+    return EdgeImage(smooth=smooth, slope_noise=slope_noise)
+
+
+def follow_edges(image: EdgeImage, view: V, outline: Outline, windows_px: Sequence[float]) -> V:
+    """`view` moved so that one outline lies on the image's edges; the view itself when too few are found."""
     delta = np.zeros(len(view.prior_sigma))
     motion = _motion(view, delta, outline.points_m)  # of a plane: hardly changes within a dozen pixels
-    for window in PLATE_WINDOWS_PX:
-        delta, _ = _step(smooth, slope_noise, view, delta, edges=outline, window_px=window, motion=motion)
+    for window in windows_px:
+        delta, _ = _step(
+            image.smooth, image.slope_noise, view, delta, edges=outline, window_px=window, motion=motion
+        )
     return view.moved(delta)
+
+
+def confirmed(image: EdgeImage, view: View, outline: Outline) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(N,) which samples of the outline the image shows, and which of them have an edge within `NEAR_PX`."""
+    found = _look(image.smooth, image.slope_noise, view, outline, LAST_LOOK_PX)
+    return found.visible, found.ok & (np.abs(found.offset_px) <= NEAR_PX)
 
 
 def noise_sigma(gray: Image) -> float:

@@ -1,0 +1,71 @@
+"""A plate of known size before a camera of known or typical focal length: six numbers instead of a homography's eight.
+
+Two of a homography's freedoms are no motion of a rigid plate. Without them a side that the image does not show, or that a
+cable or a glare hides, follows from the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from perception.vision.view import Array, homography
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RigidPlate:
+    """A `View` of the plate's plane; moves by a turn (rad, camera axes), then a shift in units of its distance.
+
+    Attributes:
+        R, t_m: camera_from_plate, (3, 3) and (3,).
+        focal_px, middle_px: of a camera without lens errors.
+        sigma_px: one sigma of what a motion does to a pixel.
+    """
+
+    R: Array
+    t_m: Array
+    focal_px: float
+    middle_px: Array
+    sigma_px: float
+
+    @property
+    def prior_sigma(self) -> Array:
+        """(6,) turns and relative shifts that move the plate's border by about `sigma_px`."""
+        reach = self.sigma_px / self.focal_px
+        return np.array([4.0 * reach] * 3 + [reach, reach, 2.0 * reach])
+
+    @property
+    def px_from_plate(self) -> Array:
+        """(3, 3) homography from the plate (m) to pixels."""
+        K = np.array([[self.focal_px, 0, self.middle_px[0]], [0, self.focal_px, self.middle_px[1]], [0, 0, 1.0]])
+        return np.asarray(K @ np.column_stack([self.R[:, 0], self.R[:, 1], self.t_m]))
+
+    def project(self, points_m: ArrayLike) -> Array:
+        """(N, 2) pixels of (N, 2 or 3) points of the plate's plane; NaN behind the camera."""
+        points = np.asarray(points_m, float)[:, :2]
+        h = np.column_stack([points, np.ones(len(points))]) @ self.px_from_plate.T
+        return np.asarray(h[:, :2] / np.where(h[:, 2:] > 0, h[:, 2:], np.nan))
+
+    def moved(self, delta: Array) -> RigidPlate:
+        """The plate after a motion by (6,) parameters."""
+        turn = cv2.Rodrigues(np.asarray(delta[:3], float))[0]
+        return replace(self, R=turn @ self.R, t_m=self.t_m + float(np.linalg.norm(self.t_m)) * delta[3:])
+
+
+def rigid_plate(corners_m: Array, corners_px: Array, *, focal_px: float, middle_px: Array, sigma_px: float) -> RigidPlate:
+    """The rigid plate nearest to four corners.
+
+    The columns of K^-1 H are r1, r2 and t up to a common scale (Z. Zhang, IEEE PAMI 22(11), 2000, sec. 3.1); the nearest
+    rotation follows by singular values.
+    """
+    H = homography(corners_m, corners_px)
+    K = np.array([[focal_px, 0, middle_px[0]], [0, focal_px, middle_px[1]], [0, 0, 1.0]])
+    h = np.linalg.solve(K, H)
+    scale = 2.0 / float(np.linalg.norm(h[:, 0]) + np.linalg.norm(h[:, 1]))
+    h = h * (scale if h[2, 2] > 0 else -scale)
+    u, _, vt = np.linalg.svd(np.column_stack([h[:, 0], h[:, 1], np.cross(h[:, 0], h[:, 1])]))
+    R = u @ np.diag([1.0, 1.0, float(np.linalg.det(u @ vt))]) @ vt
+    return RigidPlate(R=R, t_m=h[:, 2], focal_px=focal_px, middle_px=middle_px, sigma_px=sigma_px)

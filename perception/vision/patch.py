@@ -15,6 +15,8 @@ from perception.vision.view import Array, View, homography
 OVERSAMPLING = 1.5  # rectified pixels per image pixel: keeps detail through the second interpolation
 MAX_SIDE_PX = 320
 HEIGHT_STEP_M = 0.01
+BEND_NODES = 9  # a side of the grid that the lens's bend over a patch is known at; it is smooth
+LEAST_BEND_PX = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -109,9 +111,12 @@ def rectify(
     shift = above[4:] - above[:4]
     grown = np.linalg.norm(above[4:] - above[4:].mean(axis=0), axis=1).sum()
     growth = grown / np.linalg.norm(above[:4] - above[:4].mean(axis=0), axis=1).sum() - 1.0
+    bend_px = _bend(
+        view, np.array([cx, cy]), (w, h), plane_z_m, np.asarray(shift_px, float), patch_from_image, px_per_m
+    )
     return Patch(
-        gray=_warp(gray_image, patch_from_image, size),
-        colour=_warp(image, patch_from_image, size) if image.ndim == 3 else None,
+        gray=_warp(gray_image, patch_from_image, size, bend_px),
+        colour=_warp(image, patch_from_image, size, bend_px) if image.ndim == 3 else None,
         inside=_inside(gray_image.shape, patch_from_image, size),
         px_per_m=px_per_m,
         image_px_per_m=image_px_per_m,
@@ -122,11 +127,52 @@ def rectify(
     )
 
 
-def _warp(image: Image, patch_from_image: Array, size: tuple[int, int]) -> Image:
-    return np.asarray(
-        cv2.warpPerspective(image, patch_from_image, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
-        np.uint8,
-    )
+def _bend(
+    view: View,
+    centre_m: Array,
+    half_m: tuple[float, float],
+    plane_z_m: float,
+    shift_px: Array,
+    patch_from_image: Array,
+    px_per_m: float,
+) -> NDArray[np.float32] | None:
+    """What a homography through the corners misses between them, image px at a grid of nodes; None when that is little.
+
+    Towards the border of a view a lens with k1 = -0.08 bends a slider's track by more than a pixel.
+    """
+    (w, h), n = half_m, BEND_NODES
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-w, w, n), np.linspace(h, -h, n)))
+    points = np.column_stack([x + centre_m[0], y + centre_m[1], np.full(n * n, plane_z_m)])
+    straight = _apply(np.asarray(np.linalg.inv(patch_from_image), float), np.column_stack([x + w, h - y]) * px_per_m)
+    bend = (view.project(points) + shift_px - straight).reshape(n, n, 2)
+    if not np.isfinite(bend).all() or np.abs(bend).max() < LEAST_BEND_PX:
+        return None
+    return bend.astype(np.float32)
+
+
+def _warp(image: Image, patch_from_image: Array, size: tuple[int, int], bend_px: NDArray[np.float32] | None) -> Image:
+    if bend_px is None:
+        flags = cv2.INTER_LINEAR
+        return np.asarray(
+            cv2.warpPerspective(image, patch_from_image, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8
+        )
+    u, v = _places(patch_from_image, size, bend_px)
+    return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+
+def _places(
+    patch_from_image: Array, size: tuple[int, int], bend_px: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Image coordinates u and v, each (H, W), of every patch pixel: through the homography, plus the bend."""
+    to_nodes = np.array([[(BEND_NODES - 1) / (size[0] - 1), 0.0, 0.0], [0.0, (BEND_NODES - 1) / (size[1] - 1), 0.0]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    bend = cv2.warpAffine(bend_px, to_nodes, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    m = np.linalg.inv(patch_from_image)
+    x, y = np.arange(size[0]), np.arange(size[1])[:, None]
+    depth = m[2, 0] * x + m[2, 1] * y + m[2, 2]
+    u = (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / depth + bend[:, :, 0]
+    v = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / depth + bend[:, :, 1]
+    return u.astype(np.float32), v.astype(np.float32)
 
 
 def _inside(shape: tuple[int, ...], patch_from_image: Array, size: tuple[int, int]) -> NDArray[np.bool_]:

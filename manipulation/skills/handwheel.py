@@ -12,7 +12,7 @@ from hal.errors import InvalidRequest
 from hal.motion import Compliance, Guard, Quantity
 from hal.panel import Handwheel
 from manipulation.skills.contact import against_turn, centre_between
-from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
+from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
 from manipulation.skills.steps import STANDOFF_M, Attempt, perform
 from manipulation.stroke import arc
 from manipulation.workcell import Workcell, panel_from_grip
@@ -93,7 +93,7 @@ def handwheel(
         skill="handwheel",
         object_name=name,
         target=f"{target_rad:.3f} rad",
-        is_reached=lambda seen: seen.angle_rad is not None and abs(seen.angle_rad - target_rad) <= TOLERANCE_RAD,
+        is_reached=lambda seen: surely_within(seen.angle_rad, target_rad, TOLERANCE_RAD, sigma=seen.sigma),
         verify=look if verify is not None else None,
     )
 

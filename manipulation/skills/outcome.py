@@ -26,12 +26,24 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObjectState:
-    """What a look says about an object: a named state, a value of its scale, or an angle clockwise from up."""
+    """What a look says about an object: a named state, a value of its scale, or an angle clockwise from up.
+
+    `sigma` is the look's own one sigma of value or angle.
+    """
 
     name: str
     state: str | None = None
     value: float | None = None
     angle_rad: float | None = None
+    sigma: float = 0.0
+
+
+SURE = 2.0  # sigmas of the look; a cap 2.36 % off was once read as 1.9 and called done within 2
+
+
+def surely_within(measured: float | None, goal: float, allowed: float, *, sigma: float) -> bool:
+    """Is what was measured within `allowed` of the goal even if the look erred by as much as it does now and then?"""
+    return measured is not None and abs(measured - goal) + SURE * sigma <= allowed
 
 
 Verify = Callable[[], ObjectState | None]

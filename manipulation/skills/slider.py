@@ -11,7 +11,7 @@ from hal.errors import InvalidRequest
 from hal.motion import Guard, Quantity
 from hal.panel import Slider
 from manipulation.skills.contact import meet
-from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
+from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
 from manipulation.skills.steps import STANDOFF_M, Attempt, perform
 from manipulation.stroke import shifted
 from manipulation.workcell import Workcell, panel_from_grip
@@ -94,7 +94,7 @@ def slider(
         skill="slider",
         object_name=name,
         target=f"{target:g} {scale.unit}".strip(),
-        is_reached=lambda seen: seen.value is not None and abs(seen.value - target) <= allowed,
+        is_reached=lambda seen: surely_within(seen.value, target, allowed, sigma=seen.sigma),
         verify=look if verify is not None else None,
     )
 

@@ -128,7 +128,8 @@ def state_of(reading: ObjectReading, thing: PanelObject) -> ObjectState:
     angle_rad = reading.value if isinstance(thing, Handwheel | Lever) else None
     if angle_rad is None and isinstance(thing, Lever | Rotary) and reading.state is not None:
         angle_rad = next((s.angle_rad for s in thing.states if s.name == reading.state), None)
-    return ObjectState(name=reading.name, state=reading.state, value=reading.value, angle_rad=angle_rad)
+    sigma = 0.0 if reading.uncertainty is None else reading.uncertainty
+    return ObjectState(name=reading.name, state=reading.state, value=reading.value, angle_rad=angle_rad, sigma=sigma)
 
 
 def _perform(session: Session, thing: PanelObject, target: str, eye: _Eye, before: ObjectReading | None) -> SkillReport:

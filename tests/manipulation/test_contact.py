@@ -15,7 +15,7 @@ from hal.motion import DeclaredMotion, Hold, MotionLog, MotionOutcome, MotionRep
 from manipulation.kinematics import Kinematics
 from manipulation.skills.contact import onset
 from manipulation.skills.lever import lever
-from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, wrapped
+from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, surely_within, wrapped
 from manipulation.skills.probe import contact_of
 from manipulation.skills.slider import slider
 from manipulation.skills.steps import Attempt, perform
@@ -111,6 +111,21 @@ def test_a_look_that_denies_leads_to_another_try_and_at_most_three() -> None:
     assert deed(cell(COMPLETED), lambda attempt: 1.0, [OFF, ON]).attempts == 2
     failed = deed(cell(COMPLETED), lambda attempt: 1.0, [OFF, OFF, OFF])
     assert failed.outcome is Outcome.SLIPPED and failed.attempts == 3
+
+
+def test_a_look_that_may_err_confirms_only_what_it_would_confirm_two_sigmas_off() -> None:
+    assert surely_within(71.2, 70.0, 2.0, sigma=0.3)
+    assert not surely_within(71.9, 70.0, 2.0, sigma=0.3)
+    assert surely_within(71.9, 70.0, 2.0, sigma=0.0)
+    assert not surely_within(None, 70.0, 2.0, sigma=0.0)
+
+
+@given(truth=st.floats(60.0, 80.0), error=st.floats(-2.0, 2.0), sigma=st.floats(0.0, 0.9))
+def test_nothing_outside_the_tolerance_is_confirmed_by_an_error_of_two_sigmas(
+    truth: float, error: float, sigma: float
+) -> None:
+    if surely_within(truth + error * sigma, 70.0, 2.0, sigma=sigma):
+        assert abs(truth - 70.0) <= 2.0 + 1e-9
 
 
 def test_a_second_press_never_undoes_the_first() -> None:

@@ -1,0 +1,28 @@
+"""What a reading tells the skills."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from hal.panel import Slider, load_panel
+from perception.vision.reading import ObjectReading
+from service.operations.manipulate import state_of
+
+PANEL = Path(__file__).parents[3] / "panels" / "bench.toml"
+
+
+def reading(uncertainty: float | None) -> ObjectReading:
+    return ObjectReading(
+        name="setpoint", kind="slider", present=True, centre_px=np.zeros(2), outline_px=np.zeros((4, 2)), value=71.1,
+        unit="%", uncertainty=uncertainty,
+    )  # fmt: skip
+
+
+def test_the_skill_learns_how_sure_the_look_is() -> None:
+    thing = load_panel(PANEL).object("setpoint")
+    assert isinstance(thing, Slider)
+    assert state_of(reading(0.3), thing).sigma == 0.3
+    assert state_of(reading(None), thing).sigma == 0.0
+    assert state_of(reading(0.3), thing).value == 71.1

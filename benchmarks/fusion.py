@@ -243,7 +243,7 @@ def table(*, quick: bool) -> Iterator[Row]:
     yield from exactness(1 if quick else 2, rng)
     yield from consistency(60 if quick else 400, rng)
     yield from mismatches(30 if quick else 300, rng)
-    yield from table_ii(6 if quick else 20, rng)
+    yield from table_ii(20 if quick else 60, rng)
     yield from certificates(30 if quick else 200, rng)
     yield from clock(rng)
     yield from large_and_proven(rng, 1 if quick else 3)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusion.robust import fuse
+from fusion.certify import quadratic_forms
+from fusion.dual import minimiser
+from fusion.robust import fuse, used_entries
 from fusion.simulate import CODES, problem
 from fusion.solve import solve
 from hal.geometry import UncertainPose
@@ -15,4 +17,6 @@ def warm_up() -> None:
     made = problem(CODES, np.random.default_rng(0))
     solve(made.measurements, made.base_from_object)
     fuse(made.measurements, prior=UncertainPose(parent_from_child=made.base_from_object, covariance=1e-4 * np.eye(6)))
-    fuse(made.measurements)
+    b, _, local = used_entries(made.measurements, fuse(made.measurements))
+    forms = quadratic_forms(b, local.rotation, local.translation_m, np.zeros(3), np.zeros(3), 1.0)
+    minimiser(forms.sum(axis=0), local.rotation, local.translation_m)

@@ -1,4 +1,3 @@
-# ruff: noqa: PLR0912, PLR0915 - a compiled loop keeps one equation in one place
 # mypy: disallow-untyped-defs=False
 """Compiled three-point poses: the first half of the paper's direct route (Section II-B), and seeds for the refinement.
 
@@ -88,36 +87,32 @@ def refine_depths(s, d2, cosines):
 
 
 @jit
-def three_point(P, f, Rs, ts):
-    """Poses that carry three points (3, 3) onto three unit rays (3, 3); fills Rs, ts (4 of them), returns how many.
-
-    The depths s solve three law-of-cosines equations. Two combinations without constant term are conics in s; the
-    pencil of both holds a pair of lines (a cubic), each of which meets a conic twice. Where noise makes a crossing
-    complex its real part is kept: close to a double root the truth is there.
-    Source: Grunert 1841; the pencil of conics as in Finsterwalder, see Haralick et al., IJCV 13(3), 1994, Section 2.
-    """
-    d2 = np.empty(3)
-    cosines = np.empty(3)
+def laws_of_cosines(P, f, d2, cosines):
+    """Squared sides d2 and cosines between rays (3 each, opposite corner k) of points P (3, 3) and unit rays f (3, 3)."""
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         side = mix3(1.0, P[i], -1.0, P[j])
         d2[k] = dot3(side, side)
         cosines[k] = dot3(f[i], f[j])
-    # Conics D1 = d2[1] M0 - d2[0] M1 and D2 = d2[2] M0 - d2[0] M2, with M_k the form of equation k.
-    scale = 1.0 / d2[0]
-    r1, r2 = d2[1] * scale, d2[2] * scale
-    D1 = np.zeros((3, 3))
-    D2 = np.zeros((3, 3))
-    D1[0, 0] = -1.0
-    D1[1, 1] = r1
-    D1[2, 2] = r1 - 1.0
+
+
+@jit
+def conics(d2, cosines):
+    """D1 = d2[1] M0 - d2[0] M1 and D2 = d2[2] M0 - d2[0] M2 over d2[0], with M_k the form of law k: s^T D s = 0."""
+    r1, r2 = d2[1] / d2[0], d2[2] / d2[0]
+    D1, D2 = np.zeros((3, 3)), np.zeros((3, 3))
+    D1[0, 0], D1[1, 1], D1[2, 2] = -1.0, r1, r1 - 1.0
+    D2[0, 0], D2[1, 1], D2[2, 2] = -1.0, r2 - 1.0, r2
     D1[1, 2] = D1[2, 1] = -r1 * cosines[0]
-    D1[0, 2] = D1[2, 0] = cosines[1]
-    D2[0, 0] = -1.0
-    D2[1, 1] = r2 - 1.0
-    D2[2, 2] = r2
     D2[1, 2] = D2[2, 1] = -r2 * cosines[0]
+    D1[0, 2] = D1[2, 0] = cosines[1]
     D2[0, 1] = D2[1, 0] = cosines[2]
+    return D1, D2
+
+
+@jit
+def line_pair(D1, D2, lines):
+    """Fill `lines` (2, 3) with the two lines of a degenerate conic of the pencil w1 D1 + w2 D2; False when there is none."""
     C1, C2 = cofactors(D1), cofactors(D2)
     c3 = c2 = c1 = c0 = 0.0
     for i in range(3):
@@ -129,16 +124,18 @@ def three_point(P, f, Rs, ts):
     # det(D1 + g D2) = c3 g^3 + c2 g^2 + c1 g + c0; solved for 1/g when that is better conditioned.
     if abs(c3) >= abs(c0):
         if c3 == 0.0:
-            return 0
+            return False
         w1, w2 = 1.0, real_cubic_root(c2 / c3, c1 / c3, c0 / c3)
     else:
         w1, w2 = real_cubic_root(c1 / c0, c2 / c0, c3 / c0), 1.0
-    D, E = np.empty((3, 3)), np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            D[i, j] = E[i, j] = w1 * D1[i, j] + w2 * D2[i, j]
+    split(w1 * D1 + w2 * D2, lines)
+    return True
+
+
+@jit
+def split(D, lines):
+    """The lines l, m of D = l m^T + m l^T: -adj(D) = p p^T with p their crossing, and D + [p]x has rank one."""
     B = cofactors(D)
-    # A pair of lines l m^T + m l^T: -adj(D) = p p^T with p their crossing; D + [p]x has rank one.
     k = 0
     for i in range(1, 3):
         if abs(B[i, i]) > abs(B[k, k]):
@@ -148,6 +145,7 @@ def three_point(P, f, Rs, ts):
     if beta > 0.0:
         for i in range(3):
             p[i] = B[i, k] / beta
+    E = D.copy()
     E[0, 1] += p[2]
     E[0, 2] -= p[1]
     E[1, 0] -= p[2]
@@ -159,66 +157,96 @@ def three_point(P, f, Rs, ts):
         for j in range(3):
             if abs(E[i, j]) > abs(E[bi, bj]):
                 bi, bj = i, j
-    lines = np.empty((2, 3))
     for i in range(3):
-        lines[0, i] = E[bi, i]
-        lines[1, i] = E[i, bj]
+        lines[0, i], lines[1, i] = E[bi, i], E[i, bj]
+
+
+@jit
+def crossings(line, D1, S):
+    """Fill S (2, 3) with the ratios of depths where a line meets the conic D1; how many: 2, or 0 for no line."""
+    k = 0
+    for i in range(1, 3):
+        if abs(line[i]) > abs(line[k]):
+            k = i
+    if line[k] == 0.0:
+        return 0
+    i, j = (k + 1) % 3, (k + 2) % 3
+    # s_k = -(l_i s_i + l_j s_j) / l_k into D1: q2 x^2 + q1 x + q0 = 0 for x = s_i / s_j
+    e, h = -line[i] / line[k], -line[j] / line[k]
+    q2 = D1[i, i] + 2.0 * e * D1[i, k] + e * e * D1[k, k]
+    q1 = 2.0 * (D1[i, j] + h * D1[i, k] + e * D1[j, k] + e * h * D1[k, k])
+    q0 = D1[j, j] + 2.0 * h * D1[j, k] + h * h * D1[k, k]
+    root = np.sqrt(max(q1 * q1 - 4.0 * q2 * q0, 0.0))
+    w = -0.5 * (q1 + root) if q1 >= 0.0 else -0.5 * (q1 - root)
+    S[0, i], S[0, j] = w, q2
+    S[1, i], S[1, j] = q0, w
+    for n in range(2):
+        S[n, k] = e * S[n, i] + h * S[n, j]
+    return 2
+
+
+@jit
+def sized(s, d2, cosines):
+    """Bring depths s, known up to a factor, to the sides' size and refine them; False where one is not in front."""
+    sign = -1.0 if s[0] + s[1] + s[2] < 0.0 else 1.0
+    for n in range(3):
+        s[n] *= sign
+    if not (s[0] > 0.0 and s[1] > 0.0 and s[2] > 0.0):
+        return False
+    total = 0.0
+    for n in range(3):
+        a, b = (n + 1) % 3, (n + 2) % 3
+        total += s[a] * s[a] + s[b] * s[b] - 2.0 * s[a] * s[b] * cosines[n]
+    if not total > 0.0:
+        return False
+    size = np.sqrt((d2[0] + d2[1] + d2[2]) / total)
+    refined = np.empty(3)
+    for n in range(3):
+        s[n] *= size
+        refined[n] = s[n]
+    refine_depths(refined, d2, cosines)
+    if refined[0] > 0.0 and refined[1] > 0.0 and refined[2] > 0.0 and np.isfinite(refined[0]):
+        s[:] = refined
+    return True
+
+
+@jit
+def carried(P, f, s, R, t):
+    """Fill R, t: the pose that carries points P (3, 3) to depths s (3,) along the rays f; False when it is no pose."""
+    Q = np.empty((3, 3))
+    for n in range(3):
+        for a in range(3):
+            Q[n, a] = s[n] * f[n, a]
+    put2(R, product3(triad(Q[0], Q[1], Q[2]), triad(P[0], P[1], P[2]).T))
+    if not np.isfinite(R[0, 0]):
+        return False
+    for a in range(3):
+        total = 0.0
+        for n in range(3):
+            total += Q[n, a] - R[a, 0] * P[n, 0] - R[a, 1] * P[n, 1] - R[a, 2] * P[n, 2]
+        t[a] = total / 3.0
+    return True
+
+
+@jit
+def three_point(P, f, Rs, ts):
+    """Poses that carry three points (3, 3) onto three unit rays (3, 3); fills Rs, ts (4 of them), returns how many.
+
+    The depths s solve three law-of-cosines equations. Two combinations without constant term are conics in s; the
+    pencil of both holds a pair of lines (a cubic), each of which meets a conic twice. Where noise makes a crossing
+    complex its real part is kept: close to a double root the truth is there.
+    Source: Grunert 1841; the pencil of conics as in Finsterwalder, see Haralick et al., IJCV 13(3), 1994, Section 2.
+    """
+    d2, cosines = np.empty(3), np.empty(3)
+    laws_of_cosines(P, f, d2, cosines)
+    D1, D2 = conics(d2, cosines)
+    lines, S = np.empty((2, 3)), np.empty((2, 3))
+    if not line_pair(D1, D2, lines):
+        return 0
     count = 0
-    frame = triad(P[0], P[1], P[2]).T
     for which in range(2):
-        line = lines[which]
-        k = 0
-        for i in range(1, 3):
-            if abs(line[i]) > abs(line[k]):
-                k = i
-        if line[k] == 0.0:
-            continue
-        i, j = (k + 1) % 3, (k + 2) % 3
-        # s_k = -(l_i s_i + l_j s_j) / l_k into D1: q2 x^2 + q1 x + q0 = 0 for x = s_i / s_j
-        e, h = -line[i] / line[k], -line[j] / line[k]
-        q2 = D1[i, i] + 2.0 * e * D1[i, k] + e * e * D1[k, k]
-        q1 = 2.0 * (D1[i, j] + h * D1[i, k] + e * D1[j, k] + e * h * D1[k, k])
-        q0 = D1[j, j] + 2.0 * h * D1[j, k] + h * h * D1[k, k]
-        root = np.sqrt(max(q1 * q1 - 4.0 * q2 * q0, 0.0))
-        w = -0.5 * (q1 + root) if q1 >= 0.0 else -0.5 * (q1 - root)
-        for branch in range(2):
-            s = np.empty(3)
-            if branch == 0:
-                s[i], s[j] = w, q2
-            else:
-                s[i], s[j] = q0, w
-            s[k] = e * s[i] + h * s[j]
-            sign = -1.0 if s[0] + s[1] + s[2] < 0.0 else 1.0
-            for n in range(3):
-                s[n] *= sign
-            if not (s[0] > 0.0 and s[1] > 0.0 and s[2] > 0.0):
-                continue
-            total = 0.0
-            for n in range(3):
-                a, b = (n + 1) % 3, (n + 2) % 3
-                total += s[a] * s[a] + s[b] * s[b] - 2.0 * s[a] * s[b] * cosines[n]
-            if not total > 0.0:
-                continue
-            size = np.sqrt((d2[0] + d2[1] + d2[2]) / total)
-            refined = np.empty(3)
-            for n in range(3):
-                s[n] *= size
-                refined[n] = s[n]
-            refine_depths(refined, d2, cosines)
-            if refined[0] > 0.0 and refined[1] > 0.0 and refined[2] > 0.0 and np.isfinite(refined[0]):
-                s = refined
-            Q = np.empty((3, 3))
-            for n in range(3):
-                for a in range(3):
-                    Q[n, a] = s[n] * f[n, a]
-            R = product3(triad(Q[0], Q[1], Q[2]), frame)
-            if not np.isfinite(R[0, 0]):
-                continue
-            put2(Rs[count], R)
-            for a in range(3):
-                t = 0.0
-                for n in range(3):
-                    t += Q[n, a] - R[a, 0] * P[n, 0] - R[a, 1] * P[n, 1] - R[a, 2] * P[n, 2]
-                ts[count, a] = t / 3.0
-            count += 1
+        for branch in range(crossings(lines[which], D1, S)):
+            s = S[branch]
+            if sized(s, d2, cosines) and carried(P, f, s, Rs[count], ts[count]):
+                count += 1
     return count

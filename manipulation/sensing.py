@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 GRAVITY_M_PER_S2 = 9.80665
 RANGE_WAIT_S = 0.004
 READ_WAIT_S = 0.02  # longest that one tick waits for a device; a tick itself lasts 2 to 8 ms
-PACED_WAIT_S = 0.25  # the same where the world stands still meanwhile: a busy machine is no broken device
+PACED_WAIT_S = 0.45  # the same where the world stands still so long: a busy machine is no broken device
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -70,8 +70,10 @@ class WorldClient:
         self.rate_hz = config.cell.file.cell.control_rate_hz
         self.proximity: tuple[str, ...] = ()
         self._clock = clock
-        self._lock = threading.RLock()
+        self._lock = threading.RLock()  # of the world: held while it steps, and while it draws
+        self._orders = threading.Lock()  # of the next step's request, so that nobody waits for a picture to give one
         self._request = np.zeros(REQUEST)
+        self._under_way = 0  # what the step now in the world says to the drives
         self._owed_ticks = 0.0
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._order = itertools.count()  # of two events at one tick the first comes first
@@ -149,11 +151,14 @@ class WorldClient:
         return max(0.0, behind - lost)
 
     def _step(self, ticks: int) -> None:
-        request = self._request
-        request[0], request[1] = Op.STEP, ticks
-        message = request.tobytes()
-        request[:] = 0.0
+        with self._orders:
+            request = self._request
+            request[0], request[1] = Op.STEP, ticks
+            self._under_way = int(request[2])
+            message = request.tobytes()
+            request[:] = 0.0
         self._take(self._link.step(message))
+        self._under_way = 0
 
     def _take(self, message: bytes) -> None:
         snapshot = Snapshot(np.frombuffer(message))
@@ -178,35 +183,37 @@ class WorldClient:
     @property
     def is_enabled(self) -> bool:
         """Will the drives follow a set-point that is given now?"""
-        pending = int(self._request[2])
-        if pending & Drive.ENABLE:
-            return True
-        return self.frame.snapshot.is_enabled and not pending & Drive.STOP
+        for orders in (int(self._request[2]), self._under_way):
+            if orders & Drive.ENABLE:
+                return True
+            if orders & Drive.STOP:
+                return False
+        return self.frame.snapshot.is_enabled
 
     def enable(self) -> None:
         """Drives follow from the next tick on."""
-        with self._lock:
+        with self._orders:
             self._request[2] = (int(self._request[2]) & Drive.STOP) | Drive.ENABLE
 
     def stop(self) -> None:
         """Drives brake from the next tick on, whatever else was pending."""
-        with self._lock:
+        with self._orders:
             self._request[2] = Drive.STOP
 
     def aim_arm(self, position_rad: Array) -> None:
         """The set-point of the next tick."""
-        with self._lock:
+        with self._orders:
             self._request[2] = int(self._request[2]) | Drive.SETPOINT
             self._request[JOINTS_AT : JOINTS_AT + len(position_rad)] = position_rad
 
     def aim_gripper(self, width_m: float, force_n: float, speed_m_per_s: float) -> None:
         """The gripper's next goal."""
-        with self._lock:
+        with self._orders:
             self._request[GRIPPER_AT : GRIPPER_AT + 4] = (1.0, width_m, force_n, speed_m_per_s)
 
     def switch_lights(self, on: tuple[bool, ...]) -> None:
         """The border lights from the next tick on."""
-        with self._lock:
+        with self._orders:
             self._request[LIGHTS_AT : LIGHTS_AT + 1 + len(on)] = (1.0, *on)
 
     # -- pictures and truth ---------------------------------------------------------------------------------------

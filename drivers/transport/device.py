@@ -32,8 +32,10 @@ class WireDevice(Generic[T]):
     """Base of all drivers: the newest sample, its health and its errors.
 
     Args:
-        max_age_s: samples older than this are never given out; three periods are usual. In a cell whose safety section
-            allows older readings, that limit holds: a busy host is no broken device.
+        max_age_s: samples older than this are never given out; three periods are usual. In a real cell whose safety
+            section allows older readings, that limit holds: a busy host is no broken device. Beside a simulated world
+            it does not, as the world waits for a late sample: an arm whose set-points hang in a wire must not be
+            moved on by a controller that looks at an old state.
     """
 
     kind: ClassVar[DeviceKind]
@@ -41,7 +43,9 @@ class WireDevice(Generic[T]):
     def __init__(self, context: Context, *, max_age_s: float) -> None:
         self.context = context
         cell = context.cell
-        self.max_age_s = max_age_s if cell is None else max(max_age_s, cell.file.safety.max_reading_age_s)
+        self.max_age_s = max_age_s
+        if cell is not None and cell.file.cell.mode != "mixed":
+            self.max_age_s = max(max_age_s, cell.file.safety.max_reading_age_s)
         self.mailbox: Mailbox[T] = Mailbox()
         self.errors = 0
         self._sequence = 0

@@ -78,3 +78,21 @@ def test_wired_devices_connect_to_their_emulators(name: str) -> None:
 def test_the_emulators_are_registered() -> None:
     assert emulator_factory("modbus_io") is modbus_io.start
     assert emulator_factory("tfmini") is tfmini.start
+
+
+@pytest.mark.parametrize("mode", ["mixed", "real"])
+def test_only_a_real_cell_takes_older_states_than_the_driver_would(mode: str) -> None:
+    """Beside a simulated world a late state is waited for: one 0.1 s old would let the arm be 25 mm behind."""
+    cell = load_cell(CELLS / "wire-ur.toml")
+    parts = cell.file.model_copy(update={"cell": cell.file.cell.model_copy(update={"mode": mode})})
+    far_side = emulator_factory("ur")(scripted.ScriptedArm(), {"rate_hz": 125.0})
+    device: Any = None
+    try:
+        context = Context(name="arm", cell=cell.model_copy(update={"file": parts}))
+        device = connect(context, "ur:rtde", {"rate_hz": 125.0, **far_side.address})
+        oldest_s = cell.file.safety.max_reading_age_s
+        assert device.max_age_s == (oldest_s if mode == "real" else pytest.approx(5.0 / 125.0))
+    finally:
+        if device is not None:
+            device.close()
+        far_side.close()

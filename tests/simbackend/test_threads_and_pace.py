@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -102,3 +103,31 @@ def test_a_world_at_the_walls_pace_catches_up_and_forgets_a_pause() -> None:
         assert world_s() - before_s == pytest.approx(0.2, abs=0.005)
     finally:
         shared.close()
+
+
+def test_nobody_waits_for_the_world_to_give_an_order(bench: SimCell) -> None:
+    """An emulated wire that hung for the time of a picture would look like a dead device to its driver."""
+    arm = bench.connect("arm")
+    arm.enable(deadline=bench.deadline())
+    bench.clock.sleep(0.002)
+    here = arm.read_state(deadline=bench.deadline()).value.position_rad
+    world: Any = bench.shared.get("world", dict)
+    is_busy, may_go_on, is_given = threading.Event(), threading.Event(), threading.Event()
+
+    def keep_busy() -> None:
+        is_busy.set()
+        may_go_on.wait(60.0)
+
+    def command() -> None:
+        arm.command_position(here, deadline=bench.deadline())
+        is_given.set()
+
+    world.at(bench.clock.now_s() + 0.002, keep_busy)
+    threads = [threading.Thread(target=bench.clock.sleep, args=(0.002,)), threading.Thread(target=command)]
+    threads[0].start()
+    assert is_busy.wait(60.0)
+    threads[1].start()
+    assert is_given.wait(30.0)
+    may_go_on.set()
+    for thread in threads:
+        thread.join(60.0)

@@ -22,10 +22,12 @@ from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, DeviceUnavailable
 from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
+from hal.strict import validate
 from service.child import Lifeline, kill_own_group
-from service.connection import BEHIND, CLOCK, MOVER, PREFIX
+from service.connection import BEHIND, CLOCK, MOVER, PREFIX, SWAPPER
 from service.latch import Beat, Latch
-from service.motion import start_controller
+from service.motion import MotionPort, start_controller
+from service.seats import Connect, Seat, Swapper, checked
 
 BEAT_S = 0.05
 CLOSE_TIMEOUT_S = 4.0
@@ -43,29 +45,45 @@ class CellRuntime:
     _closers: list[Callable[[], None]] = field(default_factory=list)
 
     @classmethod
-    def start(cls, cell: Cell, *, is_latched: Callable[[], bool]) -> CellRuntime:
+    def start(
+        cls, cell: Cell, *, is_latched: Callable[[], bool], swapped: Mapping[str, DeviceSection] | None = None
+    ) -> CellRuntime:
         """Start emulators, connect all devices at once, then start the control thread.
 
         Args:
             is_latched: read by the control thread each tick.
+            swapped: what takes the place of sections of the cell file, as an earlier run had it.
 
         Raises:
             CellError: what could not be connected, all of it in one error; everything else is closed again.
         """
+        emulated = {name: cell.file.devices[name].driver for name in cell.file.emulators}
+        cell.file.devices.update(swapped or {})
         _import_drivers(cell)
         clock = clock_for(cell)
         shared = Shared()
         closers: list[Callable[[], None]] = [shared.close]
         try:
             far_sides = start_emulators(cell, clock, shared, closers)
-            addresses = {name: far_side.address for name, far_side in far_sides.items()}
-            devices = _connect_all(cell, clock, shared, addresses, closers)
-            objects: dict[str, Any] = {**devices, PREFIX + CLOCK: clock}
+
+            def complete(name: str, section: DeviceSection) -> DeviceSection:
+                if section.driver != emulated.get(name):
+                    return section
+                return section.model_copy(update={"options": {**section.options, **far_sides[name].address}})
+
+            def connect(name: str, section: DeviceSection) -> Any:
+                context = Context(name=name, clock=clock, cell=cell, shared=shared)
+                return checked(name, connect_device(context, section.driver, section.options), section)
+
+            sections = {name: complete(name, section) for name, section in cell.file.devices.items()}
+            seats = _connect_all(cell, sections, connect, closers)
+            objects: dict[str, Any] = {**seats, PREFIX + CLOCK: clock}
             objects |= {PREFIX + BEHIND + name: far_side.backing for name, far_side in far_sides.items()}
+            motion: MotionPort | None = None
             if cell.names_of(DeviceKind.ARM):
-                controller = start_controller(cell, devices, clock=clock, is_latched=is_latched)
-                closers.append(controller.close)
-                objects[PREFIX + MOVER] = controller
+                objects[PREFIX + MOVER] = motion = start_controller(cell, seats, clock=clock, is_latched=is_latched)
+                closers.append(motion.close)
+            objects[PREFIX + SWAPPER] = Swapper(cell, connect=connect, complete=complete, seats=seats, motion=motion)
         except BaseException:
             _close_all(closers)
             raise
@@ -121,26 +139,17 @@ def start_emulators(cell: Cell, clock: Clock, shared: Shared, closers: list[Call
 
 
 def _connect_all(
-    cell: Cell,
-    clock: Clock,
-    shared: Shared,
-    addresses: Mapping[str, Mapping[str, Any]],
-    closers: list[Callable[[], None]],
-) -> dict[str, Any]:
-    def connect(name: str, section: DeviceSection) -> Any:
-        context = Context(name=name, clock=clock, cell=cell, shared=shared)
-        return connect_device(context, section.driver, {**section.options, **addresses.get(name, {})})
-
-    sections = cell.file.devices
+    cell: Cell, sections: Mapping[str, DeviceSection], connect: Connect, closers: list[Callable[[], None]]
+) -> dict[str, Seat]:
     with ThreadPoolExecutor(len(sections), thread_name_prefix="connect") as pool:
         waiting = {name: pool.submit(connect, name, section) for name, section in sections.items()}
     failed: dict[str, CellError] = {}
-    devices: dict[str, Any] = {}
+    seats: dict[str, Seat] = {}
     for name, future in waiting.items():
         error = future.exception()
         if error is None:
-            devices[name] = future.result()
-            closers.append(devices[name].close)
+            seats[name] = Seat(future.result())
+            closers.append(seats[name].close)
         elif isinstance(error, CellError):
             failed[name] = error
         else:
@@ -149,7 +158,7 @@ def _connect_all(
             log.error("devices.%s", name, exc_info=error)
     if failed:
         raise gathered(failed, total=len(sections), cell=cell)
-    return devices
+    return seats
 
 
 def gathered(failed: Mapping[str, CellError], *, total: int, cell: Cell) -> CellError:
@@ -184,6 +193,7 @@ class CellOrder:
     beat_path: str
     address: str
     authkey: str
+    swapped: dict[str, dict[str, Any]]
 
     def to_line(self) -> str:
         """One line of JSON."""
@@ -228,7 +238,9 @@ def main() -> None:
 def _run(order: CellOrder, lifeline: Lifeline, is_latched: Callable[[], bool], end: threading.Event) -> None:
     from hal.host import serve
 
-    runtime = CellRuntime.start(load_cell(Path(order.cell_path), seed=order.seed), is_latched=is_latched)
+    swapped = {name: validate(block, DeviceSection, source=f"devices.{name}") for name, block in order.swapped.items()}
+    cell = load_cell(Path(order.cell_path), seed=order.seed)
+    runtime = CellRuntime.start(cell, is_latched=is_latched, swapped=swapped)
     server = serve(runtime.objects, order.address, bytes.fromhex(order.authkey), clock=runtime.clock)
     lifeline.write_line("ready")
     end.wait()

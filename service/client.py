@@ -58,6 +58,10 @@ class Client:
         """The JSON answer to a POST; errors as for `get`."""
         return json.loads(self.fetch("POST", path, body, headers=headers))
 
+    def put(self, path: str, body: Any) -> Any:
+        """The JSON answer to a PUT; errors as for `get`."""
+        return json.loads(self.fetch("PUT", path, body))
+
     def fetch(self, method: str, path: str, body: Any = None, *, headers: dict[str, str] | None = None) -> bytes:
         """The raw answer; errors as for `get`."""
         connection, answer = self._ask(method, path, body, headers or {})

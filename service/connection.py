@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from typing import Any, Protocol, cast
 
-from hal.clock import Clock
-from hal.config import Cell
+from hal.clock import Clock, Deadline, WallClock
+from hal.config import Cell, DeviceSection
 from hal.devices import DeviceKind
 from hal.errors import DeviceUnavailable, InvalidRequest, Unsupported
 from hal.motion import Mover
@@ -16,7 +16,10 @@ from hal.motion import Mover
 CLOCK = "clock"  # names of the served objects that are no devices; `Name` in the cell file cannot contain a dot
 MOVER = "mover"
 PREFIX = "cell."
+SWAPPER = "swapper"
 BEHIND = "behind."  # the device behind the emulated wire of the device with this name
+
+SWAP_TIMEOUT_S = 20.0  # the most patient driver tries for six seconds, and the old one may have to be connected again
 
 
 class CellConnection(Protocol):
@@ -111,6 +114,11 @@ class LocalConnection:
         """The backing devices themselves."""
         return {name: self._objects[PREFIX + BEHIND + name] for name in emulated(self.cell, kind)}
 
+    def swap(self, name: str, section: DeviceSection) -> None:
+        """Another device for `name`; see `service.seats.Swapper`."""
+        deadline = Deadline.after(WallClock(), SWAP_TIMEOUT_S)
+        self._objects[PREFIX + SWAPPER].swap(name, section.driver, section.options, deadline=deadline)
+
     def close(self) -> None:
         """Close the cell."""
         self._close()
@@ -128,8 +136,9 @@ class RemoteConnection:
         self._lock = threading.Lock()
         self._connect: Connect | None = None
         self._generation = 0
-        self._proxies: list[Any] = []
+        self._proxies: list[tuple[str, Any]] = []
         self._mine = threading.local()
+        self._swaps: dict[str, int] = {}
 
     def attach(self, connect: Connect) -> None:
         """A cell process is ready; proxies of an earlier one are dropped."""
@@ -163,6 +172,15 @@ class RemoteConnection:
         """Proxies of the backing devices."""
         return {name: self._proxy(PREFIX + BEHIND + name) for name in emulated(self.cell, kind)}
 
+    def swap(self, name: str, section: DeviceSection) -> None:
+        """Another device for `name`; see `service.seats.Swapper`. Proxies of the old one are dropped."""
+        deadline = Deadline.after(WallClock(), SWAP_TIMEOUT_S)
+        self._proxy(PREFIX + SWAPPER).swap(name, section.driver, section.options, deadline=deadline)
+        self.cell.file.devices[name] = section
+        with self._lock:
+            self._swaps[name] = self._swaps.get(name, 0) + 1
+            self._proxies = [item for item in self._proxies if item[0] != name]
+
     def close(self) -> None:
         """Close all proxies."""
         self.detach()
@@ -172,7 +190,7 @@ class RemoteConnection:
             self._connect = connect
             self._generation += 1
             old, self._proxies = self._proxies, []
-        for proxy in old:
+        for _, proxy in old:
             _close_link(proxy)
 
     def _proxy(self, name: str) -> Any:
@@ -180,8 +198,9 @@ class RemoteConnection:
         if mine.get("generation") != self._generation:
             mine.clear()
             mine["generation"] = self._generation
-        if name in mine:
-            return mine[name]
+        swaps = self._swaps.get(name, 0)
+        if name in mine and mine[name][0] == swaps:
+            return mine[name][1]
         connect = self._connect
         if connect is None:
             raise DeviceUnavailable(
@@ -189,9 +208,10 @@ class RemoteConnection:
                 hint="wait for its restart; `GET /readyz` and the terminal of `panelwright serve` say why",
                 device=name.removeprefix(PREFIX),
             )
-        proxy = mine[name] = connect(name)
+        proxy = connect(name)
+        mine[name] = (swaps, proxy)
         with self._lock:
-            self._proxies.append(proxy)
+            self._proxies.append((name, proxy))
         return proxy
 
 

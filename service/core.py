@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from hal.config import Cell
+from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceUnavailable, InvalidRequest, Stopped
 from service.gate import GatedConnection
 from service.journal import Journal
@@ -103,6 +103,24 @@ class Service:
 
         plain = request.model_dump(mode="json")
         return self.tasks.start(verb, plain, work, moves=operation.moves, holder=holder, key=key)
+
+    def swap_device(self, name: str, section: DeviceSection) -> None:
+        """Another driver or other options for a device, until the service ends; see `service.seats.Swapper`.
+
+        Raises:
+            DeviceUnavailable: the cell is not up.
+            DeviceError, ConfigError: the new one did not connect; the old one is kept.
+            MotionRefused, Busy: not now.
+        """
+        self._check_cell()
+        started_s = time.monotonic()
+        told = {"device": name, "before": self.cell.file.devices[name].driver, "driver": section.driver}
+        try:
+            self.supervisor.swap(name, section)
+        except CellError as error:
+            self.note("device-swap-failed", {**told, "why": error.what})
+            raise
+        self.note("device-swapped", {**told, "seconds": round(time.monotonic() - started_s, 3)})
 
     def close(self) -> None:
         """Stop the arm, end tasks and processes, close the journal. Bounded and idempotent."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from scipy.spatial.transform import RigidTransform
 
@@ -15,7 +15,10 @@ from hal.config import Cell
 from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, MotionRefused
 from hal.geometry import Array, identity
-from hal.motion import DeclaredMotion, MotionReport, Mover, RobotState
+from hal.motion import DeclaredMotion, MotionReport, RobotState
+
+if TYPE_CHECKING:
+    from manipulation.control import Controller
 
 STATE_WAIT_S = 2.0
 T = TypeVar("T")
@@ -28,24 +31,23 @@ class MotionPort:
     that a read takes, and the readers get the newest snapshot while a motion runs.
     """
 
-    def __init__(
-        self, controller: Mover, *, clock: Clock, is_latched: Callable[[], bool], close: Callable[[], None]
-    ) -> None:
-        self._controller = controller
+    def __init__(self, start: Callable[[], Controller], *, clock: Clock, is_latched: Callable[[], bool]) -> None:
+        self._start = start
+        self._controller = start()
         self._clock = clock
         self._is_latched = is_latched
-        self._close = close
         self._newest: RobotState | None = None
+        self._is_restarting = False
         self._is_executing = threading.Lock()
         self._devices_in_use = threading.Lock()
 
     def execute(self, motion: DeclaredMotion) -> MotionReport:
         """Run the motion; see `hal.motion.Mover`."""
-        return self._alone(motion.name, lambda: self._controller.execute(motion))
+        return self._alone(f"motion {motion.name!r}", lambda: self._controller.execute(motion))
 
     def tare(self) -> Array:
         """Zero the contact wrench; see `hal.motion.Mover`."""
-        return self._alone("tare", self._controller.tare)
+        return self._alone("tare", lambda: self._controller.tare())  # noqa: PLW0108  # the one of the moment
 
     def cancel(self) -> None:
         """End the running motion."""
@@ -58,7 +60,8 @@ class MotionPort:
         from the sensors' noise, and the same seed would no longer give the same mission.
         """
         newest = self._newest
-        if newest is not None and isinstance(self._clock, SimClock) and newest.stamp_s == self._clock.now_s():
+        is_still = isinstance(self._clock, SimClock) and newest is not None and newest.stamp_s == self._clock.now_s()
+        if newest is not None and (is_still or self._is_restarting):
             return replace(newest, is_stopped=self._is_latched())
         self._newest = self._read()
         return self._newest
@@ -71,17 +74,45 @@ class MotionPort:
             if is_free:
                 self._devices_in_use.release()
 
+    def at_rest(self, work: Callable[[], None]) -> None:
+        """Run `work` while no motion runs or begins.
+
+        Raises:
+            MotionRefused: a motion runs.
+        """
+        self._alone("exchange of a device", work)
+
+    def restart(self, between: Callable[[], None]) -> None:
+        """End the control thread, which stops the arm; run `between`; start the thread anew, with the drives off.
+
+        Raises:
+            MotionRefused: a motion runs.
+        """
+
+        def work() -> None:
+            self._is_restarting = True
+            self._controller.close()
+            try:
+                between()
+            finally:
+                try:
+                    self._controller, self._newest = self._start(), None
+                finally:
+                    self._is_restarting = False
+
+        self._alone("exchange of a device", work)
+
     def close(self) -> None:
         """Stop the arm and end the control thread."""
-        self._close()
+        self._controller.close()
 
-    def _alone(self, name: str, work: Callable[[], T]) -> T:
+    def _alone(self, what: str, work: Callable[[], T]) -> T:
         if not self._is_executing.acquire(blocking=False):
-            raise MotionRefused(f"motion {name!r} refused: another motion runs", hint="wait for it or cancel it")
+            raise MotionRefused(f"{what} refused: another motion runs", hint="wait for it or cancel it")
         try:
             if not self._devices_in_use.acquire(timeout=STATE_WAIT_S):
                 raise MotionRefused(
-                    f"motion {name!r} refused: the state cannot be read", hint="a device hangs; see GET /v1/devices"
+                    f"{what} refused: the state cannot be read", hint="a device hangs; see GET /v1/devices"
                 )
             try:
                 return work()
@@ -110,26 +141,42 @@ def start_controller(
             key="devices",
         )
     wrist = _first(cell, devices, DeviceKind.FORCE_TORQUE)
-    controller = Controller(
-        _first(cell, devices, DeviceKind.ARM),
-        gripper,
-        wrist,
-        _first(cell, devices, DeviceKind.TOUCH),
-        tuple(devices[name] for name in cell.names_of(DeviceKind.PROXIMITY)),
-        clock=clock,
-        safety=cell.file.safety,
-        load=_load(cell, wrist),
-        flange_from_sensor=_flange_from(cell, wrist),
-        is_latched=is_latched,
-        flange_from_grip=_flange_from(cell, gripper),
-        rate_hz=cell.file.cell.control_rate_hz,
-    )
-    try:
-        controller.start()
-    except CellError:
-        controller.close()
-        raise
-    return MotionPort(controller, clock=clock, is_latched=is_latched, close=controller.close)
+
+    def start() -> Controller:
+        arm = _first(cell, devices, DeviceKind.ARM)
+        _check_joints(cell, arm)
+        controller = Controller(
+            arm,
+            gripper,
+            wrist,
+            _first(cell, devices, DeviceKind.TOUCH),
+            tuple(devices[name] for name in cell.names_of(DeviceKind.PROXIMITY)),
+            clock=clock,
+            safety=cell.file.safety,
+            load=_load(cell, wrist),
+            flange_from_sensor=_flange_from(cell, wrist),
+            is_latched=is_latched,
+            flange_from_grip=_flange_from(cell, gripper),
+            rate_hz=cell.file.cell.control_rate_hz,
+        )
+        try:
+            controller.start()
+        except CellError:
+            controller.close()
+            raise
+        return controller
+
+    return MotionPort(start, clock=clock, is_latched=is_latched)
+
+
+def _check_joints(cell: Cell, arm: Any) -> None:
+    joints, parked = len(arm.capabilities().links), len(cell.file.workspace.park_rad)
+    if joints != parked:
+        raise ConfigError(
+            f"{arm.name} has {joints} joints, workspace.park_rad has {parked}",
+            hint="give one angle a joint",
+            key="workspace.park_rad",
+        )
 
 
 def _first(cell: Cell, devices: Mapping[str, Any], kind: DeviceKind) -> Any:

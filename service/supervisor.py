@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from hal.config import Cell
+from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceTimeout, DeviceUnavailable, MotionRefused
 from service.cell import CellOrder, CellRuntime, error_from_line
 from service.child import Child
@@ -104,6 +104,7 @@ class Supervisor:
         self._local: LocalConnection | None = None
         self._child: Child | None = None
         self._restarts = 0
+        self._swapped: dict[str, DeviceSection] = {}
         self._problem: CellError | None = None
         self._is_ready = threading.Event()
         self._is_closing = threading.Event()
@@ -165,6 +166,11 @@ class Supervisor:
             )
         self._report("stop-reset", {"source": source, "count": seen_count})
         return self.latch.state()
+
+    def swap(self, name: str, section: DeviceSection) -> None:
+        """Another device for `name`, also after a restart of the cell process; see `service.seats.Swapper`."""
+        (self._local or self._remote).swap(name, section)
+        self._swapped[name] = section
 
     def processes(self) -> tuple[ProcessHealth, ...]:
         """State of the supervised processes."""
@@ -229,6 +235,7 @@ class Supervisor:
             beat_path=str(self._folder / "beat"),
             address=str(self._folder / f"cell-{secrets.token_hex(4)}.sock"),
             authkey=secrets.token_hex(32),
+            swapped={name: section.model_dump(mode="json") for name, section in self._swapped.items()},
         )
         child = self._begin_child(on_line, on_exit)
         child.write_line(order.to_line())

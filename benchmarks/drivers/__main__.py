@@ -12,6 +12,7 @@ from benchmarks.drivers.fuzz import part_fuzz
 from benchmarks.drivers.life import part_isolation, part_reconnect
 from benchmarks.drivers.motion import part_csp, part_kill, part_ur
 from benchmarks.drivers.stamps import part_stamps
+from benchmarks.drivers.swap import part_swap
 from benchmarks.drivers.wire import part_decode, part_latency, part_rtu
 
 PARTS: dict[str, Callable[[float], None]] = {
@@ -20,6 +21,7 @@ PARTS: dict[str, Callable[[float], None]] = {
     "decode": part_decode,
     "stamps": part_stamps,
     "reconnect": part_reconnect,
+    "swap": part_swap,
     "isolation": part_isolation,
     "ur": part_ur,
     "csp": part_csp,

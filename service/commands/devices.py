@@ -13,6 +13,7 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
+from hal.errors import ConfigError
 from service.client import ApiError, Client
 from service.commands.common import Url, UrlDefault, client_of, console, find_cell
 
@@ -89,6 +90,22 @@ def watch_devices(url: Url = UrlDefault, period_s: Annotated[float, typer.Option
         while True:
             time.sleep(period_s)
             live.update(_table(client))
+
+
+@app.command("swap")
+def swap_device(
+    name: Name,
+    driver: Annotated[str, typer.Argument(help="Another driver, e.g. serial:tfmini.")],
+    options: Annotated[str, typer.Option(help="Its options, as JSON.")] = "{}",
+    url: Url = UrlDefault,
+) -> None:
+    """Connect another driver in the place of a device while the cell runs."""
+    try:
+        block = {"driver": driver, "options": json.loads(options)}
+    except ValueError as error:
+        raise ConfigError(f"--options is not JSON: {error}", hint='for example \'{"port": "/dev/ttyUSB0"}\'') from error
+    view = client_of(url).put(f"/v1/devices/{name}", block)
+    console.print(f"{name}: {view['driver']}, {view['health']['quality']}; {escape(view['health']['detail'])}")
 
 
 @app.command("fault")

@@ -21,7 +21,7 @@ from service.http.guard import Allowed, Guard
 from service.http.health import SAFETY_NOTE, own_version
 from service.http.hub import Hub
 from service.http.metrics import Metrics
-from service.http.models import FaultRequest, LeaseRequest, ResetRequest
+from service.http.models import FaultRequest, LeaseRequest, ResetRequest, SwapRequest
 from service.http.problems import Problem, install
 from service.http.readings import ReadingDesk
 from service.http.state import AppState
@@ -104,7 +104,14 @@ def _document(app: FastAPI, bodies: list[type[BaseModel]]) -> dict[str, Any]:
     if app.openapi_schema:
         return app.openapi_schema
     document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
-    models: list[type[BaseModel]] = [*dict.fromkeys(bodies), FaultRequest, LeaseRequest, ResetRequest, Problem]
+    models: list[type[BaseModel]] = [
+        *dict.fromkeys(bodies),
+        FaultRequest,
+        LeaseRequest,
+        ResetRequest,
+        SwapRequest,
+        Problem,
+    ]
     _, extra = models_json_schema(
         [(model, "validation") for model in models], ref_template="#/components/schemas/{model}"
     )

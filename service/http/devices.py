@@ -1,4 +1,4 @@
-"""`/v1/devices`: health, newest reading, and faults for simulated devices."""
+"""`/v1/devices`: health, newest reading, another driver at run time, and faults for simulated devices."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from fastapi import APIRouter, Path, Query
 from fastapi import Depends as DependsOn
 from starlette.responses import JSONResponse, Response
 
-from hal.errors import CellError, Unsupported
+from hal.errors import CellError, InvalidRequest, Unsupported
 from service.connection import check_name
 from service.core import Service
 from service.http.body import body_schema, strict_body
-from service.http.models import DeviceDetail, DeviceList, DeviceView, FaultRequest, HealthView, ReadingView
+from service.http.models import DeviceDetail, DeviceList, DeviceView, FaultRequest, HealthView, ReadingView, SwapRequest
 from service.http.problems import RESPONSES
 from service.http.readings import as_json
-from service.http.state import LeaseToken, State
+from service.http.state import AppState, LeaseToken, State
 from service.jsonable import jsonable
 
 router = APIRouter(prefix="/v1/devices", tags=["devices"], responses=RESPONSES)
@@ -74,6 +74,31 @@ async def read_device(
     return JSONResponse(as_json(name, state.service.cell.file.devices[name].kind, snapshot), headers=headers)
 
 
+@router.put(
+    "/{name}",
+    summary="Another driver or other options for a device, while the cell runs",
+    operation_id="swap_device",
+    openapi_extra=body_schema(
+        SwapRequest, {"driver": "serial:tfmini", "options": {"port": "/dev/serial/by-id/tfmini"}}, required=True
+    ),
+)
+async def swap_device(
+    state: State,
+    name: Name,
+    request: Annotated[SwapRequest, DependsOn(strict_body(SwapRequest))],
+    lease_token: LeaseToken = None,
+) -> DeviceDetail:
+    """The other devices go on. When the new driver does not connect, the old one is kept and the problem says so.
+
+    Refused while a motion runs if the device has a part in motions; after a swap of the arm its drives are off until the
+    next motion. The cell file is not changed: after a restart of the service it holds again.
+    """
+    check_name(state.service.cell, name)
+    state.service.lease.check(lease_token)
+    await state.in_thread(functools.partial(_swap, state, name, request))
+    return await state.in_thread(functools.partial(_detail, state.service, name))
+
+
 @router.post(
     "/{name}/fault",
     summary="Simulated cells: begin or end a fault in a device",
@@ -89,6 +114,19 @@ async def inject_fault(
     check_name(state.service.cell, name)
     state.service.lease.check(lease_token)
     return await state.act(functools.partial(_inject, state.service, name, request))
+
+
+def _swap(state: AppState, name: str, request: SwapRequest) -> None:
+    section = state.service.cell.file.devices[name]
+    if request.kind not in (None, section.kind) or request.mount not in (None, section.mount):
+        raise InvalidRequest(
+            f"{name} stays a {section.kind} with its mount", hint="send driver and options alone", device=name
+        )
+    if "capture" in request.options:
+        raise InvalidRequest("captures cannot be started over HTTP", hint="put capture into the cell file", device=name)
+    fresh = section.model_copy(update={"driver": request.driver, "options": request.options})
+    state.service.swap_device(name, fresh)
+    state.readings.forget(name)
 
 
 def _inject(service: Service, name: str, request: FaultRequest) -> DeviceView:

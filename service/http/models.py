@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Field
 
+from hal.config import Mount
 from hal.devices import DeviceKind, Fault
 from hal.strict import Strict
 from service.jsonable import jsonable
@@ -141,6 +142,15 @@ class FaultRequest(Strict):
 
     fault: Fault | None = None
     magnitude: Finite = 0.0
+
+
+class SwapRequest(Strict):
+    """Another driver for a device, as its block in a cell file says it; kind and mount stay what they are."""
+
+    driver: Annotated[str, Field(pattern=r"^[a-z0-9_.+-]+:[a-z0-9_.+-]+$", max_length=100, examples=["serial:tfmini"])]
+    options: Annotated[dict[str, Any], Field(max_length=100)] = {}
+    kind: DeviceKind | None = None
+    mount: Mount | None = None
 
 
 class FrameView(BaseModel):

@@ -76,6 +76,11 @@ class ReadingDesk:
             self._snapshots[name] = snapshot
             return snapshot
 
+    def forget(self, name: str) -> None:
+        """Another device sits there now."""
+        self._snapshots.pop(name, None)
+        self._pictures.pop(name, None)
+
     def png(self, name: str, *, max_age_s: float) -> bytes:
         """The reading as a PNG picture; encoded once a snapshot."""
         snapshot = self.read(name, max_age_s=max_age_s)

@@ -155,6 +155,9 @@ def test_devices_and_tasks_are_shown_on_the_terminal(served_alone: Served) -> No
     lines = _run("devices", "read", "finger_proximity", "--samples", "3", "--jsonl", *url).stdout.splitlines()
     assert len(lines) == 3
     assert '"value": 0.123' in lines[0]
+    swapped = _run("devices", "swap", "finger_proximity", "fake:proximity", *url)
+    assert "finger_proximity: fake:proximity, valid" in swapped.stdout
+    _assert_refused(_run("devices", "swap", "finger_proximity", "fake:lights", *url), "keeps fake:proximity")
     assert "latched" in _run("stop", *url).stdout
     assert "clear" in _run("stop", "--reset", *url).stdout
     assert _run("task", "list", *url).returncode == 0

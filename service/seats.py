@@ -1,0 +1,215 @@
+"""Seats of a running cell: whoever holds a seat keeps talking to whatever device sits there now."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from typing import Any, Protocol
+
+from hal.clock import Deadline
+from hal.config import Cell, DeviceSection
+from hal.devices import DeviceKind
+from hal.errors import CellError, ConfigError, DeviceUnavailable, MotionRefused
+from service.errors import Busy
+
+WIRE_KEYS = ("host", "port", "channel", "device")  # options that name a port which takes one driver at a time
+HAS_MEMORY = {DeviceKind.ARM, DeviceKind.FORCE_TORQUE}  # the control thread keeps kinematics and bias of these
+IN_MOTION = HAS_MEMORY | {DeviceKind.GRIPPER, DeviceKind.TOUCH, DeviceKind.PROXIMITY}
+log = logging.getLogger(__name__)
+
+
+class Seat:
+    """Passes everything on to the device that sits here."""
+
+    def __init__(self, device: Any) -> None:
+        self._device = device
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self._device, name)
+
+    def __dir__(self) -> list[str]:
+        return dir(self._device)  # what a host offers to other processes
+
+    def close(self) -> None:
+        """Close the device of the moment."""
+        self._device.close()
+
+    def occupant(self) -> Any:
+        """The device itself."""
+        return self._device
+
+    def put(self, device: Any) -> None:
+        """Another device sits here from now on; the one before is the caller's to close."""
+        self._device = device
+
+
+class MotionDesk(Protocol):
+    """What a swap needs of the motion port."""
+
+    def at_rest(self, work: Callable[[], None]) -> None:
+        """Run `work` while no motion runs or begins.
+
+        Raises:
+            MotionRefused: a motion runs.
+        """
+        ...
+
+    def restart(self, between: Callable[[], None]) -> None:
+        """End the control thread, which stops the arm; run `between`; start the thread anew, with the drives off.
+
+        Raises:
+            MotionRefused: a motion runs.
+        """
+        ...
+
+
+Connect = Callable[[str, DeviceSection], Any]
+"""Connects the device of a name as a section says that `Complete` has made."""
+Complete = Callable[[str, DeviceSection], DeviceSection]
+"""A section with the address of the cell's emulator, where it means the device behind that."""
+
+
+class Swapper:
+    """Puts other devices into the seats while the cell runs, one at a time.
+
+    The new device is connected before the old one is closed, unless both are on one port. Motion power is off after a
+    swap of the arm until the next declared motion asks for it, and a device that moves is not swapped during a motion.
+
+    Args:
+        connect, complete: what the start of the cell used.
+        motion: the motion port; None in a cell without an arm.
+    """
+
+    def __init__(
+        self,
+        cell: Cell,
+        *,
+        connect: Connect,
+        complete: Complete,
+        seats: Mapping[str, Seat],
+        motion: MotionDesk | None,
+    ) -> None:
+        self._sections = cell.file.devices
+        self._connect = connect
+        self._complete = complete
+        self._seats = seats
+        self._motion = motion
+        self._busy = threading.Lock()
+
+    def swap(self, name: str, driver: str, options: dict[str, Any], *, deadline: Deadline) -> None:  # noqa: ARG002
+        """Another driver or other options for the device `name`.
+
+        Args:
+            deadline: of the caller's wait for the answer; a connection that fails takes as long as its driver tries.
+
+        Raises:
+            DeviceError, ConfigError: the new one did not connect; the old one is kept, and the error says so.
+            MotionRefused: a motion runs. Busy: another device is being swapped.
+        """
+        if not self._busy.acquire(blocking=False):
+            raise Busy("another device is being swapped", hint="send it again in a moment", device=name)
+        try:
+            section = self._sections[name].model_copy(update={"driver": driver, "options": options})
+            old, new = self._complete(name, self._sections[name]), self._complete(name, section)
+            if _share_a_port(old, new):
+                self._swap_on_one_port(name, old, new)
+            else:
+                self._swap_side_by_side(name, new)
+            self._sections[name] = section  # everybody who looks into the cell file sees what is connected
+        finally:
+            self._busy.release()
+
+    def _swap_side_by_side(self, name: str, new: DeviceSection) -> None:
+        seat, old = self._seats[name], self._seats[name].occupant()
+        with self._kept(name):
+            fresh = self._connect(name, new)
+        try:
+            with self._kept(name):
+                self._seated(new.kind, lambda: seat.put(fresh))
+        except CellError:
+            if seat.occupant() is fresh:  # the control thread does not take it
+                self._seated(new.kind, lambda: seat.put(old))
+            fresh.close()
+            raise
+        old.close()
+
+    def _swap_on_one_port(self, name: str, old: DeviceSection, new: DeviceSection) -> None:
+        try:
+            with self._kept(name):
+                self._seated(new.kind, lambda: self._reseat(name, new))
+        except MotionRefused:
+            raise  # nothing was touched
+        except CellError:
+            self._seated(new.kind, lambda: self._return(name, old))
+            raise
+
+    def _reseat(self, name: str, section: DeviceSection) -> None:
+        seat = self._seats[name]
+        seat.close()
+        seat.put(self._connect(name, section))
+
+    def _return(self, name: str, old: DeviceSection) -> None:
+        """The old device again, after its port was given to one that did not connect."""
+        try:
+            self._reseat(name, old)
+        except CellError as error:
+            raise DeviceUnavailable(
+                f"{name}: the new driver did not connect, and the old one, {old.driver}, did not come back: {error.what}",
+                hint=error.hint,
+                device=name,
+            ) from error
+
+    def _seated(self, kind: DeviceKind, work: Callable[[], None]) -> None:
+        if self._motion is None or kind not in IN_MOTION:
+            work()
+        elif kind in HAS_MEMORY:
+            self._motion.restart(work)
+        else:
+            self._motion.at_rest(work)
+
+    @contextmanager
+    def _kept(self, name: str) -> Iterator[None]:
+        """Errors inside say that the old device stays."""
+        driver = self._sections[name].driver
+        kept = f"{name} keeps {driver}, as the new driver"
+        try:
+            yield
+        except MotionRefused:
+            raise
+        except CellError as error:
+            details = {**error.details, "kept": driver}
+            raise type(error)(f"{kept} did not connect: {error.what}", hint=error.hint, **details) from error
+        except Exception as error:  # a defect of the new driver
+            log.exception("devices.%s", name)
+            raise DeviceUnavailable(
+                f"{kept} failed: {type(error).__name__}: {error}",
+                hint="report it to the driver's author",
+                device=name,
+                kept=driver,
+            ) from error
+
+
+def checked(name: str, device: Any, section: DeviceSection) -> Any:
+    """The device, if it is of the kind that its section says.
+
+    Raises:
+        ConfigError: it is not; it has been closed.
+    """
+    if device.kind is section.kind:
+        return device
+    with suppress(CellError):
+        device.close()
+    raise ConfigError(
+        f"devices.{name}.driver: {section.driver} is a {device.kind}, not a {section.kind}",
+        hint=f"choose a driver of a {section.kind}",
+        key=f"devices.{name}.driver",
+    )
+
+
+def _share_a_port(a: DeviceSection, b: DeviceSection) -> bool:
+    wires = [tuple(section.options.get(key) for key in WIRE_KEYS) for section in (a, b)]
+    return wires[0] == wires[1] and any(part is not None for part in wires[0])

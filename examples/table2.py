@@ -3,7 +3,7 @@
     python -m examples.table2 [--seed N] [--out FOLDER]
 
 Prints the paper's errors beside plain least squares over everything (its objective) beside the robust fusion, after each of the
-16 measurements. With --out it draws the first six poses, as SVG and as one PNG.
+16 measurements, and draws the first six poses, as SVG and as one PNG.
 """
 
 from __future__ import annotations
@@ -92,6 +92,8 @@ def draw(made: Problem, folder: Path) -> None:
         title = f"after {n} measurement{'s' if n > 1 else ''}"
         (folder / f"pose_{n}.svg").write_text(svg(drawings, sight, title=title))
         axes(ax, drawings, sight, title=title)
+    named = dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
+    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=3)
     figure.savefig(folder / "figure13.png", dpi=110)
 
 
@@ -115,13 +117,12 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="folder for the drawings")
+    parser.add_argument("--out", type=Path, default=Path("runs/table2"), help="folder for the drawings [%(default)s]")
     args = parser.parse_args()
     made = problem(TABLE_II, np.random.default_rng(args.seed), bad=[0])
     print("\n".join(table(made)))
-    if args.out is not None:
-        draw(made, args.out)
-        print(f"drawings in {args.out}")
+    draw(made, args.out)
+    print(f"drawings: {args.out / 'figure13.png'} and pose_1.svg to pose_6.svg beside it")
 
 
 __all__ = ["PAPER", "Sight", "draw", "errors", "outlines", "poses_after", "robust", "table"]

@@ -12,6 +12,7 @@ from perception.calibration.hand_eye import HandEye
 from perception.calibration.intrinsics import CameraCalibration
 from perception.calibration.scanner import ScannerCalibration
 from perception.calibration.wrench import WrenchCalibration
+from perception.toml_text import toml_lines
 
 
 def mount_of(parent_from_device: UncertainPose) -> MountRecord:
@@ -89,16 +90,8 @@ def _three(values: object) -> Vector3:
 def _toml(record: CalibrationRecord) -> str:
     """TOML of the record: scalars first, then one table a part."""
     data = record.model_dump(by_alias=True, exclude_none=True)
-    lines = [f"{key} = {_value(value)}" for key, value in data.items() if not isinstance(value, dict)]
+    lines = toml_lines({key: value for key, value in data.items() if not isinstance(value, dict)})
     for key, table in data.items():
         if isinstance(table, dict):
-            lines += ["", f"[{key}]", *(f"{name} = {_value(value)}" for name, value in table.items())]
+            lines += ["", f"[{key}]", *toml_lines(table)]
     return "\n".join(lines) + "\n"
-
-
-def _value(value: object) -> str:
-    if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    if isinstance(value, tuple | list):
-        return "[" + ", ".join(_value(v) for v in value) + "]"
-    return repr(value)

@@ -9,7 +9,6 @@ import pytest
 
 from benchmarks.vision_drawing import Disturbance
 from hal.errors import Ambiguous, InvalidRequest, NotFound
-from hal.panel import load_panel
 from perception.vision.blind import recognise
 from perception.vision.features import LENGTH, region_shape
 from perception.vision.knowledge import (
@@ -23,7 +22,7 @@ from perception.vision.knowledge import (
 )
 from perception.vision.match import distances, distances_reference
 from perception.vision.plate import find_plate
-from perception.vision.teach import check, panel_text, plate_points, questions, teach
+from perception.vision.teach import check, plate_points, teach
 from perception.vision.view import CameraView
 from tests.perception.vision.bench_panel import panel, scene
 
@@ -124,8 +123,6 @@ def test_a_look_that_would_rob_another_kind_is_refused() -> None:
 def test_clicks_are_checked() -> None:
     image, view = overview()
     with pytest.raises(InvalidRequest):
-        teach(image, shipped_knowledge(), kind="new_thing", clicks_px=[pixel_of(view, "emergency")], plate_m=PLATE)
-    with pytest.raises(InvalidRequest):
         teach(image, shipped_knowledge(), kind="gauge", clicks_px=[], plate_m=PLATE)
     with pytest.raises(NotFound):
         plate_points(view, [(2.0, 2.0)], PLATE)
@@ -168,34 +165,3 @@ def test_shape_features_do_not_change_with_turn_and_size() -> None:
     assert a.aspect == pytest.approx(b.aspect, rel=0.06) and d.aspect == pytest.approx(1.0, abs=0.03)
     assert np.allclose(a.descriptors, b.descriptors, atol=0.04)
     assert max(d.descriptors) < 0.02 < max(a.descriptors)
-
-
-def test_a_dialogue_and_clicks_make_a_panel_file(tmp_path: Path) -> None:
-    image, view = overview()
-    lesson = teach(
-        image,
-        shipped_knowledge(),
-        kind="mushroom",
-        clicks_px=[pixel_of(view, "emergency")],
-        size_m=(0.04, 0.04),
-        plate_m=PLATE,
-    )
-    found = next(c for c in check(image, lesson.knowledge, plate_m=PLATE) if c.kind == "mushroom")
-    keys = [q.key for q in questions("gauge", lesson.knowledge)]
-    assert keys[:2] == ["kind", "name"] and "at_max" in keys
-    dial = {
-        "kind": "gauge",
-        "name": "inlet",
-        "minimum": "0",
-        "maximum": "10",
-        "unit": "bar",
-        "at_min": "-2.3",
-        "at_max": "2.3",
-    }
-    text = panel_text("taught", PLATE, [(found, {"name": "stop"}), (found, dial)])
-    path = tmp_path / "taught.toml"
-    path.write_text(text, encoding="utf-8")
-    made = load_panel(path)
-    assert {thing.name for thing in made.objects} == {"stop", "inlet"}
-    with pytest.raises(InvalidRequest):
-        panel_text("taught", PLATE, [(found, {**dial, "minimum": "low"})])

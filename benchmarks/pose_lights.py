@@ -246,7 +246,7 @@ def _visible(levels: list[NDArray[Any]], lights_px: Array, noise: float) -> NDAr
             shown.append(False)
             continue
         patch = on[v - 2 : v + 3, u - 2 : u + 3]
-        around = np.clip(levels[0], 0, 255)[v - 9 : v + 10, u - 9 : u + 10]
+        around = np.clip(levels[0], 0, 255)[max(v - 9, 0) : v + 10, max(u - 9, 0) : u + 10]
         rise = float(patch.min() - np.median(around))
         even = float(patch.max() - patch.min())
         shown.append(rise > max(12.0, 4.0 * noise) and even < 0.35 * max(rise, 1.0) + 12.0)

@@ -36,6 +36,7 @@ def _app() -> Callable[[], None]:
     from service.commands.demo import demo
     from service.commands.develop import conform, emulate, new_driver
     from service.commands.doctor import doctor
+    from service.commands.range import batch, range_image
     from service.commands.serve import serve
     from service.commands.teach import teach
     from service.commands.warm import warm
@@ -55,6 +56,8 @@ def _app() -> Callable[[], None]:
     app.command()(conform)
     app.command()(warm)
     app.command()(teach)
+    app.command("range")(range_image)
+    app.add_typer(batch, name="batch")
     app.command()(emulate)
     app.command("new-driver")(new_driver)
     return app

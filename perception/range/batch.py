@@ -1,7 +1,7 @@
 """Thousands of recorded scans on dask.distributed: the same result whatever the number of workers.
 
 A task holds at least 20 images, because handing one over costs about as much as a tenth of an image. A worker that is
-lost is replaced and its tasks run again (`retries`); an image that cannot be read becomes a result with its error.
+lost is replaced and its tasks run again; an image that cannot be read becomes a result with its error.
 """
 
 from __future__ import annotations
@@ -10,18 +10,20 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from hal.errors import CellError, ConfigError, InvalidRequest
 from perception.range.analyse import analyse
-from perception.range.recordings import load_recording
-from perception.range.render import scene_json
+from perception.range.recordings import AS_FILED, SUFFIXES, Reading, load_recording
+from perception.range.render import MARK, scene_json
 
 IMAGES_A_TASK = 20
 RETRIES = 3
-SUFFIXES = (".npz", ".png")
+LOOK_S = 10.0  # how often the scheduler is asked whether anybody still works
+ALONE_LOOKS = 6  # looks without any worker that end the batch: a replacement is up within seconds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,30 +36,33 @@ class BatchResult:
 
 
 def recordings_in(folder: Path) -> list[Path]:
-    """The recordings of a folder, in the order of their names.
+    """The recordings of a folder, in the order of their names; pictures that `panelwright range` drew are left out.
 
     Raises:
-        InvalidRequest: there is no such folder, or it holds no npz and no png.
+        InvalidRequest: there is no such folder, or it holds no recording.
     """
     if not folder.is_dir():
         raise InvalidRequest(f"{folder} is no folder", hint="give the folder that holds the recordings")
-    paths = sorted(p for p in folder.iterdir() if p.suffix in SUFFIXES)
+    paths = sorted(p for p in folder.resolve().iterdir() if p.suffix.lower() in SUFFIXES and MARK not in p.suffixes)
     if not paths:
-        raise InvalidRequest(f"{folder} holds no recordings", hint=f"expected {' or '.join(SUFFIXES)} files")
+        raise InvalidRequest(f"{folder} holds no recordings", hint=f"expected {', '.join(SUFFIXES)} files")
     return paths
 
 
-def analyse_files(paths: Sequence[str]) -> list[BatchResult]:
+def analyse_files(paths: Sequence[str], reading: Reading = AS_FILED) -> list[BatchResult]:
     """Analyse recordings one after the other: what one task does on a worker."""
-    return [_one(Path(path)) for path in paths]
+    return [_one(Path(path), reading) for path in paths]
 
 
-def _one(path: Path) -> BatchResult:
+def _one(path: Path, reading: Reading) -> BatchResult:
     try:
-        depth, sensor = load_recording(path)
+        depth, sensor = load_recording(path, reading=reading)
         scene = analyse(depth, sensor)
     except CellError as error:
         return BatchResult(name=path.name, scene=None, error=f"{type(error).__name__}: {error.what}")
+    except Exception as defect:
+        # A defect of ours on one image must not cost the others theirs.
+        return BatchResult(name=path.name, scene=None, error=f"Defect: {type(defect).__name__}: {defect}")
     return BatchResult(name=path.name, scene=scene_json(scene), error=None)
 
 
@@ -73,6 +78,7 @@ def batch_range(
     *,
     scheduler: str = "local",
     workers: int = 2,
+    reading: Reading = AS_FILED,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[BatchResult]:
     """Analyse every recording of a folder.
@@ -80,6 +86,7 @@ def batch_range(
     Args:
         scheduler: "local" starts `workers` processes here; "tcp://host:port" uses a running dask scheduler, whose
             workers must see the folder under the same path.
+        reading: what the files do not say, as for `load_recording`.
         progress: called with images done and images in all after each task.
 
     Returns:
@@ -87,15 +94,12 @@ def batch_range(
 
     Raises:
         InvalidRequest: the folder holds no recordings.
-        ConfigError: the scheduler is neither "local" nor a tcp address that answers.
+        ConfigError: the scheduler is neither "local" nor a tcp address that answers, or its workers are gone.
     """
     groups = tasks_of(recordings_in(folder))
-    total = sum(len(g) for g in groups)
     with _client(scheduler, workers) as client:
-        futures = client.map(analyse_files, groups, retries=RETRIES, pure=False)
-        if progress is not None:
-            _watch(futures, groups, progress, total)
-        gathered: list[list[BatchResult]] = client.gather(futures)
+        futures = client.map(partial(analyse_files, reading=reading), groups, retries=RETRIES, pure=False)
+        gathered = _gathered(client, futures, [len(g) for g in groups], progress or (lambda *_: None))
     return [result for group in gathered for result in group]
 
 
@@ -105,13 +109,36 @@ def write_results(path: Path, results: Sequence[BatchResult]) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _watch(futures: list[Any], groups: list[list[str]], progress: Callable[[int, int], None], total: int) -> None:
+def _gathered(
+    client: Any, futures: list[Any], sizes: list[int], progress: Callable[[int, int], None]
+) -> list[list[BatchResult]]:
+    """The results in order; says after each task how many images are done.
+
+    Raises:
+        ConfigError: a task killed worker after worker, the workers cannot run it, or no worker is left.
+    """
     distributed: Any = import_module("distributed")
-    sizes = {future.key: len(group) for future, group in zip(futures, groups, strict=True)}
-    done = 0
-    for future in distributed.as_completed(futures):
-        done += sizes[future.key]
-        progress(done, total)
+    size_of = {future.key: size for future, size in zip(futures, sizes, strict=True)}
+    waiting, done, alone = set(futures), 0, 0
+    while waiting:
+        try:
+            finished = distributed.wait(waiting, timeout=LOOK_S, return_when="FIRST_COMPLETED").done
+        except TimeoutError:
+            finished = set()
+        alone = 0 if finished or client.nthreads() else alone + 1
+        if alone == ALONE_LOOKS:
+            raise ConfigError("all workers are gone and none came back", hint="start workers: dask worker tcp://...")
+        waiting -= finished
+        for future in finished:
+            done += size_of[future.key]
+            progress(done, sum(sizes))
+    try:
+        gathered: list[list[BatchResult]] = client.gather(futures)
+    except (distributed.KilledWorker, distributed.CancelledError, OSError) as error:
+        raise ConfigError(f"a task was lost for good: {error}", hint="see the workers' logs; out of memory?") from error
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"a worker lacks {error.name!r}", hint="install panelwright where the workers run") from error
+    return gathered
 
 
 @contextmanager
@@ -131,7 +158,11 @@ def _client(scheduler: str, workers: int) -> Iterator[Any]:
         raise ConfigError(f"scheduler is {scheduler!r}", hint='use "local" or "tcp://host:port"')
     try:
         client = distributed.Client(scheduler, timeout="10s")
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise ConfigError(f"no dask scheduler answers at {scheduler}", hint="start one: dask scheduler") from error
     with client:
+        try:
+            client.wait_for_workers(1, timeout=LOOK_S)
+        except TimeoutError as error:
+            raise ConfigError(f"{scheduler} has no workers", hint=f"start some: dask worker {scheduler}") from error
         yield client

@@ -96,6 +96,11 @@ SURFACE_KEYS = {
 MODEL_KEYS = {"surfaces", "symmetric", "motion", "motion_axis", "low", "high"}
 
 
+def shipped_models() -> tuple[ComponentModel, ...]:
+    """The component models that come with the package (`components.toml`)."""
+    return load_models(Path(__file__).with_name("components.toml"))
+
+
 def load_models(path: Path) -> tuple[ComponentModel, ...]:
     """The component models of a TOML file.
 

@@ -1,13 +1,18 @@
-"""Range recordings on disk: npz and 16-bit PNG, decoded to metres with their sensor.
+"""Range recordings on disk: npz, npy, PNG and TIFF, decoded to metres with their sensor.
 
 npz: `depth` (float or integer) and JSON text `meta` with `unit` ("m" or "mm"), `sensor` ({"kind": "pinhole", "shape",
 "f", "fy", "cx", "cy"} or {"kind": "ortho", "shape", "pitch"}; pitch in the unit), or `K` = fx, fy, cx, cy with depth in
 millimetres. Where `depth` is absent, 8-bit codes `u8` are decoded with `meta.u8` (`near`, `far`, 0 near .. 255 far).
+npy, PNG and TIFF: the bare image; what it does not say comes from a `Reading`.
 """
 
 from __future__ import annotations
 
 import json
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,57 +26,179 @@ from perception.range.window import Window, decode_scaled
 
 Array = NDArray[np.float64]
 
+SUFFIXES = (".npz", ".npy", ".png", ".tif", ".tiff")
 UNITS_M = {"m": 1.0, "mm": 0.001}
+DEFAULT_CODE_M = 0.001  # what a code of a 16-bit depth image usually stands for
 DEFAULT_FOCAL_PER_WIDTH = 0.9  # structured-light cameras see about 58 degrees across
+UNREADABLE = (OSError, ValueError, KeyError, TypeError, IndexError, EOFError, zipfile.BadZipFile, zlib.error)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reading:
+    """How to read a recording: what its file does not say, or says wrongly.
+
+    Attributes:
+        scale_m: metres a unit of floats or a code of integers; instead of what the file says.
+        near_m, far_m: window of 8-bit codes, 0 near to 255 far; given together.
+        focal_px: fx and fy of a pinhole sensor.
+        centre_px: its cx and cy; the middle of the image by default.
+        pitch_m: pixel pitch of an orthographic sensor; excludes `focal_px`.
+        codes: read the 8-bit codes of an npz even where it has depth.
+
+    Raises:
+        InvalidRequest: values that contradict each other or make no sense.
+    """
+
+    scale_m: float | None = None
+    near_m: float | None = None
+    far_m: float | None = None
+    focal_px: tuple[float, float] | None = None
+    centre_px: tuple[float, float] | None = None
+    pitch_m: float | None = None
+    codes: bool = False
+
+    def __post_init__(self) -> None:
+        if (self.near_m is None) != (self.far_m is None):
+            raise InvalidRequest("a window has two ends", hint="give near and far together")
+        if self.pitch_m is not None and (self.focal_px is not None or self.centre_px is not None):
+            raise InvalidRequest(
+                "a sensor is either orthographic or a pinhole", hint="give the pixel pitch, or focal lengths and centre"
+            )
+        if self.centre_px is not None and self.focal_px is None:
+            raise InvalidRequest("an image centre without a focal length", hint="give the focal length too")
+        if self.scale_m is not None and not (self.scale_m > 0 and np.isfinite(self.scale_m)):
+            raise InvalidRequest(f"scale of {self.scale_m} m is not positive", hint="0.001 for millimetres")
+
+    @property
+    def window(self) -> Window | None:
+        """The window of 8-bit codes, if it is given."""
+        if self.near_m is None or self.far_m is None:
+            return None
+        return Window(near_m=self.near_m, far_m=self.far_m)
+
+    def sensor(self, shape: tuple[int, int]) -> RangeSensorModel | None:
+        """The sensor model that is given, for an image of `shape` (H, W); None when none is."""
+        h, w = shape
+        if self.pitch_m is not None:
+            return OrthographicSensor(width_px=w, height_px=h, pixel_pitch_m=self.pitch_m)
+        if self.focal_px is None:
+            return None
+        (fx, fy), (cx, cy) = self.focal_px, self.centre_px or ((w - 1) / 2, (h - 1) / 2)
+        return PinholeSensor(width_px=w, height_px=h, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy)
+
+
+AS_FILED = Reading()
 
 
 def load_recording(
-    path: Path, *, sensor: RangeSensorModel | None = None, png_scale_m: float = 0.001, codes: bool = False
+    path: Path, *, reading: Reading = AS_FILED, sensor: RangeSensorModel | None = None, codes: bool = False
 ) -> tuple[Array, RangeSensorModel]:
     """Depth (H, W) in metres with NaN, and the sensor model, of one recording.
 
     Args:
-        sensor: used instead of what the file says; needed for PNG (else a 58 degree pinhole is assumed).
-        png_scale_m: metres a code of a PNG; code 0 is no reading.
-        codes: read the 8-bit codes even where the file has depth.
+        reading: what the file does not say.
+        sensor: used instead of what file and `reading` say.
+        codes: as `Reading.codes`.
 
     Raises:
         InvalidRequest: the file cannot be read as a recording; the message says why.
     """
+    load = _loader(path)
     try:
-        return _load_png(path, sensor, png_scale_m) if path.suffix == ".png" else _load_npz(path, sensor, codes)
-    except (OSError, ValueError, KeyError) as error:
-        raise InvalidRequest(
-            f"{path.name} is no range recording: {error}", hint="npz with depth and meta, or 16-bit PNG"
-        ) from error
+        depth, filed = load(path, reading, codes or reading.codes)
+    except UNREADABLE as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        missing = isinstance(error, OSError)
+        hint = "check the path" if missing else "npz with depth and meta, npy, 16-bit PNG or TIFF"
+        raise InvalidRequest(f"{path.name} is no range recording: {reason}", hint=hint) from error
+    if depth.ndim != 2:
+        raise InvalidRequest(f"{path.name} holds shape {depth.shape}", hint="one (H, W) depth image a file")
+    shape = (depth.shape[0], depth.shape[1])
+    return depth, sensor or reading.sensor(shape) or filed or assumed_sensor(shape)
 
 
-def _load_png(path: Path, sensor: RangeSensorModel | None, scale_m: float) -> tuple[Array, RangeSensorModel]:
+def assumptions(path: Path, reading: Reading) -> tuple[str, ...]:
+    """What is taken for granted when `path` is loaded with `reading`: plain sentences."""
+    bare = path.suffix.lower() != ".npz"
+    out = []
+    if bare and reading.sensor((1, 1)) is None:
+        out.append("no sensor is given: a pinhole of 58 degrees across is assumed, so sizes may be off by its error")
+    if path.suffix.lower() == ".png" and reading.scale_m is None and reading.window is None:
+        out.append("no scale is given: a code is taken for 1 mm, 0 for no reading")
+    return tuple(out)
+
+
+def assumed_sensor(shape: tuple[int, int]) -> PinholeSensor:
+    """A pinhole of 58 degrees across for an image of `shape` (H, W) whose sensor nobody names."""
+    h, w = shape
+    focal = DEFAULT_FOCAL_PER_WIDTH * w
+    return PinholeSensor(width_px=w, height_px=h, fx_px=focal, fy_px=focal, cx_px=(w - 1) / 2, cy_px=(h - 1) / 2)
+
+
+Loaded = tuple[Array, RangeSensorModel | None]
+
+
+def _loader(path: Path) -> Callable[[Path, Reading, bool], Loaded]:
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        return _load_npz
+    if suffix == ".npy":
+        return _load_npy
+    if suffix in SUFFIXES:
+        return _load_picture
+    raise InvalidRequest(f"{path.name} is of no known kind", hint=f"recordings end in {', '.join(SUFFIXES)}")
+
+
+def _load_picture(path: Path, reading: Reading, codes: bool) -> Loaded:  # noqa: ARG001 - a picture holds one image
     raw = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     if raw is None or raw.ndim != 2:
-        raise ValueError("not a single-channel PNG")
-    h, w = raw.shape
-    focal = DEFAULT_FOCAL_PER_WIDTH * w
-    assumed = PinholeSensor(width_px=w, height_px=h, fx_px=focal, fy_px=focal, cx_px=(w - 1) / 2, cy_px=(h - 1) / 2)
-    return decode_scaled(raw, scale_m), sensor or assumed
+        raise ValueError("not a picture of one channel")
+    return _decoded(raw, reading), None
 
 
-def _load_npz(path: Path, sensor: RangeSensorModel | None, codes: bool) -> tuple[Array, RangeSensorModel]:
+def _load_npy(path: Path, reading: Reading, codes: bool) -> Loaded:  # noqa: ARG001 - an array holds one image
+    with path.open("rb") as file:
+        return _decoded(np.lib.format.read_array(file, allow_pickle=False), reading), None
+
+
+def _decoded(raw: NDArray[Any], reading: Reading) -> Array:
+    """Metres of a bare image: floats are metres, 16-bit codes millimetres, 8-bit codes need their window."""
+    if raw.dtype.kind == "f":
+        return np.asarray(raw, float) * (reading.scale_m or 1.0)
+    if reading.window is not None:
+        return reading.window.decode(raw)
+    if raw.dtype.itemsize == 1 and reading.scale_m is None:
+        raise InvalidRequest(
+            "8-bit codes say nothing without their window", hint="give near and far in metres, or the scale of a code"
+        )
+    return decode_scaled(raw, reading.scale_m or DEFAULT_CODE_M)
+
+
+def _load_npz(path: Path, reading: Reading, codes: bool) -> Loaded:
+    if path.stat().st_size and not zipfile.is_zipfile(path):
+        raise ValueError("it is no zip archive, or not all of it is there")
     with np.load(path, allow_pickle=False) as data:
         meta = json.loads(str(data["meta"])) if "meta" in data.files else _meta_of_intrinsics(data)
         unit = UNITS_M[meta.get("unit", "mm")]
-        depth = _depth(data, meta, unit, codes)
-    return depth, sensor or sensor_from_meta(meta["sensor"], unit)
+        depth = _depth(data, meta, unit, reading, codes)
+    filed = sensor_from_meta(meta["sensor"], unit) if "sensor" in meta else None
+    return depth, filed
 
 
-def _depth(data: Any, meta: dict[str, Any], unit: float, codes: bool) -> Array:
+def _depth(data: Any, meta: dict[str, Any], unit: float, reading: Reading, codes: bool) -> Array:
     if "depth" in data.files and not codes:
-        return np.asarray(data["depth"], float) * unit
+        raw = data["depth"]
+        scale = reading.scale_m or unit
+        return np.asarray(raw, float) * scale if raw.dtype.kind == "f" else decode_scaled(raw, scale)
+    if reading.window is not None:
+        return reading.window.decode(data["u8"])
     u8 = meta["u8"]
     return Window(near_m=u8["near"] * unit, far_m=u8["far"] * unit).decode(data["u8"])
 
 
 def _meta_of_intrinsics(data: Any) -> dict[str, Any]:
+    if "K" not in data.files:
+        return {"unit": "mm"}
     fx, fy, cx, cy = (float(v) for v in data["K"])
     shape = list(data["depth"].shape)
     return {"unit": "mm", "sensor": {"kind": "pinhole", "shape": shape, "f": fx, "fy": fy, "cx": cx, "cy": cy}}

@@ -10,10 +10,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.geometry import to_json
 from perception.range.analyse import RangeScene
+from perception.range.match import Match
 from perception.range.primitives import Surface
 
 Array = NDArray[np.float64]
+
+MARK = ".surfaces"  # in the name of what is drawn of a recording, so that no batch takes it for one
+PICTURE_PX = 768  # small images are shown larger, or nobody could read what is written on them
+LEAST_WRITTEN_PX = 500
 
 
 def scene_json(scene: RangeScene) -> dict[str, Any]:
@@ -44,6 +50,20 @@ def surface_json(surface: Surface) -> dict[str, Any]:
     }
 
 
+def match_json(match: Match) -> dict[str, Any]:
+    """A component found: pose with covariance (6x6 as `UncertainPose`), which surface is which, state, free turns."""
+    pose = match.sensor_from_object
+    return {
+        "model": match.model,
+        "sensor_from_object": {**to_json(pose.parent_from_child), "covariance": pose.covariance.tolist()},
+        "surfaces": match.labels,
+        "state": match.state,
+        "state_sigma": match.state_sigma,
+        "free": list(match.free),
+        "score": match.score,
+    }
+
+
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.tolist()
@@ -61,16 +81,25 @@ def colours(count: int) -> NDArray[np.uint8]:
 
 
 def picture(scene: RangeScene) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB image: one colour a surface, with its number and type written on it."""
-    image = colours(len(scene.surfaces))[scene.labels].copy()
+    """(sH, sW, 3) RGB image: one colour a surface, its number and type on it; small images are s times as large."""
+    labels = scene.labels
+    scale = max(1, PICTURE_PX // max(labels.shape))
+    image = np.kron(colours(len(scene.surfaces))[labels], np.ones((scale, scale, 1), np.uint8))
     for surface in scene.surfaces:
-        v, u = np.nonzero(scene.labels == surface.label)
-        if v.size < 60:
+        v, u = np.nonzero(labels == surface.label)
+        if v.size * scale**2 < LEAST_WRITTEN_PX:
             continue
         k = int(np.argmin((u - np.median(u)) ** 2 + (v - np.median(v)) ** 2))
-        text = f"{surface.label} {str(surface.type)[:3]}"
-        cv2.putText(image, text, (int(u[k]) - 12, int(v[k]) + 4), cv2.FONT_HERSHEY_SIMPLEX, 0.35, (255, 255, 255), 1)
+        _write(image, f"{surface.label} {str(surface.type)[:3]}", scale * int(u[k]), scale * int(v[k]))
     return image
+
+
+def _write(image: NDArray[np.uint8], text: str, u_px: int, v_px: int) -> None:
+    """White letters with a dark rim, so that they can be read on every colour."""
+    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.4, 1)
+    at = (u_px - width // 2, v_px + height // 2)
+    for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, thickness, cv2.LINE_AA)
 
 
 def write_png(path: Path, scene: RangeScene) -> None:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 
 import cv2
+import distributed
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -15,7 +18,7 @@ from perception.range.batch import analyse_files, batch_range, recordings_in, ta
 from perception.range.features import corner_point, crease_line
 from perception.range.polar import PolarScan, depth_image, fitting_view, sweep_points
 from perception.range.recordings import load_recording
-from perception.range.render import picture, scene_json, write_ply, write_png
+from perception.range.render import MARK, picture, scene_json, write_ply, write_png
 from tests.perception.range.scenes import PINHOLE, ball_on_table, nearest, noisy, plane_depth
 
 META = {"unit": "m", "sensor": {"kind": "pinhole", "shape": [120, 160], "f": 180.0, "cx": 79.5, "cy": 59.5}}
@@ -77,6 +80,61 @@ def test_the_batch_is_the_same_for_one_and_two_workers(folder):
     assert seen[-1] == (6, 6)
 
 
+def _shut_out(worker_pids, seen):
+    """A progress callback that kills one worker process as soon as a task is done."""
+
+    def progress(done, total):
+        if not seen:
+            os.kill(worker_pids[0], signal.SIGKILL)
+        seen.append((done, total))
+
+    return progress
+
+
+@pytest.mark.slow
+def test_a_lost_worker_costs_nothing_but_time(tmp_path):
+    for k in range(80):
+        save(tmp_path / f"scan_{k:02d}.npz", noisy(ball_on_table().depth_m, 0.0005, seed=k % 4))
+    plain = analyse_files([str(p) for p in recordings_in(tmp_path)])
+    seen: list[tuple[int, int]] = []
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        pids = list(client.run(os.getpid).values())
+        result = batch_range(tmp_path, scheduler=cluster.scheduler_address, progress=_shut_out(pids, seen))
+        with pytest.raises(ProcessLookupError):
+            os.kill(pids[0], 0)
+    assert result == plain
+    assert seen[-1] == (80, 80)
+
+
+@pytest.mark.slow
+def test_a_scheduler_without_workers_is_refused_in_time(folder, monkeypatch):
+    monkeypatch.setattr("perception.range.batch.LOOK_S", 0.2)
+    with (
+        distributed.LocalCluster(n_workers=0, dashboard_address=None, host="127.0.0.1") as cluster,
+        pytest.raises(ConfigError, match="no workers"),
+    ):
+        batch_range(folder, scheduler=cluster.scheduler_address)
+
+
+def test_a_defect_on_one_recording_costs_only_itself(folder, monkeypatch):
+    def broken(depth, sensor):
+        raise ZeroDivisionError("a defect")
+
+    monkeypatch.setattr("perception.range.batch.analyse", broken)
+    results = analyse_files([str(p) for p in recordings_in(folder)])
+    assert {r.error for r in results} == {"Defect: ZeroDivisionError: a defect"}
+
+
+def test_drawn_pictures_are_no_recordings(folder):
+    (folder / f"scan_0{MARK}.png").write_bytes(b"a picture")
+    assert not [p for p in recordings_in(folder) if MARK in p.name]
+
+
 def test_empty_folders_and_wrong_schedulers_are_refused(tmp_path, folder):
     with pytest.raises(InvalidRequest):
         recordings_in(tmp_path / "missing")
@@ -90,9 +148,9 @@ def test_json_picture_and_point_cloud(tmp_path):
     scene = analyse(depth, PINHOLE)
     document = json.loads(json.dumps(scene_json(scene)))
     assert {s["type"] for s in document["surfaces"]} == {"plane", "sphere", "cylinder"}
-    assert picture(scene).shape == (120, 160, 3)
+    assert picture(scene).shape == (480, 640, 3)
     write_png(tmp_path / "a.png", scene)
-    assert cv2.imread(str(tmp_path / "a.png")).shape == (120, 160, 3)
+    assert cv2.imread(str(tmp_path / "a.png")).shape == (480, 640, 3)
     write_ply(tmp_path / "a.ply", scene, depth)
     head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
     assert f"element vertex {116 * 160}".encode() in head and len(body) == 116 * 160 * 15

@@ -1,0 +1,190 @@
+"""`panelwright range` and `panelwright batch range`: recorded range images to named surfaces."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from hal.errors import InvalidRequest
+from service.commands.common import console
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from perception.range import RangeScene, Surface
+    from perception.range.batch import BatchResult
+    from perception.range.match import Match
+    from perception.range.recordings import Reading
+
+batch = typer.Typer(help="Folders of recordings on many workers (dask).", no_args_is_help=True)
+SHOWN_ERRORS = 5
+SHOWN_SURFACES = 25
+
+Scale = Annotated[float | None, typer.Option(help="Metres a unit, instead of what the file says (0.001: mm).")]
+Near = Annotated[float | None, typer.Option(help="Metres at code 0 of 8-bit codes; with --far.")]
+Far = Annotated[float | None, typer.Option(help="Metres at code 255 of 8-bit codes; with --near.")]
+Focal = Annotated[str | None, typer.Option(help="Pinhole sensor: F or FX,FY in pixels.")]
+Centre = Annotated[str | None, typer.Option(help="Pinhole sensor: CX,CY in pixels; the middle by default.")]
+Pitch = Annotated[float | None, typer.Option(help="Orthographic sensor: metres between pixels.")]
+
+
+def range_image(
+    file: Annotated[Path, typer.Argument(help="Recording: npz, npy, PNG or TIFF.")],
+    *,
+    out: Annotated[Path, typer.Option(help="Folder for the results; made if it is not there.")] = Path(),
+    models: Annotated[str | None, typer.Option(help="Look for components: a file of models, or `shipped`.")] = None,
+    scale: Scale = None,
+    near: Near = None,
+    far: Far = None,
+    focal: Focal = None,
+    centre: Centre = None,
+    pitch: Pitch = None,
+) -> None:
+    """Analyse one range image: NAME.surfaces.json, .png (coloured) and .ply (coloured points)."""
+    from perception.range import analyse
+    from perception.range.match import match_models
+    from perception.range.models import load_models, shipped_models
+    from perception.range.recordings import assumptions, load_recording
+    from perception.range.render import MARK, match_json, scene_json, write_ply, write_png
+
+    reading = _reading(scale, near, far, focal, centre, pitch)
+    library = () if models is None else shipped_models() if models == "shipped" else load_models(Path(models))
+    depth, sensor = load_recording(file, reading=reading)
+    scene = analyse(depth, sensor)
+    matches = match_models(scene, depth, library) if library else ()
+    assumed = assumptions(file, reading)
+    _print_surfaces(scene)
+    _print_matches(matches)
+    for sentence in (*scene.warnings, *assumed):
+        console.print(f"[yellow]note[/]   {escape(sentence)}")
+    document = {"recording": file.name, "assumed": list(assumed), **scene_json(scene)}
+    document["components"] = [match_json(match) for match in matches]
+    written = [_in_folder(out) / f"{file.stem}{MARK}{suffix}" for suffix in (".json", ".png", ".ply")]
+    written[0].write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_png(written[1], scene)
+    write_ply(written[2], scene, depth)
+    console.print("wrote " + ", ".join(str(path) for path in written), markup=False)
+
+
+@batch.command("range")
+def batch_range_images(
+    folder: Annotated[Path, typer.Argument(help="Folder of recordings: npz, npy, PNG or TIFF.")],
+    *,
+    scheduler: Annotated[str, typer.Option(help='"local", or tcp://host:port of a dask scheduler.')] = "local",
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Processes of the local scheduler.")] = 2,
+    out: Annotated[Path, typer.Option(help="File for the results: a JSON object a line.")] = Path("surfaces.jsonl"),
+    scale: Scale = None,
+    near: Near = None,
+    far: Far = None,
+    focal: Focal = None,
+    centre: Centre = None,
+    pitch: Pitch = None,
+) -> None:
+    """Analyse every recording of a folder; ends with 1 when one of them gave no result."""
+    from perception.range.batch import batch_range, recordings_in, write_results
+
+    reading = _reading(scale, near, far, focal, centre, pitch)
+    total = len(recordings_in(folder))
+    _in_folder(out.parent)  # before hours of work, not after
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("range images", total=total)
+        results = batch_range(
+            folder,
+            scheduler=scheduler,
+            workers=workers,
+            reading=reading,
+            progress=lambda done, _: bar.update(task, completed=done),
+        )
+    write_results(out, results)
+    failed = [result for result in results if result.error is not None]
+    _print_failed(failed)
+    console.print(f"wrote {out}: {total - len(failed)} of {total} recordings analysed", markup=False)
+    raise typer.Exit(1 if failed else 0)
+
+
+def _reading(
+    scale: float | None,
+    near: float | None,
+    far: float | None,
+    focal: str | None,
+    centre: str | None,
+    pitch: float | None,
+) -> Reading:
+    from perception.range.recordings import Reading
+
+    return Reading(
+        scale_m=scale,
+        near_m=near,
+        far_m=far,
+        focal_px=None if focal is None else _pair(focal, "--focal"),
+        centre_px=None if centre is None else _pair(centre, "--centre"),
+        pitch_m=pitch,
+    )
+
+
+def _pair(text: str, option: str) -> tuple[float, float]:
+    """Two numbers of an option; one number stands for both."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+        first, second = numbers if len(numbers) > 1 else numbers * 2
+    except ValueError:
+        raise InvalidRequest(f"{option} {text!r} is not two numbers", hint=f"for example {option} 525,525") from None
+    return first, second
+
+
+def _in_folder(folder: Path) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidRequest(f"{folder} cannot be written: {error.strerror}", hint="choose another --out") from None
+    return folder
+
+
+def _print_surfaces(scene: RangeScene) -> None:
+    table = Table("label", "type", "pixels", "what", "rms", box=None, pad_edge=False)
+    for surface in scene.surfaces[:SHOWN_SURFACES]:
+        row = (str(surface.label), str(surface.type), str(surface.pixels), _words(surface))
+        table.add_row(*row, f"{1e3 * surface.rms_m:.2f} mm")
+    console.print(table)
+    if len(scene.surfaces) > SHOWN_SURFACES:
+        console.print(f"and {len(scene.surfaces) - SHOWN_SURFACES} smaller ones")
+
+
+def _print_matches(matches: Sequence[Match]) -> None:
+    for match in matches:
+        x, y, z = 1e3 * match.sensor_from_object.parent_from_child.translation
+        surfaces = ", ".join(f"{name} {label}" for name, label in match.labels.items())
+        console.print(f"{match.model} at ({x:.1f}, {y:.1f}, {z:.1f}) mm: {surfaces}", markup=False)
+
+
+def _print_failed(failed: list[BatchResult]) -> None:
+    for result in failed[:SHOWN_ERRORS]:
+        console.print(f"[red]failed[/] {escape(result.name)}  {escape(result.error or '')}")
+    if len(failed) > SHOWN_ERRORS:
+        console.print(f"[red]failed[/] and {len(failed) - SHOWN_ERRORS} more; the results name them")
+
+
+def _words(surface: Surface) -> str:
+    """The sizes that tell a surface from others, in millimetres and degrees."""
+    from math import degrees
+
+    from perception.range import Cone, Cylinder, Ellipsoid, Plane, Sphere
+
+    p = surface.primitive
+    match p:
+        case Plane():
+            x, y, z = p.normal
+            return f"normal {x:.3f} {y:.3f} {z:.3f}, {1e3 * abs(float(p.normal @ p.point_m)):.1f} mm off"
+        case Sphere() | Cylinder():
+            return f"radius {1e3 * p.radius_m:.2f} mm" + (", from inside" if p.seen_from_inside else "")
+        case Cone():
+            return f"half angle {degrees(p.half_angle_rad):.2f} deg" + (", from inside" if p.seen_from_inside else "")
+        case Ellipsoid():
+            return "radii " + ", ".join(f"{1e3 * r:.1f}" for r in p.radii_m) + " mm"

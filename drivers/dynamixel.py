@@ -9,24 +9,25 @@ from __future__ import annotations
 import math
 import struct
 from collections import deque
+from contextlib import suppress
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
-from drivers import dxl2
 from drivers.arms import Array, KinematicsOptions, SetPointFilter, capabilities
-from drivers.transport.bus import Bus, PolledDevice
+from drivers.dxl2_client import BusOptions, DynamixelClient, dynamixel_bus
+from drivers.transport.bus import PolledDevice
 from drivers.transport.device import wall_until
-from drivers.transport.link import BadAnswer, Link, NoAnswer, Refused, WireError, drain, now_s
-from drivers.transport.options import SerialOptions, read_options, serial_opener
+from drivers.transport.link import BadAnswer, NoAnswer, Refused, WireError, now_s
+from drivers.transport.options import read_options
 from hal.clock import Deadline
 from hal.devices import ArmCapabilities, DeviceKind, JointState
 from hal.errors import DeviceFault
 from hal.readings import Stamped
 from hal.registry import Context
 
-MODEL, MODE, TORQUE, HARDWARE_ERROR, BUS_WATCHDOG, GOAL, STATE = 0, 11, 64, 70, 98, 116, 126
+MODE, TORQUE, HARDWARE_ERROR, BUS_WATCHDOG, GOAL, STATE = 11, 64, 70, 98, 116, 126
 STATE_BYTES = 10  # current16 velocity32 position32
 POSITION_MODE = 3
 COUNTS_PER_TURN, CENTRE = 4096, 2048
@@ -39,117 +40,16 @@ MOVING_RAD_PER_S = 0.03
 HARDWARE_BITS = {0: "supply voltage", 2: "overheating", 3: "encoder", 4: "electrical shock", 5: "overload"}
 
 
-class DynamixelOptions(SerialOptions):
+class DynamixelOptions(BusOptions):
     """Options of `serial:dynamixel`; `directions` turns joints round, `zero_counts` is where each joint is at 0 rad."""
 
-    baud: Annotated[int, Field(ge=9600, le=4_500_000)] = 1_000_000
     ids: tuple[Annotated[int, Field(ge=0, le=252)], ...] = (1, 2, 3, 4, 5, 6)
     directions: tuple[int, ...] | None = None
     zero_counts: tuple[int, ...] | None = None
     rate_hz: Annotated[float, Field(gt=0, le=500)] = 100.0
-    timeout_s: Annotated[float, Field(gt=0, le=1)] = 0.03
     watchdog_s: Annotated[float, Field(ge=0.02, le=2.5)] = 0.1
     is_fast: bool = True
     kinematics: KinematicsOptions
-
-
-class DynamixelClient:
-    """Requests and status packets; what comes back must be from who was asked, in size and order.
-
-    After a lost answer the line is drained for one time-out, as a status packet does not tell what it answers.
-    """
-
-    def __init__(self, link: Link, *, timeout_s: float) -> None:
-        self._link = link
-        self._timeout_s = timeout_s
-        self._is_late = False
-
-    def read(self, id_: int, address: int, length: int, until_s: float) -> bytes:
-        """A block of one servo."""
-        return self._ask(dxl2.read(id_, address, length), [id_], length, until_s)[id_]
-
-    def write(self, id_: int, address: int, data: bytes, until_s: float) -> None:
-        """A block of one servo, acknowledged."""
-        self._ask(dxl2.write(id_, address, data), [id_], 0, until_s)
-
-    def sync_read(self, ids: tuple[int, ...], address: int, length: int, until_s: float) -> dict[int, bytes]:
-        """The same block of all servos, one packet each."""
-        return self._ask(dxl2.sync_read(address, length, ids), list(ids), length, until_s)
-
-    def fast_sync_read(self, ids: tuple[int, ...], address: int, length: int, until_s: float) -> dict[int, bytes]:
-        """The same block of all servos in one packet."""
-        packets = self._exchange(dxl2.sync_read(address, length, ids, fast=True), 1, until_s)
-        data = packets[0].parameters
-        step = length + 4  # error, id, data, and a CRC over everything so far
-        least = len(ids) * step - 2  # the last CRC is the packet's own
-        if len(data) < least:
-            raise BadAnswer(f"{len(ids)} servos answer {len(data)} bytes instead of {least}")
-        blocks = {}
-        for i, id_ in enumerate(ids):
-            error, got = data[i * step], data[i * step + 1]
-            if got != id_ or packets[0].id != dxl2.BROADCAST:
-                raise BadAnswer(f"servo {got} answers in place of {id_}")
-            self._check(id_, error)
-            blocks[id_] = data[i * step + 2 : i * step + 2 + length]
-        return blocks
-
-    def sync_write(self, address: int, length: int, values: dict[int, bytes], until_s: float) -> None:
-        """A block of each servo; nobody answers."""
-        self._link.write(dxl2.sync_write(address, length, values), until_s)
-
-    def _ask(self, request: bytes, ids: list[int], length: int, until_s: float) -> dict[int, bytes]:
-        packets = self._exchange(request, len(ids), until_s)
-        for packet, id_ in zip(packets, ids, strict=True):
-            if packet.id != id_ or len(packet.parameters) < 1:
-                raise BadAnswer(f"servo {packet.id} answers in place of {id_}")
-            self._check(id_, packet.parameters[0])
-            if len(packet.parameters) != 1 + length:
-                raise BadAnswer(f"servo {id_} answers {len(packet.parameters) - 1} bytes instead of {length}")
-        return {packet.id: packet.parameters[1:] for packet in packets}
-
-    def _exchange(self, request: bytes, count: int, until_s: float) -> list[dxl2.Packet]:
-        """Ask again after a lost answer while there is time."""
-        while True:
-            try:
-                return self._attempt(request, count, until_s)
-            except NoAnswer:
-                if until_s - now_s() < 0.5 * self._timeout_s:
-                    raise
-
-    def _attempt(self, request: bytes, count: int, until_s: float) -> list[dxl2.Packet]:
-        if self._is_late:
-            quarantine_s = min(now_s() + self._timeout_s, until_s)
-            while now_s() < quarantine_s:
-                self._link.read(quarantine_s)
-            self._is_late = False
-        drain(self._link)
-        self._link.write(request, until_s)
-        framer = dxl2.framer()
-        found: list[dxl2.Packet] = []
-        end_s = min(until_s, now_s() + self._timeout_s)
-        while len(found) < count:
-            chunk = self._link.read(end_s)
-            if not chunk:
-                self._is_late = True
-                raise NoAnswer(f"{count - len(found)} of {count} servos do not answer")
-            packets = [_unpacked(frame) for frame in framer.feed(chunk)]
-            found += [packet for packet in packets if packet.instruction == dxl2.STATUS]  # others are our own echo
-        return found[:count]
-
-    @staticmethod
-    def _check(id_: int, error: int) -> None:
-        if error & ~dxl2.ALERT:
-            text = dxl2.ERRORS.get(error & ~dxl2.ALERT, "not in the manual")
-            raise Refused(f"servo {id_}: error {error & ~dxl2.ALERT} ({text})", code=error)
-        if error & dxl2.ALERT:
-            raise Refused(f"servo {id_}: hardware alert; only a reboot helps", code=error)
-
-
-def _unpacked(frame: bytes) -> dxl2.Packet:
-    """Fast sync answers are not stuffed, so taking stuffing off could damage them."""
-    if frame[4] == dxl2.BROADCAST and frame[7] == dxl2.STATUS:
-        return dxl2.Packet(frame[4], frame[7], frame[8:])  # with the last CRC, so that all blocks have one size
-    return dxl2.decode(frame)
 
 
 class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
@@ -158,12 +58,7 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
     kind = DeviceKind.ARM
 
     def __init__(self, context: Context, options: DynamixelOptions) -> None:
-        opener, name = serial_opener(options, context.name)
-
-        def make() -> Bus[DynamixelClient]:
-            return Bus(name, open_link=opener, client=lambda link: DynamixelClient(link, timeout_s=options.timeout_s))
-
-        bus: Bus[DynamixelClient] = context.shared.get(f"dynamixel {name}", make)
+        bus = dynamixel_bus(context, options)
         super().__init__(context, bus, rate_hz=options.rate_hz, max_age_s=max(4.0 / options.rate_hz, 0.04))
         self._options = options
         n = len(options.ids)
@@ -171,6 +66,7 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
         self._zero = np.array(options.zero_counts or (CENTRE,) * n, dtype=float)
         self._filter = SetPointFilter(context.name, options.kinematics, command_rate_hz=options.rate_hz)
         self._polls = 0
+        self._modes: tuple[DynamixelClient | None, dict[int, int]] = (None, {})  # what a broken set-up has learned
         self._pending: deque[dict[int, bytes]] = deque(maxlen=1)  # the newest goals, not yet sent
 
     def capabilities(self) -> ArmCapabilities:
@@ -221,21 +117,35 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
     def set_up(self, client: DynamixelClient) -> None:
         """Each servo must answer; motion stays off until `enable`."""
         self._filter.begin(None)
-        for id_ in self._options.ids:
-            until_s = now_s() + 4 * self._options.timeout_s
-            client.read(id_, MODEL, 2, until_s)
-            mode = client.read(id_, MODE, 1, until_s)[0]
+        for id_, mode in self._read_modes(client).items():
             if mode != POSITION_MODE:
                 raise Refused(f"servo {id_} is in mode {mode}, not {POSITION_MODE} (position)", code=mode)
+
+    def _read_modes(self, client: DynamixelClient) -> dict[int, int]:
+        """Of all servos at once or, on a bad wire, one by one, going on where the attempt before ended."""
+        o = self._options
+        modes = self._modes[1] if self._modes[0] is client else {}
+        if not modes:
+            with suppress(NoAnswer):
+                blocks = self._read_all(client, MODE, 1, now_s() + 2 * o.timeout_s)
+                return {id_: block[0] for id_, block in blocks.items()}
+        self._modes = (client, modes)
+        for id_ in set(o.ids) - set(modes):
+            modes[id_] = client.read(id_, MODE, 1, now_s() + 4 * o.timeout_s)[0]
+        self._modes = (None, {})
+        return modes
+
+    def _read_all(self, client: DynamixelClient, address: int, length: int, until_s: float) -> dict[int, bytes]:
+        ask = client.fast_sync_read if self._options.is_fast else client.sync_read
+        return ask(self._options.ids, address, length, until_s)
 
     def poll(self, client: DynamixelClient) -> None:
         """Current, velocity and position of all servos, stamped in the middle of the exchange."""
         o = self._options
         self._send_pending(client, now_s() + o.timeout_s)
-        asked_s = now_s()
-        until_s = asked_s + 2 * o.timeout_s
-        ask = client.fast_sync_read if o.is_fast else client.sync_read
-        blocks = ask(o.ids, STATE, STATE_BYTES, until_s)
+        until_s = now_s() + 2 * o.timeout_s
+        blocks = self._read_all(client, STATE, STATE_BYTES, until_s)
+        asked_s, answered_s = client.asked_s, now_s()
         rows = np.array([struct.unpack("<hii", blocks[id_]) for id_ in o.ids], dtype=float)
         self._polls += 1
         if self._filter.is_open and self._polls % WATCHDOG_EVERY == 0:
@@ -248,7 +158,7 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
                 is_enabled=self._filter.is_open,
                 is_moving=bool(np.any(np.abs(velocity) > MOVING_RAD_PER_S)),
             ),
-            valid_s=0.5 * (asked_s + now_s()),
+            valid_s=0.5 * (asked_s + answered_s),
         )
 
     def _watch(self, client: DynamixelClient, until_s: float) -> None:

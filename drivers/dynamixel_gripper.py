@@ -12,10 +12,10 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from drivers.dynamixel import DynamixelClient
-from drivers.transport.bus import Bus, PolledDevice
+from drivers.dxl2_client import BusOptions, DynamixelClient, dynamixel_bus
+from drivers.transport.bus import PolledDevice
 from drivers.transport.link import Refused, now_s
-from drivers.transport.options import SerialOptions, read_options, serial_opener
+from drivers.transport.options import read_options
 from drivers.transport.timebase import HostTime, Unwrapper
 from hal.clock import Deadline
 from hal.devices import DeviceKind, GripperCapabilities, GripperState
@@ -23,7 +23,7 @@ from hal.errors import DeviceFault, DeviceTimeout, DeviceUnavailable, InvalidReq
 from hal.readings import Stamped
 from hal.registry import Context
 
-MODEL, MODE, TORQUE, WATCHDOG, GOAL_CURRENT, PROFILE_VELOCITY, GOAL, STATE = 0, 11, 64, 98, 102, 112, 116, 120
+MODE, TORQUE, WATCHDOG, GOAL_CURRENT, PROFILE_VELOCITY, GOAL, STATE = 11, 64, 98, 102, 112, 116, 120
 BLOCK = struct.Struct("<H4xhii")  # tick, moving, PWM, current, velocity, position
 TICK_BITS, TICK_S = 15, 0.001
 GRIP_MODE = 5
@@ -38,14 +38,12 @@ LIMIT_CURRENT = 1193
 CONNECT_S = 4.0
 
 
-class GripperOptions(SerialOptions):
+class GripperOptions(BusOptions):
     """Options of `serial:dynamixel_gripper`; the counts at the ends of the stroke and the force of an ampere are
     those of the built gripper: measure them."""
 
-    baud: Annotated[int, Field(ge=9600, le=4_500_000)] = 1_000_000
     id: Annotated[int, Field(ge=0, le=252)] = 7
     rate_hz: Annotated[float, Field(gt=0, le=200)] = 50.0
-    timeout_s: Annotated[float, Field(gt=0, le=1)] = 0.03
     watchdog_s: Annotated[float, Field(ge=0.02, le=2.5)] = 0.5
     stroke_m: Annotated[float, Field(gt=0, le=0.3)] = 0.08
     closed_count: Annotated[int, Field(ge=-(2**20), le=2**20)] = 2048
@@ -61,12 +59,7 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
     kind = DeviceKind.GRIPPER
 
     def __init__(self, context: Context, options: GripperOptions) -> None:
-        opener, name = serial_opener(options, context.name)
-
-        def make() -> Bus[DynamixelClient]:
-            return Bus(name, open_link=opener, client=lambda link: DynamixelClient(link, timeout_s=options.timeout_s))
-
-        bus: Bus[DynamixelClient] = context.shared.get(f"dynamixel {name}", make)
+        bus = dynamixel_bus(context, options)
         super().__init__(context, bus, rate_hz=options.rate_hz, max_age_s=max(4.0 / options.rate_hz, 0.04))
         self._options = options
         self._goal: int | None = None
@@ -137,7 +130,6 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
         """The servo must answer, and be in the mode that limits its current; torque stays as it is."""
         self._clock, o = (Unwrapper(bits=TICK_BITS, tick_s=TICK_S), HostTime()), self._options
         until_s = now_s() + 6 * o.timeout_s
-        client.read(o.id, MODEL, 2, until_s)
         mode = client.read(o.id, MODE, 1, until_s)[0]
         if mode == GRIP_MODE:
             return
@@ -147,12 +139,12 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
 
     def poll(self, client: DynamixelClient) -> None:
         """Clock, current, velocity and position in one block; the clock tells a late answer from a young one."""
-        asked_s, o = now_s(), self._options
-        block = client.read(o.id, STATE, BLOCK.size, asked_s + 2 * o.timeout_s)
+        o = self._options
+        block = client.read(o.id, STATE, BLOCK.size, now_s() + 2 * o.timeout_s)
         tick, current, velocity, position = BLOCK.unpack(block)
         ticks, host = self._clock
         device_s = ticks.seconds(tick)
-        valid_s = host.host_s(device_s=device_s, arrived_s=0.5 * (asked_s + now_s()))
+        valid_s = host.host_s(device_s=device_s, arrived_s=0.5 * (client.asked_s + now_s()))
         is_moving = abs(velocity) >= MOVING_COUNTS
         is_short = self._goal is not None and abs(position - self._goal) > AT_GOAL_COUNTS
         is_holding = is_short and not is_moving and abs(current) >= HOLDING_PART * self._goal_current

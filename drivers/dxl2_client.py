@@ -1,0 +1,235 @@
+"""The host's side of a Dynamixel 2.0 bus: requests, status packets, and none taken for the answer to another request."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
+
+from drivers import dxl2
+from drivers.transport.bus import Bus
+from drivers.transport.link import Link, NoAnswer, Refused, drain, drain_until_quiet, now_s
+from drivers.transport.options import SerialOptions, serial_opener
+from hal.registry import Context
+
+QUARANTINE_S, LONGEST_QUARANTINE_S = 0.1, 0.8  # how long late answers are waited for; it doubles with each more lost
+DOUBT_S = 1.0  # an answer that is overtaken by others may come so late
+PROBES = range(1, 13)  # lengths of a read from address 0, where no servo has gaps
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What tells a status packet from others: id, bytes, and for a packet of several servos their order."""
+
+    id: int
+    size: int
+    order: tuple[int, ...] = ()
+
+    def fits(self, packet: dxl2.Packet) -> bool:
+        """Can this be the packet?"""
+        if (packet.id, len(packet.parameters)) != (self.id, self.size):
+            return False
+        return not self.order or tuple(packet.parameters[1 :: self.size // len(self.order)]) == self.order
+
+
+Shape = tuple[Part, ...]
+"""All packets of an answer."""
+
+
+class BusOptions(SerialOptions):
+    """Keys of every device on a Dynamixel bus."""
+
+    baud: Annotated[int, Field(ge=9600, le=4_500_000)] = 1_000_000
+    timeout_s: Annotated[float, Field(gt=0, le=1)] = 0.03
+
+
+class DynamixelClient:
+    """Requests and status packets; what comes back must be from who was asked, in size and order.
+
+    A status packet does not tell what it answers, so no request is sent whose answer could be mistaken for a lost one's.
+    A block of all servos is asked for with its ids in another order each time. Other requests wait for the late answer, and if
+    it does not come, a block of a length that nobody waits for is read first: a bus answers in order, so what comes
+    after that answer is young. After two lost answers there is a pause, or a slow bus would never catch up.
+    """
+
+    def __init__(self, link: Link, *, timeout_s: float) -> None:
+        self._link = link
+        self._timeout_s = timeout_s
+        self._framer = dxl2.framer()
+        self._unanswered: list[Shape] = []  # oldest first
+        self._overtaken: deque[tuple[float, Shape]] = deque(maxlen=64)  # lost, and later ones were answered
+        self._lost_in_a_row = 0
+        self._why = ""
+        self._turn = 0
+        self.asked_s = 0.0  # when the last request left
+
+    def read(self, id_: int, address: int, length: int, until_s: float) -> bytes:
+        """A block of one servo."""
+        return self._ask(dxl2.read(id_, address, length), (id_,), length, until_s)[id_]
+
+    def write(self, id_: int, address: int, data: bytes, until_s: float) -> None:
+        """A block of one servo, acknowledged."""
+        self._ask(dxl2.write(id_, address, data), (id_,), 0, until_s)
+
+    def sync_read(self, ids: tuple[int, ...], address: int, length: int, until_s: float) -> dict[int, bytes]:
+        """The same block of all servos, one packet each."""
+        return self._ask(dxl2.sync_read(address, length, ids), ids, length, until_s)
+
+    def fast_sync_read(self, ids: tuple[int, ...], address: int, length: int, until_s: float) -> dict[int, bytes]:
+        """The same block of all servos in one packet."""
+        step = length + 4  # error, id, data, and a CRC over everything so far
+
+        def request() -> tuple[bytes, Shape]:
+            self._turn += 1
+            turns = [ids[i:] + ids[:i] for i in ((self._turn + k) % len(ids) for k in range(len(ids)))]
+            shapes = [(Part(dxl2.BROADCAST, len(ids) * step, turn),) for turn in turns]
+            shape = min(shapes, key=self._doubted_since_s)
+            return dxl2.sync_read(address, length, shape[0].order, fast=True), shape
+
+        data = self._exchange(request, ids, until_s)[0].parameters
+        blocks = {data[at + 1]: data[at : at + step] for at in range(0, len(data), step)}
+        for id_, block in blocks.items():
+            _check(id_, block[0])
+        return {id_: blocks[id_][2 : 2 + length] for id_ in ids}
+
+    def sync_write(self, address: int, length: int, values: dict[int, bytes], until_s: float) -> None:
+        """A block of each servo; nobody answers."""
+        self._link.write(dxl2.sync_write(address, length, values), until_s)
+
+    def _ask(self, request: bytes, ids: tuple[int, ...], length: int, until_s: float) -> dict[int, bytes]:
+        shape = tuple(Part(id_, 1 + length) for id_ in ids)
+        packets = self._exchange(lambda: (request, shape), ids, until_s)
+        for packet in packets:
+            _check(packet.id, packet.parameters[0])
+        return {packet.id: packet.parameters[1:] for packet in packets}
+
+    def _exchange(
+        self, request: Callable[[], tuple[bytes, Shape]], ids: tuple[int, ...], until_s: float
+    ) -> list[dxl2.Packet]:
+        """Ask again after a lost answer while there is time."""
+        while True:
+            try:
+                self._wait_for_late(until_s)
+                frame, shape = request()
+                if self._is_awaited(shape):
+                    self._probe(ids[0], until_s)
+                return self._attempt(frame, shape, ids, until_s)
+            except NoAnswer:
+                if until_s - now_s() < 0.5 * self._timeout_s:
+                    raise
+
+    def _attempt(self, request: bytes, shape: Shape, ids: tuple[int, ...], until_s: float) -> list[dxl2.Packet]:
+        self._note_late(self._packets(drain(self._link)))
+        self.asked_s = now_s()
+        self._link.write(request, until_s)
+        self._unanswered.append(shape)
+        found: list[dxl2.Packet] = []
+        odd: list[dxl2.Packet] = []
+        end_s = min(until_s, self.asked_s + self._timeout_s)
+        while chunk := self._link.read(end_s):
+            for packet in self._packets(chunk):
+                if shape[len(found)].fits(packet):
+                    found.append(packet)
+                elif packet.id in ids and len(packet.parameters) == 1 and packet.parameters[0]:
+                    self._unanswered.remove(shape)
+                    _check(packet.id, packet.parameters[0])
+                else:
+                    odd.append(packet)
+                if len(found) == len(shape):
+                    self._is_answered(shape)
+                    return found
+        self._lost_in_a_row += 1
+        self._note_late(odd)
+        what = f"{len(shape) - len(found)} of {len(shape)} answers of servos {', '.join(map(str, ids))} do not come"
+        self._why = what + "".join(f"; servo {x.id} sent {len(x.parameters)} bytes" for x in odd[:1])
+        raise NoAnswer(self._why)
+
+    def _is_answered(self, shape: Shape) -> None:
+        """The bus answers in order: whatever was lost before will hardly come."""
+        self._overtaken += [(self.asked_s, lost) for lost in self._unanswered if lost != shape]
+        self._unanswered.clear()
+        self._lost_in_a_row = 0
+
+    def _is_awaited(self, shape: Shape) -> bool:
+        return any(set(shape) & set(lost) for lost in self._unanswered)
+
+    def _doubted_since_s(self, shape: Shape) -> float:
+        """When an answer of this shape was last lost; never and long ago are the same."""
+        if self._is_awaited(shape):
+            return math.inf
+        lost_s = [then_s for then_s, lost in self._overtaken if set(shape) & set(lost)]
+        return max([then_s for then_s in lost_s if now_s() - then_s < DOUBT_S], default=0.0)
+
+    def _wait_for_late(self, until_s: float) -> None:
+        """Listen after a second lost answer, the longer the more were lost.
+
+        Raises:
+            NoAnswer: the pause is longer than the caller can wait.
+        """
+        if self._lost_in_a_row < 2:
+            return
+        pause_s = min(QUARANTINE_S * 2.0 ** (self._lost_in_a_row - 2), LONGEST_QUARANTINE_S)
+        end_s = self.asked_s + self._timeout_s + pause_s
+        while self._unanswered and now_s() < end_s:
+            chunk = self._link.read(min(end_s, until_s))
+            self._note_late(self._packets(chunk))
+            if not chunk and until_s < end_s:
+                raise NoAnswer(self._why)
+
+    def _probe(self, id_: int, until_s: float) -> None:
+        """Ask what no lost answer fits, so that nothing can be mistaken after it.
+
+        Raises:
+            NoAnswer: the line is not known to be clean yet.
+        """
+        shapes = [(Part(id_, 1 + length),) for length in PROBES]
+        free = [shape for shape in shapes if not self._is_awaited(shape)]
+        if not free:  # the servo is off, or so slow that it has to be let finish
+            drain_until_quiet(self._link, quiet_s=self._timeout_s + QUARANTINE_S, until_s=until_s)
+            self._unanswered.clear()
+            return
+        with suppress(Refused):  # an error report is an answer too
+            self._attempt(dxl2.read(id_, 0, free[0][0].size - 1), free[0], (id_,), until_s)
+        self._unanswered.clear()
+
+    def _note_late(self, packets: Iterable[dxl2.Packet]) -> None:
+        """Answers to requests that were given up: neither they nor those before are waited for any longer."""
+        for packet in packets:
+            fits = [i for i, lost in enumerate(self._unanswered) if lost[-1].fits(packet)]
+            if fits:
+                del self._unanswered[: fits[0] + 1]
+
+    def _packets(self, chunk: bytes) -> list[dxl2.Packet]:
+        """Status packets; others are the echo of our own."""
+        packets = [_unpacked(frame) for frame in self._framer.feed(chunk)]
+        return [packet for packet in packets if packet.instruction == dxl2.STATUS]
+
+
+def dynamixel_bus(context: Context, options: BusOptions) -> Bus[DynamixelClient]:
+    """The bus of this port; devices that name the same port get the same one."""
+    opener, name = serial_opener(options, context.name)
+
+    def make() -> Bus[DynamixelClient]:
+        return Bus(name, open_link=opener, client=lambda link: DynamixelClient(link, timeout_s=options.timeout_s))
+
+    return context.shared.get(f"dynamixel {name}", make)
+
+
+def _check(id_: int, error: int) -> None:
+    if error & ~dxl2.ALERT:
+        text = dxl2.ERRORS.get(error & ~dxl2.ALERT, "not in the manual")
+        raise Refused(f"servo {id_}: error {error & ~dxl2.ALERT} ({text})", code=error)
+    if error & dxl2.ALERT:
+        raise Refused(f"servo {id_}: hardware alert; only a reboot helps", code=error)
+
+
+def _unpacked(frame: bytes) -> dxl2.Packet:
+    """Fast sync answers are not stuffed, so taking stuffing off could damage them."""
+    if frame[4] == dxl2.BROADCAST and frame[7] == dxl2.STATUS:
+        return dxl2.Packet(frame[4], frame[7], frame[8:])  # with the last CRC, so that all blocks have one size
+    return dxl2.decode(frame)

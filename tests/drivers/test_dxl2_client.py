@@ -1,0 +1,147 @@
+"""The host's side of a Dynamixel bus: an answer that comes too late is never the answer to another request."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import cast
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers import dxl2
+from drivers.dxl2_client import DynamixelClient
+from drivers.transport.checks import crc_dynamixel
+from drivers.transport.link import Link, NoAnswer, Refused, now_s
+
+IDS = (1, 2, 3, 4, 5, 6)
+Fate = Callable[[int, bytes], list[tuple[int, bytes]]]
+"""What becomes of the answer to request number n: pieces, each after so many further requests."""
+
+
+class Bus:
+    """Servos whose every register holds the number of the request that it is asked with; some answers come late."""
+
+    name, byte_s = "bus", 0.0
+
+    def __init__(self, fate: Fate) -> None:
+        self.asked: list[dxl2.Packet] = []
+        self._fate = fate
+        self._coming: list[tuple[int, bytes]] = []
+        self._framer = dxl2.framer()
+
+    def write(self, data: bytes, until_s: float) -> None:
+        for frame in self._framer.feed(data):
+            self.asked.append(packet := dxl2.decode(frame))
+            number = len(self.asked)
+            self._coming += [(number + later, piece) for later, piece in self._fate(number, answer(packet, number))]
+
+    def read(self, until_s: float) -> bytes:
+        due = [piece for number, piece in self._coming if number <= len(self.asked)]
+        self._coming = [item for item in self._coming if item[0] > len(self.asked)]
+        return b"".join(due)
+
+    def is_present(self) -> bool:
+        return True
+
+    def close(self) -> None: ...
+
+
+def answer(packet: dxl2.Packet, number: int) -> bytes:
+    _, length = struct.unpack_from("<HH", packet.parameters)
+    block = bytes([number]) * length
+    if packet.instruction == dxl2.READ:
+        return dxl2.encode(packet.id, dxl2.STATUS, b"\0" + block)
+    ids = packet.parameters[4:]
+    if packet.instruction == dxl2.SYNC_READ:
+        return b"".join(dxl2.encode(id_, dxl2.STATUS, b"\0" + block) for id_ in ids)
+    frame = dxl2.HEADER + struct.pack("<BHB", dxl2.BROADCAST, 1 + len(ids) * (4 + length), dxl2.STATUS)
+    for id_ in ids:
+        frame += bytes([0, id_]) + block
+        frame += struct.pack("<H", crc_dynamixel(frame))
+    return frame
+
+
+def client_of(fate: Fate) -> tuple[Bus, DynamixelClient]:
+    bus = Bus(fate)
+    return bus, DynamixelClient(cast(Link, bus), timeout_s=0.002)
+
+
+def soon() -> float:
+    return now_s() + 0.05
+
+
+@given(st.lists(st.sampled_from([0, 0, 1, 2, None]), min_size=8, max_size=40))
+def test_no_answer_is_older_than_its_question(late: list[int | None]) -> None:
+    """Each answer late by some requests or lost, in order or not."""
+
+    def fate(number: int, whole: bytes) -> list[tuple[int, bytes]]:
+        later = late[number % len(late)]
+        return [] if later is None else [(later, whole)]
+
+    bus, client = client_of(fate)
+    for _ in range(12):
+        try:
+            blocks = client.fast_sync_read(IDS, 126, 10, now_s() + 0.004)
+        except NoAnswer:
+            continue
+        assert {block[0] for block in blocks.values()} == {len(bus.asked)}
+        assert list(blocks) == list(IDS)
+
+
+@given(st.lists(st.sampled_from([0, 0, 0, 1, 2, None]), min_size=8, max_size=40))
+def test_no_late_answer_of_one_servo_is_taken_on_a_bus_that_keeps_order(late: list[int | None]) -> None:
+    due = 0
+
+    def fate(number: int, whole: bytes) -> list[tuple[int, bytes]]:
+        nonlocal due
+        later = late[number % len(late)]
+        if later is None:
+            return []
+        due = max(due, number + later)  # never before an earlier one
+        return [(due - number, whole)]
+
+    bus, client = client_of(fate)
+    for _ in range(12):
+        try:
+            block = client.read(2, 120, 16, now_s() + 0.004)
+        except NoAnswer:
+            continue
+        assert block[0] == len(bus.asked)
+
+
+def test_an_answer_given_twice_counts_once() -> None:
+    bus, client = client_of(lambda _, whole: [(0, whole), (1, whole)])
+    for _ in range(5):
+        assert client.fast_sync_read(IDS, 126, 10, soon())[1][0] == len(bus.asked)
+
+
+def test_halves_that_come_apart_are_one_answer_however_late_the_second_is() -> None:
+    bus, client = client_of(lambda n, whole: [(0, whole[:9]), (n == 1, whole[9:])])
+    assert client.read(1, 11, 1, soon()) == b"\x03"  # one lost, one probe, one good
+    assert [x.parameters for x in bus.asked] == [b"\x0b\0\x01\0", b"\0\0\x02\0", b"\x0b\0\x01\0"]
+
+
+def test_packets_that_fit_nothing_are_told() -> None:
+    other = dxl2.encode(9, dxl2.STATUS, b"\0\x01\x02")
+    _, client = client_of(lambda _n, _whole: [(0, other)])
+    with pytest.raises(NoAnswer, match=r"1 of 1 answers of servos 1 do not come; servo 9 sent 3 bytes"):
+        client.read(1, 132, 4, now_s() + 0.0005)
+
+
+def test_an_error_report_in_place_of_an_answer_is_raised_at_once() -> None:
+    report = dxl2.encode(2, dxl2.STATUS, b"\x02")
+    bus, client = client_of(lambda n, whole: [(0, report if n == 1 else whole)])
+    with pytest.raises(Refused, match=r"servo 2: error 2 \(instruction unknown\)"):
+        client.fast_sync_read(IDS, 126, 10, soon())
+    assert len(client.fast_sync_read(IDS, 126, 10, soon())) == 6
+    assert len(bus.asked) == 2
+
+
+def test_a_bus_that_is_silent_for_long_is_asked_less_and_less() -> None:
+    bus, client = client_of(lambda _n, _whole: [])
+    for _ in range(50):
+        with pytest.raises(NoAnswer):
+            client.fast_sync_read(IDS, 126, 10, now_s() + 0.004)
+    assert len(bus.asked) < 25

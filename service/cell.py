@@ -20,6 +20,7 @@ from hal.clock import Clock, PacedClock, SimClock, WallClock
 from hal.config import Cell, DeviceSection, load_cell
 from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, DeviceUnavailable
+from hal.garbage import set_aside
 from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
 from hal.strict import validate
@@ -242,6 +243,7 @@ def _run(order: CellOrder, lifeline: Lifeline, is_latched: Callable[[], bool], e
     cell = load_cell(Path(order.cell_path), seed=order.seed)
     runtime = CellRuntime.start(cell, is_latched=is_latched, swapped=swapped)
     server = serve(runtime.objects, order.address, bytes.fromhex(order.authkey), clock=runtime.clock)
+    set_aside()
     lifeline.write_line("ready")
     end.wait()
     runtime.close()

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from hal.config import Cell
 from hal.errors import CellError
+from hal.garbage import set_aside
 from service.core import Service
 from service.operations.context import Operation
 from service.stop_host import bound_socket
@@ -152,6 +153,7 @@ class Panelwright:
             state_of_app(app).hub.close()
 
         self._server = HttpServer(app, self._listener, on_exit=on_exit)
+        set_aside()
         if self._error is not None:
             self._server.stop()  # the cell failed before there was a server to end
         if self._wants_warmth:  # beside the cell's start, which waits for another process
@@ -180,6 +182,7 @@ def _warm() -> None:
         warm()
     except Exception:  # the first user gets it with its context
         log.warning("warming up failed", exc_info=True)
+    set_aside()
 
 
 def exit_on_sigterm() -> None:

@@ -1,7 +1,7 @@
 """Far sides in a process of their own, so that their work does not count as the drivers'.
 
 `python -m benchmarks.drivers.far_process NAME..` prints a line of addresses; then each line on its input is an order:
-`inject silent|disconnected|none`, `log NAME` (prints when its frames left), `end`.
+`inject silent|disconnected|none`, `log NAME` (prints when its frames left), `count NAME COUNTER`, `end`.
 """
 
 from __future__ import annotations
@@ -63,6 +63,9 @@ def main() -> None:
         if what == "inject":
             for side in sides.values():
                 side.inject(None if rest == "none" else Fault(rest))
+        elif what == "count":
+            name, _, counter = rest.rpartition(" ")
+            answer = getattr(sides[name], counter)
         elif what == "log":
             answer = [sent_s for sent_s, _ in list(sides[rest].sent)]
         print(json.dumps(answer), flush=True)

@@ -9,7 +9,7 @@ from copy import copy
 from typing import Generic, TypeVar
 
 from drivers.transport.link import now_s
-from hal.errors import CellError
+from hal.errors import CellError, DeviceTimeout
 from hal.readings import Stamped
 
 T = TypeVar("T")
@@ -62,6 +62,8 @@ class Mailbox(Generic[T]):
     def wait(self, *, oldest_host_s: float, until_s: float, errors_since_s: float = -math.inf) -> Stamped[T] | None:
         """The newest sample that was valid at or after `oldest_host_s`; None when none has come at `until_s`.
 
+        A device that has fallen silent may speak before `until_s`: only then its silence is the answer.
+
         Args:
             errors_since_s: on the links' clock; an older error is no answer to a reader who wants a newer sample.
 
@@ -70,18 +72,19 @@ class Mailbox(Generic[T]):
         """
         with self._changed:
             while True:
-                if self._error is not None and self._error_s >= errors_since_s:
-                    raise copy(self._error)  # each reader gets its own, so that tracebacks do not pile up
+                error = self._error if self._error_s >= errors_since_s else None
+                if error is not None and not isinstance(error, DeviceTimeout):
+                    raise copy(error)  # each reader gets its own, so that tracebacks do not pile up
                 newest = self.peek()
                 if newest is not None and newest.host_time_s >= oldest_host_s:
                     return newest
                 left_s = until_s - now_s()
-                if left_s <= 0.0 or not self._changed.wait(left_s):
-                    return self._late(oldest_host_s)
-
-    def _late(self, oldest_host_s: float) -> Stamped[T] | None:
-        newest = self.peek()
-        return newest if newest is not None and newest.host_time_s >= oldest_host_s else None
+                if left_s > 0.0:
+                    self._changed.wait(left_s)
+                    continue
+                if error is not None:
+                    raise copy(error)
+                return None
 
     def since(self, sequence: int) -> tuple[list[Stamped[T]], int]:
         """Samples after `sequence` still in the ring, oldest first, and how many were lost to a slow reader."""

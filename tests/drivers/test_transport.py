@@ -28,7 +28,7 @@ from drivers.transport.modbus import ModbusRtu, ModbusTcp
 from drivers.transport.port import Port
 from drivers.transport.serial_link import open_serial, port_owner
 from drivers.transport.socket_link import open_tcp, open_udp
-from hal.errors import DeviceFault, DeviceUnavailable
+from hal.errors import DeviceFault, DeviceTimeout, DeviceUnavailable
 from hal.readings import Stamped
 from tests.drivers.rigs import until
 
@@ -191,6 +191,19 @@ def test_an_error_reaches_all_readers_until_the_next_sample() -> None:
             box.wait(oldest_host_s=0.0, until_s=later())
     box.publish(Stamped(value=1, host_time_s=1.0, sequence=1))
     assert box.wait(oldest_host_s=0.0, until_s=later()) is not None
+
+
+def test_silence_is_the_answer_only_when_the_readers_time_is_over() -> None:
+    box: Mailbox[int] = Mailbox()
+    box.fail(DeviceTimeout("silent for 0.3 s", hint="check power"))
+    with pytest.raises(DeviceTimeout, match="silent"):
+        box.wait(oldest_host_s=0.0, until_s=now_s())
+    got: list[Stamped[int] | None] = []
+    reader = threading.Thread(target=lambda: got.append(box.wait(oldest_host_s=0.0, until_s=later(5.0))))
+    reader.start()
+    box.publish(Stamped(value=3, host_time_s=1.0, sequence=1))
+    reader.join(5.0)
+    assert got[0] is not None and got[0].value == 3
 
 
 def test_a_waiting_reader_wakes_with_the_sample() -> None:

@@ -1,0 +1,41 @@
+"""Full collections skip what was set aside, and still find later cycles."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+
+import pytest
+
+from hal.garbage import set_aside
+
+
+class Link:
+    """Two of these make a cycle."""
+
+    other: Link | None = None
+
+
+@pytest.fixture(autouse=True)
+def thawed() -> object:
+    """Leave the collector of the test process as it was."""
+    yield
+    gc.unfreeze()
+
+
+def test_a_full_collection_does_not_walk_what_was_set_aside() -> None:
+    kept = [Link() for _ in range(1000)]
+    assert len(gc.get_objects()) > len(kept)
+    set_aside()
+    assert gc.get_freeze_count() > len(kept)
+    assert len(gc.get_objects()) < len(kept)
+
+
+def test_cycles_made_afterwards_are_still_collected() -> None:
+    set_aside()
+    a, b = Link(), Link()
+    a.other, b.other = b, a
+    gone = weakref.ref(a)
+    del a, b
+    gc.collect()
+    assert gone() is None

@@ -14,78 +14,26 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from perception.range.rays import MISS_SIGMAS, SCRATCH, normal_equations, residuals
 from perception.range.surfaces import (
     CONE,
     CYLINDER,
     FREEDOM,
-    GRAZING_COSINE,
     PLANE,
     QUADRIC,
     SIZE,
     SPHERE,
-    depth_and_jacobian,
     frame_of,
     stepped,
     tangent_frame,
 )
 
 TRIM_SIGMAS = 3.0
-MISS_SIGMAS = 6.0  # a ray that misses the surface costs as much as a residual of this size
-CAUCHY_WIDTH = 2.0
 ROUGH_SAMPLES = 36
 ROUGH_LIMIT = 5.0
 LARGEST_RADIUS_M = 10.0
 QUADRIC_PER_SAMPLE = 1.15  # a simple surface under white noise costs about 0.95 a sample, and its price
 STEP_GOAL = 1e-3  # of a standard deviation of each parameter: a step that small changes nothing that matters
-
-
-@njit(cache=True)
-def residuals(kind, th, x, y, z, sigma, perspective, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (N,) with residuals in sigmas, lessened at grazing rays; NaN where the ray misses."""
-    J = np.empty(9)
-    frame = np.zeros(6)
-    frame_of(kind, th, frame)
-    for i in range(x.shape[0]):
-        zm, cosine = depth_and_jacobian(kind, th, frame, x[i], y[i], perspective, J)
-        out[i] = (z[i] - zm) / sigma[i] * min(1.0, cosine / GRAZING_COSINE)
-
-
-@njit(cache=True)
-def _normal_equations(kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g):  # type: ignore[no-untyped-def]
-    """Gauss-Newton matrix, gradient, cost and number of used samples; Cauchy of `scale`, or a trim when scale is 0."""
-    p = FREEDOM[kind]
-    J = np.empty(9)
-    H[:] = 0.0
-    g[:] = 0.0
-    cost, used = 0.0, 0
-    c2 = scale * scale * CAUCHY_WIDTH * CAUCHY_WIDTH
-    for i in range(x.shape[0]):
-        zm, cosine = depth_and_jacobian(kind, th, frame, x[i], y[i], perspective, J)
-        grazing = min(1.0, cosine / GRAZING_COSINE)
-        missed = not np.isfinite(zm)
-        w = grazing / sigma[i]
-        e = MISS_SIGMAS if missed else (z[i] - zm) * w
-        if scale > 0.0:
-            ratio = e * e / c2
-            cost += c2 * np.log1p(ratio)
-            weight = 1.0 / (1.0 + ratio)
-        else:
-            cost += min(e * e, trim * trim)
-            weight = 1.0 if abs(e) <= trim else 0.0
-        if missed or weight == 0.0:
-            continue
-        used += 1
-        wj = weight * w
-        for a in range(p):
-            ja = wj * J[a]
-            g[a] += ja * e
-            jaw = ja * w
-            for b in range(a + 1):
-                H[a, b] += jaw * J[b]
-    for a in range(p):
-        for b in range(a):
-            H[b, a] = H[a, b]
-    return cost, used
 
 
 @njit(cache=True)
@@ -104,8 +52,9 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed):  #
     frame, new_frame = np.zeros(6), np.zeros(6)
     H, g = np.zeros((9, 9)), np.zeros(9)
     H2, g2 = np.zeros((9, 9)), np.zeros(9)
+    work = np.empty(SCRATCH)
     frame_of(kind, th, frame)
-    cost, used = _normal_equations(kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g)
+    cost, used = normal_equations(kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g, work)
     damping = 1e-4
     for _ in range(steps):
         A = np.empty((p, p))
@@ -125,7 +74,9 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed):  #
             small = max(small, abs(step[a]) * np.sqrt(H[a, a]))
         trial = stepped(kind, th, frame, step)
         frame_of(kind, trial, new_frame)
-        new_cost, new_used = _normal_equations(kind, trial, new_frame, x, y, z, sigma, perspective, scale, trim, H2, g2)
+        new_cost, new_used = normal_equations(
+            kind, trial, new_frame, x, y, z, sigma, perspective, scale, trim, H2, g2, work
+        )
         if new_cost <= cost and new_used >= p:
             th, cost, used = trial, new_cost, new_used
             frame[:] = new_frame
@@ -444,13 +395,11 @@ def is_ellipsoid(th):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def trimmed_cost(kind, th, x, y, z, sigma, perspective, limit, stride):  # type: ignore[no-untyped-def]
     """Sum of squared residuals, each at most limit^2, over every `stride`-th sample."""
-    frame, J = np.zeros(6), np.empty(9)
-    frame_of(kind, th, frame)
+    e = np.empty(x.shape[0])
+    residuals(kind, th, x, y, z, sigma, perspective, e)
     cost = 0.0
     for i in range(0, x.shape[0], stride):
-        zm, cosine = depth_and_jacobian(kind, th, frame, x[i], y[i], perspective, J)
-        e = (z[i] - zm) / sigma[i] * min(1.0, cosine / GRAZING_COSINE)
-        cost += min(e * e, limit * limit) if np.isfinite(e) else limit * limit
+        cost += min(e[i] * e[i], limit * limit) if np.isfinite(e[i]) else limit * limit
     return cost
 
 

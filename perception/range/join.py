@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from perception.range import fit
+from perception.range import fit, rays
 from perception.range.finish import FREE, Samples, thinned
 from perception.range.surfaces import PLANE, depth_on, depths_on
 
@@ -67,7 +67,7 @@ def _is_scrap(
         return False
     s = thinned(samples[small], PAIR_SAMPLES)
     e = np.empty(s.x.size)
-    fit.residuals(kinds[big], parameters[big], s.x, s.y, s.z, s.sigma, perspective, e)
+    rays.residuals(kinds[big], parameters[big], s.x, s.y, s.z, s.sigma, perspective, e)
     # Rays just outside the outline miss; those that hit decide, when they are the larger part.
     hit = np.isfinite(e)
     return bool(hit.mean() > 0.5 and np.mean(np.abs(e[hit]) < SCRAP_SIGMAS) > JOINED_SHARE)
@@ -86,7 +86,7 @@ def _joint_fit(
     joint, _, _, _, _ = fit.fit_robust(kind, th, both.x, both.y, both.z, both.sigma, perspective, FREE, 3)
     for s in (a, b):
         e = np.empty(s.x.size)
-        fit.residuals(kind, joint, s.x, s.y, s.z, s.sigma, perspective, e)
+        rays.residuals(kind, joint, s.x, s.y, s.z, s.sigma, perspective, e)
         good = np.abs(e) < fit.TRIM_SIGMAS
         if good.mean() < JOINED_SHARE or float(np.mean(e[good] ** 2)) > JOINED_MEAN_SQUARE:
             return None

@@ -1,0 +1,125 @@
+"""The loops over many rays agree with the plain functions of `surfaces`, ray by ray, and their sums with numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from perception.range import rays
+from perception.range.surfaces import (
+    CONE,
+    CYLINDER,
+    FREEDOM,
+    GRAZING_COSINE,
+    PLANE,
+    QUADRIC,
+    SIZE,
+    SPHERE,
+    depth_and_jacobian,
+    frame_of,
+)
+
+CENTRE = np.array([0.01, 0.02, 0.6])
+KINDS = [PLANE, SPHERE, CYLINDER, CONE, QUADRIC]
+GRAZING_RAD = 1e-3  # closer to the outline a root of a difference of rounding errors decides
+
+
+def random_surface(kind: int, rng: np.random.Generator) -> np.ndarray:
+    """Parameters of a surface half a metre away that most rays of `random_rays` meet."""
+    th = np.zeros(SIZE)
+    direction = rng.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    side = rng.choice([-1.0, 1.0])
+    if kind == PLANE:
+        normal = np.array([*rng.uniform(-0.5, 0.5, 2), -1.0])
+        th[:3] = normal / np.linalg.norm(normal)
+        th[3] = th[:3] @ CENTRE
+    elif kind == SPHERE:
+        th[:5] = [*CENTRE, 0.1, side]
+    elif kind == CYLINDER:
+        th[:8] = [*CENTRE, *direction, 0.1, side]
+    elif kind == CONE:
+        th[:8] = [*CENTRE, *direction, 0.4, side]
+    else:
+        th[:4] = [*CENTRE, 0.1]
+        th[4:7], th[7:13], th[13] = [1.0, 0.8, 1.2], 0.1 * rng.normal(size=6), -1.0
+    return th
+
+
+def random_rays(perspective: bool, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    reach = 0.25 if perspective else 0.15
+    return tuple(rng.uniform(-reach, reach, (2, count)))
+
+
+def plain_rows(kind, th, x, y, perspective):
+    """Depth, cosine (N,) and derivatives (N, p), one ray at a time by the reference."""
+    frame = np.zeros(6)
+    frame_of(kind, th, frame)
+    z, cosine, J = np.empty(x.size), np.empty(x.size), np.zeros((x.size, 9))
+    for i in range(x.size):
+        z[i], cosine[i] = depth_and_jacobian(kind, th, frame, x[i], y[i], perspective, J[i])
+    return z, cosine, J[:, : FREEDOM[kind]], frame
+
+
+@pytest.mark.parametrize("perspective", [True, False], ids=["pinhole", "orthographic"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_ray_is_as_the_plain_function_has_it(kind, perspective):
+    rng = np.random.default_rng(kind)
+    for _ in range(20):
+        th = random_surface(kind, rng)
+        x, y = random_rays(perspective, 100, rng)
+        z, cosine, J, frame = plain_rows(kind, th, x, y, perspective)
+        work = np.zeros(rays.SCRATCH)
+        rays.fill_rows(kind, th, frame, x, y, 0, 100, perspective, work)
+        rows = work.reshape(-1, rays.CHUNK)[:, :100]
+        np.testing.assert_array_equal(np.isnan(rows[rays.DEPTH]), np.isnan(z))
+        seen = cosine > GRAZING_RAD
+        np.testing.assert_allclose(rows[rays.DEPTH][seen], z[seen], rtol=1e-9)
+        np.testing.assert_allclose(rows[rays.COSINE][seen], cosine[seen], rtol=1e-6)
+        derivatives = rows[rays.FIRST : rays.FIRST + FREEDOM[kind]].T
+        np.testing.assert_allclose(derivatives[seen], J[seen], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("perspective", [True, False], ids=["pinhole", "orthographic"])
+@pytest.mark.parametrize("scale", [0.0, 1.5])
+@pytest.mark.parametrize("kind", KINDS)
+def test_sums_are_those_of_numpy(kind, scale, perspective):
+    """300 samples are two whole chunks and a part, some gross errors, some rays that miss."""
+    rng = np.random.default_rng(10 + kind)
+    th = random_surface(kind, rng)
+    x, y = random_rays(perspective, 300, rng)
+    truth, cosine, J, frame = plain_rows(kind, th, x, y, perspective)
+    sigma = rng.uniform(0.5e-3, 2e-3, 300)
+    z = np.nan_to_num(truth, nan=0.6) + sigma * rng.normal(size=300)
+    z[::17] += 0.05
+    H, g = np.ones((9, 9)), np.ones(9)
+    cost, used = rays.normal_equations(
+        kind, th, frame, x, y, z, sigma, perspective, scale, 3.0, H, g, np.empty(rays.SCRATCH)
+    )
+
+    hit = np.isfinite(truth)
+    w = np.where(hit, np.minimum(1.0, cosine / GRAZING_COSINE) / sigma, 0.0)
+    e = np.where(hit, (z - np.nan_to_num(truth)) * w, rays.MISS_SIGMAS)
+    if scale:
+        c2 = (scale * rays.CAUCHY_WIDTH) ** 2
+        weight, wanted_cost = hit / (1.0 + e**2 / c2), c2 * np.log1p(e**2 / c2).sum()
+    else:
+        weight = hit & (np.abs(e) <= 3.0)
+        wanted_cost = np.minimum(e**2, 9.0).sum()
+    Jw = np.where(hit[:, None], J, 0.0) * w[:, None]
+    p = FREEDOM[kind]
+    wanted = (Jw * weight[:, None]).T @ Jw
+    assert cost == pytest.approx(wanted_cost, rel=1e-9)
+    assert used == np.count_nonzero(weight)
+    np.testing.assert_allclose(H[:p, :p], wanted, rtol=1e-6, atol=1e-9 * np.abs(wanted).max())
+    np.testing.assert_allclose(g[:p], (Jw * weight[:, None]).T @ e, rtol=1e-6, atol=1e-7 * np.abs(Jw).max())
+    assert not H[p:].any() and not g[p:].any()
+
+
+def test_residuals_are_in_sigmas_and_nan_where_a_ray_misses():
+    th = np.zeros(SIZE)
+    th[:5] = [0.0, 0.0, 0.6, 0.1, 1.0]
+    x, y, z = np.array([0.0, 0.0, 0.5]), np.zeros(3), np.array([0.5, 0.502, 0.6])
+    out = np.empty(3)
+    rays.residuals(SPHERE, th, x, y, z, np.full(3, 1e-3), True, out)
+    np.testing.assert_allclose(out, [0.0, 2.0, np.nan], atol=1e-9)

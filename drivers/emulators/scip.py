@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -89,9 +90,9 @@ class ScipEmulator(WireEmulator):
                 self.reply(peer, _message(line, "02" if self._is_lit else "00"))
                 self._is_lit = True
             case "PP":
-                self.reply(peer, _message(line, "00", self._parameters()))
+                self.reply(peer, _listing(line, self._parameters()))
             case "VV":
-                self.reply(peer, _message(line, "00", [b"VEND:panelwright emulator;", b"PROT:SCIP 2.0;"]))
+                self.reply(peer, _listing(line, {"VEND": "panelwright emulator", "PROT": "SCIP 2.0"}))
             case "MD":
                 self._left = int(line[13:15]) or None
                 self._stream, self._is_lit = (peer, line), True
@@ -101,9 +102,9 @@ class ScipEmulator(WireEmulator):
             case _:
                 self.reply(peer, _message(line, "0E"))
 
-    def _parameters(self) -> list[bytes]:
+    def _parameters(self) -> dict[str, str | int]:
         o = self._o
-        values = {
+        return {
             "MODL": "URG-04LX",
             "DMIN": o.min_mm,
             "DMAX": o.max_mm,
@@ -113,7 +114,6 @@ class ScipEmulator(WireEmulator):
             "AFRT": o.front_step,
             "SCAN": o.scans_per_minute,
         }
-        return [f"{key}:{value};".encode() for key, value in values.items()]
 
     def _scan(self, echo: str, status: str) -> bytes:
         first, last, cluster = int(echo[2:6]), int(echo[6:10]), int(echo[10:12])
@@ -138,8 +138,16 @@ def encode_ranges(range_mm: NDArray[np.int64]) -> bytes:
     return (shifted + 0x30).astype(np.uint8).tobytes()
 
 
-def _message(echo: str, status: str, lines: list[bytes] | None = None) -> bytes:
-    summed = [line + bytes([sum_scip(line)]) for line in (status.encode(), *(lines or []))]
+def _message(echo: str, status: str, lines: Iterable[bytes] = ()) -> bytes:
+    return (
+        b"\n".join([echo.encode(), *(line + bytes([sum_scip(line)]) for line in (status.encode(), *lines))]) + b"\n\n"
+    )
+
+
+def _listing(echo: str, values: Mapping[str, str | int]) -> bytes:
+    """`KEY:value;` lines, summed without the `;`: other people's clients insist on it."""
+    lines = [f"{key}:{value}".encode() for key, value in values.items()]
+    summed = [b"00" + bytes([sum_scip(b"00")]), *(line + b";" + bytes([sum_scip(line)]) for line in lines)]
     return b"\n".join([echo.encode(), *summed]) + b"\n\n"
 
 

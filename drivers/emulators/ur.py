@@ -48,17 +48,24 @@ SILENT_CYCLES = re.compile(r"while silent < (\d+):")
 CYCLE_S = 0.002
 
 
+PortNumber = Annotated[int, Field(ge=0, le=65535)]  # 0: a free one; a controller's own are 30004, 30002, 29999
+
+
 class UrEmulatorOptions(FaultOptions):
     """`[emulators.NAME.emulator_options]`"""
 
     rate_hz: Annotated[float, Field(gt=0, le=500)] = 125.0
+    rtde_port: PortNumber = 0
+    script_port: PortNumber = 0
+    dashboard_port: PortNumber = 0
 
 
 class UrPorts:
     """RTDE, script and dashboard ports; a peer is `(role, connection)`."""
 
-    def __init__(self) -> None:
-        self._ports = {"rtde": TcpPort(), "script": TcpPort(), "dashboard": TcpPort()}
+    def __init__(self, options: UrEmulatorOptions) -> None:
+        numbers = {"rtde": options.rtde_port, "script": options.script_port, "dashboard": options.dashboard_port}
+        self._ports = {role: TcpPort(number) for role, number in numbers.items()}
 
     @property
     def address(self) -> dict[str, Any]:
@@ -100,7 +107,7 @@ class UrEmulator(WireEmulator):
     """The controller, running."""
 
     def __init__(self, backing: Arm, options: UrEmulatorOptions) -> None:
-        self.ports = UrPorts()
+        self.ports = UrPorts(options)
         super().__init__(self.ports, options, name="ur")
         self._backing = backing
         self.period_s = 1.0 / options.rate_hz

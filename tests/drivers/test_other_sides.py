@@ -1,7 +1,7 @@
 """Other people's clients against our emulators: no protocol may rest on this project's code alone.
 
-They are not among the requirements: `pip install dynamixel-sdk minimalmodbus libscrc NetFT` to run all of these.
-pymodbus, python-can and canopen, which are, prove the rest in test_modbus_io, test_ft300 and test_cia402.
+All of them come with the `test` extra; pymodbus, python-can and canopen prove the rest in test_modbus_io, test_ft300 and
+test_cia402. For LMS 200 no client installs from a package registry, for Bota and TFmini there is none (libscrc: their sums).
 """
 
 from typing import Any

@@ -1,0 +1,115 @@
+"""Other people's clients of scanners and of the UR controller against our emulators; see `test_other_sides` for the rest."""
+
+import json
+import math
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.emulators import rplidar, scip, ur
+from drivers.emulators.beams import line_m
+from drivers.emulators.scripted import ScriptedArm, ScriptedScanner, scripted_scan
+from hal.devices import RangeImage
+from tests.drivers.rigs import until
+
+UR_CLIENT = """
+import json
+from dashboard_client import DashboardClient
+from rtde_io import RTDEIOInterface
+from rtde_receive import RTDEReceiveInterface
+
+names = ["timestamp", "actual_q", "actual_qd", "target_q", "robot_mode", "safety_mode", "runtime_state", "speed_scaling"]
+receive = RTDEReceiveInterface("127.0.0.1", 125.0, names)
+dashboard = DashboardClient("127.0.0.1")
+dashboard.connect()
+io = RTDEIOInterface("127.0.0.1")
+seen = {
+    "position_rad": list(receive.getActualQ()),
+    "modes": [receive.getRobotMode(), receive.getSafetyMode()],
+    "dashboard": [dashboard.robotmode(), dashboard.safetystatus(), dashboard.polyscopeVersion()],
+    "slider": io.setSpeedSlider(0.5),
+}
+dashboard.stop()
+for client in (io, dashboard, receive):
+    client.disconnect()
+print(json.dumps(seen))
+"""
+
+
+def is_a_scan(range_m: Any, angle_rad: Any, *, step_m: float) -> bool:
+    """Do the ranges show one of the scripted scans, to the wire's own resolution?"""
+    caps = ScriptedScanner().capabilities()
+    true_m = [line_m(RangeImage(depth_m=scripted_scan(k)), caps, np.asarray(angle_rad)) for k in range(100)]
+    return any(np.allclose(range_m, m, atol=step_m) for m in true_m)
+
+
+def test_hokuyolx_reads_parameters_and_scans() -> None:
+    hokuyolx: Any = pytest.importorskip("hokuyolx")
+    far_side = scip.start(ScriptedScanner(), {"transport": "tcp", "scans_per_minute": 6000})
+    where = (far_side.address["host"], far_side.address["port"])
+    laser = hokuyolx.HokuyoLX(addr=where, tsync=False, convert_time=False)
+    try:
+        assert (laser.amin, laser.amax, laser.aforw, laser.ares, laser.dmax) == (44, 725, 384, 1024, 4095)
+        angle_rad = (np.arange(44, 726) - 384) * math.tau / 1024
+        first_ms, scan_mm = laser.get_dist()
+        assert is_a_scan(scan_mm / 1000, angle_rad, step_m=0.00051)
+        stamps_ms = []
+        for scan_mm, stamp_ms, _ in laser.iter_dist(scans=3):
+            assert is_a_scan(scan_mm / 1000, angle_rad, step_m=0.00051)
+            stamps_ms.append(stamp_ms)
+        assert len(stamps_ms) == 3 and first_ms <= stamps_ms[0] <= stamps_ms[1] <= stamps_ms[2]
+        laser.standby()
+    finally:
+        laser.close()
+        far_side.close()
+
+
+@pytest.mark.parametrize("mode", ["normal", "express"])
+def test_rplidar_roboticia_reads_identity_health_and_nodes(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    module: Any = pytest.importorskip("rplidar")
+    far_side = rplidar.start(ScriptedScanner(), {"scan_rate_hz": 20.0})
+    monkeypatch.setattr("serial.Serial.setDTR", lambda *_: None)  # a pty has no such line
+    lidar = module.RPLidar(far_side.address["port"])
+    try:
+        assert lidar.get_health() == ("Good", 0)
+        assert lidar.get_info()["model"] == 24
+        turns: list[list[tuple[float, float]]] = [[]]
+        for is_new, _, angle_deg, distance_mm in lidar.iter_measures(mode, max_buf_meas=False):
+            if is_new:
+                turns.append([])
+            turns[-1].append((angle_deg, distance_mm))
+            if len(turns) == 4:
+                break
+        assert all(is_seen(np.array(turn)) for turn in turns[1:3])
+        lidar.stop()
+    finally:
+        lidar.disconnect()
+        far_side.close()
+
+
+def is_seen(turn: Any) -> bool:
+    """Is a turn (N, 2) of degrees and millimetres one of the scripted scans? Angles come in 1/64 degree or coarser."""
+    away_from_seam = turn[np.abs(turn[:, 0] - 180.0) > 1.0]
+    angle_rad = (np.deg2rad(away_from_seam[:, 0]) + np.pi) % math.tau - np.pi
+    return is_a_scan(away_from_seam[:, 1] / 1000, angle_rad, step_m=0.0021)
+
+
+def test_ur_rtde_reads_the_arm_and_asks_the_dashboard() -> None:
+    """Its clients hold the interpreter while they connect, so they run in a process of their own."""
+    pytest.importorskip("rtde_receive")
+    arm = ScriptedArm()
+    far_side = ur.start(arm, {"rtde_port": 30_004, "script_port": 30_002, "dashboard_port": 29_999})
+    try:
+        ran = subprocess.run([sys.executable, "-c", UR_CLIENT], capture_output=True, text=True, timeout=60, check=False)
+        assert ran.returncode == 0, ran.stderr
+        seen = json.loads(ran.stdout.splitlines()[-1])
+        assert seen["position_rad"] == pytest.approx(arm.position_rad)
+        assert seen["modes"] == [7, 1]
+        assert seen["dashboard"] == ["Robotmode: RUNNING", "Safetystatus: NORMAL", "5.11.0.0"]
+        assert seen["slider"] is True
+        until(lambda: arm.stops > 0)
+    finally:
+        far_side.close()

@@ -9,19 +9,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hal.errors import InvalidRequest, NotFound
-from perception.range import finish, join
+from perception.range import finish, join, merge
 from perception.range.claim import fill_small_gaps
 from perception.range.compete import Candidates
 from perception.range.features import RangeFeature, features_of
 from perception.range.noise import NoiseModel, estimate_noise, typical_depths_m
 from perception.range.primitives import Plane, Surface, SurfaceType
-from perception.range.segment import Task, reclaimed, segment
+from perception.range.segment import Task, segment, settled
 from perception.range.sensor import RangeSensorModel
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 
 LEAST_VALID_PIXELS = 16
+SETTLING_SWEEPS = 4
 LARGEST_PIXELS = 2**26  # 8192 x 8192; about 0.13 kB of working memory a pixel, measured at 2048 x 2048
 
 
@@ -141,6 +142,9 @@ def _finished(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) 
     depth, sensor = task.depth_m, task.sensor
     count = len(found.kinds)
     samples = finish.samples_by_label(depth, sensor, noise, labels, count)
+    touching = merge.merge_touching(labels, sensor.packed(), found.kinds, found.parameters, samples, noise)
+    labels = np.array([0, *touching], np.int32)[labels]
+    samples = finish.samples_by_label(depth, sensor, noise, labels, count)
     owner = join.join_pieces(depth, sensor.packed(), found.kinds, found.parameters, samples)
     joined = np.array([0, *owner], np.int32)[labels]
     if owner != list(range(1, count + 1)):
@@ -156,7 +160,7 @@ def _finished(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) 
         surfaces.append(surface)
         final.add(found.kinds[k], th)
         renamed[k + 1] = new
-    labels = reclaimed(task, noise, renamed[joined], final, sweeps=1)
+    labels = settled(task, noise, renamed[joined], final, sweeps=SETTLING_SWEEPS)
     fill_small_gaps(labels, depth, 2)
     return labels, tuple(surfaces)
 

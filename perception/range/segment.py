@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from perception.range.components import for_each_tile, label_components
 from perception.range.grid import Grid, block_size, build_grid
 from perception.range.noise import WORST_SHARE, NoiseModel, typical_depths_m
 from perception.range.sensor import RangeSensorModel
+from perception.range.settle import settle
 from perception.range.surfaces import PLANE
 
 Array = NDArray[np.float64]
@@ -142,6 +144,22 @@ def _border_sweep(task: Task, constants: tuple[Array, Array, NDArray[np.int64], 
         pool=task.pool,
     )
     return after
+
+
+def settled(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, sweeps: int) -> Labels:
+    """Labels after `sweeps` in which pixels between two equally good surfaces follow their neighbours."""
+    kinds, table = found.arrays()
+    packed, law = task.sensor.packed(), noise.packed()
+    slow = noise.slow_share(float(typical_depths_m(task.depth_m)[2]))
+    for _ in range(sweeps):
+        before, labels = labels, np.empty_like(labels)
+        for_each_tile(
+            partial(settle, task.depth_m, packed, law, slow, before, kinds, table, labels),
+            before.shape[0],
+            task.tiles,
+            pool=task.pool,
+        )
+    return labels
 
 
 def _recover_planes(task: Task, grid: Grid, blocks: Labels, found: Candidates) -> float:

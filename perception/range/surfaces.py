@@ -161,6 +161,17 @@ def normal_on(kind, th, px, py, pz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def normals_on(kind, th, x, y, z, perspective, out):  # type: ignore[no-untyped-def]
+    """Unit normals towards the sensor at the rays (x, y) and depths z (N,) into `out` (N, 3)."""
+    for i in range(x.shape[0]):
+        px, py = (x[i] * z[i], y[i] * z[i]) if perspective else (x[i], y[i])
+        nx, ny, nz = normal_on(kind, th, px, py, z[i])
+        facing = nx * x[i] + ny * y[i] + nz if perspective else nz
+        side = -1.0 if facing > 0.0 else 1.0
+        out[i, 0], out[i, 1], out[i, 2] = side * nx, side * ny, side * nz
+
+
+@njit(cache=True)
 def depth_and_jacobian(kind, th, frame, x, y, perspective, J):  # type: ignore[no-untyped-def]
     """Depth, cosine of incidence, and J = dz / d(tangent parameters): dz = -(dF/dtheta) / (dF/dz) on F = 0."""
     z = depth_on(kind, th, x, y, perspective)

@@ -1,0 +1,71 @@
+"""Pixels that two surfaces explain about equally go where their neighbours are.
+
+Near a crease, and on the whole ring where a wrong plane cuts a ball, the depth of one pixel cannot tell two surfaces
+apart, least of all under slow noise, which pixels share. So a pixel's residual competes with the labels around it
+(iterated conditional modes; Besag, J. R. Stat. Soc. B 48(3), 1986).
+"""
+
+# ruff: noqa: PLR0912 - compiled loops take plain arrays, and long
+# bodies and plain comparisons are what compiles fast.
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.claim import CLAIM_SIGMAS, misfit
+from perception.range.grid import sigma_at
+
+REACH_PX = 2  # neighbours of 5 x 5
+SHARED_PX = 25.0  # they share one value of the slow noise
+NEIGHBOUR_WEIGHT = 3.0  # in units of half a squared residual, for a pixel whose neighbours all bear the other label
+MOST = 12
+
+
+@njit(cache=True, nogil=True)
+def settle(depth, sen, noise, slow_share, labels, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]
+    """Judge again the rows [top, bottom) of `labels` (H, W) where labels meet; writes `out` (H, W)."""
+    H, W = depth.shape
+    perspective = sen[0] > 0
+    near, votes = np.empty(MOST, np.int32), np.empty(MOST)
+    evidence = 0.5 / (1.0 + slow_share * (SHARED_PX - 1.0))
+    for v in range(top, bottom):
+        y = (v - sen[4]) / sen[2]
+        for u in range(W):
+            own = labels[v, u]
+            out[v, u] = own
+            z = depth[v, u]
+            if not np.isfinite(z):
+                continue
+            n, total = 0, 0.0
+            for i in range(max(0, v - REACH_PX), min(H, v + REACH_PX + 1)):
+                for j in range(max(0, u - REACH_PX), min(W, u + REACH_PX + 1)):
+                    if i == v and j == u:
+                        continue
+                    k = labels[i, j]
+                    if k == 0:
+                        continue
+                    total += 1.0
+                    at = -1
+                    for m in range(n):
+                        if near[m] == k:
+                            at = m
+                            break
+                    if at >= 0:
+                        votes[at] += 1.0
+                    elif n < MOST:
+                        near[n], votes[n] = k, 1.0
+                        n += 1
+            if n == 0 or (n == 1 and near[0] == own):
+                continue
+            x = (u - sen[3]) / sen[1]
+            sigma = sigma_at(noise, z)
+            best, label = np.inf, 0
+            for m in range(n):
+                e = misfit(kinds[near[m]], ths[near[m]], x, y, z, sigma, perspective)
+                if not e < CLAIM_SIGMAS:
+                    continue
+                cost = evidence * e * e + NEIGHBOUR_WEIGHT * (1.0 - votes[m] / total)
+                if cost < best:
+                    best, label = cost, near[m]
+            if label > 0 or own == 0:
+                out[v, u] = label

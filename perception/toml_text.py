@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 
 def toml_value(value: object) -> str:
@@ -21,3 +21,12 @@ def toml_value(value: object) -> str:
 def toml_lines(table: Mapping[str, object]) -> list[str]:
     """`key = value` for every entry."""
     return [f"{key} = {toml_value(value)}" for key, value in table.items()]
+
+
+def toml_document(top: Mapping[str, object], tables: Mapping[str, Sequence[Mapping[str, object]]]) -> str:
+    """A document of scalars and arrays of tables."""
+    lines = toml_lines(top)
+    for name, rows in tables.items():
+        for row in rows:
+            lines += ["", f"[[{name}]]", *toml_lines(row)]
+    return "\n".join(lines) + "\n"

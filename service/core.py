@@ -85,9 +85,10 @@ class Service:
         operation = self.operations.get(verb)
         if operation is None:
             raise InvalidRequest(f"there is no verb {verb!r}", hint=f"verbs: {', '.join(self.operations)}")
-        holder = self.lease.check(lease_token) if operation.moves else None
+        moves = operation.may_move(request)
+        holder = self.lease.check(lease_token) if moves else None
         self._check_cell()
-        if operation.moves and self.supervisor.latch.is_set():
+        if moves and self.supervisor.latch.is_set():
             raise stopped(self.supervisor.latch.state().source)
 
         def work(task: TaskContext) -> Any:
@@ -102,7 +103,7 @@ class Service:
             )
 
         plain = request.model_dump(mode="json")
-        return self.tasks.start(verb, plain, work, moves=operation.moves, holder=holder, key=key)
+        return self.tasks.start(verb, plain, work, moves=moves, holder=holder, key=key)
 
     def swap_device(self, name: str, section: DeviceSection) -> None:
         """Another driver or other options for a device, until the service ends; see `service.seats.Swapper`.

@@ -16,7 +16,7 @@ import numpy as np
 from hal.errors import InvalidRequest
 from hal.panel import OBJECT_KINDS, Panel
 from hal.strict import validate
-from perception.toml_text import toml_lines
+from perception.toml_text import toml_document
 from perception.vision.features import PLATE_PX_PER_M
 from perception.vision.knowledge import NOTHING, Knowledge
 from perception.vision.sub_object import sub_objects
@@ -177,12 +177,9 @@ def panel_text(name: str, overview: Overview, lights: LightsFound, objects: Sequ
     ]
     object_rows = [_object(draft, overview) for draft in objects]
     validate({**top, "lights": light_rows, "objects": object_rows}, Panel, source=f"panel {name!r}")
-    note = [] if lights.are_seen else ["# No border lights were seen: these places are a guess. Measure them."]
-    lines = ["# Taught from one image: places and sizes are as good as its overview.", *toml_lines(top), *note]
-    for table, rows in (("lights", light_rows), ("objects", object_rows)):
-        for row in rows:
-            lines += ["", f"[[{table}]]", *toml_lines(row)]
-    return "\n".join(lines) + "\n"
+    note = [] if lights.are_seen else ["# No border lights were seen: their places are a guess. Measure them.\n"]
+    remark = "# Taught from one image: places and sizes are as good as its overview.\n"
+    return remark + "".join(note) + toml_document(top, {"lights": light_rows, "objects": object_rows})
 
 
 def _object(draft: PanelObjectDraft, overview: Overview) -> dict[str, Any]:

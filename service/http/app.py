@@ -16,7 +16,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from service.core import Service
-from service.http import control, devices, health, knowledge, missions, stream, tasks, verbs
+from service.http import control, devices, health, images, knowledge, missions, stream, tasks, teaching, verbs
 from service.http.guard import Allowed, Guard
 from service.http.health import SAFETY_NOTE, own_version
 from service.http.hub import Hub
@@ -25,6 +25,7 @@ from service.http.models import FaultRequest, LeaseRequest, ResetRequest, SwapRe
 from service.http.problems import Problem, install
 from service.http.readings import ReadingDesk
 from service.http.state import AppState
+from service.lessons import OutlineRequest, TeachRequest
 
 WEB = Path(__file__).parents[1] / "web"
 DESCRIPTION = f"""
@@ -68,6 +69,8 @@ def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
         tasks.router,
         devices.router,
         knowledge.router,
+        images.router,
+        teaching.router,
         control.router,
         missions.router,
         health.router,
@@ -110,7 +113,11 @@ def _document(app: FastAPI, bodies: list[type[BaseModel]]) -> dict[str, Any]:
         LeaseRequest,
         ResetRequest,
         SwapRequest,
+        OutlineRequest,
+        TeachRequest,
         Problem,
+        OutlineRequest,
+        TeachRequest,
     ]
     _, extra = models_json_schema(
         [(model, "validation") for model in models], ref_template="#/components/schemas/{model}"

@@ -10,8 +10,10 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.http.problems import problem_response
+from service.images import MAX_IMAGE_BYTES
 
 MAX_BODY_BYTES = 1_000_000
+LARGE_BODIES = {("POST", "/v1/images"): MAX_IMAGE_BYTES}
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 SECURITY_HEADERS = [
     (b"x-content-type-options", b"nosniff"),
@@ -65,7 +67,7 @@ class Guard:
             self._count(status)
             await problem_response(status, "request-refused", what, hint=hint)(scope, receive, send)
             return
-        await self._app(scope, _limited(receive), self._sender(send))
+        await self._app(scope, _limited(receive, _most_bytes(scope)), self._sender(send))
 
     def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str, str] | None:
         if _hostname(headers.get("host", "")) not in self._allowed.hosts:
@@ -76,8 +78,8 @@ class Guard:
         length = headers.get("content-length", "0")
         if not length.isascii() or not length.isdigit():
             return 400, "Content-Length is not a number", "send a correct request"
-        if int(length[:20]) > MAX_BODY_BYTES:
-            return 413, f"a body may have at most {MAX_BODY_BYTES} bytes", "send less"
+        if int(length[:20]) > _most_bytes(scope):
+            return 413, f"a body may have at most {_most_bytes(scope)} bytes", "send less"
         return None
 
     def _is_own(self, headers: Headers) -> bool:
@@ -98,7 +100,12 @@ class Guard:
         return with_headers
 
 
-def _limited(receive: Receive) -> Receive:
+def _most_bytes(scope: Scope) -> int:
+    """How much a request may bring: an image more than anything else."""
+    return LARGE_BODIES.get((scope.get("method", ""), scope["path"]), MAX_BODY_BYTES)
+
+
+def _limited(receive: Receive, most_bytes: int) -> Receive:
     """Count what really arrives: a chunked body announces no length."""
     total = 0
 
@@ -107,7 +114,7 @@ def _limited(receive: Receive) -> Receive:
         message = await receive()
         if message["type"] == "http.request":
             total += len(message.get("body", b""))
-            if total > MAX_BODY_BYTES:
+            if total > most_bytes:
                 raise BodyTooLarge
         return message
 

@@ -120,7 +120,9 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(BodyTooLarge)
     async def _too_large(_request: Request, _error: BodyTooLarge) -> Response:
-        return problem_response(413, "body-too-large", "the body is too big", hint="send less than 1 MB")
+        return problem_response(
+            413, "body-too-large", "the body is too big", hint="send less than 1 MB, an image less than 32 MB"
+        )
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(_request: Request, error: RequestValidationError) -> Response:

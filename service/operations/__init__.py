@@ -46,6 +46,10 @@ def _judge(context: OperationContext, request: requests.JudgeRequest) -> Any:
     return judge(context.connection, context.runs_dir / request.mission)
 
 
+def _is_stored(request: requests.StoredLook) -> bool:
+    return request.image is not None
+
+
 OPERATIONS: dict[str, Operation] = {
     operation.name: operation
     for operation in (
@@ -62,6 +66,7 @@ OPERATIONS: dict[str, Operation] = {
             run=_in_session("recognise", "run_recognise"),
             summary="Find the panel's objects in the camera's image or surfaces in the range image",
             example={"use": ["vision"], "mode": "taught"},
+            is_still=_is_stored,
         ),
         Operation(
             name="inspect",
@@ -69,6 +74,7 @@ OPERATIONS: dict[str, Operation] = {
             run=_in_session("inspect", "run_inspect"),
             summary="Read instruments, lamps, switches and valves from close up",
             example={"objects": ["pressure", "main_valve"]},
+            is_still=_is_stored,
         ),
         Operation(
             name="fuse",

@@ -65,6 +65,7 @@ class Operation:
         summary: one line for the API document.
         example: a body that works on the shipped cell.
         moves: whether it may move the arm (needs the lease when one is held, and excludes other motion tasks).
+        is_still: tells of requests for which it does not, although it may.
     """
 
     name: str
@@ -73,3 +74,8 @@ class Operation:
     summary: str
     example: dict[str, Any] = field(default_factory=dict)
     moves: bool = True
+    is_still: Callable[[Any], bool] = field(default=lambda _request: False)
+
+    def may_move(self, request: BaseModel) -> bool:
+        """May the arm move for this request?"""
+        return self.moves and not self.is_still(request)

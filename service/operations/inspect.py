@@ -20,6 +20,7 @@ from service.operations.eyes import Look, look, settle
 from service.operations.locate import go_to_overview, locate
 from service.operations.requests import InspectRequest, RecogniseRequest
 from service.operations.session import Session, panel_object_or_all
+from service.operations.stored import read_stored, reading_row_json
 from service.operations.travel import go_to_camera_view
 from service.operations.views import close_up_groups, close_up_poses
 from service.report.plots import png_of
@@ -87,19 +88,7 @@ def reading_row(reading: ObjectReading, when: str) -> Reading:
 
 def reading_json(session: Session, reading: ObjectReading) -> dict[str, Any]:
     """A reading as the API gives it; the place in the base frame when the panel's pose is known."""
-    row: dict[str, Any] = {
-        "name": reading.name,
-        "kind": reading.kind,
-        "present": reading.present,
-        "value": reading.value,
-        "unit": reading.unit,
-        "uncertainty": reading.uncertainty,
-        "state": reading.state,
-        "text": reading.text,
-        "confidence": reading.confidence,
-        "reason": reading.reason,
-        "centre_px": list(reading.centre_px),
-    }
+    row = reading_row_json(reading)
     panel = session.memory.base_from_panel
     if reading.centre_m is not None and panel is not None:
         row["centre_in_panel_m"] = list(reading.centre_m)
@@ -109,6 +98,8 @@ def reading_json(session: Session, reading: ObjectReading) -> dict[str, Any]:
 
 def run_inspect(session: Session, request: InspectRequest) -> dict[str, Any]:
     """The verb `inspect`."""
+    if request.image is not None:
+        return read_stored(session, request)
     names = panel_object_or_all(session.panel, request.objects)
     ensure_located(session.part(0.0, 0.3))
     found = inspect_close(session.part(0.3, 1.0), names) if request.close_up else inspect_here(session, names)

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
-
-import cv2
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from hal.errors import Unsupported
 from perception.range import PinholeSensor, RangeScene, analyse
@@ -16,14 +11,13 @@ from service.operations.inspect import run_recognise_taught
 from service.operations.locate import go_to_overview
 from service.operations.requests import RecogniseRequest
 from service.operations.session import Session
-from service.report.plots import png_of
-
-if TYPE_CHECKING:
-    from perception.vision.blind import Candidate
+from service.operations.stored import blind_answer, blind_in_stored, read_stored
 
 
 def run_recognise(session: Session, request: RecogniseRequest) -> dict[str, Any]:
     """Objects of the panel file or of any panel in the image, and surfaces in the range image, as asked."""
+    if request.image is not None:
+        return blind_in_stored(session, request) if request.mode == "blind" else read_stored(session, request)
     answer: dict[str, Any] = {}
     if "vision" in request.use:
         answer |= run_recognise_taught(session, request) if request.mode == "taught" else _blind(session, request)
@@ -34,31 +28,13 @@ def run_recognise(session: Session, request: RecogniseRequest) -> dict[str, Any]
 
 def _blind(session: Session, request: RecogniseRequest) -> dict[str, Any]:
     """Which kinds of object are where in this image, without a panel file."""
-    from perception.vision.blind import recognise
-    from perception.vision.knowledge import shipped_knowledge
-
     if request.move:
         go_to_overview(session)
         settle(session)
     seen = look(session, request.camera)
-    plate_m = (session.panel.width_m, session.panel.height_m)
-    found = recognise(seen.pixels, shipped_knowledge(), plate_m=plate_m, focal_px=seen.intrinsics.fx_px)
-    picture = png_of(_drawn(seen.pixels, [c for c in found if c.reason is None]))
-    return {
-        "candidates": list(found),
-        "pictures": [session.context.task.artefact("blind.png", picture, "image/png")],
-    }
-
-
-def _drawn(pixels: NDArray[np.uint8], candidates: Sequence[Candidate]) -> NDArray[np.uint8]:
-    """The image with a ring and a name at every candidate, RGB."""
-    picture = cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB) if pixels.ndim == 2 else pixels.copy()
-    for candidate in candidates:
-        u, v = (round(float(x)) for x in candidate.centre_px)
-        cv2.circle(picture, (u, v), 12, (40, 220, 60), 2, cv2.LINE_AA)
-        text = f"{candidate.kind} {candidate.confidence:.2f}"
-        cv2.putText(picture, text, (u + 14, v + 4), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 220, 60), 1, cv2.LINE_AA)
-    return np.asarray(picture, np.uint8)
+    return blind_answer(
+        session, seen.pixels, (session.panel.width_m, session.panel.height_m), focal_px=seen.intrinsics.fx_px
+    )
 
 
 def _surfaces(session: Session, request: RecogniseRequest) -> list[dict[str, Any]]:

@@ -16,6 +16,10 @@ Row3 = tuple[Vector3, Vector3, Vector3]
 Length = Annotated[float, Field(ge=-100.0, le=100.0)]
 Point = tuple[Length, Length, Length]
 ObjectName = Annotated[str, Field(min_length=1, max_length=41)]
+ImageId = Annotated[str, Field(pattern=r"^[0-9a-f]{24}$")]
+Side = Annotated[float, Field(gt=0.0, le=10.0)]
+PlateSize = tuple[Side, Side]
+Distortion = Annotated[float, Field(ge=-100.0, le=100.0)]
 
 
 class PoseBody(Strict):
@@ -41,18 +45,58 @@ class PanelPoseRequest(Strict):
     scan: Annotated[bool, Field(description="also fit the plate's plane to a range image")] = False
 
 
-class RecogniseRequest(Strict):
-    """Find the objects of the panel file in the camera's image, or surfaces in the range image."""
+class LensBody(Strict):
+    """A camera's lens: pinhole and radial-tangential; `distortion` is k1, k2, p1, p2, k3 as OpenCV has them."""
+
+    fx_px: Annotated[float, Field(gt=0.0, le=1e6)]
+    fy_px: Annotated[float, Field(gt=0.0, le=1e6)]
+    cx_px: Annotated[float, Field(ge=-1e5, le=1e5)]
+    cy_px: Annotated[float, Field(ge=-1e5, le=1e5)]
+    distortion: tuple[Distortion, Distortion, Distortion, Distortion, Distortion] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class StoredLook(Strict):
+    """What may be asked of a stored image instead of a live camera; nothing moves then."""
+
+    image: Annotated[ImageId | None, Field(description="id of a stored image (POST /v1/images); else the camera's")] = (
+        None
+    )
+    panel: Annotated[ObjectName | None, Field(description="a taught panel; else the cell's")] = None
+    plate_m: Annotated[PlateSize | None, Field(description="width and height of the plate; else the panel's")] = None
+    camera: Annotated[ObjectName | None, Field(description="whose image, or whose lens took the stored one")] = None
+    lens: Annotated[LensBody | None, Field(description="the lens that took the stored image")] = None
+    camera_from_panel: Annotated[
+        PoseBody | None, Field(description="where the panel was; else its border is looked for")
+    ] = None
+
+    @model_validator(mode="after")
+    def _is_of_one_kind(self) -> StoredLook:
+        if self.image is None and (self.panel or self.plate_m or self.lens or self.camera_from_panel):
+            raise ValueError("panel, plate_m, lens and camera_from_panel go with a stored `image`")
+        if self.lens is not None and self.camera is not None:
+            raise ValueError("give a lens or a camera's name, not both")
+        if self.camera_from_panel is not None and self.lens is None and self.camera is None:
+            raise ValueError("a pose needs the lens: give `lens` or `camera`")
+        return self
+
+
+class RecogniseRequest(StoredLook):
+    """Find the objects of a panel file in an image, of any panel (`blind`), or surfaces in the range image."""
 
     use: Annotated[tuple[Literal["vision", "range"], ...], Field(min_length=1)] = ("vision",)
     mode: Literal["taught", "blind"] = "taught"
-    camera: ObjectName | None = None
     objects: Annotated[tuple[ObjectName, ...], Field(max_length=200)] | None = None
     move: bool = True
 
+    @model_validator(mode="after")
+    def _sees_what_it_uses(self) -> RecogniseRequest:
+        if self.image is not None and "range" in self.use:
+            raise ValueError("a stored image has no range: use vision")
+        return self
 
-class InspectRequest(Strict):
-    """Read instruments, lamps, switches and valves from close up."""
+
+class InspectRequest(StoredLook):
+    """Read instruments, lamps, switches and valves from close up, or in a stored image."""
 
     objects: Annotated[tuple[ObjectName, ...], Field(max_length=200)] | None = None
     close_up: Annotated[bool, Field(description="drive to close-ups; false reads the overview only")] = True

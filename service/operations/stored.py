@@ -1,0 +1,186 @@
+"""Stored images instead of live cameras: the same answers, nothing moves, and nothing is believed of the cell after it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.calibration import CameraIntrinsics
+from hal.errors import InvalidRequest
+from hal.geometry import UncertainPose
+from hal.panel import Panel
+from perception.vision.reading import ObjectReading
+from service.images import ImageStore
+from service.operations.requests import InspectRequest, RecogniseRequest, StoredLook
+from service.operations.session import Session, panel_object_or_all
+from service.report.plots import png_of
+from service.teachings import Teachings
+
+if TYPE_CHECKING:
+    from perception.vision.blind import Candidate
+    from perception.vision.view import View
+
+Pixels = NDArray[np.uint8]
+PICTURE_WIDTH_PX = 1600  # wider pictures are shown smaller: nobody looks at 40 megapixels
+BORDER_SIGMA_PX = 1.0  # of a corner of the plate where two of its sides meet
+
+
+def read_stored(session: Session, request: RecogniseRequest | InspectRequest) -> dict[str, Any]:
+    """A taught panel in a stored image: every object with what it says, and the annotated picture.
+
+    Raises:
+        NoSuchImage, NoSuchKnowledge: unknown image or panel.
+        InvalidRequest, NotObservable, NotFound, Ambiguous: the image cannot be answered for; says why and what helps.
+    """
+    from perception.vision.annotate import draw_annotated
+    from perception.vision.framing import check_upright
+    from perception.vision.image import as_gray
+    from perception.vision.taught import inspect_view
+
+    pixels = _stores(session)[0].pixels(request.image or "")
+    panel = panel_of(session, request.panel)
+    names = panel_object_or_all(panel, request.objects)
+    gray = as_gray(pixels)
+    view = _view(session, request, gray, panel)
+    check_upright(gray, view, panel)
+    readings = inspect_view(pixels, gray, view, panel, names=names)
+    picture = shown(draw_annotated(pixels, readings))
+    return {
+        "panel": panel.name,
+        "objects": [reading_row_json(reading) for reading in readings],
+        "missing": [reading.name for reading in readings if not reading.present],
+        "pictures": [session.context.task.artefact("annotated.png", png_of(picture), "image/png")],
+    }
+
+
+def blind_in_stored(session: Session, request: RecogniseRequest) -> dict[str, Any]:
+    """Which kinds of object are where in a stored image.
+
+    Raises:
+        as `read_stored`.
+    """
+    from perception.vision.framing import one_plate
+    from perception.vision.image import as_gray
+
+    pixels = _stores(session)[0].pixels(request.image or "")
+    plate_m = request.plate_m
+    if plate_m is None:
+        panel = panel_of(session, request.panel)
+        plate_m = (panel.width_m, panel.height_m)
+    gray = as_gray(pixels)
+    lens = _lens(session, request, gray)
+    focal_px = lens.fx_px if lens is not None else None
+    one_plate(gray, plate_m, focal_px=focal_px)
+    return blind_answer(session, pixels, plate_m, focal_px=focal_px)
+
+
+def blind_answer(
+    session: Session, pixels: Pixels, plate_m: tuple[float, float], *, focal_px: float | None
+) -> dict[str, Any]:
+    """All candidates, refused ones with their reasons, and a picture of the others."""
+    from perception.vision.blind import recognise
+
+    found = recognise(pixels, _stores(session)[1].knowledge(), plate_m=plate_m, focal_px=focal_px)
+    picture = png_of(shown(_drawn(pixels, [c for c in found if c.reason is None])))
+    return {
+        "candidates": list(found),
+        "pictures": [session.context.task.artefact("blind.png", picture, "image/png")],
+    }
+
+
+def panel_of(session: Session, name: str | None) -> Panel:
+    """A taught panel by its name; the cell's own for None or its name.
+
+    Raises:
+        NoSuchKnowledge: nobody taught it.
+    """
+    if name is None or name == session.panel.name:
+        return session.panel
+    return _stores(session)[1].panel(name)
+
+
+def reading_row_json(reading: ObjectReading) -> dict[str, Any]:
+    """A reading as the API gives it, without a place in the room."""
+    return {
+        "name": reading.name,
+        "kind": reading.kind,
+        "present": reading.present,
+        "value": reading.value,
+        "unit": reading.unit,
+        "uncertainty": reading.uncertainty,
+        "state": reading.state,
+        "text": reading.text,
+        "confidence": reading.confidence,
+        "reason": reading.reason,
+        "centre_px": list(reading.centre_px),
+    }
+
+
+def shown(picture: Pixels) -> Pixels:
+    """The picture, no wider than people can see."""
+    width = picture.shape[1]
+    if width <= PICTURE_WIDTH_PX:
+        return picture
+    scale = PICTURE_WIDTH_PX / width
+    return np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _stores(session: Session) -> tuple[ImageStore, Teachings]:
+    runs = session.context.runs_dir
+    return ImageStore(runs), Teachings.of_runs(runs)
+
+
+def _view(session: Session, request: StoredLook, gray: Pixels, panel: Panel) -> View:
+    """Where the panel is: as the caller says, or by its border, through the lens if that is known."""
+    from perception.vision.framing import one_plate
+    from perception.vision.quadrangle import estimate
+    from perception.vision.view import CameraView
+
+    lens = _lens(session, request, gray)
+    if lens is not None and request.camera_from_panel is not None:
+        return CameraView(intrinsics=lens, camera_from_panel=request.camera_from_panel.pose())
+    plate_m = request.plate_m or (panel.width_m, panel.height_m)
+    plate = one_plate(gray, plate_m, focal_px=lens.fx_px if lens is not None else None)
+    if lens is None:
+        return plate.view
+    corners_m = np.column_stack([plate.view.corners_m, np.zeros(4)])
+    pose = estimate(corners_m, plate.view.project(corners_m), BORDER_SIGMA_PX**2, lens)
+    return CameraView(
+        intrinsics=lens,
+        camera_from_panel=UncertainPose(parent_from_child=pose.camera_from_object, covariance=pose.covariance),
+    )
+
+
+def _lens(session: Session, request: StoredLook, gray: Pixels) -> CameraIntrinsics | None:
+    """The lens of the request, checked against the image's size."""
+    height, width = gray.shape
+    if request.lens is not None:
+        return CameraIntrinsics(width_px=width, height_px=height, **request.lens.model_dump())
+    if request.camera is None:
+        return None
+    lens = session.lens(request.camera)
+    if (lens.width_px, lens.height_px) != (width, height):
+        raise InvalidRequest(
+            f"the image has {width}x{height} px, camera {request.camera!r} is calibrated for"
+            f" {lens.width_px}x{lens.height_px}",
+            hint="name the camera that took it, give its `lens`, or leave both out",
+        )
+    return lens
+
+
+def _drawn(pixels: Pixels, candidates: Sequence[Candidate]) -> Pixels:
+    """The image with an outline and a name at every candidate, RGB."""
+    picture = cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB) if pixels.ndim == 2 else pixels.copy()
+    thick = max(1, round(picture.shape[1] / 800))
+    for candidate in candidates:
+        box = np.rint(candidate.box_px).astype(np.int32).reshape(-1, 1, 2)
+        cv2.polylines(picture, [box], True, (40, 220, 60), thick, cv2.LINE_AA)
+        u, v = (int(x) for x in box.reshape(-1, 2).min(axis=0))
+        text = f"{candidate.kind} {candidate.confidence:.2f}"
+        at = (max(u, 0), max(v - 4, 10 * thick))
+        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45 * thick, (40, 220, 60), thick, cv2.LINE_AA)
+    return np.asarray(picture, np.uint8)

@@ -1,0 +1,254 @@
+"""Stored images over HTTP: what is uploaded is checked, kept, read blind and taught; bad ones are typed refusals."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import cv2
+import httpx2
+import numpy as np
+import pytest
+from PIL import Image as Pillow
+
+from hal.config import load_cell
+from perception.vision.view import CameraView
+from service.operations import OPERATIONS
+from service.serve import Options, Panelwright
+from tests.perception.vision.bench_panel import TOML, panel, scene
+from tests.service.conftest import WriteCell
+
+PLATE = [0.60, 0.40]
+Shown = tuple[np.ndarray, CameraView]
+
+
+@pytest.fixture(scope="module")
+def house(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Panelwright]:
+    """A cell of fakes before the panel that the images show, with the real verbs."""
+    cell_path = write_module_cell(robot=True)
+    text = TOML.replace('style = "lcd" }', 'style = "lcd", minimum = -99.0 }')
+    (cell_path.parent / "panel.toml").write_text(text)
+    options = Options(port=0, runs_dir=tmp_path_factory.mktemp("runs"), inline=True)
+    panelwright = Panelwright(load_cell(cell_path), options, operations=OPERATIONS)
+    panelwright.start()
+    yield panelwright
+    panelwright.close()
+
+
+@pytest.fixture
+def web(house: Panelwright) -> Iterator[httpx2.Client]:
+    with httpx2.Client(base_url=house.url, timeout=60.0, trust_env=False) as http:
+        yield http
+
+
+@pytest.fixture(scope="module")
+def shown() -> Shown:
+    image, intrinsics, pose = scene(tilt_deg=3.0, distance_m=0.66, pose_error=0.0)
+    return image, CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+
+
+def png(image: np.ndarray) -> bytes:
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def store(web: httpx2.Client, image: np.ndarray) -> str:
+    answer = web.post("/v1/images", content=png(image), headers={"Content-Type": "image/png"})
+    assert answer.status_code == 201, answer.text
+    return str(answer.json()["id"])
+
+
+def corners(view: CameraView, name: str, half_m: float) -> list[list[float]]:
+    x, y = panel().object(name).position_m
+    return view.project([[x - half_m, y + half_m, 0.0], [x + half_m, y - half_m, 0.0]]).tolist()
+
+
+def is_problem(answer: httpx2.Response, status: int, kind: str, words: str) -> None:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    problem = answer.json()
+    assert problem["type"] == f"urn:panelwright:{kind}", problem
+    assert words in problem["detail"], problem
+    assert len(problem["hint"]) > 8
+
+
+def test_an_image_is_kept_listed_fetched_and_deleted(web: httpx2.Client, shown: Shown) -> None:
+    first = store(web, shown[0])
+    assert store(web, shown[0]) == first, "the same image has the same id"
+    listed = {image["id"]: image for image in web.get("/v1/images").json()["images"]}
+    assert (listed[first]["width_px"], listed[first]["height_px"]) == (1280, 960)
+    assert web.get(f"/v1/images/{first}").content == png(shown[0])
+    assert web.delete(f"/v1/images/{first}").status_code == 204
+    is_problem(web.get(f"/v1/images/{first}"), 404, "no-such-image", "no stored image")
+
+
+def _truncated() -> bytes:
+    return png(scene(size=(320, 240))[0])[:-2000]
+
+
+def _deep(channels: int) -> bytes:
+    return cv2.imencode(".png", np.zeros((40, 40, channels), np.uint16))[1].tobytes()
+
+
+def _huge() -> bytes:
+    stream = io.BytesIO()
+    Pillow.new("1", (10_000, 10_000)).save(stream, "PNG")
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (lambda: b"", "not an image"),
+        (lambda: b"<svg/>", "not an image"),
+        (lambda: png(np.zeros((1, 1), np.uint8)), "1x1"),
+        (lambda: _deep(1), "8 bits"),
+        (lambda: _deep(3), "8 bits"),
+        (_huge, "10000x10000"),
+        (_truncated, "damaged"),
+    ],
+)
+def test_what_is_no_usable_image_is_not_kept(web: httpx2.Client, data: Callable[[], bytes], words: str) -> None:
+    before = web.get("/v1/images").json()
+    answer = web.post("/v1/images", content=data(), headers={"Content-Type": "image/png"})
+    is_problem(answer, 422, "invalid-request", words)
+    assert web.get("/v1/images").json() == before
+
+
+def test_an_upload_says_that_it_is_an_image_and_is_bounded(web: httpx2.Client, shown: Shown) -> None:
+    for media in ("text/plain", "multipart/form-data", "application/json"):
+        answer = web.post("/v1/images", content=png(shown[0]), headers={"Content-Type": media})
+        is_problem(answer, 415, "bad-body", "no image's")
+    answer = web.post("/v1/images", content=b" " * 32_000_001, headers={"Content-Type": "image/png"})
+    assert answer.status_code == 413
+
+
+def _ask(web: httpx2.Client, verb: str, body: dict[str, Any]) -> httpx2.Response:
+    return web.post(f"/v1/{verb}?wait_s=30", json=body)
+
+
+def test_a_taught_panel_is_read_with_and_without_a_lens(web: httpx2.Client, shown: Shown) -> None:
+    image, view = shown
+    lens = view.intrinsics
+    optics = {"fx_px": lens.fx_px, "fy_px": lens.fy_px, "cx_px": lens.cx_px, "cy_px": lens.cy_px,
+              "distortion": list(lens.distortion)}  # fmt: skip
+    stored = store(web, image)
+    for more in ({}, {"lens": optics}):
+        for verb, mode in (("inspect", {}), ("recognise", {"mode": "taught"})):
+            task = _ask(web, verb, {"image": stored, **mode, **more})
+            assert task.status_code == 200, task.text
+            result = task.json()["result"]
+            rows = {row["name"]: row for row in result["objects"]}
+            assert rows["pressure"]["value"] == pytest.approx(6.3, abs=0.2)
+            assert rows["flow"]["text"] == "47.3"
+            picture = web.get(result["pictures"][0])
+            assert picture.headers["content-type"] == "image/png"
+            assert np.asarray(Pillow.open(io.BytesIO(picture.content))).shape == (960, 1280, 3)
+
+
+def test_a_stored_image_needs_neither_lease_nor_a_clear_stop_and_teaches_the_cell_nothing(
+    web: httpx2.Client, house: Panelwright, shown: Shown
+) -> None:
+    stored = store(web, shown[0])
+    web.post("/v1/stop")
+    task = _ask(web, "inspect", {"image": stored, "objects": ["pressure"]})
+    assert task.status_code == 200 and task.json()["moves"] is False
+    assert house.service.memory.recall("readings") is None
+    assert web.post("/v1/stop/reset").status_code == 200
+
+
+def test_blind_recognition_draws_what_it_finds(web: httpx2.Client, shown: Shown) -> None:
+    answer = _ask(web, "recognise", {"image": store(web, shown[0]), "mode": "blind", "plate_m": PLATE})
+    assert answer.status_code == 200, answer.text
+    result = answer.json()["result"]
+    assert any(c["kind"] == "rotary" and c["reason"] is None for c in result["candidates"])
+    assert web.get(result["pictures"][0]).content.startswith(b"\x89PNG")
+
+
+def _bare(image: np.ndarray, view: CameraView) -> np.ndarray:
+    """The image with the emergency mushroom painted over with plate."""
+    u, v = np.rint(view.project([panel().object("emergency").point_m])[0]).astype(int)
+    out = image.copy()
+    out[v - 60 : v + 60, u - 60 : u + 60] = np.median(image[v - 70 : v - 60, u - 70 : u + 70])
+    return out
+
+
+@pytest.mark.parametrize("mode", [{"mode": "blind", "plate_m": PLATE}, {"mode": "blind"}])
+@pytest.mark.parametrize(
+    ("change", "kind", "words"),
+    [
+        (np.zeros_like, "not-observable", "black"),
+        (lambda image: np.full_like(image, 255), "not-observable", "saturated"),
+        (lambda image: np.full_like(image, 90), "not-found", "no plate"),
+        (lambda image: np.hstack([image, image]), "ambiguous", "two panels"),
+    ],
+    ids=["black", "saturated", "nothing", "two"],
+)
+def test_blind_recognition_refuses_what_shows_no_panel_or_two(
+    web: httpx2.Client, shown: Shown, mode: dict[str, Any], change: Callable[[np.ndarray], np.ndarray], kind: str,
+    words: str,
+) -> None:  # fmt: skip
+    stored = store(web, np.ascontiguousarray(change(shown[0])))
+    is_problem(_ask(web, "recognise", {"image": stored, **mode}), 409, kind, words)
+
+
+@pytest.mark.parametrize("verb", ["inspect", "recognise"])
+@pytest.mark.parametrize(
+    ("change", "more", "kind", "words"),
+    [
+        (np.zeros_like, {}, "not-observable", "black"),
+        (lambda image: np.full_like(image, 255), {}, "not-observable", "saturated"),
+        (lambda image: np.full_like(image, 90), {}, "not-found", "no plate"),
+        (lambda image: np.hstack([image, image]), {}, "ambiguous", "two panels"),
+        (lambda image: image[::-1, ::-1], {}, "not-found", "upside down"),
+        (lambda image: image, {"panel": "nobody"}, "no-such-knowledge", "no panel"),
+        (lambda image: image, {"camera": "wrist_camera"}, None, ""),
+        (lambda image: image, {"wrong": True}, "not-found", "does not show panel"),
+    ],
+    ids=["black", "saturated", "nothing", "two", "upside down", "unknown panel", "no lens", "wrong calibration"],
+)
+def test_what_an_image_cannot_answer_is_refused_with_a_reason(
+    web: httpx2.Client, shown: Shown, verb: str, change: Callable[[np.ndarray], np.ndarray], more: dict[str, Any],
+    kind: str | None, words: str,
+) -> None:  # fmt: skip
+    image, view = shown
+    if more.get("wrong"):
+        pose = view.camera_from_panel.parent_from_child
+        more = {
+            "lens": {"fx_px": 900.0, "fy_px": 900.0, "cx_px": 500.0, "cy_px": 300.0},
+            "camera_from_panel": {
+                "translation_m": pose.translation.tolist(),
+                "quaternion_xyzw": pose.rotation.as_quat().tolist(),
+                "covariance": (1e-6 * np.eye(6)).tolist(),
+            },
+        }
+    answer = _ask(web, verb, {"image": store(web, np.ascontiguousarray(change(image))), **more})
+    assert 400 <= answer.status_code < 500, answer.text
+    if kind is not None:
+        is_problem(answer, 404 if kind.startswith("no-such") else 409, kind, words)
+
+
+def test_an_object_that_is_not_there_and_one_in_glare_are_said(web: httpx2.Client, shown: Shown) -> None:
+    image, view = shown
+    dazzled = _bare(image, view)
+    u, v = np.rint(view.project([panel().object("pressure").point_m])[0]).astype(int)
+    cv2.circle(dazzled, (int(u), int(v)), 78, 255, -1)
+    rows = {
+        row["name"]: row for row in _ask(web, "inspect", {"image": store(web, dazzled)}).json()["result"]["objects"]
+    }
+    assert not rows["emergency"]["present"] and "bare plate" in rows["emergency"]["reason"]
+    assert rows["pressure"]["value"] is None and rows["pressure"]["reason"]
+
+
+def test_requests_that_make_no_sense_are_refused(web: httpx2.Client, shown: Shown) -> None:
+    stored = store(web, shown[0])
+    for verb, body in (
+        ("recognise", {"plate_m": PLATE}),
+        ("recognise", {"image": stored, "use": ["range"]}),
+        ("recognise", {"image": "../../etc/passwd"}),
+        ("recognise", {"image": stored, "plate_m": [0.6, -1.0], "mode": "blind"}),
+        ("inspect", {"image": stored, "camera_from_panel": {"translation_m": [0, 0, 1]}}),
+    ):
+        answer = _ask(web, verb, body)
+        assert answer.status_code == 422, answer.text
+    is_problem(_ask(web, "inspect", {"image": "0" * 24}), 404, "no-such-image", "no stored image")

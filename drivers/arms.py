@@ -77,7 +77,9 @@ def ur10e() -> KinematicsOptions:
     )
 
 
-def capabilities(k: KinematicsOptions, *, command_rate_hz: float, watchdog_s: float | None) -> ArmCapabilities:
+def capabilities(
+    k: KinematicsOptions, *, command_rate_hz: float, watchdog_s: float | None, resolution_rad: float = 0.0
+) -> ArmCapabilities:
     """From the options."""
     return ArmCapabilities(
         model=k.model,
@@ -90,6 +92,7 @@ def capabilities(k: KinematicsOptions, *, command_rate_hz: float, watchdog_s: fl
         command_rate_hz=command_rate_hz,
         link_radius_m=k.link_radius_m,
         watchdog_s=watchdog_s,
+        resolution_rad=resolution_rad,
     )
 
 

@@ -72,7 +72,9 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
     def capabilities(self) -> ArmCapabilities:
         """From the options."""
         o = self._options
-        return capabilities(o.kinematics, command_rate_hz=o.rate_hz, watchdog_s=o.watchdog_s)
+        return capabilities(
+            o.kinematics, command_rate_hz=o.rate_hz, watchdog_s=o.watchdog_s, resolution_rad=RAD_PER_COUNT
+        )
 
     def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
         """Newest measured joints."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from hal.motion import Compliance, Guard, MotionReport, Quantity
+from hal.motion import Compliance, Guard, Hold, MotionReport, Quantity
 from manipulation.skills.outcome import Outcome, SkillFailure
 from manipulation.skills.steps import Attempt
 from manipulation.stroke import shifted
@@ -29,6 +29,11 @@ SOFT_PUSH = Compliance(
     max_offset_m=0.015,
 )
 ONSET_N = 1.0  # above noise, drift and inertia in a slow move
+COARSE_RAD = 5e-4  # an arm whose joints move in such steps, or larger ones, shakes its hand by more than it feels
+REST_S = 0.12  # what shook has come to rest, and the mean of the second half knows 0.1 N
+REST_RATIO = 0.4  # of the force that stopped the move; creeping pads and friction may take the rest away
+LEAST_M = 0.0005
+MOST_TRIES = 24  # something that gives way at once leaves no force at rest either, but the hand gets no further
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,7 +55,11 @@ class Meeting:
 def meet(
     attempt: Attempt, goal: RigidTransform, *, name: str, speed_m_per_s: float, stop_n: float, ticks: int = 2
 ) -> Meeting:
-    """Move straight to `goal` (base_from_grip, same rotation) until a force of `stop_n` against the motion."""
+    """Move straight to `goal` (base_from_grip, same rotation) until a force of `stop_n` against the motion.
+
+    The hand's own inertia passes for a contact when the arm moves in jerks: the steps of servos that resolve 1.5 mrad
+    are several newtons. On such an arm a force that is gone at rest was no contact, and the move goes on.
+    """
     start = attempt.pose()
     ahead = goal.translation - start.translation
     length = float(np.linalg.norm(ahead))
@@ -58,12 +67,27 @@ def meet(
     in_tool = start.rotation.inv().apply(-unit)
     axis = (float(in_tool[0]), float(in_tool[1]), float(in_tool[2]))
     guard = Guard(name="contact", quantity=Quantity.FORCE, limit=stop_n, axis=axis, ticks=ticks)
-    report = attempt.straight(goal, name=name, speed_m_per_s=speed_m_per_s, guards=(guard,))
+    for _ in range(MOST_TRIES):
+        report = attempt.straight(goal, name=name, speed_m_per_s=speed_m_per_s, guards=(guard,))
+        deepest = float((report.base_from_tool.translation - start.translation) @ unit)
+        if report.tripped is None or length - deepest < LEAST_M or not _shakes(attempt):
+            break
+        if force_at_rest_n(attempt, in_tool) >= REST_RATIO * stop_n:
+            break
     depth = (report.log.tip_m - start.translation) @ unit
     force = report.log.wrench[:, :3] @ in_tool
-    deepest = float((report.base_from_tool.translation - start.translation) @ unit)
     way, give = onset(depth, force, deepest)
     return Meeting(way_m=way, give_n_per_m=give, is_met=report.tripped is not None, report=report)
+
+
+def _shakes(attempt: Attempt) -> bool:
+    return attempt.cell.kinematics.capabilities.resolution_rad >= COARSE_RAD
+
+
+def force_at_rest_n(attempt: Attempt, in_tool: Array) -> float:
+    """Force along a unit vector in tool axes while the arm stands still, N: the mean, once what shook is at rest."""
+    wrench = attempt.run(Hold(name="feel at rest", duration_s=REST_S)).log.wrench
+    return float(np.mean(wrench[len(wrench) // 2 :, :3] @ in_tool))
 
 
 def onset(depth_m: Array, force_n: Array, deepest_m: float) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 from hal.errors import InvalidRequest
 from hal.motion import Guard, Quantity
 from hal.panel import Slider
-from manipulation.skills.contact import meet
+from manipulation.skills.contact import force_at_rest_n, meet
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
 from manipulation.skills.steps import STANDOFF_M, Attempt, perform
 from manipulation.stroke import shifted
@@ -114,6 +114,7 @@ def _push(attempt: Attempt, thing: Slider, push: _Push) -> float:
             raise SkillFailure(Outcome.MISSED, "the fingertip landed on the cap")
         attempt.advance(-0.002, name="lift off the plate", speed_m_per_s=0.03)
     ahead = push.sign * cell.panel_pose.rotation.apply([np.cos(thing.angle_rad), np.sin(thing.angle_rad), 0.0])
+    begun = attempt.pose().translation
     met = meet(
         attempt,
         _moved(attempt, SEEK_M * ahead),
@@ -124,7 +125,6 @@ def _push(attempt: Attempt, thing: Slider, push: _Push) -> float:
     )
     if not met.is_met:
         raise SkillFailure(Outcome.MISSED, "no cap was met")
-    begun = met.report.log.tip_m[0]
     face = float(met.way_m - (attempt.pose().translation - begun) @ ahead)  # from here back to the face, not positive
     length = abs(push.goal_m - push.start_m)
     start = attempt.pose().translation
@@ -173,7 +173,5 @@ def _go(attempt: Attempt, thing: Slider, ahead: np.ndarray, distance_m: float, n
 
 def _give_m(attempt: Attempt, ahead: np.ndarray) -> float:
     """How far the pads give under the push that friction holds now."""
-    report = attempt.reports[-1]
-    against = report.base_from_tool.rotation.inv().apply(-ahead)
-    force = max(0.0, float(report.wrench[:3] @ against))
+    force = max(0.0, force_at_rest_n(attempt, attempt.pose().rotation.inv().apply(-ahead)))
     return force / attempt.cell.hand.pad_stiffness_n_per_m

@@ -175,15 +175,19 @@ def panel_text(name: str, overview: Overview, lights: LightsFound, objects: Sequ
         {"name": f"light_{corner}", "position_m": [*_metres(place), 0.0]}
         for corner, place in zip(CORNERS, lights.places_m, strict=True)
     ]
-    object_rows = [_object(draft, overview) for draft in objects]
+    object_rows = [object_row(draft, overview) for draft in objects]
     validate({**top, "lights": light_rows, "objects": object_rows}, Panel, source=f"panel {name!r}")
     note = [] if lights.are_seen else ["# No border lights were seen: their places are a guess. Measure them.\n"]
     remark = "# Taught from one image: places and sizes are as good as its overview.\n"
     return remark + "".join(note) + toml_document(top, {"lights": light_rows, "objects": object_rows})
 
 
-def _object(draft: PanelObjectDraft, overview: Overview) -> dict[str, Any]:
-    """One object's keys: from its outline, and from the answers."""
+def object_row(draft: PanelObjectDraft, overview: Overview) -> dict[str, Any]:
+    """One object's keys of the panel file: from its outline, and from the answers.
+
+    Raises:
+        InvalidRequest: an answer is no number or no choice; names object and question.
+    """
     asked = {question.key: question for question in questions(draft.kind)[1:]}
     unknown = sorted(set(draft.answers) - set(asked) - {"name"})
     if unknown:

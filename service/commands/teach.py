@@ -1,8 +1,8 @@
-"""`panelwright teach`: show one image and click at most three times, and the system knows a new kind of object."""
+"""`panelwright teach`: one image and at most three clicks, or a dialogue, and the system knows a new kind or a panel."""
 
 from __future__ import annotations
 
-import re
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,67 +12,99 @@ from hal.errors import InvalidRequest
 from service.commands.common import console
 
 if TYPE_CHECKING:
-    from perception.vision.knowledge import Knowledge
+    import numpy as np
+    from numpy.typing import NDArray
 
-NAME = re.compile(r"[a-z][a-z0-9_]{0,40}")
+    from perception.vision.panel_teach import Question
+    from service.teachings import Teachings
+
+MOST_PLATE_M = 10.0
+
+
+class Terminal:
+    """Asks a person, or a script on standard input."""
+
+    def ask(self, question: Question) -> str:
+        """One line of standard input; the question goes to standard output."""
+        from service.dialogue import NobodyAnswers
+
+        choices = f" [{'/'.join(question.choices)}]" if question.choices else ""
+        default = f" ({question.default})" if question.default else ""
+        console.print(f"{question.text}{choices}{default} ", end="", markup=False)
+        line = sys.stdin.readline()
+        if not line:
+            console.print()
+            raise NobodyAnswers("the answers ended before the questions", hint="start again; nothing more was written")
+        if not sys.stdin.isatty():
+            console.print(line.rstrip("\n"), markup=False)
+        return line.strip()
+
+    def say(self, text: str) -> None:
+        """A line of standard output."""
+        console.print(text, markup=False)
 
 
 def teach(
     image: Annotated[Path, typer.Argument(help="Overview of one upright panel with its border in view.")],
     *,
-    folder: Annotated[Path, typer.Option(help="Where taught kinds are kept; they come before the shipped ones.")],
+    folder: Annotated[Path, typer.Option(help="Where what is taught is kept; it comes before what is shipped.")] = Path(
+        "runs/knowledge"
+    ),
     plate: Annotated[str, typer.Option(help="Width,height of the plate, m.")] = "0.60,0.40",
     kind: Annotated[str | None, typer.Option(help="Kind of the clicked object; a new name makes a new kind.")] = None,
     click: Annotated[
         list[str] | None, typer.Option(help="X,Y in pixels; the middle, or two opposite corners, then the middle.")
     ] = None,
-    check: Annotated[bool, typer.Option("--check", help="Only show what is found with the taught kinds.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Only show what is found with what was taught.")] = False,
+    dialogue: Annotated[
+        bool, typer.Option("--dialogue", help="Ask for everything, also when no person sits at the terminal.")
+    ] = False,
 ) -> None:
-    """Teach a kind of object by clicks, or show with --check what is found now."""
-    from perception.vision import teach as lessons
-    from perception.vision.image import decode
-    from perception.vision.knowledge import write_kind
+    """Teach by clicks (--kind), by questions and answers (alone), or show with --check what is found now."""
+    from service.teachings import Teachings
 
     plate_m = _pair(plate, "--plate")
-    if min(plate_m) <= 0 or max(plate_m) > 10:
+    if min(plate_m) <= 0 or max(plate_m) > MOST_PLATE_M:
         raise InvalidRequest(f"no plate is {plate} m", hint="for example --plate 0.60,0.40")
-    if check == (kind is not None):
-        raise InvalidRequest("give either --kind or --check", hint="teach first, then check")
-    try:
-        pixels = decode(image.read_bytes())
-    except OSError as error:
-        raise InvalidRequest(f"{image} cannot be read: {error.strerror}", hint="check the path") from None
-    knowledge = _known(folder)
-    if kind is None:
-        for found in lessons.check(pixels, knowledge, plate_m=plate_m):
-            x, y = found.centre_px
-            verdict = f"refused: {found.reason}" if found.reason else f"confidence {found.confidence:.2f}"
-            console.print(f"{found.kind} at {x:.0f},{y:.0f} px  {verdict}", markup=False)
+    if sum((check, kind is not None, dialogue)) > 1:
+        raise InvalidRequest("give one of --kind, --check and --dialogue", hint="teach first, then check")
+    if not (check or kind is not None or dialogue or sys.stdin.isatty()):
+        raise InvalidRequest("nobody is there to ask", hint="give --kind, --check, or --dialogue with answers on stdin")
+    pixels = _read(image)
+    teachings = Teachings(folder)
+    if kind is not None:
+        _by_clicks(teachings, pixels, plate_m, kind=kind, clicks=click or [])
         return
-    if not NAME.fullmatch(kind):
-        raise InvalidRequest(f"{kind!r} is no name of a kind", hint="small letters, digits and underscores")
-    clicks_px = [_pair(text, "--click") for text in click or ()]
-    lesson = lessons.teach(
-        pixels, knowledge, kind=kind, clicks_px=clicks_px, plate_m=plate_m, source="panelwright teach"
-    )
-    if not lesson.added:
+    from service.dialogue import Dialogue
+
+    talk = Dialogue.about(Terminal(), teachings, pixels, plate_m)
+    if check:
+        talk.show_found()
+    else:
+        talk.run()
+
+
+def _by_clicks(
+    teachings: Teachings, pixels: NDArray[np.uint8], plate_m: tuple[float, float], *, kind: str, clicks: list[str]
+) -> None:
+    from service.lessons import teach_kind
+
+    clicks_px = tuple(_pair(text, "--click") for text in clicks)
+    taught = teach_kind(teachings, pixels, plate_m, kind=kind, clicks_px=clicks_px)
+    if not taught["added"]:
         console.print(f"{kind} looks like that already: nothing was written", markup=False)
         return
-    folder.mkdir(parents=True, exist_ok=True)
-    console.print(f"wrote {write_kind(lesson.kind, folder)}", markup=False)
+    console.print(f"wrote {taught['path']}", markup=False)
 
 
-def _known(folder: Path) -> Knowledge:
-    """The shipped kinds, each replaced by the folder's own of that name."""
-    from perception.vision.knowledge import Knowledge, load_knowledge, shipped_knowledge
+def _read(image: Path) -> NDArray[np.uint8]:
+    from perception.vision.image import decode
 
-    shipped = shipped_knowledge()
-    if not any(folder.glob("*.toml")):
-        return shipped
-    taught = load_knowledge(folder).kinds
-    names = {kind.name for kind in taught}
-    kinds = (*(kind for kind in shipped.kinds if kind.name not in names), *taught)
-    return Knowledge(kinds=kinds, spread=shipped.spread)  # the unit of likeness stays what the shipped looks gave
+    try:
+        data = image.read_bytes()
+    except OSError as error:
+        raise InvalidRequest(f"{image} cannot be read: {error.strerror}", hint="check the path") from None
+    return decode(data)
 
 
 def _pair(text: str, option: str) -> tuple[float, float]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import re
 from pathlib import Path
 
 import cv2
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 
 from hal.errors import InvalidRequest
+from hal.panel import load_panel
 from perception.vision.knowledge import load_knowledge, shipped_knowledge
 from perception.vision.view import CameraView
 from service.commands.teach import teach
@@ -47,3 +50,62 @@ def test_a_name_that_leaves_the_folder_is_refused(tmp_path: Path) -> None:
     clicks = _example(tmp_path / "panel.png")
     with pytest.raises(InvalidRequest, match="no name of a kind"):
         teach(tmp_path / "panel.png", folder=tmp_path / "kinds", kind="../up", click=clicks)
+
+
+def _talk(monkeypatch: pytest.MonkeyPatch, *lines: str) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO("".join(f"{line}\n" for line in lines)))
+
+
+def _pixels(name: str, half_m: float = 0.0) -> str:
+    """Clicks on an object of the example: its middle, or two corners."""
+    _, intrinsics, pose = scene(tilt_deg=5.0, distance_m=0.66, pose_error=0.0)
+    view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+    steps = [[0.0, 0.0, 0.0]] if half_m == 0.0 else [[-half_m, half_m, 0.0], [half_m, -half_m, 0.0]]
+    return " ".join(f"{u:.1f},{v:.1f}" for u, v in view.project(np.array(panel().object(name).point_m) + steps))
+
+
+def test_the_dialogue_teaches_a_kind_and_shows_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _example(tmp_path / "panel.png")
+    clicks = _pixels("emergency", 0.02)
+    _talk(monkeypatch, "kind", "somewhere", "3,3", clicks, "no", clicks, "", "Not A Name", "mushroom", "no")
+    teach(tmp_path / "panel.png", folder=tmp_path / "kinds", dialogue=True)
+    said = capsys.readouterr().out
+    assert "is not pixels" in said and "beside the plate" in said and "is no name" in said
+    assert "found a circle of 40 x 40 mm" in said
+    assert sum(line.startswith("mushroom at") for line in said.splitlines()) == 1
+    assert [kind.name for kind in load_knowledge(tmp_path / "kinds").kinds] == ["mushroom"]
+
+
+def test_the_dialogue_teaches_a_whole_panel_and_reads_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _example(tmp_path / "panel.png")
+    gauge = [_pixels("pressure"), "yes", "gauge", "pressure", "much", "0", "10", "bar", "-135", "135", "yes"]
+    knob = [_pixels("mode"), "yes", "", "mode", "off=-45.8, low, high", "off=-45.8, low=0, high=45.8", "yes"]
+    stop = [_pixels("emergency"), "yes", "mushroom", "pressure", "halt", "no"]
+    _talk(monkeypatch, "panel", "pump_room", "", *gauge, *knob, *stop)
+    teach(tmp_path / "panel.png", folder=tmp_path / "kinds", dialogue=True)
+    said = capsys.readouterr().out
+    assert "must be a number" in said and "there is a 'pressure' already" in said
+    made = load_panel(tmp_path / "kinds" / "panels" / "pump_room.toml")
+    assert [(thing.name, thing.kind) for thing in made.objects] == [
+        ("pressure", "gauge"), ("mode", "rotary"), ("halt", "mushroom"),
+    ]  # fmt: skip
+    assert "mode (rotary): high" in said
+    assert re.search(r"pressure \(gauge\): 6\.[1-5]", said)
+
+
+def test_a_script_that_ends_too_early_or_never_makes_sense_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _example(tmp_path / "panel.png")
+    for lines, words in ((["kind", _pixels("emergency")], "ended before"), (["kind", *["?"] * 9], "not pixels")):
+        _talk(monkeypatch, *lines)
+        with pytest.raises(InvalidRequest, match=words):
+            teach(tmp_path / "panel.png", folder=tmp_path / "kinds", dialogue=True)
+    _talk(monkeypatch)
+    with pytest.raises(InvalidRequest, match="nobody is there"):
+        teach(tmp_path / "panel.png", folder=tmp_path / "kinds")
+    assert not (tmp_path / "kinds").exists()

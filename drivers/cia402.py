@@ -10,14 +10,16 @@ from __future__ import annotations
 import struct
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
 from drivers.arms import Array, KinematicsOptions, SetPointFilter, capabilities
+from drivers.cia402_setup import CONSUMER, PRODUCER, SDO_REQUEST, SDO_S, SdoClient, SetUp, upload_request
 from drivers.cia402_states import DISABLE, FAULT_RESET, QUICK_STOP, DriveState, state_of, towards_enabled
+from drivers.cia402_sync import SyncCount
 from drivers.transport.canbus import CanCodec, CanFrame, CanOptions, can_opener
 from drivers.transport.device import StreamDevice, wall_until
 from drivers.transport.link import Link, NoAnswer, Refused, drain, now_s
@@ -28,26 +30,14 @@ from hal.errors import DeviceFault, DeviceTimeout
 from hal.readings import Stamped
 from hal.registry import Context
 
-NMT, SYNC, EMCY, TPDO1, TPDO2, RPDO1, SDO_ANSWER, SDO_REQUEST, HEARTBEAT = (
-    0x000, 0x080, 0x080, 0x180, 0x280, 0x200, 0x580, 0x600, 0x700
-)  # fmt: skip
+NMT, SYNC, RPDO1, HEARTBEAT = 0x000, 0x080, 0x200, 0x700
 START, PRE_OPERATIONAL = 0x01, 0x80
 OPERATIONAL = 5
-CSP = 8
-MAPPINGS = {0x1600: (0x60400010, 0x607A0020), 0x1A00: (0x60410010, 0x60640020)}
-SDO_S = 0.25
 CONNECT_S = 6.0  # seven objects of each of six drives
 MOVING_RAD_PER_S = 1e-3
-ABORTS = {
-    0x05030000: "toggle bit",
-    0x05040001: "command",
-    0x06010002: "read-only",
-    0x06020000: "no such object",
-    0x06070010: "length",
-    0x06090011: "no such sub-index",
-    0x06090030: "value",
-    0x08000000: "general error",
-}
+MOST_OWED = 4  # SYNCs that a drive may leave unanswered before it is waited for
+MOST_KNOWN = 64  # SYNCs whose time is kept
+PROBES = ((CONSUMER, 1), (PRODUCER, 0))  # objects that every configured drive has, asked in turn
 
 
 class Cia402Options(CanOptions):
@@ -68,7 +58,7 @@ class Axis:
     status: int | None = None
     increments: int = 0
     velocity: int = 0
-    is_fresh: bool = False
+    count: SyncCount = field(default_factory=SyncCount)
 
     @property
     def state(self) -> DriveState:
@@ -89,15 +79,22 @@ class Cia402(StreamDevice[JointState]):
         self._codec = codec()
         self._rad = np.radians(options.degrees_per_increment)
         self._filter = SetPointFilter(context.name, options.kinematics, command_rate_hz=options.rate_hz)
+        self._set_up = SetUp(
+            options.nodes,
+            consumer=options.host_node << 16 | round(1000 * options.heartbeat_s),
+            producer_ms=round(500 * options.heartbeat_s),
+        )
         self._axes = {node: Axis() for node in options.nodes}
         self._targets = dict.fromkeys(options.nodes, 0)
         self._is_wanted = False  # operation enabled is wanted
         self._is_reset = False  # a fault reset was asked for
         self._commands = threading.Lock()
         self._next_sync_s = 0.0
-        self._sync_s = 0.0
+        self._syncs = self._published = 0
+        self._sync_s = [0.0] * MOST_KNOWN
         self._next_beat_s = 0.0
         self.missed_syncs = 0
+        self.held_syncs = 0
 
     def capabilities(self) -> ArmCapabilities:
         """From the options."""
@@ -116,7 +113,7 @@ class Cia402(StreamDevice[JointState]):
         """
         measured = self.newest(deadline).value.position_rad
         with self._commands:
-            self._targets = {node: axis.increments for node, axis in self._axes.items()}
+            self._targets = self._increments(measured)
             self._is_reset = self._is_wanted = True
         rest, until_s = threading.Event(), wall_until(deadline)
         while not self._all_in(DriveState.OPERATION_ENABLED):
@@ -134,9 +131,11 @@ class Cia402(StreamDevice[JointState]):
                 self._switch_off()
                 raise self._not_enabled()
             sent = self._filter.passed(position_rad, now_s())
-            increments = np.round(sent / self._rad).astype(int)
-            self._targets = dict(zip(self._options.nodes, (int(i) for i in increments), strict=True))
+            self._targets = self._increments(sent)
             return sent
+
+    def _increments(self, position_rad: Array) -> dict[int, int]:
+        return {node: round(q / self._rad) for node, q in zip(self._options.nodes, position_rad, strict=True)}
 
     def stop(self, *, deadline: Deadline) -> None:  # noqa: ARG002  # nothing waits
         """Quick stop of all drives with the next SYNC."""
@@ -151,54 +150,11 @@ class Cia402(StreamDevice[JointState]):
         link.write(self._codec.opening(o.bitrate), now_s() + SDO_S)
         drain(link)
         self._send(link, NMT, bytes([PRE_OPERATIONAL, 0]))
-        for node in o.nodes:
-            self._configure(link, node)
+        self._set_up.run(SdoClient(link, self._codec))
         self._axes = {node: Axis() for node in o.nodes}
+        self._syncs = self._published = 0
         self._send(link, NMT, bytes([START, 0]))
         self._next_sync_s = self._next_beat_s = now_s()
-
-    def _configure(self, link: Link, node: int) -> None:
-        o = self._options
-        for index, wanted in MAPPINGS.items():
-            mapped = tuple(self._upload(link, node, index, sub) for sub in (1, 2))
-            if mapped != wanted:
-                shown = ", ".join(f"{entry:08X}" for entry in mapped)
-                raise Refused(f"node {node}: object {index:04X}h maps {shown}", code=index)
-        consumer = o.host_node << 16 | round(1000 * o.heartbeat_s)
-        self._download(link, node, 0x1016, 1, struct.pack("<I", consumer))
-        self._download(link, node, 0x1017, 0, struct.pack("<H", round(500 * o.heartbeat_s)))
-        self._download(link, node, 0x6060, 0, struct.pack("<b", CSP))
-
-    def _upload(self, link: Link, node: int, index: int, sub: int) -> int:
-        """Expedited SDO read."""
-        answer = self._sdo(link, node, struct.pack("<BHB4x", 0x40, index, sub))
-        size = 4 - (answer[0] >> 2 & 3)
-        return int.from_bytes(answer[4 : 4 + size], "little")
-
-    def _download(self, link: Link, node: int, index: int, sub: int, data: bytes) -> None:
-        """Expedited SDO write."""
-        command = 0x23 | (4 - len(data)) << 2
-        self._sdo(link, node, struct.pack("<BHB", command, index, sub) + data.ljust(4, b"\0"))
-
-    def _sdo(self, link: Link, node: int, request: bytes) -> bytes:
-        for _ in range(3):
-            self._send(link, SDO_REQUEST + node, request)
-            until_s = now_s() + SDO_S
-            while chunk := link.read(until_s):
-                for frame in self._codec.feed(chunk):
-                    is_answer = frame.id == SDO_ANSWER + node and len(frame.data) == 8
-                    if is_answer and frame.data[1:4] == request[1:4]:
-                        return self._checked(node, frame.data)
-        raise NoAnswer(f"node {node} does not answer; is it powered, and is the bit rate right?")
-
-    @staticmethod
-    def _checked(node: int, answer: bytes) -> bytes:
-        if answer[0] != 0x80:
-            return answer
-        code = int.from_bytes(answer[4:], "little")
-        index = int.from_bytes(answer[1:3], "little")
-        text = ABORTS.get(code, "see CiA 301")
-        raise Refused(f"node {node}: object {index:04X}h: SDO abort {code:08X}h ({text})", code=code)
 
     def _send(self, link: Link, id_: int, data: bytes = b"") -> None:
         link.write(self._codec.encode(CanFrame(id_, data)), now_s() + SDO_S)
@@ -223,9 +179,26 @@ class Cia402(StreamDevice[JointState]):
             targets = self._targets
             self._is_reset = self._is_reset and any(axis.state is DriveState.FAULT for axis in self._axes.values())
         frames = [CanFrame(RPDO1 + n, struct.pack("<Hi", words[n], targets[n])) for n in self._options.nodes]
-        self._sync_s = now_s()
-        batch = b"".join(self._codec.encode(frame) for frame in (*frames, CanFrame(SYNC, b"")))
-        link.write(batch, self._sync_s + SDO_S)
+        now = now_s()
+        probes = [frame for node, axis in self._axes.items() if (frame := self._probe(node, axis, now)) is not None]
+        is_behind = max(axis.count.owed for axis in self._axes.values()) >= MOST_OWED
+        # More SYNCs would only queue up, and every answer would be older than the one before.
+        batch = probes if is_behind else [*probes, *frames, CanFrame(SYNC, b"")]
+        link.write(b"".join(self._codec.encode(frame) for frame in batch), now + SDO_S)
+        if is_behind:
+            self.held_syncs += 1
+            return
+        self._syncs += 1
+        self._sync_s[self._syncs % MOST_KNOWN] = now
+        for axis in self._axes.values():
+            axis.count.synced()
+
+    def _probe(self, node: int, axis: Axis, now: float) -> CanFrame | None:
+        """A question whose answer tells late PDOs from lost ones, if any are owed."""
+        if not axis.count.wants_probe(now):
+            return None
+        axis.count.probed(now)
+        return CanFrame(SDO_REQUEST + node, upload_request(*PROBES[axis.count.probes % len(PROBES)]))
 
     def _control_word(self, axis: Axis) -> int:
         if not self._is_wanted:
@@ -243,14 +216,20 @@ class Cia402(StreamDevice[JointState]):
                 continue
             match frame.id & 0x780:
                 case 0x180 if len(frame.data) == 6:
-                    axis.status, axis.increments = struct.unpack("<Hi", frame.data)
-                    axis.is_fresh = True
+                    axis.status, increments = struct.unpack("<Hi", frame.data)
+                    if axis.count.took(0, frame.data):
+                        axis.increments = increments
+                        self._publish_when_complete()
                 case 0x280 if len(frame.data) == 6:
-                    axis.velocity, _ = struct.unpack("<ih", frame.data)
-                    self._publish_when_complete()
+                    if axis.count.took(1, frame.data):
+                        axis.velocity, _ = struct.unpack("<ih", frame.data)
+                        self._publish_when_complete()
+                case 0x580 if frame.data[1:4] == upload_request(*PROBES[axis.count.probes % len(PROBES)])[1:4]:
+                    axis.count.probe_answered()
                 case 0x080 if len(frame.data) == 8:
                     self._emergency(node, frame.data)
                 case 0x700 if frame.data == b"\x00":
+                    self._set_up.forget(node)
                     raise NoAnswer(f"node {node} has restarted")
 
     def _emergency(self, node: int, data: bytes) -> None:
@@ -261,10 +240,11 @@ class Cia402(StreamDevice[JointState]):
 
     def _publish_when_complete(self) -> None:
         axes = [self._axes[node] for node in self._options.nodes]
-        if not all(axis.is_fresh for axis in axes):
+        answered = axes[0].count.answered
+        is_complete = all(axis.count.answered == answered for axis in axes)
+        if answered is None or answered <= self._published or not is_complete:
             return
-        for axis in axes:
-            axis.is_fresh = False
+        self._published = answered
         velocity = np.array([axis.velocity for axis in axes]) * self._rad
         self.publish(
             JointState(
@@ -273,7 +253,7 @@ class Cia402(StreamDevice[JointState]):
                 is_enabled=self._filter.is_open and self._all_in(DriveState.OPERATION_ENABLED),
                 is_moving=bool(np.any(np.abs(velocity) > MOVING_RAD_PER_S)),
             ),
-            valid_s=self._sync_s,
+            valid_s=self._sync_s[answered % MOST_KNOWN],
         )
 
     def _all_in(self, state: DriveState) -> bool:

@@ -17,7 +17,8 @@ from hal.errors import CellError
 from hal.readings import Quality, Stamped
 
 SLACK_S = 0.05
-STALL_S = 0.03  # this process was not run for so long: no driver can answer in time then
+BEAT_S = 0.005
+STALL_S = 0.001  # the probe woke so much too late: this process did not run, and no driver could have answered
 REST_S = 0.005
 PROCESSES = 2
 AT_ONCE = 7  # cells a process
@@ -42,7 +43,7 @@ class Cell:
 
 
 class StallProbe:
-    """A thread that does nothing but wake: where it is late, so is everybody."""
+    """A thread that does nothing but wake: where it is late, so is everybody. A driver that blocks does not delay it."""
 
     def __init__(self) -> None:
         self._stalls: list[tuple[float, float]] = []
@@ -52,10 +53,10 @@ class StallProbe:
 
     def _run(self) -> None:
         before_s = time.monotonic()
-        while not self._ending.wait(0.005):
+        while not self._ending.wait(BEAT_S):
             now_s = time.monotonic()
-            if now_s - before_s > STALL_S:
-                self._stalls.append((before_s, now_s))
+            if now_s - before_s > BEAT_S + STALL_S:
+                self._stalls.append((before_s + BEAT_S, now_s))
             before_s = now_s
 
     def stalled_s(self, start_s: float, end_s: float) -> float:
@@ -137,7 +138,10 @@ def _one_read(item: Bench, device: Any, backing: Any, cell: Cell, probe: StallPr
     ended_s = time.monotonic()
     over_s = ended_s - started_s - READ_S - SLACK_S
     if over_s > 0.0:
-        is_stall = probe.stalled_s(started_s, ended_s) >= over_s
+        stalled_s = probe.stalled_s(started_s, ended_s)
+        is_stall = stalled_s >= over_s
+        if not is_stall:
+            print(f"    {item.name}: {1e3 * over_s:.0f} ms late, {1e3 * stalled_s:.0f} ms of it without the processor")
         cell.stalled += is_stall
         cell.late_calls += not is_stall
     if sample is None or sample.quality is Quality.INVALID:

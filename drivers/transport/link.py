@@ -11,6 +11,8 @@ import time
 from pathlib import Path
 from typing import Protocol
 
+FLOOD_BYTES = 1 << 20  # more than any buffer between a device and us holds
+
 
 class WireError(Exception):
     """Something went wrong on a wire."""
@@ -85,9 +87,9 @@ def now_s() -> float:
 
 
 def drain(link: Link) -> bytes:
-    """Everything that lies ready; whatever came before a request cannot be its answer."""
+    """Everything that lies ready; whatever came before a request cannot be its answer. A flood does not hold it up."""
     late = b""
-    while chunk := link.read(0.0):
+    while len(late) < FLOOD_BYTES and (chunk := link.read(0.0)):
         late += chunk
     return late
 

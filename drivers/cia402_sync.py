@@ -1,0 +1,72 @@
+"""Which SYNC does a PDO answer? It does not say, so SYNCs and PDOs are counted."""
+
+from __future__ import annotations
+
+PDOS = 2  # of a drive on each SYNC
+PROBE_S = 0.1  # a probe that was not answered for so long is lost
+
+
+class SyncCount:
+    """Counts what one drive owes.
+
+    A drive answers in order, so its next PDO belongs to the oldest SYNC that it has not answered. One that owes PDOs may
+    be late or have lost some, and then the next look older than they are. Which of the two, a probe tells: when an SDO
+    that was asked after those SYNCs has been answered, what has not come by then never will.
+    """
+
+    def __init__(self) -> None:
+        self._sent = 0
+        self._owed = [0] * PDOS
+        self._answered: list[int | None] = [None] * PDOS
+        self._last = [b""] * PDOS
+        self._syncs_since_probe: int | None = None
+        self._probed_s = 0.0
+        self.probes = 0
+
+    @property
+    def answered(self) -> int | None:
+        """Number of the SYNC that all newest PDOs belong to; None when they do not belong together."""
+        first = self._answered[0]
+        return first if all(number == first for number in self._answered) else None
+
+    @property
+    def owed(self) -> int:
+        """SYNCs whose PDOs have not all come."""
+        return max(self._owed)
+
+    def synced(self) -> None:
+        """A SYNC has been sent; the first has number 1."""
+        self._sent += 1
+        self._owed = [owed + 1 for owed in self._owed]
+        if self._syncs_since_probe is not None:
+            self._syncs_since_probe += 1
+
+    def took(self, pdo: int, data: bytes) -> bool:
+        """PDO number `pdo` has come; tells whether it is a new one.
+
+        One that was not owed is a stray, and then it is not known which of the two is young; the same twice is no matter.
+        """
+        if self._owed[pdo] == 0:
+            if data != self._last[pdo]:
+                self._answered[pdo] = None
+            return False
+        self._owed[pdo] -= 1
+        self._answered[pdo] = self._sent - self._owed[pdo]
+        self._last[pdo] = data
+        return True
+
+    def wants_probe(self, now_s: float) -> bool:
+        """Asked just before a SYNC: is something owed, and no probe on its way?"""
+        is_on_its_way = self._syncs_since_probe is not None and now_s - self._probed_s < PROBE_S
+        return any(self._owed) and not is_on_its_way
+
+    def probed(self, now_s: float) -> None:
+        """A probe has been sent; an earlier one no longer counts."""
+        self._syncs_since_probe, self._probed_s = 0, now_s
+        self.probes += 1
+
+    def probe_answered(self) -> None:
+        """Only the SYNCs since the probe are still owed."""
+        if self._syncs_since_probe is not None:
+            self._owed = [self._syncs_since_probe] * PDOS
+            self._syncs_since_probe = None

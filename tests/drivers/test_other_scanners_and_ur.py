@@ -2,14 +2,18 @@
 
 import json
 import math
+import os
+import pty
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from drivers.emulators import rplidar, scip, ur
+from drivers.emulators import lms200, rplidar, scip, ur
 from drivers.emulators.beams import line_m
 from drivers.emulators.scripted import ScriptedArm, ScriptedScanner, scripted_scan
 from hal.devices import RangeImage
@@ -36,6 +40,32 @@ dashboard.stop()
 for client in (io, dashboard, receive):
     client.disconnect()
 print(json.dumps(seen))
+"""
+
+
+GRABBER_INI = """
+[global]
+rawlog_prefix = {folder}/scan
+time_between_launches = 0
+SF_max_time_span = 0.1
+use_sensoryframes = 0
+GRABBER_PERIOD_MS = 200
+
+[LASER]
+driver = CSickLaserSerial
+process_rate = 50
+sensorLabel = LMS
+COM_port_LIN = {port}
+COM_baudRate = 38400
+mm_mode = 1
+FOV = 180
+resolution = 100
+pose_x = 0
+pose_y = 0
+pose_z = 0
+pose_yaw = 0
+pose_pitch = 0
+pose_roll = 0
 """
 
 
@@ -113,3 +143,34 @@ def test_ur_rtde_reads_the_arm_and_asks_the_dashboard() -> None:
         until(lambda: arm.stops > 0)
     finally:
         far_side.close()
+
+
+def test_rawlog_grabber_sets_up_the_lms_200_and_records_its_scans(tmp_path: Path) -> None:
+    """The MRPT grabber finds the power-up baud rate, changes it, sets millimetres and streams; it wants a terminal."""
+    if shutil.which("rawlog-grabber") is None:
+        pytest.skip("rawlog-grabber is not installed (Debian package mrpt-apps)")
+    far_side = lms200.start(ScriptedScanner(), {})
+    (tmp_path / "lms.ini").write_text(GRABBER_INI.format(folder=tmp_path, port=far_side.address["port"]))
+    keyboard, terminal = pty.openpty()
+    command = ["rawlog-grabber", str(tmp_path / "lms.ini")]
+    try:
+        with subprocess.Popen(command, stdin=terminal, stdout=subprocess.PIPE, text=True) as grabber:
+            saved = (line for line in grabber.stdout or () if "Saved" in line)
+            for _ in range(5):
+                next(saved)
+            assert (far_side.baud, far_side.is_streaming) == (38_400, True)
+            os.write(keyboard, b"\x1b")
+            for _ in saved:  # to its end: it dies of a closed pipe
+                pass
+        assert grabber.returncode == 0
+    finally:
+        os.close(keyboard)
+        os.close(terminal)
+        far_side.close()
+    log = next(tmp_path.glob("*.rawlog"))
+    edit = ["rawlog-edit", "--export-2d-scans-txt", "--input", str(log), "--out-dir", f"{tmp_path}/"]
+    subprocess.run(edit, check=True, capture_output=True)
+    rows = np.loadtxt(next(tmp_path.glob("*_LMS.txt")), comments="%")
+    angle_rad = np.deg2rad(np.arange(181) - 90.0)
+    assert len(rows) >= 10
+    assert all(is_a_scan(row[1:182], angle_rad, step_m=0.00051) for row in rows)

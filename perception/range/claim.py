@@ -1,20 +1,19 @@
 """From blocks back to pixels: every pixel goes to the neighbouring surface that explains its depth best."""
 
-# ruff: noqa: PLR0912 - compiled loops take plain arrays, and long
-# bodies and plain comparisons are what compiles fast.
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
 from perception.range.grid import sigma_at
-from perception.range.surfaces import depth_on, normal_on
+from perception.range.rays import LOOSE
+from perception.range.surfaces import PLANE, depth_on, normal_on
 
 CLAIM_SIGMAS = 3.5
 MAX_CANDIDATES = 8
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def claim_pixels(depth, sen, noise, blocks, size, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]
     """Label each pixel of `depth` (H, W) with the best surface among those of the 3x3 blocks around it.
 
@@ -22,42 +21,123 @@ def claim_pixels(depth, sen, noise, blocks, size, kinds, ths, out, top, bottom):
     `kinds` and `ths` from 1.
     """
     H, W = depth.shape
+    w = blocks.shape[1]
+    perspective = sen[0] > 0
+    only = np.empty(w, np.int32)
+    for r in range(top, bottom):
+        _only_labels(blocks, r, only)
+        last = min(r * size + size, H)
+        c = 0
+        while c < w:
+            k, start = only[c], c
+            c += 1
+            if k < 0:
+                _claim_block(depth, sen, noise, blocks, size, kinds, ths, out, r, start)
+                continue
+            while c < w and only[c] == k:
+                c += 1
+            first, end = start * size, min(c * size, W)
+            for v in range(r * size, last):
+                if k == 0:
+                    out[v, first:end] = 0
+                elif kinds[k] == PLANE:
+                    _claim_run(depth[v, first:end], ths[k], k, first, v, sen, noise, perspective, out[v, first:end])
+                else:
+                    y = (v - sen[4]) / sen[2]
+                    for u in range(first, end):
+                        z = depth[v, u]
+                        x = (u - sen[3]) / sen[1]
+                        mine = misfit(kinds[k], ths[k], x, y, z, sigma_at(noise, z), perspective) < CLAIM_SIGMAS
+                        out[v, u] = k if mine else 0
+
+
+@njit(cache=True, error_model="numpy")
+def _only_labels(blocks, r, only):  # type: ignore[no-untyped-def]
+    """The one label that the 3x3 blocks around each block of row r hold, 0 where they hold none, -1 where several."""
+    h, w = blocks.shape
+    above, here, below = blocks[max(r - 1, 0)], blocks[r], blocks[min(r + 1, h - 1)]
+    for c in range(w):
+        left, right = max(c - 1, 0), min(c + 1, w - 1)
+        most = max(above[left], above[c], above[right], here[left], here[c], here[right])
+        most = max(most, below[left], below[c], below[right])
+        same = True
+        for j in (left, c, right):
+            same &= above[j] == most or above[j] == 0
+            same &= here[j] == most or here[j] == 0
+            same &= below[j] == most or below[j] == 0
+        only[c] = most if same else -1
+
+
+@njit(cache=True, error_model="numpy", fastmath=LOOSE)
+def _claim_run(depth, th, label, first, v, sen, noise, perspective, out):  # type: ignore[no-untyped-def]
+    """Pixels first, first + 1, ... of row v that a plane explains: their squared misfit, without branch or root."""
+    p = 1.0 if perspective else 0.0
+    y = (v - sen[4]) / sen[2]
+    per_x = 1.0 / sen[1]
+    dy = p * y
+    at = th[3] - th[1] * (y - dy)
+    along = th[1] * dy + th[2]
+    limit = CLAIM_SIGMAS * CLAIM_SIGMAS
+    for i in range(out.shape[0]):
+        x = (first + i - sen[3]) * per_x
+        dx = p * x
+        z = depth[i]
+        e = z - (at - th[0] * (x - dx)) / (th[0] * dx + along)
+        z2 = z * z
+        white, slow, step = noise[0] + noise[1] * z2, noise[2] + noise[3] * z2, noise[4] + noise[5] * z2
+        variance = max(white * white, step * step * (1.0 / 12.0)) + slow * slow
+        out[i] = label if e * e < limit * variance else 0
+
+
+@njit(cache=True, error_model="numpy")
+def _claim_block(depth, sen, noise, blocks, size, kinds, ths, out, r, c):  # type: ignore[no-untyped-def]
+    """The pixels of one block among whose neighbours several surfaces compete."""
+    H, W = depth.shape
     h, w = blocks.shape
     perspective = sen[0] > 0
     near = np.empty(MAX_CANDIDATES, np.int32)
-    for r in range(top, bottom):
-        for c in range(w):
-            n = 0
-            for i in range(max(0, r - 1), min(h, r + 2)):
-                for j in range(max(0, c - 1), min(w, c + 2)):
-                    k = blocks[i, j]
-                    if k == 0:
-                        continue
-                    new = True
-                    for m in range(n):
-                        if near[m] == k:
-                            new = False
-                    if new and n < MAX_CANDIDATES:
-                        near[n] = k
-                        n += 1
-            for v in range(r * size, min(r * size + size, H)):
-                y = (v - sen[4]) / sen[2]
-                for u in range(c * size, min(c * size + size, W)):
-                    out[v, u] = 0
-                    z = depth[v, u]
-                    if n == 0 or not np.isfinite(z):
-                        continue
-                    x = (u - sen[3]) / sen[1]
-                    best, label = CLAIM_SIGMAS, 0
-                    sigma = sigma_at(noise, z)
-                    for m in range(n):
-                        e = misfit(kinds[near[m]], ths[near[m]], x, y, z, sigma, perspective)
-                        if e < best:
-                            best, label = e, near[m]
-                    out[v, u] = label
+    n = 0
+    for i in range(max(0, r - 1), min(h, r + 2)):
+        for j in range(max(0, c - 1), min(w, c + 2)):
+            k = blocks[i, j]
+            new = k > 0
+            for m in range(n):
+                if near[m] == k:
+                    new = False
+            if new and n < MAX_CANDIDATES:
+                near[n] = k
+                n += 1
+    for v in range(r * size, min(r * size + size, H)):
+        y = (v - sen[4]) / sen[2]
+        for u in range(c * size, min(c * size + size, W)):
+            out[v, u] = _best_of(depth[v, u], (u - sen[3]) / sen[1], y, noise, near, n, kinds, ths, perspective)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy")
+def _best_of(z, x, y, noise, near, n, kinds, ths, perspective):  # type: ignore[no-untyped-def]
+    """The label among near[:n] whose surface explains the depth best, 0 when none does within `CLAIM_SIGMAS`."""
+    best, label = CLAIM_SIGMAS, 0
+    if not np.isfinite(z):
+        return label
+    sigma = sigma_at(noise, z)
+    for m in range(n):
+        e = misfit(kinds[near[m]], ths[near[m]], x, y, z, sigma, perspective)
+        if e < best:
+            best, label = e, near[m]
+    return label
+
+
+@njit(cache=True, error_model="numpy")
+def _differs(above, here, below, out):  # type: ignore[no-untyped-def]
+    """Non-zero where one of the eight neighbours has another label; the first and last column stay 0."""
+    for u in range(1, here.shape[0] - 1):
+        own = here[u]
+        upper = (above[u - 1] ^ own) | (above[u] ^ own) | (above[u + 1] ^ own)
+        lower = (below[u - 1] ^ own) | (below[u] ^ own) | (below[u + 1] ^ own)
+        out[u] = upper | lower | (here[u - 1] ^ own) | (here[u + 1] ^ own)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def claim_borders(depth, sen, noise, labels, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]
     """Judge again each pixel whose 3x3 neighbourhood holds another label; regions gain or lose at most one pixel.
 
@@ -65,47 +145,29 @@ def claim_borders(depth, sen, noise, labels, kinds, ths, out, top, bottom):  # t
     """
     H, W = depth.shape
     perspective = sen[0] > 0
-    near = np.empty(9, np.int32)
+    near, differs = np.empty(9, np.int32), np.zeros(W, np.int32)
     out[top:bottom] = labels[top:bottom]
     for v in range(max(1, top), min(H - 1, bottom)):
+        _differs(labels[v - 1], labels[v], labels[v + 1], differs)
         y = (v - sen[4]) / sen[2]
         for u in range(1, W - 1):
-            own = labels[v, u]
-            if (
-                labels[v, u - 1] == own
-                and labels[v, u + 1] == own
-                and labels[v - 1, u] == own
-                and labels[v + 1, u] == own
-                and labels[v - 1, u - 1] == own
-                and labels[v - 1, u + 1] == own
-                and labels[v + 1, u - 1] == own
-                and labels[v + 1, u + 1] == own
-            ):
-                continue
-            z = depth[v, u]
-            if not np.isfinite(z):
+            if differs[u] == 0 or not np.isfinite(depth[v, u]):
                 continue
             n = 0
-            for i in range(9):
-                k = labels[v - 1 + i // 3, u - 1 + i % 3]
-                new = k > 0
-                for m in range(n):
-                    if near[m] == k:
-                        new = False
-                if new:
-                    near[n] = k
-                    n += 1
-            x = (u - sen[3]) / sen[1]
-            best, label = CLAIM_SIGMAS, 0
-            sigma = sigma_at(noise, z)
-            for m in range(n):
-                e = misfit(kinds[near[m]], ths[near[m]], x, y, z, sigma, perspective)
-                if e < best:
-                    best, label = e, near[m]
-            out[v, u] = label
+            for i in range(v - 1, v + 2):
+                for j in range(u - 1, u + 2):
+                    k = labels[i, j]
+                    new = k > 0
+                    for m in range(n):
+                        if near[m] == k:
+                            new = False
+                    if new:
+                        near[n] = k
+                        n += 1
+            out[v, u] = _best_of(depth[v, u], (u - sen[3]) / sen[1], y, noise, near, n, kinds, ths, perspective)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def misfit(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]
     """|z - surface| in sigmas, eased at grazing rays where half a pixel moves the depth far; infinite on a miss."""
     zm = depth_on(kind, th, x, y, perspective)
@@ -120,7 +182,7 @@ def misfit(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-de
     return e * min(1.0, max(facing, 0.2) / 0.5)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def fill_small_gaps(label, depth, sweeps):  # type: ignore[no-untyped-def]
     """Give each unlabelled valid pixel the label that at least 5 of its 8 neighbours agree on; `sweeps` times."""
     H, W = label.shape
@@ -145,30 +207,54 @@ def fill_small_gaps(label, depth, sweeps):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def bucket(label, count):  # type: ignore[no-untyped-def]
-    """Flat pixel indices grouped by label: label k owns indices[starts[k] : starts[k + 1]]; starts is (count + 2,)."""
+    """Flat pixel indices grouped by label: label k owns indices[starts[k] : starts[k + 1]]; starts is (count + 2,).
+
+    Label 0 owns nothing: unlabelled pixels are left out.
+    """
     flat = label.ravel()
     starts = np.zeros(count + 2, np.int64)
     for i in range(flat.shape[0]):
-        starts[flat[i] + 1] += 1
+        if flat[i]:
+            starts[flat[i] + 1] += 1
     for k in range(count + 1):
         starts[k + 1] += starts[k]
     place = starts.copy()
-    indices = np.empty(flat.shape[0], np.int32)
+    indices = np.empty(starts[count + 1], np.int32)
     for i in range(flat.shape[0]):
         k = flat[i]
-        indices[place[k]] = i
-        place[k] += 1
+        if k:
+            indices[place[k]] = i
+            place[k] += 1
     return starts, indices
 
 
-@njit(cache=True)
-def gather(depth, sen, noise, indices, x, y, z, sigma):  # type: ignore[no-untyped-def]
-    """Fill ray coordinates, depth and sigma of the pixels `indices` (flat) into the given (N,) arrays."""
-    W = depth.shape[1]
-    flat = depth.ravel()
-    for k in range(indices.shape[0]):
-        i = indices[k]
-        x[k] = (i % W - sen[3]) / sen[1]
-        y[k] = (i // W - sen[4]) / sen[2]
-        z[k] = flat[i]
-        sigma[k] = sigma_at(noise, flat[i])
+@njit(cache=True, error_model="numpy", nogil=True)
+def gather_all(depth, sen, noise, labels, count):  # type: ignore[no-untyped-def]
+    """Ray coordinates, depth and sigma of all labelled pixels, grouped by label in raster order.
+
+    Returns starts (count + 2,) and four arrays; label k owns [starts[k], starts[k + 1]).
+    """
+    H, W = depth.shape
+    flat = labels.ravel()
+    starts = np.zeros(count + 2, np.int64)
+    for i in range(flat.shape[0]):
+        if flat[i]:
+            starts[flat[i] + 1] += 1
+    for k in range(count + 1):
+        starts[k + 1] += starts[k]
+    total = starts[count + 1]
+    x, y, z, sigma = np.empty(total), np.empty(total), np.empty(total), np.empty(total)
+    place = starts.copy()
+    per_x = 1.0 / sen[1]
+    for v in range(H):
+        yv = (v - sen[4]) / sen[2]
+        for u in range(W):
+            k = labels[v, u]
+            if k == 0:
+                continue
+            i = place[k]
+            place[k] = i + 1
+            x[i], y[i], z[i] = (u - sen[3]) * per_x, yv, depth[v, u]
+    for i in range(total):
+        sigma[i] = sigma_at(noise, z[i])
+    return starts, x, y, z, sigma

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from perception.range import fit, grow
@@ -22,7 +23,6 @@ GOOD_SHARE = 0.75
 WHOLE_SHARE = 0.85  # a fit to the whole component that explains less has rivals grown from parts of it
 LOCAL_BLOCKS = 45
 LOCAL_TRIES = 5
-ALL_KINDS = np.ones(5, np.bool_)
 FEW_BLOCKS_FOR_QUADRIC = 60
 LEAST_NORMALS = 10
 
@@ -88,61 +88,76 @@ def explain(
 
 def fit_best(grid: Grid, members: NDArray[np.int64]) -> Fit | None:
     """The kind that explains these blocks most cheaply, or None when none does."""
-    if members.size < 5:
-        return None
-    normals = grid.normal.reshape(-1, 3)
+    kind, parameters, share = _fit_blocks(*_columns(grid), members)
+    return Fit(kind=kind, parameters=parameters, share=share) if kind >= 0 else None
+
+
+def _columns(grid: Grid) -> tuple[Array, Array, Array, Array, Array, bool, int, float]:
+    x, y, z, sigma = (a.ravel() for a in (grid.x, grid.y, grid.z, grid.sigma))
+    return x, y, z, sigma, grid.normal.reshape(-1, 3), grid.perspective, grid.size_px**2, grid.slow_share
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fit_blocks(x, y, z, sigma, normal, perspective, pixels, slow_share, members):  # type: ignore[no-untyped-def]
+    """Kind (-1 when none explains them), parameters (16,) and explained share of the blocks `members` (flat)."""
+    count = members.shape[0]
+    if count < 5:
+        return -1, np.zeros(SIZE), 0.0
     # Evenly spread over the region; a fixed choice keeps results equal from run to run.
-    pick = members if members.size <= FIT_SAMPLES else members[_spread(members.size, FIT_SAMPLES)]
-    x, y, z, sigma = (a.ravel()[pick] for a in (grid.x, grid.y, grid.z, grid.sigma))
-    points = np.stack([x * z, y * z, z] if grid.perspective else [x, y, z], axis=1)
-    kinds = ALL_KINDS.copy()
-    kinds[QUADRIC] = members.size >= FEW_BLOCKS_FOR_QUADRIC
-    known = np.isfinite(normals[pick, 0])
-    kinds[[SPHERE, CYLINDER, CONE]] = int(np.count_nonzero(known)) >= LEAST_NORMALS
+    n = min(count, FIT_SAMPLES)
+    points, P, N = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    few = np.empty((4, n))
+    known = 0
+    for k in range(n):
+        i = members[k if count == n else (k * (count - 1)) // (n - 1)]
+        scale = z[i] if perspective else 1.0
+        few[0, k], few[1, k], few[2, k], few[3, k] = x[i], y[i], z[i], sigma[i]
+        points[k, 0], points[k, 1], points[k, 2] = x[i] * scale, y[i] * scale, z[i]
+        if np.isfinite(normal[i, 0]):
+            P[known], N[known] = points[k], normal[i]
+            known += 1
+    kinds = np.ones(5, np.bool_)
+    kinds[QUADRIC] = count >= FEW_BLOCKS_FOR_QUADRIC
+    kinds[SPHERE] = kinds[CYLINDER] = kinds[CONE] = known >= LEAST_NORMALS
+    # Slow noise covers samples together: so many count as one.
+    patches = max(count * pixels / SLOW_NOISE_AREA_PX, 1.0)
+    correlated = 1.0 + slow_share * max(n / patches - 1.0, 0.0)
     ths, mean2, kept, score = fit.fit_kinds(
-        points,
-        points[known],
-        normals[pick[known]],
-        x,
-        y,
-        z,
-        sigma,
-        grid.perspective,
-        kinds,
-        _correlated_samples(grid, pick.size, members.size),
+        points, P[:known], N[:known], few[0], few[1], few[2], few[3], perspective, kinds, correlated
     )
-    score = np.where((mean2 < GOOD_MEAN_SQUARE) & (kept > GOOD_SHARE), score, np.inf)
-    best = int(np.argmin(score))
-    if not np.isfinite(score[best]):
-        return None
-    return Fit(kind=best, parameters=ths[best], share=float(kept[best]))
-
-
-def _correlated_samples(grid: Grid, samples: int, blocks: int) -> float:
-    """How many samples count as one, because slow noise covers them together."""
-    patches = max(blocks * grid.size_px**2 / SLOW_NOISE_AREA_PX, 1.0)
-    return 1.0 + grid.slow_share * max(samples / patches - 1.0, 0.0)
-
-
-def _spread(size: int, count: int) -> NDArray[np.int64]:
-    return (np.arange(count) * (size - 1)) // (count - 1)
+    best, least = -1, np.inf
+    for k in range(5):
+        if mean2[k] < GOOD_MEAN_SQUARE and kept[k] > GOOD_SHARE and score[k] < least:
+            best, least = k, score[k]
+    return best, ths[best].copy(), kept[best]
 
 
 def _local_fits(grid: Grid, members: NDArray[np.int64]) -> list[Fit]:
     """Fits to small neighbourhoods spread over a component that no single primitive explains."""
-    w = grid.z.shape[1]
-    rows, columns = members // w, members % w
-    inside = np.flatnonzero(np.isfinite(grid.rms.ravel()[members]))
-    if inside.size < LOCAL_TRIES + 2:
-        return []
-    reach2 = LOCAL_BLOCKS / np.pi
-    out = []
-    for seed in inside[_spread(inside.size, LOCAL_TRIES + 2)[1:-1]]:
-        near = (rows - rows[seed]) ** 2 + (columns - columns[seed]) ** 2 <= reach2
-        best = fit_best(grid, members[near])
-        if best is not None:
-            out.append(best)
-    return out
+    kinds, ths, shares = _fit_parts(*_columns(grid), members, grid.rms.ravel(), grid.z.shape[1])
+    return [Fit(kind=int(kinds[k]), parameters=ths[k], share=float(shares[k])) for k in np.flatnonzero(kinds >= 0)]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fit_parts(  # type: ignore[no-untyped-def]
+    x, y, z, sigma, normal, perspective, pixels, slow_share, members, rms, w
+):
+    """`_fit_blocks` of the blocks around `LOCAL_TRIES` seeds that are evenly spread over `members`."""
+    kinds, ths, shares = np.full(LOCAL_TRIES, -1), np.zeros((LOCAL_TRIES, SIZE)), np.zeros(LOCAL_TRIES)
+    inside = members[np.isfinite(rms[members])]
+    if inside.shape[0] < LOCAL_TRIES + 2:
+        return kinds, ths, shares
+    near = np.empty(members.shape[0], members.dtype)
+    for t in range(LOCAL_TRIES):
+        seed = inside[((t + 1) * (inside.shape[0] - 1)) // (LOCAL_TRIES + 1)]
+        count = 0
+        for k in range(members.shape[0]):
+            row, column = members[k] // w - seed // w, members[k] % w - seed % w
+            if row * row + column * column <= LOCAL_BLOCKS / np.pi:
+                near[count] = members[k]
+                count += 1
+        kinds[t], ths[t], shares[t] = _fit_blocks(x, y, z, sigma, normal, perspective, pixels, slow_share, near[:count])
+    return kinds, ths, shares
 
 
 def _grown(grid: Grid, option: Fit, free: Flags, members: NDArray[np.int64]) -> tuple[NDArray[np.int32], float]:

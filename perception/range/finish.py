@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from perception.range import fit
-from perception.range.claim import bucket, gather
+from perception.range.claim import gather_all
 from perception.range.noise import NoiseModel
 from perception.range.primitives import (
     COVARIANCE_OVER,
@@ -19,13 +20,13 @@ from perception.range.primitives import (
     primitive_of,
 )
 from perception.range.sensor import RangeSensorModel
-from perception.range.surfaces import FREEDOM, PLANE, QUADRIC
+from perception.range.starts import solve_positive
+from perception.range.surfaces import FREEDOM, QUADRIC
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 
 COARSE_SAMPLES = 300  # a refined start on these leaves the full fit one step
-FULL_STEPS = 1
 SLOW_NOISE_AREA_PX = 150.0  # pixels that share one value of the slow noise; sets how little averaging gains on it
 STEP_AREA_PX = 16.0
 FREE = np.zeros(9, np.bool_)
@@ -45,15 +46,9 @@ def samples_by_label(
     depth_m: Array, sensor: RangeSensorModel, noise: NoiseModel, labels: Labels, count: int
 ) -> list[Samples]:
     """The pixels of labels 1 to `count`; entry 0 of the list is label 1."""
-    starts, indices = bucket(labels, count)
-    out = []
-    packed, law = sensor.packed(), noise.packed()
-    for k in range(1, count + 1):
-        mine = indices[starts[k] : starts[k + 1]]
-        x, y, z, sigma = (np.empty(mine.size) for _ in range(4))
-        gather(depth_m, packed, law, mine, x, y, z, sigma)
-        out.append(Samples(x=x, y=y, z=z, sigma=sigma))
-    return out
+    starts, x, y, z, sigma = gather_all(depth_m, sensor.packed(), noise.packed(), labels, count)
+    cuts = [slice(a, b) for a, b in zip(starts[1:-1].tolist(), starts[2:].tolist(), strict=True)]
+    return [Samples(x=x[c], y=y[c], z=z[c], sigma=sigma[c]) for c in cuts]
 
 
 def thinned(samples: Samples, most: int) -> Samples:
@@ -77,21 +72,12 @@ def refine_surface(
 ) -> tuple[Surface, Array]:
     """The surface after the ray-depth fit to all its pixels, and its parameter vector."""
     perspective = bool(sensor.packed()[0] > 0)
-    few = thinned(samples, COARSE_SAMPLES)
-    th, _, _, _, _ = fit.fit_robust(kind, th, few.x, few.y, few.z, few.sigma, perspective, fixed, 1)
-    s = samples
-    if kind == PLANE and not fixed.any():
-        th, H, cost, used = fit.refine_plane(th, s.x, s.y, s.z, s.sigma, perspective, fit.TRIM_SIGMAS)
-    else:
-        th, H, cost, used = fit.refine(
-            kind, th, s.x, s.y, s.z, s.sigma, perspective, FULL_STEPS, 0.0, fit.TRIM_SIGMAS, fixed
-        )
-    n = s.x.size
-    kept = max(cost - (n - used) * fit.TRIM_SIGMAS**2, 0.0)
+    s, n = samples, samples.x.size
+    th, H, inverse, middles, kept, used = refined(kind, th, s.x, s.y, s.z, s.sigma, perspective, fixed)
     misfit = float(np.sqrt(kept / max(used - FREEDOM[kind], 1)))
-    depth = float(np.median(few.z)) if n else np.nan
-    covariance = _covariance(H, kind, fixed) * max(misfit**2, 0.05) * averaging_loss(noise, depth)
-    x, y = (float(np.median(a)) for a in (few.x, few.y))
+    x, y, depth, sigma = middles.tolist()
+    loss = averaging_loss(noise, depth)
+    covariance = (_pseudo_inverse(H, kind, fixed) if inverse is None else inverse) * (max(misfit**2, 0.05) * loss)
     middle = np.array([x * depth, y * depth, depth] if perspective else [x, y, depth])
     surface = Surface(
         label=label,
@@ -101,11 +87,53 @@ def refine_surface(
         covariance_over=COVARIANCE_OVER[kind],
         frame=frame_vectors(kind, th) if kind != QUADRIC else np.eye(3)[:2],
         pixels=n,
-        rms_m=misfit * float(np.median(few.sigma)) if n else 0.0,
+        rms_m=misfit * sigma if n else 0.0,
         misfit=misfit,
         middle_m=middle,
     )
     return surface, th
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def refined(kind, th, x, y, z, sigma, perspective, fixed):  # type: ignore[no-untyped-def]
+    """The fit to samples (N,): robust on a few that are evenly spread, then one step on all.
+
+    Returns:
+        parameters, information matrix (9, 9), its inverse (p, p) or None, medians (4,) of x, y, z and sigma,
+        squared residuals of the kept samples, samples kept.
+    """
+    n = x.shape[0]
+    if n == 0:
+        return th, np.zeros((9, 9)), None, np.full(4, np.nan), 0.0, 0
+    few = np.empty((4, min(n, COARSE_SAMPLES)))
+    for k in range(few.shape[1]):
+        i = (k * (n - 1)) // max(few.shape[1] - 1, 1)
+        few[0, k], few[1, k], few[2, k], few[3, k] = x[i], y[i], z[i], sigma[i]
+    th, _, _, _, _ = fit.fit_robust(kind, th, few[0], few[1], few[2], few[3], perspective, fixed, 1)
+    th, H, kept, used = fit.last_step(kind, th, x, y, z, sigma, perspective, fixed)
+    middles = np.empty(4)
+    for a in range(4):
+        middles[a] = np.median(few[a])
+    return th, H, _inverse(H, FREEDOM[kind], fixed), middles, kept, used
+
+
+@njit(cache=True, error_model="numpy")
+def _inverse(H, p, fixed):  # type: ignore[no-untyped-def]
+    """(p, p) inverse over the free parameters, zero elsewhere; None when they are not all determined."""
+    A, b, out, scale = np.empty((p, p)), np.empty(p), np.zeros((p, p)), np.empty(p)
+    for i in range(p):
+        scale[i] = 1.0 / np.sqrt(max(H[i, i], 1e-300))
+    for k in range(p):
+        for i in range(p):
+            for j in range(p):
+                held = fixed[i] or fixed[j]
+                A[i, j] = (1.0 if i == j else 0.0) if held else H[i, j] * scale[i] * scale[j]
+            b[i] = 1.0 if i == k and not fixed[k] else 0.0
+        if not solve_positive(A, b, p):
+            return None
+        for i in range(p):
+            out[i, k] = b[i] * scale[i] * scale[k]
+    return out
 
 
 def averaging_loss(noise: NoiseModel, depth_m: float) -> float:
@@ -119,15 +147,12 @@ def averaging_loss(noise: NoiseModel, depth_m: float) -> float:
     return float((white + SLOW_NOISE_AREA_PX * slow + STEP_AREA_PX * step) / max(total, 1e-30))
 
 
-def _covariance(H: Array, kind: int, fixed: NDArray[np.bool_]) -> Array:
+def _pseudo_inverse(H: Array, kind: int, fixed: NDArray[np.bool_]) -> Array:
+    """(p, p) inverse of an information matrix that leaves a direction free: what is determined keeps its variance."""
     p = int(FREEDOM[kind])
     free = np.flatnonzero(~fixed[:p])
     out = np.zeros((p, p))
     scale = 1.0 / np.sqrt(np.maximum(np.diag(H)[free], 1e-300))
-    A = H[np.ix_(free, free)] * np.outer(scale, scale)
-    try:
-        inner = np.linalg.inv(A)
-    except np.linalg.LinAlgError:
-        inner = np.linalg.pinv(A, rcond=1e-12, hermitian=True)
+    inner = np.linalg.pinv(H[np.ix_(free, free)] * np.outer(scale, scale), rcond=1e-12, hermitian=True)
     out[np.ix_(free, free)] = inner * np.outer(scale, scale)
     return out

@@ -5,16 +5,23 @@ the residual is `(z_measured - z_surface) / sigma(z)`. Robust start (Cauchy weig
 at `TRIM_SIGMAS` and plain least squares (Levenberg's damping, Marquardt's scaling).
 """
 
-
-# bodies and plain comparisons are what compiles fast.
-# ruff: noqa: PLR0912, PLR0915 - compiled loops are long
-
+# ruff: noqa: PLR0912 - the kinds are told apart in one compiled body
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
 from perception.range.rays import MISS_SIGMAS, SCRATCH, normal_equations, residuals
+from perception.range.starts import (
+    is_ellipsoid,
+    normal_axis,
+    quadric_of_sphere,
+    solve_positive,
+    start_cone,
+    start_cylinder,
+    start_plane,
+    start_sphere,
+)
 from perception.range.surfaces import (
     CONE,
     CYLINDER,
@@ -25,7 +32,6 @@ from perception.range.surfaces import (
     SPHERE,
     frame_of,
     stepped,
-    tangent_frame,
 )
 
 TRIM_SIGMAS = 3.0
@@ -36,7 +42,7 @@ QUADRIC_PER_SAMPLE = 1.15  # a simple surface under white noise costs about 0.95
 STEP_GOAL = 1e-3  # of a standard deviation of each parameter: a step that small changes nothing that matters
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed):  # type: ignore[no-untyped-def]
     """Minimise the ray residuals from `th`.
 
@@ -56,14 +62,9 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed):  #
     frame_of(kind, th, frame)
     cost, used = normal_equations(kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g, work)
     damping = 1e-4
+    A, step = np.empty((p, p)), np.empty(p)
     for _ in range(steps):
-        A = np.empty((p, p))
-        step = np.empty(p)
-        for a in range(p):
-            for b in range(p):
-                A[a, b] = 0.0 if fixed[a] or fixed[b] else H[a, b]
-            A[a, a] = A[a, a] * (1.0 + damping) + 1e-12 if not fixed[a] else 1.0
-            step[a] = 0.0 if fixed[a] else g[a]
+        _damped(H, g, fixed, damping, p, A, step)
         if not solve_positive(A, step, p):
             damping *= 10.0
             if damping > 1e6:
@@ -92,105 +93,42 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed):  #
     return th, H, cost, used
 
 
-@njit(cache=True, nogil=True)
-def refine_plane(th, x, y, z, sigma, perspective, trim):  # type: ignore[no-untyped-def]
-    """One trimmed Gauss-Newton step of a plane in two passes over the samples; returns as `refine` does.
+@njit(cache=True, error_model="numpy", nogil=True)
+def last_step(kind, th, x, y, z, sigma, perspective, fixed):  # type: ignore[no-untyped-def]
+    """One Gauss-Newton step on all samples from a start that is good already, in a single pass over them.
 
-    The ray depth of the plane (a, b, c) is 1 / (a x + b y + c) or a x + b y + c, so the step is linear in them:
-    dz = -z^2 (x, y, 1) dm or (x, y, 1) dm. The information matrix is carried over to tilts and offset.
+    The matrix and the trim are those of the start; the cost after the step follows from the quadratic model.
+
+    Returns:
+        parameters, information matrix (9, 9), squared residuals of the kept samples, samples kept.
     """
-    m = np.zeros(3)
-    if perspective:
-        m[0], m[1], m[2] = th[0] / th[3], th[1] / th[3], th[2] / th[3]
-    else:
-        m[0], m[1], m[2] = -th[0] / th[2], -th[1] / th[2], th[3] / th[2]
-    S = np.zeros((3, 3))
-    cost, used = 0.0, 0
-    for sweep in range(2):
-        S[:] = 0.0
-        b = np.zeros(3)
-        cost, used = 0.0, 0
-        for i in range(x.shape[0]):
-            g = m[0] * x[i] + m[1] * y[i] + m[2]
-            zm = 1.0 / g if perspective else g
-            e = (z[i] - zm) / sigma[i]
-            if not abs(e) <= trim:
-                cost += trim * trim
-                continue
-            cost += e * e
-            used += 1
-            w = -zm * zm / sigma[i] if perspective else 1.0 / sigma[i]
-            wx, wy = w * x[i], w * y[i]
-            S[0, 0] += wx * wx
-            S[0, 1] += wx * wy
-            S[0, 2] += wx * w
-            S[1, 1] += wy * wy
-            S[1, 2] += wy * w
-            S[2, 2] += w * w
-            b[0] += wx * e
-            b[1] += wy * e
-            b[2] += w * e
-        S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
-        if sweep == 0 and used > 3 and solve_positive(S.copy(), b, 3):
-            for k in range(3):
-                m[k] += b[k]
-    out = th.copy()
-    if perspective:
-        length = np.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
-        side = 1.0 if th[3] >= 0.0 else -1.0
-        out[0], out[1], out[2], out[3] = side * m[0] / length, side * m[1] / length, side * m[2] / length, side / length
-    else:
-        length = np.sqrt(m[0] * m[0] + m[1] * m[1] + 1.0)
-        side = 1.0 if th[2] >= 0.0 else -1.0
-        side /= length
-        out[0], out[1], out[2], out[3] = -side * m[0], -side * m[1], side, side * m[2]
-    frame, B = np.zeros(6), np.zeros((3, 3))
-    frame_of(PLANE, out, frame)
-    n2, d = out[2], out[3]
-    for k in range(2):
-        for a in range(3):
-            if perspective:
-                B[a, k] = frame[3 * k + a] / d
-            elif a < 2:
-                B[a, k] = -(frame[3 * k + a] * n2 - out[a] * frame[3 * k + 2]) / (n2 * n2)
-            else:
-                B[a, k] = -d * frame[3 * k + 2] / (n2 * n2)
-    for a in range(3):
-        B[a, 2] = -out[a] / (d * d) if perspective else (1.0 / n2 if a == 2 else 0.0)
-    H = np.zeros((9, 9))
-    H[:3, :3] = B.T @ S @ B
-    return out, H, cost, used
+    p = FREEDOM[kind]
+    H, g, frame = np.zeros((9, 9)), np.zeros(9), np.zeros(6)
+    frame_of(kind, th, frame)
+    cost, used = normal_equations(
+        kind, th, frame, x, y, z, sigma, perspective, 0.0, TRIM_SIGMAS, H, g, np.empty(SCRATCH)
+    )
+    kept = max(cost - (x.shape[0] - used) * TRIM_SIGMAS * TRIM_SIGMAS, 0.0)
+    A, step = np.empty((p, p)), np.empty(p)
+    _damped(H, g, fixed, 0.0, p, A, step)
+    if used <= p or not solve_positive(A, step, p):
+        return th, H, kept, used
+    for a in range(p):
+        kept -= 0.0 if fixed[a] else g[a] * step[a]
+    return stepped(kind, th, frame, step), H, max(kept, 0.0), used
 
 
-@njit(cache=True)
-def solve_positive(A, b, p):  # type: ignore[no-untyped-def]
-    """Solve A x = b by Cholesky, overwriting both; False when A is not positive definite."""
-    for i in range(p):
-        top = A[i, i]
-        for j in range(i + 1):
-            s = A[i, j]
-            for k in range(j):
-                s -= A[i, k] * A[j, k]
-            if i == j:
-                if s <= 1e-13 * top:
-                    return False
-                A[i, i] = np.sqrt(s)
-            else:
-                A[i, j] = s / A[j, j]
-    for i in range(p):
-        s = b[i]
-        for k in range(i):
-            s -= A[i, k] * b[k]
-        b[i] = s / A[i, i]
-    for i in range(p - 1, -1, -1):
-        s = b[i]
-        for k in range(i + 1, p):
-            s -= A[k, i] * b[k]
-        b[i] = s / A[i, i]
-    return True
+@njit(cache=True, error_model="numpy")
+def _damped(H, g, fixed, damping, p, A, step):  # type: ignore[no-untyped-def]
+    """The system of one step into `A` (p, p) and `step` (p,): fixed parameters stay where they are."""
+    for a in range(p):
+        for b in range(p):
+            A[a, b] = 0.0 if fixed[a] or fixed[b] else H[a, b]
+        A[a, a] = A[a, a] * (1.0 + damping) + 1e-12 if not fixed[a] else 1.0
+        step[a] = 0.0 if fixed[a] else g[a]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _middle_scale(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]
     """Robust residual scale, 1.48 times the median of |e|, at least 1."""
     e = np.empty(x.shape[0])
@@ -200,7 +138,7 @@ def _middle_scale(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-unt
     return max(1.0, 1.4826 * np.median(e))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def fit_robust(kind, th, x, y, z, sigma, perspective, fixed, rounds):  # type: ignore[no-untyped-def]
     """Refine under Cauchy weights whose scale falls with the residuals; ends with the trimmed fit.
 
@@ -217,182 +155,7 @@ def fit_robust(kind, th, x, y, z, sigma, perspective, fixed, rounds):  # type: i
     return th, H, max(kept, 0.0) / max(used - FREEDOM[kind], 1), used / max(n, 1), cost
 
 
-@njit(cache=True)
-def centroid(P):  # type: ignore[no-untyped-def]
-    """Mean of points (N, 3)."""
-    c = np.zeros(3)
-    n = P.shape[0]
-    for i in range(n):
-        for a in range(3):
-            c[a] += P[i, a]
-    for a in range(3):
-        c[a] /= n
-    return c
-
-
-@njit(cache=True)
-def scatter(P, c):  # type: ignore[no-untyped-def]
-    """(3, 3) sum of (P_i - c)(P_i - c)'."""
-    S = np.zeros((3, 3))
-    for i in range(P.shape[0]):
-        x, y, z = P[i, 0] - c[0], P[i, 1] - c[1], P[i, 2] - c[2]
-        S[0, 0] += x * x
-        S[1, 1] += y * y
-        S[2, 2] += z * z
-        S[0, 1] += x * y
-        S[0, 2] += x * z
-        S[1, 2] += y * z
-    S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
-    return S
-
-
-@njit(cache=True)
-def start_plane(P):  # type: ignore[no-untyped-def]
-    """Plane through points (N, 3) by principal axes."""
-    th = np.zeros(SIZE)
-    c = centroid(P)
-    _, V = np.linalg.eigh(scatter(P, c))
-    side = -1.0 if V[2, 0] > 0 else 1.0  # towards the sensor, but for planes that the ray only grazes
-    for a in range(3):
-        th[a] = side * V[a, 0]
-        th[3] += th[a] * c[a]
-    return th
-
-
-@njit(cache=True)
-def _least_squares(rows, values):  # type: ignore[no-untyped-def]
-    """Solve rows (N, m) x = values (N,) by normal equations; (x, solved)."""
-    n, m = rows.shape
-    A, b = np.zeros((m, m)), np.zeros(m)
-    for i in range(n):
-        for j in range(m):
-            r = rows[i, j]
-            b[j] += r * values[i]
-            for k in range(j + 1):
-                A[j, k] += r * rows[i, k]
-    for j in range(m):
-        for k in range(j):
-            A[k, j] = A[j, k]
-        A[j, j] = A[j, j] * (1.0 + 1e-9) + 1e-18
-    return b, solve_positive(A, b, m)
-
-
-@njit(cache=True)
-def _side(P, N, th, axis):  # type: ignore[no-untyped-def]
-    """+1 when the normals point away from the centre or axis of `th`, -1 when towards it."""
-    outward = 0.0
-    for i in range(P.shape[0]):
-        x, y, z = P[i, 0] - th[0], P[i, 1] - th[1], P[i, 2] - th[2]
-        h = x * axis[0] + y * axis[1] + z * axis[2]
-        outward += N[i, 0] * (x - h * axis[0]) + N[i, 1] * (y - h * axis[1]) + N[i, 2] * (z - h * axis[2])
-    return 1.0 if outward >= 0 else -1.0
-
-
-@njit(cache=True)
-def start_sphere(P, N):  # type: ignore[no-untyped-def]
-    """Algebraic sphere |X|^2 = 2 c . X + k about the centroid; side from the normals."""
-    th = np.zeros(SIZE)
-    c = centroid(P)
-    n = P.shape[0]
-    rows, values = np.ones((n, 4)), np.zeros(n)
-    for i in range(n):
-        for a in range(3):
-            d = P[i, a] - c[a]
-            rows[i, a] = 2.0 * d
-            values[i] += d * d
-    b, ok = _least_squares(rows, values)
-    if not ok:
-        return th, False
-    square = b[3]
-    for a in range(3):
-        th[a] = c[a] + b[a]
-        square += b[a] * b[a]
-    th[3] = np.sqrt(max(square, 1e-12))
-    th[4] = _side(P, N, th, np.zeros(3))
-    return th, True
-
-
-@njit(cache=True)
-def normal_axis(N, centred):  # type: ignore[no-untyped-def]
-    """Direction that the normals avoid (cylinder), or along which they are constant (cone, centred)."""
-    _, V = np.linalg.eigh(scatter(N, centroid(N) if centred else np.zeros(3)))
-    return V[:, 0].copy()
-
-
-@njit(cache=True)
-def start_cylinder(P, N, axis):  # type: ignore[no-untyped-def]
-    """Circle (algebraic) of the points seen along `axis`."""
-    th = np.zeros(SIZE)
-    e = tangent_frame(axis[0], axis[1], axis[2])
-    c = centroid(P)
-    n = P.shape[0]
-    rows, values = np.ones((n, 3)), np.zeros(n)
-    for i in range(n):
-        x, y, z = P[i, 0] - c[0], P[i, 1] - c[1], P[i, 2] - c[2]
-        p, q = x * e[0] + y * e[1] + z * e[2], x * e[3] + y * e[4] + z * e[5]
-        rows[i, 0], rows[i, 1] = 2.0 * p, 2.0 * q
-        values[i] = p * p + q * q
-    b, ok = _least_squares(rows, values)
-    if not ok:
-        return th, False
-    for a in range(3):
-        th[a] = c[a] + b[0] * e[a] + b[1] * e[3 + a]
-        th[3 + a] = axis[a]
-    th[6] = np.sqrt(max(b[2] + b[0] * b[0] + b[1] * b[1], 1e-12))
-    th[7] = _side(P, N, th, axis)
-    return th, True
-
-
-@njit(cache=True)
-def start_cone(P, N, axis):  # type: ignore[no-untyped-def]
-    """Apex from n . X = n . apex; the angle from n . axis = -sin(angle)."""
-    th = np.zeros(SIZE)
-    c = centroid(P)
-    n = P.shape[0]
-    values = np.zeros(n)
-    along = 0.0
-    for i in range(n):
-        for a in range(3):
-            values[i] += N[i, a] * (P[i, a] - c[a])
-            along += N[i, a] * axis[a] / n
-    b, ok = _least_squares(N, values)
-    if not ok:
-        return th, False
-    inward = 1.0 if b[0] * axis[0] + b[1] * axis[1] + b[2] * axis[2] < 0 else -1.0
-    for a in range(3):
-        th[a] = c[a] + b[a]
-        th[3 + a] = inward * axis[a]
-    th[6] = min(max(np.arcsin(min(abs(along), 0.999)), 0.02), 1.5)
-    th[7] = _side(P, N, th, th[3:6])
-    return th, True
-
-
-@njit(cache=True)
-def quadric_of_sphere(th):  # type: ignore[no-untyped-def]
-    """The sphere as a quadric centred on it: the start of an ellipsoid fit."""
-    out = np.zeros(SIZE)
-    out[:3] = th[:3]
-    out[3] = max(th[3], 1e-6)
-    out[4], out[5], out[6], out[13] = 1.0, 1.0, 1.0, -1.0
-    return out
-
-
-@njit(cache=True)
-def is_ellipsoid(th):  # type: ignore[no-untyped-def]
-    """Whether the quadric is a real ellipsoid of sane proportions (longest radius at most 8 times the shortest)."""
-    A = np.array(
-        [[th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]]
-    )
-    b = 0.5 * th[10:13]
-    w, V = np.linalg.eigh(A)
-    if w[0] <= 1e-3:
-        return False
-    t = V.T @ b
-    rest = t[0] * t[0] / w[0] + t[1] * t[1] / w[1] + t[2] * t[2] / w[2] - th[13]
-    return rest > 0 and w[2] < 64.0 * w[0]
-
-
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def trimmed_cost(kind, th, x, y, z, sigma, perspective, limit, stride):  # type: ignore[no-untyped-def]
     """Sum of squared residuals, each at most limit^2, over every `stride`-th sample."""
     e = np.empty(x.shape[0])
@@ -403,7 +166,7 @@ def trimmed_cost(kind, th, x, y, z, sigma, perspective, limit, stride):  # type:
     return cost
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_samples):  # type: ignore[no-untyped-def]
     """Fit every kind in the (5,) mask `kinds` to one set of samples, `points` (N, 3).
 
@@ -471,7 +234,7 @@ def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_sampl
     return ths, mean2, kept, score
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _is_sane(kind, th):  # type: ignore[no-untyped-def]
     if kind == CYLINDER:
         return th[6] < LARGEST_RADIUS_M

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from perception.range.fit import solve_positive
+from perception.range.starts import solve_positive
 from perception.range.surfaces import PLANE, depth_on, normal_on
 
 GROW_SIGMAS = 3.0

@@ -1,0 +1,150 @@
+"""Compiled passes over pixels and their small algebra against plain numpy."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from perception.range import claim, finish
+from perception.range.noise import NoiseModel
+from perception.range.starts import principal_axes
+from perception.range.surfaces import CYLINDER, PLANE, SIZE, SPHERE
+from tests.perception.range.scenes import PARALLEL, PINHOLE
+
+NOISE = NoiseModel(white=(0.0005, 0.0002), correlated=(0.0, 0.0003), step=(0.0004, 0.0))
+KINDS = np.array([0, PLANE, SPHERE, PLANE, CYLINDER])
+
+
+def competing_surfaces() -> np.ndarray:
+    """(5, 16) parameters of two planes, a ball and a pipe at about 0.6 m; entry 0 is unused."""
+    table = np.zeros((5, SIZE))
+    table[1, :4] = [0.0, 0.0, -1.0, -0.62]
+    table[2, :5] = [-0.05, 0.0, 0.62, 0.05, 1.0]
+    table[3, :4] = [0.6, 0.0, -0.8, -0.48]
+    table[4, :8] = [0.1, 0.0, 0.62, 0.0, 1.0, 0.0, 0.03, 1.0]
+    return table
+
+
+def random_case(sensor, seed, size=2):
+    """Depth near the surfaces with holes, and a block map of random patches."""
+    rng = np.random.default_rng(seed)
+    depth = 0.6 + 0.02 * rng.normal(size=(sensor.height_px, sensor.width_px)) * (rng.random((120, 160)) < 0.5)
+    depth[rng.random(depth.shape) < 0.02] = np.nan
+    h, w = -(-depth.shape[0] // size), -(-depth.shape[1] // size)
+    coarse = rng.integers(0, 5, (h // 6 + 1, w // 6 + 1))
+    blocks = np.kron(coarse, np.ones((6, 6), int))[:h, :w].astype(np.int32)
+    return depth, np.ascontiguousarray(blocks)
+
+
+def best_label(sensor, depth, v, u, near, table):
+    """Smallest label of least misfit among `near`, by the definition."""
+    packed, z = sensor.packed(), depth[v, u]
+    best, label = claim.CLAIM_SIGMAS, 0
+    for k in near:
+        e = claim.misfit(
+            KINDS[k],
+            table[k],
+            (u - packed[3]) / packed[1],
+            (v - packed[4]) / packed[2],
+            z,
+            float(NOISE.sigma_m(z)),
+            bool(packed[0] > 0),
+        )
+        if e < best:
+            best, label = e, k
+    return label
+
+
+def around(labels, v, u):
+    """Labels of the 3x3 neighbourhood, in raster order of first sight."""
+    patch = labels[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2].ravel()
+    return list(dict.fromkeys(int(k) for k in patch if k > 0))
+
+
+@pytest.mark.parametrize("sensor", [PINHOLE, PARALLEL], ids=["pinhole", "orthographic"])
+@pytest.mark.parametrize("tiles", [1, 5])
+def test_pixels_go_to_the_best_surface_of_the_blocks_around(sensor, tiles):
+    depth, blocks = random_case(sensor, 1)
+    table, out = competing_surfaces(), np.full(depth.shape, -1, np.int32)
+    cuts = np.linspace(0, blocks.shape[0], tiles + 1).astype(int).tolist()
+    for top, bottom in pairwise(cuts):
+        claim.claim_pixels(depth, sensor.packed(), NOISE.packed(), blocks, 2, KINDS, table, out, top, bottom)
+    assert (out >= 0).all() and len(np.unique(out)) == 5
+    rng = np.random.default_rng(0)
+    for v, u in zip(rng.integers(0, 120, 3000), rng.integers(0, 160, 3000), strict=True):
+        assert out[v, u] == best_label(sensor, depth, v, u, around(blocks, v // 2, u // 2), table)
+
+
+@pytest.mark.parametrize("sensor", [PINHOLE, PARALLEL], ids=["pinhole", "orthographic"])
+def test_only_pixels_beside_another_label_are_judged_again(sensor):
+    depth, blocks = random_case(sensor, 2, size=1)
+    table, out = competing_surfaces(), np.empty(depth.shape, np.int32)
+    claim.claim_borders(depth, sensor.packed(), NOISE.packed(), blocks, KINDS, table, out, 0, 50)
+    claim.claim_borders(depth, sensor.packed(), NOISE.packed(), blocks, KINDS, table, out, 50, 120)
+    for v in range(120):
+        for u in range(160):
+            edge = v in (0, 119) or u in (0, 159)
+            alike = (blocks[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2] == blocks[v, u]).all()
+            if edge or alike or np.isnan(depth[v, u]):
+                assert out[v, u] == blocks[v, u]
+            elif (v + u) % 7 == 0:  # the plain search is slow: a seventh of them
+                assert out[v, u] == best_label(sensor, depth, v, u, around(blocks, v, u), table)
+
+
+@pytest.mark.parametrize("sensor", [PINHOLE, PARALLEL], ids=["pinhole", "orthographic"])
+def test_samples_of_each_label_come_in_raster_order(sensor):
+    depth, labels = random_case(sensor, 3, size=1)
+    labels[np.isnan(depth)] = 0
+    samples = finish.samples_by_label(depth, sensor, NOISE, labels, 4)
+    packed = sensor.packed()
+    for k, mine in enumerate(samples, 1):
+        v, u = np.nonzero(labels == k)
+        np.testing.assert_allclose(mine.x, (u - packed[3]) / packed[1], atol=1e-15)
+        np.testing.assert_allclose(mine.y, (v - packed[4]) / packed[2], atol=1e-15)
+        np.testing.assert_array_equal(mine.z, depth[v, u])
+        np.testing.assert_allclose(mine.sigma, NOISE.sigma_m(depth[v, u]), rtol=1e-12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10**6), rank=st.integers(1, 3), size=st.floats(1e-8, 1e8))
+def test_principal_axes_are_those_of_lapack(seed, rank, size):
+    rows = np.random.default_rng(seed).normal(size=(rank, 3)) * np.array([1.0, 0.1, 3.0])
+    S = size * rows.T @ rows
+    values, vectors = principal_axes(S)
+    np.testing.assert_allclose(values, np.linalg.eigvalsh(S), atol=1e-13 * np.trace(S))
+    np.testing.assert_allclose(vectors @ vectors.T, np.eye(3), atol=1e-13)
+    np.testing.assert_allclose(S @ vectors, vectors * values, atol=1e-13 * np.trace(S))
+
+
+def test_a_sphere_is_refined_to_its_bound_and_its_covariance_is_the_inverse_information():
+    """20 noisy images of one ball: errors over sigma spread like a unit normal, also with a radius held by a prior."""
+    rng = np.random.default_rng(5)
+    u, v = np.meshgrid(np.linspace(-0.1, 0.1, 60), np.linspace(-0.1, 0.1, 60))
+    keep = np.hypot(u, v) < 0.09
+    x, y, sigma = u[keep], v[keep], np.full(keep.sum(), 1e-3)
+    truth = np.array([0.0, 0.0, 0.6, 0.1])
+    surface = 0.6 - np.sqrt(0.01 - x**2 - y**2)
+    free, held = np.zeros(9, bool), np.arange(9) == 3
+    scores = []
+    for _ in range(20):
+        start = np.zeros(SIZE)
+        start[:5] = [0.002, -0.001, 0.601, 0.1, 1.0]
+        z = surface + sigma * rng.normal(size=x.size)
+        th, H, covariance, middles, kept, used = finish.refined(SPHERE, start, x, y, z, sigma, False, free)
+        np.testing.assert_allclose(covariance @ H[:4, :4], np.eye(4), atol=1e-8)
+        assert kept / used == pytest.approx(0.97, abs=0.1)
+        np.testing.assert_allclose(middles[:2], 0.0, atol=0.02)
+        scores.append((th[:4] - truth) / np.sqrt(np.diag(covariance)))
+        th, _, covariance, *_ = finish.refined(SPHERE, start, x, y, z, sigma, False, held)
+        assert th[3] == 0.1 and not covariance[3].any() and covariance[0, 0] > 0
+    assert 0.6 < np.std(scores) < 1.5
+
+
+def test_an_undetermined_direction_has_no_inverse():
+    H = np.zeros((9, 9))
+    H[0, 0] = H[1, 1] = 4.0
+    assert finish._inverse(H, 3, np.zeros(9, bool)) is None

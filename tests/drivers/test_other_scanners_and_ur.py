@@ -168,8 +168,8 @@ def test_rawlog_grabber_sets_up_the_lms_200_and_records_its_scans(tmp_path: Path
         os.close(terminal)
         far_side.close()
     log = next(tmp_path.glob("*.rawlog"))
-    edit = ["rawlog-edit", "--export-2d-scans-txt", "--input", str(log), "--out-dir", f"{tmp_path}/"]
-    subprocess.run(edit, check=True, capture_output=True)
+    edit = ["rawlog-edit", "--export-2d-scans-txt", "--input", log.name]  # it joins folders to names without a slash
+    subprocess.run(edit, check=True, capture_output=True, cwd=tmp_path)
     rows = np.loadtxt(next(tmp_path.glob("*_LMS.txt")), comments="%")
     angle_rad = np.deg2rad(np.arange(181) - 90.0)
     assert len(rows) >= 10

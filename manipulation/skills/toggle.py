@@ -64,7 +64,10 @@ def toggle(cell: Workcell, name: str, target: str, *, verify: Verify | None = No
         goal = shifted(here, here.rotation.inv().apply(sweep))
         # The bat's own effort acts at its tip; the fingertip pushes lower down.
         stop_n = EFFORT_SPREAD * thing.force_n / GRIP_RATIO + END_N
-        guard = Guard(name="end stop", quantity=Quantity.FORCE, limit=stop_n, ticks=1)
+        # Only against the sweep: what wedges the finger up along the leaning bat is no effort of the bat.
+        x, y, z = here.rotation.inv().apply(-sweep / np.linalg.norm(sweep))
+        against = (float(x), float(y), float(z))
+        guard = Guard(name="end stop", quantity=Quantity.FORCE, limit=stop_n, axis=against, ticks=1)
         report = attempt.straight(
             goal, name="sweep", speed_m_per_s=SWEEP_M_PER_S, guards=(guard,), compliance=SOFT_PUSH
         )

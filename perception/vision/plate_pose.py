@@ -55,7 +55,9 @@ class RigidPlate:
         return replace(self, R=turn @ self.R, t_m=self.t_m + float(np.linalg.norm(self.t_m)) * delta[3:])
 
 
-def rigid_plate(corners_m: Array, corners_px: Array, *, focal_px: float, middle_px: Array, sigma_px: float) -> RigidPlate:
+def rigid_plate(
+    corners_m: Array, corners_px: Array, *, focal_px: float, middle_px: Array, sigma_px: float
+) -> RigidPlate:
     """The rigid plate nearest to four corners.
 
     The columns of K^-1 H are r1, r2 and t up to a common scale (Z. Zhang, IEEE PAMI 22(11), 2000, sec. 3.1); the nearest

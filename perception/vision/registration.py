@@ -117,9 +117,7 @@ def follow_edges(image: EdgeImage, view: V, outline: Outline, windows_px: Sequen
     delta = np.zeros(len(view.prior_sigma))
     motion = _motion(view, delta, outline.points_m)  # of a plane: hardly changes within a dozen pixels
     for window in windows_px:
-        delta, _ = _step(
-            image.smooth, image.slope_noise, view, delta, edges=outline, window_px=window, motion=motion
-        )
+        delta, _ = _step(image.smooth, image.slope_noise, view, delta, edges=outline, window_px=window, motion=motion)
     return view.moved(delta)
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.range import fit
+from perception.range import fit, rays
 from perception.range.borders import Border, borders_of, step_and_turn
 from perception.range.finish import FREE, SLOW_NOISE_AREA_PX, Samples, thinned
 from perception.range.noise import NoiseModel
@@ -133,8 +133,8 @@ class Agglomeration:
 
     def _residuals(self, kind: int, th: Array, s: Samples) -> Array:
         e = np.empty(s.x.size)
-        fit.residuals(kind, th, s.x, s.y, s.z, s.sigma, self.perspective, e)
-        return np.asarray(np.where(np.isfinite(e), np.abs(e), fit.MISS_SIGMAS))
+        rays.residuals(kind, th, s.x, s.y, s.z, s.sigma, self.perspective, e)
+        return np.asarray(np.where(np.isfinite(e), np.abs(e), rays.MISS_SIGMAS))
 
     def _judged(self, pair: tuple[int, int]) -> Merger | None:
         """The joint description of a pair if it gains, else None."""

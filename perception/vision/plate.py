@@ -62,6 +62,9 @@ def find_plate(gray: Image, width_m: float, height_m: float, *, focal_px: float 
     return None if found is None else Plate(view=found, sides_seen=tuple(line is not None for line in lines))  # type: ignore[arg-type]
 
 
+_Attempt = tuple[list[Array | None], tuple[float, ...], float]  # lines, windows in pixels, sigma in pixels
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Search:
     """What every attempt to lay the plate through coarse lines needs."""
@@ -78,7 +81,7 @@ class _Search:
         view = self._laid(lines, WINDOWS_PX, START_SIGMA_PX)
         found = [] if view is None else [(self._score(view), view)]
         if view is None or self._least_confirmed(view) < CONFIRMED:
-            attempts = [(lines, FAR_WINDOWS_PX, FAR_SIGMA_PX)]
+            attempts: list[_Attempt] = [(lines, FAR_WINDOWS_PX, FAR_SIGMA_PX)]
             for side in range(4):
                 fewer = [None if k == side else line for k, line in enumerate(lines)]
                 attempts.append((fewer, WINDOWS_PX, START_SIGMA_PX))

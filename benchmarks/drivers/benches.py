@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +30,9 @@ from drivers.emulators import (
 from drivers.emulators.base import WireEmulator
 from drivers.emulators.beams import line_m
 from drivers.emulators.faults import WireFault
-from hal.devices import RangeImage
+from hal.clock import Deadline
+from hal.devices import JointState, RangeImage, Wrench
+from hal.readings import Stamped
 from hal.registry import Context, connect
 
 
@@ -44,6 +48,53 @@ class Bench:
     options: dict[str, Any]
     far_options: dict[str, Any]
     faults: tuple[WireFault, ...] = tuple(WireFault)
+    taken_s: Callable[[Any, Any], float] | None = None
+    """When a value was taken (monotonic), where the value tells and the protocol lets a driver know."""
+
+
+class MovingArm(scripted.ScriptedArm):
+    """An arm whose joints tell the time: each rises at the same speed, for some seconds, and begins anew."""
+
+    SPEED_RAD_PER_S, TURN_S = 0.5, 4.0
+
+    def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
+        """Where it is now."""
+        stamped = super().read_state(deadline=deadline)
+        moved_rad = self.SPEED_RAD_PER_S * (time.monotonic() % self.TURN_S)
+        return replace(stamped, value=replace(stamped.value, position_rad=self.position_rad + moved_rad))
+
+    def seconds(self, value: JointState) -> Any:
+        """Seconds since the beginning that each joint tells."""
+        return (value.position_rad - self.position_rad) / self.SPEED_RAD_PER_S
+
+    def taken_s(self, value: JointState) -> float:
+        """The oldest joint's time; it was not longer ago than one turn, and rounding may bring it before now."""
+        now_s = time.monotonic() + SAME_MOMENT_S
+        return now_s - float(np.max((now_s - self.seconds(value)) % self.TURN_S))
+
+
+class TimedForceTorque(scripted.ScriptedForceTorque):
+    """Remembers when each reading was taken."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._read_s: deque[float] = deque(maxlen=4096)
+
+    def count(self, deadline: Deadline) -> tuple[int, float]:
+        """Index of this read and its time."""
+        self._read_s.append(time.monotonic())
+        return super().count(deadline)
+
+    def taken_s(self, value: Wrench) -> float:
+        """By the index that the force tells."""
+        ago = self.reads - round(value.force_n[0] / 0.01)
+        return self._read_s[-1 - ago]
+
+
+def taken_s(value: Any, backing: Any) -> float:
+    """What the backing remembers."""
+    when_s: float = backing.taken_s(value)
+    return when_s
 
 
 def true_wrench(value: Any, backing: Any) -> bool:
@@ -111,13 +162,10 @@ def turn_angles(count: int) -> Any:
 
 
 def true_joints(value: Any, backing: Any) -> bool:
-    """Where the arm stands."""
-    return bool(np.array_equal(value.position_rad, backing.position_rad))
-
-
-def near_joints(value: Any, backing: Any) -> bool:
-    """Where the arm stands, to the last count of the servos."""
-    return bool(np.allclose(value.position_rad, backing.position_rad, atol=0.0008))
+    """All joints of one moment, to the last count of the servos."""
+    seconds = backing.seconds(value)
+    apart_s = (seconds - seconds[0] + backing.TURN_S / 2.0) % backing.TURN_S - backing.TURN_S / 2.0
+    return bool(np.ptp(apart_s) < SAME_MOMENT_S)
 
 
 def true_width(value: Any, backing: Any) -> bool:
@@ -130,6 +178,7 @@ def true_lights(value: Any, backing: Any) -> bool:
     return bool(value == backing.on)
 
 
+SAME_MOMENT_S = 0.02  # servos are read one after another, on a busy machine
 WITHOUT_CRC = tuple(f for f in WireFault if f is not WireFault.CRC)
 FAST_SCAN = {"scans_per_minute": 2400}
 BENCHES = (
@@ -164,7 +213,7 @@ BENCHES = (
     Bench(
         name="ft300 stream",
         start=ft300.start,
-        backing=scripted.ScriptedForceTorque,
+        backing=TimedForceTorque,
         driver="serial:ft300",
         is_true=true_wrench,
         options={},
@@ -173,8 +222,9 @@ BENCHES = (
     Bench(
         name="ft300 modbus",
         start=ft300.start,
-        backing=scripted.ScriptedForceTorque,
+        backing=TimedForceTorque,
         driver="modbus:ft300",
+        taken_s=taken_s,
         is_true=true_wrench,
         options={},
         far_options={},
@@ -209,7 +259,7 @@ BENCHES = (
     Bench(
         name="netft",
         start=netft.start,
-        backing=scripted.ScriptedForceTorque,
+        backing=TimedForceTorque,
         driver="udp:netft",
         is_true=true_wrench,
         options={},
@@ -218,8 +268,9 @@ BENCHES = (
     Bench(
         name="bota",
         start=bota.start,
-        backing=scripted.ScriptedForceTorque,
+        backing=TimedForceTorque,
         driver="serial:bota",
+        taken_s=taken_s,
         is_true=true_wrench,
         options={},
         far_options={},
@@ -273,8 +324,9 @@ BENCHES = (
     Bench(
         name="ur",
         start=ur.start,
-        backing=scripted.ScriptedArm,
+        backing=MovingArm,
         driver="ur:rtde",
+        taken_s=taken_s,
         is_true=true_joints,
         options={"rate_hz": 125.0},
         far_options={},
@@ -282,18 +334,20 @@ BENCHES = (
     Bench(
         name="cia402",
         start=cia402.start,
-        backing=scripted.ScriptedArm,
+        backing=MovingArm,
         driver="can:cia402",
-        is_true=near_joints,
+        taken_s=taken_s,
+        is_true=true_joints,
         options={},
         far_options={},
     ),
     Bench(
         name="dynamixel",
         start=dynamixel.start,
-        backing=scripted.ScriptedArm,
+        backing=MovingArm,
         driver="serial:dynamixel",
-        is_true=near_joints,
+        taken_s=taken_s,
+        is_true=true_joints,
         options={},
         far_options={},
     ),

@@ -147,5 +147,11 @@ def _one_read(item: Bench, device: Any, backing: Any, cell: Cell, probe: StallPr
     if sample is None or sample.quality is Quality.INVALID:
         return
     cell.good += 1
-    cell.stale += sample.age_s(CLOCK.now_s()) > device.max_age_s + SLACK_S + (ended_s - started_s)
-    cell.wrong += not item.is_true(sample.value, backing)
+    age_s, call_s = sample.age_s(CLOCK.now_s()), ended_s - started_s
+    if not item.is_true(sample.value, backing):
+        cell.wrong += 1
+        return
+    is_old = age_s > device.max_age_s + SLACK_S + call_s
+    if item.taken_s is not None:
+        is_old |= time.monotonic() - item.taken_s(sample.value, backing) > age_s + SLACK_S + call_s
+    cell.stale += is_old

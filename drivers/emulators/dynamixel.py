@@ -109,6 +109,8 @@ class DynamixelEmulator(WireEmulator):
 
     def _obey(self, packet: dxl2.Packet) -> None:
         p = packet.parameters
+        if packet.instruction in (dxl2.READ, dxl2.SYNC_READ, dxl2.FAST_SYNC_READ):
+            self._refresh()  # once: all servos of an answer show one moment
         match packet.instruction:
             case dxl2.PING:
                 for id_ in self._addressed(packet.id):
@@ -163,7 +165,6 @@ class DynamixelEmulator(WireEmulator):
                 self._is_new_goal |= address == GOAL and not error
 
     def _block(self, id_: int, address: int, length: int) -> bytes:
-        self._refresh()
         return bytes(self.servos[id_].table[address : address + length])
 
     def _refresh(self) -> None:

@@ -7,75 +7,46 @@ wall clock the thread always ticks and holds the arm.
 
 from __future__ import annotations
 
-import os
-import queue
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from hal.calibration import ToolLoad
-from hal.clock import Clock, Deadline, SimClock, WallClock
+from hal.clock import Clock, SimClock
 from hal.config import SafetySection
 from hal.devices import Arm, ForceTorque, Gripper, Proximity, Touch
 from hal.errors import CellError, DeviceFault, MotionRefused, Stopped
 from hal.geometry import identity
-from hal.lockstep import share_core
 from hal.motion import (
     CartesianPath,
     DeclaredMotion,
     GripperMotion,
-    Guard,
     Hold,
     MotionOutcome,
     MotionReport,
-    Quantity,
-    Reaction,
     RobotState,
 )
 from manipulation import kernels
-from manipulation.guards import GuardSet, Measured
+from manipulation.control_thread import ControlThread
+from manipulation.drives import Drives
+from manipulation.endings import Ending, Watch
 from manipulation.kinematics import Kinematics
 from manipulation.recorder import Recorder
 from manipulation.runs import Run, Tick, begin
-from manipulation.sensing import ContactWrench, DeviceFailure, Devices, Look, RangeReader, Sample, ToolView, read_wait_s
+from manipulation.sensing import ContactWrench, DeviceFailure, Devices, RangeReader, Sample, ToolView
 from manipulation.setpoint import SetPointFilter, check, flange_matrix
 
 Array = NDArray[np.float64]
-T = TypeVar("T")
 
-TRACKING_LIMIT_M = 0.02
-LOADED_START_RATIO = 1.2  # otherwise a jammed hand could never be taken away
 SETTLE_S = 0.3
 SETTLED_RAD = 2e-4
 SETTLED_RAD_PER_S = 0.02
 TARE_S = 0.1
 SLOW_TICKS = 4  # gripper and proximity are read every so many ticks
-COMMAND_WAIT_S = 0.25
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _End:
-    """Why a motion is over."""
-
-    outcome: MotionOutcome
-    cause: str
-    tripped: str | None = None
-    device: str | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Job:
-    """Work for the control thread."""
-
-    call: Callable[[], Any]
-    result: Future[Any]
 
 
 class Controller:
@@ -128,34 +99,26 @@ class Controller:
         self._grip = flange_matrix(identity() if flange_from_grip is None else flange_from_grip)
         self._dt_s = 1.0 / (rate_hz or capabilities.command_rate_hz)
         self._filter = SetPointFilter(self.kinematics, self._grip, safety.speed_limit_m_per_s, self._dt_s)
-        self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
-        self._thread: threading.Thread | None = None
+        self._drives = Drives(arm, clock, self._dt_s)
+        self._is_lockstep = isinstance(clock, SimClock)
+        self._thread = ControlThread(beat=None if self._is_lockstep else self._hold, at_end=self._drives.stop)
         self._busy = threading.Lock()
         self._cancel = threading.Event()
-        self._closing = threading.Event()
         self._newest: Sample | None = None
         self._faults: tuple[str, ...] = ()
         self._is_moving = False
-        self._is_holding = False
-        self._next_tick_s = clock.now_s()
 
     # -- life ------------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
         """Warm the compiled kernels, then start the control thread; a second call does nothing."""
-        if self._thread is not None:
-            return
         kernels.warm(self.kinematics.dh)
-        self._thread = threading.Thread(target=self._loop, name="control", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Cancel what runs, stop the arm, end the thread; a second call does nothing."""
-        self._closing.set()
         self._cancel.set()
-        self._jobs.put(None)
-        if self._thread is not None:
-            self._thread.join(timeout=2.0)
+        self._thread.close()
 
     # -- the Mover port --------------------------------------------------------------------------------------------
 
@@ -170,7 +133,7 @@ class Controller:
             raise MotionRefused(f"motion {motion.name!r} refused: another motion runs", hint="wait for it or cancel it")
         try:
             self._cancel.clear()
-            return self._on_thread(lambda: self._execute(motion))
+            return self._thread.do(lambda: self._execute(motion))
         finally:
             self._busy.release()
 
@@ -189,7 +152,7 @@ class Controller:
         if not self._busy.acquire(blocking=False):
             raise MotionRefused("tare refused: a motion runs", hint="tare when the arm rests")
         try:
-            return self._on_thread(self._tare)
+            return self._thread.do(self._tare)
         finally:
             self._busy.release()
 
@@ -199,71 +162,28 @@ class Controller:
         Raises:
             DeviceFault: there is no snapshot, and a device fails.
         """
-        if self._ticks_only_in_motion and self._busy.acquire(blocking=False):
+        if self._is_lockstep and self._busy.acquire(blocking=False):
             try:
-                self._on_thread(self._refresh)
+                self._thread.do(self._refresh)
             finally:
                 self._busy.release()
         sample = self._newest
         if sample is None:
-            sample = self._on_thread(self._refresh)
+            sample = self._thread.do(self._refresh)
         return self._state_of(sample)
 
-    # -- the thread ------------------------------------------------------------------------------------------------
+    # -- between motions -------------------------------------------------------------------------------------------
 
-    @property
-    def _ticks_only_in_motion(self) -> bool:
-        return isinstance(self._clock, SimClock)
-
-    def _on_thread(self, call: Callable[[], T]) -> T:
-        if self._thread is None or self._closing.is_set():
-            raise MotionRefused("the controller does not run", hint="start the cell first")
-        result: Future[T] = Future()
-        self._jobs.put(_Job(call, result))
-        return result.result()
-
-    def _loop(self) -> None:
-        if self._ticks_only_in_motion:
-            share_core(os.getpid())
-        while not self._closing.is_set():
-            try:
-                job = self._jobs.get(block=self._ticks_only_in_motion)
-            except queue.Empty:
-                self._idle_tick()
-                continue
-            if job is not None:
-                self._do(job)
-        self._drain()
-        with suppress(CellError):
-            self._devices.arm.stop(deadline=Deadline.after(self._clock, COMMAND_WAIT_S))
-
-    def _drain(self) -> None:
-        # Callers that asked while the controller closed get an answer too.
-        while True:
-            try:
-                job = self._jobs.get(block=False)
-            except queue.Empty:
-                return
-            if job is not None:
-                job.result.set_exception(MotionRefused("the controller was closed", hint="start the cell again"))
-
-    def _do(self, job: _Job) -> None:
-        try:
-            job.result.set_result(job.call())
-        except BaseException as error:  # whatever went wrong belongs to the caller; the thread lives on
-            self._is_moving = False
-            job.result.set_exception(error)
-
-    def _idle_tick(self) -> None:
-        """Hold the arm between motions on a wall clock, so that its watchdog stays quiet and the state fresh."""
+    def _hold(self) -> None:
+        """One tick between motions on a wall clock: the arm stays, its watchdog quiet, the state fresh."""
         with suppress(DeviceFailure):
             sample = self._read()
             if self._is_latched():
-                self._release()
-            elif self._is_holding:
+                self._drives.switch_off()
+            elif self._drives.are_on:
                 self._send(self._filter.last_rad)
             self._newest = sample
-        self._pass_tick()
+        self._drives.pass_tick()
 
     def _refresh(self) -> Sample:
         try:
@@ -287,13 +207,13 @@ class Controller:
             check(motion, self.kinematics, sample.position_rad)
             self._filter = SetPointFilter(self.kinematics, tool, self._safety.speed_limit_m_per_s, self._dt_s)
             self._filter.begin_at(sample.position_rad)
-            self._enable()
+            self._drives.switch_on()
             run = self._begin(motion, sample)
         except DeviceFailure as failure:
-            end = _End(outcome=MotionOutcome.FAULT, cause=f"{failure}; nothing moved", device=failure.device)
+            end = Ending(outcome=MotionOutcome.FAULT, cause=f"{failure}; nothing moved", device=failure.device)
             return self._report(motion, end, started_s, view, recorder)
         self._is_moving = True
-        self._next_tick_s = self._clock.now_s()
+        self._drives.begin_rhythm()
         try:
             end = self._run(motion, run, sample, view, recorder)
         finally:
@@ -307,16 +227,22 @@ class Controller:
             device = str(error.details.get("device", self._devices.gripper.name))
             raise DeviceFailure(device, error.what) from error
 
-    def _run(self, motion: DeclaredMotion, run: Run, sample: Sample, view: ToolView, recorder: Recorder) -> _End:
+    def _run(self, motion: DeclaredMotion, run: Run, sample: Sample, view: ToolView, recorder: Recorder) -> Ending:
         started_s = sample.stamp_s
         look = view.look(sample, self._filter.last_rad)
-        guards = GuardSet((*motion.guards, *self._standing_guards(look.wrench)), look.base_from_tool)
+        watch = Watch(
+            motion.guards,
+            self._safety.force_limit_n,
+            look,
+            is_latched=self._is_latched,
+            is_cancelled=self._cancel.is_set,
+        )
         ticks = 0
         over_since_s: float | None = None
         while True:
             elapsed_s = sample.stamp_s - started_s
             recorder.note(elapsed_s, sample.position_rad, look.wrench, look.base_from_tool[:3, 3])
-            end = self._why_end(guards, elapsed_s, sample, look)
+            end = watch.ending(elapsed_s, sample, look)
             try:
                 if end is None:
                     tick = Tick(elapsed_s, sample, look.wrench, self._filter.last_rad, self._dt_s)
@@ -324,51 +250,17 @@ class Controller:
                     if run.is_over(tick):
                         over_since_s = elapsed_s if over_since_s is None else over_since_s
                         if self._has_settled(motion, wanted, sample, elapsed_s - over_since_s):
-                            return _End(outcome=MotionOutcome.COMPLETED, cause="ran to its declared end")
+                            return Ending(outcome=MotionOutcome.COMPLETED, cause="ran to its declared end")
                     self._send(self._filter.apply(wanted))
-                    self._pass_tick()
+                    self._drives.pass_tick()
                     ticks += 1
                     sample = self._newest = self._read(None if ticks % SLOW_TICKS == 0 else sample)
                     look = view.look(sample, self._filter.last_rad)
                     continue
             except DeviceFailure as failure:
-                end = _End(outcome=MotionOutcome.FAULT, cause=str(failure), device=failure.device)
+                end = Ending(outcome=MotionOutcome.FAULT, cause=str(failure), device=failure.device)
             self._come_to_rest(end)
             return end
-
-    def _why_end(self, guards: GuardSet, elapsed_s: float, sample: Sample, look: Look) -> _End | None:
-        if self._is_latched():
-            return _End(outcome=MotionOutcome.STOPPED, cause="the stop latch was set")
-        if self._cancel.is_set():
-            return _End(outcome=MotionOutcome.CANCELLED, cause="cancelled by the caller")
-        guard = guards.tripped(
-            Measured(
-                elapsed_s=elapsed_s,
-                wrench=look.wrench,
-                base_from_tool=look.base_from_tool,
-                commanded_tip_m=look.commanded_tip_m,
-                contacts=sample.contacts,
-                proximity_m=sample.proximity_m,
-            )
-        )
-        if guard is None:
-            return None
-        outcome = MotionOutcome.FAULT if guard.reaction is Reaction.FAULT else MotionOutcome.GUARD
-        side = "at most" if guard.below else "at least"
-        return _End(
-            outcome=outcome, cause=f"guard {guard.name}: {guard.quantity} {side} {guard.limit:g}", tripped=guard.name
-        )
-
-    def _standing_guards(self, wrench: Array) -> tuple[Guard, ...]:
-        """Force and tracking hold in every motion; one that begins under load may go on while that does not grow."""
-        loaded = LOADED_START_RATIO * float(np.linalg.norm(wrench[:3]))
-        force = max(self._safety.force_limit_n, loaded)
-        return (
-            Guard(name="force_limit", quantity=Quantity.FORCE, limit=force, reaction=Reaction.FAULT),
-            Guard(
-                name="tracking", quantity=Quantity.TRACKING, limit=TRACKING_LIMIT_M, ticks=5, reaction=Reaction.FAULT
-            ),
-        )
 
     def _has_settled(self, motion: DeclaredMotion, wanted: Array, sample: Sample, over_s: float) -> bool:
         if isinstance(motion, Hold | GripperMotion) or over_s >= SETTLE_S:
@@ -376,29 +268,22 @@ class Controller:
         at_goal = np.abs(wanted - self._filter.last_rad).max() < SETTLED_RAD
         return bool(at_goal and np.abs(sample.velocity_rad_per_s).max() < SETTLED_RAD_PER_S)
 
-    def _come_to_rest(self, end: _End) -> None:
+    def _come_to_rest(self, end: Ending) -> None:
         """Decelerate at the limit, then hold; only the arm is listened to, since another device may be what failed."""
         if end.device is not None:
             self._faults = (f"{end.device}: {end.cause}",)
         try:
             while True:
                 self._send(self._filter.apply(self._filter.last_rad))
-                self._pass_tick()
+                self._drives.pass_tick()
                 if self._filter.is_at_rest:
                     break
         except DeviceFailure:
-            self._release()
+            self._drives.switch_off()
         if end.outcome is MotionOutcome.STOPPED:
-            self._release()
+            self._drives.switch_off()
         with suppress(DeviceFailure):
             self._newest = self._read()
-
-    def _release(self) -> None:
-        """Take the drives off: stop latched, or the arm does not answer."""
-        if self._is_holding:
-            with suppress(CellError):
-                self._devices.arm.stop(deadline=Deadline.after(self._clock, COMMAND_WAIT_S))
-        self._is_holding = False
 
     def _tare(self) -> Array:
         if self._is_latched():
@@ -407,11 +292,11 @@ class Controller:
         try:
             sample = self._read()
             self._filter.begin_at(sample.position_rad)
-            self._enable()
-            self._next_tick_s = self._clock.now_s()
+            self._drives.switch_on()
+            self._drives.begin_rhythm()
             for _ in range(max(2, round(TARE_S / self._dt_s))):
                 self._send(self._filter.last_rad)
-                self._pass_tick()
+                self._drives.pass_tick()
                 sample = self._newest = self._read()
                 flange = kernels.frames(self.kinematics.dh, sample.position_rad)[-1]
                 free.append(sample.raw_wrench - self._contact.weight(flange))
@@ -427,31 +312,11 @@ class Controller:
         self._faults = ()
         return sample
 
-    def _enable(self) -> None:
-        try:
-            self._devices.arm.enable(deadline=Deadline.after(self._clock, COMMAND_WAIT_S))
-        except CellError as error:
-            raise DeviceFailure(self._devices.arm.name, error.what) from error
-        self._is_holding = True
-
     def _send(self, position_rad: Array) -> None:
-        try:
-            deadline = Deadline(self._clock.now_s() + read_wait_s(self._clock), self._clock)
-            self._filter.sent(self._devices.arm.command_position(position_rad, deadline=deadline))
-        except CellError as error:
-            raise DeviceFailure(self._devices.arm.name, error.what) from error
-
-    def _pass_tick(self) -> None:
-        if not isinstance(self._clock, WallClock):
-            self._clock.sleep(self._dt_s)
-            return
-        now_s = self._clock.now_s()
-        # After a late tick the rhythm starts anew: catching up would bunch set-points.
-        self._next_tick_s = max(self._next_tick_s + self._dt_s, now_s)
-        self._clock.sleep(self._next_tick_s - now_s)
+        self._filter.sent(self._drives.send(position_rad))
 
     def _report(
-        self, motion: DeclaredMotion, end: _End, started_s: float, view: ToolView, recorder: Recorder
+        self, motion: DeclaredMotion, end: Ending, started_s: float, view: ToolView, recorder: Recorder
     ) -> MotionReport:
         sample = self._newest
         n = len(self.kinematics.dh)

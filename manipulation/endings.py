@@ -1,0 +1,92 @@
+"""What ends a motion early: the stop latch, its caller, its guards, and those that hold in every motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.motion import Guard, MotionOutcome, Quantity, Reaction
+from manipulation.guards import GuardSet, Measured
+from manipulation.sensing import Look, Sample
+
+Array = NDArray[np.float64]
+
+TRACKING_LIMIT_M = 0.02
+TRACKING_TICKS = 5
+LOADED_START_RATIO = 1.2  # otherwise a jammed hand could never be taken away
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ending:
+    """Why a motion is over."""
+
+    outcome: MotionOutcome
+    cause: str
+    tripped: str | None = None
+    device: str | None = None
+
+
+class Watch:
+    """Looks every tick whether the motion must end.
+
+    Args:
+        declared: the guards that the motion brings.
+        force_limit_n: holds in every motion.
+        look: what is measured at its start.
+        is_latched, is_cancelled: asked every tick.
+    """
+
+    def __init__(
+        self,
+        declared: Sequence[Guard],
+        force_limit_n: float,
+        look: Look,
+        *,
+        is_latched: Callable[[], bool],
+        is_cancelled: Callable[[], bool],
+    ) -> None:
+        self._guards = GuardSet((*declared, *_standing_guards(force_limit_n, look.wrench)), look.base_from_tool)
+        self._is_latched = is_latched
+        self._is_cancelled = is_cancelled
+
+    def ending(self, elapsed_s: float, sample: Sample, look: Look) -> Ending | None:
+        """Why the motion must end now, or None."""
+        if self._is_latched():
+            return Ending(outcome=MotionOutcome.STOPPED, cause="the stop latch was set")
+        if self._is_cancelled():
+            return Ending(outcome=MotionOutcome.CANCELLED, cause="cancelled by the caller")
+        guard = self._guards.tripped(
+            Measured(
+                elapsed_s=elapsed_s,
+                wrench=look.wrench,
+                base_from_tool=look.base_from_tool,
+                commanded_tip_m=look.commanded_tip_m,
+                contacts=sample.contacts,
+                proximity_m=sample.proximity_m,
+            )
+        )
+        if guard is None:
+            return None
+        outcome = MotionOutcome.FAULT if guard.reaction is Reaction.FAULT else MotionOutcome.GUARD
+        side = "at most" if guard.below else "at least"
+        cause = f"guard {guard.name}: {guard.quantity} {side} {guard.limit:g}"
+        return Ending(outcome=outcome, cause=cause, tripped=guard.name)
+
+
+def _standing_guards(force_limit_n: float, wrench: Array) -> tuple[Guard, ...]:
+    """Force and tracking hold in every motion; one that begins under load may go on while that does not grow."""
+    loaded_n = LOADED_START_RATIO * float(np.linalg.norm(wrench[:3]))
+    force_n = max(force_limit_n, loaded_n)
+    return (
+        Guard(name="force_limit", quantity=Quantity.FORCE, limit=force_n, reaction=Reaction.FAULT),
+        Guard(
+            name="tracking",
+            quantity=Quantity.TRACKING,
+            limit=TRACKING_LIMIT_M,
+            ticks=TRACKING_TICKS,
+            reaction=Reaction.FAULT,
+        ),
+    )

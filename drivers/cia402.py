@@ -226,6 +226,7 @@ class Cia402(StreamDevice[JointState]):
                         self._publish_when_complete()
                 case 0x580 if frame.data[1:4] == upload_request(*PROBES[axis.count.probes % len(PROBES)])[1:4]:
                     axis.count.probe_answered()
+                    self._publish_when_complete()
                 case 0x080 if len(frame.data) == 8:
                     self._emergency(node, frame.data)
                 case 0x700 if frame.data == b"\x00":

@@ -9,9 +9,10 @@ PROBE_S = 0.1  # a probe that was not answered for so long is lost
 class SyncCount:
     """Counts what one drive owes.
 
-    A drive answers in order, so its next PDO belongs to the oldest SYNC that it has not answered. One that owes PDOs may
-    be late or have lost some, and then the next look older than they are. Which of the two, a probe tells: when an SDO
-    that was asked after those SYNCs has been answered, what has not come by then never will.
+    A drive answers in order, so its next PDO belongs to the oldest SYNC that it has not answered. One that owes more may be
+    late or have lost some, and what it sends then is of no known SYNC. Which of the two, a probe tells: when an SDO that
+    was asked after those SYNCs has been answered, what has not come by then never will, and if nothing is missing by then,
+    nothing was lost.
     """
 
     def __init__(self) -> None:
@@ -25,7 +26,7 @@ class SyncCount:
 
     @property
     def answered(self) -> int | None:
-        """Number of the SYNC that all newest PDOs belong to; None when they do not belong together."""
+        """Number of the SYNC that all newest PDOs belong to; None when that is not known, or not one and the same."""
         first = self._answered[0]
         return first if all(number == first for number in self._answered) else None
 
@@ -51,7 +52,7 @@ class SyncCount:
                 self._answered[pdo] = None
             return False
         self._owed[pdo] -= 1
-        self._answered[pdo] = self._sent - self._owed[pdo]
+        self._answered[pdo] = None if self._owed[pdo] else self._sent
         self._last[pdo] = data
         return True
 
@@ -66,7 +67,12 @@ class SyncCount:
         self.probes += 1
 
     def probe_answered(self) -> None:
-        """Only the SYNCs since the probe are still owed."""
-        if self._syncs_since_probe is not None:
-            self._owed = [self._syncs_since_probe] * PDOS
-            self._syncs_since_probe = None
+        """Only the SYNCs since the probe are still owed; if just these are, what came before is what it was taken for."""
+        since = self._syncs_since_probe
+        if since is None:
+            return
+        for pdo in range(PDOS):
+            if self._owed[pdo] == since and self._last[pdo]:
+                self._answered[pdo] = self._sent - since
+            self._owed[pdo] = since
+        self._syncs_since_probe = None

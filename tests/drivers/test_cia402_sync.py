@@ -23,9 +23,10 @@ def as_data(number: int, pdo: int) -> bytes:
 
 
 @given(st.lists(st.sampled_from([0, 0, 0, 1, 2, 5, None]), min_size=5, max_size=60))
-def test_no_pdo_looks_younger_than_it_is_on_a_drive_that_keeps_order(fates: list[Fate]) -> None:
+def test_each_pdo_is_of_the_sync_that_it_is_said_to_be_of_on_a_drive_that_keeps_order(fates: list[Fate]) -> None:
     """Each answer comes so many periods late, holding up those behind it, or is lost."""
     count, wire = SyncCount(), deque[tuple[int, bytes | None, int]]()  # (period of arrival, PDO or probe, which)
+    newest = [0] * PDOS
     fate, free_at = itertools.cycle(fates), 0
     for number in range(1, 200):
         if count.wants_probe(number * PERIOD_S):
@@ -42,22 +43,45 @@ def test_no_pdo_looks_younger_than_it_is_on_a_drive_that_keeps_order(fates: list
                 wire.append((free_at, as_data(number, pdo), pdo))
         while wire and wire[0][0] <= number:
             _, data, which = wire.popleft()
-            if data is None:
-                if which == count.probes:  # an older one names another object
-                    count.probe_answered()
-            elif count.took(which, data) and count.answered is not None:
-                assert count.answered <= struct.unpack("<IB", data)[0]
+            if data is not None and count.took(which, data):
+                newest[which] = struct.unpack("<IB", data)[0]
+            elif data is None and which == count.probes:  # an older one names another object
+                count.probe_answered()
+            if count.answered is not None:
+                assert newest == [count.answered] * PDOS
 
 
-def test_a_drive_that_is_one_period_late_loses_nothing() -> None:
+def test_a_drive_that_is_one_period_late_loses_nothing_as_the_probes_tell() -> None:
     count, answered = SyncCount(), []
     count.synced()
     for number in range(1, 5):
+        assert count.wants_probe(number * PERIOD_S)
+        count.probed(number * PERIOD_S)
         count.synced()
         for pdo in range(PDOS):
             assert count.took(pdo, as_data(number, pdo))
+        assert count.answered is None, "it may be of the next SYNC, if that one's were lost"
+        count.probe_answered()
         answered.append(count.answered)
     assert answered == [1, 2, 3, 4]
+
+
+def test_when_all_pdos_of_a_sync_and_the_probe_are_lost_the_next_ones_are_not_taken_for_them() -> None:
+    count = SyncCount()
+    for number in range(1, 4):
+        if count.wants_probe(number * PERIOD_S):
+            count.probed(number * PERIOD_S)
+        count.synced()
+        if number != 2:
+            for pdo in range(PDOS):
+                count.took(pdo, as_data(number, pdo))
+    assert count.answered is None
+    count.probed(1.0)
+    count.probe_answered()
+    count.synced()
+    for pdo in range(PDOS):
+        count.took(pdo, as_data(4, pdo))
+    assert count.answered == 4
 
 
 def test_after_a_lost_pdo_a_probe_brings_the_numbers_together() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from drivers.polar import Beams, LineScanner
+from drivers.transport.capture import inside
 from drivers.transport.checks import crc_sick
 from drivers.transport.framing import Framer
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
@@ -125,8 +126,8 @@ class Lms200(LineScanner):
 
     @staticmethod
     def _set_baud(link: Link, baud: int) -> None:
-        if isinstance(link, SerialLink):
-            link.set_baud(baud)
+        if (line := inside(link, SerialLink)) is not None:
+            line.set_baud(baud)
 
     def _ask(self, link: Link, payload: bytes, code: int, timeout_s: float = ANSWER_S) -> bytes:
         """Payload of the answer with `code`; asked three times."""

@@ -17,6 +17,7 @@ from pydantic import Field
 
 from drivers.polar import Beams, LineScanner, within
 from drivers.rplidar_express import CAPSULE_BYTES, EXPRESS_TYPE, REQUEST, CapsuleParser, Points, split_turns
+from drivers.transport.capture import inside
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.options import SerialOptions, read_options, serial_opener
 from drivers.transport.serial_link import SerialLink
@@ -142,8 +143,8 @@ class Rplidar(LineScanner):
 
     def start(self, link: Link) -> None:
         """Start the motor, stop, identify, ask for its health (one reset if it is ill), scan."""
-        if isinstance(link, SerialLink):
-            link.set_dtr(False)  # an A1's motor turns while DTR is low
+        if (line := inside(link, SerialLink)) is not None:
+            line.set_dtr(False)  # an A1's motor turns while DTR is low
         link.write(bytes([0xA5, STOP]), now_s() + ANSWER_S)
         drain_until_quiet(link, quiet_s=0.02, until_s=now_s() + ANSWER_S)
         self._ask(link, bytes([0xA5, GET_INFO]), descriptor(20, 0, INFO_TYPE), 20)

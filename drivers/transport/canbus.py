@@ -77,7 +77,8 @@ class Slcan:
         """Lines to frames."""
         *lines, self._buffer = (self._buffer + chunk).replace(b"\x07", b"\r").split(b"\r")
         self._buffer = self._buffer[-LONGEST_LINE:]
-        frames = [self._line(line) for line in lines if line[:1] == b"t"]
+        # No hex digit is a `t`: the last one begins the frame, whatever noise stands before it.
+        frames = [self._line(line[line.rindex(b"t") :]) for line in lines if b"t" in line]
         return [frame for frame in frames if frame is not None]
 
     def _line(self, line: bytes) -> CanFrame | None:
@@ -113,9 +114,11 @@ class RawCan:
 def can_opener(options: CanOptions, device: str) -> tuple[Callable[[], Link], Callable[[], CanCodec], str]:
     """What opens the channel, what makes its codec, and its name."""
     if options.is_slcan:
-        opener = opener_with_files(options, lambda: open_serial(options.channel, baud=options.baud, device=device))
+        opener = opener_with_files(
+            options, device, lambda: open_serial(options.channel, baud=options.baud, device=device)
+        )
         return opener, Slcan, f"slcan {options.channel}, {options.bitrate} bit/s"
-    opener = opener_with_files(options, lambda: open_socketcan(options.channel, device=device))
+    opener = opener_with_files(options, device, lambda: open_socketcan(options.channel, device=device))
     return opener, RawCan, f"can {options.channel}"
 
 

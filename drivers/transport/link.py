@@ -1,4 +1,4 @@
-"""A link carries bytes under a deadline; capture and replay are links too.
+"""A link carries bytes under a deadline.
 
 Times here are `time.monotonic` seconds: a wire does not know the cell's clock. These errors stay inside `drivers`;
 `drivers.transport.device` turns them into the errors of `hal` with the device's name.
@@ -6,9 +6,7 @@ Times here are `time.monotonic` seconds: a wire does not know the cell's clock. 
 
 from __future__ import annotations
 
-import json
 import time
-from pathlib import Path
 from typing import Protocol
 
 FLOOD_BYTES = 1 << 20  # more than any buffer between a device and us holds
@@ -103,93 +101,3 @@ def drain_until_quiet(link: Link, *, quiet_s: float, until_s: float) -> int:
             break
         dropped += len(chunk)
     return dropped
-
-
-class CaptureLink:
-    """A link that writes all traffic to a file, one JSON object a line: `{"t": s, "dir": "rx", "hex": "5959.."}`."""
-
-    def __init__(self, inner: Link, path: Path) -> None:
-        self._inner = inner
-        self._file = path.open("a", encoding="ascii")
-        self._start_s = now_s()
-
-    @property
-    def name(self) -> str:
-        """Name of the link inside."""
-        return self._inner.name
-
-    @property
-    def byte_s(self) -> float:
-        """As the link inside."""
-        return self._inner.byte_s
-
-    def read(self, until_s: float) -> bytes:
-        """As the link inside."""
-        chunk = self._inner.read(until_s)
-        if chunk:
-            self._note("rx", chunk)
-        return chunk
-
-    def write(self, data: bytes, until_s: float) -> None:
-        """As the link inside."""
-        self._note("tx", data)
-        self._inner.write(data, until_s)
-
-    def is_present(self) -> bool:
-        """As the link inside."""
-        return self._inner.is_present()
-
-    def close(self) -> None:
-        """Close link and file."""
-        self._inner.close()
-        self._file.close()
-
-    def _note(self, direction: str, data: bytes) -> None:
-        line = {"t": round(now_s() - self._start_s, 6), "dir": direction, "hex": data.hex()}
-        self._file.write(json.dumps(line) + "\n")
-
-
-class ReplayLink:
-    """Gives out the received bytes of a capture, at their recorded times or, unless `paced`, as fast as asked.
-
-    What is written is accepted and forgotten. The end of the recording is the loss of the link.
-    """
-
-    def __init__(self, path: Path, *, paced: bool = False) -> None:
-        lines = [json.loads(line) for line in path.read_text(encoding="ascii").splitlines()]
-        self._chunks = [(float(x["t"]), bytes.fromhex(x["hex"])) for x in lines if x["dir"] == "rx"][::-1]
-        self._name = f"replay of {path.name}"
-        self._paced = paced
-        self._start_s = now_s()
-
-    @property
-    def name(self) -> str:
-        """`replay of FILE`."""
-        return self._name
-
-    @property
-    def byte_s(self) -> float:
-        """Not recorded."""
-        return 0.0
-
-    def read(self, until_s: float) -> bytes:
-        """The next recorded chunk."""
-        if not self._chunks:
-            raise LinkLost(f"{self._name} is at its end")
-        due_s = self._start_s + self._chunks[-1][0] if self._paced else now_s()
-        if due_s > until_s:
-            time.sleep(max(0.0, until_s - now_s()))
-            return b""
-        time.sleep(max(0.0, due_s - now_s()))
-        return self._chunks.pop()[1]
-
-    def write(self, data: bytes, until_s: float) -> None:
-        """Nobody listens."""
-
-    def is_present(self) -> bool:
-        """A recording stays."""
-        return True
-
-    def close(self) -> None:
-        """Nothing to release."""
-        self._chunks.clear()

@@ -8,7 +8,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 
-from drivers.transport.link import CaptureLink, Link, ReplayLink
+from drivers.transport.capture import CaptureLink, replay_opener
+from drivers.transport.link import Link
 from drivers.transport.serial_link import open_serial
 from drivers.transport.socket_link import open_tcp, open_udp
 from hal.registry import Context
@@ -69,22 +70,21 @@ def read_options(context: Context, options: dict[str, Any], model: type[M]) -> M
 
 def serial_opener(options: SerialOptions, device: str) -> tuple[Callable[[], Link], str]:
     """What opens the port, and the link's name."""
-    return opener_with_files(options, lambda: open_serial(options.port, baud=options.baud, device=device)), (
-        f"serial {options.port}, {options.baud} baud"
-    )
+    opener = opener_with_files(options, device, lambda: open_serial(options.port, baud=options.baud, device=device))
+    return opener, f"serial {options.port}, {options.baud} baud"
 
 
 def tcp_opener(options: TcpOptions, device: str) -> tuple[Callable[[], Link], str]:
     """What connects, and the link's name."""
     opener = opener_with_files(
-        options, lambda: open_tcp(options.host, options.port, timeout_s=CONNECT_TIMEOUT_S, device=device)
+        options, device, lambda: open_tcp(options.host, options.port, timeout_s=CONNECT_TIMEOUT_S, device=device)
     )
     return opener, f"tcp {options.host}:{options.port}"
 
 
 def udp_opener(options: UdpOptions, device: str) -> tuple[Callable[[], Link], str]:
     """What makes the socket, and the link's name."""
-    opener = opener_with_files(options, lambda: open_udp(options.host, options.port, device=device))
+    opener = opener_with_files(options, device, lambda: open_udp(options.host, options.port, device=device))
     return opener, f"udp {options.host}:{options.port}"
 
 
@@ -92,18 +92,24 @@ def either_opener(options: EitherOptions, device: str) -> tuple[Callable[[], Lin
     """Serial or TCP."""
     if isinstance(options.port, int):
         host, number = options.host or "127.0.0.1", options.port
-        opener = opener_with_files(options, lambda: open_tcp(host, number, timeout_s=CONNECT_TIMEOUT_S, device=device))
+        opener = opener_with_files(
+            options, device, lambda: open_tcp(host, number, timeout_s=CONNECT_TIMEOUT_S, device=device)
+        )
         return opener, f"tcp {host}:{number}"
     path = options.port
-    opener = opener_with_files(options, lambda: open_serial(path, baud=options.baud, device=device))
+    opener = opener_with_files(options, device, lambda: open_serial(path, baud=options.baud, device=device))
     return opener, f"serial {path}, {options.baud} baud"
 
 
-def opener_with_files(options: Captured, opener: Callable[[], Link]) -> Callable[[], Link]:
-    """The opener itself, or one that captures or replays."""
+def opener_with_files(options: Captured, device: str, opener: Callable[[], Link]) -> Callable[[], Link]:
+    """The opener itself, or one that captures or replays.
+
+    Raises:
+        ConfigError: the file to replay is no capture.
+    """
     capture, replay = options.capture, options.replay
     if replay is not None:
-        return lambda: ReplayLink(replay)
+        return replay_opener(replay, device)
     if capture is not None:
         return lambda: CaptureLink(opener(), capture)
     return opener

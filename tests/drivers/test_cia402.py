@@ -49,6 +49,13 @@ def test_kernel_frames_round_trip(sent: list[CanFrame]) -> None:
     assert codec.feed(b"".join(codec.encode(frame) for frame in sent)) == sent
 
 
+def test_noise_and_a_false_header_before_a_line_cost_nothing() -> None:
+    codec = Slcan()
+    line = codec.encode(CanFrame(0x181, b"123456"))
+    assert codec.feed(b"\x00t9tt" + line[:5] + line) == [CanFrame(0x181, b"123456")]
+    assert codec.bad == 0
+
+
 def test_a_line_that_lost_characters_is_no_frame() -> None:
     codec = Slcan()
     assert codec.feed(b"t1816270023\rt18162700230000\rt1G12AABB\r") == []

@@ -14,12 +14,10 @@ import pytest
 from drivers.emulators.ports import PtyPort, TcpPort, UdpPort
 from drivers.transport.checks import crc_modbus
 from drivers.transport.link import (
-    CaptureLink,
     Link,
     LinkLost,
     NoAnswer,
     Refused,
-    ReplayLink,
     drain,
     drain_until_quiet,
     now_s,
@@ -158,19 +156,6 @@ def test_draining_ends_when_the_line_is_quiet_and_in_any_case(pty_port: PtyPort)
         pty_port.send(None, bytes(100))
         assert drain_until_quiet(link, quiet_s=0.02, until_s=later()) == 100
         assert drain(link) == b""
-
-
-def test_a_capture_replays_to_the_same_bytes(tmp_path: Path) -> None:
-    path = tmp_path / "capture.jsonl"
-    inner = ScriptLink(b"first", b"second")
-    with closing(CaptureLink(inner, path)) as link:
-        for ask in (b"a", b"b"):
-            link.write(ask, later())
-            link.read(later())
-    replay = ReplayLink(path)
-    assert [replay.read(later()), replay.read(later())] == [b"first", b"second"]
-    with pytest.raises(LinkLost, match="end"):
-        replay.read(later())
 
 
 def test_the_mailbox_gives_the_newest_and_counts_what_a_slow_reader_lost() -> None:

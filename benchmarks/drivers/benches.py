@@ -178,7 +178,7 @@ def true_lights(value: Any, backing: Any) -> bool:
     return bool(value == backing.on)
 
 
-SAME_MOMENT_S = 0.02  # servos are read one after another, on a busy machine
+SAME_MOMENT_S = 0.008  # two counts of a servo at the speed of `MovingArm` are 6 ms
 WITHOUT_CRC = tuple(f for f in WireFault if f is not WireFault.CRC)
 FAST_SCAN = {"scans_per_minute": 2400}
 BENCHES = (

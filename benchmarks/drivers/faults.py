@@ -47,21 +47,26 @@ class StallProbe:
 
     def __init__(self) -> None:
         self._stalls: list[tuple[float, float]] = []
+        self._beat_s = time.monotonic()
+        self._beaten = threading.Condition()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def _run(self) -> None:
-        before_s = time.monotonic()
         while not self._ending.wait(BEAT_S):
-            now_s = time.monotonic()
-            if now_s - before_s > BEAT_S + STALL_S:
-                self._stalls.append((before_s + BEAT_S, now_s))
-            before_s = now_s
+            with self._beaten:
+                now_s, before_s = time.monotonic(), self._beat_s
+                if now_s - before_s > BEAT_S + STALL_S:
+                    self._stalls.append((before_s + BEAT_S, now_s))
+                self._beat_s = now_s
+                self._beaten.notify_all()
 
     def stalled_s(self, start_s: float, end_s: float) -> float:
-        """How much of that time this process stood still."""
-        return sum(max(0.0, min(end_s, b) - max(start_s, a)) for a, b in list(self._stalls))
+        """How much of that time this process stood still; asks once the probe, too, has come so far."""
+        with self._beaten:
+            self._beaten.wait_for(lambda: self._beat_s >= end_s, timeout=1.0)
+            return sum(max(0.0, min(end_s, b) - max(start_s, a)) for a, b in self._stalls)
 
     def close(self) -> None:
         """End the thread."""
@@ -136,22 +141,24 @@ def _one_read(item: Bench, device: Any, backing: Any, cell: Cell, probe: StallPr
         cell.untyped += 1
         print(f"    untyped: {error!r}")
     ended_s = time.monotonic()
-    over_s = ended_s - started_s - READ_S - SLACK_S
-    if over_s > 0.0:
+    late_s = ended_s - started_s - READ_S - SLACK_S
+    if late_s > 0.0:
         stalled_s = probe.stalled_s(started_s, ended_s)
-        is_stall = stalled_s >= over_s
-        if not is_stall:
-            print(f"    {item.name}: {1e3 * over_s:.0f} ms late, {1e3 * stalled_s:.0f} ms of it without the processor")
-        cell.stalled += is_stall
-        cell.late_calls += not is_stall
+        cell.stalled += stalled_s >= late_s
+        cell.late_calls += stalled_s < late_s
     if sample is None or sample.quality is Quality.INVALID:
         return
     cell.good += 1
-    age_s, call_s = sample.age_s(CLOCK.now_s()), ended_s - started_s
     if not item.is_true(sample.value, backing):
         cell.wrong += 1
         return
-    is_old = age_s > device.max_age_s + SLACK_S + call_s
-    if item.taken_s is not None:
-        is_old |= time.monotonic() - item.taken_s(sample.value, backing) > age_s + SLACK_S + call_s
-    cell.stale += is_old
+    young_s = max(sample.age_s(CLOCK.now_s()) - (time.monotonic() - ended_s), 0.0)
+    if young_s > device.max_age_s + SLACK_S + (ended_s - started_s):
+        cell.stale += 1
+    elif item.taken_s is not None:
+        taken_s = item.taken_s(sample.value, backing)
+        hidden_s = ended_s - taken_s - young_s - SLACK_S
+        if hidden_s > 0.0:
+            stalled_s = probe.stalled_s(taken_s, ended_s)
+            cell.stalled += stalled_s >= hidden_s
+            cell.stale += stalled_s < hidden_s

@@ -1,5 +1,7 @@
 // Calls of the HTTP API. A problem (RFC 9457) becomes an Error whose message a person can read.
 
+export const FINAL = ["succeeded", "failed", "cancelled"]; // states of a task that has ended
+
 export class ProblemError extends Error {
   constructor(problem, status) {
     super(problem.detail || `the service answered ${status}`);
@@ -16,6 +18,22 @@ export async function get(path) {
 export async function post(path, body) {
   const json = body === undefined ? {} : { headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
   return answered(await fetch(path, { method: "POST", ...json }));
+}
+
+// A file as it is: its type says what it is.
+export async function upload(path, data) {
+  return answered(await fetch(path, { method: "POST", headers: { "Content-Type": data.type }, body: data }));
+}
+
+export async function remove(path) {
+  return answered(await fetch(path, { method: "DELETE" }));
+}
+
+// The task when it has ended well, however long that takes; a failed one is an Error as any other problem is.
+export async function finished(task) {
+  while (!FINAL.includes(task.state)) task = await get(`/v1/tasks/${task.id}?wait_s=10`);
+  if (task.state !== "succeeded") throw new ProblemError(task.problem || { detail: `the task was ${task.state}` }, 409);
+  return task;
 }
 
 async function answered(response) {

@@ -1,8 +1,7 @@
 // Starts missions, follows the running task by server-sent events, lists tasks, links the last report.
-import { get, post, repeat } from "./api.js";
+import { FINAL, get, post, repeat } from "./api.js";
 import { isLatched } from "./stop.js";
 
-const FINAL = ["succeeded", "failed", "cancelled"];
 const $ = (selector) => document.querySelector(selector);
 let followed = null; // id of the task whose events we show
 let isActive = false;

@@ -1,0 +1,114 @@
+// The image to click on: uploaded, stored, or taken by a camera of the cell; its clicks, and the outline drawn over it.
+import { get, upload } from "./api.js";
+
+const MOST_CLICKS = 3;
+const SVG = "http://www.w3.org/2000/svg";
+const $ = (selector) => document.querySelector(selector);
+const picture = $("#picture");
+let image = null; // the stored image that is shown
+let points = [];
+let pointed = null; // takes the next click instead of the outline
+let listeners = [];
+
+export const chosenImage = () => image && image.id;
+export const clicks = () => points;
+export const onClicks = (listener) => listeners.push(listener);
+
+// The next click goes to `taker(x, y)`: the end of a scale, for example.
+export function pointAt(taker) {
+  pointed = taker;
+  $("#canvas").dataset.pointing = taker ? "yes" : "no";
+}
+
+export async function startImage({ attempt, changed }) {
+  const keep = (data) => attempt(async () => {
+    show(await upload("/v1/images", data));
+    changed();
+    await list();
+  });
+  $("#file").addEventListener("change", (event) => event.target.files[0] && keep(event.target.files[0]));
+  $("#stored").addEventListener("change", async (event) => {
+    const { images } = await get("/v1/images");
+    const found = images.find((one) => one.id === event.target.value);
+    if (found) show(found);
+    changed();
+  });
+  $("#canvas").addEventListener("click", click);
+  $("#clear").addEventListener("click", clear);
+  await attempt(async () => {
+    await list();
+    const { devices } = await get("/v1/devices");
+    const cameras = devices.filter((device) => device.kind === "camera");
+    $("#cameras").replaceChildren(...cameras.map((camera) => taker(camera.name, keep, attempt)));
+  });
+}
+
+function taker(name, keep, attempt) {
+  const button = document.createElement("button");
+  button.textContent = `Take from ${name.replaceAll("_", " ")}`;
+  button.addEventListener("click", () => attempt(async () => {
+    const answer = await fetch(`/v1/devices/${name}/reading?format=png`, { cache: "no-store" });
+    if (!answer.ok) throw new Error((await answer.json()).detail);
+    await keep(await answer.blob());
+  }));
+  return button;
+}
+
+async function list() {
+  const { images } = await get("/v1/images");
+  const options = images.map((one) => {
+    const when = new Date(1000 * one.stored_s).toLocaleString();
+    return new Option(`${one.width_px} × ${one.height_px} · ${when}`, one.id, false, image !== null && one.id === image.id);
+  });
+  $("#stored").replaceChildren(new Option("stored images …", ""), ...options);
+}
+
+function show(stored) {
+  image = stored;
+  $("#canvas").dataset.empty = "no";
+  $("#image-line").textContent = `${stored.width_px} × ${stored.height_px} px`;
+  clear();
+}
+
+function clear() {
+  points = [];
+  pointAt(null);
+  $("#clear").disabled = true;
+  showPicture(null);
+  tell();
+}
+
+function click(event) {
+  if (!image) return;
+  const box = picture.getBoundingClientRect();
+  const x = ((event.clientX - box.left) / box.width) * image.width_px - 0.5;
+  const y = ((event.clientY - box.top) / box.height) * image.height_px - 0.5;
+  if (pointed) {
+    pointed(x, y);
+    return pointAt(null);
+  }
+  points = points.length >= MOST_CLICKS ? [[x, y]] : [...points, [x, y]]; // a fourth click begins anew
+  $("#clear").disabled = false;
+  showPicture(null);
+  tell();
+}
+
+const tell = () => listeners.forEach((listener) => listener(points));
+
+// Shows the stored image (or `url` in its place) with the clicks and an outline.
+export function showPicture(outline, url = image && image.url) {
+  if (!image) return;
+  if (!picture.src.endsWith(url)) picture.src = url;
+  const marks = $("#marks");
+  marks.setAttribute("viewBox", `-0.5 -0.5 ${image.width_px} ${image.height_px}`);
+  const unit = image.width_px / 800;
+  const shapes = points.map(([x, y]) => shape("path", { d: `M${x - 7 * unit} ${y}h${14 * unit}M${x} ${y - 7 * unit}v${14 * unit}`, stroke: "#e8b04b" }, unit));
+  if (outline) shapes.unshift(shape("polygon", { points: outline.map((p) => p.join(",")).join(" "), stroke: "#4fb3bf", id: "outline" }, unit));
+  marks.replaceChildren(...(url === image.url ? shapes : []));
+}
+
+function shape(name, attributes, unit) {
+  const node = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries({ ...attributes, fill: "none", "stroke-width": 2 * unit })) node.setAttribute(key, value);
+  return node;
+}

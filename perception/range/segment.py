@@ -151,14 +151,16 @@ def settled(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *,
     kinds, table = found.arrays()
     packed, law = task.sensor.packed(), noise.packed()
     slow = noise.slow_share(float(typical_depths_m(task.depth_m)[2]))
+    earlier = np.full_like(labels, -1)
     for _ in range(sweeps):
-        before, labels = labels, np.empty_like(labels)
+        after = np.empty_like(labels)
         for_each_tile(
-            partial(settle, task.depth_m, packed, law, slow, before, kinds, table, labels),
-            before.shape[0],
+            partial(settle, task.depth_m, packed, law, slow, earlier, labels, kinds, table, after),
+            labels.shape[0],
             task.tiles,
             pool=task.pool,
         )
+        earlier, labels = labels, after
     return labels
 
 

@@ -19,30 +19,38 @@ REACH_PX = 2  # neighbours of 5 x 5
 SHARED_PX = 25.0  # they share one value of the slow noise
 NEIGHBOUR_WEIGHT = 3.0  # in units of half a squared residual, for a pixel whose neighbours all bear the other label
 MOST = 12
+NO_LABEL = np.int32(2**31 - 1)
 
 
-@njit(cache=True, nogil=True)
-def settle(depth, sen, noise, slow_share, labels, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]
-    """Judge again the rows [top, bottom) of `labels` (H, W) where labels meet; writes `out` (H, W)."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def settle(depth, sen, noise, slow_share, earlier, labels, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]
+    """Judge again the rows [top, bottom) of `labels` (H, W) where labels meet; writes `out` (H, W).
+
+    `earlier`: the labels before the last sweep, anything else at first. A pixel around which nothing has changed since
+    would be judged as it was, so it is not judged again.
+    """
     H, W = depth.shape
     perspective = sen[0] > 0
     near, votes = np.empty(MOST, np.int32), np.empty(MOST)
+    least, most, change = np.empty(W + 4, np.int32), np.empty(W + 4, np.int32), np.empty(W + 4, np.int32)
+    contested = np.empty(W, np.bool_)
     evidence = 0.5 / (1.0 + slow_share * (SHARED_PX - 1.0))
     for v in range(top, bottom):
         y = (v - sen[4]) / sen[2]
+        out[v] = labels[v]
+        least[:], most[:], change[:] = NO_LABEL, 0, 0
+        for i in range(max(0, v - REACH_PX), min(H, v + REACH_PX + 1)):
+            _add_row(earlier[i], labels[i], least[2:-2], most[2:-2], change[2:-2])
+        _contested(labels[v], least, most, change, contested)
         for u in range(W):
-            own = labels[v, u]
-            out[v, u] = own
             z = depth[v, u]
-            if not np.isfinite(z):
+            if not contested[u] or not np.isfinite(z):
                 continue
             n, total = 0, 0.0
             for i in range(max(0, v - REACH_PX), min(H, v + REACH_PX + 1)):
                 for j in range(max(0, u - REACH_PX), min(W, u + REACH_PX + 1)):
-                    if i == v and j == u:
-                        continue
                     k = labels[i, j]
-                    if k == 0:
+                    if k == 0 or (i == v and j == u):
                         continue
                     total += 1.0
                     at = -1
@@ -55,8 +63,9 @@ def settle(depth, sen, noise, slow_share, labels, kinds, ths, out, top, bottom):
                     elif n < MOST:
                         near[n], votes[n] = k, 1.0
                         n += 1
-            if n == 0 or (n == 1 and near[0] == own):
+            if n == 0:
                 continue
+            own = labels[v, u]
             x = (u - sen[3]) / sen[1]
             sigma = sigma_at(noise, z)
             best, label = np.inf, 0
@@ -69,3 +78,24 @@ def settle(depth, sen, noise, slow_share, labels, kinds, ths, out, top, bottom):
                     best, label = cost, near[m]
             if label > 0 or own == 0:
                 out[v, u] = label
+
+
+@njit(cache=True, error_model="numpy")
+def _add_row(earlier, labels, least, most, change):  # type: ignore[no-untyped-def]
+    """One more row of the neighbourhood: least label that is none of 0, largest label, non-zero where one changed."""
+    for u in range(labels.shape[0]):
+        k = labels[u]
+        least[u] = min(least[u], k if k > 0 else NO_LABEL)
+        most[u] = max(most[u], k)
+        change[u] |= k ^ earlier[u]
+
+
+@njit(cache=True, error_model="numpy")
+def _contested(own, least, most, change, out):  # type: ignore[no-untyped-def]
+    """Where the five columns around hold another label than the pixel's own, and one of their pixels changed."""
+    for u in range(own.shape[0]):
+        k = own[u]
+        low = min(least[u], least[u + 1], least[u + 2], least[u + 3], least[u + 4])
+        high = max(most[u], most[u + 1], most[u + 2], most[u + 3], most[u + 4])
+        changed = change[u] | change[u + 1] | change[u + 2] | change[u + 3] | change[u + 4]
+        out[u] = (changed != 0) & ((high != k) | ((k > 0) & (low != k)))

@@ -1,0 +1,66 @@
+"""Pixels between equally good surfaces follow their neighbours: the compiled sweep against its definition."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from perception.range import settle
+from perception.range.claim import CLAIM_SIGMAS, misfit
+from tests.perception.range.scenes import PARALLEL, PINHOLE
+from tests.perception.range.test_claim_kernels import KINDS, NOISE, competing_surfaces, random_case
+
+SLOW_SHARE = 0.4
+
+
+def swept(sensor, depth, labels, earlier, cuts=(0, 50, 120)):
+    """Labels after one compiled sweep in tiles between the rows `cuts`."""
+    out = np.full_like(labels, -1)
+    table = competing_surfaces()
+    for top, bottom in pairwise(cuts):
+        settle.settle(
+            depth, sensor.packed(), NOISE.packed(), SLOW_SHARE, earlier, labels, KINDS, table, out, top, bottom
+        )
+    return out
+
+
+def settled_label(sensor, depth, labels, v, u):
+    """One pixel by the definition: half a squared residual competes with the share of other labels around."""
+    packed, z, table, reach = sensor.packed(), depth[v, u], competing_surfaces(), settle.REACH_PX
+    top, left = max(v - reach, 0), max(u - reach, 0)
+    patch = labels[top : v + reach + 1, left : u + reach + 1].copy()
+    patch[v - top, u - left] = 0
+    present, votes = np.unique(patch[patch > 0], return_counts=True)
+    if not np.isfinite(z) or present.size == 0 or present.tolist() == [labels[v, u]]:
+        return labels[v, u]
+    evidence = 0.5 / (1.0 + SLOW_SHARE * (settle.SHARED_PX - 1.0))
+    at = ((u - packed[3]) / packed[1], (v - packed[4]) / packed[2], z, float(NOISE.sigma_m(z)), bool(packed[0] > 0))
+    misfits = np.array([misfit(KINDS[k], table[k], *at) for k in present])
+    cost = evidence * misfits**2 + settle.NEIGHBOUR_WEIGHT * (1.0 - votes / votes.sum())
+    cost[misfits >= CLAIM_SIGMAS] = np.inf
+    best = int(np.argmin(cost))
+    if np.isfinite(cost[best]):
+        return present[best]
+    return labels[v, u]
+
+
+@pytest.mark.parametrize("sensor", [PINHOLE, PARALLEL], ids=["pinhole", "orthographic"])
+def test_a_sweep_is_its_definition(sensor):
+    depth, labels = random_case(sensor, 4, size=1)
+    out = swept(sensor, depth, labels, np.full_like(labels, -1))
+    assert (out != labels).any()
+    rng = np.random.default_rng(0)
+    for v, u in zip(rng.integers(0, 120, 1500), rng.integers(0, 160, 1500), strict=True):
+        assert out[v, u] == settled_label(sensor, depth, labels, v, u)
+
+
+def test_pixels_around_which_nothing_changed_need_not_be_judged_again():
+    depth, labels = random_case(PINHOLE, 5, size=1)
+    never = np.full_like(labels, -1)
+    earlier = never
+    for _ in range(4):
+        after = swept(PINHOLE, depth, labels, earlier)
+        np.testing.assert_array_equal(after, swept(PINHOLE, depth, labels, never, cuts=(0, 120)))
+        earlier, labels = labels, after

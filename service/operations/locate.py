@@ -13,7 +13,7 @@ from hal.errors import Ambiguous, NotFound
 from hal.geometry import UncertainPose, compose, difference, matrix_of, to_json
 from perception.range import PinholeSensor, PlaneFit, fit_plane_near
 from perception.vision.lights import find_lights
-from perception.vision.lights_assign import assign_lights
+from perception.vision.lights.assign import assign_lights
 from perception.vision.quadrangle import QuadranglePose, estimate
 from service.operations.beliefs import believed_panel, expected_panel
 from service.operations.evidence import LightEvidence, PlaneEvidence

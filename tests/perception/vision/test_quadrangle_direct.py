@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.errors import InvalidRequest, NotObservable
-from perception.vision.quadrangle_cost import chi_square, expand, rotation_of
-from perception.vision.quadrangle_direct import direct_poses, three_light_poses
-from perception.vision.quadrangle_p3p import real_cubic_root
+from perception.vision.quadrangle.cost import chi_square, expand, rotation_of
+from perception.vision.quadrangle.direct import direct_poses, three_light_poses
+from perception.vision.quadrangle.three_point import real_cubic_root
 from tests.perception.vision.quadrangle_cases import CAMERA, RECTANGLE, SHAPES, angle_deg, pixels_of, view
 
 FULL = sorted(name for name in SHAPES if name != "three in a row")

@@ -1,15 +1,15 @@
 # mypy: disallow-untyped-defs=False
 """Compiled posterior over the normal of the object: the profile at a given normal, and the mirror's share.
 
-Conventions as in `quadrangle_cost`.
+Conventions as in `cost`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from perception.vision.quadrangle_cost import chi_square, expand, rotation_of, solve_damped, turn_onto
-from perception.vision.quadrangle_jit import back3, cross3, dot3, jit, mix3, product3, put1, times3, unit3
+from perception.vision.quadrangle.cost import chi_square, expand, rotation_of, solve_damped, turn_onto
+from perception.vision.quadrangle.jit import back3, cross3, dot3, jit, mix3, product3, put1, times3, unit3
 
 MIRROR_TURN_COS = 0.99619469809  # 5 degrees: normals nearer than this are one pose, not two
 RING_STEP_RAD = 0.10471975512  # 6 degrees; 2.5 degrees gave the same mass (correlation 0.999, 8000 problems)

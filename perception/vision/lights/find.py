@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.errors import InvalidRequest
-from perception.vision.lights_core import Core, lamp_core, level_at
-from perception.vision.lights_registration import Registration, register
+from perception.vision.lights.core import Core, lamp_core, level_at
+from perception.vision.lights.registration import Registration, register
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]

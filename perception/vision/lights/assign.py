@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from hal.calibration import CameraIntrinsics
 from hal.errors import Ambiguous, InvalidRequest, NotFound
 from perception.camera_model import undistort_pixels
-from perception.vision.lights_find import LightBlobs
-from perception.vision.lights_search import (
+from perception.vision.lights.find import LightBlobs
+from perception.vision.lights.search import (
     CONTRAST_SPREAD,
     MISSING_INSIDE,
     MISSING_OUTSIDE,

@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest, NotFound, NotObservable
 from hal.geometry import UncertainPose
-from perception.vision.quadrangle_search import solve
+from perception.vision.quadrangle.search import solve
 
 Array = NDArray[np.float64]
 

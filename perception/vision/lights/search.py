@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.vision.quadrangle_jit import jit
-from perception.vision.quadrangle_p3p import three_point
+from perception.vision.quadrangle.jit import jit
+from perception.vision.quadrangle.three_point import three_point
 
 SIZE_SPREAD = 0.2  # standard deviation of log diameter among equal lamps
 CONTRAST_SPREAD = 0.6  # of log contrast: uneven light, ageing, angle

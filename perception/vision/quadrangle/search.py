@@ -6,10 +6,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.vision.quadrangle_arrays import inverse6, log_det6, move_origin, plane_of, prepare
-from perception.vision.quadrangle_jit import jit, mix3, put1, put2, times3
-from perception.vision.quadrangle_minima import all_minima
-from perception.vision.quadrangle_posterior import MIRROR_TURN_COS, normal_spread, opposite, ring_mass, sight_frame
+from perception.vision.quadrangle.arrays import inverse6, log_det6, move_origin, plane_of, prepare
+from perception.vision.quadrangle.jit import jit, mix3, put1, put2, times3
+from perception.vision.quadrangle.minima import all_minima
+from perception.vision.quadrangle.posterior import MIRROR_TURN_COS, normal_spread, opposite, ring_mass, sight_frame
 
 WORTHLESS = 60.0  # chi-square above the best at which a minimum has odds of 1 in 1e13
 
@@ -23,7 +23,7 @@ def solve(points, pixels, covariance, camera, near_sigmas2, Rs, ts, costs, Cs, m
         Rs (M, 3, 3), ts (M, 3), costs (M,), Cs (M, 6, 6), masses (M,): filled. Poses are of the object's own origin.
             When the other side of the line of sight has mass but no minimum, its middle is appended, covariance 0.
 
-    Returns: number of poses, number of them that are minima, error code (0 fine, others in `quadrangle`).
+    Returns: number of poses, number of them that are minima, error code (0 fine, others in `pose`).
     """
     m, A, X = np.empty((4, 2)), np.empty((4, 3)), np.empty((4, 3))
     bad = prepare(pixels, covariance, camera, m, A)

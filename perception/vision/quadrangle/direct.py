@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest, NotFound, NotObservable
 from perception.camera_model import project, rays
-from perception.vision.quadrangle_p3p import three_point
+from perception.vision.quadrangle.three_point import three_point
 
 Array = NDArray[np.float64]
 

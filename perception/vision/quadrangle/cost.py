@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.vision.quadrangle_jit import cross3, jit, mix3, product3
+from perception.vision.quadrangle.jit import cross3, jit, mix3, product3
 
 CONVERGED = 1e-9  # predicted fall of chi-square: 3e-5 of a standard deviation
 MAX_STEPS = 60

@@ -1,14 +1,14 @@
 # mypy: disallow-untyped-defs=False
 """Compiled three-point poses: the first half of the paper's direct route (Section II-B), and seeds for the refinement.
 
-The code reads from `real_cubic_root` down to `three_point`; conventions as in `quadrangle_core`.
+The code reads from `real_cubic_root` down to `three_point`; conventions as in `cost`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from perception.vision.quadrangle_jit import cross3, dot3, jit, mix3, product3, put2, unit3
+from perception.vision.quadrangle.jit import cross3, dot3, jit, mix3, product3, put2, unit3
 
 
 @jit

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.vision.quadrangle_cost import solve_damped
-from perception.vision.quadrangle_jit import jit
-from perception.vision.quadrangle_p3p import cofactors, real_cubic_root
+from perception.vision.quadrangle.cost import solve_damped
+from perception.vision.quadrangle.jit import jit
+from perception.vision.quadrangle.three_point import cofactors, real_cubic_root
 
 
 @jit

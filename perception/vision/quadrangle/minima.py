@@ -1,14 +1,14 @@
 # ruff: noqa: PLR0912 - a compiled loop keeps one equation in one place
 # mypy: disallow-untyped-defs=False
-"""Compiled search for every local minimum of the four-light reprojection error. Conventions as in `quadrangle_cost`."""
+"""Compiled search for every local minimum of the four-light reprojection error. Conventions as in `cost`."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from perception.vision.quadrangle_cost import chi_square, minimise, turn_onto
-from perception.vision.quadrangle_jit import cross3, dot3, jit, mix3, product3, put1, put2, times3, unit3
-from perception.vision.quadrangle_p3p import three_point
+from perception.vision.quadrangle.cost import chi_square, minimise, turn_onto
+from perception.vision.quadrangle.jit import cross3, dot3, jit, mix3, product3, put1, put2, times3, unit3
+from perception.vision.quadrangle.three_point import three_point
 
 
 @jit

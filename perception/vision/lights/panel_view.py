@@ -10,16 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from hal.calibration import CameraIntrinsics
 from perception.camera_model import check_size
-from perception.vision.lights_assign import UPRIGHT, AssignedLights, LightMissing, WrongLamp, assign_lights
-from perception.vision.lights_find import LightBlobs, find_lights, gray_of
-from perception.vision.lights_registration import CameraMoved
+from perception.vision.lights.assign import UPRIGHT, AssignedLights, WrongLamp, assign_lights
+from perception.vision.lights.find import LightBlobs, find_lights
 from perception.vision.quadrangle import QuadranglePose, estimate
 from perception.vision.quadrangle import warm_up as warm_up_quadrangle
-
-__all__ = [
-    "UPRIGHT", "AssignedLights", "CameraMoved", "LightBlobs", "LightMissing", "PanelView", "WrongLamp", "assign_lights",
-    "find_lights", "gray_of", "panel_pose", "warm_up",
-]  # fmt: skip
 
 MODEL_SIGMA_PX = 0.15  # what the lens model and the lamps' own centres add to each coordinate of a light
 LEAST_P_VALUE = 1e-5

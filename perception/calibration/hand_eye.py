@@ -88,7 +88,7 @@ def calibrate_hand_eye(
             break
         del used[worst]
         check_turns([views[k] for k in used])
-    _check_accuracy(minimum, len(kept))
+    check_accuracy(minimum.covariance, len(kept))
     return HandEye(
         flange_from_camera=UncertainPose(parent_from_child=x, covariance=minimum.covariance[:6, :6]),
         base_from_target=UncertainPose(parent_from_child=z, covariance=minimum.covariance[6:, 6:]),
@@ -229,17 +229,22 @@ def _fit(
     return state, minimum
 
 
-def _check_accuracy(minimum: Minimum, count: int) -> None:
-    values, vectors = np.linalg.eigh(minimum.covariance[:3, :3])
-    turn = np.linalg.eigvalsh(minimum.covariance[3:6, 3:6])
-    if np.sqrt(values[2]) <= LIMIT_M and np.sqrt(turn[2]) <= LIMIT_RAD:
+def check_accuracy(covariance: Array, count: int, *, limit_m: float = LIMIT_M, limit_rad: float = LIMIT_RAD) -> None:
+    """Refuse a mount (first six rows of `covariance`) that `count` views leave too uncertain.
+
+    Raises:
+        NotObservable: one sigma of its worst direction is above a limit; `details["next_axis"]` helps.
+    """
+    values, vectors = np.linalg.eigh(covariance[:3, :3])
+    turn = np.linalg.eigvalsh(covariance[3:6, 3:6])
+    if np.sqrt(values[2]) <= limit_m and np.sqrt(turn[2]) <= limit_rad:
         return
     weak = vectors[:, 2]
     next_axis = np.cross(weak, np.eye(3)[int(np.argmin(np.abs(weak)))])
     words = np.round(next_axis / np.linalg.norm(next_axis), 2).tolist()
     raise NotObservable(
         f"{count} views leave the camera uncertain by {1e3 * np.sqrt(values[2]):.1f} mm along "
-        f"{np.round(weak, 2).tolist()} (flange axes)",
+        f"{np.round(weak, 2).tolist()} (flange axes) and by {np.degrees(np.sqrt(turn[2])):.2f} deg",
         hint=f"add views turned by 20 degrees or more about {words} (flange axes), or nearer to the target",
         next_axis=words, sigma_mm=round(1e3 * float(np.sqrt(values[2])), 2),
     )  # fmt: skip

@@ -216,18 +216,37 @@ def _first_pose(view: BoardView, intrinsics: CameraIntrinsics) -> RigidTransform
     return transform(R, t - R @ [0.0, 0.0, height])
 
 
-def _parameters(intrinsics: CameraIntrinsics) -> Array:
+def parameters(intrinsics: CameraIntrinsics) -> Array:
+    """(9,) values of `NAMES`."""
     return np.array([
         intrinsics.fx_px, intrinsics.fy_px, intrinsics.cx_px, intrinsics.cy_px, *intrinsics.distortion
     ])  # fmt: skip
 
 
-def _with_parameters(intrinsics: CameraIntrinsics, values: Array) -> CameraIntrinsics:
+def with_parameters(intrinsics: CameraIntrinsics, values: Array) -> CameraIntrinsics:
+    """The lens with the nine values of `NAMES`."""
     fx, fy, cx, cy, *lens = (float(v) for v in values)
     return CameraIntrinsics(
         width_px=intrinsics.width_px, height_px=intrinsics.height_px, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy,
         distortion=(lens[0], lens[1], lens[2], lens[3], lens[4]),
     )  # fmt: skip
+
+
+def lens_jacobian(normalised: Array, intrinsics: CameraIntrinsics) -> Array:
+    """(N, 2, 9) derivatives of the pixels of (N, 2) undistorted normalised points by `NAMES`."""
+    x, y = normalised.T
+    r2 = x * x + y * y
+    d = distort(normalised, intrinsics)
+    focal = np.array([intrinsics.fx_px, intrinsics.fy_px])
+    by_lens = np.zeros((len(normalised), 2, 9))
+    by_lens[:, 0, 0], by_lens[:, 1, 1] = d[:, 0], d[:, 1]
+    by_lens[:, 0, 2] = by_lens[:, 1, 3] = 1.0
+    bend = np.stack([
+        np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3], axis=1),
+        np.stack([y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3], axis=1),
+    ], axis=1)  # fmt: skip
+    by_lens[:, :, 4:] = focal[:, None] * bend
+    return by_lens
 
 
 def _projection(view: BoardView, pose: RigidTransform, intrinsics: CameraIntrinsics) -> tuple[Array, Array, Array]:
@@ -238,16 +257,7 @@ def _projection(view: BoardView, pose: RigidTransform, intrinsics: CameraIntrins
     n = q[:, :2] / z[:, None]
     d = distort(n, intrinsics)
     focal = np.array([intrinsics.fx_px, intrinsics.fy_px])
-    x, y = n.T
-    r2 = x * x + y * y
-    by_lens = np.zeros((len(n), 2, 9))
-    by_lens[:, 0, 0], by_lens[:, 1, 1] = d[:, 0], d[:, 1]
-    by_lens[:, 0, 2] = by_lens[:, 1, 3] = 1.0
-    bend = np.stack([
-        np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3], axis=1),
-        np.stack([y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3], axis=1),
-    ], axis=1)  # fmt: skip
-    by_lens[:, :, 4:] = focal[:, None] * bend
+    by_lens = lens_jacobian(n, intrinsics)
     by_point = np.zeros((len(n), 2, 3))
     by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0 / z
     by_point[:, :, 2] = -n / z[:, None]
@@ -273,10 +283,10 @@ def _fit(views: Sequence[BoardView], start: _State, index: list[int]) -> tuple[_
         return np.concatenate(residuals), np.vstack(rows)
 
     def move(state: _State, step: Array) -> _State:
-        values = _parameters(state.intrinsics)
+        values = parameters(state.intrinsics)
         values[index] += step[:n]
         poses = tuple(perturbed(pose, step[n + 6 * k : n + 6 * k + 6]) for k, pose in enumerate(state.poses))
-        return _State(intrinsics=_with_parameters(state.intrinsics, values), poses=poses)
+        return _State(intrinsics=with_parameters(state.intrinsics, values), poses=poses)
 
     try:
         return descend(start, linearise, move)

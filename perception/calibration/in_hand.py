@@ -1,0 +1,244 @@
+"""Camera on the hand, from known points seen from many poses of the arm: mount, target and lens in one fit.
+
+Pixel: u = lens((A X)^-1 Z (p + e)) with A = base_from_flange, X = flange_from_camera, Z = base_from_target. X, Z, the
+lens and the errors e of the points are estimated together; what is known beforehand of lens and points (one sigma
+each) enters as measurements, and the arm's own repeatability is marginalised into the noise of every view. So the
+covariance of X tells all of it. Covariances are over translation then rotation in the parent's axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+from scipy.stats import chi2
+
+from hal.calibration import CameraIntrinsics
+from hal.errors import InvalidRequest
+from hal.geometry import UncertainPose, certain, matrix_of, perturbed, skew
+from perception.calibration.hand_eye import HandEyeView, check_accuracy, check_turns
+from perception.calibration.intrinsics import NAMES, lens_jacobian, parameters, with_parameters
+from perception.calibration.newton import Minimum, descend
+from perception.camera_model import project_with_jacobian
+
+Array = NDArray[np.float64]
+
+FREE = ("fx", "fy", "cx", "cy", "k1")
+INDEX = [NAMES.index(name) for name in FREE]
+LIMIT_M = 0.001  # one sigma: a mount that is known less well than this is worse than a drawing
+LIMIT_RAD = 0.0035
+OUTLIER_P = 1e-4  # a view that chance alone explains less often than this is left out
+FEWEST_VIEWS = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class InHandView:
+    """One station: where the arm says its flange is, the target's points in the image (N, 2), covariance (N, 2, 2)."""
+
+    base_from_flange: RigidTransform
+    pixels_px: Array
+    covariance_px: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class InHandState:
+    """What is estimated: X, Z, the lens, and the errors (N, 3) of the target's points, m, target frame."""
+
+    flange_from_camera: RigidTransform
+    base_from_target: RigidTransform
+    intrinsics: CameraIntrinsics
+    point_errors_m: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Beforehand:
+    """One sigma of what is known before any view, and of the arm.
+
+    Attributes:
+        focal_ratio, centre_px, k1: of the lens.
+        point_m: of each coordinate of the target's points.
+        arm_m, arm_rad: repeatability of the arm, drawn anew at every station.
+    """
+
+    focal_ratio: float
+    centre_px: float
+    k1: float
+    point_m: float = 1e-4
+    arm_m: float = 1e-4
+    arm_rad: float = 1e-4
+
+
+UNKNOWN_LENS = Beforehand(focal_ratio=0.02, centre_px=15.0, k1=0.1)  # what a maker's data sheet is worth
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class InHandCalibration:
+    """The calibration.
+
+    Attributes:
+        flange_from_camera, base_from_target: with covariance.
+        intrinsics, lens_sigma: the lens, and one sigma of each of `FREE`.
+        rms_px: of the residuals of the used views, both coordinates together.
+        chi_square, degrees: of the fit; their ratio is near 1 when the stated noise is right.
+        used: views kept.
+    """
+
+    flange_from_camera: UncertainPose
+    base_from_target: UncertainPose
+    intrinsics: CameraIntrinsics
+    lens_sigma: Array
+    rms_px: float
+    chi_square: float
+    degrees: int
+    used: tuple[int, ...]
+
+
+def calibrate_in_hand(
+    views: Sequence[InHandView], points_m: Array, start: InHandState, known: Beforehand,
+    *, limit_m: float = LIMIT_M, limit_rad: float = LIMIT_RAD,
+) -> InHandCalibration:  # fmt: skip
+    """Mount, target pose and lens from four views or more.
+
+    Args:
+        views: stations; every view shows all points, in their order.
+        points_m: (N, 3) in the target's frame, as drawn.
+        start: nominal values; `point_errors_m` is (N, 3) of zeros.
+        limit_m, limit_rad: the mount must come out at least this certain (one sigma, worst direction).
+
+    Raises:
+        InvalidRequest: too few views, wrong shapes or not finite.
+        NotObservable: the hand turned about one axis only, or the mount stays too uncertain; says what to add.
+
+    Source: the bundle of Tabb, Ahmad Yousef, Machine Vision and Applications 28, 2017, with priors.
+    """
+    _check(views, points_m)
+    used = list(range(len(views)))
+    while True:
+        kept = [views[k] for k in used]
+        check_turns([HandEyeView(base_from_flange=v.base_from_flange, camera_from_target=certain(v.base_from_flange))
+                     for v in kept])  # fmt: skip
+        state, minimum = _fit(kept, points_m, start, known)
+        errors = [_chi_square(view, points_m, state, known) for view in kept]
+        worst = int(np.argmax(errors))
+        if chi2.sf(errors[worst], 2 * len(points_m)) > OUTLIER_P or len(used) <= FEWEST_VIEWS:
+            break
+        del used[worst]
+    check_accuracy(minimum.covariance, len(used), limit_m=limit_m, limit_rad=limit_rad)
+    rest = np.concatenate([_residual(views[k], points_m, state)[0] for k in used])
+    return InHandCalibration(
+        flange_from_camera=UncertainPose(
+            parent_from_child=state.flange_from_camera, covariance=minimum.covariance[:6, :6]
+        ),
+        base_from_target=UncertainPose(
+            parent_from_child=state.base_from_target, covariance=minimum.covariance[6:12, 6:12]
+        ),
+        intrinsics=state.intrinsics, lens_sigma=np.sqrt(np.diag(minimum.covariance)[12 : 12 + len(FREE)]),
+        rms_px=float(np.sqrt(np.mean(rest**2))), chi_square=minimum.chi_square,
+        degrees=len(rest) - 12, used=tuple(used),
+    )  # fmt: skip
+
+
+def _check(views: Sequence[InHandView], points_m: Array) -> None:
+    if len(views) < FEWEST_VIEWS:
+        raise InvalidRequest(f"{len(views)} views; four are the least", hint="take twelve, turned about several axes")
+    for k, view in enumerate(views):
+        if view.pixels_px.shape != (len(points_m), 2) or view.covariance_px.shape != (len(points_m), 2, 2):
+            raise InvalidRequest(f"views[{k}] needs a pixel and a covariance a point", hint="leave that view out")
+        if not (np.isfinite(view.pixels_px).all() and np.isfinite(view.covariance_px).all()):
+            raise InvalidRequest(f"views[{k}] is not finite", hint="leave that view out")
+
+
+def _fit(
+    views: Sequence[InHandView], points_m: Array, start: InHandState, known: Beforehand
+) -> tuple[InHandState, Minimum]:
+    priors = _priors(start.intrinsics, known, len(points_m))
+    believed = parameters(start.intrinsics)[INDEX]
+    state = start
+    for _ in range(2):  # the weights depend on the levers only; at the first answer they are exact enough
+        whiten = [np.linalg.inv(np.linalg.cholesky(_noise(view, points_m, state, known))) for view in views]
+
+        def linearise(at: InHandState, whiten: list[Array] = whiten) -> tuple[Array, Array]:
+            surprise = np.concatenate([parameters(at.intrinsics)[INDEX] - believed, at.point_errors_m.ravel()])
+            residuals = [surprise / priors]
+            rows = [np.hstack([np.zeros((len(priors), 12)), np.diag(1.0 / priors)])]
+            for view, W in zip(views, whiten, strict=True):
+                r, J = _residual(view, points_m, at)
+                residuals.append(W @ r)
+                rows.append(W @ J)
+            return np.concatenate(residuals), np.vstack(rows)
+
+        state, minimum = descend(state, linearise, _moved)
+    return state, minimum
+
+
+def _priors(lens: CameraIntrinsics, known: Beforehand, count: int) -> Array:
+    """One sigma of the lens and of the points' coordinates, as they stand in the state's step."""
+    of_lens = [
+        known.focal_ratio * lens.fx_px,
+        known.focal_ratio * lens.fy_px,
+        known.centre_px,
+        known.centre_px,
+        known.k1,
+    ]
+    return np.array(of_lens + [known.point_m] * (3 * count))
+
+
+def _moved(state: InHandState, step: Array) -> InHandState:
+    values = parameters(state.intrinsics)
+    values[INDEX] += step[12 : 12 + len(FREE)]
+    return InHandState(
+        flange_from_camera=perturbed(state.flange_from_camera, step[:6]),
+        base_from_target=perturbed(state.base_from_target, step[6:12]),
+        intrinsics=with_parameters(state.intrinsics, values),
+        point_errors_m=state.point_errors_m + step[12 + len(FREE) :].reshape(-1, 3),
+    )
+
+
+def _residual(view: InHandView, points_m: Array, state: InHandState) -> tuple[Array, Array]:
+    """(2N,) pixels that the state predicts less the measured ones, and their derivatives by the state's step."""
+    Rx, Rz = matrix_of(state.flange_from_camera), matrix_of(state.base_from_target)
+    Ra = matrix_of(view.base_from_flange)
+    turned = (points_m + state.point_errors_m) @ Rz.T
+    in_flange = (turned + state.base_from_target.translation - view.base_from_flange.translation) @ Ra
+    q = (in_flange - state.flange_from_camera.translation) @ Rx
+    pixels, by_q = project_with_jacobian(q, state.intrinsics)
+    n = len(points_m)
+    camera_from_base = (Ra @ Rx).T
+    J = np.zeros((n, 2, 12 + len(FREE) + 3 * n))
+    lever = [skew(p) for p in in_flange - state.flange_from_camera.translation]
+    J[:, :, :3], J[:, :, 3:6] = -by_q @ Rx.T, by_q @ (Rx.T @ np.array(lever))  # - r x f = [f]x r
+    J[:, :, 6:9] = by_q @ camera_from_base
+    J[:, :, 9:12] = by_q @ (camera_from_base @ np.array([-skew(p) for p in turned]))
+    J[:, :, 12 : 12 + len(FREE)] = lens_jacobian(q[:, :2] / q[:, 2:], state.intrinsics)[:, :, INDEX]
+    by_point = by_q @ camera_from_base @ Rz
+    for k in range(n):
+        J[k, :, 12 + len(FREE) + 3 * k :][:, :3] = by_point[k]
+    return (pixels - view.pixels_px).ravel(), J.reshape(2 * n, -1)
+
+
+def _noise(view: InHandView, points_m: Array, state: InHandState, known: Beforehand) -> Array:
+    """(2N, 2N) covariance of a view's residuals: of the pixels, and what the arm's repeatability does to all of them."""
+    Rx, Rz = matrix_of(state.flange_from_camera), matrix_of(state.base_from_target)
+    Ra = matrix_of(view.base_from_flange)
+    world = (points_m + state.point_errors_m) @ Rz.T + state.base_from_target.translation
+    from_flange = world - view.base_from_flange.translation
+    _, by_q = project_with_jacobian(
+        (from_flange @ Ra - state.flange_from_camera.translation) @ Rx, state.intrinsics
+    )  # fmt: skip
+    camera_from_base = (Ra @ Rx).T
+    by_arm = np.concatenate(
+        [-by_q @ camera_from_base, by_q @ (camera_from_base @ np.array([skew(p) for p in from_flange]))], axis=2
+    ).reshape(-1, 6)
+    arm = np.diag([known.arm_m**2] * 3 + [known.arm_rad**2] * 3)
+    noise = by_arm @ arm @ by_arm.T
+    for k, covariance in enumerate(view.covariance_px):
+        noise[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += covariance
+    return np.asarray(noise)
+
+
+def _chi_square(view: InHandView, points_m: Array, state: InHandState, known: Beforehand) -> float:
+    r, _ = _residual(view, points_m, state)
+    return float(r @ np.linalg.solve(_noise(view, points_m, state, known), r))

@@ -1,0 +1,137 @@
+"""Camera on the hand: derivatives, statistics of the covariance, a wrong view, degenerate sets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from hal.calibration import CameraIntrinsics
+from hal.errors import InvalidRequest, NotObservable
+from hal.geometry import difference, perturbed, transform_rpy
+from perception.calibration.hand_eye import stations
+from perception.calibration.in_hand import (
+    FREE,
+    UNKNOWN_LENS,
+    Beforehand,
+    InHandCalibration,
+    InHandState,
+    InHandView,
+    _moved,
+    _residual,
+    calibrate_in_hand,
+)
+from perception.camera_model import project
+
+LENS = CameraIntrinsics(width_px=640, height_px=480, fx_px=460.0, fy_px=460.0, cx_px=319.5, cy_px=239.5,
+                        distortion=(-0.08, 0.02, 0.0, 0.0, 0.0))  # fmt: skip
+POINTS = np.array([[-0.28, 0.18, 0.004], [0.28, 0.18, 0.004], [0.28, -0.18, 0.004], [-0.28, -0.18, 0.004]])
+X_TRUE = transform_rpy([0.003, -0.09, 0.06], [0.01, -0.02, 0.015])
+Z_TRUE = transform_rpy([0.95, 0.03, 0.55], [1.55, 0.05, -1.52])
+KNOWN = Beforehand(focal_ratio=5e-4, centre_px=0.3, k1=2e-3)
+SIGMA_PX = 0.08
+
+
+def start() -> InHandState:
+    return InHandState(
+        flange_from_camera=transform_rpy([0.0, -0.09, 0.06], [0.0, 0.0, 0.0]),
+        base_from_target=perturbed(Z_TRUE, [0.004, -0.003, 0.002, 0.01, 0.005, -0.01]),
+        intrinsics=LENS, point_errors_m=np.zeros((4, 3)),
+    )  # fmt: skip
+
+
+def poses(count: int = 12) -> list[RigidTransform]:
+    return stations(Z_TRUE, X_TRUE, distance_m=0.72, count=count, cone_rad=0.5)
+
+
+def drawn(seed: int, flanges: list[RigidTransform], known: Beforehand = KNOWN) -> list[InHandView]:
+    """Views with every error drawn as stated."""
+    rng = np.random.default_rng(seed)
+    z = rng.standard_normal(3)
+    lens = replace(LENS, fx_px=LENS.fx_px * (1 + known.focal_ratio * z[0]), fy_px=LENS.fy_px * (1 + known.focal_ratio * z[1]),
+                   cx_px=LENS.cx_px + known.centre_px * z[2])  # fmt: skip
+    points = POINTS + known.point_m * rng.standard_normal((4, 3))
+    arm = np.repeat([known.arm_m, known.arm_rad], 3)
+    views = []
+    for flange in flanges:
+        real = perturbed(flange, arm * rng.standard_normal(6))
+        pixels = project(((real * X_TRUE).inv() * Z_TRUE).apply(points), lens)
+        views.append(InHandView(
+            base_from_flange=flange, pixels_px=pixels + SIGMA_PX * rng.standard_normal((4, 2)),
+            covariance_px=np.tile(SIGMA_PX**2 * np.eye(2), (4, 1, 1)),
+        ))  # fmt: skip
+    return views
+
+
+def solved(seed: int, **more: float) -> InHandCalibration:
+    return calibrate_in_hand(drawn(seed, poses()), POINTS, start(), KNOWN, **more)
+
+
+def test_the_derivatives_are_those_of_finite_differences() -> None:
+    view, state, step = drawn(1, poses(4))[2], start(), 1e-6
+    _, jacobian = _residual(view, POINTS, state)
+    for k in range(12 + len(FREE) + 12):
+        bump = np.zeros(12 + len(FREE) + 12)
+        bump[k] = step
+        change = _residual(view, POINTS, _moved(state, bump))[0] - _residual(view, POINTS, _moved(state, -bump))[0]
+        assert np.allclose(change / (2 * step), jacobian[:, k], rtol=1e-4, atol=1e-3), k
+
+
+def test_twelve_views_of_four_lights_reach_the_goal_and_say_how_well() -> None:
+    nees, ratio = [], []
+    for seed in range(20):
+        result = solved(seed)
+        e = difference(X_TRUE, result.flange_from_camera.parent_from_child)
+        assert np.linalg.norm(e[:3]) < 1e-3
+        assert np.degrees(np.linalg.norm(e[3:])) < 0.2
+        nees.append(e @ np.linalg.solve(result.flange_from_camera.covariance, e) / 6.0)
+        ratio.append(result.chi_square / result.degrees)
+    assert 0.6 < np.mean(nees) < 1.5
+    assert 0.9 < np.mean(ratio) < 1.1
+
+
+def test_an_unknown_lens_is_found_along_with_the_mount() -> None:
+    rough = replace(
+        start(), intrinsics=replace(LENS, fx_px=466.0, fy_px=466.0, cx_px=316.0, distortion=(-0.05, 0.02, 0, 0, 0))
+    )
+    views = drawn(5, stations(Z_TRUE, X_TRUE, distance_m=0.62, count=10, cone_rad=0.5) + poses(10))
+    result = calibrate_in_hand(views, POINTS, rough, UNKNOWN_LENS, limit_m=0.005, limit_rad=0.02)
+    sigma = dict(zip(FREE, result.lens_sigma, strict=True))
+    assert abs(result.intrinsics.fx_px - LENS.fx_px) < 4 * sigma["fx"] < 8.0
+    assert abs(result.intrinsics.cx_px - LENS.cx_px) < 4 * sigma["cx"] < 40.0
+
+
+def test_a_view_of_something_else_is_left_out_by_its_number() -> None:
+    views = drawn(3, poses())
+    views[5] = replace(views[5], pixels_px=views[5].pixels_px[[1, 2, 3, 0]])
+    result = calibrate_in_hand(views, POINTS, start(), KNOWN)
+    assert 5 not in result.used and len(result.used) >= 10
+    assert np.linalg.norm(difference(X_TRUE, result.flange_from_camera.parent_from_child)[:3]) < 1e-3
+
+
+def test_turns_about_one_axis_are_refused_and_another_is_named() -> None:
+    flanges = [perturbed(poses(1)[0], [0, 0, 0, *(a * np.array([0.0, 0.0, 1.0]))]) for a in np.linspace(-0.3, 0.3, 8)]
+    with pytest.raises(NotObservable) as refused:
+        calibrate_in_hand(drawn(2, flanges), POINTS, start(), KNOWN)
+    turned_about = poses(1)[0].rotation.inv().apply([0.0, 0.0, 1.0])
+    assert abs(np.dot(refused.value.details["next_axis"], turned_about)) < 0.1
+
+
+def test_too_little_turning_is_refused_with_the_direction_that_stays_open() -> None:
+    rng = np.random.default_rng(0)
+    flanges = [
+        perturbed(poses(1)[0], [0, 0, 0, *Rotation.random(random_state=rng).apply([0.06, 0, 0])]) for _ in range(6)
+    ]
+    with pytest.raises(NotObservable, match="uncertain by"):
+        calibrate_in_hand(drawn(2, flanges), POINTS, start(), KNOWN)
+
+
+def test_unusable_views_are_named() -> None:
+    views = drawn(1, poses(5))
+    with pytest.raises(InvalidRequest, match="four are the least"):
+        calibrate_in_hand(views[:3], POINTS, start(), KNOWN)
+    broken = replace(views[1], pixels_px=np.full((4, 2), np.nan))
+    with pytest.raises(InvalidRequest, match=r"views\[1\]"):
+        calibrate_in_hand([views[0], broken, *views[2:]], POINTS, start(), KNOWN)

@@ -170,6 +170,7 @@ class Cia402(StreamDevice[JointState]):
             late = int((now - self._next_sync_s) / period_s)
             self.missed_syncs += late
             self._next_sync_s += (late + 1) * period_s
+            self.take_in(link, 0.0)  # what lies ready answers earlier SYNCs
             self._cycle(link)
         return max(0.0, min(self._next_sync_s, self._next_beat_s) - now_s())
 

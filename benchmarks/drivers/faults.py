@@ -122,43 +122,57 @@ def fault_cell(item: Bench, fault: WireFault, every: int, seconds: float, probe:
     while time.monotonic() < end_s:
         try:
             with running(item, options) as (device, _, backing):
+                reader = Reader(item, device, backing, cell, probe)
                 while time.monotonic() < end_s:
-                    _one_read(item, device, backing, cell, probe)
+                    reader.read()
                     rest.wait(REST_S)
         except CellError:
             cell.errors += 1  # it could not be connected, and said so
     return cell
 
 
-def _one_read(item: Bench, device: Any, backing: Any, cell: Cell, probe: StallProbe) -> None:
-    started_s = time.monotonic()
-    sample: Stamped[Any] | None = None
-    try:
-        sample = device.newest(deadline())
-    except CellError:
-        cell.errors += 1
-    except Exception as error:
-        cell.untyped += 1
-        print(f"    untyped: {error!r}")
-    ended_s = time.monotonic()
-    late_s = ended_s - started_s - READ_S - SLACK_S
-    if late_s > 0.0:
-        stalled_s = probe.stalled_s(started_s, ended_s)
-        cell.stalled += stalled_s >= late_s
-        cell.late_calls += stalled_s < late_s
-    if sample is None or sample.quality is Quality.INVALID:
-        return
-    cell.good += 1
-    if not item.is_true(sample.value, backing):
-        cell.wrong += 1
-        return
-    young_s = max(sample.age_s(CLOCK.now_s()) - (time.monotonic() - ended_s), 0.0)
-    if young_s > device.max_age_s + SLACK_S + (ended_s - started_s):
-        cell.stale += 1
-    elif item.taken_s is not None:
-        taken_s = item.taken_s(sample.value, backing)
-        hidden_s = ended_s - taken_s - young_s - SLACK_S
-        if hidden_s > 0.0:
-            stalled_s = probe.stalled_s(taken_s, ended_s)
-            cell.stalled += stalled_s >= hidden_s
-            cell.stale += stalled_s < hidden_s
+class Reader:
+    """Reads one device and judges what comes."""
+
+    def __init__(self, item: Bench, device: Any, backing: Any, cell: Cell, probe: StallProbe) -> None:
+        self._item = item
+        self._device = device
+        self._backing = backing
+        self._cell = cell
+        self._probe = probe
+        self._last: Stamped[Any] | None = None
+
+    def read(self) -> None:
+        """One call; a value is judged once, its age every time."""
+        started_s = time.monotonic()
+        sample: Stamped[Any] | None = None
+        try:
+            sample = self._device.newest(deadline())
+        except CellError:
+            self._cell.errors += 1
+        except Exception as error:
+            self._cell.untyped += 1
+            print(f"    untyped: {error!r}")
+        ended_s, call_s = time.monotonic(), time.monotonic() - started_s
+        self._cell.late_calls += self._is_ours(started_s, ended_s, call_s - READ_S - SLACK_S)
+        if sample is None or sample.quality is Quality.INVALID:
+            return
+        self._cell.good += 1
+        age_s = max(0.0, CLOCK.now_s() - sample.host_time_s - (time.monotonic() - ended_s))
+        is_old = age_s > self._device.max_age_s + SLACK_S + call_s
+        if sample is not self._last:
+            self._last = sample
+            is_true = self._item.is_true(sample.value, self._backing)
+            self._cell.wrong += not is_true
+            if is_true and self._item.taken_s is not None:
+                taken_s = self._item.taken_s(sample.value, self._backing)
+                is_old |= self._is_ours(taken_s, ended_s, ended_s - taken_s - age_s - SLACK_S)
+        self._cell.stale += is_old
+
+    def _is_ours(self, start_s: float, end_s: float, over_s: float) -> bool:
+        """Is a lateness our own? The machine's, when this process stood still for so much of that time, is counted apart."""
+        if over_s <= 0.0:
+            return False
+        is_stall = self._probe.stalled_s(start_s, end_s) >= over_s
+        self._cell.stalled += is_stall
+        return not is_stall

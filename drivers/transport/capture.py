@@ -199,11 +199,8 @@ def replay_opener(path: Path, device: str) -> Callable[[], Link]:
 
     def opened() -> Link:
         if not sessions:
-            raise DeviceUnavailable(
-                f"{device}: the recording {path.name} is at its end",
-                hint="connect again to see it again",
-                device=device,
-            )
+            what, hint = f"{device}: the recording {path.name} is at its end", "connect again to see it again"
+            raise DeviceUnavailable(what, hint=hint, device=device, recording="ended")
         return ReplayLink(sessions.popleft())
 
     return opened

@@ -284,20 +284,24 @@ class StreamDevice(WireDevice[T]):
 
     def serve(self, link: Link) -> None:
         """Read one chunk (owner thread)."""
-        chunk = link.read(now_s() + self.keep_going(link))
-        arrived_s = now_s()
-        if chunk:
-            self.bytes_in += len(chunk)
-            before = self.mailbox.published
-            self.receive(chunk, arrived_s)
-            if self.mailbox.published > before:
-                self._heard_s = arrived_s
-                return
-        silent_s = arrived_s - self._heard_s
+        self.take_in(link, now_s() + self.keep_going(link))
+        silent_s = now_s() - self._heard_s
         if silent_s > 3 * SLICE_S and not link.is_present():
             raise LinkLost(f"{link.name}: its name has vanished or leads to another port")
         if silent_s > self._silence_s:
             raise NoAnswer(f"no valid data for {silent_s:.2f} s; {self.wire_counts()}")
+
+    def take_in(self, link: Link, until_s: float) -> None:
+        """Wait for a chunk until then and parse it (owner thread)."""
+        chunk = link.read(until_s)
+        if not chunk:
+            return
+        arrived_s = now_s()
+        self.bytes_in += len(chunk)
+        before = self.mailbox.published
+        self.receive(chunk, arrived_s)
+        if self.mailbox.published > before:
+            self._heard_s = arrived_s
 
     def lost(self, error: Exception) -> None:
         """Tell all readers (owner thread)."""

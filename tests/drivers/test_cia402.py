@@ -28,7 +28,7 @@ CALM = {"heartbeat_s": 1.0}  # a busy test machine is no dead host
 class TestCia402(ArmContract):
     @pytest.fixture
     def rig(self) -> Iterator[Rig[Any]]:
-        with wired_rig(emulator.start(ScriptedArm(), {}), DRIVER, {"heartbeat_s": 0.2}, sample_period_s=0.1) as rig:
+        with wired_rig(emulator.start(ScriptedArm(), {}), DRIVER, CALM, sample_period_s=0.1) as rig:
             yield rig
 
 

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import islice
+from types import MappingProxyType
 from typing import Any
 
 from hal.clock import Clock, Deadline
@@ -24,11 +26,17 @@ from service.jsonable import jsonable
 
 CONNECT_ATTEMPTS = 3  # a device that gives nothing three times in a row is not there
 LOOK_AGAIN_S = 0.0005
+ERROR_REST_S = 0.02  # a device that is not there says so at once, again and again
 
 
 @contextmanager
-def only_device(cell: Cell, name: str) -> Iterator[tuple[Callable[[], Any], Clock]]:
-    """What connects the device `name` anew, and its clock; its emulator runs meanwhile if the cell has one.
+def only_device(
+    cell: Cell, name: str, more_options: Mapping[str, Any] = MappingProxyType({})
+) -> Iterator[tuple[Callable[[], Any], Clock, dict[str, Any]]]:
+    """What connects the device `name` anew, its clock and its options; its emulator runs meanwhile if the cell has one.
+
+    Args:
+        more_options: beside those of the cell file.
 
     Raises:
         ConfigError: the cell has no such device, or its options are wrong.
@@ -43,12 +51,13 @@ def only_device(cell: Cell, name: str) -> Iterator[tuple[Callable[[], Any], Cloc
     try:
         far_side = start_emulators(alone, clock, shared, closers).get(name)
         address = {} if far_side is None else far_side.address
+        options = {**section.options, **address}
 
         def connect() -> Any:
             context = Context(name=name, clock=clock, cell=cell, shared=shared)
-            return connect_device(context, section.driver, {**section.options, **address})
+            return connect_device(context, section.driver, {**options, **more_options})
 
-        yield connect, clock
+        yield connect, clock, options
     finally:
         for close in closers[::-1]:
             close()
@@ -64,7 +73,7 @@ def read_lines(cell: Cell, name: str, *, samples: int, timeout_s: float) -> Iter
         timeout_s: deadline of each call.
     """
     kind = cell.file.devices[name].kind if name in cell.file.devices else DeviceKind.ARM
-    with only_device(cell, name) as (connect, clock):
+    with only_device(cell, name) as (connect, clock, _):
         left = samples
         for _ in range(CONNECT_ATTEMPTS):
             started_s = time.monotonic()
@@ -79,24 +88,23 @@ def read_lines(cell: Cell, name: str, *, samples: int, timeout_s: float) -> Iter
                     return
                 continue
             try:
-                yield from _samples(device, name, kind, clock, left, timeout_s)
+                yield from islice(samples_of(device, name, kind, clock, timeout_s), left)
             finally:
                 device.close()
             return
 
 
-def _samples(
-    device: Any, name: str, kind: DeviceKind, clock: Clock, count: int, timeout_s: float
-) -> Iterator[dict[str, Any]]:
+def samples_of(device: Any, name: str, kind: DeviceKind, clock: Clock, timeout_s: float) -> Iterator[dict[str, Any]]:
+    """New samples and errors of a connected device without end, in the form of `read_lines`."""
     read, last = getattr(device, READS[kind]), -1
-    for _ in range(count):
-        started_s = time.monotonic()
+    for started_s in iter(time.monotonic, None):
         deadline = Deadline.after(clock, timeout_s)
         try:
             while (stamped := read(deadline=deadline)).sequence == last and not deadline.is_past():
                 clock.sleep(LOOK_AGAIN_S)
         except CellError as error:
             yield _error(name, kind, error, time.monotonic() - started_s)
+            clock.sleep(ERROR_REST_S)
             continue
         last = stamped.sequence
         yield _sample(name, kind, stamped, clock, time.monotonic() - started_s)

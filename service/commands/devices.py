@@ -1,4 +1,4 @@
-"""`panelwright devices …`: look at the devices of a running service, or at one device of a cell file."""
+"""`panelwright devices …`: look at the devices of a running service, or read, record and replay one of a cell file."""
 
 from __future__ import annotations
 
@@ -6,19 +6,25 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
 from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from hal.errors import ConfigError
+from hal.errors import CellError, ConfigError
 from service.client import ApiError, Client
 from service.commands.common import Url, UrlDefault, client_of, console, find_cell
 
-app = typer.Typer(help="Look at the devices of a running service.", invoke_without_command=True)
+if TYPE_CHECKING:
+    from service.watching import Row
+
+app = typer.Typer(help="Look at devices, read, record and replay them.", invoke_without_command=True)
+err_console = Console(stderr=True, highlight=False, soft_wrap=True)
 Name = Annotated[str, typer.Argument(help="Name of the device in the cell file.")]
+TimeoutOption = Annotated[float, typer.Option(min=0.01, max=60, help="Deadline of each reading.")]
 STYLES = {"valid": "green", "degraded": "yellow", "invalid": "red"}
 
 
@@ -74,22 +80,130 @@ def _read_directly(cell: Path, name: str, *, samples: int, jsonl: bool, timeout_
     for item in read_lines(load_cell(find_cell(cell)), name, samples=samples, timeout_s=timeout_s):
         good += "error" not in item
         if jsonl:
-            sys.stdout.write(as_line(item))
-            sys.stdout.flush()
+            _write(item)
         else:
             console.print_json(as_line(item))
     if not good:
         raise typer.Exit(1)
 
 
+@app.command("record")
+def record_device(
+    name: Name,
+    out: Annotated[Path, typer.Argument(help="File to write, JSON lines.")],
+    *,
+    cell: Annotated[Path, typer.Option("--cell", help="Cell file that has the device; connected here, no service.")],
+    seconds: Annotated[float, typer.Option(min=0.1, max=86_400, help="How long.")] = 10.0,
+    jsonl: Annotated[
+        bool, typer.Option("--jsonl", help="Print the samples meanwhile, one JSON object a line.")
+    ] = False,
+    timeout_s: TimeoutOption = 0.5,
+) -> None:
+    """Write down all that a device and its driver say to each other."""
+    from hal.config import load_cell
+    from service.recording import record
+
+    tally = Tally(jsonl=jsonl)
+    for item in record(load_cell(find_cell(cell)), name, out, duration_s=seconds, timeout_s=timeout_s):
+        tally.take(item)
+    err_console.print(f"{tally}; wrote {out} ({out.stat().st_size / 1024:.0f} KiB)")
+    err_console.print(f"see it again: panelwright devices replay {out}")
+
+
+@app.command("replay")
+def replay_device(
+    recording: Annotated[Path, typer.Argument(help="File that `record` has written.")],
+    *,
+    jsonl: Annotated[bool, typer.Option("--jsonl", help="Print the samples, one JSON object a line.")] = False,
+    timeout_s: TimeoutOption = 0.5,
+) -> None:
+    """Let the recorded device's driver read a recording in the place of the wire, at its pace."""
+    from service.recording import replay
+
+    tally = Tally(jsonl=jsonl)
+    for item in replay(recording, timeout_s=timeout_s):
+        tally.take(item)
+    err_console.print(str(tally))
+
+
+class Tally:
+    """Counts samples and errors, and prints them if wanted."""
+
+    def __init__(self, *, jsonl: bool) -> None:
+        self._jsonl = jsonl
+        self._samples = self._errors = 0
+        self._first_s = self._last_s = 0.0
+
+    def take(self, item: dict[str, Any]) -> None:
+        """One sample or error."""
+        if self._jsonl:
+            _write(item)
+        if "error" in item:
+            self._errors += 1
+            return
+        self._last_s = item["host_time_s"]
+        self._first_s = self._first_s if self._samples else self._last_s
+        self._samples += 1
+
+    def __str__(self) -> str:
+        lasted_s = self._last_s - self._first_s
+        rate = f" in {lasted_s:.1f} s, {(self._samples - 1) / lasted_s:.0f} a second" if lasted_s > 0.0 else ""
+        return f"{self._samples} samples{rate}, {self._errors} errors"
+
+
+def _write(item: dict[str, Any]) -> None:
+    from service.direct_read import as_line
+
+    sys.stdout.write(as_line(item))
+    sys.stdout.flush()
+
+
 @app.command("watch")
-def watch_devices(url: Url = UrlDefault, period_s: Annotated[float, typer.Option(min=0.1)] = 1.0) -> None:
-    """Health of all devices, again and again, until Ctrl-C."""
-    client = client_of(url)
-    with Live(_table(client), console=console) as live:
+def watch_devices(
+    url: Url = UrlDefault,
+    *,
+    period_s: Annotated[float, typer.Option(min=0.1, max=60, help="Time between two looks.")] = 1.0,
+    pictures: Annotated[
+        bool, typer.Option(help="Also read cameras and range scanners, which costs a picture.")
+    ] = False,
+    count: Annotated[int, typer.Option(min=0, help="Looks until the end; 0: until Ctrl-C.")] = 0,
+) -> None:
+    """Values, rates, ages and error counters of all devices, again and again."""
+    from service.watching import Watch
+
+    watch, looks = Watch(client_of(url), with_pictures=pictures), 0
+    with Live(console=console, auto_refresh=False) as live:
         while True:
+            try:
+                shown: Table | str = _watched(watch.look())
+            except CellError as error:  # the service may come back
+                shown = f"[red]{escape(error.what)}[/]; try: {escape(error.hint)}"
+            live.update(shown, refresh=True)
+            looks += 1
+            if looks == count:
+                return
             time.sleep(period_s)
-            live.update(_table(client))
+
+
+def _watched(rows: list[Row]) -> Table:
+    columns = ("name", "driver", "health", "value", "samples/s", "age ms", "samples", "errors", "reconnects", "link")
+    table = Table(*columns, box=None, pad_edge=False)
+    for row in rows:
+        style = STYLES.get(row.health.split()[0], "red")
+        errors = f"{row.errors} [red](+{row.errors_since})[/]" if row.errors_since else str(row.errors)
+        table.add_row(
+            row.name,
+            row.driver,
+            f"[{style}]{row.health}[/]",
+            escape(row.value),
+            "" if row.rate_hz is None else f"{row.rate_hz:.1f}",
+            "" if row.age_s is None else f"{1e3 * row.age_s:.0f}",
+            str(row.samples),
+            errors,
+            str(row.reconnects),
+            escape(row.detail),
+        )
+    return table
 
 
 @app.command("swap")

@@ -18,7 +18,7 @@ from typing import Any
 
 from hal.clock import Clock, PacedClock, SimClock, WallClock
 from hal.config import Cell, DeviceSection, load_cell
-from hal.devices import DeviceKind
+from hal.devices import DeviceKind, Fault
 from hal.errors import CellError, ConfigError, DeviceUnavailable
 from hal.garbage import set_aside
 from hal.registry import Context, Shared, device_factory, emulator_factory
@@ -116,10 +116,11 @@ def clock_for(cell: Cell) -> Clock:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FarSide:
-    """An emulated wire: the options that make a driver find it, and the device that answers behind it."""
+    """An emulated wire: the options that make a driver find it, the device that answers behind it, and what breaks it."""
 
     address: dict[str, Any]
     backing: Any
+    inject: Callable[[Fault | None], None] | None
 
 
 def start_emulators(cell: Cell, clock: Clock, shared: Shared, closers: list[Callable[[], None]]) -> dict[str, FarSide]:
@@ -135,7 +136,7 @@ def start_emulators(cell: Cell, clock: Clock, shared: Shared, closers: list[Call
         except ConfigError as error:
             raise ConfigError(f"{cell.path}: {key}: {error.what}", hint=error.hint, **error.details) from error
         closers.append(emulator.close)
-        far_sides[name] = FarSide(emulator.address, backing)
+        far_sides[name] = FarSide(emulator.address, backing, getattr(emulator, "inject", None))
     return far_sides
 
 

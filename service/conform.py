@@ -15,6 +15,7 @@ from hal.registry import Context, Shared
 from hal.registry import connect as connect_device
 from service.cell import clock_for, start_emulators
 
+LINK = "link"  # property of a test: what the device says about its wire
 SAMPLE_PERIOD_S = {DeviceKind.ARM: 0.02, DeviceKind.CAMERA: 0.2, DeviceKind.RANGE_SCANNER: 0.2}
 
 
@@ -36,6 +37,13 @@ class Bench:
         address = {} if far_side is None else far_side.address
         return connect_device(context, section.driver, {**section.options, **address})
 
+    def fault_injection(self, name: str, device: Any) -> Callable[[Fault | None], None] | None:
+        """What breaks the device or its wire; None for a real device on a real wire."""
+        if isinstance(device, FaultInjection):
+            return device.inject_fault
+        far_side = self._far_sides.get(name)
+        return None if far_side is None else far_side.inject
+
     def close(self) -> None:
         """End emulators and world."""
         for close in self._closers[::-1]:
@@ -43,44 +51,33 @@ class Bench:
         self._closers.clear()
 
 
-def run(cell: Cell, *, devices: Sequence[str], level: str, arguments: Sequence[str] = ()) -> int:
+def run(cell: Cell, *, devices: Sequence[str], level: str, report: Path | None = None) -> int:
     """Try the named devices (all when empty) up to a level; returns pytest's exit code.
 
+    Args:
+        report: where to write what was found, as `report.md` and `report.json`: the path without the ending.
+
     Raises:
-        ConfigError: pytest is not installed.
+        ConfigError: pytest is not installed, or the report cannot be written.
     """
     try:
         import pytest
     except ModuleNotFoundError:
         raise ConfigError("the conformance kit needs pytest", hint="pip install 'panelwright[test]'") from None
+    from service.conform_report import Notebook, write_report
+
     names = tuple(devices) or tuple(cell.file.devices)
+    notebook = Notebook(level)
     with tempfile.TemporaryDirectory(prefix="panelwright-conform-") as folder:
         # A file and a root of its own keep pytest from collecting the project's tests.
         path = Path(folder) / f"test_{cell.name}.py"
         call = f"classes_for({str(cell.path.resolve())!r}, {cell.file.cell.seed}, {names!r}, {level!r})"
         path.write_text(f"from service.conform import classes_for\n\nglobals().update({call})\n")
         options = ["-p", "no:cacheprovider", "-c", "/dev/null", "--rootdir", folder, "-v", "--tb=short", "--no-header"]
-        return int(pytest.main([str(path), *options, *arguments], plugins=[_UpToLevel(level)]))
-
-
-class _UpToLevel:
-    """A pytest plugin that leaves out the promises above a level."""
-
-    def __init__(self, level: str) -> None:
-        self._level = level
-
-    def pytest_configure(self, config: Any) -> None:
-        config.addinivalue_line("markers", "conformance(level): level of a promise")
-
-    def pytest_collection_modifyitems(self, config: Any, items: list[Any]) -> None:
-        from hal.conformance import LEVELS
-
-        allowed = LEVELS[: [str(item) for item in LEVELS].index(self._level) + 1]
-        above = [
-            item for item in items if (mark := item.get_closest_marker("conformance")) and mark.args[0] not in allowed
-        ]
-        config.hook.pytest_deselected(items=above)
-        items[:] = [item for item in items if item not in above]
+        code = int(pytest.main([str(path), *options], plugins=[notebook]))
+    if report is not None:
+        write_report(report, cell, names, notebook)
+    return code
 
 
 def classes_for(cell_path: str, seed: int, names: Sequence[str], level: str) -> dict[str, Any]:
@@ -95,7 +92,12 @@ def classes_for(cell_path: str, seed: int, names: Sequence[str], level: str) -> 
         yield bench
         bench.close()
 
-    return {"bench": bench, **{f"Test_{name}": _class(cell, name, may_move=level == "motion") for name in names}}
+    return {"bench": bench, **{class_name(name): _class(cell, name, may_move=level == "motion") for name in names}}
+
+
+def class_name(device: str) -> str:
+    """Name of a device's test class."""
+    return f"Test_{device}"
 
 
 def _class(cell: Cell, name: str, *, may_move: bool) -> type:
@@ -106,13 +108,13 @@ def _class(cell: Cell, name: str, *, may_move: bool) -> type:
     kind = cell.file.devices[name].kind
 
     @pytest.fixture
-    def rig(_self: object, bench: Bench) -> Iterator[Any]:
+    def rig(_self: object, bench: Bench, record_property: Callable[[str, object], None]) -> Iterator[Any]:
         device = bench.connect(name)
-        inject: Callable[[Fault | None], None] | None = None
-        if isinstance(device, FaultInjection):
-            inject = device.inject_fault
-        period_s = SAMPLE_PERIOD_S.get(kind, 0.05)
+        record_property(LINK, device.health().detail)
+        inject, period_s = bench.fault_injection(name, device), SAMPLE_PERIOD_S.get(kind, 0.05)
         yield Rig(device=device, clock=bench.clock, sample_period_s=period_s, inject=inject, may_move=may_move)
+        if inject is not None:
+            inject(None)  # a test that failed may have left it broken
         device.close()
 
-    return type(f"Test_{name}", (CONTRACTS[kind],), {"rig": rig})
+    return type(class_name(name), (CONTRACTS[kind],), {"rig": rig})

@@ -32,9 +32,12 @@ def conform(
     level: Annotated[
         LevelChoice, typer.Option(help="How far to go; `motion` works arm, gripper and lights.")
     ] = LevelChoice.READ,
+    report: Annotated[
+        Path | None, typer.Option(help="Report without its ending; runs/conform-CELL when not given.")
+    ] = None,
     seed: SeedOption = None,
 ) -> None:
-    """Try the promises of every device kind on the devices of a cell."""
+    """Try the promises of every device kind on the devices of a cell, and write a report (Markdown and JSON)."""
     from service.conform import run
 
     loaded = read_cell(cell, seed)
@@ -43,7 +46,10 @@ def conform(
             raise ConfigError(
                 f"{loaded.path} has no device {name!r}", hint=f"devices: {', '.join(loaded.file.devices)}"
             )
-    raise typer.Exit(run(loaded, devices=device or (), level=str(level)))
+    stem = report or Path("runs") / f"conform-{loaded.name}"
+    code = run(loaded, devices=device or (), level=str(level), report=stem)
+    console.print(f"report: {stem}.md, {stem}.json")
+    raise typer.Exit(code)
 
 
 def emulate(

@@ -17,15 +17,29 @@ from typing import Any
 import serial.tools.list_ports
 
 from drivers.transport.device import WireDevice
-from drivers.transport.serial_link import STABLE_NAMES, latency_timer_ms, port_owner
+from drivers.transport.serial_link import STABLE_NAMES, SYSFS, latency_timer_ms, port_owner
 from hal.clock import Deadline, WallClock
 from hal.config import Cell
 from hal.errors import CellError, ConfigError, DeviceUnavailable
 from hal.registry import Context, connect
 
-BAUDS = (9_600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600, 1_000_000)
+BAUDS = (
+    115_200,
+    57_600,
+    1_000_000,
+    19_200,
+    9_600,
+    38_400,
+    460_800,
+    921_600,
+    230_400,
+)  # each costs seconds: usual ones first
 SAMPLES = 30
 SLOW_TIMER_MS = 2
+TIMER_HINT = (
+    "the drivers shorten it when they open the port, if they may; for good by a udev rule: "
+    'ACTION=="add", SUBSYSTEM=="usb-serial", ATTR{latency_timer}="1"'
+)
 Connect = Callable[[str, str, dict[str, Any]], Any]
 
 
@@ -56,8 +70,12 @@ def serial_path(options: Mapping[str, Any]) -> str | None:
     return found if isinstance(found, str) and "/" in found else None
 
 
-def examine_port(path: str) -> Finding:
-    """Is it there, may it be opened, does somebody have it, and how long does its adapter hold bytes back?"""
+def examine_port(path: str, *, sysfs: Path = SYSFS) -> Finding:
+    """Is it there, may it be opened, does somebody have it, and how long does its adapter hold bytes back?
+
+    Args:
+        sysfs: where the kernel describes serial ports.
+    """
     if not Path(path).exists():
         return Finding(path, False, "does not exist", "plug the device in, or correct the path in the cell file")
     if not os.access(path, os.R_OK | os.W_OK):
@@ -65,22 +83,28 @@ def examine_port(path: str) -> Finding:
         return Finding(path, False, "you may not open it", hint)
     if (owner := port_owner(path)) is not None:
         return Finding(path, False, f"taken by {owner}", "close that program or choose another port")
-    timer_ms = latency_timer_ms(path)
+    timer_ms = latency_timer_ms(path, sysfs=sysfs)
     if timer_ms is None:
         return Finding(path, True, "free; its driver has no latency timer")
-    hint = "the drivers ask for 1 ms at each opening; a udev rule sets it for good" if timer_ms > SLOW_TIMER_MS else ""
-    return Finding(path, True, f"free; latency timer {timer_ms} ms", hint)
+    return Finding(path, True, f"free; latency timer {timer_ms} ms", TIMER_HINT if timer_ms > SLOW_TIMER_MS else "")
 
 
 def examine_device(
-    name: str, driver: str, options: dict[str, Any], path: str, *, open_device: Connect | None = None
+    name: str,
+    driver: str,
+    options: dict[str, Any],
+    path: str,
+    *,
+    open_device: Connect | None = None,
+    look_at: Callable[[str], Finding] = examine_port,
 ) -> Iterator[Finding]:
     """Its port, then the device as configured; when it gives no data, at which other baud rate it does.
 
     Args:
         open_device: connects by name, driver and options; the installed drivers unless given.
+        look_at: what finds out about the port.
     """
-    port = examine_port(path)
+    port = look_at(path)
     if not port.is_good:
         yield Finding(name, False, f"{path} {port.what}", port.hint)
         return

@@ -18,6 +18,8 @@ PTY_MAJORS = range(136, 144)  # Linux devices.txt
 BITS_PER_BYTE = 10
 USUAL_PORTS = ("ttyUSB*", "ttyACM*", "ttyAMA*")  # a look at /sys by pyserial costs a millisecond at every attempt
 STABLE_NAMES = Path("/dev/serial/by-id")
+SYSFS = Path("/sys/class/tty")
+SHORT_TIMER_MS = 1  # an FTDI adapter's shortest; 16 is what it has from the factory
 
 
 class SerialLink(FdLink):
@@ -29,7 +31,7 @@ class SerialLink(FdLink):
         self._path = path
         self._device_id = os.fstat(port.fileno()).st_rdev
         self.is_low_latency = _ask_for_low_latency(port)
-        timer_ms = latency_timer_ms(path)
+        timer_ms = shorten_latency_timer(path)
         self.latency = "" if timer_ms is None else f", latency timer {timer_ms} ms"
         self._name += self.latency
 
@@ -93,13 +95,29 @@ def _ask_for_low_latency(port: serial.Serial) -> bool:
     return True
 
 
-def latency_timer_ms(path: str) -> int | None:
+def latency_timer_ms(path: str, *, sysfs: Path = SYSFS) -> int | None:
     """How long the USB adapter behind `path` holds bytes back, in ms; None when its driver does not say."""
-    file = Path("/sys/class/tty") / Path(os.path.realpath(path)).name / "device" / "latency_timer"
     try:
-        return int(file.read_text())
+        return int(_timer_file(path, sysfs).read_text())
     except (OSError, ValueError):
         return None
+
+
+def shorten_latency_timer(path: str, *, sysfs: Path = SYSFS) -> int | None:
+    """Set the adapter's timer to its shortest where this user may; what it is then, in ms, or None when it has none.
+
+    Drivers that obey the low-latency request of an open port have done it already.
+    """
+    timer_ms = latency_timer_ms(path, sysfs=sysfs)
+    if timer_ms is None or timer_ms <= SHORT_TIMER_MS:
+        return timer_ms
+    with suppress(OSError):
+        _timer_file(path, sysfs).write_text(f"{SHORT_TIMER_MS}\n")
+    return latency_timer_ms(path, sysfs=sysfs)
+
+
+def _timer_file(path: str, sysfs: Path) -> Path:
+    return sysfs / Path(os.path.realpath(path)).name / "device" / "latency_timer"
 
 
 def _unavailable(path: str, device: str, error: Exception) -> DeviceUnavailable:
@@ -127,7 +145,10 @@ def _ports_now() -> str:
 
 def port_owner(path: str) -> str | None:
     """`name (pid N)` of a process that has `path` open, or None when it cannot be seen."""
-    wanted = os.path.realpath(path)
+    try:
+        wanted = os.path.realpath(path)
+    except OSError:
+        return None  # it has vanished meanwhile
     for folder in Path("/proc").glob("[0-9]*/fd"):
         try:
             if any(os.path.realpath(fd) == wanted for fd in folder.iterdir()):

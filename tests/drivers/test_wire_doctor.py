@@ -1,6 +1,7 @@
 """The doctor finds missing, taken and forbidden ports, wrong baud rates, and measures what answers."""
 
 import os
+import termios
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,8 @@ import pytest
 from drivers.emulators import lms200, tfmini
 from drivers.emulators.ports import PtyPort
 from drivers.emulators.scripted import ScriptedProximity, ScriptedScanner
-from drivers.transport.serial_link import latency_timer_ms
-from drivers.wire_doctor import examine_device, examine_port, measured, serial_path
+from drivers.transport.serial_link import latency_timer_ms, port_owner, shorten_latency_timer
+from drivers.wire_doctor import Finding, examine_device, examine_port, measured, serial_path
 from hal.errors import DeviceTimeout, DeviceUnavailable
 from hal.registry import Context, connect
 
@@ -83,6 +84,81 @@ def test_a_device_that_never_answers_keeps_its_own_words(tmp_path: Path) -> None
     path.touch()
     (found,) = examine_device("finger", "x:y", {}, str(path), open_device=open_device)
     assert (found.what, found.hint) == ("finger is silent", "power?")
+
+
+class NoisyAtOtherBauds(PtyPort):
+    """A line on which a wrong baud rate gives noise."""
+
+    def send(self, peer: Any, data: bytes) -> None:
+        """The frame, or what a receiver at another speed makes of it."""
+        super().send(peer, data if self.speed() == termios.B115200 else bytes(b ^ 0xE6 for b in data[::2]))
+
+
+def test_a_driver_at_the_wrong_baud_rate_is_told_the_one_that_answers() -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tfmini, "PtyPort", NoisyAtOtherBauds)
+        far_side = tfmini.start(ScriptedProximity(), {})
+    path = str(far_side.port.path)
+    options, free = {"port": path, "baud": 9600}, Finding(path, True, "free")
+    with closing(far_side):
+        found = list(examine_device("finger", "serial:tfmini", options, path, look_at=lambda _: free))
+    assert [(f.is_good, f.what) for f in found] == [(False, "wrong baud rate: it answers at 115200")]
+    assert found[0].hint == "set `baud = 115200` in its options"
+
+
+@pytest.fixture
+def adapter(tmp_path: Path) -> tuple[Path, Path, Path]:
+    """A USB adapter as the kernel shows it: stable name, tree of sysfs, latency timer."""
+    device = tmp_path / "ttyUSB7"
+    device.touch()
+    stable = tmp_path / "usb-acme-if00"
+    stable.symlink_to(device)
+    timer = tmp_path / "sys" / "ttyUSB7" / "device" / "latency_timer"
+    timer.parent.mkdir(parents=True)
+    timer.write_text("16\n")
+    return stable, tmp_path / "sys", timer
+
+
+def test_the_latency_timer_is_found_behind_the_stable_name_and_shortened(adapter: tuple[Path, Path, Path]) -> None:
+    stable, sysfs, timer = adapter
+    assert latency_timer_ms(str(stable), sysfs=sysfs) == 16
+    found = examine_port(str(stable), sysfs=sysfs)
+    assert found.is_good and found.what == "free; latency timer 16 ms" and "udev" in found.hint
+    assert shorten_latency_timer(str(stable), sysfs=sysfs) == 1
+    assert timer.read_text() == "1\n"
+    assert examine_port(str(stable), sysfs=sysfs).hint == ""
+
+
+def test_a_timer_that_may_not_be_set_is_reported_as_it_is(
+    adapter: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stable, sysfs, timer = adapter
+
+    def refuse(*_: object) -> int:
+        raise PermissionError(13, "not yours")
+
+    monkeypatch.setattr(Path, "write_text", refuse)
+    assert shorten_latency_timer(str(stable), sysfs=sysfs) == 16
+    assert timer.read_text() == "16\n"
+
+
+@pytest.mark.parametrize("text", ["", "fast\n"])
+def test_a_timer_that_says_nothing_is_none(text: str, adapter: tuple[Path, Path, Path]) -> None:
+    stable, sysfs, timer = adapter
+    timer.write_text(text)
+    assert shorten_latency_timer(str(stable), sysfs=sysfs) is None
+    assert "no latency timer" in examine_port(str(stable), sysfs=sysfs).what
+
+
+def test_a_port_whose_name_vanishes_while_it_is_looked_at_has_no_timer_and_no_owner(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def vanished(path: str) -> str:
+        raise FileNotFoundError(2, "gone", path)
+
+    monkeypatch.setattr(os.path, "realpath", vanished)
+    assert shorten_latency_timer("/dev/x") is None
+    assert port_owner("/dev/x") is None
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from hal.garbage import set_aside
 from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
 from hal.strict import validate
+from service.calibrations import Calibrations
 from service.child import Lifeline, kill_own_group
 from service.connection import BEHIND, CLOCK, MOVER, PREFIX, SWAPPER
 from service.latch import Beat, Latch
@@ -47,13 +48,19 @@ class CellRuntime:
 
     @classmethod
     def start(
-        cls, cell: Cell, *, is_latched: Callable[[], bool], swapped: Mapping[str, DeviceSection] | None = None
+        cls,
+        cell: Cell,
+        *,
+        is_latched: Callable[[], bool],
+        swapped: Mapping[str, DeviceSection] | None = None,
+        runs_dir: Path | None = None,
     ) -> CellRuntime:
         """Start emulators, connect all devices at once, then start the control thread.
 
         Args:
             is_latched: read by the control thread each tick.
             swapped: what takes the place of sections of the cell file, as an earlier run had it.
+            runs_dir: where `panelwright calibrate` keeps records; motion uses those, devices the cell file's own.
 
         Raises:
             CellError: what could not be connected, all of it in one error; everything else is closed again.
@@ -82,7 +89,9 @@ class CellRuntime:
             objects |= {PREFIX + BEHIND + name: far_side.backing for name, far_side in far_sides.items()}
             motion: MotionPort | None = None
             if cell.names_of(DeviceKind.ARM):
-                objects[PREFIX + MOVER] = motion = start_controller(cell, seats, clock=clock, is_latched=is_latched)
+                measured = cell if runs_dir is None else Calibrations.of_runs(runs_dir, cell).applied()
+                motion = start_controller(measured, seats, clock=clock, is_latched=is_latched)
+                objects[PREFIX + MOVER] = motion
                 closers.append(motion.close)
             objects[PREFIX + SWAPPER] = Swapper(cell, connect=connect, complete=complete, seats=seats, motion=motion)
         except BaseException:
@@ -195,6 +204,7 @@ class CellOrder:
     beat_path: str
     address: str
     authkey: str
+    runs_dir: str | None
     swapped: dict[str, dict[str, Any]]
 
     def to_line(self) -> str:
@@ -242,7 +252,8 @@ def _run(order: CellOrder, lifeline: Lifeline, is_latched: Callable[[], bool], e
 
     swapped = {name: validate(block, DeviceSection, source=f"devices.{name}") for name, block in order.swapped.items()}
     cell = load_cell(Path(order.cell_path), seed=order.seed)
-    runtime = CellRuntime.start(cell, is_latched=is_latched, swapped=swapped)
+    runs_dir = None if order.runs_dir is None else Path(order.runs_dir)
+    runtime = CellRuntime.start(cell, is_latched=is_latched, swapped=swapped, runs_dir=runs_dir)
     server = serve(runtime.objects, order.address, bytes.fromhex(order.authkey), clock=runtime.clock)
     set_aside()
     lifeline.write_line("ready")

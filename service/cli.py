@@ -32,7 +32,7 @@ def main() -> None:
 def _app() -> Callable[[], None]:
     import typer
 
-    from service.commands import devices, tasks
+    from service.commands import calibrate, devices, tasks
     from service.commands.demo import demo
     from service.commands.develop import conform, emulate, new_driver
     from service.commands.doctor import doctor
@@ -56,6 +56,7 @@ def _app() -> Callable[[], None]:
     app.command()(conform)
     app.command()(warm)
     app.command()(teach)
+    app.add_typer(calibrate.app, name="calibrate")
     app.command("range")(range_image)
     app.add_typer(batch, name="batch")
     app.command()(emulate)

@@ -14,6 +14,7 @@ from pydantic import BaseModel
 
 from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceUnavailable, InvalidRequest, Stopped
+from service.calibrations import Calibrations
 from service.gate import GatedConnection
 from service.journal import Journal
 from service.lease import LeaseDesk
@@ -51,11 +52,12 @@ class Service:
         self.operations = operations
         self.runs_dir = runs_dir
         self.memory = CellMemory()
+        self.calibrations = Calibrations.of_runs(runs_dir, cell)
         self.started_s = time.monotonic()
         state_dir = runs_dir / ".service"
         self.journal = Journal(state_dir / "journal.sqlite")
         self.supervisor = Supervisor(
-            cell, stop_listener=stop_listener, origins=origins, inline=inline, report=self.note
+            cell, stop_listener=stop_listener, origins=origins, inline=inline, runs_dir=runs_dir, report=self.note
         )
         self.tasks = TaskStore(state_dir / "tasks", recorder=self.journal, stop_motion=self._stop_motion)
         self.lease = LeaseDesk(ttl_s=cell.file.safety.lease_ttl_s, on_loss=self.tasks.cancel_moving, report=self.note)
@@ -94,7 +96,9 @@ class Service:
         def work(task: TaskContext) -> Any:
             return operation.run(
                 OperationContext(
-                    connection=GatedConnection(self.supervisor.connection, task.check_cancelled),
+                    connection=GatedConnection(
+                        self.supervisor.connection, task.check_cancelled, cell=self.calibrations.applied()
+                    ),
                     task=task,
                     runs_dir=self.runs_dir,
                     state=self.memory,

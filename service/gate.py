@@ -44,16 +44,17 @@ class GatedMover:
 
 
 class GatedConnection:
-    """The cell's connection with a gated mover."""
+    """The cell's connection with a gated mover, and with the calibrations of the moment the task began."""
 
-    def __init__(self, connection: CellConnection, check: Callable[[], None]) -> None:
+    def __init__(self, connection: CellConnection, check: Callable[[], None], *, cell: Cell | None = None) -> None:
         self._connection = connection
         self._check = check
+        self._cell = cell
 
     @property
     def cell(self) -> Cell:
-        """The cell file."""
-        return self._connection.cell
+        """The cell file, with what was calibrated here in place of its records."""
+        return self._cell or self._connection.cell
 
     @property
     def clock(self) -> Clock:

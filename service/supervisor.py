@@ -77,6 +77,7 @@ class Supervisor:
         stop_listener: bound socket of the stop port; None for no port (tests).
         origins: web origins that may read answers of the stop port.
         inline: cell and stop port in this process.
+        runs_dir: where calibrations are kept; None: only the cell file's own count.
         report: told about starts, deaths, stops and resets.
     """
 
@@ -87,10 +88,12 @@ class Supervisor:
         stop_listener: socket.socket | None = None,
         origins: tuple[str, ...] = (),
         inline: bool = False,
+        runs_dir: Path | None = None,
         report: Report = lambda _kind, _data: None,
     ) -> None:
         self.cell = cell
         self.inline = inline
+        self._runs_dir = runs_dir
         self._report = report
         self._folder = Path(tempfile.mkdtemp(prefix="panelwright-"))
         self.latch = Latch.create(self._folder / "latch")
@@ -207,7 +210,7 @@ class Supervisor:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _start_inline(self) -> None:
-        runtime = CellRuntime.start(self.cell, is_latched=self.latch.is_set)
+        runtime = CellRuntime.start(self.cell, is_latched=self.latch.is_set, runs_dir=self._runs_dir)
         self._local = LocalConnection(self.cell, runtime.objects, close=runtime.close)
         self._is_ready.set()
 
@@ -235,6 +238,7 @@ class Supervisor:
             beat_path=str(self._folder / "beat"),
             address=str(self._folder / f"cell-{secrets.token_hex(4)}.sock"),
             authkey=secrets.token_hex(32),
+            runs_dir=None if self._runs_dir is None else str(self._runs_dir.absolute()),
             swapped={name: section.model_dump(mode="json") for name, section in self._swapped.items()},
         )
         child = self._begin_child(on_line, on_exit)

@@ -7,7 +7,7 @@ Covariances are over translation then rotation in the parent's axes, as everywhe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -252,7 +252,7 @@ def check_accuracy(covariance: Array, count: int, *, limit_m: float = LIMIT_M, l
 
 def propose_next(
     done: Sequence[HandEyeView], result: tuple[RigidTransform, RigidTransform], candidates: Sequence[RigidTransform],
-    *, view_covariance: Array, arm_sigma_m: float = 1e-4, arm_sigma_rad: float = 1e-4,
+    *, view_covariance: Callable[[RigidTransform], Array], arm_sigma_m: float = 1e-4, arm_sigma_rad: float = 1e-4,
 ) -> tuple[int, float]:  # fmt: skip
     """Which flange pose to go to next: the one that shrinks the covariance of X most.
 
@@ -260,7 +260,7 @@ def propose_next(
         done: the stations so far (one or more).
         result: X and Z as far as known (nominal values will do).
         candidates: base_from_flange poses from which the target is in view.
-        view_covariance: 6x6 of a camera_from_target, as expected.
+        view_covariance: the 6x6 covariance that a view of a camera_from_target is expected to have.
 
     Returns: index into `candidates`, and log det of X's covariance after it (lower is better).
 
@@ -273,7 +273,8 @@ def propose_next(
     arm = np.diag([arm_sigma_m**2] * 3 + [arm_sigma_rad**2] * 3)
 
     def information(flange: RigidTransform) -> Array:
-        seen = UncertainPose(parent_from_child=(flange * x).inv() * z, covariance=view_covariance)
+        pose = (flange * x).inv() * z
+        seen = UncertainPose(parent_from_child=pose, covariance=view_covariance(pose))
         stack = _Stack.of([HandEyeView(base_from_flange=flange, camera_from_target=seen)])
         J = np.hstack([_jacobians(stack, x)[1][0], -np.eye(6)])
         return np.asarray(J.T @ np.linalg.solve(_noise(stack, x, arm)[0], J))

@@ -126,16 +126,18 @@ def calibrate_in_hand(
         if chi2.sf(errors[worst], 2 * len(points_m)) > OUTLIER_P or len(used) <= FEWEST_VIEWS:
             break
         del used[worst]
-    check_accuracy(minimum.covariance, len(used), limit_m=limit_m, limit_rad=limit_rad)
     rest = np.concatenate([_residual(views[k], points_m, state)[0] for k in used])
+    # More scatter than was stated: then everything is as much less certain.
+    covariance = minimum.covariance * max(1.0, minimum.chi_square / (len(rest) - 12))
+    check_accuracy(covariance, len(used), limit_m=limit_m, limit_rad=limit_rad)
     return InHandCalibration(
         flange_from_camera=UncertainPose(
-            parent_from_child=state.flange_from_camera, covariance=minimum.covariance[:6, :6]
+            parent_from_child=state.flange_from_camera, covariance=covariance[:6, :6]
         ),
         base_from_target=UncertainPose(
-            parent_from_child=state.base_from_target, covariance=minimum.covariance[6:12, 6:12]
+            parent_from_child=state.base_from_target, covariance=covariance[6:12, 6:12]
         ),
-        intrinsics=state.intrinsics, lens_sigma=np.sqrt(np.diag(minimum.covariance)[12 : 12 + len(FREE)]),
+        intrinsics=state.intrinsics, lens_sigma=np.sqrt(np.diag(covariance)[12 : 12 + len(FREE)]),
         rms_px=float(np.sqrt(np.mean(rest**2))), chi_square=minimum.chi_square,
         degrees=len(rest) - 12, used=tuple(used),
     )  # fmt: skip

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
-from hal.calibration import CalibrationRecord, IntrinsicsRecord, LoadRecord, MountRecord, Vector3, load_calibration
+from hal.calibration import CalibrationRecord, IntrinsicsRecord, LoadRecord, MountRecord, Vector3
 from hal.geometry import UncertainPose
 from perception.calibration.hand_eye import HandEye
+from perception.calibration.in_hand import FREE, InHandCalibration
 from perception.calibration.intrinsics import CameraCalibration
 from perception.calibration.scanner import ScannerCalibration
 from perception.calibration.wrench import WrenchCalibration
@@ -25,7 +24,10 @@ def mount_of(parent_from_device: UncertainPose) -> MountRecord:
 
 
 def record_of(
-    device: str, result: HandEye | CameraCalibration | ScannerCalibration | WrenchCalibration, *, date: str
+    device: str,
+    result: HandEye | InHandCalibration | CameraCalibration | ScannerCalibration | WrenchCalibration,
+    *,
+    date: str,
 ) -> CalibrationRecord:
     """The record of one result, version 1.
 
@@ -38,6 +40,8 @@ def record_of(
         return CalibrationRecord(
             device=device, date=date, method="hand-eye", mount=mount_of(result.flange_from_camera), quality=quality
         )
+    if isinstance(result, InHandCalibration):
+        return _in_hand_record(device, result, date)
     if isinstance(result, ScannerCalibration):
         quality = {"chi_square_ratio": result.chi_square / max(result.degrees, 1), "rms_m": result.rms_m}
         return CalibrationRecord(
@@ -55,16 +59,40 @@ def record_of(
     return _camera_record(device, result, date)
 
 
-def save(record: CalibrationRecord, path: Path) -> CalibrationRecord:
-    """Write the record as TOML with a version one above the file's, and return it as written.
+def renewed(current: CalibrationRecord, found: CalibrationRecord) -> CalibrationRecord:
+    """What was found, over what the present record says of the rest; one version further."""
+    parts = {name: getattr(found, name) for name in ("mount", "intrinsics", "load")}
+    update = {name: part for name, part in parts.items() if part is not None}
+    about = {"date": found.date, "method": found.method, "quality": found.quality, "version": current.version + 1}
+    return current.model_copy(update=update | about)
 
-    Raises:
-        ConfigError: the file that is there is no calibration record.
-    """
-    if path.exists():
-        record = record.model_copy(update={"version": load_calibration(path).version + 1})
-    path.write_text(_toml(record), encoding="utf-8")
-    return record
+
+def to_toml(record: CalibrationRecord) -> str:
+    """The record as a file has it: scalars first, then one table a part."""
+    data = record.model_dump(by_alias=True, exclude_none=True)
+    lines = toml_lines({key: value for key, value in data.items() if not isinstance(value, dict)})
+    for key, table in data.items():
+        if isinstance(table, dict):
+            lines += ["", f"[{key}]", *toml_lines(table)]
+    return "\n".join(lines) + "\n"
+
+
+def _in_hand_record(device: str, result: InHandCalibration, date: str) -> CalibrationRecord:
+    i = result.intrinsics
+    sigma = dict(zip(FREE, result.lens_sigma.tolist(), strict=True))
+    mount = mount_of(result.flange_from_camera)
+    return CalibrationRecord(
+        device=device, date=date, method="hand-eye and lens by the panel's lights",
+        mount=mount,
+        intrinsics=IntrinsicsRecord(
+            width_px=i.width_px, height_px=i.height_px, fx_px=i.fx_px, fy_px=i.fy_px, cx_px=i.cx_px, cy_px=i.cy_px,
+            distortion=i.distortion, rms_px=result.rms_px, sigma_k1=sigma["k1"],
+            sigma_focal_ratio=max(sigma["fx"] / i.fx_px, sigma["fy"] / i.fy_px),
+            sigma_centre_px=max(sigma["cx"], sigma["cy"]),
+        ),
+        quality={"chi_square_ratio": result.chi_square / max(result.degrees, 1), "views": float(len(result.used)),
+                 "rms_px": result.rms_px, "sigma_m": max(mount.sigma_m), "sigma_rad": max(mount.sigma_rad)},
+    )  # fmt: skip
 
 
 def _camera_record(device: str, result: CameraCalibration, date: str) -> CalibrationRecord:
@@ -85,13 +113,3 @@ def _camera_record(device: str, result: CameraCalibration, date: str) -> Calibra
 def _three(values: object) -> Vector3:
     x, y, z = (float(v) for v in np.asarray(values, float))
     return (x, y, z)
-
-
-def _toml(record: CalibrationRecord) -> str:
-    """TOML of the record: scalars first, then one table a part."""
-    data = record.model_dump(by_alias=True, exclude_none=True)
-    lines = toml_lines({key: value for key, value in data.items() if not isinstance(value, dict)})
-    for key, table in data.items():
-        if isinstance(table, dict):
-            lines += ["", f"[{key}]", *toml_lines(table)]
-    return "\n".join(lines) + "\n"

@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 LIMIT_M = 0.003
 LIMIT_RAD = 0.02
+ARM_SIGMA = (1e-4, 1e-4, 1e-4)  # m along the plate's normal, rad about its two axes: what the arm repeats to
 NAMES = ("shift along x", "shift along y", "shift along z", "turn about x", "turn about y", "turn about z")
 
 
@@ -48,8 +49,9 @@ def calibrate_scanner(
 ) -> ScannerCalibration:
     """The scanner's mount, and the plate's plane (its z axis, through its origin) refined along with it.
 
-    Minimises sum (n . (A_i Y p) - d)^2 / sigma^2 over Y = flange_from_scanner and the plane (n, d), the plane held by
-    the covariance of `base_from_plate`.
+    Minimises sum (n_i . (A_i Y p) - d_i)^2 / sigma^2 over Y = flange_from_scanner and the plane (n, d), the plane held
+    by the covariance of `base_from_plate`. Every scan meets the plane a little off, n_i and d_i, within what the arm
+    repeats to: thousands of points a scan would otherwise promise micrometres.
 
     Args:
         views: scans from several distances and tilts.
@@ -64,42 +66,45 @@ def calibrate_scanner(
     if not points:
         raise InvalidRequest("no scans", hint="take six or more, tilted about both axes of the plate")
     frame = matrix_of(base_from_plate.parent_from_child)
-    n0, e1, e2 = frame[:, 2], frame[:, 0], frame[:, 1]
-    d0 = float(n0 @ base_from_plate.parent_from_child.translation)
+    n0, across = frame[:, 2], frame[:, :2]
+    origin = base_from_plate.parent_from_child.translation
     prior = _plane_prior(base_from_plate)
-
-    def plane(bend: Array) -> tuple[Array, float]:
-        n = n0 + bend[0] * e1 + bend[1] * e2
-        return n / np.linalg.norm(n), d0 + float(bend[2])
-
+    loose = np.diag(1.0 / np.array(ARM_SIGMA)[[1, 2, 0]])  # bends are two tilts, then a shift
     sigmas = [_across(view, p, matrix_of(start), n0) for view, p in zip(views, points, strict=True)]
+    count = 9 + 3 * len(views)
 
     def linearise(state: tuple[RigidTransform, Array]) -> tuple[Array, Array]:
-        pose, bend = state
-        n, d = plane(bend)
+        pose, bends = state
         Ry = matrix_of(pose)
-        residuals, rows = [prior @ bend], [np.hstack([np.zeros((3, 6)), prior])]
-        for view, p, sigma in zip(views, points, sigmas, strict=True):
+        held = np.zeros((3 + 3 * len(views), count))
+        held[:3, 6:9], held[3:, 9:] = prior, np.kron(np.eye(len(views)), loose)
+        residuals, rows = [held[:, 6:] @ bends], [held]
+        for k, (view, p, sigma) in enumerate(zip(views, points, sigmas, strict=True)):
+            bend = bends[:3] + bends[3 + 3 * k : 6 + 3 * k]
+            n = n0 + across @ bend[:2]  # its length grows by the square of milliradians
             Ra = matrix_of(view.base_from_flange)
             turned = p @ Ry.T
-            world = (turned + pose.translation) @ Ra.T + view.base_from_flange.translation
+            world = (turned + pose.translation) @ Ra.T + view.base_from_flange.translation - origin
             nf = Ra.T @ n
-            row = np.hstack([np.tile(nf, (len(p), 1)), np.cross(turned, nf), world @ np.column_stack([e1, e2]),
-                             -np.ones((len(p), 1))])  # fmt: skip
-            residuals.append((world @ n - d) / sigma)
-            rows.append(row / sigma[:, None])
+            by_bend = np.hstack([world @ across, -np.ones((len(p), 1))]) / sigma[:, None]
+            row = np.zeros((len(p), count))
+            row[:, :6] = np.hstack([np.tile(nf, (len(p), 1)), np.cross(turned, nf)]) / sigma[:, None]
+            row[:, 6:9] = row[:, 9 + 3 * k : 12 + 3 * k] = by_bend
+            residuals.append((world @ n - bend[2]) / sigma)
+            rows.append(row)
         return np.concatenate(residuals), np.vstack(rows)
 
-    (pose, bend), minimum = descend(
-        (start, np.zeros(3)), linearise, lambda s, step: (perturbed(s[0], step[:6]), s[1] + step[6:])
+    (pose, bends), minimum = descend(
+        (start, np.zeros(count - 6)), linearise, lambda s, step: (perturbed(s[0], step[:6]), s[1] + step[6:])
     )
+    normal = n0 + across @ bends[:2]
+    plane = (normal / np.linalg.norm(normal), float((normal @ origin + bends[2]) / np.linalg.norm(normal)))
     covariance = minimum.covariance[:6, :6]
     _check(covariance)
-    count = sum(len(p) for p in points)
-    rest_m = linearise((pose, bend))[0][3:] * np.concatenate(sigmas)
+    rest_m = linearise((pose, bends))[0][3 + 3 * len(views) :] * np.concatenate(sigmas)
     return ScannerCalibration(
-        flange_from_scanner=UncertainPose(parent_from_child=pose, covariance=covariance), plane_base=plane(bend),
-        chi_square=minimum.chi_square, degrees=count - 6, rms_m=float(np.sqrt(np.mean(rest_m**2))),
+        flange_from_scanner=UncertainPose(parent_from_child=pose, covariance=covariance), plane_base=plane,
+        chi_square=minimum.chi_square, degrees=len(rest_m) - 6, rms_m=float(np.sqrt(np.mean(rest_m**2))),
     )  # fmt: skip
 
 
@@ -121,13 +126,13 @@ def _across(view: ScannerView, points: Array, R: Array, normal: Array) -> Array:
 
 
 def _plane_prior(plate: UncertainPose) -> Array:
-    """Square root information of (bend 1, bend 2, offset), from the plate's 6x6 covariance."""
-    R, t = matrix_of(plate.parent_from_child), plate.parent_from_child.translation
+    """Square root information of (bend 1, bend 2, shift at its origin), from the plate's 6x6 covariance."""
+    R = matrix_of(plate.parent_from_child)
     n, e1, e2 = R[:, 2], R[:, 0], R[:, 1]
-    # A turn r moves n by r x n: bend1 = e1 . (r x n) = r . (n x e1) = r . e2, bend2 = -r . e1, and d = n . t.
+    # A turn r moves n by r x n: bend1 = e1 . (r x n) = r . (n x e1) = r . e2, bend2 = -r . e1; the shift is n . t.
     J = np.zeros((3, 6))
     J[0, 3:], J[1, 3:] = e2, -e1
-    J[2, :3], J[2, 3:] = n, np.cross(n, t)
+    J[2, :3] = n
     covariance = J @ plate.covariance @ J.T + 1e-12 * np.eye(3)
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 

@@ -16,7 +16,19 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from service.core import Service
-from service.http import control, devices, health, images, knowledge, missions, stream, tasks, teaching, verbs
+from service.http import (
+    calibrations,
+    control,
+    devices,
+    health,
+    images,
+    knowledge,
+    missions,
+    stream,
+    tasks,
+    teaching,
+    verbs,
+)
 from service.http.guard import Allowed, Guard
 from service.http.health import SAFETY_NOTE, own_version
 from service.http.hub import Hub
@@ -71,6 +83,7 @@ def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
         knowledge.router,
         images.router,
         teaching.router,
+        calibrations.router,
         control.router,
         missions.router,
         health.router,

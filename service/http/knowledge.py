@@ -28,10 +28,11 @@ async def show_panel(state: State) -> dict[str, Any]:
 
 def _frames(service: Service) -> list[FrameView]:
     frames = []
-    for name, section in service.cell.file.devices.items():
+    cell = service.calibrations.applied()
+    for name, section in cell.file.devices.items():
         if section.mount is None:
             continue
-        mount = service.cell.calibrations[section.mount.calibration].mount
+        mount = cell.calibrations[section.mount.calibration].mount
         if mount is not None:
             frames.append(_frame(section.mount.parent, name, mount.pose(), "calibration"))
     try:

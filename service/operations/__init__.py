@@ -98,6 +98,14 @@ OPERATIONS: dict[str, Operation] = {
             example={"touches": 4},
         ),
         Operation(
+            name="calibrations",
+            request_model=requests.CalibrationRequest,
+            run=_in_session("calibrate", "run_calibrations"),
+            summary="Calibrate camera, hand-eye, range scanner or tool: the arm drives through poses, the record is kept",
+            example={"what": "hand-eye", "poses": 12},
+            is_still=lambda request: request.dry_run,
+        ),
+        Operation(
             name="judge",
             request_model=requests.JudgeRequest,
             run=_judge,

@@ -13,7 +13,7 @@ from hal.errors import Ambiguous, NotFound
 from hal.geometry import UncertainPose, compose, difference, matrix_of, to_json
 from perception.range import PinholeSensor, PlaneFit, fit_plane_near
 from perception.vision.lights import find_lights
-from perception.vision.lights.assign import assign_lights
+from perception.vision.lights.assign import AssignedLights, assign_lights
 from perception.vision.quadrangle import QuadranglePose, estimate
 from service.operations.beliefs import believed_panel, expected_panel
 from service.operations.evidence import LightEvidence, PlaneEvidence
@@ -78,18 +78,10 @@ def locate(session: Session) -> Located:
 
 def locate_in(session: Session, pair: LightPair) -> Located:
     """The panel's pose in a pair of images."""
-    look, lights = pair.on, session.panel.lights
-    lights_m = np.array([light.position_m for light in lights])
-    blobs = find_lights(pair.off.pixels, pair.on.pixels)
+    look = pair.on
     expected = believed_panel(session).parent_from_child
-    upright = matrix_of(look.base_from_camera.parent_from_child.inv() * expected)
-    chosen = assign_lights(
-        blobs,
-        lights_m,
-        image_size_px=(look.intrinsics.width_px, look.intrinsics.height_px),
-        intrinsics=look.intrinsics,
-        upright=upright,
-    )
+    chosen = lights_in(session, pair)
+    lights_m = np.array([light.position_m for light in session.panel.lights])
     covariance_px = chosen.covariance_px + model_sigma_px(session, look, expected) ** 2 * np.eye(2)
     pose = estimate(lights_m, chosen.points_px, covariance_px, look.intrinsics)
     _check_fit(session, pose)
@@ -101,6 +93,23 @@ def locate_in(session: Session, pair: LightPair) -> Located:
         pair=pair,
         lights_px=chosen.points_px,
         evidence=_light_evidence(session, look, chosen.points_px, covariance_px),
+    )
+
+
+def lights_in(session: Session, pair: LightPair) -> AssignedLights:
+    """The panel's lights in a pair of images, in the order of the panel file.
+
+    Raises:
+        NotFound, Ambiguous: not all are seen, or something else stands where they should.
+    """
+    look = pair.on
+    upright = look.base_from_camera.parent_from_child.inv() * believed_panel(session).parent_from_child
+    return assign_lights(
+        find_lights(pair.off.pixels, pair.on.pixels),
+        np.array([light.position_m for light in session.panel.lights]),
+        image_size_px=(look.intrinsics.width_px, look.intrinsics.height_px),
+        intrinsics=look.intrinsics,
+        upright=matrix_of(upright),
     )
 
 

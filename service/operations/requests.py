@@ -247,6 +247,21 @@ class MissionRequest(Strict):
     touches: Annotated[int, Field(ge=3, le=12)] = 4
 
 
+class CalibrationRequest(Strict):
+    """Measure where a sensor sits, how a lens bends, or what the tool weighs; the arm drives through the poses itself."""
+
+    what: Annotated[
+        Literal["camera", "hand-eye", "scanner", "tool"],
+        Field(
+            description="`camera`: lens and mount; `hand-eye`: mount, the lens being known; `scanner`: mount of the range "
+            "scanner; `tool`: bias of the force/torque sensor, weight and centre of the tool"
+        ),
+    ]
+    device: Annotated[ObjectName | None, Field(description="which one; else the first of its kind")] = None
+    poses: Annotated[int, Field(ge=4, le=40, description="so many stations are measured")] = 12
+    dry_run: Annotated[bool, Field(description="only plan the stations; nothing moves, nothing is written")] = False
+
+
 class JudgeRequest(Strict):
     """Compare a finished mission's report with what the simulator says (simulated cells only)."""
 

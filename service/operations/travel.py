@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +60,27 @@ def go_to_first(session: Session, base_from_flange: Iterable[RigidTransform], *,
         if tries > MOST_TRIES:
             break
     raise Unreachable(f"{name}: {reason}", hint="move the panel or the arm's foot; see workspace in the cell file")
+
+
+def reachable(session: Session, base_from_flange: Sequence[RigidTransform]) -> list[int]:
+    """Which of the poses the arm can stand in without touching anything; says nothing about the way there."""
+    state = session.mover.state()
+    model = workcell(session).collision(width_m=state.gripper_width_m)
+    return [k for k, pose in enumerate(base_from_flange) if _goals(model, pose, state.position_rad)]
+
+
+def go_to_joints(session: Session, goal_rad: Array, *, name: str) -> bool:
+    """Drive to a joint vector; False when something is in the way, and nothing moved."""
+    cell = workcell(session)
+    state = session.mover.state()
+    if not cell.collision(width_m=state.gripper_width_m).is_clear(goal_rad, margin_m=CLEAR_M):
+        return False
+    try:
+        trajectory = cell.transfer(state.position_rad, goal_rad, width_m=state.gripper_width_m, name=name)
+    except Unreachable:
+        return False
+    session.run(trajectory)
+    return True
 
 
 def park(session: Session) -> None:

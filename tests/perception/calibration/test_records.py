@@ -5,16 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from hal.calibration import load_calibration
-from hal.errors import ConfigError
 from hal.geometry import UncertainPose, difference, transform_rpy
+from perception.calibration.hand_eye import calibrate_hand_eye
+from perception.calibration.in_hand import calibrate_in_hand
 from perception.calibration.intrinsics import calibrate_camera
-from perception.calibration.records import mount_of, record_of, save
+from perception.calibration.records import mount_of, record_of, renewed, to_toml
 from perception.calibration.scanner import ScannerCalibration
 from perception.calibration.wrench import calibrate_wrench
 from tests.perception.calibration.test_hand_eye import good_flanges, station_views
+from tests.perception.calibration.test_in_hand import KNOWN, POINTS, drawn, start
+from tests.perception.calibration.test_in_hand import poses as twelve
 from tests.perception.calibration.test_intrinsics import DOTS, views
 from tests.perception.calibration.test_wrench import poses, reading
 
@@ -28,8 +30,6 @@ def test_a_mount_comes_back_with_its_covariance() -> None:
 
 
 def test_every_kind_of_result_is_written_and_read_back(tmp_path: Path) -> None:
-    from perception.calibration.hand_eye import calibrate_hand_eye
-
     R = poses(8, 1)
     mount = UncertainPose(parent_from_child=transform_rpy([0.1, 0, 0], [0, 0, 1]), covariance=1e-8 * np.eye(6))
     scanner = ScannerCalibration(flange_from_scanner=mount, plane_base=(np.array([0.0, 0, 1]), 0.5), chi_square=90.0,
@@ -41,26 +41,32 @@ def test_every_kind_of_result_is_written_and_read_back(tmp_path: Path) -> None:
         "wrist_ft": calibrate_wrench(R, [reading(r) for r in R]),
     }
     for name, result in results.items():
-        record = save(record_of(name, result, date="2026-11-21T00:00:00Z"), tmp_path / f"{name}.toml")
+        record = record_of(name, result, date="2026-11-21T00:00:00Z")
+        (tmp_path / f"{name}.toml").write_text(to_toml(record))
         back = load_calibration(tmp_path / f"{name}.toml")
         assert back == record
         assert back.device == name
         assert back.quality
 
 
-def test_saving_again_counts_the_version_up(tmp_path: Path) -> None:
-    R = poses(8, 1)
-    record = record_of("wrist_ft", calibrate_wrench(R, [reading(r) for r in R]), date="2026-11-21T00:00:00Z")
-    path = tmp_path / "wrist_ft.toml"
-    assert [save(record, path).version for _ in range(3)] == [1, 2, 3]
-    assert load_calibration(path).version == 3
+def test_a_renewed_record_keeps_what_was_not_measured_and_counts_up() -> None:
+    camera = record_of("camera", calibrate_camera(views(DOTS, 6, seed=1), (640, 480)), date="2026-11-20")
+    mount = record_of("camera", calibrate_hand_eye(station_views(good_flanges(), 1)), date="2026-11-21")
+    record = renewed(camera, mount)
+    assert (record.version, record.date, record.method) == (2, "2026-11-21", "hand-eye")
+    assert record.intrinsics == camera.intrinsics and record.mount == mount.mount
+    assert record.quality == mount.quality
+    assert renewed(record, camera).version == 3
 
 
-def test_another_file_is_never_overwritten(tmp_path: Path) -> None:
-    path = tmp_path / "cell.toml"
-    path.write_text("[cell]\nname = 'bench'\n")
-    R = poses(8, 1)
-    record = record_of("wrist_ft", calibrate_wrench(R, [reading(r) for r in R]), date="2026-11-21T00:00:00Z")
-    with pytest.raises(ConfigError):
-        save(record, path)
-    assert "bench" in path.read_text()
+def test_lens_and_mount_found_together_make_one_record(tmp_path: Path) -> None:
+    result = calibrate_in_hand(drawn(1, twelve()), POINTS, start(), KNOWN)
+    record = record_of("wrist_camera", result, date="2026-11-21")
+    (tmp_path / "camera.toml").write_text(to_toml(record))
+    back = load_calibration(tmp_path / "camera.toml")
+    assert back == record and back.intrinsics is not None and back.mount is not None
+    assert back.intrinsics.intrinsics() == result.intrinsics
+    pose = back.mount.pose()
+    assert np.allclose(difference(pose.parent_from_child, result.flange_from_camera.parent_from_child), 0.0, atol=1e-12)
+    assert np.allclose(np.diag(pose.covariance), np.diag(result.flange_from_camera.covariance))
+    assert 0.0 < back.quality["sigma_m"] < 1e-3 and back.quality["views"] == 12.0

@@ -1,0 +1,160 @@
+"""What was calibrated on this machine: records over those of the cell file, one folder a cell, older versions kept.
+
+The cell file's own records say what the cell was built to (a simulated cell draws its truth about them). What the arm
+found out later lies over them, in `RUNS/calibrations/<cell>/`, and is what tasks compute with.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+from hal.calibration import CalibrationRecord, load_calibration
+from hal.config import Cell
+from hal.errors import ConfigError
+from service.errors import NoSuchTask
+
+FOLDER = "calibrations"
+OLDER = "older"
+
+
+class NoSuchCalibration(NoSuchTask):
+    """No device of the cell has a calibration under that name, or nothing was calibrated here."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibrated:
+    """A device's record in use. `is_measured`: found by calibrating here; else it is the cell file's own."""
+
+    device: str
+    parent: str
+    record: CalibrationRecord
+    is_measured: bool
+    path: Path
+    older: tuple[Path, ...]
+
+
+class Calibrations:
+    """The records of one cell."""
+
+    _lock = threading.Lock()  # of all of this process
+
+    def __init__(self, folder: Path, cell: Cell) -> None:
+        self.folder = folder
+        self._cell = cell
+
+    @classmethod
+    def of_runs(cls, runs_dir: Path, cell: Cell) -> Calibrations:
+        """Where a service keeps them. A simulated cell of another seed is another cell: its sensors sit elsewhere."""
+        section = cell.file.cell
+        name = section.name if section.mode == "real" else f"{section.name}-seed{section.seed}"
+        return cls(runs_dir / FOLDER / name, cell)
+
+    def applied(self) -> Cell:
+        """The cell with what was measured in place of the cell file's records.
+
+        Raises:
+            ConfigError: a measured record is malformed; names it.
+        """
+        measured = {name: load_calibration(path) for name, path in self._measured().items()}
+        if not measured:
+            return self._cell
+        return Cell.model_construct(
+            path=self._cell.path,
+            file=self._cell.file,
+            panel=self._cell.panel,
+            calibrations={**self._cell.calibrations, **measured},
+        )
+
+    def all(self) -> list[Calibrated]:
+        """One entry a mounted device, in the order of the cell file."""
+        cell, measured = self.applied(), self._measured()
+        found = []
+        for device, section in cell.file.devices.items():
+            if section.mount is None:
+                continue
+            name = section.mount.calibration
+            path = measured.get(name, self._cell.path.parent / self._cell.file.cell.calibrations / f"{name}.toml")
+            older = tuple(sorted((self.folder / OLDER).glob(f"{name}.v*.toml"), key=lambda p: p.stat().st_mtime_ns))
+            found.append(
+                Calibrated(
+                    device=device,
+                    parent=section.mount.parent,
+                    record=cell.calibrations[name],
+                    is_measured=name in measured,
+                    path=path,
+                    older=older,
+                )
+            )
+        return found
+
+    def of(self, device: str) -> Calibrated:
+        """The record of one device.
+
+        Raises:
+            NoSuchCalibration: no such device, or it has no mount.
+        """
+        for entry in self.all():
+            if entry.device == device:
+                return entry
+        raise NoSuchCalibration(
+            f"no calibration of a device called {device[:60]!r}",
+            hint=f"calibrated devices: {', '.join(entry.device for entry in self.all())}",
+        )
+
+    def write(self, record: CalibrationRecord) -> Path:
+        """Keep a record as the one in use; the one before moves to `older/`. Whole or not at all.
+
+        Raises:
+            ConfigError: the device has no mount, so nothing would read the record.
+        """
+        from perception.calibration.records import to_toml
+
+        section = self._cell.file.devices[record.device]
+        if section.mount is None:
+            raise ConfigError(
+                f"devices.{record.device} has no mount, so its calibration belongs nowhere",
+                hint="add mount = { parent = ..., calibration = ... } to the cell file",
+                file=str(self._cell.path),
+            )
+        path = self.folder / f"{section.mount.calibration}.toml"
+        with self._lock:
+            (self.folder / OLDER).mkdir(parents=True, exist_ok=True)
+            fresh = path.with_suffix(".new")
+            fresh.write_text(to_toml(record), encoding="utf-8")
+            if path.exists():
+                version = load_calibration(path).version
+                os.link(path, _unused(self.folder / OLDER / f"{path.stem}.v{version}.toml"))
+            fresh.replace(path)
+        return path
+
+    def forget(self, device: str) -> None:
+        """Go back to the cell file's own record; what was measured moves to `older/`.
+
+        Raises:
+            NoSuchCalibration: nothing was measured for it.
+        """
+        entry = self.of(device)
+        if not entry.is_measured:
+            raise NoSuchCalibration(
+                f"{device} uses the record of the cell file: there is nothing to forget",
+                hint="POST /v1/calibrations measures one",
+            )
+        with self._lock:
+            older = self.folder / OLDER / f"{entry.path.stem}.v{entry.record.version}.toml"
+            entry.path.rename(_unused(older))
+
+    def _measured(self) -> dict[str, Path]:
+        """Files of this folder that stand for a record of the cell, by the record's name."""
+        return {name: path for name in self._cell.calibrations if (path := self.folder / f"{name}.toml").exists()}
+
+
+def _unused(path: Path) -> Path:
+    """The path, or one beside it that does not exist yet: an older record is never overwritten."""
+    count, free = 1, path
+    while free.exists():
+        count += 1
+        free = path.with_name(f"{path.stem}-{count}.toml")
+    return free

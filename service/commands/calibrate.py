@@ -1,0 +1,187 @@
+"""`panelwright calibrate`: the arm drives a sensor through stations that tell most and keeps a dated record.
+
+Works on a simulated cell unless told otherwise, and with `--url` on a running service.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from service.client import Client
+from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, client_of, console, read_cell
+from service.commands.leaving import leave
+from service.commands.tasks import follow
+
+app = typer.Typer(
+    help="Calibrate: the arm drives through poses, measures, and keeps a versioned, dated record with its quality.",
+    no_args_is_help=True,
+)
+Poses = Annotated[int, typer.Option(min=4, max=40, help="Stations to measure from.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Only plan the stations: nothing moves, nothing is written.")]
+Runs = Annotated[Path, typer.Option(help="Folder of the records: RUNS/calibrations/CELL.")]
+Device = Annotated[str | None, typer.Option(help="Which device; else the first of its kind in the cell file.")]
+ServiceUrl = Annotated[str | None, typer.Option("--url", help="Use this running service instead of starting the cell.")]
+RUNS = Path("runs")
+
+
+@app.command()
+def camera(
+    *,
+    cell: CellOption = DEFAULT_CELL,
+    seed: SeedOption = None,
+    poses: Poses = 16,
+    device: Device = None,
+    dry_run: DryRun = False,
+    runs: Runs = RUNS,
+    url: ServiceUrl = None,
+) -> None:
+    """Lens and mount of a camera whose lens is not known, by the panel's lights."""
+    _run("camera", cell, seed, runs, url, {"poses": poses, "device": device, "dry_run": dry_run})
+
+
+@app.command("hand-eye")
+def hand_eye(
+    *,
+    cell: CellOption = DEFAULT_CELL,
+    seed: SeedOption = None,
+    poses: Poses = 12,
+    device: Device = None,
+    dry_run: DryRun = False,
+    runs: Runs = RUNS,
+    url: ServiceUrl = None,
+) -> None:
+    """Where the camera sits in the hand and where the panel stands, by the panel's lights."""
+    _run("hand-eye", cell, seed, runs, url, {"poses": poses, "device": device, "dry_run": dry_run})
+
+
+@app.command()
+def scanner(
+    *,
+    cell: CellOption = DEFAULT_CELL,
+    seed: SeedOption = None,
+    poses: Poses = 12,
+    device: Device = None,
+    dry_run: DryRun = False,
+    runs: Runs = RUNS,
+    url: ServiceUrl = None,
+) -> None:
+    """Where the range scanner sits in the hand, by scans of the plate (calibrate the camera first)."""
+    _run("scanner", cell, seed, runs, url, {"poses": poses, "device": device, "dry_run": dry_run})
+
+
+@app.command()
+def tool(
+    *,
+    cell: CellOption = DEFAULT_CELL,
+    seed: SeedOption = None,
+    poses: Poses = 12,
+    device: Device = None,
+    dry_run: DryRun = False,
+    runs: Runs = RUNS,
+    url: ServiceUrl = None,
+) -> None:
+    """Bias of the force/torque sensor, and weight and centre of the tool, with the hand turned every way."""
+    _run("tool", cell, seed, runs, url, {"poses": poses, "device": device, "dry_run": dry_run})
+
+
+@app.command("list")
+def list_records(
+    *, cell: CellOption = DEFAULT_CELL, seed: SeedOption = None, runs: Runs = RUNS, url: ServiceUrl = None
+) -> None:
+    """The records in use: version, date, method, one sigma."""
+    if url is not None:
+        entries = client_of(url).get("/v1/calibrations")["calibrations"]
+    else:
+        from service.calibrations import Calibrations
+
+        found = Calibrations.of_runs(runs, read_cell(cell, seed)).all()
+        entries = [{**e.record.model_dump(), "is_measured": e.is_measured} for e in found]
+    table = Table("device", "version", "date", "from", "method", "1 sigma", box=None, pad_edge=False)
+    for entry in entries:
+        origin = "[green]measured[/]" if entry["is_measured"] else "cell file"
+        words = (entry["device"], str(entry["version"]), entry["date"], origin)
+        table.add_row(*words, escape(entry["method"]), _sigma(entry["mount"]))
+    console.print(table)
+
+
+def _run(what: str, cell: Path, seed: int | None, runs: Path, url: str | None, body: dict[str, Any]) -> None:
+    """One calibration as a task, on a running service or on a cell of our own; ends the process with its code."""
+    request = {"what": what, **{key: value for key, value in body.items() if value is not None}}
+    if url is not None:
+        raise typer.Exit(0 if _follow(client_of(url), request) else 1)
+    from service.serve import Options, Panelwright, exit_on_sigterm
+
+    loaded = read_cell(cell, seed)
+    exit_on_sigterm()
+    panelwright = Panelwright(loaded, Options(port=0, runs_dir=runs))
+    console.print(f"cell [bold]{loaded.name}[/], {loaded.file.cell.mode}, seed {loaded.file.cell.seed}: starting")
+    code = 1
+    try:
+        panelwright.start()
+        client = Client(url=panelwright.url)
+        stop = client.get("/v1/stop")
+        if stop["is_latched"] and not request["dry_run"]:  # as in `demo`: to run it is to say that the cell is clear
+            client.post("/v1/stop/reset", {"seen_count": stop["count"]})
+        code = 0 if _follow(client, request) else 1
+    except KeyboardInterrupt:
+        console.print("stopped by Ctrl-C: arm stopped, nothing written")
+        code = 130
+    finally:
+        panelwright.close()
+    leave(code)
+
+
+def _follow(client: Client, request: dict[str, Any]) -> bool:
+    task = follow(client, client.post("/v1/calibrations", request)["id"])
+    result = task["result"]
+    if result is None:
+        return False
+    _show_plan(result) if result["dry_run"] else _show_record(result)
+    return True
+
+
+def _show_plan(result: dict[str, Any]) -> None:
+    table = Table("station", "x m", "y m", "z m", "flange looks along", box=None, pad_edge=False)
+    for k, station in enumerate(result["stations"], 1):
+        x, y, z, w = station["quaternion_xyzw"]
+        along = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+        place = [f"{value:.3f}" for value in station["translation_m"]]
+        table.add_row(str(k), *place, "  ".join(f"{value:+.2f}" for value in along))
+    console.print(table)
+    console.print(
+        f"{len(result['stations'])} stations planned for {result['device']}; nothing moved, nothing was written"
+    )
+
+
+def _show_record(result: dict[str, Any]) -> None:
+    record, change = result["record"], result["change"]
+    console.print(f"[bold]{record['device']}[/] version {record['version']}, {record['method']}, {record['date']}")
+    if result["what"] != "tool":
+        console.print(f"  mount    one sigma {_sigma(record['mount'])}; moved by {_moved(change)}")
+    if "intrinsics" in record and result["what"] != "tool":
+        lens = record["intrinsics"]
+        sigma = lens["fx_px"] * lens["sigma_focal_ratio"]
+        console.print(f"  lens     focal length {lens['fx_px']:.2f} ± {sigma:.2f} px, residual {lens['rms_px']:.3f} px")
+    if result["what"] == "tool":
+        load, sigma_g = record["load"], 1e3 * record["quality"]["mass_sigma_kg"]
+        bias = ", ".join(f"{value:+.2f}" for value in load["bias_force_n"])
+        console.print(f"  tool     {1e3 * load['mass_kg']:.1f} ± {sigma_g:.1f} g; bias {bias} N")
+    if "chi_square_ratio" in record["quality"]:
+        console.print(f"  scatter  {math.sqrt(record['quality']['chi_square_ratio']):.2f} times the stated noise")
+    console.print(f"  written  {result['path']}; in use from {result['in_use_from']}")
+
+
+def _moved(change: dict[str, float]) -> str:
+    return f"{1e3 * change['moved_m']:.2f} mm and {math.degrees(change['turned_rad']):.3f} deg"
+
+
+def _sigma(mount: dict[str, Any] | None) -> str:
+    if mount is None:
+        return "no mount"
+    return f"{1e3 * math.hypot(*mount['sigma_m']):.2f} mm {math.degrees(math.hypot(*mount['sigma_rad'])):.3f} deg"

@@ -1,0 +1,82 @@
+"""`/v1/calibrations`: the records in use, where each comes from and how good it is. `POST` is the verb of that name."""
+
+from __future__ import annotations
+
+import functools
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query
+from pydantic import BaseModel, Field
+
+from service.calibrations import Calibrated
+from service.http.problems import RESPONSES
+from service.http.state import AppState, State
+
+router = APIRouter(prefix="/v1/calibrations", tags=["calibrations"], responses=RESPONSES)
+DeviceName = Annotated[str, Path(max_length=64, examples=["wrist_camera"])]
+
+
+class CalibrationView(BaseModel):
+    """The calibration that tasks compute with. `is_measured` False: the cell file's own record."""
+
+    device: str
+    parent: Annotated[str, Field(description="frame that the device sits on")]
+    is_measured: bool
+    version: int
+    date: str
+    method: str
+    mount: dict[str, Any] | None
+    intrinsics: dict[str, Any] | None
+    load: dict[str, Any] | None
+    quality: Annotated[dict[str, float], Field(description="what the method says of itself, SI units")]
+    older: Annotated[list[str], Field(description="records of before, oldest first, kept beside it")]
+    path: str
+    toml: str | None = None
+
+
+class CalibrationList(BaseModel):
+    """One calibration a mounted device."""
+
+    calibrations: list[CalibrationView]
+
+
+@router.get("", summary="Calibrations in use", operation_id="list_calibrations")
+async def list_calibrations(
+    state: State, toml: Annotated[bool, Query(description="with the text of the records")] = False
+) -> CalibrationList:
+    return CalibrationList(calibrations=await state.in_thread(functools.partial(_all, state, with_text=toml)))
+
+
+@router.get("/{name}", summary="The calibration of one device, with its TOML", operation_id="show_calibration")
+async def show_calibration(state: State, name: DeviceName) -> CalibrationView:
+    return _view(await state.in_thread(functools.partial(state.service.calibrations.of, name)), with_text=True)
+
+
+@router.delete(
+    "/{name}",
+    status_code=204,
+    summary="Use the cell file's own record again; the measured one is kept among the older ones",
+    operation_id="forget_calibration",
+)
+async def forget_calibration(state: State, name: DeviceName) -> None:
+    await state.in_thread(functools.partial(state.service.calibrations.forget, name))
+    state.service.note("calibration-forgotten", {"device": name})
+
+
+def _all(state: AppState, *, with_text: bool) -> list[CalibrationView]:
+    return [_view(entry, with_text=with_text) for entry in state.service.calibrations.all()]
+
+
+def _view(entry: Calibrated, *, with_text: bool) -> CalibrationView:
+    from perception.calibration.records import to_toml
+
+    record = entry.record.model_dump(mode="json", by_alias=True)
+    return CalibrationView(
+        device=entry.device,
+        parent=entry.parent,
+        is_measured=entry.is_measured,
+        older=[path.name for path in entry.older],
+        path=str(entry.path),
+        toml=to_toml(entry.record) if with_text else None,
+        **{key: record[key] for key in ("version", "date", "method", "mount", "intrinsics", "load", "quality")},
+    )

@@ -1,0 +1,155 @@
+"""Where to measure from when a sensor on the hand is calibrated: stations that tell most, that the arm can reach."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from hal.calibration import CameraIntrinsics
+from hal.errors import Ambiguous, NotFound, Unreachable
+from hal.geometry import certain, matrix_of, transform
+from manipulation.kinematics import Kinematics
+from perception.calibration.hand_eye import HandEyeView, propose_next, stations
+from perception.camera_model import project
+from service.operations.eyes import settle
+from service.operations.session import Session
+from service.operations.travel import go_to_first, reachable
+
+Array = NDArray[np.float64]
+
+EDGE_PX = 24.0  # a light this near the image's edge may be cut
+CONE_RAD = 0.6
+REACH_STEPS = (1.0, 1.2, 1.45)  # distances, as shares of the nearest that shows everything
+LIGHTS_SIGMA = (2e-4, 2e-4, 5e-4, 8e-4, 8e-4, 3e-4)  # of four lights 0.6 m away, 460 px focal length: m, rad
+PLATE_SIGMA = (1.0, 1.0, 2e-4, 5e-4, 5e-4, 1.0)  # a plane says nothing of shifts in it and of turns about its normal
+WRIST_RAD = (-2.4, -1.6, -0.8, 0.0, 0.8, 1.6, 2.4)
+
+T = TypeVar("T")
+View = Callable[[RigidTransform], Array]
+"""The 6x6 covariance of a view, by where the target is in the sensor's axes."""
+
+
+def around(
+    base_from_target: RigidTransform, flange_from_sensor: RigidTransform, distance_m: float, *, steps: Sequence[float]
+) -> list[RigidTransform]:
+    """Flange poses from which the sensor looks at the target's middle: a cone, several distances, four rolls."""
+    found = []
+    for share in steps:
+        for k, flange in enumerate(
+            stations(base_from_target, flange_from_sensor, distance_m=share * distance_m, count=24, cone_rad=CONE_RAD)
+        ):
+            turn = Rotation.from_rotvec([0.0, 0.0, (k % 4) * np.pi / 2])
+            roll = transform(turn.as_matrix(), np.zeros(3))
+            found.append(flange * flange_from_sensor * roll * flange_from_sensor.inv())
+    return found
+
+
+def in_view(
+    flange: RigidTransform, flange_from_camera: RigidTransform, base_from_points: RigidTransform, points_m: Array,
+    lens: CameraIntrinsics,
+) -> bool:  # fmt: skip
+    """Are all points in the image, clear of its edge?"""
+    seen = ((flange * flange_from_camera).inv() * base_from_points).apply(points_m)
+    if (seen[:, 2] < 0.1).any():
+        return False
+    pixels = project(seen, lens)
+    limit = np.array([lens.width_px, lens.height_px]) - EDGE_PX
+    return bool((pixels > EDGE_PX).all() and (pixels < limit).all())
+
+
+def lights_view(_target: RigidTransform) -> Array:
+    """What a view of the four lights is worth."""
+    return np.diag(np.square(LIGHTS_SIGMA))
+
+
+def plate_view(target: RigidTransform) -> Array:
+    """What a scan of the plate is worth: its height and tilts only."""
+    turn = np.kron(np.eye(2), matrix_of(target))
+    return np.asarray(turn @ np.diag(np.square(PLATE_SIGMA)) @ turn.T)
+
+
+def order(
+    session: Session,
+    candidates: Sequence[RigidTransform],
+    x: RigidTransform,
+    z: RigidTransform,
+    view: View,
+    *,
+    count: int,
+) -> list[RigidTransform]:
+    """All candidates that the arm can stand in, the `count` that together tell most of X first.
+
+    Raises:
+        Unreachable: fewer than `count` are left.
+    """
+    free = [candidates[k] for k in reachable(session, candidates)]
+    if len(free) < count:
+        raise Unreachable(
+            f"the arm reaches {len(free)} of {len(candidates)} stations before the panel, {count} are wanted",
+            hint="ask for fewer poses, or put the panel where the arm can look at it from several sides",
+        )
+    chosen: list[RigidTransform] = []
+    done: list[HandEyeView] = []
+    while len(chosen) < count:
+        best, _ = propose_next(done, (x, z), free, view_covariance=view)
+        flange = free.pop(best)
+        chosen.append(flange)
+        pose = certain((flange * x).inv() * z)
+        done.append(HandEyeView(base_from_flange=flange, camera_from_target=pose))
+    return chosen + free
+
+
+def visit(
+    session: Session, flanges: Sequence[RigidTransform], measure: Callable[[], T], *, count: int, name: str
+) -> list[T]:
+    """Drive to one station after the other and measure at each; those without a free way or without a sight are left out.
+
+    Raises:
+        Unreachable: the stations are used up before `count` were measured from; says why the last one was not.
+    """
+    found: list[T] = []
+    why = ""
+    for flange in flanges:
+        session.progress(0.1 + 0.8 * len(found) / count, f"{name}: station {len(found) + 1} of {count}", why)
+        try:
+            go_to_first(session, [flange], name=f"{name} {len(found) + 1}")
+            settle(session)
+            found.append(measure())
+        except (Unreachable, NotFound, Ambiguous) as error:
+            why = f"one left out: {error.what}"
+            continue
+        if len(found) == count:
+            return found
+    raise Unreachable(
+        f"only {len(found)} of {count} stations could be measured from; {why or 'no other is left'}",
+        hint="ask for fewer poses, or give the arm more room before the panel",
+    )
+
+
+def wrist_turns(kinematics: Kinematics, park_rad: Array, base_from_sensor: Callable[[Array], Array]) -> list[Array]:
+    """Joint vectors about the parking place with the wrist turned every way, those first that spread gravity most.
+
+    Args:
+        base_from_sensor: (3, 3) rotation of the sensor at a joint vector.
+    """
+    low, high = np.array(kinematics.capabilities.lower_rad), np.array(kinematics.capabilities.upper_rad)
+    grid = [
+        park_rad + np.concatenate([np.zeros(len(park_rad) - 3), turn])
+        for turn in np.array(np.meshgrid(WRIST_RAD, WRIST_RAD, (-1.2, 0.0, 1.2))).reshape(3, -1).T
+    ]
+    left = [q for q in grid if (q > low + 0.02).all() and (q < high - 0.02).all()]
+    down = [base_from_sensor(q)[2] for q in left]  # the base's z axis in sensor axes
+    information = 1e-3 * np.eye(3)
+    ordered: list[Array] = []
+    while left:
+        # Greedy D-optimality of the directions that gravity comes from.
+        gain = [float(d @ np.linalg.solve(information, d)) for d in down]
+        best = int(np.argmax(gain))
+        d = down.pop(best)
+        ordered.append(left.pop(best))
+        information += np.outer(d, d)
+    return ordered

@@ -77,6 +77,7 @@ class Cia402(StreamDevice[JointState]):
         self._options = options
         self._make_codec: Callable[[], CanCodec] = codec
         self._codec = codec()
+        self._answer_s = self.patience * SDO_S
         self._rad = np.radians(options.degrees_per_increment)
         self._filter = SetPointFilter(context.name, options.kinematics, command_rate_hz=options.rate_hz)
         self._set_up = SetUp(
@@ -147,17 +148,17 @@ class Cia402(StreamDevice[JointState]):
         o = self._options
         self._switch_off()
         self._codec = self._make_codec()
-        link.write(self._codec.opening(o.bitrate), now_s() + SDO_S)
+        link.write(self._codec.opening(o.bitrate), now_s() + self._answer_s)
         drain(link)
         self._send(link, NMT, bytes([PRE_OPERATIONAL, 0]))
-        self._set_up.run(SdoClient(link, self._codec))
+        self._set_up.run(SdoClient(link, self._codec, answer_s=self._answer_s))
         self._axes = {node: Axis() for node in o.nodes}
         self._syncs = self._published = 0
         self._send(link, NMT, bytes([START, 0]))
         self._next_sync_s = self._next_beat_s = now_s()
 
     def _send(self, link: Link, id_: int, data: bytes = b"") -> None:
-        link.write(self._codec.encode(CanFrame(id_, data)), now_s() + SDO_S)
+        link.write(self._codec.encode(CanFrame(id_, data)), now_s() + self._answer_s)
 
     def keep_going(self, link: Link) -> float:
         """Heartbeat, targets and SYNC when they are due."""
@@ -185,7 +186,7 @@ class Cia402(StreamDevice[JointState]):
         is_behind = max(axis.count.owed for axis in self._axes.values()) >= MOST_OWED
         # More SYNCs would only queue up, and every answer would be older than the one before.
         batch = probes if is_behind else [*probes, *frames, CanFrame(SYNC, b"")]
-        link.write(b"".join(self._codec.encode(frame) for frame in batch), now + SDO_S)
+        link.write(b"".join(self._codec.encode(frame) for frame in batch), now + self._answer_s)
         if is_behind:
             self.held_syncs += 1
             return

@@ -47,13 +47,17 @@ class Objects(Protocol):
 class SdoClient:
     """Expedited transfers; each is repeated by itself, as it names what it is about and changes nothing twice.
 
+    Args:
+        answer_s: how long an answer is waited for.
+
     Raises:
         NoAnswer: nobody answers as that node. Refused: SDO abort.
     """
 
-    def __init__(self, link: Link, codec: CanCodec) -> None:
+    def __init__(self, link: Link, codec: CanCodec, *, answer_s: float = SDO_S) -> None:
         self._link = link
         self._codec = codec
+        self._answer_s = answer_s
 
     def upload(self, node: int, index: int, sub: int) -> int:
         """Value of an object, unsigned."""
@@ -68,8 +72,8 @@ class SdoClient:
 
     def _transfer(self, node: int, request: bytes) -> bytes:
         for _ in range(ATTEMPTS):
-            self._link.write(self._codec.encode(CanFrame(SDO_REQUEST + node, request)), now_s() + SDO_S)
-            until_s = now_s() + SDO_S
+            self._link.write(self._codec.encode(CanFrame(SDO_REQUEST + node, request)), now_s() + self._answer_s)
+            until_s = now_s() + self._answer_s
             while chunk := self._link.read(until_s):
                 for frame in self._codec.feed(chunk):
                     is_answer = frame.id == SDO_ANSWER + node and len(frame.data) == 8

@@ -143,7 +143,7 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
         Raises:
             DeviceFault, DeviceTimeout, DeviceUnavailable: not active within `activation_s`.
         """
-        until_s = now_s() + self._options.activation_s
+        until_s = now_s() + self.patience * self._options.activation_s
         actions: list[int] | None = None
         last: CellError | None = None
         while now_s() < until_s:

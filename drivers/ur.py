@@ -170,8 +170,8 @@ class Ur(StreamDevice[JointState]):
             raise Refused(f"recipe refused: {error}", code=0) from None
 
     def _ask(self, link: Link, request: bytes, kind: str) -> bytes:
-        link.write(request, now_s() + ANSWER_S)
-        until_s = now_s() + ANSWER_S
+        link.write(request, now_s() + self.patience * ANSWER_S)
+        until_s = now_s() + self.patience * ANSWER_S
         while chunk := link.read(until_s):
             for got, payload in self._parser.feed(chunk):
                 if got == kind and rtde.package(got, payload) != request:  # texts may come in between; echoes are ours
@@ -248,7 +248,7 @@ class Ur(StreamDevice[JointState]):
             return
         if self._was_playing:
             what, hint = "has ended (watchdog or pendant)", "enable again"
-        elif now_s() - self._enabled_s > PROGRAM_START_S:
+        elif now_s() - self._enabled_s > self.patience * PROGRAM_START_S:
             what, hint = "does not start", "set the robot to remote control"
         else:
             return

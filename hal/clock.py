@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-IDLE_S = 0.5  # a paced world that nobody has ticked for this long stands still; time passes without it
+IDLE_S = 5.0  # a paced world that nobody has ticked for this long stands still; time passes without it
+TICKS_KEPT = 512
 
 
 class Clock(Protocol):
@@ -80,8 +82,9 @@ class PacedClock:
         self._advance = advance
         self._lock = threading.Lock()
         self._now_s = time.monotonic()
-        self._ticked_at_s = self._now_s  # on the wall
+        self._ticked_at_s = self._now_s - IDLE_S  # on the wall; until the first tick time passes with it
         self._ticking = 0
+        self._ticks: deque[tuple[float, float]] = deque(maxlen=TICKS_KEPT)  # (wall, this clock) at the end of each
 
     def attach(self, advance: Callable[[float], float]) -> None:
         """Let this clock drive a world."""
@@ -109,11 +112,28 @@ class PacedClock:
                 self._now_s += duration_s
                 self._ticking -= 1
                 self._ticked_at_s = time.monotonic()
+                self._ticks.append((self._ticked_at_s, self._now_s))
 
-    def _present_s(self) -> float:
+    def at_s(self, wall_s: float) -> float:
+        """What this clock showed when `time.monotonic` showed `wall_s`; beyond its memory it went with the wall.
+
+        What a wire between a cell and its simulated world carries ages in this time: a machine that is too slow makes
+        its frames late, and its world as late as they are.
+        """
+        with self._lock:
+            if wall_s >= self._ticked_at_s:
+                return self._present_s(wall_s)
+            for ticked_s, now_s in reversed(self._ticks):
+                if ticked_s <= wall_s:
+                    return now_s
+            first_s, then_s = self._ticks[0] if self._ticks else (self._ticked_at_s, self._now_s)
+            return then_s - max(0.0, first_s - wall_s)
+
+    def _present_s(self, wall_s: float | None = None) -> float:
         if self._ticking:
             return self._now_s
-        return self._now_s + max(0.0, time.monotonic() - self._ticked_at_s - IDLE_S)
+        wall_s = time.monotonic() if wall_s is None else wall_s
+        return self._now_s + max(0.0, wall_s - self._ticked_at_s - IDLE_S)
 
 
 class ReplayClock:

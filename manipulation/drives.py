@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 from hal.clock import Clock, Deadline, WallClock
 from hal.devices import Arm
 from hal.errors import CellError
-from manipulation.sensing import DeviceFailure, read_wait_s
+from manipulation.sensing import DeviceFailure, command_wait_s, read_wait_s
 
 Array = NDArray[np.float64]
-
-SWITCH_WAIT_S = 0.25
 
 
 class Drives:
@@ -34,7 +32,7 @@ class Drives:
             DeviceFailure: the arm refuses or does not answer.
         """
         try:
-            self._arm.enable(deadline=Deadline.after(self._clock, SWITCH_WAIT_S))
+            self._arm.enable(deadline=Deadline.after(self._clock, command_wait_s(self._clock)))
         except CellError as error:
             raise DeviceFailure(self._arm.name, error.what) from error
         self.are_on = True
@@ -48,7 +46,7 @@ class Drives:
     def stop(self) -> None:
         """Ask the arm to stop, whatever is known of it; an arm that does not hear stops by its own watchdog."""
         with suppress(CellError):
-            self._arm.stop(deadline=Deadline.after(self._clock, SWITCH_WAIT_S))
+            self._arm.stop(deadline=Deadline.after(self._clock, command_wait_s(self._clock)))
 
     def send(self, position_rad: Array) -> Array:
         """Send a set-point (n,), rad; returns what the arm took.

@@ -14,7 +14,7 @@ from hal.devices import Gripper
 from hal.motion import CartesianPath, Compliance, GripperMotion, Hold, JointTrajectory
 from manipulation import kernels
 from manipulation.kinematics import Kinematics
-from manipulation.sensing import Sample
+from manipulation.sensing import Sample, command_wait_s
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,6 @@ TURN_ARM_M = 0.1  # a turn of 1 rad counts as this much way
 DAMPING = 1e-3  # of the damped least squares; strokes are chosen clear of singularities beforehand
 GRIP_START_S = 0.08  # a gripper needs this long to report that it moves
 GRIP_REST_S = 0.05
-COMMAND_WAIT_S = 0.25  # a gripper's command crosses a slow bus once a motion, not every tick
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,7 +199,7 @@ def begin(
         case Hold():
             return HoldRun(motion)
         case GripperMotion():
-            return GripperRun(motion, gripper, Deadline.after(clock, COMMAND_WAIT_S))
+            return GripperRun(motion, gripper, Deadline.after(clock, command_wait_s(clock)))
 
 
 def _fade(elapsed_s: float) -> float:

@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 GRAVITY_M_PER_S2 = 9.80665
 RANGE_WAIT_S = 0.004
 READ_WAIT_S = 0.02  # longest that one tick waits for a device; a tick itself lasts 2 to 8 ms
-PACED_WAIT_S = 0.45  # the same where the world stands still so long: a busy machine is no broken device
+PACED_WAIT_S = 1.0  # the same where the world stands still so long: a busy machine is no broken device
+COMMAND_WAIT_S = 0.25  # for what crosses a slow bus once a motion, not every tick
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -92,6 +93,11 @@ class RangeReader:
 def read_wait_s(clock: Clock) -> float:
     """How long one tick may wait for a device."""
     return PACED_WAIT_S if isinstance(clock, PacedClock) else READ_WAIT_S
+
+
+def command_wait_s(clock: Clock) -> float:
+    """How long a motion may wait at its begin or end for a command to be taken."""
+    return 2.0 * PACED_WAIT_S if isinstance(clock, PacedClock) else COMMAND_WAIT_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

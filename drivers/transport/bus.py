@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
 
@@ -20,6 +21,7 @@ R = TypeVar("R")
 T = TypeVar("T")
 IDLE_S = 0.02
 SET_UP_AGAIN_AFTER = 5  # polls without an answer: it may have been switched off and on
+YIELD_S, LONGEST_YIELD_S = 0.0005, 0.02  # a caller gets the bus between two polls, and a poll between its many calls
 SLOWEST_POLL_S = 0.5  # a dead station may cost a live one at most one time-out in this time
 
 
@@ -67,6 +69,7 @@ class Bus(Generic[C]):
         self._client: C | None = None
         self._slots: list[_Slot[C]] = []
         self._lock = threading.Lock()
+        self._callers: deque[None] = deque()  # one for each that waits for the bus
         self._open_link = open_link
         self._rest = threading.Event()  # never set: a rest that needs no other clock
         self._port: Port[Link] | None = None
@@ -106,7 +109,12 @@ class Bus(Generic[C]):
         Raises:
             NoAnswer: the bus stayed busy until `until_s`. LinkLost: the bus is down. What `work` raises.
         """
-        if not self._lock.acquire(timeout=max(0.0, until_s - now_s())):
+        self._callers.append(None)
+        try:
+            is_ours = self._lock.acquire(timeout=max(0.0, until_s - now_s()))
+        finally:
+            self._callers.pop()
+        if not is_ours:
             raise NoAnswer(f"bus {self.name} stays busy")
         try:
             if self._client is None:
@@ -140,6 +148,7 @@ class Bus(Generic[C]):
         if slot is None or wait_s > 0.0:
             self._rest.wait(min(wait_s, IDLE_S))
             return
+        self._let_callers_pass()
         try:
             with self._lock:
                 self._serve(slot)
@@ -147,6 +156,12 @@ class Bus(Generic[C]):
             raise
         except (WireError, CellError) as error:
             self._note_failure(slot, error, link)
+
+    def _let_callers_pass(self) -> None:
+        """A lock goes to whoever is there: a bus that is polled without a pause would never be a caller's."""
+        until_s = now_s() + LONGEST_YIELD_S
+        while self._callers and now_s() < until_s:
+            self._rest.wait(YIELD_S)
 
     def _serve(self, slot: _Slot[C]) -> None:
         if self._client is None:

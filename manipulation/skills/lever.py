@@ -28,6 +28,8 @@ LAST_RAD = np.radians(9.0)  # the prototype met the end stop at more than 300 N 
 OVERTRAVEL_RAD = np.radians(12.0)  # play of the cage and give of the pads
 LAST_M_PER_S = 0.018
 END_RISE_N = 8.0
+SHORT_RAD = np.radians(4.0)  # a rise so far before the state is no end stop: the bar stuck and slipped
+STOP_TRIES = 3
 EFFORT_SPREAD = 1.6
 EFFORT_FLOOR_N = 35.0
 LARGEST_STOP_N = 92.0  # below the cell's protective limit, so that a stiff valve is told from a collision
@@ -183,15 +185,41 @@ def _carry(attempt: Attempt, thing: Lever, turn: _Turn, hub: Array) -> float:
             raise SkillFailure(
                 outcome, f"it did not give way at {report.peak_force_n:.0f} N", reached=turn.start_rad + sign * turned
             )
-    rest_rad = abs(span_rad) - fast_rad + OVERTRAVEL_RAD
-    poses = arc(attempt.pose(), centre_m=hub, axis=axis, angle_rad=sign * rest_rad)
-    rise = Guard(name="end stop", quantity=Quantity.FORCE_RISE, limit=END_RISE_N, axis=against)
-    report = attempt.along(
-        poses, name="turn to the stop", speed_m_per_s=LAST_M_PER_S, guards=(rise, strong), compliance=YIELDING
-    )
-    force = float(np.linalg.norm(report.wrench[:3]))
-    lag_rad = (CAGE_SIDE_M + force / cell.hand.pad_stiffness_n_per_m) / radius
-    return sign * max(0.0, _between(start, report.base_from_tool) - lag_rad)
+    way = _Arc(hub=hub, axis=sign * axis, radius_m=radius, span_rad=abs(span_rad), against=against)
+    return sign * _to_the_stop(attempt, way, start, strong)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Arc:
+    """Where the bar turns: hub (3,) m and axis (3,) in the base frame, positive in the sense of the stroke."""
+
+    hub: Array
+    axis: Array
+    radius_m: float
+    span_rad: float
+    against: tuple[float, float, float]
+
+
+def _to_the_stop(attempt: Attempt, way: _Arc, start: RigidTransform, strong: Guard) -> float:
+    """Slowly on until the force rises where the end stop can be; a rise before that was the bar's own friction.
+
+    Returns the angle by which the bar turned since `start`.
+    """
+    rise = Guard(name="end stop", quantity=Quantity.FORCE_RISE, limit=END_RISE_N, axis=way.against)
+    tries = 0
+    while True:
+        tries += 1
+        here = attempt.pose()
+        rest_rad = way.span_rad - _between(start, here) + OVERTRAVEL_RAD
+        report = attempt.along(
+            arc(here, centre_m=way.hub, axis=way.axis, angle_rad=rest_rad),
+            name="turn to the stop", speed_m_per_s=LAST_M_PER_S, guards=(rise, strong), compliance=YIELDING,
+        )  # fmt: skip
+        force = float(np.linalg.norm(report.wrench[:3]))
+        lag_rad = (CAGE_SIDE_M + force / attempt.cell.hand.pad_stiffness_n_per_m) / way.radius_m
+        turned = max(0.0, _between(start, report.base_from_tool) - lag_rad)
+        if report.tripped != rise.name or turned > way.span_rad - SHORT_RAD or tries == STOP_TRIES:
+            return turned
 
 
 def _between(start: RigidTransform, end: RigidTransform) -> float:

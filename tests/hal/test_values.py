@@ -72,6 +72,32 @@ def test_a_paced_clock_that_nobody_ticks_goes_on() -> None:
         assert time.monotonic() < give_up_s
 
 
+def test_a_paced_clock_tells_what_it_showed_at_a_moment_of_the_wall() -> None:
+    clock = PacedClock()
+    ticks: list[tuple[float, float]] = []
+    for _ in range(3):
+        clock.sleep(0.001)
+        ticks.append((time.monotonic(), clock.now_s()))
+    for wall_s, shown_s in ticks:
+        assert clock.at_s(wall_s) == shown_s
+    assert clock.at_s(ticks[0][0] - 10.0) < ticks[0][1] - 9.0  # before its memory it went with the wall
+
+
+def test_a_paced_clock_does_not_count_the_time_that_a_tick_took_too_long() -> None:
+    walls: list[float] = []
+
+    def slow_world(_: float) -> float:
+        walls.append(time.monotonic())
+        while time.monotonic() < walls[-1] + 0.05:
+            pass
+        return 0.0
+
+    clock = PacedClock(slow_world)
+    clock.sleep(0.002)
+    clock.sleep(0.002)
+    assert clock.now_s() - clock.at_s(walls[1]) == pytest.approx(0.002)
+
+
 def test_a_replay_clock_never_goes_back() -> None:
     clock = ReplayClock(start_s=5.0)
     clock.seek(4.0)

@@ -142,12 +142,12 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
         return ask(self._options.ids, address, length, until_s)
 
     def poll(self, client: DynamixelClient) -> None:
-        """Current, velocity and position of all servos, stamped in the middle of the exchange."""
+        """Current, velocity and position of all servos."""
         o = self._options
         self._send_pending(client, now_s() + o.timeout_s)
         until_s = now_s() + 2 * o.timeout_s
         blocks = self._read_all(client, STATE, STATE_BYTES, until_s)
-        asked_s, answered_s = client.asked_s, now_s()
+        valid_s = self.exchanges.taken_s(client.asked_s, now_s())
         rows = np.array([struct.unpack("<hii", blocks[id_]) for id_ in o.ids], dtype=float)
         self._polls += 1
         if self._filter.is_open and self._polls % WATCHDOG_EVERY == 0:
@@ -160,7 +160,7 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
                 is_enabled=self._filter.is_open,
                 is_moving=bool(np.any(np.abs(velocity) > MOVING_RAD_PER_S)),
             ),
-            valid_s=0.5 * (asked_s + answered_s),
+            valid_s=valid_s,
         )
 
     def _watch(self, client: DynamixelClient, until_s: float) -> None:

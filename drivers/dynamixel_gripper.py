@@ -144,7 +144,7 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
         tick, current, velocity, position = BLOCK.unpack(block)
         ticks, host = self._clock
         device_s = ticks.seconds(tick)
-        valid_s = host.host_s(device_s=device_s, arrived_s=0.5 * (client.asked_s + now_s()))
+        valid_s = host.host_s(device_s=device_s, arrived_s=self.exchanges.taken_s(client.asked_s, now_s()))
         is_moving = abs(velocity) >= MOVING_COUNTS
         is_short = self._goal is not None and abs(position - self._goal) > AT_GOAL_COUNTS
         is_holding = is_short and not is_moving and abs(current) >= HOLDING_PART * self._goal_current

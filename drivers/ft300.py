@@ -195,13 +195,12 @@ class Ft300Registers(PolledDevice[Wrench, ModbusMaster]):
 
     def poll(self, client: ModbusMaster) -> None:
         """Six registers."""
-        asked_s = now_s()
-        words = client.read_registers(
-            unit=self._options.unit, address=WRENCH_REGISTER, count=6, until_s=asked_s + client.attempt_s
-        )
+        unit, until_s = self._options.unit, now_s() + client.attempt_s
+        words = client.read_registers(unit=unit, address=WRENCH_REGISTER, count=6, until_s=until_s)
         value = wrench(struct.unpack(">6h", struct.pack(">6H", *words)))
         quality, cause = condition(value, self._options)
-        self.publish(value, valid_s=0.5 * (asked_s + now_s()), quality=quality, cause=cause)
+        valid_s = self.exchanges.taken_s(client.asked_s, now_s())
+        self.publish(value, valid_s=valid_s, quality=quality, cause=cause)
 
 
 def connect_stream(context: Context, options: dict[str, Any]) -> Ft300Stream:

@@ -109,11 +109,10 @@ class IoDevice(PolledDevice[T, ModbusMaster]):
         """Nothing to set: the poll identifies it."""
 
     def poll(self, client: ModbusMaster) -> None:
-        """All inputs in one request, stamped in the middle of the exchange."""
-        asked_s = now_s()
+        """All inputs in one request."""
         io = self._io
-        inputs = client.read_bits(unit=io.unit, address=0, count=io.inputs, until_s=asked_s + client.attempt_s)
-        self.take(inputs, 0.5 * (asked_s + now_s()))
+        inputs = client.read_bits(unit=io.unit, address=0, count=io.inputs, until_s=now_s() + client.attempt_s)
+        self.take(inputs, self.exchanges.taken_s(client.asked_s, now_s()))
 
     @abstractmethod
     def take(self, inputs: tuple[bool, ...], valid_s: float) -> None:

@@ -177,8 +177,7 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
 
     def poll(self, client: ModbusMaster) -> None:
         """Three registers to width and grip."""
-        asked_s = now_s()
-        status = self._status(client, asked_s + client.attempt_s)
+        status = self._status(client, now_s() + client.attempt_s)
         if status.fault > ACTIVATION_PENDING and status.fault not in PASSING_FAULTS:
             text = FAULTS.get(status.fault, "fault not in the manual")
             raise Refused(f"gripper fault {status.fault:X}h: {text}", code=status.fault)
@@ -192,7 +191,7 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
                 is_moving=status.goes_to and (status.object == 0 or not is_current),
                 is_holding=is_holding,
             ),
-            valid_s=0.5 * (asked_s + now_s()),
+            valid_s=self.exchanges.taken_s(client.asked_s, now_s()),
             quality=quality,
             cause=cause,
         )

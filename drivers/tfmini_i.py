@@ -95,14 +95,13 @@ class ModbusTfmini(PolledDevice[float, ModbusMaster]):
 
     def poll(self, client: ModbusMaster) -> None:
         """Distance, strength and clock in one request; a measurement that was read before is none."""
-        asked_s = now_s()
-        raw, strength, _, high, low = client.read_registers(
-            unit=self._options.unit, address=READING_REGISTER, count=5, until_s=asked_s + client.attempt_s
-        )
+        unit, until_s = self._options.unit, now_s() + client.attempt_s
+        words = client.read_registers(unit=unit, address=READING_REGISTER, count=5, until_s=until_s)
+        raw, strength, _, high, low = words
         stamp_ms = high << 16 | low
         if not self._clock.is_new(stamp_ms):
             return
-        device_s, valid_s = self._clock.times_s(stamp_ms, 0.5 * (asked_s + now_s()))
+        device_s, valid_s = self._clock.times_s(stamp_ms, self.exchanges.taken_s(client.asked_s, now_s()))
         value, quality, cause = self._options.judge(raw * CM, strength)
         self.publish(value, valid_s=valid_s, device_time_s=device_s, quality=quality, cause=cause)
 

@@ -11,6 +11,7 @@ from typing import Generic, Protocol, TypeVar
 from drivers.transport.device import CONNECT_S, WireDevice
 from drivers.transport.link import BadAnswer, Link, LinkLost, NoAnswer, WireError, now_s
 from drivers.transport.port import Port
+from drivers.transport.timebase import ExchangeTime
 from hal.clock import Deadline
 from hal.errors import CellError
 from hal.registry import Context
@@ -198,6 +199,7 @@ class PolledDevice(WireDevice[T], Generic[T, C]):
         super().__init__(context, max_age_s=max_age_s)
         self.bus = bus
         self.rate_hz = rate_hz
+        self.exchanges = ExchangeTime()
 
     @property
     def period_s(self) -> float:

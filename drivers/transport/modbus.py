@@ -41,6 +41,7 @@ class ModbusMaster(ABC):
         self._link = link
         self._timeout_s = timeout_s
         self.late_bytes = 0
+        self.asked_s = 0.0  # when the last request left
 
     def read_bits(
         self, *, unit: int, address: int, count: int, until_s: float, function: int = READ_INPUTS
@@ -117,6 +118,7 @@ class ModbusTcp(ModbusMaster):
     def _exchange(self, unit: int, request: bytes, head: bytes, rest: int, until_s: float) -> bytes:
         self._tid = self._tid % 0xFFFF + 1
         self.late_bytes += len(drain(self._link))
+        self.asked_s = now_s()
         self._link.write(struct.pack(">HHHB", self._tid, 0, len(request) + 1, unit) + request, until_s)
         buffer, answer_until_s = b"", self._answer_until(until_s)
         while chunk := self._link.read(answer_until_s):
@@ -154,7 +156,6 @@ class ModbusRtu(ModbusMaster):
         self._gap_s = gap_s
         self._quarantine_s = quarantine_s
         self._quiet_since_s = 0.0
-        self._asked_s = 0.0
         self._unanswered: set[tuple[int, int]] = set()  # (unit, function)
 
     @property
@@ -169,7 +170,7 @@ class ModbusRtu(ModbusMaster):
 
     def _clean(self, unit: int, function: int, until_s: float) -> None:
         """Quarantine, then a request that no lost answer fits."""
-        end_s = min(self._asked_s + self._timeout_s + self._quarantine_s, until_s)
+        end_s = min(self.asked_s + self._timeout_s + self._quarantine_s, until_s)
         while now_s() < end_s:
             late = self._link.read(end_s)
             self.late_bytes += len(late)
@@ -192,7 +193,7 @@ class ModbusRtu(ModbusMaster):
         """
         frame = bytes([unit]) + struct.pack(">BHH", READ_HOLDING, 0, 1)
         frame += struct.pack("<H", crc_modbus(frame))
-        self._asked_s = now_s()
+        self.asked_s = now_s()
         self._link.write(frame, until_s)
         heard, answer_until_s = b"", self._answer_until(until_s)
         while not heard.removeprefix(frame) and (chunk := self._link.read(answer_until_s)):
@@ -216,7 +217,7 @@ class ModbusRtu(ModbusMaster):
         frame = bytes([unit]) + request
         self._wait_for_gap()
         self.late_bytes += len(drain(self._link))
-        self._asked_s = now_s()
+        self.asked_s = now_s()
         self._link.write(frame + struct.pack("<H", crc_modbus(frame)), until_s)
         self._unanswered.add((unit, head[0]))
         buffer, answer_until_s = b"", self._answer_until(until_s)

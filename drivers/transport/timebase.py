@@ -8,6 +8,7 @@ from collections import deque
 WINDOW_S = 0.5  # long enough to hold some frames that were not late, short enough to follow a clock that runs badly
 MAX_DRIFT = 0.05  # of a device's clock against the host's; quartz has 1e-4, a clock counted in software some percent
 QUARTZ_DRIFT = 5e-4  # below this no slope is drawn: it costs 0.4 ms at most
+EXCHANGES = 64
 REPEATED = 0.3  # of a period: nearer together than a device can send
 LATELY = 8  # frames: one of so many was not late; a talker that has shifted is followed after so many
 ALMOST = 0.1  # of a period: the jitter of a gap that a lost frame has left
@@ -82,6 +83,24 @@ class HostTime:
         if abs(drift) < QUARTZ_DRIFT:
             drift = 0.0  # what such a slope shows is the jitter of the two differences
         return offset_s + min(max(drift, -MAX_DRIFT), MAX_DRIFT) * min(at_s - then_s, 2.0 * WINDOW_S)
+
+
+class ExchangeTime:
+    """When a device that is asked has taken what it answers: somewhere between request and answer.
+
+    The shortest exchange lately is what wire and device need, and the middle of that is taken. One that lasted longer has
+    waited, maybe after the value was taken, so that of the later part nothing is claimed:
+
+        taken = asked + min_i (answered_i - asked_i) / 2.
+    """
+
+    def __init__(self) -> None:
+        self._lasted_s: deque[float] = deque(maxlen=EXCHANGES)
+
+    def taken_s(self, asked_s: float, answered_s: float) -> float:
+        """When the value of this exchange was taken, on the clock of both."""
+        self._lasted_s.append(answered_s - asked_s)
+        return asked_s + 0.5 * min(self._lasted_s)
 
 
 class FrameTimes:

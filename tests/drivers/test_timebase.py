@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.transport.timebase import FrameTimes, HostTime, Unwrapper
+from drivers.transport.timebase import EXCHANGES, ExchangeTime, FrameTimes, HostTime, Unwrapper
 
 
 @given(st.lists(st.integers(0, 30_000), min_size=1, max_size=50), st.integers(0, 65_535))
@@ -87,3 +87,24 @@ def test_repeated_bytes_at_the_same_moment_are_one_frame_and_line_time_counts() 
     times = FrameTimes(period_s=0.01, frame_bytes=9)
     assert times.stamped([b"a", b"a"], arrived_s=5.0, byte_s=1e-4) == [(b"a", pytest.approx(5.0 - 9e-4))]
     assert [frame for frame, _ in times.stamped([b"a"], arrived_s=5.01, byte_s=1e-4)] == [b"a"]
+
+
+def test_an_exchange_that_lasts_claims_nothing_for_the_time_that_it_waited() -> None:
+    exchanges = ExchangeTime()
+    assert exchanges.taken_s(1.0, 1.004) == pytest.approx(1.002)
+    assert exchanges.taken_s(2.0, 2.1) == pytest.approx(2.002), "the value may be as old as the request"
+    assert exchanges.taken_s(3.0, 3.002) == pytest.approx(3.001)
+
+
+@given(st.lists(st.tuples(st.floats(0, 0.01), st.floats(0, 0.1), st.floats(0, 0.1)), min_size=1, max_size=200))
+def test_no_answer_looks_younger_than_half_of_the_shortest_exchange(waits: list[tuple[float, float, float]]) -> None:
+    """Each exchange: the wire's part, waiting before the value is taken, waiting after it."""
+    exchanges, asked_s, shortest_s = ExchangeTime(), 0.0, 1.0
+    for wire_s, before_s, after_s in waits:
+        lasted_s = wire_s + before_s + after_s
+        shortest_s = min(shortest_s, lasted_s)
+        claimed_s = exchanges.taken_s(asked_s, asked_s + lasted_s)
+        assert asked_s - 1e-9 <= claimed_s <= asked_s + 0.5 * lasted_s + 1e-9
+        if len(waits) < EXCHANGES:
+            assert claimed_s <= asked_s + 0.5 * shortest_s + 1e-9
+        asked_s += 1.0

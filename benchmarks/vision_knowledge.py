@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.vision.blind import PLATE_M, Candidate, candidate_places, chosen, lay_out
-from perception.vision.features import PLATE_PX_PER_M, Ground, look_at
+from perception.vision.features import PLATE_PX_PER_M, WEIGHTS, Ground, look_at
 from perception.vision.knowledge import NOTHING, Kind, Knowledge, spread_of, write_kind
 from perception.vision.match import CLIP
 from perception.vision.plate import find_plate
@@ -84,7 +84,7 @@ def knowledge_of(taught: Sequence[Lesson]) -> Knowledge:
         )
         for name in sorted(set(names.tolist()))
     ]
-    kept = _condensed(looks / spread_of(kinds), names)
+    kept = _condensed(looks / spread_of(kinds), names, weights=WEIGHTS)
     rounded = np.round(looks[kept] / STEP) * STEP
     short = tuple(replace(kind, looks=rounded[names[kept] == kind.name]) for kind in kinds)
     return Knowledge(kinds=short, spread=spread_of(short))
@@ -112,14 +112,16 @@ def _size_m(taught: Sequence[Lesson], name: str) -> tuple[float, float]:
     return float(width), float(height)
 
 
-def _condensed(scaled: Array, names: NDArray[np.str_]) -> NDArray[np.int64]:
+def _condensed(scaled: Array, names: NDArray[np.str_], *, weights: Array | None = None) -> NDArray[np.int64]:
     """Indices of the looks to keep: those that the others kept do not name with the margin of their kind."""
+    share = np.ones(scaled.shape[1]) if weights is None else weights
+    share = share / share.sum()
     own, other = np.full(len(scaled), np.inf), np.full(len(scaled), np.inf)
     margin = np.where(names == NOTHING, NOTHING_MARGIN, OBJECT_MARGIN)
     kept: list[int] = []
 
     def keep(i: int) -> None:
-        distance = np.minimum(np.abs(scaled - scaled[i]), CLIP).mean(axis=1)
+        distance = np.minimum(np.abs(scaled - scaled[i]), CLIP) @ share
         same = names == names[i]
         own[same] = np.minimum(own[same], distance[same])
         other[~same] = np.minimum(other[~same], distance[~same])

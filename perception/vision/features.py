@@ -1,8 +1,10 @@
-"""What a place on the plate looks like, told in numbers that a person can check, whichever way the object is turned.
+"""What a place on the plate looks like, told in numbers that a person can check.
 
-Around a middle, on circles of growing radius: relative gray (median), unevenness (inner 70 % range), and edge strength
-(median and strong). Logarithms of ratios to the plate's own gray, so exposure and light cancel; medians, so a cable or a
-highlight spoils a few numbers and not all. For closed regions: the paper's size, height, width, aspect and Fourier shape
+Around a middle, on circles of growing radius, whichever way the object is turned: relative gray (median), unevenness
+(inner 70 % range), and edge strength (median and strong). Then, towards eight directions of the upright plate, relative
+gray and edges on rings: a toggle's plate is taller than wide, a display wider than high. Logarithms of ratios to the
+plate's own gray, so exposure and light cancel; medians and directions, so a cable or a highlight spoils a few numbers and
+not all. For closed regions: the paper's size, height, width, aspect and Fourier shape
 descriptors (C. T. Zahn and R. Z. Roskies, IEEE Trans. Computers 21(3), 1972, in the complex form of G. H. Granlund, 1972).
 """
 
@@ -21,13 +23,22 @@ from perception.vision.view import Array
 
 PLATE_PX_PER_M = 1500.0  # resolution of the rectified plate
 RADII_M = np.arange(0.0015, 0.045, 0.003)
-ANGLES = np.linspace(0.0, 2 * np.pi, 48, endpoint=False)
+ANGLES = (np.arange(32) + 0.5) * 2 * np.pi / 32
 AROUND_PX = (
     np.stack([np.outer(RADII_M, np.sin(ANGLES)), -np.outer(RADII_M, np.cos(ANGLES))]).reshape(2, -1) * PLATE_PX_PER_M
 )
-RANKS = (7, 24, 40)  # of 48: 15, 50 and 85 %
+RANKS = (5, 16, 27)  # of 32: 15, 50 and 85 %
+AT_ONCE = 64  # places: what lies between stays in the cache, and in memory that the process already has
 GROUPS = ("gray", "uneven", "edge", "strong_edge")
-LENGTH = len(GROUPS) * len(RADII_M)
+DIRECTIONS = 8  # clockwise from straight up
+RINGS = len(RADII_M) // 2  # two radii each; the outermost is left to neighbours
+EACH = len(ANGLES) // DIRECTIONS
+# (angles, DIRECTIONS) mean over two radii and the angles about a direction
+TOWARDS = np.roll(np.kron(np.eye(DIRECTIONS), np.full((EACH, 1), 0.5 / EACH)), -(EACH // 2), axis=0).astype(np.float32)
+AROUND_GROUPS = ("gray_around", "edge_around")
+LENGTH = len(GROUPS) * len(RADII_M) + len(AROUND_GROUPS) * DIRECTIONS * RINGS
+# What is the same whichever way a thing is turned counts as much as what lies in which direction: twice a number.
+WEIGHTS = np.repeat([2.0, 1.0], [len(GROUPS) * len(RADII_M), len(AROUND_GROUPS) * DIRECTIONS * RINGS])
 EDGE_GAIN = 40.0
 DESCRIPTORS = 12
 
@@ -67,21 +78,34 @@ def plate_gray(picture: Image) -> NDArray[np.float32]:
 
 
 def look_at(ground: Ground, places_px: ArrayLike) -> Array:
-    """(N, LENGTH) looks of (N, 2) places (u, v) of the rectified plate, in the order of `GROUPS`."""
-    places = np.asarray(places_px, float)
+    """(N, LENGTH) looks of (N, 2) places (u, v) of the rectified plate: `GROUPS`, then `AROUND_GROUPS`."""
+    places = np.asarray(places_px, float).reshape(-1, 2)
+    parts = [_looks(ground, places[k : k + AT_ONCE]) for k in range(0, len(places), AT_ONCE)]
+    return np.concatenate(parts).astype(float) if parts else np.zeros((0, LENGTH))
+
+
+def _looks(ground: Ground, places: Array) -> NDArray[np.float32]:
     u, v = places[:, :1] + AROUND_PX[0], places[:, 1:] + AROUND_PX[1]
     shape = (len(places), len(RADII_M), len(ANGLES))
-    gray = np.sort(sample_at(ground.picture, u, v).reshape(shape), axis=2)
-    edge = np.sort(sample_at(ground.edges.strength, u, v).reshape(shape), axis=2)
+    gray = sample_at(ground.picture, u, v).reshape(shape)
+    edge = sample_at(ground.edges.strength, u, v).reshape(shape)
     height, width = ground.picture.shape
     at_u = np.clip(places[:, 0], 0, width - 1).astype(int)
     at_v = np.clip(places[:, 1], 0, height - 1).astype(int)
-    level = ground.plate_gray[at_v, at_u].astype(float)[:, None] + 4.0
-    low, middle, high = (np.log((gray[:, :, k] + 6.0) / (level + 6.0)) for k in RANKS)
-    edge_middle, edge_high = edge[:, :, RANKS[1]], edge[:, :, RANKS[2]]
-    return np.concatenate(
-        [middle, high - low, np.log1p(EDGE_GAIN * edge_middle / level), np.log1p(EDGE_GAIN * edge_high / level)], axis=1
-    )
+    level = ground.plate_gray[at_v, at_u][:, None]
+    gray_around = np.log((_around(gray) + 6.0) / (level + 10.0))
+    edge_around = np.log1p(EDGE_GAIN * _around(edge) / (level + 4.0))
+    gray.sort(axis=2)
+    edge.sort(axis=2)
+    low, middle, high = (np.log((gray[:, :, k] + 6.0) / (level + 10.0)) for k in RANKS)
+    edge_middle, edge_high = (np.log1p(EDGE_GAIN * edge[:, :, k] / (level + 4.0)) for k in RANKS[1:])
+    return np.concatenate([middle, high - low, edge_middle, edge_high, gray_around, edge_around], axis=1)
+
+
+def _around(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, DIRECTIONS * RINGS) means of (N, radii, angles) values, direction by direction."""
+    rings = values[:, : 2 * RINGS].reshape(len(values), RINGS, 2, -1).sum(axis=2)
+    return np.asarray((rings @ TOWARDS).transpose(0, 2, 1).reshape(len(values), -1))
 
 
 def region_shape(mask: NDArray[np.bool_]) -> RegionShape | None:

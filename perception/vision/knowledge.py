@@ -1,8 +1,8 @@
 """What the system knows of kinds of objects: readable TOML, one file a kind, written by teaching or by hand.
 
 A kind has a size and looks. A look is what one taught example looked like (see `features`): four rows of numbers over the
-distance from the middle, in hundredths. The file `nothing.toml` holds looks of what is *not* an object: screws, labels,
-parts of objects. Adding a look to one kind changes no other kind's looks.
+distance from the middle, in hundredths, and two tables with such a row a direction. The file `nothing.toml` holds looks
+of what is *not* an object: screws, labels, parts of objects. Adding a look to one kind changes no other kind's looks.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 
 from hal.errors import ConfigError
 from hal.strict import Strict, load_toml
-from perception.vision.features import GROUPS, LENGTH, RADII_M
+from perception.vision.features import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
 from perception.vision.view import Array
 
 NOTHING = "nothing"
@@ -25,14 +25,33 @@ UNIT = 100.0  # looks are stored in hundredths
 
 Row = Annotated[tuple[int, ...], Field(min_length=len(RADII_M), max_length=len(RADII_M))]
 
+RingRow = Annotated[tuple[int, ...], Field(min_length=RINGS, max_length=RINGS)]
+Around = Annotated[tuple[RingRow, ...], Field(min_length=DIRECTIONS, max_length=DIRECTIONS)]
+
 
 class LookRecord(Strict):
-    """One example: relative gray, unevenness, edges and strong edges over the distance from the middle, hundredths."""
+    """One example: relative gray, unevenness, edges and strong edges over the distance from the middle, hundredths.
+
+    `gray_around` and `edge_around` have a row a direction, clockwise from straight up; left out, every direction is as
+    `gray` and `edge` are all around.
+    """
 
     gray: Row
     uneven: Row
     edge: Row
     strong_edge: Row
+    gray_around: Around | None = None
+    edge_around: Around | None = None
+
+    @property
+    def look(self) -> Array:
+        """(LENGTH,) in the order of `features`."""
+        around = [
+            np.asarray(given, float).ravel() if given is not None else np.tile(_ring_means(row), DIRECTIONS)
+            for given, row in ((self.gray_around, self.gray), (self.edge_around, self.edge))
+        ]
+        rows = np.array([*self.gray, *self.uneven, *self.edge, *self.strong_edge], float)
+        return np.concatenate([rows, *around]) / UNIT
 
 
 class KindRecord(Strict):
@@ -130,8 +149,11 @@ def write_kind(kind: Kind, folder: Path) -> Path:
         lines.append(f'taught_by = "{kind.taught_by}"')
     for look in kind.looks:
         lines.append("\n[[looks]]")
-        for name, row in zip(GROUPS, look.reshape(len(GROUPS), -1), strict=True):
-            lines.append(f"{name} = [{', '.join(str(round(float(v) * UNIT)) for v in row)}]")
+        rows = look[: len(GROUPS) * len(RADII_M)].reshape(len(GROUPS), -1)
+        lines += [f"{name} = {_written(row)}" for name, row in zip(GROUPS, rows, strict=True)]
+        tables = look[len(GROUPS) * len(RADII_M) :].reshape(len(AROUND_GROUPS), DIRECTIONS, RINGS)
+        for name, table in zip(AROUND_GROUPS, tables, strict=True):
+            lines.append(f"{name} = [{', '.join(_written(row) for row in table)}]")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 
@@ -141,10 +163,18 @@ def _is_other(path: Path) -> bool:
 
 
 def _kind(record: KindRecord) -> Kind:
-    looks = np.array([[*look.gray, *look.uneven, *look.edge, *look.strong_edge] for look in record.looks], float) / UNIT
     return Kind(
         name=record.name,
         size_m=(record.width_m, record.height_m),
-        looks=looks.reshape(-1, LENGTH),
+        looks=np.array([look.look for look in record.looks]).reshape(-1, LENGTH),
         taught_by=record.taught_by,
     )
+
+
+def _ring_means(row: tuple[int, ...]) -> Array:
+    """(RINGS,) of a row over all radii."""
+    return np.asarray(np.array(row[: 2 * RINGS], float).reshape(RINGS, 2).mean(axis=1))
+
+
+def _written(row: Array) -> str:
+    return f"[{', '.join(str(round(float(v) * UNIT)) for v in row)}]"

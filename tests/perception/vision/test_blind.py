@@ -4,13 +4,25 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from benchmarks.vision_drawing import Disturbance
 from hal.errors import Ambiguous, InvalidRequest, NotFound
 from perception.vision.blind import recognise
-from perception.vision.features import LENGTH, region_shape
+from perception.vision.features import (
+    AROUND_GROUPS,
+    DIRECTIONS,
+    GROUPS,
+    LENGTH,
+    RADII_M,
+    RINGS,
+    Ground,
+    look_at,
+    plate_gray,
+    region_shape,
+)
 from perception.vision.knowledge import (
     NOTHING,
     Kind,
@@ -22,6 +34,7 @@ from perception.vision.knowledge import (
 )
 from perception.vision.match import distances, distances_reference
 from perception.vision.plate import find_plate
+from perception.vision.shapes import find_edges
 from perception.vision.teach import check, plate_points, teach
 from perception.vision.view import CameraView
 from tests.perception.vision.bench_panel import panel, scene
@@ -141,6 +154,31 @@ def test_knowledge_survives_its_files(tmp_path: Path) -> None:
         again = loaded.kind(kind.name)
         assert again is not None and again.size_m == kind.size_m
         assert np.allclose(again.looks, kind.looks)
+
+
+def test_a_look_written_without_directions_is_the_same_all_around(tmp_path: Path) -> None:
+    row = list(range(len(RADII_M)))
+    rows = "\n".join(f"{name} = {row}" for name in GROUPS)
+    (tmp_path / "disc.toml").write_text(f'name = "disc"\nwidth_m = 0.05\nheight_m = 0.05\n[[looks]]\n{rows}\n')
+    look = load_knowledge(tmp_path).kinds[0].looks[0]
+    around = look[len(GROUPS) * len(RADII_M) :].reshape(len(AROUND_GROUPS), DIRECTIONS, RINGS)
+    assert np.allclose(around, (2 * np.arange(RINGS) + 0.5) / 100)
+
+
+def test_a_disc_looks_the_same_from_all_directions_and_a_bar_does_not() -> None:
+    looks = {}
+    for name in ("disc", "bar"):
+        picture = np.full((200, 200), 150, np.uint8)
+        if name == "disc":
+            cv2.circle(picture, (100, 100), 30, 60, -1)
+        else:
+            cv2.rectangle(picture, (40, 90), (160, 110), 60, -1)
+        ground = Ground(picture=picture.astype(np.float32), edges=find_edges(picture), plate_gray=plate_gray(picture))
+        gray, edge = look_at(ground, [(100, 100)])[0][len(GROUPS) * len(RADII_M) :].reshape(2, DIRECTIONS, RINGS)
+        looks[name] = gray, edge
+    assert np.ptp(looks["disc"][0], axis=0).max() < 0.1
+    up, right = looks["bar"][0][0], looks["bar"][0][2]
+    assert (right[2:5] < -0.3).all() and (up[2:5] > -0.05).all()
 
 
 def test_the_fast_match_agrees_with_the_plain_one() -> None:

@@ -28,7 +28,7 @@ LAST_RAD = np.radians(9.0)  # the prototype met the end stop at more than 300 N 
 OVERTRAVEL_RAD = np.radians(12.0)  # play of the cage and give of the pads
 LAST_M_PER_S = 0.018
 END_RISE_N = 8.0
-SHORT_RAD = np.radians(4.0)  # a rise so far before the state is no end stop: the bar stuck and slipped
+SHORT_RAD = np.radians(1.0)  # a tool that stands so far before the state has met no end stop: the bar stuck and slipped
 STOP_TRIES = 3
 EFFORT_SPREAD = 1.6
 EFFORT_FLOOR_N = 35.0
@@ -216,10 +216,11 @@ def _to_the_stop(attempt: Attempt, way: _Arc, start: RigidTransform, strong: Gua
             name="turn to the stop", speed_m_per_s=LAST_M_PER_S, guards=(rise, strong), compliance=YIELDING,
         )  # fmt: skip
         force = float(np.linalg.norm(report.wrench[:3]))
+        tool_rad = _between(start, report.base_from_tool)
         lag_rad = (CAGE_SIDE_M + force / attempt.cell.hand.pad_stiffness_n_per_m) / way.radius_m
-        turned = max(0.0, _between(start, report.base_from_tool) - lag_rad)
-        if report.tripped != rise.name or turned > way.span_rad - SHORT_RAD or tries == STOP_TRIES:
-            return turned
+        # The tool is ahead of the bar by a lag that is known badly, so at the stop it has always passed the state.
+        if report.tripped != rise.name or tool_rad > way.span_rad - SHORT_RAD or tries == STOP_TRIES:
+            return max(0.0, tool_rad - lag_rad)
 
 
 def _between(start: RigidTransform, end: RigidTransform) -> float:

@@ -48,7 +48,7 @@ def carried(ends: list[tuple[float, str | None]]) -> tuple[Turned, float]:
     return attempt, _to_the_stop(cast(Attempt, attempt), way, START, STRONG)
 
 
-@pytest.mark.parametrize("end", [(93.0, "end stop"), (102.0, None), (83.0, "effort")])
+@pytest.mark.parametrize("end", [(91.0, "end stop"), (89.5, "end stop"), (102.0, None), (83.0, "effort")])
 def test_an_end_stop_a_free_way_and_too_much_effort_end_it_at_once(end: tuple[float, str | None]) -> None:
     attempt, turned_rad = carried([end])
     assert len(attempt.goals_rad) == 1
@@ -56,7 +56,7 @@ def test_an_end_stop_a_free_way_and_too_much_effort_end_it_at_once(end: tuple[fl
 
 
 def test_a_rise_long_before_the_state_is_passed_on_the_way_to_the_same_goal() -> None:
-    attempt, turned_rad = carried([(82.0, "end stop"), (88.0, "end stop"), (94.0, "end stop")])
+    attempt, turned_rad = carried([(82.0, "end stop"), (88.5, "end stop"), (94.0, "end stop")])
     assert np.degrees(turned_rad) == pytest.approx(94.0 - LAG_DEG)
     assert attempt.goals_rad == pytest.approx([attempt.goals_rad[0]] * 3)
 

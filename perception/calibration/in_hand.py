@@ -32,6 +32,8 @@ LIMIT_M = 0.001  # one sigma: a mount that is known less well than this is worse
 LIMIT_RAD = 0.0035
 OUTLIER_P = 1e-4  # a view that chance alone explains less often than this is left out
 FEWEST_VIEWS = 4
+ROUGHLY = np.repeat([0.1, 0.3, 0.1, 0.3], 3)  # m and rad: mount and target before any view, so that first ones compare
+LEVER_M = 0.1  # at which a turn of the mount counts as much as a shift
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -141,6 +143,48 @@ def calibrate_in_hand(
         rms_px=float(np.sqrt(np.mean(rest**2))), chi_square=minimum.chi_square,
         degrees=len(rest) - 12, used=tuple(used),
     )  # fmt: skip
+
+
+def propose_view(
+    done: Sequence[RigidTransform], candidates: Sequence[RigidTransform], points_m: Array, state: InHandState,
+    known: Beforehand, *, sigma_px: float = 0.05,
+) -> tuple[int, float]:  # fmt: skip
+    """Which flange pose to look from next: the one after which the mount is known best.
+
+    Args:
+        done: base_from_flange of the stations so far.
+        candidates: poses from which all points are in view.
+        state: what is believed now; nominal values will do.
+        sigma_px: expected noise of a point.
+
+    Returns: index into `candidates`, and one sigma of the mount after it, m: of its place, with its turn at 0.1 m.
+
+    Raises:
+        InvalidRequest: no candidates.
+    """
+    if not candidates:
+        raise InvalidRequest("no candidate poses", hint="give flange poses from which the target is in view")
+    priors = _priors(state.intrinsics, known, len(points_m))
+    beforehand = np.diag(np.concatenate([ROUGHLY**-2.0, priors**-2.0]))
+    so_far = sum((_information(pose, points_m, state, known, sigma_px) for pose in done), beforehand)
+    weight = np.repeat([1.0, LEVER_M**2], 3)
+    scores = []
+    for pose in candidates:
+        covariance = np.linalg.inv(so_far + _information(pose, points_m, state, known, sigma_px))
+        scores.append(float(np.sqrt(np.diag(covariance)[:6] @ weight)))
+    best = int(np.argmin(scores))
+    return best, scores[best]
+
+
+def _information(
+    flange: RigidTransform, points_m: Array, state: InHandState, known: Beforehand, sigma_px: float
+) -> Array:
+    """What one view tells of the state's step."""
+    nothing = np.zeros((len(points_m), 2))
+    covariance = np.tile(sigma_px**2 * np.eye(2), (len(points_m), 1, 1))
+    view = InHandView(base_from_flange=flange, pixels_px=nothing, covariance_px=covariance)
+    _, J = _residual(view, points_m, state)
+    return np.asarray(J.T @ np.linalg.solve(_noise(view, points_m, state, known), J))
 
 
 def _check(views: Sequence[InHandView], points_m: Array) -> None:

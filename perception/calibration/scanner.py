@@ -99,12 +99,14 @@ def calibrate_scanner(
     )
     normal = n0 + across @ bends[:2]
     plane = (normal / np.linalg.norm(normal), float((normal @ origin + bends[2]) / np.linalg.norm(normal)))
-    covariance = minimum.covariance[:6, :6]
+    degrees = sum(len(p) for p in points) - 6
+    # More scatter than was stated: then everything is as much less certain.
+    covariance = minimum.covariance[:6, :6] * max(1.0, minimum.chi_square / degrees)
     _check(covariance)
     rest_m = linearise((pose, bends))[0][3 + 3 * len(views) :] * np.concatenate(sigmas)
     return ScannerCalibration(
         flange_from_scanner=UncertainPose(parent_from_child=pose, covariance=covariance), plane_base=plane,
-        chi_square=minimum.chi_square, degrees=len(rest_m) - 6, rms_m=float(np.sqrt(np.mean(rest_m**2))),
+        chi_square=minimum.chi_square, degrees=degrees, rms_m=float(np.sqrt(np.mean(rest_m**2))),
     )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from hal.calibration import CalibrationRecord, IntrinsicsRecord
+from hal.calibration import CalibrationRecord
 from hal.devices import DeviceKind
 from hal.errors import InvalidRequest, NotObservable, Unsupported
 from hal.geometry import difference, matrix_of, to_json
@@ -22,6 +22,7 @@ from perception.calibration.in_hand import (
     InHandState,
     InHandView,
     calibrate_in_hand,
+    propose_view,
 )
 from perception.calibration.records import record_of, renewed
 from perception.calibration.scanner import ScannerCalibration, ScannerView, calibrate_scanner
@@ -33,12 +34,13 @@ from service.operations.locate import go_to_overview, lights_in, locate, scan_pl
 from service.operations.requests import CalibrationRequest
 from service.operations.session import Session
 from service.operations.stations import (
+    LIGHTS_CONE_RAD,
+    PLATE_CONE_RAD,
     REACH_STEPS,
     around,
+    by_plate,
     in_view,
-    lights_view,
     order,
-    plate_view,
     visit,
     wrist_turns,
 )
@@ -116,7 +118,9 @@ def _measure(
     locate(session)
     if request.what == "scanner":
         return _scanner(session, device, request.poses)
-    return _camera(session, device, request.poses, is_lens_known=request.what == "hand-eye")
+    return _camera(
+        session, device, request.poses, _beforehand(session, device, is_lens_known=request.what == "hand-eye")
+    )
 
 
 def _planned(session: Session, request: CalibrationRequest, device: str) -> list[dict[str, Any]]:
@@ -126,25 +130,29 @@ def _planned(session: Session, request: CalibrationRequest, device: str) -> list
         return [
             {"joints_rad": q.tolist(), **to_json(arm.flange(q))} for q in _tool_joints(session, device)[: request.poses]
         ]
-    plan = _camera_stations if request.what in ("camera", "hand-eye") else _scanner_stations
-    return [to_json(flange) for flange in plan(session, device, request.poses)[: request.poses]]
+    if request.what == "scanner":
+        flanges = _scanner_stations(session, device, request.poses)
+    else:
+        known = _beforehand(session, device, is_lens_known=request.what == "hand-eye")
+        flanges = _camera_stations(session, device, request.poses, known)
+    return [to_json(flange) for flange in flanges[: request.poses]]
 
 
 # -- camera: lens and mount by the panel's lights ---------------------------------------------------------------------
 
 
-def _camera_stations(session: Session, camera: str, count: int) -> list[RigidTransform]:
-    x, z = session.mount(camera).parent_from_child, believed_panel(session).parent_from_child
-    lens, points_m = session.lens(camera), _lights_m(session)
+def _camera_stations(session: Session, camera: str, count: int, known: Beforehand) -> list[RigidTransform]:
+    start, points_m = _nominal(session, camera), _lights_m(session)
+    x, z, lens = start.flange_from_camera, start.base_from_target, start.intrinsics
     nearest_m = overview_distance_m(session.panel, lens, 0.0)
-    candidates = [
-        flange for flange in around(z, x, nearest_m, steps=REACH_STEPS) if in_view(flange, x, z, points_m, lens)
-    ]
-    return order(session, candidates, x, z, lights_view, count=count)
+    candidates = around(z, x, nearest_m, steps=REACH_STEPS, cone_rad=LIGHTS_CONE_RAD)
+    seen = [flange for flange in candidates if in_view(flange, x, z, points_m, lens)]
+    return order(session, seen, lambda done, left: propose_view(done, left, points_m, start, known)[0], count=count)
 
 
-def _camera(session: Session, camera: str, count: int, *, is_lens_known: bool) -> InHandCalibration:
-    flanges = _camera_stations(session, camera, count)
+def _camera(session: Session, camera: str, count: int, known: Beforehand) -> InHandCalibration:
+    session.progress(0.08, "choose the stations that tell most")
+    flanges = _camera_stations(session, camera, count, known)
 
     def measure() -> InHandView:
         pair = look_with_lights(session)
@@ -157,27 +165,29 @@ def _camera(session: Session, camera: str, count: int, *, is_lens_known: bool) -
 
     views = visit(session, flanges, measure, count=count, name="look")
     session.progress(0.92, "solve")
-    lens = session.cell.calibration_of(camera).intrinsics
-    known = _beforehand(session, lens if is_lens_known else None)
-    start = InHandState(
+    result = calibrate_in_hand(views, _lights_m(session), _nominal(session, camera), known)
+    _check_scatter(result.chi_square, result.degrees, "the panel file's light positions, the lens, and for reflections")
+    return result
+
+
+def _nominal(session: Session, camera: str) -> InHandState:
+    return InHandState(
         flange_from_camera=session.mount(camera).parent_from_child,
         base_from_target=believed_panel(session).parent_from_child,
         intrinsics=session.lens(camera),
         point_errors_m=np.zeros((len(session.panel.lights), 3)),
     )
-    result = calibrate_in_hand(views, _lights_m(session), start, known)
-    _check_scatter(result.chi_square, result.degrees, "the panel file's light positions, the lens, and for reflections")
-    return result
 
 
 def _lights_m(session: Session) -> Array:
     return np.array([light.position_m for light in session.panel.lights])
 
 
-def _beforehand(session: Session, lens: IntrinsicsRecord | None) -> Beforehand:
+def _beforehand(session: Session, camera: str, *, is_lens_known: bool) -> Beforehand:
+    """What is known of the lens by its record or by nobody, of the lights, and of the arm."""
     arm = session.connection.device(session.first(DeviceKind.ARM)).capabilities()
-    known = UNKNOWN_LENS
-    if lens is not None:
+    known, lens = UNKNOWN_LENS, session.cell.calibration_of(camera).intrinsics
+    if is_lens_known and lens is not None:
         stated = (lens.sigma_focal_ratio, lens.sigma_centre_px, lens.sigma_k1)
         ratio, centre, k1 = (max(a, b) for a, b in zip(stated, LEAST_LENS, strict=True))
         known = Beforehand(focal_ratio=ratio, centre_px=centre, k1=k1)
@@ -190,8 +200,8 @@ def _beforehand(session: Session, lens: IntrinsicsRecord | None) -> Beforehand:
 
 def _scanner_stations(session: Session, scanner: str, count: int) -> list[RigidTransform]:
     x, z = session.mount(scanner).parent_from_child, believed_panel(session).parent_from_child
-    candidates = around(z, x, SCANNER_DISTANCE_M, steps=SCANNER_STEPS)
-    return order(session, candidates, x, z, plate_view, count=count)
+    candidates = around(z, x, SCANNER_DISTANCE_M, steps=SCANNER_STEPS, cone_rad=PLATE_CONE_RAD)
+    return order(session, candidates, by_plate(x, z), count=count)
 
 
 def _scanner(session: Session, scanner: str, count: int) -> ScannerCalibration:

@@ -22,25 +22,26 @@ from service.operations.travel import go_to_first, reachable
 Array = NDArray[np.float64]
 
 EDGE_PX = 24.0  # a light this near the image's edge may be cut
-CONE_RAD = 0.6
-REACH_STEPS = (1.0, 1.2, 1.45)  # distances, as shares of the nearest that shows everything
-LIGHTS_SIGMA = (2e-4, 2e-4, 5e-4, 8e-4, 8e-4, 3e-4)  # of four lights 0.6 m away, 460 px focal length: m, rad
+LIGHTS_CONE_RAD = 0.95  # 0.6 rad leave the camera's depth in the hand uncertain by half as much again
+PLATE_CONE_RAD = 0.6
+REACH_STEPS = (0.8, 1.0, 1.2, 1.45, 1.7)  # distances, as shares of the nearest that shows everything upright
 PLATE_SIGMA = (1.0, 1.0, 2e-4, 5e-4, 5e-4, 1.0)  # a plane says nothing of shifts in it and of turns about its normal
 WRIST_RAD = (-2.4, -1.6, -0.8, 0.0, 0.8, 1.6, 2.4)
 
 T = TypeVar("T")
-View = Callable[[RigidTransform], Array]
-"""The 6x6 covariance of a view, by where the target is in the sensor's axes."""
+Propose = Callable[[Sequence[RigidTransform], Sequence[RigidTransform]], int]
+"""Given the stations so far and the candidates: which of these is best next."""
 
 
 def around(
-    base_from_target: RigidTransform, flange_from_sensor: RigidTransform, distance_m: float, *, steps: Sequence[float]
-) -> list[RigidTransform]:
+    base_from_target: RigidTransform, flange_from_sensor: RigidTransform, distance_m: float, *, steps: Sequence[float],
+    cone_rad: float,
+) -> list[RigidTransform]:  # fmt: skip
     """Flange poses from which the sensor looks at the target's middle: a cone, several distances, four rolls."""
     found = []
     for share in steps:
         for k, flange in enumerate(
-            stations(base_from_target, flange_from_sensor, distance_m=share * distance_m, count=24, cone_rad=CONE_RAD)
+            stations(base_from_target, flange_from_sensor, distance_m=share * distance_m, count=30, cone_rad=cone_rad)
         ):
             turn = Rotation.from_rotvec([0.0, 0.0, (k % 4) * np.pi / 2])
             roll = transform(turn.as_matrix(), np.zeros(3))
@@ -61,27 +62,32 @@ def in_view(
     return bool((pixels > EDGE_PX).all() and (pixels < limit).all())
 
 
-def lights_view(_target: RigidTransform) -> Array:
-    """What a view of the four lights is worth."""
-    return np.diag(np.square(LIGHTS_SIGMA))
-
-
 def plate_view(target: RigidTransform) -> Array:
     """What a scan of the plate is worth: its height and tilts only."""
     turn = np.kron(np.eye(2), matrix_of(target))
     return np.asarray(turn @ np.diag(np.square(PLATE_SIGMA)) @ turn.T)
 
 
+def by_plate(flange_from_sensor: RigidTransform, base_from_plate: RigidTransform) -> Propose:
+    """Chooses what tells most of a sensor that sees a plate."""
+
+    def propose(done: Sequence[RigidTransform], candidates: Sequence[RigidTransform]) -> int:
+        views = [
+            HandEyeView(
+                base_from_flange=flange,
+                camera_from_target=certain((flange * flange_from_sensor).inv() * base_from_plate),
+            )
+            for flange in done
+        ]
+        return propose_next(views, (flange_from_sensor, base_from_plate), candidates, view_covariance=plate_view)[0]
+
+    return propose
+
+
 def order(
-    session: Session,
-    candidates: Sequence[RigidTransform],
-    x: RigidTransform,
-    z: RigidTransform,
-    view: View,
-    *,
-    count: int,
+    session: Session, candidates: Sequence[RigidTransform], propose: Propose, *, count: int
 ) -> list[RigidTransform]:
-    """All candidates that the arm can stand in, the `count` that together tell most of X first.
+    """All candidates that the arm can stand in; the `count` that together tell most come first.
 
     Raises:
         Unreachable: fewer than `count` are left.
@@ -93,13 +99,8 @@ def order(
             hint="ask for fewer poses, or put the panel where the arm can look at it from several sides",
         )
     chosen: list[RigidTransform] = []
-    done: list[HandEyeView] = []
     while len(chosen) < count:
-        best, _ = propose_next(done, (x, z), free, view_covariance=view)
-        flange = free.pop(best)
-        chosen.append(flange)
-        pose = certain((flange * x).inv() * z)
-        done.append(HandEyeView(base_from_flange=flange, camera_from_target=pose))
+        chosen.append(free.pop(propose(chosen, free)))
     return chosen + free
 
 

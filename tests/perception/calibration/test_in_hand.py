@@ -22,6 +22,7 @@ from perception.calibration.in_hand import (
     _moved,
     _residual,
     calibrate_in_hand,
+    propose_view,
 )
 from perception.camera_model import project
 
@@ -135,3 +136,22 @@ def test_unusable_views_are_named() -> None:
     broken = replace(views[1], pixels_px=np.full((4, 2), np.nan))
     with pytest.raises(InvalidRequest, match=r"views\[1\]"):
         calibrate_in_hand([views[0], broken, *views[2:]], POINTS, start(), KNOWN)
+
+
+def test_the_next_view_is_the_one_after_which_the_mount_is_known_best() -> None:
+    candidates, state = poses(10), start()
+    done = [candidates.pop(0)]
+    best, sigma = propose_view(done, candidates, POINTS, state, KNOWN)
+    assert sigma == min(propose_view(done, [pose], POINTS, state, KNOWN)[1] for pose in candidates)
+    assert propose_view([*done, candidates[best]], candidates, POINTS, state, KNOWN)[1] < sigma
+    with pytest.raises(InvalidRequest, match="no candidate"):
+        propose_view(done, [], POINTS, state, KNOWN)
+
+
+def test_what_is_promised_of_the_stations_is_what_the_fit_states() -> None:
+    flanges = poses(12)
+    promised = propose_view(flanges[:-1], flanges[-1:], POINTS, start(), KNOWN, sigma_px=SIGMA_PX)[1]
+    result = calibrate_in_hand(drawn(1, flanges), POINTS, start(), KNOWN)
+    variance = np.diag(result.flange_from_camera.covariance)
+    scatter = max(1.0, result.chi_square / result.degrees)
+    assert np.sqrt((variance[:3].sum() + 0.01 * variance[3:].sum()) / scatter) == pytest.approx(promised, rel=0.1)

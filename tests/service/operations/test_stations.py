@@ -5,19 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from hal.config import load_cell
 from hal.errors import NotObservable
 from hal.geometry import certain, matrix_of, transform_rpy
 from manipulation.kinematics import Kinematics
-from perception.calibration.hand_eye import HandEyeView, check_turns, propose_next
+from perception.calibration.hand_eye import HandEyeView, check_turns
 from perception.calibration.wrench import GRAVITY_M_PER_S2, calibrate_wrench
 from perception.camera_model import project
 from service.operations.stations import (
     EDGE_PX,
     around,
+    by_plate,
     in_view,
-    lights_view,
     plate_view,
     wrist_turns,
 )
@@ -31,7 +32,7 @@ LENS = CELL.calibration_of("wrist_camera").intrinsics.intrinsics()  # type: igno
 
 
 def test_stations_look_at_the_middle_from_the_front() -> None:
-    flanges = around(BASE_FROM_PANEL, X, 0.6, steps=(1.0, 1.3))
+    flanges = around(BASE_FROM_PANEL, X, 0.6, steps=(1.0, 1.3), cone_rad=0.6)
     for flange in flanges:
         middle = ((flange * X).inv() * BASE_FROM_PANEL).apply([0.0, 0.0, 0.0])
         assert np.allclose(middle[:2], 0.0, atol=1e-9)
@@ -44,7 +45,7 @@ def test_stations_look_at_the_middle_from_the_front() -> None:
 
 
 def test_in_view_means_clear_of_the_edge() -> None:
-    near, far = (around(BASE_FROM_PANEL, X, distance_m, steps=(1.0,))[0] for distance_m in (0.35, 0.75))
+    near, far = (around(BASE_FROM_PANEL, X, distance_m, steps=(1.0,), cone_rad=0.6)[0] for distance_m in (0.35, 0.75))
     assert in_view(far, X, BASE_FROM_PANEL, LIGHTS, LENS)
     assert not in_view(near, X, BASE_FROM_PANEL, LIGHTS, LENS)
     pixels = project(((far * X).inv() * BASE_FROM_PANEL).apply(LIGHTS), LENS)
@@ -60,14 +61,13 @@ def test_a_plate_tells_its_height_and_tilts_in_any_pose() -> None:
         assert normal @ covariance[3:, 3:] @ normal > 0.5
 
 
-def test_the_first_stations_chosen_turn_about_several_axes() -> None:
-    candidates = around(BASE_FROM_PANEL, X, 0.6, steps=(1.0,))
-    done: list[HandEyeView] = []
+def test_the_first_stations_chosen_for_a_scanner_turn_about_several_axes() -> None:
+    candidates = around(BASE_FROM_PANEL, X, 0.45, steps=(1.0,), cone_rad=0.6)
+    propose = by_plate(X, BASE_FROM_PANEL)
+    done: list[RigidTransform] = []
     for _ in range(4):
-        best, _ = propose_next(done, (X, BASE_FROM_PANEL), candidates, view_covariance=lights_view)
-        seen = (candidates[best] * X).inv() * BASE_FROM_PANEL
-        done.append(HandEyeView(base_from_flange=candidates.pop(best), camera_from_target=certain(seen)))
-    check_turns(done)  # raises when they share an axis
+        done.append(candidates.pop(propose(done, candidates)))
+    check_turns([HandEyeView(base_from_flange=f, camera_from_target=certain(f)) for f in done])  # raises if not
 
 
 def test_wrist_turns_tell_weight_from_bias_within_the_limits() -> None:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from hal.errors import ConfigError
 from service.commands.common import DEFAULT_CELL, SeedOption, console, find_cell, read_cell
-
-Name = re.compile(r"[a-z][a-z0-9_]{1,40}")
 
 
 class LevelChoice(StrEnum):
@@ -83,27 +79,24 @@ def emulate(
 
 
 def new_driver(
-    name: Annotated[str, typer.Argument(help="Module name, e.g. vl53l1x.")],
+    what: Annotated[str, typer.Argument(help="KIND:NAME, e.g. scanner:foo; the name becomes a module.")],
     *,
-    kind: Annotated[str, typer.Option(help="Which of the eight interfaces it implements, e.g. proximity.")],
-    folder: Annotated[Path, typer.Option(help="Project to write into.")] = Path(),
+    transport: Annotated[str, typer.Option(help="serial or tcp.")] = "serial",
+    folder: Annotated[
+        Path, typer.Option(help="panelwright's own tree, or where a package of its own shall be.")
+    ] = Path(),
+    package: Annotated[
+        str | None, typer.Option(help="Name of the package, outside panelwright's tree; panelwright_NAME if not given.")
+    ] = None,
 ) -> None:
-    """Write a driver, its conformance test and its entry point, ready to be filled in."""
-    if not Name.fullmatch(name):
-        raise ConfigError(f"{name!r} is no module name", hint="small letters, digits and underscores")
-    from hal.devices import DeviceKind
-    from service.scaffold import driver_files
+    """Write a driver that runs as it is: options, emulator, conformance test, page; then change what the manual says."""
+    from service.new_driver import parse_kind, write_driver
 
-    if kind not in list(DeviceKind):
-        raise ConfigError(f"there is no kind {kind!r}", hint=f"kinds: {', '.join(DeviceKind)}")
-    files = driver_files(name, DeviceKind(kind))
-    taken = [path for path in files if (folder / path).exists()]
-    if taken:
-        raise ConfigError(f"{folder / taken[0]} exists already", hint="choose another name; nothing was written")
-    for path, text in files.items():
-        (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / path).write_text(text)
-        console.print(f"wrote {folder / path}")
-    table = escape('[project.entry-points."panelwright.devices"]')
-    console.print(f'add to pyproject.toml, {table}:\n  "{name}:{kind}" = "drivers.{name}:connect"')
-    console.print(f"then: pip install -e . && pytest {folder / next(reversed(files))}")
+    kind, name = parse_kind(what)
+    written = write_driver(kind, name, transport=transport, folder=folder, package=package)
+    for path in written.files:
+        console.print(f"wrote {path}")
+    for path in written.registered:
+        console.print(f"registered {transport}:{name} in {path}")
+    console.print(f"try it: {written.try_it}")
+    console.print(f"then, for cell files to find it: {written.install}")

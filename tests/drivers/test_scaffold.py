@@ -7,10 +7,13 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from drivers.scaffold import new_driver
 from hal.devices import DeviceKind
 from hal.errors import ConfigError
+from service.cli import _app
+from service.new_driver import parse_kind, with_lines, write_driver
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "driver-package"
@@ -37,21 +40,59 @@ def run_pytest(folder: Path, *paths: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize(
     ("kind", "transport"),
-    [(DeviceKind.PROXIMITY, "serial"), (DeviceKind.FORCE_TORQUE, "tcp"), (DeviceKind.TOUCH, "serial")],
+    [
+        (DeviceKind.PROXIMITY, "serial"),
+        (DeviceKind.FORCE_TORQUE, "tcp"),
+        (DeviceKind.TOUCH, "serial"),
+        (DeviceKind.RANGE_SCANNER, "serial"),
+        (DeviceKind.LIGHTS, "tcp"),
+    ],
 )
 def test_a_new_driver_is_clean_and_passes_the_kit(kind: DeviceKind, transport: str, tmp_path: Path) -> None:
-    files = new_driver("acme_one", kind, transport=transport, package="fresh", own_package=True)  # type: ignore[arg-type]
-    for path, text in files.items():
-        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / path).write_text(text)
-    (tmp_path / "fresh" / "__init__.py").touch()
-    ruff = Path(sys.executable).with_name("ruff")
-    command = [str(ruff), "check", "--config", str(ROOT / "pyproject.toml"), "--no-cache", str(tmp_path / "fresh")]
-    checked = subprocess.run([*command, "--ignore", "I001"], capture_output=True, text=True, check=False)
+    runner = CliRunner()
+    arguments = ["new-driver", f"{kind}:acme_one", "--transport", transport, "--folder", str(tmp_path)]
+    told = runner.invoke(_app(), arguments)  # type: ignore[arg-type]  # a Typer app
+    assert told.exit_code == 0, told.output
+    ruff = [
+        str(Path(sys.executable).with_name("ruff")),
+        "check",
+        "--no-cache",
+        "--config",
+        str(ROOT / "pyproject.toml"),
+    ]
+    checked = subprocess.run(
+        [*ruff, "--ignore", "I001,S101", str(tmp_path)], capture_output=True, text=True, check=False
+    )
     assert checked.returncode == 0, checked.stdout
     done = run_pytest(tmp_path)
     assert done.returncode == 0, done.stdout[-3000:]
-    assert max(len((tmp_path / path).read_text().splitlines()) for path in files) <= 120
+    written = {path.relative_to(tmp_path): path.read_text() for path in tmp_path.rglob("*.*") if path.is_file()}
+    assert {"README.md", "pyproject.toml"} <= {str(path) for path in written}
+    assert max(len(text.splitlines()) for text in written.values()) <= 120
+
+
+def test_in_this_tree_a_driver_has_its_places_and_is_registered(tmp_path: Path) -> None:
+    (tmp_path / "drivers" / "emulators").mkdir(parents=True)
+    project = tmp_path / "pyproject.toml"
+    project.write_text((ROOT / "pyproject.toml").read_text())
+    written = write_driver(DeviceKind.RANGE_SCANNER, "acme", transport="serial", folder=tmp_path, package=None)
+    assert [str(path.relative_to(tmp_path)) for path in written.files] == [
+        "drivers/acme.py",
+        "drivers/emulators/acme.py",
+        "tests/drivers/test_acme.py",
+        "docs/driver_acme.md",
+    ]
+    points = tomllib.loads(project.read_text())["project"]["entry-points"]
+    assert points["panelwright.devices"]["serial:acme"] == "drivers.acme:connect"
+    assert points["panelwright.emulators"]["acme"] == "drivers.emulators.acme:start"
+    with pytest.raises(ConfigError, match=r"drivers/acme\.py exists already"):
+        write_driver(DeviceKind.RANGE_SCANNER, "acme", transport="tcp", folder=tmp_path, package=None)
+
+
+def test_a_project_without_the_tables_says_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="has no table") as caught:
+        with_lines("[project]\n", {"[x]": "y"}, tmp_path / "pyproject.toml")
+    assert "by hand" in caught.value.hint
 
 
 @pytest.mark.parametrize("name", ["Acme", "9a", "a-b", ""])
@@ -60,10 +101,26 @@ def test_a_name_that_is_no_module_is_refused(name: str) -> None:
         new_driver(name, DeviceKind.PROXIMITY)
 
 
-def test_a_kind_without_template_says_where_to_start() -> None:
+@pytest.mark.parametrize("what", ["foo", "scanner:", "laser:foo"])
+def test_what_is_no_kind_and_name_is_refused(what: str) -> None:
+    with pytest.raises(ConfigError):
+        parse_kind(what)
+    assert parse_kind("scanner:foo") == (DeviceKind.RANGE_SCANNER, "foo")
+
+
+def test_a_kind_or_transport_without_template_says_where_to_start() -> None:
     with pytest.raises(ConfigError, match="arm") as caught:
         new_driver("acme", DeviceKind.ARM)
     assert "proximity" in caught.value.hint
+    with pytest.raises(ConfigError, match="pigeon"):
+        new_driver("acme", DeviceKind.PROXIMITY, transport="pigeon")  # type: ignore[arg-type]
+
+
+def test_the_example_package_is_what_the_scaffold_writes() -> None:
+    files = new_driver("rangefinder", DeviceKind.PROXIMITY, package="acme_rangefinder")
+    for path, text in files.items():
+        if path.name != "README.md":
+            assert (EXAMPLE / path).read_text() == text, f"{path} differs: write it again with panelwright new-driver"
 
 
 def test_the_example_package_registers_from_outside_and_passes_the_kit(tmp_path: Path) -> None:

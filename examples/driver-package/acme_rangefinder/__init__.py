@@ -1,1 +1,1 @@
-"""An example: a driver that lives outside panelwright's tree."""
+"""Rangefinder for panelwright."""

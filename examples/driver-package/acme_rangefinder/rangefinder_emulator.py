@@ -27,7 +27,8 @@ class RangefinderEmulator(WireEmulator):
     def on_tick(self) -> None:
         """One frame."""
         sample = self._backing.read_distance_m(deadline=self.deadline())
-        numbers = [round(1000.0 * value) for value in [sample.value]]
+        values = [sample.value]
+        numbers = [round(1000.0 * value) for value in values]
         self._counter = (self._counter + 1) % 256
         body = FRAME.pack(HEADER, self._counter, *numbers, 0)[:-1]
         self.send(None, body + bytes([sum_low_byte(body)]))

@@ -14,23 +14,26 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import UncertainPose, matrix_of, perturbed
-from perception.calibration.newton import descend
+from perception.calibration.newton import Minimum, descend
 
 Array = NDArray[np.float64]
 
 LIMIT_M = 0.003
 LIMIT_RAD = 0.02
+OUTLIER_SIGMAS = 3.0  # further off the plate than that is something mounted on it, or a beam on two surfaces
+ROUNDS = 3
+LEAST_POINTS = 20
 ARM_SIGMA = (1e-4, 1e-4, 1e-4)  # m along the plate's normal, rad about its two axes: what the arm repeats to
 NAMES = ("shift along x", "shift along y", "shift along z", "turn about x", "turn about y", "turn about z")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScannerView:
-    """One scan of the plate: the flange pose, points (N, 3) in scanner axes (m), noise of a point along its ray (m)."""
+    """One scan of the plate: the flange pose, points (N, 3) in scanner axes (m), noise along the rays (m), one or (N,)."""
 
     base_from_flange: RigidTransform
     points_m: Array
-    sigma_m: float
+    sigma_m: float | Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,54 +68,99 @@ def calibrate_scanner(
     points = [_checked(k, view) for k, view in enumerate(views)]
     if not points:
         raise InvalidRequest("no scans", hint="take six or more, tilted about both axes of the plate")
-    frame = matrix_of(base_from_plate.parent_from_child)
-    n0, across = frame[:, 2], frame[:, :2]
-    origin = base_from_plate.parent_from_child.translation
-    prior = _plane_prior(base_from_plate)
-    loose = np.diag(1.0 / np.array(ARM_SIGMA)[[1, 2, 0]])  # bends are two tilts, then a shift
-    sigmas = [_across(view, p, matrix_of(start), n0) for view, p in zip(views, points, strict=True)]
-    count = 9 + 3 * len(views)
-
-    def linearise(state: tuple[RigidTransform, Array]) -> tuple[Array, Array]:
-        pose, bends = state
-        Ry = matrix_of(pose)
-        held = np.zeros((3 + 3 * len(views), count))
-        held[:3, 6:9], held[3:, 9:] = prior, np.kron(np.eye(len(views)), loose)
-        residuals, rows = [held[:, 6:] @ bends], [held]
-        for k, (view, p, sigma) in enumerate(zip(views, points, sigmas, strict=True)):
-            bend = bends[:3] + bends[3 + 3 * k : 6 + 3 * k]
-            n = n0 + across @ bend[:2]  # its length grows by the square of milliradians
-            Ra = matrix_of(view.base_from_flange)
-            turned = p @ Ry.T
-            world = (turned + pose.translation) @ Ra.T + view.base_from_flange.translation - origin
-            nf = Ra.T @ n
-            by_bend = np.hstack([world @ across, -np.ones((len(p), 1))]) / sigma[:, None]
-            row = np.zeros((len(p), count))
-            row[:, :6] = np.hstack([np.tile(nf, (len(p), 1)), np.cross(turned, nf)]) / sigma[:, None]
-            row[:, 6:9] = row[:, 9 + 3 * k : 12 + 3 * k] = by_bend
-            residuals.append((world @ n - bend[2]) / sigma)
-            rows.append(row)
-        return np.concatenate(residuals), np.vstack(rows)
-
-    (pose, bends), minimum = descend(
-        (start, np.zeros(count - 6)), linearise, lambda s, step: (perturbed(s[0], step[:6]), s[1] + step[6:])
-    )
-    normal = n0 + across @ bends[:2]
-    plane = (normal / np.linalg.norm(normal), float((normal @ origin + bends[2]) / np.linalg.norm(normal)))
-    degrees = sum(len(p) for p in points) - 6
+    normal, R = matrix_of(base_from_plate.parent_from_child)[:, 2], matrix_of(start)
+    scans = [
+        _Scan(base_from_flange=view.base_from_flange, points_m=p, sigma_m=_across(view, p, R, normal))
+        for view, p in zip(views, points, strict=True)
+    ]
+    state = (start, np.zeros(3 + 3 * len(scans)))
+    for _ in range(ROUNDS):
+        state, minimum = _fit(scans, state, base_from_plate)
+        kept = [scan.within(OUTLIER_SIGMAS, state, k, base_from_plate) for k, scan in enumerate(scans)]
+        if all(len(new.points_m) == len(old.points_m) for new, old in zip(kept, scans, strict=True)):
+            break
+        scans = kept
+    pose, bends = state
+    degrees = sum(len(scan.points_m) for scan in scans) - 6
     # More scatter than was stated: then everything is as much less certain.
     covariance = minimum.covariance[:6, :6] * max(1.0, minimum.chi_square / degrees)
     _check(covariance)
-    rest_m = linearise((pose, bends))[0][3 + 3 * len(views) :] * np.concatenate(sigmas)
+    frame, origin = matrix_of(base_from_plate.parent_from_child), base_from_plate.parent_from_child.translation
+    n = frame[:, 2] + frame[:, :2] @ bends[:2]
+    length = float(np.linalg.norm(n))
+    rest_m = np.concatenate([scan.heights(state, k, base_from_plate) for k, scan in enumerate(scans)])
     return ScannerCalibration(
-        flange_from_scanner=UncertainPose(parent_from_child=pose, covariance=covariance), plane_base=plane,
+        flange_from_scanner=UncertainPose(parent_from_child=pose, covariance=covariance),
+        plane_base=(n / length, float((n @ origin + bends[2]) / length)),
         chi_square=minimum.chi_square, degrees=degrees, rms_m=float(np.sqrt(np.mean(rest_m**2))),
     )  # fmt: skip
 
 
+State = tuple[RigidTransform, Array]
+"""The scanner's mount, and bends (two tilts, rad, and a shift, m) of the plate, then of each scan against it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Scan:
+    """A scan with the noise (N,) of its points across the plate."""
+
+    base_from_flange: RigidTransform
+    points_m: Array
+    sigma_m: Array
+
+    def rows(self, state: State, index: int, plate: UncertainPose) -> tuple[Array, Array, Array]:
+        """Heights (N,) over the plate as this scan meets it, and their derivatives (N, 6) by mount and (N, 3) by bends."""
+        pose, bends = state
+        frame, origin = matrix_of(plate.parent_from_child), plate.parent_from_child.translation
+        bend = bends[:3] + bends[3 + 3 * index : 6 + 3 * index]
+        n = frame[:, 2] + frame[:, :2] @ bend[:2]  # its length grows by the square of milliradians
+        Ra = matrix_of(self.base_from_flange)
+        turned = self.points_m @ matrix_of(pose).T
+        world = (turned + pose.translation) @ Ra.T + self.base_from_flange.translation - origin
+        by_pose = np.hstack([np.tile(Ra.T @ n, (len(turned), 1)), np.cross(turned, Ra.T @ n)])
+        by_bend = np.hstack([world @ frame[:, :2], -np.ones((len(turned), 1))])
+        return world @ n - bend[2], by_pose, by_bend
+
+    def heights(self, state: State, index: int, plate: UncertainPose) -> Array:
+        """(N,) over the plate, m."""
+        return self.rows(state, index, plate)[0]
+
+    def within(self, sigmas: float, state: State, index: int, plate: UncertainPose) -> _Scan:
+        """The scan without what is no part of the plate."""
+        near = np.abs(self.heights(state, index, plate)) < sigmas * self.sigma_m
+        if near.sum() < LEAST_POINTS:
+            return self
+        return _Scan(base_from_flange=self.base_from_flange, points_m=self.points_m[near], sigma_m=self.sigma_m[near])
+
+
+def _fit(scans: Sequence[_Scan], start: State, plate: UncertainPose) -> tuple[State, Minimum]:
+    loose = np.diag(1.0 / np.array(ARM_SIGMA)[[1, 2, 0]])
+    count = 9 + 3 * len(scans)
+    held = np.zeros((3 + 3 * len(scans), count))
+    held[:3, 6:9], held[3:, 9:] = _plane_prior(plate), np.kron(np.eye(len(scans)), loose)
+
+    def linearise(state: State) -> tuple[Array, Array]:
+        residuals, rows = [held[:, 6:] @ state[1]], [held]
+        for k, scan in enumerate(scans):
+            heights, by_pose, by_bend = scan.rows(state, k, plate)
+            row = np.zeros((len(heights), count))
+            row[:, :6] = by_pose
+            row[:, 6:9] = row[:, 9 + 3 * k : 12 + 3 * k] = by_bend
+            residuals.append(heights / scan.sigma_m)
+            rows.append(row / scan.sigma_m[:, None])
+        return np.concatenate(residuals), np.vstack(rows)
+
+    return descend(start, linearise, lambda s, step: (perturbed(s[0], step[:6]), s[1] + step[6:]))
+
+
 def _checked(index: int, view: ScannerView) -> Array:
     points = np.asarray(view.points_m, float)
-    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all() or view.sigma_m <= 0:
+    if (
+        points.ndim != 2
+        or points.shape[1] != 3
+        or not np.isfinite(points).all()
+        or not (np.asarray(view.sigma_m) > 0).all()
+    ):
         raise InvalidRequest(
             f"views[{index}]: points must be finite (N, 3) with a positive sigma, not {points.shape}",
             hint="drop the readings without an echo",

@@ -216,7 +216,7 @@ def _scanner(session: Session, scanner: str, count: int) -> ScannerCalibration:
         return ScannerView(
             base_from_flange=session.mover.state().base_from_flange,
             points_m=np.column_stack([(u[some] - c.cx) / c.fx * z, (v[some] - c.cy) / c.fy * z, z]),
-            sigma_m=float(seen.fit.noise.sigma_m(float(np.median(z)))),
+            sigma_m=seen.fit.noise.sigma_m(z),
         )
 
     views = visit(session, flanges, measure, count=count, name="scan")

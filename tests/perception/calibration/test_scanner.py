@@ -74,3 +74,18 @@ def test_bad_scans_are_refused() -> None:
     good.points_m[3] = np.inf
     with pytest.raises(InvalidRequest, match=r"views\[0\]"):
         calibrate_scanner([good], Y_TRUE, plate)
+
+
+def test_what_stands_on_the_plate_does_not_pull() -> None:
+    rng = np.random.default_rng(4)
+    plate = UncertainPose(parent_from_child=PLATE, covariance=PLATE_COVARIANCE)
+    clean = [scan(f, rng, is_line=False) for f in flanges(6)]
+    dirty = []
+    for view in clean:
+        points = view.points_m.copy()
+        points[::12] *= 0.95  # 20 mm nearer: a meter on the plate
+        dirty.append(ScannerView(base_from_flange=view.base_from_flange, points_m=points, sigma_m=view.sigma_m))
+    results = [calibrate_scanner(made, Y_TRUE, plate) for made in (clean, dirty)]
+    poses = [result.flange_from_scanner.parent_from_child for result in results]
+    assert np.linalg.norm(difference(poses[0], poses[1])[:3]) < 1e-3
+    assert results[1].degrees < results[0].degrees

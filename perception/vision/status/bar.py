@@ -21,6 +21,7 @@ def bar_contrast(
     height_m: ArrayLike | None = None,
     quantile: float = 0.3,
     flank: tuple[float, float] = FLANK,
+    beside_m: float = 0.0,
 ) -> Array:
     """(N,) signed contrast (gray levels) of a bar from the object's middle towards each angle, clockwise from up.
 
@@ -30,6 +31,7 @@ def bar_contrast(
 
     Args:
         height_m: height above the plate of the bar's ends (inner, outer), or one height, or None for the patch's plane.
+        beside_m: how far to the right of the line from the middle the bar lies, parallel to it.
     """
     angle = np.atleast_1d(np.asarray(angles_rad, float))
     ends_z = [None, None] if height_m is None else list(np.broadcast_to(np.asarray(height_m, float), (2,)))
@@ -40,7 +42,8 @@ def bar_contrast(
     across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(length, 1e-9)  # as it appears: bars may lean
     count = max(6, round(float(length.max())))
     share = np.linspace(0.0, 1.0, count)[None, :, None, None]
-    offsets = np.array([*CORE, -flank[0], -flank[1], flank[0], flank[1]]) * half_width_m * patch.px_per_m
+    offsets = np.array([*CORE, -flank[0], -flank[1], flank[0], flank[1]]) * half_width_m
+    offsets = (offsets + beside_m) * patch.px_per_m
     place = ends[0][:, None, None, :] + share * along[:, None, None, :]
     place = place + offsets[None, None, :, None] * across[:, None, None, :]
     shape = (len(angle) * count, len(offsets))

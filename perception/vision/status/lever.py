@@ -13,6 +13,9 @@ from perception.vision.status.bar import bar_contrast
 from perception.vision.status.choice import choose, contrast_noise
 
 BAR_FROM, BAR_TO = 0.40, 0.92  # share of the length: outside the hub, inside the tip
+FLANK = (1.35, 1.6)  # of the half width: pipes and flanges lie close by
+BESIDE = np.linspace(-1.5, 1.5, 13)  # of the half width: a shadow falls to one side
+SHADOW_SHARE = 0.4  # of the bar's width that its shadow has
 SWEEP_RAD = np.deg2rad(np.arange(-30.0, 30.5, 1.0))
 BETWEEN_RAD = 0.16  # a quarter-turn valve that is 9 degrees off its stop is neither open nor closed
 ANGLE_SIGMA_RAD = 0.02
@@ -25,7 +28,7 @@ def read_lever(patch: Patch, spec: Lever) -> Status:
     angles = np.array([state.angle_rad for state in spec.states])
     tried = (angles[:, None] + WOBBLE_RAD).ravel()
     contrast = bar_contrast(
-        patch, tried, along_m=(BAR_FROM * L, BAR_TO * L), half_width_m=spec.width_m / 2, flank=(1.35, 1.6)
+        patch, tried, along_m=(BAR_FROM * L, BAR_TO * L), half_width_m=spec.width_m / 2, flank=FLANK
     )
     evidence = np.abs(contrast).reshape(len(angles), -1).max(axis=1)
     r = np.linspace(BAR_FROM, BAR_TO, 8)[:, None] * L
@@ -37,9 +40,29 @@ def read_lever(patch: Patch, spec: Lever) -> Status:
     angle = _bar_angle(patch, spec, nominal)
     # Seen aslant, the bar's walls turn its image by up to the lean of its height over its length.
     lean_m = float(np.linalg.norm(patch.parallax_px_per_m)) * spec.height_m / patch.px_per_m
-    if abs(angle - nominal) > BETWEEN_RAD + lean_m / spec.length_m:
-        return refused(f"the lever stands between its states, at {angle:.2f} rad: turn it to its stop", unit="rad")
-    return replace(status, value=angle, unit="rad", uncertainty=ANGLE_SIGMA_RAD)
+    if abs(angle - nominal) <= BETWEEN_RAD + lean_m / spec.length_m:
+        return replace(status, value=angle, unit="rad", uncertainty=ANGLE_SIGMA_RAD)
+    if _is_parallel(patch, spec, nominal):
+        return replace(status, value=nominal, unit="rad", uncertainty=BETWEEN_RAD)
+    return refused(f"the lever stands between its states, at {angle:.2f} rad: turn it to its stop", unit="rad")
+
+
+def _is_parallel(patch: Patch, spec: Lever, nominal: float) -> bool:
+    """Is what stands out a line beside the state's direction and parallel to it, rather than a bar turned off it?
+
+    A handle of the plate's own gray shows by the shadow along its side alone; a handle between its states lies across.
+    """
+    along_m = (BAR_FROM * spec.length_m, BAR_TO * spec.length_m)
+    turned = parallel = 0.0
+    for half_width_m in (spec.width_m / 2, SHADOW_SHARE * spec.width_m / 2):
+        across = bar_contrast(patch, nominal + SWEEP_RAD, along_m=along_m, half_width_m=half_width_m, flank=FLANK)
+        turned = max(turned, float(np.abs(across).max()))
+        for beside_m in BESIDE * spec.width_m / 2:
+            line = bar_contrast(
+                patch, nominal, along_m=along_m, half_width_m=half_width_m, flank=FLANK, beside_m=float(beside_m)
+            )
+            parallel = max(parallel, abs(float(line[0])))
+    return parallel > turned
 
 
 def _bar_angle(patch: Patch, spec: Lever, nominal: float) -> float:
@@ -47,7 +70,7 @@ def _bar_angle(patch: Patch, spec: Lever, nominal: float) -> float:
     L = spec.length_m
     tried = nominal + SWEEP_RAD
     contrast = np.abs(
-        bar_contrast(patch, tried, along_m=(BAR_FROM * L, BAR_TO * L), half_width_m=spec.width_m / 2, flank=(1.35, 1.6))
+        bar_contrast(patch, tried, along_m=(BAR_FROM * L, BAR_TO * L), half_width_m=spec.width_m / 2, flank=FLANK)
     )
     smooth = np.convolve(contrast, np.ones(5) / 5.0, "same")
     return float(tried[2 + int(np.argmax(smooth[2:-2]))])

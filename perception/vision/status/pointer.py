@@ -21,6 +21,7 @@ ANGLE_STEP_PX = 0.7  # at the outer radius
 RIVAL_APART_RAD = np.deg2rad(14.0)  # further than a pointer is wide
 PIVOT_SIGMA_PX = 0.5  # how far the true pivot may lie from the registered middle, image px
 REFINE_RAD = np.deg2rad(7.0)
+NUMERAL = 1.6  # times the ink of the typical row
 
 Float32 = NDArray[np.float32]
 
@@ -246,6 +247,9 @@ def _row_centres(part: Array, offset: Array, near: NDArray[np.bool_]) -> tuple[A
     """Per radius: centre of the ink within `near` (rad), its mass, and its width (rad)."""
     shown = np.where(near, part, 0.0)
     top = shown.max(axis=1, keepdims=True)
+    # A pointer is of one gray: rows where something stands out much more belong to a numeral or a tick beside it.
+    top = np.where(top > NUMERAL * float(np.median(top)), 0.0, top)
+    shown = np.where(top > 0, shown, 0.0)
     shown = np.maximum(shown - 0.3 * top, 0.0)
     mass = shown.sum(axis=1)
     step = float(abs(offset[1] - offset[0]))

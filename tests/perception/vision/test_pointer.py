@@ -1,0 +1,46 @@
+"""A dim pointer on a dark face: the bright numeral that it touches must not turn it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from perception.vision.patch import Patch
+from perception.vision.status.pointer import find_pointer
+
+SIZE, RADIUS_M, PX_PER_M = 240, 0.045, 2200.0
+
+
+def face(angle_rad: float, seed: int) -> Patch:
+    """A dark face with a dim pointer, and a bright numeral 8 degrees beside it."""
+    middle = np.full(2, SIZE / 2)
+    picture = np.full((SIZE, SIZE), 35.0, np.float32)
+    R = RADIUS_M * PX_PER_M
+
+    def towards(angle: float, share: float) -> np.ndarray:
+        return middle + share * R * np.array([np.sin(angle), -np.cos(angle)])
+
+    side = 0.05 * R * np.array([np.cos(angle_rad), np.sin(angle_rad)])
+    pointer = np.array([middle + side, towards(angle_rad, 0.78), middle - side])
+    cv2.fillPoly(picture, [np.round(pointer * 16).astype(np.int32)], 65.0, cv2.LINE_AA, shift=4)
+    numeral = towards(angle_rad - np.deg2rad(8.0), 0.54)
+    cv2.circle(picture, tuple(np.round(numeral).astype(int).tolist()), round(0.07 * R), 220.0, -1, cv2.LINE_AA)
+    noise = np.random.default_rng(seed).normal(0.0, 2.0, picture.shape)
+    gray = np.clip(np.round(cv2.GaussianBlur(picture, (0, 0), 1.5) + noise), 0, 255).astype(np.uint8)
+    return Patch(
+        gray=gray, colour=None, inside=np.ones(gray.shape, bool), px_per_m=PX_PER_M, image_px_per_m=PX_PER_M / 1.5,
+        origin_px=middle, parallax_px_per_m=np.zeros(2), growth_per_m=0.0, plane_z_m=0.0,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("angle_deg", [-100.0, 20.0, 100.0])
+def test_a_bright_numeral_beside_a_dim_pointer_does_not_turn_it(angle_deg: float) -> None:
+    R = RADIUS_M
+    for seed in range(3):
+        fit = find_pointer(
+            face(float(np.deg2rad(angle_deg)), seed), pivot_m=(0.0, 0.0), inner_m=0.25 * R, outer_m=0.6 * R,
+            fine_m=(0.25 * R, 0.72 * R),
+        )  # fmt: skip
+        assert fit is not None and not fit.is_dark
+        assert np.rad2deg(fit.angle_rad) == pytest.approx(angle_deg, abs=1.2)

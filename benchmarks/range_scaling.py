@@ -30,10 +30,11 @@ from perception.range.batch import IMAGES_A_TASK, analyse_files, batch_range, re
 from perception.range.claim import claim_borders, claim_pixels
 from perception.range.components import _merge_seam, _scan, merge_rounds, tile_rows
 from perception.range.geometry import geometry_of
-from perception.range.grid import _blocks, _tangents
+from perception.range.grid import _blocks
 from perception.range.noise import estimate_noise
 from perception.range.sensor import PinholeSensor
 from perception.range.surfaces import SIZE
+from perception.range.tangents import tangent_planes
 from perception.range.warm import warm_up
 
 Array = NDArray[np.float64]
@@ -137,7 +138,7 @@ def _tiled_steps(depth: Array, sensor: PinholeSensor, labels: NDArray[np.int32])
     return [
         lambda a, b: geometry_of(depth[max(0, a - HALO_ROWS) : b + HALO_ROWS], sensor, scale_px=1.5),
         lambda a, b: _blocks(depth, packed, law, 2, x, y, z, sigma, count, a // 2, b // 2),
-        lambda a, b: _tangents(x, y, z, count, sigma, True, 1, 2.5 / packed[1], 2, normal, rms, a // 2, b // 2),
+        lambda a, b: tangent_planes(x, y, z, count, sigma, True, 1, 5.0 / packed[1], normal, rms, a // 2, b // 2),
         lambda a, b: _scan(mask, linked, linked, parent, a, b),
         lambda a, b: claim_pixels(depth, packed, law, blocks, 2, kinds, table, out, a // 2, b // 2),
         lambda a, b: claim_borders(depth, packed, law, labels, kinds, table, out, a, b),

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from hal.errors import InvalidRequest, NotFound
@@ -111,17 +112,26 @@ def checked_depth(depth_m: ArrayLike, sensor: RangeSensorModel) -> Array:
     if raw.size > LARGEST_PIXELS:
         raise InvalidRequest(f"image of {raw.size} pixels", hint=f"at most {LARGEST_PIXELS} pixels; cut it into parts")
     depth = np.array(raw, dtype=np.float64, order="C")
-    missing = ~np.isfinite(depth)
-    if sensor.packed()[0] > 0:
-        missing |= depth <= 0.0
-    depth[missing] = np.nan
-    valid = depth.size - int(missing.sum())
+    valid = int(_drop_missing(depth, -np.inf if sensor.packed()[0] == 0 else 0.0))
     if valid < LEAST_VALID_PIXELS:
         raise NotFound(
             f"only {valid} of {depth.size} pixels hold a depth", hint="check range, exposure and the invalid value"
         )
     _check_scale(depth, sensor)
     return depth
+
+
+@njit(cache=True)
+def _drop_missing(depth, least):  # type: ignore[no-untyped-def]
+    """Turn what is not finite or not beyond `least` into NaN; returns how many readings remain."""
+    flat = depth.ravel()
+    valid = 0
+    for i in range(flat.shape[0]):
+        if np.isfinite(flat[i]) and flat[i] > least:
+            valid += 1
+        else:
+            flat[i] = np.nan
+    return valid
 
 
 def _check_scale(depth: Array, sensor: RangeSensorModel) -> None:
@@ -143,12 +153,9 @@ def _finished(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) 
     count = len(found.kinds)
     samples = finish.samples_by_label(depth, sensor, noise, labels, count)
     touching = merge.merge_touching(labels, sensor.packed(), found.kinds, found.parameters, samples, noise)
-    labels = np.array([0, *touching], np.int32)[labels]
-    samples = finish.samples_by_label(depth, sensor, noise, labels, count)
+    labels, samples = finish.regrouped(depth, sensor, noise, labels, samples, touching)
     owner = join.join_pieces(depth, sensor.packed(), found.kinds, found.parameters, samples)
-    joined = np.array([0, *owner], np.int32)[labels]
-    if owner != list(range(1, count + 1)):
-        samples = finish.samples_by_label(depth, sensor, noise, joined, count)
+    joined, samples = finish.regrouped(depth, sensor, noise, labels, samples, owner)
     keep = [k for k in range(count) if owner[k] == k + 1 and samples[k].x.size >= 8]
     keep.sort(key=lambda k: -samples[k].x.size)
     surfaces, final = [], Candidates()

@@ -11,6 +11,7 @@ from perception.range.surfaces import PLANE, depth_on, normal_on
 
 CLAIM_SIGMAS = 3.5
 MAX_CANDIDATES = 8
+NO_LABEL = np.int32(2**31 - 1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -128,30 +129,43 @@ def _best_of(z, x, y, noise, near, n, kinds, ths, perspective):  # type: ignore[
 
 
 @njit(cache=True, error_model="numpy")
-def _differs(above, here, below, out):  # type: ignore[no-untyped-def]
-    """Non-zero where one of the eight neighbours has another label; the first and last column stay 0."""
-    for u in range(1, here.shape[0] - 1):
-        own = here[u]
-        upper = (above[u - 1] ^ own) | (above[u] ^ own) | (above[u + 1] ^ own)
-        lower = (below[u - 1] ^ own) | (below[u] ^ own) | (below[u + 1] ^ own)
-        out[u] = upper | lower | (here[u - 1] ^ own) | (here[u + 1] ^ own)
+def add_row(labels, least, most):  # type: ignore[no-untyped-def]
+    """One more row of a neighbourhood: the least label that is none of 0, and the largest, of each column."""
+    for u in range(labels.shape[0]):
+        k = labels[u]
+        least[u] = min(least[u], k if k > 0 else NO_LABEL)
+        most[u] = max(most[u], k)
+
+
+@njit(cache=True, error_model="numpy")
+def _contested(own, least, most, out):  # type: ignore[no-untyped-def]
+    """Where the three columns around hold another surface than the pixel's own; the outermost columns are not."""
+    for u in range(1, own.shape[0] - 1):
+        low = min(least[u - 1], least[u], least[u + 1])
+        high = max(most[u - 1], most[u], most[u + 1])
+        out[u] = (high != own[u]) | ((own[u] > 0) & (low != own[u]))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def claim_borders(depth, sen, noise, labels, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]
-    """Judge again each pixel whose 3x3 neighbourhood holds another label; regions gain or lose at most one pixel.
+    """Judge again each pixel whose 3x3 neighbourhood holds another surface; regions gain or lose at most one pixel.
 
-    Reads `labels` (H, W), writes rows [top, bottom) of `out` (H, W). The outermost pixels keep their labels.
+    Reads `labels` (H, W), writes rows [top, bottom) of `out` (H, W). The outermost pixels keep their labels, and so do
+    those that have none but their own surface and empty pixels around them: that surface has claimed them already.
     """
     H, W = depth.shape
     perspective = sen[0] > 0
-    near, differs = np.empty(9, np.int32), np.zeros(W, np.int32)
+    near, contested = np.empty(9, np.int32), np.zeros(W, np.bool_)
+    least, most = np.empty(W, np.int32), np.empty(W, np.int32)
     out[top:bottom] = labels[top:bottom]
     for v in range(max(1, top), min(H - 1, bottom)):
-        _differs(labels[v - 1], labels[v], labels[v + 1], differs)
+        least[:], most[:] = NO_LABEL, 0
+        for i in range(v - 1, v + 2):
+            add_row(labels[i], least, most)
+        _contested(labels[v], least, most, contested)
         y = (v - sen[4]) / sen[2]
         for u in range(1, W - 1):
-            if differs[u] == 0 or not np.isfinite(depth[v, u]):
+            if not contested[u] or not np.isfinite(depth[v, u]):
                 continue
             n = 0
             for i in range(v - 1, v + 2):
@@ -229,32 +243,42 @@ def bucket(label, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def gather_all(depth, sen, noise, labels, count):  # type: ignore[no-untyped-def]
-    """Ray coordinates, depth and sigma of all labelled pixels, grouped by label in raster order.
+def gather(depth, sen, noise, labels, wanted):  # type: ignore[no-untyped-def]
+    """Ray coordinates, depth and sigma of the pixels of all `wanted` (n + 1,) labels, by label in raster order.
 
-    Returns starts (count + 2,) and four arrays; label k owns [starts[k], starts[k + 1]).
+    Returns starts (n + 2,) and four arrays; label k owns [starts[k], starts[k + 1]). Label 0 owns nothing.
     """
     H, W = depth.shape
-    flat = labels.ravel()
+    count = wanted.shape[0] - 1
     starts = np.zeros(count + 2, np.int64)
-    for i in range(flat.shape[0]):
-        if flat[i]:
-            starts[flat[i] + 1] += 1
-    for k in range(count + 1):
-        starts[k + 1] += starts[k]
+    for v in range(H):
+        for u in range(W):
+            starts[labels[v, u] + 1] += 1
+    starts[1] = 0
+    for k in range(1, count + 1):
+        starts[k + 1] = starts[k] + (starts[k + 1] if wanted[k] else 0)
     total = starts[count + 1]
-    x, y, z, sigma = np.empty(total), np.empty(total), np.empty(total), np.empty(total)
+    out = np.empty((4, total))
     place = starts.copy()
     per_x = 1.0 / sen[1]
     for v in range(H):
         yv = (v - sen[4]) / sen[2]
         for u in range(W):
             k = labels[v, u]
-            if k == 0:
+            if k == 0 or not wanted[k]:
                 continue
             i = place[k]
             place[k] = i + 1
-            x[i], y[i], z[i] = (u - sen[3]) * per_x, yv, depth[v, u]
-    for i in range(total):
-        sigma[i] = sigma_at(noise, z[i])
-    return starts, x, y, z, sigma
+            out[0, i], out[1, i], out[2, i] = (u - sen[3]) * per_x, yv, depth[v, u]
+    _sigmas(out[2], noise, out[3])
+    return starts, out[0], out[1], out[2], out[3]
+
+
+@njit(cache=True, error_model="numpy", fastmath=LOOSE)
+def _sigmas(z, noise, out):  # type: ignore[no-untyped-def]
+    """`sigma_at` of many depths, without a branch."""
+    a, b, c, d, e, f = noise[0], noise[1], noise[2], noise[3], noise[4], noise[5]
+    for i in range(z.shape[0]):
+        z2 = z[i] * z[i]
+        white, slow, step = a + b * z2, c + d * z2, e + f * z2
+        out[i] = np.sqrt(max(white * white, step * step / 12.0) + slow * slow)

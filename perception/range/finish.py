@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from perception.range import fit
-from perception.range.claim import gather_all
+from perception.range.claim import gather
 from perception.range.noise import NoiseModel
 from perception.range.primitives import (
     COVARIANCE_OVER,
@@ -43,12 +43,38 @@ class Samples:
 
 
 def samples_by_label(
-    depth_m: Array, sensor: RangeSensorModel, noise: NoiseModel, labels: Labels, count: int
+    depth_m: Array,
+    sensor: RangeSensorModel,
+    noise: NoiseModel,
+    labels: Labels,
+    count: int,
+    *,
+    wanted: NDArray[np.bool_] | None = None,
 ) -> list[Samples]:
-    """The pixels of labels 1 to `count`; entry 0 of the list is label 1."""
-    starts, x, y, z, sigma = gather_all(depth_m, sensor.packed(), noise.packed(), labels, count)
+    """The pixels of labels 1 to `count`; entry 0 of the list is label 1. Labels not `wanted` (count,) stay empty."""
+    flags = np.ones(count + 1, np.bool_)
+    if wanted is not None:
+        flags[1:] = wanted
+    starts, x, y, z, sigma = gather(depth_m, sensor.packed(), noise.packed(), labels, flags)
     cuts = [slice(a, b) for a, b in zip(starts[1:-1].tolist(), starts[2:].tolist(), strict=True)]
     return [Samples(x=x[c], y=y[c], z=z[c], sigma=sigma[c]) for c in cuts]
+
+
+def regrouped(
+    depth_m: Array,
+    sensor: RangeSensorModel,
+    noise: NoiseModel,
+    labels: Labels,
+    samples: list[Samples],
+    owner: list[int],
+) -> tuple[Labels, list[Samples]]:
+    """Labels and samples after label k has gone to `owner[k - 1]`; only what was joined is gathered again."""
+    parts = np.bincount(owner, minlength=len(owner) + 1)[1:]
+    if (parts == 1).all():
+        return labels, samples
+    labels = np.array([0, *owner], np.int32)[labels]
+    joined = samples_by_label(depth_m, sensor, noise, labels, len(owner), wanted=parts > 1)
+    return labels, [old if n == 1 else new for n, old, new in zip(parts.tolist(), samples, joined, strict=True)]
 
 
 def thinned(samples: Samples, most: int) -> Samples:
@@ -56,8 +82,8 @@ def thinned(samples: Samples, most: int) -> Samples:
     n = samples.x.size
     if n <= most:
         return samples
-    pick = np.linspace(0, n - 1, most).astype(np.int64)
-    return Samples(x=samples.x[pick], y=samples.y[pick], z=samples.z[pick], sigma=samples.sigma[pick])
+    x, y, z, sigma = _picked(samples.x, samples.y, samples.z, samples.sigma, most)
+    return Samples(x=x, y=y, z=z, sigma=sigma)
 
 
 def refine_surface(
@@ -92,6 +118,17 @@ def refine_surface(
         middle_m=middle,
     )
     return surface, th
+
+
+@njit(cache=True)
+def _picked(x, y, z, sigma, most):  # type: ignore[no-untyped-def]
+    """(4, most) evenly spread samples of (N,), the first and the last among them."""
+    out = np.empty((4, most))
+    step = (x.shape[0] - 1) / max(most - 1, 1)
+    for k in range(most):
+        i = int(k * step) if k < most - 1 or most == 1 else x.shape[0] - 1
+        out[0, k], out[1, k], out[2, k], out[3, k] = x[i], y[i], z[i], sigma[i]
+    return out
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -5,7 +5,7 @@ blocks that straddle a jump keep only the larger side. Planes are linear in the 
 depth of an orthographic sensor, so one linear fit serves both.
 """
 
-# ruff: noqa: PLR0915 - compiled loops take plain arrays, and long
+# ruff: noqa: PLR0912, PLR0124 - compiled loops take plain arrays, and long
 # bodies and plain comparisons are what compiles fast.
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from perception.range.components import for_each_tile
 from perception.range.noise import NoiseModel
 from perception.range.sensor import RangeSensorModel
+from perception.range.tangents import tangent_planes
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 JUMP_SLOPE = 2.5  # a surface seen steeper than 68 degrees counts as a jump between blocks
-JUMP_SIGMAS = 4.0
 NORMAL_SIGMA_GOAL_RAD = 0.06  # tangent planes noisier than this are fitted over a wider window
 WIDEST_RADIUS = 3
 LARGE_SIDE_PX = 1024
@@ -86,14 +86,16 @@ def build_grid(
     size_px: int,
     *,
     jump_slope: float = JUMP_SLOPE,
+    corner_px: tuple[int, int] = (0, 0),
     tiles: int = 1,
     pool: ThreadPoolExecutor | None = None,
 ) -> Grid:
     """Blocks of `size_px` pixels of an (H, W) depth image and their tangent planes; the window radius follows noise.
 
-    Neighbours steeper than `jump_slope` (metres of depth per metre across) are apart.
+    Neighbours steeper than `jump_slope` (metres of depth per metre across) are apart. `corner_px`: row and column of
+    the sensor at which the image begins, for a part of a larger one.
     """
-    packed = sensor.packed()
+    packed = seen_from(sensor, corner_px)
     law = noise.packed()
     h, w = (-(-n // size_px) for n in depth_m.shape)
     x, y = np.empty((h, w)), np.empty((h, w))
@@ -104,9 +106,9 @@ def build_grid(
     known = z[np.isfinite(z)]
     middle = float(np.median(known[:: max(1, known.size // 1024)])) if known.size else 1.0
     radius, slope_sigma = _radius(noise, sensor, middle, size_px)
-    slope = jump_slope / packed[1]
+    slope = jump_slope / packed[1] * size_px
     for_each_tile(
-        lambda a, b: _tangents(x, y, z, count, sigma, perspective, radius, slope, size_px, normal, rms, a, b),
+        lambda a, b: tangent_planes(x, y, z, count, sigma, perspective, radius, slope, normal, rms, a, b),
         h,
         tiles,
         pool=pool,
@@ -124,6 +126,14 @@ def build_grid(
         normal_sigma_rad=slope_sigma,
         slow_share=noise.slow_share(middle),
     )
+
+
+def seen_from(sensor: RangeSensorModel, corner_px: tuple[int, int]) -> Array:
+    """(5,) packed sensor of the part of its image that begins at row and column `corner_px`."""
+    packed = sensor.packed()
+    packed[3] -= corner_px[1]
+    packed[4] -= corner_px[0]
+    return packed
 
 
 def _radius(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float, size_px: int) -> tuple[int, float]:
@@ -146,7 +156,7 @@ def sigma_at(noise, z):  # type: ignore[no-untyped-def]
     return np.sqrt(max(white * white, step * step / 12.0) + slow * slow)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: ignore[no-untyped-def]
     H, W = depth.shape
     w = x.shape[1]
@@ -154,24 +164,24 @@ def _blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: 
     hop = (b + BLOCK_SAMPLES - 1) // BLOCK_SAMPLES
     full = ((b + hop - 1) // hop) ** 2
     values = np.empty(full)
+    medians = np.empty(w)
     for r in range(top, bottom):
+        y[r] = (r * b + 0.5 * (b - 1) - sen[4]) / sen[2]
         for c in range(w):
-            n = 0
-            for v in range(r * b, min(r * b + b, H), hop):
-                for u in range(c * b, min(c * b + b, W), hop):
-                    d = depth[v, u]
-                    if np.isfinite(d):
-                        k = n  # insertion sort: at most 16 values
-                        while k > 0 and values[k - 1] > d:
-                            values[k] = values[k - 1]
-                            k -= 1
-                        values[k] = d
-                        n += 1
-            if 2 * n < full or n == 0:
-                x[r, c] = (c * b + 0.5 * (b - 1) - sen[3]) / sen[1]
-                y[r, c] = (r * b + 0.5 * (b - 1) - sen[4]) / sen[2]
+            x[r, c] = (c * b + 0.5 * (b - 1) - sen[3]) / sen[1]
+        if b == 1:
+            medians[:] = depth[r]
+        elif b == 2 and 2 * r + 1 < H:
+            _medians_of_four(depth[2 * r], depth[2 * r + 1], medians)
+            if W % 2 == 1:
+                medians[w - 1] = _median(depth, b, hop, r, w - 1, values)
+        else:
+            for c in range(w):
+                medians[c] = _median(depth, b, hop, r, c, values)
+        for c in range(w):
+            median = medians[c]
+            if not np.isfinite(median):
                 continue
-            median = values[(n - 1) // 2]  # a real value, never the empty middle of a jump
             pitch = (median if perspective else 1.0) / sen[1]
             sig = sigma_at(noise, median)
             tol = JUMP_SLOPE * pitch * b * 0.7 + 3.0 * sig
@@ -199,68 +209,32 @@ def _blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: 
             sigma[r, c] = np.sqrt(kept + slow * slow)
 
 
-@njit(cache=True, nogil=True)
-def _tangents(  # type: ignore[no-untyped-def]
-    x, y, z, count, sigma, perspective, radius, slope_per_pixel, b, normal, rms, top, bottom
-):
-    h, w = z.shape
-    least = max(5, ((2 * radius + 1) ** 2) * 2 // 5)
-    for r in range(top, bottom):
-        for c in range(w):
-            z0 = z[r, c]
-            if not np.isfinite(z0):
-                continue
-            base, slope = JUMP_SIGMAS * sigma[r, c], (z0 if perspective else 1.0) * slope_per_pixel * b
-            x0, y0 = x[r, c], y[r, c]
-            g0 = 1.0 / z0 if perspective else z0
-            n = 0
-            s, sx, sy, sg, sxx, sxy, syy, sxg, syg, sgg = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for i in range(max(0, r - radius), min(h, r + radius + 1)):
-                for j in range(max(0, c - radius), min(w, c + radius + 1)):
-                    zj = z[i, j]
-                    reach = max(abs(i - r), abs(j - c))
-                    if not abs(zj - z0) <= base + slope * reach:  # also refuses NaN
-                        continue
-                    k = float(count[i, j])
-                    dx, dy = x[i, j] - x0, y[i, j] - y0
-                    g = (1.0 / zj if perspective else zj) - g0
-                    n += 1
-                    s += k
-                    sx += k * dx
-                    sy += k * dy
-                    sg += k * g
-                    sxx += k * dx * dx
-                    sxy += k * dx * dy
-                    syy += k * dy * dy
-                    sxg += k * dx * g
-                    syg += k * dy * g
-                    sgg += k * g * g
-            if n < least:
-                continue
-            sxx -= sx * sx / s
-            sxy -= sx * sy / s
-            syy -= sy * sy / s
-            sxg -= sx * sg / s
-            syg -= sy * sg / s
-            sgg -= sg * sg / s
-            det = sxx * syy - sxy * sxy
-            if det <= 1e-4 * sxx * syy or det <= 0.0:
-                continue
-            p = (syy * sxg - sxy * syg) / det
-            q = (sxx * syg - sxy * sxg) / det
-            left = max(sgg - p * sxg - q * syg, 0.0) / s * n / max(n - 3, 1)
-            scale = z0 * z0 if perspective else 1.0
-            rms[r, c] = np.sqrt(left) * scale / sigma[r, c]
-            if perspective:
-                # w = p x + q y + c is the plane (p, q, c) . X = 1
-                nx, ny, nz = p, q, g0 + (sg - p * sx - q * sy) / s - p * x0 - q * y0
-                facing = nx * x0 + ny * y0 + nz
-            else:
-                nx, ny, nz = -p, -q, 1.0
-                facing = 1.0
-            length = np.sqrt(nx * nx + ny * ny + nz * nz)
-            if facing > 0:
-                length = -length
-            normal[r, c, 0] = nx / length
-            normal[r, c, 1] = ny / length
-            normal[r, c, 2] = nz / length
+@njit(cache=True, error_model="numpy")
+def _median(depth, b, hop, r, c, values):  # type: ignore[no-untyped-def]
+    """Lower median of a block's samples, a real value and never the empty middle of a jump; NaN if most are missing."""
+    n = 0
+    for v in range(r * b, min(r * b + b, depth.shape[0]), hop):
+        for u in range(c * b, min(c * b + b, depth.shape[1]), hop):
+            d = depth[v, u]
+            if np.isfinite(d):
+                k = n  # insertion sort: at most 16 values
+                while k > 0 and values[k - 1] > d:
+                    values[k] = values[k - 1]
+                    k -= 1
+                values[k] = d
+                n += 1
+    return values[(n - 1) // 2] if n > 0 and 2 * n >= values.shape[0] else np.nan
+
+
+@njit(cache=True, error_model="numpy")
+def _medians_of_four(upper, lower, out):  # type: ignore[no-untyped-def]
+    """`_median` of blocks of 2 x 2 pixels by a sorting network, missing readings last."""
+    for c in range(upper.shape[0] // 2):
+        p, q, s, t = upper[2 * c], upper[2 * c + 1], lower[2 * c], lower[2 * c + 1]
+        p, q = p if p == p else np.inf, q if q == q else np.inf
+        s, t = s if s == s else np.inf, t if t == t else np.inf
+        low_1, high_1, low_2, high_2 = min(p, q), max(p, q), min(s, t), max(s, t)
+        second, third = min(max(low_1, low_2), high_1, high_2), max(low_1, low_2, min(high_1, high_2))
+        # Of three or four readings the second, of two the first; one alone is too few.
+        median = min(low_1, low_2) if third == np.inf else second
+        out[c] = median if second < np.inf else np.nan

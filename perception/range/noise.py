@@ -23,6 +23,8 @@ QUANTILE = 0.25  # windows on creases, jumps and gross errors lie above it in al
 WORST_SHARE = 0.03  # of the depth: an image that scatters more shows no surface, and no model may explain it as one
 NORMAL_QUANTILE = -0.6745
 DEPTH_BINS = 6
+TYPICAL_SAMPLES = 2048
+CODE_SAMPLES = 1024
 STEPPED_SHARE = 0.25  # fewer distinct values than this share of the pixels: the depth comes in codes
 FLOOR_RATIO = 0.15  # of the pixel pitch: real surfaces are no truer than this, and noise-free images keep weights
 
@@ -97,13 +99,11 @@ def estimate_noise(depth_m: Array, sensor: RangeSensorModel) -> NoiseModel:
 
 def coding_step(depth_m: Array) -> tuple[float, float]:
     """`(a, b)` of the step between neighbouring depth codes `a + b z^2`; (0, 0) for continuous depth."""
-    values = depth_m[np.isfinite(depth_m)]
-    if values.size < 16:
-        return 0.0, 0.0
     # A sample decides quickly whether the depth is continuous; only coded depth is worth a full sort.
-    sample = values[:: max(1, values.size // 1024)]
-    if np.unique(sample).size > 0.7 * sample.size:
+    sample = _valid_sample(depth_m, CODE_SAMPLES)
+    if sample.size < 16 or np.unique(sample).size > 0.7 * sample.size:
         return 0.0, 0.0
+    values = depth_m[np.isfinite(depth_m)]
     codes = np.unique(values)
     if codes.size > STEPPED_SHARE * values.size or codes.size < 4:
         return 0.0, 0.0
@@ -117,11 +117,28 @@ def coding_step(depth_m: Array) -> tuple[float, float]:
 
 def typical_depths_m(depth_m: Array) -> Array:
     """(5,) quantiles of the valid depths, metres: where a noise law is judged."""
-    values = depth_m[np.isfinite(depth_m)]
-    if values.size == 0:
+    sample = np.sort(_valid_sample(depth_m, TYPICAL_SAMPLES))
+    if sample.size == 0:
         return np.ones(5)
-    sample = np.sort(values[:: max(1, values.size // 2048)])
     return np.asarray(sample[(np.array([0.1, 0.3, 0.5, 0.7, 0.9]) * (sample.size - 1)).astype(int)], float)
+
+
+@njit(cache=True)
+def _valid_sample(depth, most):  # type: ignore[no-untyped-def]
+    """Every n-th of the valid depths in raster order, n so that about `most` remain."""
+    flat = depth.ravel()
+    valid = 0
+    for i in range(flat.shape[0]):
+        valid += 1 if np.isfinite(flat[i]) else 0
+    stride = max(1, valid // most)
+    out = np.empty((valid + stride - 1) // stride)
+    seen = 0
+    for i in range(flat.shape[0]):
+        if np.isfinite(flat[i]):
+            if seen % stride == 0:
+                out[seen // stride] = flat[i]
+            seen += 1
+    return out
 
 
 def _window_law(g: Array, perspective: bool, *, spacing_px: int, stride_px: int) -> tuple[float, float]:

@@ -14,7 +14,8 @@ from perception.range.surfaces import CONE, CYLINDER, FREEDOM, GRAZING_COSINE, P
 
 CHUNK = 128
 DEPTH, COSINE, FIRST, WEIGHT, RESIDUAL = 0, 1, 2, 11, 12  # rows of the scratch array; derivatives are 2 to 10
-SCRATCH = 13 * CHUNK
+LOADED = 13  # x, y, z and sigma of the samples
+SCRATCH = 17 * CHUNK
 LANES = 16  # rows are padded with zeros to this many samples: sums then need no remainder loop
 MISS_SIGMAS = 6.0  # a ray that misses the surface costs as much as a residual of this size
 CAUCHY_WIDTH = 2.0
@@ -23,30 +24,43 @@ LOOSE = {"reassoc", "contract", "nsz", "arcp"}  # sums may be reordered; NaN kee
 
 
 @njit(cache=True, error_model="numpy")
-def fill_rows(kind, th, frame, x, y, first, n, perspective, work):  # type: ignore[no-untyped-def]
-    """Depth, cosine of incidence and derivatives (as `depth_and_jacobian`) of samples first .. first + n into `work`.
+def load_rows(x, y, z, sigma, first, n, work):  # type: ignore[no-untyped-def]
+    """Samples first .. first + n into `work`.
+
+    Loops that read and write several arrays ask at run time whether these may overlap, and round otherwise when they lie
+    side by side in memory. Within one array at fixed places there is nothing to ask: the same input, the same bits.
+    """
+    work[LOADED * CHUNK : LOADED * CHUNK + n] = x[first : first + n]
+    work[(LOADED + 1) * CHUNK : (LOADED + 1) * CHUNK + n] = y[first : first + n]
+    work[(LOADED + 2) * CHUNK : (LOADED + 2) * CHUNK + n] = z[first : first + n]
+    work[(LOADED + 3) * CHUNK : (LOADED + 3) * CHUNK + n] = sigma[first : first + n]
+
+
+@njit(cache=True, error_model="numpy")
+def fill_rows(kind, th, frame, n, perspective, work):  # type: ignore[no-untyped-def]
+    """Depth, cosine of incidence and derivatives (as `depth_and_jacobian`) of the `n` loaded samples into `work`.
 
     `work` (SCRATCH,) holds rows of CHUNK numbers; n <= CHUNK. Depth is NaN where a ray misses.
     """
     p = 1.0 if perspective else 0.0
     if kind == PLANE:
-        _plane(th, frame, x, y, first, n, p, work)
+        _plane(th, frame, n, p, work)
     elif kind == SPHERE:
-        _sphere(th, x, y, first, n, p, work)
+        _sphere(th, n, p, work)
     elif kind == CYLINDER:
-        _cylinder(th, frame, x, y, first, n, p, work)
+        _cylinder(th, frame, n, p, work)
     elif kind == CONE:
-        _cone(th, frame, x, y, first, n, p, work)
+        _cone(th, frame, n, p, work)
     else:
-        _quadric(th, x, y, first, n, p, work)
+        _quadric(th, n, p, work)
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def _plane(th, frame, x, y, first, n, p, work):  # type: ignore[no-untyped-def]
+def _plane(th, frame, n, p, work):  # type: ignore[no-untyped-def]
     nx, ny, nz, d = th[0], th[1], th[2], th[3]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
     for i in range(n):
-        xi, yi = x[first + i], y[first + i]
+        xi, yi = work[1664 + i], work[1792 + i]
         dx, dy = p * xi, p * yi
         ox, oy = xi - dx, yi - dy
         facing = nx * dx + ny * dy + nz
@@ -61,12 +75,12 @@ def _plane(th, frame, x, y, first, n, p, work):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def _sphere(th, x, y, first, n, p, work):  # type: ignore[no-untyped-def]
+def _sphere(th, n, p, work):  # type: ignore[no-untyped-def]
     cx, cy, cz, r = th[0], th[1], th[2], th[3]
     side = 1.0 if th[4] > 0 else -1.0
     inverse_r = 1.0 / r
     for i in range(n):
-        xi, yi = x[first + i], y[first + i]
+        xi, yi = work[1664 + i], work[1792 + i]
         dx, dy = p * xi, p * yi
         wx, wy = xi - dx - cx, yi - dy - cy
         a = dx * dx + dy * dy + 1.0
@@ -85,13 +99,13 @@ def _sphere(th, x, y, first, n, p, work):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def _cylinder(th, frame, x, y, first, n, p, work):  # type: ignore[no-untyped-def]
+def _cylinder(th, frame, n, p, work):  # type: ignore[no-untyped-def]
     cx, cy, cz, ax, ay, az, r = th[0], th[1], th[2], th[3], th[4], th[5], th[6]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
     side = 1.0 if th[7] > 0 else -1.0
     inverse_r = 1.0 / r
     for i in range(n):
-        xi, yi = x[first + i], y[first + i]
+        xi, yi = work[1664 + i], work[1792 + i]
         dx, dy = p * xi, p * yi
         wx, wy = xi - dx - cx, yi - dy - cy
         da = dx * ax + dy * ay + az
@@ -119,14 +133,14 @@ def _cylinder(th, frame, x, y, first, n, p, work):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def _cone(th, frame, x, y, first, n, p, work):  # type: ignore[no-untyped-def]
+def _cone(th, frame, n, p, work):  # type: ignore[no-untyped-def]
     cx, cy, cz, ax, ay, az = th[0], th[1], th[2], th[3], th[4], th[5]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
     outside = th[7] > 0
     ca, sa = np.cos(th[6]), np.sin(th[6])
     square = ca * ca
     for i in range(n):
-        xi, yi = x[first + i], y[first + i]
+        xi, yi = work[1664 + i], work[1792 + i]
         dx, dy = p * xi, p * yi
         wx, wy = xi - dx - cx, yi - dy - cy
         da = dx * ax + dy * ay + az
@@ -162,14 +176,14 @@ def _cone(th, frame, x, y, first, n, p, work):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def _quadric(th, x, y, first, n, p, work):  # type: ignore[no-untyped-def]
+def _quadric(th, n, p, work):  # type: ignore[no-untyped-def]
     s = 1.0 / th[3]
     cx, cy, cz = th[0] * s, th[1] * s, th[2] * s
     qxx, qyy, qzz, qxy, qxz, qyz, qx, qy, qz, q0 = (
         th[4], th[5], th[6], th[7], th[8], th[9], th[10], th[11], th[12], th[13],
     )  # fmt: skip
     for i in range(n):
-        xi, yi = x[first + i], y[first + i]
+        xi, yi = work[1664 + i], work[1792 + i]
         dx, dy, dz = p * xi * s, p * yi * s, s
         wx, wy, wz = xi * s - dx - cx, yi * s - dy - cy, -cz
         # Gradients at the origin of the ray and along it; the quadric is c + 2 b z + a z^2 there.
@@ -209,20 +223,20 @@ def _quadric(th, x, y, first, n, p, work):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def _residual_row(z, sigma, first, n, work):  # type: ignore[no-untyped-def]
+def _residual_row(n, work):  # type: ignore[no-untyped-def]
     for i in range(n):
         grazing = min(1.0, work[128 + i] * (1.0 / GRAZING_COSINE))
-        work[1536 + i] = (z[first + i] - work[i]) * grazing / sigma[first + i]
+        work[1536 + i] = (work[1920 + i] - work[i]) * grazing / work[2048 + i]
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def _cauchy_weights(z, sigma, first, n, c2, work):  # type: ignore[no-untyped-def]
+def _cauchy_weights(n, c2, work):  # type: ignore[no-untyped-def]
     """Rows WEIGHT and RESIDUAL under Cauchy weights, 1 + ratio in row DEPTH; returns the number of samples that hit."""
     used = 0.0
     for i in range(n):
         zm = work[i]
-        w = min(1.0, work[128 + i] * (1.0 / GRAZING_COSINE)) / sigma[first + i]
-        e = (z[first + i] - zm) * w
+        w = min(1.0, work[128 + i] * (1.0 / GRAZING_COSINE)) / work[2048 + i]
+        e = (work[1920 + i] - zm) * w
         hit = abs(e) < FARTHEST
         e2 = e * e if hit else MISS_SIGMAS * MISS_SIGMAS
         ratio = 1.0 + e2 / c2
@@ -249,13 +263,13 @@ def _sum_of_logarithms(values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def _trim_weights(z, sigma, first, n, trim, work):  # type: ignore[no-untyped-def]
+def _trim_weights(n, trim, work):  # type: ignore[no-untyped-def]
     """Rows WEIGHT and RESIDUAL under a trim; returns cost and number of samples kept."""
     used, cost = 0.0, 0.0
     for i in range(n):
         zm = work[i]
-        w = min(1.0, work[128 + i] * (1.0 / GRAZING_COSINE)) / sigma[first + i]
-        e = (z[first + i] - zm) * w
+        w = min(1.0, work[128 + i] * (1.0 / GRAZING_COSINE)) / work[2048 + i]
+        e = (work[1920 + i] - zm) * w
         kept = abs(e) <= trim
         cost += e * e if kept else trim * trim
         work[1408 + i] = w if kept else 0.0
@@ -307,12 +321,13 @@ def normal_equations(kind, th, frame, x, y, z, sigma, perspective, scale, trim, 
     count = x.shape[0]
     for first in range(0, count, CHUNK):
         n = min(CHUNK, count - first)
-        fill_rows(kind, th, frame, x, y, first, n, perspective, work)
+        load_rows(x, y, z, sigma, first, n, work)
+        fill_rows(kind, th, frame, n, perspective, work)
         if scale > 0.0:
-            hits = _cauchy_weights(z, sigma, first, n, c2, work)
+            hits = _cauchy_weights(n, c2, work)
             more = c2 * _sum_of_logarithms(work[:n])
         else:
-            more, hits = _trim_weights(z, sigma, first, n, trim, work)
+            more, hits = _trim_weights(n, trim, work)
         cost += more
         used += hits
         _add_products(p, n, work, H, g)
@@ -330,6 +345,7 @@ def residuals(kind, th, x, y, z, sigma, perspective, out):  # type: ignore[no-un
     count = x.shape[0]
     for first in range(0, count, CHUNK):
         n = min(CHUNK, count - first)
-        fill_rows(kind, th, frame, x, y, first, n, perspective, work)
-        _residual_row(z, sigma, first, n, work)
+        load_rows(x, y, z, sigma, first, n, work)
+        fill_rows(kind, th, frame, n, perspective, work)
+        _residual_row(n, work)
         out[first : first + n] = work[RESIDUAL * CHUNK : RESIDUAL * CHUNK + n]

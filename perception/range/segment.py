@@ -11,9 +11,10 @@ Each round leaves fewer free blocks, and rounds end when no surface is added.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +22,7 @@ from perception.range import grow
 from perception.range.claim import bucket, claim_borders, claim_pixels
 from perception.range.compete import Candidates, explain
 from perception.range.components import for_each_tile, label_components
-from perception.range.grid import Grid, block_size, build_grid
+from perception.range.grid import Grid, block_size, build_grid, seen_from
 from perception.range.noise import WORST_SHARE, NoiseModel, typical_depths_m
 from perception.range.sensor import RangeSensorModel
 from perception.range.settle import settle
@@ -46,21 +47,32 @@ MOST_ATTEMPTS = 120  # on one grid: bounds the time that rubble can cost
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Task:
-    """What every step needs: the (H, W) depth in metres, the sensor, and how many tiles share the pixel work."""
+    """What every step needs: the (H, W) depth in metres, the sensor, and how many tiles share the pixel work.
+
+    The depth may be a part of the sensor's image, which begins at row and column `corner_px`.
+    """
 
     depth_m: Array
     sensor: RangeSensorModel
     tiles: int = 1
     pool: ThreadPoolExecutor | None = None
+    corner_px: tuple[int, int] = (0, 0)
 
     @property
     def least_pixels(self) -> float:
         """Pixels of the smallest surface that is looked for."""
-        return LEAST_PIXELS_AT_256 * self.depth_m.size / 65536
+        return LEAST_PIXELS_AT_256 * self.sensor.width_px * self.sensor.height_px / 65536
+
+    @property
+    def packed(self) -> Array:
+        """(5,) the sensor of this part of the image, as compiled loops read it."""
+        return seen_from(self.sensor, self.corner_px)
 
     def grid(self, depth_m: Array, noise: NoiseModel, size: int, **slope: float) -> Grid:
         """Blocks of `size` pixels of a depth image of this task's sensor."""
-        return build_grid(depth_m, self.sensor, noise, size, tiles=self.tiles, pool=self.pool, **slope)
+        return build_grid(
+            depth_m, self.sensor, noise, size, corner_px=self.corner_px, tiles=self.tiles, pool=self.pool, **slope
+        )
 
 
 def segment(task: Task, noise: NoiseModel) -> tuple[Labels, Candidates, NoiseModel]:
@@ -99,23 +111,51 @@ def _settled_planes(task: Task, noise: NoiseModel) -> tuple[Candidates, Grid, La
 
 
 def _finer(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, size: int) -> Labels:
-    """Surfaces too small for the coarse blocks, from the pixels that nothing explains yet; returns new labels."""
-    left = np.where(labels == 0, task.depth_m, np.nan)
-    grid = task.grid(left, noise, size, jump_slope=STEEP_SLOPE)
+    """Surfaces too small for the coarse blocks, from the pixels that nothing explains yet; returns new labels.
+
+    Only patches that can hold the smallest surface are looked at, and only the part of the image that holds them.
+    """
+    least = max(8, round(task.least_pixels / size**2))
+    patches = unexplained(task.depth_m, labels, least if size == 1 else least * size**2 // 2, align_px=size)
+    if patches is None:
+        return labels
+    (top, left), left_over = patches
+    part = replace(task, depth_m=left_over, corner_px=(top, left))
+    grid = part.grid(left_over, noise, size, jump_slope=STEEP_SLOPE)
     blocks = np.zeros(grid.z.shape, np.int32)
     before = len(found.kinds)
-    _recover_planes(task, grid, blocks, found)
-    _recover_curved(task, grid, blocks, found, max(8, round(task.least_pixels / size**2)))
+    _recover_planes(part, grid, blocks, found)
+    _recover_curved(part, grid, blocks, found, least)
     if len(found.kinds) == before:
         return labels
-    fine = _claimed(task, noise, blocks, found, size=size)
-    return np.where(labels > 0, labels, fine)
+    inside = labels[top : top + left_over.shape[0], left : left + left_over.shape[1]]
+    inside[:] = np.where(inside > 0, inside, _claimed(part, noise, blocks, found, size=size))
+    return labels
+
+
+def unexplained(
+    depth_m: Array, labels: Labels, least_pixels: int, *, align_px: int
+) -> tuple[tuple[int, int], Array] | None:
+    """The least part of the image that holds every unlabelled patch of at least `least_pixels`, None without any.
+
+    Returns its first row and column, multiples of `align_px`, and its depth, NaN outside of those patches.
+    """
+    free = (labels == 0) & np.isfinite(depth_m)
+    _, patch, boxes, _ = cv2.connectedComponentsWithStats(free.view(np.uint8), connectivity=8)
+    large = boxes[:, cv2.CC_STAT_AREA] >= least_pixels
+    large[0] = False
+    if not large.any():
+        return None
+    left, top, width, height = (boxes[large, k] for k in range(4))
+    first_row, first_column = (int(n.min()) // align_px * align_px for n in (top, left))
+    part = np.s_[first_row : int((top + height).max()), first_column : int((left + width).max())]
+    return (first_row, first_column), np.where(large[patch[part]], depth_m[part], np.nan)
 
 
 def _claimed(task: Task, noise: NoiseModel, blocks: Labels, found: Candidates, *, size: int) -> Labels:
     labels = np.zeros(task.depth_m.shape, np.int32)
     kinds, table = found.arrays()
-    packed, law = task.sensor.packed(), noise.packed()
+    packed, law = task.packed, noise.packed()
     for_each_tile(
         lambda top, bottom: claim_pixels(task.depth_m, packed, law, blocks, size, kinds, table, labels, top, bottom),
         blocks.shape[0],
@@ -128,7 +168,7 @@ def _claimed(task: Task, noise: NoiseModel, blocks: Labels, found: Candidates, *
 def reclaimed(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, sweeps: int) -> Labels:
     """Labels after judging border pixels again `sweeps` times against the surfaces of `found`."""
     kinds, table = found.arrays()
-    packed, law = task.sensor.packed(), noise.packed()
+    packed, law = task.packed, noise.packed()
     for _ in range(sweeps):
         labels = _border_sweep(task, (packed, law, kinds, table), labels)
     return labels
@@ -149,7 +189,7 @@ def _border_sweep(task: Task, constants: tuple[Array, Array, NDArray[np.int64], 
 def settled(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, sweeps: int) -> Labels:
     """Labels after `sweeps` in which pixels between two equally good surfaces follow their neighbours."""
     kinds, table = found.arrays()
-    packed, law = task.sensor.packed(), noise.packed()
+    packed, law = task.packed, noise.packed()
     slow = noise.slow_share(float(typical_depths_m(task.depth_m)[2]))
     earlier = np.full_like(labels, -1)
     for _ in range(sweeps):
@@ -196,7 +236,7 @@ def _recover_planes(task: Task, grid: Grid, blocks: Labels, found: Candidates) -
 def _recover_curved(task: Task, grid: Grid, blocks: Labels, found: Candidates, least: int) -> None:
     """Offer each smooth component of unlabelled blocks to all primitives until no round adds a surface."""
     free: Flags = np.isfinite(grid.z) & (blocks == 0)
-    packed = task.sensor.packed()
+    packed = task.packed
     turn_limit = float(np.cos(max(0.7, 5.0 * grid.normal_sigma_rad)))
     attempts = 0
     for _ in range(ROUNDS):

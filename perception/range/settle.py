@@ -12,14 +12,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from perception.range.claim import CLAIM_SIGMAS, misfit
+from perception.range.claim import CLAIM_SIGMAS, NO_LABEL, add_row, misfit
 from perception.range.grid import sigma_at
 
 REACH_PX = 2  # neighbours of 5 x 5
 SHARED_PX = 25.0  # they share one value of the slow noise
 NEIGHBOUR_WEIGHT = 3.0  # in units of half a squared residual, for a pixel whose neighbours all bear the other label
 MOST = 12
-NO_LABEL = np.int32(2**31 - 1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -40,7 +39,8 @@ def settle(depth, sen, noise, slow_share, earlier, labels, kinds, ths, out, top,
         out[v] = labels[v]
         least[:], most[:], change[:] = NO_LABEL, 0, 0
         for i in range(max(0, v - REACH_PX), min(H, v + REACH_PX + 1)):
-            _add_row(earlier[i], labels[i], least[2:-2], most[2:-2], change[2:-2])
+            add_row(labels[i], least[2:-2], most[2:-2])
+            _add_changes(earlier[i], labels[i], change[2:-2])
         _contested(labels[v], least, most, change, contested)
         for u in range(W):
             z = depth[v, u]
@@ -81,13 +81,9 @@ def settle(depth, sen, noise, slow_share, earlier, labels, kinds, ths, out, top,
 
 
 @njit(cache=True, error_model="numpy")
-def _add_row(earlier, labels, least, most, change):  # type: ignore[no-untyped-def]
-    """One more row of the neighbourhood: least label that is none of 0, largest label, non-zero where one changed."""
+def _add_changes(earlier, labels, change):  # type: ignore[no-untyped-def]
     for u in range(labels.shape[0]):
-        k = labels[u]
-        least[u] = min(least[u], k if k > 0 else NO_LABEL)
-        most[u] = max(most[u], k)
-        change[u] |= k ^ earlier[u]
+        change[u] |= labels[u] ^ earlier[u]
 
 
 @njit(cache=True, error_model="numpy")

@@ -70,7 +70,8 @@ def test_each_ray_is_as_the_plain_function_has_it(kind, perspective):
         x, y = random_rays(perspective, 100, rng)
         z, cosine, J, frame = plain_rows(kind, th, x, y, perspective)
         work = np.zeros(rays.SCRATCH)
-        rays.fill_rows(kind, th, frame, x, y, 0, 100, perspective, work)
+        rays.load_rows(x, y, x, y, 0, 100, work)
+        rays.fill_rows(kind, th, frame, 100, perspective, work)
         rows = work.reshape(-1, rays.CHUNK)[:, :100]
         np.testing.assert_array_equal(np.isnan(rows[rays.DEPTH]), np.isnan(z))
         seen = cosine > GRAZING_RAD
@@ -123,3 +124,25 @@ def test_residuals_are_in_sigmas_and_nan_where_a_ray_misses():
     out = np.empty(3)
     rays.residuals(SPHERE, th, x, y, z, np.full(3, 1e-3), True, out)
     np.testing.assert_allclose(out, [0.0, 2.0, np.nan], atol=1e-9)
+
+
+def test_sums_do_not_depend_on_where_the_samples_lie_in_memory():
+    """Samples right before or behind the scratch array must not send a loop down another path: same input, same bits."""
+    rng = np.random.default_rng(9)
+    th = random_surface(SPHERE, rng)
+    frame, count = np.zeros(6), 300
+    frame_of(SPHERE, th, frame)
+    x, y = random_rays(False, count, rng)
+    samples = np.stack([x, y, 0.6 + 0.05 * rng.normal(size=count), np.full(count, 0.03)])
+    seen = set()
+    for place in range(5):
+        pool = np.zeros(4 * count + rays.SCRATCH)
+        parts = [pool[k * count : (k + 1) * count] for k in range(place)]
+        parts += [pool[k * count + rays.SCRATCH : (k + 1) * count + rays.SCRATCH] for k in range(place, 4)]
+        work = pool[place * count : place * count + rays.SCRATCH]
+        for part, values in zip(parts, samples, strict=True):
+            part[:] = values
+        H, g = np.zeros((9, 9)), np.zeros(9)
+        cost, _ = rays.normal_equations(SPHERE, th, frame, *parts, False, 0.0, 3.0, H, g, work)
+        seen.add((cost, H.tobytes(), g.tobytes()))
+    assert len(seen) == 1

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from typing import Annotated, Literal
+from collections.abc import Sequence
+from typing import Annotated, Literal, TypeVar
 
 from fastapi import APIRouter, Path, Query
 from fastapi import Depends as DependsOn
@@ -16,7 +17,7 @@ from service.http.images import store_of
 from service.http.problems import RESPONSES
 from service.http.state import AppState, State
 from service.lessons import OutlineRequest, TeachRequest, find_outline, questions_of, teach
-from service.teachings import KnowledgeFile, Teachings
+from service.teachings import KnowledgeFile, NoSuchKnowledge, Teachings
 
 router = APIRouter(prefix="/v1/knowledge", tags=["knowledge"], responses=RESPONSES)
 PlainName = Annotated[str, Path(max_length=64, examples=["mushroom"])]
@@ -106,6 +107,9 @@ class TaughtView(BaseModel):
     lights_are_seen: bool | None = None
 
 
+V = TypeVar("V", KindView, PanelView)
+
+
 @router.get("", summary="Kinds, objects and panels, with their TOML", operation_id="list_knowledge")
 async def list_knowledge(
     state: State, toml: Annotated[bool, Query(description="with the text of the files")] = True
@@ -150,11 +154,30 @@ async def teach_something(
     return TaughtView(**taught)
 
 
+@router.get("/kinds/{name}", summary="One kind, with its TOML", operation_id="show_kind")
+async def show_kind(state: State, name: PlainName) -> KindView:
+    kinds = (await state.in_thread(functools.partial(_knowledge, state, with_text=True))).kinds
+    return _named(kinds, name)
+
+
+@router.get("/panels/{name}", summary="One panel, with its TOML", operation_id="show_panel_knowledge")
+async def show_panel_knowledge(state: State, name: PlainName) -> PanelView:
+    panels = (await state.in_thread(functools.partial(_knowledge, state, with_text=True))).panels
+    return _named(panels, name)
+
+
 @router.delete(
     "/{group}/{name}", status_code=204, summary="Forget a taught kind or panel", operation_id="forget_knowledge"
 )
 async def forget(state: State, group: Literal["kinds", "panels"], name: PlainName) -> None:
     await state.in_thread(functools.partial(_teachings(state).forget, group, name))
+
+
+def _named(known: Sequence[V], name: str) -> V:
+    for view in known:
+        if view.name == name:
+            return view
+    raise NoSuchKnowledge("nothing of that name is known", hint="GET /v1/knowledge lists what is known")
 
 
 def _teachings(state: AppState) -> Teachings:

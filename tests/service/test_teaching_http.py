@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Callable
 
 import httpx2
 import numpy as np
@@ -106,3 +107,40 @@ def test_the_questions_of_a_kind_are_served(web: httpx2.Client) -> None:
     asked = web.get("/v1/knowledge/questions?kind=gauge").json()["questions"]
     assert [q["key"] for q in asked] == ["name", "minimum", "maximum", "unit", "at_min", "at_max"]
     assert web.get("/v1/knowledge/questions?kind=pyramid").status_code == 422
+
+
+def test_one_kind_and_one_panel_are_shown(web: httpx2.Client, house: Panelwright) -> None:
+    gauge = web.get("/v1/knowledge/kinds/gauge").json()
+    assert not gauge["is_taught"] and parse_toml(gauge["toml"], KindRecord, source="answer").name == "gauge"
+    own = house.service.cell.panel
+    assert parse_toml(web.get(f"/v1/knowledge/panels/{own.name}").json()["toml"], Panel, source="answer") == own
+    is_problem(web.get("/v1/knowledge/kinds/teapot"), 404, "no-such-knowledge", "nothing of that name")
+    is_problem(web.get("/v1/knowledge/panels/teapot"), 404, "no-such-knowledge", "nothing of that name")
+
+
+@pytest.mark.parametrize("lesson", ["outline", "kind", "panel"])
+@pytest.mark.parametrize(
+    ("change", "kind", "words"),
+    [
+        (np.zeros_like, "not-observable", "black"),
+        (lambda image: np.full_like(image, 255), "not-observable", "saturated"),
+        (lambda image: np.full_like(image, 90), "not-found", "no plate"),
+        (lambda image: np.hstack([image, image]), "ambiguous", "two panels"),
+    ],
+    ids=["black", "saturated", "nothing", "two"],
+)
+def test_images_that_teach_nothing_are_refused_with_the_reason(
+    web: httpx2.Client, shown: Shown, lesson: str, change: Callable[[np.ndarray], np.ndarray], kind: str, words: str
+) -> None:
+    image = store(web, np.ascontiguousarray(change(shown[0])))
+    before = web.get("/v1/knowledge?toml=false").json()
+    clicks = {"clicks_px": middle(shown, "pressure")}
+    thing = {"kind": "gauge", "name": "a", **clicks}
+    more = {
+        "outline": clicks,
+        "kind": {"kind": "pump", **clicks},
+        "panel": {"panel": {"name": "p", "objects": [thing]}},
+    }
+    path = "/v1/knowledge/outline" if lesson == "outline" else "/v1/knowledge/teach"
+    is_problem(web.post(path, json={"image": image, "plate_m": PLATE, **more[lesson]}), 409, kind, words)
+    assert web.get("/v1/knowledge?toml=false").json() == before

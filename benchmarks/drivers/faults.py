@@ -16,6 +16,7 @@ from drivers.emulators.faults import WireFault
 from hal.errors import CellError
 from hal.readings import Quality, Stamped
 
+MIXED = "mixed"  # another of the device's faults each time
 SLACK_S = 0.05
 BEAT_S = 0.005
 STALL_S = 0.001  # the probe woke so much too late: this process did not run, and no driver could have answered
@@ -76,21 +77,21 @@ class StallProbe:
 
 def part_faults(seconds: float) -> None:
     """Every cell, then one line a device and frequency, and the cells without any good sample by name."""
-    keys = [(item.name, fault, every) for item in BENCHES for every in (3, 20) for fault in item.faults]
+    keys = [(item.name, fault, every) for item in BENCHES for every in (3, 20) for fault in (*item.faults, MIXED)]
     order = sorted(keys, key=lambda key: (key[1], key[2], key[0]))  # a batch mixes light and heavy devices
     batches = [order[i : i + AT_ONCE] for i in range(0, len(order), AT_ONCE)]
-    cells: dict[tuple[str, WireFault, int], Cell] = {}
+    cells: dict[tuple[str, str, int], Cell] = {}
     started_s = time.monotonic()
     with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("spawn")) as pool:
         for batch, found in zip(batches, pool.map(run_batch, batches, [seconds] * len(batches)), strict=True):
             cells.update(zip(batch, found, strict=True))
     for item in BENCHES:
         for every in (3, 20):
-            _row(item, every, {fault: cells[item.name, fault, every] for fault in item.faults})
+            _row(item, every, {fault: cells[item.name, fault, every] for fault in (*item.faults, MIXED)})
     print(f"    {len(cells)} cells of {seconds:.0f} s in {time.monotonic() - started_s:.0f} s of wall time")
 
 
-def _row(item: Bench, every: int, cells: dict[WireFault, Cell]) -> None:
+def _row(item: Bench, every: int, cells: dict[str, Cell]) -> None:
     total = Cell()
     for cell in cells.values():
         total.add(cell)
@@ -104,7 +105,7 @@ def _row(item: Bench, every: int, cells: dict[WireFault, Cell]) -> None:
         print(f"    {total.stalled} more calls were late while the machine did not run this process")
 
 
-def run_batch(batch: list[tuple[str, WireFault, int]], seconds: float) -> list[Cell]:
+def run_batch(batch: list[tuple[str, str, int]], seconds: float) -> list[Cell]:
     """Some cells at the same time (in a worker process)."""
     sys.setswitchinterval(0.001)
     probe = StallProbe()
@@ -114,10 +115,12 @@ def run_batch(batch: list[tuple[str, WireFault, int]], seconds: float) -> list[C
     return found
 
 
-def fault_cell(item: Bench, fault: WireFault, every: int, seconds: float, probe: StallProbe) -> Cell:
+def fault_cell(item: Bench, fault: str, every: int, seconds: float, probe: StallProbe) -> Cell:
     """Read over a bad wire for some time; a device that could not be connected is tried again."""
     cell = Cell()
-    options = {"fault": str(fault), "every": every, "seed": every, "delay_s": 0.15, "silent_s": 0.15, "away_s": 0.05}
+    mixed = [str(kind) for kind in item.faults if kind is not WireFault.ECHO]  # an echo is on the line or is not
+    what = {"mixed": mixed} if fault == MIXED else {"fault": str(fault)}
+    options = {**what, "every": every, "seed": every, "delay_s": 0.15, "silent_s": 0.15, "away_s": 0.05}
     rest, end_s = threading.Event(), time.monotonic() + seconds
     while time.monotonic() < end_s:
         try:

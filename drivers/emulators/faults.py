@@ -30,6 +30,7 @@ class FaultOptions(Strict):
     """Options that every emulator takes."""
 
     fault: WireFault | None = None
+    mixed: tuple[WireFault, ...] = ()  # one of these each time, in place of `fault`
     every: Annotated[int, Field(ge=1)] = 3
     delay_s: Annotated[float, Field(gt=0, le=5)] = 0.3
     split_s: Annotated[float, Field(gt=0, le=1)] = 0.03
@@ -50,12 +51,10 @@ class FaultPlan:
     def next(self) -> WireFault | None:
         """The fault of the next frame, or None."""
         self.frames += 1
-        if self.options.fault is None:
-            return None
-        if self.frames % self.options.every:
+        if self.frames % self.options.every or not (self.options.fault or self.options.mixed):
             return None
         self.injected += 1
-        return self.options.fault
+        return self._random.choice(self.options.mixed) if self.options.mixed else self.options.fault
 
     def flip_bit(self, frame: bytes, protected: slice) -> bytes:
         """One bit of the part that a check sum or header rule protects, flipped; a frame without any is lost."""

@@ -8,7 +8,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
 
+from drivers.transport.capture import inside
 from drivers.transport.device import CONNECT_S, WireDevice
+from drivers.transport.fd_link import FdLink
 from drivers.transport.link import BadAnswer, Link, LinkLost, NoAnswer, WireError, now_s
 from drivers.transport.port import Port
 from drivers.transport.timebase import ExchangeTime
@@ -75,6 +77,7 @@ class Bus(Generic[C]):
         self._rest = threading.Event()  # never set: a rest that needs no other clock
         self._port: Port[Link] | None = None
         self._members = threading.Lock()
+        self._line: FdLink | None = None
 
     def attach(self, station: Station[C]) -> None:
         """Take a station in; the first one starts the owner thread."""
@@ -103,6 +106,12 @@ class Bus(Generic[C]):
     def reconnects(self) -> int:
         """How often the port was opened again."""
         return self._port.reconnects if self._port is not None else 0
+
+    @property
+    def heard_bytes(self) -> int | None:
+        """Bytes that the open port has brought; None where nobody counts them."""
+        line = self._line
+        return None if line is None else line.received
 
     def call(self, work: Callable[[C, float], R], until_s: float) -> R:
         """Run `work(client, until_s)` alone on the bus, in the caller's thread.
@@ -137,6 +146,7 @@ class Bus(Generic[C]):
 
     def set_up(self, link: Link) -> None:
         """A fresh link: every station needs its set-up again (owner thread)."""
+        self._line = inside(link, FdLink)
         with self._lock:
             self._client = self._make_client(link)
         for slot in self._slots:
@@ -256,6 +266,10 @@ class PolledDevice(WireDevice[T], Generic[T, C]):
     def reconnects(self) -> int:
         """How often the link was set up again."""
         return self.bus.reconnects
+
+    def heard_bytes(self) -> int | None:
+        """As the bus counts them, for all its stations."""
+        return self.bus.heard_bytes
 
     def link_name(self) -> str:
         """Port and speed, or address."""

@@ -8,6 +8,8 @@ from abc import abstractmethod
 from collections.abc import Callable
 from typing import ClassVar, Generic, TypeVar
 
+from drivers.transport.capture import inside
+from drivers.transport.fd_link import FdLink
 from drivers.transport.link import Link, LinkLost, NoAnswer, Refused, now_s
 from drivers.transport.mailbox import Mailbox
 from drivers.transport.port import Port
@@ -18,6 +20,11 @@ from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
 
 T = TypeVar("T")
+NOT_A_BYTE = "not one byte has come: check power, cable and that the port leads to this device"
+BYTES_WITHOUT_SENSE = (
+    "bytes come but none that fit: another device or address, or on a serial line another baud rate, which "
+    "`panelwright doctor` finds"
+)
 SLICE_S = 0.02  # a stream reader looks up this often, so that close() is quick
 CONNECT_S = 3.0  # a set-up whose first answers are lost needs several attempts
 REFUSED_S = 1.0  # a port that cannot be opened for so long is not there
@@ -154,8 +161,17 @@ class WireDevice(Generic[T]):
             return DeviceUnavailable(
                 f"{self.name} is disconnected: {error}", hint="plug it in; it reconnects by itself", **where
             )
-        hint = "check power and cable; is it the right device and baud rate?"
-        return DeviceTimeout(f"{self.name}: {error}", hint=hint, counts=self.wire_counts(), **where)
+        return DeviceTimeout(f"{self.name}: {error}", hint=self._silence_hint(), counts=self.wire_counts(), **where)
+
+    def heard_bytes(self) -> int | None:
+        """Bytes that the wire has brought so far; None where nobody counts them."""
+        return None
+
+    def _silence_hint(self) -> str:
+        heard = self.heard_bytes()
+        if heard is None or self.mailbox.published:
+            return "check power and cable; is it the right device and baud rate?"
+        return BYTES_WITHOUT_SENSE if heard else NOT_A_BYTE
 
     def health(self) -> Health:
         """State of link and newest sample; returns at once."""
@@ -200,11 +216,11 @@ class WireDevice(Generic[T]):
                 threading.Event().wait(SLICE_S)
         if self.mailbox.peek() is not None:
             return
-        why, counts, error = self._last_error, self.wire_counts(), self.mailbox.error()
+        why, counts, error, hint = self._last_error, self.wire_counts(), self.mailbox.error(), self._silence_hint()
         self.close()
         raise DeviceUnavailable(
             f"{self.name} gives no valid data: {error.what if error else why} ({counts})",
-            hint=error.hint if error else "check power, cable, baud rate and address; is it the right device?",
+            hint=error.hint if error else hint,
             device=self.name,
             link=self.link_name(),
         )
@@ -261,6 +277,8 @@ class StreamDevice(WireDevice[T]):
         self._silence_s = self.patience * silence_s
         self._heard_s = now_s()
         self.bytes_in = 0
+        self._line: FdLink | None = None
+        self._heard_before = 0
         self.byte_s = 0.0
         self.port = Port(context.name, open_link=open_link, tenant=self)
 
@@ -283,6 +301,8 @@ class StreamDevice(WireDevice[T]):
 
     def set_up(self, link: Link) -> None:
         """Start the stream (owner thread)."""
+        self._heard_before = self.heard_bytes() or 0
+        self._line = inside(link, FdLink)
         self.byte_s = link.byte_s
         self.start(link)
         self._heard_s = now_s()
@@ -334,4 +354,11 @@ class StreamDevice(WireDevice[T]):
 
     def wire_counts(self) -> str:
         """Bytes without frames mean a wrong baud rate or a wrong device."""
-        return f"{self.bytes_in} bytes, {self.mailbox.published} samples, {self.errors} errors"
+        heard = self.heard_bytes()
+        heard = self.bytes_in if heard is None else heard
+        return f"{heard} bytes, {self.mailbox.published} samples, {self.errors} errors"
+
+    def heard_bytes(self) -> int | None:
+        """What the link counts, since the device was connected; a replay counts nothing."""
+        line = self._line
+        return None if line is None else self._heard_before + line.received

@@ -18,6 +18,7 @@ class FdLink:
     def __init__(self, fd: int, name: str) -> None:
         self._fd = fd
         self._name = name
+        self.received = 0  # bytes so far: tells a dead line from one whose bytes nobody understands
         self._write_lock = threading.Lock()
         self._close_lock = threading.Lock()
         self._poll_in = select.poll()
@@ -45,6 +46,7 @@ class FdLink:
             raise LinkLost(f"{self._name}: {error}") from error
         if not data:
             raise LinkLost(f"{self._name}: the far side hung up")
+        self.received += len(data)
         return data
 
     def write(self, data: bytes, until_s: float) -> None:

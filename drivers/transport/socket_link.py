@@ -29,7 +29,9 @@ class DatagramLink(SocketLink):
         """One datagram; a far side that is not there yet counts as silence, not as loss."""
         try:
             if self._poll_in.poll(max(0.0, (until_s - now_s()) * 1e3)):
-                return self._sock.recv(CHUNK_BYTES)
+                data = self._sock.recv(CHUNK_BYTES)
+                self.received += len(data)
+                return data
         except (ConnectionRefusedError, BlockingIOError):
             return b""
         except (OSError, ValueError) as error:

@@ -14,7 +14,8 @@ LATELY = 8  # frames: one of so many was not late; a talker that has shifted is 
 ALMOST = 0.1  # of a period: the jitter of a gap that a lost frame has left
 LATE_S, SELDOM = 5e-4, 0.2
 PERIOD_OVER_S = 1.0
-RESTART_S = 1.0  # a device clock this far behind itself has been restarted
+RESTART_S = 1.0  # a device clock this far behind itself, or off what is expected, has been restarted
+LONGEST_AWAY_S = 60.0  # quartz clocks part by 30 ms in that time
 
 
 class Unwrapper:
@@ -49,10 +50,15 @@ class HostTime:
     """
 
     def __init__(self) -> None:
-        self.reset()
+        self._forget()
 
     def reset(self) -> None:
-        """The device was opened anew: its clock may have started again."""
+        """The device was opened anew: its clock may have started again, or go on, and the first frame may be late."""
+        self._is_reopened = True
+
+    def _forget(self) -> None:
+        self._is_reopened = False
+        self._arrived_s = -math.inf
         self._truest: list[tuple[float, float]] = []  # (arrived, difference) of the last two whole windows
         self._running = (0.0, math.inf)
         self._window_end_s = -math.inf
@@ -60,9 +66,10 @@ class HostTime:
 
     def host_s(self, *, device_s: float, arrived_s: float) -> float:
         """When a sample stamped `device_s` was taken, on the clock of `arrived_s`."""
-        if device_s < self._device_s - RESTART_S:
-            self.reset()
-        self._device_s = device_s
+        if device_s < self._device_s - RESTART_S or (self._is_reopened and not self._goes_on(device_s, arrived_s)):
+            self._forget()
+        self._is_reopened = False
+        self._device_s, self._arrived_s = device_s, arrived_s
         if arrived_s > self._window_end_s:
             if self._running[1] < math.inf:
                 self._truest = [*self._truest[-1:], self._running]
@@ -72,6 +79,11 @@ class HostTime:
         if difference_s < self._running[1]:
             self._running = (arrived_s, difference_s)
         return device_s + min(difference_s, self._line_s(arrived_s))
+
+    def _goes_on(self, device_s: float, arrived_s: float) -> bool:
+        """Does the clock still say what the last offset lets expect?"""
+        beyond_s = arrived_s - device_s - self._line_s(self._arrived_s)
+        return arrived_s - self._arrived_s < LONGEST_AWAY_S and -RESTART_S < beyond_s < RESTART_S
 
     def _line_s(self, at_s: float) -> float:
         if not self._truest:

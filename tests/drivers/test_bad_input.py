@@ -1,12 +1,16 @@
 """Wrong devices, wrong ids, vanishing ports: typed errors that name the device, the port and what to do."""
 
+import random
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from typing import Any
 
 import pytest
 
+from drivers.arms import kinematics_of
 from drivers.emulators import ft300, modbus_io, robotiq_2f, rplidar, scripted, tfmini
+from drivers.emulators.ports import FarPort, PtyPort, TcpPort
 from hal.errors import CellError, ConfigError, DeviceUnavailable
 from hal.registry import Context, connect
 from tests.drivers.rigs import soon, wired
@@ -41,6 +45,94 @@ def test_another_device_on_the_port_or_a_wrong_id_is_said_with_device_port_and_r
             assert name in error.what and error.hint
             assert error.details["device"] == name
             assert tried[name][1]["port"] in str(error.details["link"])
+
+
+ARM = kinematics_of(scripted.ScriptedArm().capabilities())
+SERIAL: dict[str, dict[str, Any]] = {
+    "serial:tfmini": {},
+    "modbus:tfmini": {},
+    "can:tfmini": {},
+    "serial:ft300": {},
+    "modbus:ft300": {},
+    "modbus:robotiq_2f": {},
+    "modbus:lights": {},
+    "serial:bota": {},
+    "scip:scanner": {},
+    "serial:lms200": {},
+    "serial:rplidar": {},
+    "can:cia402": {"kinematics": ARM},
+    "serial:dynamixel": {"kinematics": ARM},
+    "serial:dynamixel_gripper": {},
+}
+NETWORK: dict[str, dict[str, Any]] = {
+    "modbus:touch": {},
+    "scip:scanner": {},
+    "ur:rtde": {},
+    "ur:lights": {"outputs": [0, 1, 2, 3]},
+}
+
+
+class Chatter:
+    """A far side that is no device: it answers nothing, talks noise, or hangs up on whoever connects."""
+
+    def __init__(self, port: FarPort, way: str) -> None:
+        self.port = port
+        self._way = way
+        self._ending = threading.Event()
+        self._noise = random.Random(5)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._ending.is_set():
+            heard = self.port.receive(0.01)
+            if self._way == "noise":
+                self.port.send(None, self._noise.randbytes(50))
+            elif self._way == "hangs up" and heard:
+                self.port.vanish()
+                self.port.appear()
+
+    def close(self) -> None:
+        """End it."""
+        self._ending.set()
+        self._thread.join()
+        self.port.close()
+
+
+@pytest.mark.parametrize(
+    ("way", "hint"),
+    [("silent", "not one byte"), ("noise", "bytes come but none that fit"), ("missing", "plug the device in")],
+)
+def test_every_serial_driver_says_what_is_wrong_with_its_port(way: str, hint: str, caplog: Any) -> None:
+    with ExitStack() as stack, ThreadPoolExecutor(len(SERIAL)) as pool:
+        waiting = {}
+        for driver, options in SERIAL.items():
+            side = Chatter(PtyPort("line"), way)
+            stack.callback(side.close)
+            path = "/dev/serial/by-id/none" if way == "missing" else side.port.address["port"]
+            key = "channel" if driver.startswith("can:") else "port"
+            waiting[driver, path] = pool.submit(refusal, "finger", driver, {key: path, **options})
+        for (driver, path), future in waiting.items():
+            error = future.result()
+            assert "finger" in error.what and hint in error.hint, (driver, error.for_people())
+            assert path in f"{error.what} {error.details}", driver
+    assert not caplog.records, "a driver failed on bytes that it did not expect"
+
+
+@pytest.mark.parametrize("way", ["silent", "noise", "hangs up"])
+def test_every_network_driver_names_the_address(way: str, caplog: Any) -> None:
+    with ExitStack() as stack, ThreadPoolExecutor(len(NETWORK)) as pool:
+        waiting = {}
+        for driver, options in NETWORK.items():
+            side = Chatter(TcpPort(), way)
+            stack.callback(side.close)
+            address = side.port.address
+            waiting[driver, address["port"]] = pool.submit(refusal, "finger", driver, {**address, **options})
+        for (driver, number), future in waiting.items():
+            error = future.result()
+            assert "finger" in error.what and error.hint, (driver, error.for_people())
+            assert str(number) in f"{error.what} {error.details}", driver
+    assert not caplog.records, "a driver failed on bytes that it did not expect"
 
 
 @pytest.mark.parametrize("call", ["read", "write", "close"])

@@ -89,6 +89,24 @@ def test_repeated_bytes_at_the_same_moment_are_one_frame_and_line_time_counts() 
     assert [frame for frame, _ in times.stamped([b"a"], arrived_s=5.01, byte_s=1e-4)] == [b"a"]
 
 
+def opened_anew(device_first_s: float, arrived_first_s: float) -> float:
+    """Stamp of the first frame after a loss; before it the device's clock was 100 s behind the host's."""
+    host = HostTime()
+    for i in range(200):
+        host.host_s(device_s=0.01 * i, arrived_s=100.0 + 0.01 * i + 0.001)
+    host.reset()
+    return host.host_s(device_s=device_first_s, arrived_s=arrived_first_s)
+
+
+def test_after_a_loss_a_late_first_frame_of_a_clock_that_went_on_is_seen_to_be_late() -> None:
+    assert opened_anew(5.0, 105.151) == pytest.approx(105.001, abs=1e-4)
+
+
+@pytest.mark.parametrize("device_s", [0.5, 50.0, 3.0])
+def test_after_a_loss_another_clock_is_believed_at_once(device_s: float) -> None:
+    assert opened_anew(device_s, 105.0) == pytest.approx(105.0)
+
+
 def test_an_exchange_that_lasts_claims_nothing_for_the_time_that_it_waited() -> None:
     exchanges = ExchangeTime()
     assert exchanges.taken_s(1.0, 1.004) == pytest.approx(1.002)

@@ -152,7 +152,8 @@ def _triangulated(
     shift = [np.asarray(ragged_px * _field(rng, 3.0), np.float32) for _ in range(2)]
     z = np.where(np.isfinite(clean_mm), clean_mm, 1e5).astype(np.float32)
     moved = cv2.remap(z, u + shift[0], v + shift[1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-    z_mm = np.asarray(moved, np.float64)
+    # Only jumps are ragged: over a slanted face the matching window averages.
+    z_mm = np.asarray(np.where(np.abs(moved - z) > 0.02 * z, moved, z), np.float64)
     disparity = np.asarray(base_px_mm / z_mm, np.float64)
     x, y = u / W - 0.5, v / H - 0.5
     bend = rng.normal(size=3) * bend_px

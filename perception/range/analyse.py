@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from hal.errors import InvalidRequest, NotFound
-from perception.range import finish, join, merge
+from perception.range import bend, finish, join, merge
 from perception.range.claim import fill_small_gaps
 from perception.range.compete import Candidates
 from perception.range.features import RangeFeature, features_of
@@ -24,6 +24,7 @@ Labels = NDArray[np.int32]
 
 LEAST_VALID_PIXELS = 16
 SETTLING_SWEEPS = 4
+NAMING_SAMPLES = 150
 LARGEST_PIXELS = 2**26  # 8192 x 8192; about 0.13 kB of working memory a pixel, measured at 2048 x 2048
 
 
@@ -154,18 +155,22 @@ def _finished(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) 
     samples = finish.samples_by_label(depth, sensor, noise, labels, count)
     touching = merge.merge_touching(labels, sensor.packed(), found.kinds, found.parameters, samples, noise)
     labels, samples = finish.regrouped(depth, sensor, noise, labels, samples, touching)
-    owner = join.join_pieces(depth, sensor.packed(), found.kinds, found.parameters, samples)
+    owner = join.join_pieces(depth, sensor.packed(), found.kinds, found.parameters, samples, noise=noise)
     joined, samples = finish.regrouped(depth, sensor, noise, labels, samples, owner)
     keep = [k for k in range(count) if owner[k] == k + 1 and samples[k].x.size >= 8]
     keep.sort(key=lambda k: -samples[k].x.size)
     surfaces, final = [], Candidates()
     renamed = np.zeros(count + 1, np.int32)
     for new, k in enumerate(keep, 1):
-        surface, th = finish.refine_surface(
-            new, found.kinds[k], found.parameters[k], samples[k], sensor=sensor, noise=noise
-        )
+        kind, mine = found.kinds[k], samples[k]
+        surface, th = finish.refine_surface(new, kind, found.parameters[k], mine, sensor=sensor, noise=noise)
+        # What the sensor has bent is named straight, but keeps the bent surface's pixels.
+        final.add(kind, th)
+        few = finish.thinned(mine, NAMING_SAMPLES)
+        straight, start = bend.straightened(kind, th, few, noise, bool(sensor.packed()[0] > 0))
+        if straight != kind:
+            surface, _ = finish.refine_surface(new, straight, start, mine, sensor=sensor, noise=noise)
         surfaces.append(surface)
-        final.add(found.kinds[k], th)
         renamed[k + 1] = new
     labels = settled(task, noise, renamed[joined], final, sweeps=SETTLING_SWEEPS)
     fill_small_gaps(labels, depth, 2)

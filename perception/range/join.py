@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from perception.range import fit, rays
 from perception.range.finish import FREE, Samples, thinned
+from perception.range.noise import NoiseModel
 from perception.range.surfaces import PLANE, depth_on, depths_on
 
 Array = NDArray[np.float64]
@@ -25,7 +26,13 @@ BEHIND_SHARE = 0.15  # more of the sight line than this seen behind the surface:
 
 
 def join_pieces(
-    depth_m: Array, packed: Array, kinds: list[int], parameters: list[Array], samples: list[Samples]
+    depth_m: Array,
+    packed: Array,
+    kinds: list[int],
+    parameters: list[Array],
+    samples: list[Samples],
+    *,
+    noise: NoiseModel,
 ) -> list[int]:
     """For each surface (label k at k - 1) the label that it belongs to after joining, itself when it stays alone.
 
@@ -36,17 +43,18 @@ def join_pieces(
         return owner
     order = sorted(range(len(kinds)), key=lambda k: -samples[k].x.size)
     thin = [thinned(s, PAIR_SAMPLES) for s in samples]
-    near = _nearness(kinds, parameters, samples, bool(packed[0] > 0))
+    perspective = bool(packed[0] > 0)
+    near = _nearness(kinds, parameters, samples, perspective)
     for position, big in enumerate(order):
         if owner[big] != big + 1:
             continue
         for small in order[position + 1 :]:
             if owner[small] != small + 1 or not near[big, small]:
                 continue
-            if _is_scrap(kinds, parameters, samples, big=big, small=small, perspective=bool(packed[0] > 0)):
+            if _is_scrap(kinds, parameters, samples, big=big, small=small, perspective=perspective):
                 owner[small] = big + 1
                 continue
-            joined = _joint_fit(kinds, parameters, thin, big=big, small=small, perspective=bool(packed[0] > 0))
+            joined = _joint_fit(kinds, parameters, thin, big=big, small=small, noise=noise, perspective=perspective)
             if joined is None or _gap_between(depth_m, packed, (kinds[big], joined), thin[big], thin[small]):
                 continue
             owner[small] = big + 1
@@ -74,7 +82,14 @@ def _is_scrap(
 
 
 def _joint_fit(
-    kinds: list[int], parameters: list[Array], thin: list[Samples], *, big: int, small: int, perspective: bool
+    kinds: list[int],
+    parameters: list[Array],
+    thin: list[Samples],
+    *,
+    big: int,
+    small: int,
+    noise: NoiseModel,
+    perspective: bool,
 ) -> Array | None:
     kind, th = kinds[big], parameters[big]
     a, b = thin[big], thin[small]
@@ -84,13 +99,23 @@ def _joint_fit(
             return None
     both = _together(a, b)
     joint, _, _, _, _ = fit.fit_robust(kind, th, both.x, both.y, both.z, both.sigma, perspective, FREE, 3)
+    # What a piece leaves over by itself is bend, where noise is slow, and it is no less in the joint surface.
+    own = max(_trimmed(kinds[k], parameters[k], thin[k], perspective)[1] for k in (big, small))
+    slow = noise.slow_share(float(np.median(both.z)))
+    limit = JOINED_MEAN_SQUARE * (1.0 + slow * max(own - 1.0, 0.0))
     for s in (a, b):
-        e = np.empty(s.x.size)
-        rays.residuals(kind, joint, s.x, s.y, s.z, s.sigma, perspective, e)
-        good = np.abs(e) < fit.TRIM_SIGMAS
-        if good.mean() < JOINED_SHARE or float(np.mean(e[good] ** 2)) > JOINED_MEAN_SQUARE:
+        share, mean_square = _trimmed(kind, joint, s, perspective)
+        if share < JOINED_SHARE or mean_square > limit:
             return None
     return np.asarray(joint)
+
+
+def _trimmed(kind: int, th: Array, s: Samples, perspective: bool) -> tuple[float, float]:
+    """Share of the samples within the trim, and their mean squared residual in squared sigmas."""
+    e = np.empty(s.x.size)
+    rays.residuals(kind, th, s.x, s.y, s.z, s.sigma, perspective, e)
+    good = e[np.abs(e) < fit.TRIM_SIGMAS]
+    return good.size / max(e.size, 1), float(np.mean(good**2)) if good.size else np.inf
 
 
 def _nearness(

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.range import fit, rays
+from perception.range import bend, fit
 from perception.range.borders import Border, borders_of, step_and_turn
 from perception.range.finish import FREE, SLOW_NOISE_AREA_PX, Samples, thinned
 from perception.range.noise import NoiseModel
-from perception.range.surfaces import FREEDOM, PLANE, QUADRIC, normals_on
+from perception.range.surfaces import PLANE, QUADRIC
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -31,14 +31,17 @@ SMOOTH_SIGMAS = 3.0
 SMOOTH_SHARE = 0.8  # of both parts within `SMOOTH_LIMIT` of the joint surface, when no crease parts them
 SMOOTH_LIMIT = 5.0
 LEAST_SHARE = 0.85
+LEAST_GAIN = 1e-3
 PLAIN_MEAN_SQUARE = 1.6
+MOST_NOISE = 2.5  # times the model's variance, that two parts may show and still be joined on its strength
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Part:
     """A region while it is being joined: its surface, samples and their normals, and how well it is described.
 
-    `patches` counts independent values of the noise; `score` is Schwarz's; `tilt_sigma_rad` how far noise may turn it.
+    `patches` counts independent values of the noise; `mean_square` is what the surface leaves over, in squared sigmas;
+    `tilt_sigma_rad` how far noise may turn it.
     """
 
     kind: int
@@ -47,8 +50,13 @@ class Part:
     normals: Array
     pixels: int
     patches: float
-    score: float
+    mean_square: float
     tilt_sigma_rad: float
+
+    @property
+    def price(self) -> float:
+        """What Schwarz's criterion asks for the parameters: p ln n."""
+        return bend.schwarz_price(self.kind, self.patches)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -99,9 +107,9 @@ class Agglomeration:
 
     def _part(self, kind: int, th: Array, samples: Samples) -> Part:
         few = thinned(samples, PART_SAMPLES)
-        normals = np.empty((few.x.size, 3))
-        normals_on(kind, th, few.x, few.y, few.z, self.perspective, normals)
         patches = self._patches(samples.x.size, few)
+        kind, th = bend.simplest(kind, th, few, self.perspective, patches=patches)
+        normals = bend.surface_normals(kind, th, few, self.perspective)
         mean2, _ = self._explained(kind, th, few)
         return Part(
             kind=kind,
@@ -110,7 +118,7 @@ class Agglomeration:
             normals=normals,
             pixels=samples.x.size,
             patches=patches,
-            score=_score(kind, mean2 * patches, patches),
+            mean_square=mean2,
             tilt_sigma_rad=self._tilt_sigma(few, patches),
         )
 
@@ -127,14 +135,9 @@ class Agglomeration:
 
     def _explained(self, kind: int, th: Array, samples: Samples) -> tuple[float, float]:
         """Mean of squared residuals, each at most the trim's square, and the share of samples within the trim."""
-        e = self._residuals(kind, th, samples)
+        e = bend.residuals_of(kind, th, samples, self.perspective)
         limit = fit.TRIM_SIGMAS
         return float(np.mean(np.minimum(e * e, limit * limit))), float(np.mean(e < limit))
-
-    def _residuals(self, kind: int, th: Array, s: Samples) -> Array:
-        e = np.empty(s.x.size)
-        rays.residuals(kind, th, s.x, s.y, s.z, s.sigma, self.perspective, e)
-        return np.asarray(np.where(np.isfinite(e), np.abs(e), rays.MISS_SIGMAS))
 
     def _judged(self, pair: tuple[int, int]) -> Merger | None:
         """The joint description of a pair if it gains, else None."""
@@ -145,36 +148,33 @@ class Agglomeration:
         step, turn = step_and_turn(
             a.kind, a.parameters, b.kind, b.parameters, border.x, border.y, self.law, self.perspective
         )
-        if step > STEP_SIGMAS or turn > SHARPEST_TURN_RAD:
+        if step > STEP_SIGMAS * np.sqrt(_noise_here(a, b)) or turn > SHARPEST_TURN_RAD:
             return None
         tolerated = max(SMOOTH_TURN_RAD, SMOOTH_SIGMAS * float(np.hypot(a.tilt_sigma_rad, b.tilt_sigma_rad)))
         return self._jointly(pair, a, b, is_smooth=turn < min(tolerated, 0.5 * SHARPEST_TURN_RAD))
 
     def _jointly(self, pair: tuple[int, int], a: Part, b: Part, *, is_smooth: bool) -> Merger | None:
-        patches = a.patches + b.patches
+        noise = _noise_here(a, b)
         best: Merger | None = None
         for kind, th in self._joint_fits(a, b):
-            mean2 = [self._explained(kind, th, p.samples) for p in (a, b)]
-            cost = mean2[0][0] * a.patches + mean2[1][0] * b.patches
-            gain = a.score + b.score - _score(kind, cost, patches)
-            good = all(
-                m <= _mean_square_limit(p.patches) and s >= LEAST_SHARE for (m, s), p in zip(mean2, (a, b), strict=True)
-            )
-            near = is_smooth and all(
-                float(np.mean(self._residuals(kind, th, p.samples) < SMOOTH_LIMIT)) > SMOOTH_SHARE for p in (a, b)
-            )
-            if near:
-                gain = max(gain, 1e-3)
-            if not (good or near) or gain <= 0.0:
-                continue
-            if best is None or gain > best.gain:
+            apart, together = a.price + b.price, bend.schwarz_price(kind, a.patches + b.patches)
+            fits, near = True, is_smooth
+            for p in (a, b):
+                mean2, share = self._explained(kind, th, p.samples)
+                fits = fits and mean2 <= noise * _mean_square_limit(p.patches) and share >= LEAST_SHARE
+                e = bend.residuals_of(kind, th, p.samples, self.perspective)
+                near = near and bool(np.mean(e < SMOOTH_LIMIT) > SMOOTH_SHARE)
+                apart += p.mean_square * p.patches / noise
+                together += mean2 * p.patches / noise
+            gain = max(apart - together, LEAST_GAIN if near else 0.0)
+            if (fits or near) and gain > (0.0 if best is None else best.gain):
                 best = Merger(pair=pair, kind=kind, parameters=th, gain=gain)
         return best
 
     def _joint_fits(self, a: Part, b: Part) -> list[tuple[int, Array]]:
         both = _together(a.samples, b.samples)
         x, y, z = both.x, both.y, both.z
-        points = np.stack([x * z, y * z, z] if self.perspective else [x, y, z], axis=1)
+        points = bend.points_of(both, self.perspective)
         normals = np.concatenate([a.normals, b.normals])
         kinds = np.ones(5, np.bool_)
         kinds[QUADRIC] = QUADRIC in (a.kind, b.kind)
@@ -203,7 +203,7 @@ class Agglomeration:
             normals=normals,
             pixels=pixels,
             patches=patches,
-            score=_score(merger.kind, mean2 * patches, patches),
+            mean_square=mean2,
             tilt_sigma_rad=self._tilt_sigma(samples, patches),
         )
         for label, owner in self.owner.items():
@@ -245,8 +245,10 @@ def merge_touching(
     return [graph.owner[k] for k in range(1, len(kinds) + 1)]
 
 
-def _score(kind: int, cost: float, patches: float) -> float:
-    return cost + float(FREEDOM[kind]) * float(np.log(max(patches, 2.0)))
+def _noise_here(a: Part, b: Part) -> float:
+    """How many times the noise model's variance the two parts show by themselves; slanted faces scatter more."""
+    shown = (a.mean_square * a.patches + b.mean_square * b.patches) / (a.patches + b.patches)
+    return min(max(1.0, shown), MOST_NOISE)
 
 
 def _mean_square_limit(patches: float) -> float:

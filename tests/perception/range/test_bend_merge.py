@@ -1,0 +1,146 @@
+"""Slow errors of a sensor bend a flat face and break it into pieces: both are undone, and creases and steps stay."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from perception.range.bend import simplest, straightened, turn_of
+from perception.range.finish import Samples
+from perception.range.join import join_pieces
+from perception.range.merge import merge_touching
+from perception.range.noise import NoiseModel
+from perception.range.surfaces import CONE, CYLINDER, PLANE, SIZE, SPHERE, depths_on
+
+WHITE = NoiseModel(white=(0.002, 0.0), correlated=(0.0, 0.0), step=(0.0, 0.0))
+SLOW = NoiseModel(white=(0.001, 0.0), correlated=(0.004, 0.0), step=(0.0, 0.0))
+FOCAL_PX = 120.0
+SHAPE = (120, 160)
+PACKED = np.array([1.0, FOCAL_PX, FOCAL_PX, 79.5, 59.5])
+
+
+def surface(kind, *values):
+    th = np.zeros(SIZE)
+    th[: len(values)] = values
+    return kind, th
+
+
+def plane(normal, d):
+    n = np.asarray(normal, float)
+    return surface(PLANE, *(n / np.linalg.norm(n)), d)
+
+
+def rays(mask):
+    v, u = np.nonzero(mask)
+    return (u - PACKED[3]) / FOCAL_PX, (v - PACKED[4]) / FOCAL_PX
+
+
+def sampled(kind, th, mask, noise, *, seed=0, sigma=1.0):
+    """The samples of the pixels in `mask`, with white noise of `sigma` times the model's."""
+    x, y = rays(mask)
+    z = np.empty(x.size)
+    depths_on(kind, th, x, y, True, z)
+    assert np.isfinite(z).all()
+    scatter = noise.sigma_m(z)
+    z = z + sigma * scatter * np.random.default_rng(seed).normal(size=z.size)
+    return Samples(x=x, y=y, z=z, sigma=scatter)
+
+
+def box(top, bottom, left, right):
+    mask = np.zeros(SHAPE, bool)
+    mask[top:bottom, left:right] = True
+    return mask
+
+
+WALL = box(20, 100, 30, 130)
+BENT_WALL = surface(SPHERE, 0.0, 0.0, 14.0, 12.0, 1.0)  # 12 m radius, 2 m away: turns by 0.1 rad over the wall
+BALL = surface(SPHERE, 0.0, 0.0, 2.3, 0.3, 1.0)
+
+
+def test_a_wall_bent_by_slow_errors_is_named_a_plane():
+    kind, th = straightened(*BENT_WALL, sampled(*BENT_WALL, WALL, SLOW), SLOW, True)
+    assert kind == PLANE
+    assert abs(th[2]) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_without_slow_errors_the_same_surface_stays_a_piece_of_a_ball():
+    kind, th = straightened(*BENT_WALL, sampled(*BENT_WALL, WALL, WHITE), WHITE, True)
+    assert (kind, th[3]) == (SPHERE, 12.0)
+
+
+def test_a_ball_is_no_bent_plane():
+    samples = sampled(*BALL, box(52, 68, 70, 90), SLOW)
+    assert straightened(*BALL, samples, SLOW, True)[0] == SPHERE
+
+
+def test_a_slender_cone_under_slow_errors_is_named_a_cylinder():
+    cone = surface(CONE, 0.0, -3.0, 1.5, 0.0, 1.0, 0.0, 0.03, 1.0)
+    samples = sampled(*cone, box(40, 80, 76, 84), SLOW, sigma=0.2)
+    kind, th = straightened(*cone, samples, SLOW, True)
+    assert kind == CYLINDER
+    assert th[6] == pytest.approx(3.0 * np.tan(0.03), rel=0.1)
+
+
+def test_a_steeper_cone_stays_one():
+    cone = surface(CONE, 0.0, -1.0, 1.5, 0.0, 1.0, 0.0, 0.2, 1.0)
+    assert straightened(*cone, sampled(*cone, box(40, 80, 74, 86), SLOW, sigma=0.2), SLOW, True)[0] == CONE
+
+
+def test_turn_is_the_angle_over_which_normals_spread():
+    a = np.linspace(-0.2, 0.2, 401)
+    normals = np.stack([np.sin(a), np.zeros_like(a), -np.cos(a)], axis=1)
+    assert turn_of(normals) == pytest.approx(0.4, rel=0.05)
+
+
+def test_a_flat_patch_that_was_fitted_as_a_ball_is_cheaper_as_a_plane():
+    flat = plane([0.0, 0.3, -1.0], -2.0)
+    samples = sampled(*flat, box(50, 70, 70, 90), WHITE)
+    kind, th = simplest(*surface(SPHERE, 0.0, 0.0, 6.0, 4.0, 1.0), samples, True, patches=400.0)
+    assert kind == PLANE
+    assert abs(th[:3] @ flat[1][:3]) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_ball_stays_a_ball_when_its_bulge_is_worth_its_price():
+    samples = sampled(*BALL, box(52, 68, 70, 90), WHITE)
+    kind, th = simplest(*BALL, samples, True, patches=float(samples.x.size))
+    assert kind == SPHERE
+    assert th[3] == pytest.approx(0.3, rel=0.15)
+
+
+LEFT, RIGHT = box(20, 100, 20, 80), box(20, 100, 80, 140)
+LABELS = (LEFT + 2 * RIGHT).astype(np.int32)
+
+
+def merged(left, right, noise):
+    """The owners of labels 1 and 2, two planes that touch along a column."""
+    samples = [sampled(*left, LEFT, noise, seed=1), sampled(*right, RIGHT, noise, seed=2)]
+    kinds, parameters = [left[0], right[0]], [left[1], right[1]]
+    return merge_touching(LABELS, PACKED, kinds, parameters, samples, noise)
+
+
+@pytest.mark.parametrize("noise", [WHITE, SLOW], ids=["white", "slow"])
+@pytest.mark.parametrize(("turn_rad", "is_one"), [(0.0, True), (0.02, True), (0.8, False), (1.5, False)])
+def test_pieces_of_one_face_are_joined_and_faces_at_an_edge_are_not(noise, turn_rad, is_one):
+    half = 0.5 * turn_rad
+    left = plane([np.sin(half), 0.0, -np.cos(half)], -2.0 * np.cos(half))
+    right = plane([-np.sin(half), 0.0, -np.cos(half)], -2.0 * np.cos(half))
+    assert (len(set(merged(left, right, noise))) == 1) == is_one
+
+
+def test_a_step_between_parallel_faces_stays():
+    assert merged(plane([0, 0, -1], -2.0), plane([0, 0, -1], -2.1), SLOW) == [1, 2]
+
+
+def test_pieces_of_a_bent_table_are_joined_behind_what_parts_them():
+    left, right = plane([0.008, 0.3, -1.0], -2.0), plane([-0.008, 0.3, -1.0], -2.0)
+    apart = [sampled(*left, box(20, 100, 10, 60), SLOW, seed=1), sampled(*right, box(20, 100, 90, 150), SLOW, seed=2)]
+    depth = np.full(SHAPE, 1.5)  # something nearer between them
+    owners = join_pieces(depth, PACKED, [PLANE, PLANE], [left[1], right[1]], apart, noise=SLOW)
+    assert len(set(owners)) == 1
+
+
+def test_a_gap_that_shows_something_behind_keeps_pieces_apart():
+    flat = plane([0.0, 0.0, -1.0], -2.0)
+    apart = [sampled(*flat, box(20, 100, 10, 60), SLOW, seed=1), sampled(*flat, box(20, 100, 90, 150), SLOW, seed=2)]
+    depth = np.full(SHAPE, 4.0)
+    assert join_pieces(depth, PACKED, [PLANE, PLANE], [flat[1], flat[1]], apart, noise=SLOW) == [1, 2]

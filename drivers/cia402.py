@@ -41,12 +41,16 @@ PROBES = ((CONSUMER, 1), (PRODUCER, 0))  # objects that every configured drive h
 
 
 class Cia402Options(CanOptions):
-    """Options of `can:cia402`; `host_node` is the id of our own heartbeat."""
+    """Options of `can:cia402`; `host_node` is the id of our own heartbeat.
+
+    The thread that sends the SYNCs asks for `realtime_priority`, 0 for none; a system that refuses makes it no error.
+    """
 
     nodes: tuple[Annotated[int, Field(ge=1, le=126)], ...] = (1, 2, 3, 4, 5, 6)
     host_node: Annotated[int, Field(ge=1, le=127)] = 127
     rate_hz: Annotated[float, Field(ge=10, le=500)] = 100.0
     heartbeat_s: Annotated[float, Field(ge=0.02, le=1)] = 0.1
+    realtime_priority: Annotated[int, Field(ge=0, le=99)] = 10
     degrees_per_increment: Annotated[float, Field(gt=0)] = 0.001
     kinematics: KinematicsOptions
 
@@ -73,7 +77,13 @@ class Cia402(StreamDevice[JointState]):
 
     def __init__(self, context: Context, options: Cia402Options) -> None:
         opener, codec, name = can_opener(options, context.name)
-        super().__init__(context, open_link=opener, link_name=name, max_age_s=max(4.0 / options.rate_hz, 0.04))
+        super().__init__(
+            context,
+            open_link=opener,
+            link_name=name,
+            max_age_s=max(4.0 / options.rate_hz, 0.04),
+            realtime_priority=options.realtime_priority,
+        )
         self._options = options
         self._make_codec: Callable[[], CanCodec] = codec
         self._codec = codec()

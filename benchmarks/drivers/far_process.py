@@ -1,6 +1,6 @@
 """Far sides in a process of their own, so that their work does not count as the drivers'.
 
-`python -m benchmarks.drivers.far_process NAME..` prints a line of addresses; then each line on its input is an order:
+`python -m benchmarks.drivers.far_process NAME[?KEY=VALUE]..` prints a line of addresses; then each line on its input is an order:
 `inject silent|disconnected|none`, `log NAME` (prints when its frames left), `count NAME COUNTER`, `end`.
 """
 
@@ -15,6 +15,7 @@ from typing import Any
 
 from benchmarks.drivers.benches import bench
 from hal.devices import Fault
+from hal.garbage import set_aside
 
 
 class FarProcess:
@@ -28,6 +29,11 @@ class FarProcess:
     def _answer(self) -> Any:
         assert self._process.stdout is not None
         return json.loads(self._process.stdout.readline())
+
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self._process.pid
 
     def order(self, text: str) -> Any:
         """Give one order and wait for its answer."""
@@ -52,10 +58,17 @@ def far_process(*names: str) -> Iterator[FarProcess]:
         far.close()
 
 
+def start(text: str) -> tuple[str, Any]:
+    """The name and the far side of `NAME` or, with an option of its emulator, `NAME?KEY=VALUE`."""
+    name, _, option = text.partition("?")
+    item, (key, _, value) = bench(name), option.partition("=")
+    return name, item.start(item.backing(), {**item.far_options, **({key: value} if key else {})})
+
+
 def main() -> None:
     """Run the far sides named on the command line."""
-    items = [bench(name) for name in sys.argv[1:]]
-    sides = {item.name: item.start(item.backing(), item.far_options) for item in items}
+    sides = dict(map(start, sys.argv[1:]))
+    set_aside()  # as in a cell process: a full collection would silence all devices for 50 ms
     print(json.dumps({name: side.address for name, side in sides.items()}), flush=True)
     for text in sys.stdin:
         what, _, rest = text.strip().partition(" ")

@@ -1,10 +1,10 @@
-"""Six CiA-402 drives behind an slcan adapter on a pty, moving an arm of any backend."""
+"""Six CiA-402 drives behind an slcan adapter, on a pty or TCP, moving an arm of any backend."""
 
 from __future__ import annotations
 
 import math
 import struct
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -13,7 +13,7 @@ from drivers.arms import kinematics_of
 from drivers.cia402_states import DriveState
 from drivers.emulators.base import WireEmulator, time_of
 from drivers.emulators.faults import FaultOptions
-from drivers.emulators.ports import Peer, PtyPort
+from drivers.emulators.ports import Peer, PtyPort, TcpPort
 from drivers.transport.canbus import CanFrame, Slcan
 from hal.devices import Arm, Device
 from hal.errors import CellError, Unsupported
@@ -36,6 +36,7 @@ SIZES = {1: 0x4F, 2: 0x4B, 3: 0x47, 4: 0x43}
 class Cia402EmulatorOptions(FaultOptions):
     """`[emulators.NAME.emulator_options]`"""
 
+    transport: Literal["serial", "tcp"] = "serial"
     first_node: Annotated[int, Field(ge=1, le=100)] = 1
 
 
@@ -96,7 +97,7 @@ class Cia402Emulator(WireEmulator):
     """The six drives, running."""
 
     def __init__(self, backing: Arm, options: Cia402EmulatorOptions) -> None:
-        super().__init__(PtyPort("slcan"), options, name="cia402")
+        super().__init__(TcpPort() if options.transport == "tcp" else PtyPort("slcan"), options, name="cia402")
         self._backing = backing
         self.nodes = tuple(range(options.first_node, options.first_node + len(backing.capabilities().links)))
         self.drives = {node: Drive() for node in self.nodes}
@@ -112,7 +113,9 @@ class Cia402Emulator(WireEmulator):
     def address(self) -> dict[str, Any]:
         """Channel, nodes and kinematics."""
         c = self._backing.capabilities()
-        return {"channel": self.port.address["port"], "nodes": list(self.nodes), "kinematics": kinematics_of(c)}
+        far = self.port.address
+        channel = f"tcp://{far['host']}:{far['port']}" if "host" in far else far["port"]
+        return {"channel": channel, "nodes": list(self.nodes), "kinematics": kinematics_of(c)}
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
         """slcan commands are acknowledged; frames are obeyed."""

@@ -1,4 +1,4 @@
-"""CAN frames over a serial adapter (slcan) or Linux SocketCAN, as bytes on a link, which captures and re-opens."""
+"""CAN frames over an slcan adapter (serial or TCP) or Linux SocketCAN, as bytes on a link, which captures and re-opens."""
 
 from __future__ import annotations
 
@@ -8,21 +8,26 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal, Protocol
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from drivers.transport.fd_link import FdLink
 from drivers.transport.link import Link
-from drivers.transport.options import Captured, opener_with_files
+from drivers.transport.options import CONNECT_TIMEOUT_S, Captured, opener_with_files
 from drivers.transport.serial_link import open_serial
+from drivers.transport.socket_link import open_tcp
 from hal.errors import DeviceUnavailable
 
 SLCAN_RATES = {rate: code for code, rate in enumerate((10, 20, 50, 100, 125, 250, 500, 800, 1000))}  # kbit/s
 RAW = struct.Struct("<IB3x8s")
 LONGEST_LINE = 32
+TCP = "tcp://"
 
 
 class CanOptions(Captured):
-    """Keys of every CAN device: `channel` is the path of an slcan adapter or the name of an interface (`can0`)."""
+    """Keys of every CAN device.
+
+    `channel` is the path of an slcan adapter, `tcp://HOST:PORT` of one on the network, or an interface's name (`can0`).
+    """
 
     channel: str
     bitrate: Literal[10000, 20000, 50000, 100000, 125000, 250000, 500000, 800000, 1000000] = 1_000_000
@@ -30,8 +35,14 @@ class CanOptions(Captured):
 
     @property
     def is_slcan(self) -> bool:
-        """Serial adapter or SocketCAN?"""
+        """Adapter or SocketCAN?"""
         return "/" in self.channel
+
+    @model_validator(mode="after")
+    def _names_a_host(self) -> CanOptions:
+        if self.channel.startswith(TCP) and tcp_address(self.channel) is None:
+            raise ValueError(f"channel: {self.channel!r} is not tcp://HOST:PORT")
+        return self
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +122,21 @@ class RawCan:
         return [CanFrame(id_ & 0x7FF, data[:length]) for id_, length, data in RAW.iter_unpack(whole)]
 
 
+def tcp_address(channel: str) -> tuple[str, int] | None:
+    """Host and port of `tcp://HOST:PORT`; None for other channels."""
+    host, _, port = channel.removeprefix(TCP).rpartition(":")
+    is_address = channel.startswith(TCP) and host and port.isascii() and port.isdigit() and int(port) < 65_536
+    return (host, int(port)) if is_address else None
+
+
 def can_opener(options: CanOptions, device: str) -> tuple[Callable[[], Link], Callable[[], CanCodec], str]:
     """What opens the channel, what makes its codec, and its name."""
+    address = tcp_address(options.channel)
+    if address is not None:
+        opener = opener_with_files(
+            options, device, lambda: open_tcp(*address, timeout_s=CONNECT_TIMEOUT_S, device=device)
+        )
+        return opener, Slcan, f"slcan {options.channel}, {options.bitrate} bit/s"
     if options.is_slcan:
         opener = opener_with_files(
             options, device, lambda: open_serial(options.channel, baud=options.baud, device=device)

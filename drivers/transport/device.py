@@ -51,11 +51,15 @@ class WireDevice(Generic[T]):
     def __init__(self, context: Context, *, max_age_s: float) -> None:
         self.context = context
         cell = context.cell
-        self.is_emulated = cell is not None and context.name in cell.file.emulators
+        is_mixed = cell is not None and cell.file.cell.mode == "mixed"
+        self.is_emulated = is_mixed and cell is not None and context.name in cell.file.emulators
         self.patience = PATIENCE if self.is_emulated else 1.0
         self.max_age_s = max_age_s
-        if cell is not None and cell.file.cell.mode != "mixed":
+        if cell is not None and not is_mixed:
             self.max_age_s = max(max_age_s, cell.file.safety.max_reading_age_s)
+        if self.is_emulated and self.kind is DeviceKind.ARM:
+            # How far the world may be ahead of the wire is way that the tracking guard sees: 5 mm at 0.25 m/s.
+            self.max_age_s = max_age_s / 2.0
         self.mailbox: Mailbox[T] = Mailbox()
         self.errors = 0
         self._sequence = 0
@@ -261,6 +265,7 @@ class StreamDevice(WireDevice[T]):
     Args:
         open_link: opens the port.
         silence_s: after this long without a sample the link is checked, then opened and set up anew.
+        realtime_priority: of the owner thread (see `Port`).
     """
 
     def __init__(
@@ -271,6 +276,7 @@ class StreamDevice(WireDevice[T]):
         link_name: str,
         max_age_s: float,
         silence_s: float = 0.5,
+        realtime_priority: int = 0,
     ) -> None:
         super().__init__(context, max_age_s=max_age_s)
         self._link_name = link_name
@@ -280,7 +286,7 @@ class StreamDevice(WireDevice[T]):
         self._line: FdLink | None = None
         self._heard_before = 0
         self.byte_s = 0.0
-        self.port = Port(context.name, open_link=open_link, tenant=self)
+        self.port = Port(context.name, open_link=open_link, tenant=self, realtime_priority=realtime_priority)
 
     @abstractmethod
     def start(self, link: Link) -> None:

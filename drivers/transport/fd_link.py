@@ -10,6 +10,7 @@ import threading
 from drivers.transport.link import LinkLost, NoAnswer, now_s
 
 CHUNK_BYTES = 65_536
+SELECT_MOST = 1024  # descriptors that `select` knows
 
 
 class FdLink:
@@ -37,7 +38,7 @@ class FdLink:
     def read(self, until_s: float) -> bytes:
         """At least one byte, or `b""` at `until_s`."""
         try:
-            if not self._poll_in.poll(max(0.0, (until_s - now_s()) * 1e3)):
+            if not self._is_readable(max(0.0, until_s - now_s())):
                 return b""
             data = os.read(self._fd, CHUNK_BYTES)
         except BlockingIOError:
@@ -48,6 +49,12 @@ class FdLink:
             raise LinkLost(f"{self._name}: the far side hung up")
         self.received += len(data)
         return data
+
+    def _is_readable(self, wait_s: float) -> bool:
+        # `poll` waits whole milliseconds, rounded up: a SYNC that is due meanwhile would leave up to 1 ms late.
+        if self._fd < SELECT_MOST:
+            return bool(select.select([self._fd], [], [], wait_s)[0])
+        return bool(self._poll_in.poll(wait_s * 1e3))
 
     def write(self, data: bytes, until_s: float) -> None:
         """Send all of `data` before `until_s`."""

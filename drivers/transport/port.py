@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
@@ -59,14 +60,17 @@ class Port(Generic[L]):
     Args:
         name: of the device or bus; the thread carries it.
         open_link: opens the port; raises `DeviceUnavailable`.
+        realtime_priority: of the owner thread, 1 to 99, where the system allows it; 0 asks for none.
     """
 
-    def __init__(self, name: str, *, open_link: Callable[[], L], tenant: Tenant[L]) -> None:
+    def __init__(self, name: str, *, open_link: Callable[[], L], tenant: Tenant[L], realtime_priority: int = 0) -> None:
         self._open_link = open_link
         self._tenant = tenant
         self._closing = threading.Event()
         self._link: L | None = None
         self._sessions = 0
+        self._realtime_priority = realtime_priority
+        self.is_realtime = False
         self._thread = threading.Thread(target=self._run, name=f"port {name}", daemon=True)
 
     def start(self) -> None:
@@ -90,6 +94,8 @@ class Port(Generic[L]):
             self._thread.join(JOIN_S)
 
     def _run(self) -> None:
+        if self._realtime_priority:
+            self.is_realtime = ask_for_realtime(self._realtime_priority)
         retry_s = FIRST_RETRY_S
         while not self._closing.is_set():
             try:
@@ -118,3 +124,16 @@ class Port(Generic[L]):
                 self._tenant.serve(link)
         finally:
             link.close()
+
+
+def ask_for_realtime(priority: int) -> bool:
+    """Let the calling thread go before all ordinary ones of the machine; tells whether the system allows it.
+
+    Linux wants CAP_SYS_NICE or an rtprio limit for that. Threads and processes that it starts do not inherit it.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+    except (AttributeError, OSError) as error:
+        log.info("no real-time priority for %s: %s", threading.current_thread().name, error)
+        return False
+    return True

@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 from drivers.cia402_states import DriveState
 from drivers.emulators import cia402 as emulator
 from drivers.emulators.scripted import ScriptedArm
-from drivers.transport.canbus import CanFrame, RawCan, Slcan
+from drivers.transport.canbus import CanFrame, CanOptions, RawCan, Slcan
+from drivers.transport.options import read_options
 from hal.conformance import ArmContract, Rig
-from hal.errors import CellError, DeviceFault, DeviceUnavailable, MotionRefused
+from hal.errors import CellError, ConfigError, DeviceFault, DeviceUnavailable, MotionRefused
 from hal.registry import Context, connect
 from tests.drivers.rigs import count_good, soon, until, wired, wired_rig
 
@@ -30,6 +31,20 @@ class TestCia402(ArmContract):
     def rig(self) -> Iterator[Rig[Any]]:
         with wired_rig(emulator.start(ScriptedArm(), {}), DRIVER, CALM, sample_period_s=0.1) as rig:
             yield rig
+
+
+class TestOverTcp(ArmContract):
+    @pytest.fixture
+    def rig(self) -> Iterator[Rig[Any]]:
+        far_side = emulator.start(ScriptedArm(), {"transport": "tcp"})
+        with wired_rig(far_side, DRIVER, CALM, sample_period_s=0.1) as rig:
+            yield rig
+
+
+@pytest.mark.parametrize("channel", ["tcp://", "tcp://127.0.0.1", "tcp://:4000", "tcp://host:70000", "tcp://host:x"])
+def test_a_channel_that_is_no_address_is_a_fault_of_the_cell_file(channel: str) -> None:
+    with pytest.raises(ConfigError, match="HOST:PORT"):
+        read_options(Context(name="arm"), {"channel": channel}, CanOptions)
 
 
 frames = st.builds(CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8))

@@ -91,7 +91,7 @@ def test_only_a_real_cell_takes_older_states_than_the_driver_would(mode: str) ->
         context = Context(name="arm", cell=cell.model_copy(update={"file": parts}))
         device = connect(context, "ur:rtde", {"rate_hz": 125.0, **far_side.address})
         oldest_s = cell.file.safety.max_reading_age_s
-        assert device.max_age_s == (oldest_s if mode == "real" else pytest.approx(5.0 / 125.0))
+        assert device.max_age_s == (oldest_s if mode == "real" else pytest.approx(2.5 / 125.0))
     finally:
         if device is not None:
             device.close()

@@ -1,5 +1,6 @@
 """Links, ports, mailboxes and Modbus masters by themselves."""
 
+import fcntl
 import os
 import socket
 import sys
@@ -13,6 +14,7 @@ import pytest
 
 from drivers.emulators.ports import PtyPort, TcpPort, UdpPort
 from drivers.transport.checks import crc_modbus
+from drivers.transport.fd_link import SELECT_MOST, FdLink
 from drivers.transport.link import (
     Link,
     LinkLost,
@@ -340,6 +342,38 @@ def test_a_port_repeats_the_set_up_after_each_loss_without_a_leak() -> None:
         port.close()
         port.close()
         far.close()
+
+
+@pytest.mark.parametrize("is_allowed", [True, False])
+def test_an_owner_thread_asks_for_real_time_and_lives_without(
+    is_allowed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, int]] = []
+
+    def schedule(pid: int, policy: int, param: os.sched_param) -> None:
+        assert (pid, policy) == (0, os.SCHED_RR | os.SCHED_RESET_ON_FORK)
+        asked.append((threading.current_thread().name, param.sched_priority))
+        if not is_allowed:
+            raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", schedule)
+    port = Port("p", open_link=ScriptLink, tenant=Tenant(), realtime_priority=7)
+    port.start()
+    until(lambda: port.link is not None)
+    port.close()
+    assert asked == [("port p", 7)]
+    assert port.is_realtime is is_allowed
+
+
+def test_descriptors_beyond_those_that_select_knows_are_read_too() -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        high = fcntl.fcntl(ours.fileno(), fcntl.F_DUPFD, SELECT_MOST)
+        os.set_blocking(high, False)
+        with closing(FdLink(high, "high")) as link:
+            assert link.read(later(0.01)) == b""
+            theirs.sendall(b"news")
+            assert link.read(later(5.0)) == b"news"
 
 
 def test_rtu_takes_an_answer_among_noise_echo_and_a_false_header() -> None:

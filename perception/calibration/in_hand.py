@@ -83,7 +83,8 @@ class InHandCalibration:
     Attributes:
         flange_from_camera, base_from_target: with covariance.
         intrinsics, lens_sigma: the lens, and one sigma of each of `FREE`.
-        rms_px: of the residuals of the used views, both coordinates together.
+        target_from_camera: (V, 4, 4) where the used views were taken from.
+        residuals_px: (V, N, 2) of the used views, measured less predicted; rms_px: of both coordinates together.
         chi_square, degrees: of the fit; their ratio is near 1 when the stated noise is right.
         used: views kept.
     """
@@ -92,6 +93,8 @@ class InHandCalibration:
     base_from_target: UncertainPose
     intrinsics: CameraIntrinsics
     lens_sigma: Array
+    target_from_camera: Array
+    residuals_px: Array
     rms_px: float
     chi_square: float
     degrees: int
@@ -140,6 +143,10 @@ def calibrate_in_hand(
             parent_from_child=state.base_from_target, covariance=covariance[6:12, 6:12]
         ),
         intrinsics=state.intrinsics, lens_sigma=np.sqrt(np.diag(covariance)[12 : 12 + len(FREE)]),
+        target_from_camera=np.array([
+            (state.base_from_target.inv() * views[k].base_from_flange * state.flange_from_camera).as_matrix() for k in used
+        ]),
+        residuals_px=-rest.reshape(len(used), -1, 2),
         rms_px=float(np.sqrt(np.mean(rest**2))), chi_square=minimum.chi_square,
         degrees=len(rest) - 12, used=tuple(used),
     )  # fmt: skip

@@ -25,6 +25,7 @@ EDGE_PX = 24.0  # a light this near the image's edge may be cut
 LIGHTS_CONE_RAD = 0.95  # 0.6 rad leave the camera's depth in the hand uncertain by half as much again
 PLATE_CONE_RAD = 0.6
 REACH_STEPS = (0.8, 1.0, 1.2, 1.45, 1.7)  # distances, as shares of the nearest that shows everything upright
+REST_S = 0.2  # servos trail by tens of milliseconds
 PLATE_SIGMA = (1.0, 1.0, 2e-4, 5e-4, 5e-4, 1.0)  # a plane says nothing of shifts in it and of turns about its normal
 WRIST_RAD = (-2.4, -1.6, -0.8, 0.0, 0.8, 1.6, 2.4)
 
@@ -118,7 +119,7 @@ def visit(
         session.progress(0.1 + 0.8 * len(found) / count, f"{name}: station {len(found) + 1} of {count}", why)
         try:
             go_to_first(session, [flange], name=f"{name} {len(found) + 1}")
-            settle(session)
+            settle(session, REST_S)
             found.append(measure())
         except (Unreachable, NotFound, Ambiguous) as error:
             why = f"one left out: {error.what}"

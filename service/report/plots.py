@@ -65,6 +65,43 @@ def range_picture(depth_m: NDArray[Any], residual_m: NDArray[Any]) -> bytes:
     return figure_png(figure)
 
 
+def stations_picture(
+    panel_from_camera: Sequence[NDArray[Any]], size_m: tuple[float, float], residuals_px: NDArray[Any]
+) -> bytes:
+    """Where a camera looked from, before the plate (4x4 each, panel frame), and what its pixels miss the fit by."""
+    figure = Figure(figsize=(10.5, 4.6), dpi=100, layout="constrained")
+    room = figure.add_subplot(1, 2, 1, projection="3d")
+    x, y = size_m[0] / 2, size_m[1] / 2
+    plate = np.array([[-x, -y], [x, -y], [x, y], [-x, y], [-x, -y]])
+    room.plot(plate[:, 0], np.zeros(5), plate[:, 1], color=INK, lw=1.5)
+    for k, pose in enumerate(panel_from_camera, 1):
+        place = pose[:3, 3]
+        for axis, colour in ((0, "#d1495b"), (1, "#3a9e5c"), (2, "#2e86ab")):
+            tip = place + 0.08 * pose[:3, axis]
+            room.plot(*np.array([place, tip]).T[[0, 2, 1]], color=colour, lw=1.6)
+        room.text(place[0], place[2], place[1], f" {k}", fontsize=7, color=SOFT)
+    room.set_xlabel("x, m", fontsize=7, color=SOFT)
+    room.set_ylabel("before the plate, m", fontsize=7, color=SOFT)
+    room.set_zlabel("y, m", fontsize=7, color=SOFT)
+    room.tick_params(labelsize=6, colors=SOFT)
+    room.set_aspect("equal")
+    room.view_init(elev=22, azim=58)
+    room.set_title("stations of the camera, its view in blue", fontsize=9, color=INK)
+    miss = figure.add_subplot(1, 2, 2)
+    for k, one in enumerate(residuals_px):
+        miss.plot(*one.T, "o", ms=3.5, color=f"C{k % 10}", alpha=0.8)
+    rms = float(np.sqrt(np.mean(residuals_px**2)))
+    turn = np.linspace(0.0, 2 * np.pi, 100)
+    miss.plot(rms * np.cos(turn), rms * np.sin(turn), color=SOFT, lw=0.8)
+    miss.axhline(0.0, color=SOFT, lw=0.4)
+    miss.axvline(0.0, color=SOFT, lw=0.4)
+    miss.set_aspect("equal", adjustable="datalim")
+    miss.set_xlabel("px", fontsize=8, color=SOFT)
+    miss.tick_params(labelsize=7, colors=SOFT)
+    miss.set_title(f"lights against the fit, rms {rms:.3f} px", fontsize=9, color=INK)
+    return figure_png(figure)
+
+
 def wrench_picture(motions: Sequence[MotionReport]) -> bytes:
     """Contact force and torque over the whole mission, with the names of the motions that pushed."""
     figure = Figure(figsize=(10.5, 4.2), dpi=100, layout="constrained")

@@ -1,0 +1,207 @@
+"""Calibrating one sensor of the hand: its stations, what is measured at each, and the solution."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from hal.devices import DeviceKind
+from hal.errors import NotObservable
+from hal.geometry import matrix_of
+from hal.motion import Hold
+from perception.calibration.in_hand import (
+    UNKNOWN_LENS,
+    Beforehand,
+    InHandCalibration,
+    InHandState,
+    InHandView,
+    calibrate_in_hand,
+    propose_view,
+)
+from perception.calibration.scanner import ScannerCalibration, ScannerView, calibrate_scanner
+from perception.calibration.wrench import WrenchCalibration, calibrate_wrench
+from service.operations.beliefs import believed_panel
+from service.operations.eyes import OLDEST_S, deadline, look_with_lights, settle
+from service.operations.locate import lights_in, scan_plate
+from service.operations.session import Session
+from service.operations.stations import (
+    LIGHTS_CONE_RAD,
+    PLATE_CONE_RAD,
+    REACH_STEPS,
+    around,
+    by_plate,
+    in_view,
+    order,
+    visit,
+    wrist_turns,
+)
+from service.operations.travel import go_to_joints, kinematics
+from service.operations.views import overview_distance_m
+
+Array = NDArray[np.float64]
+
+MOST_SCATTER = 9.0  # chi-square a degree: three times the stated noise is no noise any more
+LEAST_LENS = (1e-5, 0.01, 1e-5)  # a record without sigmas does not mean a lens without error
+SCANNER_DISTANCE_M = 0.42
+SCANNER_STEPS = (1.0, 1.35)
+POINTS_A_SCAN = 400
+WRENCH_SAMPLES = 40
+WRENCH_STEP_S = 0.01
+WEIGH_REST_S = 0.3  # the hand swings a little after a motion
+
+
+# -- camera: lens and mount by the panel's lights ---------------------------------------------------------------------
+
+
+def camera_stations(session: Session, camera: str, count: int, known: Beforehand) -> list[RigidTransform]:
+    """Flange poses from which all four lights are in view; the `count` that together tell most come first."""
+    start, points_m = _nominal(session, camera), _lights_m(session)
+    x, z, lens = start.flange_from_camera, start.base_from_target, start.intrinsics
+    nearest_m = overview_distance_m(session.panel, lens, 0.0)
+    candidates = around(z, x, nearest_m, steps=REACH_STEPS, cone_rad=LIGHTS_CONE_RAD)
+    seen = [flange for flange in candidates if in_view(flange, x, z, points_m, lens)]
+    return order(session, seen, lambda done, left: propose_view(done, left, points_m, start, known)[0], count=count)
+
+
+def measure_camera(session: Session, camera: str, count: int, known: Beforehand) -> InHandCalibration:
+    """Drive through the stations, look with the lights off and on, and solve for mount, panel and lens.
+
+    Raises:
+        Unreachable: too few stations; NotObservable: they leave the mount too uncertain, or scatter too much.
+    """
+    session.progress(0.08, "choose the stations that tell most")
+    flanges = camera_stations(session, camera, count, known)
+
+    def measure() -> InHandView:
+        pair = look_with_lights(session)
+        lights = lights_in(session, pair)
+        return InHandView(
+            base_from_flange=session.mover.state().base_from_flange,
+            pixels_px=lights.points_px,
+            covariance_px=lights.covariance_px,
+        )
+
+    views = visit(session, flanges, measure, count=count, name="look")
+    session.progress(0.92, "solve")
+    result = calibrate_in_hand(views, _lights_m(session), _nominal(session, camera), known)
+    _check_scatter(result.chi_square, result.degrees, "the panel file's light positions, the lens, and for reflections")
+    return result
+
+
+def _nominal(session: Session, camera: str) -> InHandState:
+    return InHandState(
+        flange_from_camera=session.mount(camera).parent_from_child,
+        base_from_target=believed_panel(session).parent_from_child,
+        intrinsics=session.lens(camera),
+        point_errors_m=np.zeros((len(session.panel.lights), 3)),
+    )
+
+
+def _lights_m(session: Session) -> Array:
+    return np.array([light.position_m for light in session.panel.lights])
+
+
+def beforehand(session: Session, camera: str, *, is_lens_known: bool) -> Beforehand:
+    """What is known of the lens by its record or by nobody, of the lights, and of the arm."""
+    arm = session.connection.device(session.first(DeviceKind.ARM)).capabilities()
+    known, lens = UNKNOWN_LENS, session.cell.calibration_of(camera).intrinsics
+    if is_lens_known and lens is not None:
+        stated = (lens.sigma_focal_ratio, lens.sigma_centre_px, lens.sigma_k1)
+        ratio, centre, k1 = (max(a, b) for a, b in zip(stated, LEAST_LENS, strict=True))
+        known = Beforehand(focal_ratio=ratio, centre_px=centre, k1=k1)
+    point_m = max(session.panel.tolerances.light_m, 1e-5)
+    return replace(known, point_m=point_m, arm_rad=max(known.arm_rad, arm.resolution_rad))
+
+
+# -- range scanner: the plate from several sides ----------------------------------------------------------------------
+
+
+def scanner_stations(session: Session, scanner: str, count: int) -> list[RigidTransform]:
+    """Flange poses that look at the plate; the `count` that together tell most come first."""
+    x, z = session.mount(scanner).parent_from_child, believed_panel(session).parent_from_child
+    candidates = around(z, x, SCANNER_DISTANCE_M, steps=SCANNER_STEPS, cone_rad=PLATE_CONE_RAD)
+    return order(session, candidates, by_plate(x, z), count=count)
+
+
+def measure_scanner(session: Session, scanner: str, count: int) -> ScannerCalibration:
+    """Drive through the stations, scan the plate, and solve for the mount; the panel must be located.
+
+    Raises:
+        as `measure_camera`.
+    """
+    flanges = scanner_stations(session, scanner, count)
+
+    def measure() -> ScannerView:
+        seen = scan_plate(session)
+        c, depth_m = seen.scan.capabilities, np.asarray(seen.scan.depth_m, float)
+        v, u = np.nonzero(seen.fit.inliers & np.isfinite(depth_m))
+        some = slice(None, None, max(1, len(u) // POINTS_A_SCAN))
+        z = depth_m[v, u][some]
+        return ScannerView(
+            base_from_flange=session.mover.state().base_from_flange,
+            points_m=np.column_stack([(u[some] - c.cx) / c.fx * z, (v[some] - c.cy) / c.fy * z, z]),
+            sigma_m=seen.fit.noise.sigma_m(z),
+        )
+
+    views = visit(session, flanges, measure, count=count, name="scan")
+    session.progress(0.92, "solve")
+    result = calibrate_scanner(views, session.mount(scanner).parent_from_child, session.known_panel())
+    _check_scatter(result.chi_square, result.degrees, "the plate: is it flat, and is nothing in front of it?")
+    return result
+
+
+# -- tool: weight and bias with the hand turned every way ---------------------------------------------------------------
+
+
+def tool_joints(session: Session, sensor: str) -> list[Array]:
+    """Joint vectors about the parking place, those first that turn gravity furthest in sensor axes."""
+    arm = kinematics(session)
+    turn = matrix_of(session.mount(sensor).parent_from_child)
+    return wrist_turns(arm, np.array(session.cell.file.workspace.park_rad), lambda q: matrix_of(arm.flange(q)) @ turn)
+
+
+def measure_tool(session: Session, sensor: str, count: int) -> WrenchCalibration:
+    """Turn the hand every way, read the raw wrench at rest, and solve for weight, centre and bias.
+
+    Raises:
+        NotObservable: gravity came from too few directions.
+    """
+    rotations: list[Array] = []
+    wrenches: list[Array] = []
+    turn = matrix_of(session.mount(sensor).parent_from_child)
+    for goal in tool_joints(session, sensor):
+        session.progress(0.05 + 0.85 * len(wrenches) / count, f"weigh: pose {len(wrenches) + 1} of {count}")
+        if not go_to_joints(session, goal, name=f"weigh {len(wrenches) + 1}"):
+            continue
+        settle(session, WEIGH_REST_S)
+        wrenches.append(_rest_wrench(session, sensor))
+        rotations.append(matrix_of(session.mover.state().base_from_flange) @ turn)
+        if len(wrenches) == count:
+            break
+    session.progress(0.92, "solve")
+    return calibrate_wrench(np.array(rotations), np.array(wrenches))
+
+
+def _rest_wrench(session: Session, sensor: str) -> Array:
+    """(6,) mean raw reading with the hand at rest."""
+    device = session.connection.device(sensor)
+    readings = []
+    for _ in range(WRENCH_SAMPLES):
+        session.run(Hold(name="rest", duration_s=WRENCH_STEP_S))
+        now_s = session.connection.clock.now_s()
+        wrench = device.read_wrench(deadline=deadline()).usable(now_s=now_s, max_age_s=OLDEST_S, device=sensor)
+        readings.append(np.concatenate([wrench.force_n, wrench.torque_nm]))
+    return np.asarray(np.mean(readings, axis=0))
+
+
+def _check_scatter(chi_square: float, degrees: int, what_to_check: str) -> None:
+    ratio = chi_square / max(degrees, 1)
+    if ratio > MOST_SCATTER:
+        raise NotObservable(
+            f"the measurements scatter {np.sqrt(ratio):.1f} times as far as their noise, so nothing was kept",
+            hint=f"check {what_to_check}",
+            chi_square_ratio=round(ratio, 2),
+        )

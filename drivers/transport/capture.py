@@ -18,7 +18,7 @@ from drivers.transport.link import Link, LinkLost, now_s
 from hal.errors import ConfigError, DeviceUnavailable
 
 EARLY_S = 0.01  # a replay is never quite in step; what is due so soon was there when the recorded driver looked
-WRITE_IN_S = 0.05  # a request that comes later than that will not be made
+WRITE_IN_S = 0.5  # a request that comes later than that will not be made
 AHEAD_S = 0.2  # a request is looked for so far ahead; a later one of the same bytes is another
 L = TypeVar("L")
 
@@ -128,8 +128,8 @@ def read_capture(path: Path) -> list[Session]:
 class ReplayLink:
     """Gives what the recorded driver read, when it read it, provided that it is asked what the recorded driver asked.
 
-    What was read after a request is held back until the request is written, or its time is over. The end of the recording
-    is the loss of the link.
+    What was read after a request is held back until the request is written, or its time is over; each request sets the
+    pace anew, so that a replay on a busy machine is later and not another. The end of the recording is the loss of the link.
     """
 
     def __init__(self, session: Session) -> None:
@@ -171,15 +171,19 @@ class ReplayLink:
     def write(self, data: bytes, until_s: float) -> None:  # noqa: ARG002  # a file takes anything at once
         """Let go what was read after the same bytes had been written."""
         with self._written:
-            latest_s = now_s() - self._start_s + AHEAD_S
+            latest_s, is_next = now_s() - self._start_s + AHEAD_S, True
             for i in range(len(self._events) - 1, -1, -1):
                 event = self._events[i]
                 if event.t_s > latest_s:
                     return
                 if not event.is_read and event.data == data:
-                    del self._events[i]
+                    if is_next:
+                        self._start_s = now_s() - event.t_s
+                    # Silence that was heard before it is over: how often a driver looks depends on how busy it is.
+                    self._events[i:] = [e for e in self._events[i + 1 :] if e.data or not e.is_read]
                     self._written.notify_all()
                     return
+                is_next &= event.is_read
 
     def is_present(self) -> bool:
         """A recording stays."""

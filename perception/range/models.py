@@ -1,8 +1,6 @@
-"""Matching named surfaces against models of components: which surface is which, pose, state of its moving part.
+"""Models of components: bounded primitives with tolerances in the object's own frame, read from TOML.
 
-A model is a set of primitives in the object's own frame with tolerances, read from TOML. Objects on a panel stand on
-its plane, so a model may state `on_plane = true`: its z axis is then the panel's outward normal. Matching starts from
-the model's anchor surface, pairs the others greedily by what the pose predicts, and refines the pose on all pairs.
+Components stand on a panel: the origin lies on its plane under the middle of the component, z is the outward normal.
 """
 
 from __future__ import annotations
@@ -19,9 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.errors import ConfigError
-from perception.range.primitives import SurfaceType
 
 Array = NDArray[np.float64]
+
+
+class Form(StrEnum):
+    """What a surface of a model is: the types of `SurfaceType`, and rings, which no segmentation names."""
+
+    PLANE = "plane"
+    SPHERE = "sphere"
+    CYLINDER = "cylinder"
+    CONE = "cone"
+    ELLIPSOID = "ellipsoid"
+    TORUS = "torus"
 
 
 class MotionKind(StrEnum):
@@ -38,24 +46,34 @@ class ModelSurface:
 
     Attributes:
         name: unique in its model.
-        point_m: (3,) centre of a sphere, ellipsoid or flat face; a point of an axis; the apex of a cone.
-        direction: (3,) outward normal of a plane, axis of a cylinder or cone; zeros where it has no meaning.
-        size_m: radius of a sphere or cylinder, or of the disc of equal area for a face; mean radius of an ellipsoid;
-            0 for a cone.
+        point_m: (3,) middle of a face, cylinder, ball or ring; the apex of a cone.
+        direction: (3,) outward normal of a plane, axis of a cylinder or ring, of a cone from the apex into it.
+        along: (3,) direction of a rectangular face's first side; zeros for others.
+        size_m: radius of a sphere, cylinder or disc, of the ring that a torus is bent to; 0 for cones, ellipsoids and
+            rectangles.
         half_angle_rad: of a cone, else 0.
-        tolerance_m: of `size_m` and of positions.
-        required: whether the component cannot be there without it being seen.
+        sides_m: lengths of a rectangular face's sides, None for a disc.
+        length_m: of a cylinder; 0 = unknown.
+        radii_m: (3,) of an ellipsoid along the object's axes.
+        tube_m: radius of a torus's tube.
+        between_m: least and greatest z of what there is of a sphere or cone.
+        tolerance_m: by which sizes and heights of one component may differ from another's.
         moves: whether it belongs to the moving part.
     """
 
     name: str
-    type: SurfaceType
+    type: Form
     point_m: Array
     direction: Array
+    along: Array
     size_m: float
     half_angle_rad: float
+    sides_m: tuple[float, float] | None
+    length_m: float
+    radii_m: Array
+    tube_m: float
+    between_m: tuple[float, float]
     tolerance_m: float
-    required: bool
     moves: bool
 
 
@@ -64,22 +82,22 @@ class ComponentModel:
     """A kind of component: its surfaces, how its part moves, and about which axis it looks the same.
 
     Attributes:
-        symmetric: true when a turn about the z axis changes nothing; the pose then leaves that turn free.
+        turns: how many turns about the z axis look the same; 0 when every one does, and the pose leaves it free.
         motion: slide along `motion_axis` or turn about it, between `low` and `high` (metres or radians).
     """
 
     name: str
     surfaces: tuple[ModelSurface, ...]
-    symmetric: bool
+    turns: int
     motion: MotionKind
     motion_axis: Array
     low: float
     high: float
 
     @property
-    def anchor(self) -> ModelSurface:
-        """The first required surface: matching starts from it."""
-        return next(s for s in self.surfaces if s.required)
+    def period_rad(self) -> float:
+        """The smallest turn about z after which the component looks the same; 0 when every turn does."""
+        return 2.0 * math.pi / self.turns if self.turns else 0.0
 
 
 SURFACE_KEYS = {
@@ -87,13 +105,26 @@ SURFACE_KEYS = {
     "type",
     "point_m",
     "direction",
+    "along",
     "size_m",
     "half_angle_rad",
+    "sides_m",
+    "length_m",
+    "radii_m",
+    "tube_m",
+    "between_m",
     "tolerance_m",
-    "required",
     "moves",
 }
-MODEL_KEYS = {"surfaces", "symmetric", "motion", "motion_axis", "low", "high"}
+NEEDED = {
+    Form.SPHERE: {"size_m"},
+    Form.CYLINDER: {"size_m", "direction"},
+    Form.CONE: {"half_angle_rad", "direction"},
+    Form.ELLIPSOID: {"radii_m"},
+    Form.TORUS: {"size_m", "tube_m", "direction"},
+    Form.PLANE: {"direction"},
+}
+MODEL_KEYS = {"surfaces", "turns", "motion", "motion_axis", "low", "high"}
 
 
 def shipped_models() -> tuple[ComponentModel, ...]:
@@ -132,8 +163,6 @@ def _model(name: str, table: Mapping[str, Any], *, where: str) -> ComponentModel
     surfaces = tuple(_surface(row, where=f"{where}.surfaces[{k}]") for k, row in enumerate(rows))
     if len({s.name for s in surfaces}) != len(surfaces):
         raise ConfigError(f"{where}: two surfaces share a name", hint="name each surface once")
-    if not any(s.required for s in surfaces):
-        raise ConfigError(f"{where}: no surface is required", hint="mark the one that is always seen")
     motion = table.get("motion", "none")
     if motion not in set(MotionKind):
         raise ConfigError(f"{where}.motion is {motion!r}", hint=f"one of {[str(m) for m in MotionKind]}")
@@ -143,7 +172,7 @@ def _model(name: str, table: Mapping[str, Any], *, where: str) -> ComponentModel
     return ComponentModel(
         name=name,
         surfaces=surfaces,
-        symmetric=bool(table.get("symmetric", False)),
+        turns=_turns(table, where),
         motion=MotionKind(motion),
         motion_axis=_unit(_vector(table, "motion_axis", (0.0, 0.0, 1.0), where), where),
         low=low,
@@ -151,25 +180,50 @@ def _model(name: str, table: Mapping[str, Any], *, where: str) -> ComponentModel
     )
 
 
+def _turns(table: Mapping[str, Any], where: str) -> int:
+    turns = table.get("turns", 1)
+    if isinstance(turns, bool) or not isinstance(turns, int) or turns < 0:
+        raise ConfigError(f"{where}.turns is {turns!r}", hint="how many turns look the same: 1, 2, ..., 0 = all")
+    return turns
+
+
 def _surface(row: Mapping[str, Any], *, where: str) -> ModelSurface:
     _only(row, SURFACE_KEYS, where)
     kind = row.get("type")
-    if kind not in set(SurfaceType):
-        raise ConfigError(f"{where}.type is {kind!r}", hint=f"one of {[str(t) for t in SurfaceType]}")
+    if kind not in set(Form):
+        raise ConfigError(f"{where}.type is {kind!r}", hint=f"one of {[str(t) for t in Form]}")
+    form = Form(kind)
+    missing = sorted(NEEDED[form] - set(row))
+    if form == Form.PLANE and not {"size_m", "sides_m"} & set(row):
+        missing.append("size_m")
+    if missing:
+        raise ConfigError(f"{where}: a {form} needs {missing[0]}", hint="models are drawn as rays see them")
     direction = _vector(row, "direction", (0.0, 0.0, 0.0), where)
-    if kind in (SurfaceType.PLANE, SurfaceType.CYLINDER, SurfaceType.CONE):
+    if "direction" in NEEDED[form]:
         direction = _unit(direction, f"{where}.direction")
+    sides = _pair(row, "sides_m", where) if "sides_m" in row else None
     return ModelSurface(
         name=str(row.get("name", kind)),
-        type=SurfaceType(kind),
+        type=form,
         point_m=_vector(row, "point_m", (0.0, 0.0, 0.0), where),
         direction=direction,
+        along=_along(row, direction, where) if sides is not None else np.zeros(3),
         size_m=_number(row, "size_m", 0.0, where),
         half_angle_rad=_number(row, "half_angle_rad", 0.0, where),
+        sides_m=sides,
+        length_m=_number(row, "length_m", 0.0, where),
+        radii_m=_vector(row, "radii_m", (0.0, 0.0, 0.0), where),
+        tube_m=_number(row, "tube_m", 0.0, where),
+        between_m=_pair(row, "between_m", where) if "between_m" in row else (-math.inf, math.inf),
         tolerance_m=_number(row, "tolerance_m", 0.002, where),
-        required=bool(row.get("required", False)),
         moves=bool(row.get("moves", False)),
     )
+
+
+def _along(row: Mapping[str, Any], normal: Array, where: str) -> Array:
+    """Direction of the first side, laid into the face."""
+    side = _vector(row, "along", (1.0, 0.0, 0.0), where)
+    return _unit(side - normal * float(normal @ side), f"{where}.along")
 
 
 def _only(table: Mapping[str, Any], known: set[str], where: str) -> None:
@@ -190,6 +244,13 @@ def _vector(table: Mapping[str, Any], key: str, default: Sequence[float], where:
     if not isinstance(value, list | tuple) or len(value) != 3 or not all(isinstance(v, int | float) for v in value):
         raise ConfigError(f"{where}.{key} is {value!r}", hint="give three numbers")
     return np.array(value, float)
+
+
+def _pair(table: Mapping[str, Any], key: str, where: str) -> tuple[float, float]:
+    value = table[key]
+    if not isinstance(value, list | tuple) or len(value) != 2 or not all(isinstance(v, int | float) for v in value):
+        raise ConfigError(f"{where}.{key} is {value!r}", hint="give two numbers")
+    return float(value[0]), float(value[1])
 
 
 def _unit(vector: Array, where: str) -> Array:

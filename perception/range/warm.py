@@ -6,6 +6,8 @@ import numpy as np
 
 from perception.range.analyse import analyse
 from perception.range.geometry import local_geometry
+from perception.range.match import match_models
+from perception.range.models import shipped_models
 from perception.range.plane import fit_plane_near
 from perception.range.sensor import OrthographicSensor, PinholeSensor, RangeSensorModel
 
@@ -24,6 +26,7 @@ def warm_up() -> None:
     depth = 0.6 + 0.1 * v - np.maximum(np.maximum(bump, ridge), small) + noise
     sensors: tuple[RangeSensorModel, ...] = (pinhole, parallel)
     for sensor in sensors:
-        analyse(depth, sensor)
+        scene = analyse(depth, sensor)
         local_geometry(depth, sensor)
+        match_models(scene, depth, shipped_models()[:1])
     fit_plane_near(depth, pinhole, point_m=[0.0, 0.0, 0.61], normal=[0.0, 0.0, -1.0])

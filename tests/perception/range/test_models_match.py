@@ -84,18 +84,59 @@ def test_symmetry_is_stated_and_its_turn_is_free():
     assert np.linalg.eigvalsh(match.sensor_from_object.covariance).min() > -1e-12
 
 
+def test_what_is_hidden_widens_the_covariance():
+    clear, hidden = (found(panel_image(4, hidden=h))["emergency_knob"] for h in (False, True))
+    sigmas = [np.sqrt(np.trace(m.sensor_from_object.covariance[:3, :3])) for m in (clear, hidden)]
+    assert 1e-5 < sigmas[0] < 0.001 and sigmas[0] <= sigmas[1] < 0.002
+    assert hidden.seen < 0.8 < clear.seen
+    assert hidden.score < clear.score
+
+
+def test_two_of_a_kind_share_the_pixels():
+    parts = [
+        plane_depth(SENSOR, NORMAL, MIDDLE),
+        sphere_depth(SENSOR, place(0.0, -0.03, 0.0), 0.013),
+        sphere_depth(SENSOR, place(0.0, 0.01, 0.0), 0.013),
+    ]
+    depth = np.min(parts, axis=0) + np.random.default_rng(5).normal(0, 0.0004, parts[0].shape)
+    scene = analyse(depth, SENSOR)
+    matches = match_models(scene, depth, load_models(LIBRARY))
+    assert [m.model for m in matches] == ["indicator_lamp"] * 2
+    ys = sorted(
+        float(m.sensor_from_object.parent_from_child.translation @ np.cross(NORMAL, [1, 0, 0])) for m in matches
+    )
+    assert ys[1] - ys[0] == pytest.approx(0.04, abs=0.002)
+    assert matches[0].labels["dome"] != matches[1].labels["dome"]
+
+
+def test_a_plane_is_needed_to_stand_on():
+    scene = analyse(panel_image(6), SENSOR)
+    ball = next(s for s in scene.surfaces if s.type == "sphere")
+    with pytest.raises(TypeError):
+        match_models(scene, panel_image(6), load_models(LIBRARY), panel=ball)
+
+
 def test_clutter_alone_matches_nothing():
     parts = [plane_depth(SENSOR, NORMAL, MIDDLE), sphere_depth(SENSOR, place(0.0, 0.0, 0.03), 0.05)]
     depth = np.min(parts, axis=0) + np.random.default_rng(3).normal(0, 0.0004, parts[0].shape)
     assert found(depth) == {}
 
 
-GOOD = {"surfaces": [{"name": "cap", "type": "sphere", "size_m": 0.02, "required": True}]}
+GOOD = {"surfaces": [{"name": "cap", "type": "sphere", "size_m": 0.02}]}
+FACE = {"type": "plane", "direction": [0, 0, 2.0], "sides_m": [0.04, 0.02]}
 
 
 def test_a_small_model_reads():
     (model,) = models_from({"model": {"ball": GOOD}})
-    assert model.anchor.name == "cap" and model.motion == MotionKind.NONE
+    assert model.surfaces[0].name == "cap" and model.motion == MotionKind.NONE
+    assert model.turns == 1 and model.period_rad == pytest.approx(2 * np.pi)
+
+
+def test_a_rectangle_gets_a_first_side_in_its_face():
+    (model,) = models_from({"model": {"box": {"surfaces": [{**FACE, "along": [1.0, 0, 1.0]}], "turns": 2}}})
+    face = model.surfaces[0]
+    assert face.direction.tolist() == [0, 0, 1] and face.along.tolist() == [1, 0, 0]
+    assert model.period_rad == pytest.approx(np.pi)
 
 
 @pytest.mark.parametrize(
@@ -105,9 +146,15 @@ def test_a_small_model_reads():
         {"model": {}},
         {"model": {"ball": {**GOOD, "colour": 1}}},
         {"model": {"ball": {"surfaces": []}}},
-        {"model": {"ball": {"surfaces": [{"type": "torus", "required": True}]}}},
+        {"model": {"ball": {"surfaces": [{"type": "blob"}]}}},
         {"model": {"ball": {"surfaces": [{"type": "sphere"}]}}},
-        {"model": {"ball": {"surfaces": [{"type": "plane", "required": True}]}}},
+        {"model": {"ball": {"surfaces": [{"type": "plane", "size_m": 0.02}]}}},
+        {"model": {"ball": {"surfaces": [{"type": "plane", "direction": [0, 0, 1]}]}}},
+        {"model": {"ball": {"surfaces": [{**FACE, "direction": [0, 0, 0]}]}}},
+        {"model": {"ball": {"surfaces": [{**FACE, "along": [0, 0, 1]}]}}},
+        {"model": {"ball": {"surfaces": [{**FACE, "sides_m": [0.04]}]}}},
+        {"model": {"ball": {**GOOD, "turns": -1}}},
+        {"model": {"ball": {**GOOD, "turns": True}}},
         {"model": {"ball": {"surfaces": [*GOOD["surfaces"], *GOOD["surfaces"]]}}},
         {"model": {"ball": {**GOOD, "motion": "hop"}}},
         {"model": {"ball": {**GOOD, "motion": "slide"}}},

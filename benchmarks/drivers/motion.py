@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
-from pathlib import Path
+from contextlib import closing
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from benchmarks.drivers.benches import Bench, bench, running
 from benchmarks.drivers.far_process import FarProcess, far_process
+from benchmarks.drivers.realtime import PRIORITIES, realtime
 from benchmarks.drivers.report import deadline, line
 from hal.errors import CellError
 from hal.registry import Context, connect
 
 CYCLE_S = 0.004
-REALTIME = 10
 
 
 def part_ur(seconds: float) -> None:
@@ -48,9 +46,9 @@ def part_csp(seconds: float) -> None:
     himself; as an ordinary process, where only the driver's owner thread asks for real-time priority, and with host and drives
     at real-time priority (`chrt -r 10`). Beside each stands what a bare loop of 250 Hz misses: no driver can do better.
     """
-    for priority, transport in ((0, "serial"), (0, "tcp"), (REALTIME, "serial"), (REALTIME, "tcp")):
-        what = f"CSP at 250 Hz, slcan over {transport}, {'real-time' if priority else 'ordinary'}: SYNCs not sent"
-        with far_process(f"cia402?transport={transport}") as far, _realtime(priority, far.pid) as is_given:
+    for (priority, word), transport in product(PRIORITIES, ("serial", "tcp")):
+        what = f"CSP at 250 Hz, slcan over {transport}, {word}: SYNCs not sent"
+        with far_process(f"cia402?transport={transport}") as far, realtime(priority, far.pid) as is_given:
             if not is_given:
                 line(what, "1e-3", "real-time priority is not allowed here", is_good=False)
                 continue
@@ -58,20 +56,6 @@ def part_csp(seconds: float) -> None:
         share = (missed + held) / max(1, missed + held + seen)
         measured = f"{missed} late + {held} held of {seen} ({share:.1e}; floor {floor:.1e})"
         line(what, "1e-3", measured, share <= 1e-3)
-
-
-@contextmanager
-def _realtime(priority: int, far_pid: int) -> Iterator[bool]:
-    """Give this thread, those that it starts, and a far side's process a real-time priority, and take it back."""
-    tasks = [0, *(int(entry.name) for entry in Path(f"/proc/{far_pid}/task").iterdir())]
-    try:
-        for task in tasks if priority else ():
-            os.sched_setscheduler(task, os.SCHED_RR, os.sched_param(priority))
-    except OSError:
-        yield False
-        return
-    yield True
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def _bare_loop(seconds: float) -> float:

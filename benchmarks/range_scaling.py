@@ -6,8 +6,8 @@ Tiles: every pixel step of the chain is timed tile by tile; the critical path is
 barrier a step, plus log2(P) rounds of seam merges, plus what is not tiled (region fits). Two costs of talking: shared
 memory (10 us a barrier) and messages (50 us and 10 Gbit/s for the halo rows).
 
-Batches: image times are measured, then a discrete-event simulation serves tasks to workers, with the measured cost of
-handing over a task, stragglers and one lost worker. It is checked against real runs with one and two workers.
+Batches: tasks are timed on one and on two workers, and a discrete-event simulation that serves tasks of those lengths
+must end when the real run ended. It is then carried to 1024 workers, with stragglers and one lost worker.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from __future__ import annotations
 import argparse
 import heapq
 import json
+import os
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.range.analyse import analyse
-from perception.range.batch import IMAGES_A_TASK, analyse_files, batch_range, recordings_in, tasks_of
+from perception.range.batch import IMAGES_A_TASK, _client, analyse_files, recordings_in, tasks_of
 from perception.range.claim import claim_borders, claim_pixels
 from perception.range.components import _merge_seam, _scan, merge_rounds, tile_rows
 from perception.range.geometry import geometry_of
@@ -221,32 +222,77 @@ def simulate(task_s: Array, cluster: Cluster, *, seed: int = 0) -> float:
     return makespan
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TaskRun:
+    """One task as its worker saw it: process id, wall clock at start and end, and CPU time, seconds."""
+
+    worker: int
+    start_s: float
+    end_s: float
+    cpu_s: float
+
+
+def stamped(paths: Sequence[str]) -> TaskRun:
+    """`analyse_files` of one group of recordings, timed where it runs."""
+    start_s, cpu_s = time.time(), time.process_time()
+    analyse_files(paths)
+    return TaskRun(worker=os.getpid(), start_s=start_s, end_s=time.time(), cpu_s=time.process_time() - cpu_s)
+
+
+def measured_batch(groups: list[list[str]], workers: int) -> list[TaskRun]:
+    """The tasks of a batch on that many warm local workers, in the order in which they started."""
+    with _client("local", workers) as client:
+        client.run(warm_up)
+        runs: list[TaskRun] = client.gather(client.map(stamped, groups, pure=False))
+    return sorted(runs, key=lambda r: r.start_s)
+
+
+def gaps_s(runs: Sequence[TaskRun]) -> Array:
+    """Seconds between the end of a task and the start of the next on the same worker: what handing over costs."""
+    last: dict[int, float] = {}
+    out = []
+    for run in runs:
+        if run.worker in last:
+            out.append(run.start_s - last[run.worker])
+        last[run.worker] = run.end_s
+    return np.array(out)
+
+
 def print_batch(folder: Path) -> None:
-    """Print measured runs with one and two workers beside the simulation, then the simulation up to 1024 workers."""
+    """Print measured runs with one and two workers beside the simulation, then the simulation up to 1024 workers.
+
+    The simulation gets the lengths of the tasks as they were in that run, so that other load on the machine does not
+    count, and the hand-over of the run with one worker; it must find when the last task ends.
+    """
     groups = tasks_of(recordings_in(folder))
-    lengths = np.array([_wall_s(lambda g=g: analyse_files(g)) for g in groups])  # type: ignore[misc]
     images = sum(len(g) for g in groups)
-    handover_s = 0.001
-    print(f"\nbatch of {images} images in {len(groups)} tasks of {IMAGES_A_TASK}: {lengths.sum():.2f} s in one process")
-    print(f"{'workers':>8} {'measured s':>11} {'simulated s':>12} {'apart':>7} {'efficiency':>11}")
-    one_s = 0.0
+    print(f"\nbatch of {images} images in {len(groups)} tasks of {IMAGES_A_TASK}")
+    print(
+        f"{'workers':>8} {'measured s':>11} {'simulated s':>12} {'apart':>7} {'CPU s':>7} {'efficiency by wall, by CPU':>27}"
+    )
+    one: list[TaskRun] = []
+    handover_s, one_s = 0.0, 0.0
     for workers in (1, 2):
-        measured = _batch_s(folder, workers)
-        one_s = one_s or measured
-        # What one worker takes beyond the plain loop is handing over and decoding results.
-        handover_s = max((one_s - float(lengths.sum())) / len(groups), 1e-4)
-        simulated = simulate(lengths, Cluster(workers=workers, handover_s=handover_s))
+        runs = measured_batch(groups, workers)
+        measured = max(r.end_s for r in runs) - runs[0].start_s
+        if workers == 1:
+            one, one_s, handover_s = runs, measured, float(np.mean(gaps_s(runs)))
+        lengths = np.array([r.end_s - r.start_s for r in runs])
+        # The measured span begins with the first task, after its hand-over.
+        simulated = simulate(lengths, Cluster(workers=workers, handover_s=handover_s)) - handover_s
+        cpu, one_cpu = (sum(r.cpu_s for r in some) for some in (runs, one))
         print(
-            f"{workers:8d} {measured:11.2f} {simulated:12.2f} {100 * (simulated / measured - 1):6.1f}% "
-            f"{one_s / measured / workers:11.2f}"
+            f"{workers:8d} {measured:11.2f} {simulated:12.2f} {100 * (simulated / measured - 1):6.1f}% {cpu:7.2f} "
+            f"{one_s / measured / workers:15.2f} {one_cpu / cpu:11.2f}"
         )
-    print_carried(lengths, handover_s)
+    print(f"a hand-over takes {1e3 * handover_s:.1f} ms (mean)")
+    print_carried(np.array([r.cpu_s for r in one]), handover_s)
 
 
 def print_carried(lengths: Array, handover_s: float) -> None:
     """Print simulated makespans of 200 000 images: plain, with stragglers, and with one worker lost half way."""
     many = np.random.default_rng(0).choice(lengths, 10_000)
-    network_s = min(handover_s, 0.0005)  # 200 to 500 us a task on a running scheduler
+    network_s = min(handover_s, 0.0005)  # 200 to 500 us a task on a running scheduler that nothing else disturbs
     print(f"\nsimulated, 10000 tasks, {1e3 * network_s:.2f} ms a hand-over")
     print(f"{'workers':>8} {'plain s':>9} {'efficiency':>11} {'2 % stragglers x3':>18} {'one lost':>9}")
     for workers in WORKERS:
@@ -256,24 +302,6 @@ def print_carried(lengths: Array, handover_s: float) -> None:
         lost = simulate(many, losing) if workers > 1 else np.nan
         efficiency = many.sum() / plain / workers
         print(f"{workers:8d} {plain:9.1f} {efficiency:11.2f} {slow:18.1f} {lost:9.1f}")
-
-
-def _wall_s(work: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
-
-
-def _batch_s(folder: Path, workers: int) -> float:
-    """Wall time of a batch at its steady rate: without the start of the workers and each one's first task."""
-    marks: list[float] = []
-    batch_range(folder, workers=workers, progress=lambda *_: marks.append(time.perf_counter()))
-    # The first task of each worker loads and compiles; the steady rate is what the others show.
-    steady = marks[workers:]
-    if len(steady) < 2:
-        return marks[-1] - marks[0]
-    rate = (steady[-1] - marks[workers - 1]) / len(steady)
-    return rate * len(marks)
 
 
 if __name__ == "__main__":

@@ -88,12 +88,17 @@ def analyse(
         NotFound: fewer than 16 valid pixels.
     """
     depth = checked_depth(depth_m, sensor)
-    law = noise or estimate_noise(depth, sensor)
-    task = Task(depth_m=depth, sensor=sensor, tiles=tiles, pool=pool)
+    depths = typical_depths_m(depth)
+    law = noise or estimate_noise(depth, sensor, depths_m=depths)
+    task = Task(depth_m=depth, sensor=sensor, depths_m=depths, tiles=tiles, pool=pool)
     labels, found, law = segment(task, law)
     labels, surfaces = _finished(task, law, labels, found)
     return RangeScene(
-        labels=labels, surfaces=surfaces, noise=law, sensor=sensor, warnings=_warnings(depth, sensor, law, surfaces)
+        labels=labels,
+        surfaces=surfaces,
+        noise=law,
+        sensor=sensor,
+        warnings=_warnings(float(depths[2]), sensor, law, surfaces),
     )
 
 
@@ -178,10 +183,9 @@ def _finished(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) 
 
 
 def _warnings(
-    depth: Array, sensor: RangeSensorModel, noise: NoiseModel, surfaces: tuple[Surface, ...]
+    middle: float, sensor: RangeSensorModel, noise: NoiseModel, surfaces: tuple[Surface, ...]
 ) -> tuple[str, ...]:
     out = []
-    middle = float(typical_depths_m(depth)[2])
     sigma = float(noise.sigma_m(middle))
     if sigma > 2.0 * sensor.pitch_m(middle):
         out.append(f"noise of {1e3 * sigma:.1f} mm exceeds two pixels: small surfaces are lost")

@@ -18,11 +18,14 @@ from numpy.typing import NDArray
 
 from perception.range.filters import gaussian, remove_gross_errors
 from perception.range.noise import NoiseModel, estimate_noise
+from perception.range.rays import LOOSE
 from perception.range.sensor import RangeSensorModel
 
 Array = NDArray[np.float64]
 
 CURVATURE_GOAL_PER_M = 4.0  # noise of H that still tells a ball of 0.1 m radius from a plane
+CHUNK, ROW = 128, 144  # pixels worked on at a time; a row of the scratch array holds them and a neighbour on each side
+SCRATCH = 11 * ROW
 SCALES_PX = (1.0, 1.5, 2.0, 3.0, 4.0)
 
 
@@ -30,18 +33,21 @@ SCALES_PX = (1.0, 1.5, 2.0, 3.0, 4.0)
 class LocalGeometry:
     """(H, W) maps; NaN beside holes and at the image border.
 
-    `gu`, `gv`: metres of depth per pixel. `normal` (H, W, 3) towards the sensor. `orientation_rad`: atan2(gu, gv), the
-    paper's orientation feature. `mean_curvature_per_m`, `gaussian_curvature_per_m2`: H and K. `scale_px`: sigma of the
-    gaussian that regularised the derivatives.
+    `gu`, `gv`: metres of depth per pixel. `normal` (H, W, 3) towards the sensor. `mean_curvature_per_m`,
+    `gaussian_curvature_per_m2`: H and K. `scale_px`: sigma of the gaussian that regularised the derivatives.
     """
 
     gu: Array
     gv: Array
     normal: Array
-    orientation_rad: Array
     mean_curvature_per_m: Array
     gaussian_curvature_per_m2: Array
     scale_px: float
+
+    @property
+    def orientation_rad(self) -> Array:
+        """atan2(gu, gv), the paper's orientation feature, (H, W)."""
+        return np.asarray(np.arctan2(self.gu, self.gv))
 
 
 def local_geometry(
@@ -70,17 +76,14 @@ def choose_scale(depth_m: Array, sensor: RangeSensorModel, noise: NoiseModel) ->
     return SCALES_PX[-1]
 
 
-def geometry_of(depth_m: Array, sensor: RangeSensorModel, *, scale_px: float) -> LocalGeometry:
-    """Geometry by central differences of an already smoothed (H, W) depth image."""
-    gu, gv, normal, mean, gauss = _fused(np.ascontiguousarray(depth_m), sensor.packed())
+def geometry_of(depth_m: Array | NDArray[np.float32], sensor: RangeSensorModel, *, scale_px: float) -> LocalGeometry:
+    """Geometry by central differences of an already smoothed (H, W) depth image; float32 stays float32, and is faster."""
+    z = np.ascontiguousarray(depth_m)
+    gu, gv, mean, gauss = (np.empty_like(z) for _ in range(4))
+    normal = np.empty((*z.shape, 3), z.dtype)
+    _fused(z, sensor.packed(), np.empty(SCRATCH, z.dtype), gu, gv, normal, mean, gauss)
     return LocalGeometry(
-        gu=gu,
-        gv=gv,
-        normal=normal,
-        orientation_rad=np.arctan2(gu, gv),
-        mean_curvature_per_m=mean,
-        gaussian_curvature_per_m2=gauss,
-        scale_px=scale_px,
+        gu=gu, gv=gv, normal=normal, mean_curvature_per_m=mean, gaussian_curvature_per_m2=gauss, scale_px=scale_px
     )
 
 
@@ -109,50 +112,66 @@ def graph_curvature(g: Array) -> tuple[Array, Array]:
     return ((1 + gv**2) * guu + (1 + gu**2) * gvv - 2 * gu * gv * guv) / (2 * q**1.5), (guu * gvv - guv**2) / q**2
 
 
-@njit(cache=True, nogil=True)
-def _fused(z, sen):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fused(z, sen, work, gu, gv, normal, mean, gauss):  # type: ignore[no-untyped-def]
+    """Fill the maps from `z` (H, W), a chunk of a row at a time; all in the type of `z`, `work` (SCRATCH,) too."""
     H, W = z.shape
-    gu, gv = np.full((H, W), np.nan), np.full((H, W), np.nan)
-    normal = np.full((H, W, 3), np.nan)
-    mean, gauss = np.full((H, W), np.nan), np.full((H, W), np.nan)
-    perspective = sen[0] > 0
-    ax, ay = 1.0 / sen[1], 1.0 / sen[2]
-    for v in range(1, H - 1):
-        y = (v - sen[4]) * ay
-        for u in range(1, W - 1):
-            x = (u - sen[3]) * ax
-            c = z[v, u]
-            zu, zv = 0.5 * (z[v, u + 1] - z[v, u - 1]), 0.5 * (z[v + 1, u] - z[v - 1, u])
-            zuu = z[v, u + 1] - 2.0 * c + z[v, u - 1]
-            zvv = z[v + 1, u] - 2.0 * c + z[v - 1, u]
-            zuv = 0.25 * (z[v + 1, u + 1] - z[v + 1, u - 1] - z[v - 1, u + 1] + z[v - 1, u - 1])
-            if not np.isfinite(zuu + zvv + zuv):
-                continue
-            gu[v, u], gv[v, u] = zu, zv
-            if perspective:  # X = z (x, y, 1)
-                xu0, xu1, xu2 = zu * x + c * ax, zu * y, zu
-                xv0, xv1, xv2 = zv * x, zv * y + c * ay, zv
-                a0, a1, a2 = zuu * x + 2.0 * zu * ax, zuu * y, zuu
-                b0, b1, b2 = zuv * x + zv * ax, zuv * y + zu * ay, zuv
-                d0, d1, d2 = zvv * x, zvv * y + 2.0 * zv * ay, zvv
-            else:  # X = (x, y, z)
-                xu0, xu1, xu2, xv0, xv1, xv2 = ax, 0.0, zu, 0.0, ay, zv
-                a0, a1, a2, b0, b1, b2, d0, d1, d2 = 0.0, 0.0, zuu, 0.0, 0.0, zuv, 0.0, 0.0, zvv
-            # X_v x X_u points back to the sensor (x right, y down, z away).
-            n0, n1, n2 = xv1 * xu2 - xv2 * xu1, xv2 * xu0 - xv0 * xu2, xv0 * xu1 - xv1 * xu0
-            length = np.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
-            if length <= 0.0:
-                continue
-            n0, n1, n2 = n0 / length, n1 / length, n2 / length
-            E = xu0 * xu0 + xu1 * xu1 + xu2 * xu2
-            F = xu0 * xv0 + xu1 * xv1 + xu2 * xv2
-            G = xv0 * xv0 + xv1 * xv1 + xv2 * xv2
-            # Towards the sensor is outward, so a bulge curves against the normal: minus signs make it positive.
-            e = -(a0 * n0 + a1 * n1 + a2 * n2)
-            f = -(b0 * n0 + b1 * n1 + b2 * n2)
-            g = -(d0 * n0 + d1 * n1 + d2 * n2)
-            area = E * G - F * F
-            normal[v, u, 0], normal[v, u, 1], normal[v, u, 2] = n0, n1, n2
-            mean[v, u] = 0.5 * (e * G - 2.0 * f * F + g * E) / area
-            gauss[v, u] = (e * g - f * f) / area
-    return gu, gv, normal, mean, gauss
+    for v in range(H):
+        if v in (0, H - 1):
+            gu[v], gv[v], normal[v], mean[v], gauss[v] = np.nan, np.nan, np.nan, np.nan, np.nan
+            continue
+        for u in (0, W - 1):
+            gu[v, u], gv[v, u], normal[v, u], mean[v, u], gauss[v, u] = np.nan, np.nan, np.nan, np.nan, np.nan
+        for first in range(1, W - 1, CHUNK):
+            n = min(CHUNK, W - 1 - first)
+            for k in range(3):
+                work[k * ROW : k * ROW + n + 2] = z[v - 1 + k, first - 1 : first + n + 1]
+            for i in range(n):
+                work[3 * ROW + i] = (first + i - sen[3]) / sen[1]
+            _forms(n, work.dtype.type((v - sen[4]) / sen[2]), sen, work)
+            gu[v, first : first + n] = work[4 * ROW : 4 * ROW + n]
+            gv[v, first : first + n] = work[5 * ROW : 5 * ROW + n]
+            for k in range(3):
+                normal[v, first : first + n, k] = work[(6 + k) * ROW : (6 + k) * ROW + n]
+            mean[v, first : first + n] = work[9 * ROW : 9 * ROW + n]
+            gauss[v, first : first + n] = work[10 * ROW : 10 * ROW + n]
+
+
+@njit(cache=True, error_model="numpy", fastmath=LOOSE)
+def _forms(n, y, sen, work):  # type: ignore[no-untyped-def]
+    """Derivatives, normal, H and K of one chunk, without a branch: rows 4 to 10 of `work` from rows 0 to 3."""
+    as_type = work.dtype.type
+    half, quarter, two, one = as_type(0.5), as_type(0.25), as_type(2.0), as_type(1.0)
+    # X = z (p x, p y, 1) + (1 - p) (x, y, 0), p = 1 for a pinhole and 0 for parallel rays.
+    p, ax, ay = as_type(1.0 if sen[0] > 0 else 0.0), as_type(1.0 / sen[1]), as_type(1.0 / sen[2])
+    py = p * y
+    for i in range(n):
+        c, left, right = work[145 + i], work[144 + i], work[146 + i]
+        above, below = work[1 + i], work[289 + i]
+        px = p * work[432 + i]
+        zu, zv = half * (right - left), half * (below - above)
+        zuu, zvv = right - two * c + left, below - two * c + above
+        zuv = quarter * (work[290 + i] - work[288 + i] - work[2 + i] + work[i])
+        nothing = (zuu + zvv + zuv) * as_type(0.0)  # NaN where a neighbour is missing
+        reach = p * c + (one - p)
+        xu0, xu1 = zu * px + reach * ax, zu * py
+        xv0, xv1 = zv * px, zv * py + reach * ay
+        a0, a1 = zuu * px + two * p * zu * ax, zuu * py
+        b0, b1 = zuv * px + p * zv * ax, zuv * py + p * zu * ay
+        d0, d1 = zvv * px, zvv * py + two * p * zv * ay
+        # X_v x X_u points back to the sensor (x right, y down, z away).
+        n0, n1, n2 = xv1 * zu - zv * xu1, zv * xu0 - xv0 * zu, xv0 * xu1 - xv1 * xu0
+        area = n0 * n0 + n1 * n1 + n2 * n2  # = E G - F^2
+        inverse = one / np.sqrt(area)
+        n0, n1, n2 = n0 * inverse, n1 * inverse, n2 * inverse
+        E, F, G = xu0 * xu0 + xu1 * xu1 + zu * zu, xu0 * xv0 + xu1 * xv1 + zu * zv, xv0 * xv0 + xv1 * xv1 + zv * zv
+        # Towards the sensor is outward, so a bulge curves against the normal: minus signs make it positive.
+        e, f, g = -(a0 * n0 + a1 * n1 + zuu * n2), -(b0 * n0 + b1 * n1 + zuv * n2), -(d0 * n0 + d1 * n1 + zvv * n2)
+        inverse *= inverse
+        work[576 + i] = zu + nothing
+        work[720 + i] = zv + nothing
+        work[864 + i] = n0 + nothing
+        work[1008 + i] = n1 + nothing
+        work[1152 + i] = n2 + nothing
+        work[1296 + i] = half * (e * G - two * f * F + g * E) * inverse
+        work[1440 + i] = (e * g - f * f) * inverse

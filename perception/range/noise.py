@@ -73,8 +73,8 @@ class NoiseModel:
         return self.step[0] + self.step[1] > 2.0 * (self.white[0] + self.white[1])
 
 
-def estimate_noise(depth_m: Array, sensor: RangeSensorModel) -> NoiseModel:
-    """The noise model of an (H, W) depth image in metres with NaN holes.
+def estimate_noise(depth_m: Array, sensor: RangeSensorModel, *, depths_m: Array | None = None) -> NoiseModel:
+    """The noise model of an (H, W) depth image in metres with NaN holes; `depths_m`: its typical depths, where known.
 
     Smooth surfaces are locally quadratic in 1/z (pinhole) or z (orthographic), so what a quadratic leaves over in a
     window is noise. A low quantile over the windows ignores those that hold an edge.
@@ -82,7 +82,7 @@ def estimate_noise(depth_m: Array, sensor: RangeSensorModel) -> NoiseModel:
     packed = sensor.packed()
     perspective = packed[0] > 0
     g = 1.0 / depth_m if perspective else depth_m
-    z2 = typical_depths_m(depth_m) ** 2
+    z2 = (typical_depths_m(depth_m) if depths_m is None else depths_m) ** 2
     floor = np.array([FLOOR_RATIO * sensor.pitch_m(float(z)) for z in np.sqrt(z2)])
     small = _window_law(g, perspective, spacing_px=1, stride_px=7)
     spacing = max(2, round(LARGE_SHARE * min(g.shape)))
@@ -131,6 +131,8 @@ def _valid_sample(depth, most):  # type: ignore[no-untyped-def]
     for i in range(flat.shape[0]):
         valid += 1 if np.isfinite(flat[i]) else 0
     stride = max(1, valid // most)
+    if valid == flat.shape[0]:
+        return flat[::stride].copy()
     out = np.empty((valid + stride - 1) // stride)
     seen = 0
     for i in range(flat.shape[0]):

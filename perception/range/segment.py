@@ -23,7 +23,7 @@ from perception.range.claim import bucket, claim_borders, claim_pixels
 from perception.range.compete import Candidates, explain
 from perception.range.components import for_each_tile, label_components
 from perception.range.grid import Grid, block_size, build_grid, seen_from
-from perception.range.noise import WORST_SHARE, NoiseModel, typical_depths_m
+from perception.range.noise import WORST_SHARE, NoiseModel
 from perception.range.sensor import RangeSensorModel
 from perception.range.settle import settle
 from perception.range.surfaces import PLANE
@@ -49,11 +49,13 @@ MOST_ATTEMPTS = 120  # on one grid: bounds the time that rubble can cost
 class Task:
     """What every step needs: the (H, W) depth in metres, the sensor, and how many tiles share the pixel work.
 
-    The depth may be a part of the sensor's image, which begins at row and column `corner_px`.
+    The depth may be a part of the sensor's image, which begins at row and column `corner_px`. `depths_m` (5,): the
+    whole image's `typical_depths_m`.
     """
 
     depth_m: Array
     sensor: RangeSensorModel
+    depths_m: Array
     tiles: int = 1
     pool: ThreadPoolExecutor | None = None
     corner_px: tuple[int, int] = (0, 0)
@@ -95,7 +97,7 @@ def segment(task: Task, noise: NoiseModel) -> tuple[Labels, Candidates, NoiseMod
 
 def _settled_planes(task: Task, noise: NoiseModel) -> tuple[Candidates, Grid, Labels, NoiseModel]:
     """Planes on the coarse grid, grown again under wider noise while large planes scatter more than it allows."""
-    depths = typical_depths_m(task.depth_m)
+    depths = task.depths_m
     shape = (task.depth_m.shape[0], task.depth_m.shape[1])
     for attempt in range(WIDENINGS + 1):
         size = block_size(shape, noise, task.sensor, float(depths[2]))
@@ -190,7 +192,7 @@ def settled(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *,
     """Labels after `sweeps` in which pixels between two equally good surfaces follow their neighbours."""
     kinds, table = found.arrays()
     packed, law = task.packed, noise.packed()
-    slow = noise.slow_share(float(typical_depths_m(task.depth_m)[2]))
+    slow = noise.slow_share(float(task.depths_m[2]))
     earlier = np.full_like(labels, -1)
     for _ in range(sweeps):
         after = np.empty_like(labels)

@@ -25,26 +25,33 @@ MOST = 12
 def settle(depth, sen, noise, slow_share, earlier, labels, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]
     """Judge again the rows [top, bottom) of `labels` (H, W) where labels meet; writes `out` (H, W).
 
-    `earlier`: the labels before the last sweep, anything else at first. A pixel around which nothing has changed since
-    would be judged as it was, so it is not judged again.
+    `earlier`: the labels before the last sweep, -1 at first. A pixel around which nothing has changed since would be
+    judged as it was, so it is not judged again.
     """
     H, W = depth.shape
     perspective = sen[0] > 0
     near, votes = np.empty(MOST, np.int32), np.empty(MOST)
     least, most, change = np.empty(W + 4, np.int32), np.empty(W + 4, np.int32), np.empty(W + 4, np.int32)
-    contested = np.empty(W, np.bool_)
+    judged = np.empty(W, np.bool_)
+    is_first = earlier[0, 0] < 0
     evidence = 0.5 / (1.0 + slow_share * (SHARED_PX - 1.0))
     for v in range(top, bottom):
         y = (v - sen[4]) / sen[2]
         out[v] = labels[v]
-        least[:], most[:], change[:] = NO_LABEL, 0, 0
-        for i in range(max(0, v - REACH_PX), min(H, v + REACH_PX + 1)):
-            add_row(labels[i], least[2:-2], most[2:-2])
-            _add_changes(earlier[i], labels[i], change[2:-2])
-        _contested(labels[v], least, most, change, contested)
+        rows = range(max(0, v - REACH_PX), min(H, v + REACH_PX + 1))
+        if is_first:
+            least[:], most[:] = NO_LABEL, 0
+            for i in rows:
+                add_row(labels[i], least[2:-2], most[2:-2])
+            _contested(labels[v], least, most, judged)
+        else:
+            change[:] = 0
+            for i in rows:
+                _add_changes(earlier[i], labels[i], change[2:-2])
+            _changed(change, judged)
         for u in range(W):
             z = depth[v, u]
-            if not contested[u] or not np.isfinite(z):
+            if not judged[u] or not np.isfinite(z):
                 continue
             n, total = 0, 0.0
             for i in range(max(0, v - REACH_PX), min(H, v + REACH_PX + 1)):
@@ -63,9 +70,9 @@ def settle(depth, sen, noise, slow_share, earlier, labels, kinds, ths, out, top,
                     elif n < MOST:
                         near[n], votes[n] = k, 1.0
                         n += 1
-            if n == 0:
-                continue
             own = labels[v, u]
+            if n == 0 or (n == 1 and near[0] == own):
+                continue
             x = (u - sen[3]) / sen[1]
             sigma = sigma_at(noise, z)
             best, label = np.inf, 0
@@ -87,11 +94,17 @@ def _add_changes(earlier, labels, change):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _contested(own, least, most, change, out):  # type: ignore[no-untyped-def]
-    """Where the five columns around hold another label than the pixel's own, and one of their pixels changed."""
+def _contested(own, least, most, out):  # type: ignore[no-untyped-def]
+    """Where the five columns around hold another surface than the pixel's own."""
     for u in range(own.shape[0]):
         k = own[u]
         low = min(least[u], least[u + 1], least[u + 2], least[u + 3], least[u + 4])
         high = max(most[u], most[u + 1], most[u + 2], most[u + 3], most[u + 4])
-        changed = change[u] | change[u + 1] | change[u + 2] | change[u + 3] | change[u + 4]
-        out[u] = (changed != 0) & ((high != k) | ((k > 0) & (low != k)))
+        out[u] = (high != k) | ((k > 0) & (low != k))
+
+
+@njit(cache=True, error_model="numpy")
+def _changed(change, out):  # type: ignore[no-untyped-def]
+    """Where a pixel of the five columns around changed."""
+    for u in range(out.shape[0]):
+        out[u] = (change[u] | change[u + 1] | change[u + 2] | change[u + 3] | change[u + 4]) != 0

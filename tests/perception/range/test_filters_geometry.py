@@ -96,6 +96,23 @@ def test_the_papers_formula_agrees_with_the_fundamental_forms():
     np.testing.assert_allclose(found.gaussian_curvature_per_m2[1:-1, 1:-1], K, atol=1e-12)
 
 
+@pytest.mark.parametrize("sensor", [PINHOLE, PARALLEL], ids=["pinhole", "orthographic"])
+def test_single_precision_tells_the_same_and_holes_spread_by_a_pixel(sensor):
+    depth = noisy(sphere_depth(sensor, np.array([0.0, 0.0, 0.55]), 0.3), 0.0001, seed=4)
+    depth[20, 30] = np.nan
+    exact = geometry_of(depth, sensor, scale_px=0.0)
+    single = geometry_of(depth.astype(np.float32), sensor, scale_px=0.0)
+    unknown = np.isnan(exact.mean_curvature_per_m)
+    assert (
+        unknown[19:22, 29:32].all() and unknown[0].all() and unknown[:, -1].all() and not unknown[40:80, 60:100].any()
+    )
+    for name, tolerance in (("gu", 1e-7), ("normal", 1e-4), ("mean_curvature_per_m", 0.5)):
+        mine = getattr(single, name)
+        assert mine.dtype == np.float32
+        np.testing.assert_array_equal(np.isnan(mine), np.isnan(getattr(exact, name)))
+        assert np.nanmax(np.abs(mine - getattr(exact, name))) < tolerance
+
+
 def test_curvature_classes_tell_plane_from_ball():
     depth = np.minimum(sphere_depth(PARALLEL, np.array([0.0, 0.0, 0.55]), 0.07), 0.6)
     found = local_geometry(noisy(depth, 0.0002, seed=0), PARALLEL)

@@ -2,7 +2,8 @@
 
 A rigid plate before a typical camera is laid through the lines and follows the image's edges, so a side that the image
 cuts off is where the other three put it. Where the edges do not confirm a visible side (glare or shadow misled its line),
-the plate is laid again without that line, and from further off; what is confirmed best stands.
+the plate is laid again without that line, from further off, and freely, as a steep tilt before a wider lens wants it; what
+is confirmed best stands.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from perception.vision.image import Image
 from perception.vision.outline import Outline, rectangle
 from perception.vision.plate_pose import rigid_plate
 from perception.vision.registration import EdgeImage, confirmed, edge_image, follow_edges
-from perception.vision.view import Array, PlaneView
+from perception.vision.view import Array, PlaneView, homography
 
 COARSE_WIDTH_PX = 160
 TYPICAL_FOCAL = 1.25  # of the longer image side: a lens of 44 degrees; completes a side that is cut off
@@ -26,7 +27,7 @@ SIDE_POINTS = 40
 WINDOWS_PX = (12.0, 8.0, 5.0, 3.0, 2.0)
 FAR_WINDOWS_PX = (30.0, 20.0, *WINDOWS_PX)  # for a plate whose lines were misled
 START_SIGMA_PX, FAR_SIGMA_PX = 6.0, 15.0
-FREE_WINDOWS_PX = (3.0, 2.0)  # of the last step, which allows for a lens and a focal length that are not typical
+FREE_WINDOWS_PX = (5.0, 3.0, 2.0)  # of the last step, which allows for a lens and a focal length that are not typical
 FREE_SIGMA_PX = 2.0
 CONFIRMED = 0.7  # share of a side's visible edge
 
@@ -85,24 +86,38 @@ class _Search:
             for side in range(4):
                 fewer = [None if k == side else line for k, line in enumerate(lines)]
                 attempts.append((fewer, WINDOWS_PX, START_SIGMA_PX))
-            views = [view for attempt in attempts if (view := self._laid(*attempt)) is not None]
-            found += [(self._score(view), view) for view in views]
+            laid = [self._free(lines), *(self._laid(*attempt) for attempt in attempts)]
+            found += [(self._score(view), view) for view in laid if view is not None]
         return max(found, key=lambda f: f[0])[1] if found else None
 
     def _laid(self, lines: list[Array | None], windows_px: tuple[float, ...], sigma_px: float) -> PlaneView | None:
         """The plate through the lines, moved onto the image's edges: first as a rigid one, then freely."""
-        width, height = self.corners_m.max(axis=0) * 2
-        corners = _corners(lines, self.coarse_shape, float(width / height), self.focal_px / self.shrink)
-        if corners is None:
+        corners_px = self._corners_px(lines)
+        if corners_px is None:
             return None
         rows, columns = self.image.smooth.shape
         rigid = rigid_plate(
-            self.corners_m, (corners + 0.5) * self.shrink - 0.5, focal_px=self.focal_px, sigma_px=sigma_px,
+            self.corners_m, corners_px, focal_px=self.focal_px, sigma_px=sigma_px,
             middle_px=np.array([columns - 1.0, rows - 1.0]) / 2,
         )  # fmt: skip
         rigid = follow_edges(self.image, rigid, self.outline, windows_px)
         free = PlaneView(px_from_plate=rigid.px_from_plate, corners_m=self.corners_m, sigma_px=FREE_SIGMA_PX)
         return follow_edges(self.image, free, self.outline, FREE_WINDOWS_PX)
+
+    def _free(self, lines: list[Array | None]) -> PlaneView | None:
+        """The plate through four lines, as no rigid one: a lens that is not typical shows at a steep tilt."""
+        corners_px = self._corners_px(lines) if all(line is not None for line in lines) else None
+        if corners_px is None:
+            return None
+        H = homography(self.corners_m, corners_px)
+        view = PlaneView(px_from_plate=H, corners_m=self.corners_m, sigma_px=START_SIGMA_PX)
+        return follow_edges(self.image, view, self.outline, WINDOWS_PX)
+
+    def _corners_px(self, lines: list[Array | None]) -> Array | None:
+        """(4, 2) corners in the image itself; None when the lines make none."""
+        width, height = self.corners_m.max(axis=0) * 2
+        corners = _corners(lines, self.coarse_shape, float(width / height), self.focal_px / self.shrink)
+        return None if corners is None else (corners + 0.5) * self.shrink - 0.5
 
     def _score(self, view: PlaneView) -> int:
         """Samples of the border that an edge confirms, less visible ones that none does."""

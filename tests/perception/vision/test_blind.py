@@ -33,7 +33,7 @@ from perception.vision.knowledge import (
     write_kind,
 )
 from perception.vision.match import distances, distances_reference
-from perception.vision.plate import find_plate
+from perception.vision.plate import TYPICAL_FOCAL, find_plate
 from perception.vision.shapes import find_edges
 from perception.vision.teach import check, plate_points, teach
 from perception.vision.view import CameraView
@@ -58,6 +58,19 @@ def test_the_plate_is_found_to_a_pixel_or_two() -> None:
     assert plate is not None and all(plate.sides_seen)
     corners = np.column_stack([plate.view.corners_m, np.zeros(4)])
     assert np.linalg.norm(plate.view.project(corners) - view.project(corners), axis=1).max() < 2.0
+
+
+@pytest.mark.parametrize("tilt_deg", [15.0, 30.0])
+@pytest.mark.parametrize("azimuth_deg", [0.0, 90.0, 200.0])
+def test_a_plate_tilted_before_a_lens_that_is_not_typical_is_found(tilt_deg: float, azimuth_deg: float) -> None:
+    image, intrinsics, pose = scene(
+        tilt_deg=tilt_deg, azimuth_deg=azimuth_deg, distance_m=0.85, pose_error=0.0, size=(640, 480)
+    )
+    view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+    plate = find_plate(image, *PLATE)
+    assert plate is not None and intrinsics.fx_px < 0.85 * TYPICAL_FOCAL * 640
+    corners = np.column_stack([plate.view.corners_m, np.zeros(4)])
+    assert np.linalg.norm(plate.view.project(corners) - view.project(corners), axis=1).max() < 1.5
 
 
 def test_a_plate_that_the_image_cuts_off_is_completed() -> None:

@@ -29,7 +29,7 @@ from service.child import Lifeline, kill_own_group
 from service.connection import BEHIND, CLOCK, MOVER, PREFIX, SWAPPER
 from service.latch import Beat, Latch
 from service.motion import MotionPort, start_controller
-from service.seats import Connect, Seat, Swapper, checked
+from service.seats import Connect, Seat, Swapper, checked, names_another_wire
 
 BEAT_S = 0.05
 CLOSE_TIMEOUT_S = 4.0
@@ -65,7 +65,7 @@ class CellRuntime:
         Raises:
             CellError: what could not be connected, all of it in one error; everything else is closed again.
         """
-        emulated = {name: cell.file.devices[name].driver for name in cell.file.emulators}
+        emulated = {name: cell.file.devices[name] for name in cell.file.emulators}
         cell.file.devices.update(swapped or {})
         _import_drivers(cell)
         clock = clock_for(cell)
@@ -75,7 +75,8 @@ class CellRuntime:
             far_sides = start_emulators(cell, clock, shared, closers)
 
             def complete(name: str, section: DeviceSection) -> DeviceSection:
-                if section.driver != emulated.get(name):
+                own = emulated.get(name)
+                if own is None or section.driver != own.driver or names_another_wire(section, own):
                     return section
                 return section.model_copy(update={"options": {**section.options, **far_sides[name].address}})
 

@@ -70,7 +70,7 @@ class MotionDesk(Protocol):
 Connect = Callable[[str, DeviceSection], Any]
 """Connects the device of a name as a section says that `Complete` has made."""
 Complete = Callable[[str, DeviceSection], DeviceSection]
-"""A section with the address of the cell's emulator, where it means the device behind that."""
+"""A section with the address of the cell's emulator, where it means the device behind that and names no other wire."""
 
 
 class Swapper:
@@ -208,6 +208,12 @@ def checked(name: str, device: Any, section: DeviceSection) -> Any:
         hint=f"choose a driver of a {section.kind}",
         key=f"devices.{name}.driver",
     )
+
+
+def names_another_wire(section: DeviceSection, own: DeviceSection) -> bool:
+    """Do the options say themselves where the device is, and not as the cell file does?"""
+    keys = (*WIRE_KEYS, "replay")
+    return any(key in section.options and section.options[key] != own.options.get(key) for key in keys)
 
 
 def _share_a_port(a: DeviceSection, b: DeviceSection) -> bool:

@@ -17,7 +17,10 @@ from drivers.emulators import dynamixel, modbus_io, tfmini
 from drivers.emulators.scripted import ScriptedArm, ScriptedLights, ScriptedProximity
 from hal.clock import Deadline, WallClock
 from hal.config import load_cell
+from hal.errors import DeviceUnavailable
 from hal.motion import Hold
+from service.cell import CellRuntime
+from service.connection import PREFIX, SWAPPER
 from service.serve import Options, Panelwright
 from tests.service.conftest import WriteCell
 from tests.service.verbs import OPERATIONS
@@ -251,3 +254,40 @@ def test_an_arm_that_the_control_thread_cannot_take_is_given_back(robot: Panelwr
     far_side.close()
     mover = robot.service.supervisor.connection.mover
     assert mover.execute(Hold(name="hold", duration_s=0.05)).outcome == "completed"
+
+
+EMULATED = """
+[devices.left]
+kind = "proximity"
+driver = "serial:tfmini"
+[emulators.left]
+emulator = "tfmini"
+driver = "fake:proximity"
+"""
+
+
+def test_an_address_that_is_given_is_not_replaced_by_the_emulators(write_cell: WriteCell, far_side: Any) -> None:
+    cell = load_cell(write_cell(mode="mixed", extra=EMULATED))
+    runtime = CellRuntime.start(cell, is_latched=lambda: False)
+    try:
+        swapper, left = runtime.objects[PREFIX + SWAPPER], runtime.objects["left"]
+        swapper.swap("left", "serial:tfmini", far_side.address, deadline=SOON)
+        assert left.read_distance_m(deadline=SOON).value == pytest.approx(0.456)
+        with pytest.raises(DeviceUnavailable, match=r"/dev/gone does not exist"):
+            swapper.swap("left", "serial:tfmini", {"port": "/dev/gone"}, deadline=SOON)
+        assert left.read_distance_m(deadline=SOON).value == pytest.approx(0.456), "the old one is kept, where it was"
+        swapper.swap("left", "serial:tfmini", {"unit": "mm"}, deadline=SOON)
+        assert left.read_distance_m(deadline=SOON).value == pytest.approx(0.123), (
+            "without an address it is the emulator"
+        )
+    finally:
+        runtime.close()
+    again = CellRuntime.start(
+        load_cell(write_cell(mode="mixed", extra=EMULATED)),
+        is_latched=lambda: False,
+        swapped={"left": cell.file.devices["left"].model_copy(update={"options": far_side.address})},
+    )
+    try:
+        assert again.objects["left"].read_distance_m(deadline=SOON).value == pytest.approx(0.456), "after a restart too"
+    finally:
+        again.close()

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from hal.errors import ConfigError
-from service.commands.common import DEFAULT_CELL, SeedOption, console, find_cell, read_cell
+from service.commands.common import DEFAULT_CELL, ROOT, SeedOption, console, read_cell
+
+if TYPE_CHECKING:
+    from hal.config import Cell
 
 
 class LevelChoice(StrEnum):
@@ -49,33 +53,70 @@ def conform(
 
 
 def emulate(
-    name: Annotated[str, typer.Argument(help="Device of the cell file whose wire is emulated.")],
+    name: Annotated[
+        str, typer.Argument(help="Device of the cell file whose wire is emulated, or the emulator, e.g. ur.")
+    ],
     *,
-    cell: Annotated[Path, typer.Option("--cell", help="Cell file with an [emulators.NAME] section.")] = Path(
-        "cells/mixed.toml"
-    ),
+    world: Annotated[
+        bool,
+        typer.Option("--world", help="With the simulated world behind it: the first wire cell that has such a wire."),
+    ] = False,
+    cell: Annotated[
+        Path | None, typer.Option("--cell", help="Cell file with emulators; cells/mixed.toml if none is given.")
+    ] = None,
 ) -> None:
     """Start the far side of a device's wire and say how to reach it, until Ctrl-C."""
     from hal.registry import Shared
     from service.cell import clock_for, start_emulators
 
-    loaded = read_cell(cell, None)
-    section = loaded.file.emulators.get(name)
-    if section is None:
-        known = ", ".join(loaded.file.emulators) or "none"
-        raise ConfigError(f"{find_cell(cell)} emulates no {name!r}", hint=f"its emulators: {known}")
-    alone = loaded.model_copy(update={"file": loaded.file.model_copy(update={"emulators": {name: section}})})
+    shipped = sorted((ROOT / "cells").glob("wire-*.toml")) if world else [Path("cells/mixed.toml")]
+    loaded, device = find_emulator(name, [cell] if cell is not None else shipped)
+    section = loaded.file.emulators[device]
+    alone = loaded.model_copy(update={"file": loaded.file.model_copy(update={"emulators": {device: section}})})
     shared = Shared()
     closers = [shared.close]
+    console.print(f"starting {section.emulator} with {section.driver} of {loaded.path} behind it")
     try:
         clock = clock_for(loaded)
-        address = start_emulators(alone, clock, shared, closers)[name].address
-        console.print(f"{section.emulator} for {name} is up; options for its driver: {address}")
+        address = start_emulators(alone, clock, shared, closers)[device].address
+        driver = loaded.file.devices[device].driver
+        console.print(
+            f"{section.emulator} is up, with {section.driver} of {loaded.path} behind it; a driver finds it by"
+        )
+        console.print(f"driver = {inline_toml(driver)}\noptions = {inline_toml(address)}", markup=False)
         while True:  # a simulated device lives in a world that somebody must let pass
             clock.sleep(1.0 / loaded.file.cell.control_rate_hz)
     finally:
         for close in closers[::-1]:
             close()
+
+
+def find_emulator(name: str, cells: list[Path]) -> tuple[Cell, str]:
+    """The first cell that emulates the device `name`, or a device by the emulator `name`; and that device.
+
+    Raises:
+        ConfigError: none does.
+    """
+    known: list[str] = []
+    for path in cells:
+        cell = read_cell(path, None)
+        for device, section in cell.file.emulators.items():
+            if name in (device, section.emulator):
+                return cell, device
+            known.append(f"{device} ({section.emulator})")
+    raise ConfigError(
+        f"{', '.join(str(path) for path in cells)}: nothing emulates {name!r}",
+        hint=f"emulated there: {', '.join(known) or 'nothing'}; --world looks in the wire cells",
+    )
+
+
+def inline_toml(value: Any) -> str:
+    """A value as cell files spell it, on one line."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {inline_toml(entry)}" for key, entry in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(inline_toml(entry) for entry in value) + "]"
+    return json.dumps(value)
 
 
 def new_driver(

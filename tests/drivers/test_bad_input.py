@@ -3,11 +3,12 @@
 import random
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from typing import Any
 
 import pytest
 
+from drivers import rtde
 from drivers.arms import kinematics_of
 from drivers.emulators import ft300, modbus_io, robotiq_2f, rplidar, scripted, tfmini
 from drivers.emulators.ports import FarPort, PtyPort, TcpPort
@@ -133,6 +134,37 @@ def test_every_network_driver_names_the_address(way: str, caplog: Any) -> None:
             assert "finger" in error.what and error.hint, (driver, error.for_people())
             assert str(number) in f"{error.what} {error.details}", driver
     assert not caplog.records, "a driver failed on bytes that it did not expect"
+
+
+class OldController:
+    """A UR controller that knows version 1 of RTDE alone."""
+
+    def __init__(self) -> None:
+        self.port = TcpPort()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        parser = rtde.PackageParser()
+        while not self._ending.is_set():
+            for peer, data in self.port.receive(0.01):
+                for kind, _ in parser.feed(data):
+                    self.port.send(peer, rtde.package(kind, b"\x00"))
+
+    def close(self) -> None:
+        """End it."""
+        self._ending.set()
+        self._thread.join()
+        self.port.close()
+
+
+@pytest.mark.parametrize("driver", ["ur:rtde", "ur:lights"])
+def test_a_protocol_version_that_the_device_does_not_know_is_said(driver: str) -> None:
+    with closing(OldController()) as side:
+        error = refusal("arm", driver, {**side.port.address, **NETWORK[driver]})
+    assert "does not speak RTDE version 2" in error.what
+    assert error.details["device"] == "arm" and str(side.port.address["port"]) in error.details["link"]
 
 
 @pytest.mark.parametrize("call", ["read", "write", "close"])

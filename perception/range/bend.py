@@ -21,6 +21,9 @@ BEND_TURN_RAD = 0.2  # walls and table tops of the real development frames turn 
 ENDS = 0.02  # share of the samples whose normals may turn farther
 NEAR_SIGMAS = 5.0  # the bend that a plane leaves over
 NEAR_SHARE = 0.8
+CUT_SIGMAS = 3.0
+SCRAP_AREA_PX = 600.0  # over which the slowest part of the noise, bands and waves of 30 pixels, keeps its sign
+LEAST_PRICE = 2.0  # of a parameter, Akaike's: Schwarz's is none where there is one value
 SLENDER_RAD = 0.15  # half-angle of a cone that may be a cylinder
 
 
@@ -59,6 +62,28 @@ def straightened(kind: int, th: Array, samples: Samples, noise: NoiseModel, pers
 def schwarz_price(kind: int, patches: float) -> float:
     """What Schwarz's criterion asks for the parameters of a surface: p ln n."""
     return float(FREEDOM[kind]) * float(np.log(max(patches, 2.0)))
+
+
+def scrap_gain(
+    big: tuple[int, Array],
+    small: tuple[int, Array],
+    samples: Samples,
+    pixels: int,
+    noise: NoiseModel,
+    perspective: bool,
+) -> float:
+    """How much cheaper a small piece is as part of a large surface than as a surface of its own; <= 0: it stays.
+
+    Slow noise gives a scrap of a face one value or few, and any direction; so its direction and kind count for nothing.
+    `samples`: of the small piece, which has so many `pixels`.
+    """
+    if np.mean(residuals_of(*big, samples, perspective) < NEAR_SIGMAS) < NEAR_SHARE:
+        return -np.inf
+    slow = noise.slow_share(float(np.median(samples.z)))
+    values = max(pixels / (1.0 + slow * (SCRAP_AREA_PX - 1.0)), 1.0)
+    price = float(FREEDOM[small[0]]) * max(float(np.log(values)), LEAST_PRICE)
+    saved = [float(np.mean(np.minimum(residuals_of(*s, samples, perspective), CUT_SIGMAS) ** 2)) for s in (small, big)]
+    return price + values * (saved[0] - saved[1])
 
 
 def _is_near(kind: int, th: Array, samples: Samples, perspective: bool) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from perception.range import fit, rays
+from perception.range import bend, fit, rays
 from perception.range.finish import FREE, Samples, thinned
 from perception.range.noise import NoiseModel
 from perception.range.surfaces import PLANE, depth_on, depths_on
@@ -51,7 +51,7 @@ def join_pieces(
         for small in order[position + 1 :]:
             if owner[small] != small + 1 or not near[big, small]:
                 continue
-            if _is_scrap(kinds, parameters, samples, big=big, small=small, perspective=perspective):
+            if _is_scrap(kinds, parameters, samples, big=big, small=small, noise=noise, perspective=perspective):
                 owner[small] = big + 1
                 continue
             joined = _joint_fit(kinds, parameters, thin, big=big, small=small, noise=noise, perspective=perspective)
@@ -64,16 +64,26 @@ def join_pieces(
 
 
 def _is_scrap(
-    kinds: list[int], parameters: list[Array], samples: list[Samples], *, big: int, small: int, perspective: bool
+    kinds: list[int],
+    parameters: list[Array],
+    samples: list[Samples],
+    *,
+    big: int,
+    small: int,
+    noise: NoiseModel,
+    perspective: bool,
 ) -> bool:
     """Whether a small piece lies so close along a large surface that it is only a dent in it, or a bit of its rim."""
     if samples[small].x.size > SCRAP_SHARE * samples[big].x.size:
         return False
+    s = thinned(samples[small], PAIR_SAMPLES)
+    surface, own = (kinds[big], parameters[big]), (kinds[small], parameters[small])
+    if s.x.size and bend.scrap_gain(surface, own, s, samples[small].x.size, noise, perspective) > 0.0:
+        return True
     if kinds[big] == PLANE and kinds[small] != PLANE:
         return False
     if kinds[big] == PLANE and float(parameters[big][:3] @ parameters[small][:3]) < np.cos(LARGEST_TURN_RAD):
         return False
-    s = thinned(samples[small], PAIR_SAMPLES)
     e = np.empty(s.x.size)
     rays.residuals(kinds[big], parameters[big], s.x, s.y, s.z, s.sigma, perspective, e)
     # Rays just outside the outline miss; those that hit decide, when they are the larger part.

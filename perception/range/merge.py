@@ -32,6 +32,7 @@ SMOOTH_SHARE = 0.8  # of both parts within `SMOOTH_LIMIT` of the joint surface, 
 SMOOTH_LIMIT = 5.0
 LEAST_SHARE = 0.85
 LEAST_GAIN = 1e-3
+SCRAP_SHARE = 0.1  # of the larger part
 PLAIN_MEAN_SQUARE = 1.6
 MOST_NOISE = 2.5  # times the model's variance, that two parts may show and still be joined on its strength
 
@@ -149,9 +150,19 @@ class Agglomeration:
             a.kind, a.parameters, b.kind, b.parameters, border.x, border.y, self.law, self.perspective
         )
         if step > STEP_SIGMAS * np.sqrt(_noise_here(a, b)) or turn > SHARPEST_TURN_RAD:
-            return None
+            return self._scrap(pair, a, b)
         tolerated = max(SMOOTH_TURN_RAD, SMOOTH_SIGMAS * float(np.hypot(a.tilt_sigma_rad, b.tilt_sigma_rad)))
-        return self._jointly(pair, a, b, is_smooth=turn < min(tolerated, 0.5 * SHARPEST_TURN_RAD))
+        joint = self._jointly(pair, a, b, is_smooth=turn < min(tolerated, 0.5 * SHARPEST_TURN_RAD))
+        return joint if joint is not None else self._scrap(pair, a, b)
+
+    def _scrap(self, pair: tuple[int, int], a: Part, b: Part) -> Merger | None:
+        big, small = (a, b) if a.pixels >= b.pixels else (b, a)
+        if small.pixels > SCRAP_SHARE * big.pixels:
+            return None
+        surface = (big.kind, big.parameters)
+        own = (small.kind, small.parameters)
+        gain = bend.scrap_gain(surface, own, small.samples, small.pixels, self.noise, self.perspective)
+        return Merger(pair=pair, kind=big.kind, parameters=big.parameters, gain=gain) if gain > 0.0 else None
 
     def _jointly(self, pair: tuple[int, int], a: Part, b: Part, *, is_smooth: bool) -> Merger | None:
         noise = _noise_here(a, b)

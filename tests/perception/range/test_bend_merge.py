@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perception.range.bend import simplest, straightened, turn_of
+from perception.range.bend import scrap_gain, simplest, straightened, turn_of
 from perception.range.finish import Samples
 from perception.range.join import join_pieces
 from perception.range.merge import merge_touching
@@ -144,3 +144,39 @@ def test_a_gap_that_shows_something_behind_keeps_pieces_apart():
     apart = [sampled(*flat, box(20, 100, 10, 60), SLOW, seed=1), sampled(*flat, box(20, 100, 90, 150), SLOW, seed=2)]
     depth = np.full(SHAPE, 4.0)
     assert join_pieces(depth, PACKED, [PLANE, PLANE], [flat[1], flat[1]], apart, noise=SLOW) == [1, 2]
+
+
+SPOT = box(55, 65, 75, 85)
+WALL_2M = plane([0.0, 0.0, -1.0], -2.0)
+
+
+def spot_gain(offset_m, noise):
+    """The gain of joining a spot, turned by 0.4 rad and shifted by an offset, with the wall around it."""
+    spot = plane([0.4, 0.0, -1.0], -(2.0 + offset_m) / np.hypot(0.4, 1.0))
+    samples = sampled(*plane([0, 0, -1], -(2.0 + offset_m)), SPOT, noise)
+    return scrap_gain(WALL_2M, spot, samples, int(SPOT.sum()), noise, True)
+
+
+def test_a_spot_within_slow_noise_belongs_to_the_wall_whatever_its_direction():
+    assert spot_gain(0.005, SLOW) > 0.0
+
+
+def test_under_white_noise_the_same_offset_is_a_thing_of_its_own():
+    flush = plane([0.0, 0.0, -1.0], -2.005)
+    samples = sampled(*flush, SPOT, WHITE)
+    assert scrap_gain(WALL_2M, flush, samples, int(SPOT.sum()), WHITE, True) < 0.0
+
+
+def test_a_spot_that_stands_out_of_slow_noise_stays():
+    assert spot_gain(0.06, SLOW) < 0.0
+
+
+@pytest.mark.parametrize(("offset_m", "owners"), [(0.003, [1, 1]), (0.08, [1, 2])])
+def test_a_scrap_inside_a_wall_is_swallowed_only_when_noise_explains_it(offset_m, owners):
+    odd = plane([0.5, 0.0, -1.0], -(2.0 + offset_m) / np.hypot(0.5, 1.0))
+    labels = (WALL.astype(np.int32)) + SPOT
+    samples = [
+        sampled(*WALL_2M, WALL & ~SPOT, SLOW, seed=1),
+        sampled(*plane([0, 0, -1], -(2.0 + offset_m)), SPOT, SLOW, seed=2),
+    ]
+    assert merge_touching(labels, PACKED, [PLANE, PLANE], [WALL_2M[1], odd[1]], samples, SLOW) == owners

@@ -37,7 +37,7 @@ serve: setup  ## Start the service on http://127.0.0.1:8460
 test: setup  ## Run all tests, two files at a time
 	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope -m 'not wire'
 
-test-wire: setup  ## Run whole missions over emulated wires, in real time: on a busy machine one may be late and end
+test-wire: setup  ## Run whole missions over emulated wires, in real time: about six minutes, more on a busy machine
 	@$(BIN)/python -m pytest -m wire
 
 test-fast: setup  ## Run the tests without missions and browsers

@@ -23,7 +23,7 @@ def report_of(runs: Path, log: str) -> dict[str, Any]:
     return report
 
 
-@pytest.mark.parametrize(("cell", "seed"), [("wire-ur", 2), ("wire-cia402", 2)])
+@pytest.mark.parametrize(("cell", "seed"), [("wire-ur", 2), ("wire-cia402", 2), ("wire-dynamixel", 2)])
 def test_a_wire_cell_runs_the_whole_mission_and_the_judge_agrees(cell: str, seed: int, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "service.cli", "demo", "--cell", f"cells/{cell}.toml"]
     run = subprocess.run(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.transport.device import WireDevice
-from drivers.transport.link import now_s
+from drivers.file_player import FilePlayer
 from drivers.transport.options import read_options
 from hal.calibration import CameraIntrinsics
 from hal.clock import Deadline
@@ -64,18 +62,14 @@ def to_pixels(bgr: NDArray[Any], *, is_colour: bool) -> Pixels:
     return np.ascontiguousarray(cv2.cvtColor(bgr, code), dtype=np.uint8)
 
 
-class CameraFiles(WireDevice[Image]):
-    """Plays pictures, one a period, and holds its breath between them."""
+class CameraFiles(FilePlayer[Image]):
+    """Plays pictures, or the frames of a video."""
 
     kind = DeviceKind.CAMERA
 
     def __init__(self, context: Context, options: CameraFilesOptions) -> None:
-        super().__init__(context, max_age_s=3.0 / options.rate_hz)
+        super().__init__(context, options.path, rate_hz=options.rate_hz)
         self._options = options
-        self._turn = threading.Lock()
-        self._closing = threading.Event()
-        self._next_s = 0.0
-        self._index = 0
         self._frames = self._open()
         first = self._load(0)
         self._shape = first.shape
@@ -98,26 +92,11 @@ class CameraFiles(WireDevice[Image]):
         Raises:
             DeviceTimeout: the deadline ends before the period. DeviceUnavailable: the last picture has been shown.
         """
-        self.require_open()
-        started_s = now_s()
-        until_s = started_s + deadline.remaining_s()
-        if not self._turn.acquire(timeout=max(0.0, until_s - now_s())):
-            raise self.timeout(now_s() - started_s)
-        try:
-            wait_s = self._next_s - now_s()
-            if now_s() + max(0.0, wait_s) > until_s:
-                self._closing.wait(max(0.0, until_s - now_s()))
-                raise self.timeout(now_s() - started_s)
-            self._closing.wait(max(0.0, wait_s))
-            self.require_open()
-            self._next_s = max(self._next_s, now_s()) + 1.0 / self._options.rate_hz
-            exposed_s = now_s()
-            pixels = self._load(self._index)
-            self._index += 1
-            self.publish(Image(pixels=pixels, exposure_s=self._options.exposure_s), valid_s=exposed_s)
-            return self.newest(deadline, not_before_s=-float("inf"))
-        finally:
-            self._turn.release()
+        return self.play(deadline)
+
+    def show(self, index: int, shown_s: float) -> None:
+        """One picture."""
+        self.publish(Image(pixels=self._load(index), exposure_s=self._options.exposure_s), valid_s=shown_s)
 
     def _open(self) -> list[Path] | list[Pixels]:
         path = self._options.path
@@ -165,22 +144,6 @@ class CameraFiles(WireDevice[Image]):
 
     def _missing(self, what: str, hint: str) -> DeviceUnavailable:
         return DeviceUnavailable(f"{self.name}: {what}", hint=hint, device=self.name)
-
-    def release(self) -> None:
-        """End a wait."""
-        self._closing.set()
-
-    def is_up(self) -> bool:
-        """Files stay."""
-        return True
-
-    def reconnects(self) -> int:
-        """Never."""
-        return 0
-
-    def link_name(self) -> str:
-        """The path."""
-        return f"files {self._options.path}"
 
 
 def connect(context: Context, options: dict[str, Any]) -> CameraFiles:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.transport.device import WireDevice
-from drivers.transport.link import now_s
+from drivers.file_player import FilePlayer
 from drivers.transport.options import read_options
 from hal.clock import Deadline
 from hal.devices import DeviceKind, RangeImage, RangeScannerCapabilities
@@ -43,18 +41,14 @@ class DepthCameraOptions(Strict):
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
 
 
-class DepthCamera(WireDevice[RangeImage]):
+class DepthCamera(FilePlayer[RangeImage]):
     """Plays depth pictures again and again, one a period."""
 
     kind = DeviceKind.RANGE_SCANNER
 
     def __init__(self, context: Context, options: DepthCameraOptions) -> None:
-        super().__init__(context, max_age_s=3.0 / options.rate_hz)
+        super().__init__(context, options.path, rate_hz=options.rate_hz)
         self._options = options
-        self._turn = threading.Lock()
-        self._closing = threading.Event()
-        self._next_s = 0.0
-        self._index = 0
         folder = options.path
         self._files = sorted(p for p in folder.iterdir() if p.suffix in SUFFIXES) if folder.is_dir() else []
         if not self._files:
@@ -84,30 +78,18 @@ class DepthCamera(WireDevice[RangeImage]):
 
     def read_range(self, *, deadline: Deadline) -> Stamped[RangeImage]:
         """The next picture, not before its period has come."""
-        self.require_open()
-        started_s = now_s()
-        until_s = started_s + deadline.remaining_s()
-        if not self._turn.acquire(timeout=max(0.0, until_s - now_s())):
-            raise self.timeout(now_s() - started_s)
-        try:
-            self._closing.wait(max(0.0, min(self._next_s, until_s) - now_s()))
-            self.require_open()
-            if self._next_s > until_s:
-                raise self.timeout(now_s() - started_s)
-            scanned_s = now_s()
-            self._next_s = scanned_s + 1.0 / self._options.rate_hz
-            depth_m = self._load(self._index)
-            self._index += 1
-            is_seen = bool(np.isfinite(depth_m).any())
-            self.publish(
-                RangeImage(depth_m=depth_m),
-                valid_s=scanned_s,
-                quality=Quality.VALID if is_seen else Quality.INVALID,
-                cause=Cause.NONE if is_seen else Cause.OUT_OF_RANGE,
-            )
-            return self.newest(deadline, not_before_s=-float("inf"))
-        finally:
-            self._turn.release()
+        return self.play(deadline)
+
+    def show(self, index: int, shown_s: float) -> None:
+        """One depth picture."""
+        depth_m = self._load(index)
+        is_seen = bool(np.isfinite(depth_m).any())
+        self.publish(
+            RangeImage(depth_m=depth_m),
+            valid_s=shown_s,
+            quality=Quality.VALID if is_seen else Quality.INVALID,
+            cause=Cause.NONE if is_seen else Cause.OUT_OF_RANGE,
+        )
 
     def _load(self, index: int) -> NDArray[np.float32]:
         path, o = self._files[index % len(self._files)], self._options
@@ -123,22 +105,6 @@ class DepthCamera(WireDevice[RangeImage]):
     def _fault(self, what: str) -> DeviceFault:
         self.errors += 1
         return DeviceFault(f"{self.name}: {what}", hint="remove or replace it", device=self.name)
-
-    def release(self) -> None:
-        """End a wait."""
-        self._closing.set()
-
-    def is_up(self) -> bool:
-        """Files stay."""
-        return True
-
-    def reconnects(self) -> int:
-        """Never."""
-        return 0
-
-    def link_name(self) -> str:
-        """The path."""
-        return f"files {self._options.path}"
 
 
 def _read(path: Path, unit_m: float) -> NDArray[np.float64]:

@@ -92,6 +92,18 @@ class ModbusMaster(ABC):
         """Time that a poll should give one attempt, with what it takes to clean the line before."""
         return self._timeout_s
 
+    def _listen(self, unit: int, head: bytes, rest: int, until_s: float) -> bytes:
+        buffer, answer_until_s = b"", self._answer_until(until_s)
+        while chunk := self._link.read(answer_until_s):
+            buffer += chunk
+            found = self._find(buffer, unit, head, rest)
+            if found is not None:
+                return found
+        raise self._silence(buffer, unit)
+
+    @abstractmethod
+    def _find(self, buffer: bytes, unit: int, head: bytes, rest: int) -> bytes | None: ...
+
     def _answer_until(self, until_s: float) -> float:
         return min(until_s, now_s() + self._timeout_s)
 
@@ -120,13 +132,7 @@ class ModbusTcp(ModbusMaster):
         self.late_bytes += len(drain(self._link))
         self.asked_s = now_s()
         self._link.write(struct.pack(">HHHB", self._tid, 0, len(request) + 1, unit) + request, until_s)
-        buffer, answer_until_s = b"", self._answer_until(until_s)
-        while chunk := self._link.read(answer_until_s):
-            buffer += chunk
-            found = self._find(buffer, unit, head, rest)
-            if found is not None:
-                return found
-        raise self._silence(buffer, unit)
+        return self._listen(unit, head, rest, until_s)
 
     def _find(self, buffer: bytes, unit: int, head: bytes, rest: int) -> bytes | None:
         good = struct.pack(">HHHB", self._tid, 0, len(head) + rest + 1, unit) + head
@@ -220,13 +226,7 @@ class ModbusRtu(ModbusMaster):
         self.asked_s = now_s()
         self._link.write(frame + struct.pack("<H", crc_modbus(frame)), until_s)
         self._unanswered.add((unit, head[0]))
-        buffer, answer_until_s = b"", self._answer_until(until_s)
-        while chunk := self._link.read(answer_until_s):
-            buffer += chunk
-            found = self._find(buffer, unit, head, rest)
-            if found is not None:
-                return found
-        raise self._silence(buffer, unit)
+        return self._listen(unit, head, rest, until_s)
 
     def _wait_for_gap(self) -> None:
         while (wait_s := self._quiet_since_s + self._gap_s - now_s()) > 0.0:

@@ -1,0 +1,77 @@
+"""What cameras and range scanners made of files share: one file a period, to whoever asks for the next."""
+
+from __future__ import annotations
+
+import threading
+from abc import abstractmethod
+from pathlib import Path
+from typing import TypeVar
+
+from drivers.transport.device import WireDevice
+from drivers.transport.link import now_s
+from hal.clock import Deadline
+from hal.readings import Stamped
+from hal.registry import Context
+
+T = TypeVar("T")
+
+
+class FilePlayer(WireDevice[T]):
+    """Plays files, one a period, and holds its breath between them."""
+
+    def __init__(self, context: Context, path: Path, *, rate_hz: float) -> None:
+        super().__init__(context, max_age_s=3.0 / rate_hz)
+        self._path = path
+        self._period_s = 1.0 / rate_hz
+        self._turn = threading.Lock()
+        self._closing = threading.Event()
+        self._next_s = 0.0
+        self._index = 0
+
+    @abstractmethod
+    def show(self, index: int, shown_s: float) -> None:
+        """Load file number `index`, counted on and on, and publish it as of `shown_s` (links' clock).
+
+        Raises:
+            DeviceFault: it is damaged. DeviceUnavailable: there are no more.
+        """
+
+    def play(self, deadline: Deadline) -> Stamped[T]:
+        """The next file, not before its period has come.
+
+        Raises:
+            DeviceTimeout: the deadline ends before the period. DeviceFault, DeviceUnavailable: see `show`.
+        """
+        self.require_open()
+        started_s = now_s()
+        until_s = started_s + deadline.remaining_s()
+        if not self._turn.acquire(timeout=max(0.0, until_s - now_s())):
+            raise self.timeout(now_s() - started_s)
+        try:
+            self._closing.wait(max(0.0, min(self._next_s, until_s) - now_s()))
+            self.require_open()
+            if self._next_s > until_s:
+                raise self.timeout(now_s() - started_s)
+            shown_s = now_s()
+            self._next_s = shown_s + self._period_s
+            self.show(self._index, shown_s)
+            self._index += 1
+            return self.newest(deadline, not_before_s=-float("inf"))
+        finally:
+            self._turn.release()
+
+    def release(self) -> None:
+        """End a wait."""
+        self._closing.set()
+
+    def is_up(self) -> bool:
+        """Files stay."""
+        return True
+
+    def reconnects(self) -> int:
+        """Never."""
+        return 0
+
+    def link_name(self) -> str:
+        """The path."""
+        return f"files {self._path}"

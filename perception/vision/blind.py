@@ -22,12 +22,12 @@ from perception.vision.image import Image, as_gray
 from perception.vision.knowledge import NOTHING, Knowledge
 from perception.vision.match import Prepared, nearest, nothing_column, prepared
 from perception.vision.plate import find_plate
+from perception.vision.reading import ANSWER_AT
 from perception.vision.shapes import Edges, direction_maps, find_edges, find_rectangles, find_slots
 from perception.vision.view import Array, View
 
 PLATE_M = (0.40, 0.30)
 FURTHEST = 0.8  # a place further from every look is unlike anything taught
-MARGIN = 0.01  # by which an object must be liker than nothing
 SECOND_LOOK = 0.05  # a candidate this much liker to nothing still gets a look from its best middle
 # Confidence = logistic((lead - EVEN) / SCALE), lead = how much nearer the kind is than what is next. Logistic regression
 # over 547 candidates of overviews that the looks had not been taught on (benchmarks/vision_knowledge prints the
@@ -169,9 +169,8 @@ def chosen(
         if nothing is not None:
             seen[nothing] = np.inf
         kind = knowledge.kinds[int(seen.argmin())]
-        reason = _refusal(float(seen.min()), to_other)
-        candidate = _candidate(middle, names, seen, to_other, kind.size_m, view, plate_m, reason)
-        if reason is None:
+        candidate = _candidate(middle, names, seen, to_other, kind.size_m, view, plate_m)
+        if candidate.reason is None:
             taken.append((middle[0], middle[1], max(kind.size_m) * PLATE_PX_PER_M))
             accepted.append(candidate)
         else:
@@ -179,12 +178,13 @@ def chosen(
     return (*accepted, *refused)
 
 
-def _refusal(near: float, to_nothing: float) -> str | None:
+def _refusal(near: float, confidence: float, rival: str) -> str | None:
     if near > FURTHEST:
         return "unlike everything taught: teach it, or come closer"
-    if near > to_nothing - MARGIN:
-        return "as much like something that is no object: come closer, or change the angle or the light"
-    return None
+    if confidence >= ANSWER_AT:
+        return None
+    other = "something that is no object" if rival == NOTHING else f"a {rival}"
+    return f"as much like {other}: come closer, or change the angle or the light"
 
 
 def _centred(ground: Ground, place: Array, known: Prepared, kind: int) -> Array:
@@ -203,22 +203,25 @@ def _centred(ground: Ground, place: Array, known: Prepared, kind: int) -> Array:
 
 def _candidate(
     place: Array, names: list[str], kinds: Array, to_nothing: float, size: tuple[float, float], view: View,
-    plate_m: tuple[float, float], reason: str | None,
+    plate_m: tuple[float, float],
 ) -> Candidate:  # fmt: skip
     order = np.argsort(kinds)
-    first, second = int(order[0]), int(order[1]) if len(order) > 1 and np.isfinite(kinds[order[1]]) else int(order[0])
-    lead = min(to_nothing, float(kinds[second]) if second != first else np.inf) - float(kinds[first])
+    first, second = int(order[0]), int(order[min(1, len(order) - 1)])
+    to_second = float(kinds[second]) if second != first else np.inf
+    rival, to_rival = (names[second], to_second) if to_second < to_nothing else (NOTHING, to_nothing)
+    lead = to_rival - float(kinds[first])
+    confidence = float(1.0 / (1.0 + np.exp(-np.clip((lead - EVEN) / SCALE, -8.0, 8.0))))
     x, y = place[0] / PLATE_PX_PER_M - plate_m[0] / 2, plate_m[1] / 2 - place[1] / PLATE_PX_PER_M
     w, h = size[0] / 2, size[1] / 2
     box = np.array([[x - w, y + h, 0], [x + w, y + h, 0], [x + w, y - h, 0], [x - w, y - h, 0], [x, y, 0]])
     px = view.project(box)
     return Candidate(
         kind=names[first],
-        confidence=float(1.0 / (1.0 + np.exp(-np.clip((lead - EVEN) / SCALE, -8.0, 8.0)))),
+        confidence=confidence,
         centre_px=px[4],
         centre_m=np.array([x, y]),
         box_px=px[:4],
         distance=float(kinds[first]),
-        rival=(names[second] if second != first else NOTHING, float(min(kinds[second], to_nothing))),
-        reason=reason,
+        rival=(rival, to_rival),
+        reason=_refusal(float(kinds[first]), confidence, rival),
     )

@@ -10,12 +10,13 @@ import pytest
 
 from benchmarks.vision_drawing import Disturbance
 from hal.errors import Ambiguous, InvalidRequest, NotFound
-from perception.vision.blind import recognise
+from perception.vision.blind import chosen, recognise
 from perception.vision.features import (
     AROUND_GROUPS,
     DIRECTIONS,
     GROUPS,
     LENGTH,
+    PLATE_PX_PER_M,
     RADII_M,
     RINGS,
     Ground,
@@ -36,7 +37,7 @@ from perception.vision.match import distances, distances_reference
 from perception.vision.plate import TYPICAL_FOCAL, find_plate
 from perception.vision.shapes import find_edges
 from perception.vision.teach import check, plate_points, teach
-from perception.vision.view import CameraView
+from perception.vision.view import CameraView, PlaneView
 from tests.perception.vision.bench_panel import panel, scene
 
 PLATE = (0.60, 0.40)
@@ -192,6 +193,23 @@ def test_a_disc_looks_the_same_from_all_directions_and_a_bar_does_not() -> None:
     assert np.ptp(looks["disc"][0], axis=0).max() < 0.1
     up, right = looks["bar"][0][0], looks["bar"][0][2]
     assert (right[2:5] < -0.3).all() and (up[2:5] > -0.05).all()
+
+
+def test_what_is_as_much_like_one_kind_as_another_is_refused_by_name() -> None:
+    picture = np.full((300, 400), 150, np.uint8)
+    cv2.circle(picture, (200, 150), 30, 60, -1)
+    ground = Ground(picture=picture.astype(np.float32), edges=find_edges(picture), plate_gray=plate_gray(picture))
+    place = np.array([[200.0, 150.0]])
+    look = look_at(ground, place)
+    plate_m = (400 / PLATE_PX_PER_M, 300 / PLATE_PX_PER_M)
+    view = PlaneView(px_from_plate=np.diag([PLATE_PX_PER_M, -PLATE_PX_PER_M, 1.0]), corners_m=np.zeros((4, 2)))
+    near, far = (Kind(name=name, size_m=(0.04, 0.04), looks=look + off) for name, off in (("a", 0.0), ("b", 1.5)))
+    twin = Kind(name="b", size_m=(0.04, 0.04), looks=look + 0.001)
+    spread = np.ones(LENGTH)
+    (clear,) = chosen(ground, place, look, Knowledge(kinds=(near, far), spread=spread), view, plate_m)
+    (doubtful,) = chosen(ground, place, look, Knowledge(kinds=(near, twin), spread=spread), view, plate_m)
+    assert clear.reason is None and clear.kind == "a" and clear.confidence > 0.99
+    assert doubtful.reason is not None and "a b" in doubtful.reason and doubtful.rival[0] == "b"
 
 
 def test_the_fast_match_agrees_with_the_plain_one() -> None:

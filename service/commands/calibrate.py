@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from service.client import Client
+from service.commands.board import board
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, client_of, console, read_cell
 from service.commands.leaving import leave
 from service.commands.tasks import follow
@@ -22,6 +23,7 @@ app = typer.Typer(
     help="Calibrate: the arm drives through poses, measures, and keeps a versioned, dated record with its quality.",
     no_args_is_help=True,
 )
+app.command()(board)
 Poses = Annotated[int, typer.Option(min=4, max=40, help="Stations to measure from.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Only plan the stations: nothing moves, nothing is written.")]
 Runs = Annotated[Path, typer.Option(help="Folder of the records: RUNS/calibrations/CELL.")]

@@ -70,7 +70,7 @@ def teach(
         raise InvalidRequest("give one of --kind, --check and --dialogue", hint="teach first, then check")
     if not (check or kind is not None or dialogue or sys.stdin.isatty()):
         raise InvalidRequest("nobody is there to ask", hint="give --kind, --check, or --dialogue with answers on stdin")
-    pixels = _read(image)
+    pixels = read_image(image)
     teachings = Teachings(folder)
     if kind is not None:
         _by_clicks(teachings, pixels, plate_m, kind=kind, clicks=click or [])
@@ -97,7 +97,12 @@ def _by_clicks(
     console.print(f"wrote {taught['path']}", markup=False)
 
 
-def _read(image: Path) -> NDArray[np.uint8]:
+def read_image(image: Path) -> NDArray[np.uint8]:
+    """Pixels of an image file.
+
+    Raises:
+        InvalidRequest: it cannot be read, or is no usable image.
+    """
     from perception.vision.image import decode
 
     try:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import range_matching
+from benchmarks.range_sensors import SENSORS, table_top
 from perception.range import Surface, analyse
 from perception.range.primitives import Cone, Cylinder, Ellipsoid, Plane, Sphere
 from perception.range.recordings import load_recording, sensor_from_meta
@@ -107,6 +108,7 @@ def print_table(seeds: int) -> None:
         return
     gen, score = range_module("gen"), range_module("score")
     lines = [*_quality_lines(gen, score, seeds), *_code_lines(gen, score, seeds), *_real_lines(score)]
+    lines += _sensor_lines(gen, score, seeds)
     lines += _matching_lines(gen, min(seeds, MATCHED_SEEDS))
     lines += _time_lines(gen)
     lines += _peer_lines(gen)
@@ -241,6 +243,16 @@ def _matching_lines(gen: ModuleType, seeds: int) -> list[Line]:
             measured=f"{place_mm:.2f} mm, {angle_deg:.2f} deg",
             passed=place_mm <= 1.0 and angle_deg <= 0.5,
         ),
+    ]
+
+
+def _sensor_lines(gen: ModuleType, score: ModuleType, seeds: int) -> list[Line]:
+    """Table tops as structured light, stereo and time of flight see them: many images with truth, but simulated."""
+    numbers = range(100, 100 + max(1, seeds // 4))
+    summary, _ = _scored(score, [table_top(gen, sensor, seed) for sensor in SENSORS for seed in numbers])
+    return [
+        _correct("simulated depth sensors, T 0.8", 0.70, summary),
+        _correct("simulated depth sensors, T 0.9", 0.50, summary, "0.9"),
     ]
 
 

@@ -110,15 +110,15 @@ def inspect_view(
     )
 
 
-def read_patch(patch: Patch, spec: PanelObject, *, digits_taught: bool = True) -> Status:
-    """The status of one object by the reader of its kind."""
+def read_patch(patch: Patch, spec: PanelObject, *, digits_taught: bool = True, before: float | None = None) -> Status:
+    """The status of one object by the reader of its kind; the value `before` tells between a display's likely numbers."""
     match spec.kind:
         case "gauge":
             return read_gauge(patch, spec)
         case "panel_meter":
             return read_panel_meter(patch, spec)
         case "display":
-            return read_display(patch, spec, digits_taught=digits_taught)
+            return read_display(patch, spec, digits_taught=digits_taught, before=before)
         case "lamp":
             return read_lamp(patch, spec)
         case "button":
@@ -195,7 +195,8 @@ def _inspect_one(
     if 2 * max(footprint_m(spec)[:2]) * patch.image_px_per_m < MIN_RESOLUTION_PX:
         status = refused("the object is too small in this image: come closer")
     else:
-        status = plausible(read_patch(patch, spec, digits_taught=digits_taught), spec, before)
+        last = None if before is None else before.value
+        status = plausible(read_patch(patch, spec, digits_taught=digits_taught, before=last), spec, before)
     return replace(
         reading,
         present=True,

@@ -6,6 +6,8 @@ gray is followed. What reaches deep into the object from there covers it.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +20,25 @@ LARGEST_SHARE = 0.4  # of the object: what follows the gray of a cable and fills
 DEEP = 0.35  # of the object's smaller half size: labels and ticks do not reach that far in
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Crossing:
+    """A place on the path around an object that stands out from the plate: where something comes in.
+
+    Attributes:
+        middle_px, tangent: (2,) its middle in the patch, and the path's unit direction there.
+        length_px: along the path.
+        gray: of its middle; is_darker: than the plate round it.
+        side: of a rectangle's path, 0 to 3 from the top clockwise; 0 of a round one.
+    """
+
+    middle_px: Array
+    tangent: Array
+    length_px: float
+    gray: float
+    is_darker: bool
+    side: int
+
+
 def covered(patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool) -> NDArray[np.bool_] | None:
     """(H, W) mask of what lies across the object in the patch; None when nothing does.
 
@@ -26,29 +47,63 @@ def covered(patch: Patch, *, half_width_m: float, half_height_m: float, is_round
         is_round: whether the object is a disc (of `half_width_m`) and not a rectangle.
     """
     smooth = np.asarray(cv2.GaussianBlur(patch.gray, (0, 0), 1.0), np.uint8)
-    path_u, path_v = _path(patch, half_width_m, half_height_m, is_round)
-    inside = (path_u > 1) & (path_v > 1) & (path_u < patch.gray.shape[1] - 2) & (path_v < patch.gray.shape[0] - 2)
-    if inside.sum() < 16:
+    found = border_crossings(patch, half_width_m=half_width_m, half_height_m=half_height_m, is_round=is_round)
+    if not found:
         return None
-    values = sample_at(smooth, path_u, path_v)
-    size = max(9, len(values) // 5) | 1
-    around = np.pad(values, size // 2, mode="wrap")
-    # every fourth sample of a window tells its median as well
-    typical = np.median(np.lib.stride_tricks.sliding_window_view(around, size)[:, ::4], axis=1)
-    odd = inside & (np.abs(values - typical) > max(STANDS_OUT, 4.0 * _noise(patch)))
     depth = _depth(patch, half_width_m, half_height_m, is_round)
     least = DEEP * min(half_width_m, half_height_m) * patch.px_per_m
     mask = np.zeros(patch.gray.shape, bool)
-    for first, last in _runs(odd):
-        middle = (first + last) // 2 % len(values)
-        seed = (round(float(path_u[middle])), round(float(path_v[middle])))
-        region = _followed(smooth, seed)
+    for crossing in found:
+        u, v = crossing.middle_px
+        region = _followed(smooth, (round(float(u)), round(float(v))))
         within = region & (depth > 0)
         if within.sum() > LARGEST_SHARE * (depth > 0).sum() or not within.any():
             continue
         if float(depth[within].max()) >= least:
             mask |= region
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0) if mask.any() else None
+
+
+def border_crossings(patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool) -> list[Crossing]:
+    """The places just outside of an object's border that stand out from the plate round them; arguments as `covered`."""
+    smooth = np.asarray(cv2.GaussianBlur(patch.gray, (0, 0), 1.0), np.uint8)
+    path_u, path_v = _path(patch, half_width_m, half_height_m, is_round)
+    inside = (path_u > 1) & (path_v > 1) & (path_u < patch.gray.shape[1] - 2) & (path_v < patch.gray.shape[0] - 2)
+    if inside.sum() < 16:
+        return []
+    values = sample_at(smooth, path_u, path_v)
+    size = max(9, len(values) // 5) | 1
+    around = np.pad(values, size // 2, mode="wrap")
+    # every fourth sample of a window tells its median as well
+    typical = np.median(np.lib.stride_tricks.sliding_window_view(around, size)[:, ::4], axis=1)
+    odd = inside & (np.abs(values - typical) > max(STANDS_OUT, 4.0 * _noise(patch)))
+    n = len(values)
+    points = np.column_stack([path_u, path_v])
+    sides = np.zeros(n, int) if is_round else _sides(patch, points, half_width_m, half_height_m)
+    found = []
+    for first, last in _runs(odd):
+        at = np.arange(first, last + 1) % n
+        middle = int(at[len(at) // 2])
+        step = points[(middle + 1) % n] - points[(middle - 1) % n]
+        gray = float(np.median(values[at[len(at) // 3 : len(at) - len(at) // 3]]))  # its edges are blurred
+        found.append(
+            Crossing(
+                middle_px=points[middle],
+                tangent=step / max(float(np.linalg.norm(step)), 1e-9),
+                length_px=0.8 * len(at),
+                gray=gray,
+                is_darker=gray < float(typical[middle]),
+                side=int(sides[middle]),
+            )
+        )
+    return found
+
+
+def _sides(patch: Patch, points: Array, w: float, h: float) -> NDArray[np.int64]:
+    """(N,) which side of the rectangle every point of its path lies at: 0 to 3 from the top clockwise."""
+    x, y = ((points[:, k] - patch.pixel_of(0.0, 0.0, 0.0)[k]) / patch.px_per_m for k in (0, 1))
+    flat = np.abs(y) - h > np.abs(x) - w
+    return np.asarray(np.where(flat, np.where(y < 0, 0, 2), np.where(x > 0, 1, 3)), np.int64)
 
 
 def _path(patch: Patch, w: float, h: float, is_round: bool) -> tuple[Array, Array]:

@@ -1,0 +1,89 @@
+"""Cables in front of an object: bands that come in over its border on one side and leave on another.
+
+Where a cable crosses a dark window its gray may be the window's; on the plate just outside it is plain. So the closed path
+around the object is searched for places that stand out, and every two of them that match in gray and width are joined by a
+band, which must have one gray all along, straight or with one bend.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations, product
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.vision.patch import Patch, sample_at
+from perception.vision.status.cover import Crossing, border_crossings
+from perception.vision.view import Array
+
+SAME_GRAY = 16.0  # levels along a band; real cables shine a little
+ALONG_SHARE = 0.8  # of the band's axis that must have its gray
+MOST_WIDTH = 0.5  # of the object's smaller side: wider things are not looked past
+BENDS = (0.0, -0.3, 0.3, -0.6, 0.6, -1.0, 1.0, -1.6, 1.6, -2.3, 2.3)  # of the band's width, sideways
+INK_EDGE_PX = 4.0
+BENT_AT = (0.5, 0.3, 0.7)  # of its length
+
+
+def hidden_by_bands(
+    patch: Patch, *, half_width_m: float, half_height_m: float, dark_ink: bool
+) -> NDArray[np.bool_] | None:
+    """(H, W) mask of the cables that cross a display in the patch; None when none does.
+
+    Args:
+        dark_ink: whether segments are darker than their ground. The blurred edge of a cable that differs from the ground as
+            segments do would pass for ink, so it is hidden too; any other edge shows what lies beside it.
+    """
+    ends = border_crossings(patch, half_width_m=half_width_m, half_height_m=half_height_m, is_round=False)
+    if len(ends) < 2:
+        return None
+    smooth = np.asarray(cv2.GaussianBlur(patch.gray, (0, 0), 0.8), np.uint8)
+    least_side = 2 * min(half_width_m, half_height_m) * patch.px_per_m
+    mask = np.zeros(patch.gray.shape, np.uint8)
+    ground = _ground(patch, half_width_m, half_height_m)
+    for a, b in combinations(ends, 2):
+        line = _joined(smooth, a, b, least_side)
+        if line is not None:
+            points, width = line
+            width += INK_EDGE_PX if ((a.gray + b.gray) / 2 < ground - SAME_GRAY / 2) == dark_ink else 0.0
+            cv2.polylines(mask, [np.round(points * 16).astype(np.int32)], False, 1, max(1, round(width)), cv2.LINE_8, 4)
+    return mask > 0 if mask.any() else None
+
+
+def _ground(patch: Patch, half_width_m: float, half_height_m: float) -> float:
+    """Typical gray of the window."""
+    x, y = np.meshgrid(np.linspace(-0.8, 0.8, 24) * half_width_m, np.linspace(-0.8, 0.8, 12) * half_height_m)
+    return float(np.median(patch.sample(x, y, 0.0)))
+
+
+def _joined(smooth: NDArray[np.uint8], a: Crossing, b: Crossing, least_side_px: float) -> tuple[Array, float] | None:
+    """(3, 2) axis and width in px of the band between two places on the border; None when there is none."""
+    if a.side == b.side or abs(a.gray - b.gray) > 2 * SAME_GRAY or a.is_darker != b.is_darker:
+        return None
+    along = b.middle_px - a.middle_px
+    length = float(np.linalg.norm(along))
+    if length < 0.4 * least_side_px:
+        return None
+    along = along / length
+    widths = [end.length_px * abs(float(along[0] * end.tangent[1] - along[1] * end.tangent[0])) for end in (a, b)]
+    width = max(widths)
+    if min(widths) < 1.0 or width > MOST_WIDTH * least_side_px or width > 2.2 * min(widths):
+        return None
+    across = np.array([-along[1], along[0]]) * width
+    t = np.linspace(0.0, 1.0, max(12, round(length / 1.5)))
+    wanted = a.gray + t * (b.gray - a.gray)
+    best: tuple[float, Array] | None = None
+    for at, bend in product(BENT_AT, BENDS):
+        middle = a.middle_px + at * (b.middle_px - a.middle_px) + bend * across
+        axis = np.column_stack(
+            [np.interp(t, [0, at, 1], [p[i] for p in (a.middle_px, middle, b.middle_px)]) for i in (0, 1)]
+        )
+        sides = np.array([-0.25, 0.0, 0.25])[:, None, None] * across
+        u, v = np.moveaxis(axis + sides, 2, 0)
+        off = np.abs(sample_at(smooth, u, v) - wanted)
+        share = float((off < SAME_GRAY).mean())
+        if best is None or share > best[0] + (0.01 if bend else -1e-9):
+            best = share, np.array([a.middle_px, middle, b.middle_px])
+    if best is None or best[0] < ALONG_SHARE:
+        return None
+    return best[1], width

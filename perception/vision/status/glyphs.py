@@ -1,0 +1,157 @@
+"""What seven segments say: characters by likelihood, numbers as blanks, perhaps a sign, then digits.
+
+A segment's level is normal around the level of lit segments of its cell, or around that of unlit ones; a hidden segment says
+nothing, so that what it would have decided stays undecided. Every number that is about as likely as the best is listed:
+a range or a previous reading may tell between them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from perception.vision.view import Array
+
+SEGMENTS = "abcdefg"  # top, upper right, lower right, bottom, lower left, upper left, middle
+GLYPHS = (
+    ("0", "abcdef"), ("1", "bc"), ("2", "abged"), ("3", "abgcd"), ("4", "fgbc"), ("5", "afgcd"), ("6", "afgedc"),
+    ("7", "abc"), ("8", "abcdefg"), ("9", "abcdfg"), ("7", "abcf"), ("6", "fgedc"), ("9", "abcfg"), ("-", "g"),
+)  # fmt: skip
+#: (characters, 7) which segments a character lights.
+LIT = np.array([[s in lit for s in SEGMENTS] for _, lit in GLYPHS])
+NAMES = [name for name, _ in GLYPHS]
+RARE = {10: 1.5, 11: 1.5, 12: 1.5}  # nats: other ways to draw 7, 6 and 9
+
+LEAST_NOISE = 1.0  # levels
+LEVEL_NOISE = 0.8  # of the ink's spread: a level is the median of five places, each the best of three
+LEAST_SEEN = 0.19  # share of a segment below which it says nothing
+SPREAD = 0.16  # one sigma of a lit segment's level over that level: uneven light, blur, pixels
+LEAK = 0.15  # the same for an unlit one: its lit neighbours' blur
+CELL_SPREAD = 0.4  # one sigma of the logarithm of a cell's lit level over the display's
+MOST_LOSS = 9.0  # nats that one segment may cost: something else than noise has happened to it
+CLOSE = 7.0  # nats: characters listed beside the best of their cell
+MOST_LISTED = 300
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Levels:
+    """Levels of a display's segments.
+
+    Attributes:
+        ink, seen: (cells, 7) level and seen share of every segment.
+        unlit, noise: (cells,) level of what is not lit, and one sigma of a level's noise, in every cell.
+        lit: level of lit segments.
+    """
+
+    ink: Array
+    seen: Array
+    unlit: Array
+    noise: Array
+    lit: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Number:
+    """One way to read a display: its characters from the first cell to the last (blanks kept) and its log-likelihood."""
+
+    characters: str
+    log_likelihood: float
+
+
+def separate(ink: Array, seen: Array, loops: Array, loop_noise: Array) -> Levels | None:
+    """Levels with lit and unlit told apart (N. Otsu, IEEE SMC 9(1), 1979); None where they do not separate.
+
+    Args:
+        ink, seen: (cells, 7) level and seen share of every segment.
+        loops, loop_noise: (cells,) mean and spread inside the loops; NaN where they are hidden.
+    """
+    clear = ink[seen >= LEAST_SEEN]
+    values = np.sort(np.concatenate([clear, loops[np.isfinite(loops)]]))  # with the loops: "888" has nothing unlit
+    if len(clear) < 2 or len(values) < 4:
+        return None
+    n = np.arange(1, len(values))
+    low, high = np.cumsum(values)[:-1] / n, (values.sum() - np.cumsum(values)[:-1]) / (len(values) - n)
+    k = int((n * (len(values) - n) * (high - low) ** 2).argmax())
+    if high[k] - low[k] < 2.5:
+        return None
+    spread = np.where(
+        np.isfinite(loop_noise), loop_noise, np.nanmedian(loop_noise) if np.isfinite(loop_noise).any() else LEAST_NOISE
+    )
+    noise = np.maximum(LEAST_NOISE, LEVEL_NOISE * spread)
+    # The best across a stroke lies above the mean: unlit segments look brighter than loops by about a sigma.
+    local = np.where(np.isfinite(loops), loops + noise, low[k])
+    return Levels(
+        ink=ink, seen=seen, unlit=0.5 * (local + np.minimum(low[k], local + 2 * noise)), lit=float(high[k]), noise=noise
+    )
+
+
+def likelihoods(levels: Levels) -> tuple[Array, Array]:
+    """(cells, characters) and (cells,) log-likelihood of every character, and of a blank cell."""
+    weight = np.where(levels.seen >= LEAST_SEEN, np.minimum(1.0, levels.seen * 1.5), 0.0)  # (cells, 7)
+    w, ink = weight[:, None, :], levels.ink[:, None, :]
+    there = w * LIT
+    total = there.sum(axis=2, keepdims=True)
+    # The lit level of the cell, drawn to the display's as by one more segment.
+    own = ((there * ink).sum(axis=2, keepdims=True) + 0.5 * levels.lit) / (total + 0.5)
+    unlit, noise = levels.unlit[:, None, None], levels.noise[:, None, None]
+    own = np.clip(own, unlit + 0.15 * np.maximum(levels.lit - unlit, 1.0), 2.5 * levels.lit)
+    sigma = np.sqrt(noise**2 + (np.where(LIT, SPREAD, LEAK) * own) ** 2)
+    miss = (ink - np.where(LIT, own, unlit)) / sigma
+    segments = -np.minimum(0.5 * miss**2, MOST_LOSS) - np.log(sigma / levels.lit)
+    characters = (w * segments).sum(axis=2) - 0.5 * (np.log(own / levels.lit)[:, :, 0] / CELL_SPREAD) ** 2
+    for k, loss in RARE.items():
+        characters[:, k] -= loss
+    spread = np.sqrt(noise[:, 0] ** 2 + (0.5 * LEAK * levels.lit) ** 2)
+    dim = -np.minimum(0.5 * ((levels.ink - unlit[:, 0]) / spread) ** 2, MOST_LOSS) - np.log(spread / levels.lit)
+    return np.asarray(characters), np.asarray((weight * dim).sum(axis=1))
+
+
+def numbers(characters: Array, blank: Array) -> list[Number]:
+    """Every likely number, best first: blanks, perhaps a sign (and blanks behind it), then digits.
+
+    Args:
+        characters, blank: from `likelihoods`.
+    """
+    count = len(blank)
+    minus = characters[:, NAMES.index("-")]
+    digits = _digits(characters)
+    lead = np.concatenate([[0.0], np.cumsum(blank)])
+    best_digit = digits.max(axis=1)
+    tail = np.concatenate([np.cumsum(best_digit[::-1])[::-1], [0.0]])
+    forms: list[tuple[float, int, int]] = []  # total, cells before the first digit, place of the sign or -1
+    for first in range(count):
+        forms.append((float(lead[first] + tail[first]), first, -1))
+        forms += [(float(lead[first] - blank[k] + minus[k] + tail[first]), first, k) for k in range(first)]
+    forms.sort(reverse=True)
+    listed: list[Number] = []
+    for total, first, sign in forms:
+        if total < forms[0][0] - CLOSE or len(listed) >= MOST_LISTED:
+            break
+        prefix = "".join("-" if k == sign else " " for k in range(first))
+        listed += [
+            Number(characters=prefix + text, log_likelihood=total - loss)
+            for text, loss in _alternatives(digits[first:])
+        ]
+    return sorted(listed, key=lambda n: n.log_likelihood, reverse=True)
+
+
+def _digits(characters: Array) -> Array:
+    """(cells, 10) log-likelihood of every digit, by its best form."""
+    return np.stack(
+        [characters[:, [k for k, name in enumerate(NAMES) if name == d]].max(axis=1) for d in "0123456789"], 1
+    )
+
+
+def _alternatives(digits: Array) -> list[tuple[str, float]]:
+    """(text, nats below the best) of the likely strings of digits."""
+    close = []
+    for row in digits:
+        order = np.argsort(-row)
+        close.append([(str(k), float(row[order[0]] - row[k])) for k in order if row[order[0]] - row[k] <= CLOSE])
+    while np.prod([len(c) for c in close]) > MOST_LISTED:  # drop the least likely of all
+        worst = max(range(len(close)), key=lambda i: close[i][-1][1] if len(close[i]) > 1 else -1.0)
+        close[worst].pop()
+    texts = [("".join(c for c, _ in choice), sum(loss for _, loss in choice)) for choice in product(*close)]
+    return [(text, loss) for text, loss in texts if loss <= CLOSE]

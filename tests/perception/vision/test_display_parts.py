@@ -1,0 +1,158 @@
+"""The parts of the display reader: characters by likelihood, the comb's worth, cables, the point; and own renderings."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks.display_drawing import DisplayCase, draw_photograph, draw_taught
+from hal.panel import Display
+from perception.vision.patch import Patch
+from perception.vision.photo_display import read_photograph
+from perception.vision.reading import Status
+from perception.vision.status.band import hidden_by_bands
+from perception.vision.status.comb import AXES, find_combs
+from perception.vision.status.comb_jit import LEFT_OVER, apartness, cell_worth, comb_worth
+from perception.vision.status.display import read_display, read_window
+from perception.vision.status.glyphs import LIT, NAMES, Levels, likelihoods, numbers, separate
+from perception.vision.status.ink import segment_ink
+from perception.vision.taught import patch_of
+from perception.vision.view import PlaneView, homography
+from tests.perception.vision.test_display import window
+
+
+def levels_of(text: str, *, hidden: tuple[tuple[int, int], ...] = ()) -> Levels:
+    ink = np.array([LIT[NAMES.index(c)] * 80.0 if c != " " else np.zeros(7) for c in text])
+    seen = np.ones_like(ink)
+    for cell, segment in hidden:
+        ink[cell, segment], seen[cell, segment] = 0.0, 0.0
+    found = separate(ink, seen, np.zeros(len(text)), np.ones(len(text)))
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("text", ["0123456789", "   7", " -42", "-  5", "888"])
+def test_clear_segments_say_one_number(text: str) -> None:
+    listed = numbers(*likelihoods(levels_of(text)))
+    assert listed[0].characters == text
+    assert len(listed) == 1 or listed[0].log_likelihood - listed[1].log_likelihood > 3.5
+
+
+def test_what_a_hidden_segment_decides_stays_open() -> None:
+    b = 1  # upper right: 5 or 9
+    listed = numbers(*likelihoods(levels_of("19", hidden=((1, b),))))
+    assert {n.characters for n in listed[:2]} == {"15", "19"}
+    assert listed[0].log_likelihood == pytest.approx(listed[1].log_likelihood, abs=0.1)
+
+
+@pytest.mark.parametrize(("before", "wanted"), [(95.0, "99"), (54.0, "59"), (None, None)])
+def test_the_previous_reading_tells_between_what_is_left(before: float | None, wanted: str | None) -> None:
+    gray = window("99", slant=0.0)
+    status = read_window(
+        gray, digits=2, decimals=0, dark=False, limits=(0.0, 200.0), hidden=over_segment_b(gray), before=before
+    )
+    assert status.text == wanted
+
+
+def test_the_range_tells_between_what_is_left() -> None:
+    gray = window("99", slant=0.0)
+    status = read_window(gray, digits=2, decimals=0, dark=False, limits=(60.0, 120.0), hidden=over_segment_b(gray))
+    assert status.text == "99"
+
+
+def over_segment_b(gray: np.ndarray) -> np.ndarray:
+    """Mask over the upper right segment of the first of two digits in `window`."""
+    hidden = np.zeros(gray.shape, bool)
+    left = 0.5 * (gray.shape[1] - 1.5 * 20 - 20)
+    hidden[17:32, round(left + 20 - 5) : round(left + 20 + 4)] = True
+    return hidden
+
+
+def test_a_cells_worth_is_what_its_best_character_explains_less_what_it_leaves() -> None:
+    random = np.random.default_rng(3)
+    for _ in range(50):
+        levels, areas, loops = random.uniform(0, 90, 7), random.uniform(5, 20, 7), float(random.uniform(0, 2e4))
+        total = loops + float((areas * levels**2).sum())
+        explained = [float((areas * levels)[lit].sum()) ** 2 / float(areas[lit].sum()) for lit in LIT]
+        wanted = max(0.0, *(e - LEFT_OVER * (total - e) for e in explained))
+        assert cell_worth(levels, areas, loops, LIT) == pytest.approx(wanted)
+
+
+def test_the_true_comb_is_worth_more_than_any_shifted_one() -> None:
+    ink, seen = segment_ink(window("2048", slant=0.0), is_dark=False)
+    _, comb = find_combs(ink, seen)[0]
+    assert (
+        comb.count == 4 and comb.height_px == pytest.approx(40.0, abs=3.0) and comb.pitch_px == pytest.approx(30, abs=1)
+    )
+    place = np.array([comb.left_px, comb.pitch_px, comb.width_px, comb.top_px, comb.bottom_px, comb.slant])
+    worth = comb_worth(ink, seen, place, 4, AXES, LIT)
+    for k, step in ((0, 5.0), (0, -5.0), (1, 3.0), (3, 6.0), (4, -6.0)):
+        moved = place.copy()
+        moved[k] += step
+        assert comb_worth(ink, seen, moved, 4, AXES, LIT) < worth
+
+
+def test_neighbours_that_share_an_upright_count_less() -> None:
+    gaps = np.linspace(0.0, 0.4, 30)
+    factors = np.array([apartness(float(g)) for g in gaps])
+    assert (np.diff(factors) >= 0).all() and factors[0] < 0.5 and factors[-1] == 1.0
+
+
+def plate_patch(*, cable: tuple[int, int] | None) -> Patch:
+    gray = np.full((110, 200), 170, np.uint8)
+    gray[25:85, 30:170] = 25
+    if cable is not None:
+        cv2.line(gray, (cable[0], -5), (cable[1], 115), 60, 12, cv2.LINE_AA)
+    gray = cv2.GaussianBlur(gray, (0, 0), 1.2)
+    noise = np.random.default_rng(0).normal(0, 1.5, gray.shape)
+    return Patch(
+        gray=np.clip(gray + noise, 0, 255).astype(np.uint8), colour=None, inside=np.ones(gray.shape, bool), px_per_m=1000.0,
+        image_px_per_m=1000.0, origin_px=np.array([99.5, 54.5]), parallax_px_per_m=np.zeros(2), growth_per_m=0.0, plane_z_m=0.0,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("cable", [(100, 100), (60, 95), (150, 120)])
+def test_a_cable_is_masked_where_it_lies(cable: tuple[int, int]) -> None:
+    found = hidden_by_bands(plate_patch(cable=cable), half_width_m=0.07, half_height_m=0.03, dark_ink=False)
+    assert found is not None
+    drawn = np.zeros(found.shape, np.uint8)
+    cv2.line(drawn, (cable[0], -5), (cable[1], 115), 1, 8)
+    inside = np.zeros(found.shape, bool)
+    inside[25:85, 30:170] = True
+    assert found[(drawn > 0) & inside].mean() > 0.97
+    assert found[inside].mean() < 0.3
+
+
+def test_nothing_is_masked_without_a_cable() -> None:
+    assert hidden_by_bands(plate_patch(cable=None), half_width_m=0.07, half_height_m=0.03, dark_ink=False) is None
+
+
+def read_case(case: DisplayCase, *, known: bool) -> Status:
+    """The reading of a drawn display through a plane view that knows its place."""
+    w, h = 0.02 * case.size[0], 0.02 * case.size[1]
+    plate = np.array([[-w / 2, h / 2], [w / 2, h / 2], [w / 2, -h / 2], [-w / 2, -h / 2]])
+    view = PlaneView(px_from_plate=homography(plate, case.corners_px), corners_m=plate)
+    spec = Display(
+        name="d", position_m=(0.0, 0.0), width_m=w + 0.002, height_m=h + 0.002, digits=case.digits,
+        decimals=case.decimals, style="lcd" if case.is_dark else "led", minimum=-1e9, maximum=1e9,
+    )  # fmt: skip
+    return read_display(patch_of(case.image, case.image, view, spec, np.zeros(2)), spec, digits_taught=known)
+
+
+@pytest.mark.parametrize("level", ["easy", "medium"])
+def test_own_renderings_are_read_when_their_digits_are_known(level: str) -> None:
+    cases = [draw_taught(seed, level) for seed in range(6)]
+    assert sum(read_case(case, known=True).text == case.text for case in cases) >= 5
+
+
+def test_a_cable_and_glare_never_make_many_sure_wrong_readings() -> None:
+    cases = [draw_taught(seed, "hard") for seed in range(12)]
+    answers = [(case, read_case(case, known=False)) for case in cases]
+    assert sum(s.answered and s.text != c.text and s.confidence > 0.8 for c, s in answers) <= 1
+    assert sum(s.text == c.text for c, s in answers) >= 4
+
+
+def test_photographs_of_low_contrast_are_read_by_and_large() -> None:
+    cases = [draw_photograph(seed, "low contrast") for seed in range(6)]
+    assert sum(read_photograph(case.image, scene=False).text == case.text for case in cases) >= 4

@@ -32,64 +32,32 @@ ServiceUrl = Annotated[str | None, typer.Option("--url", help="Use this running 
 RUNS = Path("runs")
 
 
-@app.command()
-def camera(
-    *,
-    cell: CellOption = DEFAULT_CELL,
-    seed: SeedOption = None,
-    poses: Poses = 16,
-    device: Device = None,
-    dry_run: DryRun = False,
-    runs: Runs = RUNS,
-    url: ServiceUrl = None,
-) -> None:
-    """Lens and mount of a camera whose lens is not known, by the panel's lights."""
-    _run("camera", cell, seed, runs, url, {"poses": poses, "device": device, "dry_run": dry_run})
+def _add_command(what: str, poses_usual: int, summary: str) -> None:
+    """One command a thing to calibrate: they differ in nothing but what is measured and from how many stations."""
+
+    def calibrate(
+        *,
+        cell: CellOption = DEFAULT_CELL,
+        seed: SeedOption = None,
+        poses: Poses = poses_usual,
+        device: Device = None,
+        dry_run: DryRun = False,
+        runs: Runs = RUNS,
+        url: ServiceUrl = None,
+    ) -> None:
+        _run(what, cell, seed, runs, url, {"poses": poses, "device": device, "dry_run": dry_run})
+
+    app.command(what, help=summary)(calibrate)
 
 
-@app.command("hand-eye")
-def hand_eye(
-    *,
-    cell: CellOption = DEFAULT_CELL,
-    seed: SeedOption = None,
-    poses: Poses = 12,
-    device: Device = None,
-    dry_run: DryRun = False,
-    runs: Runs = RUNS,
-    url: ServiceUrl = None,
-) -> None:
-    """Where the camera sits in the hand and where the panel stands, by the panel's lights."""
-    _run("hand-eye", cell, seed, runs, url, {"poses": poses, "device": device, "dry_run": dry_run})
-
-
-@app.command()
-def scanner(
-    *,
-    cell: CellOption = DEFAULT_CELL,
-    seed: SeedOption = None,
-    poses: Poses = 12,
-    device: Device = None,
-    dry_run: DryRun = False,
-    runs: Runs = RUNS,
-    url: ServiceUrl = None,
-) -> None:
-    """Where the range scanner sits in the hand, by scans of the plate (calibrate the camera first)."""
-    _run("scanner", cell, seed, runs, url, {"poses": poses, "device": device, "dry_run": dry_run})
-
-
-@app.command()
-def tool(
-    *,
-    cell: CellOption = DEFAULT_CELL,
-    seed: SeedOption = None,
-    poses: Poses = 12,
-    device: Device = None,
-    dry_run: DryRun = False,
-    runs: Runs = RUNS,
-    url: ServiceUrl = None,
-) -> None:
-    """Bias of the force/torque sensor, and weight and centre of the tool, with the hand turned every way."""
-    _run("tool", cell, seed, runs, url, {"poses": poses, "device": device, "dry_run": dry_run})
+_add_command("camera", 16, "Lens and mount of a camera whose lens is not known, by the panel's lights.")
+_add_command("hand-eye", 12, "Where the camera sits in the hand and where the panel stands, by the panel's lights.")
+_add_command(
+    "scanner", 12, "Where the range scanner sits in the hand, by scans of the plate (calibrate the camera first)."
+)
+_add_command(
+    "tool", 12, "Bias of the force/torque sensor, and weight and centre of the tool, with the hand turned every way."
+)
 
 
 @app.command("list")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import mmap
 import struct
+import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +37,7 @@ UNREADABLE = LatchState(is_latched=True, count=0, time_s=0.0, source="latch not 
 
 
 class Latch:
-    """A mapped latch file. One process writes; any number reads without a lock.
+    """A mapped latch file. One process writes, its threads one after the other; any number reads without a lock.
 
     A sequence counter guards the record (a seqlock): odd while it is being written, different when it changed
     meanwhile. The flag alone is one byte, so `is_set` needs no retry.
@@ -46,6 +47,7 @@ class Latch:
         with path.open("r+b") as file:
             self._memory = mmap.mmap(file.fileno(), SIZE)
         self._sequence = _word(self._memory, "Q")
+        self._writing = threading.RLock()
 
     @classmethod
     def create(cls, path: Path) -> Latch:
@@ -84,14 +86,16 @@ class Latch:
 
     def set(self, source: str) -> LatchState:
         """Latch the stop. Always succeeds, also when it is latched already."""
-        return self._write(LATCHED, source)
+        with self._writing:
+            return self._write(LATCHED, source)
 
     def reset(self, source: str, *, seen_count: int) -> bool:
         """Clear the latch, if nobody stopped again since the caller saw `seen_count`; tells whether it is clear."""
-        if self.state().count != seen_count:
-            return False
-        self._write(CLEAR, source)
-        return True
+        with self._writing:
+            if self.state().count != seen_count:
+                return False
+            self._write(CLEAR, source)
+            return True
 
     def close(self) -> None:
         """Unmap; a second call does nothing."""

@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 
 CURVATURE_GOAL_PER_M = 4.0  # noise of H that still tells a ball of 0.1 m radius from a plane
 CHUNK, ROW = 128, 144  # pixels worked on at a time; a row of the scratch array holds them and a neighbour on each side
+ABOVE, HERE, BELOW = 0, ROW, 2 * ROW  # rows of depth, each from one pixel before the chunk
+ACROSS = 3 * ROW  # x of each pixel's ray at depth 1
+GU, GV, NORMAL, MEAN, GAUSS = 4 * ROW, 5 * ROW, 6 * ROW, 9 * ROW, 10 * ROW  # the normal takes three rows
 SCRATCH = 11 * ROW
 SCALES_PX = (1.0, 1.5, 2.0, 3.0, 4.0)
 
@@ -127,14 +130,14 @@ def _fused(z, sen, work, gu, gv, normal, mean, gauss):  # type: ignore[no-untype
             for k in range(3):
                 work[k * ROW : k * ROW + n + 2] = z[v - 1 + k, first - 1 : first + n + 1]
             for i in range(n):
-                work[3 * ROW + i] = (first + i - sen[3]) / sen[1]
+                work[ACROSS + i] = (first + i - sen[3]) / sen[1]
             _forms(n, work.dtype.type((v - sen[4]) / sen[2]), sen, work)
-            gu[v, first : first + n] = work[4 * ROW : 4 * ROW + n]
-            gv[v, first : first + n] = work[5 * ROW : 5 * ROW + n]
+            gu[v, first : first + n] = work[GU : GU + n]
+            gv[v, first : first + n] = work[GV : GV + n]
             for k in range(3):
-                normal[v, first : first + n, k] = work[(6 + k) * ROW : (6 + k) * ROW + n]
-            mean[v, first : first + n] = work[9 * ROW : 9 * ROW + n]
-            gauss[v, first : first + n] = work[10 * ROW : 10 * ROW + n]
+                normal[v, first : first + n, k] = work[NORMAL + k * ROW : NORMAL + k * ROW + n]
+            mean[v, first : first + n] = work[MEAN : MEAN + n]
+            gauss[v, first : first + n] = work[GAUSS : GAUSS + n]
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
@@ -146,12 +149,12 @@ def _forms(n, y, sen, work):  # type: ignore[no-untyped-def]
     p, ax, ay = as_type(1.0 if sen[0] > 0 else 0.0), as_type(1.0 / sen[1]), as_type(1.0 / sen[2])
     py = p * y
     for i in range(n):
-        c, left, right = work[145 + i], work[144 + i], work[146 + i]
-        above, below = work[1 + i], work[289 + i]
-        px = p * work[432 + i]
+        c, left, right = work[HERE + 1 + i], work[HERE + i], work[HERE + 2 + i]
+        above, below = work[ABOVE + 1 + i], work[BELOW + 1 + i]
+        px = p * work[ACROSS + i]
         zu, zv = half * (right - left), half * (below - above)
         zuu, zvv = right - two * c + left, below - two * c + above
-        zuv = quarter * (work[290 + i] - work[288 + i] - work[2 + i] + work[i])
+        zuv = quarter * (work[BELOW + 2 + i] - work[BELOW + i] - work[ABOVE + 2 + i] + work[ABOVE + i])
         nothing = (zuu + zvv + zuv) * as_type(0.0)  # NaN where a neighbour is missing
         reach = p * c + (one - p)
         xu0, xu1 = zu * px + reach * ax, zu * py
@@ -168,10 +171,10 @@ def _forms(n, y, sen, work):  # type: ignore[no-untyped-def]
         # Towards the sensor is outward, so a bulge curves against the normal: minus signs make it positive.
         e, f, g = -(a0 * n0 + a1 * n1 + zuu * n2), -(b0 * n0 + b1 * n1 + zuv * n2), -(d0 * n0 + d1 * n1 + zvv * n2)
         inverse *= inverse
-        work[576 + i] = zu + nothing
-        work[720 + i] = zv + nothing
-        work[864 + i] = n0 + nothing
-        work[1008 + i] = n1 + nothing
-        work[1152 + i] = n2 + nothing
-        work[1296 + i] = half * (e * G - two * f * F + g * E) * inverse
-        work[1440 + i] = (e * g - f * f) * inverse
+        work[GU + i] = zu + nothing
+        work[GV + i] = zv + nothing
+        work[NORMAL + i] = n0 + nothing
+        work[NORMAL + ROW + i] = n1 + nothing
+        work[NORMAL + 2 * ROW + i] = n2 + nothing
+        work[MEAN + i] = half * (e * G - two * f * F + g * E) * inverse
+        work[GAUSS + i] = (e * g - f * f) * inverse

@@ -13,9 +13,12 @@ from numba import njit
 from perception.range.surfaces import CONE, CYLINDER, FREEDOM, GRAZING_COSINE, PLANE, SPHERE, frame_of
 
 CHUNK = 128
-DEPTH, COSINE, FIRST, WEIGHT, RESIDUAL = 0, 1, 2, 11, 12  # rows of the scratch array; derivatives are 2 to 10
-LOADED = 13  # x, y, z and sigma of the samples
-SCRATCH = 17 * CHUNK
+ROWS = [row * CHUNK for row in range(17)]  # where each row of the scratch array begins
+DEPTH, COSINE = ROWS[:2]
+D0, D1, D2, D3, D4, D5, D6, D7, D8 = ROWS[2:11]  # derivatives of depth by the surface's free directions
+WEIGHT, RESIDUAL = ROWS[11:13]
+X, Y, Z, SIGMA = ROWS[13:]  # the samples
+SCRATCH = len(ROWS) * CHUNK
 LANES = 16  # rows are padded with zeros to this many samples: sums then need no remainder loop
 MISS_SIGMAS = 6.0  # a ray that misses the surface costs as much as a residual of this size
 CAUCHY_WIDTH = 2.0
@@ -30,10 +33,10 @@ def load_rows(x, y, z, sigma, first, n, work):  # type: ignore[no-untyped-def]
     Loops that read and write several arrays ask at run time whether these may overlap, and round otherwise when they lie
     side by side in memory. Within one array at fixed places there is nothing to ask: the same input, the same bits.
     """
-    work[LOADED * CHUNK : LOADED * CHUNK + n] = x[first : first + n]
-    work[(LOADED + 1) * CHUNK : (LOADED + 1) * CHUNK + n] = y[first : first + n]
-    work[(LOADED + 2) * CHUNK : (LOADED + 2) * CHUNK + n] = z[first : first + n]
-    work[(LOADED + 3) * CHUNK : (LOADED + 3) * CHUNK + n] = sigma[first : first + n]
+    work[X : X + n] = x[first : first + n]
+    work[Y : Y + n] = y[first : first + n]
+    work[Z : Z + n] = z[first : first + n]
+    work[SIGMA : SIGMA + n] = sigma[first : first + n]
 
 
 @njit(cache=True, error_model="numpy")
@@ -60,18 +63,18 @@ def _plane(th, frame, n, p, work):  # type: ignore[no-untyped-def]
     nx, ny, nz, d = th[0], th[1], th[2], th[3]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
     for i in range(n):
-        xi, yi = work[1664 + i], work[1792 + i]
+        xi, yi = work[X + i], work[Y + i]
         dx, dy = p * xi, p * yi
         ox, oy = xi - dx, yi - dy
         facing = nx * dx + ny * dy + nz
         k = -1.0 / facing
         z = (nx * ox + ny * oy - d) * k if abs(facing) > 1e-6 else np.nan
         px, py = ox + z * dx, oy + z * dy
-        work[i] = z
-        work[128 + i] = abs(facing) / np.sqrt(dx * dx + dy * dy + 1.0)
-        work[256 + i] = k * (px * e0 + py * e1 + z * e2)
-        work[384 + i] = k * (px * f0 + py * f1 + z * f2)
-        work[512 + i] = -k
+        work[DEPTH + i] = z
+        work[COSINE + i] = abs(facing) / np.sqrt(dx * dx + dy * dy + 1.0)
+        work[D0 + i] = k * (px * e0 + py * e1 + z * e2)
+        work[D1 + i] = k * (px * f0 + py * f1 + z * f2)
+        work[D2 + i] = -k
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
@@ -80,7 +83,7 @@ def _sphere(th, n, p, work):  # type: ignore[no-untyped-def]
     side = 1.0 if th[4] > 0 else -1.0
     inverse_r = 1.0 / r
     for i in range(n):
-        xi, yi = work[1664 + i], work[1792 + i]
+        xi, yi = work[X + i], work[Y + i]
         dx, dy = p * xi, p * yi
         wx, wy = xi - dx - cx, yi - dy - cy
         a = dx * dx + dy * dy + 1.0
@@ -90,12 +93,12 @@ def _sphere(th, n, p, work):  # type: ignore[no-untyped-def]
         nx, ny, nz = (wx + z * dx) * inverse_r, (wy + z * dy) * inverse_r, (z - cz) * inverse_r
         facing = nx * dx + ny * dy + nz
         k = 1.0 / facing
-        work[i] = z if abs(facing) > 1e-6 else np.nan
-        work[128 + i] = abs(facing) / np.sqrt(a)
-        work[256 + i] = k * nx
-        work[384 + i] = k * ny
-        work[512 + i] = k * nz
-        work[640 + i] = k
+        work[DEPTH + i] = z if abs(facing) > 1e-6 else np.nan
+        work[COSINE + i] = abs(facing) / np.sqrt(a)
+        work[D0 + i] = k * nx
+        work[D1 + i] = k * ny
+        work[D2 + i] = k * nz
+        work[D3 + i] = k
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
@@ -105,7 +108,7 @@ def _cylinder(th, frame, n, p, work):  # type: ignore[no-untyped-def]
     side = 1.0 if th[7] > 0 else -1.0
     inverse_r = 1.0 / r
     for i in range(n):
-        xi, yi = work[1664 + i], work[1792 + i]
+        xi, yi = work[X + i], work[Y + i]
         dx, dy = p * xi, p * yi
         wx, wy = xi - dx - cx, yi - dy - cy
         da = dx * ax + dy * ay + az
@@ -123,13 +126,13 @@ def _cylinder(th, frame, n, p, work):  # type: ignore[no-untyped-def]
         facing = nx * dx + ny * dy + nz
         k = 1.0 / facing
         n1, n2 = k * (nx * e0 + ny * e1 + nz * e2), k * (nx * f0 + ny * f1 + nz * f2)
-        work[i] = z if abs(facing) > 1e-6 else np.nan
-        work[128 + i] = abs(facing) / np.sqrt(d2)
-        work[256 + i] = n1
-        work[384 + i] = n2
-        work[512 + i] = h * n1
-        work[640 + i] = h * n2
-        work[768 + i] = k
+        work[DEPTH + i] = z if abs(facing) > 1e-6 else np.nan
+        work[COSINE + i] = abs(facing) / np.sqrt(d2)
+        work[D0 + i] = n1
+        work[D1 + i] = n2
+        work[D2 + i] = h * n1
+        work[D3 + i] = h * n2
+        work[D4 + i] = k
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
@@ -140,7 +143,7 @@ def _cone(th, frame, n, p, work):  # type: ignore[no-untyped-def]
     ca, sa = np.cos(th[6]), np.sin(th[6])
     square = ca * ca
     for i in range(n):
-        xi, yi = work[1664 + i], work[1792 + i]
+        xi, yi = work[X + i], work[Y + i]
         dx, dy = p * xi, p * yi
         wx, wy = xi - dx - cx, yi - dy - cy
         da = dx * ax + dy * ay + az
@@ -165,14 +168,14 @@ def _cone(th, frame, n, p, work):  # type: ignore[no-untyped-def]
         facing = nx * dx + ny * dy + nz
         k = -1.0 / facing
         tilt = -k * (scale * h + sa)
-        work[i] = z if abs(facing) > 1e-6 and abs(a) > 1e-15 else np.nan
-        work[128 + i] = abs(facing) / np.sqrt(d2)
-        work[256 + i] = -k * nx
-        work[384 + i] = -k * ny
-        work[512 + i] = -k * nz
-        work[640 + i] = tilt * (qx * e0 + qy * e1 + qz * e2)
-        work[768 + i] = tilt * (qx * f0 + qy * f1 + qz * f2)
-        work[896 + i] = -k * (rho * sa + h * ca)
+        work[DEPTH + i] = z if abs(facing) > 1e-6 and abs(a) > 1e-15 else np.nan
+        work[COSINE + i] = abs(facing) / np.sqrt(d2)
+        work[D0 + i] = -k * nx
+        work[D1 + i] = -k * ny
+        work[D2 + i] = -k * nz
+        work[D3 + i] = tilt * (qx * e0 + qy * e1 + qz * e2)
+        work[D4 + i] = tilt * (qx * f0 + qy * f1 + qz * f2)
+        work[D5 + i] = -k * (rho * sa + h * ca)
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
@@ -183,7 +186,7 @@ def _quadric(th, n, p, work):  # type: ignore[no-untyped-def]
         th[4], th[5], th[6], th[7], th[8], th[9], th[10], th[11], th[12], th[13],
     )  # fmt: skip
     for i in range(n):
-        xi, yi = work[1664 + i], work[1792 + i]
+        xi, yi = work[X + i], work[Y + i]
         dx, dy, dz = p * xi * s, p * yi * s, s
         wx, wy, wz = xi * s - dx - cx, yi * s - dy - cy, -cz
         # Gradients at the origin of the ray and along it; the quadric is c + 2 b z + a z^2 there.
@@ -209,24 +212,24 @@ def _quadric(th, n, p, work):  # type: ignore[no-untyped-def]
         cosine = abs(slope) / np.sqrt(d2 * (gx * gx + gy * gy + gz * gz) + 1e-300)
         k = -1.0 / slope
         zz = wz * wz
-        work[i] = z if cosine * np.sqrt(d2) > 1e-6 * s and abs(slope) > 1e-12 else np.nan
-        work[128 + i] = cosine
-        work[256 + i] = k * (wx * wx - zz)
-        work[384 + i] = k * (wy * wy - zz)
-        work[512 + i] = k * wx * wy
-        work[640 + i] = k * wx * wz
-        work[768 + i] = k * wy * wz
-        work[896 + i] = k * wx
-        work[1024 + i] = k * wy
-        work[1152 + i] = k * wz
-        work[1280 + i] = k
+        work[DEPTH + i] = z if cosine * np.sqrt(d2) > 1e-6 * s and abs(slope) > 1e-12 else np.nan
+        work[COSINE + i] = cosine
+        work[D0 + i] = k * (wx * wx - zz)
+        work[D1 + i] = k * (wy * wy - zz)
+        work[D2 + i] = k * wx * wy
+        work[D3 + i] = k * wx * wz
+        work[D4 + i] = k * wy * wz
+        work[D5 + i] = k * wx
+        work[D6 + i] = k * wy
+        work[D7 + i] = k * wz
+        work[D8 + i] = k
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
 def _residual_row(n, work):  # type: ignore[no-untyped-def]
     for i in range(n):
-        grazing = min(1.0, work[128 + i] * (1.0 / GRAZING_COSINE))
-        work[1536 + i] = (work[1920 + i] - work[i]) * grazing / work[2048 + i]
+        grazing = min(1.0, work[COSINE + i] * (1.0 / GRAZING_COSINE))
+        work[RESIDUAL + i] = (work[Z + i] - work[DEPTH + i]) * grazing / work[SIGMA + i]
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
@@ -234,16 +237,16 @@ def _cauchy_weights(n, c2, work):  # type: ignore[no-untyped-def]
     """Rows WEIGHT and RESIDUAL under Cauchy weights, 1 + ratio in row DEPTH; returns the number of samples that hit."""
     used = 0.0
     for i in range(n):
-        zm = work[i]
-        w = min(1.0, work[128 + i] * (1.0 / GRAZING_COSINE)) / work[2048 + i]
-        e = (work[1920 + i] - zm) * w
+        zm = work[DEPTH + i]
+        w = min(1.0, work[COSINE + i] * (1.0 / GRAZING_COSINE)) / work[SIGMA + i]
+        e = (work[Z + i] - zm) * w
         hit = abs(e) < FARTHEST
         e2 = e * e if hit else MISS_SIGMAS * MISS_SIGMAS
         ratio = 1.0 + e2 / c2
         root = 1.0 / np.sqrt(ratio)
-        work[i] = ratio
-        work[1408 + i] = root * w if hit else 0.0
-        work[1536 + i] = root * e if hit else 0.0
+        work[DEPTH + i] = ratio
+        work[WEIGHT + i] = root * w if hit else 0.0
+        work[RESIDUAL + i] = root * e if hit else 0.0
         used += 1.0 if hit else 0.0
     return used
 
@@ -267,13 +270,13 @@ def _trim_weights(n, trim, work):  # type: ignore[no-untyped-def]
     """Rows WEIGHT and RESIDUAL under a trim; returns cost and number of samples kept."""
     used, cost = 0.0, 0.0
     for i in range(n):
-        zm = work[i]
-        w = min(1.0, work[128 + i] * (1.0 / GRAZING_COSINE)) / work[2048 + i]
-        e = (work[1920 + i] - zm) * w
+        zm = work[DEPTH + i]
+        w = min(1.0, work[COSINE + i] * (1.0 / GRAZING_COSINE)) / work[SIGMA + i]
+        e = (work[Z + i] - zm) * w
         kept = abs(e) <= trim
         cost += e * e if kept else trim * trim
-        work[1408 + i] = w if kept else 0.0
-        work[1536 + i] = e if kept else 0.0
+        work[WEIGHT + i] = w if kept else 0.0
+        work[RESIDUAL + i] = e if kept else 0.0
         used += 1.0 if kept else 0.0
     return cost, used
 
@@ -296,15 +299,15 @@ def _weighted(row, weight):  # type: ignore[no-untyped-def]
 def _add_products(p, n, work, H, g):  # type: ignore[no-untyped-def]
     """Add J' W J to the lower triangle of `H` and J' W e to `g` from the rows of one chunk."""
     padded = (n + LANES - 1) // LANES * LANES
-    work[WEIGHT * CHUNK + n : WEIGHT * CHUNK + padded] = 0.0
-    work[RESIDUAL * CHUNK + n : RESIDUAL * CHUNK + padded] = 0.0
-    weight, e = work[WEIGHT * CHUNK : WEIGHT * CHUNK + padded], work[RESIDUAL * CHUNK : RESIDUAL * CHUNK + padded]
+    work[WEIGHT + n : WEIGHT + padded] = 0.0
+    work[RESIDUAL + n : RESIDUAL + padded] = 0.0
+    weight, e = work[WEIGHT : WEIGHT + padded], work[RESIDUAL : RESIDUAL + padded]
     for a in range(p):
-        mine = work[(FIRST + a) * CHUNK : (FIRST + a) * CHUNK + padded]
+        mine = work[D0 + a * CHUNK : D0 + a * CHUNK + padded]
         _weighted(mine, weight)
         g[a] += _dot(mine, e)
         for b in range(a + 1):
-            H[a, b] += _dot(mine, work[(FIRST + b) * CHUNK : (FIRST + b) * CHUNK + padded])
+            H[a, b] += _dot(mine, work[D0 + b * CHUNK : D0 + b * CHUNK + padded])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -348,4 +351,4 @@ def residuals(kind, th, x, y, z, sigma, perspective, out):  # type: ignore[no-un
         load_rows(x, y, z, sigma, first, n, work)
         fill_rows(kind, th, frame, n, perspective, work)
         _residual_row(n, work)
-        out[first : first + n] = work[RESIDUAL * CHUNK : RESIDUAL * CHUNK + n]
+        out[first : first + n] = work[RESIDUAL : RESIDUAL + n]

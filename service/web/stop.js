@@ -4,14 +4,18 @@ import { get, post, repeat } from "./api.js";
 const box = document.querySelector("#stop-box");
 const line = document.querySelector("#stop-line");
 const reset = document.querySelector("#reset");
+const PATIENCE_MS = 5000; // after this the slower way to stop no longer delays a reset
 let count = 0;
+let stopping = 0; // presses of which one way is still under way: it would latch again what was reset before it arrives
 
 export function startStop(stopUrl) {
   const stop = () => {
     line.textContent = "stopping …";
+    stopping += 1;
     const asked = [fetch(stopUrl, { method: "POST" }).then((answer) => answer.json()), post("/v1/stop")];
     Promise.any(asked).then(show).catch(() => (line.textContent = "NO ANSWER: use the hardware stop"));
-    Promise.allSettled(asked).then(look); // the slower of the two has raised the count again
+    const bothWays = Promise.allSettled(asked).then(look); // the slower of the two has raised the count again
+    Promise.race([bothWays, after(PATIENCE_MS)]).catch(() => {}).then(allowReset);
   };
   document.querySelector("#stop").addEventListener("click", stop);
   document.addEventListener("keydown", (event) => event.key === "Escape" && stop());
@@ -27,6 +31,13 @@ export function startStop(stopUrl) {
 
 export const isLatched = () => box.dataset.latched === "yes";
 
+const after = (ms) => new Promise((done) => setTimeout(done, ms));
+
+function allowReset() {
+  stopping -= 1;
+  reset.hidden = stopping > 0 || !isLatched();
+}
+
 async function look() {
   show(await get("/v1/stop"));
 }
@@ -36,6 +47,6 @@ function show(state) {
   count = state.count;
   box.dataset.latched = state.is_latched ? "yes" : "no";
   line.textContent = state.is_latched ? `STOPPED · ${state.source}` : "clear to move";
-  reset.hidden = !state.is_latched;
+  reset.hidden = stopping > 0 || !state.is_latched;
   document.dispatchEvent(new CustomEvent("latch", { detail: state.is_latched }));
 }

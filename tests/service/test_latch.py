@@ -73,6 +73,17 @@ def test_a_long_or_broken_source_is_cut_not_refused(tmp_path: Path) -> None:
     assert latch.set("\ud800").is_latched
 
 
+def test_stops_of_several_threads_are_all_counted(tmp_path: Path) -> None:
+    latch = Latch.create(tmp_path / "latch")
+    before = latch.state().count
+    threads = [threading.Thread(target=lambda: [latch.set("press") for _ in range(500)]) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert latch.state().count == before + 2000
+
+
 def test_readers_never_see_a_mixed_record(tmp_path: Path) -> None:
     latch = Latch.create(tmp_path / "latch")
     end = threading.Event()

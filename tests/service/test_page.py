@@ -114,6 +114,21 @@ def test_stop_latches_visibly_and_only_a_reset_clears_it(page: Any, served_page:
     page.wait_for_selector("#start:not([disabled])")
 
 
+def test_no_reset_is_offered_while_a_stop_is_under_way(page: Any, served_page: Panelwright) -> None:
+    """A press stops on two ways; one that arrives after the reset would refuse it or latch again."""
+    held: list[Any] = []
+    page.route(lambda url: url == served_page.stop_url, lambda route: held.append(route))  # noqa: PLW0108 - it needs a function of Python
+    page.click("#stop")
+    _until(
+        page, "document.querySelector('#stop-box').dataset.latched === 'yes' && document.querySelector('#reset').hidden"
+    )
+    eventually(lambda: page.evaluate("() => true") and held)[0].continue_()
+    page.click("#reset:not([hidden])")
+    _until(page, "document.querySelector('#stop-box').dataset.latched === 'no'")
+    assert not served_page.service.supervisor.latch.is_set()
+    page.unroute_all()
+
+
 def test_the_escape_key_stops_and_a_narrow_screen_still_shows_the_button(page: Any, served_page: Panelwright) -> None:
     page.set_viewport_size({"width": 420, "height": 800})
     assert page.is_visible("#stop")

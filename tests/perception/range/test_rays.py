@@ -72,13 +72,14 @@ def test_each_ray_is_as_the_plain_function_has_it(kind, perspective):
         work = np.zeros(rays.SCRATCH)
         rays.load_rows(x, y, x, y, 0, 100, work)
         rays.fill_rows(kind, th, frame, 100, perspective, work)
-        rows = work.reshape(-1, rays.CHUNK)[:, :100]
-        np.testing.assert_array_equal(np.isnan(rows[rays.DEPTH]), np.isnan(z))
+        depth, cosine_row = work[rays.DEPTH :][:100], work[rays.COSINE :][:100]
+        np.testing.assert_array_equal(np.isnan(depth), np.isnan(z))
         seen = cosine > GRAZING_RAD
-        np.testing.assert_allclose(rows[rays.DEPTH][seen], z[seen], rtol=1e-9)
-        np.testing.assert_allclose(rows[rays.COSINE][seen], cosine[seen], rtol=1e-6)
-        derivatives = rows[rays.FIRST : rays.FIRST + FREEDOM[kind]].T
-        np.testing.assert_allclose(derivatives[seen], J[seen], rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(depth[seen], z[seen], rtol=1e-9)
+        np.testing.assert_allclose(cosine_row[seen], cosine[seen], rtol=1e-6)
+        for column in range(FREEDOM[kind]):
+            derivative = work[rays.D0 + column * rays.CHUNK :][:100]
+            np.testing.assert_allclose(derivative[seen], J[seen, column], rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("perspective", [True, False], ids=["pinhole", "orthographic"])

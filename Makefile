@@ -34,8 +34,8 @@ demo: setup  ## Run the whole mission on the simulated cell and leave a report i
 serve: setup  ## Start the service on http://127.0.0.1:8460
 	@$(BIN)/panelwright serve
 
-test: setup  ## Run all tests, two files at a time
-	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope -m 'not wire'
+test: setup  ## Run all tests, two files at a time; PYTEST_OPTIONS go to pytest
+	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope -m 'not wire' $(PYTEST_OPTIONS)
 
 test-wire: setup  ## Run whole missions over emulated wires, in real time: about six minutes, more on a busy machine
 	@$(BIN)/python -m pytest -m wire

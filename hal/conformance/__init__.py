@@ -11,18 +11,33 @@ class TestMyScanner(RangeScannerContract):
 Levels: *static* (what can be said without the wire), *connect*, *read*, *motion* (things move or switch).
 """
 
-from hal.conformance.contracts import (
-    CONTRACTS,
-    ArmContract,
+from typing import Any
+
+from hal.conformance.acting import ArmContract, GripperContract, LightsContract
+from hal.conformance.device import DeviceContract
+from hal.conformance.rig import LEVELS, Level, Rig
+from hal.conformance.sensing import (
     CameraContract,
     ForceTorqueContract,
-    GripperContract,
-    LightsContract,
     ProximityContract,
     RangeScannerContract,
     TouchContract,
 )
-from hal.conformance.rig import LEVELS, Level, Rig
+from hal.devices import DeviceKind
+
+CONTRACTS: dict[DeviceKind, type[DeviceContract[Any]]] = {
+    contract.kind: contract
+    for contract in (
+        ArmContract,
+        GripperContract,
+        CameraContract,
+        RangeScannerContract,
+        ProximityContract,
+        TouchContract,
+        ForceTorqueContract,
+        LightsContract,
+    )
+}
 
 __all__ = [
     "CONTRACTS",

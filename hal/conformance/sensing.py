@@ -1,0 +1,107 @@
+"""What cameras, range scanners, proximity, touch and force/torque sensors promise."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from hal.conformance.device import DeviceContract, level
+from hal.conformance.rig import Level, Rig
+from hal.devices import Camera, DeviceKind, ForceTorque, Proximity, RangeScanner, Touch
+from hal.readings import Quality, Stamped
+
+
+class CameraContract(DeviceContract[Camera]):
+    """Frames of the promised size that began after the call."""
+
+    kind = DeviceKind.CAMERA
+
+    def read(self, rig: Rig[Camera], duration_s: float = 2.0) -> Stamped[Any]:
+        """A frame."""
+        return rig.device.read_image(deadline=rig.deadline(duration_s))
+
+    def check_value(self, rig: Rig[Camera], value: Any) -> None:
+        """Size, depth and colour as promised."""
+        c = rig.device.capabilities()
+        shape = (c.height_px, c.width_px, 3) if c.is_colour else (c.height_px, c.width_px)
+        assert value.pixels.shape == shape
+        assert value.pixels.dtype == np.uint8
+
+    @level(Level.STATIC)
+    def test_the_nominal_lens_fits_the_image(self, rig: Rig[Camera]) -> None:
+        c = rig.device.capabilities()
+        assert (c.nominal.width_px, c.nominal.height_px) == (c.width_px, c.height_px)
+        assert c.nominal.fx_px > 0 and c.nominal.fy_px > 0
+
+
+class RangeScannerContract(DeviceContract[RangeScanner]):
+    """Range images in metres with NaN where nothing was seen."""
+
+    kind = DeviceKind.RANGE_SCANNER
+
+    def read(self, rig: Rig[RangeScanner], duration_s: float = 2.0) -> Stamped[Any]:
+        """A range image."""
+        return rig.device.read_range(deadline=rig.deadline(duration_s))
+
+    def check_value(self, rig: Rig[RangeScanner], value: Any) -> None:
+        """Shape as promised; ranges within the sensor's limits or NaN."""
+        c = rig.device.capabilities()
+        assert value.depth_m.shape == (c.height, c.width)
+        assert value.depth_m.dtype == np.float32
+        seen = value.depth_m[np.isfinite(value.depth_m)]
+        assert not np.any(np.isinf(value.depth_m))
+        assert np.all((seen >= 0.5 * c.min_range_m) & (seen <= 1.1 * c.max_range_m))
+
+
+class ProximityContract(DeviceContract[Proximity]):
+    """A distance, or an invalid reading when nothing is near."""
+
+    kind = DeviceKind.PROXIMITY
+
+    def read(self, rig: Rig[Proximity], duration_s: float = 2.0) -> Stamped[Any]:
+        """A distance."""
+        return rig.device.read_distance_m(deadline=rig.deadline(duration_s))
+
+    def check_value(self, rig: Rig[Proximity], value: Any) -> None:
+        """Within the measuring range."""
+        c = rig.device.capabilities()
+        assert isinstance(value, float)
+        assert c.min_range_m - 5 * c.sigma_m <= value <= c.max_range_m + 5 * c.sigma_m
+
+    @level(Level.READ)
+    def test_nothing_in_range_is_invalid_and_not_a_number(self, rig: Rig[Proximity]) -> None:
+        sample = self.read(rig)
+        assert math.isfinite(sample.value) or sample.quality is Quality.INVALID
+
+
+class TouchContract(DeviceContract[Touch]):
+    """One switch a channel."""
+
+    kind = DeviceKind.TOUCH
+
+    def read(self, rig: Rig[Touch], duration_s: float = 2.0) -> Stamped[Any]:
+        """All switches."""
+        return rig.device.read_contacts(deadline=rig.deadline(duration_s))
+
+    def check_value(self, rig: Rig[Touch], value: Any) -> None:
+        """A bool a channel."""
+        assert len(value) == len(rig.device.capabilities().channels)
+        assert all(isinstance(contact, bool) for contact in value)
+
+
+class ForceTorqueContract(DeviceContract[ForceTorque]):
+    """A raw wrench."""
+
+    kind = DeviceKind.FORCE_TORQUE
+
+    def read(self, rig: Rig[ForceTorque], duration_s: float = 2.0) -> Stamped[Any]:
+        """A wrench."""
+        return rig.device.read_wrench(deadline=rig.deadline(duration_s))
+
+    def check_value(self, rig: Rig[ForceTorque], value: Any) -> None:
+        """Finite and within the measuring range."""
+        c = rig.device.capabilities()
+        assert value.force_n.shape == value.torque_nm.shape == (3,)
+        assert np.all(np.abs(value.force_n) <= c.force_range_n) and np.all(np.abs(value.torque_nm) <= c.torque_range_nm)

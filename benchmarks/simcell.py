@@ -15,9 +15,10 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.clock import SimClock
 from hal.config import Cell, load_cell
-from hal.devices import DeviceKind, ObjectTruth
+from hal.devices import DeviceKind
 from hal.geometry import UncertainPose, perturbed
 from hal.registry import Context, Shared, connect
+from hal.simulated import ObjectTruth
 from manipulation.control import Controller
 from manipulation.skills.outcome import ObjectState
 from manipulation.timing import SpeedLimits

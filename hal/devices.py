@@ -11,7 +11,7 @@ Common promises (checked by `hal.conformance`):
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal, Protocol, runtime_checkable
 
@@ -357,46 +357,6 @@ class Lights(Device, Protocol):
     def read_on(self, *, deadline: Deadline) -> Stamped[tuple[bool, ...]]:
         """Newest feedback of each channel."""
         ...
-
-
-class Fault(StrEnum):
-    """What can be injected into a simulated device."""
-
-    SILENT = "silent"
-    STALE = "stale"
-    FROZEN = "frozen"
-    BIASED = "biased"
-    DISCONNECTED = "disconnected"
-
-
-@runtime_checkable
-class FaultInjection(Protocol):
-    """Extra of simulated devices."""
-
-    def inject_fault(self, fault: Fault | None, *, magnitude: float = 0.0) -> None:
-        """Begin a fault, or end it with None."""
-        ...
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ObjectTruth:
-    """What an object of the simulated panel really shows: only for judging a finished mission."""
-
-    name: str
-    value: float | None = None
-    state: str | None = None
-    text: str | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Truth:
-    """What the simulator knows. Never reachable from perception, fusion, manipulation or missions."""
-
-    base_from_panel_matrix: Array  # (4, 4)
-    objects: tuple[ObjectTruth, ...]
-    peak_force_n: float
-    sim_time_s: float
-    initial: tuple[ObjectTruth, ...] = field(default=())
 
 
 PROTOCOLS: dict[DeviceKind, type] = {

@@ -18,11 +18,12 @@ from typing import Any
 
 from hal.clock import Clock, PacedClock, SimClock, WallClock
 from hal.config import Cell, DeviceSection, load_cell
-from hal.devices import DeviceKind, Fault
+from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, DeviceUnavailable
 from hal.garbage import set_aside
 from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
+from hal.simulated import Fault
 from hal.strict import validate
 from service.calibrations import Calibrations
 from service.child import Lifeline, kill_own_group

@@ -9,10 +9,11 @@ from typing import Any
 
 from hal.clock import Clock
 from hal.config import Cell, load_cell
-from hal.devices import DeviceKind, Fault, FaultInjection
+from hal.devices import DeviceKind
 from hal.errors import ConfigError
 from hal.registry import Context, Shared
 from hal.registry import connect as connect_device
+from hal.simulated import Fault, FaultInjection
 from service.cell import clock_for, start_emulators
 
 LINK = "link"  # property of a test: what the device says about its wire

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from hal.clock import Deadline
-from hal.devices import ArmCapabilities, DeviceKind, JointState, Truth
+from hal.devices import ArmCapabilities, DeviceKind, JointState
 from hal.errors import InvalidRequest, MotionRefused
 from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
+from hal.simulated import Truth
 from simbackend import kernels
 from simbackend.arm_model import MODELS
 from simbackend.client import Frame

@@ -14,9 +14,9 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.clock import Clock, SimClock
 from hal.config import Cell
-from hal.devices import Truth
 from hal.errors import ConfigError, DeviceFault
 from hal.registry import Context
+from hal.simulated import Truth
 from simbackend.arm_model import MODELS
 from simbackend.draws import Draws
 from simbackend.link import WorldLink

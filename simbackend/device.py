@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any, Generic, TypeVar
 
 from hal.clock import Deadline
-from hal.devices import DeviceKind, Fault, Health
+from hal.devices import DeviceKind, Health
 from hal.errors import DeviceTimeout, DeviceUnavailable
 from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
+from hal.simulated import Fault
 from hal.strict import Strict, validate
 from simbackend.client import Frame, WorldClient
 from simbackend.wire import Snapshot

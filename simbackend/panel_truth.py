@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from hal.devices import ObjectTruth
 from hal.panel import Button, Gauge, Handwheel, Lamp, Lever, Mushroom, PanelMeter, Rotary, Slider, State, Toggle
+from hal.simulated import ObjectTruth
 from simbackend.mechanisms import Mechanism, Spring
 from simbackend.panel_state import Built
 

@@ -8,7 +8,6 @@ from typing import Any
 from scipy.spatial.transform import RigidTransform
 
 from hal.config import Cell
-from hal.devices import ObjectTruth
 from hal.panel import (
     Button,
     Handwheel,
@@ -20,6 +19,7 @@ from hal.panel import (
     Slider,
     Toggle,
 )
+from hal.simulated import ObjectTruth
 from simbackend import textures
 from simbackend.draws import Draws
 from simbackend.mechanisms import (

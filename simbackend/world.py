@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from hal.devices import Truth
+from hal.simulated import Truth
 from simbackend.arm_model import MODELS, arm_urdf, base_from_flange
 from simbackend.draws import Draws
 from simbackend.drive import ArmDrive, GripperDrive

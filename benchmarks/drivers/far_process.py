@@ -14,8 +14,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from benchmarks.drivers.benches import bench
-from hal.devices import Fault
 from hal.garbage import set_aside
+from hal.simulated import Fault
 
 
 class FarProcess:

@@ -13,9 +13,9 @@ from typing import Any
 from drivers.emulators.faults import FaultOptions, FaultPlan, WireFault
 from drivers.emulators.ports import FarPort, Peer
 from hal.clock import Deadline, WallClock
-from hal.devices import Fault
 from hal.errors import CellError, Unsupported
 from hal.readings import Stamped
+from hal.simulated import Fault
 
 LOOK_UP_S = 0.02
 BACKING_S = 0.2

@@ -10,9 +10,10 @@ from typing import Any, Generic, TypeVar
 import pytest
 
 from hal.conformance.rig import SILENT_READS, SLACK_S, Level, Rig
-from hal.devices import PROTOCOLS, Device, DeviceKind, Fault
+from hal.devices import PROTOCOLS, Device, DeviceKind
 from hal.errors import DeviceTimeout, DeviceUnavailable
 from hal.readings import Quality, Stamped
+from hal.simulated import Fault
 
 D = TypeVar("D", bound=Device)
 level = pytest.mark.conformance

@@ -10,7 +10,8 @@ from typing import Generic, TypeVar
 import pytest
 
 from hal.clock import Clock, Deadline
-from hal.devices import Device, Fault
+from hal.devices import Device
+from hal.simulated import Fault
 
 D = TypeVar("D", bound=Device)
 READ_S = 2.0  # generous: a busy machine is not a broken device

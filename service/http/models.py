@@ -7,7 +7,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, Field
 
 from hal.config import Mount
-from hal.devices import DeviceKind, Fault
+from hal.devices import DeviceKind
+from hal.simulated import Fault
 from hal.strict import Strict
 from service.jsonable import jsonable
 from service.task_model import Task, TaskEvent, TaskState

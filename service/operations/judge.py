@@ -10,10 +10,11 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
-from hal.devices import DeviceKind, ObjectTruth, Truth
+from hal.devices import DeviceKind
 from hal.errors import Unsupported
 from hal.geometry import difference
 from hal.panel import Panel, PanelObject
+from hal.simulated import ObjectTruth, Truth
 from service.connection import CellConnection
 from service.report.write import render, write_json
 

@@ -9,8 +9,8 @@ import pytest
 
 from benchmarks.manipulation import SKILLS
 from benchmarks.simcell import SimBench, open_bench
-from hal.devices import Fault
 from hal.errors import DeviceFault, Stopped
+from hal.simulated import Fault
 from manipulation.skills.outcome import Outcome
 from manipulation.skills.probe import touch_probe
 from manipulation.skills.steps import park

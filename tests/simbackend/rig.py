@@ -10,8 +10,9 @@ from typing import Any
 
 from hal.clock import Deadline, SimClock
 from hal.config import Cell, load_cell
-from hal.devices import Device, Fault
+from hal.devices import Device
 from hal.registry import Context, Shared, connect
+from hal.simulated import Fault
 
 ROOT = Path(__file__).parents[2]
 BENCH = ROOT / "cells" / "bench.toml"

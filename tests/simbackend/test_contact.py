@@ -11,7 +11,7 @@ from eaik.IK_DH import DhRobot
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from hal.devices import ObjectTruth
+from hal.simulated import ObjectTruth
 from simbackend.arm_model import base_from_flange
 from simbackend.client import true_mount
 from simbackend.draws import Draws

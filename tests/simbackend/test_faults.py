@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hal.devices import Fault, FaultInjection
 from hal.errors import ConfigError, DeviceTimeout, DeviceUnavailable
 from hal.readings import Quality, Stamped
+from hal.simulated import Fault, FaultInjection
 from simbackend.wire import REQUEST, Op
 from tests.simbackend.rig import SimCell
 

@@ -16,7 +16,6 @@ from hal.devices import (
     CameraCapabilities,
     DeviceKind,
     DhLink,
-    Fault,
     ForceTorqueCapabilities,
     GripperCapabilities,
     GripperState,
@@ -33,6 +32,7 @@ from hal.devices import (
 from hal.errors import ConfigError, DeviceTimeout, DeviceUnavailable
 from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
+from hal.simulated import Fault
 
 OPTIONS = {"fail", "crash_at_connect", "child_pid_file", "immortal"}  # immortal: works on after `close`
 

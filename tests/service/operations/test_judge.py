@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hal.devices import ObjectTruth, Truth
 from hal.geometry import perturbed, to_json, transform_rpy
 from hal.panel import load_panel
+from hal.simulated import ObjectTruth, Truth
 from service.operations.judge import AFTER, agrees, compare
 
 PANEL = load_panel(Path(__file__).parents[3] / "panels/bench.toml")

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from hal.config import load_cell
-from hal.devices import Fault, ObjectTruth, Truth
 from hal.errors import CellError
+from hal.simulated import Fault, ObjectTruth, Truth
 from service.cell import CellRuntime
 from service.connection import LocalConnection
 from service.operations.context import CellMemory, OperationContext

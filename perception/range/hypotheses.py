@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from perception.range.analyse import RangeScene
 from perception.range.models import ComponentModel, Form, ModelSurface, MotionKind
-from perception.range.primitives import Cylinder, Plane, Sphere
+from perception.range.primitives import Cylinder, Plane, Sphere, Surface
 from perception.range.solids import boxes_of, solid_of
 from perception.range.verify import Solid, View
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 LEAST_HEIGHT_M = 0.002
 LEAST_PIXELS = 12
@@ -79,24 +80,31 @@ def pieces_of(scene: RangeScene, view: View) -> list[Piece]:
         mine = stands_out & (scene.labels == surface.label)
         if mine.sum() < max(LEAST_PIXELS, LEAST_SHARE * surface.pixels):
             continue
-        axis, centre = np.zeros(3), None
-        p = surface.primitive
-        if isinstance(p, Plane):
-            axis = view.R.T @ p.normal
-        elif isinstance(p, Cylinder):
-            axis = view.R.T @ p.axis
-        elif isinstance(p, Sphere):
-            centre = view.R.T @ (p.centre_m - view.p)
-        out.append(_piece(in_panel[mine], axis, isinstance(p, Plane), surface.label, centre))
-    loose = (stands_out & (scene.labels == 0)).astype(np.uint8)
-    count, patch, stats, _ = cv2.connectedComponentsWithStats(loose, connectivity=4)
-    for k in range(1, count):
-        if stats[k, cv2.CC_STAT_AREA] >= LEAST_PIXELS:
-            out.append(_piece(in_panel[patch == k], np.zeros(3), False, 0, None))
-    return out
+        out += [_piece(in_panel[part], view, surface) for part in _and_its_patches(mine)]
+    loose = stands_out & (scene.labels == 0)
+    return out + [_piece(in_panel[patch], view, None) for patch in _patches(loose)]
 
 
-def _piece(points: Array, axis: Array, is_plane: bool, label: int, centre: Array | None) -> Piece:
+def _and_its_patches(mine: Flags) -> list[Flags]:
+    """All pixels of a surface, and each patch by itself: caps of two buttons at one height count as one surface."""
+    patches = _patches(mine)
+    return [mine, *patches] if len(patches) > 1 else [mine]
+
+
+def _patches(mask: Flags) -> list[Flags]:
+    count, patch, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    return [patch == k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= LEAST_PIXELS]
+
+
+def _piece(points: Array, view: View, surface: Surface | None) -> Piece:
+    axis, centre, is_plane = np.zeros(3), None, False
+    match None if surface is None else surface.primitive:
+        case Plane(normal=normal):
+            axis, is_plane = view.R.T @ normal, True
+        case Cylinder(axis=direction):
+            axis = view.R.T @ direction
+        case Sphere(centre_m=ball):
+            centre = view.R.T @ (ball - view.p)
     middle = np.median(points, axis=0)
     xy = points[:, :2] - points[:, :2].mean(axis=0)
     _, vectors = np.linalg.eigh(xy.T @ xy)
@@ -115,7 +123,7 @@ def _piece(points: Array, axis: Array, is_plane: bool, label: int, centre: Array
         is_plane=is_plane,
         heading_rad=float(np.arctan2(along[1], along[0])),
         half_m=half,
-        label=label,
+        label=0 if surface is None else surface.label,
     )
 
 

@@ -109,6 +109,18 @@ def test_two_of_a_kind_share_the_pixels():
     assert matches[0].labels["dome"] != matches[1].labels["dome"]
 
 
+def test_caps_of_two_buttons_at_one_height_are_one_surface_and_two_buttons():
+    plate = plane_depth(SENSOR, NORMAL, MIDDLE)
+    caps = [disc_depth(place(x, 0.01, 0.010), 0.013) for x in (-0.03, 0.03)]
+    depth = np.min([plate, *caps], axis=0) + np.random.default_rng(7).normal(0, 0.0004, plate.shape)
+    depth[:, 102:138] = 0.4  # a bar from the one to the other
+    scene = analyse(depth, SENSOR)
+    assert len(scene.surfaces) == 3
+    buttons = [m for m in load_models(LIBRARY) if m.name == "push_button"]
+    matches = match_models(scene, depth, buttons)
+    assert [m.model for m in matches] == ["push_button"] * 2
+
+
 def test_a_plane_is_needed_to_stand_on():
     scene = analyse(panel_image(6), SENSOR)
     ball = next(s for s in scene.surfaces if s.type == "sphere")

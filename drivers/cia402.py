@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field
 
 from drivers.arms import Array, KinematicsOptions, SetPointFilter, capabilities
-from drivers.cia402_setup import CONSUMER, PRODUCER, SDO_REQUEST, SDO_S, SdoClient, SetUp, upload_request
+from drivers.cia402_setup import PROBES, SDO_REQUEST, SDO_S, SdoClient, SetUp, upload_request
 from drivers.cia402_states import DISABLE, FAULT_RESET, QUICK_STOP, DriveState, state_of, towards_enabled
 from drivers.cia402_sync import SyncCount
 from drivers.transport.canbus import CanCodec, CanFrame, CanOptions, can_opener
@@ -37,7 +37,6 @@ CONNECT_S = 6.0  # seven objects of each of six drives
 MOVING_RAD_PER_S = 1e-3
 MOST_OWED = 4  # SYNCs that a drive may leave unanswered before it is waited for
 MOST_KNOWN = 64  # SYNCs whose time is kept
-PROBES = ((CONSUMER, 1), (PRODUCER, 0))  # objects that every configured drive has, asked in turn
 
 
 class Cia402Options(CanOptions):
@@ -193,7 +192,7 @@ class Cia402(StreamDevice[JointState]):
         frames = [CanFrame(RPDO1 + n, struct.pack("<Hi", words[n], targets[n])) for n in self._options.nodes]
         now = now_s()
         probes = [frame for node, axis in self._axes.items() if (frame := self._probe(node, axis, now)) is not None]
-        is_behind = max(axis.count.owed for axis in self._axes.values()) >= MOST_OWED
+        is_behind = any(axis.count.owed >= MOST_OWED or axis.count.needs_rest for axis in self._axes.values())
         # More SYNCs would only queue up, and every answer would be older than the one before.
         batch = probes if is_behind else [*probes, *frames, CanFrame(SYNC, b"")]
         link.write(b"".join(self._codec.encode(frame) for frame in batch), now + self._answer_s)

@@ -12,6 +12,8 @@ from drivers.transport.link import Link, NoAnswer, Refused, now_s
 SDO_ANSWER, SDO_REQUEST = 0x580, 0x600
 MAPPINGS = {0x1600: (0x60400010, 0x607A0020), 0x1A00: (0x60410010, 0x60640020)}
 CONSUMER, PRODUCER, MODE = 0x1016, 0x1017, 0x6060  # heartbeats and mode of operation
+# Objects that every configured drive has, asked in turn: so many that the answer to an old probe names another one.
+PROBES = ((CONSUMER, 1), (PRODUCER, 0), (MODE, 0), *((index, sub) for index in MAPPINGS for sub in (1, 2)))
 CSP = 8
 SDO_S = 0.25
 ATTEMPTS = 3

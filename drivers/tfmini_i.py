@@ -18,7 +18,7 @@ from drivers.transport.link import Link, now_s
 from drivers.transport.modbus import ModbusMaster
 from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
 from drivers.transport.options import read_options
-from drivers.transport.timebase import HostTime, Unwrapper
+from drivers.transport.timebase import FrameTimes, HostTime, Unwrapper
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ProximityCapabilities
 from hal.readings import Stamped
@@ -118,6 +118,7 @@ class CanTfmini(StreamDevice[float]):
         self._make_codec = codec
         self._codec: CanCodec = codec()
         self._clock = SensorClock()
+        self._times = FrameTimes(period_s=1.0 / options.rate_hz, frame_bytes=0)  # the adapter's line is no bus line
         order = "<" if options.byte_order == "little" else ">"
         self._with_clock, self._without_clock = struct.Struct(order + "HHI"), struct.Struct(order + "HH")
 
@@ -133,6 +134,7 @@ class CanTfmini(StreamDevice[float]):
         """Open the channel; the sensor talks by itself."""
         self._codec = self._make_codec()
         self._clock.reset()
+        self._times.reset()
         link.write(self._codec.opening(self._options.bitrate), now_s() + OPEN_S)
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
@@ -149,7 +151,10 @@ class CanTfmini(StreamDevice[float]):
                 return
             device_s, arrived_s = self._clock.times_s(stamp_ms, arrived_s)
         elif len(frame.data) == WITHOUT_CLOCK_BYTES:
+            if not (fresh := self._times.stamped([frame.data], arrived_s=arrived_s, byte_s=0.0)):
+                return
             raw, strength = self._without_clock.unpack_from(frame.data)
+            arrived_s = fresh[0][1]
         else:
             self.errors += 1
             return

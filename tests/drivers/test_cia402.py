@@ -3,7 +3,7 @@
 import struct
 import threading
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 import can
 import canopen
@@ -12,6 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.arms import kinematics_of
+from drivers.cia402 import Cia402, Cia402Options
 from drivers.cia402_states import DriveState
 from drivers.emulators import cia402 as emulator
 from drivers.emulators.scripted import ScriptedArm
@@ -91,6 +93,43 @@ def test_no_fault_of_the_bus_gives_wrong_joints(fault: str) -> None:
     }
     with wired(emulator.start(arm, options), DRIVER, {**CALM, "rate_hz": 50.0}) as device:
         assert count_good(device, lambda s: np.allclose(s.position_rad, arm.position_rad, atol=1e-5), wanted=3) >= 3
+
+
+class Unread:
+    """A link whose other side answers when the test does."""
+
+    name = "unread"
+
+    def __init__(self) -> None:
+        self.written = b""
+
+    def write(self, data: bytes, until_s: float) -> None:
+        assert until_s > 0.0
+        self.written += data
+
+
+def pdos(node: int, number: int, copies: int = 1) -> bytes:
+    """Both PDOs of a drive whose position tells the number of the SYNC, each so many times."""
+    frames = (0x180, struct.pack("<Hi", 0x27, number)), (0x280, struct.pack("<ih", number, 0))
+    return b"".join(copies * Slcan().encode(CanFrame(function + node, data)) for function, data in frames)
+
+
+def test_a_repeated_pdo_is_not_taken_for_the_answer_to_the_next_sync() -> None:
+    """Two SYNCs are under way, and the last drive's answers to the first of them come twice."""
+    context, c = Context(name="arm"), ScriptedArm().capabilities()
+    options = {"channel": "/dev/unread", "nodes": [*range(1, 7)], "kinematics": kinematics_of(c)}
+    device, link = Cia402(context, read_options(context, options, Cia402Options)), cast(Any, Unread())
+    seen = []
+    for number, cycles in ((1, 1), (2, 2), (3, 0), (4, 1)):
+        for _ in range(cycles):
+            device._cycle(link)
+        for node in range(1, 7):
+            device.receive(pdos(node, number, copies=2 if (node, number) == (6, 2) else 1), 0.0)
+            if (sample := device.mailbox.peek()) is not None:
+                seen.append(np.degrees(sample.value.position_rad) * 1000)
+    assert link.written.count(b"t0800\r") == 4
+    assert np.ptp(seen, axis=1).max() < 0.5, "joints of different moments"
+    np.testing.assert_allclose(seen[-1], 4)
 
 
 def test_enabling_takes_the_measured_position_as_target() -> None:

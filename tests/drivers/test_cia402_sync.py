@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import struct
-from collections import deque
 
 import pytest
 from hypothesis import given
@@ -22,33 +21,80 @@ def as_data(number: int, pdo: int) -> bytes:
     return struct.pack("<IB", number, pdo)
 
 
-@given(st.lists(st.sampled_from([0, 0, 0, 1, 2, 5, None]), min_size=5, max_size=60))
-def test_each_pdo_is_of_the_sync_that_it_is_said_to_be_of_on_a_drive_that_keeps_order(fates: list[Fate]) -> None:
-    """Each answer comes so many periods late, holding up those behind it, or is lost."""
-    count, wire = SyncCount(), deque[tuple[int, bytes | None, int]]()  # (period of arrival, PDO or probe, which)
-    newest = [0] * PDOS
-    fate, free_at = itertools.cycle(fates), 0
-    for number in range(1, 200):
+class Wire:
+    """Frames of one drive on their way, each with its fate: periods late, holding up those behind it, or lost; once or twice."""
+
+    def __init__(self, fates: list[Fate], twice: list[bool], *, sdo_later: int) -> None:
+        self._fates, self._twice = itertools.cycle(fates), itertools.cycle(twice)
+        self._free_at, self._sdo_later = 0, sdo_later
+        self._frames: list[tuple[int, int, bytes | None, int]] = []  # (period of arrival, order, PDO or probe, which)
+        self._order = itertools.count()
+
+    def put(self, period: int, data: bytes | None, which: int) -> None:
+        for _ in range(1 + next(self._twice)):
+            later = next(self._fates)
+            if later is not None:
+                self._free_at = max(self._free_at, period + later)
+                arrival = self._free_at + (self._sdo_later if data is None else 0)
+                self._frames.append((arrival, next(self._order), data, which))
+
+    def take(self, period: int) -> list[tuple[bytes | None, int]]:
+        arrived = sorted(frame for frame in self._frames if frame[0] <= period)
+        self._frames = [frame for frame in self._frames if frame[0] > period]
+        return [(data, which) for _, _, data, which in arrived]
+
+
+@given(
+    st.lists(st.sampled_from([0, 0, 0, 1, 2, 5, None]), min_size=5, max_size=60),
+    st.lists(st.sampled_from([False, False, True]), min_size=1, max_size=30),
+    st.sampled_from([1, 1000]),
+)
+def test_each_pdo_is_of_the_sync_that_it_is_said_to_be_of_on_a_drive_that_keeps_order(
+    fates: list[Fate], twice: list[bool], standing_for: int
+) -> None:
+    """What each SYNC finds changes every so many SYNCs: every time when the arm moves, never when it stands."""
+    count, wire, newest = SyncCount(), Wire(fates, twice, sdo_later=0), [0] * PDOS
+    for number in range(1, 80):
         if count.wants_probe(number * PERIOD_S):
             count.probed(number * PERIOD_S)
-            later = next(fate)
-            if later is not None:
-                free_at = max(free_at, number + later)
-                wire.append((free_at, None, count.probes))
+            wire.put(number, None, count.probes)
         count.synced()
         for pdo in range(PDOS):
-            later = next(fate)
-            if later is not None:
-                free_at = max(free_at, number + later)
-                wire.append((free_at, as_data(number, pdo), pdo))
-        while wire and wire[0][0] <= number:
-            _, data, which = wire.popleft()
+            wire.put(number, as_data(number // standing_for, pdo), pdo)
+        for data, which in wire.take(number):
             if data is not None and count.took(which, data):
                 newest[which] = struct.unpack("<IB", data)[0]
             elif data is None and which == count.probes:  # an older one names another object
                 count.probe_answered()
             if count.answered is not None:
-                assert newest == [count.answered] * PDOS
+                assert newest == [count.answered // standing_for] * PDOS
+
+
+@pytest.mark.parametrize("sdo_later", [0, 1, 3])
+@pytest.mark.parametrize("standing_for", [1, 1000])
+def test_after_repeats_losses_and_delays_each_sync_is_answered_again(sdo_later: int, standing_for: int) -> None:
+    """A drive answers SDOs in turn or, when it is busy, after younger PDOs; the arm moves or stands."""
+    fates: list[Fate] = [0] * 20 + [2, None, 0, 0, 1, None] + [0] * 7 + [None, 0]
+    count, number, answered = SyncCount(), 0, []
+    bad, good = Wire(fates, [False, False, True], sdo_later=sdo_later), Wire([0], [False], sdo_later=sdo_later)
+    for period in range(1, 200):
+        wire = bad if period < 150 else good
+        if count.wants_probe(period * PERIOD_S):
+            count.probed(period * PERIOD_S)
+            wire.put(period, None, count.probes)
+        if not count.needs_rest:
+            number += 1
+            count.synced()
+            for pdo in range(PDOS):
+                wire.put(period, as_data(number // standing_for, pdo), pdo)
+        for data, which in [*bad.take(period), *good.take(period)]:
+            if data is not None:
+                count.took(which, data)
+            elif which == count.probes:
+                count.probe_answered()
+        answered.append(count.answered == number)
+    assert all(answered[180:])
+    assert any(answered[:140])
 
 
 def test_a_drive_that_is_one_period_late_loses_nothing_as_the_probes_tell() -> None:
@@ -114,6 +160,42 @@ def test_the_same_twice_is_no_matter() -> None:
         assert count.took(pdo, as_data(1, pdo))
         assert not count.took(pdo, as_data(1, pdo))
     assert count.answered == 1
+
+
+def test_of_two_that_are_owed_a_repeated_one_answers_one() -> None:
+    count = SyncCount()
+    count.synced()
+    count.synced()
+    for pdo in range(PDOS):
+        assert count.took(pdo, as_data(1, pdo))
+        assert not count.took(pdo, as_data(1, pdo))
+        assert count.answered is None, "the second SYNC has not been answered"
+    for pdo in range(PDOS):
+        assert count.took(pdo, as_data(2, pdo))
+    assert count.answered == 2
+
+
+def test_a_drive_whose_pdos_overtake_its_sdo_answers_is_given_rest_when_one_was_lost() -> None:
+    count = SyncCount()
+    assert count.wants_probe(0.0), "the first one finds out"
+    count.probed(0.0)
+    count.synced()
+    for pdo in range(PDOS):
+        count.took(pdo, as_data(1, pdo))
+    count.probe_answered()
+    assert count.answered == 1
+    assert not count.needs_rest
+    count.synced()
+    count.took(1, as_data(2, 1))
+    assert count.needs_rest
+    assert count.wants_probe(1.0)
+    count.probed(1.0)
+    count.probe_answered()
+    assert not count.needs_rest
+    count.synced()
+    for pdo in range(PDOS):
+        count.took(pdo, as_data(3, pdo))
+    assert count.answered == 3
 
 
 def test_a_lost_probe_is_asked_again() -> None:

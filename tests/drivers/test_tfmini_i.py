@@ -64,14 +64,14 @@ def test_a_measurement_that_was_read_before_is_no_new_sample() -> None:
 
 
 @pytest.mark.parametrize("order", ["little", "big"])
-def test_frames_of_the_tf03_of_other_nodes_and_of_other_lengths(order: Any) -> None:
+def test_frames_of_the_tf03_repeated_of_other_nodes_and_of_other_lengths(order: Any) -> None:
     device = CanTfmini(Context(name="finger"), CanTfminiOptions(channel="/dev/null", byte_order=order))
     mark = "<" if order == "little" else ">"
-    codec = Slcan()
-    for id_, data in ((3, struct.pack(mark + "HHH", 123, 500, 0)), (4, bytes(8)), (3, bytes(5))):
+    codec, reading = Slcan(), struct.pack(mark + "HHH", 123, 500, 0)
+    for id_, data in ((3, reading), (3, reading), (4, bytes(8)), (3, bytes(5))):
         device.receive(codec.encode(CanFrame(id_, data)), 1.0)
     samples, _ = device.mailbox.since(0)
-    assert [sample.value for sample in samples] == [pytest.approx(1.23)]
+    assert [sample.value for sample in samples] == [pytest.approx(1.23)], "one that came twice is one"
     assert samples[0].device_time_s is None
     assert device.health().errors == 1
 

@@ -72,18 +72,23 @@ def _joined(smooth: NDArray[np.uint8], a: Crossing, b: Crossing, least_side_px: 
     across = np.array([-along[1], along[0]]) * width
     t = np.linspace(0.0, 1.0, max(12, round(length / 1.5)))
     wanted = a.gray + t * (b.gray - a.gray)
-    best: tuple[float, Array] | None = None
-    for at, bend in product(BENT_AT, BENDS):
-        middle = a.middle_px + at * (b.middle_px - a.middle_px) + bend * across
-        axis = np.column_stack(
-            [np.interp(t, [0, at, 1], [p[i] for p in (a.middle_px, middle, b.middle_px)]) for i in (0, 1)]
-        )
-        sides = np.array([-0.25, 0.0, 0.25])[:, None, None] * across
-        u, v = np.moveaxis(axis + sides, 2, 0)
-        off = np.abs(sample_at(smooth, u, v) - wanted)
-        share = float((off < SAME_GRAY).mean())
-        if best is None or share > best[0] + (0.01 if bend else -1e-9):
-            best = share, np.array([a.middle_px, middle, b.middle_px])
-    if best is None or best[0] < ALONG_SHARE:
+    shapes = list(product(BENT_AT, BENDS))
+    middles = np.array([a.middle_px + at * (b.middle_px - a.middle_px) + bend * across for at, bend in shapes])
+    knots = np.array([at for at, _ in shapes])[:, None]
+    first, second = np.minimum(t / knots, 1.0), np.maximum((t - knots) / (1.0 - knots), 0.0)  # along either leg
+    axes = (
+        a.middle_px
+        + first[..., None] * (middles - a.middle_px)[:, None]
+        + second[..., None] * (b.middle_px - middles)[:, None]
+    )
+    sides = np.array([-0.25, 0.0, 0.25])[:, None] * across
+    points = axes[:, None] + sides[:, None]  # (shapes, sides, along, 2)
+    flat = points.reshape(len(shapes), -1, 2)
+    off = np.abs(sample_at(smooth, flat[..., 0], flat[..., 1]) - np.tile(wanted, len(sides)))
+    shares = np.count_nonzero(off < SAME_GRAY, axis=1) / off.shape[1]
+    k = int(
+        (shares + 0.01 * np.array([bend == 0.0 for _, bend in shapes])).argmax()
+    )  # straight unless a bend is better
+    if shares[k] < ALONG_SHARE:
         return None
-    return best[1], width
+    return np.array([a.middle_px, middles[k], b.middle_px]), width

@@ -1,4 +1,4 @@
-"""Compiled parts of the comb search: how well a cell's segments make a character, along rows of places and in one comb.
+"""Compiled sums behind the comb search: what cells of seven segments make a character, along rows of places and in one comb.
 
 A cell's worth is the ink energy that its best character explains by segments of one level, less what it leaves:
 P - k (T - P) with T = sum(area * level^2) over segments and loops, P = (sum of area * level over the lit ones)^2 / their
@@ -19,14 +19,20 @@ LEFT_OVER = 0.7  # k: what unexplained ink costs
 STROKE = 0.05  # half of a stroke's width over the digit height
 INNER = 0.22  # of an axis, left out at either end: there other segments meet it
 LOOP = 0.2  # half size of the probed middle of a loop, over the cell's width; half of that over its height
-PARTS = 5
 FREE_GAP = 0.13
 LEAST_GAP = 0.08  # between neighbours' uprights over the digit height: closer ones would be one upright shared
+COARSE = 20.0  # a digit is this many places high in the coarse search
+LEAST_WEIGHT = 0.15  # share of a segment seen below which it says nothing
+MOST_CELLS = 64
+
+#: Middle of every segment's axis in a cell of unit width and height, y down; the first row is x, the second y.
+MIDDLES = np.array([[0.5, 1.0, 1.0, 0.5, 0.0, 0.0, 0.5], [0.0, 0.25, 0.75, 1.0, 0.75, 0.25, 0.5]])
+FLAT = np.array([True, False, False, True, False, False, True])
 
 
 @njit(cache=True)
-def cell_worth(levels: Array, areas: Array, loops: float, lit: NDArray[np.bool_]) -> float:  # pragma: no cover
-    """Worth of one cell: (7,) levels and seen areas, energy in its loops, (characters, 7) which segments are lit."""
+def cell_worth(levels: Array, areas: Array, loops: float, lit: Array) -> float:  # pragma: no cover
+    """Worth of one cell: (7,) levels and seen areas, energy in its loops, (characters, 7) 1 where a segment is lit."""
     total = loops
     for s in range(7):
         total += areas[s] * levels[s] * levels[s]
@@ -34,59 +40,63 @@ def cell_worth(levels: Array, areas: Array, loops: float, lit: NDArray[np.bool_]
     for g in range(lit.shape[0]):
         area = product = 0.0
         for s in range(7):
-            if lit[g, s]:
-                area += areas[s]
-                product += areas[s] * levels[s]
+            seen = lit[g, s] * areas[s]
+            area += seen
+            product += seen * levels[s]
         if area > 0.0:
-            explained = product * product / area
-            best = max(best, explained - LEFT_OVER * (total - explained))
-    return best
+            best = max(best, product * product / area)
+    return max(0.0, best - LEFT_OVER * (total - best))
 
 
 @njit(cache=True)
-def _mean(
-    ink: Array, seen: Array, x0: float, y0: float, x1: float, y1: float
-) -> tuple[float, float]:  # pragma: no cover
-    """(mean ink of what is seen, seen area) of a box, by integral images."""
-    height, width = ink.shape[0] - 1, ink.shape[1] - 1
-    left, right = max(0, min(width, round(x0))), max(0, min(width, round(x1)))
-    top, bottom = max(0, min(height, round(y0))), max(0, min(height, round(y1)))
-    if right <= left or bottom <= top:
-        return 0.0, 0.0
-    area = seen[bottom, right] - seen[top, right] - seen[bottom, left] + seen[top, left]
-    if area < 1.0:
-        return 0.0, 0.0
-    return (ink[bottom, right] - ink[top, right] - ink[bottom, left] + ink[top, left]) / area, area
+def _boxes(top: float, height: float, width: float) -> Array:  # pragma: no cover
+    """(9, 4) left, top, right, bottom of the seven segments and the two loops of a cell whose left upright is at column 0."""
+    boxes = np.empty((9, 4))
+    s, half = STROKE * height, height / 2
+    for k in range(7):
+        x, y = MIDDLES[0, k] * width + 0.5, top + MIDDLES[1, k] * height + 0.5
+        dx, dy = ((0.5 - INNER) * width, s) if FLAT[k] else (s, (0.5 - INNER) * half)
+        boxes[k] = np.array([x - dx, y - dy, x + dx, y + dy])
+    for k in range(2):
+        x, y = 0.5 * width + 0.5, top + (0.25 + 0.5 * k) * height + 0.5
+        boxes[7 + k] = np.array([x - LOOP * width, y - LOOP * half, x + LOOP * width, y + LOOP * half])
+    return boxes
+
+
+@njit(cache=True)
+def _at_most(value: float, most: int) -> int:  # pragma: no cover
+    """The nearest integer from 0 to `most`."""
+    return max(0, min(most, int(value + 0.5)))
 
 
 @njit(cache=True)
 def worth_along(
-    ink: Array, seen: Array, top: float, height: float, width: float, lit: NDArray[np.bool_], out: Array
+    ink: Array, seen: Array, whole: bool, place: tuple[float, float, float], stride: int, lit: Array, out: Array
 ) -> None:  # pragma: no cover
-    """Worth of upright cells whose left upright stands at column 0, 1, ... of integral images `ink` and `seen`.
+    """Worth of upright cells whose left upright stands at column 0, `stride`, ... of integral images `ink` and `seen`.
 
     Args:
-        top: row of the top segment's axis; height: from there to the bottom's; width: between the uprights' axes, px.
-        out: (W,) filled.
+        whole: nothing is hidden, so that areas need not be looked up.
+        place: row of the top segment's axis, height from there to the bottom's, width between the uprights' axes, px.
+        out: filled.
     """
-    s = STROKE * height
-    levels, areas = np.zeros(7), np.zeros(7)
-    half = height / 2
-    for x in range(len(out)):
-        x0, x1 = x + INNER * width + 0.5, x + (1 - INNER) * width + 0.5
-        for k, y in ((0, 0.0), (6, 0.5), (3, 1.0)):
-            v = top + y * height + 0.5
-            levels[k], areas[k] = _mean(ink, seen, x0, v - s, x1, v + s)
-        for k, dx, dy in ((5, 0.0, 0.0), (1, width, 0.0), (4, 0.0, half), (2, width, half)):
-            v = top + dy + 0.5
-            u = x + dx + 0.5
-            levels[k], areas[k] = _mean(ink, seen, u - s, v + INNER * half, u + s, v + (1 - INNER) * half)
-        loops = 0.0
-        for y in (0.25, 0.75):
-            u, v = x + 0.5 * width + 0.5, top + y * height + 0.5
-            level, area = _mean(ink, seen, u - LOOP * width, v - LOOP * half, u + LOOP * width, v + LOOP * half)
-            loops += area * level * level
-        out[x] = cell_worth(levels, areas, loops, lit)
+    rows, columns = ink.shape[0] - 1, ink.shape[1] - 1
+    boxes = _boxes(place[0], place[1], place[2])
+    levels, areas = np.zeros(9), np.zeros(9)
+    for k in range(len(out)):
+        for b in range(9):
+            left, right = _at_most(k * stride + boxes[b, 0], columns), _at_most(k * stride + boxes[b, 2], columns)
+            top, bottom = _at_most(boxes[b, 1], rows), _at_most(boxes[b, 3], rows)
+            area = float((right - left) * (bottom - top))
+            if not whole:
+                area = seen[bottom, right] - seen[top, right] - seen[bottom, left] + seen[top, left]
+            if area < 1.0:
+                levels[b], areas[b] = 0.0, 0.0
+                continue
+            levels[b] = (ink[bottom, right] - ink[top, right] - ink[bottom, left] + ink[top, left]) / area
+            areas[b] = area
+        loops = areas[7] * levels[7] * levels[7] + areas[8] * levels[8] * levels[8]
+        out[k] = cell_worth(levels, areas, loops, lit)
 
 
 @njit(cache=True)
@@ -98,25 +108,28 @@ def apartness(gap: float) -> float:  # pragma: no cover
 
 @njit(cache=True)
 def best_pitch(
-    worth: Array, pitches: Array, width: float, height: float, most: int, free: float
+    worth: Array, stride: int, pitches: Array, size: tuple[float, float], columns: int, most: int, free: float
 ) -> tuple[float, float, float, int]:  # pragma: no cover
-    """(worth, left column, pitch, cells) of the best comb of at most `most` cells over (W,) worths of cells.
+    """(worth, left column, pitch, cells) of the best comb of at most `most` cells over worths of cells `stride` apart.
 
     Args:
-        free: how far the comb's middle may lie from the middle column; combs off the middle count down to half.
+        pitches: to try, over the width; size: width and height of a cell, px.
+        free: how far the comb's middle may lie from the middle column, over `columns`; off the middle counts less.
     """
-    size = len(worth)
+    width, height = size
     best, left, pitch, count = 0.0, 0.0, 0.0, 0
-    cells = np.zeros(64)
-    for p in pitches:
+    cells = np.zeros(MOST_CELLS)
+    for ratio in pitches:
+        p = ratio * width
+        if p - width < LEAST_GAP * height:
+            continue
         room = apartness((p - width) / height)
         phase = -0.1 * width
         while phase < p - 0.1 * width:
             n = 0
             u = phase
-            while u + width < size + 0.1 * width and n < 64:
-                k = max(0, min(size - 1, round(u)))
-                cells[n] = worth[k]
+            while u + width < columns + 0.1 * width and n < MOST_CELLS:
+                cells[n] = worth[_at_most(u / stride, len(worth) - 1)]
                 n += 1
                 u += p
             for first in range(n):
@@ -127,12 +140,36 @@ def best_pitch(
                     total += cells[last]
                     if cells[last] <= 0.0:
                         continue
-                    off = abs(phase + (first + last) / 2 * p + width / 2 - size / 2) / max(free * size, 1.0)
+                    off = abs(phase + (first + last) / 2 * p + width / 2 - columns / 2) / max(free * columns, 1.0)
                     score = total * room * (1.0 - 0.15 * min(off, 1.0))
                     if off <= 1.0 and score > best:
                         best, left, pitch, count = score, phase + first * p, p, last - first + 1
-            phase += 1.0
+            phase += stride
     return best, left, pitch, count
+
+
+@njit(cache=True)
+def guesses(
+    ink: Array, seen: Array, whole: bool, rows: Array, widths: Array, pitches: Array, most: int, free: float, lit: Array
+) -> Array:  # pragma: no cover
+    """(rows x widths, 7) worth, left, pitch, width, top, height, cells of the best comb for every row pair and width.
+
+    Args:
+        ink, seen: integral images of the upright picture.
+        rows: (R, 2) top and height, px; widths: over the height; pitches: over the width.
+    """
+    found = np.zeros((len(rows) * len(widths), 7))
+    columns = ink.shape[1] - 1
+    for r in range(len(rows)):
+        top, height = rows[r]
+        stride = max(1, int(height / COARSE))
+        worth = np.empty((columns + stride - 1) // stride)
+        for w in range(len(widths)):
+            width = widths[w] * height
+            worth_along(ink, seen, whole, (top, height, width), stride, lit, worth)
+            score, left, pitch, count = best_pitch(worth, stride, pitches, (width, height), columns, most, free)
+            found[r * len(widths) + w] = np.array([score, left, pitch, width, top, height, float(count)])
+    return found
 
 
 @njit(cache=True)
@@ -149,72 +186,70 @@ def _at(image: Float32, u: float, v: float) -> float:  # pragma: no cover
 
 @njit(cache=True)
 def comb_worth(
-    ink: Float32, seen: Float32, comb: Array, count: int, axes: Array, lit: NDArray[np.bool_]
+    means: Float32, shares: Float32, whole: bool, comb: Array, count: int, lit: Array
 ) -> float:  # pragma: no cover
-    """Worth of a comb (left, pitch, width, top, bottom, slant) of `count` cells; `ink` is 0 where `seen` is 0."""
+    """Worth of a comb (left, pitch, width, top, bottom, slant) of `count` cells.
+
+    Args:
+        means: (3, H, W) mean ink of a flat segment, an upright one, and mean square in a loop, around every pixel.
+        shares: (2, H, W) seen share of a flat and an upright segment around every pixel; not looked at when `whole`.
+    """
     left, pitch, width, top, bottom, slant = comb
     height = bottom - top
-    s = 0.8 * STROKE * height
+    long = (1 - 2 * INNER) * 2 * STROKE * height
     levels, areas = np.zeros(7), np.zeros(7)
     total = 0.0
     for cell in range(count):
         for k in range(7):
-            flat = axes[k, 0, 1] == axes[k, 1, 1]
-            whole = (1 - 2 * INNER) * 2 * STROKE * height * (width if flat else height / 2)
-            value = weight = 0.0
-            for i in range(PARTS):
-                share = INNER + (1 - 2 * INNER) * i / (PARTS - 1)
-                x = axes[k, 0, 0] + share * (axes[k, 1, 0] - axes[k, 0, 0])
-                v = top + (axes[k, 0, 1] + share * (axes[k, 1, 1] - axes[k, 0, 1])) * height
-                u = left + cell * pitch + x * width + slant * ((top + bottom) / 2 - v)
-                for j in range(-1, 2):
-                    du, dv = (0.0, j * s) if flat else (j * s, 0.0)
-                    value += _at(ink, u + du, v + dv)
-                    weight += _at(seen, u + du, v + dv)
-            levels[k] = value / weight if weight > 0.5 else 0.0
-            areas[k] = whole * weight / (3 * PARTS)
+            kind = 0 if FLAT[k] else 1
+            v = top + MIDDLES[1, k] * height
+            u = left + cell * pitch + MIDDLES[0, k] * width + slant * ((top + bottom) / 2 - v)
+            weight = 1.0 if whole else _at(shares[kind], u, v)
+            levels[k] = _at(means[kind], u, v) / weight if weight > LEAST_WEIGHT else 0.0
+            areas[k] = long * (width if kind == 0 else height / 2) * (weight if weight > LEAST_WEIGHT else 0.0)
         loops = 0.0
         for y in (0.25, 0.75):
             v = top + y * height
-            u = left + cell * pitch + 0.5 * width + slant * ((top + bottom) / 2 - v)
-            for i in range(-1, 2):
-                for j in range(-1, 2):
-                    loops += _at(ink, u + i * LOOP * width * 0.7, v + j * LOOP * height / 2 * 0.7) ** 2 / 9
+            loops += _at(means[2], left + cell * pitch + 0.5 * width + slant * ((top + bottom) / 2 - v), v)
         total += cell_worth(levels, areas, loops * 2 * LOOP * width * LOOP * height, lit)
     return total * (apartness((pitch - width) / height) if count > 1 else 1.0)
 
 
 @njit(cache=True)
 def refine_comb(
-    ink: Float32, seen: Float32, comb: Array, count: int, axes: Array, lit: NDArray[np.bool_], steps: Array
+    means: Float32, shares: Float32, whole: bool, comb: Array, count: int, lit: Array, steps: Array, lean: float
 ) -> float:  # pragma: no cover
     """Coordinate search around a comb, which is changed in place; its worth.
 
     Args:
+        means, shares, whole: as `comb_worth`.
         comb: (6,) left, pitch, width, top, bottom, slant.
         steps: search steps over the digit height, one round each.
+        lean: slant that was taken out of the picture.
     """
-    score = comb_worth(ink, seen, comb, count, axes, lit)
+    score = comb_worth(means, shares, whole, comb, count, lit)
     moves = np.array([
         [1.0, 0, 0, 0, 0, 0], [0, 1.0, 0, 0, 0, 0], [-1.0, 1.0, 0, 0, 0, 0], [-0.5, 0, 1.0, 0, 0, 0],
         [0, 0, 0, 1.0, 0, 0], [0, 0, 0, 0, 1.0, 0], [0, 0, 0, 1.0, 1.0, 0], [0, 0, 0, 0, 0, 1.0],
     ])  # fmt: skip
+    tried = np.empty(6)
     for step in steps:
         for _ in range(3):
             height = comb[4] - comb[3]
-            chosen, best = comb, score
+            chosen, best = comb.copy(), score
             for k in range(len(moves)):
                 for sign in (-1.0, 1.0):
-                    change = sign * step * moves[k]
-                    change[:5] *= height
+                    for i in range(6):
+                        tried[i] = sign * step * moves[k, i] * (height if i < 5 else 1.0)
                     if moves[k, 1] != 0.0:
-                        change[1] /= max(1, count - 1)
-                    tried = comb + change
-                    if not is_sound(tried, count, ink.shape[0], ink.shape[1]):
+                        tried[1] /= max(1, count - 1)
+                    tried += comb
+                    if not is_sound(tried, count, means.shape[1], means.shape[2], lean):
                         continue
-                    value = comb_worth(ink, seen, tried, count, axes, lit)
+                    value = comb_worth(means, shares, whole, tried, count, lit)
                     if value > best:
-                        chosen, best = tried, value
+                        chosen[:] = tried
+                        best = value
             if best <= score:
                 break
             comb[:] = chosen
@@ -223,7 +258,7 @@ def refine_comb(
 
 
 @njit(cache=True)
-def is_sound(comb: Array, count: int, rows: int, columns: int) -> bool:  # pragma: no cover
+def is_sound(comb: Array, count: int, rows: int, columns: int, lean: float) -> bool:  # pragma: no cover
     """Whether cells keep apart (else neighbours would share an upright), stay in the picture and look like digits."""
     left, pitch, width, top, bottom, slant = comb
     height = bottom - top
@@ -231,5 +266,47 @@ def is_sound(comb: Array, count: int, rows: int, columns: int) -> bool:  # pragm
     return bool(
         height >= 6.0 and pitch - width >= LEAST_GAP * height and 0.33 * height <= width <= 0.72 * height
         and left >= -0.1 * width and right <= columns + 0.1 * width and top >= 0.0 and bottom <= rows - 1.0
-        and -0.06 <= slant <= 0.32
+        and -0.06 <= slant + lean <= 0.32
     )  # fmt: skip
+
+
+@njit(cache=True)
+def slant_energies(uprights: Float32, slants: Array) -> Array:  # pragma: no cover
+    """(slants,) sum of the squared column sums of the picture sheared by every slant: most when uprights stand."""
+    rows, columns = uprights.shape
+    middle = (rows - 1) / 2
+    energies = np.zeros(len(slants))
+    for k in range(len(slants)):
+        sums = np.zeros(columns + 2 * rows)
+        for y in range(rows):
+            shift = rows + slants[k] * (y - middle)
+            whole = int(shift)
+            part = shift - whole
+            for x in range(columns):
+                value = uprights[y, x]
+                sums[x + whole] += value * (1.0 - part)
+                sums[x + whole + 1] += value * part
+        energies[k] = (sums * sums).sum()
+    return energies
+
+
+@njit(cache=True)
+def row_scores(profile: Array, heights: Array, step: float) -> Array:  # pragma: no cover
+    """(N, 3) score, top and height of digits whose flat segments would lie in rows of much flat ink and the loops' not."""
+    rows = len(profile)
+    found = np.zeros((len(heights) * (int(rows / step) + 1), 3))
+    n = 0
+    at = np.zeros(5)
+    for height in heights:
+        top = 0.02 * rows
+        while top < 0.98 * rows - height:
+            for k in range(5):
+                y = top + 0.25 * k * height
+                i = min(int(y), rows - 2)
+                at[k] = profile[i] + (y - i) * (profile[i + 1] - profile[i])
+            least = min(at[0], at[2], at[4])
+            score = at[0] + at[2] + at[4] + 2.0 * least - 1.2 * (at[1] + at[3])
+            found[n, 0], found[n, 1], found[n, 2] = score, top, height
+            n += 1
+            top += step
+    return found[:n]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from perception.vision.patch import Patch, sample_at
@@ -72,10 +73,7 @@ def border_crossings(patch: Patch, *, half_width_m: float, half_height_m: float,
     if inside.sum() < 16:
         return []
     values = sample_at(smooth, path_u, path_v)
-    size = max(9, len(values) // 5) | 1
-    around = np.pad(values, size // 2, mode="wrap")
-    # every fourth sample of a window tells its median as well
-    typical = np.median(np.lib.stride_tricks.sliding_window_view(around, size)[:, ::4], axis=1)
+    typical = ring_medians(np.round(values).astype(np.uint8), max(9, len(values) // 5) | 1)
     odd = inside & (np.abs(values - typical) > max(STANDS_OUT, 4.0 * _noise(patch)))
     n = len(values)
     points = np.column_stack([path_u, path_v])
@@ -150,5 +148,30 @@ def _followed(smooth: NDArray[np.uint8], seed: tuple[int, int]) -> NDArray[np.bo
 
 
 def _noise(patch: Patch) -> float:
-    gray = patch.gray[::2].astype(np.float32)
-    return float(np.median(np.abs(gray[:, 2:] - 2 * gray[:, 1:-1] + gray[:, :-2]))) / 1.65
+    gray = patch.gray[::2].astype(np.int16)
+    counts = np.bincount(np.abs(gray[:, 2:] - 2 * gray[:, 1:-1] + gray[:, :-2]).ravel())
+    return float(np.searchsorted(np.cumsum(counts), 0.5 * counts.sum())) / 1.65
+
+
+@njit(cache=True)
+def ring_medians(values: NDArray[np.uint8], size: int) -> Array:  # pragma: no cover
+    """(N,) median of the `size` (odd, at most N) values around every one of a closed path: a histogram that slides along."""
+    n, half = len(values), size // 2
+    counts = np.zeros(256, np.int64)
+    for k in range(-half, half + 1):
+        counts[values[k % n]] += 1
+    medians = np.empty(n)
+    level, below = 0, 0  # below: how many of the window are less than level
+    for i in range(n):
+        while below + counts[level] <= half:
+            below += counts[level]
+            level += 1
+        while below > half:
+            level -= 1
+            below -= counts[level]
+        medians[i] = level
+        gone, come = values[(i - half) % n], values[(i + half + 1) % n]
+        counts[gone] -= 1
+        counts[come] += 1
+        below += int(come < level) - int(gone < level)
+    return medians

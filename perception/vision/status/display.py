@@ -19,10 +19,11 @@ from perception.vision.image import Image
 from perception.vision.patch import Patch
 from perception.vision.reading import ANSWER_AT, Status, probability, refused
 from perception.vision.status.band import hidden_by_bands
-from perception.vision.status.comb import Comb, find_combs, loop_levels, segment_levels
+from perception.vision.status.comb import Comb, find_combs
 from perception.vision.status.comb_jit import Float32, apartness
 from perception.vision.status.glyphs import LIT, NAMES, Number, likelihoods, numbers, separate
 from perception.vision.status.ink import segment_ink, without_border
+from perception.vision.status.levels import loop_levels, segment_levels
 from perception.vision.status.point import Point, find_point
 from perception.vision.view import Array
 
@@ -90,11 +91,8 @@ def read_window(
         before: the previous reading.
     """
     gray, hidden = _working_size(gray, hidden)
-    found = [
-        decoded
-        for is_dark in ((True, False) if dark is None else (dark,))
-        for decoded in _decoded(gray, is_dark, hidden, digits)
-    ]
+    polarities = (True, False) if dark is None else (dark,)
+    found = [decoded for is_dark in polarities if (decoded := _decoded(gray, is_dark, hidden, digits)) is not None]
     if not found:
         return refused("no digits stand out: come closer, or change the angle or the light", unit=unit)
     best = max(found, key=lambda d: d.explained * apartness(d.comb.gap) - CELL_COST * d.comb.count)
@@ -102,11 +100,11 @@ def read_window(
     return _answer(best, point, unit, decimals, limits, before, covered=hidden is not None and bool(hidden.any()))
 
 
-def _decoded(gray: Image, is_dark: bool, hidden: NDArray[np.bool_] | None, digits: int | None) -> list[Decoded]:
+def _decoded(gray: Image, is_dark: bool, hidden: NDArray[np.bool_] | None, digits: int | None) -> Decoded | None:
     ink, seen = segment_ink(gray, is_dark, hidden)
     ink = without_border(ink)
     combs = find_combs(ink, seen, most=digits or 8, free=KNOWN_FREE if digits else FREE)
-    return [d for _, comb in combs if (d := decode(ink, seen, comb)) is not None]
+    return next((d for _, comb in combs if (d := decode(ink, seen, comb)) is not None), None)
 
 
 def decode(ink: Float32, seen: Float32, comb: Comb) -> Decoded | None:

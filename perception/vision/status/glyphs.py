@@ -76,9 +76,8 @@ def separate(ink: Array, seen: Array, loops: Array, loop_noise: Array) -> Levels
     k = int((n * (len(values) - n) * (high - low) ** 2).argmax())
     if high[k] - low[k] < 2.5:
         return None
-    spread = np.where(
-        np.isfinite(loop_noise), loop_noise, np.nanmedian(loop_noise) if np.isfinite(loop_noise).any() else LEAST_NOISE
-    )
+    known = loop_noise[np.isfinite(loop_noise)]
+    spread = np.where(np.isfinite(loop_noise), loop_noise, np.median(known) if len(known) else LEAST_NOISE)
     noise = np.maximum(LEAST_NOISE, LEVEL_NOISE * spread)
     # The best across a stroke lies above the mean: unlit segments look brighter than loops by about a sigma.
     local = np.where(np.isfinite(loops), loops + noise, low[k])

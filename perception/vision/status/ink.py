@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from perception.vision.image import Image
@@ -38,8 +39,8 @@ def segment_ink(gray: Image, is_dark: bool, hidden: NDArray[np.bool_] | None = N
         background = cv2.morphologyEx(filled, cv2.MORPH_OPEN, kernel)
         ink = cv2.subtract(filled, background).astype(np.float32)
     if not is_dark:
-        seen = seen * (SATURATED - background > HEADROOM * np.percentile(ink, 98)).astype(np.float32)
-    ink = np.maximum(ink - np.percentile(ink[seen > 0] if lost.any() else ink, 35), 0.0) * seen
+        seen = seen * (SATURATED - background > HEADROOM * level_at(ink, 0.98)).astype(np.float32)
+    ink = np.maximum(ink - level_at(ink[seen > 0] if lost.any() else ink, 0.35), 0.0) * seen
     return np.asarray(ink, np.float32), seen
 
 
@@ -57,7 +58,7 @@ def _drowned(gray: Image, is_dark: bool) -> NDArray[np.bool_]:
 
 def without_border(ink: Float32) -> Float32:
     """The ink less what hangs together with the picture's border over a long stretch: a frame, not a segment."""
-    strong = float(np.percentile(ink, 98.5))
+    strong = level_at(ink, 0.985)
     mask = (ink > 0.3 * strong).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
     rows, columns = ink.shape
@@ -69,3 +70,27 @@ def without_border(ink: Float32) -> Float32:
         return ink
     gone = cv2.dilate(np.isin(labels, drop).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return np.asarray(np.where(gone, 0.0, ink), np.float32)
+
+
+def level_at(ink: Float32, share: float) -> float:
+    """The level that this share of the ink (from 0 to 255) does not exceed, to a level."""
+    counts = np.bincount(ink.astype(np.uint8).ravel(), minlength=256)
+    return float(np.searchsorted(np.cumsum(counts), share * ink.size))
+
+
+@njit(cache=True)
+def column_levels(ink: Float32, share: float) -> Float32:  # pragma: no cover
+    """(W,) the level that this share of every column of the ink (from 0 to 255) does not exceed, to a level."""
+    rows, columns = ink.shape
+    out = np.zeros(columns, np.float32)
+    counts = np.zeros(256, np.int64)
+    for x in range(columns):
+        counts[:] = 0
+        for y in range(rows):
+            counts[min(255, int(ink[y, x]))] += 1
+        level, above = 256, 0
+        while above < (1.0 - share) * rows and level > 0:
+            level -= 1
+            above += counts[level]
+        out[x] = level
+    return out

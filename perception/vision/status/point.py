@@ -6,16 +6,25 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.special import erf
 
-from perception.vision.patch import sample_at
 from perception.vision.status.comb import AXES, Comb
 from perception.vision.status.comb_jit import Float32
 from perception.vision.view import Array
 
 RADIUS = 0.075  # of the digit height
-LEVEL = 0.45  # of a lit segment: a dot and no dot are equally likely there
+LEVEL = 0.55  # of a lit segment: a dot and no dot are equally likely there
 LEVEL_SPREAD = 0.07
 HIDDEN_ODDS = -0.7  # logarithm, of a point in a gap that is hidden against no point at all
+STRIP = (0.55, 1.25)  # rows that are looked at, over the digit height from its top
+HALF_STROKES = np.array([0.045, 0.065])  # of the digit height: tried, with every blur
+BLURS = np.array([0.02, 0.05, 0.09])
+INSETS = (0.08, 0.22)  # of a segment's axis, at either end, by which its stroke is shorter
+PLACES_X = np.linspace(0.25, 0.75, 6)  # of the gap
+PLACES_Y = np.linspace(-0.12, 0.06, 7)  # of the digit height, from the bottom segments' axis
+STEPS = 8  # places a px at which a stroke's profile is tabled
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,40 +44,44 @@ def find_point(ink: Float32, seen: Float32, comb: Comb, lit_levels: Array) -> Po
     Args:
         lit_levels: (cells, 7) levels of the lit segments, 0 for the others.
     """
-    drawn, sigma_px = _drawn(ink, comb, lit_levels)
-    h = comb.height_px
-    dot = _dot(RADIUS * h, sigma_px)
-    found = cv2.filter2D(ink - drawn, -1, dot / float((dot * dot).sum()), borderType=cv2.BORDER_REPLICATE)
-    gap = (comb.pitch_px - comb.width_px) / comb.width_px
-    x, y = (m[None] for m in np.meshgrid(np.linspace(0.25, 0.75, 6), np.linspace(-0.12, 0.06, 7)))
-    cell = np.arange(comb.count - 1, dtype=float)[:, None, None]
     if comb.count < 2:
         return Point(place=None, probability=1.0)
-    u, v = comb.place(1.0 + gap * x, 1.0 + y, cell)
-    lines = (comb.count - 1, -1)
-    u, v = u.reshape(lines), np.broadcast_to(v, u.shape).reshape(lines)
-    levels = np.asarray(sample_at(found, u, v), float).max(axis=1)
-    clear = sample_at(seen, u, v, outside=0.0).mean(axis=1) > 0.6
-    amplitude = float(np.percentile(drawn, 99.0))
-    levels = levels / np.maximum(_local(lit_levels), 0.2)  # behind glare a dot is dimmer, as its neighbours are
+    levels, clear = dot_levels(ink, seen, comb, lit_levels)
     if not clear.any():
         return Point(place=None, probability=0.5)
     order = np.sort(levels[clear])
     typical = max(float(np.median(order[:-1])), 0.0) if len(order) > 1 else 0.0
-    odds = ((levels - typical) / max(amplitude, 1e-6) - LEVEL) / LEVEL_SPREAD
+    odds = (levels - typical - LEVEL) / LEVEL_SPREAD
     odds = np.append(np.where(clear, np.clip(odds, -30.0, 30.0), HIDDEN_ODDS), 0.0)  # the last: no point
     share = np.exp(odds - odds.max())
     k = int(share.argmax())
     return Point(place=None if k == len(levels) else k + 1, probability=float(share[k] / share.sum()))
 
 
-def _local(lit_levels: Array) -> Array:
-    """(cells - 1,) lit level beside every gap over the display's."""
+def dot_levels(ink: Float32, seen: Float32, comb: Comb, lit_levels: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """(cells - 1,) level of the best dot in every gap over that of lit segments beside it, and whether the gap is seen."""
+    first, last = (round(comb.top_px + share * comb.height_px) for share in STRIP)
+    first, last = max(0, first), min(len(ink), last)
+    if last - first < 3:
+        return np.zeros(comb.count - 1), np.zeros(comb.count - 1, bool)
+    strip, clear = ink[first:last], seen[first:last]
+    drawn, sigma_px = _drawn(strip, clear, comb, lit_levels, first)
+    rest = (strip - drawn) * clear
+    dot = _dot(RADIUS * comb.height_px, sigma_px)
+    levels, visible = _best_dots(rest, clear, dot, comb.numbers, comb.count, first, PLACES_X, PLACES_Y)
+    gain = float(np.percentile(drawn, 99.0)) / max(float(lit_levels.max()), 1e-6)
+    return levels / np.maximum(gain * _beside(lit_levels), 1e-6), visible > 0
+
+
+def _beside(lit_levels: Array) -> Array:
+    """(cells - 1,) level of lit segments beside every gap: behind glare a dot is dimmer, as its neighbours are."""
     lit = lit_levels > 0
     cells = np.where(lit.any(axis=1), (lit_levels * lit).sum(axis=1) / np.maximum(lit.sum(axis=1), 1), np.nan)
-    typical = float(np.nanmedian(cells)) if np.isfinite(cells).any() else 1.0
-    cells = np.where(np.isfinite(cells), cells / max(typical, 1e-6), 1.0)
-    return np.asarray(np.minimum(0.5 * (cells[:-1] + cells[1:]), 1.0))
+    if not np.isfinite(cells).any():
+        return np.ones(len(cells) - 1)
+    typical = float(np.median(cells[np.isfinite(cells)]))
+    cells = np.where(np.isfinite(cells), cells, typical)
+    return np.clip(0.5 * (cells[:-1] + cells[1:]), 0.2 * typical, typical)
 
 
 def _dot(radius_px: float, sigma_px: float) -> Float32:
@@ -79,31 +92,93 @@ def _dot(radius_px: float, sigma_px: float) -> Float32:
     return np.asarray(cv2.GaussianBlur(disc, (0, 0), max(sigma_px, 0.3), borderType=cv2.BORDER_CONSTANT), np.float32)
 
 
-def _drawn(ink: Float32, comb: Comb, levels: Array) -> tuple[Float32, float]:
+def _drawn(strip: Float32, clear: Float32, comb: Comb, lit_levels: Array, first: int) -> tuple[Float32, float]:
     """The lit segments as drawn strokes with the width and blur that leave the least, and that blur in px."""
     h = comb.height_px
-    tried = []
-    for stroke in (0.09, 0.13):
-        canvas = _strokes(ink.shape, comb, levels, max(1, round(stroke * h)))
-        for sigma in (0.02 * h, 0.05 * h, 0.09 * h):
-            shape = np.asarray(cv2.GaussianBlur(canvas, (0, 0), max(sigma, 0.3)), np.float32)
-            fit = shape * (_dot_product(shape, ink) / max(_dot_product(shape, shape), 1e-6))
-            tried.append((cv2.norm(ink, fit, cv2.NORM_L2SQR), fit, sigma))
-    _, fit, sigma = min(tried, key=lambda t: t[0])
-    return np.asarray(fit, np.float32), float(sigma)
+    shapes = [(half * h, max(blur * h, 0.3)) for half in HALF_STROKES for blur in BLURS]
+    reach = (HALF_STROKES[-1] + 2.5 * BLURS[-1]) * h
+    distance = np.arange(0.0, reach + 1.0, 1.0 / STEPS)
+    tables = np.array([_profile(distance, half, blur) for half, blur in shapes], np.float32)
+    levels = np.ascontiguousarray(lit_levels, float)
+    drawn = [_strokes((first, *strip.shape), comb.numbers, levels, AXES, inset, tables) for inset in INSETS]
+    canvases = np.concatenate(drawn).reshape(len(INSETS) * len(shapes), -1)
+    canvases *= clear.ravel()
+    along = canvases @ strip.ravel()
+    square = np.maximum((canvases * canvases).sum(axis=1), 1e-6)
+    k = int((along * along / square).argmax())  # least squares: what is left is |strip|^2 less this
+    return np.asarray(canvases[k] * (along[k] / square[k]), np.float32).reshape(strip.shape), shapes[k % len(shapes)][1]
 
 
-def _dot_product(a: Float32, b: Float32) -> float:
-    """Sum of products of two pictures."""
-    return float(np.dot(a.ravel(), b.ravel()))
+def _profile(distance: Array, half_px: float, sigma_px: float) -> Array:
+    """Height of a blurred stroke of unit height at a distance from its axis."""
+    scale = np.sqrt(2.0) * sigma_px
+    return np.asarray(0.5 * (erf((half_px - distance) / scale) + erf((half_px + distance) / scale)))
 
 
-def _strokes(shape: tuple[int, ...], comb: Comb, levels: Array, thickness_px: int) -> Float32:
-    canvas = np.zeros(shape, np.float32)
-    for k, j in zip(*np.nonzero(levels > 0), strict=True):
-        start, end = AXES[j]
-        ends = start + np.array([[0.12], [0.88]]) * (end - start)
-        u, v = comb.place(ends[:, 0], ends[:, 1], np.array(float(k)))
-        (u0, u1), (v0, v1) = np.round(u * 16).astype(int), np.round(v * 16).astype(int)
-        cv2.line(canvas, (int(u0), int(v0)), (int(u1), int(v1)), float(levels[k, j]), thickness_px, cv2.LINE_AA, 4)
-    return canvas
+@njit(cache=True)
+def _strokes(
+    strip: tuple[int, int, int], comb: Array, lit_levels: Array, axes: Array, inset: float, tables: Float32
+) -> Float32:  # pragma: no cover
+    """(shapes, rows, columns) sum of the lit segments' strokes on a strip that begins at row strip[0].
+
+    Args:
+        tables: (shapes, N) height of a stroke at every 1 / STEPS px from its axis.
+    """
+    first, rows, columns = strip
+    left, pitch, width, top, bottom, slant = comb
+    height = bottom - top
+    shapes, reach = tables.shape[0], (tables.shape[1] - 1) / STEPS
+    canvases = np.zeros((shapes, rows, columns), np.float32)
+    ends = np.empty((2, 2))
+    for cell in range(lit_levels.shape[0]):
+        for k in range(7):
+            level = lit_levels[cell, k]
+            if level <= 0.0:
+                continue
+            for e in range(2):
+                share = inset if e == 0 else 1.0 - inset
+                x = axes[k, 0, 0] + share * (axes[k, 1, 0] - axes[k, 0, 0])
+                v = top + (axes[k, 0, 1] + share * (axes[k, 1, 1] - axes[k, 0, 1])) * height
+                ends[e, 0], ends[e, 1] = left + cell * pitch + x * width + slant * ((top + bottom) / 2 - v), v - first
+            along_u, along_v = ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1]
+            length = along_u * along_u + along_v * along_v
+            for y in range(max(0, int(ends[:, 1].min() - reach)), min(rows, int(ends[:, 1].max() + reach) + 1)):
+                for x in range(max(0, int(ends[:, 0].min() - reach)), min(columns, int(ends[:, 0].max() + reach) + 1)):
+                    t = min(1.0, max(0.0, ((x - ends[0, 0]) * along_u + (y - ends[0, 1]) * along_v) / length))
+                    du, dv = x - ends[0, 0] - t * along_u, y - ends[0, 1] - t * along_v
+                    off = int(np.sqrt(du * du + dv * dv) * STEPS)
+                    if off < tables.shape[1]:
+                        for s in range(shapes):
+                            canvases[s, y, x] += level * tables[s, off]
+    return canvases
+
+
+@njit(cache=True)
+def _best_dots(
+    rest: Float32, seen: Float32, dot: Float32, comb: Array, count: int, first: int, xs: Array, ys: Array
+) -> tuple[Array, Array]:  # pragma: no cover
+    """(count - 1,) least-squares height of the best dot in every gap, and 1 where the gap is seen."""
+    left, pitch, width, top, bottom, slant = comb
+    rows, columns = rest.shape
+    half = dot.shape[0] // 2
+    best, clear = np.full(count - 1, -np.inf), np.zeros(count - 1)
+    for gap in range(count - 1):
+        visible = 0
+        for y in ys:
+            for x in xs:
+                v = bottom + y * (bottom - top)
+                u = left + gap * pitch + width + x * (pitch - width) + slant * ((top + bottom) / 2 - v)
+                i, j = round(v) - first, round(u)
+                product = total = 0.0
+                for a in range(max(0, i - half), min(rows, i + half + 1)):
+                    for b in range(max(0, j - half), min(columns, j + half + 1)):
+                        weight = dot[a - i + half, b - j + half]
+                        product += weight * rest[a, b]
+                        total += weight * weight
+                if total > 0.0:
+                    best[gap] = max(best[gap], product / total)
+                if 0 <= i < rows and 0 <= j < columns and seen[i, j] > 0.5:
+                    visible += 1
+        if visible > 0.6 * len(xs) * len(ys):
+            clear[gap] = 1.0
+    return np.maximum(best, -1e6), clear

@@ -12,11 +12,13 @@ from perception.vision.patch import Patch
 from perception.vision.photo_display import read_photograph
 from perception.vision.reading import Status
 from perception.vision.status.band import hidden_by_bands
-from perception.vision.status.comb import AXES, find_combs
+from perception.vision.status.comb import LIT_SHARES, find_combs, segment_means
 from perception.vision.status.comb_jit import LEFT_OVER, apartness, cell_worth, comb_worth
+from perception.vision.status.cover import ring_medians
 from perception.vision.status.display import read_display, read_window
 from perception.vision.status.glyphs import LIT, NAMES, Levels, likelihoods, numbers, separate
 from perception.vision.status.ink import segment_ink
+from perception.vision.status.point import dot_levels, find_point
 from perception.vision.taught import patch_of
 from perception.vision.view import PlaneView, homography
 from tests.perception.vision.test_display import window
@@ -76,7 +78,7 @@ def test_a_cells_worth_is_what_its_best_character_explains_less_what_it_leaves()
         total = loops + float((areas * levels**2).sum())
         explained = [float((areas * levels)[lit].sum()) ** 2 / float(areas[lit].sum()) for lit in LIT]
         wanted = max(0.0, *(e - LEFT_OVER * (total - e) for e in explained))
-        assert cell_worth(levels, areas, loops, LIT) == pytest.approx(wanted)
+        assert cell_worth(levels, areas, loops, LIT_SHARES) == pytest.approx(wanted)
 
 
 def test_the_true_comb_is_worth_more_than_any_shifted_one() -> None:
@@ -85,18 +87,38 @@ def test_the_true_comb_is_worth_more_than_any_shifted_one() -> None:
     assert (
         comb.count == 4 and comb.height_px == pytest.approx(40.0, abs=3.0) and comb.pitch_px == pytest.approx(30, abs=1)
     )
-    place = np.array([comb.left_px, comb.pitch_px, comb.width_px, comb.top_px, comb.bottom_px, comb.slant])
-    worth = comb_worth(ink, seen, place, 4, AXES, LIT)
+    means, shares = segment_means(ink, seen, True, comb.width_px, comb.height_px)
+    worth = comb_worth(means, shares, True, comb.numbers, 4, LIT_SHARES)
     for k, step in ((0, 5.0), (0, -5.0), (1, 3.0), (3, 6.0), (4, -6.0)):
-        moved = place.copy()
+        moved = comb.numbers
         moved[k] += step
-        assert comb_worth(ink, seen, moved, 4, AXES, LIT) < worth
+        assert comb_worth(means, shares, True, moved, 4, LIT_SHARES) < worth
 
 
 def test_neighbours_that_share_an_upright_count_less() -> None:
     gaps = np.linspace(0.0, 0.4, 30)
     factors = np.array([apartness(float(g)) for g in gaps])
     assert (np.diff(factors) >= 0).all() and factors[0] < 0.5 and factors[-1] == 1.0
+
+
+@pytest.mark.parametrize("size", [9, 31, 97])
+def test_sliding_medians_of_a_ring_are_its_medians(size: int) -> None:
+    values = np.random.default_rng(size).integers(0, 256, 97).astype(np.uint8)
+    around = np.pad(values, size // 2, mode="wrap")
+    wanted = [np.median(around[k : k + size]) for k in range(len(values))]
+    assert ring_medians(values, size).tolist() == wanted
+
+
+@pytest.mark.parametrize(("text", "place"), [("26.48", 2), ("2.648", 1), ("2648", None)])
+def test_a_dot_stands_out_from_gaps_without_one(text: str, place: int | None) -> None:
+    ink, seen = segment_ink(window(text, slant=0.0), is_dark=False)
+    _, comb = find_combs(ink, seen)[0]
+    lit = np.array([LIT[NAMES.index(c)] * 150.0 for c in "2648"])
+    levels, clear = dot_levels(ink, seen, comb, lit)
+    assert clear.all()
+    for gap, level in enumerate(levels, start=1):
+        assert level > 0.8 if gap == place else level < 0.35
+    assert find_point(ink, seen, comb, lit).place == place
 
 
 def plate_patch(*, cable: tuple[int, int] | None) -> Patch:

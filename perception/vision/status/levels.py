@@ -1,0 +1,99 @@
+"""Levels of the segments of a comb, and of its loops, from the ink."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.vision.status.comb import AXES, Comb
+from perception.vision.status.comb_jit import INNER, STROKE, Float32
+from perception.vision.view import Array
+
+PARTS = 5  # places along a segment's axis
+CLEAR = 0.6  # of a pixel seen
+LEAST_LOOP_PLACES = 6
+LOOP_X = np.linspace(0.36, 0.64, 3)
+LOOP_Y = np.array([0.2, 0.25, 0.3, 0.7, 0.75, 0.8])
+
+
+def segment_levels(ink: Float32, seen: Float32, comb: Comb) -> tuple[Array, Array]:
+    """(cells, 7) ink of every segment, the median along its axis of the best across its stroke, and its seen share."""
+    return _segments(ink, seen, comb.numbers, comb.count, AXES)
+
+
+def loop_levels(ink: Float32, seen: Float32, comb: Comb) -> tuple[Array, Array]:
+    """(cells,) mean and standard deviation of the ink inside the loops of every cell, where no segment is; NaN unseen."""
+    return _loops(ink, seen, comb.numbers, comb.count, LOOP_X, LOOP_Y)
+
+
+@njit(cache=True)
+def _value(image: Float32, u: float, v: float) -> float:  # pragma: no cover
+    """Bilinear value; outside is 0, and fades in over a pixel."""
+    height, width = image.shape
+    if u <= -1.0 or v <= -1.0 or u >= width or v >= height:
+        return 0.0
+    x, y = int(np.floor(u)), int(np.floor(v))
+    a, b = u - x, v - y
+    value = 0.0
+    for j in range(2):
+        for i in range(2):
+            if 0 <= x + i < width and 0 <= y + j < height:
+                value += image[y + j, x + i] * (a if i else 1 - a) * (b if j else 1 - b)
+    return value
+
+
+@njit(cache=True)
+def _segments(
+    ink: Float32, seen: Float32, comb: Array, count: int, axes: Array
+) -> tuple[Array, Array]:  # pragma: no cover
+    left, pitch, width, top, bottom, slant = comb
+    height = bottom - top
+    levels, shares = np.zeros((count, 7)), np.zeros((count, 7))
+    best = np.zeros(PARTS)
+    for cell in range(count):
+        for k in range(7):
+            flat = axes[k, 0, 1] == axes[k, 1, 1]
+            n = 0
+            for i in range(PARTS):
+                t = INNER + (1 - 2 * INNER) * i / (PARTS - 1)
+                x = axes[k, 0, 0] + t * (axes[k, 1, 0] - axes[k, 0, 0])
+                v = top + (axes[k, 0, 1] + t * (axes[k, 1, 1] - axes[k, 0, 1])) * height
+                u = left + cell * pitch + x * width + slant * ((top + bottom) / 2 - v)
+                strongest, clear, axis_clear = -1.0, 0, False
+                for j in range(-1, 2):
+                    across = j * 0.8 * STROKE * height
+                    du, dv = (0.0, across) if flat else (across, 0.0)
+                    if _value(seen, u + du, v + dv) > CLEAR:
+                        clear += 1
+                        axis_clear = axis_clear or j == 0
+                        strongest = max(strongest, _value(ink, u + du, v + dv))
+                if axis_clear and clear >= 2:  # the outer part alone is no witness: a stroke may be narrower
+                    best[n] = strongest
+                    n += 1
+            levels[cell, k] = np.median(best[:n]) if n else 0.0
+            shares[cell, k] = n / PARTS
+    return levels, shares
+
+
+@njit(cache=True)
+def _loops(
+    ink: Float32, seen: Float32, comb: Array, count: int, xs: Array, ys: Array
+) -> tuple[Array, Array]:  # pragma: no cover
+    left, pitch, width, top, bottom, slant = comb
+    means, spreads = np.full(count, np.nan), np.full(count, np.nan)
+    for cell in range(count):
+        n = 0
+        total = squares = 0.0
+        for y in ys:
+            v = top + y * (bottom - top)
+            for x in xs:
+                u = left + cell * pitch + x * width + slant * ((top + bottom) / 2 - v)
+                if _value(seen, u, v) > CLEAR:
+                    value = _value(ink, u, v)
+                    n += 1
+                    total += value
+                    squares += value * value
+        if n >= LEAST_LOOP_PLACES:
+            means[cell] = total / n
+            spreads[cell] = np.sqrt(max(squares / n - (total / n) ** 2, 0.0))
+    return means, spreads

@@ -23,7 +23,7 @@ from service.connection import CellConnection, LocalConnection, RemoteConnection
 from service.latch import Beat, Latch, LatchState
 from service.stop_host import InlineStop, ProcessStop
 
-START_TIMEOUT_S = 240.0  # the very first start compiles the control kernels, minutes on a busy machine
+START_TIMEOUT_S = 400.0  # the very first start compiles the control kernels beside much else, minutes on a busy machine
 MAX_RESTARTS = 3
 BEAT_TIMEOUT_S = 10.0  # the beat thread shares its interpreter with numba's compiler, which holds the lock for seconds
 WATCH_S = 0.1

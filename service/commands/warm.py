@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor
 from multiprocessing import get_context
 
 from service.commands.common import DEFAULT_CELL, CellOption, console, read_cell
@@ -21,12 +21,19 @@ def warm(cell: CellOption = DEFAULT_CELL) -> None:
     def report(stage: str) -> None:
         console.print(f"warm: {stage} ready after {time.monotonic() - started_s:.0f} s")
 
+    def report_ended(stage: Future[str]) -> None:
+        if stage.exception() is None:
+            report(stage.result())
+
     with ProcessPoolExecutor(PROCESSES, mp_context=get_context("spawn")) as pool:
-        for ended in as_completed([pool.submit(run_stage, name) for name in STAGES]):
-            report(ended.result())
-    supervisor = Supervisor(read_cell(cell, None))
-    try:
-        supervisor.start()
-    finally:
-        supervisor.close()
-    report("control and simulation")
+        stages = [pool.submit(run_stage, name) for name in STAGES]
+        for stage in stages:
+            stage.add_done_callback(report_ended)
+        supervisor = Supervisor(read_cell(cell, None))
+        try:
+            supervisor.start()  # beside the pool: its own processes compile the control loop and the world
+        finally:
+            supervisor.close()
+        report("control and simulation")
+        for stage in stages:
+            stage.result()

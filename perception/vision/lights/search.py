@@ -1,4 +1,3 @@
-# ruff: noqa: PLR0912, PLR0915 - a compiled loop keeps one sum in one place
 # mypy: disallow-untyped-defs=False
 """Compiled search for the taught quadrangle among blobs: every ordered triple, its poses, the fourth light."""
 
@@ -17,6 +16,9 @@ MISSING_OUTSIDE = 1.0  # ... and outside, plus the next figure for every image w
 OUTSIDE_PER_WIDTH = 20.0
 ROUNDER = 0.2  # a disc tilted by t has aspect cos t; blur makes it rounder by this much
 UNCHECKED = 3.0  # three points fit always: what a hypothesis without a fourth light to check it costs
+FARTHEST_MISS2 = 16.0  # squared, in standard deviations: a blob farther from the fourth light's place is another thing
+UNLIKE = 1.2  # log ratio of diameters above which two blobs are not equal lamps at any tilt
+SHOWN_WIDTH = 1.7725  # a lamp of radius r shows sqrt(area) = sqrt(pi) r f / z
 
 
 @jit
@@ -29,6 +31,71 @@ def spread(values, n):
     for i in range(n):
         total += (values[i] - mean) ** 2
     return total
+
+
+@jit
+def rays_of(centres, camera):
+    """(n, 3) unit rays through ideal pixels."""
+    rays = np.empty((centres.shape[0], 3))
+    for i in range(centres.shape[0]):
+        u, v = (centres[i, 0] - camera[2]) / camera[0], (centres[i, 1] - camera[3]) / camera[1]
+        norm = np.sqrt(u * u + v * v + 1.0)
+        rays[i, 0], rays[i, 1], rays[i, 2] = u / norm, v / norm, 1.0 / norm
+    return rays
+
+
+@jit
+def turns(centres, i, j, k):
+    """Twice the signed area of three blobs: its sign tells in which sense they follow each other."""
+    ij, ik = centres[j] - centres[i], centres[k] - centres[i]
+    return ij[0] * ik[1] - ij[1] * ik[0]
+
+
+@jit
+def pose_score(R, upright, roundness, prior):
+    """What a rotation costs that is tilted or rolled, or under which round lamps would look flatter than they do."""
+    Q = R @ upright.T
+    tilt = np.arccos(min(1.0, max(-1.0, Q[2, 2])))
+    roll = np.arctan2(Q[1, 0] - Q[0, 1], Q[0, 0] + Q[1, 1])
+    flat = max(roundness - Q[2, 2], 0.0)
+    return -0.5 * ((tilt / prior[0]) ** 2 + (roll / prior[1]) ** 2 + (flat / ROUNDER) ** 2)
+
+
+@jit
+def alike(sizes, contrasts, n):
+    """What it costs that the first n lamps differ in size and contrast."""
+    return -0.5 * (spread(sizes, n) / SIZE_SPREAD**2 + spread(contrasts, n) / CONTRAST_SPREAD**2)
+
+
+@jit
+def unseen(u, v, frame):
+    """What a fourth light costs that is at a place and not seen there."""
+    beyond = max(-u, u - frame[0], 0.0) + max(-v, v - frame[1], 0.0)
+    missing = MISSING_OUTSIDE + OUTSIDE_PER_WIDTH * beyond / frame[0] if beyond > 0.0 else MISSING_INSIDE
+    return -UNCHECKED - missing
+
+
+@jit
+def choose_fourth(centres, traits, q, camera, frame, prior, omit, order, sizes, contrasts):
+    """The blob that serves best as the light `omit`, put into `order` (-1: none does); returns its score.
+
+    Args:
+        q: (3,) where the light must be, camera frame.
+        sizes, contrasts: (4,) of the other three lamps, log; the last place is used here.
+    """
+    u, v = camera[0] * q[0] / q[2] + camera[2], camera[1] * q[1] / q[2] + camera[3]
+    score = unseen(u, v, frame) + alike(sizes, contrasts, 3)
+    order[omit] = -1
+    for c in range(centres.shape[0]):
+        miss2 = ((centres[c, 0] - u) ** 2 + (centres[c, 1] - v) ** 2) / prior[2] ** 2
+        if miss2 > FARTHEST_MISS2 or c in (order[0], order[1], order[2], order[3]):
+            continue
+        sizes[3] = traits[1, c] + np.log(q[2])
+        contrasts[3] = traits[2, c]
+        mine = traits[0, c] - 0.5 * miss2 + alike(sizes, contrasts, 4)
+        if mine > score:
+            score, order[omit] = mine, c
+    return score
 
 
 @jit
@@ -46,90 +113,56 @@ def search(centres, traits, X, upright, camera, frame, prior, omit, best, chosen
     light's miss.
     """
     n = centres.shape[0]
-    reward, log_size, log_contrast, aspect = traits[0], traits[1], traits[2], traits[3]
-    most = 0.0
-    for i in range(n):
-        most = max(most, reward[i])
-    names = np.empty(3, np.int64)
-    at = 0
-    for o in range(4):
-        if o != omit:
-            names[at] = o
-            at += 1
+    reward, log_size = traits[0], traits[1]
+    most = max(reward.max(), 0.0) if n > 0 else 0.0
+    names = np.array([(omit + 1) % 4, (omit + 2) % 4, (omit + 3) % 4])
+    names.sort()
     P, f = np.empty((3, 3)), np.empty((3, 3))
     for a in range(3):
         P[a] = X[names[a]]
-    rays = np.empty((n, 3))
-    for i in range(n):
-        u, v = (centres[i, 0] - camera[2]) / camera[0], (centres[i, 1] - camera[3]) / camera[1]
-        norm = np.sqrt(u * u + v * v + 1.0)
-        rays[i, 0], rays[i, 1], rays[i, 2] = u / norm, v / norm, 1.0 / norm
+    rays = rays_of(centres, camera)
     e1, e2 = upright @ (P[1] - P[0]), upright @ (P[2] - P[0])
     turn = e1[0] * e2[1] - e1[1] * e2[0]
-    Rs, ts = np.empty((4, 3, 3)), np.empty((4, 3))
-    sizes, contrasts = np.empty(4), np.empty(4)
     order = np.empty(4, np.int64)
     for i in range(n):
         for j in range(n):
-            if j == i or abs(log_size[i] - log_size[j]) > 1.2:
+            if j == i or abs(log_size[i] - log_size[j]) > UNLIKE:
                 continue
             for k in range(n):
-                if k in (i, j) or abs(log_size[i] - log_size[k]) > 1.2:
+                if k in (i, j) or abs(log_size[i] - log_size[k]) > UNLIKE:
                     continue
-                cross = (centres[j, 0] - centres[i, 0]) * (centres[k, 1] - centres[i, 1]) - (
-                    centres[j, 1] - centres[i, 1]
-                ) * (centres[k, 0] - centres[i, 0])
-                if cross * turn <= 0.0:
+                if turns(centres, i, j, k) * turn <= 0.0:
                     continue
                 base = reward[i] + reward[j] + reward[k]
                 if base + most <= best[best.shape[0] - 1]:
                     continue  # everything else only costs
-                roundness = (aspect[i] + aspect[j] + aspect[k]) / 3.0
                 f[0], f[1], f[2] = rays[i], rays[j], rays[k]
-                found = three_point(P, f, Rs, ts)
-                for s in range(found):
-                    Q = Rs[s] @ upright.T
-                    tilt = np.arccos(min(1.0, max(-1.0, Q[2, 2])))
-                    roll = np.arctan2(Q[1, 0] - Q[0, 1], Q[0, 0] + Q[1, 1])
-                    score = base - 0.5 * (tilt / prior[0]) ** 2 - 0.5 * (roll / prior[1]) ** 2
-                    score -= 0.5 * (max(roundness - Q[2, 2], 0.0) / ROUNDER) ** 2
-                    order[names[0]], order[names[1]], order[names[2]], order[omit] = i, j, k, -1
-                    for a in range(3):
-                        c = order[names[a]]
-                        z = Rs[s, 2, 0] * P[a, 0] + Rs[s, 2, 1] * P[a, 1] + Rs[s, 2, 2] * P[a, 2] + ts[s, 2]
-                        sizes[a] = log_size[c] + np.log(max(z, 1e-9))
-                        contrasts[a] = log_contrast[c]
-                    q = Rs[s] @ X[omit] + ts[s]
-                    if q[2] <= 0.0:
-                        continue
-                    u, v = camera[0] * q[0] / q[2] + camera[2], camera[1] * q[1] / q[2] + camera[3]
-                    beyond = max(-u, u - frame[0], 0.0) + max(-v, v - frame[1], 0.0)
-                    seen = score - UNCHECKED
-                    if beyond > 0.0:
-                        seen -= MISSING_OUTSIDE + OUTSIDE_PER_WIDTH * beyond / frame[0]
-                    else:
-                        seen -= MISSING_INSIDE
-                    # A lamp of radius r shows sqrt(area) = sqrt(pi) r f / z.
-                    usual = np.log(1.7725 * prior[3] * camera[0])
-                    mean = (sizes[0] + sizes[1] + sizes[2]) / 3.0
-                    score -= 0.5 * ((mean - usual) / RADIUS_SPREAD) ** 2
-                    seen -= 0.5 * ((mean - usual) / RADIUS_SPREAD) ** 2
-                    seen -= 0.5 * spread(sizes, 3) / SIZE_SPREAD**2 + 0.5 * spread(contrasts, 3) / CONTRAST_SPREAD**2
-                    for fourth in range(n):
-                        if fourth in (i, j, k):
-                            continue
-                        miss2 = ((centres[fourth, 0] - u) ** 2 + (centres[fourth, 1] - v) ** 2) / prior[2] ** 2
-                        if miss2 > 16.0:
-                            continue
-                        sizes[3] = log_size[fourth] + np.log(q[2])
-                        contrasts[3] = log_contrast[fourth]
-                        with_fourth = score + reward[fourth] - 0.5 * miss2
-                        with_fourth -= 0.5 * spread(sizes, 4) / SIZE_SPREAD**2
-                        with_fourth -= 0.5 * spread(contrasts, 4) / CONTRAST_SPREAD**2
-                        if with_fourth > seen:
-                            seen = with_fourth
-                            order[omit] = fourth
-                    insert(seen, order, best, chosen)
+                order[names[0]], order[names[1]], order[names[2]] = i, j, k
+                try_triple(
+                    P, f, names, base, centres, traits, X, upright, camera, frame, prior, omit, order, best, chosen
+                )
+
+
+@jit
+def try_triple(P, f, names, base, centres, traits, X, upright, camera, frame, prior, omit, order, best, chosen):
+    """Score every pose that three blobs allow, each with the fourth blob that suits it best."""
+    Rs, ts = np.empty((4, 3, 3)), np.empty((4, 3))
+    sizes, contrasts = np.empty(4), np.empty(4)
+    usual = np.log(SHOWN_WIDTH * prior[3] * camera[0])
+    roundness = (traits[3, order[names[0]]] + traits[3, order[names[1]]] + traits[3, order[names[2]]]) / 3.0
+    for s in range(three_point(P, f, Rs, ts)):
+        q = Rs[s] @ X[omit] + ts[s]
+        if q[2] <= 0.0:
+            continue
+        for a in range(3):
+            c = order[names[a]]
+            z = Rs[s, 2, 0] * P[a, 0] + Rs[s, 2, 1] * P[a, 1] + Rs[s, 2, 2] * P[a, 2] + ts[s, 2]
+            sizes[a] = traits[1, c] + np.log(max(z, 1e-9))
+            contrasts[a] = traits[2, c]
+        strange = ((sizes[0] + sizes[1] + sizes[2]) / 3.0 - usual) / RADIUS_SPREAD
+        score = base + pose_score(Rs[s], upright, roundness, prior) - 0.5 * strange**2
+        score += choose_fourth(centres, traits, q, camera, frame, prior, omit, order, sizes, contrasts)
+        insert(score, order, best, chosen)
 
 
 @jit

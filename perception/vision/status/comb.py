@@ -33,10 +33,10 @@ AXES = np.array([
 ])  # fmt: skip
 SLANTS = np.tan(np.deg2rad(np.arange(-2.0, 16.1, 2.0)))
 WIDTHS = np.array([0.40, 0.49, 0.60])  # between the uprights' axes, over the digit height
-PITCHES = np.geomspace(1.25, 2.6, 22)  # over that width
+PITCHES = np.geomspace(1.25, 2.6, 16)  # over that width
 HEIGHTS = np.geomspace(0.34, 0.94, 10)  # of a digit over the picture's
-ROWS_TRIED = 6
-REFINED = 3
+ROWS_TRIED = 4
+REFINED = 2
 REFINE_STEPS = np.array([0.05, 0.025, 0.012])  # of the digit height
 EVEN_OUT = 0.45  # dimmer parts of the picture are raised until their ink reaches this share of the strongest
 LIT_SHARES = LIT.astype(float)

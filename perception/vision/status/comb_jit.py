@@ -82,19 +82,19 @@ def worth_along(
     """
     rows, columns = ink.shape[0] - 1, ink.shape[1] - 1
     boxes = _boxes(place[0], place[1], place[2])
+    energy, clear = np.empty((9, columns + 1)), np.empty((9, columns + 1))  # of a box's rows, left of every column
+    for b in range(9):
+        top, bottom = _at_most(boxes[b, 1], rows), _at_most(boxes[b, 3], rows)
+        for x in range(columns + 1):
+            energy[b, x] = ink[bottom, x] - ink[top, x]
+            clear[b, x] = (bottom - top) * x if whole else seen[bottom, x] - seen[top, x]
     levels, areas = np.zeros(9), np.zeros(9)
     for k in range(len(out)):
         for b in range(9):
             left, right = _at_most(k * stride + boxes[b, 0], columns), _at_most(k * stride + boxes[b, 2], columns)
-            top, bottom = _at_most(boxes[b, 1], rows), _at_most(boxes[b, 3], rows)
-            area = float((right - left) * (bottom - top))
-            if not whole:
-                area = seen[bottom, right] - seen[top, right] - seen[bottom, left] + seen[top, left]
-            if area < 1.0:
-                levels[b], areas[b] = 0.0, 0.0
-                continue
-            levels[b] = (ink[bottom, right] - ink[top, right] - ink[bottom, left] + ink[top, left]) / area
-            areas[b] = area
+            area = clear[b, right] - clear[b, left]
+            areas[b] = area if area >= 1.0 else 0.0
+            levels[b] = (energy[b, right] - energy[b, left]) / area if area >= 1.0 else 0.0
         loops = areas[7] * levels[7] * levels[7] + areas[8] * levels[8] * levels[8]
         out[k] = cell_worth(levels, areas, loops, lit)
 

@@ -24,6 +24,7 @@ LEAST_GAP = 0.08  # between neighbours' uprights over the digit height: closer o
 COARSE = 20.0  # a digit is this many places high in the coarse search
 LEAST_WEIGHT = 0.15  # share of a segment seen below which it says nothing
 MOST_CELLS = 64
+BEYOND = (0.14, 0.34)  # of the digit height, above and below it: an upright that goes on there belongs to a frame
 
 #: Middle of every segment's axis in a cell of unit width and height, y down; the first row is x, the second y.
 MIDDLES = np.array([[0.5, 1.0, 1.0, 0.5, 0.0, 0.0, 0.5], [0.0, 0.25, 0.75, 1.0, 0.75, 0.25, 0.5]])
@@ -49,9 +50,10 @@ def cell_worth(levels: Array, areas: Array, loops: float, lit: Array) -> float: 
 
 
 @njit(cache=True)
-def _boxes(top: float, height: float, width: float) -> Array:  # pragma: no cover
-    """(9, 4) left, top, right, bottom of the seven segments and the two loops of a cell whose left upright is at column 0."""
-    boxes = np.empty((9, 4))
+def cell_boxes(top: float, height: float, width: float) -> Array:  # pragma: no cover
+    """(13, 4) left, top, right, bottom of parts of a cell whose left upright is at column 0: its seven segments, its two
+    loops, and what is above and below the left and the right uprights."""
+    boxes = np.empty((13, 4))
     s, half = STROKE * height, height / 2
     for k in range(7):
         x, y = MIDDLES[0, k] * width + 0.5, top + MIDDLES[1, k] * height + 0.5
@@ -60,6 +62,10 @@ def _boxes(top: float, height: float, width: float) -> Array:  # pragma: no cove
     for k in range(2):
         x, y = 0.5 * width + 0.5, top + (0.25 + 0.5 * k) * height + 0.5
         boxes[7 + k] = np.array([x - LOOP * width, y - LOOP * half, x + LOOP * width, y + LOOP * half])
+        x, y = k * width + 0.5, top + 0.5
+        boxes[9 + 2 * k] = np.array([x - 1.5 * s, y - BEYOND[1] * height, x + 1.5 * s, y - BEYOND[0] * height])
+        y += height
+        boxes[10 + 2 * k] = np.array([x - 1.5 * s, y + BEYOND[0] * height, x + 1.5 * s, y + BEYOND[1] * height])
     return boxes
 
 
@@ -81,22 +87,24 @@ def worth_along(
         out: filled.
     """
     rows, columns = ink.shape[0] - 1, ink.shape[1] - 1
-    boxes = _boxes(place[0], place[1], place[2])
-    energy, clear = np.empty((9, columns + 1)), np.empty((9, columns + 1))  # of a box's rows, left of every column
-    for b in range(9):
+    boxes = cell_boxes(place[0], place[1], place[2])
+    energy, clear = np.empty((13, columns + 1)), np.empty((13, columns + 1))  # of a box's rows, left of every column
+    for b in range(13):
         top, bottom = _at_most(boxes[b, 1], rows), _at_most(boxes[b, 3], rows)
         for x in range(columns + 1):
             energy[b, x] = ink[bottom, x] - ink[top, x]
             clear[b, x] = (bottom - top) * x if whole else seen[bottom, x] - seen[top, x]
-    levels, areas = np.zeros(9), np.zeros(9)
+    levels, areas = np.zeros(13), np.zeros(13)
     for k in range(len(out)):
-        for b in range(9):
+        for b in range(13):
             left, right = _at_most(k * stride + boxes[b, 0], columns), _at_most(k * stride + boxes[b, 2], columns)
             area = clear[b, right] - clear[b, left]
             areas[b] = area if area >= 1.0 else 0.0
             levels[b] = (energy[b, right] - energy[b, left]) / area if area >= 1.0 else 0.0
-        loops = areas[7] * levels[7] * levels[7] + areas[8] * levels[8] * levels[8]
-        out[k] = cell_worth(levels, areas, loops, lit)
+        rest = areas[7] * levels[7] * levels[7] + areas[8] * levels[8] * levels[8]
+        for b in (9, 11):  # as much as its upright is worth
+            rest += 2.0 * areas[1] * min(levels[b], levels[b + 1]) ** 2 / LEFT_OVER
+        out[k] = cell_worth(levels, areas, rest, lit)
 
 
 @njit(cache=True)

@@ -8,7 +8,7 @@ equally likely there is no answer.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -23,7 +23,7 @@ from perception.vision.status.comb import Comb, find_combs
 from perception.vision.status.comb_jit import Float32, apartness
 from perception.vision.status.glyphs import LIT, NAMES, Number, likelihoods, numbers, separate
 from perception.vision.status.ink import segment_ink, without_border
-from perception.vision.status.levels import loop_levels, segment_levels
+from perception.vision.status.levels import loop_levels, segment_levels, without_frames
 from perception.vision.status.point import Point, find_point
 from perception.vision.view import Array
 
@@ -104,17 +104,27 @@ def _decoded(gray: Image, is_dark: bool, hidden: NDArray[np.bool_] | None, digit
     ink, seen = segment_ink(gray, is_dark, hidden)
     ink = without_border(ink)
     combs = find_combs(ink, seen, most=digits or 8, free=KNOWN_FREE if digits else FREE)
-    return next((d for _, comb in combs if (d := decode(ink, seen, comb)) is not None), None)
+    return next((d for _, comb in combs if (d := decode(ink, seen, comb, all_cells=digits is not None))), None)
 
 
-def decode(ink: Float32, seen: Float32, comb: Comb) -> Decoded | None:
-    """What a comb may show; None when lit and unlit do not separate."""
-    levels = separate(*segment_levels(ink, seen, comb), *loop_levels(ink, seen, comb))
+def decode(ink: Float32, seen: Float32, comb: Comb, *, all_cells: bool = False) -> Decoded | None:
+    """What a comb may show; None when lit and unlit do not separate.
+
+    Args:
+        all_cells: the comb's last cell is the display's; else blank ones at its end are no part of it.
+    """
+    segments, shares = segment_levels(ink, seen, comb)
+    levels = separate(without_frames(ink, comb, segments), shares, *loop_levels(ink, seen, comb))
     if levels is None:
         return None
-    listed = numbers(*likelihoods(levels))
+    characters, blank = likelihoods(levels)
+    count = comb.count
+    while not all_cells and count > 1 and blank[count - 1] > characters[count - 1].max():
+        count -= 1
+    comb = replace(comb, count=count)
+    listed = numbers(characters[:count], blank[:count])
     shown = np.array([_lit(c) for c in listed[0].characters])
-    lit_levels = np.where(shown, levels.ink, 0.0)
+    lit_levels = np.where(shown, levels.ink[:count], 0.0)
     explained = _explained(ink, comb, lit_levels)
     return Decoded(ink=ink, seen=seen, listed=listed, explained=explained, comb=comb, lit_levels=lit_levels)
 

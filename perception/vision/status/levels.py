@@ -6,11 +6,12 @@ import numpy as np
 from numba import njit
 
 from perception.vision.status.comb import AXES, Comb
-from perception.vision.status.comb_jit import INNER, STROKE, Float32
+from perception.vision.status.comb_jit import BEYOND, INNER, STROKE, Float32
 from perception.vision.view import Array
 
 PARTS = 5  # places along a segment's axis
 CLEAR = 0.6  # of a pixel seen
+FRAME_LEVEL = 0.5  # of an upright's level, above and below it: it is a frame's side
 LEAST_LOOP_PLACES = 6
 LOOP_X = np.linspace(0.36, 0.64, 3)
 LOOP_Y = np.array([0.2, 0.25, 0.3, 0.7, 0.75, 0.8])
@@ -24,6 +25,16 @@ def segment_levels(ink: Float32, seen: Float32, comb: Comb) -> tuple[Array, Arra
 def loop_levels(ink: Float32, seen: Float32, comb: Comb) -> tuple[Array, Array]:
     """(cells,) mean and standard deviation of the ink inside the loops of every cell, where no segment is; NaN unseen."""
     return _loops(ink, seen, comb.numbers, comb.count, LOOP_X, LOOP_Y)
+
+
+def without_frames(ink: Float32, comb: Comb, levels: Array) -> Array:
+    """(cells, 7) levels with those uprights taken away that go on above and below the digit: a frame's side, no segment."""
+    beyond = _beyond(ink, comb.numbers, comb.count)
+    out = levels.copy()
+    for side, (upper, lower) in enumerate(((5, 4), (1, 2))):
+        drop = beyond[:, side] > FRAME_LEVEL * np.maximum(levels[:, upper], levels[:, lower])
+        out[:, [upper, lower]] = np.where(drop[:, None], 0.0, out[:, [upper, lower]])
+    return out
 
 
 @njit(cache=True)
@@ -97,3 +108,23 @@ def _loops(
             means[cell] = total / n
             spreads[cell] = np.sqrt(max(squares / n - (total / n) ** 2, 0.0))
     return means, spreads
+
+
+@njit(cache=True)
+def _beyond(ink: Float32, comb: Array, count: int) -> Array:  # pragma: no cover
+    """(cells, 2) least ink of the places above and below the left and the right uprights, each the best across."""
+    left, pitch, width, top, bottom, slant = comb
+    height = bottom - top
+    found = np.zeros((count, 2))
+    for cell in range(count):
+        for side in range(2):
+            least = np.inf
+            for y in (-BEYOND[1], -BEYOND[0], 1.0 + BEYOND[0], 1.0 + BEYOND[1]):
+                v = top + y * height
+                u = left + cell * pitch + side * width + slant * ((top + bottom) / 2 - v)
+                strongest = 0.0
+                for across in range(-2, 3):
+                    strongest = max(strongest, _value(ink, u + 0.8 * STROKE * height * across, v))
+                least = min(least, strongest)
+            found[cell, side] = least
+    return found

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hal.panel import Slider
+from perception.vision.image import WHITE_LEVEL
 from perception.vision.outline import footprint_m
 from perception.vision.patch import Patch, sample_at
 from perception.vision.reading import Status, gated, probability, refused
@@ -14,7 +17,11 @@ from perception.vision.status.choice import contrast_noise
 from perception.vision.status.cover import covered
 from perception.vision.view import Array
 
-SIDE = (0.22, 0.32, 0.40)  # of the cap's width: beyond the slot, inside the cap
+SLOT = 0.2  # of the cap's width: half of the slot and what blurs it
+EDGE_BOX = 0.22  # of the cap's length: a line across its middle is further from its edges
+LEAST_OPEN = 0.4  # of a box that must not be covered
+SLACK = 0.12  # of the cap's length: by how much a cap may differ from its drawing
+SIDES = np.linspace(-0.40, 0.40, 17)  # of the cap's width: inside the cap
 
 
 def read_slider(patch: Patch, spec: Slider) -> Status:
@@ -23,52 +30,27 @@ def read_slider(patch: Patch, spec: Slider) -> Status:
     lo, hi = sorted((spec.scale.at_min, spec.scale.at_max))
     step = 1.0 / patch.px_per_m
     s = np.arange(lo - along, hi + along, step)
-    left, right = (_profile(patch, spec.angle_rad, s, side * across * np.array(SIDE)) for side in (-1.0, 1.0))
+    left, right = (_profile(patch, spec.angle_rad, s, side) for side in _beside_slot(patch, spec))
     seen = float(np.mean([patch.seen(*_place(spec.angle_rad, s, np.array([o * across]))) for o in (-0.3, 0.3)]))
-    if (
-        float(
-            np.mean(sample_at(patch.inside.astype(np.uint8), *patch.pixel_of(*_place(spec.angle_rad, s, np.zeros(1)))))
-        )
-        < 0.97
-    ):
+    u, v = patch.pixel_of(*_place(spec.angle_rad, s, np.zeros(1)))
+    if float(np.mean(sample_at(patch.inside.astype(np.uint8), u, v))) < 0.97:
         return refused("part of the track is outside the image: move the camera", unit=spec.scale.unit)
-    if seen < 0.4:
-        return refused(
-            "the slider cannot be seen (glare, shadow or cover): change the angle or the light", unit=spec.scale.unit
-        )
-    footprint = footprint_m(spec)
     lean_m = _base_shift_m(patch, spec)  # the foot of the cap shows on that side of its top
-    width = max(3, round((along + abs(lean_m)) / step))
-    kernel = np.ones(width) / width
-    # The cap stands out and may lean over the footprint: look for what comes in from further away.
-    lean_px = float(np.linalg.norm(patch.parallax_px_per_m)) * spec.cap_size_m[2]
-    room_m = 0.004 + lean_px / patch.px_per_m
-    cover = covered(patch, half_width_m=footprint[0] + room_m, half_height_m=footprint[1] + room_m, is_round=False)
-    open_ = np.ones_like(s) if cover is None else _open(patch, cover, spec.angle_rad, s, 0.4 * across)
-    if _is_cap(np.minimum(left, right), s, open_, along + abs(lean_m)):
-        open_ = np.ones_like(s)
-    best, best_profile = (-1.0, 0, np.zeros_like(s)), np.zeros_like(s)
-    for is_dark in (True, False):
-        both = np.minimum(_hat(left, width, is_dark), _hat(right, width, is_dark)) * open_
-        both = _closed(both, 0.45 * along / step)  # a cap may carry a line across its middle
-        score = np.convolve(both, kernel, "same")
-        score[(s - lean_m / 2 < lo - 2 * step) | (s - lean_m / 2 > hi + 2 * step)] = 0.0
-        top = int(score.argmax())
-        if score[top] > best[0]:
-            best, best_profile = (float(score[top]), top, score), both
-    peak, top, score = best
+    open_ = _uncovered(patch, spec, s, np.minimum(left, right), lean_m)
+    found = _best_pair(left, right, s, open_, along_m=along, lean_m=lean_m, limits_m=(lo, hi))
     noise = contrast_noise(patch)
-    apart = np.abs(s - s[top]) > 1.2 * along
-    rival = float(score[apart].max()) if apart.any() else 0.0
-    if peak < 2.0 * noise:
-        return refused("no cap stands out on the track: come closer or add light", unit=spec.scale.unit)
-    place = float(np.clip(_cap_middle(best_profile, top, s, along_m=along, lean_m=lean_m), lo, hi))
+    if found.peak < 2.0 * noise:
+        if seen < 0.4:
+            reason = "the slider cannot be seen (glare, shadow or cover): change the angle or the light"
+        else:
+            reason = "no cap stands out on the track: come closer or add light"
+        return refused(reason, unit=spec.scale.unit)
+    place = float(np.clip(found.place_m, lo, hi))
     slope = abs(spec.scale.value_at(place + 1e-4) - spec.scale.value_at(place - 1e-4)) / 2e-4
     confidence = probability(
         [
-            (np.log(peak / noise), np.log(3.0), 0.3),
-            (np.log((rival + noise) / (peak + noise)), np.log(0.7), -0.12),
-            (seen, 0.55, 0.1),
+            (np.log(found.peak / noise), np.log(3.0), 0.3),
+            (np.log((found.rival + noise) / (found.peak + noise)), np.log(0.7), -0.12),
         ]
     )
     return gated(
@@ -79,6 +61,108 @@ def read_slider(patch: Patch, spec: Slider) -> Status:
             confidence=confidence,
         )
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Cap:
+    """Where the middle of the cap's top is, m along the track, and the contrast of its weaker edge and of its best rival."""
+
+    place_m: float
+    peak: float
+    rival: float
+
+
+def _best_pair(
+    left: Array, right: Array, s: Array, open_: Array, *, along_m: float, lean_m: float, limits_m: tuple[float, float]
+) -> _Cap:
+    """The pair of opposite edges as far apart as the cap is long; what lies between them (a line, a shine) is free.
+
+    Every edge counts with the weaker of the two sides of the slot, and the pair with its weaker edge: a tick or a label
+    is on one side, glare and shadow have one edge.
+    """
+    step = float(s[1] - s[0])
+    low_shift, high_shift = along_m / 2 - min(lean_m, 0.0), along_m / 2 + max(lean_m, 0.0)
+    box, slack = EDGE_BOX * along_m / step, SLACK * along_m / step
+    falls = np.stack([_fall(side, open_, box) for side in (left, right)])
+    hidden = np.isnan(falls[0])
+    white = np.stack([_near((side >= WHITE_LEVEL).astype(float), box) for side in (left, right)])
+    off = (s < limits_m[0] - SLACK * along_m) | (s > limits_m[1] + SLACK * along_m)
+    sides: list[tuple[Array, Array, Array, Array]] = []
+    for sign in (1.0, -1.0):
+        into, out = (_both_sides(np.maximum(k * np.nan_to_num(falls), 0.0), white) for k in (sign, -sign))
+        at_low, at_high = (
+            np.interp(s + shift, s, _near(edge, slack)) for edge, shift in ((into, -low_shift), (out, high_shift))
+        )
+        no_low, no_high = (np.interp(s + shift, s, hidden) > 0.5 for shift in (-low_shift, high_shift))
+        score = np.where(off | no_low | no_high, 0.0, np.minimum(at_low, at_high))
+        # What has one of its edges under a cable may be the cap as well: it is a rival with all that can be seen of it.
+        perhaps = np.where(no_low, np.where(no_high, 0.0, at_high), np.where(no_high, at_low, score))
+        sides.append((score, np.where(off, 0.0, perhaps), into, out))
+    (score, perhaps, into, out), other = sorted(sides, key=lambda side: -float(side[0].max()))
+    top = int(score.argmax())
+    if score[top] <= 0:
+        return _Cap(place_m=0.0, peak=0.0, rival=0.0)
+    apart = np.abs(s - s[top]) > 0.4 * along_m
+    low = _crest(s, into, float(s[top]) - low_shift, SLACK * along_m)
+    high = _crest(s, out, float(s[top]) + high_shift, SLACK * along_m)
+    place = (low + high - lean_m) / 2
+    if abs(lean_m) >= 0.1 * along_m:  # only one edge is the top's, the other is the foot's
+        place = low + along_m / 2 if lean_m > 0 else high - along_m / 2
+    rival = max(float(perhaps[apart].max(initial=0.0)), float(other[1].max()))
+    return _Cap(place_m=place, peak=float(score[top]), rival=rival)
+
+
+def _fall(profile: Array, open_: Array, box: float) -> Array:
+    """By how much the gray falls at every place: mean over a box before less mean over a box behind, NaN if covered."""
+    n = max(2, round(box))
+    weight, gray = np.pad(open_, n, mode="edge"), np.pad(profile, n, mode="edge")
+    count, total = (np.concatenate([[0.0], np.cumsum(x)]) for x in (weight, weight * gray))
+    at = np.arange(len(profile)) + n
+    before, behind = count[at] - count[at - n], count[at + n] - count[at]
+    seen = np.minimum(before, behind) >= LEAST_OPEN * n
+    means = [
+        part / np.maximum(k, 1.0)
+        for part, k in ((total[at] - total[at - n], before), (total[at + n] - total[at], behind))
+    ]
+    return np.asarray(np.where(seen, means[0] - means[1], np.nan))
+
+
+def _near(profile: Array, reach: float) -> Array:
+    """Largest value within `reach` samples."""
+    kernel = np.ones((1, 2 * max(1, round(reach)) + 1), np.uint8)
+    return np.asarray(cv2.dilate(np.asarray(profile, np.float32)[None], kernel)[0], float)
+
+
+def _both_sides(edges: Array, white: Array) -> Array:
+    """(N,) the weaker of the two sides' edges; beside saturation an edge is weaker than it is, and the other side tells."""
+    weaker = edges.min(axis=0)
+    blind = white > 0
+    return np.asarray(np.where(blind[0] != blind[1], np.where(blind[0], edges[1], edges[0]), weaker))
+
+
+def _crest(s: Array, edge: Array, at_m: float, reach_m: float) -> float:
+    """Where an edge signal has its crest within reach of a place, m."""
+    near = np.flatnonzero(np.abs(s - at_m) <= reach_m + (s[1] - s[0]))
+    k = int(near[edge[near].argmax()])
+    if not 0 < k < len(s) - 1:
+        return float(s[k])
+    bend = edge[k - 1] - 2 * edge[k] + edge[k + 1]
+    offset = 0.5 * (edge[k - 1] - edge[k + 1]) / bend if bend < 0 else 0.0
+    return float(s[k] + np.clip(offset, -0.5, 0.5) * (s[1] - s[0]))
+
+
+def _uncovered(patch: Patch, spec: Slider, s: Array, profile: Array, lean_m: float) -> Array:
+    """1 where nothing lies across the track, else 0."""
+    # The cap stands out and may lean over the footprint: look for what comes in from further away.
+    lean_px = float(np.linalg.norm(patch.parallax_px_per_m)) * spec.cap_size_m[2]
+    room_m = 0.004 + lean_px / patch.px_per_m
+    width, height, _ = footprint_m(spec)
+    cover = covered(patch, half_width_m=width + room_m, half_height_m=height + room_m, is_round=False)
+    if cover is None:
+        return np.ones_like(s)
+    open_ = _open(patch, cover, spec.angle_rad, s, 0.4 * spec.cap_size_m[1])
+    is_cap = _is_cap(profile, s, open_, spec.cap_size_m[0] + abs(lean_m))
+    return np.ones_like(s) if is_cap else open_
 
 
 def _is_cap(profile: Array, s: Array, open_: Array, width_m: float) -> bool:
@@ -101,15 +185,6 @@ def _is_cap(profile: Array, s: Array, open_: Array, width_m: float) -> bool:
     return abs(length_m - width_m) < 0.3 * width_m
 
 
-def _hat(profile: Array, width: int, is_dark: bool) -> Array:
-    """What is narrower than twice the cap stands out; glare and shadow do not."""
-    size = round(2.6 * width) | 1
-    padded = np.pad(profile, size, mode="edge").astype(np.float32)[None]
-    operation = cv2.MORPH_BLACKHAT if is_dark else cv2.MORPH_TOPHAT
-    hat = cv2.morphologyEx(padded, operation, np.ones((1, size), np.uint8))[0, size:-size]
-    return np.asarray(np.maximum(hat - np.median(hat), 0.0), float)
-
-
 def _closed(profile: Array, width: float) -> Array:
     kernel = np.ones((1, max(3, round(width)) | 1), np.uint8)
     return np.asarray(cv2.morphologyEx(profile.astype(np.float32)[None], cv2.MORPH_CLOSE, kernel)[0], float)
@@ -127,6 +202,21 @@ def _base_shift_m(patch: Patch, spec: Slider) -> float:
     return float(u * np.cos(spec.angle_rad) - v * np.sin(spec.angle_rad))
 
 
+def _beside_slot(patch: Patch, spec: Slider) -> tuple[Array, Array]:
+    """Distances across the track, m, at which the cap is looked for: inside the cap, not on the slot as it appears.
+
+    The slot lies deeper than the cap's top, so from aside it shows beside the track's middle.
+    """
+    across = spec.cap_size_m[1]
+    u, v = -patch.parallax_px_per_m * spec.cap_size_m[2] / patch.px_per_m
+    slot = -float(u * np.sin(spec.angle_rad) + v * np.cos(spec.angle_rad))
+    free = SIDES[np.abs(SIDES * across - slot) >= SLOT * across] * across
+    left, right = free[free < slot], free[free >= slot]
+    if min(len(left), len(right)) >= 3:
+        return left, right
+    return free[: len(free) // 2], free[len(free) // 2 :]
+
+
 def _place(angle_rad: float, s: Array, across: Array) -> tuple[Array, Array]:
     c, n = np.cos(angle_rad), np.sin(angle_rad)
     return s[:, None] * c - across * n, s[:, None] * n + across * c
@@ -134,30 +224,3 @@ def _place(angle_rad: float, s: Array, across: Array) -> tuple[Array, Array]:
 
 def _profile(patch: Patch, angle_rad: float, s: Array, across: Array) -> Array:
     return np.asarray(patch.sample(*_place(angle_rad, s, across)).mean(axis=1), float)
-
-
-def _cap_middle(profile: Array, top: int, s: Array, *, along_m: float, lean_m: float) -> float:
-    """Middle of the cap's top from the edges of what stands out.
-
-    Where the cap leans towards one side its wall shows there, in its own gray: then only the other edge is the top's.
-    """
-    near = slice(max(0, top - 2), top + 3)
-    half = 0.5 * float(np.median(profile[near]) or profile[top])
-    first, last = top, top
-    while first > 0 and profile[first - 1] > half:
-        first -= 1
-    while last < len(profile) - 1 and profile[last + 1] > half:
-        last += 1
-    low = s[first] - _part(profile, first, first - 1, half) * (s[1] - s[0])
-    high = s[last] + _part(profile, last, last + 1, half) * (s[1] - s[0])
-    if abs(lean_m) < 0.1 * along_m:
-        return float((low + high - lean_m) / 2)
-    return float(low + along_m / 2 if lean_m > 0 else high - along_m / 2)
-
-
-def _part(profile: Array, inside: int, outside: int, level: float) -> float:
-    """How far between two samples the profile crosses a level."""
-    if not 0 <= outside < len(profile):
-        return 0.0
-    drop = profile[inside] - profile[outside]
-    return float(np.clip((profile[inside] - level) / drop, 0.0, 1.0)) if drop > 0 else 0.5

@@ -143,7 +143,9 @@ def patch_of(image: Image, gray: Image, view: View, spec: PanelObject, shift_px:
     margin = LAMP_MARGIN if spec.kind in ("lamp", "button") else MARGIN
     plane = 0.0 if spec.kind == "toggle" else height
     # What stands out appears beside its foot: the patch must hold both.
-    side = (0.012 if spec.kind == "slider" else 0.003) + (_lean_m(view, spec, height) if spec.kind == "toggle" else 0.0)
+    side = 0.012 if spec.kind == "slider" else 0.003
+    if spec.kind == "toggle":  # and the plate beyond its tip, where it must have ended
+        side += _lean_m(view, spec, height) + 2.0 * spec.bat_radius_m
     return rectify(
         image,
         view,
@@ -160,7 +162,7 @@ def _lean_m(view: View, spec: PanelObject, height_m: float) -> float:
     """How far beside its foot a point at that height appears, in metres on the plate."""
     x, y = spec.position_m
     px = view.project([[x, y, 0.0], [x, y, height_m], [x + 0.01, y, 0.0], [x, y + 0.01, 0.0]])
-    scale = 0.5 * float(np.linalg.norm(px[2] - px[0]) + np.linalg.norm(px[3] - px[0])) / 0.01
+    scale = min(float(np.linalg.norm(px[2] - px[0])), float(np.linalg.norm(px[3] - px[0]))) / 0.01
     return float(np.linalg.norm(px[1] - px[0])) / max(scale, 1e-9)
 
 

@@ -12,21 +12,16 @@ from perception.vision.status.choice import choose, contrast_noise
 
 BAT_FROM, BAT_TO = 0.62, 0.95  # of the length: the nut around the foot looks like a bar too
 BRIGHT_ODDS = 2.0  # bats are metal or white far more often than darker than their base
+BEYOND = (1.5, 3.0)  # of the bat's radius past its tip: clear of its round end
+BEHIND = (0.8, 1.7)  # of it behind the foot: still before the nut
+GOES_ON = 3.0  # how much what goes on counts: it may stand out less there
 PIVOT_M = 0.004  # a bat turns about a point that far above the plate
 
 
 def read_toggle(patch: Patch, spec: Toggle) -> Status:
     """State of a toggle switch. `patch` shows the plate (or any plane: heights are followed)."""
-    reach, height = spec.bat_length_m * np.sin(spec.tilt_rad), spec.bat_length_m * np.cos(spec.tilt_rad)
-    contrast = bar_contrast(
-        patch,
-        np.array([0.0, np.pi]),
-        along_m=(BAT_FROM * reach, BAT_TO * reach),
-        half_width_m=0.8 * spec.bat_radius_m,
-        quantile=0.5,
-        height_m=(PIVOT_M + BAT_FROM * height, PIVOT_M + BAT_TO * height),
-        flank=(1.6, 1.9),
-    )
+    reach = spec.bat_length_m * np.sin(spec.tilt_rad)
+    contrast = np.array([_bat(patch, spec, angle) for angle in (0.0, np.pi)])
     y = np.linspace(-1, 1, 12)[:, None] * reach
     seen = patch.seen(np.array([-1.0, 0.0, 1.0]) * spec.bat_radius_m + 0 * y, y + np.zeros(3))
     # A bat has one colour: what is dark on one side and bright on the other is the rest of the switch.
@@ -34,3 +29,40 @@ def read_toggle(patch: Patch, spec: Toggle) -> Status:
         (np.maximum(contrast, 0.0), BRIGHT_ODDS), (np.maximum(-contrast, 0.0), 1.0), key=lambda e: e[0].max() * e[1]
     )
     return choose(["on", "off"], evidence[0], noise=contrast_noise(patch), seen=seen, what="bat")
+
+
+def _bat(patch: Patch, spec: Toggle, angle_rad: float) -> float:
+    """Signed contrast of a bat that leans towards an angle, less what goes on beyond its tip or behind its foot.
+
+    A bat ends there. A cable does not, nor does the bat in its other position where the view runs along both.
+    """
+    reach, height = spec.bat_length_m * np.sin(spec.tilt_rad), spec.bat_length_m * np.cos(spec.tilt_rad)
+
+    def stretch(first: float, last: float) -> float:
+        return float(
+            bar_contrast(
+                patch,
+                angle_rad,
+                along_m=(first * reach, last * reach),
+                half_width_m=0.8 * spec.bat_radius_m,
+                quantile=0.5,
+                height_m=(PIVOT_M + first * height, PIVOT_M + last * height),
+                flank=(1.6, 1.9),
+            )[0]
+        )
+
+    bat = stretch(BAT_FROM, BAT_TO)
+    foot, tip = (
+        np.array(patch.pixel_of(k * reach * np.sin(angle_rad), k * reach * np.cos(angle_rad), PIVOT_M + k * height))
+        for k in (0.0, 1.0)
+    )
+    radii = (
+        spec.bat_radius_m * patch.px_per_m / max(float(np.linalg.norm(tip - foot)), 1e-9)
+    )  # of the bat as it appears
+    if radii > 1.0:
+        return bat  # seen from its tip: it has no length
+    beyond, behind = (
+        stretch(1.0 + BEYOND[0] * radii, 1.0 + BEYOND[1] * radii), stretch(-BEHIND[1] * radii, -BEHIND[0] * radii),
+    )  # fmt: skip
+    goes_on = max(beyond, 0.0) if bat > 0 else max(-beyond, -behind, 0.0)  # behind a bright bat its nut may shine
+    return float(np.sign(bat) * max(abs(bat) - GOES_ON * goes_on, 0.0))

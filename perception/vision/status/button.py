@@ -11,6 +11,7 @@ from perception.vision.status.press import cap_height, one_sided_shade, sheen
 
 SHADE_HALF, SHADE_SCALE = 0.06, 0.015  # a flush cap stays below 0.05, one that stands out reaches 0.1
 MODEL_SHARE = 0.25
+UNSEEN = "the button cannot be seen (glare, shadow or cover): change the angle or the light"
 SHEEN_HALF, SHEEN_SCALE = 0.08, 0.03
 
 
@@ -24,12 +25,13 @@ def read_cap(patch: Patch, spec: Button | Mushroom) -> Status:
     R = spec.radius_m
     a = np.linspace(0, 2 * np.pi, 24)
     seen = patch.seen(np.outer([0.5, 0.8, 1.0], np.sin(a)) * R, np.outer([0.5, 0.8, 1.0], np.cos(a)) * R)
-    if seen < 0.4:
-        return refused("the button cannot be seen (glare, shadow or cover): change the angle or the light")
-    evidence = _by_height(patch, spec) if patch.growth_per_m > 0 else _by_shade(patch, R)
+    by_height = patch.growth_per_m > 0
+    if seen < 0.4 and not by_height:  # edges show beside saturation, shades do not
+        return refused(UNSEEN)
+    evidence = _by_height(patch, spec) if by_height else _by_shade(patch, R)
     if evidence is None:
-        return refused("the cap's edge cannot be found: come closer or add light")
-    confidence = float(1.0 / (1.0 + np.exp(-abs(evidence)))) * min(1.0, seen + 0.2)
+        return refused(UNSEEN if seen < 0.4 else "the cap's edge cannot be found: come closer or add light")
+    confidence = float(1.0 / (1.0 + np.exp(-abs(evidence)))) * (1.0 if by_height else min(1.0, seen + 0.2))
     if confidence < 0.75:
         return refused(
             "pressed and released look alike from here: look from the side or closer", confidence=2 * confidence - 1

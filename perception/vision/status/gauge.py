@@ -13,15 +13,13 @@ from perception.vision.status.pointer import PointerFit, find_pointer, wrapped
 POINTER_FROM, POINTER_TO = 0.25, 0.60  # share of the radius over which every gauge pointer has ink and no numeral is
 FINE_TO = 0.72
 STOP_RAD = np.deg2rad(6.0)  # a pointer rests that far beyond its scale at most
-UNREADABLE = "the face cannot be seen (glare, shadow or cover): change the angle or the light"
+LEAST_SEEN = 0.25  # share of a face
 
 
 def read_gauge(patch: Patch, spec: Gauge) -> Status:
     """Value of a round gauge. `patch` shows the plane of the face, origin at its middle."""
     R = spec.radius_m
     seen = _seen(patch, R)
-    if seen < 0.25:
-        return refused(UNREADABLE, unit=spec.scale.unit)
     fit = find_pointer(
         patch,
         cover=covered(patch, half_width_m=R, half_height_m=R, is_round=True),
@@ -31,8 +29,15 @@ def read_gauge(patch: Patch, spec: Gauge) -> Status:
         fine_m=(POINTER_FROM * R, FINE_TO * R),
     )
     if fit is None:
-        return refused("no pointer stands out on the face: come closer or add light", unit=spec.scale.unit)
+        return no_pointer(seen, spec.scale.unit)
     return status_of_pointer(fit, spec.scale, seen)
+
+
+def no_pointer(seen: float, unit: str) -> Status:
+    """The refusal of a face without a pointer, by the share of it that can be seen."""
+    if seen < LEAST_SEEN:
+        return refused("the face cannot be seen (glare, shadow or cover): change the angle or the light", unit=unit)
+    return refused("no pointer stands out on the face: come closer or add light", unit=unit)
 
 
 def status_of_pointer(fit: PointerFit, scale: Scale, seen: float) -> Status:
@@ -58,13 +63,16 @@ def status_of_pointer(fit: PointerFit, scale: Scale, seen: float) -> Status:
 
 
 def pointer_confidence(fit: PointerFit, seen: float) -> float:
-    """Confidence of a pointer from contrast, rival, support and visibility."""
+    """Confidence of a pointer from contrast, rival, support and visibility.
+
+    A dark pointer shows on a saturated face as well: what saturation hides is missing from its support.
+    """
     return probability(
         [
             (np.log(fit.strength), np.log(9.0), 0.15),
             (0.55 - fit.rival_ratio, 0.0, 0.03),
             (fit.supported, 0.72, 0.03),
-            (seen, 0.35, 0.08),
+            (1.0 if fit.is_dark else seen, 0.35, 0.08),
             (0.35 - fit.unknown, 0.0, 0.05),
         ]
     )

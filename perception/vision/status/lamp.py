@@ -21,8 +21,8 @@ def read_lamp(patch: Patch, spec: Lamp) -> Status:
         _ring(patch, light, spec.radius_m, r, a) for r in ((0.0, 0.15, 0.3), (0.5, 0.6, 0.7), (1.45, 1.6, 1.75))
     )
     around = float(np.median(plate))
-    if around >= WHITE_LEVEL - 2:
-        return refused("glare covers the lamp: change the angle or the light")
+    if around >= WHITE_LEVEL - 2 and core.mean() >= LIT_RATIO * WHITE_LEVEL:
+        return refused("glare covers the lamp: change the angle or the light")  # a darker lens is unlit all the more
     level = max(around, 8.0)
     brightness = np.log(max(float(core.mean()), 2.0) / level / LIT_RATIO)
     peaked = np.log((float(core.mean()) + 8.0) / (float(np.median(rim)) + 8.0))

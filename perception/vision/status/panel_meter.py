@@ -6,9 +6,9 @@ import numpy as np
 
 from hal.panel import PanelMeter
 from perception.vision.patch import Patch
-from perception.vision.reading import Status, refused
+from perception.vision.reading import Status
 from perception.vision.status.cover import covered
-from perception.vision.status.gauge import STOP_RAD, UNREADABLE, status_of_pointer
+from perception.vision.status.gauge import STOP_RAD, no_pointer, status_of_pointer
 from perception.vision.status.pointer import find_pointer
 
 POINTER_FROM, POINTER_TO = 0.30, 0.85  # share of the needle's length that is in the window, before the ticks begin
@@ -19,8 +19,6 @@ def read_panel_meter(patch: Patch, spec: PanelMeter) -> Status:
     lo, hi = sorted((spec.scale.at_min, spec.scale.at_max))
     pivot = (0.0, -spec.pivot_below_m)
     seen = _seen(patch, spec, lo, hi)
-    if seen < 0.25:
-        return refused(UNREADABLE, unit=spec.scale.unit)
     margin = 1.5 * STOP_RAD
     fit = find_pointer(
         patch,
@@ -33,7 +31,7 @@ def read_panel_meter(patch: Patch, spec: PanelMeter) -> Status:
         width_rad=np.deg2rad(14.0),
     )
     if fit is None:
-        return refused("no pointer stands out on the face: come closer or add light", unit=spec.scale.unit)
+        return no_pointer(seen, spec.scale.unit)
     return status_of_pointer(fit, spec.scale, seen)
 
 

@@ -138,12 +138,13 @@ def ink_along_angle(polar: Float32, width: float, is_dark: bool, *, wraps: bool)
 def _hidden(
     patch: Patch, cover: NDArray[np.bool_] | None, pivot_m: tuple[float, float], radii_m: Array, angles_rad: Array
 ) -> NDArray[np.bool_]:
-    """(radii, angles) what something lies across."""
-    if cover is None:
-        return np.zeros((len(radii_m), len(angles_rad)), bool)
+    """(radii, angles) what something lies across, or what is outside the image."""
     x = pivot_m[0] + radii_m[:, None] * np.sin(angles_rad)
     y = pivot_m[1] + radii_m[:, None] * np.cos(angles_rad)
-    return np.asarray(sample_at(cover.astype(np.uint8), *patch.pixel_of(x, y)) > 0.2)
+    lost = ~patch.inside if cover is None else cover | ~patch.inside
+    if not lost.any():
+        return np.zeros((len(radii_m), len(angles_rad)), bool)
+    return np.asarray(sample_at(lost.astype(np.uint8), *patch.pixel_of(x, y)) > 0.2)
 
 
 def _low_mean(columns: Array, low: float, high: float) -> Array:

@@ -17,6 +17,10 @@ from perception.vision.status.choice import contrast_noise
 from perception.vision.view import Array
 
 EDGE_SIGMA_PX = 0.25  # of one edge point, image px, model error of a rendered or real cap included
+RESOLVED = (
+    1.5  # widths of an edge: a wall that shows narrower than that runs into the face, and its foot cannot be told
+)
+SHARP_PX, PULL = 1.8, 1.0  # edges wider than sharp ones are pulled by their neighbours: the excess times that, px
 PLACE_SIGMA_M = 3e-4  # building tolerance of the cap's place
 RADIUS_SIGMA_M = 1.5e-4
 
@@ -50,7 +54,7 @@ def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, fo
     use = is_face | (foot_m is not None)
     slack = 1.2 / patch.image_px_per_m
     reach = np.where(is_face, outward * (high_m - low_m) / 2, 0.0) + slack
-    offset, found = _edges(patch, radius_m, a, middle, expected, reach)
+    offset, found, width_px = _edges(patch, radius_m, a, middle, expected, reach)
     ok = found & use
     if ok.sum() < 0.4 * use.sum() or (ok & is_face).sum() < 6:
         return None
@@ -58,7 +62,9 @@ def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, fo
         return None  # the foot is not where a cap of this size has it: something else was followed
     J = np.column_stack([np.where(is_face, outward, 0.0), np.sin(a), np.cos(a), np.ones_like(a)])[ok]
     prior = np.diag([1 / (high_m - low_m) ** 2, *[1 / PLACE_SIGMA_M**2] * 2, 1 / RADIUS_SIGMA_M**2])
-    sigma = EDGE_SIGMA_PX / patch.image_px_per_m
+    wall_px = np.abs(expected) * patch.image_px_per_m
+    blurred = (~is_face) & (wall_px < RESOLVED * width_px)
+    sigma = np.where(blurred, np.hypot(EDGE_SIGMA_PX, 0.5 * wall_px), EDGE_SIGMA_PX)[ok] / patch.image_px_per_m
     measured = (offset - expected)[ok]
     solution, N = np.zeros(4), prior
     for _ in range(6):
@@ -66,17 +72,21 @@ def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, fo
         w = 1.0 / (1.0 + (residual / (2 * sigma)) ** 2) / sigma**2 / 3.0  # neighbours share their error
         N = J.T @ (w[:, None] * J) + prior
         solution = np.linalg.solve(N, J.T @ (w * measured))
-    if float(np.median(np.abs(measured - J @ solution))) > 2.0 * sigma:
+    if float(np.median(np.abs(measured - J @ solution) / sigma)) > 2.0:
         return None  # some other edge, a printed ring perhaps, was followed
+    lean = float(np.mean(outward[is_face]))
+    pull_m = PULL * max(width_px - SHARP_PX, 0.0) / patch.image_px_per_m / lean
     return CapHeight(
-        height_m=float(middle + solution[0]), sigma_m=float(np.sqrt(np.linalg.inv(N)[0, 0])), found=float(ok.mean())
+        height_m=float(middle + solution[0]),
+        sigma_m=float(np.hypot(np.sqrt(np.linalg.inv(N)[0, 0]), pull_m)),
+        found=float(ok.mean()),
     )
 
 
 def _edges(
     patch: Patch, radius_m: float, a: Array, z_m: float, expected_m: Array, reach_m: Array
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Radial offset of the strongest edge near each expected offset, and whether it is one."""
+) -> tuple[Array, NDArray[np.bool_], float]:
+    """Radial offset of the strongest edge near each expected offset, whether it is one, and the edges' width, image px."""
     t = np.linspace(-1.0, 1.0, 25)
     r = radius_m + expected_m[:, None] + reach_m[:, None] * t
     values = patch.sample(np.sin(a)[:, None] * r, np.cos(a)[:, None] * r, z_m)
@@ -88,7 +98,9 @@ def _edges(
         & (best < len(t) - 2)
         & (strength > max(2.0 * contrast_noise(patch), 0.3 * float(np.median(strength))))
     )
-    return expected_m + reach_m * t[best], found
+    steps = np.abs(np.diff(values, axis=1)).sum(axis=1)
+    width = steps / np.maximum(strength, 1e-6) / patch.px_per_m * patch.image_px_per_m
+    return expected_m + reach_m * t[best], found, float(np.median(width[found])) if found.any() else np.inf
 
 
 def one_sided_shade(

@@ -7,13 +7,16 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
 from hal.geometry import UncertainPose, transform_rpy
 from hal.strict import Strict, load_toml
 
 Vector3 = tuple[float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
+CORRELATIONS = 15  # of six axes with one another
+ROUNDING = 1e-4  # of correlations that a person or a file has rounded
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,19 +47,41 @@ class ToolLoad:
 
 
 class MountRecord(Strict):
-    """Pose of a device on its parent: fixed-axis roll, pitch, yaw, and one sigma for each of the six axes."""
+    """Pose of a device on its parent: fixed-axis roll, pitch, yaw, and one sigma for each of the six axes.
+
+    `correlations` are those of the six (x, y, z, turns about x, y, z): the lower triangle, row by row, without the
+    diagonal; empty: there are none.
+    """
 
     position_m: Vector3
     rpy_rad: Vector3
     sigma_m: Vector3 = (0.0, 0.0, 0.0)
     sigma_rad: Vector3 = (0.0, 0.0, 0.0)
+    correlations: tuple[float, ...] = ()
+
+    @model_validator(mode="after")
+    def _is_a_covariance(self) -> MountRecord:
+        if len(self.correlations) not in (0, CORRELATIONS):
+            raise ValueError(
+                f"correlations are {CORRELATIONS} numbers, a lower triangle; here are {len(self.correlations)}"
+            )
+        if np.linalg.eigvalsh(self._correlation_matrix())[0] < -ROUNDING:
+            raise ValueError("no six axes can be correlated like this: the matrix has a negative eigenvalue")
+        return self
 
     def pose(self) -> UncertainPose:
         """`parent_from_device` with its covariance."""
         sigma = np.array([*self.sigma_m, *self.sigma_rad])
         return UncertainPose(
-            parent_from_child=transform_rpy(self.position_m, self.rpy_rad), covariance=np.diag(sigma**2)
+            parent_from_child=transform_rpy(self.position_m, self.rpy_rad),
+            covariance=self._correlation_matrix() * np.outer(sigma, sigma),
         )
+
+    def _correlation_matrix(self) -> NDArray[np.float64]:
+        lower = np.zeros((6, 6))
+        if self.correlations:
+            lower[np.tril_indices(6, -1)] = self.correlations
+        return np.eye(6) + lower + lower.T
 
 
 class IntrinsicsRecord(Strict):

@@ -15,11 +15,13 @@ from perception.toml_text import toml_lines
 
 
 def mount_of(parent_from_device: UncertainPose) -> MountRecord:
-    """Position, fixed-axis roll pitch yaw, and one sigma an axis; correlations are not kept by a record."""
-    pose, sigma = parent_from_device.parent_from_child, np.sqrt(np.diag(parent_from_device.covariance))
+    """Position, fixed-axis roll pitch yaw, one sigma an axis and how the axes' errors go together."""
+    pose, covariance = parent_from_device.parent_from_child, parent_from_device.covariance
+    sigma = np.sqrt(np.diag(covariance))
+    correlations = (covariance / np.outer(sigma, sigma))[np.tril_indices(6, -1)] if np.all(sigma > 0) else np.empty(0)
     return MountRecord(
         position_m=_three(pose.translation), rpy_rad=_three(pose.rotation.as_euler("xyz")), sigma_m=_three(sigma[:3]),
-        sigma_rad=_three(sigma[3:]),
+        sigma_rad=_three(sigma[3:]), correlations=tuple(np.round(correlations, 6).tolist()),
     )  # fmt: skip
 
 

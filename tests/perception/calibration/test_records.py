@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
+from pydantic import ValidationError
 
-from hal.calibration import load_calibration
+from hal.calibration import MountRecord, load_calibration
 from hal.geometry import UncertainPose, difference, transform_rpy
 from perception.calibration.hand_eye import calibrate_hand_eye
 from perception.calibration.in_hand import calibrate_in_hand
@@ -23,10 +25,28 @@ from tests.perception.calibration.test_wrench import poses, reading
 
 def test_a_mount_comes_back_with_its_covariance() -> None:
     pose = transform_rpy([0.1, -0.2, 0.3], [0.1, -0.4, 2.0])
-    mount = UncertainPose(parent_from_child=pose, covariance=np.diag([1e-6, 4e-6, 9e-6, 1e-8, 4e-8, 9e-8]))
+    factor = np.diag([1e-3, 2e-3, 3e-3, 1e-4, 2e-4, 3e-4]) @ np.random.default_rng(1).normal(size=(6, 6))
+    mount = UncertainPose(parent_from_child=pose, covariance=factor @ factor.T)
     back = mount_of(mount).pose()
     assert np.abs(difference(pose, back.parent_from_child)).max() < 1e-12
-    np.testing.assert_allclose(back.covariance, mount.covariance)
+    sigma = np.sqrt(np.diag(mount.covariance))
+    np.testing.assert_allclose(back.covariance, mount.covariance, atol=1e-6 * sigma.max() ** 2)
+
+
+def test_an_axis_without_an_error_has_no_correlations() -> None:
+    mount = UncertainPose(
+        parent_from_child=transform_rpy([0.0, 0.0, 0.1], [0.0, 0.0, 0.0]), covariance=np.zeros((6, 6))
+    )
+    assert mount_of(mount).correlations == ()
+    np.testing.assert_array_equal(mount_of(mount).pose().covariance, np.zeros((6, 6)))
+
+
+@pytest.mark.parametrize(
+    ("correlations", "words"), [((0.1, 0.2), "15 numbers"), ((0.9, 0.9, -0.9, *[0.0] * 12), "negative eigenvalue")]
+)
+def test_correlations_that_cannot_be_are_refused(correlations: tuple[float, ...], words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        MountRecord(position_m=(0.0, 0.0, 0.1), rpy_rad=(0.0, 0.0, 0.0), correlations=correlations)
 
 
 def test_every_kind_of_result_is_written_and_read_back(tmp_path: Path) -> None:

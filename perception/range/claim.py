@@ -10,6 +10,7 @@ from perception.range.rays import LOOSE
 from perception.range.surfaces import PLANE, depth_on, normal_on
 
 CLAIM_SIGMAS = 3.5
+PLAIN_SIGMAS = 1.0  # a pixel that its own block's surface explains so well is not offered to the others
 MAX_CANDIDATES = 8
 NO_LABEL = np.int32(2**31 - 1)
 
@@ -48,7 +49,7 @@ def claim_pixels(depth, sen, noise, blocks, size, kinds, ths, out, top, bottom):
                     for u in range(first, end):
                         z = depth[v, u]
                         x = (u - sen[3]) / sen[1]
-                        mine = misfit(kinds[k], ths[k], x, y, z, sigma_at(noise, z), perspective) < CLAIM_SIGMAS
+                        mine = misfit_of(k, kinds, ths, x, y, z, sigma_at(noise, z), perspective) < CLAIM_SIGMAS
                         out[v, u] = k if mine else 0
 
 
@@ -111,18 +112,30 @@ def _claim_block(depth, sen, noise, blocks, size, kinds, ths, out, r, c):  # typ
     for v in range(r * size, min(r * size + size, H)):
         y = (v - sen[4]) / sen[2]
         for u in range(c * size, min(c * size + size, W)):
-            out[v, u] = _best_of(depth[v, u], (u - sen[3]) / sen[1], y, noise, near, n, kinds, ths, perspective)
+            x = (u - sen[3]) / sen[1]
+            out[v, u] = _best_of(depth[v, u], x, y, noise, blocks[r, c], near, n, kinds, ths, perspective)
 
 
 @njit(cache=True, error_model="numpy")
-def _best_of(z, x, y, noise, near, n, kinds, ths, perspective):  # type: ignore[no-untyped-def]
-    """The label among near[:n] whose surface explains the depth best, 0 when none does within `CLAIM_SIGMAS`."""
+def _best_of(z, x, y, noise, own, near, n, kinds, ths, perspective):  # type: ignore[no-untyped-def]
+    """The label among near[:n] whose surface explains the depth best, 0 when none does within `CLAIM_SIGMAS`.
+
+    `own` > 0 is taken without a look at the others when it explains the depth within `PLAIN_SIGMAS`.
+    """
     best, label = CLAIM_SIGMAS, 0
     if not np.isfinite(z):
         return label
     sigma = sigma_at(noise, z)
+    if own > 0:
+        best = min(best, misfit_of(own, kinds, ths, x, y, z, sigma, perspective))
+        if best < CLAIM_SIGMAS:
+            label = own
+        if best < PLAIN_SIGMAS:
+            return label
     for m in range(n):
-        e = misfit(kinds[near[m]], ths[near[m]], x, y, z, sigma, perspective)
+        if near[m] == own:
+            continue
+        e = misfit_of(near[m], kinds, ths, x, y, z, sigma, perspective)
         if e < best:
             best, label = e, near[m]
     return label
@@ -138,38 +151,44 @@ def add_row(labels, least, most):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _contested(own, least, most, out):  # type: ignore[no-untyped-def]
-    """Where the three columns around hold another surface than the pixel's own; the outermost columns are not."""
-    for u in range(1, own.shape[0] - 1):
-        low = min(least[u - 1], least[u], least[u + 1])
-        high = max(most[u - 1], most[u], most[u + 1])
+def contested(own, least, most, out):  # type: ignore[no-untyped-def]
+    """Where the three columns around hold another surface than the pixel's own.
+
+    `least` and `most` are (W + 2,), with a column of no surface before the first and after the last.
+    """
+    for u in range(own.shape[0]):
+        low = min(least[u], least[u + 1], least[u + 2])
+        high = max(most[u], most[u + 1], most[u + 2])
         out[u] = (high != own[u]) | ((own[u] > 0) & (low != own[u]))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def claim_borders(depth, sen, noise, labels, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]
-    """Judge again each pixel whose 3x3 neighbourhood holds another surface; regions gain or lose at most one pixel.
+def claim_borders(depth, sen, noise, labels, newest, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]
+    """Judge again each pixel whose 3x3 neighbourhood holds another surface, and one of label `newest` or later.
 
-    Reads `labels` (H, W), writes rows [top, bottom) of `out` (H, W). The outermost pixels keep their labels, and so do
-    those that have none but their own surface and empty pixels around them: that surface has claimed them already.
+    Reads `labels` (H, W), writes rows [top, bottom) of `out` (H, W). Where earlier surfaces meet they have competed for
+    every pixel already (`claim_pixels`).
     """
     H, W = depth.shape
     perspective = sen[0] > 0
-    near, contested = np.empty(9, np.int32), np.zeros(W, np.bool_)
-    least, most = np.empty(W, np.int32), np.empty(W, np.int32)
+    near, judged = np.empty(9, np.int32), np.empty(W, np.bool_)
+    least, most = np.empty(W + 2, np.int32), np.empty(W + 2, np.int32)
     out[top:bottom] = labels[top:bottom]
-    for v in range(max(1, top), min(H - 1, bottom)):
+    for v in range(top, bottom):
+        first, last = max(v - 1, 0), min(v + 2, H)
         least[:], most[:] = NO_LABEL, 0
-        for i in range(v - 1, v + 2):
-            add_row(labels[i], least, most)
-        _contested(labels[v], least, most, contested)
+        for i in range(first, last):
+            add_row(labels[i], least[1:-1], most[1:-1])
+        if most.max() < newest:
+            continue
+        contested(labels[v], least, most, judged)
         y = (v - sen[4]) / sen[2]
-        for u in range(1, W - 1):
-            if not contested[u] or not np.isfinite(depth[v, u]):
+        for u in range(W):
+            if not judged[u] or max(most[u], most[u + 1], most[u + 2]) < newest:
                 continue
             n = 0
-            for i in range(v - 1, v + 2):
-                for j in range(u - 1, u + 2):
+            for i in range(first, last):
+                for j in range(max(u - 1, 0), min(u + 2, W)):
                     k = labels[i, j]
                     new = k > 0
                     for m in range(n):
@@ -178,7 +197,19 @@ def claim_borders(depth, sen, noise, labels, kinds, ths, out, top, bottom):  # t
                     if new:
                         near[n] = k
                         n += 1
-            out[v, u] = _best_of(depth[v, u], (u - sen[3]) / sen[1], y, noise, near, n, kinds, ths, perspective)
+            out[v, u] = _best_of(depth[v, u], (u - sen[3]) / sen[1], y, noise, 0, near, n, kinds, ths, perspective)
+
+
+@njit(cache=True, error_model="numpy")
+def misfit_of(k, kinds, ths, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]
+    """`misfit` of surface k of a table: planes, which most are, in a line."""
+    if kinds[k] != PLANE:
+        return misfit(kinds[k], ths[k], x, y, z, sigma, perspective)
+    p = 1.0 if perspective else 0.0
+    facing = p * (ths[k, 0] * x + ths[k, 1] * y) + ths[k, 2]
+    if not abs(facing) >= 1e-9:
+        return np.inf
+    return abs(z - (ths[k, 3] - (1.0 - p) * (ths[k, 0] * x + ths[k, 1] * y)) / facing) / sigma
 
 
 @njit(cache=True, error_model="numpy")

@@ -90,9 +90,8 @@ def segment(task: Task, noise: NoiseModel) -> tuple[Labels, Candidates, NoiseMod
     _recover_curved(task, grid, blocks, found, least)
     labels = _claimed(task, noise, blocks, found, size=size)
     if size > 1:
-        labels = reclaimed(task, noise, labels, found, sweeps=1)
         labels = _finer(task, noise, labels, found, size=size // 2)
-    return reclaimed(task, noise, labels, found, sweeps=2), found, noise
+    return labels, found, noise
 
 
 def _settled_planes(task: Task, noise: NoiseModel) -> tuple[Candidates, Grid, Labels, NoiseModel]:
@@ -132,7 +131,7 @@ def _finer(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, 
         return labels
     inside = labels[top : top + left_over.shape[0], left : left + left_over.shape[1]]
     inside[:] = np.where(inside > 0, inside, _claimed(part, noise, blocks, found, size=size))
-    return labels
+    return _reclaimed(task, noise, labels, found, newest=before + 1)
 
 
 def unexplained(
@@ -167,21 +166,14 @@ def _claimed(task: Task, noise: NoiseModel, blocks: Labels, found: Candidates, *
     return labels
 
 
-def reclaimed(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, sweeps: int) -> Labels:
-    """Labels after judging border pixels again `sweeps` times against the surfaces of `found`."""
+def _reclaimed(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, newest: int) -> Labels:
+    """Labels after the pixels beside surfaces of label `newest` and later were judged again."""
     kinds, table = found.arrays()
     packed, law = task.packed, noise.packed()
-    for _ in range(sweeps):
-        labels = _border_sweep(task, (packed, law, kinds, table), labels)
-    return labels
-
-
-def _border_sweep(task: Task, constants: tuple[Array, Array, NDArray[np.int64], Array], before: Labels) -> Labels:
-    packed, law, kinds, table = constants
-    after = np.empty_like(before)
+    after = np.empty_like(labels)
     for_each_tile(
-        lambda top, bottom: claim_borders(task.depth_m, packed, law, before, kinds, table, after, top, bottom),
-        before.shape[0],
+        lambda top, bottom: claim_borders(task.depth_m, packed, law, labels, newest, kinds, table, after, top, bottom),
+        labels.shape[0],
         task.tiles,
         pool=task.pool,
     )

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from perception.range.claim import CLAIM_SIGMAS, NO_LABEL, add_row, misfit
+from perception.range.claim import CLAIM_SIGMAS, NO_LABEL, add_row, contested, misfit_of
 from perception.range.grid import sigma_at
 
 REACH_PX = 2  # neighbours of 5 x 5
@@ -31,24 +31,25 @@ def settle(depth, sen, noise, slow_share, earlier, labels, kinds, ths, out, top,
     H, W = depth.shape
     perspective = sen[0] > 0
     near, votes = np.empty(MOST, np.int32), np.empty(MOST)
-    least, most, change = np.empty(W + 4, np.int32), np.empty(W + 4, np.int32), np.empty(W + 4, np.int32)
+    least, most, change = np.empty(W + 2, np.int32), np.empty(W + 2, np.int32), np.empty(W + 4, np.int32)
     judged = np.empty(W, np.bool_)
     is_first = earlier[0, 0] < 0
     evidence = 0.5 / (1.0 + slow_share * (SHARED_PX - 1.0))
     for v in range(top, bottom):
         y = (v - sen[4]) / sen[2]
         out[v] = labels[v]
-        rows = range(max(0, v - REACH_PX), min(H, v + REACH_PX + 1))
-        if is_first:
-            least[:], most[:] = NO_LABEL, 0
-            for i in rows:
-                add_row(labels[i], least[2:-2], most[2:-2])
-            _contested(labels[v], least, most, judged)
-        else:
+        if not is_first:
             change[:] = 0
-            for i in rows:
+            for i in range(max(0, v - REACH_PX), min(H, v + REACH_PX + 1)):
                 _add_changes(earlier[i], labels[i], change[2:-2])
-            _changed(change, judged)
+            if not change.any():
+                continue
+        least[:], most[:] = NO_LABEL, 0
+        for i in range(max(0, v - 1), min(H, v + 2)):
+            add_row(labels[i], least[1:-1], most[1:-1])
+        contested(labels[v], least, most, judged)
+        if not is_first:
+            _keep_changed(change, judged)
         for u in range(W):
             z = depth[v, u]
             if not judged[u] or not np.isfinite(z):
@@ -77,10 +78,13 @@ def settle(depth, sen, noise, slow_share, earlier, labels, kinds, ths, out, top,
             sigma = sigma_at(noise, z)
             best, label = np.inf, 0
             for m in range(n):
-                e = misfit(kinds[near[m]], ths[near[m]], x, y, z, sigma, perspective)
+                least_cost = NEIGHBOUR_WEIGHT * (1.0 - votes[m] / total)
+                if least_cost >= best:
+                    continue  # not even a perfect fit would win
+                e = misfit_of(near[m], kinds, ths, x, y, z, sigma, perspective)
                 if not e < CLAIM_SIGMAS:
                     continue
-                cost = evidence * e * e + NEIGHBOUR_WEIGHT * (1.0 - votes[m] / total)
+                cost = evidence * e * e + least_cost
                 if cost < best:
                     best, label = cost, near[m]
             if label > 0 or own == 0:
@@ -94,17 +98,7 @@ def _add_changes(earlier, labels, change):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _contested(own, least, most, out):  # type: ignore[no-untyped-def]
-    """Where the five columns around hold another surface than the pixel's own."""
-    for u in range(own.shape[0]):
-        k = own[u]
-        low = min(least[u], least[u + 1], least[u + 2], least[u + 3], least[u + 4])
-        high = max(most[u], most[u + 1], most[u + 2], most[u + 3], most[u + 4])
-        out[u] = (high != k) | ((k > 0) & (low != k))
-
-
-@njit(cache=True, error_model="numpy")
-def _changed(change, out):  # type: ignore[no-untyped-def]
-    """Where a pixel of the five columns around changed."""
-    for u in range(out.shape[0]):
-        out[u] = (change[u] | change[u + 1] | change[u + 2] | change[u + 3] | change[u + 4]) != 0
+def _keep_changed(change, judged):  # type: ignore[no-untyped-def]
+    """Clear `judged` where no pixel of the five columns around changed."""
+    for u in range(judged.shape[0]):
+        judged[u] &= (change[u] | change[u + 1] | change[u + 2] | change[u + 3] | change[u + 4]) != 0

@@ -33,7 +33,8 @@ def settled_label(sensor, depth, labels, v, u):
     patch = labels[top : v + reach + 1, left : u + reach + 1].copy()
     patch[v - top, u - left] = 0
     present, votes = np.unique(patch[patch > 0], return_counts=True)
-    if not np.isfinite(z) or present.size == 0 or present.tolist() == [labels[v, u]]:
+    beside = labels[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2]
+    if not np.isfinite(z) or not set(beside[beside > 0]) - {labels[v, u]}:
         return labels[v, u]
     evidence = 0.5 / (1.0 + SLOW_SHARE * (settle.SHARED_PX - 1.0))
     at = ((u - packed[3]) / packed[1], (v - packed[4]) / packed[2], z, float(NOISE.sigma_m(z)), bool(packed[0] > 0))

@@ -142,7 +142,7 @@ def _tiled_steps(depth: Array, sensor: PinholeSensor, labels: NDArray[np.int32])
         lambda a, b: tangent_planes(x, y, z, count, sigma, True, 1, 5.0 / packed[1], normal, rms, a // 2, b // 2),
         lambda a, b: _scan(mask, linked, linked, parent, a, b),
         lambda a, b: claim_pixels(depth, packed, law, blocks, 2, kinds, table, out, a // 2, b // 2),
-        lambda a, b: claim_borders(depth, packed, law, labels, kinds, table, out, a, b),
+        lambda a, b: claim_borders(depth, packed, law, labels, 1, kinds, table, out, a, b),
     ]
 
 

@@ -157,6 +157,7 @@ def _check_scale(depth: Array, sensor: RangeSensorModel) -> None:
 def _finished(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) -> tuple[Labels, tuple[Surface, ...]]:
     depth, sensor = task.depth_m, task.sensor
     count = len(found.kinds)
+    law, perspective = noise.packed(), bool(sensor.packed()[0] > 0)
     samples = finish.samples_by_label(depth, sensor, noise, labels, count)
     touching = merge.merge_touching(labels, sensor.packed(), found.kinds, found.parameters, samples, noise)
     labels, samples = finish.regrouped(depth, sensor, noise, labels, samples, touching)
@@ -172,7 +173,7 @@ def _finished(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) 
         # What the sensor has bent is named straight, but keeps the bent surface's pixels.
         final.add(kind, th)
         few = finish.thinned(mine, NAMING_SAMPLES)
-        straight, start = bend.straightened(kind, th, few, noise, bool(sensor.packed()[0] > 0))
+        straight, start = bend.straightened(kind, th, few, law, perspective)
         if straight != kind:
             surface, _ = finish.refine_surface(new, straight, start, mine, sensor=sensor, noise=noise)
         surfaces.append(surface)

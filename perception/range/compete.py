@@ -25,6 +25,7 @@ LOCAL_BLOCKS = 45
 LOCAL_TRIES = 5
 FEW_BLOCKS_FOR_QUADRIC = 60
 LEAST_NORMALS = 10
+GIVE_UP = 14.0  # a fit that keeps three quarters within three sigmas leaves 8 at most, once it has converged
 
 
 @dataclass(slots=True, eq=False)
@@ -123,7 +124,7 @@ def _fit_blocks(x, y, z, sigma, normal, perspective, pixels, slow_share, members
     patches = max(count * pixels / SLOW_NOISE_AREA_PX, 1.0)
     correlated = 1.0 + slow_share * max(n / patches - 1.0, 0.0)
     ths, mean2, kept, score = fit.fit_kinds(
-        points, P[:known], N[:known], few[0], few[1], few[2], few[3], perspective, kinds, correlated
+        points, P[:known], N[:known], few[0], few[1], few[2], few[3], perspective, kinds, correlated, GIVE_UP
     )
     best, least = -1, np.inf
     for k in range(5):

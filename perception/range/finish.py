@@ -77,13 +77,10 @@ def regrouped(
     return labels, [old if n == 1 else new for n, old, new in zip(parts.tolist(), samples, joined, strict=True)]
 
 
-def thinned(samples: Samples, most: int) -> Samples:
-    """At most `most` of the samples, evenly spread; the same choice every time."""
-    n = samples.x.size
-    if n <= most:
-        return samples
-    x, y, z, sigma = _picked(samples.x, samples.y, samples.z, samples.sigma, most)
-    return Samples(x=x, y=y, z=z, sigma=sigma)
+def thinned(samples: Samples, most: int) -> Array:
+    """(4, N) x, y, z and sigma of at most `most` of the samples, evenly spread; the same choice every time."""
+    most = min(samples.x.size, most)
+    return np.asarray(picked(samples.x, samples.y, samples.z, samples.sigma, most))
 
 
 def refine_surface(
@@ -121,7 +118,7 @@ def refine_surface(
 
 
 @njit(cache=True)
-def _picked(x, y, z, sigma, most):  # type: ignore[no-untyped-def]
+def picked(x, y, z, sigma, most):  # type: ignore[no-untyped-def]
     """(4, most) evenly spread samples of (N,), the first and the last among them."""
     out = np.empty((4, most))
     step = (x.shape[0] - 1) / max(most - 1, 1)

@@ -5,7 +5,7 @@ the residual is `(z_measured - z_surface) / sigma(z)`. Robust start (Cauchy weig
 at `TRIM_SIGMAS` and plain least squares (Levenberg's damping, Marquardt's scaling).
 """
 
-# ruff: noqa: PLR0912 - the kinds are told apart in one compiled body
+# ruff: noqa: PLR0912, PLR0915 - the kinds are told apart in one compiled body
 from __future__ import annotations
 
 import numpy as np
@@ -167,11 +167,12 @@ def trimmed_cost(kind, th, x, y, z, sigma, perspective, limit, stride):  # type:
 
 
 @njit(cache=True, error_model="numpy")
-def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_samples):  # type: ignore[no-untyped-def]
+def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_samples, give_up):  # type: ignore[no-untyped-def]
     """Fit every kind in the (5,) mask `kinds` to one set of samples, `points` (N, 3).
 
     `P` and `N` (M, 3) are those points that have a tangent plane, and its normal; only starts use them. All starts
-    run a few robust steps on a quarter of the samples; those that may still win are fitted to the end.
+    run a few robust steps on a quarter of the samples; those that may still win are fitted to the end, and none whose
+    squared residuals, each at most `ROUGH_LIMIT` squared, still have a mean beyond `give_up`.
 
     Returns per kind: parameters (5, SIZE), mean squared residual, share kept, and the criterion
     `trimmed cost / correlated_samples + p ln n` by which kinds compete (Schwarz), infinite where a kind does not fit.
@@ -213,7 +214,8 @@ def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_sampl
         rough[k] = trimmed_cost(kind, th, rx, ry, rz, rs, perspective, ROUGH_LIMIT, 1) / correlated_samples
         best_rough = min(best_rough, rough[k])
     # A start that is clearly behind after the rough fit is not going to win.
-    allowed = 2.0 * best_rough + 0.5 * rx.shape[0] / correlated_samples
+    per_sample = rx.shape[0] / correlated_samples
+    allowed = min(2.0 * best_rough + 0.5 * per_sample, give_up * per_sample)
     for k in range(6):
         kind = start_kind[k]
         if kind < 0 or rough[k] > allowed or not kinds[kind]:
@@ -222,7 +224,7 @@ def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_sampl
         s = cost / correlated_samples + FREEDOM[kind] * price
         if s < score[kind] and _is_sane(kind, th):
             ths[kind], mean2[kind], kept[kind], score[kind] = th, m, share, s
-    if kinds[QUADRIC] and start_kind[1] >= 0 and starts[1, 3] < LARGEST_RADIUS_M:
+    if kinds[QUADRIC] and best_rough <= allowed and start_kind[1] >= 0 and starts[1, 3] < LARGEST_RADIUS_M:
         # Nine parameters explain most things: they are tried when nothing simpler does.
         simple = np.min(score)
         if simple > n / correlated_samples * QUADRIC_PER_SAMPLE:

@@ -156,6 +156,13 @@ def sigma_at(noise, z):  # type: ignore[no-untyped-def]
     return np.sqrt(max(white * white, step * step / 12.0) + slow * slow)
 
 
+@njit(cache=True, error_model="numpy")
+def slow_share_at(noise, z):  # type: ignore[no-untyped-def]
+    """Part of the variance at depth z that neighbouring pixels share; `noise` as `NoiseModel.packed`."""
+    slow, sigma = noise[2] + noise[3] * z * z, sigma_at(noise, z)
+    return slow * slow / max(sigma * sigma, 1e-30)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: ignore[no-untyped-def]
     H, W = depth.shape

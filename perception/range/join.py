@@ -6,8 +6,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from perception.range import bend, fit, rays
-from perception.range.finish import FREE, Samples, thinned
+from perception.range import bend, fit
+from perception.range.finish import Samples, thinned
+from perception.range.grid import slow_share_at
 from perception.range.noise import NoiseModel
 from perception.range.surfaces import PLANE, depth_on, depths_on
 
@@ -16,6 +17,8 @@ Array = NDArray[np.float64]
 PAIR_SAMPLES = 150
 JOINED_SHARE = 0.85
 JOINED_MEAN_SQUARE = 1.6
+ROUGH_STRIDE = 5  # of the samples of a first fit
+ROUGH_SHARE = 0.5  # of them must lie near it before all are fitted
 NEAR_SAMPLES = 16
 NEAR_SIGMAS = 20.0
 SCRAP_SHARE = 0.1
@@ -23,6 +26,7 @@ SCRAP_SIGMAS = 6.0
 LARGEST_TURN_RAD = 0.2
 SIGHT_SAMPLES = 40
 BEHIND_SHARE = 0.15  # more of the sight line than this seen behind the surface: a gap, not an occluder
+APART, SCRAP, JOINED = 0, 1, 2
 
 
 def join_pieces(
@@ -41,9 +45,10 @@ def join_pieces(
     owner = list(range(1, len(kinds) + 1))
     if len(kinds) < 2:
         return owner
-    order = sorted(range(len(kinds)), key=lambda k: -samples[k].x.size)
+    pixels = [s.x.size for s in samples]
+    order = sorted((k for k in range(len(kinds)) if pixels[k]), key=lambda k: -pixels[k])
     thin = [thinned(s, PAIR_SAMPLES) for s in samples]
-    perspective = bool(packed[0] > 0)
+    perspective, law = bool(packed[0] > 0), noise.packed()
     near = _nearness(kinds, parameters, samples, perspective)
     for position, big in enumerate(order):
         if owner[big] != big + 1:
@@ -51,81 +56,87 @@ def join_pieces(
         for small in order[position + 1 :]:
             if owner[small] != small + 1 or not near[big, small]:
                 continue
-            if _is_scrap(kinds, parameters, samples, big=big, small=small, noise=noise, perspective=perspective):
-                owner[small] = big + 1
+            large, little = ((kinds[k], parameters[k], thin[k], pixels[k]) for k in (big, small))
+            verdict, joint = related(*large, *little, law, perspective)
+            if verdict == APART:
                 continue
-            joined = _joint_fit(kinds, parameters, thin, big=big, small=small, noise=noise, perspective=perspective)
-            if joined is None or _gap_between(depth_m, packed, (kinds[big], joined), thin[big], thin[small]):
-                continue
+            if verdict == JOINED:
+                if _gap_between(depth_m, packed, (kinds[big], joint), thin[big], thin[small]):
+                    continue
+                parameters[big] = joint
+                thin[big] = np.concatenate([thin[big], thin[small]], axis=1)
             owner[small] = big + 1
-            parameters[big] = joined
-            thin[big] = _together(thin[big], thin[small])
     return owner
 
 
-def _is_scrap(
-    kinds: list[int],
-    parameters: list[Array],
-    samples: list[Samples],
-    *,
-    big: int,
-    small: int,
-    noise: NoiseModel,
-    perspective: bool,
-) -> bool:
-    """Whether a small piece lies so close along a large surface that it is only a dent in it, or a bit of its rim."""
-    if samples[small].x.size > SCRAP_SHARE * samples[big].x.size:
-        return False
-    s = thinned(samples[small], PAIR_SAMPLES)
-    surface, own = (kinds[big], parameters[big]), (kinds[small], parameters[small])
-    if s.x.size and bend.scrap_gain(surface, own, s, samples[small].x.size, noise, perspective) > 0.0:
-        return True
-    if kinds[big] == PLANE and kinds[small] != PLANE:
-        return False
-    if kinds[big] == PLANE and float(parameters[big][:3] @ parameters[small][:3]) < np.cos(LARGEST_TURN_RAD):
-        return False
-    e = np.empty(s.x.size)
-    rays.residuals(kinds[big], parameters[big], s.x, s.y, s.z, s.sigma, perspective, e)
-    # Rays just outside the outline miss; those that hit decide, when they are the larger part.
-    hit = np.isfinite(e)
-    return bool(hit.mean() > 0.5 and np.mean(np.abs(e[hit]) < SCRAP_SIGMAS) > JOINED_SHARE)
+@njit(cache=True, error_model="numpy", nogil=True)
+def related(  # type: ignore[no-untyped-def]
+    kind, th, samples, pixels, other_kind, other, others, other_pixels, noise, perspective
+):
+    """What a smaller piece is to a larger one: nothing, a scrap of it, or a piece of one surface, whose parameters follow.
 
-
-def _joint_fit(
-    kinds: list[int],
-    parameters: list[Array],
-    thin: list[Samples],
-    *,
-    big: int,
-    small: int,
-    noise: NoiseModel,
-    perspective: bool,
-) -> Array | None:
-    kind, th = kinds[big], parameters[big]
-    a, b = thin[big], thin[small]
-    if kind == PLANE and kinds[small] == PLANE:
-        turn = float(th[:3] @ parameters[small][:3])
+    Samples are (4, N) as in `bend`.
+    """
+    if other_pixels <= SCRAP_SHARE * pixels and _is_scrap(
+        kind, th, other_kind, other, others, other_pixels, noise, perspective
+    ):
+        return SCRAP, th
+    if kind == PLANE and other_kind == PLANE:
+        turn = th[0] * other[0] + th[1] * other[1] + th[2] * other[2]
         if turn < np.cos(LARGEST_TURN_RAD):
-            return None
-    both = _together(a, b)
-    joint, _, _, _, _ = fit.fit_robust(kind, th, both.x, both.y, both.z, both.sigma, perspective, FREE, 3)
+            return APART, th
+    both = np.concatenate((samples, others), 1)
     # What a piece leaves over by itself is bend, where noise is slow, and it is no less in the joint surface.
-    own = max(_trimmed(kinds[k], parameters[k], thin[k], perspective)[1] for k in (big, small))
-    slow = noise.slow_share(float(np.median(both.z)))
-    limit = JOINED_MEAN_SQUARE * (1.0 + slow * max(own - 1.0, 0.0))
-    for s in (a, b):
+    own = max(_trimmed(kind, th, samples, perspective)[1], _trimmed(other_kind, other, others, perspective)[1])
+    limit = JOINED_MEAN_SQUARE * (1.0 + slow_share_at(noise, np.median(both[2])) * max(own - 1.0, 0.0))
+    rough = _fitted(kind, th, np.ascontiguousarray(both[:, ::ROUGH_STRIDE]), perspective, 1)
+    for s in (samples, others):
+        if _trimmed(kind, rough, s, perspective)[0] < ROUGH_SHARE:
+            return APART, th
+    joint = _fitted(kind, th, both, perspective, 3)
+    for s in (samples, others):
         share, mean_square = _trimmed(kind, joint, s, perspective)
-        if share < JOINED_SHARE or mean_square > limit:
-            return None
-    return np.asarray(joint)
+        if share < JOINED_SHARE or not mean_square <= limit:
+            return APART, th
+    return JOINED, joint
 
 
-def _trimmed(kind: int, th: Array, s: Samples, perspective: bool) -> tuple[float, float]:
+@njit(cache=True, error_model="numpy")
+def _is_scrap(kind, th, own_kind, own, samples, pixels, noise, perspective):  # type: ignore[no-untyped-def]
+    """Whether a small piece lies so close along a large surface that it is only a dent in it, or a bit of its rim."""
+    if bend.scrap_gain(kind, th, own_kind, own, samples, pixels, noise, perspective) > 0.0:
+        return True
+    if kind == PLANE and own_kind != PLANE:
+        return False
+    if kind == PLANE and th[0] * own[0] + th[1] * own[1] + th[2] * own[2] < np.cos(LARGEST_TURN_RAD):
+        return False
+    hit, near = 0, 0
+    for i in range(samples.shape[1]):
+        z = depth_on(kind, th, samples[0, i], samples[1, i], perspective)
+        if np.isfinite(z):
+            hit += 1
+            near += abs(samples[2, i] - z) < SCRAP_SIGMAS * samples[3, i]
+    # Rays just outside the outline miss; those that hit decide, when they are the larger part.
+    return 2 * hit > samples.shape[1] and near > JOINED_SHARE * hit
+
+
+@njit(cache=True, error_model="numpy")
+def _fitted(kind, th, s, perspective, rounds):  # type: ignore[no-untyped-def]
+    free = np.zeros(9, np.bool_)
+    th, _, _, _, _ = fit.fit_robust(kind, th, s[0], s[1], s[2], s[3], perspective, free, rounds)
+    return th
+
+
+@njit(cache=True, error_model="numpy")
+def _trimmed(kind, th, s, perspective):  # type: ignore[no-untyped-def]
     """Share of the samples within the trim, and their mean squared residual in squared sigmas."""
-    e = np.empty(s.x.size)
-    rays.residuals(kind, th, s.x, s.y, s.z, s.sigma, perspective, e)
-    good = e[np.abs(e) < fit.TRIM_SIGMAS]
-    return good.size / max(e.size, 1), float(np.mean(good**2)) if good.size else np.inf
+    e = bend.residual_sizes(kind, th, s, perspective)
+    kept, total = 0, 0.0
+    for i in range(e.shape[0]):
+        if e[i] < fit.TRIM_SIGMAS:
+            kept += 1
+            total += e[i] * e[i]
+    return kept / max(e.shape[0], 1), total / kept if kept else np.inf
 
 
 def _nearness(
@@ -133,8 +144,8 @@ def _nearness(
 ) -> NDArray[np.bool_]:
     """(n, n) whether surface i, extended, passes near most of piece j: a cheap refusal before the joint fits."""
     few = [thinned(s, NEAR_SAMPLES) for s in samples]
-    starts = np.cumsum([0] + [s.x.size for s in few])
-    x, y, z, sigma = (np.concatenate([getattr(s, name) for s in few]) for name in ("x", "y", "z", "sigma"))
+    starts = np.cumsum([0] + [s.shape[1] for s in few])
+    x, y, z, sigma = np.concatenate(few, axis=1)
     return np.asarray(_near_matrix(np.array(kinds), np.stack(parameters), starts, x, y, z, sigma, perspective))
 
 
@@ -156,27 +167,18 @@ def _near_matrix(kinds, ths, starts, x, y, z, sigma, perspective):  # type: igno
     return near
 
 
-def _together(a: Samples, b: Samples) -> Samples:
-    return Samples(
-        x=np.concatenate([a.x, b.x]),
-        y=np.concatenate([a.y, b.y]),
-        z=np.concatenate([a.z, b.z]),
-        sigma=np.concatenate([a.sigma, b.sigma]),
-    )
-
-
-def _gap_between(depth_m: Array, packed: Array, surface: tuple[int, Array], a: Samples, b: Samples) -> bool:
-    """Whether the sensor sees past the surface on the shortest line between the two pieces."""
-    d2 = (a.x[:, None] - b.x[None, :]) ** 2 + (a.y[:, None] - b.y[None, :]) ** 2
+def _gap_between(depth_m: Array, packed: Array, surface: tuple[int, Array], a: Array, b: Array) -> bool:
+    """Whether the sensor sees past the surface on the shortest line between two pieces of samples (4, N)."""
+    d2 = (a[0][:, None] - b[0][None, :]) ** 2 + (a[1][:, None] - b[1][None, :]) ** 2
     i, j = np.unravel_index(int(np.argmin(d2)), d2.shape)
     t = np.linspace(0.0, 1.0, SIGHT_SAMPLES)[1:-1]
-    x, y = a.x[i] + t * (b.x[j] - a.x[i]), a.y[i] + t * (b.y[j] - a.y[i])
+    x, y = a[0, i] + t * (b[0, j] - a[0, i]), a[1, i] + t * (b[1, j] - a[1, i])
     u = np.clip(np.rint(x * packed[1] + packed[3]).astype(int), 0, depth_m.shape[1] - 1)
     v = np.clip(np.rint(y * packed[2] + packed[4]).astype(int), 0, depth_m.shape[0] - 1)
     seen = depth_m[v, u]
     perspective = bool(packed[0] > 0)
     model = np.empty(x.size)
     depths_on(*surface, x, y, perspective, model)
-    slack = 6.0 * float(np.median(a.sigma))
+    slack = 6.0 * float(np.median(a[3]))
     behind = seen > model + np.maximum(slack, 3.0 * np.abs(seen) / packed[1] if perspective else 3.0 / packed[1])
     return bool(np.mean(behind) > BEHIND_SHARE)

@@ -54,23 +54,7 @@ def settle(depth, sen, noise, slow_share, earlier, labels, kinds, ths, out, top,
             z = depth[v, u]
             if not judged[u] or not np.isfinite(z):
                 continue
-            n, total = 0, 0.0
-            for i in range(max(0, v - REACH_PX), min(H, v + REACH_PX + 1)):
-                for j in range(max(0, u - REACH_PX), min(W, u + REACH_PX + 1)):
-                    k = labels[i, j]
-                    if k == 0 or (i == v and j == u):
-                        continue
-                    total += 1.0
-                    at = -1
-                    for m in range(n):
-                        if near[m] == k:
-                            at = m
-                            break
-                    if at >= 0:
-                        votes[at] += 1.0
-                    elif n < MOST:
-                        near[n], votes[n] = k, 1.0
-                        n += 1
+            n, total = _counted(labels, v, u, near, votes)
             own = labels[v, u]
             if n == 0 or (n == 1 and near[0] == own):
                 continue
@@ -89,6 +73,30 @@ def settle(depth, sen, noise, slow_share, earlier, labels, kinds, ths, out, top,
                     best, label = cost, near[m]
             if label > 0 or own == 0:
                 out[v, u] = label
+
+
+@njit(cache=True, error_model="numpy")
+def _counted(labels, v, u, near, votes):  # type: ignore[no-untyped-def]
+    """Labels of the neighbours into `near`, how many bear each into `votes`; their number, and that of neighbours."""
+    H, W = labels.shape
+    n, total = 0, 0.0
+    for i in range(max(0, v - REACH_PX), min(H, v + REACH_PX + 1)):
+        for j in range(max(0, u - REACH_PX), min(W, u + REACH_PX + 1)):
+            k = labels[i, j]
+            if k == 0 or (i == v and j == u):
+                continue
+            total += 1.0
+            at = -1
+            for m in range(n):
+                if near[m] == k:
+                    at = m
+                    break
+            if at >= 0:
+                votes[at] += 1.0
+            elif n < MOST:
+                near[n], votes[n] = k, 1.0
+                n += 1
+    return n, total
 
 
 @njit(cache=True, error_model="numpy")

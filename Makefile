@@ -35,13 +35,13 @@ serve: setup  ## Start the service on http://127.0.0.1:8460
 	@$(BIN)/panelwright serve
 
 test: setup  ## Run all tests, two files at a time; PYTEST_OPTIONS go to pytest
-	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope -m 'not wire' $(PYTEST_OPTIONS)
+	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope --no-loadscope-reorder -m 'not wire' $(PYTEST_OPTIONS)
 
 test-wire: setup  ## Run whole missions over emulated wires, in real time: about six minutes, more on a busy machine
 	@$(BIN)/python -m pytest -m wire
 
-test-fast: setup  ## Run the tests without missions and browsers
-	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope -m 'not slow and not wire'
+test-fast: setup  ## Run the tests without missions, browsers and scaffolds
+	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope --no-loadscope-reorder -m 'not slow and not wire'
 
 lint: setup  ## Style, types and layering
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .

@@ -38,6 +38,7 @@ def run_pytest(folder: Path, *paths: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "transport"),
     [

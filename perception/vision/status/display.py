@@ -81,6 +81,7 @@ def read_display(patch: Patch, spec: Display, *, digits_taught: bool = True, bef
 def read_window(
     gray: Image, *, digits: int | None, decimals: int | None, dark: bool | None, unit: str = "",
     limits: tuple[float, float] | None = None, hidden: NDArray[np.bool_] | None = None, before: float | None = None,
+    framed: bool = False,
 ) -> Status:  # fmt: skip
     """Text of an upright window that shows nothing but the digits.
 
@@ -89,10 +90,13 @@ def read_window(
         limits: smallest and largest value possible.
         hidden: (H, W) True where something lies across the window.
         before: the previous reading.
+        framed: the picture shows a frame all round.
     """
     gray, hidden = _working_size(gray, hidden)
     polarities = (True, False) if dark is None else (dark,)
-    found = [decoded for is_dark in polarities if (decoded := _decoded(gray, is_dark, hidden, digits)) is not None]
+    found = [
+        decoded for is_dark in polarities if (decoded := _decoded(gray, is_dark, hidden, digits, framed)) is not None
+    ]
     if not found:
         return refused("no digits stand out: come closer, or change the angle or the light", unit=unit)
     best = max(found, key=lambda d: d.explained * apartness(d.comb.gap) - CELL_COST * d.comb.count)
@@ -100,9 +104,11 @@ def read_window(
     return _answer(best, point, unit, decimals, limits, before, covered=hidden is not None and bool(hidden.any()))
 
 
-def _decoded(gray: Image, is_dark: bool, hidden: NDArray[np.bool_] | None, digits: int | None) -> Decoded | None:
+def _decoded(
+    gray: Image, is_dark: bool, hidden: NDArray[np.bool_] | None, digits: int | None, framed: bool
+) -> Decoded | None:
     ink, seen = segment_ink(gray, is_dark, hidden)
-    ink = without_border(ink)
+    ink = without_border(ink, framed=framed)
     combs = find_combs(ink, seen, most=digits or 8, free=KNOWN_FREE if digits else FREE)
     return next((d for _, comb in combs if (d := decode(ink, seen, comb, all_cells=digits is not None))), None)
 

@@ -35,6 +35,11 @@ CLOSE = 7.0  # nats: characters listed beside the best of their cell
 MOST_LISTED = 300
 
 
+def lit_segments(text: str) -> int:
+    """How many segments a text lights."""
+    return sum(int(LIT[NAMES.index(character)].sum()) for character in text if character in NAMES)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Levels:
     """Levels of a display's segments.

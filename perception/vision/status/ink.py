@@ -13,6 +13,7 @@ from perception.vision.status.comb_jit import Float32
 HEADROOM = 0.5  # of a lit segment: where less is left below white, nothing can be told
 KERNEL = 0.30  # of the picture's height: wider than any stroke, narrower than what light does
 SATURATED = 252
+BORDER_ROUNDS = 4
 WIDEST_STROKE = 0.17  # of the picture's height
 
 
@@ -56,20 +57,35 @@ def _drowned(gray: Image, is_dark: bool) -> NDArray[np.bool_]:
     return np.asarray(cv2.morphologyEx(white, cv2.MORPH_OPEN, np.ones((size, size), np.uint8)) > 0)
 
 
-def without_border(ink: Float32) -> Float32:
-    """The ink less what hangs together with the picture's border over a long stretch: a frame, not a segment."""
-    strong = level_at(ink, 0.985)
-    mask = (ink > 0.3 * strong).astype(np.uint8)
+def without_border(ink: Float32, *, framed: bool = False) -> Float32:
+    """The ink less what hangs together with the picture's border over a long stretch: a frame, not a segment.
+
+    Args:
+        framed: a frame surely surrounds the digits: what touches the border anywhere is not theirs. It is taken away level
+            by level, since a frame may stand out far more than the digits do.
+    """
+    for _ in range(BORDER_ROUNDS if framed else 1):
+        gone = _at_border(ink, 0.3 * level_at(ink, 0.985), framed)
+        if gone is None:
+            break
+        ink = np.asarray(np.where(gone, 0.0, ink), np.float32)
+    return ink
+
+
+def _at_border(ink: Float32, least: float, framed: bool) -> NDArray[np.bool_] | None:
+    """(H, W) where ink above a level hangs together with the border, a little widened; None where none does."""
+    mask = (ink > least).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
     rows, columns = ink.shape
     edge = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
     touching = np.bincount(edge, minlength=count)
-    drop = [k for k in range(1, count) if touching[k] > 0.3 * min(rows, columns) and
-            (stats[k, cv2.CC_STAT_WIDTH] > 0.5 * columns or stats[k, cv2.CC_STAT_HEIGHT] > 0.8 * rows)]  # fmt: skip
-    if not drop:
-        return ink
-    gone = cv2.dilate(np.isin(labels, drop).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return np.asarray(np.where(gone, 0.0, ink), np.float32)
+    drop = touching > (0 if framed else 0.3 * min(rows, columns))
+    if not framed:
+        drop &= (stats[:, cv2.CC_STAT_WIDTH] > 0.5 * columns) | (stats[:, cv2.CC_STAT_HEIGHT] > 0.8 * rows)
+    drop[0] = False
+    if not drop.any():
+        return None
+    return np.asarray(cv2.dilate(drop[labels].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
 
 
 def level_at(ink: Float32, share: float) -> float:

@@ -5,14 +5,18 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from benchmarks.display_drawing import draw_photograph
 from perception.vision.digit_search import CELL_PX, MARGIN, STRIDE, cell_scores, find_digit_rows
-from perception.vision.photo_display import ROWS_TRIED, read_photograph
+from perception.vision.photo_display import ROWS_TRIED, _agreed, read_photograph
+from perception.vision.reading import Status, refused
 from perception.vision.status.comb import LIT_SHARES
 from perception.vision.status.comb_jit import cell_boxes
 from perception.vision.status.display import read_window
 from perception.vision.status.glyphs import LIT
+from perception.vision.status.ink import without_border
 from tests.perception.vision.test_display import window
 
 
@@ -60,6 +64,35 @@ def test_a_frames_sides_are_no_ones() -> None:
     framed = cv2.copyMakeBorder(gray, 0, 0, 12, 12, cv2.BORDER_CONSTANT, value=25)
     framed[:, 8:12] = framed[:, -12:-8] = 170
     assert read_window(framed, digits=None, decimals=None, dark=False).text == "8.0"
+
+
+@pytest.mark.parametrize("turned_deg", [-6.0, 5.0])
+def test_a_turned_crop_is_straightened(turned_deg: float) -> None:
+    gray = cv2.copyMakeBorder(window("26.08", dark=True, high=60), 12, 12, 12, 12, cv2.BORDER_REPLICATE)
+    size = gray.shape[::-1]
+    turn = cv2.getRotationMatrix2D((size[0] / 2, size[1] / 2), turned_deg, 1.0)
+    assert (
+        read_photograph(cv2.warpAffine(gray, turn, size, borderMode=cv2.BORDER_REPLICATE), scene=False).text == "26.08"
+    )
+
+
+def test_a_frame_that_stands_out_more_than_the_digits_is_left_aside() -> None:
+    ink = np.zeros((60, 140), np.float32)
+    ink[20:40, 60:64] = 20.0
+    ink[:, :6], ink[54:, :] = 200.0, 90.0
+    left = without_border(ink, framed=True)
+    assert left[20:40, 60:64].min() == 20.0
+    left[20:40, 60:64] = 0.0
+    assert left.max() < 20.0
+
+
+@given(st.lists(st.tuples(st.sampled_from(["12", "8.8", None]), st.floats(0.5, 0.97)), min_size=1, max_size=6))
+def test_rivals_make_an_answer_less_sure(read: list[tuple[str | None, float]]) -> None:
+    answers = [(1.0, Status(text=t, value=1.0, confidence=c) if t else refused("no")) for t, c in read]
+    agreed = _agreed(answers)
+    assert agreed.confidence <= max((c for t, c in read if t), default=0.0)
+    if len({t for t, _ in read if t}) == 1:
+        assert agreed.answered and agreed.confidence == pytest.approx(max(c for t, c in read if t))
 
 
 def test_own_scenes_are_read_by_and_large() -> None:

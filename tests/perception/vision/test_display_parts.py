@@ -6,21 +6,18 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.display_drawing import DisplayCase, draw_photograph, draw_taught
-from hal.panel import Display
+from benchmarks.display_drawing import draw_photograph, draw_taught
+from benchmarks.display_report import read_case
 from perception.vision.patch import Patch
 from perception.vision.photo_display import read_photograph
-from perception.vision.reading import Status
 from perception.vision.status.band import hidden_by_bands
 from perception.vision.status.comb import LIT_SHARES, find_combs, segment_means
 from perception.vision.status.comb_jit import LEFT_OVER, apartness, cell_worth, comb_worth
 from perception.vision.status.cover import ring_medians
-from perception.vision.status.display import read_display, read_window
+from perception.vision.status.display import read_window
 from perception.vision.status.glyphs import LIT, NAMES, Levels, likelihoods, numbers, separate
 from perception.vision.status.ink import segment_ink
 from perception.vision.status.point import dot_levels, find_point
-from perception.vision.taught import patch_of
-from perception.vision.view import PlaneView, homography
 from tests.perception.vision.test_display import window
 
 
@@ -148,18 +145,6 @@ def test_a_cable_is_masked_where_it_lies(cable: tuple[int, int]) -> None:
 
 def test_nothing_is_masked_without_a_cable() -> None:
     assert hidden_by_bands(plate_patch(cable=None), half_width_m=0.07, half_height_m=0.03, dark_ink=False) is None
-
-
-def read_case(case: DisplayCase, *, known: bool) -> Status:
-    """The reading of a drawn display through a plane view that knows its place."""
-    w, h = 0.02 * case.size[0], 0.02 * case.size[1]
-    plate = np.array([[-w / 2, h / 2], [w / 2, h / 2], [w / 2, -h / 2], [-w / 2, -h / 2]])
-    view = PlaneView(px_from_plate=homography(plate, case.corners_px), corners_m=plate)
-    spec = Display(
-        name="d", position_m=(0.0, 0.0), width_m=w + 0.002, height_m=h + 0.002, digits=case.digits,
-        decimals=case.decimals, style="lcd" if case.is_dark else "led", minimum=-1e9, maximum=1e9,
-    )  # fmt: skip
-    return read_display(patch_of(case.image, case.image, view, spec, np.zeros(2)), spec, digits_taught=known)
 
 
 @pytest.mark.parametrize("level", ["easy", "medium"])

@@ -16,6 +16,7 @@ from perception.range.compete import Candidates
 from perception.range.features import RangeFeature, features_of
 from perception.range.noise import NoiseModel, estimate_noise, typical_depths_m
 from perception.range.primitives import Plane, Surface, SurfaceType
+from perception.range.regions import regions_of
 from perception.range.segment import Task, segment, settled
 from perception.range.sensor import RangeSensorModel
 
@@ -157,28 +158,27 @@ def _check_scale(depth: Array, sensor: RangeSensorModel) -> None:
 def _finished(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) -> tuple[Labels, tuple[Surface, ...]]:
     depth, sensor = task.depth_m, task.sensor
     count = len(found.kinds)
-    law, perspective = noise.packed(), bool(sensor.packed()[0] > 0)
-    samples = finish.samples_by_label(depth, sensor, noise, labels, count)
-    touching = merge.merge_touching(labels, sensor.packed(), found.kinds, found.parameters, samples, noise)
-    labels, samples = finish.regrouped(depth, sensor, noise, labels, samples, touching)
-    owner = join.join_pieces(depth, sensor.packed(), found.kinds, found.parameters, samples, noise=noise)
-    joined, samples = finish.regrouped(depth, sensor, noise, labels, samples, owner)
-    keep = [k for k in range(count) if owner[k] == k + 1 and samples[k].x.size >= 8]
-    keep.sort(key=lambda k: -samples[k].x.size)
+    packed, law = sensor.packed(), noise.packed()
+    regions = regions_of(depth, packed, law, labels, count)
+    regions = regions.given_to(merge.merge_touching(regions, found.kinds, found.parameters))
+    owner = join.join_pieces(regions, found.kinds, found.parameters)
+    regions = regions.given_to(owner)
+    pixels, few = regions.pixels, regions.few(NAMING_SAMPLES)
+    keep = [k for k in range(count) if owner[k] == k + 1 and pixels[k] >= 8]
+    keep.sort(key=lambda k: -pixels[k])
     surfaces, final = [], Candidates()
     renamed = np.zeros(count + 1, np.int32)
     for new, k in enumerate(keep, 1):
-        kind, mine = found.kinds[k], samples[k]
+        kind, mine = found.kinds[k], regions.samples(k + 1)
         surface, th = finish.refine_surface(new, kind, found.parameters[k], mine, sensor=sensor, noise=noise)
         # What the sensor has bent is named straight, but keeps the bent surface's pixels.
         final.add(kind, th)
-        few = finish.thinned(mine, NAMING_SAMPLES)
-        straight, start = bend.straightened(kind, th, few, law, perspective)
+        straight, start = bend.straightened(kind, th, few[k], law, bool(packed[0] > 0))
         if straight != kind:
             surface, _ = finish.refine_surface(new, straight, start, mine, sensor=sensor, noise=noise)
         surfaces.append(surface)
         renamed[k + 1] = new
-    labels = settled(task, noise, renamed[joined], final, sweeps=SETTLING_SWEEPS)
+    labels = settled(task, noise, renamed[regions.labels], final, sweeps=SETTLING_SWEEPS)
     fill_small_gaps(labels, depth, 2)
     return labels, tuple(surfaces)
 

@@ -59,22 +59,32 @@ def borders_of(labels: Ints, packed: Array) -> dict[tuple[int, int], Border]:
 def _contacts(labels, gap):  # type: ignore[no-untyped-def]
     """Pair key (a << 32 | b, a < b) and place of each contact along rows and columns, over at most `gap` zeros."""
     H, W = labels.shape
-    keys, us, vs = np.empty(2 * H * W, np.int64), np.empty(2 * H * W), np.empty(2 * H * W)
+    keys, us, vs = np.empty(8 * W, np.int64), np.empty(8 * W), np.empty(8 * W)
+    above, above_at = np.zeros(W, np.int32), np.zeros(W, np.int32)
     n = 0
-    for axis in range(2):
-        lines, length = (H, W) if axis == 0 else (W, H)
-        for line in range(lines):
-            last, at = 0, -1
-            for k in range(length):
-                label = labels[line, k] if axis == 0 else labels[k, line]
-                if label == 0:
-                    continue
-                if last > 0 and label != last and k - at <= gap + 1:
-                    middle = 0.5 * (at + k)
-                    keys[n] = (min(last, label) << 32) | max(last, label)
-                    us[n], vs[n] = (middle, line) if axis == 0 else (line, middle)
-                    n += 1
-                last, at = label, k
+    for v in range(H):
+        if n + 2 * W > keys.shape[0]:
+            keys, us, vs = (
+                np.concatenate((keys, np.empty_like(keys))),
+                np.concatenate((us, np.empty_like(us))),
+                np.concatenate((vs, np.empty_like(vs))),
+            )
+        left, left_at = 0, -1
+        for u in range(W):
+            label = labels[v, u]
+            if label == 0:
+                continue
+            if left != label and left > 0 and u - left_at <= gap + 1:
+                keys[n] = (min(left, label) << 32) | max(left, label)
+                us[n], vs[n] = 0.5 * (left_at + u), v
+                n += 1
+            left, left_at = label, u
+            upper = above[u]
+            if upper != label and upper > 0 and v - above_at[u] <= gap + 1:
+                keys[n] = (min(upper, label) << 32) | max(upper, label)
+                us[n], vs[n] = u, 0.5 * (above_at[u] + v)
+                n += 1
+            above[u], above_at[u] = label, v
     return keys[:n].copy(), us[:n].copy(), vs[:n].copy()
 
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from perception.range import fit
-from perception.range.claim import gather
 from perception.range.noise import NoiseModel
 from perception.range.primitives import (
     COVARIANCE_OVER,
@@ -24,7 +21,6 @@ from perception.range.starts import solve_positive
 from perception.range.surfaces import FREEDOM, QUADRIC
 
 Array = NDArray[np.float64]
-Labels = NDArray[np.int32]
 
 COARSE_SAMPLES = 300  # a refined start on these leaves the full fit one step
 SLOW_NOISE_AREA_PX = 150.0  # pixels that share one value of the slow noise; sets how little averaging gains on it
@@ -32,71 +28,20 @@ STEP_AREA_PX = 16.0
 FREE = np.zeros(9, np.bool_)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Samples:
-    """Pixels of one region as the fits read them, (N,) each: ray coordinates, depth and its standard deviation, m."""
-
-    x: Array
-    y: Array
-    z: Array
-    sigma: Array
-
-
-def samples_by_label(
-    depth_m: Array,
-    sensor: RangeSensorModel,
-    noise: NoiseModel,
-    labels: Labels,
-    count: int,
-    *,
-    wanted: NDArray[np.bool_] | None = None,
-) -> list[Samples]:
-    """The pixels of labels 1 to `count`; entry 0 of the list is label 1. Labels not `wanted` (count,) stay empty."""
-    flags = np.ones(count + 1, np.bool_)
-    if wanted is not None:
-        flags[1:] = wanted
-    starts, x, y, z, sigma = gather(depth_m, sensor.packed(), noise.packed(), labels, flags)
-    cuts = [slice(a, b) for a, b in zip(starts[1:-1].tolist(), starts[2:].tolist(), strict=True)]
-    return [Samples(x=x[c], y=y[c], z=z[c], sigma=sigma[c]) for c in cuts]
-
-
-def regrouped(
-    depth_m: Array,
-    sensor: RangeSensorModel,
-    noise: NoiseModel,
-    labels: Labels,
-    samples: list[Samples],
-    owner: list[int],
-) -> tuple[Labels, list[Samples]]:
-    """Labels and samples after label k has gone to `owner[k - 1]`; only what was joined is gathered again."""
-    parts = np.bincount(owner, minlength=len(owner) + 1)[1:]
-    if (parts == 1).all():
-        return labels, samples
-    labels = np.array([0, *owner], np.int32)[labels]
-    joined = samples_by_label(depth_m, sensor, noise, labels, len(owner), wanted=parts > 1)
-    return labels, [old if n == 1 else new for n, old, new in zip(parts.tolist(), samples, joined, strict=True)]
-
-
-def thinned(samples: Samples, most: int) -> Array:
-    """(4, N) x, y, z and sigma of at most `most` of the samples, evenly spread; the same choice every time."""
-    most = min(samples.x.size, most)
-    return np.asarray(picked(samples.x, samples.y, samples.z, samples.sigma, most))
-
-
 def refine_surface(
     label: int,
     kind: int,
     th: Array,
-    samples: Samples,
+    samples: Array,
     *,
     sensor: RangeSensorModel,
     noise: NoiseModel,
     fixed: NDArray[np.bool_] = FREE,
 ) -> tuple[Surface, Array]:
-    """The surface after the ray-depth fit to all its pixels, and its parameter vector."""
+    """The surface after the ray-depth fit to all its pixels, samples (4, N) as in `regions`, and its parameters."""
     perspective = bool(sensor.packed()[0] > 0)
-    s, n = samples, samples.x.size
-    th, H, inverse, middles, kept, used = refined(kind, th, s.x, s.y, s.z, s.sigma, perspective, fixed)
+    n = samples.shape[1]
+    th, H, inverse, middles, kept, used = refined(kind, th, samples, perspective, fixed)
     misfit = float(np.sqrt(kept / max(used - FREEDOM[kind], 1)))
     x, y, depth, sigma = middles.tolist()
     loss = averaging_loss(noise, depth)
@@ -117,25 +62,15 @@ def refine_surface(
     return surface, th
 
 
-@njit(cache=True)
-def picked(x, y, z, sigma, most):  # type: ignore[no-untyped-def]
-    """(4, most) evenly spread samples of (N,), the first and the last among them."""
-    out = np.empty((4, most))
-    step = (x.shape[0] - 1) / max(most - 1, 1)
-    for k in range(most):
-        i = int(k * step) if k < most - 1 or most == 1 else x.shape[0] - 1
-        out[0, k], out[1, k], out[2, k], out[3, k] = x[i], y[i], z[i], sigma[i]
-    return out
-
-
 @njit(cache=True, error_model="numpy", nogil=True)
-def refined(kind, th, x, y, z, sigma, perspective, fixed):  # type: ignore[no-untyped-def]
-    """The fit to samples (N,): robust on a few that are evenly spread, then one step on all.
+def refined(kind, th, samples, perspective, fixed):  # type: ignore[no-untyped-def]
+    """The fit to samples (4, N): robust on a few that are evenly spread, then one step on all.
 
     Returns:
         parameters, information matrix (9, 9), its inverse (p, p) or None, medians (4,) of x, y, z and sigma,
         squared residuals of the kept samples, samples kept.
     """
+    x, y, z, sigma = samples[0], samples[1], samples[2], samples[3]
     n = x.shape[0]
     if n == 0:
         return th, np.zeros((9, 9)), None, np.full(4, np.nan), 0.0, 0

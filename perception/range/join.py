@@ -7,10 +7,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from perception.range import bend, fit
-from perception.range.finish import Samples, thinned
 from perception.range.grid import slow_share_at
-from perception.range.noise import NoiseModel
-from perception.range.surfaces import PLANE, depth_on, depths_on
+from perception.range.regions import Regions
+from perception.range.surfaces import PLANE, depth_on
 
 Array = NDArray[np.float64]
 
@@ -19,7 +18,7 @@ JOINED_SHARE = 0.85
 JOINED_MEAN_SQUARE = 1.6
 ROUGH_STRIDE = 5  # of the samples of a first fit
 ROUGH_SHARE = 0.5  # of them must lie near it before all are fitted
-NEAR_SAMPLES = 16
+NEAR_STRIDE = 10  # of the samples that decide whether a surface passes near a piece
 NEAR_SIGMAS = 20.0
 SCRAP_SHARE = 0.1
 SCRAP_SIGMAS = 6.0
@@ -29,15 +28,7 @@ BEHIND_SHARE = 0.15  # more of the sight line than this seen behind the surface:
 APART, SCRAP, JOINED = 0, 1, 2
 
 
-def join_pieces(
-    depth_m: Array,
-    packed: Array,
-    kinds: list[int],
-    parameters: list[Array],
-    samples: list[Samples],
-    *,
-    noise: NoiseModel,
-) -> list[int]:
+def join_pieces(regions: Regions, kinds: list[int], parameters: list[Array]) -> list[int]:
     """For each surface (label k at k - 1) the label that it belongs to after joining, itself when it stays alone.
 
     Parameters of the surviving labels are updated in place.
@@ -45,11 +36,11 @@ def join_pieces(
     owner = list(range(1, len(kinds) + 1))
     if len(kinds) < 2:
         return owner
-    pixels = [s.x.size for s in samples]
+    pixels, packed, law = regions.pixels, regions.packed, regions.law
     order = sorted((k for k in range(len(kinds)) if pixels[k]), key=lambda k: -pixels[k])
-    thin = [thinned(s, PAIR_SAMPLES) for s in samples]
-    perspective, law = bool(packed[0] > 0), noise.packed()
-    near = _nearness(kinds, parameters, samples, perspective)
+    thin = regions.few(PAIR_SAMPLES)
+    perspective = bool(packed[0] > 0)
+    near = _nearness(kinds, parameters, thin, perspective)
     for position, big in enumerate(order):
         if owner[big] != big + 1:
             continue
@@ -61,7 +52,7 @@ def join_pieces(
             if verdict == APART:
                 continue
             if verdict == JOINED:
-                if _gap_between(depth_m, packed, (kinds[big], joint), thin[big], thin[small]):
+                if gap_between(regions.depth_m, packed, kinds[big], joint, thin[big], thin[small]):
                     continue
                 parameters[big] = joint
                 thin[big] = np.concatenate([thin[big], thin[small]], axis=1)
@@ -139,11 +130,9 @@ def _trimmed(kind, th, s, perspective):  # type: ignore[no-untyped-def]
     return kept / max(e.shape[0], 1), total / kept if kept else np.inf
 
 
-def _nearness(
-    kinds: list[int], parameters: list[Array], samples: list[Samples], perspective: bool
-) -> NDArray[np.bool_]:
+def _nearness(kinds: list[int], parameters: list[Array], thin: list[Array], perspective: bool) -> NDArray[np.bool_]:
     """(n, n) whether surface i, extended, passes near most of piece j: a cheap refusal before the joint fits."""
-    few = [thinned(s, NEAR_SAMPLES) for s in samples]
+    few = [s[:, ::NEAR_STRIDE] for s in thin]
     starts = np.cumsum([0] + [s.shape[1] for s in few])
     x, y, z, sigma = np.concatenate(few, axis=1)
     return np.asarray(_near_matrix(np.array(kinds), np.stack(parameters), starts, x, y, z, sigma, perspective))
@@ -167,18 +156,25 @@ def _near_matrix(kinds, ths, starts, x, y, z, sigma, perspective):  # type: igno
     return near
 
 
-def _gap_between(depth_m: Array, packed: Array, surface: tuple[int, Array], a: Array, b: Array) -> bool:
+@njit(cache=True, error_model="numpy", nogil=True)
+def gap_between(depth, sen, kind, th, a, b):  # type: ignore[no-untyped-def]
     """Whether the sensor sees past the surface on the shortest line between two pieces of samples (4, N)."""
-    d2 = (a[0][:, None] - b[0][None, :]) ** 2 + (a[1][:, None] - b[1][None, :]) ** 2
-    i, j = np.unravel_index(int(np.argmin(d2)), d2.shape)
-    t = np.linspace(0.0, 1.0, SIGHT_SAMPLES)[1:-1]
-    x, y = a[0, i] + t * (b[0, j] - a[0, i]), a[1, i] + t * (b[1, j] - a[1, i])
-    u = np.clip(np.rint(x * packed[1] + packed[3]).astype(int), 0, depth_m.shape[1] - 1)
-    v = np.clip(np.rint(y * packed[2] + packed[4]).astype(int), 0, depth_m.shape[0] - 1)
-    seen = depth_m[v, u]
-    perspective = bool(packed[0] > 0)
-    model = np.empty(x.size)
-    depths_on(*surface, x, y, perspective, model)
-    slack = 6.0 * float(np.median(a[3]))
-    behind = seen > model + np.maximum(slack, 3.0 * np.abs(seen) / packed[1] if perspective else 3.0 / packed[1])
-    return bool(np.mean(behind) > BEHIND_SHARE)
+    H, W = depth.shape
+    perspective = sen[0] > 0
+    i, j, least = 0, 0, np.inf
+    for m in range(a.shape[1]):
+        for n in range(b.shape[1]):
+            d2 = (a[0, m] - b[0, n]) ** 2 + (a[1, m] - b[1, n]) ** 2
+            if d2 < least:
+                i, j, least = m, n, d2
+    slack = 6.0 * np.median(a[3])
+    behind = 0
+    for k in range(1, SIGHT_SAMPLES - 1):
+        t = k / (SIGHT_SAMPLES - 1)
+        x, y = a[0, i] + t * (b[0, j] - a[0, i]), a[1, i] + t * (b[1, j] - a[1, i])
+        u = min(max(int(np.rint(x * sen[1] + sen[3])), 0), W - 1)
+        v = min(max(int(np.rint(y * sen[2] + sen[4])), 0), H - 1)
+        seen = depth[v, u]
+        step = 3.0 / sen[1] * (abs(seen) if perspective else 1.0)
+        behind += seen > depth_on(kind, th, x, y, perspective) + max(slack, step)
+    return behind > BEHIND_SHARE * (SIGHT_SAMPLES - 2)

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.range.borders import Border, borders_of
-from perception.range.finish import Samples, thinned
-from perception.range.noise import NoiseModel
 from perception.range.pairs import PATCHES, PIXELS, described, figures_of, judged
+from perception.range.regions import Regions
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -58,21 +57,20 @@ class Agglomeration:
         self,
         kinds: list[int],
         parameters: list[Array],
-        samples: list[Samples],
+        samples: list[Array],
+        pixels: list[int],
         *,
         borders: dict[tuple[int, int], Border],
-        noise: NoiseModel,
+        law: Array,
         perspective: bool,
     ) -> None:
-        self.law = noise.packed()
+        self.law = law
         self.perspective = perspective
         self.parts: dict[int, Part] = {}
-        for k, region in enumerate(samples, 1):
-            if region.x.size:
-                few = thinned(region, PART_SAMPLES)
-                kind, th, normals, figures = described(
-                    kinds[k - 1], parameters[k - 1], few, float(region.x.size), self.law, perspective
-                )
+        for k, few in enumerate(samples, 1):
+            if few.size:
+                surface = (kinds[k - 1], parameters[k - 1])
+                kind, th, normals, figures = described(*surface, few, float(pixels[k - 1]), self.law, perspective)
                 self.parts[k] = Part(kind=kind, parameters=th, samples=few, normals=normals, figures=figures)
         self.borders = dict(borders)
         self.owner = {k: k for k in range(1, len(kinds) + 1)}
@@ -128,22 +126,16 @@ class Agglomeration:
             self.borders[new] = self.borders[new].with_more(border) if new in self.borders else border
 
 
-def merge_touching(
-    labels: Ints,
-    packed: Array,
-    kinds: list[int],
-    parameters: list[Array],
-    samples: list[Samples],
-    noise: NoiseModel,
-) -> list[int]:
+def merge_touching(regions: Regions, kinds: list[int], parameters: list[Array]) -> list[int]:
     """For each label (k at k - 1) the label it belongs to afterwards; updates kinds and parameters of the survivors."""
     graph = Agglomeration(
         kinds,
         parameters,
-        samples,
-        borders=borders_of(labels, packed),
-        noise=noise,
-        perspective=bool(packed[0] > 0),
+        regions.few(PART_SAMPLES),
+        regions.pixels,
+        borders=borders_of(regions.labels, regions.packed),
+        law=regions.law,
+        perspective=bool(regions.packed[0] > 0),
     )
     graph.run()
     for label, part in graph.parts.items():

@@ -78,15 +78,22 @@ def judged(  # type: ignore[no-untyped-def]
         samples, normals = np.concatenate((samples_a, samples_b), 1), np.concatenate((normals_a, normals_b))
         limit = shown * max(mean_square_limit(figures_a[PATCHES]), mean_square_limit(figures_b[PATCHES]))
         both_flat = kind_a == PLANE and kind_b == PLANE
-        if is_smooth or not (both_flat and _is_creased(samples, perspective, CREASE_MEAN_SQUARE * limit)):
+        is_hopeless = both_flat and _is_creased(samples, perspective, CREASE_MEAN_SQUARE * limit)
+        if is_smooth or not is_hopeless:
+            kind, th = (kind_a, a) if figures_a[PIXELS] >= figures_b[PIXELS] else (kind_b, b)
+            if kind != PLANE:
+                # Pieces of one bent surface: the larger's goes on over the smaller, and no other need be tried.
+                th = _continued(kind, th, samples, perspective)
+                gain = _gain(
+                    kind, th, kind_a, samples_a, figures_a, kind_b, samples_b, figures_b, is_smooth, perspective
+                )
+                if gain > LEAST_GAIN:
+                    return gain, kind, th
             with_quadric = QUADRIC in (kind_a, kind_b)
             correlated = max(samples.shape[1] / (figures_a[PATCHES] + figures_b[PATCHES]), 1.0)
             ths, there = _joint_fits(samples, normals, perspective, with_quadric, correlated)
             if both_flat and not there[PLANE]:
-                free = np.zeros(9, np.bool_)
-                ths[PLANE], _, _, _, _ = fit.fit_robust(
-                    PLANE, a, samples[0], samples[1], samples[2], samples[3], perspective, free, 3
-                )
+                ths[PLANE] = _continued(PLANE, a, samples, perspective)
                 there[PLANE] = True
             best_kind, best_gain = -1, 0.0
             for kind in range(5):
@@ -111,6 +118,15 @@ def judged(  # type: ignore[no-untyped-def]
     if figures_a[PIXELS] >= figures_b[PIXELS]:
         return _scrap(kind_a, a, figures_a, kind_b, b, samples_b, figures_b, noise, perspective)
     return _scrap(kind_b, b, figures_b, kind_a, a, samples_a, figures_a, noise, perspective)
+
+
+@njit(cache=True, error_model="numpy")
+def _continued(kind, th, samples, perspective):  # type: ignore[no-untyped-def]
+    """The surface refined on the samples of both regions."""
+    free = np.zeros(9, np.bool_)
+    x, y, z, sigma = samples[0], samples[1], samples[2], samples[3]
+    th, _, _, _, _ = fit.fit_robust(kind, th, x, y, z, sigma, perspective, free, 3)
+    return th
 
 
 @njit(cache=True, error_model="numpy")

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from hal.errors import InvalidRequest, NotFound
 from perception.range.analyse import checked_depth
 from perception.range.features import RangeFeature, plane_feature
-from perception.range.finish import Samples, refine_surface
+from perception.range.finish import refine_surface
 from perception.range.grid import Grid, block_size, build_grid
 from perception.range.noise import NoiseModel, estimate_noise
 from perception.range.primitives import Surface
@@ -175,7 +175,7 @@ def _fitted(depth: Array, sensor: RangeSensorModel, noise: NoiseModel, plane: Ar
         z = depth[inliers]
         packed = sensor.packed()
         v, u = np.nonzero(inliers)
-        samples = Samples(x=(u - packed[3]) / packed[1], y=(v - packed[4]) / packed[2], z=z, sigma=sigma[inliers])
+        samples = np.stack([(u - packed[3]) / packed[1], (v - packed[4]) / packed[2], z, sigma[inliers]])
         surface, th = refine_surface(1, PLANE, th, samples, sensor=sensor, noise=noise)
     valid = int(np.isfinite(depth).sum())
     share = float(inliers.sum()) / valid

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from perception.range.bend import scrap_gain, simplest, straightened, turn_of
-from perception.range.finish import Samples, thinned
 from perception.range.join import join_pieces
 from perception.range.merge import merge_touching
 from perception.range.noise import NoiseModel
+from perception.range.regions import regions_of
 from perception.range.surfaces import CONE, CYLINDER, PLANE, SIZE, SPHERE, depths_on
 
 WHITE = NoiseModel(white=(0.002, 0.0), correlated=(0.0, 0.0), step=(0.0, 0.0))
@@ -36,19 +36,14 @@ def rays(mask):
 
 
 def sampled(kind, th, mask, noise, *, seed=0, sigma=1.0):
-    """The samples of the pixels in `mask`, with white noise of `sigma` times the model's."""
+    """The (4, N) samples of the pixels in `mask`, with white noise of `sigma` times the model's."""
     x, y = rays(mask)
     z = np.empty(x.size)
     depths_on(kind, th, x, y, True, z)
     assert np.isfinite(z).all()
     scatter = noise.sigma_m(z)
     z = z + sigma * scatter * np.random.default_rng(seed).normal(size=z.size)
-    return Samples(x=x, y=y, z=z, sigma=scatter)
-
-
-def packed_samples(*case, **options):
-    """All of `sampled` as (4, N)."""
-    return thinned(sampled(*case, **options), SHAPE[0] * SHAPE[1])
+    return np.stack([x, y, z, scatter])
 
 
 def box(top, bottom, left, right):
@@ -63,24 +58,24 @@ BALL = surface(SPHERE, 0.0, 0.0, 2.3, 0.3, 1.0)
 
 
 def test_a_wall_bent_by_slow_errors_is_named_a_plane():
-    kind, th = straightened(*BENT_WALL, packed_samples(*BENT_WALL, WALL, SLOW), SLOW.packed(), True)
+    kind, th = straightened(*BENT_WALL, sampled(*BENT_WALL, WALL, SLOW), SLOW.packed(), True)
     assert kind == PLANE
     assert abs(th[2]) == pytest.approx(1.0, abs=1e-3)
 
 
 def test_without_slow_errors_the_same_surface_stays_a_piece_of_a_ball():
-    kind, th = straightened(*BENT_WALL, packed_samples(*BENT_WALL, WALL, WHITE), WHITE.packed(), True)
+    kind, th = straightened(*BENT_WALL, sampled(*BENT_WALL, WALL, WHITE), WHITE.packed(), True)
     assert (kind, th[3]) == (SPHERE, 12.0)
 
 
 def test_a_ball_is_no_bent_plane():
-    samples = packed_samples(*BALL, box(52, 68, 70, 90), SLOW)
+    samples = sampled(*BALL, box(52, 68, 70, 90), SLOW)
     assert straightened(*BALL, samples, SLOW.packed(), True)[0] == SPHERE
 
 
 def test_a_slender_cone_under_slow_errors_is_named_a_cylinder():
     cone = surface(CONE, 0.0, -3.0, 1.5, 0.0, 1.0, 0.0, 0.03, 1.0)
-    samples = packed_samples(*cone, box(40, 80, 76, 84), SLOW, sigma=0.2)
+    samples = sampled(*cone, box(40, 80, 76, 84), SLOW, sigma=0.2)
     kind, th = straightened(*cone, samples, SLOW.packed(), True)
     assert kind == CYLINDER
     assert th[6] == pytest.approx(3.0 * np.tan(0.03), rel=0.1)
@@ -88,9 +83,7 @@ def test_a_slender_cone_under_slow_errors_is_named_a_cylinder():
 
 def test_a_steeper_cone_stays_one():
     cone = surface(CONE, 0.0, -1.0, 1.5, 0.0, 1.0, 0.0, 0.2, 1.0)
-    assert (
-        straightened(*cone, packed_samples(*cone, box(40, 80, 74, 86), SLOW, sigma=0.2), SLOW.packed(), True)[0] == CONE
-    )
+    assert straightened(*cone, sampled(*cone, box(40, 80, 74, 86), SLOW, sigma=0.2), SLOW.packed(), True)[0] == CONE
 
 
 def test_turn_is_the_angle_over_which_normals_spread():
@@ -101,28 +94,34 @@ def test_turn_is_the_angle_over_which_normals_spread():
 
 def test_a_flat_patch_that_was_fitted_as_a_ball_is_cheaper_as_a_plane():
     flat = plane([0.0, 0.3, -1.0], -2.0)
-    samples = packed_samples(*flat, box(50, 70, 70, 90), WHITE)
+    samples = sampled(*flat, box(50, 70, 70, 90), WHITE)
     kind, th = simplest(*surface(SPHERE, 0.0, 0.0, 6.0, 4.0, 1.0), samples, True, 400.0)
     assert kind == PLANE
     assert abs(th[:3] @ flat[1][:3]) == pytest.approx(1.0, abs=1e-3)
 
 
 def test_a_ball_stays_a_ball_when_its_bulge_is_worth_its_price():
-    samples = packed_samples(*BALL, box(52, 68, 70, 90), WHITE)
+    samples = sampled(*BALL, box(52, 68, 70, 90), WHITE)
     kind, th = simplest(*BALL, samples, True, float(samples.shape[1]))
     assert kind == SPHERE
     assert th[3] == pytest.approx(0.3, rel=0.15)
 
 
 LEFT, RIGHT = box(20, 100, 20, 80), box(20, 100, 80, 140)
-LABELS = (LEFT + 2 * RIGHT).astype(np.int32)
+
+
+def image_of(parts, noise, background_m=np.nan):
+    """The regions of an image of `parts`, each a surface and its mask, the later before the earlier."""
+    depth, labels = np.full(SHAPE, background_m), np.zeros(SHAPE, np.int32)
+    for k, (shape, mask) in enumerate(parts, 1):
+        depth[mask], labels[mask] = sampled(*shape, mask, noise, seed=k)[2], k
+    return regions_of(depth, PACKED, noise.packed(), labels, len(parts))
 
 
 def merged(left, right, noise):
     """The owners of labels 1 and 2, two planes that touch along a column."""
-    samples = [sampled(*left, LEFT, noise, seed=1), sampled(*right, RIGHT, noise, seed=2)]
-    kinds, parameters = [left[0], right[0]], [left[1], right[1]]
-    return merge_touching(LABELS, PACKED, kinds, parameters, samples, noise)
+    regions = image_of([(left, LEFT), (right, RIGHT)], noise)
+    return merge_touching(regions, [left[0], right[0]], [left[1], right[1]])
 
 
 @pytest.mark.parametrize("noise", [WHITE, SLOW], ids=["white", "slow"])
@@ -140,17 +139,16 @@ def test_a_step_between_parallel_faces_stays():
 
 def test_pieces_of_a_bent_table_are_joined_behind_what_parts_them():
     left, right = plane([0.008, 0.3, -1.0], -2.0), plane([-0.008, 0.3, -1.0], -2.0)
-    apart = [sampled(*left, box(20, 100, 10, 60), SLOW, seed=1), sampled(*right, box(20, 100, 90, 150), SLOW, seed=2)]
-    depth = np.full(SHAPE, 1.5)  # something nearer between them
-    owners = join_pieces(depth, PACKED, [PLANE, PLANE], [left[1], right[1]], apart, noise=SLOW)
+    apart = [(left, box(20, 100, 10, 60)), (right, box(20, 100, 90, 150))]
+    regions = image_of(apart, SLOW, background_m=1.5)  # something nearer between them
+    owners = join_pieces(regions, [PLANE, PLANE], [left[1], right[1]])
     assert len(set(owners)) == 1
 
 
 def test_a_gap_that_shows_something_behind_keeps_pieces_apart():
     flat = plane([0.0, 0.0, -1.0], -2.0)
-    apart = [sampled(*flat, box(20, 100, 10, 60), SLOW, seed=1), sampled(*flat, box(20, 100, 90, 150), SLOW, seed=2)]
-    depth = np.full(SHAPE, 4.0)
-    assert join_pieces(depth, PACKED, [PLANE, PLANE], [flat[1], flat[1]], apart, noise=SLOW) == [1, 2]
+    regions = image_of([(flat, box(20, 100, 10, 60)), (flat, box(20, 100, 90, 150))], SLOW, background_m=4.0)
+    assert join_pieces(regions, [PLANE, PLANE], [flat[1], flat[1]]) == [1, 2]
 
 
 SPOT = box(55, 65, 75, 85)
@@ -160,7 +158,7 @@ WALL_2M = plane([0.0, 0.0, -1.0], -2.0)
 def spot_gain(offset_m, noise):
     """The gain of joining a spot, turned by 0.4 rad and shifted by an offset, with the wall around it."""
     spot = plane([0.4, 0.0, -1.0], -(2.0 + offset_m) / np.hypot(0.4, 1.0))
-    samples = packed_samples(*plane([0, 0, -1], -(2.0 + offset_m)), SPOT, noise)
+    samples = sampled(*plane([0, 0, -1], -(2.0 + offset_m)), SPOT, noise)
     return scrap_gain(*WALL_2M, *spot, samples, float(SPOT.sum()), noise.packed(), True)
 
 
@@ -170,7 +168,7 @@ def test_a_spot_within_slow_noise_belongs_to_the_wall_whatever_its_direction():
 
 def test_under_white_noise_the_same_offset_is_a_thing_of_its_own():
     flush = plane([0.0, 0.0, -1.0], -2.005)
-    samples = packed_samples(*flush, SPOT, WHITE)
+    samples = sampled(*flush, SPOT, WHITE)
     assert scrap_gain(*WALL_2M, *flush, samples, float(SPOT.sum()), WHITE.packed(), True) < 0.0
 
 
@@ -181,9 +179,6 @@ def test_a_spot_that_stands_out_of_slow_noise_stays():
 @pytest.mark.parametrize(("offset_m", "owners"), [(0.003, [1, 1]), (0.08, [1, 2])])
 def test_a_scrap_inside_a_wall_is_swallowed_only_when_noise_explains_it(offset_m, owners):
     odd = plane([0.5, 0.0, -1.0], -(2.0 + offset_m) / np.hypot(0.5, 1.0))
-    labels = (WALL.astype(np.int32)) + SPOT
-    samples = [
-        sampled(*WALL_2M, WALL & ~SPOT, SLOW, seed=1),
-        sampled(*plane([0, 0, -1], -(2.0 + offset_m)), SPOT, SLOW, seed=2),
-    ]
-    assert merge_touching(labels, PACKED, [PLANE, PLANE], [WALL_2M[1], odd[1]], samples, SLOW) == owners
+    spot = plane([0, 0, -1], -(2.0 + offset_m))
+    regions = image_of([(WALL_2M, WALL), (spot, SPOT)], SLOW)
+    assert merge_touching(regions, [PLANE, PLANE], [WALL_2M[1], odd[1]]) == owners

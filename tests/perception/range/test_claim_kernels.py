@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from perception.range import claim, finish
 from perception.range.noise import NoiseModel
+from perception.range.regions import regions_of
 from perception.range.starts import principal_axes
 from perception.range.surfaces import CYLINDER, PLANE, SIZE, SPHERE
 from tests.perception.range.scenes import PARALLEL, PINHOLE
@@ -102,14 +103,24 @@ def test_only_pixels_beside_a_new_surface_are_judged_again(sensor):
 def test_samples_of_each_label_come_in_raster_order(sensor):
     depth, labels = random_case(sensor, 3, size=1)
     labels[np.isnan(depth)] = 0
-    samples = finish.samples_by_label(depth, sensor, NOISE, labels, 4)
     packed = sensor.packed()
-    for k, mine in enumerate(samples, 1):
+    regions = regions_of(depth, packed, NOISE.packed(), labels, 4)
+    for k, few in enumerate(regions.few(100), 1):
         v, u = np.nonzero(labels == k)
-        np.testing.assert_allclose(mine.x, (u - packed[3]) / packed[1], atol=1e-15)
-        np.testing.assert_allclose(mine.y, (v - packed[4]) / packed[2], atol=1e-15)
-        np.testing.assert_array_equal(mine.z, depth[v, u])
-        np.testing.assert_allclose(mine.sigma, NOISE.sigma_m(depth[v, u]), rtol=1e-12)
+        mine = regions.samples(k)
+        expected = [(u - packed[3]) / packed[1], (v - packed[4]) / packed[2], depth[v, u], NOISE.sigma_m(depth[v, u])]
+        np.testing.assert_allclose(mine, expected, rtol=1e-12, atol=1e-15)
+        assert regions.pixels[k - 1] == v.size and few.shape == (4, 100)
+        spread = np.rint(np.linspace(0, v.size - 1, 100)).astype(int)
+        np.testing.assert_allclose(few, mine[:, spread], rtol=1e-12, atol=1e-15)
+
+
+def test_regions_given_to_others_are_those_of_the_new_labels():
+    depth, labels = random_case(PINHOLE, 4, size=1)
+    labels[np.isnan(depth)] = 0
+    given = regions_of(depth, PINHOLE.packed(), NOISE.packed(), labels, 4).given_to([1, 1, 3, 3])
+    assert given.pixels == [int(np.isin(labels, k).sum()) for k in ([1, 2], [], [3, 4], [])]
+    assert np.array_equal(given.labels, np.array([0, 1, 1, 3, 3])[labels])
 
 
 @settings(max_examples=60, deadline=None)
@@ -137,12 +148,12 @@ def test_a_sphere_is_refined_to_its_bound_and_its_covariance_is_the_inverse_info
         start = np.zeros(SIZE)
         start[:5] = [0.002, -0.001, 0.601, 0.1, 1.0]
         z = surface + sigma * rng.normal(size=x.size)
-        th, H, covariance, middles, kept, used = finish.refined(SPHERE, start, x, y, z, sigma, False, free)
+        th, H, covariance, middles, kept, used = finish.refined(SPHERE, start, np.stack([x, y, z, sigma]), False, free)
         np.testing.assert_allclose(covariance @ H[:4, :4], np.eye(4), atol=1e-8)
         assert kept / used == pytest.approx(0.97, abs=0.1)
         np.testing.assert_allclose(middles[:2], 0.0, atol=0.02)
         scores.append((th[:4] - truth) / np.sqrt(np.diag(covariance)))
-        th, _, covariance, *_ = finish.refined(SPHERE, start, x, y, z, sigma, False, held)
+        th, _, covariance, *_ = finish.refined(SPHERE, start, np.stack([x, y, z, sigma]), False, held)
         assert th[3] == 0.1 and not covariance[3].any() and covariance[0, 0] > 0
     assert 0.6 < np.std(scores) < 1.5
 

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 RESIDUAL = 1e-6  # EAIK answers an unreachable pose in the least-squares sense; a round trip through FK tells
 LARGEST_STEP_RAD = 0.35  # between neighbouring samples of a stroke; a larger step is another branch
+TURN_RAD = 2.0 * np.pi
 SINGULAR_RATIO = 0.02  # smallest singular value of the scaled Jacobian; the notes' strokes fail below
 
 
@@ -73,58 +74,53 @@ class Kinematics:
 
         Source: Elsner et al., EAIK, 2025 (subproblem decomposition); each answer is checked by forward kinematics.
         """
+        turned = [_turned(q[None], self.lower_rad, self.upper_rad)[:, 0] for q in self._branches(base_from_flange)]
+        return np.concatenate([np.empty((0, len(self.dh))), *turned])
+
+    def _branches(self, base_from_flange: RigidTransform) -> Array:
+        """(k, n) the joint vectors that reach the pose, each joint up to whole turns."""
         goal = base_from_flange.as_matrix()
         found = np.atleast_2d(np.asarray(self.solver.IK(goal).Q, float))
         if found.size == 0:
             return np.empty((0, len(self.dh)))
         found = found[np.all(np.isfinite(found), axis=1)] - self.dh[:, 3]
-        good = [q for q in found if np.abs(kernels.frames(self.dh, q)[-1] - goal).max() < RESIDUAL]
-        turned = [wrapped for q in good for wrapped in self._within_limits(q)]
-        return np.array(turned).reshape(-1, len(self.dh))
+        return found[[np.abs(kernels.frames(self.dh, q)[-1] - goal).max() < RESIDUAL for q in found]]
 
-    def follow(
-        self, base_from_flange: Sequence[RigidTransform], *, near_rad: Array, start_rad: Array | None = None
-    ) -> tuple[Array, ...]:
+    def follow(self, base_from_flange: Sequence[RigidTransform], *, near_rad: Array) -> tuple[Array, ...]:
         """Joint paths (N, n), one for each branch that follows *all* poses without a jump, limit or singularity;
         best first.
 
         The branch is chosen over the whole stroke: one lever arc in five met a wrist limit when chosen by its first
-        pose.
+        pose. Whole turns of single joints are branches of their own, but of one path: it is followed once.
 
         Args:
             near_rad: branches are ranked by how far the arm must move from here.
-            start_rad: only branches that begin within 0.35 rad of these joints.
 
         Raises:
             Unreachable: no branch does; says which pose stops the longest one.
         """
-        candidates = [self.inverse(pose) for pose in base_from_flange]
-        starts = candidates[0] if start_rad is None else _near(candidates[0], start_rad)
-        paths, furthest = [], 0
-        for q in starts:
-            path, reached = self._follow_branch(q, candidates)
-            furthest = max(furthest, reached)
-            if path is not None:
-                paths.append(path)
-        if not paths:
+        branches = [self._branches(pose) for pose in base_from_flange]
+        ranked: list[tuple[float, Array]] = []
+        furthest = 0
+        for q in branches[0]:
+            path = _unwound(q, branches[1:])
+            within = int(np.count_nonzero(_fits(path, self.lower_rad, self.upper_rad)))
+            furthest = max(furthest, min(within, len(branches) - 1))
+            if within == len(branches) and self._is_regular(path):
+                poor = min(self.conditioning(path[0]), self.conditioning(path[-1]))
+                turned = _turned(path, self.lower_rad, self.upper_rad)
+                ranked += [(self._effort(turn, near_rad, poor), turn) for turn in turned]
+        if not ranked:
             where = base_from_flange[furthest].translation
             raise Unreachable(
                 f"no arm configuration follows the path beyond pose {furthest + 1} of {len(base_from_flange)} at "
                 f"({where[0]:.3f}, {where[1]:.3f}, {where[2]:.3f}) m",
                 hint="move the panel nearer to the middle of the arm's workspace, or turn the tool about its axis",
             )
-        return tuple(sorted(paths, key=lambda path: self._effort(path, near_rad)))
+        return tuple(path for _, path in sorted(ranked, key=lambda pair: pair[0]))
 
-    def _follow_branch(self, start: Array, candidates: Sequence[Array]) -> tuple[Array | None, int]:
-        path = [start]
-        for k, options in enumerate(candidates[1:], start=1):
-            close = _near(options, path[-1])
-            if len(close) == 0:
-                return None, k
-            path.append(close[0])
-        if min(self.conditioning(q) for q in path[:: max(1, len(path) // 8)]) < SINGULAR_RATIO:
-            return None, len(path) - 1
-        return np.array(path), len(path) - 1
+    def _is_regular(self, path: Array) -> bool:
+        return min(self.conditioning(q) for q in path[:: max(1, len(path) // 8)]) >= SINGULAR_RATIO
 
     def conditioning(self, q_rad: Array) -> float:
         """Smallest singular value of the flange Jacobian with lengths scaled by 0.5 m; 0 at a singularity."""
@@ -132,26 +128,41 @@ class Kinematics:
         _, jacobian = kernels.tool_and_jacobian(self.dh, q_rad, np.eye(4))
         return float(np.linalg.svd(scale * jacobian, compute_uv=False)[-1])
 
-    def _effort(self, path: Array, near_rad: Array) -> float:
+    def _effort(self, path: Array, near_rad: Array, poor: float) -> float:
         # Seconds to get there, plus a price for ending near a limit or a singularity.
         travel = np.max(np.abs(path[0] - near_rad) / self.velocity_rad_per_s)
         margin = np.min(np.minimum(path - self.lower_rad, self.upper_rad - path))
-        poor = min(self.conditioning(path[0]), self.conditioning(path[-1]))
         return float(travel + 0.05 / (margin + 0.02) + 0.05 / (poor + 0.02))
 
-    def _within_limits(self, q: Array) -> list[Array]:
-        """All vectors equal to `q` up to whole turns of single joints and inside the limits."""
-        choices = []
-        for angle, low, high in zip(q, self.lower_rad, self.upper_rad, strict=True):
-            first = angle + 2.0 * np.pi * np.ceil((low - angle) / (2.0 * np.pi) - 1e-12)
-            choices.append(np.arange(first, high + 1e-12, 2.0 * np.pi))
-        return [np.array(c) for c in np.stack(np.meshgrid(*choices, indexing="ij"), axis=-1).reshape(-1, len(q))]
+
+def _unwound(start: Array, branches: Sequence[Array]) -> Array:
+    """(m, n) from `start` on, the nearest joint vector for each pose without whole turns in between; ends before a jump."""
+    path = [start]
+    for options in branches:
+        steps = (options - path[-1] + np.pi) % TURN_RAD - np.pi
+        lengths = np.abs(steps).max(axis=1, initial=0.0)
+        if len(steps) == 0 or lengths.min() > LARGEST_STEP_RAD:
+            break
+        path.append(path[-1] + steps[np.argmin(lengths)])
+    return np.array(path)
 
 
-def _near(options: Array, q: Array) -> Array:
-    """Rows of `options` within one step of `q`, nearest first."""
-    if len(options) == 0:
-        return options
-    distance = np.max(np.abs(options - q), axis=1)
-    order = np.argsort(distance)
-    return np.asarray(options[order][distance[order] <= LARGEST_STEP_RAD])
+def _fits(path: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
+    """(m,) for each place of a path: do whole turns bring all of the path up to there inside the limits?"""
+    low, high = np.minimum.accumulate(path), np.maximum.accumulate(path)
+    return np.asarray((high + _least_turns(low, lower) <= upper + 1e-12).all(axis=1))
+
+
+def _turned(path: Array, lower: Array, upper: Array) -> Array:
+    """(k, m, n) all paths that are equal to this one (m, n) up to whole turns of single joints and inside the limits."""
+    first = _least_turns(path.min(axis=0), lower)
+    choices = [
+        np.arange(least, limit - highest + 1e-12, TURN_RAD)
+        for least, highest, limit in zip(first, path.max(axis=0), upper, strict=True)
+    ]
+    turns = np.stack(np.meshgrid(*choices, indexing="ij"), axis=-1).reshape(-1, 1, path.shape[1])
+    return np.asarray(path + turns)
+
+
+def _least_turns(lowest: Array, lower: Array) -> Array:
+    return np.asarray(TURN_RAD * np.ceil((lower - lowest) / TURN_RAD - 1e-12))

@@ -65,6 +65,28 @@ def test_a_stroke_stays_on_one_branch_and_the_best_is_near() -> None:
         assert np.abs(forward(T3, q) - pose.as_matrix()).max() < 1e-6
 
 
+@pytest.mark.parametrize("turns", [(0, 0), (1, -1)])
+def test_whole_turns_of_a_path_are_paths_of_their_own_and_the_nearest_is_best(turns: tuple[int, int]) -> None:
+    kinematics = Kinematics.of(UR)
+    start = np.array([0.1, -1.2, 1.4, -1.1, -1.5, 0.3])
+    poses = [perturbed(kinematics.flange(start), np.array([0, 0.002 * k, 0, 0, 0, 0.01 * k])) for k in range(10)]
+    near = start + 2.0 * np.pi * np.array([0, turns[0], 0, 0, 0, turns[1]])
+    paths = kinematics.follow(poses, near_rad=near)
+    assert np.abs(paths[0][0] - near).max() < 1e-6
+    alike = [
+        p for p in paths if np.allclose(np.cos(p[0] - start), 1.0) and np.allclose(np.diff(p - paths[0], axis=0), 0)
+    ]
+    assert len(np.unique(np.round([p[0] for p in alike], 6), axis=0)) == len(alike) > 1
+    expected = np.prod(
+        [
+            sum(low <= first + 2.0 * np.pi * k <= high for k in range(-3, 4))
+            for first, low, high in zip(start, kinematics.lower_rad, kinematics.upper_rad, strict=True)
+        ]
+    )
+    assert len(alike) == expected
+    assert min(np.min([p - kinematics.lower_rad, kinematics.upper_rad - p]) for p in paths) >= -1e-9
+
+
 def test_a_stroke_out_of_the_workspace_is_unreachable_and_says_where() -> None:
     kinematics = Kinematics.of(T3)
     first = kinematics.flange(np.array([0.1, 0.3, 0.2, 0.1, 0.6, 0.0]))

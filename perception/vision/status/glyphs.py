@@ -31,6 +31,8 @@ SPREAD = 0.16  # one sigma of a lit segment's level over that level: uneven ligh
 LEAK = 0.15  # the same for an unlit one: its lit neighbours' blur
 CELL_SPREAD = 0.4  # one sigma of the logarithm of a cell's lit level over the display's
 MOST_LOSS = 9.0  # nats that one segment may cost: something else than noise has happened to it
+DROWNING = 0.6  # share of the display's lit level below which a cell's level is taken for drowned
+GHOST, MOST_GHOST = 0.12, 0.3  # unlit segments that show: one sigma of their level over the lit one; at most
 CLOSE = 7.0  # nats: characters listed beside the best of their cell
 MOST_LISTED = 300
 
@@ -103,13 +105,23 @@ def likelihoods(levels: Levels) -> tuple[Array, Array]:
     own = np.clip(own, unlit + 0.15 * np.maximum(levels.lit - unlit, 1.0), 2.5 * levels.lit)
     sigma = np.sqrt(noise**2 + (np.where(LIT, SPREAD, LEAK) * own) ** 2)
     miss = (ink - np.where(LIT, own, unlit)) / sigma
-    segments = -np.minimum(0.5 * miss**2, MOST_LOSS) - np.log(sigma / levels.lit)
+    # Where light drowns most of a cell's level it may drown a segment altogether: what is missing there says less.
+    most_loss = np.where(LIT, MOST_LOSS * np.clip(own / (DROWNING * levels.lit), 0.2, 1.0), MOST_LOSS)
+    segments = -np.minimum(0.5 * miss**2, most_loss) - np.log(sigma / levels.lit)
     characters = (w * segments).sum(axis=2) - 0.5 * (np.log(own / levels.lit)[:, :, 0] / CELL_SPREAD) ** 2
     for k, loss in RARE.items():
         characters[:, k] -= loss
-    spread = np.sqrt(noise[:, 0] ** 2 + (0.5 * LEAK * levels.lit) ** 2)
-    dim = -np.minimum(0.5 * ((levels.ink - unlit[:, 0]) / spread) ** 2, MOST_LOSS) - np.log(spread / levels.lit)
-    return np.asarray(characters), np.asarray((weight * dim).sum(axis=1))
+    return np.asarray(characters), _blank(levels, weight)
+
+
+def _blank(levels: Levels, weight: Array) -> Array:
+    """(cells,) log-likelihood of a blank cell: its segments show alike, as ghosts do, and hardly more than its loops."""
+    unlit, noise = levels.unlit[:, None], levels.noise[:, None]
+    ghost = np.sort(np.where(weight > 0, levels.ink, unlit), axis=1)[:, 3:4]  # the median
+    ghost = np.clip(ghost, unlit, unlit + MOST_GHOST * levels.lit)
+    spread = np.sqrt(noise**2 + (0.5 * LEAK * levels.lit) ** 2)
+    loss = np.minimum(0.5 * ((levels.ink - ghost) / spread) ** 2, MOST_LOSS) + np.log(spread / levels.lit)
+    return np.asarray(-(weight * loss).sum(axis=1) - 0.5 * ((ghost - unlit)[:, 0] / (GHOST * levels.lit)) ** 2)
 
 
 def numbers(characters: Array, blank: Array) -> list[Number]:

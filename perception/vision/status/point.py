@@ -15,13 +15,13 @@ from perception.vision.status.comb_jit import Float32
 from perception.vision.view import Array
 
 RADIUS = 0.075  # of the digit height
-LEVEL = 0.55  # of a lit segment: a dot and no dot are equally likely there
+LEVEL = 0.60  # of a lit segment: a dot and no dot are equally likely there
 LEVEL_SPREAD = 0.07
 HIDDEN_ODDS = -0.7  # logarithm, of a point in a gap that is hidden against no point at all
 STRIP = (0.55, 1.25)  # rows that are looked at, over the digit height from its top
 HALF_STROKES = np.array([0.045, 0.065])  # of the digit height: tried, with every blur
 BLURS = np.array([0.02, 0.05, 0.09])
-INSETS = (0.08, 0.22)  # of a segment's axis, at either end, by which its stroke is shorter
+INSETS = (0.08, 0.2, 0.32)  # of a segment's axis, at either end, by which its stroke is shorter
 PLACES_X = np.linspace(0.25, 0.75, 6)  # of the gap
 PLACES_Y = np.linspace(-0.12, 0.06, 7)  # of the digit height, from the bottom segments' axis
 STEPS = 8  # places a px at which a stroke's profile is tabled

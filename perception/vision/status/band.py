@@ -18,7 +18,7 @@ from perception.vision.status.cover import Crossing, border_crossings
 from perception.vision.view import Array
 
 SAME_GRAY = 16.0  # levels along a band; real cables shine a little
-ALONG_SHARE = 0.8  # of the band's axis that must have its gray
+ALONG_SHARE = 0.72  # of the band's axis that must have its gray
 MOST_WIDTH = 0.5  # of the object's smaller side: wider things are not looked past
 BENDS = (0.0, -0.3, 0.3, -0.6, 0.6, -1.0, 1.0, -1.6, 1.6, -2.3, 2.3)  # of the band's width, sideways
 INK_EDGE_PX = 4.0
@@ -81,7 +81,7 @@ def _joined(smooth: NDArray[np.uint8], a: Crossing, b: Crossing, least_side_px: 
         + first[..., None] * (middles - a.middle_px)[:, None]
         + second[..., None] * (b.middle_px - middles)[:, None]
     )
-    sides = np.array([-0.25, 0.0, 0.25])[:, None] * across
+    sides = np.array([-0.2, 0.0, 0.2])[:, None] * across * (min(widths) / width)
     points = axes[:, None] + sides[:, None]  # (shapes, sides, along, 2)
     flat = points.reshape(len(shapes), -1, 2)
     off = np.abs(sample_at(smooth, flat[..., 0], flat[..., 1]) - np.tile(wanted, len(sides)))

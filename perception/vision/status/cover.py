@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 from perception.vision.patch import Patch, sample_at
 from perception.vision.view import Array
 
-STANDS_OUT = 14.0  # gray levels, and four sigmas of the noise
+STANDS_OUT = (
+    14.0  # gray levels, and four sigmas of the noise; less in a dark picture, as everything stands out less there
+)
+STANDS_OUT_SHARE, LEAST_STANDS_OUT = 0.12, 5.0
 LARGEST_SHARE = 0.4  # of the object: what follows the gray of a cable and fills more has leaked into the object
 DEEP = 0.35  # of the object's smaller half size: labels and ticks do not reach that far in
 
@@ -74,7 +77,8 @@ def border_crossings(patch: Patch, *, half_width_m: float, half_height_m: float,
         return []
     values = sample_at(smooth, path_u, path_v)
     typical = ring_medians(np.round(values).astype(np.uint8), max(9, len(values) // 5) | 1)
-    odd = inside & (np.abs(values - typical) > max(STANDS_OUT, 4.0 * _noise(patch)))
+    least = np.clip(STANDS_OUT_SHARE * typical, LEAST_STANDS_OUT, STANDS_OUT)
+    odd = inside & (np.abs(values - typical) > np.maximum(least, 4.0 * _noise(patch)))
     n = len(values)
     points = np.column_stack([path_u, path_v])
     sides = np.zeros(n, int) if is_round else _sides(patch, points, half_width_m, half_height_m)

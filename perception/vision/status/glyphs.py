@@ -31,7 +31,6 @@ SPREAD = 0.16  # one sigma of a lit segment's level over that level: uneven ligh
 LEAK = 0.15  # the same for an unlit one: its lit neighbours' blur
 CELL_SPREAD = 0.4  # one sigma of the logarithm of a cell's lit level over the display's
 MOST_LOSS = 9.0  # nats that one segment may cost: something else than noise has happened to it
-DROWNING = 0.6  # share of the display's lit level below which a cell's level is taken for drowned
 GHOST, MOST_GHOST = 0.12, 0.3  # unlit segments that show: one sigma of their level over the lit one; at most
 CLOSE = 7.0  # nats: characters listed beside the best of their cell
 MOST_LISTED = 300
@@ -105,9 +104,7 @@ def likelihoods(levels: Levels) -> tuple[Array, Array]:
     own = np.clip(own, unlit + 0.15 * np.maximum(levels.lit - unlit, 1.0), 2.5 * levels.lit)
     sigma = np.sqrt(noise**2 + (np.where(LIT, SPREAD, LEAK) * own) ** 2)
     miss = (ink - np.where(LIT, own, unlit)) / sigma
-    # Where light drowns most of a cell's level it may drown a segment altogether: what is missing there says less.
-    most_loss = np.where(LIT, MOST_LOSS * np.clip(own / (DROWNING * levels.lit), 0.2, 1.0), MOST_LOSS)
-    segments = -np.minimum(0.5 * miss**2, most_loss) - np.log(sigma / levels.lit)
+    segments = -np.minimum(0.5 * miss**2, MOST_LOSS) - np.log(sigma / levels.lit)
     characters = (w * segments).sum(axis=2) - 0.5 * (np.log(own / levels.lit)[:, :, 0] / CELL_SPREAD) ** 2
     for k, loss in RARE.items():
         characters[:, k] -= loss

@@ -14,6 +14,7 @@ HEADROOM = 0.5  # of a lit segment: where less is left below white, nothing can 
 KERNEL = 0.30  # of the picture's height: wider than any stroke, narrower than what light does
 SATURATED = 252
 BORDER_ROUNDS = 4
+BRIGHT_GROUND = 0.5  # share of the picture
 WIDEST_STROKE = 0.17  # of the picture's height
 
 
@@ -46,12 +47,12 @@ def segment_ink(gray: Image, is_dark: bool, hidden: NDArray[np.bool_] | None = N
 
 
 def _drowned(gray: Image, is_dark: bool) -> NDArray[np.bool_]:
-    """Where glare hides glowing segments: saturated, and wider than a stroke, which may be saturated itself.
+    """Where glare hides segments: saturated, and wider than a stroke, which may glow into saturation itself.
 
-    A bright ground that is saturated hides no dark segment: its absence is seen.
+    A bright ground that is saturated nearly everywhere hides no dark segment, its absence is seen; in a bright spot it is not.
     """
     white = (gray >= SATURATED).astype(np.uint8)
-    if is_dark or not white.any():
+    if not white.any() or (is_dark and white.mean() > BRIGHT_GROUND):
         return np.zeros(gray.shape, bool)
     size = max(3, round(WIDEST_STROKE * gray.shape[0])) | 1
     return np.asarray(cv2.morphologyEx(white, cv2.MORPH_OPEN, np.ones((size, size), np.uint8)) > 0)

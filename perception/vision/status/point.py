@@ -15,7 +15,7 @@ from perception.vision.status.comb_jit import Float32
 from perception.vision.view import Array
 
 RADIUS = 0.075  # of the digit height
-LEVEL = 0.60  # of a lit segment: a dot and no dot are equally likely there
+LEVEL = 0.70  # of a lit segment: a dot and no dot are equally likely there
 LEVEL_SPREAD = 0.07
 HIDDEN_ODDS = -0.7  # logarithm, of a point in a gap that is hidden against no point at all
 STRIP = (0.55, 1.25)  # rows that are looked at, over the digit height from its top
@@ -81,7 +81,7 @@ def _beside(lit_levels: Array) -> Array:
         return np.ones(len(cells) - 1)
     typical = float(np.median(cells[np.isfinite(cells)]))
     cells = np.where(np.isfinite(cells), cells, typical)
-    return np.clip(0.5 * (cells[:-1] + cells[1:]), 0.2 * typical, typical)
+    return np.maximum(0.5 * (cells[:-1] + cells[1:]), 0.2 * typical)
 
 
 def _dot(radius_px: float, sigma_px: float) -> Float32:
@@ -157,7 +157,7 @@ def _strokes(
 def _best_dots(
     rest: Float32, seen: Float32, dot: Float32, comb: Array, count: int, first: int, xs: Array, ys: Array
 ) -> tuple[Array, Array]:  # pragma: no cover
-    """(count - 1,) least-squares height of the best dot in every gap, and 1 where the gap is seen."""
+    """(count - 1,) least-squares height of the best dot over an even ground in every gap, and 1 where the gap is seen."""
     left, pitch, width, top, bottom, slant = comb
     rows, columns = rest.shape
     half = dot.shape[0] // 2
@@ -169,14 +169,17 @@ def _best_dots(
                 v = bottom + y * (bottom - top)
                 u = left + gap * pitch + width + x * (pitch - width) + slant * ((top + bottom) / 2 - v)
                 i, j = round(v) - first, round(u)
-                product = total = 0.0
+                product = total = weights = inks = n = 0.0
                 for a in range(max(0, i - half), min(rows, i + half + 1)):
                     for b in range(max(0, j - half), min(columns, j + half + 1)):
                         weight = dot[a - i + half, b - j + half]
                         product += weight * rest[a, b]
                         total += weight * weight
-                if total > 0.0:
-                    best[gap] = max(best[gap], product / total)
+                        weights += weight
+                        inks += rest[a, b]
+                        n += 1.0
+                if n > 1.0 and total > weights * weights / n:
+                    best[gap] = max(best[gap], (product - weights * inks / n) / (total - weights * weights / n))
                 if 0 <= i < rows and 0 <= j < columns and seen[i, j] > 0.5:
                     visible += 1
         if visible > 0.6 * len(xs) * len(ys):

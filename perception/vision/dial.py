@@ -23,6 +23,7 @@ from perception.vision.status.pointer import PointerFit, find_pointer
 
 SIDE_PX = 220
 NUMERALS_FROM, TIP_AT = 0.45, 0.72  # share of the radius: beyond any round hub, within every pointer
+LEAST_HUB = 0.18  # of the radius: a drop's hub is wider than any needle's
 SCALE_END_RAD = np.deg2rad(135.0)  # three quarters of a turn is what almost all round gauges use
 
 
@@ -82,7 +83,7 @@ def _coloured_pointer(image: Image, u: float, v: float, radius: float) -> Pointe
             region, separation = _region(sign * part, disc, (round(u), round(v)))
             if region is not None and (best is None or separation > best[0]):
                 best = separation, region
-    return None if best is None else _axis(best[1], radius, best[0])
+    return None if best is None else _axis(best[1], (u, v), radius, best[0])
 
 
 def _region(
@@ -110,7 +111,10 @@ def _region(
     return (region, separation) if 0.03 < share < 0.4 and near and separation > 4.0 else (None, 0.0)
 
 
-def _axis(region: NDArray[np.bool_], radius: float, separation: float) -> PointerFit | None:
+def _axis(
+    region: NDArray[np.bool_], middle: tuple[float, float], radius: float, separation: float
+) -> PointerFit | None:
+    """The axis of a drop: a wide hub about the dial's middle with one tip; None for any other pointer."""
     inner = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
     core = np.argwhere(inner > 0.93 * inner.max())
     hub = core.mean(axis=0)[::-1]
@@ -119,6 +123,8 @@ def _axis(region: NDArray[np.bool_], radius: float, separation: float) -> Pointe
     hub_radius, reach = float(inner.max()), float(np.percentile(away, 99.7))
     if reach < 1.4 * hub_radius or reach < 0.4 * radius:
         return None  # a disc points nowhere
+    if hub_radius < LEAST_HUB * radius or np.hypot(*(hub - middle)) > 0.15 * radius:
+        return None  # a thick place off the middle is a counterweight or a letter
     far = points[away > max(1.15 * hub_radius, 0.55 * reach)]
     direction = far.mean(axis=0)
     angle = float(np.arctan2(direction[0], -direction[1]))

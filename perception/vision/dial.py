@@ -14,15 +14,20 @@ from numpy.typing import NDArray
 
 from hal.panel import Scale
 from perception.vision.circles import find_circles
-from perception.vision.image import Image, as_gray
+from perception.vision.image import WHITE_LEVEL, Image, as_gray
 from perception.vision.patch import Patch
 from perception.vision.reading import Status, gated, refused
 from perception.vision.shapes import find_edges
 from perception.vision.status.gauge import pointer_confidence, status_of_pointer
-from perception.vision.status.pointer import PointerFit, find_pointer
+from perception.vision.status.pointer import PointerFit, find_pointer, unroll
 
 SIDE_PX = 220
 NUMERALS_FROM, TIP_AT = 0.45, 0.72  # share of the radius: beyond any round hub, within every pointer
+LEAST_CONNECTED = 0.7  # of the way to the hub: a pointer comes from it, a glare or a numeral does not
+LEAST_SIDE_PX = 90
+UNSEEN_RIM = 0.48  # of the picture: the radius where no outline is found
+PIVOT_OFF = 0.08  # of the radius: seen aslant, the outline found is not about the pivot
+LEAST_SEPARATION = 3.2  # spreads of the face: two halves of one blurred gray lie 2.7 apart
 LEAST_HUB = 0.18  # of the radius: a drop's hub is wider than any needle's
 SCALE_END_RAD = np.deg2rad(135.0)  # three quarters of a turn is what almost all round gauges use
 
@@ -44,17 +49,20 @@ def read_dial(
     scale = SIDE_PX / max(image.shape[:2])
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
     gray = as_gray(np.asarray(small, np.uint8))
-    u, v, radius = _dial_circle(gray)
+    u, v, radius = _dial_circle(as_gray(image), scale)
     drop = _coloured_pointer(np.asarray(small, np.uint8), u, v, radius)
     fits = [] if drop is None else [drop]
-    for channel, dark in _channels(np.asarray(small, np.uint8), gray) if drop is None else []:
-        fit = find_pointer(
-            _patch(channel, u, v), pivot_m=(0.0, 0.0), inner_m=NUMERALS_FROM * radius, outer_m=TIP_AT * radius,
-            fine_m=(0.35 * radius, 0.78 * radius), width_rad=np.deg2rad(50.0), quantile=0.4, dark=dark,
-            prior_pivot_px=0.02 * radius,
-        )  # fmt: skip
-        if fit is not None:
-            fits.append(fit)
+    glare = _glare(gray, u, v, radius)
+    for channel in _channels(np.asarray(small, np.uint8), gray) if drop is None else []:
+        for dark in (True, False):
+            patch = _patch(channel, u, v)
+            fit = find_pointer(
+                patch, pivot_m=(0.0, 0.0), inner_m=NUMERALS_FROM * radius, outer_m=TIP_AT * radius,
+                fine_m=(0.35 * radius, 0.78 * radius), width_rad=np.deg2rad(50.0), quantile=0.4, dark=dark,
+                prior_pivot_px=0.02 * radius, cover=glare,
+            )  # fmt: skip
+            if fit is not None and _reaches_hub(patch, fit.angle_rad, radius) >= LEAST_CONNECTED:
+                fits.append(fit)
     if not fits:
         return refused("no pointer stands out on the dial: come closer or add light")
     fit = max(fits, key=_clearness)
@@ -108,7 +116,7 @@ def _region(
     face = channel[disc & ~region]
     spread = 1.4826 * float(np.median(np.abs(face - np.median(face)))) + 1.0
     separation = (float(np.median(channel[region])) - float(np.median(face))) / spread
-    return (region, separation) if 0.03 < share < 0.4 and near and separation > 4.0 else (None, 0.0)
+    return (region, separation) if 0.03 < share < 0.4 and near and separation > LEAST_SEPARATION else (None, 0.0)
 
 
 def _axis(
@@ -123,7 +131,7 @@ def _axis(
     hub_radius, reach = float(inner.max()), float(np.percentile(away, 99.7))
     if reach < 1.4 * hub_radius or reach < 0.4 * radius:
         return None  # a disc points nowhere
-    if hub_radius < LEAST_HUB * radius or np.hypot(*(hub - middle)) > 0.15 * radius:
+    if hub_radius < LEAST_HUB * radius or np.hypot(*(hub - middle)) > 0.25 * radius:
         return None  # a thick place off the middle is a counterweight or a letter
     far = points[away > max(1.15 * hub_radius, 0.55 * reach)]
     direction = far.mean(axis=0)
@@ -147,32 +155,72 @@ def _clearness(fit: PointerFit) -> float:
     return float(np.log(fit.strength) + 3.0 * (1.0 - fit.rival_ratio) + 2.0 * fit.supported)
 
 
-def _dial_circle(gray: Image) -> tuple[float, float, float]:
-    """Middle and radius of the dial: the largest round outline about the picture's middle, else the picture itself."""
-    height, width = gray.shape
+def _dial_circle(gray: Image, scale: float) -> tuple[float, float, float]:
+    """Middle and radius, both times `scale`, of the largest round outline about the picture's middle, or of the picture.
+
+    A small picture is looked at in about its own size: blown up, its edges would be too faint.
+    """
+    own = np.clip(max(gray.shape), LEAST_SIDE_PX, SIDE_PX) / max(gray.shape)
+    interpolation = cv2.INTER_AREA if own < 1 else cv2.INTER_CUBIC
+    picture = np.asarray(cv2.resize(gray, None, fx=own, fy=own, interpolation=interpolation), np.uint8)
+    height, width = picture.shape
     middle = np.array([(width - 1) / 2, (height - 1) / 2])
     most = 0.52 * max(width, height)
     circles = [
         c
-        for c in find_circles(find_edges(gray, sigma_px=1.5), least_px=0.55 * most, most_px=most)
+        for c in find_circles(find_edges(picture, sigma_px=1.5), least_px=0.55 * most, most_px=most)
         if np.hypot(c.u - middle[0], c.v - middle[1]) < 0.12 * most
     ]
+    ratio = scale / own
     if not circles:
-        return float(middle[0]), float(middle[1]), 0.5 * min(width, height)
+        return float(middle[0]) * ratio, float(middle[1]) * ratio, UNSEEN_RIM * min(width, height) * ratio
     best = max(circles, key=lambda c: c.coverage * c.radius)
-    return best.u, best.v, best.radius
+    return best.u * ratio, best.v * ratio, best.radius * ratio
 
 
-def _channels(image: Image, gray: Image) -> list[tuple[Image, bool | None]]:
-    """Pictures in which a pointer may stand out, and whether it is dark in them (None: either)."""
-    channels: list[tuple[Image, bool | None]] = [(gray, None)]
+def _glare(gray: Image, u: float, v: float, radius: float) -> NDArray[np.bool_] | None:
+    """(H, W) saturated spots that do not come from the dial's middle, as a pointer does; None where there are none."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((gray >= WHITE_LEVEL).astype(np.uint8))
+    y, x = np.mgrid[: gray.shape[0], : gray.shape[1]]
+    middle = np.unique(labels[np.hypot(x - u, y - v) < 0.2 * radius])
+    least, most = (share * np.pi * radius**2 for share in (0.002, 0.15))
+    spots = [k for k in range(1, count) if k not in middle and least < stats[k, cv2.CC_STAT_AREA] < most]
+    if not spots:
+        return None
+    size = round(0.16 * radius) | 1  # a spot has a halo
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    return np.asarray(cv2.dilate(np.isin(labels, spots).astype(np.uint8), kernel) > 0)
+
+
+def _reaches_hub(patch: Patch, angle_rad: float, radius: float) -> float:
+    """Share of the way from the hub to the numerals that looks like the pointer further out rather than like the face."""
+    turn = np.linspace(-np.pi, np.pi, 180)
+    outer = np.linspace(NUMERALS_FROM, TIP_AT, 12) * radius
+    inner = np.linspace(0.15, NUMERALS_FROM, 12) * radius
+    face = np.median(unroll(patch, (0.0, 0.0), outer, turn, None), axis=1)
+    beside = angle_rad + np.deg2rad(np.array([-2.0, 0.0, 2.0]))
+    pointer = unroll(patch, (0.0, 0.0), outer, beside, None).mean(axis=1)
+    contrast = float(np.median(pointer - face))
+    if contrast == 0:
+        return 0.0
+    # The pivot may lie off the dial's middle: the way in is a strip, as wide as that.
+    off = np.linspace(-PIVOT_OFF, PIVOT_OFF, 9) * radius
+    x = inner[:, None] * np.sin(angle_rad) + off * np.cos(angle_rad)
+    y = inner[:, None] * np.cos(angle_rad) - off * np.sin(angle_rad)
+    way = (patch.sample(x, y) - float(np.median(face))) / contrast
+    return float((way.max(axis=1) > 0.5).mean())
+
+
+def _channels(image: Image, gray: Image) -> list[Image]:
+    """Pictures in which a pointer may stand out, darker or brighter than the face."""
+    channels = [gray]
     if image.ndim == 3:
         lab = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_RGB2LAB).astype(np.float32)
         for k in (1, 2):
             part = cv2.GaussianBlur(lab[:, :, k], (0, 0), 1.0)
             low, high = np.percentile(part, [2, 99.5])
             if high - low >= 12.0:
-                channels.append((np.clip((part - low) * (220.0 / (high - low)) + 10, 0, 255).astype(np.uint8), None))
+                channels.append(np.clip((part - low) * (220.0 / (high - low)) + 10, 0, 255).astype(np.uint8))
     return channels
 
 

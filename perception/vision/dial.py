@@ -16,18 +16,21 @@ from hal.panel import Scale
 from perception.vision.circles import find_circles
 from perception.vision.image import WHITE_LEVEL, Image, as_gray
 from perception.vision.patch import Patch
-from perception.vision.reading import Status, gated, refused
+from perception.vision.reading import Status, gated, limited, refused
 from perception.vision.shapes import find_edges
 from perception.vision.status.gauge import pointer_confidence, status_of_pointer
-from perception.vision.status.pointer import PointerFit, find_pointer, unroll
+from perception.vision.status.pointer import PointerFit, find_pointer, unroll, wrapped
 
 SIDE_PX = 220
 NUMERALS_FROM, TIP_AT = 0.45, 0.72  # share of the radius: beyond any round hub, within every pointer
 LEAST_CONNECTED = 0.7  # of the way to the hub: a pointer comes from it, a glare or a numeral does not
+SAME_RAD = np.deg2rad(6.0)
+CLEARER_BY = 0.5  # than the best pointer elsewhere, as `_clearness` counts
 LEAST_SIDE_PX = 90
 UNSEEN_RIM = 0.48  # of the picture: the radius where no outline is found
 PIVOT_OFF = 0.08  # of the radius: seen aslant, the outline found is not about the pivot
 LEAST_SEPARATION = 3.2  # spreads of the face: two halves of one blurred gray lie 2.7 apart
+LEAST_COLOUR = 5.0  # of Lab: less is the noise of a camera or of JPEG
 LEAST_HUB = 0.18  # of the radius: a drop's hub is wider than any needle's
 SCALE_END_RAD = np.deg2rad(135.0)  # three quarters of a turn is what almost all round gauges use
 
@@ -45,48 +48,71 @@ def read_dial(
     Raises:
         InvalidRequest, NotObservable: bad image.
     """
-    as_gray(image)
-    scale = SIDE_PX / max(image.shape[:2])
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
-    gray = as_gray(np.asarray(small, np.uint8))
-    u, v, radius = _dial_circle(as_gray(image), scale)
-    drop = _coloured_pointer(np.asarray(small, np.uint8), u, v, radius)
-    fits = [] if drop is None else [drop]
-    glare = _glare(gray, u, v, radius)
-    for channel in _channels(np.asarray(small, np.uint8), gray) if drop is None else []:
-        for dark in (True, False):
-            patch = _patch(channel, u, v)
-            fit = find_pointer(
-                patch, pivot_m=(0.0, 0.0), inner_m=NUMERALS_FROM * radius, outer_m=TIP_AT * radius,
-                fine_m=(0.35 * radius, 0.78 * radius), width_rad=np.deg2rad(50.0), quantile=0.4, dark=dark,
-                prior_pivot_px=0.02 * radius, cover=glare,
-            )  # fmt: skip
-            if fit is not None and _reaches_hub(patch, fit.angle_rad, radius) >= LEAST_CONNECTED:
-                fits.append(fit)
+    fits = _pointers(image)
     if not fits:
         return refused("no pointer stands out on the dial: come closer or add light")
     fit = max(fits, key=_clearness)
     if circular:
         value = minimum + (fit.angle_rad % (2 * np.pi)) / (2 * np.pi) * (maximum - minimum)
         sigma = fit.sigma_rad / (2 * np.pi) * (maximum - minimum)
-        return gated(Status(value=float(value), uncertainty=float(sigma), confidence=pointer_confidence(fit, 1.0)))
-    low, high = ends_rad or (-SCALE_END_RAD, SCALE_END_RAD)
-    return status_of_pointer(fit, Scale(minimum=minimum, maximum=maximum, unit="", at_min=low, at_max=high), 1.0)
+        status = Status(value=float(value), uncertainty=float(sigma), confidence=pointer_confidence(fit, 1.0))
+    else:
+        low, high = ends_rad or (-SCALE_END_RAD, SCALE_END_RAD)
+        scale = Scale(minimum=minimum, maximum=maximum, unit="", at_min=low, at_max=high)
+        status = status_of_pointer(fit, scale, 1.0)
+    return gated(limited(status, _agreement(fit, fits)))
 
 
-def _coloured_pointer(image: Image, u: float, v: float, radius: float) -> PointerFit | None:
-    """A pointer of a colour of its own: its region is a hub with a tip, and its axis runs from the one to the other.
+def _pointers(image: NDArray[Any]) -> list[PointerFit]:
+    """What looks like a pointer, in every channel of the picture and of either polarity; a drop leaves no question."""
+    gray = as_gray(image)
+    scale = SIDE_PX / max(image.shape[:2])
+    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    picture = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=interpolation), np.uint8)
+    u, v, radius = _dial_circle(gray, scale)
+    drop = _drop(picture, u, v, radius)
+    if drop is not None:
+        return [drop]
+    gray = as_gray(picture)
+    glare = _glare(gray, u, v, radius)
+    fits = []
+    y, x = np.mgrid[: gray.shape[0], : gray.shape[1]]
+    for channel, least in _channels(picture, gray, np.hypot(x - u, y - v) < radius):
+        patch = _patch(channel, u, v)
+        for dark in (True, False):
+            fit = find_pointer(
+                patch, pivot_m=(0.0, 0.0), inner_m=NUMERALS_FROM * radius, outer_m=TIP_AT * radius,
+                fine_m=(0.35 * radius, 0.78 * radius), width_rad=np.deg2rad(50.0), quantile=0.4, dark=dark,
+                prior_pivot_px=0.02 * radius, cover=glare,
+            )  # fmt: skip
+            if fit is None or fit.contrast < least:
+                continue
+            if _reaches_hub(patch, fit.angle_rad, radius) >= LEAST_CONNECTED:
+                fits.append(fit)
+    return fits
+
+
+def _agreement(best: PointerFit, fits: list[PointerFit]) -> float:
+    """Most confidence that the channels leave: less than an answer needs where a clear one points elsewhere."""
+    others = [f for f in fits if abs(wrapped(np.array(f.angle_rad - best.angle_rad))) > SAME_RAD]
+    rival = max((_clearness(f) for f in others), default=-np.inf)
+    return float(1.0 / (1.0 + np.exp(-(_clearness(best) - rival - CLEARER_BY) / 0.3)))
+
+
+def _drop(image: Image, u: float, v: float, radius: float) -> PointerFit | None:
+    """A wide hub with one tip, in a colour or gray of its own: its axis runs from the one to the other.
 
     The axis does not need the dial's middle, so a pointer seen from the side is read right.
     """
-    if image.ndim == 2:
-        return None
-    lab = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_RGB2LAB).astype(np.float32)
+    planes: list[NDArray[Any]] = [as_gray(image)]
+    if image.ndim == 3:
+        lab = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_RGB2LAB)
+        planes += [lab[:, :, 1], lab[:, :, 2]]
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     disc = np.hypot(x - u, y - v) < 0.86 * radius
     best: tuple[float, NDArray[np.bool_]] | None = None
-    for k in (1, 2):
-        part = cv2.GaussianBlur(lab[:, :, k], (0, 0), 1.5)
+    for plane in planes:
+        part = cv2.GaussianBlur(plane.astype(np.float32), (0, 0), 1.5)
         for sign in (1.0, -1.0):
             region, separation = _region(sign * part, disc, (round(u), round(v)))
             if region is not None and (best is None or separation > best[0]):
@@ -187,7 +213,7 @@ def _glare(gray: Image, u: float, v: float, radius: float) -> NDArray[np.bool_] 
     spots = [k for k in range(1, count) if k not in middle and least < stats[k, cv2.CC_STAT_AREA] < most]
     if not spots:
         return None
-    size = round(0.16 * radius) | 1  # a spot has a halo
+    size = round(0.24 * radius) | 1  # a spot has a halo
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     return np.asarray(cv2.dilate(np.isin(labels, spots).astype(np.uint8), kernel) > 0)
 
@@ -211,16 +237,18 @@ def _reaches_hub(patch: Patch, angle_rad: float, radius: float) -> float:
     return float((way.max(axis=1) > 0.5).mean())
 
 
-def _channels(image: Image, gray: Image) -> list[Image]:
-    """Pictures in which a pointer may stand out, darker or brighter than the face."""
-    channels = [gray]
+def _channels(image: Image, gray: Image, disc: NDArray[np.bool_]) -> list[tuple[Image, float]]:
+    """Pictures in which a pointer may stand out, darker or brighter than the face, and the least contrast there."""
+    channels = [(gray, 0.0)]
     if image.ndim == 3:
         lab = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_RGB2LAB).astype(np.float32)
         for k in (1, 2):
             part = cv2.GaussianBlur(lab[:, :, k], (0, 0), 1.0)
-            low, high = np.percentile(part, [2, 99.5])
+            low, high = np.percentile(part[disc], [2, 99.5])
             if high - low >= 12.0:
-                channels.append(np.clip((part - low) * (220.0 / (high - low)) + 10, 0, 255).astype(np.uint8))
+                gain = 220.0 / (high - low)
+                coded = np.clip((part - low) * gain + 10, 0, 255).astype(np.uint8)
+                channels.append((coded, LEAST_COLOUR * gain))
     return channels
 
 

@@ -21,9 +21,10 @@ INNER = 0.22  # of an axis, left out at either end: there other segments meet it
 LOOP = 0.2  # half size of the probed middle of a loop, over the cell's width; half of that over its height
 FREE_GAP = 0.13
 LEAST_GAP = 0.08  # between neighbours' uprights over the digit height: closer ones would be one upright shared
-COARSE = 20.0  # a digit is this many places high in the coarse search
+COARSE = 15.0  # a digit is this many places high in the coarse search
 LEAST_WEIGHT = 0.15  # share of a segment seen below which it says nothing
 MOST_CELLS = 64
+NEGLIGIBLE = 0.02  # of the best cell's worth
 BEYOND = (0.14, 0.34)  # of the digit height, above and below it: an upright that goes on there belongs to a frame
 
 #: Middle of every segment's axis in a cell of unit width and height, y down; the first row is x, the second y.
@@ -37,15 +38,16 @@ def cell_worth(levels: Array, areas: Array, loops: float, lit: Array) -> float: 
     total = loops
     for s in range(7):
         total += areas[s] * levels[s] * levels[s]
-    best = 0.0
+    square, over = 0.0, 1.0  # P of the best character is square / over: compared crosswise, a division takes long
     for g in range(lit.shape[0]):
         area = product = 0.0
         for s in range(7):
             seen = lit[g, s] * areas[s]
             area += seen
             product += seen * levels[s]
-        if area > 0.0:
-            best = max(best, product * product / area)
+        if product * product * over > square * area:
+            square, over = product * product, area
+    best = square / over
     return max(0.0, best - LEFT_OVER * (total - best))
 
 
@@ -94,17 +96,28 @@ def worth_along(
         for x in range(columns + 1):
             energy[b, x] = ink[bottom, x] - ink[top, x]
             clear[b, x] = (bottom - top) * x if whole else seen[bottom, x] - seen[top, x]
+    lefts, rights = np.empty(13, np.int64), np.empty(13, np.int64)
+    for b in range(13):
+        lefts[b], rights[b] = int(np.floor(boxes[b, 0] + 0.5)), int(np.floor(boxes[b, 2] + 0.5))
     levels, areas = np.zeros(13), np.zeros(13)
+    most = 0.0
     for k in range(len(out)):
         for b in range(13):
-            left, right = _at_most(k * stride + boxes[b, 0], columns), _at_most(k * stride + boxes[b, 2], columns)
+            left, right = max(0, min(columns, k * stride + lefts[b])), max(0, min(columns, k * stride + rights[b]))
             area = clear[b, right] - clear[b, left]
             areas[b] = area if area >= 1.0 else 0.0
             levels[b] = (energy[b, right] - energy[b, left]) / area if area >= 1.0 else 0.0
+        segments = 0.0
+        for b in range(7):
+            segments += areas[b] * levels[b] * levels[b]
+        if segments < NEGLIGIBLE * most:  # it cannot be worth more than that
+            out[k] = 0.0
+            continue
         rest = areas[7] * levels[7] * levels[7] + areas[8] * levels[8] * levels[8]
         for b in (9, 11):  # as much as its upright is worth
             rest += 2.0 * areas[1] * min(levels[b], levels[b + 1]) ** 2 / LEFT_OVER
         out[k] = cell_worth(levels, areas, rest, lit)
+        most = max(most, out[k])
 
 
 @njit(cache=True)
@@ -127,6 +140,7 @@ def best_pitch(
     width, height = size
     best, left, pitch, count = 0.0, 0.0, 0.0, 0
     cells = np.zeros(MOST_CELLS)
+    per_stride = 1.0 / stride
     for ratio in pitches:
         p = ratio * width
         if p - width < LEAST_GAP * height:
@@ -137,7 +151,7 @@ def best_pitch(
             n = 0
             u = phase
             while u + width < columns + 0.1 * width and n < MOST_CELLS:
-                cells[n] = worth[_at_most(u / stride, len(worth) - 1)]
+                cells[n] = worth[max(0, min(len(worth) - 1, int(u * per_stride + 0.5)))]
                 n += 1
                 u += p
             for first in range(n):
@@ -280,13 +294,14 @@ def is_sound(comb: Array, count: int, rows: int, columns: int, lean: float) -> b
 
 @njit(cache=True)
 def slant_energies(uprights: Float32, slants: Array) -> Array:  # pragma: no cover
-    """(slants,) sum of the squared column sums of the picture sheared by every slant: most when uprights stand."""
+    """(slants,) sum of the squared column sums (of every second row) of the picture sheared by every slant: most when
+    uprights stand."""
     rows, columns = uprights.shape
     middle = (rows - 1) / 2
     energies = np.zeros(len(slants))
     for k in range(len(slants)):
         sums = np.zeros(columns + 2 * rows)
-        for y in range(rows):
+        for y in range(0, rows, 2):
             shift = rows + slants[k] * (y - middle)
             whole = int(shift)
             part = shift - whole

@@ -152,7 +152,7 @@ def _followed(smooth: NDArray[np.uint8], seed: tuple[int, int]) -> NDArray[np.bo
 
 
 def _noise(patch: Patch) -> float:
-    gray = patch.gray[::2].astype(np.int16)
+    gray = patch.gray[::4].astype(np.int16)
     counts = np.bincount(np.abs(gray[:, 2:] - 2 * gray[:, 1:-1] + gray[:, :-2]).ravel())
     return float(np.searchsorted(np.cumsum(counts), 0.5 * counts.sum())) / 1.65
 

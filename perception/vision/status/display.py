@@ -218,6 +218,6 @@ def _working_size(gray: Image, hidden: NDArray[np.bool_] | None) -> tuple[Image,
         return gray, hidden
     size = (max(8, round(columns * WORK_ROWS / rows)), WORK_ROWS)
     small = np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
-    if hidden is None:
+    if hidden is None or not hidden.any():
         return small, None
-    return small, cv2.resize(hidden.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.25
+    return small, cv2.resize(hidden.astype(np.uint8) * 4, size, interpolation=cv2.INTER_LINEAR) > 1

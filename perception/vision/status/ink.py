@@ -89,10 +89,17 @@ def _at_border(ink: Float32, least: float, framed: bool) -> NDArray[np.bool_] | 
     return np.asarray(cv2.dilate(drop[labels].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
 
 
-def level_at(ink: Float32, share: float) -> float:
+@njit(cache=True)
+def level_at(ink: Float32, share: float) -> float:  # pragma: no cover
     """The level that this share of the ink (from 0 to 255) does not exceed, to a level."""
-    counts = np.bincount(ink.astype(np.uint8).ravel(), minlength=256)
-    return float(np.searchsorted(np.cumsum(counts), share * ink.size))
+    counts = np.zeros(256, np.int64)
+    for value in ink.flat:
+        counts[min(255, int(value))] += 1
+    level, upto = 0, counts[0]
+    while upto < share * ink.size and level < 255:
+        level += 1
+        upto += counts[level]
+    return float(level)
 
 
 @njit(cache=True)

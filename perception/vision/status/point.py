@@ -15,13 +15,13 @@ from perception.vision.status.comb_jit import Float32
 from perception.vision.view import Array
 
 RADIUS = 0.075  # of the digit height
-LEVEL = 0.70  # of a lit segment: a dot and no dot are equally likely there
+LEVEL = 0.58  # of a lit segment: a dot and no dot are equally likely there
 LEVEL_SPREAD = 0.07
 HIDDEN_ODDS = -0.7  # logarithm, of a point in a gap that is hidden against no point at all
 STRIP = (0.55, 1.25)  # rows that are looked at, over the digit height from its top
 HALF_STROKES = np.array([0.045, 0.065])  # of the digit height: tried, with every blur
 BLURS = np.array([0.02, 0.05, 0.09])
-INSETS = (0.08, 0.2, 0.32)  # of a segment's axis, at either end, by which its stroke is shorter
+INSETS = (0.2, 0.08, 0.32)  # of a segment's axis, at either end, by which its stroke is shorter
 PLACES_X = np.linspace(0.25, 0.75, 6)  # of the gap
 PLACES_Y = np.linspace(-0.12, 0.06, 7)  # of the digit height, from the bottom segments' axis
 STEPS = 8  # places a px at which a stroke's profile is tabled
@@ -96,17 +96,25 @@ def _drawn(strip: Float32, clear: Float32, comb: Comb, lit_levels: Array, first:
     """The lit segments as drawn strokes with the width and blur that leave the least, and that blur in px."""
     h = comb.height_px
     shapes = [(half * h, max(blur * h, 0.3)) for half in HALF_STROKES for blur in BLURS]
-    reach = (HALF_STROKES[-1] + 2.5 * BLURS[-1]) * h
-    distance = np.arange(0.0, reach + 1.0, 1.0 / STEPS)
-    tables = np.array([_profile(distance, half, blur) for half, blur in shapes], np.float32)
-    levels = np.ascontiguousarray(lit_levels, float)
-    drawn = [_strokes((first, *strip.shape), comb.numbers, levels, AXES, inset, tables) for inset in INSETS]
-    canvases = np.concatenate(drawn).reshape(len(INSETS) * len(shapes), -1)
-    canvases *= clear.ravel()
-    along = canvases @ strip.ravel()
-    square = np.maximum((canvases * canvases).sum(axis=1), 1e-6)
-    k = int((along * along / square).argmax())  # least squares: what is left is |strip|^2 less this
-    return np.asarray(canvases[k] * (along[k] / square[k]), np.float32).reshape(strip.shape), shapes[k % len(shapes)][1]
+    distance = np.arange(0.0, (HALF_STROKES[-1] + 2.5 * BLURS[-1]) * h + 1.0, 1.0 / STEPS)
+    tables = np.stack([_profile(distance, half, blur) for half, blur in shapes], axis=1).astype(np.float32)
+    where = (first, *strip.shape), comb.numbers, np.ascontiguousarray(lit_levels, float), AXES
+    k, drawn, left = _closest(_strokes(*where, INSETS[0], tables), strip, clear)
+    for inset in INSETS[1:]:
+        _, other, other_left = _closest(_strokes(*where, inset, tables[:, k : k + 1].copy()), strip, clear)
+        if other_left < left:
+            drawn, left = other, other_left
+    return drawn, shapes[k][1]
+
+
+def _closest(canvases: Float32, strip: Float32, clear: Float32) -> tuple[int, Float32, float]:
+    """Which of (rows, columns, shapes) pictures fits the strip best, that picture at its best strength, what it leaves."""
+    seen = (canvases * clear[..., None]).reshape(strip.size, -1)
+    along = strip.ravel() @ seen
+    square = np.maximum(np.einsum("pk,pk->k", seen, seen), 1e-6)
+    k = int((along * along / square).argmax())
+    drawn = np.asarray(seen[:, k] * (along[k] / square[k]), np.float32).reshape(strip.shape)
+    return k, drawn, float((strip * strip * clear).sum() - along[k] * along[k] / square[k])
 
 
 def _profile(distance: Array, half_px: float, sigma_px: float) -> Array:
@@ -119,16 +127,16 @@ def _profile(distance: Array, half_px: float, sigma_px: float) -> Array:
 def _strokes(
     strip: tuple[int, int, int], comb: Array, lit_levels: Array, axes: Array, inset: float, tables: Float32
 ) -> Float32:  # pragma: no cover
-    """(shapes, rows, columns) sum of the lit segments' strokes on a strip that begins at row strip[0].
+    """(rows, columns, shapes) sum of the lit segments' strokes on a strip that begins at row strip[0].
 
     Args:
-        tables: (shapes, N) height of a stroke at every 1 / STEPS px from its axis.
+        tables: (N, shapes) height of a stroke at every 1 / STEPS px from its axis.
     """
     first, rows, columns = strip
     left, pitch, width, top, bottom, slant = comb
     height = bottom - top
-    shapes, reach = tables.shape[0], (tables.shape[1] - 1) / STEPS
-    canvases = np.zeros((shapes, rows, columns), np.float32)
+    shapes, reach = tables.shape[1], (tables.shape[0] - 1) / STEPS
+    canvases = np.zeros((rows, columns, shapes), np.float32)
     ends = np.empty((2, 2))
     for cell in range(lit_levels.shape[0]):
         for k in range(7):
@@ -147,9 +155,9 @@ def _strokes(
                     t = min(1.0, max(0.0, ((x - ends[0, 0]) * along_u + (y - ends[0, 1]) * along_v) / length))
                     du, dv = x - ends[0, 0] - t * along_u, y - ends[0, 1] - t * along_v
                     off = int(np.sqrt(du * du + dv * dv) * STEPS)
-                    if off < tables.shape[1]:
+                    if off < tables.shape[0]:
                         for s in range(shapes):
-                            canvases[s, y, x] += level * tables[s, off]
+                            canvases[y, x, s] += level * tables[off, s]
     return canvases
 
 

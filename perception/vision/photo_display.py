@@ -18,7 +18,7 @@ from perception.vision.status.glyphs import lit_segments
 DIGIT_WINDOW_PX = 64
 SCENE_PX = 640  # larger sides are reduced to this for the search
 ROWS_TRIED = 4
-ROOM_ABOVE, ROOM_BESIDE = 0.5, 1.2  # round a row's cells, over the digit height
+ROOM_ABOVE, ROOM_BESIDE = 0.5, 1.6  # round a row's cells, over the digit height
 TURNS = np.tan(np.deg2rad(np.arange(-8.0, 8.1, 1.0)))  # looked for
 RIVAL = 0.3  # how much another text read nearby takes from the confidence
 FRAME = 0.08  # of a crop's height that a frame may take

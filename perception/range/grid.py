@@ -5,7 +5,7 @@ blocks that straddle a jump keep only the larger side. Planes are linear in the 
 depth of an orthographic sensor, so one linear fit serves both.
 """
 
-# ruff: noqa: PLR0912, PLR0124 - compiled loops take plain arrays, and long
+# ruff: noqa: PLR0124 - compiled loops take plain arrays, and long
 # bodies and plain comparisons are what compiles fast.
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Grid:
 
 
 def block_size(shape: tuple[int, int], noise: NoiseModel, sensor: RangeSensorModel, depth_m: float) -> int:
-    """Pixels along a block: 1 below 192 rows, 2 below 384, then the least (2 to 4) that gives steady tangent planes.
+    """Pixels along a block: 1 below 192 rows, 2 below 384, then 3, or 4 where the noise asks for steadier tangent planes.
 
     Above 1024 rows blocks grow with the image, so that the number of blocks, and with it memory, stays bounded.
     """
@@ -63,9 +63,8 @@ def block_size(shape: tuple[int, int], noise: NoiseModel, sensor: RangeSensorMod
     if min(shape) < 384:
         return 2
     coarse = -(-min(shape) // LARGE_SIDE_PX)
-    for size in (2 * coarse, 3 * coarse):
-        if slope_sigma_rad(noise, sensor, depth_m, side_px=5 * size) <= NORMAL_SIGMA_GOAL_RAD:
-            return size
+    if slope_sigma_rad(noise, sensor, depth_m, side_px=15 * coarse) <= NORMAL_SIGMA_GOAL_RAD:
+        return 3 * coarse
     return 4 * coarse
 
 
@@ -178,9 +177,9 @@ def _blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: 
             x[r, c] = (c * b + 0.5 * (b - 1) - sen[3]) / sen[1]
         if b == 1:
             medians[:] = depth[r]
-        elif b == 2 and 2 * r + 1 < H:
-            _medians_of_four(depth[2 * r], depth[2 * r + 1], medians)
-            if W % 2 == 1:
+        elif b <= BLOCK_SAMPLES and (r + 1) * b <= H:
+            _medians_of_four(depth[r * b], depth[(r + 1) * b - 1], b, medians)
+            if W % b:
                 medians[w - 1] = _median(depth, b, hop, r, w - 1, values)
         else:
             for c in range(w):
@@ -192,21 +191,24 @@ def _blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: 
             pitch = (median if perspective else 1.0) / sen[1]
             sig = sigma_at(noise, median)
             tol = JUMP_SLOPE * pitch * b * 0.7 + 3.0 * sig
-            su, sv, sg, m = 0.0, 0.0, 0.0, 0
+            su, sv, sg, m = 0.0, 0.0, 0.0, 0.0
+            per_median = 1.0 / median
             for v in range(r * b, min(r * b + b, H), hop):
                 for u in range(c * b, min(c * b + b, W), hop):
-                    d = depth[v, u]
-                    if abs(d - median) <= tol:
-                        su += u
-                        sv += v
-                        sg += 1.0 / d if perspective else d
-                        m += 1
+                    d = depth[v, u] - median
+                    inside = abs(d) <= tol  # refuses NaN
+                    q = d * per_median if perspective else d
+                    # 1 / (1 + q) by its series: a division less a pixel
+                    sg += (q * (q * (q - 1.0) + 1.0) if perspective else -q) if inside else 0.0
+                    su += u if inside else 0.0
+                    sv += v if inside else 0.0
+                    m += 1.0 if inside else 0.0
             x[r, c] = (su / m - sen[3]) / sen[1]
             y[r, c] = (sv / m - sen[4]) / sen[2]
             if 2 * m < full:
                 continue
-            z[r, c] = m / sg if perspective else sg / m
-            count[r, c] = m
+            z[r, c] = median / (1.0 - sg / m) if perspective else median - sg / m
+            count[r, c] = int(m)
             z2 = median * median
             slow = noise[2] + noise[3] * z2
             fast = sig * sig - slow * slow
@@ -234,10 +236,11 @@ def _median(depth, b, hop, r, c, values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _medians_of_four(upper, lower, out):  # type: ignore[no-untyped-def]
-    """`_median` of blocks of 2 x 2 pixels by a sorting network, missing readings last."""
-    for c in range(upper.shape[0] // 2):
-        p, q, s, t = upper[2 * c], upper[2 * c + 1], lower[2 * c], lower[2 * c + 1]
+def _medians_of_four(upper, lower, b, out):  # type: ignore[no-untyped-def]
+    """Lower medians of the corners of blocks of b x b pixels, by a sorting network, missing readings last."""
+    for c in range(upper.shape[0] // b):
+        i, j = c * b, c * b + b - 1
+        p, q, s, t = upper[i], upper[j], lower[i], lower[j]
         p, q = p if p == p else np.inf, q if q == q else np.inf
         s, t = s if s == s else np.inf, t if t == t else np.inf
         low_1, high_1, low_2, high_2 = min(p, q), max(p, q), min(s, t), max(s, t)

@@ -4,7 +4,6 @@ A region grows while its own model explains the next block, so it stops at a cre
 there. A plane that grew on a curved surface betrays itself: a quadratic explains its support clearly better.
 """
 
-# ruff: noqa: PLR0912, PLR0915 - compiled loops take plain arrays, and long
 # bodies and plain comparisons are what compiles fast.
 from __future__ import annotations
 
@@ -18,6 +17,12 @@ GROW_SIGMAS = 3.0
 CURVED_RMS = 0.4  # in sigmas: how much a quadratic may gain over a plane before the plane is a strip of something bent
 CURVED_F = 4.0  # and how significant that gain must be (F ratio)
 SEED_LEVELS = 64
+SWEEPS = 3  # of growing a plane from one seed, each with the plane of the sweep before
+SAME_BLOCKS = 200  # of which no more than one may come or go in a sweep that is the last
+MOST_PLANES = 512
+STEADY_RMS = 1.8  # what a tangent plane leaves over in sigmas, up to which its normal counts
+LOOSE_NORMAL = 0.5  # length of a normal that seeds a plane but does not count
+TAKEN = np.int32(2**31 - 1)
 
 
 @njit(cache=True)
@@ -84,16 +89,17 @@ def plane_from_coefficients(m, perspective, th):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _quadratic_gain(idx, count, x, y, g, weight, x0, y0, scale):  # type: ignore[no-untyped-def]
-    """Sum of squares (in sigmas) left by a plane and by a quadratic over the blocks idx[:count]."""
+def _quadratic_gain(idx, count, table, x0, y0, scale):  # type: ignore[no-untyped-def]
+    """Sum of squares (in sigmas) left by a plane and by a quadratic over the blocks idx[:count] of a padded table."""
     A, b, row = np.zeros((6, 6)), np.zeros(6), np.empty(6)
     total = 0.0
-    g0 = g[idx[0]]
+    g0 = table[idx[0], 2]
+    inverse = 1.0 / scale
     for k in range(count):
         i = idx[k]
-        px, py = (x[i] - x0) / scale, (y[i] - y0) / scale
+        px, py = (table[i, 0] - x0) * inverse, (table[i, 1] - y0) * inverse
         row[0], row[1], row[2], row[3], row[4], row[5] = 1.0, px, py, px * px, px * py, py * py
-        w, value = weight[i], g[i] - g0
+        w, value = table[i, 3], table[i, 2] - g0
         total += w * value * value
         for a in range(6):
             b[a] += w * row[a] * value
@@ -121,104 +127,150 @@ def grow_planes(  # type: ignore[no-untyped-def]
     Blocks of supports that turned out curved are marked in `tried` so that they seed nothing again.
     """
     h, w = z.shape
-    n_all = h * w
-    fx, fy, fz, fs = x.ravel(), y.ravel(), z.ravel(), sigma.ravel()
-    ff, fl, ft, fr = free.ravel(), label.ravel(), tried.ravel(), rms.ravel()
-    fn = normal.reshape(n_all, 3)
-    g, weight = np.empty(n_all), np.empty(n_all)
-    for i in range(n_all):
-        zi = fz[i]
-        g[i] = 1.0 / zi if perspective else zi
-        s = fs[i] / (zi * zi) if perspective else fs[i]
-        weight[i] = 1.0 / (s * s)
-    mark = np.zeros(n_all, np.int32)
-    queue = np.empty(n_all, np.int32)
-    ths, counts, mean2 = np.zeros((512, 16)), np.zeros(512, np.int64), np.zeros(512)
+    table, mark, across = _padded(x, y, z, sigma, normal, rms, free, perspective)
+    ff, fl, ft = free.ravel(), label.ravel(), tried.ravel()
+    queue = np.empty(h * w, np.int32)
+    ths, counts, mean2 = np.zeros((MOST_PLANES, 16)), np.zeros(MOST_PLANES, np.int64), np.zeros(MOST_PLANES)
     found = 0
     stamp = 0
     m, S, th = np.zeros(3), np.zeros(9), np.zeros(16)
     for o in range(order.shape[0]):
         seed = order[o]
-        if not ff[seed] or ft[seed] or found == 512:
+        if not ff[seed] or ft[seed] or found == MOST_PLANES:
             continue
-        nx, ny, nz = fn[seed, 0], fn[seed, 1], fn[seed, 2]
-        if perspective:
-            d = (nx * fx[seed] + ny * fy[seed] + nz) * fz[seed]
-            if abs(d) < 1e-9:
-                continue
-            m[0], m[1], m[2] = nx / d, ny / d, nz / d
-        else:
-            m[0], m[1] = -nx / nz, -ny / nz
-            m[2] = g[seed] - m[0] * fx[seed] - m[1] * fy[seed]
-        plane_from_coefficients(m, perspective, th)
+        start = (seed // w + 1) * across + seed % w + 1
+        if not _tangent(table[start], perspective, m):
+            continue
         count = 0
-        for sweep in range(3):
+        for sweep in range(SWEEPS):
+            plane_from_coefficients(m, perspective, th)
+            before = count
             stamp += 1
-            S[:] = 0.0
-            queue[0] = seed
-            mark[seed] = stamp
-            count, head, refit_at = 1, 0, 8
-            while head < count:
-                i = queue[head]
-                head += 1
-                wgt = weight[i]
-                S[0] += wgt
-                S[1] += wgt * fx[i]
-                S[2] += wgt * fy[i]
-                S[3] += wgt * fx[i] * fx[i]
-                S[4] += wgt * fx[i] * fy[i]
-                S[5] += wgt * fy[i] * fy[i]
-                S[6] += wgt * g[i]
-                S[7] += wgt * fx[i] * g[i]
-                S[8] += wgt * fy[i] * g[i]
-                if sweep == 0 and head == refit_at:
-                    refit_at *= 2
-                    if solve3(S, m):
-                        plane_from_coefficients(m, perspective, th)
-                r, c = i // w, i % w
-                slack = GROW_SIGMAS if sweep else GROW_SIGMAS + 2.0 / np.sqrt(head)
-                for s in range(4):
-                    rr = r + (1 if s == 0 else -1 if s == 1 else 0)
-                    cc = c + (1 if s == 2 else -1 if s == 3 else 0)
-                    if rr < 0 or cc < 0 or rr >= h or cc >= w:
-                        continue
-                    j = rr * w + cc
-                    if mark[j] == stamp or not ff[j]:
-                        continue
-                    e = (g[j] - m[0] * fx[j] - m[1] * fy[j] - m[2]) ** 2 * weight[j]
-                    if not e <= slack * slack:
-                        continue
-                    if fr[j] < 1.8:
-                        turn = th[0] * fn[j, 0] + th[1] * fn[j, 1] + th[2] * fn[j, 2]
-                        if turn < cos_limit:
-                            continue
-                    mark[j] = stamp
-                    queue[count] = j
-                    count += 1
+            count = _grown(table, mark, across, start, stamp, sweep, m, th, perspective, cos_limit, queue, S)
             if count < least or not solve3(S, m):
                 count = 0
                 break
-            plane_from_coefficients(m, perspective, th)
+            if sweep > 0 and abs(count - before) * SAME_BLOCKS < count:
+                break
         if count == 0:
             ft[seed] = True
             continue
+        plane_from_coefficients(m, perspective, th)
         x0, y0 = S[1] / S[0], S[2] / S[0]
         scale = np.sqrt(max(S[3] / S[0] - x0 * x0 + S[5] / S[0] - y0 * y0, 1e-30))
-        flat, bent = _quadratic_gain(queue, count, fx, fy, g, weight, x0, y0, scale)
+        flat, bent = _quadratic_gain(queue, count, table, x0, y0, scale)
         gain = (flat - bent) / 3.0
         ratio = gain / max(bent / max(count - 6, 1), 0.3)
-        if (flat - bent > CURVED_RMS * CURVED_RMS * count and ratio > CURVED_F) or flat > 3.0 * count:
-            for k in range(count):
-                ft[queue[k]] = True
-            continue
+        is_bent = (flat - bent > CURVED_RMS * CURVED_RMS * count and ratio > CURVED_F) or flat > 3.0 * count
         for k in range(count):
-            ff[queue[k]] = False
-            fl[queue[k]] = first_label + found
+            i = queue[k]
+            at = (i // across - 1) * w + i % across - 1
+            if is_bent:
+                ft[at] = True
+                continue
+            ff[at] = False
+            fl[at] = first_label + found
+            mark[i] = TAKEN
+        if is_bent:
+            continue
         ths[found] = th
         counts[found] = count
         mean2[found] = flat / max(count - 3, 1)
         found += 1
     return ths[:found].copy(), counts[:found].copy(), mean2[:found].copy()
+
+
+@njit(cache=True, error_model="numpy")
+def _padded(x, y, z, sigma, normal, rms, free, perspective):  # type: ignore[no-untyped-def]
+    """Blocks with a frame of taken ones around, one row of numbers each, so that growing needs no look at the rim.
+
+    Returns (N, 8) x, y, g, its weight, normal (0 where it says nothing), z; marks (N,), `TAKEN` where a block is not
+    free; and the number of blocks across.
+    """
+    h, w = z.shape
+    across = w + 2
+    table, mark = np.zeros(((h + 2) * across, 8)), np.full((h + 2) * across, TAKEN, np.int32)
+    for r in range(h):
+        for c in range(w):
+            if not free[r, c]:
+                continue
+            i = (r + 1) * across + c + 1
+            d = z[r, c]
+            s = sigma[r, c] / (d * d) if perspective else sigma[r, c]
+            mark[i] = 0
+            table[i, 0], table[i, 1], table[i, 2] = x[r, c], y[r, c], 1.0 / d if perspective else d
+            table[i, 3], table[i, 7] = 1.0 / (s * s), d
+            if np.isfinite(rms[r, c]):
+                # The length of the normal says whether it counts: noisy ones do not hold a plane back.
+                size = 1.0 if rms[r, c] < STEADY_RMS else LOOSE_NORMAL
+                for k in range(3):
+                    table[i, 4 + k] = size * normal[r, c, k]
+    return table, mark, across
+
+
+@njit(cache=True, error_model="numpy")
+def _tangent(block, perspective, m):  # type: ignore[no-untyped-def]
+    """Coefficients of the tangent plane of one row of the table into `m`; False where its ray grazes it."""
+    x, y, nx, ny, nz = block[0], block[1], block[4], block[5], block[6]
+    if perspective:
+        d = (nx * x + ny * y + nz) * block[7]
+        if abs(d) < 1e-9 * (abs(nx) + abs(ny) + abs(nz)):
+            return False
+        m[0], m[1], m[2] = nx / d, ny / d, nz / d
+        return True
+    m[0], m[1] = -nx / nz, -ny / nz
+    m[2] = block[2] - m[0] * x - m[1] * y
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _grown(table, mark, across, seed, stamp, sweep, m, th, perspective, cos_limit, queue, S):  # type: ignore[no-untyped-def]
+    """Blocks connected to `seed` that the plane g = m . (x, y, 1) explains, into `queue`; returns how many.
+
+    `S` receives their sums as `solve3` reads them. In the first sweep the plane follows the blocks as they come.
+    """
+    S[:] = 0.0
+    queue[0] = seed
+    mark[seed] = stamp
+    count, head, refit_at = 1, 0, 8
+    a, b, c = m[0], m[1], m[2]
+    limit = GROW_SIGMAS * GROW_SIGMAS
+    while head < count:
+        i = queue[head]
+        head += 1
+        x, y, g, weight = table[i, 0], table[i, 1], table[i, 2], table[i, 3]
+        wx, wy = weight * x, weight * y
+        S[0] += weight
+        S[1] += wx
+        S[2] += wy
+        S[3] += wx * x
+        S[4] += wx * y
+        S[5] += wy * y
+        S[6] += weight * g
+        S[7] += wx * g
+        S[8] += wy * g
+        if sweep == 0:
+            if head == refit_at:
+                refit_at *= 2
+                if solve3(S, m):
+                    plane_from_coefficients(m, perspective, th)
+                    a, b, c = m[0], m[1], m[2]
+            limit = (GROW_SIGMAS + 2.0 / np.sqrt(head)) ** 2
+        for side in range(4):
+            j = i + (across if side == 0 else -across if side == 1 else 1 if side == 2 else -1)
+            if mark[j] >= stamp:
+                continue
+            e = table[j, 2] - a * table[j, 0] - b * table[j, 1] - c
+            if not e * e * table[j, 3] <= limit:
+                continue
+            nx, ny, nz = table[j, 4], table[j, 5], table[j, 6]
+            turn = th[0] * nx + th[1] * ny + th[2] * nz
+            if turn < cos_limit and nx * nx + ny * ny + nz * nz > 0.5:
+                continue
+            mark[j] = stamp
+            queue[count] = j
+            count += 1
+    return count
 
 
 @njit(cache=True)

@@ -90,7 +90,7 @@ def segment(task: Task, noise: NoiseModel) -> tuple[Labels, Candidates, NoiseMod
     _recover_curved(task, grid, blocks, found, least)
     labels = _claimed(task, noise, blocks, found, size=size)
     if size > 1:
-        labels = _finer(task, noise, labels, found, size=size // 2)
+        labels = _finer(task, noise, labels, found, size=(size + 1) // 2)
     return labels, found, noise
 
 

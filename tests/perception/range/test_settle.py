@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from perception.range import settle
-from perception.range.claim import CLAIM_SIGMAS, misfit
+from perception.range.claim import CLAIM_SIGMAS, PLAIN_SIGMAS, misfit
 from tests.perception.range.scenes import PARALLEL, PINHOLE
 from tests.perception.range.test_claim_kernels import KINDS, NOISE, competing_surfaces, random_case
 
@@ -39,6 +39,9 @@ def settled_label(sensor, depth, labels, v, u):
     evidence = 0.5 / (1.0 + SLOW_SHARE * (settle.SHARED_PX - 1.0))
     at = ((u - packed[3]) / packed[1], (v - packed[4]) / packed[2], z, float(NOISE.sigma_m(z)), bool(packed[0] > 0))
     misfits = np.array([misfit(KINDS[k], table[k], *at) for k in present])
+    safe = np.count_nonzero(beside == labels[v, u]) > settle.SAFE_NEIGHBOURS
+    if safe and labels[v, u] > 0 and misfit(KINDS[labels[v, u]], table[labels[v, u]], *at) < PLAIN_SIGMAS:
+        return labels[v, u]
     cost = evidence * misfits**2 + settle.NEIGHBOUR_WEIGHT * (1.0 - votes / votes.sum())
     cost[misfits >= CLAIM_SIGMAS] = np.inf
     best = int(np.argmin(cost))

@@ -5,7 +5,6 @@ They are for judging the reader where no photographs with known values are at ha
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 
 import cv2
@@ -156,18 +155,31 @@ def error_of(dial: DrawnDial) -> tuple[float | None, float]:
     return 10 * abs((error + 5) % 10 - 5 if dial.circular else error), status.confidence
 
 
-def summary(seeds: range) -> str:
-    """Shares read within 2 %, refused, and wrong above 5 %, of all and of every shape of pointer."""
-    count: Counter[tuple[str, str]] = Counter()
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DialResult:
+    """What came of one drawn dial: see `error_of`."""
+
+    shape: str
+    error: float | None
+    confidence: float
+
+
+def read_drawn(seeds: range) -> list[DialResult]:
+    """The reader on every seed's dial."""
+    results = []
     for seed in seeds:
         dial = draw_dial(seed)
-        error, _ = error_of(dial)
-        kind = "refused" if error is None else "right" if error <= 2.0 else "wrong" if error > 5.0 else "off"
-        for group in ("all", dial.shape):
-            count[group, kind] += 1
+        error, confidence = error_of(dial)
+        results.append(DialResult(shape=dial.shape, error=error, confidence=confidence))
+    return results
+
+
+def summary(results: list[DialResult]) -> list[str]:
+    """Shares read within 2 %, refused, and wrong above 5 %, of all and of every shape of pointer."""
     lines = []
     for group in ("all", *SHAPES):
-        total = max(1, sum(n for (g, _), n in count.items() if g == group))
-        shares = " / ".join(f"{count[group, kind] / total:.3f}" for kind in ("right", "refused", "wrong"))
-        lines.append(f"  {group:8s} {shares}")
-    return "\n".join(lines)
+        errors = [r.error for r in results if group in ("all", r.shape)]
+        given = np.array([e for e in errors if e is not None])
+        shares = (np.sum(given <= 2.0), len(errors) - len(given), np.sum(given > 5.0))
+        lines.append(f"  {group:8s} {' / '.join(f'{n / max(1, len(errors)):.3f}' for n in shares)}")
+    return lines

@@ -17,17 +17,19 @@ from scipy.spatial.transform import RigidTransform
 
 from benchmarks.display_report import display_lines
 from benchmarks.vision import run
-from benchmarks.vision_dials import summary as dials
-from benchmarks.vision_drawing import Disturbance, Shown, camera, draw_panel, looking_at
-from hal.config import load_cell
+from benchmarks.vision_axes import axes, random_state, shipped_panel
+from benchmarks.vision_dials import read_drawn
+from benchmarks.vision_dials import summary as dial_lines
+from benchmarks.vision_drawing import camera, draw_panel, looking_at
+from benchmarks.vision_reliability import Answer, draw_reliability, reliability_lines
 from hal.errors import CellError
 from hal.geometry import certain
-from hal.panel import Panel, PanelObject
+from hal.panel import PanelObject
 from perception.vision.blind import recognise
 from perception.vision.image import Image
 from perception.vision.knowledge import shipped_knowledge
 from perception.vision.segment import grow_regions
-from perception.vision.taught import inspect, patch_of, read_patch
+from perception.vision.taught import patch_of, read_patch
 from perception.vision.view import CameraView
 
 LEVELS = ("easy", "medium", "hard")
@@ -37,22 +39,33 @@ PASS = {
 }  # fmt: skip
 STATES = ("toggle", "rotary", "button", "lamp", "lever")
 POINTERS = ("gauge", "panel_meter")
+ROOT = Path(__file__).resolve().parent.parent
+DRAWN_DIALS = range(200)
 
 
 def report(data: Path) -> int:
     """Print everything; 1 if the development images are not there."""
+    answers: list[Answer] = []
     if not data.exists():
         print(f"no development images at {data.name}: only the axes can be measured")
     else:
         inputs, score = (_module(data / f"{name}.py") for name in ("make_inputs", "score"))
         truth = json.loads((data / "synth_dev" / "truth.json").read_text(encoding="utf-8"))
-        answers = run(inputs.jobs(truth), data / "synth_dev", timed=True)
-        _table(truth, answers, score)
+        jobs = run(inputs.jobs(truth), data / "synth_dev", timed=True)
+        rows = _table(truth, jobs, score)
+        answers += [Answer(confidence=r["confidence"], right=r["error"] <= 2.0) for r in rows if r["answered"]]
         real = json.loads((data / "real" / "truth.json").read_text(encoding="utf-8"))
         _real(real, run(inputs.jobs(real), data / "real", timed=True), score)
         _speed(data / "synth_dev")
+    drawn = read_drawn(DRAWN_DIALS)
+    print("drawn dials of many looks (not fitted to): within 2 % / refused / wrong above 5 %")
+    print("\n".join(dial_lines(drawn)))
+    answers += [Answer(confidence=r.confidence, right=r.error <= 2.0) for r in drawn if r.error is not None]
     display_lines()
-    _axes()
+    answers += axes()
+    print("\n".join(reliability_lines("all of these readings", answers)))
+    draw_reliability(answers, ROOT / "runs" / "vision_reliability.png")
+    print("drawn in runs/vision_reliability.png")
     return 0 if data.exists() else 1
 
 
@@ -77,7 +90,8 @@ def _line(what: str, measured: list[float], passes: tuple[float, ...], *, at_mos
     )
 
 
-def _table(truth: dict[str, Any], answers: dict[str, Any], score: ModuleType) -> None:
+def _table(truth: dict[str, Any], answers: dict[str, Any], score: ModuleType) -> list[dict[str, Any]]:
+    """Prints the issue's lines; returns the rows of the taught readings."""
     print("\nmeasured on the development images, easy / medium / hard; blind knowledge was taught on these images")
     blind = {n: t for n, t in truth.items() if t["kind"] == "overview" and "lights_on" not in t}
     result = score.score_panels(blind, {n: answers.get(f"{Path(n).stem}/blind", {}) for n in blind})
@@ -108,6 +122,7 @@ def _table(truth: dict[str, Any], answers: dict[str, Any], score: ModuleType) ->
     wrong = float(np.mean([r["error"] > 2.0 for r in kept]))
     print(f"{'answered of readable':52s} {len(given) / len(rows):.3f}")
     _line("wrong among answers after refusing 5 % more", [wrong], (0.02,), at_most=True)
+    return rows
 
 
 def _taught_rows(truth: dict[str, Any], answers: dict[str, Any], score: ModuleType) -> list[dict[str, Any]]:
@@ -147,8 +162,6 @@ def _real(truth: dict[str, Any], answers: dict[str, Any], score: ModuleType) -> 
     result = score.score_real(photographs, {n: answers.get(Path(n).stem, {}) for n in photographs})
     _line("photographs: water-meter dials within 2 %", [result["watermeter_dial"]["within2"]], (0.85,))
     print(f"{'photographs: pressure gauge, % FS':52s} {result['psi_gauge']['max_fs']}")
-    print("drawn dials of many looks (not fitted to): within 2 % / refused / wrong above 5 %")
-    print(dials(range(200)))
     print("photographs of displays cannot be given out: unmeasured; own renderings follow below")
 
 
@@ -161,11 +174,11 @@ def _speed(folder: Path) -> None:
     _line("segmentation with sums, blurs", [regions / blur], (30,), at_most=True)
     overview = _best([partial(_quiet, partial(recognise, g, knowledge)) for g in pictures], 3)
     _line("blind overview, blurs", [overview / blur], (400,), at_most=True)
-    panel = load_cell(Path(__file__).resolve().parent.parent / "cells" / "bench.toml").panel
+    panel = shipped_panel()
     intrinsics = camera(1280, 960, focal_px=1200.0)
     pose = certain(RigidTransform.from_matrix(looking_at(distance_m=0.62)))
     view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
-    image = draw_panel(panel, view, (960, 1280), _random_state(panel, 0))
+    image = draw_panel(panel, view, (960, 1280), random_state(panel, 0))
     readings = [_best([partial(_read_one, image, view, thing)], 5) for thing in panel.objects]
     _line("one taught reading (patch and reader), ms: median", [1e3 * float(np.median(readings))], (3.0,), at_most=True)
     _line("  the slowest kind", [1e3 * max(readings)], (3.0,), at_most=True)
@@ -194,82 +207,3 @@ def _quiet(task: Callable[[], object]) -> object:
         return task()
     except CellError as error:
         return error
-
-
-def _axes() -> None:
-    """Every axis alone, on the shipped panel drawn through a camera: share read right, and wrong by more than 5 % FS."""
-    panel = load_cell(Path(__file__).resolve().parent.parent / "cells" / "bench.toml").panel
-    print("\nrobustness, one axis at a time (shipped panel, drawn): read right / refused / wrong above 5 % FS")
-    for tilt in (0, 15, 30, 45):
-        _axis(f"tilt {tilt} deg", panel, tilt_deg=float(tilt))
-    for ratio in (2.0, 4.0, 10.0):
-        _axis(f"illumination {ratio:g}:1", panel, disturbance=Disturbance(slope_ratio=ratio))
-    for exposure in (0.25, 0.5, 1.5, 2.0):
-        _axis(f"exposure x{exposure:g}", panel, disturbance=Disturbance(exposure=exposure))
-    for sigma in (1.5, 3.0):
-        _axis(f"blur {sigma:g} px", panel, disturbance=Disturbance(blur_sigma_px=sigma))
-    for noise in (12.0, 25.0):
-        _axis(f"noise {noise:g}", panel, disturbance=Disturbance(noise_sigma=noise))
-    for distance in (0.4, 0.7, 1.0):
-        _axis(f"distance {distance:g} m", panel, distance_m=distance)
-    spot = Disturbance(glare=((300.0, 260.0, 60.0), (800.0, 520.0, 60.0)))
-    _axis("two glares", panel, disturbance=spot)
-    _axis("a cable", panel, disturbance=Disturbance(cables=((520.0, 0.0, 640.0, 959.0, 14.0),)))
-
-
-def _axis(
-    what: str, panel: Panel, *, tilt_deg: float = 0.0, distance_m: float = 0.62, disturbance: Disturbance | None = None
-) -> None:  # fmt: skip
-    intrinsics = camera(1280, 960, focal_px=1200.0)
-    pose = certain(RigidTransform.from_matrix(looking_at(distance_m=distance_m, tilt_rad=np.deg2rad(tilt_deg))))
-    view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
-    right = refused = bad = total = 0
-    for seed in range(3):
-        shown = _random_state(panel, seed)
-        image = draw_panel(panel, view, (960, 1280), shown, disturbance)
-        try:
-            readings = inspect(image, intrinsics, pose, panel)
-        except CellError:
-            refused += len(panel.objects)
-            total += len(panel.objects)
-            continue
-        for reading in readings:
-            error = _error(panel, reading, shown[reading.name])
-            total += 1
-            refused += error is None
-            right += error is not None and error <= 2.0
-            bad += error is not None and error > 5.0
-    print(f"  {what:24s} {right / total:.2f} / {refused / total:.2f} / {bad / total:.2f}")
-
-
-def _random_state(panel: Panel, seed: int) -> dict[str, Shown]:
-    random = np.random.default_rng(seed)
-    shown: dict[str, Shown] = {}
-    for thing in panel.objects:
-        share = float(random.uniform(0.05, 0.95))
-        match thing.kind:
-            case "gauge" | "panel_meter" | "slider":
-                shown[thing.name] = thing.scale.minimum + share * (thing.scale.maximum - thing.scale.minimum)
-            case "display":
-                shown[thing.name] = f"{thing.minimum + share * (thing.maximum - thing.minimum):.{thing.decimals}f}"
-            case "lamp" | "toggle":
-                shown[thing.name] = "on" if share > 0.5 else "off"
-            case "button" | "mushroom":
-                shown[thing.name] = "pressed" if share > 0.5 else "released"
-            case "rotary" | "lever":
-                shown[thing.name] = thing.states[int(share * len(thing.states))].name
-            case "handwheel":
-                shown[thing.name] = 4.0 * share - 2.0
-    return shown
-
-
-def _error(panel: Panel, reading: Any, shown: Shown) -> float | None:
-    """Error in % of full scale, 100 for a wrong state or text, None for a refusal."""
-    if not reading.answered:
-        return None
-    if reading.text is not None or reading.state is not None:
-        return 0.0 if shown in (reading.text, reading.state) else 100.0
-    if reading.kind == "handwheel":
-        return float(abs((reading.value - float(shown) + np.pi) % (2 * np.pi) - np.pi) / (2 * np.pi) * 100)
-    scale = panel.object(reading.name).scale  # type: ignore[union-attr]
-    return float(abs(reading.value - float(shown)) / (scale.maximum - scale.minimum) * 100)

@@ -30,7 +30,7 @@ class Crossing:
 
     Attributes:
         middle_px, tangent: (2,) its middle in the patch, and the path's unit direction there.
-        length_px: along the path.
+        length_px: along the path, where it differs by more than half: without the skirts of its blur.
         gray: of its middle; is_darker: than the plate round it.
         side: of a rectangle's path, 0 to 3 from the top clockwise; 0 of a round one.
     """
@@ -92,7 +92,8 @@ def border_crossings(patch: Patch, *, half_width_m: float, half_height_m: float,
             Crossing(
                 middle_px=points[middle],
                 tangent=step / max(float(np.linalg.norm(step)), 1e-9),
-                length_px=0.8 * len(at),
+                length_px=0.8
+                * float(np.count_nonzero(np.abs(values[at] - typical[at]) > 0.5 * abs(gray - typical[middle]))),
                 gray=gray,
                 is_darker=gray < float(typical[middle]),
                 side=int(sides[middle]),

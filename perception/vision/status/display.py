@@ -33,6 +33,8 @@ CELL_COST = 0.008  # a comb with one more cell must explain that much more
 TEMPERATURE = 2.0  # what is wrong with one segment is wrong with its neighbours too: they count half
 KNOWN_FREE, FREE = 0.35, 0.5  # how far the digits may sit from the middle, over the width
 
+MOST_NAMED, NAMED = 4, 0.1  # numbers that a refusal names: at most; the share of the likelihood that each has
+
 Prior = Callable[[float], float]
 
 
@@ -171,10 +173,12 @@ def _answer(
     confidence *= probability([(found.explained, 0.3, 0.06)]) / 0.732
     confidence = min(confidence, 0.97)
     if confidence < ANSWER_AT:
+        rivals = [possible[i][0] for i in np.argsort(-share)[:MOST_NAMED] if share[i] > NAMED]
+        maybe = f" ({' or '.join(rivals)}?)" if len(rivals) > 1 else ""
         why = (
-            "something lies across the digits: move it or look past it"
+            f"something lies across the digits{maybe}: move it or look past it"
             if covered and share[k] < 0.8
-            else "the evidence is too weak: come closer, change the angle or the light"
+            else f"the evidence is too weak{maybe}: come closer, change the angle or the light"
         )
         return refused(why, confidence=confidence, unit=unit)
     half_digit = 0.5 * 10.0 ** -(len(text.split(".")[1]) if "." in text else 0)

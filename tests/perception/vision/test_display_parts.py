@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -58,6 +60,12 @@ def test_the_range_tells_between_what_is_left() -> None:
     gray = window("99", slant=0.0)
     status = read_window(gray, digits=2, decimals=0, dark=False, limits=(60.0, 120.0), hidden=over_segment_b(gray))
     assert status.text == "99"
+
+
+def test_a_refusal_names_what_it_may_be() -> None:
+    gray = window("99", slant=0.0)
+    status = read_window(gray, digits=2, decimals=0, dark=False, limits=(0.0, 200.0), hidden=over_segment_b(gray))
+    assert not status.answered and "59" in (status.reason or "") and "99" in (status.reason or "")
 
 
 def over_segment_b(gray: np.ndarray) -> np.ndarray:
@@ -140,7 +148,15 @@ def test_a_cable_is_masked_where_it_lies(cable: tuple[int, int]) -> None:
     inside = np.zeros(found.shape, bool)
     inside[25:85, 30:170] = True
     assert found[(drawn > 0) & inside].mean() > 0.97
-    assert found[inside].mean() < 0.3
+    assert found[inside].mean() < 0.3  # the cable is 12 px of 140 wide
+
+
+def test_a_cable_in_a_dark_picture_is_masked_too() -> None:
+    bright = plate_patch(cable=(60, 95))
+    dark = replace(bright, gray=(bright.gray * 0.35).astype(np.uint8))
+    masks = [hidden_by_bands(p, half_width_m=0.07, half_height_m=0.03, dark_ink=False) for p in (bright, dark)]
+    assert masks[0] is not None and masks[1] is not None
+    assert (masks[0] & masks[1]).sum() > 0.85 * (masks[0] | masks[1]).sum()
 
 
 def test_nothing_is_masked_without_a_cable() -> None:

@@ -7,6 +7,7 @@ Every edge pixel names the centres that its gradient points at, for every radius
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import hypot
 
 import cv2
 import numpy as np
@@ -53,18 +54,19 @@ def find_circles(edges: Edges, *, least_px: float, most_px: float) -> list[Circl
         height, width = edges.strong.shape
         votes = np.zeros((len(radii), height // cell + 2, width // cell + 2), np.float32)
         _vote(votes, *points, radii, cell)
-        for u0, v0, r0 in _peaks(_pooled(votes, radii), radii, cell):
+        _pool(votes, radii)
+        for u0, v0, r0 in _peaks(votes, radii, cell):
             circle = _verified_circle(edges, u0, v0, r0)
             if circle is not None:
                 found.append(circle)
     return _distinct(found)
 
 
-def _pooled(votes: Float32, radii: Array) -> Float32:
-    """Votes summed over neighbouring places and radii, over the circumference."""
+def _pool(votes: Float32, radii: Array) -> None:
+    """In place: votes summed over neighbouring places and radii, over the circumference."""
     for plane in votes:
         cv2.GaussianBlur(plane, (0, 0), 0.9, dst=plane)
-    return np.asarray(_averaged(votes, radii.astype(np.float32)), np.float32)
+    _average(votes, radii.astype(np.float32))
 
 
 def _peaks(votes: Float32, radii: Array, cell: int) -> list[tuple[float, float, float]]:
@@ -109,23 +111,26 @@ def circle_coverage(edges: Edges, circles: Array) -> Array:
 def _distinct(circles: list[Circle]) -> list[Circle]:
     kept: list[Circle] = []
     for c in sorted(circles, key=lambda c: c.coverage, reverse=True):
-        if not any(np.hypot(c.u - k.u, c.v - k.v) < 4 and abs(c.radius - k.radius) < 2 for k in kept):
+        if not any(abs(c.radius - k.radius) < 2 and hypot(c.u - k.u, c.v - k.v) < 4 for k in kept):
             kept.append(c)
     return kept
 
 
 @njit(cache=True)
-def _averaged(planes: Float32, radii: Float32) -> Float32:  # pragma: no cover
-    """Mean of every plane and its two neighbours, the outermost as they are, over the radius."""
+def _average(planes: Float32, radii: Float32) -> None:  # pragma: no cover
+    """In place: mean of every plane and its two neighbours, the outermost as they are, over the radius."""
     count, height, width = planes.shape
-    out = np.empty_like(planes)
+    before, here = planes[0].copy(), planes[0].copy()
     for k in range(count):
-        below, above = (k - 1, k + 1) if 0 < k < count - 1 else (k, k)
+        inner = 0 < k < count - 1
         share = np.float32(1.0 / (3.0 * radii[k]))
+        above = planes[k + 1 if inner else k]
         for y in range(height):
             for x in range(width):
-                out[k, y, x] = (planes[below, y, x] + planes[k, y, x] + planes[above, y, x]) * share
-    return out
+                value = planes[k, y, x]
+                here[y, x] = value
+                planes[k, y, x] = ((before[y, x] if inner else value) + value + above[y, x]) * share
+        before, here = here, before
 
 
 @njit(cache=True)
@@ -134,13 +139,14 @@ def _vote(
 ) -> None:  # pragma: no cover
     """One vote a radius on either side of every edge pixel; radius by radius, so that one plane stays in the cache."""
     _, height, width = votes.shape
+    share = 1.0 / cell  # cells are powers of two: exactly as dividing, and quicker
     for k in range(len(radii)):
         plane = votes[k]
+        reach = radii[k] * share
         for i in range(len(u)):
-            dx, dy = radii[k] * nx[i], radii[k] * ny[i]
+            x0, y0, dx, dy = u[i] * share + 0.5, v[i] * share + 0.5, reach * nx[i], reach * ny[i]
             for sign in (-1.0, 1.0):
-                x = int((u[i] + sign * dx) / cell + 0.5)
-                y = int((v[i] + sign * dy) / cell + 0.5)
+                x, y = int(x0 + sign * dx), int(y0 + sign * dy)
                 if 0 <= x < width and 0 <= y < height:
                     plane[y, x] += 1.0
 

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from perception.vision.status.comb_fit import refine_comb
 from perception.vision.status.comb_jit import (
     INNER,
     LOOP,
     STROKE,
     Float32,
     guesses,
-    refine_comb,
     row_scores,
     slant_energies,
 )
@@ -123,7 +123,7 @@ def _refined(upright: Float32, clear: Float32, whole: bool, guess: Array, slant:
 def segment_means(
     upright: Float32, clear: Float32, whole: bool, width_px: float, height_px: float
 ) -> tuple[Float32, Float32]:
-    """What `comb_jit.comb_worth` looks up: means over boxes of the size of a segment of such cells, around every pixel."""
+    """What `comb_fit.comb_worth` looks up: means over boxes of the size of a segment of such cells, around every pixel."""
     stroke = round(2 * STROKE * height_px) | 1
     boxes = (
         (round((1 - 2 * INNER) * width_px) | 1, stroke),

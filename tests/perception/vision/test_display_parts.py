@@ -14,7 +14,8 @@ from perception.vision.patch import Patch
 from perception.vision.photo_display import read_photograph
 from perception.vision.status.band import hidden_by_bands
 from perception.vision.status.comb import LIT_SHARES, find_combs, segment_means
-from perception.vision.status.comb_jit import LEFT_OVER, apartness, cell_worth, comb_worth
+from perception.vision.status.comb_fit import comb_worth
+from perception.vision.status.comb_jit import LEFT_OVER, apartness, cell_worth
 from perception.vision.status.cover import ring_medians
 from perception.vision.status.display import read_window
 from perception.vision.status.glyphs import LIT, NAMES, Levels, likelihoods, numbers, separate

@@ -1,0 +1,118 @@
+"""Compiled continuous search around a rough comb: what it is worth by box means, and the steps that make it worth more."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.vision.status.comb_jit import (
+    FLAT,
+    INNER,
+    LEAST_GAP,
+    LEAST_WEIGHT,
+    LOOP,
+    MIDDLES,
+    STROKE,
+    Float32,
+    apartness,
+    cell_worth,
+)
+from perception.vision.view import Array
+
+
+@njit(cache=True)
+def _at(image: Float32, u: float, v: float) -> float:  # pragma: no cover
+    """Bilinear value, 0 outside."""
+    height, width = image.shape
+    if u < 0.0 or v < 0.0 or u > width - 1 or v > height - 1:
+        return 0.0
+    x, y = min(int(u), width - 2), min(int(v), height - 2)
+    a, b = u - x, v - y
+    above = image[y, x] * (1 - a) + image[y, x + 1] * a
+    return float(above * (1 - b) + (image[y + 1, x] * (1 - a) + image[y + 1, x + 1] * a) * b)
+
+
+@njit(cache=True)
+def comb_worth(
+    means: Float32, shares: Float32, whole: bool, comb: Array, count: int, lit: Array
+) -> float:  # pragma: no cover
+    """Worth of a comb (left, pitch, width, top, bottom, slant) of `count` cells.
+
+    Args:
+        means: (3, H, W) mean ink of a flat segment, an upright one, and mean square in a loop, around every pixel.
+        shares: (2, H, W) seen share of a flat and an upright segment around every pixel; not looked at when `whole`.
+    """
+    left, pitch, width, top, bottom, slant = comb
+    height = bottom - top
+    long = (1 - 2 * INNER) * 2 * STROKE * height
+    levels, areas = np.zeros(7), np.zeros(7)
+    total = 0.0
+    for cell in range(count):
+        for k in range(7):
+            kind = 0 if FLAT[k] else 1
+            v = top + MIDDLES[1, k] * height
+            u = left + cell * pitch + MIDDLES[0, k] * width + slant * ((top + bottom) / 2 - v)
+            weight = 1.0 if whole else _at(shares[kind], u, v)
+            levels[k] = _at(means[kind], u, v) / weight if weight > LEAST_WEIGHT else 0.0
+            areas[k] = long * (width if kind == 0 else height / 2) * (weight if weight > LEAST_WEIGHT else 0.0)
+        loops = 0.0
+        for y in (0.25, 0.75):
+            v = top + y * height
+            loops += _at(means[2], left + cell * pitch + 0.5 * width + slant * ((top + bottom) / 2 - v), v)
+        total += cell_worth(levels, areas, loops * 2 * LOOP * width * LOOP * height, lit)
+    return total * (apartness((pitch - width) / height) if count > 1 else 1.0)
+
+
+@njit(cache=True)
+def refine_comb(
+    means: Float32, shares: Float32, whole: bool, comb: Array, count: int, lit: Array, steps: Array, lean: float
+) -> float:  # pragma: no cover
+    """Coordinate search around a comb, which is changed in place; its worth.
+
+    Args:
+        means, shares, whole: as `comb_worth`.
+        comb: (6,) left, pitch, width, top, bottom, slant.
+        steps: search steps over the digit height, one round each.
+        lean: slant that was taken out of the picture.
+    """
+    score = comb_worth(means, shares, whole, comb, count, lit)
+    moves = np.array([
+        [1.0, 0, 0, 0, 0, 0], [0, 1.0, 0, 0, 0, 0], [-1.0, 1.0, 0, 0, 0, 0], [-0.5, 0, 1.0, 0, 0, 0],
+        [0, 0, 0, 1.0, 0, 0], [0, 0, 0, 0, 1.0, 0], [0, 0, 0, 1.0, 1.0, 0], [0, 0, 0, 0, 0, 1.0],
+    ])  # fmt: skip
+    tried = np.empty(6)
+    for step in steps:
+        for _ in range(3):
+            height = comb[4] - comb[3]
+            chosen, best = comb.copy(), score
+            for k in range(len(moves)):
+                for sign in (-1.0, 1.0):
+                    for i in range(6):
+                        tried[i] = sign * step * moves[k, i] * (height if i < 5 else 1.0)
+                    if moves[k, 1] != 0.0:
+                        tried[1] /= max(1, count - 1)
+                    tried += comb
+                    if not is_sound(tried, count, means.shape[1], means.shape[2], lean):
+                        continue
+                    value = comb_worth(means, shares, whole, tried, count, lit)
+                    if value > best:
+                        chosen[:] = tried
+                        best = value
+            if best <= score:
+                break
+            comb[:] = chosen
+            score = best
+    return score
+
+
+@njit(cache=True)
+def is_sound(comb: Array, count: int, rows: int, columns: int, lean: float) -> bool:  # pragma: no cover
+    """Whether cells keep apart (else neighbours would share an upright), stay in the picture and look like digits."""
+    left, pitch, width, top, bottom, slant = comb
+    height = bottom - top
+    right = left + (count - 1) * pitch + width
+    return bool(
+        height >= 6.0 and pitch - width >= LEAST_GAP * height and 0.33 * height <= width <= 0.72 * height
+        and left >= -0.1 * width and right <= columns + 0.1 * width and top >= 0.0 and bottom <= rows - 1.0
+        and -0.06 <= slant + lean <= 0.32
+    )  # fmt: skip

@@ -26,6 +26,7 @@ from hal.motion import (
     DeclaredMotion,
     GripperMotion,
     Hold,
+    JointTrajectory,
     MotionOutcome,
     MotionReport,
     RobotState,
@@ -42,7 +43,9 @@ from manipulation.setpoint import SetPointFilter, check, flange_matrix
 
 Array = NDArray[np.float64]
 
+RAN = "ran to its declared end"
 SETTLE_S = 0.3
+CATCH_UP_S = 2.0  # for a set-point that speed limits hold back
 SETTLED_RAD = 2e-4
 SETTLED_RAD_PER_S = 0.02
 TARE_S = 0.1
@@ -250,7 +253,7 @@ class Controller:
                     if run.is_over(tick):
                         over_since_s = elapsed_s if over_since_s is None else over_since_s
                         if self._has_settled(motion, wanted, sample, elapsed_s - over_since_s):
-                            return Ending(outcome=MotionOutcome.COMPLETED, cause="ran to its declared end")
+                            return Ending(outcome=MotionOutcome.COMPLETED, cause=self._end_of(motion, wanted))
                     self._send(self._filter.apply(wanted))
                     self._drives.pass_tick()
                     ticks += 1
@@ -263,10 +266,21 @@ class Controller:
             return end
 
     def _has_settled(self, motion: DeclaredMotion, wanted: Array, sample: Sample, over_s: float) -> bool:
-        if isinstance(motion, Hold | GripperMotion) or over_s >= SETTLE_S:
+        if isinstance(motion, Hold | GripperMotion):
             return True
-        at_goal = np.abs(wanted - self._filter.last_rad).max() < SETTLED_RAD
-        return bool(at_goal and np.abs(sample.velocity_rad_per_s).max() < SETTLED_RAD_PER_S)
+        is_behind = np.abs(wanted - self._filter.last_rad).max() >= SETTLED_RAD
+        if not is_behind and np.abs(sample.velocity_rad_per_s).max() < SETTLED_RAD_PER_S:
+            return True
+        # A path may be far from its joints for good, where it yields; a trajectory's set-point is only on its way.
+        return over_s >= (CATCH_UP_S if is_behind and isinstance(motion, JointTrajectory) else SETTLE_S)
+
+    def _end_of(self, motion: DeclaredMotion, wanted: Array) -> str:
+        """The cause of a completed motion; tells when the limits have kept a trajectory's set-point from its end."""
+        left_rad = np.abs(wanted - self._filter.last_rad)
+        k = int(np.argmax(left_rad))
+        if left_rad[k] < SETTLED_RAD or not isinstance(motion, JointTrajectory):
+            return RAN
+        return f"{RAN}, but joint {k + 1} is still {1e3 * left_rad[k]:.1f} mrad away from it"
 
     def _come_to_rest(self, end: Ending) -> None:
         """Decelerate at the limit, then hold; only the arm is listened to, since another device may be what failed."""

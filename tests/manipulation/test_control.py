@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Iterator
 
@@ -80,6 +81,22 @@ def test_a_trajectory_ends_where_it_was_declared_and_begins_at_the_measured_join
     assert report.outcome is MotionOutcome.COMPLETED
     assert np.abs(report.position_rad - goal).max() < 1e-3
     assert np.abs(rig.world.commands[0] - (HOME + 0.02)).max() < 1e-3
+
+
+@pytest.mark.parametrize(("leap_rad", "cause"), [(0.2, "declared end$"), (1.5, r"joint 1 is still \d+\.\d mrad away")])
+def test_a_set_point_that_the_limits_hold_back_is_waited_for_and_what_is_left_is_told(
+    rig: Rig, leap_rad: float, cause: str
+) -> None:
+    goal = HOME + np.array([leap_rad, 0, 0, 0, 0, 0])
+    times = np.array([0.0, 0.01, 0.02])
+    leap = JointTrajectory(
+        name="leap", times_s=times, positions_rad=np.array([HOME, HOME, goal]), velocities_rad_per_s=np.zeros((3, 6))
+    )
+    report = rig.controller.execute(leap)
+    assert report.outcome is MotionOutcome.COMPLETED
+    assert re.search(cause, report.cause)
+    assert report.ended_s - report.started_s > 0.3
+    assert (np.abs(report.position_rad - goal).max() < 2e-3) == (leap_rad < 1.0)
 
 
 def test_contact_stops_an_approach_close_to_the_wall(rig: Rig) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from typing import Annotated, Any
 
 import numpy as np
@@ -97,7 +98,10 @@ def capabilities(
 
 
 class SetPointFilter:
-    """The last check before the drive: shape, finiteness, limits, and no jump from the last set-point."""
+    """The last check before the drive: shape, finiteness, limits, and no jump from the last set-point.
+
+    Any thread may close it: a lost link does, while the control thread has a set-point in hand.
+    """
 
     def __init__(self, name: str, k: KinematicsOptions, *, command_rate_hz: float) -> None:
         self._name = name
@@ -106,10 +110,12 @@ class SetPointFilter:
         self._period_s = 1.0 / command_rate_hz
         self._last: Array | None = None
         self._last_s = 0.0
+        self._passing = threading.Lock()
 
     def begin(self, measured_rad: Array | None) -> None:
         """Commands start from here; None refuses all commands."""
-        self._last = measured_rad
+        with self._passing:
+            self._last = measured_rad
 
     @property
     def is_open(self) -> bool:
@@ -129,11 +135,12 @@ class SetPointFilter:
                 hint="check the planner",
                 device=self._name,
             )
-        if self._last is None:
-            raise MotionRefused(f"{self._name}: the drives are off", hint="call enable first", device=self._name)
-        elapsed_s = min(max(now_s - self._last_s, self._period_s), 10.0 * self._period_s)
-        step = self._velocity * elapsed_s * STEP_MARGIN
-        near = np.clip(wanted, self._last - step, self._last + step)
-        sent: Array = np.clip(near, self._lower, self._upper)
-        self._last, self._last_s = sent, now_s
-        return sent
+        with self._passing:
+            if self._last is None:
+                raise MotionRefused(f"{self._name}: the drives are off", hint="call enable first", device=self._name)
+            elapsed_s = min(max(now_s - self._last_s, self._period_s), 10.0 * self._period_s)
+            step = self._velocity * elapsed_s * STEP_MARGIN
+            near = np.clip(wanted, self._last - step, self._last + step)
+            sent: Array = np.clip(near, self._lower, self._upper)
+            self._last, self._last_s = sent, now_s
+            return sent

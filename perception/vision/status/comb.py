@@ -95,10 +95,11 @@ def find_combs(ink: Float32, seen: Float32, *, most: int = 8, free: float = 0.5)
     if len(rows) == 0:
         return []
     slant = _slant(even, flat)
-    upright, clear = _upright(even, slant), _upright(seen, slant)
-    whole = bool(seen.min() > 0)
-    sums = cv2.integral(upright, sdepth=cv2.CV_64F), cv2.integral(clear, sdepth=cv2.CV_64F)
-    rough = guesses(np.asarray(sums[0]), np.asarray(sums[1]), whole, rows, WIDTHS, PITCHES, most, free, LIT_SHARES)
+    whole = bool(seen.min() > 0)  # then nobody looks at what is seen
+    upright, clear = _upright(even, slant), seen if whole else _upright(seen, slant)
+    sums = np.asarray(cv2.integral(upright, sdepth=cv2.CV_64F), float)
+    shares = sums if whole else np.asarray(cv2.integral(clear, sdepth=cv2.CV_64F), float)
+    rough = guesses(sums, shares, whole, rows, WIDTHS, PITCHES, most, free, LIT_SHARES)
     found = []
     for guess in rough[np.argsort(-rough[:, 0])][:REFINED]:
         if guess[0] <= 0:

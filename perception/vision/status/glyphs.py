@@ -22,6 +22,7 @@ GLYPHS = (
 #: (characters, 7) which segments a character lights.
 LIT = np.array([[s in lit for s in SEGMENTS] for _, lit in GLYPHS])
 NAMES = [name for name, _ in GLYPHS]
+FORMS = [[k for k, name in enumerate(NAMES) if name == digit] for digit in "0123456789"]
 RARE = {10: 1.5, 11: 1.5, 12: 1.5}  # nats: other ways to draw 7, 6 and 9
 
 LEAST_NOISE = 1.0  # levels
@@ -152,9 +153,7 @@ def numbers(characters: Array, blank: Array) -> list[Number]:
 
 def _digits(characters: Array) -> Array:
     """(cells, 10) log-likelihood of every digit, by its best form."""
-    return np.stack(
-        [characters[:, [k for k, name in enumerate(NAMES) if name == d]].max(axis=1) for d in "0123456789"], 1
-    )
+    return np.stack([characters[:, forms].max(axis=1) for forms in FORMS], 1)
 
 
 def _alternatives(digits: Array) -> list[tuple[str, float]]:

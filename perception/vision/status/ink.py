@@ -76,6 +76,8 @@ def without_border(ink: Float32, *, framed: bool = False) -> Float32:
 def _at_border(ink: Float32, least: float, framed: bool) -> NDArray[np.bool_] | None:
     """(H, W) where ink above a level hangs together with the border, a little widened; None where none does."""
     mask = (ink > least).astype(np.uint8)
+    if not (mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()):
+        return None
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
     rows, columns = ink.shape
     edge = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])

@@ -35,9 +35,9 @@ serve: setup  ## Start the service on http://127.0.0.1:8460
 	@$(BIN)/panelwright serve
 
 test: setup  ## Run all tests, two files at a time; PYTEST_OPTIONS go to pytest
-	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope --no-loadscope-reorder -m 'not wire' $(PYTEST_OPTIONS)
+	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope --no-loadscope-reorder $(PYTEST_OPTIONS)
 
-test-wire: setup  ## Run whole missions over emulated wires, in real time: about six minutes, more on a busy machine
+test-wire: setup  ## Run only the missions over emulated wires
 	@$(BIN)/python -m pytest -m wire
 
 test-fast: setup  ## Run the tests without missions, browsers and scaffolds

@@ -12,6 +12,8 @@ from perception.vision.status.press import cap_height, one_sided_shade, sheen
 SHADE_HALF, SHADE_SCALE = 0.06, 0.015  # a flush cap stays below 0.05, one that stands out reaches 0.1
 MODEL_SHARE = 0.25
 UNSEEN = "the button cannot be seen (glare, shadow or cover): change the angle or the light"
+LEAST_SHADE = 0.04  # a fainter one has no side
+MOST_SHEEN = 4.0  # log odds
 SHEEN_HALF, SHEEN_SCALE = 0.08, 0.03
 
 
@@ -53,5 +55,6 @@ def _by_height(patch: Patch, spec: Button | Mushroom) -> float | None:
 def _by_shade(patch: Patch, radius_m: float) -> float:
     """Log odds of `released` from a shadow on one side and a sheen on the other."""
     shade, towards_rad = one_sided_shade(patch, radius_m=radius_m, ring=(0.90, 1.05), outside=(1.12, 1.3))
-    shine = sheen(patch, radius_m=radius_m, towards_rad=towards_rad)
-    return (shade - SHADE_HALF) / SHADE_SCALE + float(np.clip((shine - SHEEN_HALF) / SHEEN_SCALE, -2.0, 3.0))
+    # A faint shade does not say where the light is: its side is that of the noise, or of a middle that is a little off.
+    shine = sheen(patch, radius_m=radius_m, towards_rad=towards_rad if shade >= LEAST_SHADE else None)
+    return (shade - SHADE_HALF) / SHADE_SCALE + float(np.clip((shine - SHEEN_HALF) / SHEEN_SCALE, -2.0, MOST_SHEEN))

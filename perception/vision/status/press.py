@@ -118,10 +118,10 @@ def one_sided_shade(
     return float(abs(harmonic)), float(np.angle(harmonic))
 
 
-def sheen(patch: Patch, *, radius_m: float, towards_rad: float) -> float:
+def sheen(patch: Patch, *, radius_m: float, towards_rad: float | None) -> float:
     """Brightest spot of a cap's face over the face's median, relative to the plate, if it lies on the side of the light.
 
-    Negative when the brightest spot lies on another side.
+    Negative when the brightest spot lies on another side; `towards_rad` None: the side of the light is not known.
     """
     a = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     r = radius_m * np.linspace(0.1, 0.62, 7)
@@ -130,7 +130,7 @@ def sheen(patch: Patch, *, radius_m: float, towards_rad: float) -> float:
     smooth = cv2.blur(np.concatenate([face, face, face], axis=1), (7, 3))[:, len(a) : 2 * len(a)]
     k = int(smooth.argmax()) % len(a)
     height = float(smooth.max() - np.median(face)) / level
-    return height * float(np.cos(a[k] - towards_rad))
+    return height if towards_rad is None else height * float(np.cos(a[k] - towards_rad))
 
 
 def _around(patch: Patch, radii_m: Array, angles: Array) -> Array:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hal.panel import Handwheel
+from perception.vision.image import WHITE_LEVEL
 from perception.vision.patch import Patch
 from perception.vision.reading import Status, gated, probability, refused
 from perception.vision.status.choice import contrast_noise
@@ -13,6 +17,7 @@ from perception.vision.status.pointer import unroll, wrapped
 from perception.vision.view import Array
 
 STEPS = 720
+GLARE = 0.25  # of the radius: marks are smaller
 BESIDE = 28  # steps: 14 degrees, beyond a spoke and its mark
 
 
@@ -28,7 +33,12 @@ def read_handwheel(patch: Patch, spec: Handwheel) -> Status:
     if seen < 0.4:
         return refused("the wheel cannot be seen (glare, shadow or cover): change the angle or the light", unit="rad")
     noise = contrast_noise(patch)
-    ink = np.median(np.abs(spoke - np.median(spoke, axis=1, keepdims=True)), axis=0)
+    glare = _glare(patch, R)
+    dazzled = unroll(glare, (0.0, 0.0), np.linspace(0.42, 0.72, 8) * R, angles, None) > 0.2
+    typical = np.nanmedian(
+        np.where(dazzled & ~dazzled.all(axis=1, keepdims=True), np.nan, spoke), axis=1, keepdims=True
+    )
+    ink = np.median(np.where(dazzled, 0.0, np.abs(spoke - typical)), axis=0)
     window = STEPS // 60
     ink = _smooth(ink, window)
     folded = np.sort(ink.reshape(n, -1), axis=0)[: max(1, n - 1)].mean(axis=0) if STEPS % n == 0 else _fold(ink, n)
@@ -37,6 +47,8 @@ def read_handwheel(patch: Patch, spec: Handwheel) -> Status:
     phase = _peak(folded, phase_step) * 2 * np.pi / STEPS
     places = phase + 2 * np.pi * np.arange(n) / n
     profile = np.array([_at(mark, p) for p in places])
+    drowned = unroll(glare, (0.0, 0.0), np.linspace(0.45, 0.97, 12) * R, angles, None)
+    profile = np.where(np.array([_at_most(drowned, p) for p in places]) > 0.2, np.nan, profile)
     deviation = np.array([_mark_evidence(profile, k) for k in range(n)])
     best = int(deviation.argmax())
     second = float(np.sort(deviation)[-2]) if n > 1 else 0.0
@@ -88,6 +100,25 @@ def _at(mark: NDArray[np.float32], angle: float) -> Array:
 
 def _mark_evidence(profile: Array, k: int) -> float:
     """How far spoke `k` differs from the others over at least two neighbouring radii, gray levels."""
-    others = np.median(np.delete(profile, k, axis=0), axis=0)
-    difference = np.abs(profile[k] - others)
+    rest = np.delete(profile, k, axis=0)
+    known = np.isfinite(rest).any(axis=0) & np.isfinite(profile[k])
+    others = np.nanmedian(np.where(known, rest, 0.0), axis=0)
+    difference = np.where(known, np.abs(profile[k] - others), 0.0)
     return float(np.minimum(difference[:-1], difference[1:]).max())
+
+
+def _at_most(mask: NDArray[np.float32], angle: float) -> Array:
+    """Largest value at a spoke and to both sides of it, where `_at` looks."""
+    step = round(angle / (2 * np.pi) * STEPS)
+    return np.asarray(mask[:, (step + np.arange(-BESIDE - 4, BESIDE + 5)) % STEPS].max(axis=1), float)
+
+
+def _glare(patch: Patch, radius_m: float) -> Patch:
+    """The patch with 1 where glare hides the wheel: saturated, and wider than any mark."""
+    white = (patch.gray >= WHITE_LEVEL).astype(np.uint8)
+    if not white.any():
+        return replace(patch, gray=white)
+    size = max(3, round(GLARE * radius_m * patch.px_per_m)) | 1
+    round_ = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    wide = cv2.morphologyEx(white, cv2.MORPH_OPEN, round_)
+    return replace(patch, gray=np.asarray(cv2.dilate(wide, np.ones((size // 2 | 1,) * 2, np.uint8)), np.uint8))

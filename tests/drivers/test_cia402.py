@@ -180,6 +180,13 @@ def test_a_drive_that_restarts_is_set_up_again_and_stays_off() -> None:
             device.command_position(arm.position_rad, deadline=soon())
 
 
+@pytest.fixture
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A connection that must fail is given up after 3 s; the drives are asked for what is wrong long before."""
+    monkeypatch.setattr("drivers.cia402.CONNECT_S", 3.0)
+
+
+@pytest.mark.usefixtures("hurried")
 def test_a_wrong_pdo_mapping_is_refused() -> None:
     far_side = emulator.start(ScriptedArm(), {})
     far_side.drives[2].objects[(0x1A00, 2)] = struct.pack("<I", 0x606C0020)
@@ -187,6 +194,7 @@ def test_a_wrong_pdo_mapping_is_refused() -> None:
         raise AssertionError("it connected")
 
 
+@pytest.mark.usefixtures("hurried")
 def test_a_missing_node_is_named() -> None:
     far_side = emulator.start(ScriptedArm(), {})
     try:

@@ -47,10 +47,10 @@ def tries_of(candidate: Candidate, pieces: list[Piece], view: View) -> list[Try]
     ]
     coarse = []
     starts = SMALL_STARTS if stride == 1 else STARTS + len(pieces) // 4
-    for t in _apart(quick, APART_M, APART_RAD)[:starts]:
+    for t in _apart(quick, APART_M, APART_RAD, starts):
         ways = ways_of(candidate.model, t.q, COARSE_M, COARSE_RAD)
         coarse.append(climb(candidate, t.q, view, ways=ways, levels=COARSE_LEVELS, stride=stride))
-    apart = _apart(coarse, SAME_PLACE_M, np.pi)[: FINE_STARTS + len(pieces) // 8]
+    apart = _apart(coarse, SAME_PLACE_M, np.pi, FINE_STARTS + len(pieces) // 8)
     return [t for t in apart if t.score > WORST_START]
 
 
@@ -62,16 +62,17 @@ def _stride(candidate: Candidate, view: View) -> int:
     return 1 if pixels < FEW_PIXELS else 2 if pixels < MANY_PIXELS else 3
 
 
-def _apart(tries: list[Try], apart_m: float, apart_rad: float) -> list[Try]:
-    """Best first, without those that stand where a better one stands."""
+def _apart(tries: list[Try], apart_m: float, apart_rad: float, most: int) -> list[Try]:
+    """The best ones first, at most so many, without those that stand where a better one stands."""
+    ranked = sorted(tries, key=lambda t: -t.score)
+    q = np.array([t.q[:4] for t in ranked]).reshape(-1, 4)
+    is_open = np.ones(len(ranked), np.bool_)
     kept: list[Try] = []
-    for t in sorted(tries, key=lambda t: -t.score):
-        if not any(
-            abs(t.q[0] - k.q[0]) + abs(t.q[1] - k.q[1]) + abs(t.q[3] - k.q[3]) < apart_m
-            and abs(t.q[2] - k.q[2]) < apart_rad
-            for k in kept
-        ):
-            kept.append(t)
+    while is_open.any() and len(kept) < most:
+        best = int(is_open.argmax())
+        kept.append(ranked[best])
+        off = np.abs(q - q[best])
+        is_open &= (off[:, 0] + off[:, 1] + off[:, 3] >= apart_m) | (off[:, 2] >= apart_rad)
     return kept
 
 

@@ -1,14 +1,14 @@
-"""The verb `recognise`: objects by vision, surfaces by range."""
+"""The verb `recognise`: objects by vision, surfaces by range and what they belong to."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from hal.errors import Unsupported
-from perception.range import PinholeSensor, RangeScene, analyse
+from service.operations.beliefs import believed_panel
 from service.operations.eyes import look, scan, settle
 from service.operations.inspect import run_recognise_taught
 from service.operations.locate import go_to_overview
+from service.operations.relief import find_by_surfaces, surfaces_in
 from service.operations.requests import RecogniseRequest
 from service.operations.session import Session
 from service.operations.stored import blind_answer, blind_in_stored, read_stored
@@ -22,7 +22,7 @@ def run_recognise(session: Session, request: RecogniseRequest) -> dict[str, Any]
     if "vision" in request.use:
         answer |= run_recognise_taught(session, request) if request.mode == "taught" else _blind(session, request)
     if "range" in request.use:
-        answer["surfaces"] = _surfaces(session, request)
+        answer |= _by_range(session, request)
     return answer
 
 
@@ -37,18 +37,20 @@ def _blind(session: Session, request: RecogniseRequest) -> dict[str, Any]:
     )
 
 
-def _surfaces(session: Session, request: RecogniseRequest) -> list[dict[str, Any]]:
+def _by_range(session: Session, request: RecogniseRequest) -> dict[str, Any]:
+    """The surfaces of one range image, and the objects of the panel file whose surfaces are among them."""
     if request.move and "vision" not in request.use:
         go_to_overview(session)
         settle(session)
     session.progress(0.9, "scan")
     image = scan(session)
-    c = image.capabilities
-    if c.projection != "pinhole":
-        raise Unsupported(f"{image.scanner} has {c.projection} projection", hint="use a pinhole range scanner")
-    sensor = PinholeSensor(width_px=c.width, height_px=c.height, fx_px=c.fx, fy_px=c.fy, cx_px=c.cx, cy_px=c.cy)
-    scene: RangeScene = analyse(image.depth_m, sensor)
-    return [
-        {"label": s.label, "type": str(s.type), "primitive": s.primitive, "pixels": s.pixels, "rms_m": s.rms_m}
-        for s in scene.surfaces
-    ]
+    scene = surfaces_in(image)
+    plate = scene.largest_plane()
+    return {
+        "surfaces": [
+            {"label": s.label, "type": str(s.type), "primitive": s.primitive, "pixels": s.pixels, "rms_m": s.rms_m}
+            for s in scene.surfaces
+        ],
+        "plate": plate.label,
+        "by_surfaces": find_by_surfaces(scene, image, session.panel, believed_panel(session), plate),
+    }

@@ -19,6 +19,7 @@ from perception.range.primitives import Plane, Surface, SurfaceType
 from perception.range.regions import regions_of
 from perception.range.segment import Task, segment, settled
 from perception.range.sensor import RangeSensorModel
+from perception.range.straight import doubt_about
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
@@ -99,7 +100,7 @@ def analyse(
         surfaces=surfaces,
         noise=law,
         sensor=sensor,
-        warnings=_warnings(float(depths[2]), sensor, law, surfaces),
+        warnings=_warnings(depth, float(depths[2]), sensor, law, surfaces),
     )
 
 
@@ -184,9 +185,10 @@ def _finished(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) 
 
 
 def _warnings(
-    middle: float, sensor: RangeSensorModel, noise: NoiseModel, surfaces: tuple[Surface, ...]
+    depth: Array, middle: float, sensor: RangeSensorModel, noise: NoiseModel, surfaces: tuple[Surface, ...]
 ) -> tuple[str, ...]:
-    out = []
+    doubt = doubt_about(depth, sensor)
+    out = [] if doubt is None else [f"the sensor model seems wrong: {doubt}"]
     sigma = float(noise.sigma_m(middle))
     if sigma > 2.0 * sensor.pitch_m(middle):
         out.append(f"noise of {1e3 * sigma:.1f} mm exceeds two pixels: small surfaces are lost")

@@ -147,7 +147,7 @@ def _window_law(g: Array, perspective: bool, *, spacing_px: int, stride_px: int)
     if min(g.shape) <= (WINDOW - 1) * spacing_px:
         return 0.0, 0.0
     freedom = WINDOW * WINDOW - BASIS.shape[0]
-    z, rms = _window_rms(g, BASIS, spacing_px, stride_px, perspective)
+    z, rms = window_rms(g, BASIS, spacing_px, stride_px, perspective)
     if z.size == 0:
         return 0.0, 0.0
     rms *= WINDOW / np.sqrt(freedom)
@@ -189,7 +189,7 @@ def _two_non_negative(p: Array, q: Array, y: Array) -> tuple[float, float]:
     return 0.0, only_b
 
 
-def _orthonormal_quadratics(side: int) -> Array:
+def quadratics(side: int) -> Array:
     """(6, side^2) orthonormal polynomials up to degree 2 on a square window."""
     t = np.arange(side) - (side - 1) / 2
     v, u = np.meshgrid(t, t, indexing="ij")
@@ -198,11 +198,11 @@ def _orthonormal_quadratics(side: int) -> Array:
     return np.ascontiguousarray(q.T)
 
 
-BASIS = _orthonormal_quadratics(WINDOW)
+BASIS = quadratics(WINDOW)
 
 
 @njit(cache=True)
-def _window_rms(g, basis, spacing, stride, perspective):  # type: ignore[no-untyped-def]
+def window_rms(g, basis, spacing, stride, perspective):  # type: ignore[no-untyped-def]
     """Depth at the middle of each complete window, and the rms in metres that a quadratic leaves over in it."""
     H, W = g.shape
     side = int(np.sqrt(basis.shape[1]) + 0.5)

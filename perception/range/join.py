@@ -18,7 +18,7 @@ JOINED_SHARE = 0.85
 JOINED_MEAN_SQUARE = 1.6
 ROUGH_STRIDE = 5  # of the samples of a first fit
 ROUGH_SHARE = 0.5  # of them must lie near it before all are fitted
-NEAR_STRIDE = 10  # of the samples that decide whether a surface passes near a piece
+NEAR_SAMPLES = 16  # at least (a small piece: all it has) decide whether a surface passes near a piece
 NEAR_SIGMAS = 20.0
 SCRAP_SHARE = 0.1
 SCRAP_SIGMAS = 6.0
@@ -132,7 +132,7 @@ def _trimmed(kind, th, s, perspective):  # type: ignore[no-untyped-def]
 
 def _nearness(kinds: list[int], parameters: list[Array], thin: list[Array], perspective: bool) -> NDArray[np.bool_]:
     """(n, n) whether surface i, extended, passes near most of piece j: a cheap refusal before the joint fits."""
-    few = [s[:, ::NEAR_STRIDE] for s in thin]
+    few = [s[:, :: max(1, s.shape[1] // NEAR_SAMPLES)] for s in thin]
     starts = np.cumsum([0] + [s.shape[1] for s in few])
     x, y, z, sigma = np.concatenate(few, axis=1)
     return np.asarray(_near_matrix(np.array(kinds), np.stack(parameters), starts, x, y, z, sigma, perspective))

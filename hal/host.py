@@ -11,6 +11,7 @@ import contextlib
 import multiprocessing
 import os
 import secrets
+import socket
 import tempfile
 import threading
 from collections.abc import Callable, Mapping
@@ -62,8 +63,7 @@ class HostServer:
         self._thread.join(timeout=1.0)
         self._listener.close()
         for connection in list(self._connections):
-            with contextlib.suppress(OSError):
-                connection.close()
+            _hang_up(connection)
 
     def _accept(self) -> None:
         while not self._is_closed.is_set():
@@ -87,6 +87,15 @@ class HostServer:
         finally:
             self._connections.discard(connection)
             channel.close()
+
+
+def _hang_up(connection: Connection) -> None:
+    """End a connection that another thread reads from; that one sees the end and closes it.
+
+    Closed under the reader, it would sleep on, and fail with a TypeError at the next byte.
+    """
+    with contextlib.suppress(OSError), socket.socket(fileno=os.dup(connection.fileno())) as end:
+        end.shutdown(socket.SHUT_RDWR)
 
 
 def _describe(target: object) -> tuple[frozenset[str], dict[str, Any]]:

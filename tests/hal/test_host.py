@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hal.clock import Deadline, WallClock
 from hal.errors import ConfigError, DeviceFault, DeviceTimeout, DeviceUnavailable
-from hal.host import HostProcess, isolated_device
+from hal.host import HostProcess, HostServer, Proxy, isolated_device
 from hal.readings import Stamped
 
 
@@ -117,3 +119,23 @@ def test_an_error_while_starting_reaches_the_parent() -> None:
 def test_a_simulated_device_cannot_be_alone() -> None:
     with pytest.raises(ConfigError, match="cannot be isolated"):
         isolated_device("arm", "sim:arm", {})
+
+
+def test_a_closing_server_ends_the_threads_that_wait_for_its_clients(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    faults: list[threading.ExceptHookArgs] = []
+    monkeypatch.setattr(threading, "excepthook", faults.append)
+    before = set(threading.enumerate())
+    server = HostServer(make(), str(tmp_path / "socket"), b"key", WallClock())
+    proxies = [Proxy(server.address, b"key", "calculator", WallClock()) for _ in range(5)]
+    serving = [thread for thread in threading.enumerate() if thread.name == "host-serve" and thread not in before]
+    assert len(serving) == 5
+    server.close()
+    for thread in serving:
+        thread.join(30.0)
+        assert not thread.is_alive()
+    for proxy in proxies:
+        with pytest.raises(DeviceUnavailable):
+            proxy.double(np.zeros(1))
+    assert not faults

@@ -12,10 +12,9 @@ def _imports() -> None:
 
 
 def _vision() -> None:
-    from perception.vision import lights, quadrangle
+    from perception.vision.warm import warm_up
 
-    quadrangle.warm_up()
-    lights.warm_up()
+    warm_up()
 
 
 def _range() -> None:
@@ -30,7 +29,19 @@ def _fusion() -> None:
     warm_up()
 
 
-STAGES: Mapping[str, Callable[[], None]] = {"imports": _imports, "vision": _vision, "range": _range, "fusion": _fusion}
+def _planning() -> None:
+    from manipulation.warm import warm_up
+
+    warm_up()
+
+
+STAGES: Mapping[str, Callable[[], None]] = {
+    "imports": _imports,
+    "range": _range,
+    "vision": _vision,
+    "fusion": _fusion,
+    "planning": _planning,
+}
 """What the service process computes with. The cell and world processes warm their own loops when they start."""
 
 

@@ -1,0 +1,19 @@
+"""Warming up runs the hot loops on something that they can really work on."""
+
+from __future__ import annotations
+
+import pytest
+
+from perception.vision import warm as vision
+from perception.vision.photo_display import read_photograph
+from service.warm import STAGES, run_stage
+
+
+@pytest.mark.parametrize("stage", ["planning", "vision"])
+def test_a_stage_runs_through_and_says_its_name(stage: str) -> None:
+    assert stage in STAGES
+    assert run_stage(stage) == stage
+
+
+def test_the_picture_that_warms_the_display_reader_is_read() -> None:
+    assert read_photograph(vision.three_eights(), scene=True).text == "88.8"

@@ -12,7 +12,7 @@ import pytest
 
 from service.serve import Panelwright
 from tests.perception.vision.bench_panel import panel
-from tests.service.test_page import CHROMIUM, FLAGS, _until
+from tests.service.test_page import CHROMIUM, FLAGS, PATIENCE_MS, _until
 from tests.service.test_stored_images import Shown, house, shown
 
 __all__ = ["house", "shown"]  # fixtures
@@ -32,6 +32,7 @@ def page(house: Panelwright, shown: Shown, tmp_path_factory: pytest.TempPathFact
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=str(CHROMIUM), args=FLAGS)
         tab = browser.new_page(viewport={"width": 1400, "height": 1100})
+        tab.set_default_timeout(PATIENCE_MS)
         faults: list[str] = []
         tab.on("pageerror", lambda error: faults.append(str(error)))
         tab.on("console", lambda line: faults.append(line.text) if "Content Security" in line.text else None)
@@ -45,10 +46,10 @@ def page(house: Panelwright, shown: Shown, tmp_path_factory: pytest.TempPathFact
 
 def _click(page: Any, shown: Shown, *places_m: tuple[float, float]) -> None:
     """Click on points of the plate, as far as the page shows them."""
-    box = page.locator("#picture").bounding_box()
-    scale = box["width"] / shown[0].shape[1]
+    picture = page.locator("#picture")
     for u, v in shown[1].project([[x, y, 0.0] for x, y in places_m]):
-        page.mouse.click(box["x"] + (u + 0.5) * scale, box["y"] + (v + 0.5) * scale)
+        scale = picture.bounding_box()["width"] / shown[0].shape[1]
+        picture.click(position={"x": (u + 0.5) * scale, "y": (v + 0.5) * scale})  # once it no longer moves
 
 
 def _corners(name: str, half_m: float) -> tuple[tuple[float, float], tuple[float, float]]:

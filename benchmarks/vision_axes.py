@@ -118,5 +118,5 @@ def _error(panel: Panel, reading: Any, shown: Shown) -> float | None:
         return 0.0 if shown in (reading.text, reading.state) else 100.0
     if reading.kind == "handwheel":
         return float(abs((reading.value - float(shown) + np.pi) % (2 * np.pi) - np.pi) / (2 * np.pi) * 100)
-    scale = panel.object(reading.name).scale  # type: ignore[union-attr]
+    scale = panel.object(reading.name).scale  # type: ignore[union-attr]  # all other kinds have one
     return float(abs(reading.value - float(shown)) / (scale.maximum - scale.minimum) * 100)

@@ -61,7 +61,7 @@ def image(*, with_objects: bool, projection: str = "pinhole") -> Scan:
         render(solid_of(model), boxes_of(model), np.zeros(n), np.zeros(3), R, at, sen, window, 1, m, k)
         depth = np.minimum(depth, m) if with_objects else depth
     c = RangeScannerCapabilities(
-        projection=projection,  # type: ignore[arg-type]
+        projection=projection,  # type: ignore[arg-type]  # any text is tried
         width=SIDE,
         height=SIDE,
         fx=FOCAL_PX,

@@ -52,6 +52,12 @@ def _click(page: Any, shown: Shown, *places_m: tuple[float, float]) -> None:
         picture.click(position={"x": (u + 0.5) * scale, "y": (v + 0.5) * scale})  # once it no longer moves
 
 
+def _outlined(page: Any, button: str) -> None:
+    """Wait for the answer to the clicks: it must be an outline, and then the button works."""
+    _until(page, "!document.querySelector('#found').textContent.startsWith('Looking')")
+    assert page.is_enabled(button), page.text_content("#found")
+
+
 def _corners(name: str, half_m: float) -> tuple[tuple[float, float], tuple[float, float]]:
     x, y = panel().object(name).position_m
     return (x - half_m, y + half_m), (x + half_m, y - half_m)
@@ -71,7 +77,7 @@ def test_a_click_shows_the_outline_that_was_found(page: Any, shown: Shown) -> No
 
 def test_a_new_kind_is_named_saved_and_found(page: Any, shown: Shown) -> None:
     _click(page, shown, *_corners("emergency", 0.02))
-    page.wait_for_selector("#teach-kind:not([disabled])")
+    _outlined(page, "#teach-kind")
     page.fill("#kind", "mushroom")
     page.click("#teach-kind")
     _until(page, "document.querySelector('#saved').textContent.includes('the new kind mushroom')")
@@ -97,7 +103,7 @@ def test_a_whole_panel_is_put_together_saved_and_read(page: Any, shown: Shown) -
     page.fill("#panel-name", "pump_room")
     gauge = panel().object("pressure")
     _click(page, shown, gauge.position_m)
-    page.wait_for_selector("#add-object:not([disabled])")
+    _outlined(page, "#add-object")
     page.select_option("#object-kind", "gauge")
     _until(page, "document.querySelector('[data-key=at_min]')")
     page.fill("[data-key=name]", "pressure")
@@ -107,7 +113,7 @@ def test_a_whole_panel_is_put_together_saved_and_read(page: Any, shown: Shown) -
     page.click("#add-object")
     _until(page, "document.querySelector('#objects').textContent.includes('pressure · gauge')")
     _click(page, shown, *_corners("emergency", 0.02))
-    page.wait_for_selector("#add-object:not([disabled])")
+    _outlined(page, "#add-object")
     page.select_option("#object-kind", "mushroom")
     _until(page, "document.querySelectorAll('#questions [data-key]').length === 1")
     page.fill("[data-key=name]", "halt")

@@ -27,6 +27,8 @@ Labels = NDArray[np.int32]
 LEAST_VALID_PIXELS = 16
 SETTLING_SWEEPS = 4
 NAMING_SAMPLES = 150
+LEAST_KEPT_PIXELS = 8
+CRUMB_SHARE = 0.5  # of the smallest surface that is looked for
 LARGEST_PIXELS = 2**26  # 8192 x 8192; 6.0 GB at most, measured
 
 
@@ -165,7 +167,7 @@ def _finished(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) 
     owner = join.join_pieces(regions, found.kinds, found.parameters)
     regions = regions.given_to(owner)
     pixels, few = regions.pixels, regions.few(NAMING_SAMPLES)
-    keep = [k for k in range(count) if owner[k] == k + 1 and pixels[k] >= 8]
+    keep = [k for k in range(count) if owner[k] == k + 1 and pixels[k] >= LEAST_KEPT_PIXELS]
     keep.sort(key=lambda k: -pixels[k])
     surfaces, final = [], Candidates()
     renamed = np.zeros(count + 1, np.int32)
@@ -180,6 +182,7 @@ def _finished(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) 
         surfaces.append(surface)
         renamed[k + 1] = new
     labels = settled(task, noise, renamed[regions.labels], final, sweeps=SETTLING_SWEEPS)
+    labels, surfaces = finish.without_crumbs(labels, surfaces, max(LEAST_KEPT_PIXELS, CRUMB_SHARE * task.least_pixels))
     fill_small_gaps(labels, depth, 2)
     return labels, tuple(surfaces)
 

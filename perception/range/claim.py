@@ -251,6 +251,16 @@ def fill_small_gaps(label, depth, sweeps):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def pixels_of(label, count):  # type: ignore[no-untyped-def]
+    """How many pixels each of the labels 1 to `count` has, (count,)."""
+    flat = label.ravel()
+    sizes = np.zeros(count + 1, np.int64)
+    for i in range(flat.shape[0]):
+        sizes[flat[i]] += 1
+    return sizes[1:]
+
+
+@njit(cache=True)
 def bucket(label, count):  # type: ignore[no-untyped-def]
     """Flat pixel indices grouped by label: label k owns indices[starts[k] : starts[k + 1]]; starts is (count + 2,).
 

@@ -1,12 +1,15 @@
-"""Last refinement of each region on its own pixels, with covariance and figures of fit."""
+"""Last refinement of each region on its own pixels, with covariance and figures of fit; what is too small goes."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from perception.range import fit
+from perception.range.claim import pixels_of
 from perception.range.noise import NoiseModel
 from perception.range.primitives import (
     COVARIANCE_OVER,
@@ -21,6 +24,7 @@ from perception.range.starts import solve_positive
 from perception.range.surfaces import FREEDOM, QUADRIC
 
 Array = NDArray[np.float64]
+Labels = NDArray[np.int32]
 
 COARSE_SAMPLES = 300  # a refined start on these leaves the full fit one step
 SLOW_NOISE_AREA_PX = 150.0  # pixels that share one value of the slow noise; sets how little averaging gains on it
@@ -103,6 +107,16 @@ def _inverse(H, p, fixed):  # type: ignore[no-untyped-def]
         for i in range(p):
             out[i, k] = b[i] * scale[i] * scale[k]
     return out
+
+
+def without_crumbs(labels: Labels, surfaces: list[Surface], least: float) -> tuple[Labels, list[Surface]]:
+    """Labels and surfaces, numbered anew, without those that their neighbours have left fewer than `least` pixels."""
+    kept = [s for s, pixels in zip(surfaces, pixels_of(labels, len(surfaces)), strict=True) if pixels >= least]
+    if len(kept) == len(surfaces):
+        return labels, surfaces
+    renamed = np.zeros(len(surfaces) + 1, np.int32)
+    renamed[[s.label for s in kept]] = np.arange(1, len(kept) + 1)
+    return renamed[labels], [replace(s, label=new) for new, s in enumerate(kept, 1)]
 
 
 def averaging_loss(noise: NoiseModel, depth_m: float) -> float:

@@ -7,6 +7,7 @@ import pytest
 
 from hal.errors import CellError, InvalidRequest, NotFound
 from perception.range import Cylinder, Sphere, SurfaceType, analyse
+from perception.range.finish import without_crumbs
 from tests.perception.range.scenes import PARALLEL, PINHOLE, ball_on_table, noisy, plane_depth
 
 
@@ -102,3 +103,13 @@ def test_infinite_and_negative_depth_count_as_missing():
     scene = analyse(depth, PINHOLE)
     assert not scene.labels[:20].any()
     assert scene.labels[30:].all()
+
+
+def test_surfaces_that_keep_next_to_no_pixels_are_dropped_and_the_rest_numbered_anew():
+    scene = analyse(noisy(ball_on_table(PARALLEL).depth_m, 0.0003, seed=6), PARALLEL)
+    labels = np.where(scene.labels == 1, 0, scene.labels).astype(np.int32)
+    labels[0, :7] = 1
+    after, kept = without_crumbs(labels, list(scene.surfaces), 8)
+    assert [s.label for s in kept] == list(range(1, len(scene.surfaces)))
+    assert [s.primitive for s in kept] == [s.primitive for s in scene.surfaces[1:]]
+    np.testing.assert_array_equal(after, np.where(labels > 1, labels - 1, 0))

@@ -182,6 +182,7 @@ def _speed(folder: Path) -> None:
     readings = [_best([partial(_read_one, image, view, thing)], 5) for thing in panel.objects]
     _line("one taught reading (patch and reader), ms: median", [1e3 * float(np.median(readings))], (3.0,), at_most=True)
     _line("  the slowest kind", [1e3 * max(readings)], (3.0,), at_most=True)
+    print(f"{'  the same two, blurs':52s} {np.median(readings) / blur:.3g} / {max(readings) / blur:.3g}")
 
 
 def _read_one(image: Image, view: CameraView, thing: PanelObject) -> object:

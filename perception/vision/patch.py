@@ -18,6 +18,10 @@ HEIGHT_STEP_M = 0.01
 BEND_NODES = 9  # a side of the grid that the lens's bend over a patch is known at; it is smooth
 LEAST_BEND_PX = 0.05
 
+#: Corners of a patch clockwise from the upper left, and the grid that the bend is known at, in half sizes from its middle.
+CORNERS = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
+NODES = np.array([[x, y] for y in np.linspace(1.0, -1.0, BEND_NODES) for x in np.linspace(-1.0, 1.0, BEND_NODES)])
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Patch:
@@ -95,59 +99,49 @@ def rectify(
         shift_px: (2,) what the object's own registration found: added to the projected points.
         gray: the gray version of `image`, to save its making.
     """
-    cx, cy = np.asarray(centre_m, float)
-    w, h = half_width_m, half_height_m
-    corners_m = np.array([[-w, h], [w, h], [w, -h], [-w, -h]])
-    points = np.column_stack([corners_m + np.array([cx, cy]), np.full(4, plane_z_m)])
-    corners_px = view.project(points) + np.asarray(shift_px, float)
-    image_px_per_m = float(np.sqrt(_area(corners_px) / (4 * w * h)))
-    px_per_m = min(OVERSAMPLING * image_px_per_m, MAX_SIDE_PX / (2 * max(w, h)))
-    size = (round(2 * w * px_per_m) + 1, round(2 * h * px_per_m) + 1)
-    target = np.array([[0, 0], [2 * w, 0], [2 * w, 2 * h], [0, 2 * h]]) * px_per_m
-    patch_from_image = homography(corners_px, target)
+    half = np.array([half_width_m, half_height_m])
+    places = np.vstack([CORNERS, CORNERS, NODES]) * half + np.asarray(centre_m, float)
+    heights = np.full(len(places), plane_z_m)
+    heights[4:8] += HEIGHT_STEP_M
+    seen_px = view.project(np.column_stack([places, heights])) + np.asarray(shift_px, float)
+    corners_px, nodes_px = seen_px[:4], seen_px[8:]
+    image_px_per_m = float(np.sqrt(_area(corners_px) / (4 * half.prod())))
+    px_per_m = min(OVERSAMPLING * image_px_per_m, MAX_SIDE_PX / (2 * float(half.max())))
+    width, height = (round(2 * side * px_per_m) + 1 for side in (half_width_m, half_height_m))
+    middle = half * px_per_m
+    patch_from_image = homography(corners_px, _in_patch(CORNERS, middle))
+    image_from_patch = np.asarray(np.linalg.inv(patch_from_image), float)
     gray_image = image if image.ndim == 2 else gray if gray is not None else as_gray(image)
-    step = np.array([0.0, 0.0, HEIGHT_STEP_M])
-    above = _apply(patch_from_image, view.project(np.vstack([points, points + step])) + np.asarray(shift_px, float))
-    shift = above[4:] - above[:4]
-    grown = np.linalg.norm(above[4:] - above[4:].mean(axis=0), axis=1).sum()
-    growth = grown / np.linalg.norm(above[:4] - above[:4].mean(axis=0), axis=1).sum() - 1.0
-    bend_px = _bend(
-        view, np.array([cx, cy]), (w, h), plane_z_m, np.asarray(shift_px, float), patch_from_image, px_per_m
-    )
+    low, high = _apply(patch_from_image, seen_px[:8]).reshape(2, 4, 2)
+    spread = [float(np.linalg.norm(at - at.mean(axis=0), axis=1).sum()) for at in (low, high)]
+    bend_px = _bend(nodes_px - _apply(image_from_patch, _in_patch(NODES, middle)))
+    size = (width, height)
     return Patch(
         gray=_warp(gray_image, patch_from_image, size, bend_px),
         colour=_warp(image, patch_from_image, size, bend_px) if image.ndim == 3 else None,
-        inside=_inside(gray_image.shape, patch_from_image, size),
+        inside=_inside(gray_image.shape, patch_from_image, image_from_patch, size),
         px_per_m=px_per_m,
         image_px_per_m=image_px_per_m,
-        origin_px=np.array([w, h]) * px_per_m,
-        parallax_px_per_m=shift.mean(axis=0) / HEIGHT_STEP_M,
-        growth_per_m=float(growth / HEIGHT_STEP_M),
+        origin_px=middle,
+        parallax_px_per_m=(high - low).mean(axis=0) / HEIGHT_STEP_M,
+        growth_per_m=(spread[1] / spread[0] - 1.0) / HEIGHT_STEP_M,
         plane_z_m=plane_z_m,
     )
 
 
-def _bend(
-    view: View,
-    centre_m: Array,
-    half_m: tuple[float, float],
-    plane_z_m: float,
-    shift_px: Array,
-    patch_from_image: Array,
-    px_per_m: float,
-) -> NDArray[np.float32] | None:
-    """What a homography through the corners misses between them, image px at a grid of nodes; None when that is little.
+def _in_patch(places: Array, middle_px: Array) -> Array:
+    """(N, 2) patch coordinates of places given in half sizes from the middle, y up."""
+    return np.asarray(middle_px + places * np.array([1.0, -1.0]) * middle_px, float)
+
+
+def _bend(missed_px: Array) -> NDArray[np.float32] | None:
+    """What a homography through the corners misses at the `NODES`, image px, as a grid; None when that is little.
 
     Towards the border of a view a lens with k1 = -0.08 bends a slider's track by more than a pixel.
     """
-    (w, h), n = half_m, BEND_NODES
-    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-w, w, n), np.linspace(h, -h, n)))
-    points = np.column_stack([x + centre_m[0], y + centre_m[1], np.full(n * n, plane_z_m)])
-    straight = _apply(np.asarray(np.linalg.inv(patch_from_image), float), np.column_stack([x + w, h - y]) * px_per_m)
-    bend = (view.project(points) + shift_px - straight).reshape(n, n, 2)
-    if not np.isfinite(bend).all() or np.abs(bend).max() < LEAST_BEND_PX:
+    if not np.isfinite(missed_px).all() or np.abs(missed_px).max() < LEAST_BEND_PX:
         return None
-    return bend.astype(np.float32)
+    return missed_px.reshape(BEND_NODES, BEND_NODES, 2).astype(np.float32)
 
 
 def _warp(image: Image, patch_from_image: Array, size: tuple[int, int], bend_px: NDArray[np.float32] | None) -> Image:
@@ -175,9 +169,11 @@ def _places(
     return u.astype(np.float32), v.astype(np.float32)
 
 
-def _inside(shape: tuple[int, ...], patch_from_image: Array, size: tuple[int, int]) -> NDArray[np.bool_]:
+def _inside(
+    shape: tuple[int, ...], patch_from_image: Array, image_from_patch: Array, size: tuple[int, int]
+) -> NDArray[np.bool_]:
     corners = np.array([[0, 0], [size[0] - 1, 0], [size[0] - 1, size[1] - 1], [0, size[1] - 1]], float)
-    back = _apply(np.asarray(np.linalg.inv(patch_from_image), float), corners)
+    back = _apply(image_from_patch, corners)
     if (back >= 0).all() and (back[:, 0] <= shape[1] - 1).all() and (back[:, 1] <= shape[0] - 1).all():
         return np.ones((size[1], size[0]), bool)
     ones = np.ones(shape[:2], np.uint8)

@@ -1,4 +1,4 @@
-"""Compiles, or loads from the cache, what reading displays computes with, so that the first one is read as fast as any."""
+"""Compiles, or loads from the cache, what displays and pointers are read with, so that the first is read as fast as any."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.vision import lights, quadrangle
+from perception.vision.dial import read_dial
 from perception.vision.photo_display import read_photograph
 from perception.vision.status.display import read_window
 
 DIGIT_PX = (72, 40)  # height and width
 STROKE_PX = 8
+DIAL_PX = 110  # half of the picture
 
 
 def warm_up() -> None:
-    """Run the compiled functions of the light search, the pose of four lights and the display reader once."""
+    """Run the compiled functions of the light search, the pose of four lights, the display and the pointer reader once."""
     quadrangle.warm_up()
     lights.warm_up()
     window = three_eights()
@@ -22,6 +24,15 @@ def warm_up() -> None:
     hidden[:, -6:] = True
     read_window(window, digits=3, decimals=1, dark=True, hidden=hidden)
     read_photograph(window, scene=True)
+    read_dial(upright_pointer(), minimum=0.0, maximum=1.0, circular=True)
+
+
+def upright_pointer() -> NDArray[np.uint8]:
+    """A black pointer on a bright round face."""
+    v, u = np.mgrid[-DIAL_PX:DIAL_PX, -DIAL_PX:DIAL_PX]
+    face = np.where(np.hypot(u, v) < 0.95 * DIAL_PX, 200, 60)
+    face[(abs(u) < 0.04 * DIAL_PX) & (v < 0.1 * DIAL_PX) & (v > -0.8 * DIAL_PX)] = 20
+    return face.astype(np.uint8)
 
 
 def three_eights() -> NDArray[np.uint8]:

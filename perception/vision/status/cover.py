@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from perception.vision.bilinear import step_counts
 from perception.vision.patch import Patch, sample_at
 from perception.vision.view import Array
 
@@ -153,8 +154,7 @@ def _followed(smooth: NDArray[np.uint8], seed: tuple[int, int]) -> NDArray[np.bo
 
 
 def _noise(patch: Patch) -> float:
-    gray = patch.gray[::4].astype(np.int16)
-    counts = np.bincount(np.abs(gray[:, 2:] - 2 * gray[:, 1:-1] + gray[:, :-2]).ravel())
+    counts = step_counts(np.ascontiguousarray(patch.gray), 4)
     return float(np.searchsorted(np.cumsum(counts), 0.5 * counts.sum())) / 1.65
 
 

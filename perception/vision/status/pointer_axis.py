@@ -1,0 +1,101 @@
+"""Compiled fit of a pointer's axis through its ink: theta(r) = theta0 + e / r, with e the pivot's offset across it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from perception.vision.view import Array
+
+NUMERAL = 1.6  # times the ink of the typical row
+HALF_LEVEL = 0.3  # of a row's strongest ink: less is the pointer's blur
+OWN_WIDTH = (35.0, 0.6)  # percentile of the rows' widths; what is looked at to either side of the axis, over it
+ROUNDS, WEIGHINGS = 3, 5
+LEAST_ROWS = 3
+PIVOTS_AT_MOST = 2.0  # weight of a row over the typical one's
+
+
+@njit(cache=True)
+def row_centres(
+    ink: NDArray[np.float32], offset: Array, middle: Array, half: Array
+) -> tuple[Array, Array, Array]:  # pragma: no cover
+    """(rows,) centre of the ink (rad), its mass and its width (rad), within `half` of `middle` in every row.
+
+    A pointer is of one gray: rows where something stands out much more belong to a numeral or a tick beside it.
+
+    Args:
+        ink: (rows, angles); offset: (angles,) rad.
+        middle, half: (rows,) rad.
+    """
+    rows, columns = ink.shape
+    top = np.zeros(rows)
+    for i in range(rows):
+        for j in range(columns):
+            if abs(offset[j] - middle[i]) < half[i]:
+                top[i] = max(top[i], ink[i, j])
+    most = NUMERAL * np.median(top)
+    step = abs(offset[1] - offset[0])
+    centre, mass, width = np.zeros(rows), np.zeros(rows), np.zeros(rows)
+    for i in range(rows):
+        if top[i] <= 0.0 or top[i] > most:
+            continue
+        moment = 0.0
+        for j in range(columns):
+            if abs(offset[j] - middle[i]) < half[i]:
+                over = max(ink[i, j] - HALF_LEVEL * top[i], 0.0)
+                mass[i] += over
+                moment += over * offset[j]
+        centre[i] = moment / mass[i]
+        width[i] = mass[i] * step / ((1.0 - HALF_LEVEL) * top[i])
+    return centre, mass, width
+
+
+@njit(cache=True)
+def fitted_line(
+    r: Array, theta: Array, mass: Array, e_sigma: float, least_m: float
+) -> tuple[float, float, float]:  # pragma: no cover
+    """theta0, e and the variance of theta0 of theta(r) = theta0 + e / r, by Cauchy-weighted least squares.
+
+    Args:
+        r, theta, mass: (N,) of rows with ink: m, rad, and its amount.
+        e_sigma: one sigma of e, m; least_m: of a row's centre across the pointer, m.
+    """
+    weight = np.minimum(mass / np.median(mass), PIVOTS_AT_MOST)
+    theta0, e, variance = float(np.median(theta)), 0.0, 0.0
+    for _ in range(WEIGHINGS):
+        residual_m = (theta - theta0 - e / r) * r
+        scale = max(1.4826 * float(np.median(np.abs(residual_m))), least_m)
+        w = weight / (1.0 + (residual_m / (1.5 * scale)) ** 2) * r**2 / scale**2
+        # Normal equations of the two unknowns.
+        a, b, c = w.sum(), (w / r).sum(), (w / r**2).sum() + 1.0 / e_sigma**2
+        p, q = (w * theta).sum(), (w * theta / r).sum()
+        determinant = a * c - b * b
+        theta0, e, variance = (c * p - b * q) / determinant, (a * q - b * p) / determinant, c / determinant
+    return theta0, e, variance
+
+
+@njit(cache=True)
+def pointer_axis(
+    ink: NDArray[np.float32], r: Array, offset: Array, reach_rad: float, e_sigma: float, px_per_m: float
+) -> tuple[float, float]:  # pragma: no cover
+    """Angle (rad, as `offset`) of the pointer near offset 0 and its variance; NaN where too few rows have ink.
+
+    What touches the pointer (a numeral, a tick) widens some rows: each round looks within the pointer's own width only.
+
+    Args:
+        ink: (rows, angles); r: (rows,) m; offset: (angles,) rad from the rough pointer.
+        reach_rad: to either side that the first round looks.
+        e_sigma: one sigma of the pivot's offset, m.
+    """
+    middle, half = np.zeros(len(r)), np.full(len(r), reach_rad)
+    theta0, variance = np.nan, np.nan
+    for _ in range(ROUNDS):
+        theta, mass, width = row_centres(ink, offset, middle, half)
+        there = mass > 0
+        if there.sum() < LEAST_ROWS:
+            return np.nan, np.nan
+        theta0, e, variance = fitted_line(r[there], theta[there], mass[there], e_sigma, 0.15 / px_per_m)
+        half_m = OWN_WIDTH[1] * (np.percentile((width * r)[there], OWN_WIDTH[0]) + 1.0 / px_per_m)
+        middle, half = theta0 + e / r, half_m / r
+    return theta0, variance

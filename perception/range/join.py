@@ -23,7 +23,9 @@ NEAR_SIGMAS = 20.0
 SCRAP_SHARE = 0.1
 SCRAP_SIGMAS = 6.0
 LARGEST_TURN_RAD = 0.2
-SIGHT_SAMPLES = 40
+SIGHT_LINES = 5
+GAP_SIGMAS = 6.0
+GROOVE_PX = 2  # a single pixel may be a gross error
 BEHIND_SHARE = 0.15  # more of the sight line than this seen behind the surface: a gap, not an occluder
 APART, SCRAP, JOINED = 0, 1, 2
 
@@ -52,7 +54,8 @@ def join_pieces(regions: Regions, kinds: list[int], parameters: list[Array]) -> 
             if verdict == APART:
                 continue
             if verdict == JOINED:
-                if gap_between(regions.depth_m, packed, kinds[big], joint, thin[big], thin[small]):
+                own = np.array([False, *(k in (big + 1, small + 1) for k in owner)])
+                if gap_between(regions.depth_m, packed, regions.labels, own, kinds[big], joint, thin[big], thin[small]):
                     continue
                 parameters[big] = joint
                 thin[big] = np.concatenate([thin[big], thin[small]], axis=1)
@@ -157,24 +160,44 @@ def _near_matrix(kinds, ths, starts, x, y, z, sigma, perspective):  # type: igno
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def gap_between(depth, sen, kind, th, a, b):  # type: ignore[no-untyped-def]
-    """Whether the sensor sees past the surface on the shortest line between two pieces of samples (4, N)."""
-    H, W = depth.shape
-    perspective = sen[0] > 0
-    i, j, least = 0, 0, np.inf
+def gap_between(depth, sen, labels, own, kind, th, a, b):  # type: ignore[no-untyped-def]
+    """Whether the sensor sees past the surface on most of the shortest lines between two pieces of samples (4, N).
+
+    `own` says which `labels` (H, W) belong to the pieces: what lies between them shows a groove, however narrow.
+    """
+    nearest, distance = np.empty(a.shape[1], np.int64), np.empty(a.shape[1])
     for m in range(a.shape[1]):
+        least = np.inf
         for n in range(b.shape[1]):
             d2 = (a[0, m] - b[0, n]) ** 2 + (a[1, m] - b[1, n]) ** 2
             if d2 < least:
-                i, j, least = m, n, d2
-    slack = 6.0 * np.median(a[3])
-    behind = 0
-    for k in range(1, SIGHT_SAMPLES - 1):
-        t = k / (SIGHT_SAMPLES - 1)
-        x, y = a[0, i] + t * (b[0, j] - a[0, i]), a[1, i] + t * (b[1, j] - a[1, i])
-        u = min(max(int(np.rint(x * sen[1] + sen[3])), 0), W - 1)
-        v = min(max(int(np.rint(y * sen[2] + sen[4])), 0), H - 1)
+                nearest[m], least = n, d2
+        distance[m] = least
+    slack = GAP_SIGMAS * np.median(a[3])
+    lines = np.argsort(distance)[:SIGHT_LINES]
+    gaps = 0
+    for m in lines:
+        n = nearest[m]
+        gaps += _is_gap(depth, sen, labels, own, kind, th, a[0, m], a[1, m], b[0, n], b[1, n], slack)
+    return 2 * gaps > lines.shape[0]
+
+
+@njit(cache=True, error_model="numpy")
+def _is_gap(depth, sen, labels, own, kind, th, ax, ay, bx, by, slack):  # type: ignore[no-untyped-def]
+    """Whether much of the line from ray a to ray b lies behind the surface, or `GROOVE_PX` in a row of neither piece."""
+    H, W = depth.shape
+    perspective = sen[0] > 0
+    du, dv = (bx - ax) * sen[1], (by - ay) * sen[2]
+    count = max(int(max(abs(du), abs(dv))), 1)
+    behind, run = 0, 0
+    for k in range(1, count):
+        u = min(max(int(np.rint(ax * sen[1] + sen[3] + du * k / count)), 0), W - 1)
+        v = min(max(int(np.rint(ay * sen[2] + sen[4] + dv * k / count)), 0), H - 1)
         seen = depth[v, u]
+        past = seen - depth_on(kind, th, (u - sen[3]) / sen[1], (v - sen[4]) / sen[2], perspective)
         step = 3.0 / sen[1] * (abs(seen) if perspective else 1.0)
-        behind += seen > depth_on(kind, th, x, y, perspective) + max(slack, step)
-    return behind > BEHIND_SHARE * (SIGHT_SAMPLES - 2)
+        behind += past > max(slack, step)
+        run = run + 1 if past > slack and not own[labels[v, u]] else 0
+        if run == GROOVE_PX:
+            return True
+    return behind > BEHIND_SHARE * (count - 1)

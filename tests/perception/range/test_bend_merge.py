@@ -151,6 +151,15 @@ def test_a_gap_that_shows_something_behind_keeps_pieces_apart():
     assert join_pieces(regions, [PLANE, PLANE], [flat[1], flat[1]]) == [1, 2]
 
 
+@pytest.mark.parametrize(("depth_m", "is_one"), [(0.03, False), (0.004, True), (-0.03, True)])
+def test_a_groove_keeps_coplanar_pieces_apart_and_a_ridge_or_a_scratch_does_not(depth_m, is_one):
+    flat = plane([0.0, 0.0, -1.0], -2.0)
+    pieces = [(flat, box(20, 100, 10, 70)), (flat, box(20, 100, 75, 150))]
+    regions = image_of(pieces, WHITE, background_m=2.0 + depth_m)
+    owner = join_pieces(regions, [PLANE, PLANE], [flat[1], flat[1]])
+    assert (len(set(owner)) == 1) == is_one
+
+
 SPOT = box(55, 65, 75, 85)
 WALL_2M = plane([0.0, 0.0, -1.0], -2.0)
 

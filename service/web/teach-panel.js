@@ -4,6 +4,8 @@ import { get } from "./api.js";
 const $ = (selector) => document.querySelector(selector);
 const KINDS = ["gauge", "panel_meter", "display", "lamp", "button", "toggle", "rotary", "slider", "lever", "handwheel", "mushroom"];
 const POINTED = ["at_min", "at_max"]; // places that can be clicked on
+const fields = () => [...$("#questions").querySelectorAll("[data-key]")];
+const answerTo = (key) => fields().find((input) => input.dataset.key === key);
 
 // `clicks()` gives the present clicks, `pointAt` takes one more, `save` gets the finished lesson.
 export function startPanel({ clicks, pointAt, save, attempt }) {
@@ -21,8 +23,22 @@ export function startPanel({ clicks, pointAt, save, attempt }) {
 
   async function ask() {
     const mine = ++asked;
-    const { questions } = await get(`/v1/knowledge/questions?kind=${$("#object-kind").value}`);
-    if (mine === asked) $("#questions").replaceChildren(...questions.map(field));
+    const kind = $("#object-kind").value;
+    if (fields().length && $("#questions").dataset.kind === kind) return;
+    const { questions } = await get(`/v1/knowledge/questions?kind=${kind}`);
+    if (mine !== asked) return;
+    const typed = fields().filter((input) => input.value !== input.dataset.offered);
+    $("#questions").replaceChildren(...questions.map(field));
+    $("#questions").dataset.kind = kind;
+    typed.forEach(keep);
+  }
+
+  // What was typed before the questions of another kind came answers theirs too, the name above all.
+  function keep({ dataset, value }) {
+    const input = answerTo(dataset.key);
+    if (!input) return;
+    input.value = value;
+    if (input.value !== value) input.value = input.dataset.offered; // none of its choices
   }
 
   function field(question) {
@@ -32,6 +48,7 @@ export function startPanel({ clicks, pointAt, save, attempt }) {
     input.dataset.key = question.key;
     if (question.choices.length) input.append(...question.choices.map((choice) => new Option(choice, choice)));
     input.value = question.default;
+    input.dataset.offered = input.value;
     label.append(words, POINTED.includes(question.key) ? pointable(input) : input);
     return label;
   }
@@ -39,19 +56,21 @@ export function startPanel({ clicks, pointAt, save, attempt }) {
   function pointable(input) {
     const box = Object.assign(document.createElement("span"), { className: "pointed" });
     const button = Object.assign(document.createElement("button"), { type: "button", textContent: "point" });
-    button.addEventListener("click", () => pointAt((x, y) => (input.value = `${x.toFixed(1)},${y.toFixed(1)}`)));
+    const { key } = input.dataset; // its input may have been replaced when the click comes
+    button.addEventListener("click", () => pointAt((x, y) => keep({ dataset: { key }, value: `${x.toFixed(1)},${y.toFixed(1)}` })));
     box.append(input, button);
     return box;
   }
 
   function add() {
     const answers = {};
-    for (const input of $("#questions").querySelectorAll("[data-key]")) answers[input.dataset.key] = input.value.trim();
+    for (const input of fields()) answers[input.dataset.key] = input.value.trim();
     const { name, ...rest } = answers;
     if (!name) return attempt(() => Promise.reject(new Error("The object needs a name")));
     objects = [...objects.filter((one) => one.name !== name), { kind: $("#object-kind").value, name, clicks_px: clicks(), answers: rest }];
     list();
     $("#clear").click();
+    $("#questions").replaceChildren();
     attempt(ask);
   }
 

@@ -14,6 +14,7 @@ from service.serve import Panelwright
 from tests.perception.vision.bench_panel import panel
 from tests.service.test_page import CHROMIUM, FLAGS, PATIENCE_MS, _until
 from tests.service.test_stored_images import Shown, house, shown
+from tests.service.waiting import eventually
 
 __all__ = ["house", "shown"]  # fixtures
 pytestmark = [
@@ -23,25 +24,31 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def page(house: Panelwright, shown: Shown, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """The page with an image uploaded."""
+def browser() -> Iterator[Any]:
     from playwright.sync_api import sync_playwright
 
-    file = tmp_path_factory.mktemp("upload") / "panel.png"
-    cv2.imwrite(str(file), shown[0])
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=str(CHROMIUM), args=FLAGS)
-        tab = browser.new_page(viewport={"width": 1400, "height": 1100})
-        tab.set_default_timeout(PATIENCE_MS)
-        faults: list[str] = []
-        tab.on("pageerror", lambda error: faults.append(str(error)))
-        tab.on("console", lambda line: faults.append(line.text) if "Content Security" in line.text else None)
-        tab.goto(f"{house.url}/teach.html")
-        tab.set_input_files("#file", str(file))
-        _until(tab, "document.querySelector('#picture').naturalWidth === 1280")
-        yield tab
-        assert not faults
+        yield browser
         browser.close()
+
+
+@pytest.fixture
+def page(browser: Any, house: Panelwright, shown: Shown, tmp_path: Path) -> Iterator[Any]:
+    """The page with an image uploaded; every test has a page of its own, so that none begins with another's clicks."""
+    file = tmp_path / "panel.png"
+    cv2.imwrite(str(file), shown[0])
+    tab = browser.new_page(viewport={"width": 1400, "height": 1100})
+    tab.set_default_timeout(PATIENCE_MS)
+    faults: list[str] = []
+    tab.on("pageerror", lambda error: faults.append(str(error)))
+    tab.on("console", lambda line: faults.append(line.text) if "Content Security" in line.text else None)
+    tab.goto(f"{house.url}/teach.html")
+    tab.set_input_files("#file", str(file))
+    _until(tab, "document.querySelector('#picture').naturalWidth === 1280")
+    yield tab
+    assert not faults
+    tab.close()
 
 
 def _click(page: Any, shown: Shown, *places_m: tuple[float, float]) -> None:
@@ -90,12 +97,10 @@ def test_a_new_kind_is_named_saved_and_found(page: Any, shown: Shown) -> None:
 
 
 def test_a_click_beside_the_panel_or_on_nothing_is_explained(page: Any, shown: Shown) -> None:
-    page.click("#clear")
     _click(page, shown, (0.12, -0.15))
     _until(page, "document.querySelector('#found').classList.contains('bad')")
     assert "nothing but plate" in page.text_content("#found")
     assert page.is_disabled("#teach-kind")
-    page.click("#clear")
 
 
 def test_a_whole_panel_is_put_together_saved_and_read(page: Any, shown: Shown) -> None:
@@ -122,6 +127,24 @@ def test_a_whole_panel_is_put_together_saved_and_read(page: Any, shown: Shown) -
     _until(page, "document.querySelector('#saved').textContent.includes('Saved panel pump_room')")
     _until(page, "document.querySelector('#results').textContent.includes('pressure · gauge6.')")
     assert "/artefacts/annotated.png" in page.get_attribute("#picture", "src")
+
+
+def test_what_is_typed_stays_when_the_questions_of_another_kind_come_late(page: Any) -> None:
+    page.click("#mode-panel")
+    _until(page, "document.querySelector('[data-key=at_min]')")
+    held: list[Any] = []
+
+    def hold(route: Any) -> None:
+        held.append(route)
+
+    page.route("**/v1/knowledge/questions*", hold)
+    page.select_option("#object-kind", "display")
+    _until(page, "document.querySelector('#object-kind').value === 'display'")
+    page.fill("[data-key=name]", "level")
+    eventually(lambda: page.title() and held)  # asking lets the events of the browser in
+    held[0].continue_()
+    _until(page, "!document.querySelector('[data-key=at_min]')")
+    assert page.input_value("[data-key=name]") == "level"
 
 
 def test_what_is_no_image_is_explained(page: Any, tmp_path: Path) -> None:

@@ -15,6 +15,17 @@ export async function get(path) {
   return answered(await fetch(path, { cache: "no-store" }));
 }
 
+// The same, asked again until there is an answer: what a page cannot do without.
+export async function insist(path) {
+  for (;;) {
+    try {
+      return await get(path);
+    } catch {
+      await new Promise((done) => setTimeout(done, 1000));
+    }
+  }
+}
+
 export async function post(path, body) {
   const json = body === undefined ? {} : { headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
   return answered(await fetch(path, { method: "POST", ...json }));

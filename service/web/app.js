@@ -1,5 +1,5 @@
 // Puts the parts of the page together and tells the person when the service is out of reach.
-import { get, repeat } from "./api.js";
+import { insist, repeat } from "./api.js";
 import { startDevices } from "./devices.js";
 import { startLive } from "./live.js";
 import { startMission } from "./mission.js";
@@ -8,11 +8,9 @@ import { startView } from "./view.js";
 
 const banner = document.querySelector("#banner");
 
-async function describe() {
-  const info = await get("/v1/info");
+function describe(info) {
   const where = info.mode === "sim" ? "simulated" : info.mode === "mixed" ? "partly simulated" : "real";
   document.querySelector("#cell-line").textContent = `cell ${info.cell} · ${where} · panel ${info.panel} · seed ${info.seed}`;
-  return info;
 }
 
 async function watchService() {
@@ -28,10 +26,12 @@ async function watchService() {
   }
 }
 
-const info = await describe();
-startStop(info.stop_url);
+const asked = insist("/v1/info");
+startStop(asked.then((info) => info.stop_url));
+repeat(watchService, () => 2000);
+const info = await asked;
+describe(info);
 startMission(info.verbs);
 startDevices();
 startView();
 startLive();
-repeat(watchService, () => 2000);

@@ -8,11 +8,13 @@ const PATIENCE_MS = 5000; // after this the slower way to stop no longer delays 
 let count = 0;
 let stopping = 0; // presses of which one way is still under way: it would latch again what was reset before it arrives
 
+// `stopUrl` is a promise: the button works from the first moment, and the stop process is told once its port is known.
 export function startStop(stopUrl) {
   const stop = () => {
     line.textContent = "stopping …";
     stopping += 1;
-    const asked = [fetch(stopUrl, { method: "POST" }).then((answer) => answer.json()), post("/v1/stop")];
+    const known = Promise.race([stopUrl, after(PATIENCE_MS).then(() => Promise.reject(new Error("no port")))]); // never a late stop
+    const asked = [known.then((url) => fetch(url, { method: "POST" })).then((answer) => answer.json()), post("/v1/stop")];
     Promise.any(asked).then(show).catch(() => (line.textContent = "NO ANSWER: use the hardware stop"));
     const bothWays = Promise.allSettled(asked).then(look); // the slower of the two has raised the count again
     Promise.race([bothWays, after(PATIENCE_MS)]).catch(() => {}).then(allowReset);

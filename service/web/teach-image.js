@@ -27,12 +27,12 @@ export async function startImage({ attempt, changed }) {
     await list();
   });
   $("#file").addEventListener("change", (event) => event.target.files[0] && keep(event.target.files[0]));
-  $("#stored").addEventListener("change", async (event) => {
+  $("#stored").addEventListener("change", (event) => attempt(async () => {
     const { images } = await get("/v1/images");
     const found = images.find((one) => one.id === event.target.value);
     if (found) show(found);
     changed();
-  });
+  }));
   $("#canvas").addEventListener("click", click);
   $("#clear").addEventListener("click", clear);
   await attempt(async () => {

@@ -1,5 +1,5 @@
 // The teach page: choose an image, click on an object, see what was found, name it, save it, and look what is found now.
-import { finished, get, post, remove } from "./api.js";
+import { finished, get, insist, post, remove } from "./api.js";
 import { startStop } from "./stop.js";
 import { chosenImage, clicks, onClicks, pointAt, showPicture, startImage } from "./teach-image.js";
 import { startPanel } from "./teach-panel.js";
@@ -155,6 +155,7 @@ function choose(mode) {
   enable();
 }
 
+startStop(insist("/v1/info").then((info) => info.stop_url));
 const panel = startPanel({ clicks, pointAt, save: savePanel, attempt });
 onClicks(look);
 startImage({ attempt, changed: enable });
@@ -166,6 +167,4 @@ $("#show-plain").addEventListener("click", () => {
 });
 for (const mode of ["kind", "panel"]) $(`#mode-${mode}`).addEventListener("click", () => choose(mode));
 enable();
-await attempt(listKnown);
-const info = await get("/v1/info");
-startStop(info.stop_url);
+attempt(listKnown);

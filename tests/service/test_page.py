@@ -131,6 +131,21 @@ def test_no_reset_is_offered_while_a_stop_is_under_way(page: Any, served_page: P
     page.unroute_all()
 
 
+def test_the_stop_works_before_the_page_knows_anything(page: Any, served_page: Panelwright) -> None:
+    tab = page.context.browser.new_page()
+    tab.route("**/v1/info", lambda route: route.abort())
+    tab.goto(served_page.url)
+    tab.click("#stop")
+    _until(tab, "document.querySelector('#stop-box').dataset.latched === 'yes'")
+    assert served_page.service.supervisor.latch.is_set()
+    tab.unroute_all()
+    _until(tab, "document.querySelector('#cell-line').textContent.includes('cell fake')")  # asked again and again
+    tab.click("#reset:not([hidden])")  # not before both ways of the stop have ended
+    _until(tab, "document.querySelector('#stop-box').dataset.latched === 'no'")
+    assert not served_page.service.supervisor.latch.is_set()
+    tab.close()
+
+
 def test_the_escape_key_stops_and_a_narrow_screen_still_shows_the_button(page: Any, served_page: Panelwright) -> None:
     page.set_viewport_size({"width": 420, "height": 800})
     assert page.is_visible("#stop")

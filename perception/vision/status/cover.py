@@ -22,6 +22,7 @@ STANDS_OUT = (
 )
 STANDS_OUT_SHARE, LEAST_STANDS_OUT = 0.12, 5.0
 LARGEST_SHARE = 0.4  # of the object: what follows the gray of a cable and fills more has leaked into the object
+OUTSIDE = 0.06  # of an object's larger half size: how far beyond its border the path runs
 DEEP = 0.35  # of the object's smaller half size: labels and ticks do not reach that far in
 
 
@@ -32,7 +33,7 @@ class Crossing:
     Attributes:
         middle_px, tangent: (2,) its middle in the patch, and the path's unit direction there.
         length_px: along the path, where it differs by more than half: without the skirts of its blur.
-        gray: of its middle; is_darker: than the plate round it.
+        gray: of its middle; is_darker: than the plate round it; by: how many gray levels.
         side: of a rectangle's path, 0 to 3 from the top clockwise; 0 of a round one.
     """
 
@@ -41,6 +42,7 @@ class Crossing:
     length_px: float
     gray: float
     is_darker: bool
+    by: float
     side: int
 
 
@@ -69,10 +71,16 @@ def covered(patch: Patch, *, half_width_m: float, half_height_m: float, is_round
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0) if mask.any() else None
 
 
-def border_crossings(patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool) -> list[Crossing]:
-    """The places just outside of an object's border that stand out from the plate round them; arguments as `covered`."""
+def border_crossings(
+    patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool, beyond: float = OUTSIDE
+) -> list[Crossing]:
+    """The places just outside of an object's border that stand out from the plate round them; arguments as `covered`.
+
+    Args:
+        beyond: distance of the path from the border, over the larger half size.
+    """
     smooth = np.asarray(cv2.GaussianBlur(patch.gray, (0, 0), 1.0), np.uint8)
-    path_u, path_v = _path(patch, half_width_m, half_height_m, is_round)
+    path_u, path_v = _path(patch, half_width_m, half_height_m, is_round, 1.0 + beyond)
     inside = (path_u > 1) & (path_v > 1) & (path_u < patch.gray.shape[1] - 2) & (path_v < patch.gray.shape[0] - 2)
     if inside.sum() < 16:
         return []
@@ -97,6 +105,7 @@ def border_crossings(patch: Patch, *, half_width_m: float, half_height_m: float,
                 * float(np.count_nonzero(np.abs(values[at] - typical[at]) > 0.5 * abs(gray - typical[middle]))),
                 gray=gray,
                 is_darker=gray < float(typical[middle]),
+                by=abs(gray - float(typical[middle])),
                 side=int(sides[middle]),
             )
         )
@@ -110,8 +119,7 @@ def _sides(patch: Patch, points: Array, w: float, h: float) -> NDArray[np.int64]
     return np.asarray(np.where(flat, np.where(y < 0, 0, 2), np.where(x > 0, 1, 3)), np.int64)
 
 
-def _path(patch: Patch, w: float, h: float, is_round: bool) -> tuple[Array, Array]:
-    beyond = 1.06
+def _path(patch: Patch, w: float, h: float, is_round: bool, beyond: float) -> tuple[Array, Array]:
     step = 0.8 / patch.px_per_m
     if is_round:
         a = np.linspace(0, 2 * np.pi, max(64, round(2 * np.pi * w * beyond / step)), endpoint=False)

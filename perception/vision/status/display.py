@@ -21,15 +21,17 @@ from perception.vision.reading import ANSWER_AT, Status, probability, refused
 from perception.vision.status.band import hidden_by_bands
 from perception.vision.status.comb import Comb, find_combs
 from perception.vision.status.comb_jit import Float32, apartness
-from perception.vision.status.glyphs import LIT, NAMES, Number, likelihoods, numbers, separate
+from perception.vision.status.glyphs import CLOSE, LIT, NAMES, Number, likelihoods, numbers, separate
 from perception.vision.status.ink import segment_ink, without_border
-from perception.vision.status.levels import loop_levels, segment_levels, without_frames
+from perception.vision.status.levels import loop_levels, segment_levels, with_hidden_ends, without_frames
 from perception.vision.status.point import Point, find_point
 from perception.vision.view import Array
 
 MARGIN = 0.09  # share of the smaller side that a frame may take
 WORK_ROWS = 64  # a window is read with so many rows: a stroke is 4 px wide then
+MOST_CELLS = 8  # of a display that nobody has counted
 CELL_COST = 0.008  # a comb with one more cell must explain that much more
+WORTH_WEIGHT = 8.0  # nats a character that a comb of e times the worth may fit worse
 TEMPERATURE = 2.0  # what is wrong with one segment is wrong with its neighbours too: they count half
 KNOWN_FREE, FREE = 0.35, 0.5  # how far the digits may sit from the middle, over the width
 
@@ -46,6 +48,7 @@ class Decoded:
         ink, seen: (H, W) what the comb was laid on.
         explained: share of the ink.
         lit_levels: (cells, 7) level of the best number's lit segments, 0 for the others.
+        fit: mean log-likelihood of its characters.
     """
 
     ink: Float32
@@ -54,6 +57,7 @@ class Decoded:
     explained: float
     comb: Comb
     lit_levels: Array
+    fit: float
 
 
 def read_display(patch: Patch, spec: Display, *, digits_taught: bool = True, before: float | None = None) -> Status:
@@ -110,9 +114,18 @@ def _decoded(
     gray: Image, is_dark: bool, hidden: NDArray[np.bool_] | None, digits: int | None, framed: bool
 ) -> Decoded | None:
     ink, seen = segment_ink(gray, is_dark, hidden)
-    ink = without_border(ink, framed=framed)
-    combs = find_combs(ink, seen, most=digits or 8, free=KNOWN_FREE if digits else FREE)
-    return next((d for _, comb in combs if (d := decode(ink, seen, comb, all_cells=digits is not None))), None)
+    ink, lost = without_border(ink, framed=framed)
+    if lost is not None:
+        seen = np.asarray(np.where(lost, 0.0, seen), np.float32)
+    most = digits or MOST_CELLS
+    combs = find_combs(ink, seen, most=most, free=KNOWN_FREE if digits else FREE)
+    if not seen.all():
+        combs = [(worth, with_hidden_ends(seen, comb, most)) for worth, comb in combs]
+    found = [(worth, d) for worth, comb in combs if (d := decode(ink, seen, comb, all_cells=digits is not None))]
+    if not found:
+        return None
+    # A comb that is too high claims ink by its size that it has not: its segments' levels do not agree.
+    return max(found, key=lambda f: f[1].fit + WORTH_WEIGHT * np.log(f[0] / found[0][0]))[1]
 
 
 def decode(ink: Float32, seen: Float32, comb: Comb, *, all_cells: bool = False) -> Decoded | None:
@@ -126,15 +139,27 @@ def decode(ink: Float32, seen: Float32, comb: Comb, *, all_cells: bool = False) 
     if levels is None:
         return None
     characters, blank = likelihoods(levels)
-    count = comb.count
-    while not all_cells and count > 1 and blank[count - 1] > characters[count - 1].max():
-        count -= 1
+    listed = numbers(characters, blank) if all_cells else _of_any_length(characters, blank)
+    count = len(listed[0].characters)
     comb = replace(comb, count=count)
-    listed = numbers(characters[:count], blank[:count])
     shown = np.array([_lit(c) for c in listed[0].characters])
     lit_levels = np.where(shown, levels.ink[:count], 0.0)
     explained = _explained(ink, comb, lit_levels)
-    return Decoded(ink=ink, seen=seen, listed=listed, explained=explained, comb=comb, lit_levels=lit_levels)
+    written = shown.any(axis=1)
+    fit = float(characters[:count].max(axis=1)[written].mean()) if written.any() else -np.inf
+    return Decoded(ink=ink, seen=seen, listed=listed, explained=explained, comb=comb, lit_levels=lit_levels, fit=fit)
+
+
+def _of_any_length(characters: Array, blank: Array) -> list[Number]:
+    """The likely numbers of a display whose last cells may be no part of it, best first."""
+    tail = np.append(np.cumsum(blank[::-1])[::-1], 0.0)  # log-likelihood that all cells from one on are blank
+    listed = [
+        replace(number, log_likelihood=number.log_likelihood + float(tail[count]))
+        for count in range(1, len(blank) + 1)
+        for number in numbers(characters[:count], blank[:count])
+    ]
+    listed.sort(key=lambda n: n.log_likelihood, reverse=True)
+    return [n for n in listed if n.log_likelihood > listed[0].log_likelihood - CLOSE]
 
 
 def _lit(character: str) -> NDArray[np.bool_]:
@@ -195,6 +220,8 @@ def _expected(value: float, before: float | None, span: float) -> float:
 def _with_point(characters: str, point: Point | None, decimals: int | None) -> str:
     """Text with its decimal point: where the panel file says, else where a dot is lit at the foot of a gap."""
     place = (len(characters) - decimals if decimals else None) if point is None else point.place
+    if place is not None and place >= len(characters):
+        place = None  # of a shorter number
     if place and not characters[place - 1].isdigit():
         return ""  # a point stands behind a digit
     text = characters if place is None else f"{characters[:place]}.{characters[place:]}"

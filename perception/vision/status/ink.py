@@ -15,6 +15,7 @@ KERNEL = 0.30  # of the picture's height: wider than any stroke, narrower than w
 SATURATED = 252
 BORDER_ROUNDS = 4
 BRIGHT_GROUND = 0.5  # share of the picture
+DEEP, LEAST_DEEP = 0.22, 0.3  # of the picture's height: from its border, and px there that no frame seen aslant has
 WIDEST_STROKE = 0.17  # of the picture's height
 
 
@@ -58,23 +59,31 @@ def _drowned(gray: Image, is_dark: bool) -> NDArray[np.bool_]:
     return np.asarray(cv2.morphologyEx(white, cv2.MORPH_OPEN, np.ones((size, size), np.uint8)) > 0)
 
 
-def without_border(ink: Float32, *, framed: bool = False) -> Float32:
-    """The ink less what hangs together with the picture's border over a long stretch: a frame, not a segment.
+def without_border(ink: Float32, *, framed: bool = False) -> tuple[Float32, NDArray[np.bool_] | None]:
+    """The ink less what hangs together with the picture's border over a long stretch, a frame and not a segment; and what
+    of it reaches in among the digits, which it may hide or take along: that is not known to be background.
 
     Args:
         framed: a frame surely surrounds the digits: what touches the border anywhere is not theirs. It is taken away level
             by level, since a frame may stand out far more than the digits do.
+
+    Returns:
+        (H, W) the ink left, and a mask of what may hide digits; None where nothing does, and of what is surely a frame.
     """
+    lost: NDArray[np.bool_] | None = None
     for _ in range(BORDER_ROUNDS if framed else 1):
-        gone = _at_border(ink, 0.3 * level_at(ink, 0.985), framed)
-        if gone is None:
+        found = _at_border(ink, 0.3 * level_at(ink, 0.985), framed)
+        if found is None:
             break
+        gone, deep = found
         ink = np.asarray(np.where(gone, 0.0, ink), np.float32)
-    return ink
+        lost = deep if not framed and deep.any() else None
+    return ink, lost
 
 
-def _at_border(ink: Float32, least: float, framed: bool) -> NDArray[np.bool_] | None:
-    """(H, W) where ink above a level hangs together with the border, a little widened; None where none does."""
+def _at_border(ink: Float32, least: float, framed: bool) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
+    """(H, W) where ink above a level hangs together with the border, a little widened, and the parts of it that reach deep
+    into the picture; None where none does."""
     mask = (ink > least).astype(np.uint8)
     if not (mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()):
         return None
@@ -88,7 +97,11 @@ def _at_border(ink: Float32, least: float, framed: bool) -> NDArray[np.bool_] | 
     drop[0] = False
     if not drop.any():
         return None
-    return np.asarray(cv2.dilate(drop[labels].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    inset = round(DEEP * rows)
+    core = labels[inset : rows - inset, inset : columns - inset]
+    deep = drop & (np.bincount(core.ravel(), minlength=count) > LEAST_DEEP * rows)
+    gone, lost = (cv2.dilate(part[labels].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0 for part in (drop, deep))
+    return np.asarray(gone), np.asarray(lost)
 
 
 @njit(cache=True)

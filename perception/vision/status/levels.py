@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numba import njit
 
@@ -11,6 +13,7 @@ from perception.vision.view import Array
 
 PARTS = 5  # places along a segment's axis
 CLEAR = 0.6  # of a pixel seen
+WHOLLY_SEEN = 0.5  # share of the least seen segment
 FRAME_LEVEL = 0.5  # of an upright's level, above and below it: it is a frame's side
 LEAST_LOOP_PLACES = 6
 LOOP_X = np.linspace(0.36, 0.64, 3)
@@ -35,6 +38,34 @@ def without_frames(ink: Float32, comb: Comb, levels: Array) -> Array:
         drop = beyond[:, side] > FRAME_LEVEL * np.maximum(levels[:, upper], levels[:, lower])
         out[:, [upper, lower]] = np.where(drop[:, None], 0.0, out[:, [upper, lower]])
     return out
+
+
+def with_hidden_ends(seen: Float32, comb: Comb, most: int) -> Comb:
+    """The comb with the cells beside its ends that are hidden in part: a digit that a cable crosses makes no character and
+    so no cell, and without it the number would be another one.
+
+    Args:
+        seen: (H, W) 1 where the display is seen.
+        most: number of cells at most.
+    """
+    for step_px in (comb.pitch_px, -comb.pitch_px):
+        while comb.count < most:
+            beyond = comb.count * comb.pitch_px if step_px > 0 else step_px
+            end = replace(comb, left_px=comb.left_px + beyond, count=1)
+            if not _fits(end, seen.shape[1]):
+                break
+            _, shares = segment_levels(seen, seen, end)
+            if shares.min() >= WHOLLY_SEEN:
+                break
+            comb = replace(comb, left_px=comb.left_px + min(step_px, 0.0), count=comb.count + 1)
+    return comb
+
+
+def _fits(cell: Comb, columns: int) -> bool:
+    """Whether a cell of its own lies inside the picture with its strokes."""
+    u, _ = cell.place(np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.0, 1.0, 0.0, 1.0]), np.zeros(4))
+    half = STROKE * cell.height_px
+    return bool(u.min() >= half and u.max() <= columns - 1 - half)
 
 
 @njit(cache=True)

@@ -80,7 +80,7 @@ def test_a_frame_that_stands_out_more_than_the_digits_is_left_aside() -> None:
     ink = np.zeros((60, 140), np.float32)
     ink[20:40, 60:64] = 20.0
     ink[:, :6], ink[54:, :] = 200.0, 90.0
-    left = without_border(ink, framed=True)
+    left, _ = without_border(ink, framed=True)
     assert left[20:40, 60:64].min() == 20.0
     left[20:40, 60:64] = 0.0
     assert left.max() < 20.0

@@ -13,13 +13,14 @@ from benchmarks.display_report import read_case
 from perception.vision.patch import Patch
 from perception.vision.photo_display import read_photograph
 from perception.vision.status.band import hidden_by_bands
-from perception.vision.status.comb import LIT_SHARES, find_combs, segment_means
+from perception.vision.status.comb import LIT_SHARES, Comb, find_combs, segment_means
 from perception.vision.status.comb_fit import comb_worth
 from perception.vision.status.comb_jit import LEFT_OVER, apartness, cell_worth
 from perception.vision.status.cover import ring_medians
 from perception.vision.status.display import read_window
 from perception.vision.status.glyphs import LIT, NAMES, Levels, likelihoods, numbers, separate
 from perception.vision.status.ink import segment_ink
+from perception.vision.status.levels import with_hidden_ends
 from perception.vision.status.point import dot_levels, find_point
 from tests.perception.vision.test_display import window
 
@@ -127,11 +128,11 @@ def test_a_dot_stands_out_from_gaps_without_one(text: str, place: int | None) ->
     assert find_point(ink, seen, comb, lit).place == place
 
 
-def plate_patch(*, cable: tuple[int, int] | None) -> Patch:
+def plate_patch(*, cable: tuple[int, int] | None, cable_gray: int = 60) -> Patch:
     gray = np.full((110, 200), 170, np.uint8)
     gray[25:85, 30:170] = 25
     if cable is not None:
-        cv2.line(gray, (cable[0], -5), (cable[1], 115), 60, 12, cv2.LINE_AA)
+        cv2.line(gray, (cable[0], -5), (cable[1], 115), cable_gray, 12, cv2.LINE_AA)
     gray = cv2.GaussianBlur(gray, (0, 0), 1.2)
     noise = np.random.default_rng(0).normal(0, 1.5, gray.shape)
     return Patch(
@@ -140,9 +141,11 @@ def plate_patch(*, cable: tuple[int, int] | None) -> Patch:
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("gray", [60, 170])  # nearly the window's, and the plate's own
 @pytest.mark.parametrize("cable", [(100, 100), (60, 95), (150, 120)])
-def test_a_cable_is_masked_where_it_lies(cable: tuple[int, int]) -> None:
-    found = hidden_by_bands(plate_patch(cable=cable), half_width_m=0.07, half_height_m=0.03, dark_ink=False)
+def test_a_cable_is_masked_where_it_lies(cable: tuple[int, int], gray: int) -> None:
+    patch = plate_patch(cable=cable, cable_gray=gray)
+    found = hidden_by_bands(patch, half_width_m=0.07, half_height_m=0.03, dark_ink=False)
     assert found is not None
     drawn = np.zeros(found.shape, np.uint8)
     cv2.line(drawn, (cable[0], -5), (cable[1], 115), 1, 8)
@@ -175,6 +178,29 @@ def test_a_cable_and_glare_never_make_many_sure_wrong_readings() -> None:
     answers = [(case, read_case(case, known=False)) for case in cases]
     assert sum(s.answered and s.text != c.text and s.confidence > 0.8 for c, s in answers) <= 1
     assert sum(s.text == c.text for c, s in answers) >= 4
+
+
+@pytest.mark.parametrize("seed", [3065, 3093, 3108, 3124, 3171])
+def test_a_digit_that_a_cable_crosses_is_not_left_out(seed: int) -> None:
+    case = draw_taught(seed, "hard")
+    status = read_case(case, known=True)
+    assert status.text in (None, case.text)
+
+
+def test_cells_beside_a_comb_belong_to_it_where_they_are_hidden() -> None:
+    seen = np.ones((40, 200), np.float32)
+    seen[:, 150:165] = 0.0
+    comb = Comb(left_px=60.0, pitch_px=30.0, width_px=15.0, top_px=8.0, bottom_px=32.0, slant=0.1, count=3)
+    assert with_hidden_ends(seen, comb, 8) == replace(comb, count=4)
+    assert with_hidden_ends(seen, comb, 3) == comb  # the display has no more
+    assert with_hidden_ends(seen[:, ::-1].copy(), comb, 8) == replace(comb, left_px=30.0, count=4)
+    assert with_hidden_ends(seen[:, :160], comb, 8) == comb  # no room for a fourth
+
+
+@pytest.mark.parametrize(("seed", "level"), [(5010, "easy"), (5172, "hard")])
+def test_a_comb_that_is_too_high_does_not_win(seed: int, level: str) -> None:
+    case = draw_taught(seed, level)
+    assert read_case(case, known=True).text == case.text
 
 
 def test_photographs_of_low_contrast_are_read_by_and_large() -> None:

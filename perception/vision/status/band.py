@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.vision.patch import Patch, sample_at
-from perception.vision.status.cover import OUTSIDE, Crossing, border_crossings
+from perception.vision.status.cover import OUTSIDE, Crossing, border_crossings, smoothed
 from perception.vision.view import Array
 
 SAME_GRAY = 16.0  # levels along a band; real cables shine a little
@@ -37,16 +37,17 @@ def hidden_by_bands(
         dark_ink: whether segments are darker than their ground. The blurred edge of a cable that differs from the ground as
             segments do would pass for ink, so it is hidden too; any other edge shows what lies beside it.
     """
+    smooth = smoothed(patch)
     inset = INSET * 2 * min(half_width_m, half_height_m)
     paths = [
         border_crossings(
-            patch, half_width_m=half_width_m - less, half_height_m=half_height_m - less, is_round=False, beyond=beyond
+            patch, half_width_m=half_width_m - less, half_height_m=half_height_m - less, is_round=False, beyond=beyond,
+            smooth=smooth,
         )
         for less, beyond in ((0.0, OUTSIDE), (inset, 0.0))
-    ]
+    ]  # fmt: skip
     if max(len(ends) for ends in paths) < 2:
         return None
-    smooth = np.asarray(cv2.GaussianBlur(patch.gray, (0, 0), 0.8), np.uint8)
     least_side = 2 * min(half_width_m, half_height_m) * patch.px_per_m
     mask = np.zeros(patch.gray.shape, np.uint8)
     ground = _ground(patch, half_width_m, half_height_m)

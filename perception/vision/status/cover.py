@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from perception.vision.bilinear import step_counts
+from perception.vision.image import Image
 from perception.vision.patch import Patch, sample_at
 from perception.vision.view import Array
 
@@ -53,8 +54,10 @@ def covered(patch: Patch, *, half_width_m: float, half_height_m: float, is_round
         half_width_m, half_height_m: of the object; the patch must reach beyond it.
         is_round: whether the object is a disc (of `half_width_m`) and not a rectangle.
     """
-    smooth = np.asarray(cv2.GaussianBlur(patch.gray, (0, 0), 1.0), np.uint8)
-    found = border_crossings(patch, half_width_m=half_width_m, half_height_m=half_height_m, is_round=is_round)
+    smooth = smoothed(patch)
+    found = border_crossings(
+        patch, half_width_m=half_width_m, half_height_m=half_height_m, is_round=is_round, smooth=smooth
+    )
     if not found:
         return None
     depth = _depth(patch, half_width_m, half_height_m, is_round)
@@ -72,44 +75,56 @@ def covered(patch: Patch, *, half_width_m: float, half_height_m: float, is_round
 
 
 def border_crossings(
-    patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool, beyond: float = OUTSIDE
-) -> list[Crossing]:
+    patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool, beyond: float = OUTSIDE,
+    smooth: Image | None = None,
+) -> list[Crossing]:  # fmt: skip
     """The places just outside of an object's border that stand out from the plate round them; arguments as `covered`.
 
     Args:
         beyond: distance of the path from the border, over the larger half size.
+        smooth: what `smoothed` makes of the patch, to save its making.
     """
-    smooth = np.asarray(cv2.GaussianBlur(patch.gray, (0, 0), 1.0), np.uint8)
     path_u, path_v = _path(patch, half_width_m, half_height_m, is_round, 1.0 + beyond)
     inside = (path_u > 1) & (path_v > 1) & (path_u < patch.gray.shape[1] - 2) & (path_v < patch.gray.shape[0] - 2)
-    if inside.sum() < 16:
+    if np.count_nonzero(inside) < 16:
         return []
-    values = sample_at(smooth, path_u, path_v)
+    values = sample_at(smoothed(patch) if smooth is None else smooth, path_u, path_v)
     typical = ring_medians(np.round(values).astype(np.uint8), max(9, len(values) // 5) | 1)
-    least = np.clip(STANDS_OUT_SHARE * typical, LEAST_STANDS_OUT, STANDS_OUT)
-    odd = inside & (np.abs(values - typical) > np.maximum(least, 4.0 * _noise(patch)))
+    least = np.minimum(np.maximum(STANDS_OUT_SHARE * typical, LEAST_STANDS_OUT), STANDS_OUT)
+    off = np.abs(values - typical)
+    odd = inside & (off > least)
+    if odd.any():
+        odd &= off > 4.0 * _noise(patch)
+    runs = _runs(odd)
+    if not runs:
+        return []
     n = len(values)
     points = np.column_stack([path_u, path_v])
     sides = np.zeros(n, int) if is_round else _sides(patch, points, half_width_m, half_height_m)
     found = []
-    for first, last in _runs(odd):
+    for first, last in runs:
         at = np.arange(first, last + 1) % n
         middle = int(at[len(at) // 2])
         step = points[(middle + 1) % n] - points[(middle - 1) % n]
         gray = float(np.median(values[at[len(at) // 3 : len(at) - len(at) // 3]]))  # its edges are blurred
+        by = gray - float(typical[middle])
         found.append(
             Crossing(
                 middle_px=points[middle],
                 tangent=step / max(float(np.linalg.norm(step)), 1e-9),
-                length_px=0.8
-                * float(np.count_nonzero(np.abs(values[at] - typical[at]) > 0.5 * abs(gray - typical[middle]))),
+                length_px=0.8 * float(np.count_nonzero(off[at] > 0.5 * abs(by))),
                 gray=gray,
-                is_darker=gray < float(typical[middle]),
-                by=abs(gray - float(typical[middle])),
+                is_darker=by < 0,
+                by=abs(by),
                 side=int(sides[middle]),
             )
         )
     return found
+
+
+def smoothed(patch: Patch) -> Image:
+    """The patch's gray as crossings are looked for in it."""
+    return np.asarray(cv2.GaussianBlur(patch.gray, (0, 0), 1.0), np.uint8)
 
 
 def _sides(patch: Patch, points: Array, w: float, h: float) -> NDArray[np.int64]:

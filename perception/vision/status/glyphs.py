@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
+from math import prod
 
 import numpy as np
 
@@ -22,7 +23,7 @@ GLYPHS = (
 #: (characters, 7) which segments a character lights.
 LIT = np.array([[s in lit for s in SEGMENTS] for _, lit in GLYPHS])
 NAMES = [name for name, _ in GLYPHS]
-FORMS = [[k for k, name in enumerate(NAMES) if name == digit] for digit in "0123456789"]
+OTHER_FORMS = [(int(name), k) for k, name in enumerate(NAMES) if k >= 10 and name.isdigit()]
 RARE = {10: 1.5, 11: 1.5, 12: 1.5}  # nats: other ways to draw 7, 6 and 9
 
 LEAST_NOISE = 1.0  # levels
@@ -153,16 +154,20 @@ def numbers(characters: Array, blank: Array) -> list[Number]:
 
 def _digits(characters: Array) -> Array:
     """(cells, 10) log-likelihood of every digit, by its best form."""
-    return np.stack([characters[:, forms].max(axis=1) for forms in FORMS], 1)
+    digits = characters[:, :10].copy()
+    for digit, k in OTHER_FORMS:
+        np.maximum(digits[:, digit], characters[:, k], out=digits[:, digit])
+    return digits
 
 
 def _alternatives(digits: Array) -> list[tuple[str, float]]:
     """(text, nats below the best) of the likely strings of digits."""
-    close = []
-    for row in digits:
-        order = np.argsort(-row)
-        close.append([(str(k), float(row[order[0]] - row[k])) for k in order if row[order[0]] - row[k] <= CLOSE])
-    while np.prod([len(c) for c in close]) > MOST_LISTED:  # drop the least likely of all
+    losses = digits.max(axis=1, keepdims=True) - digits
+    close = [
+        sorted(((str(k), loss) for k, loss in enumerate(row) if loss <= CLOSE), key=lambda c: c[1])
+        for row in losses.tolist()
+    ]
+    while prod(len(c) for c in close) > MOST_LISTED:  # drop the least likely of all
         worst = max(range(len(close)), key=lambda i: close[i][-1][1] if len(close[i]) > 1 else -1.0)
         close[worst].pop()
     texts = [("".join(c for c, _ in choice), sum(loss for _, loss in choice)) for choice in product(*close)]

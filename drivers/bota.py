@@ -10,10 +10,10 @@ from pydantic import Field
 
 from drivers.ft300 import RangeOptions, capabilities
 from drivers.transport.checks import crc_x25
-from drivers.transport.device import StreamDevice
 from drivers.transport.framing import Framer
 from drivers.transport.link import Link, NoAnswer, drain_until_quiet, now_s
 from drivers.transport.options import SerialOptions, read_options, serial_opener
+from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import HostTime, Unwrapper
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ForceTorqueCapabilities, Wrench

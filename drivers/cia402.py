@@ -21,9 +21,10 @@ from drivers.cia402_setup import PROBES, SDO_REQUEST, SDO_S, SdoClient, SetUp, u
 from drivers.cia402_states import DISABLE, FAULT_RESET, QUICK_STOP, DriveState, state_of, towards_enabled
 from drivers.cia402_sync import SyncCount
 from drivers.transport.canbus import CanCodec, CanFrame, CanOptions, can_opener
-from drivers.transport.device import StreamDevice, wall_until
+from drivers.transport.device import wall_until
 from drivers.transport.link import Link, NoAnswer, Refused, drain, now_s
 from drivers.transport.options import read_options
+from drivers.transport.stream import StreamDevice
 from hal.clock import Deadline
 from hal.devices import ArmCapabilities, DeviceKind, JointState
 from hal.errors import DeviceFault, DeviceTimeout

@@ -13,12 +13,12 @@ from pydantic import Field
 
 from drivers.transport.bus import PolledDevice
 from drivers.transport.checks import crc_modbus
-from drivers.transport.device import StreamDevice
 from drivers.transport.framing import Framer
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.modbus import ModbusMaster, ModbusRtu
 from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
 from drivers.transport.options import SerialOptions, read_options, serial_opener
+from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import FrameTimes
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ForceTorqueCapabilities, Wrench

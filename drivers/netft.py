@@ -12,9 +12,9 @@ import numpy as np
 from pydantic import Field
 
 from drivers.ft300 import RangeOptions, capabilities
-from drivers.transport.device import StreamDevice
 from drivers.transport.link import Link, drain_until_quiet, now_s
 from drivers.transport.options import PortNumber, UdpOptions, read_options, udp_opener
+from drivers.transport.stream import StreamDevice
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ForceTorqueCapabilities, Wrench
 from hal.readings import Cause, Quality, Stamped

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.transport.device import StreamDevice
+from drivers.transport.stream import StreamDevice
 from hal.clock import Deadline
 from hal.devices import DeviceKind, RangeImage, RangeScannerCapabilities
 from hal.errors import DeviceUnavailable

@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from drivers.transport.checks import sum_low_byte
-from drivers.transport.device import StreamDevice
 from drivers.transport.framing import Framer
 from drivers.transport.link import Link, NoAnswer, now_s
 from drivers.transport.options import SerialOptions, read_options, serial_opener
+from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import FrameTimes
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ProximityCapabilities

@@ -13,11 +13,11 @@ from pydantic import Field
 from drivers.tfmini import EchoOptions
 from drivers.transport.bus import PolledDevice
 from drivers.transport.canbus import CanCodec, CanFrame, CanOptions, can_opener
-from drivers.transport.device import StreamDevice
 from drivers.transport.link import Link, now_s
 from drivers.transport.modbus import ModbusMaster
 from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
 from drivers.transport.options import read_options
+from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import FrameTimes, HostTime, Unwrapper
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ProximityCapabilities

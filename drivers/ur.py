@@ -16,10 +16,11 @@ from pydantic import Field
 
 from drivers import rtde
 from drivers.arms import Array, KinematicsOptions, SetPointFilter, capabilities, ur10e
-from drivers.transport.device import StreamDevice, wall_until
+from drivers.transport.device import wall_until
 from drivers.transport.link import Link, LinkLost, NoAnswer, Refused, WireError, drain, now_s
 from drivers.transport.options import CONNECT_TIMEOUT_S, PortNumber, TcpOptions, read_options, tcp_opener
 from drivers.transport.socket_link import open_tcp
+from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import HostTime
 from hal.clock import Deadline, WallClock
 from hal.devices import ArmCapabilities, DeviceKind, JointState

@@ -17,9 +17,10 @@ from pydantic import Field, model_validator
 
 from drivers import rtde
 from drivers.points import require_same_number, wanted_lights
-from drivers.transport.device import StreamDevice, wall_until
+from drivers.transport.device import wall_until
 from drivers.transport.link import Link, LinkLost, NoAnswer, Refused, WireError, now_s
 from drivers.transport.options import PortNumber, Seconds, TcpOptions, read_options, tcp_opener
+from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import HostTime
 from hal.clock import Deadline
 from hal.devices import DeviceKind, LightsCapabilities, TouchCapabilities

@@ -62,7 +62,7 @@ def _kind(kind: DeviceKind) -> str:
 
 
 STREAM: Imports = {
-    "drivers.transport.device": ("StreamDevice",),
+    "drivers.transport.stream": ("StreamDevice",),
     "hal.clock": ("Deadline",),
     "hal.readings": ("Stamped",),
 }
@@ -201,7 +201,7 @@ def command(on: Sequence[bool]) -> bytes:
         imports={
             **STREAM,
             "collections.abc": ("Sequence",),
-            "drivers.transport.device": ("StreamDevice", "wall_until"),
+            "drivers.transport.device": ("wall_until",),
             "drivers.transport.link": ("LinkLost", "WireError"),
             "hal.devices": ("DeviceKind", "LightsCapabilities"),
             "hal.errors": ("InvalidRequest",),

@@ -5,14 +5,10 @@ from __future__ import annotations
 import math
 import threading
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import ClassVar, Generic, TypeVar
 
-from drivers.transport.capture import inside
-from drivers.transport.fd_link import FdLink
-from drivers.transport.link import Link, LinkLost, NoAnswer, Refused, now_s
+from drivers.transport.link import LinkLost, Refused, now_s
 from drivers.transport.mailbox import Mailbox
-from drivers.transport.port import Port
 from hal.clock import Deadline, PacedClock
 from hal.devices import DeviceKind, Health
 from hal.errors import CellError, DeviceFault, DeviceTimeout, DeviceUnavailable
@@ -257,114 +253,3 @@ class WireDevice(Generic[T]):
     def wire_counts(self) -> str:
         """Counters that tell a wrong baud rate from a dead device."""
         return f"{self.mailbox.published} samples, {self.errors} errors"
-
-
-class StreamDevice(WireDevice[T]):
-    """A device that talks by itself. The subclass says how to start it and what its bytes mean.
-
-    Args:
-        open_link: opens the port.
-        silence_s: after this long without a sample the link is checked, then opened and set up anew.
-        realtime_priority: of the owner thread (see `Port`).
-    """
-
-    def __init__(
-        self,
-        context: Context,
-        *,
-        open_link: Callable[[], Link],
-        link_name: str,
-        max_age_s: float,
-        silence_s: float = 0.5,
-        realtime_priority: int = 0,
-    ) -> None:
-        super().__init__(context, max_age_s=max_age_s)
-        self._link_name = link_name
-        self._silence_s = self.patience * silence_s
-        self._heard_s = now_s()
-        self.bytes_in = 0
-        self._line: FdLink | None = None
-        self._heard_before = 0
-        self.byte_s = 0.0
-        self.port = Port(context.name, open_link=open_link, tenant=self, realtime_priority=realtime_priority)
-
-    @abstractmethod
-    def start(self, link: Link) -> None:
-        """Stop a running stream, flush, identify, configure, start: as if the device had been left in any state."""
-
-    @abstractmethod
-    def receive(self, chunk: bytes, arrived_s: float) -> None:
-        """Parse bytes and `publish` what is complete; never raises on bad data, may raise `WireError` to start anew."""
-
-    def join(self, timeout_s: float = CONNECT_S) -> None:
-        """Start the owner thread and wait for the first sample.
-
-        Raises:
-            DeviceUnavailable: none came.
-        """
-        self.port.start()
-        self.await_first(timeout_s)
-
-    def set_up(self, link: Link) -> None:
-        """Start the stream (owner thread)."""
-        self._heard_before = self.heard_bytes() or 0
-        self._line = inside(link, FdLink)
-        self.byte_s = link.byte_s
-        self.start(link)
-        self._heard_s = now_s()
-
-    def keep_going(self, link: Link) -> float:  # noqa: ARG002  # for those that need it
-        """Send what the device must hear regularly; returns how long the next read may wait, in seconds."""
-        return SLICE_S
-
-    def serve(self, link: Link) -> None:
-        """Read one chunk (owner thread)."""
-        self.take_in(link, now_s() + self.keep_going(link))
-        silent_s = now_s() - self._heard_s
-        if silent_s > 3 * SLICE_S and not link.is_present():
-            raise LinkLost(f"{link.name}: its name has vanished or leads to another port")
-        if silent_s > self._silence_s:
-            raise NoAnswer(f"no valid data for {silent_s:.2f} s; {self.wire_counts()}")
-
-    def take_in(self, link: Link, until_s: float) -> None:
-        """Wait for a chunk until then and parse it (owner thread)."""
-        chunk = link.read(until_s)
-        if not chunk:
-            return
-        arrived_s = now_s()
-        self.bytes_in += len(chunk)
-        before = self.mailbox.published
-        self.receive(chunk, arrived_s)
-        if self.mailbox.published > before:
-            self._heard_s = arrived_s
-
-    def lost(self, error: Exception) -> None:
-        """Tell all readers (owner thread)."""
-        self.fail(error)
-
-    def release(self) -> None:
-        """End the owner thread."""
-        self.port.close()
-
-    def is_up(self) -> bool:
-        """Is the link open and set up?"""
-        return self.port.link is not None
-
-    def reconnects(self) -> int:
-        """How often the link was set up again."""
-        return self.port.reconnects
-
-    def link_name(self) -> str:
-        """Port and speed, or address."""
-        return self._link_name
-
-    def wire_counts(self) -> str:
-        """Bytes without frames mean a wrong baud rate or a wrong device."""
-        heard = self.heard_bytes()
-        heard = self.bytes_in if heard is None else heard
-        return f"{heard} bytes, {self.mailbox.published} samples, {self.errors} errors"
-
-    def heard_bytes(self) -> int | None:
-        """What the link counts, since the device was connected; a replay counts nothing."""
-        line = self._line
-        return None if line is None else self._heard_before + line.received

@@ -6,10 +6,10 @@ import struct
 from typing import Any
 
 from drivers.transport.checks import sum_low_byte
-from drivers.transport.device import StreamDevice
 from drivers.transport.framing import Framer
 from drivers.transport.link import Link, drain
 from drivers.transport.options import SerialOptions, read_options, serial_opener
+from drivers.transport.stream import StreamDevice
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ProximityCapabilities
 from hal.readings import Stamped

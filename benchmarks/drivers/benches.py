@@ -1,16 +1,28 @@
-"""Every driver with a far side: how it is started, and whether a value is one of the last true ones."""
+"""Every driver with a far side: how it is started, with which options, and how its values are judged."""
 
 from __future__ import annotations
 
-import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
+from benchmarks.drivers.truths import (
+    MovingArm,
+    TimedForceTorque,
+    scip_angles,
+    sick_angles,
+    taken_s,
+    true_centimetres,
+    true_distance,
+    true_express,
+    true_joints,
+    true_lights,
+    true_scan,
+    true_width,
+    true_wrench,
+    turn_angles,
+)
 from drivers.emulators import (
     bota,
     cia402,
@@ -28,11 +40,7 @@ from drivers.emulators import (
     ur,
 )
 from drivers.emulators.base import WireEmulator
-from drivers.emulators.beams import line_m
 from drivers.emulators.faults import WireFault
-from hal.clock import Deadline
-from hal.devices import JointState, RangeImage, Wrench
-from hal.readings import Stamped
 from hal.registry import Context, connect
 
 
@@ -45,140 +53,13 @@ class Bench:
     backing: Callable[[], Any]
     driver: str
     is_true: Callable[[Any, Any], bool]
-    options: dict[str, Any]
-    far_options: dict[str, Any]
+    options: dict[str, Any] = field(default_factory=dict)
+    far_options: dict[str, Any] = field(default_factory=dict)
     faults: tuple[WireFault, ...] = tuple(WireFault)
     taken_s: Callable[[Any, Any], float] | None = None
     """When a value was taken (monotonic), where the value tells and the protocol lets a driver know."""
 
 
-class MovingArm(scripted.ScriptedArm):
-    """An arm whose joints tell the time: each rises at the same speed, for some seconds, and begins anew."""
-
-    SPEED_RAD_PER_S, TURN_S = 0.5, 4.0
-
-    def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
-        """Where it is now."""
-        stamped = super().read_state(deadline=deadline)
-        moved_rad = self.SPEED_RAD_PER_S * (time.monotonic() % self.TURN_S)
-        return replace(stamped, value=replace(stamped.value, position_rad=self.position_rad + moved_rad))
-
-    def seconds(self, value: JointState) -> Any:
-        """Seconds since the beginning that each joint tells."""
-        return (value.position_rad - self.position_rad) / self.SPEED_RAD_PER_S
-
-    def taken_s(self, value: JointState) -> float:
-        """The oldest joint's time; it was not longer ago than one turn, and rounding may bring it before now."""
-        now_s = time.monotonic() + SAME_MOMENT_S
-        return now_s - float(np.max((now_s - self.seconds(value)) % self.TURN_S))
-
-
-class TimedForceTorque(scripted.ScriptedForceTorque):
-    """Remembers when each reading was taken."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._read_s: deque[float] = deque(maxlen=4096)
-
-    def count(self, deadline: Deadline) -> tuple[int, float]:
-        """Index of this read and its time."""
-        self._read_s.append(time.monotonic())
-        return super().count(deadline)
-
-    def taken_s(self, value: Wrench) -> float:
-        """By the index that the force tells."""
-        ago = self.reads - round(value.force_n[0] / 0.01)
-        return self._read_s[-1 - ago]
-
-
-def taken_s(value: Any, backing: Any) -> float:
-    """What the backing remembers."""
-    when_s: float = backing.taken_s(value)
-    return when_s
-
-
-def true_wrench(value: Any, backing: Any) -> bool:
-    """All six components of one of the last 100 readings."""
-    index = round(value.force_n[0] / 0.01)
-    true = scripted.scripted_wrench(index)
-    got, want = [*value.force_n, *value.torque_nm], [*true.force_n, *true.torque_nm]
-    return backing.reads - 100 <= index <= backing.reads and bool(np.allclose(got, want, atol=0.0052))
-
-
-def true_distance(value: float, backing: Any) -> bool:
-    """A whole millimetre step of one of the last 100 readings."""
-    steps = (value - backing.first_m) / 0.001
-    index = backing.reads % 1000
-    return bool(abs(steps - round(steps)) < 1e-6 and (index - round(steps)) % 1000 <= 100)
-
-
-def true_centimetres(value: float, backing: Any) -> bool:
-    """One of the last 100 readings, to the centimetre."""
-    true_m = backing.first_m + 0.001 * (np.arange(backing.reads - 100, backing.reads + 1) % 1000)
-    return bool(np.min(np.abs(np.round(true_m, 2) - value)) < 1e-6)
-
-
-def true_express(value: RangeImage, backing: Any) -> bool:
-    """One of the last 60 scans; its 384 measurements fall into 360 sectors, so each beam may be its neighbour's."""
-    c, seen_m = backing.capabilities(), value.depth_m[0]
-    seen = np.isfinite(seen_m)
-    for index in range(max(1, backing.reads - 60), backing.reads + 1):
-        line = line_m(RangeImage(depth_m=scripted.scripted_scan(index)), c, turn_angles(len(seen_m)))
-        near = np.stack([np.roll(line, shift) for shift in (-2, -1, 0, 1, 2)])[:, seen]
-        low, high = np.fmin.reduce(near), np.fmax.reduce(near)
-        if np.all((seen_m[seen] >= low - 1e-3) & (seen_m[seen] <= high + 1e-3)):
-            return True
-    return False
-
-
-def true_scan(angles: Callable[[int], Any]) -> Callable[[RangeImage, Any], bool]:
-    """Beam for beam one of the last 60 scans."""
-
-    def is_true(value: RangeImage, backing: Any) -> bool:
-        angle_rad = angles(value.depth_m.shape[1])
-        c = backing.capabilities()
-        for index in range(max(1, backing.reads - 60), backing.reads + 1):
-            true = line_m(RangeImage(depth_m=scripted.scripted_scan(index)), c, angle_rad)
-            if np.allclose(value.depth_m[0], true, atol=6e-4):
-                return True
-        return False
-
-    return is_true
-
-
-def scip_angles(count: int) -> Any:
-    """URG-04LX."""
-    return (np.arange(count) + 44.0 - 384.0) * (2 * np.pi / 1024)
-
-
-def sick_angles(count: int) -> Any:
-    """180 degrees."""
-    return np.radians(np.linspace(-90.0, 90.0, count))
-
-
-def turn_angles(count: int) -> Any:
-    """A turn, signed."""
-    return (np.arange(count) * (2 * np.pi / count) + np.pi) % (2 * np.pi) - np.pi
-
-
-def true_joints(value: Any, backing: Any) -> bool:
-    """All joints of one moment, to the last count of the servos."""
-    seconds = backing.seconds(value)
-    apart_s = (seconds - seconds[0] + backing.TURN_S / 2.0) % backing.TURN_S - backing.TURN_S / 2.0
-    return bool(np.ptp(apart_s) < SAME_MOMENT_S)
-
-
-def true_width(value: Any, backing: Any) -> bool:
-    """The jaws rest on a thing of 40 mm."""
-    return bool(abs(value.width_m - 0.04) < 4e-4 and backing.reads > 0)
-
-
-def true_lights(value: Any, backing: Any) -> bool:
-    """What is lit."""
-    return bool(value == backing.on)
-
-
-SAME_MOMENT_S = 0.008  # two counts of a servo at the speed of `MovingArm` are 6 ms
 WITHOUT_CRC = tuple(f for f in WireFault if f is not WireFault.CRC)
 FAST_SCAN = {"scans_per_minute": 2400}
 BENCHES = (
@@ -188,8 +69,6 @@ BENCHES = (
         backing=scripted.ScriptedProximity,
         driver="serial:tfmini",
         is_true=true_distance,
-        options={},
-        far_options={},
     ),
     Bench(
         name="tfmini modbus",
@@ -197,8 +76,6 @@ BENCHES = (
         backing=scripted.ScriptedProximity,
         driver="modbus:tfmini",
         is_true=true_centimetres,
-        options={},
-        far_options={},
     ),
     Bench(
         name="tfmini can",
@@ -206,8 +83,6 @@ BENCHES = (
         backing=scripted.ScriptedProximity,
         driver="can:tfmini",
         is_true=true_centimetres,
-        options={},
-        far_options={},
         faults=WITHOUT_CRC,
     ),
     Bench(
@@ -216,8 +91,6 @@ BENCHES = (
         backing=TimedForceTorque,
         driver="serial:ft300",
         is_true=true_wrench,
-        options={},
-        far_options={},
     ),
     Bench(
         name="ft300 modbus",
@@ -226,8 +99,6 @@ BENCHES = (
         driver="modbus:ft300",
         taken_s=taken_s,
         is_true=true_wrench,
-        options={},
-        far_options={},
     ),
     Bench(
         name="robotiq_2f",
@@ -235,8 +106,6 @@ BENCHES = (
         backing=lambda: scripted.ScriptedGripper(object_m=0.04),
         driver="modbus:robotiq_2f",
         is_true=true_width,
-        options={},
-        far_options={},
     ),
     Bench(
         name="modbus_io tcp",
@@ -244,7 +113,6 @@ BENCHES = (
         backing=scripted.ScriptedLights,
         driver="modbus:lights",
         is_true=true_lights,
-        options={},
         far_options={"transport": "tcp"},
     ),
     Bench(
@@ -253,7 +121,6 @@ BENCHES = (
         backing=scripted.ScriptedLights,
         driver="modbus:lights",
         is_true=true_lights,
-        options={},
         far_options={"transport": "rtu"},
     ),
     Bench(
@@ -262,8 +129,6 @@ BENCHES = (
         backing=TimedForceTorque,
         driver="udp:netft",
         is_true=true_wrench,
-        options={},
-        far_options={},
     ),
     Bench(
         name="bota",
@@ -272,8 +137,6 @@ BENCHES = (
         driver="serial:bota",
         taken_s=taken_s,
         is_true=true_wrench,
-        options={},
-        far_options={},
     ),
     Bench(
         name="scip serial",
@@ -281,7 +144,6 @@ BENCHES = (
         backing=scripted.ScriptedScanner,
         driver="scip:scanner",
         is_true=true_scan(scip_angles),
-        options={},
         far_options={**FAST_SCAN, "transport": "serial"},
     ),
     Bench(
@@ -290,7 +152,6 @@ BENCHES = (
         backing=scripted.ScriptedScanner,
         driver="scip:scanner",
         is_true=true_scan(scip_angles),
-        options={},
         far_options=FAST_SCAN,
     ),
     Bench(
@@ -299,8 +160,6 @@ BENCHES = (
         backing=scripted.ScriptedScanner,
         driver="serial:lms200",
         is_true=true_scan(sick_angles),
-        options={},
-        far_options={},
     ),
     Bench(
         name="rplidar",
@@ -329,7 +188,6 @@ BENCHES = (
         taken_s=taken_s,
         is_true=true_joints,
         options={"rate_hz": 125.0},
-        far_options={},
     ),
     Bench(
         name="cia402",
@@ -338,8 +196,6 @@ BENCHES = (
         driver="can:cia402",
         taken_s=taken_s,
         is_true=true_joints,
-        options={},
-        far_options={},
     ),
     Bench(
         name="dynamixel",
@@ -348,8 +204,6 @@ BENCHES = (
         driver="serial:dynamixel",
         taken_s=taken_s,
         is_true=true_joints,
-        options={},
-        far_options={},
     ),
 )
 

@@ -1,0 +1,145 @@
+"""Backings whose values tell which reading they are, and whether a value is one of the last true ones."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from drivers.emulators import scripted
+from drivers.emulators.beams import line_m
+from hal.clock import Deadline
+from hal.devices import JointState, RangeImage, Wrench
+from hal.readings import Stamped
+
+SAME_MOMENT_S = 0.008  # two counts of a servo at the speed of `MovingArm` are 6 ms
+
+
+class MovingArm(scripted.ScriptedArm):
+    """An arm whose joints tell the time: each rises at the same speed, for some seconds, and begins anew."""
+
+    SPEED_RAD_PER_S, TURN_S = 0.5, 4.0
+
+    def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
+        """Where it is now."""
+        stamped = super().read_state(deadline=deadline)
+        moved_rad = self.SPEED_RAD_PER_S * (time.monotonic() % self.TURN_S)
+        return replace(stamped, value=replace(stamped.value, position_rad=self.position_rad + moved_rad))
+
+    def seconds(self, value: JointState) -> Any:
+        """Seconds since the beginning that each joint tells."""
+        return (value.position_rad - self.position_rad) / self.SPEED_RAD_PER_S
+
+    def taken_s(self, value: JointState) -> float:
+        """The oldest joint's time; it was not longer ago than one turn, and rounding may bring it before now."""
+        now_s = time.monotonic() + SAME_MOMENT_S
+        return now_s - float(np.max((now_s - self.seconds(value)) % self.TURN_S))
+
+
+class TimedForceTorque(scripted.ScriptedForceTorque):
+    """Remembers when each reading was taken."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._read_s: deque[float] = deque(maxlen=4096)
+
+    def count(self, deadline: Deadline) -> tuple[int, float]:
+        """Index of this read and its time."""
+        self._read_s.append(time.monotonic())
+        return super().count(deadline)
+
+    def taken_s(self, value: Wrench) -> float:
+        """By the index that the force tells."""
+        ago = self.reads - round(value.force_n[0] / 0.01)
+        return self._read_s[-1 - ago]
+
+
+def taken_s(value: Any, backing: Any) -> float:
+    """What the backing remembers."""
+    when_s: float = backing.taken_s(value)
+    return when_s
+
+
+def true_wrench(value: Any, backing: Any) -> bool:
+    """All six components of one of the last 100 readings."""
+    index = round(value.force_n[0] / 0.01)
+    true = scripted.scripted_wrench(index)
+    got, want = [*value.force_n, *value.torque_nm], [*true.force_n, *true.torque_nm]
+    return backing.reads - 100 <= index <= backing.reads and bool(np.allclose(got, want, atol=0.0052))
+
+
+def true_distance(value: float, backing: Any) -> bool:
+    """A whole millimetre step of one of the last 100 readings."""
+    steps = (value - backing.first_m) / 0.001
+    index = backing.reads % 1000
+    return bool(abs(steps - round(steps)) < 1e-6 and (index - round(steps)) % 1000 <= 100)
+
+
+def true_centimetres(value: float, backing: Any) -> bool:
+    """One of the last 100 readings, to the centimetre."""
+    true_m = backing.first_m + 0.001 * (np.arange(backing.reads - 100, backing.reads + 1) % 1000)
+    return bool(np.min(np.abs(np.round(true_m, 2) - value)) < 1e-6)
+
+
+def true_express(value: RangeImage, backing: Any) -> bool:
+    """One of the last 60 scans; its 384 measurements fall into 360 sectors, so each beam may be its neighbour's."""
+    c, seen_m = backing.capabilities(), value.depth_m[0]
+    seen = np.isfinite(seen_m)
+    for index in range(max(1, backing.reads - 60), backing.reads + 1):
+        line = line_m(RangeImage(depth_m=scripted.scripted_scan(index)), c, turn_angles(len(seen_m)))
+        near = np.stack([np.roll(line, shift) for shift in (-2, -1, 0, 1, 2)])[:, seen]
+        low, high = np.fmin.reduce(near), np.fmax.reduce(near)
+        if np.all((seen_m[seen] >= low - 1e-3) & (seen_m[seen] <= high + 1e-3)):
+            return True
+    return False
+
+
+def true_scan(angles: Callable[[int], Any]) -> Callable[[RangeImage, Any], bool]:
+    """Beam for beam one of the last 60 scans."""
+
+    def is_true(value: RangeImage, backing: Any) -> bool:
+        angle_rad = angles(value.depth_m.shape[1])
+        c = backing.capabilities()
+        for index in range(max(1, backing.reads - 60), backing.reads + 1):
+            true = line_m(RangeImage(depth_m=scripted.scripted_scan(index)), c, angle_rad)
+            if np.allclose(value.depth_m[0], true, atol=6e-4):
+                return True
+        return False
+
+    return is_true
+
+
+def scip_angles(count: int) -> Any:
+    """URG-04LX."""
+    return (np.arange(count) + 44.0 - 384.0) * (2 * np.pi / 1024)
+
+
+def sick_angles(count: int) -> Any:
+    """180 degrees."""
+    return np.radians(np.linspace(-90.0, 90.0, count))
+
+
+def turn_angles(count: int) -> Any:
+    """A turn, signed."""
+    return (np.arange(count) * (2 * np.pi / count) + np.pi) % (2 * np.pi) - np.pi
+
+
+def true_joints(value: Any, backing: Any) -> bool:
+    """All joints of one moment, to the last count of the servos."""
+    seconds = backing.seconds(value)
+    apart_s = (seconds - seconds[0] + backing.TURN_S / 2.0) % backing.TURN_S - backing.TURN_S / 2.0
+    return bool(np.ptp(apart_s) < SAME_MOMENT_S)
+
+
+def true_width(value: Any, backing: Any) -> bool:
+    """The jaws rest on a thing of 40 mm."""
+    return bool(abs(value.width_m - 0.04) < 4e-4 and backing.reads > 0)
+
+
+def true_lights(value: Any, backing: Any) -> bool:
+    """What is lit."""
+    return bool(value == backing.on)

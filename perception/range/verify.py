@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 HIT = 3.0  # log-likelihood of a pixel that agrees, over one of a gross error
 HIDDEN = -0.4
+MIXED = -0.4  # half of the beams at a jump say anything between its sides: as likely there as a gross error
 SEEN_THROUGH = -3.0
 GOES_ON = -2.0
 RING_PX = 2
@@ -27,7 +28,7 @@ SLACK_M = 0.0002  # by which real components differ from their models beside siz
 SLOPE_SHARE = 0.3  # of the depth step to the next pixel: nobody places an outline better
 STEEPEST_M = 0.004
 TRIES = 4
-HITS, BEHIND, RING, FRONT, COVERED = range(5)
+HITS, BEHIND, RING, FRONT, COVERED, BETWEEN = range(6)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -114,7 +115,8 @@ def judged(rows, boxes, tolerance, slide, q, z, panel, sigma, sen, R0, p0, strid
         stride: every how manieth pixel is looked at; with 1, `rim` may ask for what goes on beyond the outline, too.
         m, k, hits: scratch of the image's size: drawn depth, row and whether explained, packed as `render` does.
         lift: (S,) filled with how much deeper than drawn each row was found.
-        counts: (5,) filled with pixels explained, seen through, going on, hidden, and covered at all.
+        counts: (6,) filled with pixels explained, seen through, going on, hidden, covered at all, and mixed with what
+            is beside.
     """
     H, W = z.shape
     S = rows.shape[0]
@@ -149,10 +151,13 @@ def judged(rows, boxes, tolerance, slide, q, z, panel, sigma, sen, R0, p0, strid
             wide = least + slope * slope
             r, b = z[v, u] - m[j, i] - lift[s], z[v, u] - panel[v, u]
             gain = HIT - 0.5 * r * r / wide - 0.5 * np.log(wide / least)
+            floor, kind = (HIDDEN, FRONT) if r < 0.0 else (SEEN_THROUGH, BEHIND)
             if gain > 0.0:
-                hits[j, i] = 1
-            counts[HITS if gain > 0.0 else FRONT if r < 0.0 else BEHIND] += 1.0
-            score += max(gain, HIDDEN if r < 0.0 else SEEN_THROUGH) - max(HIT - 0.5 * b * b / least, 0.0)
+                hits[j, i], kind = 1, HITS
+            elif r > 0.0 and z[v, u] < _deepest_beside(m, k, j, i, h, w, panel[v, u]) - 3.0 * sigma[v, u]:
+                floor, kind = MIXED, BETWEEN
+            counts[kind] += 1.0
+            score += max(gain, floor) - max(HIT - 0.5 * b * b / least, 0.0)
     if rim:
         score += GOES_ON * _going_on(m, k, window, h, w, z, panel, sigma, hits, counts)
     return score * stride * stride
@@ -182,6 +187,16 @@ def _slope(m, k, j, i, h, w):  # type: ignore[no-untyped-def]
         out = max(out, abs(m[j, i] - m[j - 1, i]))
     elif j + 1 < h and k[j + 1, i] == k[j, i]:
         out = max(out, abs(m[j, i] - m[j + 1, i]))
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _deepest_beside(m, k, j, i, h, w, panel):  # type: ignore[no-untyped-def]
+    """Depth of the deepest thing drawn in or beside a pixel: of what a beam there may have mixed with its own."""
+    out = m[j, i]
+    for b in range(max(j - 1, 0), min(j + 2, h)):
+        for a in range(max(i - 1, 0), min(i + 2, w)):
+            out = max(out, m[b, a] if k[b, a] >= 0 else panel)
     return out
 
 
@@ -226,7 +241,7 @@ def climbed(rows, boxes, tolerance, slide, q, ways, low, high, levels, z, panel,
     H, W = z.shape
     n = (2 * H + stride) // stride, (2 * W + stride) // stride
     m, k, hits = np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)
-    lift, counts = np.empty(rows.shape[0]), np.empty(5)
+    lift, counts = np.empty(rows.shape[0]), np.empty(6)
     best = judged(rows, boxes, tolerance, slide, q, z, panel, sigma, sen, R0, p0, stride, rim, m, k, lift, hits, counts)
     size = 1.0
     for _ in range(levels):
@@ -267,7 +282,7 @@ def climbed(rows, boxes, tolerance, slide, q, ways, low, high, levels, z, panel,
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Explained:
-    """What a hypothesis explains: (5,) `counts` as in `judged`, (H, W) row drawn or -1, and the pixels that agree."""
+    """What a hypothesis explains: (6,) `counts` as in `judged`, (H, W) row drawn or -1, and the pixels that agree."""
 
     counts: Array
     rows: NDArray[np.int64]
@@ -279,7 +294,7 @@ def explained(solid: Solid, q: Array, view: View) -> Explained:
     H, W = view.depth_m.shape
     n = 2 * H + 1, 2 * W + 1
     m, k, hits = np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)
-    lift, counts = np.empty(len(solid.rows)), np.empty(5)
+    lift, counts = np.empty(len(solid.rows)), np.empty(6)
     judged(
         solid.rows, solid.boxes, solid.tolerance_m, solid.slide, q, view.depth_m, view.panel_m, view.sigma_m,
         view.packed, view.R, view.p, 1, True, m, k, lift, hits, counts,

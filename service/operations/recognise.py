@@ -8,10 +8,12 @@ from service.operations.beliefs import believed_panel
 from service.operations.eyes import look, scan, settle
 from service.operations.inspect import run_recognise_taught
 from service.operations.locate import go_to_overview
-from service.operations.relief import find_by_surfaces, surfaces_in
+from service.operations.relief import find_by_surfaces, mark_of, sighting_json, surfaces_in
 from service.operations.requests import RecogniseRequest
 from service.operations.session import Session
 from service.operations.stored import blind_answer, blind_in_stored, read_stored
+from service.report.plots import png_of
+from service.report.surfaces import surfaces_picture
 
 
 def run_recognise(session: Session, request: RecogniseRequest) -> dict[str, Any]:
@@ -44,13 +46,16 @@ def _by_range(session: Session, request: RecogniseRequest) -> dict[str, Any]:
         settle(session)
     session.progress(0.9, "scan")
     image = scan(session)
-    scene = surfaces_in(image)
+    scene, believed = surfaces_in(image), believed_panel(session)
     plate = scene.largest_plane()
+    sightings = find_by_surfaces(scene, image, session.panel, believed, plate)
+    drawn = surfaces_picture(scene, [mark_of(sighting, image, believed) for sighting in sightings])
     return {
         "surfaces": [
             {"label": s.label, "type": str(s.type), "primitive": s.primitive, "pixels": s.pixels, "rms_m": s.rms_m}
             for s in scene.surfaces
         ],
         "plate": plate.label,
-        "by_surfaces": find_by_surfaces(scene, image, session.panel, believed_panel(session), plate),
+        "by_surfaces": [sighting_json(sighting) for sighting in sightings],
+        "range_picture": session.context.task.artefact("surfaces.png", png_of(drawn), "image/png"),
     }

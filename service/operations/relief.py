@@ -2,29 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
 
 from hal.errors import Unsupported
 from hal.geometry import UncertainPose, compose
-from hal.panel import Handwheel, Mushroom, Panel, PanelObject
+from hal.panel import Handwheel, Mushroom, Panel
 from perception.range import PinholeSensor, RangeScene, Surface, analyse
 from perception.range.match import Match, match_models
-from perception.range.models import ComponentModel, models_from
+from perception.range.models import ComponentModel
 from service.operations.eyes import Scan
 from service.operations.locate import pose_json
+from service.operations.relief_models import models_of
+from service.operations.spots import half_footprint_m
+from service.report.surfaces import Mark
+
+Array = NDArray[np.float64]
 
 NEAR_M = 0.02  # a match further from where the file has its object is another thing
-HUB_RADIUS_M = 0.009
-SPOKE_RADIUS_M = 0.003
+LEAST_PIXELS = 20  # over an object's footprint; with fewer it is not in view
+OUTLINE_POINTS = 48
 
 
-def models_of(panel: Panel) -> tuple[ComponentModel, ...]:
-    """A model for each mushroom and handwheel of the panel file, under the object's name."""
-    tables = {thing.name: table for thing in panel.objects if (table := _table(thing)) is not None}
-    return models_from({"model": tables}, where=f"panel {panel.name}") if tables else ()
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sighting:
+    """What one range image shows of an object of the panel file.
+
+    Attributes:
+        match, base_from_object: None when it was not found; `why` says so then.
+        off_m: distance between where it was found and where the panel file and the believed pose have it.
+        state: how far a mushroom is pressed in (m, 0 to -travel), or a wheel's angle clockwise (rad, modulo one spoke).
+    """
+
+    thing: Mushroom | Handwheel
+    match: Match | None = None
+    base_from_object: UncertainPose | None = None
+    off_m: float | None = None
+    state: float | None = None
+    why: str = ""
 
 
 def surfaces_in(image: Scan) -> RangeScene:
@@ -43,41 +63,64 @@ def surfaces_in(image: Scan) -> RangeScene:
 
 def find_by_surfaces(
     scene: RangeScene, image: Scan, panel: Panel, base_from_panel: UncertainPose, plate: Surface
-) -> list[dict[str, Any]]:
-    """Where the scan shows the panel's mushrooms and handwheels: a row for each, with what is seen of it.
+) -> list[Sighting]:
+    """Where the scan shows the panel's mushrooms and handwheels, each looked for near its place in the panel file.
 
     Args:
         plate: the plane that they stand on, in the scanner's frame.
         base_from_panel: where the panel is believed to be; it tells two of a kind apart.
     """
+    models = models_of(panel)
+    things = [thing for thing in panel.objects if isinstance(thing, Mushroom | Handwheel)]
+    if not things:
+        return []
     depth = np.asarray(image.depth_m, float)
-    matches = match_models(scene, depth, models_of(panel), panel=plate)
-    rows = [_row(thing, matches, image, base_from_panel) for thing in panel.objects]
-    return [row for row in rows if row is not None]
+    panel_from_scanner = base_from_panel.parent_from_child.inv() * image.base_from_scanner.parent_from_child
+    points = panel_from_scanner.apply(scene.sensor.points(depth).reshape(-1, 3)).reshape(*depth.shape, 3)
+    return [_sighting(thing, models, scene, image, points, base_from_panel, plate) for thing in things]
 
 
-def _row(
-    thing: PanelObject, matches: Sequence[Match], image: Scan, base_from_panel: UncertainPose
-) -> dict[str, Any] | None:
-    if not isinstance(thing, Mushroom | Handwheel):
-        return None
+def _sighting(
+    thing: Mushroom | Handwheel, models: Mapping[str, ComponentModel], scene: RangeScene, image: Scan, points: Array,
+    base_from_panel: UncertainPose, plate: Surface,
+) -> Sighting:  # fmt: skip
+    """Of `points` (H, W, 3), in the panel's frame, only those about the object are looked at: that is what keeps it quick."""
+    away = np.abs(points[..., :2] - thing.position_m).max(axis=-1)
+    half = max(half_footprint_m(thing))
+    if np.count_nonzero(away < half) < LEAST_PIXELS:
+        return Sighting(thing=thing, why="not in the scanner's view")
+    near = np.where(away < half + thing.height_m + NEAR_M, np.asarray(image.depth_m, float), np.nan)
     expected = base_from_panel.parent_from_child.apply([*thing.position_m, 0.0])
-    found: list[tuple[float, UncertainPose, Match]] = []
-    for match in matches:
+    found = []
+    for match in match_models(scene, near, (models[thing.name],), panel=plate):
         pose = compose(image.base_from_scanner, match.sensor_from_object)
-        off_m = float(np.linalg.norm(pose.parent_from_child.translation - expected))
-        if off_m < NEAR_M and match.model == thing.name:
-            found.append((off_m, pose, match))
+        found.append((float(np.linalg.norm(pose.parent_from_child.translation - expected)), pose, match))
     if not found:
-        return {"name": thing.name, "kind": thing.kind, "found": False}
+        return Sighting(thing=thing, why="no surfaces like its own near its place")
     off_m, pose, match = min(found, key=lambda f: f[0])
-    return {
-        "name": thing.name,
-        "kind": thing.kind,
-        "found": True,
-        "base_from_object": pose_json(pose),
-        "off_panel_file_m": off_m,
-        "state": match.state,
+    if off_m > NEAR_M:
+        return Sighting(thing=thing, why=f"the nearest like it stands {1e3 * off_m:.0f} mm from its place")
+    state = _state(thing, match, base_from_panel.parent_from_child.inv() * pose.parent_from_child)
+    return Sighting(thing=thing, match=match, base_from_object=pose, off_m=off_m, state=state)
+
+
+def _state(thing: Mushroom | Handwheel, match: Match, panel_from_object: RigidTransform) -> float | None:
+    if isinstance(thing, Mushroom):
+        return match.state
+    x, y, _ = panel_from_object.rotation.apply([1.0, 0.0, 0.0])
+    return float(-np.arctan2(y, x) % (2.0 * np.pi / thing.spokes))
+
+
+def sighting_json(sighting: Sighting) -> dict[str, Any]:
+    """A sighting as the API gives it."""
+    thing, match = sighting.thing, sighting.match
+    row: dict[str, Any] = {"name": thing.name, "kind": thing.kind, "found": match is not None}
+    if match is None or sighting.base_from_object is None:
+        return row | {"why": sighting.why}
+    return row | {
+        "base_from_object": pose_json(sighting.base_from_object),
+        "off_panel_file_m": sighting.off_m,
+        "state": sighting.state,
         "state_sigma": match.state_sigma,
         "seen": match.seen,
         "score": match.score,
@@ -85,68 +128,22 @@ def _row(
     }
 
 
-def _table(thing: PanelObject) -> dict[str, Any] | None:
-    match thing:
-        case Mushroom():
-            return _mushroom(thing)
-        case Handwheel():
-            return _handwheel(thing)
-    return None
-
-
-def _mushroom(thing: Mushroom) -> dict[str, Any]:
-    """A head, the upper half of its height, on a stem half as wide."""
-    up, head_m = [0.0, 0.0, 1.0], 0.5 * thing.height_m
-    cap = {"type": "plane", "point_m": [0, 0, thing.height_m], "direction": up, "size_m": thing.radius_m}
-    wall = {
-        "type": "cylinder",
-        "point_m": [0, 0, thing.height_m - 0.5 * head_m],
-        "direction": up,
-        "size_m": thing.radius_m,
-        "length_m": head_m,
-    }
-    return {
-        "turns": 0,
-        "motion": "slide",
-        "motion_axis": up,
-        "low": -thing.travel_m,
-        "high": 0.0,
-        "surfaces": [{"name": n, "moves": True, **s} for n, s in (("cap", cap), ("wall", wall))],
-    }
-
-
-def _handwheel(thing: Handwheel) -> dict[str, Any]:
-    """A ring and spokes at the height of its tube's middle, on a hub."""
-    up, ring_m = [0.0, 0.0, 1.0], thing.height_m - thing.rim_m
-    rows: list[dict[str, Any]] = [
-        {
-            "name": "rim",
-            "type": "torus",
-            "point_m": [0, 0, ring_m],
-            "direction": up,
-            "size_m": thing.radius_m,
-            "tube_m": thing.rim_m,
-        },
-        {"name": "hub", "type": "plane", "point_m": [0, 0, thing.height_m], "direction": up, "size_m": HUB_RADIUS_M},
-    ]
-    for k in range(thing.spokes):
-        angle = 0.5 * np.pi - 2.0 * np.pi * k / thing.spokes  # the first points up, as the file counts angles
-        along = np.array([np.cos(angle), np.sin(angle)])
-        rows.append(
-            {
-                "name": f"spoke_{k + 1}",
-                "type": "cylinder",
-                "point_m": [*(0.5 * thing.radius_m * along), ring_m],
-                "direction": [*along, 0.0],
-                "size_m": SPOKE_RADIUS_M,
-                "length_m": thing.radius_m,
-            }
-        )
-    half_turn = np.pi / thing.spokes
-    return {
-        "turns": thing.spokes,
-        "motion": "turn",
-        "low": -half_turn,
-        "high": half_turn,
-        "surfaces": [{"tolerance_m": 0.001, **row} for row in rows],
-    }
+def mark_of(sighting: Sighting, image: Scan, base_from_panel: UncertainPose) -> Mark:
+    """The object's outline at its height: where it was found, or else where it was looked for."""
+    thing = sighting.thing
+    found = sighting.base_from_object
+    base_from_object = (
+        found.parent_from_child
+        if found is not None
+        else base_from_panel.parent_from_child * RigidTransform.from_translation([*thing.position_m, 0.0])
+    )
+    turn = np.linspace(0.0, 2.0 * np.pi, OUTLINE_POINTS, endpoint=False)
+    radius = max(half_footprint_m(thing))
+    ring = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(OUTLINE_POINTS, thing.height_m)], axis=-1)
+    x, y, z = (image.base_from_scanner.parent_from_child.inv() * base_from_object).apply(ring).T
+    c, depth = image.capabilities, np.maximum(z, 1e-3)
+    return Mark(
+        outline_px=np.stack([c.fx * x / depth + c.cx, c.fy * y / depth + c.cy], axis=-1),
+        text=thing.name if sighting.match is not None else f"{thing.name}: {sighting.why}",
+        is_found=sighting.match is not None,
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -12,14 +13,17 @@ from hal.geometry import UncertainPose
 from hal.panel import Button, Handwheel, Light, Mushroom, Panel
 from perception.range.solids import boxes_of, render, solid_of
 from service.operations.eyes import Scan
-from service.operations.relief import find_by_surfaces, models_of, surfaces_in
+from service.operations.relief import Sighting, find_by_surfaces, mark_of, sighting_json, surfaces_in
+from service.operations.relief_models import models_of
+from service.report.surfaces import FOUND, LOST, surfaces_picture
 
-SIDE = 160
-FOCAL_PX = 220.0
+SIDE = 128
+FOCAL_PX = 123.0  # the rim of the wheel is 2.3 pixels wide from 0.54 m, as in the mission
+JUMP_M = 0.008
 TILTED = Rotation.from_euler("x", np.pi - 0.15)
-SCANNER_FROM_PANEL = RigidTransform.from_components([0.0, 0.0, 0.45], TILTED)
-MUSHROOM = Mushroom(name="stop", position_m=(0.06, 0.03))
-WHEEL = Handwheel(name="bypass", position_m=(-0.05, -0.02))
+SCANNER_FROM_PANEL = RigidTransform.from_components([0.0, 0.0, 0.54], TILTED)
+MUSHROOM = Mushroom(name="stop", position_m=(0.09, 0.03))
+WHEEL = Handwheel(name="bypass", position_m=(-0.06, -0.02))
 
 
 def panel() -> Panel:
@@ -46,35 +50,52 @@ def certain(pose: RigidTransform) -> UncertainPose:
     return UncertainPose(parent_from_child=pose, covariance=np.zeros((6, 6)))
 
 
-def image(*, with_objects: bool, projection: str = "pinhole") -> Scan:
-    """The range image of the panel, 0.3 mm of noise."""
-    rng = np.random.default_rng(3)
+def drawn(panel_from_thing: RigidTransform, thing: Mushroom | Handwheel) -> np.ndarray:
+    """Depth of one object by itself."""
+    model = models_of(panel())[thing.name]
     sen = np.array([1.0, FOCAL_PX, FOCAL_PX, (SIDE - 1) / 2, (SIDE - 1) / 2])
-    R, p = SCANNER_FROM_PANEL.rotation.as_matrix(), SCANNER_FROM_PANEL.translation
-    v, u = np.mgrid[:SIDE, :SIDE]
-    rays = np.stack([(u - sen[3]) / FOCAL_PX, (v - sen[4]) / FOCAL_PX, np.ones_like(u)], axis=-1)
-    depth = (R[:, 2] @ p) / (rays @ R[:, 2])
-    for model, thing in zip(models_of(panel()), (MUSHROOM, WHEEL), strict=True):
-        m, k = np.empty((SIDE, SIDE)), np.empty((SIDE, SIDE), np.int64)
-        at, window = p + R @ [*thing.position_m, 0.0], np.array([0, 0, SIDE, SIDE])
-        n = len(model.surfaces)
-        render(solid_of(model), boxes_of(model), np.zeros(n), np.zeros(3), R, at, sen, window, 1, m, k)
-        depth = np.minimum(depth, m) if with_objects else depth
+    pose = SCANNER_FROM_PANEL * panel_from_thing
+    m, k = np.empty((SIDE, SIDE)), np.empty((SIDE, SIDE), np.int64)
+    n, window = len(model.surfaces), np.array([0, 0, SIDE, SIDE])
+    R, p = pose.rotation.as_matrix(), pose.translation
+    render(solid_of(model), boxes_of(model), np.zeros(n), np.zeros(3), R, p, sen, window, 1, m, k)
+    return m
+
+
+def plate_depth(height_m: float = 0.0) -> np.ndarray:
+    """Depth of a plane at a height above the plate."""
+    v, u = np.mgrid[:SIDE, :SIDE] - (SIDE - 1) / 2
+    rays = np.stack([u / FOCAL_PX, v / FOCAL_PX, np.ones((SIDE, SIDE))], axis=-1)
+    R, p = SCANNER_FROM_PANEL.rotation.as_matrix(), SCANNER_FROM_PANEL.apply([0.0, 0.0, height_m])
+    return np.asarray((R[:, 2] @ p) / (rays @ R[:, 2]))
+
+
+def standing(thing: Mushroom | Handwheel, turn_rad: float = 0.0) -> RigidTransform:
+    """Pose of an object at its place in the panel file, turned counter-clockwise."""
+    return RigidTransform.from_components([*thing.position_m, 0.0], Rotation.from_euler("z", turn_rad))
+
+
+def scan_of(depth: np.ndarray, *, seed: int = 3, projection: str = "pinhole") -> Scan:
+    """A scan with 0.6 mm of noise in which half of the beams at a jump report anything between its two sides."""
+    rng = np.random.default_rng(seed)
+    near, far = (change(depth, np.ones((3, 3))) for change in (cv2.erode, cv2.dilate))
+    is_mixed = (far - near > JUMP_M) & (rng.random(depth.shape) < 0.5)
+    depth = np.where(is_mixed, near + rng.random(depth.shape) * (far - near), depth)
     c = RangeScannerCapabilities(
         projection=projection,  # type: ignore[arg-type]  # any text is tried
         width=SIDE,
         height=SIDE,
         fx=FOCAL_PX,
         fy=FOCAL_PX,
-        cx=sen[3],
-        cy=sen[4],
+        cx=(SIDE - 1) / 2,
+        cy=(SIDE - 1) / 2,
         min_range_m=0.1,
         max_range_m=1.5,
-        sigma_m=0.0003,
+        sigma_m=0.0006,
         rate_hz=5.0,
     )
     return Scan(
-        depth_m=(depth + rng.normal(0.0, 0.0003, depth.shape)).astype(np.float32),
+        depth_m=(depth + rng.normal(0.0, 0.0006, depth.shape)).astype(np.float32),
         stamp_s=0.0,
         scanner="range_scanner",
         capabilities=c,
@@ -82,31 +103,66 @@ def image(*, with_objects: bool, projection: str = "pinhole") -> Scan:
     )
 
 
-def test_both_are_found_where_they_stand():
-    scan = image(with_objects=True)
+def sightings(scan: Scan, believed: RigidTransform = SCANNER_FROM_PANEL) -> dict[str, Sighting]:
+    """What is found in a scan, by name."""
     scene = surfaces_in(scan)
-    rows = find_by_surfaces(scene, scan, panel(), certain(SCANNER_FROM_PANEL), scene.largest_plane())
+    found = find_by_surfaces(scene, scan, panel(), certain(believed), scene.largest_plane())
+    return {s.thing.name: s for s in found}
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_both_are_found_where_they_stand_though_the_rim_is_two_pixels_wide(seed):
+    turn = 0.4
+    depth = np.minimum(plate_depth(), drawn(standing(MUSHROOM), MUSHROOM))
+    seen = sightings(scan_of(np.minimum(depth, drawn(standing(WHEEL, turn), WHEEL)), seed=seed))
+    rows = [sighting_json(s) for s in seen.values()]
     assert [(r["name"], r["found"]) for r in rows] == [("stop", True), ("bypass", True)]
-    assert all(r["off_panel_file_m"] < 0.002 for r in rows)
-    assert abs(rows[0]["state"]) < 0.001
-    assert "cap" in rows[0]["surfaces"]
+    assert all(r["off_panel_file_m"] < 0.0015 for r in rows)
+    assert abs(rows[0]["state"]) < 0.001 and "cap" in rows[0]["surfaces"]
+    assert rows[1]["state"] == pytest.approx(2 * np.pi / 3 - turn, abs=0.1)
 
 
 def test_a_bare_plate_shows_neither():
-    scan = image(with_objects=False)
-    scene = surfaces_in(scan)
-    rows = find_by_surfaces(scene, scan, panel(), certain(SCANNER_FROM_PANEL), scene.largest_plane())
-    assert [r["found"] for r in rows] == [False, False]
+    seen = sightings(scan_of(plate_depth()))
+    assert [sighting_json(s)["found"] for s in seen.values()] == [False, False]
+    assert all("no surfaces" in s.why for s in seen.values())
+
+
+@pytest.mark.parametrize("what", ["lid", "mushroom"])
+def test_what_stands_in_the_place_of_the_wheel_is_not_taken_for_it(what):
+    v, u = np.mgrid[:SIDE, :SIDE]
+    middle = SCANNER_FROM_PANEL.apply([*WHEEL.position_m, 0.03])
+    off_px = np.hypot(*(FOCAL_PX * middle[k] / middle[2] + (SIDE - 1) / 2 - uv for k, uv in enumerate((u, v))))
+    lid = np.where(off_px < FOCAL_PX * 0.04 / middle[2], plate_depth(0.03), np.inf)
+    thing = lid if what == "lid" else drawn(standing(WHEEL), MUSHROOM)
+    assert sightings(scan_of(np.minimum(plate_depth(), thing)))["bypass"].match is None
 
 
 def test_a_thing_far_from_its_place_in_the_file_is_another_one():
-    scan = image(with_objects=True)
-    scene = surfaces_in(scan)
+    depth = np.minimum(plate_depth(), drawn(standing(MUSHROOM), MUSHROOM))
     moved = RigidTransform.from_components(SCANNER_FROM_PANEL.translation + np.array([0.05, 0.0, 0.0]), TILTED)
-    rows = find_by_surfaces(scene, scan, panel(), certain(moved), scene.largest_plane())
-    assert not any(r["found"] for r in rows)
+    assert all(s.match is None for s in sightings(scan_of(depth), moved).values())
+
+
+def test_what_the_scanner_does_not_see_is_said_to_be_out_of_view():
+    beside = RigidTransform.from_components(SCANNER_FROM_PANEL.translation + np.array([0.5, 0.0, 0.0]), TILTED)
+    assert {s.why for s in sightings(scan_of(plate_depth()), beside).values()} == {"not in the scanner's view"}
+
+
+def test_the_picture_rings_what_was_found_in_green_and_what_was_not_in_red():
+    scan = scan_of(np.minimum(plate_depth(), drawn(standing(MUSHROOM), MUSHROOM)))
+    scene = surfaces_in(scan)
+    found = find_by_surfaces(scene, scan, panel(), certain(SCANNER_FROM_PANEL), scene.largest_plane())
+    marks = [mark_of(s, scan, certain(SCANNER_FROM_PANEL)) for s in found]
+    image = surfaces_picture(scene, marks)
+    for mark, colour, thing in zip(marks, (FOUND, LOST), (MUSHROOM, WHEEL), strict=True):
+        at = SCANNER_FROM_PANEL.apply([thing.position_m[0], thing.position_m[1], thing.height_m])
+        assert mark.outline_px.mean(axis=0) == pytest.approx(FOCAL_PX * at[:2] / at[2] + (SIDE - 1) / 2, abs=0.6)
+        scale = image.shape[0] / SIDE
+        u, v = np.round(scale * (mark.outline_px[5] + 0.5) - 0.5).astype(int)
+        assert (image[v, u] == colour).all()
 
 
 def test_a_line_scanner_is_refused():
     with pytest.raises(Unsupported):
-        surfaces_in(image(with_objects=True, projection="polar"))
+        surfaces_in(scan_of(plate_depth(), projection="polar"))

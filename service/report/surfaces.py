@@ -1,0 +1,51 @@
+"""A range image in colours, one a surface, with what was found in it for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.range import RangeScene
+from perception.range.render import picture
+
+Pixels = NDArray[np.uint8]
+FOUND, LOST = (40, 220, 60), (255, 60, 60)
+TEXT_SCALE = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Mark:
+    """An object drawn over the image: `outline_px` (N, 2) in pixels of the range image."""
+
+    outline_px: NDArray[np.float64]
+    text: str
+    is_found: bool
+
+
+def surfaces_picture(scene: RangeScene, marks: Sequence[Mark]) -> Pixels:
+    """(sH, sW, 3) RGB: the surfaces, and over them the marks; green where found, red where looked for in vain."""
+    image = np.ascontiguousarray(picture(scene))
+    scale = image.shape[0] / scene.labels.shape[0]
+    for mark in marks:
+        colour = FOUND if mark.is_found else LOST
+        # The middle of pixel 0 of the range image is the middle of the block that shows it.
+        outline = np.round(scale * (mark.outline_px + 0.5) - 0.5).astype(np.int32)
+        cv2.polylines(image, [outline.reshape(-1, 1, 2)], True, colour, 2, cv2.LINE_AA)
+        _write(image, mark.text, outline, colour)
+    return np.asarray(image, np.uint8)
+
+
+def _write(image: Pixels, text: str, outline: NDArray[np.int32], colour: tuple[int, int, int]) -> None:
+    """Below the outline, or above it where there is no room, inside the image."""
+    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SCALE, 1)
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    x = int(np.clip(low[0], 2, max(2, image.shape[1] - width - 2)))
+    y = int(high[1]) + height + 6
+    if y > image.shape[0] - 4:
+        y = max(int(low[1]) - 6, height + 2)
+    for ink, thickness in (((0, 0, 0), 3), (colour, 1)):
+        cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, TEXT_SCALE, ink, thickness, cv2.LINE_AA)

@@ -14,22 +14,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.cell import clear_stop, run_to_end
-from hal.config import load_cell
+from hal.config import Cell, load_cell
 from service.client import Client
 from service.serve import Options, Panelwright
+from simbackend.draws import Draws
+from simbackend.panel_state import build
 
 ROOT = Path(__file__).resolve().parents[1]
-HEAD = "| seed | confirmed | judge agrees | pose mm | pose deg | in 95 % | readings right | cell s | wall s | peak N | note |"
+HEAD = (
+    "| seed | confirmed | judge agrees | pose mm | pose deg | in 95 % | readings right | by surfaces mm "
+    "| cell s | wall s | peak N | note |"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
-    """One judged mission."""
+    """One judged mission; `places_m` (3,) in the base frame: where the simulator built each object."""
 
     seed: int
     report: dict[str, Any]
+    places_m: dict[str, NDArray[np.float64]]
 
     @property
     def judge(self) -> dict[str, Any]:
@@ -37,15 +44,28 @@ class Run:
         verdict: dict[str, Any] = self.report["judge"]
         return verdict
 
+    @property
+    def by_surfaces_m(self) -> dict[str, float | None]:
+        """How far from the truth each object was found by its surfaces; None when it was not found."""
+        return {
+            check["name"]: None
+            if check["centre_in_base_m"] is None
+            else float(np.linalg.norm(check["centre_in_base_m"] - self.places_m[check["name"]]))
+            for check in self.report.get("by_surfaces", [])
+        }
+
     def row(self) -> str:
         """A line of the table."""
         v, r = self.judge, self.report
         pose = ("-", "-") if v["pose_error_m"] is None else _pose(v)
         done = f"{sum(a['confirmed'] for a in r['actions'])}/{len(r['actions'])}"
         note = "" if r["problem"] is None else r["problem"]["detail"][:80]
+        found = ", ".join(
+            f"{k} {'NOT FOUND' if e is None else f'{1e3 * e:.2f}'}" for k, e in self.by_surfaces_m.items()
+        )
         return (
             f"| {self.seed} | {done} | {_yes(v['agrees'])} | {pose[0]} | {pose[1]} | {_yes(v['inside_95'])} "
-            f"| {v['readings_right']}/{v['readings_given']} | {r['cell_s']:.1f} | {r['wall_s']:.1f} "
+            f"| {v['readings_right']}/{v['readings_given']} | {found} | {r['cell_s']:.1f} | {r['wall_s']:.1f} "
             f"| {v['peak_force_n']:.0f} | {note} |"
         )
 
@@ -57,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("last", type=int, nargs="?", default=20)
     parser.add_argument("--cell", type=Path, default=ROOT / "cells/bench.toml")
     given = parser.parse_args(arguments)
-    print(f"{HEAD}\n|{' --- |' * 11}", flush=True)
+    print(f"{HEAD}\n|{' --- |' * 12}", flush=True)
     runs = []
     for seed in range(given.first, given.last + 1):
         runs.append(run(seed, given.cell))
@@ -68,7 +88,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(seed: int, cell: Path) -> Run:
     """One mission and its judgement, in a fresh service."""
     with tempfile.TemporaryDirectory() as folder:
-        panelwright = Panelwright(load_cell(cell, seed=seed), Options(port=0, runs_dir=Path(folder)))
+        loaded = load_cell(cell, seed=seed)
+        panelwright = Panelwright(loaded, Options(port=0, runs_dir=Path(folder)))
         panelwright.start()
         try:
             client = Client(url=panelwright.url, timeout_s=120.0)
@@ -78,7 +99,18 @@ def run(seed: int, cell: Path) -> Run:
             run_to_end(client, "/v1/judge", {"mission": name})
         finally:
             panelwright.close()
-        return Run(seed=seed, report=json.loads((Path(folder) / name / "report.json").read_text(encoding="utf-8")))
+        report = json.loads((Path(folder) / name / "report.json").read_text(encoding="utf-8"))
+        return Run(seed=seed, report=report, places_m=built_places(loaded, seed))
+
+
+def built_places(cell: Cell, seed: int) -> dict[str, NDArray[np.float64]]:
+    """Where the simulator builds each object of the panel with this seed: (3,) on the plate, base frame."""
+    draws = Draws(seed)
+    base_from_panel = draws.panel_pose(cell.file.workspace)
+    return {
+        built.thing.name: base_from_panel.apply([*np.add(built.thing.position_m, built.offset_m), 0.0])
+        for built in build(cell.panel, draws)
+    }
 
 
 def summary(runs: Sequence[Run]) -> int:
@@ -91,12 +123,19 @@ def summary(runs: Sequence[Run]) -> int:
     right, given = (sum(r.judge[key] for r in runs) for key in ("readings_right", "readings_given"))
     error_mm = 1e3 * float(np.median([v["pose_error_m"] for v in posed]))
     error_deg = float(np.rad2deg(np.median([v["pose_error_rad"] for v in posed])))
+    errors_m = [error for r in runs for error in r.by_surfaces_m.values()]
+    found_mm = [1e3 * error for error in errors_m if error is not None]
     lines = [
         (f"every action confirmed: {done} of {n}", done >= 0.95 * n),
         (f"the judge agrees: {agreed} of {n}", agreed == n),
         (f"fused pose, median error: {error_mm:.2f} mm, {error_deg:.3f} deg", error_mm <= 2.0 and error_deg <= 0.3),
         (f"inside the stated 95 % ellipsoid: {inside} of {n}", inside >= 0.85 * n),
         (f"readings and states right: {right} of {given} ({100 * right / max(given, 1):.1f} %)", right >= 0.95 * given),
+        (
+            f"found by their surfaces: {len(found_mm)} of {len(errors_m)}, median error"
+            f" {np.median(found_mm) if found_mm else np.nan:.2f} mm",
+            len(found_mm) >= 0.9 * len(errors_m),
+        ),
         (f"longest mission: {max(r.report['cell_s'] for r in runs):.1f} s on the cell's clock", True),
         (f"median mission: {np.median([r.report['wall_s'] for r in runs]):.1f} s on the wall", True),
     ]

@@ -122,7 +122,15 @@ def model_sigma_px(session: Session, look: Look, base_from_panel: RigidTransform
 
 def scan_plate(session: Session) -> ScannedPlane:
     """The plate's plane from where the arm stands now."""
-    image = scan(session)
+    return plate_in(session, scan(session))
+
+
+def plate_in(session: Session, image: Scan) -> ScannedPlane:
+    """The plate's plane in a range image that was taken from where the arm stands now.
+
+    Raises:
+        NotFound: no plane near where the panel is believed to be, or a scanner that is no pinhole.
+    """
     believed = believed_panel(session)
     scanner_from_panel = compose(image.base_from_scanner.inverse(), believed)
     c = image.capabilities

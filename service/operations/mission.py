@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -23,6 +23,7 @@ from service.operations.manipulate import work
 from service.operations.requests import ActionBody, MissionRequest
 from service.operations.sense import feel, fuse_and_remember, fused_json, light_evidence
 from service.operations.session import Session
+from service.operations.surface_check import OVERVIEW, SurfaceCheck, check_surfaces, need_its_place, view_surfaces
 from service.operations.travel import park
 from service.problem import problem_of
 from service.report.drawing import panel_drawing
@@ -98,6 +99,7 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
         part.progress(0.0, "scan the plate")
         plane = scan_plate(part)
         _note_plane(record, plane)
+        by_surfaces = view_surfaces(part, plane, OVERVIEW)
     with _step(session, "recognise", 0.19, 0.22) as part:
         part.progress(0.0, "recognise the objects")
         settle(part)  # the border lights go out
@@ -117,18 +119,24 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
         record.facts["fused"] = fused_json(answer)
         record.facts["by_lights"] = pose_json(located.base_from_panel)
         record.pictures.append(_drawing(session, located))
-    _work_all(session, record, request)
+    with _step(session, "check by surfaces", 0.57, 0.58) as part:
+        part.progress(0.0, "mushroom and wheel where layout and vision have them?")
+        checks, pictures = check_surfaces(part, by_surfaces)
+        record.facts["by_surfaces"] = checks
+        record.pictures += pictures
+    _work_all(session, record, request, checks)
     with _step(session, "retreat", 0.96, 1.0) as part:
         part.progress(0.0, "park")
         park(part)
 
 
-def _work_all(session: Session, record: MissionRecord, request: MissionRequest) -> None:
+def _work_all(session: Session, record: MissionRecord, request: MissionRequest, checks: Sequence[SurfaceCheck]) -> None:
     actions = request.actions if request.actions is not None else usual_actions(session)
-    width = (0.96 - 0.57) / max(len(actions), 1)
+    width = (0.96 - 0.58) / max(len(actions), 1)
     for k, body in enumerate(actions):
-        with _step(session, f"work {body.object}", 0.57 + k * width, 0.57 + (k + 1) * width) as part:
+        with _step(session, f"work {body.object}", 0.58 + k * width, 0.58 + (k + 1) * width) as part:
             part.progress(0.0, f"work {body.object}")
+            need_its_place(checks, body.object)
             deed = work(part, body)
             record.actions.append(deed.action)
             if deed.after is not None:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
+from hal.errors import NotFound
 from service.operations.beliefs import believed_panel
 from service.operations.eyes import look, scan, settle
 from service.operations.inspect import run_recognise_taught
-from service.operations.locate import go_to_overview
-from service.operations.relief import find_by_surfaces, mark_of, sighting_json, surfaces_in
+from service.operations.locate import go_to_overview, plate_in
+from service.operations.relief import Sighting, find_by_surfaces, mark_of, sighting_json, surfaces_in
 from service.operations.requests import RecogniseRequest
 from service.operations.session import Session
 from service.operations.stored import blind_answer, blind_in_stored, read_stored
@@ -47,15 +50,21 @@ def _by_range(session: Session, request: RecogniseRequest) -> dict[str, Any]:
     session.progress(0.9, "scan")
     image = scan(session)
     scene, believed = surfaces_in(image), believed_panel(session)
-    plate = scene.largest_plane()
-    sightings = find_by_surfaces(scene, image, session.panel, believed, plate)
-    drawn = surfaces_picture(scene, [mark_of(sighting, image, believed) for sighting in sightings])
-    return {
+    answer: dict[str, Any] = {
         "surfaces": [
             {"label": s.label, "type": str(s.type), "primitive": s.primitive, "pixels": s.pixels, "rms_m": s.rms_m}
             for s in scene.surfaces
         ],
-        "plate": plate.label,
-        "by_surfaces": [sighting_json(sighting) for sighting in sightings],
-        "range_picture": session.context.task.artefact("surfaces.png", png_of(drawn), "image/png"),
+        "plate": None,
+        "by_surfaces": [],
     }
+    sightings: list[Sighting] = []
+    try:
+        fit = plate_in(session, image).fit
+        sightings = find_by_surfaces(scene, image, session.panel, believed, fit.surface)
+        label = int(np.bincount(scene.labels[fit.inliers]).argmax())
+        answer |= {"plate": label or None, "by_surfaces": [sighting_json(s) for s in sightings]}
+    except NotFound as error:
+        answer["no_plate"] = error.what  # what else is seen is an answer, too
+    drawn = surfaces_picture(scene, [mark_of(sighting, image, believed) for sighting in sightings])
+    return answer | {"range_picture": session.context.task.artefact("surfaces.png", png_of(drawn), "image/png")}

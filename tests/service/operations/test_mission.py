@@ -13,14 +13,17 @@ import numpy as np
 import pytest
 
 from hal.config import load_cell
-from hal.errors import CellError
+from hal.errors import CellError, NotFound
 from hal.simulated import Fault, ObjectTruth, Truth
 from service.cell import CellRuntime
 from service.connection import LocalConnection
 from service.operations.context import CellMemory, OperationContext
 from service.operations.judge import judge
+from service.operations.locate import go_to_overview, locate, scan_plate
 from service.operations.mission import run_mission
 from service.operations.requests import ActionBody, MissionRequest
+from service.operations.session import Session
+from service.operations.surface_check import CLOSER, OVERVIEW, check_surfaces, need_its_place, view_surfaces
 from service.task_model import Task
 from service.tasks import TaskContext
 
@@ -29,10 +32,15 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
 @contextmanager
-def mission_context(folder: Path, seed: int) -> Iterator[OperationContext]:
-    """An inline cell with a task of its own."""
+def mission_context(folder: Path, seed: int, *, misplaced_m: float = 0.0) -> Iterator[OperationContext]:
+    """An inline cell with a task of its own; the wheel is built `misplaced_m` beside where the panel file has it."""
     cell = load_cell(ROOT / "cells/bench.toml", seed=seed)
     runtime = CellRuntime.start(cell, is_latched=lambda: False)
+    if misplaced_m:
+        wheel = cell.panel.object("bypass")
+        moved = wheel.model_copy(update={"position_m": (wheel.position_m[0] - misplaced_m, wheel.position_m[1])})
+        things = tuple(moved if thing is wheel else thing for thing in cell.panel.objects)
+        cell = cell.model_copy(update={"panel": cell.panel.model_copy(update={"objects": things})})
     try:
         yield OperationContext(
             connection=LocalConnection(cell, runtime.objects, close=runtime.close),
@@ -80,8 +88,31 @@ def test_a_planted_wrong_truth_changes_nothing_but_the_judgement(tmp_path: Path)
     assert honest["judge"]["agrees"] and honest["judge"]["pose_error_m"] < 0.005
     assert not planted["judge"]["agrees"] and planted["judge"]["pose_error_m"] > 0.02
     assert honest["succeeded"]
+    checks = {check["name"]: check for check in honest["by_surfaces"]}
+    assert set(checks) == {"bypass", "emergency"}
+    assert all(c["found"] and c["agrees"] and c["off_m"] < 0.004 for c in checks.values())
+    assert checks["emergency"]["shows"] == "released"
     pictures = [path.name for path in (tmp_path / "honest/runs").glob("*/*.png")]
-    assert {"lights.png", "range.png", "pose.png", "wrench.png", "joints.png"} <= set(pictures)
+    assert {"lights.png", "range.png", "surfaces.png", "pose.png", "wrench.png", "joints.png"} <= set(pictures)
+
+
+def test_a_wheel_beside_its_place_in_the_file_is_looked_at_again_stated_and_not_worked(tmp_path: Path) -> None:
+    with mission_context(tmp_path, seed=3, misplaced_m=0.008) as context:
+        session = Session(context=context)
+        go_to_overview(session)
+        locate(session)
+        first = view_surfaces(session, scan_plate(session), OVERVIEW)
+        stood = session.mover.state().position_rad
+        checks, pictures = check_surfaces(session, first)
+        moved = np.abs(session.mover.state().position_rad - stood).max()
+    by_name = {check.name: check for check in checks}
+    assert by_name["emergency"].agrees and by_name["emergency"].seen_from == OVERVIEW
+    wheel = by_name["bypass"]
+    assert wheel.stands_elsewhere and wheel.seen_from == CLOSER and moved > 0.05
+    assert wheel.off_m == pytest.approx(0.008, abs=0.002)
+    assert [picture.name for picture in pictures] == ["surfaces", "surfaces-bypass"]
+    with pytest.raises(NotFound, match="bypass is not worked"):
+        need_its_place(checks, "bypass")
 
 
 @pytest.mark.parametrize("device", ["wrist_camera", "range_scanner"])

@@ -1,0 +1,216 @@
+"""Do the emergency mushroom and the valve wheel stand where layout and vision have them? Their surfaces tell it apart.
+
+What is not found, or found elsewhere, is looked at again from near by and stated. Nothing is overridden: what still
+stands elsewhere after the second look is not worked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from hal.devices import DeviceKind
+from hal.errors import NotFound, PerceptionError, Unreachable
+from hal.geometry import UncertainPose, compose
+from hal.panel import Handwheel, Mushroom
+from perception.range import RangeScene
+from perception.vision.reading import ObjectReading
+from service.operations.beliefs import believed_panel, known_readings
+from service.operations.eyes import Scan, settle
+from service.operations.locate import ScannedPlane, scan_plate
+from service.operations.relief import Sighting, find_by_surfaces, mark_of, surfaces_in
+from service.operations.session import Session
+from service.operations.travel import go_to_first
+from service.operations.views import close_up_poses
+from service.report.plots import png_of
+from service.report.record import Picture
+from service.report.surfaces import surfaces_picture
+
+ELSEWHERE_P = 1e-3  # one object in a thousand that stands in its place is looked at twice
+TURN_SLACK_RAD = 0.1  # a wheel's angle by its spokes and by its mark, beside three sigmas
+OVERVIEW, CLOSER = "the overview", "a closer look"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SurfaceView:
+    """One scan, its surfaces, and what of the panel file was found in it; `place`: where the arm looked from."""
+
+    place: str
+    scan: Scan
+    scene: RangeScene
+    sightings: tuple[Sighting, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SurfaceCheck:
+    """What the surfaces of one object say beside layout and vision.
+
+    Attributes:
+        centre_in_base_m: (3,) its middle on the plate, base frame.
+        off_m: along the plate, from its place in the panel file under the panel's newest pose; `sigma_m` one standard
+            deviation of that, `chi_square` its square in sigmas on two degrees of freedom. None when it was not found.
+        off_vision_m: along the plate, from where the newest image has it.
+        shows, vision_shows: its state by surfaces, and by vision.
+        agrees: place and state agree; None when it was not found.
+        finding: all that as a sentence.
+    """
+
+    name: str
+    kind: str
+    seen_from: str
+    found: bool
+    agrees: bool | None
+    centre_in_base_m: tuple[float, float, float] | None
+    off_m: float | None
+    sigma_m: float | None
+    chi_square: float | None
+    off_vision_m: float | None
+    shows: str | None
+    vision_shows: str | None
+    stands_elsewhere: bool
+    finding: str
+
+
+def view_surfaces(session: Session, plane: ScannedPlane, place: str) -> SurfaceView:
+    """The mushrooms and handwheels in a scan whose plate is known."""
+    scene = surfaces_in(plane.scan)
+    found = find_by_surfaces(scene, plane.scan, session.panel, believed_panel(session), plane.fit.surface)
+    return SurfaceView(place=place, scan=plane.scan, scene=scene, sightings=tuple(found))
+
+
+def check_surfaces(session: Session, first: SurfaceView) -> tuple[list[SurfaceCheck], list[Picture]]:
+    """Judge what was seen from the overview, and look closer where that disagrees or shows nothing.
+
+    Raises:
+        NotFound: the panel has not been located.
+        Stopped, DeviceFault, MotionError, Cancelled: the cell cannot go on.
+    """
+    base_from_panel, shown = session.known_panel(), known_readings(session)
+    checks: list[SurfaceCheck] = []
+    pictures = [_picture(session, first, "surfaces")]
+    for sighting in first.sightings:
+        name = sighting.thing.name
+        check = judged(sighting, base_from_panel, session.panel.tolerances.position_m, shown.get(name), first.place)
+        if not check.agrees:
+            again = _look_closer(session, sighting.thing)
+            if isinstance(again, SurfaceView):
+                pictures.append(_picture(session, again, f"surfaces-{name}"))
+                (second,) = [s for s in again.sightings if s.thing.name == name]
+                closer = judged(second, base_from_panel, session.panel.tolerances.position_m, shown.get(name), CLOSER)
+                check = after_both(check, closer)
+            else:
+                check = replace(check, finding=f"{check.finding}; no closer look: {again}")
+        checks.append(check)
+    return checks, pictures
+
+
+def judged(
+    sighting: Sighting, base_from_panel: UncertainPose, position_m: float, reading: ObjectReading | None, place: str
+) -> SurfaceCheck:
+    """A sighting held against the panel file and against what vision says.
+
+    Args:
+        position_m: how far an object of a built panel stands from its place in the file, one sigma.
+    """
+    thing, match = sighting.thing, sighting.match
+    if match is None or sighting.base_from_object is None:
+        return SurfaceCheck(
+            name=thing.name, kind=thing.kind, seen_from=place, found=False, agrees=None, centre_in_base_m=None,
+            off_m=None, sigma_m=None, chi_square=None, off_vision_m=None, shows=None, vision_shows=_said(thing, reading),
+            stands_elsewhere=False,
+            finding=f"not found by its surfaces: {sighting.why}",
+        )  # fmt: skip
+    panel_from_object = compose(base_from_panel.inverse(), sighting.base_from_object)
+    x, y, z = sighting.base_from_object.parent_from_child.translation
+    at_m = panel_from_object.parent_from_child.translation[:2]
+    off = at_m - thing.position_m
+    C = panel_from_object.covariance[:2, :2] + position_m**2 * np.eye(2)
+    chi_square = float(off @ np.linalg.solve(C, off))
+    is_elsewhere = bool(chi_square > chi2.ppf(1.0 - ELSEWHERE_P, 2))
+    shows_alike = _shows_alike(sighting, reading)
+    off_m, sigma_m = float(np.linalg.norm(off)), float(np.sqrt(0.5 * np.trace(C)))
+    seen = None if reading is None or reading.centre_m is None else reading.centre_m[:2]
+    shows, vision_shows = _shown(sighting), _said(thing, reading)
+    finding = f"stands {1e3 * off_m:.1f} mm from its place in the panel file (1 sigma {1e3 * sigma_m:.1f} mm)"
+    if not shows_alike:
+        finding += f"; shows {shows} by its surfaces and {vision_shows} by vision"
+    return SurfaceCheck(
+        name=thing.name, kind=thing.kind, seen_from=place, found=True, agrees=shows_alike and not is_elsewhere,
+        centre_in_base_m=(float(x), float(y), float(z)), off_m=off_m, sigma_m=sigma_m, chi_square=chi_square,
+        off_vision_m=None if seen is None else float(np.linalg.norm(at_m - seen)),
+        shows=shows, vision_shows=vision_shows, stands_elsewhere=is_elsewhere, finding=finding,
+    )  # fmt: skip
+
+
+def after_both(first: SurfaceCheck, second: SurfaceCheck) -> SurfaceCheck:
+    """What two looks say together: the closer one where it found the object, and both are told."""
+    newest = second if second.found else first
+    return replace(newest, finding=f"from {first.seen_from} {first.finding}; from {second.seen_from} {second.finding}")
+
+
+def need_its_place(checks: Iterable[SurfaceCheck], name: str) -> None:
+    """Refuse to work an object that stands elsewhere by its surfaces: the fingers would go to where the file has it.
+
+    Raises:
+        NotFound: the object was found elsewhere, twice if it could be looked at twice.
+    """
+    for check in checks:
+        if check.name == name and check.stands_elsewhere:
+            raise NotFound(
+                f"{name} is not worked: {check.finding}",
+                hint="correct its position_m in the panel file, or measure the scanner's mount (`panelwright calibrate scanner`)",
+            )
+
+
+def _shown(sighting: Sighting) -> str | None:
+    """The state by surfaces in the words of vision; a wheel's spokes look the same after each."""
+    thing, state = sighting.thing, sighting.state
+    if state is None:
+        return None
+    if isinstance(thing, Mushroom):
+        return "pressed" if state < -0.5 * thing.travel_m else "released"
+    return f"{np.degrees(state):.0f} deg (modulo {360 / thing.spokes:.0f})"
+
+
+def _said(thing: Mushroom | Handwheel, reading: ObjectReading | None) -> str | None:
+    if reading is None or not reading.answered:
+        return None
+    if isinstance(thing, Mushroom) or reading.value is None:
+        return reading.state
+    return f"{np.degrees(reading.value):.0f} deg"
+
+
+def _shows_alike(sighting: Sighting, reading: ObjectReading | None) -> bool:
+    """Do surfaces and vision give the same state? Where one of them gives none, nothing contradicts."""
+    thing, match, state = sighting.thing, sighting.match, sighting.state
+    if match is None or state is None or reading is None or not reading.answered:
+        return True
+    if isinstance(thing, Mushroom):
+        return reading.state is None or _shown(sighting) == reading.state
+    if reading.value is None:
+        return True
+    spoke = 2.0 * np.pi / thing.spokes
+    apart = abs((state - reading.value + 0.5 * spoke) % spoke - 0.5 * spoke)
+    sigma = np.hypot(match.state_sigma or 0.0, reading.uncertainty or 0.0)
+    return bool(apart <= TURN_SLACK_RAD + 3.0 * sigma)
+
+
+def _look_closer(session: Session, thing: Mushroom | Handwheel) -> SurfaceView | str:
+    """The scanner square before the object; text says why not."""
+    flange_from_scanner = session.mount(session.first(DeviceKind.RANGE_SCANNER)).parent_from_child
+    views = close_up_poses(session.known_panel().parent_from_child, thing.point_m)
+    try:
+        go_to_first(session, (v * flange_from_scanner.inv() for v in views), name=f"closer look at {thing.name}"[:60])
+        settle(session)
+        return view_surfaces(session, scan_plate(session), CLOSER)
+    except (PerceptionError, Unreachable) as error:
+        return error.what
+
+
+def _picture(session: Session, view: SurfaceView, name: str) -> Picture:
+    marks = [mark_of(s, view.scan, believed_panel(session)) for s in view.sightings]
+    title = f"surfaces in the range image from {view.place}, and what the panel file has of them"
+    return Picture(name=name, title=title, png=png_of(surfaces_picture(view.scene, marks)))

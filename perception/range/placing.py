@@ -21,7 +21,7 @@ FREE_TURN_RAD = np.pi / np.sqrt(3.0)  # of a turn of which nothing is known
 DROP = 2.0
 SHARES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of a fine step
 GROWTH_LEVELS = 2
-LEAST_PITCHES = 0.1  # nothing is placed better than a tenth of a pixel: outlines are known no better
+LEAST_PITCHES = 0.1  # nothing is placed, or turned at its rim, better than a tenth of a pixel, as outlines are known
 
 
 def placed_covariance(t: Try, view: View, base: Surface) -> tuple[Array, float]:
@@ -34,7 +34,8 @@ def placed_covariance(t: Try, view: View, base: Surface) -> tuple[Array, float]:
     deviations = [_deviation(t, way, view) for way in steps]
     pitch = view.pitch_m
     along, across = (float(np.hypot(d * FINE_M, LEAST_PITCHES * pitch)) for d in deviations[:2])
-    turn = deviations[2] * FINE_RAD if model.turns else FREE_TURN_RAD
+    reach_m = float(np.abs(t.candidate.travel[..., :2]).max())
+    turn = float(np.hypot(deviations[2] * FINE_RAD, LEAST_PITCHES * pitch / reach_m)) if model.turns else FREE_TURN_RAD
     feature = plane_feature(base)
     n = feature.direction
     c, s = np.cos(t.q[2]), np.sin(t.q[2])

@@ -119,7 +119,8 @@ def test_both_are_found_where_they_stand_though_the_rim_is_two_pixels_wide(seed)
     assert [(r["name"], r["found"]) for r in rows] == [("stop", True), ("bypass", True)]
     assert all(r["off_panel_file_m"] < 0.0015 for r in rows)
     assert abs(rows[0]["state"]) < 0.001 and "cap" in rows[0]["surfaces"]
-    assert rows[1]["state"] == pytest.approx(2 * np.pi / 3 - turn, abs=0.1)
+    off_rad = abs(rows[1]["state"] - (2 * np.pi / 3 - turn))
+    assert off_rad < 0.06 and off_rad < 4.0 * rows[1]["state_sigma"] and rows[1]["state_sigma"] < 0.03
 
 
 def test_a_bare_plate_shows_neither():

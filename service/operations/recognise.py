@@ -9,7 +9,7 @@ import numpy as np
 from hal.errors import NotFound
 from service.operations.beliefs import believed_panel
 from service.operations.eyes import look, scan, settle
-from service.operations.inspect import run_recognise_taught
+from service.operations.inspect import ensure_located, run_recognise_taught
 from service.operations.locate import go_to_overview, plate_in
 from service.operations.relief import Sighting, find_by_surfaces, mark_of, sighting_json, surfaces_in
 from service.operations.requests import RecogniseRequest
@@ -45,6 +45,7 @@ def _blind(session: Session, request: RecogniseRequest) -> dict[str, Any]:
 def _by_range(session: Session, request: RecogniseRequest) -> dict[str, Any]:
     """The surfaces of one range image, and the objects of the panel file whose surfaces are among them."""
     if request.move and "vision" not in request.use:
+        ensure_located(session.part(0.0, 0.6))
         go_to_overview(session)
         settle(session)
     session.progress(0.9, "scan")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from hal.errors import Unsupported
-from hal.geometry import UncertainPose, compose
+from hal.geometry import UncertainPose, compose, point_covariance
 from hal.panel import Handwheel, Mushroom, Panel
 from perception.range import PinholeSensor, RangeScene, Surface, analyse
 from perception.range.match import Match, match_models
@@ -24,7 +24,7 @@ from service.report.surfaces import Mark
 
 Array = NDArray[np.float64]
 
-NEAR_M = 0.02  # a match further from where the file has its object is another thing
+NEAR_M = 0.02  # a match further from where the file has its object is another thing; three sigmas of the belief beside
 LEAST_PIXELS = 20  # over an object's footprint; with fewer it is not in view
 OUTLINE_POINTS = 48
 
@@ -87,9 +87,11 @@ def _sighting(
     """Of `points` (H, W, 3), in the panel's frame, only those about the object are looked at: that is what keeps it quick."""
     away = np.abs(points[..., :2] - thing.position_m).max(axis=-1)
     half = max(half_footprint_m(thing))
-    if np.count_nonzero(away < half) < LEAST_PIXELS:
+    sigma_m = float(np.sqrt(np.linalg.eigvalsh(point_covariance(base_from_panel, thing.point_m))[-1]))
+    reach_m = NEAR_M + 3.0 * sigma_m
+    if np.count_nonzero(away < half + 3.0 * sigma_m) < LEAST_PIXELS:
         return Sighting(thing=thing, why="not in the scanner's view")
-    near = np.where(away < half + thing.height_m + NEAR_M, np.asarray(image.depth_m, float), np.nan)
+    near = np.where(away < half + thing.height_m + reach_m, np.asarray(image.depth_m, float), np.nan)
     expected = base_from_panel.parent_from_child.apply([*thing.position_m, 0.0])
     found = []
     for match in match_models(scene, near, (models[thing.name],), panel=plate):
@@ -98,7 +100,7 @@ def _sighting(
     if not found:
         return Sighting(thing=thing, why="no surfaces like its own near its place")
     off_m, pose, match = min(found, key=lambda f: f[0])
-    if off_m > NEAR_M:
+    if off_m > reach_m:
         return Sighting(thing=thing, why=f"the nearest like it stands {1e3 * off_m:.0f} mm from its place")
     state = _state(thing, match, base_from_panel.parent_from_child.inv() * pose.parent_from_child)
     return Sighting(thing=thing, match=match, base_from_object=pose, off_m=off_m, state=state)

@@ -71,6 +71,19 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     bench.client.close()
 
 
+def test_recognise_by_range_finds_mushroom_and_wheel_of_a_panel_that_nobody_has_located(bench: Bench) -> None:
+    bench.client.post("/v1/stop/reset")
+    task = bench.ended(bench.client.post("/v1/recognise", json={"use": ["range"]}).headers["location"])
+    assert task["state"] == "succeeded", task["problem"]
+    answer = task["result"]
+    assert [(row["name"], row["found"]) for row in answer["by_surfaces"]] == [("bypass", True), ("emergency", True)]
+    assert all(row["off_panel_file_m"] < 0.005 for row in answer["by_surfaces"])
+    labels = {surface["label"]: surface["type"] for surface in answer["surfaces"]}
+    assert labels[answer["plate"]] == "plane"
+    picture = bench.client.get(answer["range_picture"])
+    assert picture.headers["content-type"] == "image/png" and picture.content.startswith(b"\x89PNG")
+
+
 def test_a_device_that_dies_ends_the_mission_with_its_name_and_a_report(bench: Bench) -> None:
     url = bench.begin_mission()
     assert bench.client.post("/v1/devices/wrist_ft/fault", json={"fault": "disconnected"}).status_code == 200

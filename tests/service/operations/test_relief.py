@@ -103,10 +103,13 @@ def scan_of(depth: np.ndarray, *, seed: int = 3, projection: str = "pinhole") ->
     )
 
 
-def sightings(scan: Scan, believed: RigidTransform = SCANNER_FROM_PANEL) -> dict[str, Sighting]:
+def sightings(
+    scan: Scan, believed: RigidTransform = SCANNER_FROM_PANEL, *, sigma_m: float = 0.0
+) -> dict[str, Sighting]:
     """What is found in a scan, by name."""
     scene = surfaces_in(scan)
-    found = find_by_surfaces(scene, scan, panel(), certain(believed), scene.largest_plane())
+    pose = UncertainPose(parent_from_child=believed, covariance=np.diag([sigma_m**2] * 3 + [0.0] * 3))
+    found = find_by_surfaces(scene, scan, panel(), pose, scene.largest_plane())
     return {s.thing.name: s for s in found}
 
 
@@ -139,10 +142,12 @@ def test_what_stands_in_the_place_of_the_wheel_is_not_taken_for_it(what):
     assert sightings(scan_of(np.minimum(plate_depth(), thing)))["bypass"].match is None
 
 
-def test_a_thing_far_from_its_place_in_the_file_is_another_one():
+def test_a_thing_far_from_its_place_in_the_file_is_another_one_unless_the_panel_may_stand_there():
     depth = np.minimum(plate_depth(), drawn(standing(MUSHROOM), MUSHROOM))
     moved = RigidTransform.from_components(SCANNER_FROM_PANEL.translation + np.array([0.05, 0.0, 0.0]), TILTED)
     assert all(s.match is None for s in sightings(scan_of(depth), moved).values())
+    vaguely = sightings(scan_of(depth), moved, sigma_m=0.02)
+    assert vaguely["stop"].off_m == pytest.approx(0.05, abs=0.002) and vaguely["bypass"].match is None
 
 
 def test_what_the_scanner_does_not_see_is_said_to_be_out_of_view():

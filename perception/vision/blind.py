@@ -7,6 +7,7 @@ overlaps nothing likelier stands.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from hal.errors import NotFound
 from perception.vision.circles import find_circles
 from perception.vision.components import components
-from perception.vision.features import PLATE_PX_PER_M, Ground, look_at, plate_gray
+from perception.vision.features import PLATE_PX_PER_M, Ground, half_turned, look_at, plate_gray
 from perception.vision.image import Image, as_gray
 from perception.vision.knowledge import NOTHING, Knowledge
 from perception.vision.match import Prepared, nearest, nothing_column, prepared
@@ -27,6 +28,7 @@ from perception.vision.shapes import Edges, direction_maps, find_edges, find_rec
 from perception.vision.view import Array, View
 
 PLATE_M = (0.40, 0.30)
+UPSIDE_DOWN = 0.15  # see `uprightness`
 FURTHEST = 0.8  # a place further from every look is unlike anything taught
 SECOND_LOOK = 0.05  # a candidate this much liker to nothing still gets a look from its best middle
 # Confidence = logistic((lead - EVEN) / SCALE), lead = how much nearer the kind is than what is next. Logistic regression
@@ -81,7 +83,7 @@ def recognise(
 
     Raises:
         InvalidRequest, NotObservable: bad image.
-        NotFound: no plate in the image.
+        NotFound: no plate in the image, or a panel upside down.
     """
     gray = as_gray(image)
     if view is None:
@@ -95,7 +97,32 @@ def recognise(
     places = candidate_places(ground.edges)
     if not len(places):
         return ()
-    return chosen(ground, places, look_at(ground, places), knowledge, view, plate_m)
+    found = chosen(ground, places, look_at(ground, places), knowledge, view, plate_m)
+    if uprightness(ground, found, knowledge, plate_m) < -UPSIDE_DOWN:
+        raise NotFound(
+            "the panel is upside down: its objects look more like the taught ones turned by half a turn",
+            hint="turn the camera or the picture by half a turn",
+        )
+    return found
+
+
+def uprightness(
+    ground: Ground, found: Sequence[Candidate], knowledge: Knowledge, plate_m: tuple[float, float]
+) -> float:
+    """By how much the accepted objects look more like the taught ones as they are than turned by half a turn, in sum.
+
+    Labels stand below, pivots of meters lie low, light comes from above: an object alone may say little, a panel says much.
+    Of 47 overviews that the looks had not been taught on the least is 0.29 upright, and -0.29 turned.
+    """
+    objects = [c for c in found if c.reason is None]
+    if not objects:
+        return 0.0
+    middles = np.array([c.centre_m for c in objects]) * [1.0, -1.0] + np.array(plate_m) / 2
+    looks = look_at(ground, middles * PLATE_PX_PER_M)
+    known = prepared(knowledge)
+    columns = [[kind.name for kind in knowledge.kinds].index(c.kind) for c in objects]
+    upright, turned = (nearest(seen, known)[np.arange(len(objects)), columns] for seen in (looks, half_turned(looks)))
+    return float((turned - upright).sum())
 
 
 def lay_out(gray: Image, view: View, plate_m: tuple[float, float]) -> Ground:

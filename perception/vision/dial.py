@@ -27,6 +27,8 @@ LEAST_CONNECTED = 0.7  # of the way to the hub: a pointer comes from it, a glare
 SAME_RAD = np.deg2rad(6.0)
 CLEARER_BY = 0.5  # than the best pointer elsewhere, as `_clearness` counts
 LEAST_SIDE_PX = 90
+BRIGHT_FACE = 205  # gray level
+HALO = 0.24  # of the radius: what a saturated spot is widened by
 UNSEEN_RIM = 0.48  # of the picture: the radius where no outline is found
 PIVOT_OFF = 0.08  # of the radius: seen aslant, the outline found is not about the pivot
 LEAST_SEPARATION = 3.2  # spreads of the face: two halves of one blurred gray lie 2.7 apart
@@ -117,7 +119,10 @@ def _drop(image: Image, u: float, v: float, radius: float) -> PointerFit | None:
             region, separation = _region(sign * part, disc, (round(u), round(v)))
             if region is not None and (best is None or separation > best[0]):
                 best = separation, region
-    return None if best is None else _axis(best[1], (u, v), radius, best[0])
+    if best is None:
+        return None
+    region = best[1] | _glare_within(planes[0], best[1], radius)
+    return _axis(region, (u, v), radius, best[0])
 
 
 def _region(
@@ -177,6 +182,19 @@ def _axis(
     )
 
 
+def _glare_within(gray: NDArray[Any], region: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+    """(H, W) spots of glare on a pointer that all but its outline surrounds: they are the pointer, whatever they look like."""
+    corners = cv2.convexHull(np.argwhere(region)[:, ::-1].astype(np.int32))
+    hull = cv2.fillConvexPoly(np.zeros(region.shape, np.uint8), corners, 1) > 0
+    count, labels = cv2.connectedComponents((gray >= WHITE_LEVEL).astype(np.uint8))
+    beyond = np.unique(labels[~hull])
+    inside = [k for k in range(1, count) if k not in beyond]
+    thick = float(cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5).max())
+    if not inside or thick < 0.6 * LEAST_HUB * radius:  # a glare beside a needle makes no drop of it
+        return np.zeros(region.shape, bool)
+    return hull & _with_halo(np.isin(labels, inside), radius)
+
+
 def _clearness(fit: PointerFit) -> float:
     return float(np.log(fit.strength) + 3.0 * (1.0 - fit.rival_ratio) + 2.0 * fit.supported)
 
@@ -205,17 +223,27 @@ def _dial_circle(gray: Image, scale: float) -> tuple[float, float, float]:
 
 
 def _glare(gray: Image, u: float, v: float, radius: float) -> NDArray[np.bool_] | None:
-    """(H, W) saturated spots that do not come from the dial's middle, as a pointer does; None where there are none."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((gray >= WHITE_LEVEL).astype(np.uint8))
+    """(H, W) saturated spots, with their halos, that do not come from the dial's middle as a pointer does; None where there
+    are none, or where the face is so bright that a saturated part of it need not be a glare."""
     y, x = np.mgrid[: gray.shape[0], : gray.shape[1]]
-    middle = np.unique(labels[np.hypot(x - u, y - v) < 0.2 * radius])
+    away = np.hypot(x - u, y - v)
+    face = float(np.median(gray[away < radius]))
+    if face > BRIGHT_FACE:
+        return None
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((gray >= WHITE_LEVEL).astype(np.uint8))
+    middle = np.unique(labels[away < 0.2 * radius])
     least, most = (share * np.pi * radius**2 for share in (0.002, 0.15))
     spots = [k for k in range(1, count) if k not in middle and least < stats[k, cv2.CC_STAT_AREA] < most]
     if not spots:
         return None
-    size = round(0.24 * radius) | 1  # a spot has a halo
+    return _with_halo(np.isin(labels, spots), radius)
+
+
+def _with_halo(spots: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+    """(H, W) spots of glare as wide as they change the picture."""
+    size = round(HALO * radius) | 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    return np.asarray(cv2.dilate(np.isin(labels, spots).astype(np.uint8), kernel) > 0)
+    return np.asarray(cv2.dilate(spots.astype(np.uint8), kernel) > 0)
 
 
 def _reaches_hub(patch: Patch, angle_rad: float, radius: float) -> float:

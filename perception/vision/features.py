@@ -102,6 +102,13 @@ def _looks(ground: Ground, places: Array) -> NDArray[np.float32]:
     return np.concatenate([middle, high - low, edge_middle, edge_high, gray_around, edge_around], axis=1)
 
 
+def half_turned(looks: Array) -> Array:
+    """(N, LENGTH) what `look_at` gives of the same places when the picture is turned by half a turn."""
+    plain = len(GROUPS) * len(RADII_M)
+    tables = looks[:, plain:].reshape(len(looks), len(AROUND_GROUPS), DIRECTIONS, RINGS)
+    return np.concatenate([looks[:, :plain], np.roll(tables, DIRECTIONS // 2, axis=2).reshape(len(looks), -1)], axis=1)
+
+
 def _around(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """(N, DIRECTIONS * RINGS) means of (N, radii, angles) values, direction by direction."""
     rings = values[:, : 2 * RINGS].reshape(len(values), RINGS, 2, -1).sum(axis=2)

@@ -20,6 +20,7 @@ from perception.vision.features import (
     RADII_M,
     RINGS,
     Ground,
+    half_turned,
     look_at,
     plate_gray,
     region_shape,
@@ -234,3 +235,30 @@ def test_shape_features_do_not_change_with_turn_and_size() -> None:
     assert a.aspect == pytest.approx(b.aspect, rel=0.06) and d.aspect == pytest.approx(1.0, abs=0.03)
     assert np.allclose(a.descriptors, b.descriptors, atol=0.04)
     assert max(d.descriptors) < 0.02 < max(a.descriptors)
+
+
+def test_looks_of_a_turned_picture_are_the_turned_looks() -> None:
+    gray = np.random.default_rng(0).integers(40, 220, (301, 401)).astype(np.uint8)
+    picture = np.asarray(cv2.GaussianBlur(gray, (0, 0), 3.0), np.uint8)
+    places = np.array([[120.0, 130.0], [250.0, 170.0]])
+    looks = []
+    for shown, at in ((picture, places), (picture[::-1, ::-1].copy(), [400.0, 300.0] - places)):
+        plain = np.full(shown.shape, 120.0, np.float32)
+        looks.append(look_at(Ground(picture=shown.astype(np.float32), edges=find_edges(shown), plate_gray=plain), at))
+    assert np.abs(half_turned(looks[0]) - looks[1]).mean() < 0.01
+    assert np.abs(looks[0] - looks[1]).mean() > 0.02
+
+
+OVERVIEWS = Path(__file__).resolve().parents[4] / "shared" / "data" / "vision" / "synth_dev"
+
+
+@pytest.mark.skipif(not OVERVIEWS.exists(), reason="no overviews beside the repository")
+@pytest.mark.parametrize("name", ["p21_000", "p24_020"])
+def test_a_panel_upside_down_is_refused(name: str) -> None:
+    gray = cv2.imread(str(OVERVIEWS / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
+    assert gray is not None
+    upright = np.asarray(gray, np.uint8)
+    knowledge = shipped_knowledge()
+    assert recognise(upright, knowledge)
+    with pytest.raises(NotFound, match="upside down"):
+        recognise(np.ascontiguousarray(upright[::-1, ::-1]), knowledge)

@@ -48,3 +48,9 @@ def test_a_dial_without_a_pointer_is_refused() -> None:
     status = read_dial(image, minimum=0.0, maximum=10.0, circular=True)
     assert status.value is None
     assert status.reason
+
+
+@pytest.mark.parametrize("seed", [2088, 2203])  # a glare on a drop's hub; a face that is white itself
+def test_a_glare_on_the_pointer_or_a_white_face_does_not_mislead(seed: int) -> None:
+    error, _ = error_of(draw_dial(seed))
+    assert error is not None and error <= 2.0

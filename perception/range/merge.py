@@ -62,15 +62,19 @@ class Agglomeration:
         *,
         borders: dict[tuple[int, int], Border],
         law: Array,
+        pitch: float,
         perspective: bool,
     ) -> None:
         self.law = law
+        self.pitch = pitch
         self.perspective = perspective
         self.parts: dict[int, Part] = {}
         for k, few in enumerate(samples, 1):
             if few.size:
                 surface = (kinds[k - 1], parameters[k - 1])
-                kind, th, normals, figures = described(*surface, few, float(pixels[k - 1]), self.law, perspective)
+                kind, th, normals, figures = described(
+                    *surface, few, float(pixels[k - 1]), pitch, self.law, perspective
+                )
                 self.parts[k] = Part(kind=kind, parameters=th, samples=few, normals=normals, figures=figures)
         self.borders = dict(borders)
         self.owner = {k: k for k in range(1, len(kinds) + 1)}
@@ -95,7 +99,7 @@ class Agglomeration:
         if a is None or b is None or border.length_px < LEAST_BORDER_PX:
             return None
         first, second = ((p.kind, p.parameters, p.samples, p.normals, p.figures) for p in (a, b))
-        gain, kind, th = judged(*first, *second, border.x, border.y, self.law, self.perspective)
+        gain, kind, th = judged(*first, *second, border.x, border.y, border.length_px, self.law, self.perspective)
         return Merger(pair=pair, kind=kind, parameters=th, gain=gain) if gain > 0.0 else None
 
     def _join(self, merger: Merger) -> tuple[int, int]:
@@ -106,7 +110,7 @@ class Agglomeration:
         samples, normals = _drawn(p, q)
         patches = float(p.figures[PATCHES] + q.figures[PATCHES])
         surface = (merger.kind, merger.parameters)
-        figures = figures_of(*surface, samples, p.pixels + q.pixels, patches, self.perspective)
+        figures = figures_of(*surface, samples, p.pixels + q.pixels, patches, self.pitch, self.perspective)
         self.parts[kept] = Part(
             kind=merger.kind, parameters=merger.parameters, samples=samples, normals=normals, figures=figures
         )
@@ -135,6 +139,7 @@ def merge_touching(regions: Regions, kinds: list[int], parameters: list[Array]) 
         regions.pixels,
         borders=borders_of(regions.labels, regions.packed),
         law=regions.law,
+        pitch=1.0 / float(regions.packed[1]),
         perspective=bool(regions.packed[0] > 0),
     )
     graph.run()

@@ -1,8 +1,8 @@
 """Two touching regions, compiled: whether one surface describes both more cheaply than two do.
 
 A region is its kind, parameters, (4, N) samples, their (N, 3) normals on its surface, and FIGURES: its pixels, how many
-independent values of the noise these hold, what the surface leaves over in squared sigmas, and how far noise may have
-turned it, radians.
+independent values of the noise these hold, what the surface leaves over in squared sigmas, how far noise may have
+turned it, radians, and the side of a square of its size, metres.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from perception.range import bend, fit
 from perception.range.borders import step_and_turn
 from perception.range.finish import SLOW_NOISE_AREA_PX
 from perception.range.grid import slow_share_at
-from perception.range.starts import solve_positive
+from perception.range.starts import solve_positive, start_plane
 from perception.range.surfaces import PLANE, QUADRIC
 
-PIXELS, PATCHES, MEAN_SQUARE, TILT = range(4)
-FIGURES = 4
+PIXELS, PATCHES, MEAN_SQUARE, TILT, SIZE_M = range(5)
+FIGURES = 5
 STEP_SIGMAS = 3.0
 SHARPEST_TURN_RAD = 1.2  # between facets of one narrow cylinder; an edge of a box turns by 1.57
 SMOOTH_TURN_RAD = 0.05
@@ -26,6 +26,11 @@ SMOOTH_SIGMAS = 3.0
 SMOOTH_SHARE = 0.8  # of both parts within `SMOOTH_LIMIT` of the joint surface, when no crease parts them
 SMOOTH_LIMIT = 5.0
 LEAST_SHARE = 0.85
+UNEVEN_TURN_RAD = 0.25  # between facets of one face
+ROUNDING_PX = 4.0  # wide at most, by which an edge of a face is rounded
+ROUNDING_TURN_RAD = 0.6
+ROUNDING_SIGMAS = 2.0
+UNEVEN_SHARE = 0.02  # of the smaller facet's size
 LEAST_GAIN = 1e-3
 SCRAP_SHARE = 0.1  # of the larger part
 PLAIN_MEAN_SQUARE = 1.6
@@ -35,16 +40,19 @@ GIVE_UP = 10.0  # mean square of a rough fit, cut at five sigmas, that no full f
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def described(kind, th, samples, pixels, noise, perspective):  # type: ignore[no-untyped-def]
-    """A region by itself, as the simplest surface that describes it: kind, parameters, normals and figures."""
+def described(kind, th, samples, pixels, pitch, noise, perspective):  # type: ignore[no-untyped-def]
+    """A region by itself, as the simplest surface that describes it: kind, parameters, normals and figures.
+
+    `pitch`: between pixels, in ray coordinates.
+    """
     patches = max(pixels / (1.0 + slow_share_at(noise, np.median(samples[2])) * (SLOW_NOISE_AREA_PX - 1.0)), 1.0)
     kind, th = bend.simplest(kind, th, samples, perspective, patches)
     normals = bend.surface_normals(kind, th, samples, perspective)
-    return kind, th, normals, figures_of(kind, th, samples, pixels, patches, perspective)
+    return kind, th, normals, figures_of(kind, th, samples, pixels, patches, pitch, perspective)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def figures_of(kind, th, samples, pixels, patches, perspective):  # type: ignore[no-untyped-def]
+def figures_of(kind, th, samples, pixels, patches, pitch, perspective):  # type: ignore[no-untyped-def]
     """(FIGURES,) of a region; its tilt is sigma / (spread sqrt(patches)), the slope of a plane through noisy values."""
     out = np.empty(FIGURES)
     out[PIXELS], out[PATCHES] = pixels, patches
@@ -59,12 +67,27 @@ def figures_of(kind, th, samples, pixels, patches, perspective):  # type: ignore
         xx, xy, yy = xx + dx * dx, xy + dx * dy, yy + dy * dy
     least = 0.5 * (xx + yy - np.sqrt((xx - yy) ** 2 + 4.0 * xy * xy)) / max(n - 1, 1)
     out[TILT] = np.median(samples[3]) / np.sqrt(max(least, 1e-12) * patches)
+    out[SIZE_M] = np.sqrt(pixels) * pitch * (np.median(samples[2]) if perspective else 1.0)
     return out
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def judged(  # type: ignore[no-untyped-def]
-    kind_a, a, samples_a, normals_a, figures_a, kind_b, b, samples_b, normals_b, figures_b, x, y, noise, perspective
+    kind_a,
+    a,
+    samples_a,
+    normals_a,
+    figures_a,
+    kind_b,
+    b,
+    samples_b,
+    normals_b,
+    figures_b,
+    x,
+    y,
+    length_px,
+    noise,
+    perspective,
 ):
     """Gain of the best joint description of two regions that touch at the rays (x, y), its kind and parameters.
 
@@ -115,9 +138,16 @@ def judged(  # type: ignore[no-untyped-def]
                     best_kind, best_gain = kind, gain
             if best_kind >= 0:
                 return best_gain, best_kind, ths[best_kind].copy()
+        if both_flat and turn < UNEVEN_TURN_RAD:
+            th = start_plane(bend.points_of(samples, perspective))
+            tolerance_m = UNEVEN_SHARE * min(figures_a[SIZE_M], figures_b[SIZE_M])
+            if _is_uneven(th, samples_a, samples_b, tolerance_m, perspective):
+                return LEAST_GAIN, PLANE, th
+    is_rounding = step <= ROUNDING_SIGMAS * np.sqrt(shown) and turn <= ROUNDING_TURN_RAD
+    is_rounding &= _is_strip(figures_a[PIXELS], figures_b[PIXELS], length_px)
     if figures_a[PIXELS] >= figures_b[PIXELS]:
-        return _scrap(kind_a, a, figures_a, kind_b, b, samples_b, figures_b, noise, perspective)
-    return _scrap(kind_b, b, figures_b, kind_a, a, samples_a, figures_a, noise, perspective)
+        return _swallowed(is_rounding, kind_a, a, figures_a, kind_b, b, samples_b, figures_b, noise, perspective)
+    return _swallowed(is_rounding, kind_b, b, figures_b, kind_a, a, samples_a, figures_a, noise, perspective)
 
 
 @njit(cache=True, error_model="numpy")
@@ -164,7 +194,27 @@ def _gain(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _scrap(kind, th, figures, own_kind, own, samples, own_figures, noise, perspective):  # type: ignore[no-untyped-def]
+def _is_strip(pixels_a, pixels_b, length_px):  # type: ignore[no-untyped-def]
+    """Whether the smaller region is a narrow strip along its border with a much larger one."""
+    less = min(pixels_a, pixels_b)
+    return less < ROUNDING_PX * length_px and less < SCRAP_SHARE * max(pixels_a, pixels_b)
+
+
+@njit(cache=True, error_model="numpy")
+def _is_uneven(th, samples_a, samples_b, tolerance_m, perspective):  # type: ignore[no-untyped-def]
+    """Whether two facets leave the plane `th` by less than things that are called flat do: upholstery, cardboard."""
+    for side in range(2):
+        samples = samples_a if side == 0 else samples_b
+        e = bend.residual_sizes(PLANE, th, samples, perspective) * samples[3]
+        if not np.mean(e < tolerance_m) > SMOOTH_SHARE:
+            return False
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _swallowed(is_rounding, kind, th, figures, own_kind, own, samples, own_figures, noise, perspective):  # type: ignore[no-untyped-def]
+    if is_rounding:
+        return LEAST_GAIN, kind, th
     if own_figures[PIXELS] > SCRAP_SHARE * figures[PIXELS]:
         return 0.0, kind, th
     return bend.scrap_gain(kind, th, own_kind, own, samples, own_figures[PIXELS], noise, perspective), kind, th

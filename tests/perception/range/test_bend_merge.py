@@ -107,6 +107,7 @@ def test_a_ball_stays_a_ball_when_its_bulge_is_worth_its_price():
     assert th[3] == pytest.approx(0.3, rel=0.15)
 
 
+WALL_2M = plane([0.0, 0.0, -1.0], -2.0)
 LEFT, RIGHT = box(20, 100, 20, 80), box(20, 100, 80, 140)
 
 
@@ -131,6 +132,24 @@ def test_pieces_of_one_face_are_joined_and_faces_at_an_edge_are_not(noise, turn_
     left = plane([np.sin(half), 0.0, -np.cos(half)], -2.0 * np.cos(half))
     right = plane([-np.sin(half), 0.0, -np.cos(half)], -2.0 * np.cos(half))
     assert (len(set(merged(left, right, noise))) == 1) == is_one
+
+
+FINE = NoiseModel(white=(0.0004, 0.0), correlated=(0.0, 0.0), step=(0.0, 0.0))
+
+
+@pytest.mark.parametrize(("turn_rad", "is_one"), [(0.05, True), (0.15, False)])
+def test_facets_of_upholstery_are_one_face_and_faces_of_a_blunt_body_are_not(turn_rad, is_one):
+    # Halves 1 m wide leave their common plane by up to 0.25 m * turn; 2 % of their size are 23 mm.
+    left = plane([np.sin(turn_rad), 0.0, -np.cos(turn_rad)], -2.0 * np.cos(turn_rad))
+    assert (len(set(merged(left, plane([0.0, 0.0, -1.0], -2.0), FINE))) == 1) == is_one
+
+
+@pytest.mark.parametrize(("width_px", "is_one"), [(3, True), (9, False)])
+def test_a_rounded_edge_belongs_to_its_face_and_a_chamfer_does_not(width_px, is_one):
+    strip = plane([np.sin(0.4), 0.0, -np.cos(0.4)], -2.0 * np.cos(0.4))  # turns where the wall ends, at x = 0
+    regions = image_of([(WALL_2M, LEFT), (strip, box(20, 100, 80, 80 + width_px))], FINE)
+    owners = merge_touching(regions, [PLANE, PLANE], [WALL_2M[1], strip[1]])
+    assert (len(set(owners)) == 1) == is_one
 
 
 def test_a_step_between_parallel_faces_stays():
@@ -161,7 +180,6 @@ def test_a_groove_keeps_coplanar_pieces_apart_and_a_ridge_or_a_scratch_does_not(
 
 
 SPOT = box(55, 65, 75, 85)
-WALL_2M = plane([0.0, 0.0, -1.0], -2.0)
 
 
 def spot_gain(offset_m, noise):

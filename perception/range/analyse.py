@@ -16,7 +16,7 @@ from perception.range.compete import Candidates
 from perception.range.features import RangeFeature, features_of
 from perception.range.noise import NoiseModel, estimate_noise, typical_depths_m
 from perception.range.primitives import Plane, Surface, SurfaceType
-from perception.range.regions import regions_of
+from perception.range.regions import regions_of, renamed
 from perception.range.segment import Task, segment, settled
 from perception.range.sensor import RangeSensorModel
 from perception.range.straight import doubt_about
@@ -170,7 +170,7 @@ def _finished(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) 
     keep = [k for k in range(count) if owner[k] == k + 1 and pixels[k] >= LEAST_KEPT_PIXELS]
     keep.sort(key=lambda k: -pixels[k])
     surfaces, final = [], Candidates()
-    renamed = np.zeros(count + 1, np.int32)
+    names = np.zeros(count + 1, np.int32)
     for new, k in enumerate(keep, 1):
         kind, mine = found.kinds[k], regions.samples(k + 1)
         surface, th = finish.refine_surface(new, kind, found.parameters[k], mine, sensor=sensor, noise=noise)
@@ -180,8 +180,8 @@ def _finished(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) 
         if straight != kind:
             surface, _ = finish.refine_surface(new, straight, start, mine, sensor=sensor, noise=noise)
         surfaces.append(surface)
-        renamed[k + 1] = new
-    labels = settled(task, noise, renamed[regions.labels], final, sweeps=SETTLING_SWEEPS)
+        names[k + 1] = new
+    labels = settled(task, noise, renamed(regions.labels, names), final, sweeps=SETTLING_SWEEPS)
     labels, surfaces = finish.without_crumbs(labels, surfaces, max(LEAST_KEPT_PIXELS, CRUMB_SHARE * task.least_pixels))
     fill_small_gaps(labels, depth, 2)
     return labels, tuple(surfaces)

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from perception.range.claim import bucket
 from perception.range.grid import sigma_at
 from perception.range.surfaces import depth_on, normal_on
 
@@ -38,34 +39,47 @@ class Border:
 
 def borders_of(labels: Ints, packed: Array) -> dict[tuple[int, int], Border]:
     """Every pair of labels (a < b) that touch in (H, W) `labels`, with places on their border as ray coordinates."""
-    keys, u, v = _contacts(labels, WIDEST_GAP_PX)
-    if keys.size == 0:
-        return {}
-    order = np.argsort(keys, kind="stable")
-    keys, u, v = keys[order], u[order], v[order]
-    starts = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
-    ends = np.append(starts[1:], keys.size)
+    pairs, lengths, x, y = _borders(labels, WIDEST_GAP_PX, packed)
     out = {}
-    for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
-        count = min(end - start, PAIR_POINTS)
-        pick = start + (np.arange(count) * (end - start)) // count
-        pair = (int(keys[start] >> 32), int(keys[start] & 0xFFFFFFFF))
-        x, y = (u[pick] - packed[3]) / packed[1], (v[pick] - packed[4]) / packed[2]
-        out[pair] = Border(x=x, y=y, length_px=end - start)
+    for k in np.lexsort((pairs[:, 1], pairs[:, 0])).tolist():
+        a, b = pairs[k].tolist()
+        length = int(lengths[k])
+        count = min(length, PAIR_POINTS)
+        out[a, b] = Border(x=x[k, :count], y=y[k, :count], length_px=length)
     return out
 
 
 @njit(cache=True)
+def _borders(labels, gap, sen):  # type: ignore[no-untyped-def]
+    """Pairs (P, 2) of labels that touch, how many contacts each has, and x and y (P, PAIR_POINTS) of some of them."""
+    ids, us, vs, pairs = _contacts(labels, gap)
+    starts, order = bucket(ids, pairs.shape[0])
+    lengths = starts[2:] - starts[1:-1]
+    x, y = np.empty((pairs.shape[0], PAIR_POINTS)), np.empty((pairs.shape[0], PAIR_POINTS))
+    for k in range(pairs.shape[0]):
+        count = min(lengths[k], PAIR_POINTS)
+        for j in range(count):
+            i = order[starts[k + 1] + (j * lengths[k]) // count]
+            x[k, j], y[k, j] = (us[i] - sen[3]) / sen[1], (vs[i] - sen[4]) / sen[2]
+    return pairs, lengths, x, y
+
+
+@njit(cache=True)
 def _contacts(labels, gap):  # type: ignore[no-untyped-def]
-    """Pair key (a << 32 | b, a < b) and place of each contact along rows and columns, over at most `gap` zeros."""
+    """Contacts along rows and columns, over at most `gap` zeros, in raster order.
+
+    Returns the number of the pair (from 1) and the place of each, and the (P, 2) pairs, a < b, as they were met.
+    """
     H, W = labels.shape
-    keys, us, vs = np.empty(8 * W, np.int64), np.empty(8 * W), np.empty(8 * W)
+    ids, us, vs = np.empty(8 * W, np.int32), np.empty(8 * W), np.empty(8 * W)
     above, above_at = np.zeros(W, np.int32), np.zeros(W, np.int32)
-    n = 0
+    # Pairs of one smaller label are a linked list: no label has many neighbours.
+    newest, pairs, older = np.zeros(labels.max() + 1, np.int32), np.empty((64, 2), np.int32), np.empty(65, np.int32)
+    n, count = 0, 0
     for v in range(H):
-        if n + 2 * W > keys.shape[0]:
-            keys, us, vs = (
-                np.concatenate((keys, np.empty_like(keys))),
+        if n + 2 * W > ids.shape[0]:
+            ids, us, vs = (
+                np.concatenate((ids, np.empty_like(ids))),
                 np.concatenate((us, np.empty_like(us))),
                 np.concatenate((vs, np.empty_like(vs))),
             )
@@ -74,18 +88,30 @@ def _contacts(labels, gap):  # type: ignore[no-untyped-def]
             label = labels[v, u]
             if label == 0:
                 continue
-            if left != label and left > 0 and u - left_at <= gap + 1:
-                keys[n] = (min(left, label) << 32) | max(left, label)
-                us[n], vs[n] = 0.5 * (left_at + u), v
+            for side in range(2):
+                other, at = (left, u - left_at) if side == 0 else (above[u], v - above_at[u])
+                if other == label:
+                    continue
+                if other == 0 or at > gap + 1:
+                    continue
+                a, b = min(other, label), max(other, label)
+                k = newest[a]
+                while k > 0 and pairs[k - 1, 1] != b:
+                    k = older[k]
+                if k == 0:
+                    if count == pairs.shape[0]:
+                        pairs = np.concatenate((pairs, np.empty_like(pairs)))
+                        older = np.concatenate((older, np.empty_like(older)))
+                    pairs[count, 0], pairs[count, 1] = a, b
+                    count += 1
+                    k, older[count], newest[a] = count, newest[a], count
+                ids[n] = k
+                us[n] = 0.5 * (left_at + u) if side == 0 else u
+                vs[n] = v if side == 0 else 0.5 * (above_at[u] + v)
                 n += 1
             left, left_at = label, u
-            upper = above[u]
-            if upper != label and upper > 0 and v - above_at[u] <= gap + 1:
-                keys[n] = (min(upper, label) << 32) | max(upper, label)
-                us[n], vs[n] = u, 0.5 * (above_at[u] + v)
-                n += 1
             above[u], above_at[u] = label, v
-    return keys[:n].copy(), us[:n].copy(), vs[:n].copy()
+    return ids[:n].copy(), us[:n].copy(), vs[:n].copy(), pairs[:count].copy()
 
 
 @njit(cache=True)

@@ -7,7 +7,7 @@ from numba import njit
 
 from perception.range.grid import sigma_at
 from perception.range.rays import LOOSE
-from perception.range.surfaces import PLANE, depth_on, normal_on
+from perception.range.surfaces import LEAN, PLANE, depth_on, normal_on
 
 CLAIM_SIGMAS = 3.5
 PLAIN_SIGMAS = 1.0  # a pixel that its own block's surface explains so well is not offered to the others
@@ -53,7 +53,7 @@ def claim_pixels(depth, sen, noise, blocks, size, kinds, ths, out, top, bottom):
                         out[v, u] = k if mine else 0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def _only_labels(blocks, r, only):  # type: ignore[no-untyped-def]
     """The one label that the 3x3 blocks around each block of row r hold, 0 where they hold none, -1 where several."""
     h, w = blocks.shape
@@ -70,7 +70,7 @@ def _only_labels(blocks, r, only):  # type: ignore[no-untyped-def]
         only[c] = most if same else -1
 
 
-@njit(cache=True, error_model="numpy", fastmath=LOOSE)
+@njit(cache=True, error_model="numpy", fastmath=LOOSE, **LEAN)
 def _claim_run(depth, th, label, first, v, sen, noise, perspective, out):  # type: ignore[no-untyped-def]
     """Pixels first, first + 1, ... of row v that a plane explains: their squared misfit, without branch or root."""
     p = 1.0 if perspective else 0.0
@@ -116,7 +116,7 @@ def _claim_block(depth, sen, noise, blocks, size, kinds, ths, out, r, c):  # typ
             out[v, u] = _best_of(depth[v, u], x, y, noise, blocks[r, c], near, n, kinds, ths, perspective)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def _best_of(z, x, y, noise, own, near, n, kinds, ths, perspective):  # type: ignore[no-untyped-def]
     """The label among near[:n] whose surface explains the depth best, 0 when none does within `CLAIM_SIGMAS`.
 
@@ -141,7 +141,7 @@ def _best_of(z, x, y, noise, own, near, n, kinds, ths, perspective):  # type: ig
     return label
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def add_row(labels, least, most):  # type: ignore[no-untyped-def]
     """One more row of a neighbourhood: the least label that is none of 0, and the largest, of each column."""
     for u in range(labels.shape[0]):
@@ -150,7 +150,7 @@ def add_row(labels, least, most):  # type: ignore[no-untyped-def]
         most[u] = max(most[u], k)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def contested(own, least, most, out):  # type: ignore[no-untyped-def]
     """Where the three columns around hold another surface than the pixel's own.
 
@@ -200,7 +200,7 @@ def claim_borders(depth, sen, noise, labels, newest, kinds, ths, out, top, botto
             out[v, u] = _best_of(depth[v, u], (u - sen[3]) / sen[1], y, noise, 0, near, n, kinds, ths, perspective)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def misfit_of(k, kinds, ths, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]
     """`misfit` of surface k of a table: planes, which most are, in a line."""
     if kinds[k] != PLANE:
@@ -212,7 +212,7 @@ def misfit_of(k, kinds, ths, x, y, z, sigma, perspective):  # type: ignore[no-un
     return abs(z - (ths[k, 3] - (1.0 - p) * (ths[k, 0] * x + ths[k, 1] * y)) / facing) / sigma
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def misfit(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]
     """|z - surface| in sigmas, eased at grazing rays where half a pixel moves the depth far; infinite on a miss."""
     zm = depth_on(kind, th, x, y, perspective)
@@ -267,17 +267,27 @@ def bucket(label, count):  # type: ignore[no-untyped-def]
     Label 0 owns nothing: unlabelled pixels are left out.
     """
     flat = label.ravel()
+    n = flat.shape[0]
     starts = np.zeros(count + 2, np.int64)
-    for i in range(flat.shape[0]):
-        if flat[i]:
-            starts[flat[i] + 1] += 1
+    # Neighbours mostly share their label: sums wait until it changes.
+    own, first = np.int64(0), 0
+    for i in range(n):
+        if flat[i] != own:
+            starts[own + 1] += i - first
+            own, first = np.int64(flat[i]), i
+    starts[own + 1] += n - first
+    starts[1] = 0
     for k in range(count + 1):
         starts[k + 1] += starts[k]
     place = starts.copy()
     indices = np.empty(starts[count + 1], np.int32)
-    for i in range(flat.shape[0]):
-        k = flat[i]
-        if k:
-            indices[place[k]] = i
-            place[k] += 1
+    own, at = np.int64(0), 0
+    for i in range(n):
+        if flat[i] != own:
+            place[own] = at
+            own = np.int64(flat[i])
+            at = place[own]
+        if own > 0:
+            indices[at] = i
+            at += 1
     return starts, indices

@@ -74,7 +74,7 @@ def merge_rounds(seams: list[int]) -> list[list[int]]:
 
 
 @njit(cache=True, nogil=True)
-def _find(parent, i):  # type: ignore[no-untyped-def]
+def find(parent, i):  # type: ignore[no-untyped-def]
     while parent[i] != i:
         parent[i] = parent[parent[i]]
         i = parent[i]
@@ -82,9 +82,9 @@ def _find(parent, i):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _unite(parent, i, j):  # type: ignore[no-untyped-def]
+def unite(parent, i, j):  # type: ignore[no-untyped-def]
     """The smaller index becomes the root: roots are first pixels in raster order."""
-    a, b = _find(parent, i), _find(parent, j)
+    a, b = find(parent, i), find(parent, j)
     if a < b:
         parent[b] = a
     elif b < a:
@@ -100,9 +100,9 @@ def _scan(mask, link_right, link_down, parent, top, bottom):  # type: ignore[no-
                 continue
             i = v * W + u
             if u + 1 < W and link_right[v, u] and mask[v, u + 1]:
-                _unite(parent, i, i + 1)
+                unite(parent, i, i + 1)
             if v + 1 < bottom and link_down[v, u] and mask[v + 1, u]:
-                _unite(parent, i, i + W)
+                unite(parent, i, i + W)
 
 
 @njit(cache=True, nogil=True)
@@ -110,7 +110,7 @@ def _merge_seam(mask, link_down, parent, seam):  # type: ignore[no-untyped-def]
     W = mask.shape[1]
     for u in range(W):
         if mask[seam - 1, u] and mask[seam, u] and link_down[seam - 1, u]:
-            _unite(parent, (seam - 1) * W + u, seam * W + u)
+            unite(parent, (seam - 1) * W + u, seam * W + u)
 
 
 @njit(cache=True, nogil=True)
@@ -120,14 +120,16 @@ def _relabel(mask, parent):  # type: ignore[no-untyped-def]
     sizes = np.zeros(H * W + 1, np.int32)
     flat = label.ravel()
     found = 0
-    for i in range(H * W):
-        if not mask[i // W, i % W]:
-            continue
-        root = _find(parent, i)
-        if root == i:
-            found += 1
-            flat[i] = found
-        else:
-            flat[i] = flat[root]  # roots come first in raster order, so theirs is already known
-        sizes[flat[i]] += 1
+    for v in range(H):
+        for u in range(W):
+            if not mask[v, u]:
+                continue
+            i = v * W + u
+            root = find(parent, i)
+            if root == i:
+                found += 1
+                flat[i] = found
+            else:
+                flat[i] = flat[root]  # roots come first in raster order, so theirs is already known
+            sizes[flat[i]] += 1
     return label, sizes[: found + 1].copy()

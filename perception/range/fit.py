@@ -5,13 +5,26 @@ the residual is `(z_measured - z_surface) / sigma(z)`. Robust start (Cauchy weig
 at `TRIM_SIGMAS` and plain least squares (Levenberg's damping, Marquardt's scaling).
 """
 
-# ruff: noqa: PLR0912, PLR0915 - the kinds are told apart in one compiled body
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-from perception.range.rays import MISS_SIGMAS, SCRATCH, normal_equations, residuals
+from perception.range.rays import (
+    CHUNK,
+    ERRED,
+    ERROR,
+    FILLED,
+    LOADED,
+    MISS_SIGMAS,
+    NOTHING,
+    SCRATCH,
+    error_row,
+    fill_rows,
+    load_rows,
+    normal_equations,
+    residuals,
+)
 from perception.range.starts import (
     is_ellipsoid,
     normal_axis,
@@ -26,15 +39,17 @@ from perception.range.surfaces import (
     CONE,
     CYLINDER,
     FREEDOM,
+    LEAN,
     PLANE,
     QUADRIC,
     SIZE,
     SPHERE,
     frame_of,
-    stepped,
+    step_into,
 )
 
 TRIM_SIGMAS = 3.0
+PER_MEDIAN = 1.4826  # standard deviations of a normal law per median of its absolute value
 ROUGH_SAMPLES = 36
 ROUGH_LIMIT = 5.0
 LARGEST_RADIUS_M = 10.0
@@ -43,26 +58,42 @@ STEP_GOAL = 1e-3  # of a standard deviation of each parameter: a step that small
 
 
 @njit(cache=True, error_model="numpy")
-def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed):  # type: ignore[no-untyped-def]
-    """Minimise the ray residuals from `th`.
+def new_scratch():  # type: ignore[no-untyped-def]
+    """What a fit works in: rows of `rays`, two systems (9, 9) and (9,), that of a step, two frames, and a trial."""
+    return (
+        np.empty(SCRATCH),
+        np.empty((9, 9)),
+        np.empty(9),
+        np.empty((9, 9)),
+        np.empty(9),
+        np.empty((9, 9)),
+        np.empty(9),
+        np.empty(6),
+        np.empty(6),
+        np.empty(SIZE),
+    )
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed, scratch, held):  # type: ignore[no-untyped-def]
+    """Minimise the ray residuals from `th`, which is moved.
 
     Args:
         x, y, z, sigma: (N,) samples; coordinates as in `Grid`.
         scale: > 0: width of the Cauchy weights in sigmas; 0: trim at `trim` and plain least squares.
         fixed: (9,) bool, tangent parameters that a prior holds.
+        scratch: as `new_scratch`; its first system is the information matrix afterwards.
+        held: of the samples and `th` what `scratch` holds, as `normal_equations`.
 
     Returns:
-        parameters, information matrix (9, 9), cost, samples used.
+        cost, samples used, and what `scratch` holds of the samples and the parameters found.
     """
+    work, H, g, H2, g2, A, step, frame, new_frame, trial = scratch
     p = FREEDOM[kind]
-    frame, new_frame = np.zeros(6), np.zeros(6)
-    H, g = np.zeros((9, 9)), np.zeros(9)
-    H2, g2 = np.zeros((9, 9)), np.zeros(9)
-    work = np.empty(SCRATCH)
     frame_of(kind, th, frame)
-    cost, used = normal_equations(kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g, work)
-    damping = 1e-4
-    A, step = np.empty((p, p)), np.empty(p)
+    cost, used = normal_equations(kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g, work, held)
+    held = min(held, LOADED)
+    damping, is_fresh = 1e-4, True
     for _ in range(steps):
         _damped(H, g, fixed, damping, p, A, step)
         if not solve_positive(A, step, p):
@@ -73,16 +104,22 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed):  #
         small = 0.0
         for a in range(p):
             small = max(small, abs(step[a]) * np.sqrt(H[a, a]))
-        trial = stepped(kind, th, frame, step)
+        step_into(kind, th, frame, step, trial)
         frame_of(kind, trial, new_frame)
         new_cost, new_used = normal_equations(
-            kind, trial, new_frame, x, y, z, sigma, perspective, scale, trim, H2, g2, work
+            kind, trial, new_frame, x, y, z, sigma, perspective, scale, trim, H2, g2, work, held
         )
-        if new_cost <= cost and new_used >= p:
-            th, cost, used = trial, new_cost, new_used
-            frame[:] = new_frame
-            H[:] = H2
-            g[:] = g2
+        is_fresh = new_cost <= cost and new_used >= p
+        if is_fresh:
+            cost, used = new_cost, new_used
+            for i in range(SIZE):
+                th[i] = trial[i]
+            for i in range(6):
+                frame[i] = new_frame[i]
+            for a in range(p):
+                g[a] = g2[a]
+                for b in range(p):
+                    H[a, b] = H2[a, b]
             damping = max(damping * 0.2, 1e-9)
             if small < STEP_GOAL * 30.0:
                 break
@@ -90,7 +127,7 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed):  #
             damping *= 10.0
             if damping > 1e6 or small < STEP_GOAL:
                 break
-    return th, H, cost, used
+    return cost, used, ERRED if is_fresh and held == LOADED else held
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -106,7 +143,7 @@ def last_step(kind, th, x, y, z, sigma, perspective, fixed):  # type: ignore[no-
     H, g, frame = np.zeros((9, 9)), np.zeros(9), np.zeros(6)
     frame_of(kind, th, frame)
     cost, used = normal_equations(
-        kind, th, frame, x, y, z, sigma, perspective, 0.0, TRIM_SIGMAS, H, g, np.empty(SCRATCH)
+        kind, th, frame, x, y, z, sigma, perspective, 0.0, TRIM_SIGMAS, H, g, np.empty(SCRATCH), NOTHING
     )
     kept = max(cost - (x.shape[0] - used) * TRIM_SIGMAS * TRIM_SIGMAS, 0.0)
     A, step = np.empty((p, p)), np.empty(p)
@@ -115,10 +152,12 @@ def last_step(kind, th, x, y, z, sigma, perspective, fixed):  # type: ignore[no-
         return th, H, kept, used
     for a in range(p):
         kept -= 0.0 if fixed[a] else g[a] * step[a]
-    return stepped(kind, th, frame, step), H, max(kept, 0.0), used
+    moved = np.empty(SIZE)
+    step_into(kind, th, frame, step, moved)
+    return moved, H, max(kept, 0.0), used
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def _damped(H, g, fixed, damping, p, A, step):  # type: ignore[no-untyped-def]
     """The system of one step into `A` (p, p) and `step` (p,): fixed parameters stay where they are."""
     for a in range(p):
@@ -128,41 +167,110 @@ def _damped(H, g, fixed, damping, p, A, step):  # type: ignore[no-untyped-def]
         step[a] = 0.0 if fixed[a] else g[a]
 
 
+@njit(cache=True, error_model="numpy", **LEAN)
+def _load(x, y, z, sigma, work):  # type: ignore[no-untyped-def]
+    """Loads the samples into `work` if they have room there; returns what it holds then."""
+    if x.shape[0] > CHUNK:
+        return NOTHING
+    load_rows(x, y, z, sigma, 0, x.shape[0], work)
+    return LOADED
+
+
 @njit(cache=True, error_model="numpy")
-def _middle_scale(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]
-    """Robust residual scale, 1.48 times the median of |e|, at least 1."""
-    e = np.empty(x.shape[0])
-    residuals(kind, th, x, y, z, sigma, perspective, e)
-    for i in range(e.shape[0]):
+def _errors(kind, th, x, y, z, sigma, perspective, scratch, held):  # type: ignore[no-untyped-def]
+    """Residuals (N,) in sigmas, in `scratch` if the samples are; and what that holds then."""
+    work, frame, n = scratch[0], scratch[7], x.shape[0]
+    if held == NOTHING:
+        e = np.empty(n)
+        residuals(kind, th, x, y, z, sigma, perspective, e)
+        return e, held
+    if held == LOADED:
+        frame_of(kind, th, frame)
+        fill_rows(kind, th, frame, n, perspective, work)
+        error_row(n, work)
+        held = FILLED
+    return work[ERROR : ERROR + n], held
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def middle_scale(e):  # type: ignore[no-untyped-def]
+    """Robust residual scale, 1.48 times the median of |e|, at least 1; NaN is a ray that misses. Overwrites e (N,)."""
+    n = e.shape[0]
+    within = 0
+    for i in range(n):
         e[i] = abs(e[i]) if np.isfinite(e[i]) else MISS_SIGMAS
-    return max(1.0, 1.4826 * np.median(e))
+        within += PER_MEDIAN * e[i] <= 1.0
+    half = n // 2
+    if within > half:
+        return 1.0
+    # Hoare's selection of the middle value.
+    left, right = 0, n - 1
+    while left < right:
+        pivot, i, j = e[half], left, right
+        while i <= j:
+            while e[i] < pivot:
+                i += 1
+            while pivot < e[j]:
+                j -= 1
+            if i <= j:
+                e[i], e[j] = e[j], e[i]
+                i, j = i + 1, j - 1
+        left, right = i if j < half else left, j if half < i else right
+    middle = e[half]
+    if n % 2 == 0:
+        below = e[0]
+        for i in range(1, half):
+            below = max(below, e[i])
+        middle = 0.5 * (below + middle)
+    return max(1.0, PER_MEDIAN * middle)
 
 
 @njit(cache=True, error_model="numpy")
 def fit_robust(kind, th, x, y, z, sigma, perspective, fixed, rounds):  # type: ignore[no-untyped-def]
     """Refine under Cauchy weights whose scale falls with the residuals; ends with the trimmed fit.
 
-    Returns parameters, information matrix, mean squared residual of the kept samples, share kept.
+    Returns parameters, information matrix, mean squared residual of the kept samples, share kept, trimmed cost.
     """
-    for _ in range(rounds):
-        scale = _middle_scale(kind, th, x, y, z, sigma, perspective)
-        th, H, cost, used = refine(kind, th, x, y, z, sigma, perspective, 4, scale, TRIM_SIGMAS, fixed)
-        if scale <= 1.05:
-            break
-    th, H, cost, used = refine(kind, th, x, y, z, sigma, perspective, 3, 0.0, TRIM_SIGMAS, fixed)
-    n = x.shape[0]
-    kept = cost - (n - used) * TRIM_SIGMAS * TRIM_SIGMAS
-    return th, H, max(kept, 0.0) / max(used - FREEDOM[kind], 1), used / max(n, 1), cost
+    th, scratch = th.copy(), new_scratch()
+    # A constant would have all that is called compiled once more.
+    mean2, kept, cost = _robust(np.int64(kind), th, x, y, z, sigma, perspective, fixed, np.int64(rounds), scratch)
+    return th, scratch[1], mean2, kept, cost
 
 
 @njit(cache=True, error_model="numpy")
-def trimmed_cost(kind, th, x, y, z, sigma, perspective, limit, stride):  # type: ignore[no-untyped-def]
-    """Sum of squared residuals, each at most limit^2, over every `stride`-th sample."""
-    e = np.empty(x.shape[0])
-    residuals(kind, th, x, y, z, sigma, perspective, e)
+def _robust(kind, th, x, y, z, sigma, perspective, fixed, rounds, scratch):  # type: ignore[no-untyped-def]
+    """`fit_robust` that moves `th`; the first system of `scratch` is the information matrix."""
+    n = x.shape[0]
+    held, is_last, cost, used = _load(x, y, z, sigma, scratch[0]), rounds == 0, 0.0, 0
+    for turn in range(rounds + 1):
+        scale, steps = 0.0, 3
+        if not is_last:
+            e, held = _errors(kind, th, x, y, z, sigma, perspective, scratch, held)
+            scale, steps = middle_scale(e), 4
+        cost, used, held = refine(
+            kind, th, x, y, z, sigma, perspective, steps, scale, TRIM_SIGMAS, fixed, scratch, held
+        )
+        if is_last:
+            break
+        is_last = scale <= 1.05 or turn + 1 == rounds
+    kept = cost - (n - used) * TRIM_SIGMAS * TRIM_SIGMAS
+    return max(kept, 0.0) / max(used - FREEDOM[kind], 1), used / max(n, 1), cost
+
+
+@njit(cache=True, error_model="numpy")
+def _rough(kind, th, x, y, z, sigma, perspective, fixed, scratch):  # type: ignore[no-untyped-def]
+    """Moves `th` by a few robust steps; the sum of squared residuals then, each at most `ROUGH_LIMIT` squared."""
+    held, steps = _load(x, y, z, sigma, scratch[0]), 2
+    e, held = _errors(kind, th, x, y, z, sigma, perspective, scratch, held)
+    for _ in range(2):
+        scale = middle_scale(e)
+        _, _, held = refine(kind, th, x, y, z, sigma, perspective, steps, scale, TRIM_SIGMAS, fixed, scratch, held)
+        e, held = _errors(kind, th, x, y, z, sigma, perspective, scratch, held)
+        if scale < 1.5:
+            break
     cost = 0.0
-    for i in range(0, x.shape[0], stride):
-        cost += min(e[i] * e[i], limit * limit) if np.isfinite(e[i]) else limit * limit
+    for i in range(e.shape[0]):
+        cost += min(e[i] * e[i], ROUGH_LIMIT * ROUGH_LIMIT) if np.isfinite(e[i]) else ROUGH_LIMIT * ROUGH_LIMIT
     return cost
 
 
@@ -184,35 +292,23 @@ def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_sampl
     starts, start_kind, rough = np.zeros((6, SIZE)), np.full(6, -1), np.full(6, np.inf)
     if kinds[PLANE]:
         starts[0], start_kind[0] = start_plane(points), PLANE
-    if P.shape[0] >= 10:
-        if kinds[SPHERE] or kinds[QUADRIC]:
-            starts[1], ok = start_sphere(P, N)
-            start_kind[1] = SPHERE if ok else -1
-        for attempt in range(2):
-            axis = normal_axis(N, attempt == 1)
-            if kinds[CYLINDER]:
-                starts[2 + 2 * attempt], ok = start_cylinder(P, N, axis)
-                start_kind[2 + 2 * attempt] = CYLINDER if ok else -1
-            if kinds[CONE]:
-                starts[3 + 2 * attempt], ok = start_cone(P, N, axis)
-                start_kind[3 + 2 * attempt] = CONE if ok else -1
-    free = np.zeros(9, np.bool_)
+    if P.shape[0] >= 10 and (kinds[SPHERE] or kinds[QUADRIC]):
+        starts[1], ok = start_sphere(P, N)
+        start_kind[1] = SPHERE if ok else -1
+    free, scratch, rounds = np.zeros(9, np.bool_), new_scratch(), np.array([2, 2, 2, 2, 3])
+    last = np.int64(QUADRIC)  # no constant: `fit_robust` says why
     stride = max(1, n // ROUGH_SAMPLES)
     rx, ry, rz, rs = x[::stride].copy(), y[::stride].copy(), z[::stride].copy(), sigma[::stride].copy()
     best_rough = np.inf
     for k in range(6):
-        kind = start_kind[k]
-        if kind < 0 or (k >= 4 and best_rough < 1.3 * rx.shape[0] / correlated_samples):
-            continue  # the second axis is for components that the first cannot explain
-        th = starts[k].copy()
-        for _ in range(2):
-            scale = _middle_scale(kind, th, rx, ry, rz, rs, perspective)
-            th, _, _, _ = refine(kind, th, rx, ry, rz, rs, perspective, 2, scale, TRIM_SIGMAS, free)
-            if scale < 1.5:
-                break
-        starts[k] = th
-        rough[k] = trimmed_cost(kind, th, rx, ry, rz, rs, perspective, ROUGH_LIMIT, 1) / correlated_samples
-        best_rough = min(best_rough, rough[k])
+        if k == 4 and best_rough < 1.3 * rx.shape[0] / correlated_samples:
+            break  # the second axis is for components that the first cannot explain
+        if k in (2, 4) and P.shape[0] >= 10:
+            _start_along(P, N, k == 4, kinds, starts[k : k + 2], start_kind[k : k + 2])
+        if start_kind[k] >= 0:
+            cost = _rough(start_kind[k], starts[k], rx, ry, rz, rs, perspective, free, scratch)
+            rough[k] = cost / correlated_samples
+            best_rough = min(best_rough, rough[k])
     # A start that is clearly behind after the rough fit is not going to win.
     per_sample = rx.shape[0] / correlated_samples
     allowed = min(2.0 * best_rough + 0.5 * per_sample, give_up * per_sample)
@@ -220,7 +316,8 @@ def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_sampl
         kind = start_kind[k]
         if kind < 0 or rough[k] > allowed or not kinds[kind]:
             continue
-        th, _, m, share, cost = fit_robust(kind, starts[k].copy(), x, y, z, sigma, perspective, free, 2)
+        th = starts[k].copy()
+        m, share, cost = _robust(kind, th, x, y, z, sigma, perspective, free, rounds[kind], scratch)
         s = cost / correlated_samples + FREEDOM[kind] * price
         if s < score[kind] and _is_sane(kind, th):
             ths[kind], mean2[kind], kept[kind], score[kind] = th, m, share, s
@@ -229,11 +326,23 @@ def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_sampl
         simple = np.min(score)
         if simple > n / correlated_samples * QUADRIC_PER_SAMPLE:
             th = quadric_of_sphere(starts[1])
-            th, _, m, share, cost = fit_robust(QUADRIC, th, x, y, z, sigma, perspective, free, 3)
+            m, share, cost = _robust(last, th, x, y, z, sigma, perspective, free, rounds[last], scratch)
             if is_ellipsoid(th):
                 ths[QUADRIC], mean2[QUADRIC], kept[QUADRIC] = th, m, share
                 score[QUADRIC] = cost / correlated_samples + 9 * price
     return ths, mean2, kept, score
+
+
+@njit(cache=True, error_model="numpy")
+def _start_along(P, N, centred, kinds, starts, start_kind):  # type: ignore[no-untyped-def]
+    """Cylinder and cone along `normal_axis` into `starts` (2, SIZE), their kinds or -1 into `start_kind` (2,)."""
+    axis = normal_axis(N, centred)
+    if kinds[CYLINDER]:
+        starts[0], ok = start_cylinder(P, N, axis)
+        start_kind[0] = CYLINDER if ok else -1
+    if kinds[CONE]:
+        starts[1], ok = start_cone(P, N, axis)
+        start_kind[1] = CONE if ok else -1
 
 
 @njit(cache=True, error_model="numpy")

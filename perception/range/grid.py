@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from perception.range.components import for_each_tile
 from perception.range.noise import NoiseModel
 from perception.range.sensor import RangeSensorModel
+from perception.range.surfaces import LEAN
 from perception.range.tangents import tangent_planes
 
 Array = NDArray[np.float64]
@@ -145,7 +146,7 @@ def _radius(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float, size_px
     return WIDEST_RADIUS, sigma
 
 
-@njit(cache=True)
+@njit(cache=True, **LEAN)
 def sigma_at(noise, z):  # type: ignore[no-untyped-def]
     """Standard deviation of one pixel at depth z, metres; `noise` as `NoiseModel.packed`."""
     z2 = z * z
@@ -155,7 +156,7 @@ def sigma_at(noise, z):  # type: ignore[no-untyped-def]
     return np.sqrt(max(white * white, step * step / 12.0) + slow * slow)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def slow_share_at(noise, z):  # type: ignore[no-untyped-def]
     """Part of the variance at depth z that neighbouring pixels share; `noise` as `NoiseModel.packed`."""
     slow, sigma = noise[2] + noise[3] * z * z, sigma_at(noise, z)
@@ -218,7 +219,7 @@ def _blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: 
             sigma[r, c] = np.sqrt(kept + slow * slow)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def _median(depth, b, hop, r, c, values):  # type: ignore[no-untyped-def]
     """Lower median of a block's samples, a real value and never the empty middle of a jump; NaN if most are missing."""
     n = 0
@@ -235,7 +236,7 @@ def _median(depth, b, hop, r, c, values):  # type: ignore[no-untyped-def]
     return values[(n - 1) // 2] if n > 0 and 2 * n >= values.shape[0] else np.nan
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def _medians_of_four(upper, lower, b, out):  # type: ignore[no-untyped-def]
     """Lower medians of the corners of blocks of b x b pixels, by a sorting network, missing readings last."""
     for c in range(upper.shape[0] // b):

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from perception.range.starts import solve_positive
-from perception.range.surfaces import PLANE, depth_on, normal_on
+from perception.range.surfaces import LEAN, PLANE, depth_on, normal_on
 
 GROW_SIGMAS = 3.0
 CURVED_RMS = 0.4  # in sigmas: how much a quadratic may gain over a plane before the plane is a strip of something bent
@@ -59,7 +59,7 @@ def seed_order(normal, rms, free, reach):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, **LEAN)
 def solve3(S, out):  # type: ignore[no-untyped-def]
     """Coefficients (a, b, c) of g = a x + b y + c from sums (n, x, y, xx, xy, yy, g, xg, yg); False if degenerate."""
     n = S[0]
@@ -77,7 +77,7 @@ def solve3(S, out):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, **LEAN)
 def plane_from_coefficients(m, perspective, th):  # type: ignore[no-untyped-def]
     """PLANE parameters, normal towards the sensor, from g = a x + b y + c."""
     if perspective:
@@ -208,7 +208,7 @@ def _padded(x, y, z, sigma, normal, rms, free, perspective):  # type: ignore[no-
     return table, mark, across
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def _tangent(block, perspective, m):  # type: ignore[no-untyped-def]
     """Coefficients of the tangent plane of one row of the table into `m`; False where its ray grazes it."""
     x, y, nx, ny, nz = block[0], block[1], block[4], block[5], block[6]
@@ -223,7 +223,7 @@ def _tangent(block, perspective, m):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def _grown(table, mark, across, seed, stamp, sweep, m, th, perspective, cos_limit, queue, S):  # type: ignore[no-untyped-def]
     """Blocks connected to `seed` that the plane g = m . (x, y, 1) explains, into `queue`; returns how many.
 
@@ -288,7 +288,7 @@ def grow_surface(  # type: ignore[no-untyped-def]
     count, head, total = 0, 0, 0.0
     for k in range(seeds.shape[0]):
         j = seeds[k]
-        e2 = _explained(kind, th, fx[j], fy[j], fz[j], fs[j], fn[j], fr[j], perspective, cos_limit)
+        e2 = _explained(kind, th, fx[j], fy[j], fz[j], fs[j], fn, j, fr[j], perspective, cos_limit)
         if ff[j] and e2 >= 0.0 and mark[j] != stamp:
             mark[j] = stamp
             queue[count] = j
@@ -306,7 +306,7 @@ def grow_surface(  # type: ignore[no-untyped-def]
             j = rr * w + cc
             if mark[j] == stamp or not ff[j]:
                 continue
-            e2 = _explained(kind, th, fx[j], fy[j], fz[j], fs[j], fn[j], fr[j], perspective, cos_limit)
+            e2 = _explained(kind, th, fx[j], fy[j], fz[j], fs[j], fn, j, fr[j], perspective, cos_limit)
             if e2 < 0.0:
                 continue
             mark[j] = stamp
@@ -316,9 +316,9 @@ def grow_surface(  # type: ignore[no-untyped-def]
     return count, total
 
 
-@njit(cache=True)
-def _explained(kind, th, x, y, z, sigma, n, rms, perspective, cos_limit):  # type: ignore[no-untyped-def]
-    """Squared residual in sigmas (eased where grazing) if the surface explains the block, else -1."""
+@njit(cache=True, **LEAN)
+def _explained(kind, th, x, y, z, sigma, normals, j, rms, perspective, cos_limit):  # type: ignore[no-untyped-def]
+    """Squared residual in sigmas (eased where grazing) if the surface explains the block, whose normal is the j-th, else -1."""
     zm = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(zm):
         return -1.0
@@ -332,7 +332,7 @@ def _explained(kind, th, x, y, z, sigma, n, rms, perspective, cos_limit):  # typ
     if abs(e) > limit:
         return -1.0
     if rms < 1.8 and kind != PLANE:
-        turn = nx * n[0] + ny * n[1] + nz * n[2]
+        turn = nx * normals[j, 0] + ny * normals[j, 1] + nz * normals[j, 2]
         if facing > 0.0:
             turn = -turn
         if turn < cos_limit:

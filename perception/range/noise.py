@@ -162,28 +162,35 @@ def _window_law(g: Array, perspective: bool, *, spacing_px: int, stride_px: int)
 
 def _fit_law(z2: Array, values: Array) -> tuple[float, float]:
     """Non-negative `a + b z^2` through the values, relative errors weighed, robust to a bin without a clean window."""
-    typical = float(np.median(values))
+    a, b = _law_through(z2, values)
+    return float(a), float(b)
+
+
+@njit(cache=True, error_model="numpy")
+def _law_through(z2, values):  # type: ignore[no-untyped-def]
+    typical = np.median(values)
     if typical <= 0.0:
-        return float(np.mean(values)), 0.0
+        return np.mean(values), 0.0
     w = 1.0 / np.maximum(values, 0.1 * typical)
     a, b = typical, 0.0
     for _ in range(3):
         a, b = _two_non_negative(w, w * z2, w * values)
-        law = a + b * z2
-        # A bin far above the law is busy, not noisy.
-        w = np.where(values > 1.5 * law, 0.25 * w, w)
+        for i in range(w.shape[0]):
+            # A bin far above the law is busy, not noisy.
+            w[i] *= 0.25 if values[i] > 1.5 * (a + b * z2[i]) else 1.0
     return a, b
 
 
-def _two_non_negative(p: Array, q: Array, y: Array) -> tuple[float, float]:
+@njit(cache=True, error_model="numpy")
+def _two_non_negative(p, q, y):  # type: ignore[no-untyped-def]
     """Least squares `y = a p + b q` with a, b >= 0: the free solution, or the better of the two edges."""
-    pp, qq, pq, py, qy = (float(a @ b) for a, b in ((p, p), (q, q), (p, q), (p, y), (q, y)))
+    pp, qq, pq, py, qy = np.sum(p * p), np.sum(q * q), np.sum(p * q), np.sum(p * y), np.sum(q * y)
     det = pp * qq - pq * pq
     if det > 1e-9 * pp * qq:
         a, b = (qq * py - pq * qy) / det, (pp * qy - pq * py) / det
         if a >= 0.0 and b >= 0.0:
             return a, b
-    only_a, only_b = float(max(py / pp, 0.0)), float(max(qy / qq, 0.0))
+    only_a, only_b = max(py / pp, 0.0), max(qy / qq, 0.0)
     if only_a * py >= only_b * qy:
         return only_a, 0.0
     return 0.0, only_b

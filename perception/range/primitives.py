@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from perception.range.surfaces import CONE, CYLINDER, PLANE, QUADRIC, SPHERE, frame_of
+from perception.range.starts import principal_axes
+from perception.range.surfaces import CONE, CYLINDER, PLANE, QUADRIC, SIZE, SPHERE, frame_of, step_into
 
 Array = NDArray[np.float64]
 
@@ -165,20 +167,39 @@ def named_covariance(kind: int, th: Array, covariance: Array) -> Array:
     if kind != QUADRIC:
         return covariance
     # Ellipsoids are fitted as coefficients; centre and radii follow by finite differences.
-    J = np.empty((6, 9))
     step = np.sqrt(np.maximum(np.diag(covariance), 1e-20)) * 0.1
-    for k in range(9):
-        delta = np.zeros(9)
-        delta[k] = step[k]
-        J[:, k] = (_centre_and_radii(th, delta) - _centre_and_radii(th, -delta)) / (2.0 * step[k])
+    J = _shape_jacobian(th, step)
     return np.asarray(J @ covariance @ J.T)
 
 
-def _centre_and_radii(th: Array, delta: Array) -> Array:
-    moved = th.copy()
-    moved[4] += delta[0]
-    moved[5] += delta[1]
-    moved[6] -= delta[0] + delta[1]
-    moved[7:14] += delta[2:]
-    e = ellipsoid_of(moved)
-    return np.concatenate([e.centre_m, e.radii_m])
+@njit(cache=True, error_model="numpy")
+def _shape_jacobian(th, step):  # type: ignore[no-untyped-def]
+    """(6, 9) central differences of centre and radii over the tangent parameters of a QUADRIC, `step` (9,) each way."""
+    J, delta, frame = np.empty((6, 9)), np.zeros(9), np.zeros(6)
+    before, after = np.empty(SIZE), np.empty(SIZE)
+    for k in range(9):
+        delta[k] = step[k]
+        step_into(QUADRIC, th, frame, delta, after)
+        delta[k] = -step[k]
+        step_into(QUADRIC, th, frame, delta, before)
+        delta[k] = 0.0
+        J[:, k] = (centre_and_radii(after) - centre_and_radii(before)) / (2.0 * step[k])
+    return J
+
+
+@njit(cache=True, error_model="numpy")
+def centre_and_radii(th):  # type: ignore[no-untyped-def]
+    """(6,) centre and radii of a QUADRIC, as `ellipsoid_of`."""
+    A = np.array(
+        [[th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]]
+    )
+    values, vectors = principal_axes(A)
+    out, level = th[:6].copy(), -th[13]
+    for k in range(3):
+        t = 0.5 * (vectors[0, k] * th[10] + vectors[1, k] * th[11] + vectors[2, k] * th[12])
+        level += t * t / values[k]
+        for a in range(3):
+            out[a] -= th[3] * vectors[a, k] * t / values[k]
+    for k in range(3):
+        out[3 + k] = th[3] * np.sqrt(max(level / values[k], 0.0))
+    return out

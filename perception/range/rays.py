@@ -10,36 +10,44 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from perception.range.surfaces import CONE, CYLINDER, FREEDOM, GRAZING_COSINE, PLANE, SPHERE, frame_of
+from perception.range.surfaces import CONE, CYLINDER, FREEDOM, GRAZING_COSINE, LEAN, PLANE, SPHERE, frame_of
 
-CHUNK = 128
-ROWS = [row * CHUNK for row in range(17)]  # where each row of the scratch array begins
+CHUNK = 160  # what `merge` fits at once
+ROWS = [row * CHUNK for row in range(18)]  # where each row of the scratch array begins
 DEPTH, COSINE = ROWS[:2]
 D0, D1, D2, D3, D4, D5, D6, D7, D8 = ROWS[2:11]  # derivatives of depth by the surface's free directions
 WEIGHT, RESIDUAL = ROWS[11:13]
-X, Y, Z, SIGMA = ROWS[13:]  # the samples
+X, Y, Z, SIGMA = ROWS[13:17]  # the samples
+ERROR = ROWS[17]  # residuals before they are weighed; NaN where a ray misses
 SCRATCH = len(ROWS) * CHUNK
 LANES = 16  # rows are padded with zeros to this many samples: sums then need no remainder loop
 MISS_SIGMAS = 6.0  # a ray that misses the surface costs as much as a residual of this size
 CAUCHY_WIDTH = 2.0
 FARTHEST = 1e15  # sigmas; eight squares of it still multiply to a finite number
+# What `work` holds already: the samples, row ERROR of the surface, all of its rows.
+NOTHING, LOADED, ERRED, FILLED = range(4)
 LOOSE = {"reassoc", "contract", "nsz", "arcp"}  # sums may be reordered; NaN keeps its meaning
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def load_rows(x, y, z, sigma, first, n, work):  # type: ignore[no-untyped-def]
     """Samples first .. first + n into `work`.
 
-    Loops that read and write several arrays ask at run time whether these may overlap, and round otherwise when they lie
+    Loops that compute from several arrays ask at run time whether these may overlap, and round otherwise when they lie
     side by side in memory. Within one array at fixed places there is nothing to ask: the same input, the same bits.
     """
-    work[X : X + n] = x[first : first + n]
-    work[Y : Y + n] = y[first : first + n]
-    work[Z : Z + n] = z[first : first + n]
-    work[SIGMA : SIGMA + n] = sigma[first : first + n]
+    x, y, z, sigma = x[first:], y[first:], z[first:], sigma[first:]
+    for i in range(n):
+        work[X + i] = x[i]
+    for i in range(n):
+        work[Y + i] = y[i]
+    for i in range(n):
+        work[Z + i] = z[i]
+    for i in range(n):
+        work[SIGMA + i] = sigma[i]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def fill_rows(kind, th, frame, n, perspective, work):  # type: ignore[no-untyped-def]
     """Depth, cosine of incidence and derivatives (as `depth_and_jacobian`) of the `n` loaded samples into `work`.
 
@@ -58,7 +66,7 @@ def fill_rows(kind, th, frame, n, perspective, work):  # type: ignore[no-untyped
         _quadric(th, n, p, work)
 
 
-@njit(cache=True, error_model="numpy", fastmath=LOOSE)
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
 def _plane(th, frame, n, p, work):  # type: ignore[no-untyped-def]
     nx, ny, nz, d = th[0], th[1], th[2], th[3]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
@@ -77,7 +85,7 @@ def _plane(th, frame, n, p, work):  # type: ignore[no-untyped-def]
         work[D2 + i] = -k
 
 
-@njit(cache=True, error_model="numpy", fastmath=LOOSE)
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
 def _sphere(th, n, p, work):  # type: ignore[no-untyped-def]
     cx, cy, cz, r = th[0], th[1], th[2], th[3]
     side = 1.0 if th[4] > 0 else -1.0
@@ -101,7 +109,7 @@ def _sphere(th, n, p, work):  # type: ignore[no-untyped-def]
         work[D3 + i] = k
 
 
-@njit(cache=True, error_model="numpy", fastmath=LOOSE)
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
 def _cylinder(th, frame, n, p, work):  # type: ignore[no-untyped-def]
     cx, cy, cz, ax, ay, az, r = th[0], th[1], th[2], th[3], th[4], th[5], th[6]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
@@ -135,7 +143,7 @@ def _cylinder(th, frame, n, p, work):  # type: ignore[no-untyped-def]
         work[D4 + i] = k
 
 
-@njit(cache=True, error_model="numpy", fastmath=LOOSE)
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
 def _cone(th, frame, n, p, work):  # type: ignore[no-untyped-def]
     cx, cy, cz, ax, ay, az = th[0], th[1], th[2], th[3], th[4], th[5]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
@@ -178,7 +186,7 @@ def _cone(th, frame, n, p, work):  # type: ignore[no-untyped-def]
         work[D5 + i] = -k * (rho * sa + h * ca)
 
 
-@njit(cache=True, error_model="numpy", fastmath=LOOSE)
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
 def _quadric(th, n, p, work):  # type: ignore[no-untyped-def]
     s = 1.0 / th[3]
     cx, cy, cz = th[0] * s, th[1] * s, th[2] * s
@@ -225,14 +233,15 @@ def _quadric(th, n, p, work):  # type: ignore[no-untyped-def]
         work[D8 + i] = k
 
 
-@njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def _residual_row(n, work):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
+def error_row(n, work):  # type: ignore[no-untyped-def]
+    """Row ERROR of the filled rows: residuals in sigmas, lessened at grazing rays; NaN where the ray misses."""
     for i in range(n):
-        grazing = min(1.0, work[COSINE + i] * (1.0 / GRAZING_COSINE))
-        work[RESIDUAL + i] = (work[Z + i] - work[DEPTH + i]) * grazing / work[SIGMA + i]
+        w = min(1.0, work[COSINE + i] * (1.0 / GRAZING_COSINE)) / work[SIGMA + i]
+        work[ERROR + i] = (work[Z + i] - work[DEPTH + i]) * w
 
 
-@njit(cache=True, error_model="numpy", fastmath=LOOSE)
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
 def _cauchy_weights(n, c2, work):  # type: ignore[no-untyped-def]
     """Rows WEIGHT and RESIDUAL under Cauchy weights, 1 + ratio in row DEPTH; returns the number of samples that hit."""
     used = 0.0
@@ -240,6 +249,7 @@ def _cauchy_weights(n, c2, work):  # type: ignore[no-untyped-def]
         zm = work[DEPTH + i]
         w = min(1.0, work[COSINE + i] * (1.0 / GRAZING_COSINE)) / work[SIGMA + i]
         e = (work[Z + i] - zm) * w
+        work[ERROR + i] = e
         hit = abs(e) < FARTHEST
         e2 = e * e if hit else MISS_SIGMAS * MISS_SIGMAS
         ratio = 1.0 + e2 / c2
@@ -251,7 +261,7 @@ def _cauchy_weights(n, c2, work):  # type: ignore[no-untyped-def]
     return used
 
 
-@njit(cache=True, error_model="numpy", fastmath=LOOSE)
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
 def _sum_of_logarithms(values):  # type: ignore[no-untyped-def]
     """Sum of ln(values): the logarithm of a product of eight is one logarithm in place of eight."""
     total = 0.0
@@ -265,7 +275,7 @@ def _sum_of_logarithms(values):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, error_model="numpy", fastmath=LOOSE)
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
 def _trim_weights(n, trim, work):  # type: ignore[no-untyped-def]
     """Rows WEIGHT and RESIDUAL under a trim; returns cost and number of samples kept."""
     used, cost = 0.0, 0.0
@@ -273,6 +283,7 @@ def _trim_weights(n, trim, work):  # type: ignore[no-untyped-def]
         zm = work[DEPTH + i]
         w = min(1.0, work[COSINE + i] * (1.0 / GRAZING_COSINE)) / work[SIGMA + i]
         e = (work[Z + i] - zm) * w
+        work[ERROR + i] = e
         kept = abs(e) <= trim
         cost += e * e if kept else trim * trim
         work[WEIGHT + i] = w if kept else 0.0
@@ -281,7 +292,7 @@ def _trim_weights(n, trim, work):  # type: ignore[no-untyped-def]
     return cost, used
 
 
-@njit(cache=True, error_model="numpy", fastmath=LOOSE)
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
 def _dot(a, b):  # type: ignore[no-untyped-def]
     total = 0.0
     for i in range(a.shape[0]):
@@ -289,13 +300,13 @@ def _dot(a, b):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, error_model="numpy", fastmath=LOOSE)
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
 def _weighted(row, weight):  # type: ignore[no-untyped-def]
     for i in range(row.shape[0]):
         row[i] = row[i] * weight[i] if weight[i] > 0.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def _add_products(p, n, work, H, g):  # type: ignore[no-untyped-def]
     """Add J' W J to the lower triangle of `H` and J' W e to `g` from the rows of one chunk."""
     padded = (n + LANES - 1) // LANES * LANES
@@ -310,11 +321,14 @@ def _add_products(p, n, work, H, g):  # type: ignore[no-untyped-def]
             H[a, b] += _dot(mine, work[D0 + b * CHUNK : D0 + b * CHUNK + padded])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def normal_equations(kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g, work):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy", **LEAN, nogil=True)
+def normal_equations(  # type: ignore[no-untyped-def]
+    kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g, work, held
+):
     """Gauss-Newton matrix `H` (9, 9) and gradient `g` (9,) of the ray residuals of samples (N,); cost and used samples.
 
-    `scale` > 0: Cauchy weights of that width in sigmas; 0: samples beyond `trim` sigmas are left out.
+    `scale` > 0: Cauchy weights of that width in sigmas; 0: samples beyond `trim` sigmas are left out. `held`: what `work`
+    holds already of at most CHUNK samples; afterwards it holds the samples and row ERROR.
     """
     p = FREEDOM[kind]
     H[:] = 0.0
@@ -324,8 +338,10 @@ def normal_equations(kind, th, frame, x, y, z, sigma, perspective, scale, trim, 
     count = x.shape[0]
     for first in range(0, count, CHUNK):
         n = min(CHUNK, count - first)
-        load_rows(x, y, z, sigma, first, n, work)
-        fill_rows(kind, th, frame, n, perspective, work)
+        if held == NOTHING:
+            load_rows(x, y, z, sigma, first, n, work)
+        if held != FILLED:
+            fill_rows(kind, th, frame, n, perspective, work)
         if scale > 0.0:
             hits = _cauchy_weights(n, c2, work)
             more = c2 * _sum_of_logarithms(work[:n])
@@ -350,5 +366,6 @@ def residuals(kind, th, x, y, z, sigma, perspective, out):  # type: ignore[no-un
         n = min(CHUNK, count - first)
         load_rows(x, y, z, sigma, first, n, work)
         fill_rows(kind, th, frame, n, perspective, work)
-        _residual_row(n, work)
-        out[first : first + n] = work[RESIDUAL : RESIDUAL + n]
+        error_row(n, work)
+        for i in range(n):
+            out[first + i] = work[ERROR + i]

@@ -53,7 +53,7 @@ class Regions:
         """The regions after label k has gone to `owner[k - 1]`."""
         if owner == list(range(1, len(owner) + 1)):
             return self
-        labels = np.array([0, *owner], np.int32)[self.labels]
+        labels = renamed(self.labels, np.array([0, *owner], np.int32))
         return regions_of(self.depth_m, self.packed, self.law, labels, len(owner))
 
 
@@ -61,6 +61,16 @@ def regions_of(depth_m: Array, packed: Array, law: Array, labels: Labels, count:
     """The pixels of labels 1 to `count`."""
     starts, indices = bucket(labels, count)
     return Regions(depth_m=depth_m, packed=packed, law=law, labels=labels, starts=starts, indices=indices)
+
+
+@njit(cache=True, nogil=True)
+def renamed(labels, names):  # type: ignore[no-untyped-def]
+    """(H, W) labels after k is called `names[k]`."""
+    out = np.empty_like(labels)
+    flat, new = labels.ravel(), out.ravel()
+    for i in range(flat.shape[0]):
+        new[i] = names[flat[i]]
+    return out
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -14,7 +14,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +22,7 @@ from perception.range.claim import bucket, claim_borders, claim_pixels
 from perception.range.compete import Candidates, explain
 from perception.range.components import for_each_tile, label_components
 from perception.range.grid import Grid, block_size, build_grid, seen_from
+from perception.range.left_over import unexplained
 from perception.range.noise import WORST_SHARE, NoiseModel
 from perception.range.sensor import RangeSensorModel
 from perception.range.settle import settle
@@ -132,25 +132,6 @@ def _finer(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, 
     inside = labels[top : top + left_over.shape[0], left : left + left_over.shape[1]]
     inside[:] = np.where(inside > 0, inside, _claimed(part, noise, blocks, found, size=size))
     return _reclaimed(task, noise, labels, found, newest=before + 1)
-
-
-def unexplained(
-    depth_m: Array, labels: Labels, least_pixels: int, *, align_px: int
-) -> tuple[tuple[int, int], Array] | None:
-    """The least part of the image that holds every unlabelled patch of at least `least_pixels`, None without any.
-
-    Returns its first row and column, multiples of `align_px`, and its depth, NaN outside of those patches.
-    """
-    free = (labels == 0) & np.isfinite(depth_m)
-    _, patch, boxes, _ = cv2.connectedComponentsWithStats(free.view(np.uint8), connectivity=8)
-    large = boxes[:, cv2.CC_STAT_AREA] >= least_pixels
-    large[0] = False
-    if not large.any():
-        return None
-    left, top, width, height = (boxes[large, k] for k in range(4))
-    first_row, first_column = (int(n.min()) // align_px * align_px for n in (top, left))
-    part = np.s_[first_row : int((top + height).max()), first_column : int((left + width).max())]
-    return (first_row, first_column), np.where(large[patch[part]], depth_m[part], np.nan)
 
 
 def _claimed(task: Task, noise: NoiseModel, blocks: Labels, found: Candidates, *, size: int) -> Labels:

@@ -12,6 +12,7 @@ from numba import njit
 
 from perception.range.claim import CLAIM_SIGMAS, NO_LABEL, PLAIN_SIGMAS, add_row, contested, misfit_of
 from perception.range.grid import sigma_at
+from perception.range.surfaces import LEAN
 
 REACH_PX = 2  # neighbours of 5 x 5
 SHARED_PX = 25.0  # they share one value of the slow noise
@@ -56,7 +57,7 @@ def settle(depth, sen, noise, slow_share, earlier, labels, kinds, ths, out, top,
                         out[v, u] = _best(depth, sen, noise, evidence, labels, v, u, kinds, ths, near, votes)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def _differ(a, b):  # type: ignore[no-untyped-def]
     """Whether two rows differ, without a branch a pixel."""
     change = np.int32(0)
@@ -65,7 +66,7 @@ def _differ(a, b):  # type: ignore[no-untyped-def]
     return change != 0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def _best(depth, sen, noise, evidence, labels, v, u, kinds, ths, near, votes):  # type: ignore[no-untyped-def]
     """The label of one pixel, its own where no other touches it; `near` and `votes` (MOST,) are scratch."""
     own, z = labels[v, u], depth[v, u]
@@ -92,7 +93,7 @@ def _best(depth, sen, noise, evidence, labels, v, u, kinds, ths, near, votes):  
     return label
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def _beside(labels, v, u):  # type: ignore[no-untyped-def]
     """How many of the eight neighbours bear the pixel's own label, and how many another one."""
     H, W = labels.shape
@@ -106,7 +107,7 @@ def _beside(labels, v, u):  # type: ignore[no-untyped-def]
     return same, other
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def _counted(labels, v, u, near, votes):  # type: ignore[no-untyped-def]
     """Labels of the neighbours into `near`, how many bear each into `votes`; their number, and that of neighbours."""
     H, W = labels.shape

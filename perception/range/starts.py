@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from perception.range.surfaces import SIZE, tangent_frame
+from perception.range.surfaces import LEAN, SIZE, tangent_frame
 
 MOST_SWEEPS = 12  # of Jacobi rotations; a 3x3 matrix settles in four or five
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def solve_positive(A, b, p):  # type: ignore[no-untyped-def]
     """Solve A x = b by Cholesky, overwriting both; False when A is not positive definite."""
     for i in range(p):

@@ -10,10 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perception.range import claim, finish
+from perception.range.fit import PER_MEDIAN, middle_scale
 from perception.range.noise import NoiseModel
+from perception.range.primitives import centre_and_radii, ellipsoid_of, named_covariance
+from perception.range.rays import MISS_SIGMAS
 from perception.range.regions import regions_of
 from perception.range.starts import principal_axes
-from perception.range.surfaces import CYLINDER, PLANE, SIZE, SPHERE
+from perception.range.surfaces import CYLINDER, PLANE, QUADRIC, SIZE, SPHERE
 from tests.perception.range.scenes import PARALLEL, PINHOLE
 
 NOISE = NoiseModel(white=(0.0005, 0.0002), correlated=(0.0, 0.0003), step=(0.0004, 0.0))
@@ -132,6 +135,35 @@ def test_principal_axes_are_those_of_lapack(seed, rank, size):
     np.testing.assert_allclose(values, np.linalg.eigvalsh(S), atol=1e-13 * np.trace(S))
     np.testing.assert_allclose(vectors @ vectors.T, np.eye(3), atol=1e-13)
     np.testing.assert_allclose(S @ vectors, vectors * values, atol=1e-13 * np.trace(S))
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10**6), size=st.integers(1, 40), wide=st.sampled_from([0.3, 1.0, 4.0]))
+def test_the_middle_scale_is_that_of_numpys_median(seed, size, wide):
+    rng = np.random.default_rng(seed)
+    e = np.round(wide * rng.normal(size=size), 1)
+    e[rng.random(size) < 0.1] = np.nan
+    median = np.median(np.abs(np.nan_to_num(e, nan=MISS_SIGMAS)))
+    assert middle_scale(e) == pytest.approx(max(1.0, PER_MEDIAN * median), rel=1e-15)
+
+
+def test_an_ellipsoids_shape_and_its_covariance_are_those_of_plain_differences():
+    th = np.zeros(SIZE)
+    th[:14] = [0.1, -0.05, 0.6, 0.08, 1.0, 0.7, 1.3, 0.1, -0.05, 0.2, 0.02, -0.03, 0.01, -0.9]
+
+    def shape(q):
+        moved = th.copy()
+        moved[4:7] += [q[0], q[1], -q[0] - q[1]]
+        moved[7:14] += q[2:]
+        e = ellipsoid_of(moved)
+        return np.concatenate([e.centre_m, e.radii_m])
+
+    np.testing.assert_allclose(centre_and_radii(th), shape(np.zeros(9)), rtol=1e-12)
+    J = np.stack([(shape(1e-5 * q) - shape(-1e-5 * q)) / 2e-5 for q in np.eye(9)], axis=1)
+    root = np.random.default_rng(4).normal(size=(9, 9)) * 1e-3
+    np.testing.assert_allclose(
+        named_covariance(QUADRIC, th, root @ root.T), J @ root @ root.T @ J.T, rtol=1e-3, atol=1e-12
+    )
 
 
 def test_a_sphere_is_refined_to_its_bound_and_its_covariance_is_the_inverse_information():

@@ -31,6 +31,7 @@ MARGIN = 0.09  # share of the smaller side that a frame may take
 WORK_ROWS = 64  # a window is read with so many rows: a stroke is 4 px wide then
 MOST_CELLS = 8  # of a display that nobody has counted
 CELL_COST = 0.008  # a comb with one more cell must explain that much more
+FITS = 12.0  # nats a character whose segments' levels agree: nothing fits better
 SAME_COMB = 0.05  # of the digit height
 WORTH_WEIGHT = 8.0  # nats a character that a comb of e times the worth may fit worse
 TEMPERATURE = 2.0  # what is wrong with one segment is wrong with its neighbours too: they count half
@@ -122,13 +123,20 @@ def _decoded(
     combs = find_combs(ink, seen, most=most, free=KNOWN_FREE if digits else FREE)
     if not seen.all():
         combs = [(worth, with_hidden_ends(seen, comb, most)) for worth, comb in combs]
-    if len(combs) == 2 and _same(combs[0][1], combs[1][1]):
-        combs.pop()
-    found = [(worth, d) for worth, comb in combs if (d := decode(ink, seen, comb, all_cells=digits is not None))]
-    if not found:
-        return None
-    # A comb that is too high claims ink by its size that it has not: its segments' levels do not agree.
-    return max(found, key=lambda f: f[1].fit + WORTH_WEIGHT * np.log(f[0] / found[0][0]))[1]
+    best: Decoded | None = None
+    most_worth = score = 0.0
+    for worth, comb in combs:
+        if best is not None and (best.fit > FITS or _same(best.comb, comb)):
+            break
+        decoded = decode(ink, seen, comb, all_cells=digits is not None)
+        if decoded is None:
+            continue
+        most_worth = most_worth or worth
+        # A comb that is too high claims ink by its size that it has not: its segments' levels do not agree.
+        this = decoded.fit + WORTH_WEIGHT * float(np.log(worth / most_worth))
+        if best is None or this > score:
+            best, score = decoded, this
+    return best
 
 
 def _same(a: Comb, b: Comb) -> bool:

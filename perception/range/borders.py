@@ -88,6 +88,9 @@ def _contacts(labels, gap):  # type: ignore[no-untyped-def]
             label = labels[v, u]
             if label == 0:
                 continue
+            if left == label and above[u] == label:
+                left_at, above_at[u] = u, v  # the inside of a region: nearly every pixel
+                continue
             for side in range(2):
                 other, at = (left, u - left_at) if side == 0 else (above[u], v - above_at[u])
                 if other == label:

@@ -16,11 +16,18 @@ def main() -> None:
         raise SystemExit(2)
     from hal.errors import CellError
     from service.commands.leaving import leave
+    from service.errors import of_file
 
     try:
         _app()()
     except CellError as error:
         sys.stderr.write(error.for_people() + "\n")
+        leave(2)
+    except OSError as error:  # a folder that is not there, a right that is missing, a disk that is full
+        known = of_file(error)
+        if known is None:
+            raise
+        sys.stderr.write(known.for_people() + "\n")
         leave(2)
     except KeyboardInterrupt:
         raise SystemExit(130) from None

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
 
-from hal.errors import CellError, DeviceUnavailable, Retry
+from hal.errors import CellError, ConfigError, DeviceUnavailable, Retry
 
 DEFAULT_URL = "http://127.0.0.1:8460"
 FINAL = ("succeeded", "failed", "cancelled")
@@ -50,17 +50,18 @@ class Client:
 
         Raises:
             ApiError: the service answered with a problem.
+            ConfigError: the address is none, or something else answers there.
             DeviceUnavailable: nobody answers there.
         """
-        return json.loads(self.fetch("GET", path))
+        return _json(self.fetch("GET", path))
 
     def post(self, path: str, body: Any = None, *, headers: dict[str, str] | None = None) -> Any:
         """The JSON answer to a POST; errors as for `get`."""
-        return json.loads(self.fetch("POST", path, body, headers=headers))
+        return _json(self.fetch("POST", path, body, headers=headers))
 
     def put(self, path: str, body: Any) -> Any:
         """The JSON answer to a PUT; errors as for `get`."""
-        return json.loads(self.fetch("PUT", path, body))
+        return _json(self.fetch("PUT", path, body))
 
     def fetch(self, method: str, path: str, body: Any = None, *, headers: dict[str, str] | None = None) -> bytes:
         """The raw answer; errors as for `get`."""
@@ -101,8 +102,7 @@ class Client:
     def _ask(
         self, method: str, path: str, body: Any, headers: dict[str, str]
     ) -> tuple[http.client.HTTPConnection, http.client.HTTPResponse]:
-        parts = urlsplit(self.url)
-        connection = http.client.HTTPConnection(parts.hostname or "127.0.0.1", parts.port, timeout=self.timeout_s)
+        connection = http.client.HTTPConnection(*self._address(), timeout=self.timeout_s)
         data = None if body is None else json.dumps(body)
         typed = headers if data is None else {**headers, "Content-Type": "application/json"}
         try:
@@ -112,11 +112,30 @@ class Client:
             connection.close()
             raise self._lost(error) from error
 
+    def _address(self) -> tuple[str, int | None]:
+        parts = urlsplit(self.url if "//" in self.url else f"//{self.url}", scheme="http")  # as curl takes it
+        try:
+            host, port = parts.hostname, parts.port
+        except ValueError:
+            host = port = None
+        if host is None or parts.scheme != "http":
+            raise ConfigError(f"{self.url!r} is no address of a service", hint=f"for example {DEFAULT_URL}")
+        return host, port
+
     def _lost(self, error: Exception) -> DeviceUnavailable:
         return DeviceUnavailable(
             f"no panelwright answers at {self.url} ({type(error).__name__})",
             hint="start one with `panelwright serve`, or name its address with --url",
         )
+
+
+def _json(data: bytes) -> Any:
+    try:
+        return json.loads(data)
+    except ValueError:
+        raise ConfigError(
+            "what answers there is no panelwright", hint="`panelwright serve` prints the address of its API"
+        ) from None
 
 
 def _problem(data: bytes, status: int) -> dict[str, Any]:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+
 from hal.errors import CellError, InvalidRequest, LeaseError, Retry
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
 class Busy(CellError):
@@ -39,3 +43,17 @@ class JournalError(CellError):
 
 class Defect(CellError):
     """A fault in our own program; the text names what failed, the log has the rest."""
+
+
+def of_file(error: OSError) -> CellError | None:
+    """What an error of the file system says to a person; None when it is about something else.
+
+    A write to a full disk names no file, an open or a `mkdir` does.
+    """
+    if error.filename is None and error.errno not in FULL:
+        return None
+    where = "the disk" if error.filename is None else str(error.filename)
+    return NotPossibleNow(
+        f"{where} cannot be used: {error.strerror or error}",
+        hint="name a file in a folder that exists and may be written to, on a disk with room",
+    )

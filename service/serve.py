@@ -50,7 +50,7 @@ class Panelwright:
         self.port: int = listener.getsockname()[1]
         stop_port = options.stop_port if options.stop_port is not None else (options.port and self.port + 1)
         try:
-            stop_listener = bound_socket(options.host, stop_port)
+            stop_listener = bound_socket(options.host, stop_port, option="--stop-port")
         except CellError:
             listener.close()
             raise
@@ -89,6 +89,11 @@ class Panelwright:
     def error(self) -> CellError | None:
         """Why the cell could not start."""
         return self._error
+
+    @property
+    def is_ending(self) -> bool:
+        """Whether it was told to end, perhaps before it was up."""
+        return self._is_ending.is_set()
 
     def start(self) -> None:
         """Start the server in a thread and the cell, and wait until both are up.

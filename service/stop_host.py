@@ -152,8 +152,8 @@ def _any_port() -> socket.socket:
     return bound_socket("127.0.0.1", 0)
 
 
-def bound_socket(host: str, port: int) -> socket.socket:
-    """A bound TCP socket; `port` 0 takes any free one.
+def bound_socket(host: str, port: int, *, option: str = "--port") -> socket.socket:
+    """A bound TCP socket; `port` 0 takes any free one. `option` is what chooses another.
 
     Raises:
         ConfigError: the port is taken or may not be used.
@@ -167,7 +167,7 @@ def bound_socket(host: str, port: int) -> socket.socket:
         listener.close()
         raise ConfigError(
             f"port {port} on {host} cannot be used: {error.strerror or error}",
-            hint="another panelwright may run; end it or choose another --port",
+            hint=f"another panelwright may run; end it or choose another {option}",
             port=port,
         ) from error
     return listener

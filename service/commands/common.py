@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,7 +16,10 @@ if TYPE_CHECKING:
     from hal.config import Cell  # imports scipy: a client's command shall not wait for that
 
 ROOT = Path(__file__).parents[2]
-console = Console(highlight=False, soft_wrap=True)
+LOG_WIDTH = 160  # where there is no terminal: a table cut at 80 columns loses the names of the devices
+console = Console(
+    highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else LOG_WIDTH
+)
 
 Url = Annotated[str, typer.Option("--url", help="Address of a running service.", show_default=True)]
 CellOption = Annotated[

@@ -31,7 +31,7 @@ def demo(
     """Run the whole mission and leave a report; exit code 1 when an action was not confirmed."""
     from service.serve import Options, Panelwright, exit_on_sigterm
 
-    started_s = time.monotonic()
+    started_s, since_unix_s = time.monotonic(), time.time()
     loaded = read_cell(cell, seed)
     exit_on_sigterm()
     panelwright = Panelwright(loaded, Options(port=port, runs_dir=runs, inline=inline))
@@ -46,6 +46,8 @@ def demo(
         code = 130
     finally:
         panelwright.close()
+    if code == 130:
+        _tell_what_is_left(runs, since_unix_s)
     console.print(f"{time.monotonic() - started_s:.1f} s in all")
     leave(code)
 
@@ -68,6 +70,13 @@ def _mission(client: Client, runs: Path, *, judge: bool) -> bool:
     lag_s = client.get("/v1/info")["event_loop_lag_p99_s"]
     console.print(f"event-loop lag of the last minute: {1e3 * lag_s:.1f} ms (p99)")
     return bool(result["succeeded"])
+
+
+def _tell_what_is_left(runs: Path, since_unix_s: float) -> None:
+    """A mission that was broken off has a report of what it had measured."""
+    for report in runs.glob("*/report.html"):
+        if report.stat().st_mtime >= since_unix_s:
+            console.print(f"report of what was measured: [bold]{report}[/]")
 
 
 def _actions(actions: list[dict[str, Any]]) -> Table:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,10 +13,10 @@ import typer
 from rich.console import Console
 from rich.live import Live
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from hal.errors import CellError, ConfigError
-from service.client import ApiError, Client
+from service.client import Client
 from service.commands.common import Url, UrlDefault, client_of, console, find_cell
 
 if TYPE_CHECKING:
@@ -55,6 +56,8 @@ def read_device(
 ) -> None:
     """Read a device of the running service or, with --cell, connect it in this process."""
     if cell is not None:
+        if save is not None:
+            raise ConfigError("--save needs a running service, --cell has none", hint="leave out one of the two")
         _read_directly(cell, name, samples=samples, jsonl=jsonl, timeout_s=timeout_s)
         return
     client = client_of(url)
@@ -172,13 +175,16 @@ def watch_devices(
     from service.watching import Watch
 
     watch, looks = Watch(client_of(url), with_pictures=pictures), 0
-    with Live(console=console, auto_refresh=False) as live:
+    with Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext() as live:
         while True:
             try:
                 shown: Table | str = _watched(watch.look())
             except CellError as error:  # the service may come back
                 shown = f"[red]{escape(error.what)}[/]; try: {escape(error.hint)}"
-            live.update(shown, refresh=True)
+            if live is None:  # a log, where nothing can move: every look, as it comes
+                console.print(shown)
+            else:
+                live.update(shown, refresh=True)
             looks += 1
             if looks == count:
                 return
@@ -186,7 +192,18 @@ def watch_devices(
 
 
 def _watched(rows: list[Row]) -> Table:
-    columns = ("name", "driver", "health", "value", "samples/s", "age ms", "samples", "errors", "reconnects", "link")
+    columns = (
+        Column("name", no_wrap=True),
+        "driver",
+        "health",
+        "value",
+        "samples/s",
+        "age ms",
+        "samples",
+        "errors",
+        "reconnects",
+        "link",
+    )
     table = Table(*columns, box=None, pad_edge=False)
     for row in rows:
         style = STYLES.get(row.health.split()[0], "red")
@@ -237,12 +254,7 @@ def inject_fault(
 
 def _table(client: Client) -> Table:
     table = Table("name", "kind", "driver", "health", "samples", "errors", "detail", box=None, pad_edge=False)
-    try:
-        views = client.get("/v1/devices")["devices"]
-    except ApiError as error:
-        table.caption = escape(error.what)
-        return table
-    for view in views:
+    for view in client.get("/v1/devices")["devices"]:
         health = view["health"]
         style = STYLES.get(health["quality"], "white") if health["connected"] else "red"
         word = health["quality"] if health["connected"] else "disconnected"

@@ -74,7 +74,7 @@ def check_host(host: str) -> None:
 
 def _announce(panelwright: Panelwright) -> None:
     panelwright.wait_until_settled(START_PATIENCE_S)
-    if panelwright.error is None:
+    if panelwright.error is None and not panelwright.is_ending:  # Ctrl-C while it starts: nothing is ready
         console.print(f"panelwright: ready at [bold]{panelwright.url}[/]   stop: POST {panelwright.stop_url}")
         if panelwright.service.supervisor.latch.is_set():
             console.print("panelwright: the stop is latched; `panelwright stop --reset` when the cell is clear")

@@ -69,7 +69,7 @@ def _follow_on_terminal(client: Client, task_id: str) -> None:
 
 
 def _follow_in_log(client: Client, task_id: str) -> None:
-    begun_s = time.time()
+    begun_s = client.get(f"/v1/tasks/{task_id}")["created_s"]  # whoever comes later sees the same times
     for event in client.events(task_id):
         if event["kind"] == "progress":
             console.print(

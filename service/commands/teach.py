@@ -113,10 +113,11 @@ def read_image(image: Path) -> NDArray[np.uint8]:
 
 
 def _pair(text: str, option: str) -> tuple[float, float]:
+    example = "0.60,0.40" if option == "--plate" else "320,240"
     try:
         x, y = (float(part) for part in text.split(","))
     except ValueError:
-        raise InvalidRequest(f"{option} {text!r} is not two numbers", hint=f"for example {option} 320,240") from None
+        raise InvalidRequest(f"{option} {text!r} is not two numbers", hint=f"for example {option} {example}") from None
     if not (abs(x) < 1e6 and abs(y) < 1e6):  # false for NaN too
         raise InvalidRequest(f"{option} {text!r} is out of range", hint="give finite numbers")
     return x, y

@@ -62,7 +62,9 @@ def test_a_port_in_use_is_one_clear_message(write_cell: WriteCell, tmp_path: Pat
         taken.listen()
         port = str(taken.getsockname()[1])
         done = _run("serve", "--cell", str(write_cell()), "--port", port, "--runs", str(tmp_path / "runs"))
+        clash = _run("serve", "--cell", str(write_cell()), "--port", "0", "--stop-port", port)
     _assert_refused(done, f"port {port}", "--port")
+    _assert_refused(clash, f"port {port}", "--stop-port")
 
 
 def test_a_public_address_is_refused_while_there_are_no_keys(write_cell: WriteCell) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from service.client import Client
 from service.operations.context import Operation
 from service.serve import Options, Panelwright
 from tests.service.conftest import WriteCell
@@ -80,6 +81,19 @@ def test_cell_devices_and_picture_show(page: Any) -> None:
     _until(page, "document.querySelector('#picture').naturalWidth === 64")
     page.click("text=range scanner")
     _until(page, "document.querySelector('#picture').naturalWidth === 16")
+
+
+def test_the_tasks_can_be_read_on_a_telephone(page: Any, served_page: Panelwright) -> None:
+    """Why a task failed stood one letter a line."""
+    telephone = page.context.browser.new_page(viewport={"width": 400, "height": 800})
+    telephone.goto(served_page.url)
+    client = Client(url=served_page.url)
+    task = client.post("/v1/echo", {"text": "hello"})
+    client.get(f"/v1/tasks/{task['id']}?wait_s=30")
+    _until(telephone, "document.querySelectorAll('#tasks td.step').length")
+    assert telephone.evaluate("() => document.querySelector('#tasks td.step').clientWidth") > 100
+    assert telephone.evaluate("() => document.documentElement.scrollWidth") <= 400
+    telephone.close()
 
 
 def test_the_arm_shows_live(page: Any) -> None:

@@ -1,0 +1,146 @@
+"""What a person stumbled over at a terminal once: wrong folders, half addresses, logs, Ctrl-C before the start is over."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from hal.errors import ConfigError, InvalidRequest
+from service.client import Client
+from service.commands import demo, devices, tasks, teach
+from service.commands import serve as serving
+from service.errors import of_file
+from service.serve import Panelwright
+
+
+def test_a_folder_that_is_not_there_is_one_clear_message(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    import service.cli
+
+    def command() -> None:
+        (tmp_path / "nowhere" / "x.png").write_bytes(b"")
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(service.cli, "_app", lambda: command)
+        patched.setattr("service.commands.leaving.leave", _leave)
+        with pytest.raises(SystemExit, match="2"):
+            service.cli.main()
+    told = capsys.readouterr().err
+    assert str(tmp_path / "nowhere" / "x.png") in told
+    assert "try" in told
+
+
+def test_a_full_disk_is_told_and_a_fault_of_ours_is_not_hidden() -> None:
+    full = of_file(OSError(errno.ENOSPC, "No space left on device"))
+    assert full is not None
+    assert "No space left" in full.what
+    assert of_file(OSError("a defect")) is None
+
+
+def test_an_address_is_taken_as_curl_takes_it(served: Panelwright) -> None:
+    assert Client(url=f"localhost:{served.port}").get("/readyz")["is_ready"]
+
+
+@pytest.mark.parametrize("url", ["ftp://localhost:8460", "http://localhost:none", "http://", ""])
+def test_what_is_no_address_is_refused(url: str) -> None:
+    with pytest.raises(ConfigError, match="no address"):
+        Client(url=url).get("/readyz")
+
+
+class Stranger(BaseHTTPRequestHandler):
+    """Some other program's web page."""
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(b"<h1>hello</h1>")
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture
+def stranger() -> Iterator[str]:
+    server = HTTPServer(("127.0.0.1", 0), Stranger)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+def test_another_program_on_that_port_is_refused(stranger: str) -> None:
+    with pytest.raises(ConfigError, match="no panelwright"):
+        Client(url=stranger).get("/v1/devices")
+
+
+def test_devices_of_the_stop_port_are_no_empty_table(served: Panelwright) -> None:
+    done = CliRunner().invoke(devices.app, ["--url", f"http://127.0.0.1:{served.stop_port}"])
+    assert done.exit_code != 0
+
+
+def test_a_picture_without_a_service_is_refused_rather_than_forgotten(tmp_path: Path) -> None:
+    asked = ["read", "wrist_camera", "--cell", "cells/bench.toml", "--save", str(tmp_path / "x.png")]
+    done = CliRunner().invoke(devices.app, asked)
+    assert isinstance(done.exception, ConfigError)
+
+
+def test_a_log_of_watching_has_every_look(served: Panelwright) -> None:
+    done = CliRunner().invoke(devices.app, ["watch", "--url", served.url, "--count", "3", "--period-s", "0.1"])
+    assert done.output.count("reconnects") == 3
+    assert done.output.count("finger_proximity") == 3, done.output
+
+
+def test_a_task_watched_late_has_no_negative_times(served: Panelwright, monkeypatch: pytest.MonkeyPatch) -> None:
+    client = Client(url=served.url)
+    task = client.post("/v1/echo?wait_s=30", {"text": "hello"})
+    seen = io.StringIO()
+    monkeypatch.setattr(tasks.console, "file", seen)
+    monkeypatch.setattr(tasks.time, "time", lambda: task["ended_s"] + 100.0)
+    tasks.follow(client, task["id"])
+    assert "%" in seen.getvalue()
+    assert "-" not in seen.getvalue()
+
+
+def test_the_example_of_a_plate_is_in_metres() -> None:
+    app = typer.Typer()
+    app.command()(teach.teach)
+    done = CliRunner().invoke(app, ["x.png", "--plate", "0.6"])
+    assert isinstance(done.exception, InvalidRequest)
+    assert done.exception.hint.endswith("0.60,0.40")
+
+
+def test_nothing_is_called_ready_that_ends_already(monkeypatch: pytest.MonkeyPatch, served: Panelwright) -> None:
+    seen = io.StringIO()
+    monkeypatch.setattr(serving.console, "file", seen)
+    monkeypatch.setattr(Panelwright, "is_ending", property(lambda _self: True))
+    serving._announce(served)
+    assert seen.getvalue() == ""
+
+
+def test_a_demo_that_is_broken_off_names_the_report_of_what_it_measured(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name in ("before", "now"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "report.html").write_text("")
+    since_unix_s = (tmp_path / "now" / "report.html").stat().st_mtime
+    os.utime(tmp_path / "before" / "report.html", (since_unix_s - 60.0, since_unix_s - 60.0))
+    seen = io.StringIO()
+    monkeypatch.setattr(demo.console, "file", seen)
+    demo._tell_what_is_left(tmp_path, since_unix_s)
+    assert "now" in seen.getvalue()
+    assert "before" not in seen.getvalue()
+
+
+def _leave(code: int) -> None:
+    raise SystemExit(code)

@@ -41,19 +41,25 @@ class JournalError(CellError):
     retry = Retry.AFTER_FIX
 
 
+class FileFault(CellError):
+    """A file or folder cannot be written or read: not there, no right, no room."""
+
+    retry = Retry.AFTER_FIX
+
+
 class Defect(CellError):
     """A fault in our own program; the text names what failed, the log has the rest."""
 
 
-def of_file(error: OSError) -> CellError | None:
+def of_file(error: Exception) -> CellError | None:
     """What an error of the file system says to a person; None when it is about something else.
 
     A write to a full disk names no file, an open or a `mkdir` does.
     """
-    if error.filename is None and error.errno not in FULL:
+    if not isinstance(error, OSError) or (error.filename is None and error.errno not in FULL):
         return None
     where = "the disk" if error.filename is None else str(error.filename)
-    return NotPossibleNow(
+    return FileFault(
         f"{where} cannot be used: {error.strerror or error}",
-        hint="name a file in a folder that exists and may be written to, on a disk with room",
+        hint="see that its folder exists and may be written to, and that the disk has room",
     )

@@ -77,8 +77,11 @@ class ImageStore:
                         f"{len(kept)} images are stored already", hint="DELETE /v1/images/{image_id} of some first"
                     )
                 partial = self._folder / f"{image_id}.part"
-                partial.write_bytes(data)
-                partial.rename(self._folder / f"{image_id}{suffix}")
+                try:
+                    partial.write_bytes(data)
+                    partial.rename(self._folder / f"{image_id}{suffix}")
+                finally:
+                    partial.unlink(missing_ok=True)  # half an image of a full disk
         return self.get(image_id)
 
     def get(self, image_id: str) -> StoredImage:

@@ -5,20 +5,24 @@ from __future__ import annotations
 import sys
 from importlib.util import find_spec
 
+from scipy.spatial.transform import RigidTransform
+
 from hal.config import Cell
 from hal.errors import ConfigError
+from hal.frames import frame_tree
 from hal.registry import device_factory
 
 PYTHON = (3, 11)
 
 
 def check_machine(cell: Cell) -> None:
-    """Python's version, the simulator's engine, and that every driver of the cell exists.
+    """Python's version, the simulator's engine, and that every driver and frame of the cell exists.
 
     Raises:
         ConfigError: names what is missing and how to get it.
     """
     check_python()
+    frame_tree(cell, RigidTransform.identity())  # a mount on a frame that is not there would show at the first look
     for name, section in cell.file.devices.items():
         if section.driver.startswith("sim:"):
             check_simulator(f"devices.{name}")

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from hal.errors import Cancelled, CellError, InvalidRequest
-from service.errors import Aborted, Busy, Defect, NoSuchTask, NotPossibleNow
+from service.errors import Aborted, Busy, Defect, NoSuchTask, NotPossibleNow, of_file
 from service.jsonable import jsonable
 from service.problem import problem_of
 from service.task_model import Artefact, Task, TaskEvent, TaskState
@@ -260,7 +260,8 @@ class TaskStore:
         except Exception as error:  # a defect of an operation ends its task, never the service
             log.exception("task %s failed by a defect", task.id)
             text = f"{task.verb} failed by a defect in the program: {type(error).__name__}: {error}"
-            self._end(task, TaskState.FAILED, error=Defect(text, hint="the log has the traceback; please report it"))
+            defect = Defect(text, hint="the log has the traceback; please report it")
+            self._end(task, TaskState.FAILED, error=of_file(error) or defect)
         else:
             self._end(task, TaskState.SUCCEEDED, result=result)
 

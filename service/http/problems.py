@@ -14,7 +14,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from hal.errors import CellError, Retry
-from service.errors import Busy
+from service.errors import Busy, of_file
 from service.problem import problem_of, status_of
 
 MEDIA = "application/problem+json"
@@ -140,6 +140,9 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(Exception)
     async def _defect(request: Request, error: Exception) -> Response:
         log.error("%s %s failed by a defect", request.method, request.url.path, exc_info=error)
+        known = of_file(error)
+        if known is not None:  # a full disk, say
+            return error_response(known)
         what = f"the service failed by a defect: {type(error).__name__}"
         return problem_response(500, "defect", what, hint="the log has more; please report it", retry=Retry.NEVER)
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,6 +33,7 @@ from service.report.plots import joints_picture, lights_picture, png_of, range_p
 from service.report.record import MissionRecord, Picture
 from service.report.write import write_report
 
+log = logging.getLogger(__name__)
 BEFORE = "before the actions"
 
 
@@ -71,16 +74,26 @@ def run_mission(context: OperationContext, request: MissionRequest) -> dict[str,
         raise
     finally:
         _finish(record)
-        write_report(record, context.runs_dir / name)
+        is_reported = _report(record, context.runs_dir / name)
     return {
         "mission": name,
         "succeeded": record.succeeded,
-        "report": f"/v1/missions/{name}/report.html",
+        "report": f"/v1/missions/{name}/report.html" if is_reported else None,
         "actions": record.actions,
         "fused": record.facts.get("fused"),
         "cell_s": sum(step.cell_s for step in record.steps),
         "wall_s": sum(step.wall_s for step in record.steps),
     }
+
+
+def _report(record: MissionRecord, folder: Path) -> bool:
+    """Write the report; on a full disk what was done and read is still worth telling, so only the log complains."""
+    try:
+        write_report(record, folder)
+    except OSError as error:
+        log.warning("the report %s cannot be written: %s; free disk space", folder, error.strerror or error)
+        return False
+    return True
 
 
 def _run(session: Session, record: MissionRecord, request: MissionRequest) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
+import httpx2
 import pytest
 import typer
 from typer.testing import CliRunner
@@ -18,8 +19,12 @@ from hal.errors import ConfigError, InvalidRequest
 from service.client import Client
 from service.commands import demo, devices, tasks, teach
 from service.commands import serve as serving
+from service.commands.common import read_cell
 from service.errors import of_file
+from service.operations import mission
+from service.report.record import MissionRecord
 from service.serve import Panelwright
+from tests.service.conftest import WriteCell
 
 
 def test_a_folder_that_is_not_there_is_one_clear_message(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -140,6 +145,38 @@ def test_a_demo_that_is_broken_off_names_the_report_of_what_it_measured(
     demo._tell_what_is_left(tmp_path, since_unix_s)
     assert "now" in seen.getvalue()
     assert "before" not in seen.getvalue()
+
+
+def test_a_mount_on_a_frame_that_is_not_there_is_refused_before_anything_starts(write_cell: WriteCell) -> None:
+    path = write_cell(robot=True)
+    path.write_text(path.read_text().replace('parent = "flange"', 'parent = "flang"', 1))
+    with pytest.raises(ConfigError, match=r"mount.parent: no frame called 'flang'"):
+        read_cell(path, None)
+
+
+def test_an_image_for_which_there_is_no_room_leaves_nothing_and_says_so(
+    client: httpx2.Client, served: Panelwright, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fill(path: Path, data: bytes) -> int:
+        with path.open("wb") as file:
+            file.write(data[:10])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    picture = client.get("/v1/devices/wrist_camera/reading?format=png").content
+    with monkeypatch.context() as full:
+        full.setattr(Path, "write_bytes", fill)
+        answer = client.post("/v1/images", content=picture, headers={"Content-Type": "image/png"})
+    assert (answer.status_code, answer.json()["type"]) == (503, "urn:panelwright:file-fault")
+    assert not list(served.service.runs_dir.rglob("*.part"))
+
+
+def test_a_mission_whose_report_finds_no_room_keeps_its_result(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def fill(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(mission, "write_report", fill)
+    record = MissionRecord(mission="m", cell="c", panel="p", mode="sim", seed=1, now_s=lambda: 0.0)
+    assert not mission._report(record, tmp_path)
 
 
 def _leave(code: int) -> None:

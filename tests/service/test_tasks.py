@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -64,6 +65,16 @@ def _until_cancelled(context: TaskContext) -> None:
 def test_success_carries_the_result(bench: Bench) -> None:
     task = bench.run(lambda _: {"answer": 42})
     assert (task.state, task.result, task.fraction) == (S.SUCCEEDED, {"answer": 42}, 1.0)
+
+
+def test_a_full_disk_is_no_defect_of_ours(bench: Bench) -> None:
+    def fill(_: TaskContext) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    problem = bench.run(fill).problem
+    assert problem is not None
+    assert (problem["type"], problem["retry"]) == ("urn:panelwright:file-fault", "after-fix")
+    assert "room" in problem["hint"]
 
 
 def test_a_known_error_becomes_a_problem(bench: Bench) -> None:

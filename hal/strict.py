@@ -33,7 +33,7 @@ def load_toml(path: Path, model: type[M], what: str) -> M:
 def read_text(path: Path, what: str) -> str:
     """The text of a file that a user named."""
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # editors on Windows put a mark before the first key
     except FileNotFoundError:
         near = get_close_matches(path.name, [p.name for p in path.parent.glob("*.toml")], n=1)
         hint = f"did you mean {path.parent / near[0]}?" if near else f"give the path of a {what} (TOML)"

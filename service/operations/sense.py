@@ -15,7 +15,7 @@ from fusion.measurement import Measurement, SensingClass
 from fusion.robust import FusedPose, fuse
 from fusion.shapes import Box, Cylinder, FeatureSet, MovingPart, Shape
 from hal.devices import DeviceKind
-from hal.errors import MotionError, NotFound
+from hal.errors import MotionError, NotFound, Stopped
 from hal.geometry import UncertainPose
 from manipulation.skills.outcome import SkillFailure
 from manipulation.skills.probe import proximity_probe, touch_probe
@@ -55,6 +55,7 @@ def feel(session: Session, touches: int) -> Felt:
 
     Raises:
         NotFound: fewer than three places could be touched; says why.
+        Stopped: somebody stopped the cell.
     """
     evidence: list[Evidence] = []
     spots: list[Array] = []
@@ -66,6 +67,8 @@ def feel(session: Session, touches: int) -> Felt:
         try:
             evidence += _feel_at(session, spot)
             spots.append(spot)
+        except Stopped:
+            raise  # no spot is at fault
         except (SkillFailure, MotionError) as failure:
             skipped.append(f"({spot[0]:.3f}, {spot[1]:.3f}) m: {failure}")
     if len(spots) < LEAST_TOUCHES:

@@ -121,6 +121,12 @@ def test_broken_toml_is_told_with_its_line(cell_path: Path) -> None:
         load_cell(edit(cell_path, "[cell]", "[cell"))
 
 
+def test_the_mark_that_editors_on_windows_write_does_no_harm(cell_path: Path) -> None:
+    plain = load_cell(cell_path)
+    cell_path.write_text(cell_path.read_text(encoding="utf-8"), encoding="utf-8-sig")
+    assert load_cell(cell_path).file == plain.file
+
+
 def test_a_misspelt_key_deep_in_a_panel_is_named_without_union_tags(cell_path: Path) -> None:
     path = edit(cell_path.parent.parent / "panels/tiny.toml", "radius_m = 0.03", "radus_m = 0.03")
     with pytest.raises(ConfigError) as caught:

@@ -11,12 +11,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hal.errors import ConfigError
+from hal.errors import ConfigError, MotionRefused
 from service.child import Child
 from service.latch import Latch, LatchState
 from service.stop import StopServer
 
-ANSWER_S = 0.5
+STOP_ANSWER_S = 0.5  # then the latch is set from here
+RESET_ANSWER_S = 5.0  # a busy machine may take its time over this
 READY_S = 20.0
 MAX_RESTARTS = 3
 log = logging.getLogger(__name__)
@@ -83,18 +84,28 @@ class ProcessStop:
         self._child = self._begin()
 
     def stop(self, source: str) -> LatchState:
-        """Latch, by the stop process when it lives, else directly: then nobody else writes."""
+        """Latch, by the stop process when it answers, else directly."""
         count = self._latch.state().count
-        if not (self._child.is_alive() and self._child.write_line(f"stop {_line(source)}") and self._changed(count)):
+        is_told = self._child.is_alive() and self._child.write_line(f"stop {_line(source)}")
+        if not (is_told and self._has_changed(count, STOP_ANSWER_S)):
             self._latch.set(source)
         return self._latch.state()
 
     def reset(self, source: str, *, seen_count: int) -> bool:
-        """Ask the stop process to clear the latch; it refuses when somebody stopped after `seen_count`."""
+        """Ask the stop process to clear the latch; it refuses when somebody stopped after `seen_count`.
+
+        Raises:
+            MotionRefused: it did not answer; an answer that comes later clears nothing.
+        """
         self._is_ready.wait(READY_S)
-        count = self._latch.state().count
-        self._child.write_line(f"reset {seen_count} {_line(source)}")
-        return self._changed(count) and not self._latch.is_set()
+        is_told = self._child.write_line(f"reset {seen_count} {_line(source)}")
+        if not (is_told and self._has_changed(seen_count, RESET_ANSWER_S)):
+            self._latch.set("a reset without an answer")  # raises the count, so that the late one is refused
+            raise MotionRefused(
+                f"the stop process did not answer within {RESET_ANSWER_S:.0f} s, so the stop stays latched",
+                hint="look at the cell, then reset again; is the machine overloaded?",
+            )
+        return not self._latch.is_set()
 
     def is_alive(self) -> bool:
         """Does the process run?"""
@@ -134,8 +145,8 @@ class ProcessStop:
             self._restarts += 1
             self._child = self._begin()
 
-    def _changed(self, count: int) -> bool:
-        end_s = time.monotonic() + ANSWER_S
+    def _has_changed(self, count: int, within_s: float) -> bool:
+        end_s = time.monotonic() + within_s
         pause = threading.Event()
         while time.monotonic() < end_s:
             if self._latch.state().count != count:

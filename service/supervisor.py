@@ -41,7 +41,11 @@ class StopHost(Protocol):
         ...
 
     def reset(self, source: str, *, seen_count: int) -> bool:
-        """Clear unless somebody stopped again after `seen_count`."""
+        """Clear unless somebody stopped again after `seen_count`.
+
+        Raises:
+            MotionRefused: nobody answered.
+        """
         ...
 
     @property
@@ -159,7 +163,7 @@ class Supervisor:
         """Clear the latch. This alone moves nothing.
 
         Raises:
-            MotionRefused: somebody stopped again meanwhile, or the stop process is down (no stop, no motion).
+            MotionRefused: somebody stopped again meanwhile, or the stop process is down or silent (no stop, no motion).
         """
         if not self._stop.is_alive():
             raise MotionRefused("the stop process is down, so nothing may move", hint="restart `panelwright serve`")

@@ -171,6 +171,30 @@ def test_a_reset_that_has_not_seen_the_newest_stop_is_refused(write_cell: WriteC
         supervisor.close()
 
 
+def test_a_reset_without_an_answer_is_said_and_a_late_answer_clears_nothing(
+    write_cell: WriteCell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    supervisor = Supervisor(load_cell(write_cell()))
+    try:
+        supervisor.start()
+        seen = supervisor.stop("test").count
+        stop_pid = _pid(supervisor, "stop")
+        os.kill(stop_pid, signal.SIGSTOP)
+        monkeypatch.setattr("service.stop_host.RESET_ANSWER_S", 0.05)
+        with pytest.raises(MotionRefused, match="did not answer"):
+            supervisor.reset("test", seen_count=seen)
+        monkeypatch.undo()
+        os.kill(stop_pid, signal.SIGCONT)
+        held = supervisor.latch.state().count
+        supervisor.stop("the next line that the process obeys")
+        eventually(lambda: supervisor.latch.state().count > held)
+        assert supervisor.latch.is_set()
+        supervisor.reset("test", seen_count=supervisor.latch.state().count)
+        assert not supervisor.latch.is_set()
+    finally:
+        supervisor.close()
+
+
 @pytest.mark.parametrize("mode", ["mixed", "real"])
 def test_only_a_simulated_cell_starts_unlatched(write_cell: WriteCell, mode: str) -> None:
     supervisor = Supervisor(load_cell(write_cell(mode=mode)), inline=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import io
 import os
 import threading
 from collections.abc import Iterator
@@ -101,19 +100,17 @@ def test_a_picture_without_a_service_is_refused_rather_than_forgotten(tmp_path: 
 
 def test_a_log_of_watching_has_every_look(served: Panelwright) -> None:
     done = CliRunner().invoke(devices.app, ["watch", "--url", served.url, "--count", "3", "--period-s", "0.1"])
-    assert done.output.count("reconnects") == 3
     assert done.output.count("finger_proximity") == 3, done.output
 
 
 def test_a_task_watched_late_has_no_negative_times(served: Panelwright, monkeypatch: pytest.MonkeyPatch) -> None:
     client = Client(url=served.url)
     task = client.post("/v1/echo?wait_s=30", {"text": "hello"})
-    seen = io.StringIO()
-    monkeypatch.setattr(tasks.console, "file", seen)
     monkeypatch.setattr(tasks.time, "time", lambda: task["ended_s"] + 100.0)
-    tasks.follow(client, task["id"])
-    assert "%" in seen.getvalue()
-    assert "-" not in seen.getvalue()
+    with tasks.console.capture() as seen:
+        tasks.follow(client, task["id"])
+    assert "%" in seen.get()
+    assert "-" not in seen.get()
 
 
 def test_the_example_of_a_plate_is_in_metres() -> None:
@@ -125,26 +122,22 @@ def test_the_example_of_a_plate_is_in_metres() -> None:
 
 
 def test_nothing_is_called_ready_that_ends_already(monkeypatch: pytest.MonkeyPatch, served: Panelwright) -> None:
-    seen = io.StringIO()
-    monkeypatch.setattr(serving.console, "file", seen)
     monkeypatch.setattr(Panelwright, "is_ending", property(lambda _self: True))
-    serving._announce(served)
-    assert seen.getvalue() == ""
+    with serving.console.capture() as seen:
+        serving._announce(served)
+    assert seen.get() == ""
 
 
-def test_a_demo_that_is_broken_off_names_the_report_of_what_it_measured(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_demo_that_is_broken_off_names_the_report_of_what_it_measured(tmp_path: Path) -> None:
     for name in ("before", "now"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "report.html").write_text("")
     since_unix_s = (tmp_path / "now" / "report.html").stat().st_mtime
     os.utime(tmp_path / "before" / "report.html", (since_unix_s - 60.0, since_unix_s - 60.0))
-    seen = io.StringIO()
-    monkeypatch.setattr(demo.console, "file", seen)
-    demo._tell_what_is_left(tmp_path, since_unix_s)
-    assert "now" in seen.getvalue()
-    assert "before" not in seen.getvalue()
+    with demo.console.capture() as seen:
+        demo._tell_what_is_left(tmp_path, since_unix_s)
+    assert str(tmp_path / "now") in seen.get()
+    assert str(tmp_path / "before") not in seen.get()
 
 
 def test_a_mount_on_a_frame_that_is_not_there_is_refused_before_anything_starts(write_cell: WriteCell) -> None:

@@ -132,7 +132,7 @@ def checked_depth(depth_m: ArrayLike, sensor: RangeSensorModel) -> Array:
 
 
 @njit(cache=True)
-def _drop_missing(depth, least):  # type: ignore[no-untyped-def]
+def _drop_missing(depth, least):  # type: ignore[no-untyped-def]  # numba types it
     """Turn what is not finite or not beyond `least` into NaN; returns how many readings remain."""
     flat = depth.ravel()
     valid = 0

@@ -28,7 +28,7 @@ SLENDER_RAD = 0.15  # half-angle of a cone that may be a cylinder
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def simplest(kind, th, samples, perspective, patches):  # type: ignore[no-untyped-def]
+def simplest(kind, th, samples, perspective, patches):  # type: ignore[no-untyped-def]  # numba types it
     """The surface refined on its samples, or the simpler one that describes them more cheaply (Schwarz's criterion).
 
     `patches`: independent values of the noise among the samples. Returns kind and parameters.
@@ -49,7 +49,7 @@ def simplest(kind, th, samples, perspective, patches):  # type: ignore[no-untype
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def straightened(kind, th, samples, noise, perspective):  # type: ignore[no-untyped-def]
+def straightened(kind, th, samples, noise, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """The plane, or the cylinder for a slender cone, that slow errors have bent into this surface, else itself.
 
     `noise` as `NoiseModel.packed`. Returns kind and parameters.
@@ -71,13 +71,13 @@ def straightened(kind, th, samples, noise, perspective):  # type: ignore[no-unty
 
 
 @njit(cache=True, error_model="numpy")
-def schwarz_price(kind, patches):  # type: ignore[no-untyped-def]
+def schwarz_price(kind, patches):  # type: ignore[no-untyped-def]  # numba types it
     """What Schwarz's criterion asks for the parameters of a surface: p ln n."""
     return FREEDOM[kind] * np.log(max(patches, 2.0))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def scrap_gain(kind, th, own_kind, own, samples, pixels, noise, perspective):  # type: ignore[no-untyped-def]
+def scrap_gain(kind, th, own_kind, own, samples, pixels, noise, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """How much cheaper a small piece is as part of a large surface than as a surface of its own; <= 0: it stays.
 
     Slow noise gives a scrap of a face one value or few, and any direction; so its direction and kind count for nothing.
@@ -94,7 +94,7 @@ def scrap_gain(kind, th, own_kind, own, samples, pixels, noise, perspective):  #
 
 
 @njit(cache=True, error_model="numpy")
-def cut_mean_square(e, limit):  # type: ignore[no-untyped-def]
+def cut_mean_square(e, limit):  # type: ignore[no-untyped-def]  # numba types it
     """Mean of the squares of e (N,), each at most that of `limit`."""
     total = 0.0
     for i in range(e.shape[0]):
@@ -104,12 +104,12 @@ def cut_mean_square(e, limit):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _is_near(kind, th, samples, perspective):  # type: ignore[no-untyped-def]
+def _is_near(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
     return np.mean(residual_sizes(kind, th, samples, perspective) < NEAR_SIGMAS) > NEAR_SHARE
 
 
 @njit(cache=True, error_model="numpy")
-def _refined(kind, th, s, perspective):  # type: ignore[no-untyped-def]
+def _refined(kind, th, s, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """Parameters after a robust fit, and the mean of the squared residuals, each at most the trim's."""
     free = np.zeros(9, np.bool_)
     th, _, _, _, cost = fit_robust(kind, th, s[0], s[1], s[2], s[3], perspective, free, 2)
@@ -117,7 +117,7 @@ def _refined(kind, th, s, perspective):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _simpler(simple, kind, th, samples, perspective):  # type: ignore[no-untyped-def]
+def _simpler(simple, kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """Where the fit of a plane, or of a cylinder in place of a slender cone, starts; and whether there is one."""
     points = points_of(samples, perspective)
     if simple == PLANE:
@@ -135,7 +135,7 @@ def _simpler(simple, kind, th, samples, perspective):  # type: ignore[no-untyped
 
 
 @njit(cache=True, error_model="numpy")
-def turn_of(normals):  # type: ignore[no-untyped-def]
+def turn_of(normals):  # type: ignore[no-untyped-def]  # numba types it
     """Angle in radians over which all but `ENDS` of the unit normals (N, 3) spread."""
     n = normals.shape[0]
     mx, my, mz = np.mean(normals[:, 0]), np.mean(normals[:, 1]), np.mean(normals[:, 2])
@@ -148,7 +148,7 @@ def turn_of(normals):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def points_of(samples, perspective):  # type: ignore[no-untyped-def]
+def points_of(samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """(N, 3) positions of the samples, metres."""
     out = np.empty((samples.shape[1], 3))
     for i in range(samples.shape[1]):
@@ -158,7 +158,7 @@ def points_of(samples, perspective):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def surface_normals(kind, th, samples, perspective):  # type: ignore[no-untyped-def]
+def surface_normals(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """(N, 3) unit normals of the surface towards the sensor, at the samples."""
     normals = np.empty((samples.shape[1], 3))
     normals_on(kind, th, samples[0], samples[1], samples[2], perspective, normals)
@@ -166,7 +166,7 @@ def surface_normals(kind, th, samples, perspective):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def residual_sizes(kind, th, samples, perspective):  # type: ignore[no-untyped-def]
+def residual_sizes(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """(N,) size of the residuals along the rays, in sigmas; a ray that misses counts as far off."""
     e = np.empty(samples.shape[1])
     rays.residuals(kind, th, samples[0], samples[1], samples[2], samples[3], perspective, e)

@@ -50,7 +50,7 @@ def borders_of(labels: Ints, packed: Array) -> dict[tuple[int, int], Border]:
 
 
 @njit(cache=True)
-def _borders(labels, gap, sen):  # type: ignore[no-untyped-def]
+def _borders(labels, gap, sen):  # type: ignore[no-untyped-def]  # numba types it
     """Pairs (P, 2) of labels that touch, how many contacts each has, and x and y (P, PAIR_POINTS) of some of them."""
     ids, us, vs, pairs = _contacts(labels, gap)
     starts, order = bucket(ids, pairs.shape[0])
@@ -65,7 +65,7 @@ def _borders(labels, gap, sen):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _contacts(labels, gap):  # type: ignore[no-untyped-def]
+def _contacts(labels, gap):  # type: ignore[no-untyped-def]  # numba types it
     """Contacts along rows and columns, over at most `gap` zeros, in raster order.
 
     Returns the number of the pair (from 1) and the place of each, and the (P, 2) pairs, a < b, as they were met.
@@ -118,7 +118,7 @@ def _contacts(labels, gap):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def step_and_turn(kind_a, a, kind_b, b, x, y, noise, perspective):  # type: ignore[no-untyped-def]
+def step_and_turn(kind_a, a, kind_b, b, x, y, noise, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """Median step in sigmas and median turn in radians between two surfaces at the rays (x, y).
 
     A ray that misses one of the surfaces counts as an endless step; a turn is read where both are met.

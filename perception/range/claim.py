@@ -16,7 +16,7 @@ NO_LABEL = np.int32(2**31 - 1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def claim_pixels(depth, sen, noise, blocks, size, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]
+def claim_pixels(depth, sen, noise, blocks, size, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]  # numba types it
     """Label each pixel of `depth` (H, W) with the best surface among those of the 3x3 blocks around it.
 
     Writes the rows of blocks [top, bottom) of `out` (H, W) int32: label, or 0 beyond `CLAIM_SIGMAS`. Labels index
@@ -54,7 +54,7 @@ def claim_pixels(depth, sen, noise, blocks, size, kinds, ths, out, top, bottom):
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _only_labels(blocks, r, only):  # type: ignore[no-untyped-def]
+def _only_labels(blocks, r, only):  # type: ignore[no-untyped-def]  # numba types it
     """The one label that the 3x3 blocks around each block of row r hold, 0 where they hold none, -1 where several."""
     h, w = blocks.shape
     above, here, below = blocks[max(r - 1, 0)], blocks[r], blocks[min(r + 1, h - 1)]
@@ -71,7 +71,7 @@ def _only_labels(blocks, r, only):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE, **LEAN)
-def _claim_run(depth, th, label, first, v, sen, noise, perspective, out):  # type: ignore[no-untyped-def]
+def _claim_run(depth, th, label, first, v, sen, noise, perspective, out):  # type: ignore[no-untyped-def]  # numba types it
     """Pixels first, first + 1, ... of row v that a plane explains: their squared misfit, without branch or root."""
     p = 1.0 if perspective else 0.0
     y = (v - sen[4]) / sen[2]
@@ -92,7 +92,7 @@ def _claim_run(depth, th, label, first, v, sen, noise, perspective, out):  # typ
 
 
 @njit(cache=True, error_model="numpy")
-def _claim_block(depth, sen, noise, blocks, size, kinds, ths, out, r, c):  # type: ignore[no-untyped-def]
+def _claim_block(depth, sen, noise, blocks, size, kinds, ths, out, r, c):  # type: ignore[no-untyped-def]  # numba types it
     """The pixels of one block among whose neighbours several surfaces compete."""
     H, W = depth.shape
     h, w = blocks.shape
@@ -117,7 +117,7 @@ def _claim_block(depth, sen, noise, blocks, size, kinds, ths, out, r, c):  # typ
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _best_of(z, x, y, noise, own, near, n, kinds, ths, perspective):  # type: ignore[no-untyped-def]
+def _best_of(z, x, y, noise, own, near, n, kinds, ths, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """The label among near[:n] whose surface explains the depth best, 0 when none does within `CLAIM_SIGMAS`.
 
     `own` > 0 is taken without a look at the others when it explains the depth within `PLAIN_SIGMAS`.
@@ -142,7 +142,7 @@ def _best_of(z, x, y, noise, own, near, n, kinds, ths, perspective):  # type: ig
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def add_row(labels, least, most):  # type: ignore[no-untyped-def]
+def add_row(labels, least, most):  # type: ignore[no-untyped-def]  # numba types it
     """One more row of a neighbourhood: the least label that is none of 0, and the largest, of each column."""
     for u in range(labels.shape[0]):
         k = labels[u]
@@ -151,7 +151,7 @@ def add_row(labels, least, most):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def contested(own, least, most, out):  # type: ignore[no-untyped-def]
+def contested(own, least, most, out):  # type: ignore[no-untyped-def]  # numba types it
     """Where the three columns around hold another surface than the pixel's own.
 
     `least` and `most` are (W + 2,), with a column of no surface before the first and after the last.
@@ -163,7 +163,7 @@ def contested(own, least, most, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def claim_borders(depth, sen, noise, labels, newest, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]
+def claim_borders(depth, sen, noise, labels, newest, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]  # numba types it
     """Judge again each pixel whose 3x3 neighbourhood holds another surface, and one of label `newest` or later.
 
     Reads `labels` (H, W), writes rows [top, bottom) of `out` (H, W). Where earlier surfaces meet they have competed for
@@ -201,7 +201,7 @@ def claim_borders(depth, sen, noise, labels, newest, kinds, ths, out, top, botto
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def misfit_of(k, kinds, ths, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]
+def misfit_of(k, kinds, ths, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """`misfit` of surface k of a table: planes, which most are, in a line."""
     if kinds[k] != PLANE:
         return misfit(kinds[k], ths[k], x, y, z, sigma, perspective)
@@ -213,7 +213,7 @@ def misfit_of(k, kinds, ths, x, y, z, sigma, perspective):  # type: ignore[no-un
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def misfit(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]
+def misfit(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """|z - surface| in sigmas, eased at grazing rays where half a pixel moves the depth far; infinite on a miss."""
     zm = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(zm):
@@ -228,7 +228,7 @@ def misfit(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, error_model="numpy")
-def fill_small_gaps(label, depth, sweeps):  # type: ignore[no-untyped-def]
+def fill_small_gaps(label, depth, sweeps):  # type: ignore[no-untyped-def]  # numba types it
     """Give each unlabelled valid pixel the label that at least 5 of its 8 neighbours agree on; `sweeps` times."""
     H, W = label.shape
     for _ in range(sweeps):
@@ -251,7 +251,7 @@ def fill_small_gaps(label, depth, sweeps):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def pixels_of(label, count):  # type: ignore[no-untyped-def]
+def pixels_of(label, count):  # type: ignore[no-untyped-def]  # numba types it
     """How many pixels each of the labels 1 to `count` has, (count,)."""
     flat = label.ravel()
     sizes = np.zeros(count + 1, np.int64)
@@ -261,7 +261,7 @@ def pixels_of(label, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def bucket(label, count):  # type: ignore[no-untyped-def]
+def bucket(label, count):  # type: ignore[no-untyped-def]  # numba types it
     """Flat pixel indices grouped by label: label k owns indices[starts[k] : starts[k + 1]]; starts is (count + 2,).
 
     Label 0 owns nothing: unlabelled pixels are left out.

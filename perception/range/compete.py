@@ -99,7 +99,7 @@ def _columns(grid: Grid) -> tuple[Array, Array, Array, Array, Array, bool, int, 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _fit_blocks(x, y, z, sigma, normal, perspective, pixels, slow_share, members):  # type: ignore[no-untyped-def]
+def _fit_blocks(x, y, z, sigma, normal, perspective, pixels, slow_share, members):  # type: ignore[no-untyped-def]  # numba types it
     """Kind (-1 when none explains them), parameters (16,) and explained share of the blocks `members` (flat)."""
     count = members.shape[0]
     if count < 5:
@@ -140,7 +140,7 @@ def _local_fits(grid: Grid, members: NDArray[np.int64]) -> list[Fit]:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _fit_parts(  # type: ignore[no-untyped-def]
+def _fit_parts(  # type: ignore[no-untyped-def]  # numba types it
     x, y, z, sigma, normal, perspective, pixels, slow_share, members, rms, w
 ):
     """`_fit_blocks` of the blocks around `LOCAL_TRIES` seeds that are evenly spread over `members`."""

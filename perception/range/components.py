@@ -74,7 +74,7 @@ def merge_rounds(seams: list[int]) -> list[list[int]]:
 
 
 @njit(cache=True, nogil=True)
-def find(parent, i):  # type: ignore[no-untyped-def]
+def find(parent, i):  # type: ignore[no-untyped-def]  # numba types it
     while parent[i] != i:
         parent[i] = parent[parent[i]]
         i = parent[i]
@@ -82,7 +82,7 @@ def find(parent, i):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def unite(parent, i, j):  # type: ignore[no-untyped-def]
+def unite(parent, i, j):  # type: ignore[no-untyped-def]  # numba types it
     """The smaller index becomes the root: roots are first pixels in raster order."""
     a, b = find(parent, i), find(parent, j)
     if a < b:
@@ -92,7 +92,7 @@ def unite(parent, i, j):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _scan(mask, link_right, link_down, parent, top, bottom):  # type: ignore[no-untyped-def]
+def _scan(mask, link_right, link_down, parent, top, bottom):  # type: ignore[no-untyped-def]  # numba types it
     W = mask.shape[1]
     for v in range(top, bottom):
         for u in range(W):
@@ -106,7 +106,7 @@ def _scan(mask, link_right, link_down, parent, top, bottom):  # type: ignore[no-
 
 
 @njit(cache=True, nogil=True)
-def _merge_seam(mask, link_down, parent, seam):  # type: ignore[no-untyped-def]
+def _merge_seam(mask, link_down, parent, seam):  # type: ignore[no-untyped-def]  # numba types it
     W = mask.shape[1]
     for u in range(W):
         if mask[seam - 1, u] and mask[seam, u] and link_down[seam - 1, u]:
@@ -114,7 +114,7 @@ def _merge_seam(mask, link_down, parent, seam):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _relabel(mask, parent):  # type: ignore[no-untyped-def]
+def _relabel(mask, parent):  # type: ignore[no-untyped-def]  # numba types it
     H, W = mask.shape
     label = np.zeros((H, W), np.int32)
     sizes = np.zeros(H * W + 1, np.int32)

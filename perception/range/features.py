@@ -198,7 +198,7 @@ def features_of(surfaces: Iterable[Surface]) -> tuple[RangeFeature, ...]:
     return tuple(out)
 
 
-def _jacobian(function, size: int, step: float) -> Array:  # type: ignore[no-untyped-def]
+def _jacobian(function, size: int, step: float) -> Array:  # type: ignore[no-untyped-def]  # numba types it
     columns = []
     for k in range(size):
         d = np.zeros(size)

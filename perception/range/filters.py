@@ -78,7 +78,7 @@ def _filled(depth_m: Array, finite: NDArray[np.bool_]) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _lonely(depth, sigma, perspective, slope):  # type: ignore[no-untyped-def]
+def _lonely(depth, sigma, perspective, slope):  # type: ignore[no-untyped-def]  # numba types it
     H, W = depth.shape
     out = np.zeros((H, W), np.bool_)
     for v in range(H):
@@ -98,7 +98,7 @@ def _lonely(depth, sigma, perspective, slope):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _edge_mean(depth, tolerance, kernel, perspective, slope):  # type: ignore[no-untyped-def]
+def _edge_mean(depth, tolerance, kernel, perspective, slope):  # type: ignore[no-untyped-def]  # numba types it
     H, W = depth.shape
     radius = kernel.shape[0] // 2
     out = np.full((H, W), np.nan)

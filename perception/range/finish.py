@@ -67,7 +67,7 @@ def refine_surface(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def refined(kind, th, samples, perspective, fixed):  # type: ignore[no-untyped-def]
+def refined(kind, th, samples, perspective, fixed):  # type: ignore[no-untyped-def]  # numba types it
     """The fit to samples (4, N): robust on a few that are evenly spread, then one step on all.
 
     Returns:
@@ -91,7 +91,7 @@ def refined(kind, th, samples, perspective, fixed):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, error_model="numpy")
-def _inverse(H, p, fixed):  # type: ignore[no-untyped-def]
+def _inverse(H, p, fixed):  # type: ignore[no-untyped-def]  # numba types it
     """(p, p) inverse over the free parameters, zero elsewhere; None when they are not all determined."""
     A, b, out, scale = np.empty((p, p)), np.empty(p), np.zeros((p, p)), np.empty(p)
     for i in range(p):

@@ -58,7 +58,7 @@ STEP_GOAL = 1e-3  # of a standard deviation of each parameter: a step that small
 
 
 @njit(cache=True, error_model="numpy")
-def new_scratch():  # type: ignore[no-untyped-def]
+def new_scratch():  # type: ignore[no-untyped-def]  # numba types it
     """What a fit works in: rows of `rays`, two systems (9, 9) and (9,), that of a step, two frames, and a trial."""
     return (
         np.empty(SCRATCH),
@@ -75,7 +75,7 @@ def new_scratch():  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed, scratch, held):  # type: ignore[no-untyped-def]
+def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed, scratch, held):  # type: ignore[no-untyped-def]  # numba types it
     """Minimise the ray residuals from `th`, which is moved.
 
     Args:
@@ -131,7 +131,7 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed, scr
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def last_step(kind, th, x, y, z, sigma, perspective, fixed):  # type: ignore[no-untyped-def]
+def last_step(kind, th, x, y, z, sigma, perspective, fixed):  # type: ignore[no-untyped-def]  # numba types it
     """One Gauss-Newton step on all samples from a start that is good already, in a single pass over them.
 
     The matrix and the trim are those of the start; the cost after the step follows from the quadratic model.
@@ -158,7 +158,7 @@ def last_step(kind, th, x, y, z, sigma, perspective, fixed):  # type: ignore[no-
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _damped(H, g, fixed, damping, p, A, step):  # type: ignore[no-untyped-def]
+def _damped(H, g, fixed, damping, p, A, step):  # type: ignore[no-untyped-def]  # numba types it
     """The system of one step into `A` (p, p) and `step` (p,): fixed parameters stay where they are."""
     for a in range(p):
         for b in range(p):
@@ -168,7 +168,7 @@ def _damped(H, g, fixed, damping, p, A, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _load(x, y, z, sigma, work):  # type: ignore[no-untyped-def]
+def _load(x, y, z, sigma, work):  # type: ignore[no-untyped-def]  # numba types it
     """Loads the samples into `work` if they have room there; returns what it holds then."""
     if x.shape[0] > CHUNK:
         return NOTHING
@@ -177,7 +177,7 @@ def _load(x, y, z, sigma, work):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _errors(kind, th, x, y, z, sigma, perspective, scratch, held):  # type: ignore[no-untyped-def]
+def _errors(kind, th, x, y, z, sigma, perspective, scratch, held):  # type: ignore[no-untyped-def]  # numba types it
     """Residuals (N,) in sigmas, in `scratch` if the samples are; and what that holds then."""
     work, frame, n = scratch[0], scratch[7], x.shape[0]
     if held == NOTHING:
@@ -193,7 +193,7 @@ def _errors(kind, th, x, y, z, sigma, perspective, scratch, held):  # type: igno
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def middle_scale(e):  # type: ignore[no-untyped-def]
+def middle_scale(e):  # type: ignore[no-untyped-def]  # numba types it
     """Robust residual scale, 1.48 times the median of |e|, at least 1; NaN is a ray that misses. Overwrites e (N,)."""
     n = e.shape[0]
     within = 0
@@ -226,7 +226,7 @@ def middle_scale(e):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def fit_robust(kind, th, x, y, z, sigma, perspective, fixed, rounds):  # type: ignore[no-untyped-def]
+def fit_robust(kind, th, x, y, z, sigma, perspective, fixed, rounds):  # type: ignore[no-untyped-def]  # numba types it
     """Refine under Cauchy weights whose scale falls with the residuals; ends with the trimmed fit.
 
     Returns parameters, information matrix, mean squared residual of the kept samples, share kept, trimmed cost.
@@ -238,7 +238,7 @@ def fit_robust(kind, th, x, y, z, sigma, perspective, fixed, rounds):  # type: i
 
 
 @njit(cache=True, error_model="numpy")
-def _robust(kind, th, x, y, z, sigma, perspective, fixed, rounds, scratch):  # type: ignore[no-untyped-def]
+def _robust(kind, th, x, y, z, sigma, perspective, fixed, rounds, scratch):  # type: ignore[no-untyped-def]  # numba types it
     """`fit_robust` that moves `th`; the first system of `scratch` is the information matrix."""
     n = x.shape[0]
     held, is_last, cost, used = _load(x, y, z, sigma, scratch[0]), rounds == 0, 0.0, 0
@@ -258,7 +258,7 @@ def _robust(kind, th, x, y, z, sigma, perspective, fixed, rounds, scratch):  # t
 
 
 @njit(cache=True, error_model="numpy")
-def _rough(kind, th, x, y, z, sigma, perspective, fixed, scratch):  # type: ignore[no-untyped-def]
+def _rough(kind, th, x, y, z, sigma, perspective, fixed, scratch):  # type: ignore[no-untyped-def]  # numba types it
     """Moves `th` by a few robust steps; the sum of squared residuals then, each at most `ROUGH_LIMIT` squared."""
     held, steps = _load(x, y, z, sigma, scratch[0]), 2
     e, held = _errors(kind, th, x, y, z, sigma, perspective, scratch, held)
@@ -275,7 +275,7 @@ def _rough(kind, th, x, y, z, sigma, perspective, fixed, scratch):  # type: igno
 
 
 @njit(cache=True, error_model="numpy")
-def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_samples, give_up):  # type: ignore[no-untyped-def]
+def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_samples, give_up):  # type: ignore[no-untyped-def]  # numba types it
     """Fit every kind in the (5,) mask `kinds` to one set of samples, `points` (N, 3).
 
     `P` and `N` (M, 3) are those points that have a tangent plane, and its normal; only starts use them. All starts
@@ -334,7 +334,7 @@ def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_sampl
 
 
 @njit(cache=True, error_model="numpy")
-def _start_along(P, N, centred, kinds, starts, start_kind):  # type: ignore[no-untyped-def]
+def _start_along(P, N, centred, kinds, starts, start_kind):  # type: ignore[no-untyped-def]  # numba types it
     """Cylinder and cone along `normal_axis` into `starts` (2, SIZE), their kinds or -1 into `start_kind` (2,)."""
     axis = normal_axis(N, centred)
     if kinds[CYLINDER]:
@@ -346,7 +346,7 @@ def _start_along(P, N, centred, kinds, starts, start_kind):  # type: ignore[no-u
 
 
 @njit(cache=True, error_model="numpy")
-def _is_sane(kind, th):  # type: ignore[no-untyped-def]
+def _is_sane(kind, th):  # type: ignore[no-untyped-def]  # numba types it
     if kind == CYLINDER:
         return th[6] < LARGEST_RADIUS_M
     if kind == SPHERE:

@@ -116,7 +116,7 @@ def graph_curvature(g: Array) -> tuple[Array, Array]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fused(z, sen, work, gu, gv, normal, mean, gauss):  # type: ignore[no-untyped-def]
+def _fused(z, sen, work, gu, gv, normal, mean, gauss):  # type: ignore[no-untyped-def]  # numba types it
     """Fill the maps from `z` (H, W), a chunk of a row at a time; all in the type of `z`, `work` (SCRATCH,) too."""
     H, W = z.shape
     for v in range(H):
@@ -141,7 +141,7 @@ def _fused(z, sen, work, gu, gv, normal, mean, gauss):  # type: ignore[no-untype
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def _forms(n, y, sen, work):  # type: ignore[no-untyped-def]
+def _forms(n, y, sen, work):  # type: ignore[no-untyped-def]  # numba types it
     """Derivatives, normal, H and K of one chunk, without a branch: rows 4 to 10 of `work` from rows 0 to 3."""
     as_type = work.dtype.type
     half, quarter, two, one = as_type(0.5), as_type(0.25), as_type(2.0), as_type(1.0)

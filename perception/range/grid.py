@@ -147,7 +147,7 @@ def _radius(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float, size_px
 
 
 @njit(cache=True, **LEAN)
-def sigma_at(noise, z):  # type: ignore[no-untyped-def]
+def sigma_at(noise, z):  # type: ignore[no-untyped-def]  # numba types it
     """Standard deviation of one pixel at depth z, metres; `noise` as `NoiseModel.packed`."""
     z2 = z * z
     white = noise[0] + noise[1] * z2
@@ -157,14 +157,14 @@ def sigma_at(noise, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def slow_share_at(noise, z):  # type: ignore[no-untyped-def]
+def slow_share_at(noise, z):  # type: ignore[no-untyped-def]  # numba types it
     """Part of the variance at depth z that neighbouring pixels share; `noise` as `NoiseModel.packed`."""
     slow, sigma = noise[2] + noise[3] * z * z, sigma_at(noise, z)
     return slow * slow / max(sigma * sigma, 1e-30)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: ignore[no-untyped-def]
+def _blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: ignore[no-untyped-def]  # numba types it
     H, W = depth.shape
     w = x.shape[1]
     perspective = sen[0] > 0
@@ -220,7 +220,7 @@ def _blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: 
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _median(depth, b, hop, r, c, values):  # type: ignore[no-untyped-def]
+def _median(depth, b, hop, r, c, values):  # type: ignore[no-untyped-def]  # numba types it
     """Lower median of a block's samples, a real value and never the empty middle of a jump; NaN if most are missing."""
     n = 0
     for v in range(r * b, min(r * b + b, depth.shape[0]), hop):
@@ -237,7 +237,7 @@ def _median(depth, b, hop, r, c, values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _medians_of_four(upper, lower, b, out):  # type: ignore[no-untyped-def]
+def _medians_of_four(upper, lower, b, out):  # type: ignore[no-untyped-def]  # numba types it
     """Lower medians of the corners of blocks of b x b pixels, by a sorting network, missing readings last."""
     for c in range(upper.shape[0] // b):
         i, j = c * b, c * b + b - 1

@@ -26,7 +26,7 @@ TAKEN = np.int32(2**31 - 1)
 
 
 @njit(cache=True)
-def seed_order(normal, rms, free, reach):  # type: ignore[no-untyped-def]
+def seed_order(normal, rms, free, reach):  # type: ignore[no-untyped-def]  # numba types it
     """Free blocks with a tangent plane, flattest neighbourhood first (counting sort), as flat indices."""
     h, w = rms.shape
     key = np.full(h * w, -1, np.int32)
@@ -60,7 +60,7 @@ def seed_order(normal, rms, free, reach):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, **LEAN)
-def solve3(S, out):  # type: ignore[no-untyped-def]
+def solve3(S, out):  # type: ignore[no-untyped-def]  # numba types it
     """Coefficients (a, b, c) of g = a x + b y + c from sums (n, x, y, xx, xy, yy, g, xg, yg); False if degenerate."""
     n = S[0]
     if n <= 0.0:
@@ -78,7 +78,7 @@ def solve3(S, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, **LEAN)
-def plane_from_coefficients(m, perspective, th):  # type: ignore[no-untyped-def]
+def plane_from_coefficients(m, perspective, th):  # type: ignore[no-untyped-def]  # numba types it
     """PLANE parameters, normal towards the sensor, from g = a x + b y + c."""
     if perspective:
         nx, ny, nz, d = m[0], m[1], m[2], 1.0  # (a, b, c) . X = 1 and z > 0: this normal points away
@@ -89,7 +89,7 @@ def plane_from_coefficients(m, perspective, th):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _quadratic_gain(idx, count, table, x0, y0, scale):  # type: ignore[no-untyped-def]
+def _quadratic_gain(idx, count, table, x0, y0, scale):  # type: ignore[no-untyped-def]  # numba types it
     """Sum of squares (in sigmas) left by a plane and by a quadratic over the blocks idx[:count] of a padded table."""
     A, b, row = np.zeros((6, 6)), np.zeros(6), np.empty(6)
     total = 0.0
@@ -119,7 +119,7 @@ def _quadratic_gain(idx, count, table, x0, y0, scale):  # type: ignore[no-untype
 
 
 @njit(cache=True)
-def grow_planes(  # type: ignore[no-untyped-def]
+def grow_planes(  # type: ignore[no-untyped-def]  # numba types it
     x, y, z, sigma, normal, rms, free, label, first_label, perspective, order, least, cos_limit, tried
 ):
     """Planes over the free blocks; writes labels and returns parameters (M, 16), block counts (M,), mean squares (M,).
@@ -181,7 +181,7 @@ def grow_planes(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _padded(x, y, z, sigma, normal, rms, free, perspective):  # type: ignore[no-untyped-def]
+def _padded(x, y, z, sigma, normal, rms, free, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """Blocks with a frame of taken ones around, one row of numbers each, so that growing needs no look at the rim.
 
     Returns (N, 8) x, y, g, its weight, normal (0 where it says nothing), z; marks (N,), `TAKEN` where a block is not
@@ -209,7 +209,7 @@ def _padded(x, y, z, sigma, normal, rms, free, perspective):  # type: ignore[no-
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _tangent(block, perspective, m):  # type: ignore[no-untyped-def]
+def _tangent(block, perspective, m):  # type: ignore[no-untyped-def]  # numba types it
     """Coefficients of the tangent plane of one row of the table into `m`; False where its ray grazes it."""
     x, y, nx, ny, nz = block[0], block[1], block[4], block[5], block[6]
     if perspective:
@@ -224,7 +224,7 @@ def _tangent(block, perspective, m):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _grown(table, mark, across, seed, stamp, sweep, m, th, perspective, cos_limit, queue, S):  # type: ignore[no-untyped-def]
+def _grown(table, mark, across, seed, stamp, sweep, m, th, perspective, cos_limit, queue, S):  # type: ignore[no-untyped-def]  # numba types it
     """Blocks connected to `seed` that the plane g = m . (x, y, 1) explains, into `queue`; returns how many.
 
     `S` receives their sums as `solve3` reads them. In the first sweep the plane follows the blocks as they come.
@@ -274,7 +274,7 @@ def _grown(table, mark, across, seed, stamp, sweep, m, th, perspective, cos_limi
 
 
 @njit(cache=True)
-def grow_surface(  # type: ignore[no-untyped-def]
+def grow_surface(  # type: ignore[no-untyped-def]  # numba types it
     kind, th, x, y, z, sigma, normal, rms, free, seeds, perspective, cos_limit, mark, stamp, queue
 ):
     """Blocks connected to `seeds` that the surface explains; returns their number, indices in queue[:number].
@@ -317,7 +317,7 @@ def grow_surface(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, **LEAN)
-def _explained(kind, th, x, y, z, sigma, normals, j, rms, perspective, cos_limit):  # type: ignore[no-untyped-def]
+def _explained(kind, th, x, y, z, sigma, normals, j, rms, perspective, cos_limit):  # type: ignore[no-untyped-def]  # numba types it
     """Squared residual in sigmas (eased where grazing) if the surface explains the block, whose normal is the j-th, else -1."""
     zm = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(zm):
@@ -342,7 +342,7 @@ def _explained(kind, th, x, y, z, sigma, normals, j, rms, perspective, cos_limit
 
 
 @njit(cache=True)
-def smooth_links(z, sigma, free, slope, inverse_f, perspective, normal, rms, cos_limit):  # type: ignore[no-untyped-def]
+def smooth_links(z, sigma, free, slope, inverse_f, perspective, normal, rms, cos_limit):  # type: ignore[no-untyped-def]  # numba types it
     """Which free blocks belong with their right and lower neighbour: a small depth step and a small turn between."""
     h, w = z.shape
     right, down = np.zeros((h, w), np.bool_), np.zeros((h, w), np.bool_)

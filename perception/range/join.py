@@ -64,7 +64,7 @@ def join_pieces(regions: Regions, kinds: list[int], parameters: list[Array]) -> 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def related(  # type: ignore[no-untyped-def]
+def related(  # type: ignore[no-untyped-def]  # numba types it
     kind, th, samples, pixels, other_kind, other, others, other_pixels, noise, perspective
 ):
     """What a smaller piece is to a larger one: nothing, a scrap of it, or a piece of one surface, whose parameters follow.
@@ -96,7 +96,7 @@ def related(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _is_scrap(kind, th, own_kind, own, samples, pixels, noise, perspective):  # type: ignore[no-untyped-def]
+def _is_scrap(kind, th, own_kind, own, samples, pixels, noise, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """Whether a small piece lies so close along a large surface that it is only a dent in it, or a bit of its rim."""
     if bend.scrap_gain(kind, th, own_kind, own, samples, pixels, noise, perspective) > 0.0:
         return True
@@ -115,14 +115,14 @@ def _is_scrap(kind, th, own_kind, own, samples, pixels, noise, perspective):  # 
 
 
 @njit(cache=True, error_model="numpy")
-def _fitted(kind, th, s, perspective, rounds):  # type: ignore[no-untyped-def]
+def _fitted(kind, th, s, perspective, rounds):  # type: ignore[no-untyped-def]  # numba types it
     free = np.zeros(9, np.bool_)
     th, _, _, _, _ = fit.fit_robust(kind, th, s[0], s[1], s[2], s[3], perspective, free, rounds)
     return th
 
 
 @njit(cache=True, error_model="numpy")
-def _trimmed(kind, th, s, perspective):  # type: ignore[no-untyped-def]
+def _trimmed(kind, th, s, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """Share of the samples within the trim, and their mean squared residual in squared sigmas."""
     e = bend.residual_sizes(kind, th, s, perspective)
     kept, total = 0, 0.0
@@ -142,7 +142,7 @@ def _nearness(kinds: list[int], parameters: list[Array], thin: list[Array], pers
 
 
 @njit(cache=True)
-def _near_matrix(kinds, ths, starts, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]
+def _near_matrix(kinds, ths, starts, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]  # numba types it
     n = kinds.shape[0]
     near = np.zeros((n, n), np.bool_)
     for i in range(n):
@@ -160,7 +160,7 @@ def _near_matrix(kinds, ths, starts, x, y, z, sigma, perspective):  # type: igno
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def gap_between(depth, sen, labels, own, kind, th, a, b):  # type: ignore[no-untyped-def]
+def gap_between(depth, sen, labels, own, kind, th, a, b):  # type: ignore[no-untyped-def]  # numba types it
     """Whether the sensor sees past the surface on most of the shortest lines between two pieces of samples (4, N).
 
     `own` says which `labels` (H, W) belong to the pieces: what lies between them shows a groove, however narrow.
@@ -183,7 +183,7 @@ def gap_between(depth, sen, labels, own, kind, th, a, b):  # type: ignore[no-unt
 
 
 @njit(cache=True, error_model="numpy")
-def _is_gap(depth, sen, labels, own, kind, th, ax, ay, bx, by, slack):  # type: ignore[no-untyped-def]
+def _is_gap(depth, sen, labels, own, kind, th, ax, ay, bx, by, slack):  # type: ignore[no-untyped-def]  # numba types it
     """Whether much of the line from ray a to ray b lies behind the surface, or `GROOVE_PX` in a row of neither piece."""
     H, W = depth.shape
     perspective = sen[0] > 0

@@ -25,7 +25,7 @@ def unexplained(
 
 
 @njit(cache=True, nogil=True)
-def _patches(depth, labels, least, align):  # type: ignore[no-untyped-def]
+def _patches(depth, labels, least, align):  # type: ignore[no-untyped-def]  # numba types it
     H, W = depth.shape
     parent, free, count = np.full(H * W, np.int32(-1)), np.empty(H * W, np.int32), 0
     for v in range(H):

@@ -124,7 +124,7 @@ def typical_depths_m(depth_m: Array) -> Array:
 
 
 @njit(cache=True)
-def _valid_sample(depth, most):  # type: ignore[no-untyped-def]
+def _valid_sample(depth, most):  # type: ignore[no-untyped-def]  # numba types it
     """Every n-th of the valid depths in raster order, n so that about `most` remain."""
     flat = depth.ravel()
     valid = 0
@@ -167,7 +167,7 @@ def _fit_law(z2: Array, values: Array) -> tuple[float, float]:
 
 
 @njit(cache=True, error_model="numpy")
-def _law_through(z2, values):  # type: ignore[no-untyped-def]
+def _law_through(z2, values):  # type: ignore[no-untyped-def]  # numba types it
     typical = np.median(values)
     if typical <= 0.0:
         return np.mean(values), 0.0
@@ -182,7 +182,7 @@ def _law_through(z2, values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _two_non_negative(p, q, y):  # type: ignore[no-untyped-def]
+def _two_non_negative(p, q, y):  # type: ignore[no-untyped-def]  # numba types it
     """Least squares `y = a p + b q` with a, b >= 0: the free solution, or the better of the two edges."""
     pp, qq, pq, py, qy = np.sum(p * p), np.sum(q * q), np.sum(p * q), np.sum(p * y), np.sum(q * y)
     det = pp * qq - pq * pq
@@ -209,7 +209,7 @@ BASIS = quadratics(WINDOW)
 
 
 @njit(cache=True)
-def window_rms(g, basis, spacing, stride, perspective):  # type: ignore[no-untyped-def]
+def window_rms(g, basis, spacing, stride, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """Depth at the middle of each complete window, and the rms in metres that a quadratic leaves over in it."""
     H, W = g.shape
     side = int(np.sqrt(basis.shape[1]) + 0.5)

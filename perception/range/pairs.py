@@ -40,7 +40,7 @@ GIVE_UP = 10.0  # mean square of a rough fit, cut at five sigmas, that no full f
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def described(kind, th, samples, pixels, pitch, noise, perspective):  # type: ignore[no-untyped-def]
+def described(kind, th, samples, pixels, pitch, noise, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """A region by itself, as the simplest surface that describes it: kind, parameters, normals and figures.
 
     `pitch`: between pixels, in ray coordinates.
@@ -52,7 +52,7 @@ def described(kind, th, samples, pixels, pitch, noise, perspective):  # type: ig
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def figures_of(kind, th, samples, pixels, patches, pitch, perspective):  # type: ignore[no-untyped-def]
+def figures_of(kind, th, samples, pixels, patches, pitch, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """(FIGURES,) of a region; its tilt is sigma / (spread sqrt(patches)), the slope of a plane through noisy values."""
     out = np.empty(FIGURES)
     out[PIXELS], out[PATCHES] = pixels, patches
@@ -72,7 +72,7 @@ def figures_of(kind, th, samples, pixels, patches, pitch, perspective):  # type:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def judged(  # type: ignore[no-untyped-def]
+def judged(  # type: ignore[no-untyped-def]  # numba types it
     kind_a,
     a,
     samples_a,
@@ -151,7 +151,7 @@ def judged(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _continued(kind, th, samples, perspective):  # type: ignore[no-untyped-def]
+def _continued(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """The surface refined on the samples of both regions."""
     free = np.zeros(9, np.bool_)
     x, y, z, sigma = samples[0], samples[1], samples[2], samples[3]
@@ -160,7 +160,7 @@ def _continued(kind, th, samples, perspective):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _joint_fits(samples, normals, perspective, with_quadric, correlated):  # type: ignore[no-untyped-def]
+def _joint_fits(samples, normals, perspective, with_quadric, correlated):  # type: ignore[no-untyped-def]  # numba types it
     """Parameters (5, SIZE) of each kind on the samples of both regions, and which of them fit at all."""
     kinds = np.ones(5, np.bool_)
     kinds[QUADRIC] = with_quadric
@@ -173,7 +173,7 @@ def _joint_fits(samples, normals, perspective, with_quadric, correlated):  # typ
 
 
 @njit(cache=True, error_model="numpy")
-def _gain(  # type: ignore[no-untyped-def]
+def _gain(  # type: ignore[no-untyped-def]  # numba types it
     kind, th, kind_a, samples_a, figures_a, kind_b, samples_b, figures_b, is_smooth, perspective
 ):
     """How much cheaper the joint surface is than the two; 0 where it does not describe both."""
@@ -194,14 +194,14 @@ def _gain(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _is_strip(pixels_a, pixels_b, length_px):  # type: ignore[no-untyped-def]
+def _is_strip(pixels_a, pixels_b, length_px):  # type: ignore[no-untyped-def]  # numba types it
     """Whether the smaller region is a narrow strip along its border with a much larger one."""
     less = min(pixels_a, pixels_b)
     return less < ROUNDING_PX * length_px and less < SCRAP_SHARE * max(pixels_a, pixels_b)
 
 
 @njit(cache=True, error_model="numpy")
-def _is_uneven(th, samples_a, samples_b, tolerance_m, perspective):  # type: ignore[no-untyped-def]
+def _is_uneven(th, samples_a, samples_b, tolerance_m, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """Whether two facets leave the plane `th` by less than things that are called flat do: upholstery, cardboard."""
     for side in range(2):
         samples = samples_a if side == 0 else samples_b
@@ -212,7 +212,7 @@ def _is_uneven(th, samples_a, samples_b, tolerance_m, perspective):  # type: ign
 
 
 @njit(cache=True, error_model="numpy")
-def _swallowed(is_rounding, kind, th, figures, own_kind, own, samples, own_figures, noise, perspective):  # type: ignore[no-untyped-def]
+def _swallowed(is_rounding, kind, th, figures, own_kind, own, samples, own_figures, noise, perspective):  # type: ignore[no-untyped-def]  # numba types it
     if is_rounding:
         return LEAST_GAIN, kind, th
     if own_figures[PIXELS] > SCRAP_SHARE * figures[PIXELS]:
@@ -221,7 +221,7 @@ def _swallowed(is_rounding, kind, th, figures, own_kind, own, samples, own_figur
 
 
 @njit(cache=True, error_model="numpy")
-def _is_creased(samples, perspective, limit):  # type: ignore[no-untyped-def]
+def _is_creased(samples, perspective, limit):  # type: ignore[no-untyped-def]  # numba types it
     """Whether even a quadratic in x and y leaves more than `limit` squared sigmas a sample over.
 
     It follows whatever is smooth and turns by no more than `SHARPEST_TURN_RAD`, so it spares the fits of surfaces.
@@ -256,7 +256,7 @@ def _is_creased(samples, perspective, limit):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def shown_noise(figures_a, figures_b):  # type: ignore[no-untyped-def]
+def shown_noise(figures_a, figures_b):  # type: ignore[no-untyped-def]  # numba types it
     """How many times the noise model's variance two regions show by themselves; slanted faces scatter more."""
     na, nb = figures_a[PATCHES], figures_b[PATCHES]
     shown = (figures_a[MEAN_SQUARE] * na + figures_b[MEAN_SQUARE] * nb) / (na + nb)
@@ -264,6 +264,6 @@ def shown_noise(figures_a, figures_b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def mean_square_limit(patches):  # type: ignore[no-untyped-def]
+def mean_square_limit(patches):  # type: ignore[no-untyped-def]  # numba types it
     """What a right surface stays below in 97 of 100 cases: 1 + 2 sqrt(2 / n) of a mean of n squares, and a floor."""
     return max(PLAIN_MEAN_SQUARE, 1.0 + 2.0 * np.sqrt(2.0 / patches))

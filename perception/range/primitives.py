@@ -173,7 +173,7 @@ def named_covariance(kind: int, th: Array, covariance: Array) -> Array:
 
 
 @njit(cache=True, error_model="numpy")
-def _shape_jacobian(th, step):  # type: ignore[no-untyped-def]
+def _shape_jacobian(th, step):  # type: ignore[no-untyped-def]  # numba types it
     """(6, 9) central differences of centre and radii over the tangent parameters of a QUADRIC, `step` (9,) each way."""
     J, delta, frame = np.empty((6, 9)), np.zeros(9), np.zeros(6)
     before, after = np.empty(SIZE), np.empty(SIZE)
@@ -188,7 +188,7 @@ def _shape_jacobian(th, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def centre_and_radii(th):  # type: ignore[no-untyped-def]
+def centre_and_radii(th):  # type: ignore[no-untyped-def]  # numba types it
     """(6,) centre and radii of a QUADRIC, as `ellipsoid_of`."""
     A = np.array(
         [[th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]]

@@ -144,7 +144,7 @@ def _named(s: Array, q: Array, centre: Array, scale: float, count: int) -> Quadr
 
 
 @njit(cache=True, nogil=True)
-def _triangle(rows):  # type: ignore[no-untyped-def]
+def _triangle(rows):  # type: ignore[no-untyped-def]  # numba types it
     """(10, 10) upper triangle R of rows (N, 10) by Givens rotations, one row at a time."""
     n = rows.shape[1]
     R = np.zeros((n, n))

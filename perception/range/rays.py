@@ -30,7 +30,7 @@ LOOSE = {"reassoc", "contract", "nsz", "arcp"}  # sums may be reordered; NaN kee
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def load_rows(x, y, z, sigma, first, n, work):  # type: ignore[no-untyped-def]
+def load_rows(x, y, z, sigma, first, n, work):  # type: ignore[no-untyped-def]  # numba types it
     """Samples first .. first + n into `work`.
 
     Loops that compute from several arrays ask at run time whether these may overlap, and round otherwise when they lie
@@ -48,7 +48,7 @@ def load_rows(x, y, z, sigma, first, n, work):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def fill_rows(kind, th, frame, n, perspective, work):  # type: ignore[no-untyped-def]
+def fill_rows(kind, th, frame, n, perspective, work):  # type: ignore[no-untyped-def]  # numba types it
     """Depth, cosine of incidence and derivatives (as `depth_and_jacobian`) of the `n` loaded samples into `work`.
 
     `work` (SCRATCH,) holds rows of CHUNK numbers; n <= CHUNK. Depth is NaN where a ray misses.
@@ -67,7 +67,7 @@ def fill_rows(kind, th, frame, n, perspective, work):  # type: ignore[no-untyped
 
 
 @njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _plane(th, frame, n, p, work):  # type: ignore[no-untyped-def]
+def _plane(th, frame, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
     nx, ny, nz, d = th[0], th[1], th[2], th[3]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
     for i in range(n):
@@ -86,7 +86,7 @@ def _plane(th, frame, n, p, work):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _sphere(th, n, p, work):  # type: ignore[no-untyped-def]
+def _sphere(th, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
     cx, cy, cz, r = th[0], th[1], th[2], th[3]
     side = 1.0 if th[4] > 0 else -1.0
     inverse_r = 1.0 / r
@@ -110,7 +110,7 @@ def _sphere(th, n, p, work):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _cylinder(th, frame, n, p, work):  # type: ignore[no-untyped-def]
+def _cylinder(th, frame, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
     cx, cy, cz, ax, ay, az, r = th[0], th[1], th[2], th[3], th[4], th[5], th[6]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
     side = 1.0 if th[7] > 0 else -1.0
@@ -144,7 +144,7 @@ def _cylinder(th, frame, n, p, work):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _cone(th, frame, n, p, work):  # type: ignore[no-untyped-def]
+def _cone(th, frame, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
     cx, cy, cz, ax, ay, az = th[0], th[1], th[2], th[3], th[4], th[5]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
     outside = th[7] > 0
@@ -187,7 +187,7 @@ def _cone(th, frame, n, p, work):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _quadric(th, n, p, work):  # type: ignore[no-untyped-def]
+def _quadric(th, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
     s = 1.0 / th[3]
     cx, cy, cz = th[0] * s, th[1] * s, th[2] * s
     qxx, qyy, qzz, qxy, qxz, qyz, qx, qy, qz, q0 = (
@@ -234,7 +234,7 @@ def _quadric(th, n, p, work):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def error_row(n, work):  # type: ignore[no-untyped-def]
+def error_row(n, work):  # type: ignore[no-untyped-def]  # numba types it
     """Row ERROR of the filled rows: residuals in sigmas, lessened at grazing rays; NaN where the ray misses."""
     for i in range(n):
         w = min(1.0, work[COSINE + i] * (1.0 / GRAZING_COSINE)) / work[SIGMA + i]
@@ -242,7 +242,7 @@ def error_row(n, work):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _cauchy_weights(n, c2, work):  # type: ignore[no-untyped-def]
+def _cauchy_weights(n, c2, work):  # type: ignore[no-untyped-def]  # numba types it
     """Rows WEIGHT and RESIDUAL under Cauchy weights, 1 + ratio in row DEPTH; returns the number of samples that hit."""
     used = 0.0
     for i in range(n):
@@ -262,7 +262,7 @@ def _cauchy_weights(n, c2, work):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _sum_of_logarithms(values):  # type: ignore[no-untyped-def]
+def _sum_of_logarithms(values):  # type: ignore[no-untyped-def]  # numba types it
     """Sum of ln(values): the logarithm of a product of eight is one logarithm in place of eight."""
     total = 0.0
     n = values.shape[0]
@@ -276,7 +276,7 @@ def _sum_of_logarithms(values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _trim_weights(n, trim, work):  # type: ignore[no-untyped-def]
+def _trim_weights(n, trim, work):  # type: ignore[no-untyped-def]  # numba types it
     """Rows WEIGHT and RESIDUAL under a trim; returns cost and number of samples kept."""
     used, cost = 0.0, 0.0
     for i in range(n):
@@ -293,7 +293,7 @@ def _trim_weights(n, trim, work):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _dot(a, b):  # type: ignore[no-untyped-def]
+def _dot(a, b):  # type: ignore[no-untyped-def]  # numba types it
     total = 0.0
     for i in range(a.shape[0]):
         total += a[i] * b[i]
@@ -301,13 +301,13 @@ def _dot(a, b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _weighted(row, weight):  # type: ignore[no-untyped-def]
+def _weighted(row, weight):  # type: ignore[no-untyped-def]  # numba types it
     for i in range(row.shape[0]):
         row[i] = row[i] * weight[i] if weight[i] > 0.0 else 0.0
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _add_products(p, n, work, H, g):  # type: ignore[no-untyped-def]
+def _add_products(p, n, work, H, g):  # type: ignore[no-untyped-def]  # numba types it
     """Add J' W J to the lower triangle of `H` and J' W e to `g` from the rows of one chunk."""
     padded = (n + LANES - 1) // LANES * LANES
     work[WEIGHT + n : WEIGHT + padded] = 0.0
@@ -322,7 +322,7 @@ def _add_products(p, n, work, H, g):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN, nogil=True)
-def normal_equations(  # type: ignore[no-untyped-def]
+def normal_equations(  # type: ignore[no-untyped-def]  # numba types it
     kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g, work, held
 ):
     """Gauss-Newton matrix `H` (9, 9) and gradient `g` (9,) of the ray residuals of samples (N,); cost and used samples.
@@ -357,7 +357,7 @@ def normal_equations(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def residuals(kind, th, x, y, z, sigma, perspective, out):  # type: ignore[no-untyped-def]
+def residuals(kind, th, x, y, z, sigma, perspective, out):  # type: ignore[no-untyped-def]  # numba types it
     """Fill `out` (N,) with residuals in sigmas, lessened at grazing rays; NaN where the ray misses."""
     frame, work = np.zeros(6), np.empty(SCRATCH)
     frame_of(kind, th, frame)

@@ -64,7 +64,7 @@ def regions_of(depth_m: Array, packed: Array, law: Array, labels: Labels, count:
 
 
 @njit(cache=True, nogil=True)
-def renamed(labels, names):  # type: ignore[no-untyped-def]
+def renamed(labels, names):  # type: ignore[no-untyped-def]  # numba types it
     """(H, W) labels after k is called `names[k]`."""
     out = np.empty_like(labels)
     flat, new = labels.ravel(), out.ravel()
@@ -74,7 +74,7 @@ def renamed(labels, names):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _spread_samples(depth, sen, noise, starts, indices, most):  # type: ignore[no-untyped-def]
+def _spread_samples(depth, sen, noise, starts, indices, most):  # type: ignore[no-untyped-def]  # numba types it
     """(count, 4, most) samples and how many of them each label has."""
     count = starts.shape[0] - 2
     out, sizes = np.empty((count, 4, most)), np.empty(count, np.int64)
@@ -92,7 +92,7 @@ def _spread_samples(depth, sen, noise, starts, indices, most):  # type: ignore[n
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _samples_at(depth, sen, noise, indices):  # type: ignore[no-untyped-def]
+def _samples_at(depth, sen, noise, indices):  # type: ignore[no-untyped-def]  # numba types it
     """(4, N) samples of the pixels at flat `indices` (N,) in raster order."""
     n, W = indices.shape[0], depth.shape[1]
     flat = depth.ravel()
@@ -109,7 +109,7 @@ def _samples_at(depth, sen, noise, indices):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def _fill_sigmas(z, noise, out):  # type: ignore[no-untyped-def]
+def _fill_sigmas(z, noise, out):  # type: ignore[no-untyped-def]  # numba types it
     """`sigma_at` of many depths, without a branch."""
     a, b, c, d, e, f = noise[0], noise[1], noise[2], noise[3], noise[4], noise[5]
     for i in range(z.shape[0]):

@@ -22,7 +22,7 @@ SAFE_NEIGHBOURS = 5  # of eight: as many as a pixel beside a straight border has
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def settle(depth, sen, noise, slow_share, earlier, labels, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]
+def settle(depth, sen, noise, slow_share, earlier, labels, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]  # numba types it
     """Judge again the rows [top, bottom) of `labels` (H, W) where labels meet; writes `out` (H, W).
 
     `earlier`: the labels before the last sweep, -1 at first. A pixel around which nothing has changed since would be
@@ -58,7 +58,7 @@ def settle(depth, sen, noise, slow_share, earlier, labels, kinds, ths, out, top,
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _differ(a, b):  # type: ignore[no-untyped-def]
+def _differ(a, b):  # type: ignore[no-untyped-def]  # numba types it
     """Whether two rows differ, without a branch a pixel."""
     change = np.int32(0)
     for u in range(a.shape[0]):
@@ -67,7 +67,7 @@ def _differ(a, b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _best(depth, sen, noise, evidence, labels, v, u, kinds, ths, near, votes):  # type: ignore[no-untyped-def]
+def _best(depth, sen, noise, evidence, labels, v, u, kinds, ths, near, votes):  # type: ignore[no-untyped-def]  # numba types it
     """The label of one pixel, its own where no other touches it; `near` and `votes` (MOST,) are scratch."""
     own, z = labels[v, u], depth[v, u]
     same, other = _beside(labels, v, u)
@@ -94,7 +94,7 @@ def _best(depth, sen, noise, evidence, labels, v, u, kinds, ths, near, votes):  
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _beside(labels, v, u):  # type: ignore[no-untyped-def]
+def _beside(labels, v, u):  # type: ignore[no-untyped-def]  # numba types it
     """How many of the eight neighbours bear the pixel's own label, and how many another one."""
     H, W = labels.shape
     own = labels[v, u]
@@ -108,7 +108,7 @@ def _beside(labels, v, u):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _counted(labels, v, u, near, votes):  # type: ignore[no-untyped-def]
+def _counted(labels, v, u, near, votes):  # type: ignore[no-untyped-def]  # numba types it
     """Labels of the neighbours into `near`, how many bear each into `votes`; their number, and that of neighbours."""
     H, W = labels.shape
     n, total = 0, 0.0

@@ -103,7 +103,7 @@ def _row(s: ModelSurface) -> Array:
 
 
 @njit(cache=True, error_model="numpy")
-def hit(row, grow, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
+def hit(row, grow, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]  # numba types it
     """Depth along the ray o + t d where it first meets the surface grown by `grow`; infinite where it does not."""
     form = int(row[0])
     wx, wy, wz = ox - row[1], oy - row[2], oz - row[3]
@@ -162,7 +162,7 @@ def hit(row, grow, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _ring(R, r, ax, ay, az, wx, wy, wz, dx, dy, dz):  # type: ignore[no-untyped-def]
+def _ring(R, r, ax, ay, az, wx, wy, wz, dx, dy, dz):  # type: ignore[no-untyped-def]  # numba types it
     """A torus met by steps of its distance (sphere tracing; Hart, The Visual Computer 12, 1996)."""
     A, B = dx * dx + dy * dy + dz * dz, dx * wx + dy * wy + dz * wz
     disc = B * B - A * (wx * wx + wy * wy + wz * wz - (R + r) * (R + r))
@@ -192,7 +192,7 @@ def _ring(R, r, ax, ay, az, wx, wy, wz, dx, dy, dz):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, error_model="numpy")
-def window_of(box, shift, R, p, sen, margin, limit, window):  # type: ignore[no-untyped-def]
+def window_of(box, shift, R, p, sen, margin, limit, window):  # type: ignore[no-untyped-def]  # numba types it
     """Fill `window` (u0, v0, u1, v1) with what a box (2, 3) of the object's frame covers, clipped to `limit`."""
     u0, v0, u1, v1 = 1e9, 1e9, -1e9, -1e9
     for corner in range(8):
@@ -213,7 +213,7 @@ def window_of(box, shift, R, p, sen, margin, limit, window):  # type: ignore[no-
 
 
 @njit(cache=True, error_model="numpy")
-def render(rows, boxes, grow, shift, R, p, sen, window, stride, depth, index):  # type: ignore[no-untyped-def]
+def render(rows, boxes, grow, shift, R, p, sen, window, stride, depth, index):  # type: ignore[no-untyped-def]  # numba types it
     """Fill `depth` (infinite where nothing is met) and `index` (row number or -1) over a window of the image.
 
     Args:

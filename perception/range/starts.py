@@ -11,7 +11,7 @@ MOST_SWEEPS = 12  # of Jacobi rotations; a 3x3 matrix settles in four or five
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def solve_positive(A, b, p):  # type: ignore[no-untyped-def]
+def solve_positive(A, b, p):  # type: ignore[no-untyped-def]  # numba types it
     """Solve A x = b by Cholesky, overwriting both; False when A is not positive definite."""
     for i in range(p):
         top = A[i, i]
@@ -39,7 +39,7 @@ def solve_positive(A, b, p):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def principal_axes(S):  # type: ignore[no-untyped-def]
+def principal_axes(S):  # type: ignore[no-untyped-def]  # numba types it
     """Eigenvalues (3,), smallest first, and eigenvectors (3, 3) in columns, of a symmetric matrix.
 
     Cyclic Jacobi rotations (Golub and Van Loan, 8.5): a tenth of what a call of LAPACK costs at this size.
@@ -74,7 +74,7 @@ def principal_axes(S):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def centroid(P):  # type: ignore[no-untyped-def]
+def centroid(P):  # type: ignore[no-untyped-def]  # numba types it
     """Mean of points (N, 3)."""
     c = np.zeros(3)
     n = P.shape[0]
@@ -87,7 +87,7 @@ def centroid(P):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def scatter(P, c):  # type: ignore[no-untyped-def]
+def scatter(P, c):  # type: ignore[no-untyped-def]  # numba types it
     """(3, 3) sum of (P_i - c)(P_i - c)'."""
     S = np.zeros((3, 3))
     for i in range(P.shape[0]):
@@ -103,7 +103,7 @@ def scatter(P, c):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def start_plane(P):  # type: ignore[no-untyped-def]
+def start_plane(P):  # type: ignore[no-untyped-def]  # numba types it
     """Plane through points (N, 3) by principal axes."""
     th = np.zeros(SIZE)
     c = centroid(P)
@@ -116,7 +116,7 @@ def start_plane(P):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _least_squares(rows, values):  # type: ignore[no-untyped-def]
+def _least_squares(rows, values):  # type: ignore[no-untyped-def]  # numba types it
     """Solve rows (N, m) x = values (N,) by normal equations; (x, solved)."""
     n, m = rows.shape
     A, b = np.zeros((m, m)), np.zeros(m)
@@ -134,7 +134,7 @@ def _least_squares(rows, values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _side(P, N, th, axis):  # type: ignore[no-untyped-def]
+def _side(P, N, th, axis):  # type: ignore[no-untyped-def]  # numba types it
     """+1 when the normals point away from the centre or axis of `th`, -1 when towards it."""
     outward = 0.0
     for i in range(P.shape[0]):
@@ -145,7 +145,7 @@ def _side(P, N, th, axis):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def start_sphere(P, N):  # type: ignore[no-untyped-def]
+def start_sphere(P, N):  # type: ignore[no-untyped-def]  # numba types it
     """Algebraic sphere |X|^2 = 2 c . X + k about the centroid; side from the normals."""
     th = np.zeros(SIZE)
     c = centroid(P)
@@ -169,14 +169,14 @@ def start_sphere(P, N):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def normal_axis(N, centred):  # type: ignore[no-untyped-def]
+def normal_axis(N, centred):  # type: ignore[no-untyped-def]  # numba types it
     """Direction that the normals avoid (cylinder), or along which they are constant (cone, centred)."""
     _, V = principal_axes(scatter(N, centroid(N) if centred else np.zeros(3)))
     return V[:, 0].copy()
 
 
 @njit(cache=True, error_model="numpy")
-def start_cylinder(P, N, axis):  # type: ignore[no-untyped-def]
+def start_cylinder(P, N, axis):  # type: ignore[no-untyped-def]  # numba types it
     """Circle (algebraic) of the points seen along `axis`."""
     th = np.zeros(SIZE)
     e = tangent_frame(axis[0], axis[1], axis[2])
@@ -200,7 +200,7 @@ def start_cylinder(P, N, axis):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def start_cone(P, N, axis):  # type: ignore[no-untyped-def]
+def start_cone(P, N, axis):  # type: ignore[no-untyped-def]  # numba types it
     """Apex from n . X = n . apex; the angle from n . axis = -sin(angle)."""
     th = np.zeros(SIZE)
     c = centroid(P)
@@ -224,7 +224,7 @@ def start_cone(P, N, axis):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def quadric_of_sphere(th):  # type: ignore[no-untyped-def]
+def quadric_of_sphere(th):  # type: ignore[no-untyped-def]  # numba types it
     """The sphere as a quadric centred on it: the start of an ellipsoid fit."""
     out = np.zeros(SIZE)
     out[:3] = th[:3]
@@ -234,7 +234,7 @@ def quadric_of_sphere(th):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def is_ellipsoid(th):  # type: ignore[no-untyped-def]
+def is_ellipsoid(th):  # type: ignore[no-untyped-def]  # numba types it
     """Whether the quadric is a real ellipsoid of sane proportions (longest radius at most 8 times the shortest)."""
     A = np.array(
         [[th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]]

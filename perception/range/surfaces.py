@@ -30,7 +30,7 @@ GRAZING_COSINE = 0.3  # below it a depth residual says little about the surface:
 
 
 @njit(cache=True, **LEAN)
-def tangent_frame(ax, ay, az):  # type: ignore[no-untyped-def]
+def tangent_frame(ax, ay, az):  # type: ignore[no-untyped-def]  # numba types it
     """Two unit vectors that complete (ax, ay, az) to a right-handed frame."""
     if abs(ax) < 0.8:
         ux, uy, uz = 0.0, az, -ay
@@ -42,7 +42,7 @@ def tangent_frame(ax, ay, az):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, **LEAN)
-def _roots(a, b, c, side):  # type: ignore[no-untyped-def]
+def _roots(a, b, c, side):  # type: ignore[no-untyped-def]  # numba types it
     """Root of a z^2 + 2 b z + c: the nearer for side +1, the farther for -1; NaN without a real root."""
     disc = b * b - a * c
     if disc < 0.0:
@@ -56,7 +56,7 @@ def _roots(a, b, c, side):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, **LEAN)
-def depth_on(kind, th, x, y, perspective):  # type: ignore[no-untyped-def]
+def depth_on(kind, th, x, y, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """Depth z where the ray of (x, y) meets the surface; NaN where it does not."""
     if perspective:
         ox, oy, dx, dy = 0.0, 0.0, x, y
@@ -133,14 +133,14 @@ def depth_on(kind, th, x, y, perspective):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, **LEAN)
-def depths_on(kind, th, x, y, perspective, out):  # type: ignore[no-untyped-def]
+def depths_on(kind, th, x, y, perspective, out):  # type: ignore[no-untyped-def]  # numba types it
     """`depth_on` for arrays x, y (N,) into `out` (N,)."""
     for i in range(x.shape[0]):
         out[i] = depth_on(kind, th, x[i], y[i], perspective)
 
 
 @njit(cache=True, **LEAN)
-def normal_on(kind, th, px, py, pz):  # type: ignore[no-untyped-def]
+def normal_on(kind, th, px, py, pz):  # type: ignore[no-untyped-def]  # numba types it
     """Unit gradient of the surface at a point on it (not oriented)."""
     if kind == PLANE:
         return th[0], th[1], th[2]
@@ -165,7 +165,7 @@ def normal_on(kind, th, px, py, pz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, **LEAN)
-def normals_on(kind, th, x, y, z, perspective, out):  # type: ignore[no-untyped-def]
+def normals_on(kind, th, x, y, z, perspective, out):  # type: ignore[no-untyped-def]  # numba types it
     """Unit normals towards the sensor at the rays (x, y) and depths z (N,) into `out` (N, 3)."""
     for i in range(x.shape[0]):
         px, py = (x[i] * z[i], y[i] * z[i]) if perspective else (x[i], y[i])
@@ -176,7 +176,7 @@ def normals_on(kind, th, x, y, z, perspective, out):  # type: ignore[no-untyped-
 
 
 @njit(cache=True)
-def depth_and_jacobian(kind, th, frame, x, y, perspective, J):  # type: ignore[no-untyped-def]
+def depth_and_jacobian(kind, th, frame, x, y, perspective, J):  # type: ignore[no-untyped-def]  # numba types it
     """Depth, cosine of incidence, and J = dz / d(tangent parameters): dz = -(dF/dtheta) / (dF/dz) on F = 0."""
     z = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(z):
@@ -231,7 +231,7 @@ def depth_and_jacobian(kind, th, frame, x, y, perspective, J):  # type: ignore[n
 
 
 @njit(cache=True, **LEAN)
-def frame_of(kind, th, frame):  # type: ignore[no-untyped-def]
+def frame_of(kind, th, frame):  # type: ignore[no-untyped-def]  # numba types it
     """Fill `frame` (6,) with the tangent frame that the steps of this surface refer to."""
     if kind == PLANE:
         f = tangent_frame(th[0], th[1], th[2])
@@ -244,7 +244,7 @@ def frame_of(kind, th, frame):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, **LEAN)
-def step_into(kind, th, frame, step, out):  # type: ignore[no-untyped-def]
+def step_into(kind, th, frame, step, out):  # type: ignore[no-untyped-def]  # numba types it
     """The surface after a tangent step, into `out`; unit vectors stay unit, quadrics keep the trace of their matrix."""
     for i in range(SIZE):
         out[i] = th[i]

@@ -24,7 +24,7 @@ X, Y, Z, G, K = (row * WIDE for row in range(5))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def tangent_planes(  # type: ignore[no-untyped-def]
+def tangent_planes(  # type: ignore[no-untyped-def]  # numba types it
     x, y, z, count, sigma, perspective, radius, slope_per_block, normal, rms, top, bottom
 ):
     """Plane of least squares through the blocks around each block, within a jump of it; writes rows [top, bottom).
@@ -55,7 +55,7 @@ def tangent_planes(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _next_run(z, start):  # type: ignore[no-untyped-def]
+def _next_run(z, start):  # type: ignore[no-untyped-def]  # numba types it
     """[start, end) of the next run of known depths that no gap of `GAP` empty blocks parts; (w, w) when there is none."""
     w = z.shape[0]
     while start < w and not np.isfinite(z[start]):
@@ -69,7 +69,7 @@ def _next_run(z, start):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _load_own(x, y, z, sigma, perspective, work):  # type: ignore[no-untyped-def]
+def _load_own(x, y, z, sigma, perspective, work):  # type: ignore[no-untyped-def]  # numba types it
     n = x.shape[0]
     for c in range(n):
         work[X0 + c], work[Y0 + c], work[Z0 + c] = x[c], y[c], z[c]
@@ -79,7 +79,7 @@ def _load_own(x, y, z, sigma, perspective, work):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _load(x, y, z, count, perspective, at, wide):  # type: ignore[no-untyped-def]
+def _load(x, y, z, count, perspective, at, wide):  # type: ignore[no-untyped-def]  # numba types it
     """One row of neighbours into `wide`, the first at `at`."""
     n = x.shape[0]
     to_x, to_y, to_z, to_g, to_k = wide[X + at :], wide[Y + at :], wide[Z + at :], wide[G + at :], wide[K + at :]
@@ -100,7 +100,7 @@ def _load(x, y, z, count, perspective, at, wide):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _add(reach, n, at, wide, work):  # type: ignore[no-untyped-def]
+def _add(reach, n, at, wide, work):  # type: ignore[no-untyped-def]  # numba types it
     """Sums of 1, k, and k times x, y, g, xx, xy, yy, xg, yg, gg over one neighbour of every block, if it is near.
 
     The neighbour of the first block is the one at `at` of the rows of `wide`.
@@ -127,7 +127,7 @@ def _add(reach, n, at, wide, work):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _solve(n, least, perspective, sigma, normal, rms, work):  # type: ignore[no-untyped-def]
+def _solve(n, least, perspective, sigma, normal, rms, work):  # type: ignore[no-untyped-def]  # numba types it
     """Slopes (p, q) of g over the window, the plane's normal towards the sensor, and what it leaves over in sigmas."""
     for c in range(n):
         blocks, s, sx, sy, sg = work[N + c], work[S + c], work[SX + c], work[SY + c], work[SG + c]

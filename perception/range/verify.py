@@ -67,7 +67,7 @@ class Solid:
 
 
 @njit(cache=True, error_model="numpy")
-def _placed(boxes, slide, q, R0, p0, sen, limit, R, p, window):  # type: ignore[no-untyped-def]
+def _placed(boxes, slide, q, R0, p0, sen, limit, R, p, window):  # type: ignore[no-untyped-def]  # numba types it
     """Pose of the hypothesis into `R`, `p`, and what of the image the solid covers into `window`, with a margin."""
     c, s = np.cos(q[2]), np.sin(q[2])
     for a in range(3):
@@ -84,7 +84,7 @@ def _placed(boxes, slide, q, R0, p0, sen, limit, R, p, window):  # type: ignore[
 
 
 @njit(cache=True, error_model="numpy")
-def _lifts(m, k, window, stride, h, w, z, sigma, tolerance, is_free, lift):  # type: ignore[no-untyped-def]
+def _lifts(m, k, window, stride, h, w, z, sigma, tolerance, is_free, lift):  # type: ignore[no-untyped-def]  # numba types it
     """Mean residual of each row within its tolerance: how much higher or lower this component is than its model."""
     S = lift.shape[0]
     weight, total = np.zeros(S), np.zeros(S)
@@ -107,7 +107,7 @@ def _lifts(m, k, window, stride, h, w, z, sigma, tolerance, is_free, lift):  # t
 
 
 @njit(cache=True, error_model="numpy")
-def judged(rows, boxes, tolerance, slide, q, z, panel, sigma, sen, R0, p0, stride, rim, m, k, lift, hits, counts):  # type: ignore[no-untyped-def]
+def judged(rows, boxes, tolerance, slide, q, z, panel, sigma, sen, R0, p0, stride, rim, m, k, lift, hits, counts):  # type: ignore[no-untyped-def]  # numba types it
     """Gain of the hypothesis q = (x, y, yaw, state, growth of each row) over the bare panel.
 
     Args:
@@ -164,7 +164,7 @@ def judged(rows, boxes, tolerance, slide, q, z, panel, sigma, sen, R0, p0, strid
 
 
 @njit(cache=True, error_model="numpy")
-def _priors(q, tolerance, is_free, lift):  # type: ignore[no-untyped-def]
+def _priors(q, tolerance, is_free, lift):  # type: ignore[no-untyped-def]  # numba types it
     """Log-likelihood of heights and sizes that differ from the model's: a tolerance is two standard deviations."""
     out = 0.0
     for s in range(tolerance.shape[0]):
@@ -176,7 +176,7 @@ def _priors(q, tolerance, is_free, lift):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _slope(m, k, j, i, h, w):  # type: ignore[no-untyped-def]
+def _slope(m, k, j, i, h, w):  # type: ignore[no-untyped-def]  # numba types it
     """Depth step to the next pixel of the same row of the solid, down or sideways, the larger."""
     out = 0.0
     if i > 0 and k[j, i - 1] == k[j, i]:
@@ -191,7 +191,7 @@ def _slope(m, k, j, i, h, w):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _deepest_beside(m, k, j, i, h, w, panel):  # type: ignore[no-untyped-def]
+def _deepest_beside(m, k, j, i, h, w, panel):  # type: ignore[no-untyped-def]  # numba types it
     """Depth of the deepest thing drawn in or beside a pixel: of what a beam there may have mixed with its own."""
     out = m[j, i]
     for b in range(max(j - 1, 0), min(j + 2, h)):
@@ -201,7 +201,7 @@ def _deepest_beside(m, k, j, i, h, w, panel):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _going_on(m, k, window, h, w, z, panel, sigma, hits, counts):  # type: ignore[no-untyped-def]
+def _going_on(m, k, window, h, w, z, panel, sigma, hits, counts):  # type: ignore[no-untyped-def]  # numba types it
     """Pixels beyond the outline, or before the model, whose depth goes on smoothly from explained ones.
 
     What hides a part stands off it: before the model without a jump there is a larger thing, and no occluder.
@@ -230,7 +230,7 @@ def _going_on(m, k, window, h, w, z, panel, sigma, hits, counts):  # type: ignor
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def climbed(rows, boxes, tolerance, slide, q, ways, low, high, levels, z, panel, sigma, sen, R0, p0, stride, rim):  # type: ignore[no-untyped-def]
+def climbed(rows, boxes, tolerance, slide, q, ways, low, high, levels, z, panel, sigma, sen, R0, p0, stride, rim):  # type: ignore[no-untyped-def]  # numba types it
     """Move `q` to the best hypothesis near by and give its gain: along one of the `ways` at a time, halved each level.
 
     Args:

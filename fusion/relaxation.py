@@ -37,7 +37,7 @@ def constraints() -> tuple[Array, Array]:
     for k in range(3):
         p, q = (k + 1) % 3, (k + 2) % 3
         for i in range(3):
-            j, l = (i + 1) % 3, (i + 2) % 3  # noqa: E741
+            j, l = (i + 1) % 3, (i + 2) % 3  # noqa: E741 - the indices of the equation
             found.append(([(r[j][p], r[l][q], 1.0), (r[l][p], r[j][q], -1.0), (0, r[i][k], -1.0)], 0.0))
     for k in range(3):
         found.append(([(0, s[k], 1.0)] + [(r[i][k], t[i], 1.0) for i in range(3)], 0.0))

@@ -100,7 +100,7 @@ class Swapper:
         self._motion = motion
         self._busy = threading.Lock()
 
-    def swap(self, name: str, driver: str, options: dict[str, Any], *, deadline: Deadline) -> None:  # noqa: ARG002
+    def swap(self, name: str, driver: str, options: dict[str, Any], *, deadline: Deadline) -> None:  # noqa: ARG002 - an interface
         """Another driver or other options for the device `name`.
 
         Args:

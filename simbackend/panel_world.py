@@ -279,7 +279,7 @@ class PanelWorld:
         for name, on in self.lamps_on.items():
             if on:
                 thing = self.built[name].thing
-                assert isinstance(thing, Lamp)  # noqa: S101
+                assert isinstance(thing, Lamp)  # noqa: S101 - for mypy
                 place = self.object_pose(self.built[name]).apply([0, 0, thing.height_m])
                 lit.append(
                     Emitter(

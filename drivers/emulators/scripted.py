@@ -190,7 +190,7 @@ class ScriptedGripper(Scripted):
         )
         return Stamped(value=state, host_time_s=now_s, sequence=index)
 
-    def command(self, *, width_m: float, force_n: float, speed_m_per_s: float, deadline: Deadline) -> float:  # noqa: ARG002
+    def command(self, *, width_m: float, force_n: float, speed_m_per_s: float, deadline: Deadline) -> float:  # noqa: ARG002 - no wait
         """Set off."""
         _, now_s = self.count(deadline)
         self._from_m, self._since_s = self._width_m(now_s), now_s

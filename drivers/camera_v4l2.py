@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.camera_files import LensOptions, nominal, to_pixels
-from drivers.transport.device import WireDevice
+from drivers.transport.device import PortDevice
 from drivers.transport.link import LinkLost, NoAnswer, now_s
 from drivers.transport.options import read_options
 from drivers.transport.port import Port
@@ -82,7 +82,7 @@ class Capture:
         self._video.release()
 
 
-class CameraV4l2(WireDevice[Image]):
+class CameraV4l2(PortDevice[Image]):
     """A live camera."""
 
     kind = DeviceKind.CAMERA
@@ -131,22 +131,6 @@ class CameraV4l2(WireDevice[Image]):
             raise NoAnswer(f"the camera gives {frame.shape[1]}x{frame.shape[0]} instead of {o.width_px}x{o.height_px}")
         image = Image(pixels=to_pixels(frame, is_colour=o.is_colour), exposure_s=o.exposure_s or 1.0 / o.rate_hz)
         self.publish(image, valid_s=arrived_s - 1.0 / o.rate_hz)
-
-    def lost(self, error: Exception) -> None:
-        """Tell all readers."""
-        self.fail(error)
-
-    def release(self) -> None:
-        """End the thread and free the camera."""
-        self.port.close()
-
-    def is_up(self) -> bool:
-        """Is the camera open?"""
-        return self.port.link is not None
-
-    def reconnects(self) -> int:
-        """How often it was opened again."""
-        return self.port.reconnects
 
     def link_name(self) -> str:
         """The device."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import threading
 from abc import abstractmethod
-from typing import ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from drivers.transport.link import LinkLost, Refused, now_s
 from drivers.transport.mailbox import Mailbox
+from drivers.transport.port import Port
 from hal.clock import Deadline, PacedClock
 from hal.devices import DeviceKind, Health
 from hal.errors import CellError, DeviceFault, DeviceTimeout, DeviceUnavailable
@@ -253,3 +254,25 @@ class WireDevice(Generic[T]):
     def wire_counts(self) -> str:
         """Counters that tell a wrong baud rate from a dead device."""
         return f"{self.mailbox.published} samples, {self.errors} errors"
+
+
+class PortDevice(WireDevice[T]):
+    """A device with a port, and so an owner thread, of its own. The subclass makes the `port`."""
+
+    port: Port[Any]
+
+    def lost(self, error: Exception) -> None:
+        """Tell all readers (owner thread)."""
+        self.fail(error)
+
+    def release(self) -> None:
+        """End the owner thread, which closes the link."""
+        self.port.close()
+
+    def is_up(self) -> bool:
+        """Is the link open and set up?"""
+        return self.port.link is not None
+
+    def reconnects(self) -> int:
+        """How often the link was set up again."""
+        return self.port.reconnects

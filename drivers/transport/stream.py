@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from drivers.transport.capture import inside
-from drivers.transport.device import CONNECT_S, SLICE_S, WireDevice
+from drivers.transport.device import CONNECT_S, SLICE_S, PortDevice
 from drivers.transport.fd_link import FdLink
 from drivers.transport.link import Link, LinkLost, NoAnswer, now_s
 from drivers.transport.port import Port
@@ -16,7 +16,7 @@ from hal.registry import Context
 T = TypeVar("T")
 
 
-class StreamDevice(WireDevice[T]):
+class StreamDevice(PortDevice[T]):
     """A device that talks by itself. The subclass says how to start it and what its bytes mean.
 
     Args:
@@ -94,22 +94,6 @@ class StreamDevice(WireDevice[T]):
         self.receive(chunk, arrived_s)
         if self.mailbox.published > before:
             self._heard_s = arrived_s
-
-    def lost(self, error: Exception) -> None:
-        """Tell all readers (owner thread)."""
-        self.fail(error)
-
-    def release(self) -> None:
-        """End the owner thread."""
-        self.port.close()
-
-    def is_up(self) -> bool:
-        """Is the link open and set up?"""
-        return self.port.link is not None
-
-    def reconnects(self) -> int:
-        """How often the link was set up again."""
-        return self.port.reconnects
 
     def link_name(self) -> str:
         """Port and speed, or address."""

@@ -163,6 +163,7 @@ def taught_answer(job: Job, image: Image) -> dict[str, Any]:
 
 
 def _answer(entry: Job, reading: ObjectReading) -> dict[str, Any]:
+    """One object's answer. A refused display gives its likeliest number, with the little confidence that it has."""
     out: dict[str, Any] = {
         "id": entry["id"],
         "cls": entry["cls"],
@@ -170,6 +171,8 @@ def _answer(entry: Job, reading: ObjectReading) -> dict[str, Any]:
         "confidence": reading.confidence,
         "reason": reading.reason,
     }
+    if reading.possible:
+        out["text"] = reading.possible[0].text
     if not reading.answered:
         return out
     if reading.text is not None:
@@ -208,7 +211,9 @@ def status_answer(status: Status, key: str) -> dict[str, Any]:
     """Answer of a `dial` or `display` job."""
     value = status.value if key == "reading" else status.text
     out = {"confidence": status.confidence, "reason": status.reason}
-    return {**out, key: value} if status.answered else out
+    if status.possible:
+        value = status.possible[0].text
+    return out if value is None else {**out, key: value}
 
 
 def answer(job: Job, folder: Path) -> dict[str, Any]:

@@ -13,6 +13,15 @@ ANSWER_AT = 0.5  # below this confidence a reading is refused
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Possible:
+    """A number that what is seen of a refused display allows: how it is written, its value, and its probability."""
+
+    text: str
+    value: float
+    probability: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Status:
     """A reader's answer. At most one of `value`, `state` and `text` leads; a refusal has none of them, and a `reason`.
 
@@ -21,6 +30,7 @@ class Status:
         uncertainty: one sigma of `value`, same unit.
         confidence: 0 to 1, the expected share of right answers among such readings.
         reason: why no answer is given and what would help; None for an answer.
+        possible: what a refused display may show, likeliest first; empty where nothing is known.
     """
 
     value: float | None = None
@@ -30,6 +40,7 @@ class Status:
     text: str | None = None
     confidence: float = 0.0
     reason: str | None = None
+    possible: tuple[Possible, ...] = ()
 
     @property
     def answered(self) -> bool:
@@ -47,7 +58,7 @@ class ObjectReading:
         centre_m: (3,) its place in the panel frame by this image (plate height), None without a camera pose.
         centre_covariance_m2: (3, 3) of `centre_m`, panel axes.
         outline_px: (N, 2) contour in the image, for drawing and for the robot's look.
-        value, unit, uncertainty, state, text, confidence, reason: as in `Status`.
+        value, unit, uncertainty, state, text, confidence, reason, possible: as in `Status`.
     """
 
     name: str
@@ -64,6 +75,7 @@ class ObjectReading:
     text: str | None = None
     confidence: float = 0.0
     reason: str | None = None
+    possible: tuple[Possible, ...] = ()
 
     @property
     def answered(self) -> bool:
@@ -71,19 +83,23 @@ class ObjectReading:
         return self.present and self.reason is None
 
 
-def refused(reason: str, *, confidence: float = 0.0, unit: str = "") -> Status:
+def refused(reason: str, *, confidence: float = 0.0, unit: str = "", possible: tuple[Possible, ...] = ()) -> Status:
     """No answer, with its reason (cause, then what would help)."""
-    return Status(reason=reason, confidence=confidence, unit=unit)
+    return Status(reason=reason, confidence=confidence, unit=unit, possible=possible)
 
 
 def gated(status: Status) -> Status:
     """The same answer, or a refusal when its confidence is too low."""
     if not status.answered or status.confidence >= ANSWER_AT:
         return status
+    possible: tuple[Possible, ...] = ()
+    if status.text is not None and status.value is not None:
+        possible = (Possible(text=status.text, value=status.value, probability=status.confidence),)
     return refused(
         "the evidence is too weak: come closer, change the angle or the light",
         confidence=status.confidence,
         unit=status.unit,
+        possible=possible,
     )
 
 

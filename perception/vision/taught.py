@@ -209,6 +209,7 @@ def _inspect_one(
         text=status.text,
         confidence=status.confidence,
         reason=status.reason,
+        possible=status.possible,
     )
 
 

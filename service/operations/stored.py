@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -116,6 +117,7 @@ def reading_row_json(reading: ObjectReading) -> dict[str, Any]:
         "text": reading.text,
         "confidence": reading.confidence,
         "reason": reading.reason,
+        "possible": [asdict(number) for number in reading.possible],
         "centre_px": list(reading.centre_px),
     }
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hal.panel import Display
 from perception.vision.image import Image
 from perception.vision.patch import Patch
-from perception.vision.reading import ANSWER_AT, Status, probability, refused
+from perception.vision.reading import ANSWER_AT, Possible, Status, probability, refused
 from perception.vision.status.band import hidden_by_bands
 from perception.vision.status.comb import Comb, find_combs
 from perception.vision.status.comb_jit import Float32, apartness
@@ -38,6 +38,7 @@ TEMPERATURE = 2.0  # what is wrong with one segment is wrong with its neighbours
 KNOWN_FREE, FREE = 0.35, 0.5  # how far the digits may sit from the middle, over the width
 
 MOST_NAMED, NAMED = 4, 0.1  # numbers that a refusal names: at most; the share of the likelihood that each has
+MOST_POSSIBLE = 10  # numbers that a refusal lists for programs
 
 Prior = Callable[[float], float]
 
@@ -209,22 +210,31 @@ def _answer(
     weights = np.array([score / TEMPERATURE + _expected(value, before, high - low) for _, value, score in possible])
     share = np.exp(weights - weights.max())
     share /= share.sum()
-    k = int(share.argmax())
-    text, value, _ = possible[k]
-    confidence = float(share[k]) * (point.probability if point else 1.0)
-    confidence *= probability([(found.explained, 0.3, 0.06)]) / 0.732
-    confidence = min(confidence, 0.97)
-    if confidence < ANSWER_AT:
-        rivals = [possible[i][0] for i in np.argsort(-share)[:MOST_NAMED] if share[i] > NAMED]
-        maybe = f" ({' or '.join(rivals)}?)" if len(rivals) > 1 else ""
+    trust = (point.probability if point else 1.0) * probability([(found.explained, 0.3, 0.06)]) / 0.732
+    rivals = _ranked([(text, value) for text, value, _ in possible], share, trust)
+    best = rivals[0]
+    if best.probability < ANSWER_AT:
+        named = [rival.text for rival in rivals[:MOST_NAMED] if rival.probability > NAMED * trust]
+        maybe = f" ({' or '.join(named)}?)" if len(named) > 1 else ""
         why = (
             f"something lies across the digits{maybe}: move it or look past it"
-            if covered and share[k] < 0.8
+            if covered and share.max() < 0.8
             else f"the evidence is too weak{maybe}: come closer, change the angle or the light"
         )
-        return refused(why, confidence=confidence, unit=unit)
-    half_digit = 0.5 * 10.0 ** -(len(text.split(".")[1]) if "." in text else 0)
-    return Status(value=value, unit=unit, uncertainty=half_digit, text=text, confidence=confidence)
+        return refused(why, confidence=best.probability, unit=unit, possible=rivals[:MOST_POSSIBLE])
+    half_digit = 0.5 * 10.0 ** -(len(best.text.split(".")[1]) if "." in best.text else 0)
+    return Status(
+        value=best.value, unit=unit, uncertainty=half_digit, text=best.text, confidence=min(best.probability, 0.97)
+    )
+
+
+def _ranked(numbers: Sequence[tuple[str, float]], share: Array, trust: float) -> tuple[Possible, ...]:
+    """Texts and values with their probabilities, likeliest first; of equally likely ones the one furthest from zero.
+
+    A cable makes equals often. Whoever acts on the first of them then errs towards the alarm.
+    """
+    order = sorted(range(len(numbers)), key=lambda i: (-round(float(share[i]), 6), -abs(numbers[i][1])))
+    return tuple(Possible(text=numbers[i][0], value=numbers[i][1], probability=float(share[i]) * trust) for i in order)
 
 
 def _expected(value: float, before: float | None, span: float) -> float:

@@ -23,7 +23,9 @@ HALF_STROKES = np.array([0.045, 0.065])  # of the digit height: tried, with ever
 BLURS = np.array([0.02, 0.05, 0.09])
 INSETS = (0.2, 0.08, 0.32)  # of a segment's axis, at either end, by which its stroke is shorter
 PLACES_X = np.linspace(0.25, 0.75, 6)  # of the gap
+MORE_PLACES_X = np.linspace(0.25, 1.05, 9)  # of one hidden in part: no stroke beside it says where the comb lies
 PLACES_Y = np.linspace(-0.12, 0.06, 7)  # of the digit height, from the bottom segments' axis
+LEAST_OF_DOT = 0.4  # of a dot's picture that must be seen to tell its height
 STEPS = 8  # places a px at which a stroke's profile is tabled
 
 
@@ -38,8 +40,7 @@ class Point:
 def find_point(ink: Float32, seen: Float32, comb: Comb, lit_levels: Array) -> Point:
     """Where the decimal point is.
 
-    A dot template must reach a share of a lit segment's level and stand out from the other gaps. A gap that is hidden says
-    nothing.
+    A dot template must reach a share of a lit segment's level and stand out from the other gaps.
 
     Args:
         lit_levels: (cells, 7) levels of the lit segments, 0 for the others.
@@ -52,7 +53,8 @@ def find_point(ink: Float32, seen: Float32, comb: Comb, lit_levels: Array) -> Po
     order = np.sort(levels[clear])
     typical = max(float(np.median(order[:-1])), 0.0) if len(order) > 1 else 0.0
     odds = (levels - typical - LEVEL) / LEVEL_SPREAD
-    odds = np.append(np.where(clear, np.clip(odds, -30.0, 30.0), HIDDEN_ODDS), 0.0)  # the last: no point
+    # A gap that is hidden in part may show a dot; that it shows none says nothing. The last: no point.
+    odds = np.append(np.clip(odds, np.where(clear, -30.0, HIDDEN_ODDS), 30.0), 0.0)
     share = np.exp(odds - odds.max())
     k = int(share.argmax())
     return Point(place=None if k == len(levels) else k + 1, probability=float(share[k] / share.sum()))
@@ -69,6 +71,9 @@ def dot_levels(ink: Float32, seen: Float32, comb: Comb, lit_levels: Array) -> tu
     rest = (strip - drawn) * clear
     dot = _dot(RADIUS * comb.height_px, sigma_px)
     levels, visible = _best_dots(rest, clear, dot, comb.numbers, comb.count, first, PLACES_X, PLACES_Y)
+    if not visible.all():
+        wide, _ = _best_dots(rest, clear, dot, comb.numbers, comb.count, first, MORE_PLACES_X, PLACES_Y)
+        levels = np.where(visible > 0, levels, wide)
     gain = float(np.percentile(drawn, 99.0)) / max(float(lit_levels.max()), 1e-6)
     return levels / np.maximum(gain * _beside(lit_levels), 1e-6), visible > 0
 
@@ -169,6 +174,8 @@ def _best_dots(
     left, pitch, width, top, bottom, slant = comb
     rows, columns = rest.shape
     half = dot.shape[0] // 2
+    # What a dot's picture varies by, seen whole: a place that shows less of one cannot tell its height.
+    least = LEAST_OF_DOT * ((dot * dot).sum() - dot.sum() ** 2 / dot.size)
     best, clear = np.full(count - 1, -np.inf), np.zeros(count - 1)
     for gap in range(count - 1):
         visible = 0
@@ -180,13 +187,15 @@ def _best_dots(
                 product = total = weights = inks = n = 0.0
                 for a in range(max(0, i - half), min(rows, i + half + 1)):
                     for b in range(max(0, j - half), min(columns, j + half + 1)):
+                        if seen[a, b] < 0.5:
+                            continue
                         weight = dot[a - i + half, b - j + half]
                         product += weight * rest[a, b]
                         total += weight * weight
                         weights += weight
                         inks += rest[a, b]
                         n += 1.0
-                if n > 1.0 and total > weights * weights / n:
+                if n > 1.0 and total - weights * weights / n > least:
                     best[gap] = max(best[gap], (product - weights * inks / n) / (total - weights * weights / n))
                 if 0 <= i < rows and 0 <= j < columns and seen[i, j] > 0.5:
                     visible += 1

@@ -70,6 +70,16 @@ def test_a_refusal_names_what_it_may_be() -> None:
     assert not status.answered and "59" in (status.reason or "") and "99" in (status.reason or "")
 
 
+def test_a_refusal_lists_what_it_may_be_for_programs() -> None:
+    gray = window("99", slant=0.0)
+    status = read_window(gray, digits=2, decimals=0, dark=False, limits=(0.0, 200.0), hidden=over_segment_b(gray))
+    first, second = status.possible[:2]
+    assert (first.text, first.value) == ("99", 99.0)  # of equally likely ones the one further from zero
+    assert second.text == "59" and second.probability == pytest.approx(first.probability, rel=0.01)
+    assert status.confidence == first.probability and sum(p.probability for p in status.possible) <= 1.0
+    assert not read_window(gray, digits=2, decimals=0, dark=False).possible  # nothing is hidden: an answer
+
+
 def over_segment_b(gray: np.ndarray) -> np.ndarray:
     """Mask over the upper right segment of the first of two digits in `window`."""
     hidden = np.zeros(gray.shape, bool)
@@ -126,6 +136,18 @@ def test_a_dot_stands_out_from_gaps_without_one(text: str, place: int | None) ->
     for gap, level in enumerate(levels, start=1):
         assert level > 0.8 if gap == place else level < 0.35
     assert find_point(ink, seen, comb, lit).place == place
+
+
+def test_a_dot_that_a_cable_hides_in_part_is_found_and_a_bare_part_of_a_gap_says_nothing() -> None:
+    lit = np.array([LIT[NAMES.index(c)] * 150.0 for c in "2648"])
+    for text, place in (("26.48", 2), ("2648", None)):
+        ink, seen = segment_ink(window(text, slant=0.0), is_dark=False)
+        _, comb = find_combs(ink, seen)[0]
+        middle = round(comb.left_px + 1.5 * comb.pitch_px + 0.5 * comb.width_px)
+        seen[:, middle - 6 : middle] = 0.0  # the left half of the second gap
+        assert not dot_levels(ink, seen, comb, lit)[1][1]
+        found = find_point(ink, seen, comb, lit)
+        assert found.place == place and (found.probability > 0.95 if place else found.probability < 0.8)
 
 
 def plate_patch(*, cable: tuple[int, int] | None, cable_gray: int = 60) -> Patch:

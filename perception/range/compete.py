@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from perception.range import fit, grow
 from perception.range.finish import SLOW_NOISE_AREA_PX
 from perception.range.grid import Grid
-from perception.range.surfaces import CONE, CYLINDER, QUADRIC, SIZE, SPHERE
+from perception.range.surfaces import QUADRIC, SIZE
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
@@ -24,7 +24,6 @@ WHOLE_SHARE = 0.85  # a fit to the whole component that explains less has rivals
 LOCAL_BLOCKS = 45
 LOCAL_TRIES = 5
 FEW_BLOCKS_FOR_QUADRIC = 60
-LEAST_NORMALS = 10
 GIVE_UP = 14.0  # a fit that keeps three quarters within three sigmas leaves 8 at most, once it has converged
 
 
@@ -119,7 +118,6 @@ def _fit_blocks(x, y, z, sigma, normal, perspective, pixels, slow_share, members
             known += 1
     kinds = np.ones(5, np.bool_)
     kinds[QUADRIC] = count >= FEW_BLOCKS_FOR_QUADRIC
-    kinds[SPHERE] = kinds[CYLINDER] = kinds[CONE] = known >= LEAST_NORMALS
     # Slow noise covers samples together: so many count as one.
     patches = max(count * pixels / SLOW_NOISE_AREA_PX, 1.0)
     correlated = 1.0 + slow_share * max(n / patches - 1.0, 0.0)

@@ -53,6 +53,7 @@ PER_MEDIAN = 1.4826  # standard deviations of a normal law per median of its abs
 ROUGH_SAMPLES = 36
 ROUGH_LIMIT = 5.0
 LARGEST_RADIUS_M = 10.0
+LEAST_NORMALS = 10  # that tell where anything but a plane starts
 QUADRIC_PER_SAMPLE = 1.15  # a simple surface under white noise costs about 0.95 a sample, and its price
 STEP_GOAL = 1e-3  # of a standard deviation of each parameter: a step that small changes nothing that matters
 
@@ -289,43 +290,36 @@ def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_sampl
     mean2, kept, score = np.full(5, np.inf), np.zeros(5), np.full(5, np.inf)
     n = x.shape[0]
     price = np.log(max(n / correlated_samples, 2.0))
-    starts, start_kind, rough = np.zeros((6, SIZE)), np.full(6, -1), np.full(6, np.inf)
-    if kinds[PLANE]:
-        starts[0], start_kind[0] = start_plane(points), PLANE
-    if P.shape[0] >= 10 and (kinds[SPHERE] or kinds[QUADRIC]):
-        starts[1], ok = start_sphere(P, N)
-        start_kind[1] = SPHERE if ok else -1
     free, scratch, rounds = np.zeros(9, np.bool_), new_scratch(), np.array([2, 2, 2, 2, 3])
     last = np.int64(QUADRIC)  # no constant: `fit_robust` says why
     stride = max(1, n // ROUGH_SAMPLES)
     rx, ry, rz, rs = x[::stride].copy(), y[::stride].copy(), z[::stride].copy(), sigma[::stride].copy()
-    best_rough = np.inf
-    for k in range(6):
-        if k == 4 and best_rough < 1.3 * rx.shape[0] / correlated_samples:
-            break  # the second axis is for components that the first cannot explain
-        if k in (2, 4) and P.shape[0] >= 10:
-            _start_along(P, N, k == 4, kinds, starts[k : k + 2], start_kind[k : k + 2])
-        if start_kind[k] >= 0:
-            cost = _rough(start_kind[k], starts[k], rx, ry, rz, rs, perspective, free, scratch)
-            rough[k] = cost / correlated_samples
-            best_rough = min(best_rough, rough[k])
-    # A start that is clearly behind after the rough fit is not going to win.
     per_sample = rx.shape[0] / correlated_samples
-    allowed = min(2.0 * best_rough + 0.5 * per_sample, give_up * per_sample)
-    for k in range(6):
-        kind = start_kind[k]
-        if kind < 0 or rough[k] > allowed or not kinds[kind]:
+    starts, rough, best_rough = np.zeros((QUADRIC, SIZE)), np.full(QUADRIC, np.inf), np.inf
+    for kind in range(QUADRIC):
+        if kind == CONE and best_rough < 1.3 * per_sample:
+            break  # cones are for components that nothing simpler explains
+        if kinds[kind] and _start(kind, points, P, N, starts[kind]):
+            cost = _rough(kind, starts[kind], rx, ry, rz, rs, perspective, free, scratch)
+            rough[kind] = cost / correlated_samples
+            best_rough = min(best_rough, rough[kind])
+    # A start that is clearly behind after the rough fit is not going to win.
+    behind = 2.0 * best_rough + 0.5 * per_sample
+    give_up = give_up * per_sample
+    for kind in range(QUADRIC):
+        if not rough[kind] <= min(behind, give_up):
             continue
-        th = starts[k].copy()
+        th = starts[kind].copy()
         m, share, cost = _robust(kind, th, x, y, z, sigma, perspective, free, rounds[kind], scratch)
         s = cost / correlated_samples + FREEDOM[kind] * price
         if s < score[kind] and _is_sane(kind, th):
             ths[kind], mean2[kind], kept[kind], score[kind] = th, m, share, s
-    if kinds[QUADRIC] and best_rough <= allowed and start_kind[1] >= 0 and starts[1, 3] < LARGEST_RADIUS_M:
+    starts_near = rough[SPHERE] <= behind and best_rough <= give_up and starts[SPHERE, 3] < LARGEST_RADIUS_M
+    if kinds[QUADRIC] and starts_near:
         # Nine parameters explain most things: they are tried when nothing simpler does.
         simple = np.min(score)
         if simple > n / correlated_samples * QUADRIC_PER_SAMPLE:
-            th = quadric_of_sphere(starts[1])
+            th = quadric_of_sphere(starts[SPHERE])
             m, share, cost = _robust(last, th, x, y, z, sigma, perspective, free, rounds[last], scratch)
             if is_ellipsoid(th):
                 ths[QUADRIC], mean2[QUADRIC], kept[QUADRIC] = th, m, share
@@ -334,15 +328,21 @@ def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_sampl
 
 
 @njit(cache=True, error_model="numpy")
-def _start_along(P, N, centred, kinds, starts, start_kind):  # type: ignore[no-untyped-def]  # numba types it
-    """Cylinder and cone along `normal_axis` into `starts` (2, SIZE), their kinds or -1 into `start_kind` (2,)."""
-    axis = normal_axis(N, centred)
-    if kinds[CYLINDER]:
-        starts[0], ok = start_cylinder(P, N, axis)
-        start_kind[0] = CYLINDER if ok else -1
-    if kinds[CONE]:
-        starts[1], ok = start_cone(P, N, axis)
-        start_kind[1] = CONE if ok else -1
+def _start(kind, points, P, N, th):  # type: ignore[no-untyped-def]  # numba types it
+    """Fill `th` with an algebraic start of a simple kind; whether there is one."""
+    if kind == PLANE:
+        th[:] = start_plane(points)
+        return True
+    if P.shape[0] < LEAST_NORMALS:
+        return False
+    if kind == SPHERE:
+        start, exists = start_sphere(P, N)
+    elif kind == CYLINDER:
+        start, exists = start_cylinder(P, N, normal_axis(N, False))
+    else:
+        start, exists = start_cone(P, N, normal_axis(N, True))
+    th[:] = start
+    return exists
 
 
 @njit(cache=True, error_model="numpy")

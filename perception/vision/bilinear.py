@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -11,7 +13,7 @@ from perception.vision.view import Array
 
 
 @njit(cache=True)
-def value_at(image: Image, u: float, v: float) -> float:  # pragma: no cover
+def value_at(image: NDArray[Any], u: float, v: float) -> float:  # pragma: no cover
     """Bilinear value of an (H, W) picture; the border repeats."""
     height, width = image.shape
     u, v = min(max(u, 0.0), width - 1.0), min(max(v, 0.0), height - 1.0)

@@ -16,13 +16,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hal.panel import Panel
+from perception.vision.edge_search import strongest_edges
 from perception.vision.image import Image
 from perception.vision.outline import Outline, edges_of, plate_edges
-from perception.vision.patch import sample_at
 from perception.vision.view import Array, View
 
 WINDOWS_PX = (8.0, 5.0, 3.0, 2.0)  # search to either side; the pose is known to a few pixels
-STEP_PX = 0.5
 LAST_LOOK_PX, NEAR_PX = 2.5, 2.0  # search at the end, and how near an edge confirms the model
 LEAST_NOISE = 0.3  # gray levels: the rounding
 SMOOTHING_SIGMA_PX = 0.8
@@ -167,23 +166,8 @@ def _look(smooth: NDArray[np.float32], slope_noise: float, view: View, edges: Ou
     normals = ahead - points
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.where(length > 0, length, 1.0)
-    t = np.arange(-window_px - STEP_PX, window_px + 1.5 * STEP_PX, STEP_PX)
-    u = points[:, :1] + normals[:, :1] * t
-    v = points[:, 1:] + normals[:, 1:] * t
-    height, width = smooth.shape
-    visible = np.isfinite(u).all(axis=1) & (u >= 1).all(axis=1) & (v >= 1).all(axis=1)
-    visible &= (u < width - 2).all(axis=1) & (v < height - 2).all(axis=1)
-    values = sample_at(smooth, np.where(visible[:, None], u, 0.0), np.where(visible[:, None], v, 0.0))
-    slope = np.abs(values[:, 2:] - values[:, :-2]) / (2 * STEP_PX)
-    inner = t[1:-1]
-    weighted = slope * np.exp(-0.5 * (inner / window_px) ** 2)
-    best = np.clip(weighted.argmax(axis=1), 1, len(inner) - 2)
-    rows = np.arange(len(best))
-    before, peak, after = slope[rows, best - 1], slope[rows, best], slope[rows, best + 1]
-    bend = before - 2 * peak + after
-    sub = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
-    offset = inner[best] + STEP_PX * np.clip(sub, -1, 1)
-    ok = visible & (peak > EDGE_TO_NOISE * slope_noise + 0.5)
+    offset, slope, visible = strongest_edges(smooth, points, normals, window_px)
+    ok = visible & (slope > EDGE_TO_NOISE * slope_noise + 0.5)
     return _Found(offset_px=offset, normals_px=normals, visible=visible, ok=ok)
 
 

@@ -1,22 +1,25 @@
 """Thousands of recorded scans on dask.distributed: the same result whatever the number of workers.
 
 A task holds at least 20 images, because handing one over costs about as much as a tenth of an image. A worker that is
-lost is replaced and its tasks run again; an image that cannot be read becomes a result with its error.
+lost is replaced and its tasks run again; an image that cannot be read becomes a result with its error. What a task gave
+is kept as soon as it ends.
 """
 
 from __future__ import annotations
 
-import json
+import logging
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
 from hal.errors import CellError, ConfigError, InvalidRequest
 from perception.range.analyse import analyse
+from perception.range.batch_results import BatchResult, KeptResults
 from perception.range.recordings import AS_FILED, SUFFIXES, Reading, load_recording
 from perception.range.render import MARK, scene_json
 
@@ -24,15 +27,6 @@ IMAGES_A_TASK = 20
 RETRIES = 3
 LOOK_S = 10.0  # how often the scheduler is asked whether anybody still works
 ALONE_LOOKS = 6  # looks without any worker that end the batch: a replacement is up within seconds
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BatchResult:
-    """What one recording gave: `scene` as `render.scene_json`, or `error` and no scene."""
-
-    name: str
-    scene: dict[str, Any] | None
-    error: str | None
 
 
 def recordings_in(folder: Path) -> list[Path]:
@@ -80,6 +74,7 @@ def batch_range(
     workers: int = 2,
     reading: Reading = AS_FILED,
     progress: Callable[[int, int], None] | None = None,
+    kept: KeptResults | None = None,
 ) -> list[BatchResult]:
     """Analyse every recording of a folder.
 
@@ -87,7 +82,8 @@ def batch_range(
         scheduler: "local" starts `workers` processes here; "tcp://host:port" uses a running dask scheduler, whose
             workers must see the folder under the same path.
         reading: what the files do not say, as for `load_recording`.
-        progress: called with images done and images in all after each task.
+        progress: called with images done and images in all: at the start and after each task.
+        kept: gives the results of an earlier run that still hold, and gets those of each task as it ends.
 
     Returns:
         one result a recording, in the order of names, the same for any number of workers.
@@ -96,62 +92,61 @@ def batch_range(
         InvalidRequest: the folder holds no recordings.
         ConfigError: the scheduler is neither "local" nor a tcp address that answers, or its workers are gone.
     """
-    groups = tasks_of(recordings_in(folder))
-    with _client(scheduler, workers) as client:
-        futures = client.map(partial(analyse_files, reading=reading), groups, retries=RETRIES, pure=False)
-        gathered = _gathered(client, futures, [len(g) for g in groups], progress or (lambda *_: None))
-    return [result for group in gathered for result in group]
+    recordings = recordings_in(folder)
+    results = {} if kept is None else kept.of(recordings)
+    if progress:
+        progress(len(results), len(recordings))
+    missing = [path for path in recordings if path.name not in results]
+    if missing:
+        with _client(scheduler, workers) as client:
+            task = partial(analyse_files, reading=reading)
+            futures = client.map(task, tasks_of(missing), retries=RETRIES, pure=False)
+            for group in _as_they_end(client, futures):
+                results |= {result.name: result for result in group}
+                if kept:
+                    kept.add(group)
+                if progress:
+                    progress(len(results), len(recordings))
+    return [results[path.name] for path in recordings]
 
 
-def write_results(path: Path, results: Sequence[BatchResult]) -> None:
-    """One JSON object a line: name, scene or error."""
-    lines = (json.dumps({"name": r.name, "scene": r.scene, "error": r.error}) for r in results)
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _gathered(
-    client: Any, futures: list[Any], sizes: list[int], progress: Callable[[int, int], None]
-) -> list[list[BatchResult]]:
-    """The results in order; says after each task how many images are done.
+def _as_they_end(client: Any, futures: Sequence[Any]) -> Iterator[list[BatchResult]]:
+    """The results of each task as it ends.
 
     Raises:
-        ConfigError: a task killed worker after worker, the workers cannot run it, or no worker is left.
+        ConfigError: after the others have ended: a task killed worker after worker, or the workers cannot run it;
+            at once: no worker is left.
     """
     distributed: Any = import_module("distributed")
-    size_of = {future.key: size for future, size in zip(futures, sizes, strict=True)}
-    waiting, done, alone = set(futures), 0, 0
+    waiting, alone, lost = set(futures), 0, None
     while waiting:
         try:
-            finished = distributed.wait(waiting, timeout=LOOK_S, return_when="FIRST_COMPLETED").done
+            ended = distributed.wait(waiting, timeout=LOOK_S, return_when="FIRST_COMPLETED").done
         except TimeoutError:
-            finished = set()
-        alone = 0 if finished or client.nthreads() else alone + 1
+            ended = set()
+        alone = 0 if ended or client.nthreads() else alone + 1
         if alone == ALONE_LOOKS:
             raise ConfigError("all workers are gone and none came back", hint="start workers: dask worker tcp://...")
-        waiting -= finished
-        for future in finished:
-            done += size_of[future.key]
-            progress(done, sum(sizes))
-    try:
-        gathered: list[list[BatchResult]] = client.gather(futures)
-    except (distributed.KilledWorker, distributed.CancelledError, OSError) as error:
-        raise ConfigError(f"a task was lost for good: {error}", hint="see the workers' logs; out of memory?") from error
-    except ModuleNotFoundError as error:
-        raise ConfigError(f"a worker lacks {error.name!r}", hint="install panelwright where the workers run") from error
-    return gathered
+        waiting -= ended
+        for future in ended:
+            try:
+                group: list[BatchResult] = future.result()
+            except (distributed.KilledWorker, distributed.CancelledError, OSError) as error:
+                lost = ConfigError(f"a task was lost for good: {error}", hint="see the workers' logs; out of memory?")
+            except ModuleNotFoundError as error:
+                hint = "install panelwright where the workers run"
+                raise ConfigError(f"a worker lacks {error.name!r}", hint=hint) from error
+            else:
+                yield group
+    if lost is not None:
+        raise lost
 
 
 @contextmanager
 def _client(scheduler: str, workers: int) -> Iterator[Any]:
     distributed: Any = import_module("distributed")
     if scheduler == "local":
-        # One thread a worker: the compiled loops hold no lock, but Python between them does.
-        with (
-            distributed.LocalCluster(
-                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1"
-            ) as cluster,
-            distributed.Client(cluster) as client,
-        ):
+        with _local_cluster(distributed, workers) as cluster, distributed.Client(cluster) as client:
             yield client
         return
     if not scheduler.startswith("tcp://"):
@@ -166,3 +161,25 @@ def _client(scheduler: str, workers: int) -> Iterator[Any]:
         except TimeoutError as error:
             raise ConfigError(f"{scheduler} has no workers", hint=f"start some: dask worker {scheduler}") from error
         yield client
+
+
+def _local_cluster(distributed: Any, workers: int) -> Any:
+    """Worker processes of this machine, deaf to Ctrl-C.
+
+    A terminal sends SIGINT to all of them, and each would answer with a traceback; they end with the cluster. Threads
+    and processes inherit the mask, so a worker that is replaced later is deaf as well.
+    """
+    resource_tracker.ensure_running()  # its start would lift the mask
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        # One thread a worker: the compiled loops hold no lock, but Python between them does.
+        return distributed.LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            host="127.0.0.1",
+            silence_logs=logging.ERROR,
+        )
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -11,14 +11,15 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from hal.errors import InvalidRequest
+from hal.errors import CellError, InvalidRequest
 from service.commands.common import console
+from service.commands.leaving import INTERRUPTED, one_interrupt
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from perception.range import RangeScene, Surface
-    from perception.range.batch import BatchResult
+    from perception.range.batch_results import BatchResult, KeptResults
     from perception.range.match import Match
     from perception.range.recordings import Reading
 
@@ -85,24 +86,40 @@ def batch_range_images(
     focal: Focal = None,
     centre: Centre = None,
     pitch: Pitch = None,
+    afresh: Annotated[bool, typer.Option("--afresh", help="Drop what a stopped batch has left beside --out.")] = False,
 ) -> None:
-    """Analyse every recording of a folder; ends with 1 when one of them gave no result."""
-    from perception.range.batch import batch_range, recordings_in, write_results
+    """Analyse every recording of a folder; ends with 1 when one of them gave no result.
+
+    Ctrl-C stops it; the same command goes on where it was stopped.
+    """
+    from perception.range.batch import batch_range, recordings_in
+    from perception.range.batch_results import KeptResults
 
     reading = _reading(scale, near, far, focal, centre, pitch)
     total = len(recordings_in(folder))
     _in_folder(out.parent)  # before hours of work, not after
+    kept = KeptResults(out, folder, reading, afresh=afresh)
+    if kept.goes_on:
+        console.print(f"going on with {kept.part}; --afresh would begin anew", markup=False)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task("range images", total=total)
-        results = batch_range(
-            folder,
-            scheduler=scheduler,
-            workers=workers,
-            reading=reading,
-            progress=lambda done, _: bar.update(task, completed=done),
-        )
-    write_results(out, results)
+    try:
+        with one_interrupt(), Progress(*columns, console=console) as bar:
+            task = bar.add_task("range images", total=total)
+            results = batch_range(
+                folder,
+                scheduler=scheduler,
+                workers=workers,
+                reading=reading,
+                progress=lambda done, _: bar.update(task, completed=done),
+                kept=kept,
+            )
+    except KeyboardInterrupt:
+        _print_kept("stopped: ", kept, total)
+        raise typer.Exit(INTERRUPTED) from None
+    except CellError:
+        _print_kept("", kept, total)
+        raise
+    kept.finish(results)
     failed = [result for result in results if result.error is not None]
     _print_failed(failed)
     console.print(f"wrote {out}: {total - len(failed)} of {total} recordings analysed", markup=False)
@@ -162,6 +179,11 @@ def _print_matches(matches: Sequence[Match]) -> None:
         x, y, z = 1e3 * match.sensor_from_object.parent_from_child.translation
         surfaces = ", ".join(f"{name} {label}" for name, label in match.labels.items())
         console.print(f"{match.model} at ({x:.1f}, {y:.1f}, {z:.1f}) mm: {surfaces}", markup=False)
+
+
+def _print_kept(head: str, kept: KeptResults, total: int) -> None:
+    console.print(f"{head}{kept.done} of {total} recordings done, kept in {kept.part}", markup=False)
+    console.print("  try    the same command goes on from there; with --afresh it begins anew", markup=False)
 
 
 def _print_failed(failed: list[BatchResult]) -> None:

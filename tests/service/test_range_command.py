@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,8 +17,11 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from hal.errors import InvalidRequest, NotFound
+from perception.range.batch_results import BatchResult, KeptResults
+from perception.range.recordings import Reading
 from service.cli import _app
 from tests.perception.range.scenes import ball_on_table, noisy
+from tests.service.waiting import eventually
 
 REAL = Path(__file__).parents[2].parent / "shared" / "data" / "range" / "real"
 needs_real = pytest.mark.skipif(not REAL.is_dir(), reason="the range development data is not beside the repository")
@@ -152,15 +159,42 @@ def test_a_batch_of_nothing_is_refused_before_any_worker_starts(tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_a_batch_writes_a_line_a_recording_and_tells_of_the_bad_one(tmp_path: Path) -> None:
+def test_a_batch_goes_on_and_writes_a_line_a_recording_and_tells_of_the_bad_one(tmp_path: Path) -> None:
     folder = tmp_path / "recordings"
     folder.mkdir()
     for k in range(3):
         np.save(folder / f"scan_{k}.npy", DEPTH_M)
     (folder / "scan_9.npz").write_bytes(b"nothing")
-    result = run("batch", "range", folder, "--workers", 1, "--out", tmp_path / "all.jsonl", *FOCAL)
+    out = tmp_path / "all.jsonl"
+    earlier = KeptResults(out, folder, Reading(focal_px=(180.0, 180.0)))
+    earlier.of(folder.iterdir())
+    earlier.add([BatchResult(name="scan_2.npy", scene={"surfaces": []}, error=None)])
+    result = run("batch", "range", folder, "--workers", 1, "--out", out, *FOCAL)
     assert result.exit_code == 1 and "3 of 4" in result.output and "scan_9.npz" in result.output
-    lines = [json.loads(line) for line in (tmp_path / "all.jsonl").read_text().splitlines()]
+    assert f"going on with {earlier.part}" in result.output and not earlier.part.exists()
+    lines = [json.loads(line) for line in out.read_text().splitlines()]
     assert [line["name"] for line in lines] == ["scan_0.npy", "scan_1.npy", "scan_2.npy", "scan_9.npz"]
     assert lines[0]["scene"] == lines[1]["scene"] and len(lines[0]["scene"]["surfaces"]) == 3
+    assert lines[2]["scene"] == {"surfaces": []}
     assert lines[3]["scene"] is None and "InvalidRequest" in lines[3]["error"]
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_what_is_done_and_ends_calmly(tmp_path: Path) -> None:
+    """The terminal sends SIGINT to every process of the batch."""
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    for k in range(200):
+        np.save(folder / f"scan_{k:03d}.npy", DEPTH_M)
+    out, part = tmp_path / "all.jsonl", tmp_path / "all.jsonl.part"
+    words = [sys.executable, "-m", "service.cli", "batch", "range", folder, "--workers", "1", "--out", out, *FOCAL]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    ) as process:
+        eventually(lambda: process.poll() is not None or part.read_text().count("\n") > 1)
+        os.killpg(process.pid, signal.SIGINT)
+        said = process.communicate()[0]
+    assert process.returncode == 130, said
+    done = part.read_text().count("\n") - 1
+    assert f"stopped: {done} of 200 recordings done" in said and "the same command goes on" in said
+    assert 20 <= done < 200 and "Traceback" not in said and "WARNING" not in said

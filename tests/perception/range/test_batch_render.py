@@ -14,7 +14,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.errors import ConfigError, InvalidRequest, NotFound
 from perception.range import FeatureKind, SurfaceType, analyse
-from perception.range.batch import analyse_files, batch_range, recordings_in, tasks_of, write_results
+from perception.range.batch import analyse_files, batch_range, recordings_in, tasks_of
+from perception.range.batch_results import write_results
 from perception.range.features import corner_point, crease_line
 from perception.range.polar import PolarScan, depth_image, fitting_view, sweep_points
 from perception.range.recordings import load_recording

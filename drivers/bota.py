@@ -18,7 +18,7 @@ from drivers.transport.timebase import HostTime, Unwrapper
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ForceTorqueCapabilities, Wrench
 from hal.readings import Cause, Quality, Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 
 FRAME_BYTES = 37
 BODY = struct.Struct("<H6fIf")
@@ -126,6 +126,7 @@ def _condition(status: int, value: Wrench) -> tuple[Quality, Cause]:
     return (Quality.DEGRADED, Cause.DEVICE) if status & SLOW else (Quality.VALID, Cause.NONE)
 
 
+@takes(BotaOptions)
 def connect(context: Context, options: dict[str, Any]) -> Bota:
     """Entry point `serial:bota`."""
     device = Bota(context, read_options(context, options, BotaOptions))

@@ -17,7 +17,7 @@ from hal.clock import Deadline
 from hal.devices import CameraCapabilities, DeviceKind, Image
 from hal.errors import DeviceFault, DeviceUnavailable
 from hal.readings import Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 from hal.strict import Strict
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
@@ -146,6 +146,7 @@ class CameraFiles(FilePlayer[Image]):
         return DeviceUnavailable(f"{self.name}: {what}", hint=hint, device=self.name)
 
 
+@takes(CameraFilesOptions)
 def connect(context: Context, options: dict[str, Any]) -> CameraFiles:
     """Entry point `files:camera`."""
     return CameraFiles(context, read_options(context, options, CameraFilesOptions))

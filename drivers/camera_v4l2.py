@@ -19,13 +19,14 @@ from hal.clock import Deadline
 from hal.devices import CameraCapabilities, DeviceKind, Image
 from hal.errors import DeviceUnavailable
 from hal.readings import Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
+from hal.wires import Claim, WireOptions
 
 GRAB_FAILURES = 3
 EXPOSURE_UNIT_S = 1e-4  # V4L2_CID_EXPOSURE_ABSOLUTE counts 100 us
 
 
-class CameraV4l2Options(LensOptions):
+class CameraV4l2Options(LensOptions, WireOptions):
     """Options of `v4l2:camera`; a name under `/dev/v4l/by-id` survives re-plugging."""
 
     device: Path = Path("/dev/video0")
@@ -34,6 +35,10 @@ class CameraV4l2Options(LensOptions):
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 30.0
     is_colour: bool = True
     exposure_s: Annotated[float, Field(gt=0, le=1)] | None = None
+
+    def claims(self) -> tuple[Claim, ...]:
+        """The camera."""
+        return (Claim(wire=f"camera {self.device}"),)
 
 
 class Grabber(Protocol):
@@ -137,6 +142,7 @@ class CameraV4l2(PortDevice[Image]):
         return f"v4l2 {self._options.device}"
 
 
+@takes(CameraV4l2Options)
 def connect(context: Context, options: dict[str, Any]) -> CameraV4l2:
     """Entry point `v4l2:camera`."""
     device = CameraV4l2(context, read_options(context, options, CameraV4l2Options))

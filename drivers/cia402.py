@@ -29,7 +29,7 @@ from hal.clock import Deadline
 from hal.devices import ArmCapabilities, DeviceKind, JointState
 from hal.errors import DeviceFault, DeviceTimeout
 from hal.readings import Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 
 NMT, SYNC, RPDO1, HEARTBEAT = 0x000, 0x080, 0x200, 0x700
 START, PRE_OPERATIONAL = 0x01, 0x80
@@ -53,6 +53,11 @@ class Cia402Options(CanOptions):
     realtime_priority: Annotated[int, Field(ge=0, le=99)] = 10
     degrees_per_increment: Annotated[float, Field(gt=0)] = 0.001
     kinematics: KinematicsOptions
+
+    @property
+    def stations(self) -> tuple[str, ...]:
+        """One node an axis."""
+        return tuple(f"node {node}" for node in self.nodes)
 
 
 @dataclass(slots=True)
@@ -296,6 +301,7 @@ class Cia402(StreamDevice[JointState]):
         super().release()
 
 
+@takes(Cia402Options)
 def connect(context: Context, options: dict[str, Any]) -> Cia402:
     """Entry point `can:cia402`."""
     device = Cia402(context, read_options(context, options, Cia402Options))

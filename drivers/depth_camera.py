@@ -19,7 +19,7 @@ from hal.clock import Deadline
 from hal.devices import DeviceKind, RangeImage, RangeScannerCapabilities
 from hal.errors import DeviceFault, DeviceUnavailable
 from hal.readings import Cause, Quality, Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 from hal.strict import Strict
 
 SUFFIXES = (".png", ".npy", ".npz")
@@ -118,6 +118,7 @@ def _read(path: Path, unit_m: float) -> NDArray[np.float64]:
     return np.asarray(array, dtype=np.float64)
 
 
+@takes(DepthCameraOptions)
 def connect(context: Context, options: dict[str, Any]) -> DepthCamera:
     """Entry point `files:depth`."""
     return DepthCamera(context, read_options(context, options, DepthCameraOptions))

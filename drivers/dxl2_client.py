@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -16,6 +17,7 @@ from drivers.transport.bus import Bus
 from drivers.transport.link import Link, NoAnswer, Refused, drain, drain_until_quiet, now_s
 from drivers.transport.options import SerialOptions, serial_opener
 from hal.registry import Context
+from hal.wires import Claim
 
 QUARANTINE_S, LONGEST_QUARANTINE_S = 0.1, 0.8  # how long late answers are waited for; it doubles with each more lost
 DOUBT_S = 1.0  # an answer that is overtaken by others may come so late
@@ -46,6 +48,16 @@ class BusOptions(SerialOptions):
 
     baud: Annotated[int, Field(ge=9600, le=4_500_000)] = 1_000_000
     timeout_s: Annotated[float, Field(gt=0, le=1)] = 0.03
+
+    @property
+    @abstractmethod
+    def servos(self) -> tuple[int, ...]:
+        """Ids of the device's servos."""
+
+    def claim(self) -> Claim:
+        """Its servos, on a bus for many."""
+        stations = tuple(f"servo {id_}" for id_ in self.servos)
+        return Claim(wire=f"serial {self.port}", bus=f"Dynamixel 2.0 at {self.baud} baud", stations=stations)
 
 
 class DynamixelClient:

@@ -25,7 +25,7 @@ from hal.clock import Deadline
 from hal.devices import ArmCapabilities, DeviceKind, JointState
 from hal.errors import DeviceFault
 from hal.readings import Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 
 MODE, TORQUE, HARDWARE_ERROR, BUS_WATCHDOG, GOAL, STATE = 11, 64, 70, 98, 116, 126
 STATE_BYTES = 10  # current16 velocity32 position32
@@ -50,6 +50,11 @@ class DynamixelOptions(BusOptions):
     watchdog_s: Annotated[float, Field(ge=0.02, le=2.5)] = 0.1
     is_fast: bool = True
     kinematics: KinematicsOptions
+
+    @property
+    def servos(self) -> tuple[int, ...]:
+        """One a joint."""
+        return self.ids
 
 
 class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
@@ -200,6 +205,7 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
         return {id_: struct.pack("<i", int(c)) for id_, c in zip(self._options.ids, counts, strict=True)}
 
 
+@takes(DynamixelOptions)
 def connect(context: Context, options: dict[str, Any]) -> DynamixelArm:
     """Entry point `serial:dynamixel`."""
     device = DynamixelArm(context, read_options(context, options, DynamixelOptions))

@@ -21,7 +21,7 @@ from hal.clock import Deadline
 from hal.devices import DeviceKind, GripperCapabilities, GripperState
 from hal.errors import DeviceFault, DeviceTimeout, DeviceUnavailable, InvalidRequest
 from hal.readings import Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 
 MODE, TORQUE, WATCHDOG, GOAL_CURRENT, PROFILE_VELOCITY, GOAL, STATE = 11, 64, 98, 102, 112, 116, 120
 BLOCK = struct.Struct("<H4xhii")  # tick, moving, PWM, current, velocity, position
@@ -51,6 +51,11 @@ class GripperOptions(BusOptions):
     newtons_per_ampere: Annotated[float, Field(gt=0)] = 60.0
     max_force_n: Annotated[float, Field(gt=0)] = 60.0
     activate: bool = True
+
+    @property
+    def servos(self) -> tuple[int, ...]:
+        """Its only one."""
+        return (self.id,)
 
 
 class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
@@ -173,6 +178,7 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
         return min(max((count - o.closed_count) / (o.open_count - o.closed_count), 0.0), 1.0) * o.stroke_m
 
 
+@takes(GripperOptions)
 def connect(context: Context, options: dict[str, Any]) -> DynamixelGripper:
     """Entry point `serial:dynamixel_gripper`; switches torque on unless told not to."""
     parsed = read_options(context, options, GripperOptions)

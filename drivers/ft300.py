@@ -23,7 +23,7 @@ from drivers.transport.timebase import FrameTimes
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ForceTorqueCapabilities, Wrench
 from hal.readings import Cause, Quality, Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 from hal.strict import Strict
 
 FRAME_BYTES = 16
@@ -203,6 +203,7 @@ class Ft300Registers(PolledDevice[Wrench, ModbusMaster]):
         self.publish(value, valid_s=valid_s, quality=quality, cause=cause)
 
 
+@takes(StreamOptions)
 def connect_stream(context: Context, options: dict[str, Any]) -> Ft300Stream:
     """Entry point `serial:ft300`."""
     device = Ft300Stream(context, read_options(context, options, StreamOptions))
@@ -210,6 +211,7 @@ def connect_stream(context: Context, options: dict[str, Any]) -> Ft300Stream:
     return device
 
 
+@takes(PollOptions)
 def connect_registers(context: Context, options: dict[str, Any]) -> Ft300Registers:
     """Entry point `modbus:ft300`."""
     device = Ft300Registers(context, read_options(context, options, PollOptions))

@@ -19,7 +19,7 @@ from drivers.transport.framing import Framer
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.options import SerialOptions, read_options, serial_opener
 from drivers.transport.serial_link import SerialLink
-from hal.registry import Context
+from hal.registry import Context, takes
 
 BAUD_CODES = {9600: 0x42, 19_200: 0x41, 38_400: 0x40, 500_000: 0x48}
 ACK, NAK, NOT_ACCEPTED = 0x06, 0x15, 0x92
@@ -176,6 +176,7 @@ def decode_scan(payload: bytes) -> np.ndarray[Any, np.dtype[np.float64]]:
     return np.where((raw > 0) & (raw < FIRST_CODE), raw * unit_m, math.nan)
 
 
+@takes(Lms200Options)
 def connect(context: Context, options: dict[str, Any]) -> Lms200:
     """Entry point `serial:lms200`."""
     device = Lms200(context, read_options(context, options, Lms200Options))

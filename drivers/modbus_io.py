@@ -10,7 +10,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Annotated, Any, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 from pydantic import Field, model_validator
 
@@ -23,7 +23,7 @@ from drivers.transport.options import Seconds, read_options
 from hal.clock import Deadline
 from hal.devices import DeviceKind, LightsCapabilities, ProximityCapabilities, TouchCapabilities
 from hal.readings import Cause, Quality, Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 
 Point = Annotated[int, Field(ge=0, le=255)]
 T = TypeVar("T")
@@ -33,6 +33,7 @@ CLOSE_S = 0.08
 class IoOptions(ModbusOptions):
     """Options that all points of a remote I/O share: `port = 502` with `host` for TCP, a path for RTU."""
 
+    shared_as: ClassVar[str | None] = "remote I/O"
     inputs: Annotated[int, Field(ge=1, le=256)] = 8
 
     @model_validator(mode="after")
@@ -239,6 +240,7 @@ class IoSwitch(IoDevice[float]):
         )
 
 
+@takes(LightsOptions)
 def connect_lights(context: Context, options: dict[str, Any]) -> IoLights:
     """Entry point `modbus:lights`."""
     device = IoLights(context, read_options(context, options, LightsOptions))
@@ -246,6 +248,7 @@ def connect_lights(context: Context, options: dict[str, Any]) -> IoLights:
     return device
 
 
+@takes(TouchOptions)
 def connect_touch(context: Context, options: dict[str, Any]) -> IoTouch:
     """Entry point `modbus:touch`."""
     device = IoTouch(context, read_options(context, options, TouchOptions))
@@ -253,6 +256,7 @@ def connect_touch(context: Context, options: dict[str, Any]) -> IoTouch:
     return device
 
 
+@takes(SwitchOptions)
 def connect_switch(context: Context, options: dict[str, Any]) -> IoSwitch:
     """Entry point `modbus:proximity`."""
     device = IoSwitch(context, read_options(context, options, SwitchOptions))

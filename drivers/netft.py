@@ -18,7 +18,7 @@ from drivers.transport.stream import StreamDevice
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ForceTorqueCapabilities, Wrench
 from hal.readings import Cause, Quality, Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 
 HEADER, STOP, STREAM = 0x1234, 0, 2
 RECORD = struct.Struct(">III6i")
@@ -119,6 +119,7 @@ class Netft(StreamDevice[Wrench]):
             link.close()
 
 
+@takes(NetftOptions)
 def connect(context: Context, options: dict[str, Any]) -> Netft:
     """Entry point `udp:netft`."""
     device = Netft(context, read_options(context, options, NetftOptions))

@@ -20,7 +20,7 @@ from hal.clock import Deadline
 from hal.devices import DeviceKind, GripperCapabilities, GripperState
 from hal.errors import CellError, DeviceFault, DeviceTimeout, DeviceUnavailable, InvalidRequest
 from hal.readings import Cause, Quality, Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 
 OUTPUT, INPUT = 0x03E8, 0x07D0
 ACTIVATE, GO_TO = 0x01, 0x08
@@ -222,6 +222,7 @@ def _part(value: float, low: float, high: float) -> int:
     return round(255 * min(max((value - low) / (high - low), 0.0), 1.0))
 
 
+@takes(GripperOptions)
 def connect(context: Context, options: dict[str, Any]) -> Robotiq2F:
     """Entry point `modbus:robotiq_2f`; activates the gripper unless told not to."""
     parsed = read_options(context, options, GripperOptions)

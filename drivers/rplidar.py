@@ -21,7 +21,7 @@ from drivers.transport.capture import inside
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.options import SerialOptions, read_options, serial_opener
 from drivers.transport.serial_link import SerialLink
-from hal.registry import Context
+from hal.registry import Context, takes
 
 STOP, RESET, START_SCAN, GET_INFO, GET_HEALTH = 0x25, 0x40, 0x20, 0x50, 0x52
 INFO_TYPE, HEALTH_TYPE, SCAN_TYPE = 0x04, 0x06, 0x81
@@ -233,6 +233,7 @@ def sectors(angle_rad: NDArray[np.float64], range_m: NDArray[np.float64], count:
     return np.where(np.isfinite(nearest), nearest, math.nan)
 
 
+@takes(RplidarOptions)
 def connect(context: Context, options: dict[str, Any]) -> Rplidar:
     """Entry point `serial:rplidar`."""
     device = Rplidar(context, read_options(context, options, RplidarOptions))

@@ -5,6 +5,10 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
+
+from drivers.transport.options import PortNumber, TcpOptions
+from hal.wires import Claim
 
 HEADER = struct.Struct(">HB")
 TYPES = {
@@ -21,6 +25,17 @@ TYPES = {
 KNOWN = frozenset(b"VvOIUSPM")
 LONGEST = 4096
 REFUSALS = {"NOT_FOUND": "is not known to this controller", "IN_USE": "is taken by another client"}
+
+
+class RtdeOptions(TcpOptions):
+    """Keys of every RTDE client. A controller serves several, but some of its parts have one owner: `owns`."""
+
+    owns: ClassVar[tuple[str, ...]] = ()
+    port: PortNumber = 30_004
+
+    def claim(self) -> Claim:
+        """What it owns of the controller."""
+        return Claim(wire=f"tcp {self.host}:{self.port}", bus="RTDE", stations=self.owns)
 
 
 class RecipeRefused(ValueError):

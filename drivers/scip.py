@@ -19,7 +19,7 @@ from drivers.transport.checks import sum_scip
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.options import EitherOptions, PortNumber, either_opener, read_options
 from drivers.transport.timebase import HostTime, Unwrapper
-from hal.registry import Context
+from hal.registry import Context, takes
 
 FIRST_DISTANCE_MM = 20  # below are error codes
 STAMP_BITS, STAMP_S = 24, 0.001
@@ -217,6 +217,7 @@ def _refusal(command: str, status: str) -> Refused:
     return Refused(f"status {status} to {command[:2]} ({kind})", code=code)
 
 
+@takes(ScipOptions)
 def connect(context: Context, options: dict[str, Any]) -> Scip:
     """Entry point `scip:scanner`."""
     device = Scip(context, read_options(context, options, ScipOptions))

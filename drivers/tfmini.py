@@ -21,7 +21,7 @@ from drivers.transport.timebase import FrameTimes
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ProximityCapabilities
 from hal.readings import Cause, Quality, Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 from hal.strict import Strict
 
 FRAME_BYTES = 9
@@ -154,6 +154,7 @@ class Tfmini(StreamDevice[float]):
         self.publish(value, valid_s=valid_s, quality=quality, cause=cause, missed=bad)
 
 
+@takes(TfminiOptions)
 def connect(context: Context, options: dict[str, Any]) -> Tfmini:
     """Entry point `serial:tfmini`."""
     device = Tfmini(context, read_options(context, options, TfminiOptions))

@@ -22,7 +22,7 @@ from drivers.transport.timebase import FrameTimes, HostTime, Unwrapper
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ProximityCapabilities
 from hal.readings import Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 
 READING_REGISTER, FIRMWARE_REGISTER = 0, 6
 CM = 0.01
@@ -42,6 +42,11 @@ class CanTfminiOptions(CanOptions, EchoOptions):
     id: Annotated[int, Field(ge=0, le=0x7FF)] = 3
     byte_order: Literal["little", "big"] = "little"
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 100.0
+
+    @property
+    def stations(self) -> tuple[str, ...]:
+        """The identifier of its frames."""
+        return (f"identifier 0x{self.id:03X}",)
 
 
 class SensorClock:
@@ -162,6 +167,7 @@ class CanTfmini(StreamDevice[float]):
         self.publish(value, valid_s=arrived_s, device_time_s=device_s, quality=quality, cause=cause)
 
 
+@takes(ModbusTfminiOptions)
 def connect_modbus(context: Context, options: dict[str, Any]) -> ModbusTfmini:
     """Entry point `modbus:tfmini`."""
     device = ModbusTfmini(context, read_options(context, options, ModbusTfminiOptions))
@@ -169,6 +175,7 @@ def connect_modbus(context: Context, options: dict[str, Any]) -> ModbusTfmini:
     return device
 
 
+@takes(CanTfminiOptions)
 def connect_can(context: Context, options: dict[str, Any]) -> CanTfmini:
     """Entry point `can:tfmini`."""
     device = CanTfmini(context, read_options(context, options, CanTfminiOptions))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -18,7 +18,7 @@ from drivers import rtde
 from drivers.arms import Array, KinematicsOptions, SetPointFilter, capabilities, ur10e
 from drivers.transport.device import wall_until
 from drivers.transport.link import Link, LinkLost, NoAnswer, Refused, WireError, drain, now_s
-from drivers.transport.options import CONNECT_TIMEOUT_S, PortNumber, TcpOptions, read_options, tcp_opener
+from drivers.transport.options import CONNECT_TIMEOUT_S, PortNumber, read_options, tcp_opener
 from drivers.transport.socket_link import open_tcp
 from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import HostTime
@@ -26,7 +26,7 @@ from hal.clock import Deadline, WallClock
 from hal.devices import ArmCapabilities, DeviceKind, JointState
 from hal.errors import DeviceFault, MotionRefused
 from hal.readings import Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 
 OUTPUTS = ("timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "runtime_state")
 FIRST_REGISTER = 24  # 0-23 belong to fieldbuses
@@ -41,10 +41,10 @@ ANSWER_S = 0.5
 MOVING_RAD_PER_S = 1e-3
 
 
-class UrOptions(TcpOptions):
+class UrOptions(rtde.RtdeOptions):
     """Options of `ur:rtde`."""
 
-    port: PortNumber = 30_004
+    owns: ClassVar[tuple[str, ...]] = ("the arm",)
     script_port: PortNumber = 30_003
     rate_hz: Annotated[float, Field(gt=0, le=500)] = 500.0
     kinematics: KinematicsOptions = Field(default_factory=ur10e)
@@ -287,6 +287,7 @@ class Ur(StreamDevice[JointState]):
         self._script.write(text.encode(), until_s)
 
 
+@takes(UrOptions)
 def connect(context: Context, options: dict[str, Any]) -> Ur:
     """Entry point `ur:rtde`."""
     device = Ur(context, read_options(context, options, UrOptions))

@@ -11,7 +11,7 @@ import threading
 from abc import abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Field, model_validator
 
@@ -19,13 +19,13 @@ from drivers import rtde
 from drivers.points import require_same_number, wanted_lights
 from drivers.transport.device import wall_until
 from drivers.transport.link import Link, LinkLost, NoAnswer, Refused, WireError, now_s
-from drivers.transport.options import PortNumber, Seconds, TcpOptions, read_options, tcp_opener
+from drivers.transport.options import Seconds, read_options, tcp_opener
 from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import HostTime
 from hal.clock import Deadline
 from hal.devices import DeviceKind, LightsCapabilities, TouchCapabilities
 from hal.readings import Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 
 OUTPUTS = ("timestamp", "actual_digital_input_bits", "actual_digital_output_bits")
 INPUTS = ("standard_digital_output_mask", "standard_digital_output")
@@ -36,10 +36,9 @@ Output = Annotated[int, Field(ge=0, le=7)]
 Point = Annotated[int, Field(ge=0, le=63)]
 
 
-class UrIoOptions(TcpOptions):
+class UrIoOptions(rtde.RtdeOptions):
     """Keys that both share."""
 
-    port: PortNumber = 30_004
     rate_hz: Annotated[float, Field(gt=0, le=500)] = 125.0
 
 
@@ -47,6 +46,7 @@ class UrLightsOptions(UrIoOptions):
     """Options of `ur:lights`: an output for each light; `feedback` inputs tell whether it burns, where they are wired,
     else the output's own state is given."""
 
+    owns: ClassVar[tuple[str, ...]] = ("the digital outputs",)
     channels: tuple[str, ...] = ("top_left", "top_right", "bottom_right", "bottom_left")
     outputs: tuple[Output, ...] = (0, 1, 2, 3)
     feedback: tuple[Point, ...] | None = None
@@ -231,6 +231,7 @@ class UrTouch(UrIo):
         return tuple(bool(inputs >> point & 1) for point in self._options.contacts)
 
 
+@takes(UrLightsOptions)
 def connect_lights(context: Context, options: dict[str, Any]) -> UrLights:
     """Entry point `ur:lights`."""
     device = UrLights(context, read_options(context, options, UrLightsOptions))
@@ -238,6 +239,7 @@ def connect_lights(context: Context, options: dict[str, Any]) -> UrLights:
     return device
 
 
+@takes(UrTouchOptions)
 def connect_touch(context: Context, options: dict[str, Any]) -> UrTouch:
     """Entry point `ur:touch`."""
     device = UrTouch(context, read_options(context, options, UrTouchOptions))

@@ -13,10 +13,13 @@ from hal.clock import Clock, WallClock
 from hal.config import Cell
 from hal.devices import Device
 from hal.errors import CellError, ConfigError
+from hal.strict import Strict
 
 DEVICES = "panelwright.devices"
 EMULATORS = "panelwright.emulators"
+OPTIONS = "options_model"
 R = TypeVar("R")
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -64,6 +67,21 @@ class Context:
 Factory = Callable[[Context, dict[str, Any]], Device]
 """A driver's entry point: `connect(context, options) -> Device`; validates `options` with a strict model
 (`ConfigError`), raises `DeviceUnavailable` when the device cannot be reached."""
+
+
+def takes(model: type[Strict]) -> Callable[[F], F]:
+    """Marks a driver's entry point with the model of its options, so that they can be read without connecting."""
+
+    def mark(factory: F) -> F:
+        setattr(factory, OPTIONS, model)
+        return factory
+
+    return mark
+
+
+def options_model(factory: Factory) -> type[Strict] | None:
+    """The model that the entry point is marked with; None for one that is not."""
+    return getattr(factory, OPTIONS, None)
 
 
 def device_factory(driver: str) -> Factory:

@@ -19,6 +19,7 @@ from service.gate import GatedConnection
 from service.journal import Journal
 from service.lease import LeaseDesk
 from service.operations.context import CellMemory, Operation, OperationContext
+from service.preflight import check_wires
 from service.supervisor import Supervisor
 from service.task_model import Artefact, Task, TaskState
 from service.tasks import TaskContext, TaskStore
@@ -118,6 +119,7 @@ class Service:
             MotionRefused, Busy: not now.
         """
         self._check_cell()
+        check_wires(self.cell, {name: section})
         started_s = time.monotonic()
         told = {"device": name, "before": self.cell.file.devices[name].driver, "driver": section.driver}
         try:

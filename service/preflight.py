@@ -1,22 +1,25 @@
-"""What a cell needs of the machine, checked before anything starts, so that the message is about the cause."""
+"""What a cell needs of machine and wires, checked before anything starts, so that the message is about the cause."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from importlib.util import find_spec
+from itertools import combinations
 
 from scipy.spatial.transform import RigidTransform
 
-from hal.config import Cell
+from hal.config import Cell, DeviceSection
 from hal.errors import ConfigError
 from hal.frames import frame_tree
 from hal.registry import device_factory
+from hal.wires import claims_of, clash
 
 PYTHON = (3, 11)
 
 
 def check_machine(cell: Cell) -> None:
-    """Python's version, the simulator's engine, and that every driver and frame of the cell exists.
+    """Python's version, the simulator's engine, that every driver and frame exists, and that no two want one wire.
 
     Raises:
         ConfigError: names what is missing and how to get it.
@@ -33,6 +36,33 @@ def check_machine(cell: Cell) -> None:
             raise ConfigError(
                 f"{cell.path}: {key}: {error.what}", hint=error.hint, file=str(cell.path), key=key
             ) from None
+    check_wires(cell)
+
+
+def check_wires(cell: Cell, others: Mapping[str, DeviceSection] | None = None) -> None:
+    """Raise `ConfigError` when two devices want the same port or connection, or the same address on a bus they share.
+
+    Args:
+        others: sections to be in the place of the cell file's.
+    """
+    others = others or {}
+    emulated = cell.file.emulators.keys() - others.keys()  # their wires are made later
+    takes = [
+        (name, claim)
+        for name, section in {**cell.file.devices, **others}.items()
+        if name not in emulated
+        for claim in claims_of(section.driver, section.options)
+    ]
+    for (name, one), (other_name, other) in combinations(takes, 2):
+        found = clash(one, other)
+        if found is not None and name != other_name:
+            what, hint = found
+            raise ConfigError(
+                f"{cell.path}: devices.{name} and devices.{other_name} {what}",
+                hint=hint,
+                file=str(cell.path),
+                key=f"devices.{other_name}.options",
+            )
 
 
 def check_python() -> None:

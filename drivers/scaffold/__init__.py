@@ -122,7 +122,7 @@ def _imports(k: KindText, wire: Mapping[str, str], driver: str, far_side: str) -
         "drivers.transport.framing": ("Framer",),
         "drivers.transport.link": ("Link", "drain"),
         "drivers.transport.options": (wire["options_base"], wire["opener"], "read_options"),
-        "hal.registry": ("Context",),
+        "hal.registry": ("Context", "takes"),
     }
     far: Imports = {
         "typing": ("Any",),

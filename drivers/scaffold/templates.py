@@ -52,6 +52,7 @@ ${methods}    def start(self, link: Link) -> None:
             self.$publish(value, valid_s=arrived_s - len(frame) * self.byte_s, missed=gap - 1)
 
 
+@takes(${cls}Options)
 def connect(context: Context, options: dict[str, Any]) -> $cls:
     """Entry point `$transport:$name`."""
     device = $cls(context, read_options(context, options, ${cls}Options))

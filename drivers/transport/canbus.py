@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import struct
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal, Protocol
@@ -16,6 +17,7 @@ from drivers.transport.options import CONNECT_TIMEOUT_S, Captured, opener_with_f
 from drivers.transport.serial_link import open_serial
 from drivers.transport.socket_link import open_tcp
 from hal.errors import DeviceUnavailable
+from hal.wires import Claim
 
 SLCAN_RATES = {rate: code for code, rate in enumerate((10, 20, 50, 100, 125, 250, 500, 800, 1000))}  # kbit/s
 RAW = struct.Struct("<IB3x8s")
@@ -32,6 +34,17 @@ class CanOptions(Captured):
     channel: str
     bitrate: Literal[10000, 20000, 50000, 100000, 125000, 250000, 500000, 800000, 1000000] = 1_000_000
     baud: Annotated[int, Field(ge=300, le=4_500_000)] = 115_200
+
+    @property
+    @abstractmethod
+    def stations(self) -> tuple[str, ...]:
+        """What of the bus is this device's alone."""
+
+    def claim(self) -> Claim:
+        """Its stations; an adapter on a serial port is opened for one device, whatever hangs on its bus."""
+        if self.is_slcan and tcp_address(self.channel) is None:
+            return Claim(wire=f"serial {self.channel}")
+        return Claim(wire=f"CAN {self.channel}", bus=f"CAN at {self.bitrate} bit/s", stations=self.stations)
 
     @property
     def is_slcan(self) -> bool:

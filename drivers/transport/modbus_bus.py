@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
@@ -11,16 +11,24 @@ from drivers.transport.link import Link
 from drivers.transport.modbus import RTU_GAP_S, ModbusMaster, ModbusRtu, ModbusTcp
 from drivers.transport.options import EitherOptions, Seconds, either_opener
 from hal.registry import Context
+from hal.wires import Claim
 
 
 class ModbusOptions(EitherOptions):
     """Keys of every Modbus device."""
+
+    shared_as: ClassVar[str | None] = None
 
     unit: Annotated[int, Field(ge=1, le=247)] = 1
     rate_hz: Annotated[float, Field(gt=0, le=500)] = 100.0
     timeout_s: Seconds = 0.1
     gap_s: Annotated[float, Field(ge=0, le=0.1)] = RTU_GAP_S
     max_age_s: Seconds = 0.1
+
+    def claim(self) -> Claim:
+        """The unit, on a bus for many."""
+        bus = "Modbus TCP" if self.transport == "tcp" else f"Modbus RTU at {self.baud} baud"
+        return Claim(wire=self.wire, bus=bus, stations=(f"unit {self.unit}",), shared_as=self.shared_as)
 
 
 def modbus_bus(context: Context, options: ModbusOptions) -> Bus[ModbusMaster]:

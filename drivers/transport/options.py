@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -14,19 +15,29 @@ from drivers.transport.serial_link import open_serial
 from drivers.transport.socket_link import open_tcp, open_udp
 from hal.registry import Context
 from hal.strict import Strict, validate
+from hal.wires import Claim, WireOptions
 
 M = TypeVar("M", bound=Strict)
 PortNumber = Annotated[int, Field(ge=1, le=65535)]
 Rate = Annotated[float, Field(gt=0, le=1000)]
 Seconds = Annotated[float, Field(gt=0, le=60)]
 CONNECT_TIMEOUT_S = 0.5
+LOOPBACK = "127.0.0.1"
 
 
-class Captured(Strict):
+class Captured(WireOptions):
     """Keys of every wired driver: `capture` writes all traffic to a file, `replay` reads one instead of the wire."""
 
     capture: Path | None = None
     replay: Path | None = None
+
+    def claims(self) -> tuple[Claim, ...]:
+        """The wire, unless its traffic comes from a file."""
+        return () if self.replay is not None else (self.claim(),)
+
+    @abstractmethod
+    def claim(self) -> Claim:
+        """What the device takes of its wire."""
 
 
 class SerialOptions(Captured):
@@ -35,6 +46,10 @@ class SerialOptions(Captured):
     port: str
     baud: Annotated[int, Field(ge=300, le=4_500_000)] = 115_200
 
+    def claim(self) -> Claim:
+        """The port."""
+        return Claim(wire=f"serial {self.port}")
+
 
 class TcpOptions(Captured):
     """A TCP server."""
@@ -42,12 +57,20 @@ class TcpOptions(Captured):
     host: str
     port: PortNumber
 
+    def claim(self) -> Claim:
+        """The connection."""
+        return Claim(wire=f"tcp {self.host}:{self.port}")
+
 
 class UdpOptions(Captured):
     """A UDP server."""
 
     host: str
     port: PortNumber
+
+    def claim(self) -> Claim:
+        """The far side: it answers one."""
+        return Claim(wire=f"udp {self.host}:{self.port}")
 
 
 class EitherOptions(Captured):
@@ -61,6 +84,15 @@ class EitherOptions(Captured):
     def transport(self) -> Literal["tcp", "serial"]:
         """Which of the two the options mean."""
         return "tcp" if isinstance(self.port, int) else "serial"
+
+    @property
+    def wire(self) -> str:
+        """The wire in words."""
+        return f"tcp {self.host or LOOPBACK}:{self.port}" if self.transport == "tcp" else f"serial {self.port}"
+
+    def claim(self) -> Claim:
+        """Port or connection."""
+        return Claim(wire=self.wire)
 
 
 def read_options(context: Context, options: dict[str, Any], model: type[M]) -> M:
@@ -91,7 +123,7 @@ def udp_opener(options: UdpOptions, device: str) -> tuple[Callable[[], Link], st
 def either_opener(options: EitherOptions, device: str) -> tuple[Callable[[], Link], str]:
     """Serial or TCP."""
     if isinstance(options.port, int):
-        host, number = options.host or "127.0.0.1", options.port
+        host, number = options.host or LOOPBACK, options.port
         opener = opener_with_files(
             options, device, lambda: open_tcp(host, number, timeout_s=CONNECT_TIMEOUT_S, device=device)
         )

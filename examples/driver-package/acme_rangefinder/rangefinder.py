@@ -13,7 +13,7 @@ from drivers.transport.stream import StreamDevice
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ProximityCapabilities
 from hal.readings import Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 
 HEADER = b"\xa5\x5a"
 FRAME = struct.Struct("<2sB1iB")
@@ -66,6 +66,7 @@ class Rangefinder(StreamDevice[float]):
             self.publish(value, valid_s=arrived_s - len(frame) * self.byte_s, missed=gap - 1)
 
 
+@takes(RangefinderOptions)
 def connect(context: Context, options: dict[str, Any]) -> Rangefinder:
     """Entry point `serial:rangefinder`."""
     device = Rangefinder(context, read_options(context, options, RangefinderOptions))

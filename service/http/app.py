@@ -8,11 +8,10 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
-from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from service.core import Service
@@ -34,7 +33,9 @@ from service.http.health import SAFETY_NOTE, own_version
 from service.http.hub import Hub
 from service.http.metrics import Metrics
 from service.http.models import FaultRequest, LeaseRequest, ResetRequest, SwapRequest
+from service.http.page import Page
 from service.http.problems import Problem, install
+from service.http.query import check_query
 from service.http.readings import ReadingDesk
 from service.http.state import AppState
 from service.lessons import OutlineRequest, TeachRequest
@@ -71,6 +72,7 @@ def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
         description=DESCRIPTION,
         docs_url=None,  # their pages load scripts from elsewhere
         redoc_url=None,
+        dependencies=[Depends(check_query)],
         lifespan=_lifespan,
     )
     app.state.panelwright = state
@@ -90,7 +92,7 @@ def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
         stream.router,
     ):
         app.include_router(router)
-    app.mount("/", StaticFiles(directory=WEB, html=True), name="page")
+    app.mount("/", Page(WEB, app.routes), name="page")
     bodies = [operation.request_model for operation in service.operations.values()]
     app.openapi = lambda: _document(app, bodies)  # type: ignore[method-assign]  # the documented way to extend it
     return Guard(app, allowed=allowed, count=state.metrics.count_answer)

@@ -95,6 +95,29 @@ def test_a_broken_query_is_refused(client: httpx2.Client, query: str) -> None:
     _assert_problem(client.post(f"/v1/hold?{query}", json={}), 422)
 
 
+@pytest.mark.parametrize(
+    ("method", "call", "hint"),
+    [
+        ("post", "/v1/hold?wait=1", "did you mean 'wait_s'?"),
+        ("get", "/v1/devices/wrist_camera/reading?format=json&shape=1", "format, max_age_s"),
+        ("get", "/v1/devices?name=arm", "no query parameters"),
+        ("get", "/healthz?a=1&a=2", "no query parameters"),
+        ("post", "/v1/stop/reset?force=1", "no query parameters"),
+    ],
+)
+def test_an_unknown_query_parameter_is_refused_by_name(
+    client: httpx2.Client, method: str, call: str, hint: str
+) -> None:
+    answer = getattr(client, method)(call)
+    _assert_problem(answer, 422)
+    assert "unknown parameter" in answer.json()["detail"] and hint in answer.json()["hint"]
+
+
+def test_a_stop_works_whatever_stands_in_its_query(client: httpx2.Client) -> None:
+    assert client.post("/v1/stop?force=1").status_code == 200
+    assert client.post("/v1/stop/reset", json={}).status_code == 200
+
+
 def test_another_content_type_is_refused(client: httpx2.Client) -> None:
     for media in ("text/plain", "application/x-www-form-urlencoded", "multipart/form-data", ""):
         _assert_problem(client.post("/v1/hold", content=b"{}", headers={"Content-Type": media}), 415)
@@ -214,9 +237,32 @@ def test_a_missions_file_behind_a_link_is_not_served(client: httpx2.Client, serv
     link.unlink()
 
 
-@pytest.mark.parametrize("method", ["put", "delete", "patch"])
-def test_wrong_methods_are_405(client: httpx2.Client, method: str) -> None:
-    _assert_problem(getattr(client, method)("/v1/lease"), 405)
+@pytest.mark.parametrize(
+    ("method", "path", "allowed"),
+    [
+        ("PUT", "/v1/lease", "GET, POST"),
+        ("DELETE", "/v1/lease", "GET, POST"),
+        ("GET", "/v1/echo", "POST"),
+        ("PATCH", "/v1/echo", "POST"),
+        ("OPTIONS", "/v1/tasks", "GET"),
+        ("POST", "/v1/devices/arm", "GET, PUT"),
+        ("POST", "/v1/tasks/0/events", "GET"),
+        ("POST", "/api.js", "GET, HEAD"),
+    ],
+)
+def test_wrong_methods_are_405_and_the_right_ones_are_named(
+    client: httpx2.Client, method: str, path: str, allowed: str
+) -> None:
+    answer = client.request(method, path)
+    _assert_problem(answer, 405)
+    assert answer.headers["allow"] == allowed
+
+
+@pytest.mark.parametrize("method", ["GET", "PUT", "POST", "OPTIONS"])
+def test_a_path_that_nobody_knows_is_404_whatever_the_method(client: httpx2.Client, method: str) -> None:
+    answer = client.request(method, "/v1/nothing")
+    _assert_problem(answer, 404)
+    assert "allow" not in answer.headers
 
 
 @given(body=st.binary(max_size=300))

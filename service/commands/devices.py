@@ -15,7 +15,7 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Column, Table
 
-from hal.errors import CellError, ConfigError
+from hal.errors import CellError, ConfigError, InvalidRequest
 from service.client import Client
 from service.commands.common import Url, UrlDefault, client_of, console, find_cell
 
@@ -26,6 +26,7 @@ app = typer.Typer(help="Look at devices, read, record and replay them.", invoke_
 err_console = Console(stderr=True, highlight=False, soft_wrap=True)
 Name = Annotated[str, typer.Argument(help="Name of the device in the cell file.")]
 TimeoutOption = Annotated[float, typer.Option(min=0.01, max=60, help="Deadline of each reading.")]
+SAVED = (".png", ".npz")  # a lossy picture would be no measurement
 STYLES = {"valid": "green", "degraded": "yellow", "invalid": "red"}
 
 
@@ -62,8 +63,7 @@ def read_device(
         return
     client = client_of(url)
     if save is not None:
-        form = "npz" if save.suffix == ".npz" else "png"
-        save.write_bytes(client.fetch("GET", f"/v1/devices/{name}/reading?format={form}"))
+        save.write_bytes(client.fetch("GET", f"/v1/devices/{name}/reading?format={_form_of(save)}"))
         console.print(f"wrote {save}")
         return
     for _ in range(samples):
@@ -72,6 +72,17 @@ def read_device(
             sys.stdout.write(json.dumps(reading) + "\n")
         else:
             console.print_json(json.dumps(reading))
+
+
+def _form_of(save: Path) -> str:
+    """What the service is asked for to fill a file of that suffix."""
+    form = save.suffix.lower()
+    if form not in SAVED:
+        raise InvalidRequest(
+            f"--save {save}: nothing is written as {form or 'a file without suffix'}",
+            hint=f"suffixes: {', '.join(SAVED)}",
+        )
+    return form.removeprefix(".")
 
 
 def _read_directly(cell: Path, name: str, *, samples: int, jsonl: bool, timeout_s: float) -> None:

@@ -98,6 +98,24 @@ def test_a_picture_without_a_service_is_refused_rather_than_forgotten(tmp_path: 
     assert isinstance(done.exception, ConfigError)
 
 
+@pytest.mark.parametrize("name", ["x.jpg", "x", "x.npz.gz"])
+def test_a_picture_is_not_written_under_the_suffix_of_something_else(
+    served: Panelwright, tmp_path: Path, name: str
+) -> None:
+    done = CliRunner().invoke(
+        devices.app, ["read", "wrist_camera", "--url", served.url, "--save", str(tmp_path / name)]
+    )
+    assert isinstance(done.exception, InvalidRequest) and ".png, .npz" in done.exception.hint
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_saved_is_what_the_suffix_says(served: Panelwright, tmp_path: Path) -> None:
+    for name, head in (("x.PNG", b"\x89PNG"), ("x.npz", b"PK")):
+        words = ["read", "wrist_camera", "--url", served.url, "--save", str(tmp_path / name)]
+        assert CliRunner().invoke(devices.app, words).exit_code == 0
+        assert (tmp_path / name).read_bytes().startswith(head)
+
+
 def test_a_log_of_watching_has_every_look(served: Panelwright) -> None:
     done = CliRunner().invoke(devices.app, ["watch", "--url", served.url, "--count", "3", "--period-s", "0.1"])
     assert done.output.count("finger_proximity") == 3, done.output

@@ -19,6 +19,7 @@ from service.http.problems import RESPONSES
 from service.http.readings import as_json
 from service.http.state import AppState, LeaseToken, State
 from service.jsonable import jsonable
+from service.swap_files import with_recordings
 
 router = APIRouter(prefix="/v1/devices", tags=["devices"], responses=RESPONSES)
 Name = Annotated[str, Path(max_length=64, examples=["wrist_camera"])]
@@ -122,10 +123,8 @@ def _swap(state: AppState, name: str, request: SwapRequest) -> None:
         raise InvalidRequest(
             f"{name} stays a {section.kind} with its mount", hint="send driver and options alone", device=name
         )
-    if "capture" in request.options:
-        raise InvalidRequest("captures cannot be started over HTTP", hint="put capture into the cell file", device=name)
     fresh = section.model_copy(update={"driver": request.driver, "options": request.options})
-    state.service.swap_device(name, fresh)
+    state.service.swap_device(name, with_recordings(fresh, section, runs_dir=state.service.runs_dir))
     state.readings.forget(name)
 
 

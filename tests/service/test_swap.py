@@ -7,9 +7,12 @@ import signal
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
+import cv2
 import httpx2
+import numpy as np
 import psutil
 import pytest
 
@@ -27,6 +30,7 @@ from tests.service.verbs import OPERATIONS
 from tests.service.waiting import eventually
 
 SENSOR = "/v1/devices/finger_proximity"
+CAMERA = "/v1/devices/wrist_camera"
 SOON = Deadline.after(WallClock(), 3600.0)
 
 
@@ -119,6 +123,51 @@ def test_the_old_device_is_kept_when_the_new_one_does_not_connect(
     assert says in problem["detail"]
     assert http.get(SENSOR).json()["driver"] == "fake:proximity"
     assert value(http) == 0.123
+
+
+@pytest.fixture
+def recordings(sensors: Panelwright, http: httpx2.Client) -> Iterator[Path]:
+    """The folder of recordings, with a film of two frames; the fake camera is back in its place afterwards."""
+    folder = sensors.service.runs_dir / "recordings"
+    (folder / "film").mkdir(parents=True, exist_ok=True)
+    for number in range(2):
+        cv2.imwrite(str(folder / "film" / f"{number}.png"), np.full((8, 10, 3), 40 * number, np.uint8))
+    yield folder
+    assert http.put(CAMERA, json={"driver": "fake:camera"}).status_code == 200
+
+
+def test_a_recording_takes_the_place_of_a_camera(http: httpx2.Client, recordings: Path) -> None:
+    for path in ("film", str(recordings / "film")):
+        answer = http.put(CAMERA, json={"driver": "files:camera", "options": {"path": path}})
+        assert answer.status_code == 200, answer.text
+        png = np.frombuffer(http.get(f"{CAMERA}/reading?format=png").content, np.uint8)
+        assert cv2.imdecode(png, cv2.IMREAD_COLOR).shape == (8, 10, 3)
+
+
+@pytest.mark.parametrize(
+    ("driver", "option", "path"),
+    [
+        ("files:camera", "path", "/etc"),
+        ("files:camera", "path", ".."),
+        ("files:depth", "path", "film/../../elsewhere"),
+        ("files:camera", "path", "link"),
+        ("serial:tfmini", "replay", "/etc/passwd"),
+        ("fake:camera", "replay", "/etc/passwd"),  # does not name its options
+    ],
+)
+def test_no_other_file_of_the_machine_is_opened(
+    http: httpx2.Client, recordings: Path, driver: str, option: str, path: str
+) -> None:
+    link = recordings / "link"
+    link.symlink_to("/etc")
+    try:
+        answer = http.put(CAMERA, json={"driver": driver, "options": {option: path}})
+    finally:
+        link.unlink()
+    problem = answer.json()
+    assert answer.status_code == 422 and f"options.{option}" in problem["detail"], problem
+    assert problem["details"]["folder"] == str(recordings.resolve())
+    assert http.get(CAMERA).json()["driver"] == "fake:camera"
 
 
 def test_a_device_on_the_same_port_is_let_in_after_the_old_one_and_comes_back_if_it_must(http: httpx2.Client) -> None:

@@ -10,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.vision.image import Image, check_image
+from perception.vision.labels import Box, place_labels
 from perception.vision.reading import ObjectReading
 
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+RIM = 3  # a dark one keeps a bright text readable on a bright panel
 GREEN, AMBER, RED = (40, 220, 60), (255, 190, 0), (255, 60, 60)
 
 
@@ -25,14 +28,19 @@ def draw_annotated(image: NDArray[Any], readings: Iterable[ObjectReading]) -> Im
     rgb = np.repeat(image[:, :, None], 3, axis=2) if image.ndim == 2 else image[:, :, :3].copy()
     picture: Image = np.ascontiguousarray(rgb)
     scale = max(0.4, picture.shape[1] / 1600)
-    for reading in readings:
-        if not np.isfinite(reading.outline_px).all():
-            continue
-        colour = GREEN if reading.answered else AMBER if reading.present else RED
-        contour = np.round(reading.outline_px).astype(np.int32).reshape(-1, 1, 2)
+    drawn = [reading for reading in readings if np.isfinite(reading.outline_px).all()]
+    contours = [np.round(reading.outline_px).astype(np.int32).reshape(-1, 1, 2) for reading in drawn]
+    texts = [f"{reading.name}: {said(reading)}" for reading in drawn]
+    labels = place_labels(
+        [Box(*cv2.boundingRect(contour)) for contour in contours],
+        [_size(text, scale) for text in texts],
+        (picture.shape[1], picture.shape[0]),
+    )
+    colours = [GREEN if reading.answered else AMBER if reading.present else RED for reading in drawn]
+    for contour, colour in zip(contours, colours, strict=True):
         cv2.polylines(picture, [contour], True, colour, max(1, round(scale)), cv2.LINE_AA)
-        x, y, _, _ = cv2.boundingRect(contour)
-        _label(picture, f"{reading.name}: {said(reading)}", (x, y - 4), colour, scale)
+    for text, label, colour in zip(texts, labels, colours, strict=True):
+        _write(picture, text, label, colour, scale)
     return picture
 
 
@@ -49,9 +57,14 @@ def said(reading: ObjectReading) -> str:
     return f"{reading.value:.4g} {reading.unit}".strip()
 
 
-def _label(picture: Image, text: str, corner: tuple[int, int], colour: tuple[int, int, int], scale: float) -> None:
-    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
-    x = int(np.clip(corner[0], 0, max(0, picture.shape[1] - width)))
-    y = int(np.clip(corner[1], height + 1, picture.shape[0] - 2))
-    cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, scale, (0, 0, 0), 3, cv2.LINE_AA)
-    cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
+def _size(text: str, scale: float) -> tuple[int, int]:
+    """Width and height of the text with its rim and what hangs below the line, pixels."""
+    (width, height), below = cv2.getTextSize(text, FONT, scale, RIM)
+    return width + RIM, height + below
+
+
+def _write(picture: Image, text: str, place: Box, colour: tuple[int, int, int], scale: float) -> None:
+    _, below = cv2.getTextSize(text, FONT, scale, RIM)
+    foot = (place.x + RIM // 2, place.y + place.height - below)
+    cv2.putText(picture, text, foot, FONT, scale, (0, 0, 0), RIM, cv2.LINE_AA)
+    cv2.putText(picture, text, foot, FONT, scale, colour, 1, cv2.LINE_AA)

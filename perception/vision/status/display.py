@@ -76,7 +76,8 @@ def read_display(patch: Patch, spec: Display, *, digits_taught: bool = True, bef
         patch, half_width_m=spec.width_m / 2, half_height_m=spec.height_m / 2, dark_ink=spec.style == "lcd"
     )
     hidden = ~inside if hidden is None else hidden[rows, columns] | ~inside
-    seen = float((~hidden & (gray < 250)).mean()) if gray.size else 0.0
+    dark = spec.style == "lcd"
+    seen = float((~hidden & (dark | (gray < 250))).mean()) if gray.size else 0.0
     if seen < 0.5:
         return refused(
             "the display cannot be seen (glare, shadow or cover): change the angle or the light", unit=spec.unit

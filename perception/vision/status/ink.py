@@ -14,7 +14,8 @@ HEADROOM = 0.5  # of a lit segment: where less is left below white, nothing can 
 KERNEL = 0.30  # of the picture's height: wider than any stroke, narrower than what light does
 SATURATED = 252
 BORDER_ROUNDS = 4
-BRIGHT_GROUND = 0.5  # share of the picture
+STROKE_SHOWS = 18.0  # gray levels
+NEAR_STROKE = 0.12  # of the picture's height
 DEEP, LEAST_DEEP = 0.22, 0.3  # of the picture's height: from its border, and px there that no frame seen aslant has
 WIDEST_STROKE = 0.17  # of the picture's height
 
@@ -50,13 +51,25 @@ def segment_ink(gray: Image, is_dark: bool, hidden: NDArray[np.bool_] | None = N
 def _drowned(gray: Image, is_dark: bool) -> NDArray[np.bool_]:
     """Where glare hides segments: saturated, and wider than a stroke, which may glow into saturation itself.
 
-    A bright ground that is saturated nearly everywhere hides no dark segment, its absence is seen; in a bright spot it is not.
+    Dark segments in a saturated ground are seen, and so is their absence beside others.
     """
     white = (gray >= SATURATED).astype(np.uint8)
-    if not white.any() or (is_dark and white.mean() > BRIGHT_GROUND):
+    if not white.any():
         return np.zeros(gray.shape, bool)
     size = max(3, round(WIDEST_STROKE * gray.shape[0])) | 1
-    return np.asarray(cv2.morphologyEx(white, cv2.MORPH_OPEN, np.ones((size, size), np.uint8)) > 0)
+    drowned = cv2.morphologyEx(white, cv2.MORPH_OPEN, np.ones((size, size), np.uint8)) > 0
+    return np.asarray(drowned & ~_near_strokes(gray)) if is_dark else np.asarray(drowned)
+
+
+def _near_strokes(gray: Image) -> NDArray[np.bool_]:
+    """Where a dark stroke would show, as one nearby does: light changes little over so short a way."""
+    rows = gray.shape[0]
+    size = max(5, round(KERNEL * rows)) | 1
+    smooth = cv2.GaussianBlur(gray, (0, 0), max(0.6, 0.012 * rows))
+    darker = cv2.morphologyEx(smooth, cv2.MORPH_BLACKHAT, np.ones((size, size), np.uint8))
+    strokes = cv2.morphologyEx((darker > STROKE_SHOWS).astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    reach = round(NEAR_STROKE * rows)
+    return np.asarray(cv2.dilate(strokes, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0)
 
 
 def without_border(ink: Float32, *, framed: bool = False) -> tuple[Float32, NDArray[np.bool_] | None]:

@@ -228,3 +228,20 @@ def test_a_comb_that_is_too_high_does_not_win(seed: int, level: str) -> None:
 def test_photographs_of_low_contrast_are_read_by_and_large() -> None:
     cases = [draw_photograph(seed, "low contrast") for seed in range(6)]
     assert sum(read_photograph(case.image, scene=False).text == case.text for case in cases) >= 4
+
+
+def washed_out(text: str, *, glare_from: float) -> np.ndarray:
+    """A dark-inked window in light that saturates its ground, and from a share of its width on its segments too."""
+    gray = window(text, dark=True, slant=0.0, contrast=120.0).astype(float) + 90.0
+    gray[:, round(glare_from * gray.shape[1]) :] += 140.0
+    return np.clip(gray, 0, 255).astype(np.uint8)
+
+
+def test_dark_digits_on_a_saturated_ground_are_read() -> None:
+    status = read_window(washed_out("2648", glare_from=1.0), digits=4, decimals=0, dark=True)
+    assert status.text == "2648"
+
+
+def test_what_glare_washes_out_is_not_taken_for_blank() -> None:
+    status = read_window(washed_out("2648", glare_from=0.55), digits=4, decimals=0, dark=True)
+    assert status.text is None

@@ -266,10 +266,10 @@ class Panel(Strict):
             x, y = thing.position_m[:2]
             if abs(x) > self.width_m / 2 or abs(y) > self.height_m / 2:
                 raise ValueError(f"{thing.name} at ({x}, {y}) m lies off the plate")
+        lamps = {thing.name for thing in self.objects if isinstance(thing, Lamp)}
         for thing in self.objects:
-            lamp = getattr(thing, "lights_lamp", None)
-            if lamp is not None and lamp not in names:
-                raise ValueError(f"{thing.name} lights {lamp!r}, which is not on the panel")
+            if isinstance(thing, Button) and thing.lights_lamp not in (None, *lamps):
+                raise ValueError(f"{thing.name} lights {thing.lights_lamp!r}, which is no lamp of the panel")
         return self
 
     def object(self, name: str) -> PanelObject:

@@ -110,6 +110,16 @@ def test_a_wrong_key_or_value_is_named(cell_path: Path, old: str, new: str, key:
     assert error.retry is Retry.AFTER_FIX
 
 
+@pytest.mark.parametrize("lit", ["start", "pressure", "lamp_2"])
+def test_a_button_lights_lamps_only(cell_path: Path, lit: str) -> None:
+    """Any other object would fail in the simulator, where nobody thinks of the panel file."""
+    panel = cell_path.parents[1] / "panels/tiny.toml"
+    button = f'kind = "button"\nname = "start"\nposition_m = [0.1, 0.0]\nradius_m = 0.01\nlights_lamp = "{lit}"\n'
+    panel.write_text(f"{PANEL}[[objects]]\n{button}")
+    with pytest.raises(ConfigError, match=f"start lights '{lit}', which is no lamp"):
+        load_panel(panel)
+
+
 def test_a_missing_file_names_the_nearest_one(cell_path: Path) -> None:
     with pytest.raises(ConfigError, match="does not exist") as caught:
         load_cell(cell_path.with_name("tyni.toml"))

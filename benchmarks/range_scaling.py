@@ -21,6 +21,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -147,7 +148,7 @@ def _tiled_steps(depth: Array, sensor: PinholeSensor, labels: NDArray[np.int32])
 
 
 def _slowest_tile(step: Callable[[int, int], object], rows: int, tiles: int, repeats: int) -> float:
-    return max(_median_s(lambda r=r: step(*r), repeats) for r in tile_rows(rows, tiles))  # type: ignore[misc]
+    return max(_median_s(partial(step, *row), repeats) for row in tile_rows(rows, tiles))
 
 
 def _seam_s(side: int) -> float:

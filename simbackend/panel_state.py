@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from hal.panel import (
     Button,
@@ -58,32 +59,32 @@ def _built(thing: PanelObject, panel: Panel, draws: Draws, button_lamps: set[str
     # A tenth is the least: a part without any friction would never rest.
     ratio = max(0.1, 1.0 + panel.tolerances.effort_ratio * float(random.standard_normal()))
     u = float(random.uniform())
-    common = {"thing": thing, "offset_m": (float(dx), float(dy)), "effort_ratio": ratio}
+    common: dict[str, Any] = {"thing": thing, "offset_m": (float(dx), float(dy)), "effort_ratio": ratio}
     match thing:
         case Gauge() | PanelMeter():
             value = thing.scale.minimum + (0.05 + 0.9 * u) * (thing.scale.maximum - thing.scale.minimum)
-            return Built(**common, place=thing.scale.place_of(value), value=value)  # type: ignore[arg-type]
+            return Built(**common, place=thing.scale.place_of(value), value=value)
         case Display():
             low, high = _displayable(thing)
             value = round(low + (0.02 + 0.96 * u) * (high - low), thing.decimals)
-            return Built(**common, text=display_text(thing, value), value=value)  # type: ignore[arg-type]
+            return Built(**common, text=display_text(thing, value), value=value)
         case Lamp():
-            return Built(**common, is_on=thing.name not in button_lamps and u < 0.5)  # type: ignore[arg-type]
+            return Built(**common, is_on=thing.name not in button_lamps and u < 0.5)
         case Button():
-            return Built(**common, is_on=thing.latching and u < 0.5)  # type: ignore[arg-type]
+            return Built(**common, is_on=thing.latching and u < 0.5)
         case Mushroom():
-            return Built(**common)  # type: ignore[arg-type]
+            return Built(**common)
         case Toggle():
-            return Built(**common, place=thing.tilt_rad if u < 0.5 else -thing.tilt_rad)  # type: ignore[arg-type]
+            return Built(**common, place=thing.tilt_rad if u < 0.5 else -thing.tilt_rad)
         case Rotary() | Lever():
-            return Built(**common, place=thing.states[int(u * len(thing.states))].angle_rad)  # type: ignore[arg-type]
+            return Built(**common, place=thing.states[int(u * len(thing.states))].angle_rad)
         case Slider():
             value = thing.scale.minimum + (0.1 + 0.8 * u) * (thing.scale.maximum - thing.scale.minimum)
-            return Built(**common, place=thing.scale.place_of(value), value=value)  # type: ignore[arg-type]
+            return Built(**common, place=thing.scale.place_of(value), value=value)
         case Handwheel():
             low = max(thing.minimum_rad, -WHEEL_SPREAD_RAD)
             high = min(thing.maximum_rad, WHEEL_SPREAD_RAD)
-            return Built(**common, place=low + u * (high - low))  # type: ignore[arg-type]
+            return Built(**common, place=low + u * (high - low))
 
 
 def _displayable(thing: Display) -> tuple[float, float]:

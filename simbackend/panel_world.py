@@ -139,7 +139,8 @@ class PanelWorld:
         x, y, z = light.position_m
         pose = self.base_from_panel * RigidTransform.from_translation([x + jitter[0], y + jitter[1], jitter[2]])
         self._load_urdf(light.name, light_urdf(light), pose)
-        self._light_places.append(tuple(float(c) for c in pose.apply([0, 0, z])))  # type: ignore[arg-type]
+        x, y, z = pose.apply([0, 0, z]).tolist()
+        self._light_places.append((x, y, z))
 
     def _load_urdf(self, name: str, text: str, pose: RigidTransform) -> int:
         path = self.folder / f"{name}.urdf"
@@ -252,7 +253,8 @@ class PanelWorld:
 
     def _paint_lamp(self, name: str, *, on: bool) -> None:
         thing = self.built[name].thing
-        colour = thing.colour  # type: ignore[union-attr]
+        assert isinstance(thing, Lamp)  # noqa: S101 - the panel file lets a button light lamps only
+        colour = thing.colour
         self._paint(name, GLOW[colour] if on else PAINT[colour], LAMP_RADIANCE if on else DIM, on=on)
 
     def _paint(self, name: str, colour: Colour, level: float, *, on: bool) -> None:

@@ -38,7 +38,7 @@ def test_every_shipped_panel_loads(path: Path) -> None:
 
 
 def test_every_command_that_the_pages_name_exists() -> None:
-    known = CliRunner().invoke(_app(), ["--help"]).output  # type: ignore[arg-type]
+    known = CliRunner().invoke(_app(), ["--help"]).output
     text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
     commands = set(re.findall(r"(?:`|bin/|^)panelwright ([a-z][a-z-]+)", text, flags=re.MULTILINE))
     assert {"serve", "demo", "doctor"} <= commands

@@ -6,6 +6,7 @@ import asyncio
 import threading
 import time
 from contextlib import ExitStack, closing, suppress
+from typing import Any
 
 import numpy as np
 import psutil
@@ -39,11 +40,11 @@ def part_reconnect(seconds: float) -> None:  # noqa: ARG001  # a number of unplu
         line(f"{name}: back after unplugging, worst; leaks", "1 s; (0, 0)", measured, is_good)
 
 
-def _back_after(device: object, returned_s: float) -> float:
+def _back_after(device: Any, returned_s: float) -> float:
     rest = threading.Event()
     while True:
         with suppress(CellError):
-            device.newest(deadline(0.2), not_before_s=returned_s)  # type: ignore[attr-defined]
+            device.newest(deadline(0.2), not_before_s=returned_s)
             return time.monotonic() - returned_s
         rest.wait(0.001)
 

@@ -60,7 +60,10 @@ def find_plate(gray: Image, width_m: float, height_m: float, *, focal_px: float 
         focal_px=focal_px or TYPICAL_FOCAL * max(gray.shape),
     )  # fmt: skip
     found = search.best(lines)
-    return None if found is None else Plate(view=found, sides_seen=tuple(line is not None for line in lines))  # type: ignore[arg-type]
+    if found is None:
+        return None
+    top, right, bottom, left = (line is not None for line in lines)
+    return Plate(view=found, sides_seen=(top, right, bottom, left))
 
 
 _Attempt = tuple[list[Array | None], tuple[float, ...], float]  # lines, windows in pixels, sigma in pixels

@@ -36,7 +36,7 @@ def test_a_link_that_is_lost_while_a_set_point_passes_leaves_the_drives_off() ->
     filter_ = make_filter()
     filter_.begin(HERE)
     lose = threading.Thread(target=lambda: filter_.begin(None))
-    filter_._velocity = Interrupting(filter_._velocity, lose)  # type: ignore[assignment]  # loses the link inside the check
+    filter_._velocity = Interrupting(filter_._velocity, lose)  # loses the link inside the check
     np.testing.assert_allclose(filter_.passed(HERE, 1.0), HERE)
     lose.join()
     assert not filter_.is_open

@@ -84,7 +84,7 @@ def test_a_slow_caller_gets_a_bus_that_is_polled_without_a_pause(
     polls_awaited, calls = 0, 10
     for _ in range(calls):
         begun = station.polls
-        until(lambda begun=begun: station.polls > begun + 1)  # type: ignore[misc]
+        until(lambda begun=begun: station.polls > begun + 1)
         before = station.polls
         assert bus.call(lambda _, until_s: until_s, now_s() + 30.0) > 0.0
         polls_awaited += station.polls - before

@@ -52,7 +52,7 @@ def run_pytest(folder: Path, *paths: Path) -> subprocess.CompletedProcess[str]:
 def test_a_new_driver_is_clean_and_passes_the_kit(kind: DeviceKind, transport: str, tmp_path: Path) -> None:
     runner = CliRunner()
     arguments = ["new-driver", f"{kind}:acme_one", "--transport", transport, "--folder", str(tmp_path)]
-    told = runner.invoke(_app(), arguments)  # type: ignore[arg-type]  # a Typer app
+    told = runner.invoke(_app(), arguments)
     assert told.exit_code == 0, told.output
     ruff = [
         str(Path(sys.executable).with_name("ruff")),
@@ -114,7 +114,7 @@ def test_a_kind_or_transport_without_template_says_where_to_start() -> None:
         new_driver("acme", DeviceKind.ARM)
     assert "proximity" in caught.value.hint
     with pytest.raises(ConfigError, match="pigeon"):
-        new_driver("acme", DeviceKind.PROXIMITY, transport="pigeon")  # type: ignore[arg-type]
+        new_driver("acme", DeviceKind.PROXIMITY, transport="pigeon")
 
 
 def test_the_example_package_is_what_the_scaffold_writes() -> None:

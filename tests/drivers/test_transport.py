@@ -333,7 +333,7 @@ def test_a_port_repeats_the_set_up_after_each_loss_without_a_leak() -> None:
         before = (process.num_fds(), threading.active_count())
         for i in range(20):
             tenant.lose.set()
-            until(lambda i=i: tenant.set_ups == i + 2)  # type: ignore[misc]
+            until(lambda i=i: tenant.set_ups == i + 2)
         until(lambda: port.link is not None)
         assert (process.num_fds(), threading.active_count()) == before
         assert port.reconnects == 20

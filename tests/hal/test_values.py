@@ -34,7 +34,7 @@ def test_an_invalid_reading_is_not_usable_however_fresh() -> None:
 def test_a_sim_clock_steps_its_world() -> None:
     steps: list[float] = []
     clock = SimClock()
-    clock.attach(lambda duration_s: steps.append(duration_s) or clock.now_s() + duration_s)  # type: ignore[func-returns-value]
+    clock.attach(lambda duration_s: steps.append(duration_s) or clock.now_s() + duration_s)
     clock.sleep(0.5)
     clock.sleep(-1.0)
     assert steps == [0.5]
@@ -43,7 +43,7 @@ def test_a_sim_clock_steps_its_world() -> None:
 
 def test_a_paced_clock_steps_its_world_and_waits_for_the_wall() -> None:
     steps: list[float] = []
-    clock = PacedClock(lambda duration_s: steps.append(duration_s) or 0.0)  # type: ignore[func-returns-value]
+    clock = PacedClock(lambda duration_s: steps.append(duration_s) or 0.0)
     before = clock.now_s()
     clock.sleep(0.002)
     assert steps == [0.002]

@@ -104,7 +104,7 @@ class _Device:
     def close(self) -> None:
         return None
 
-    def stamped(self, value):  # type: ignore[no-untyped-def]
+    def stamped(self, value):
         if self.name in self.world.silent:
             raise DeviceTimeout(f"{self.name} silent", hint="check power", device=self.name)
         now_s = self.world.clock.now_s()

@@ -76,7 +76,7 @@ def cell(answer: MotionReport) -> Workcell:
     )
 
 
-def deed(work: Workcell, stroke, looks: list[ObjectState | None] | None):  # type: ignore[no-untyped-def]
+def deed(work: Workcell, stroke, looks: list[ObjectState | None] | None):
     answers = iter(looks or [])
     return perform(
         work,
@@ -145,7 +145,7 @@ def test_a_failure_retreats_and_keeps_its_name_when_the_look_agrees() -> None:
 
     result = deed(work, miss, [OFF, OFF, OFF])
     assert result.outcome is Outcome.MISSED and result.attempts == 3
-    assert work.mover.asked.count("retreat") == 3  # type: ignore[attr-defined]
+    assert work.mover.asked.count("retreat") == 3
 
 
 def test_a_failed_stroke_that_did_the_deed_is_done() -> None:
@@ -177,9 +177,9 @@ def test_what_ends_a_motion_decides_what_is_raised(answer: MotionReport, error: 
     with pytest.raises(error) as caught:
         Attempt(cell(answer)).run(Hold(name="h", duration_s=0.1))
     if error is DeviceFault:
-        assert caught.value.details["device"] == "wrist_ft"  # type: ignore[attr-defined]
+        assert caught.value.details["device"] == "wrist_ft"
     if error is SkillFailure:
-        assert caught.value.outcome is Outcome.FORCE_LIMIT  # type: ignore[attr-defined]
+        assert caught.value.outcome is Outcome.FORCE_LIMIT
 
 
 def test_a_deed_without_knowledge_of_the_object_is_refused_before_anything_moves() -> None:
@@ -194,7 +194,7 @@ def test_a_deed_without_knowledge_of_the_object_is_refused_before_anything_moves
         slider(work, "fader", 7.0)
     with pytest.raises(InvalidRequest, match="not a lever"):
         lever(work, "fader", "closed")
-    assert work.mover.asked == []  # type: ignore[attr-defined]
+    assert work.mover.asked == []
 
 
 @given(surface=st.floats(0.002, 0.01), stiffness=st.floats(2000.0, 40000.0), seed=st.integers(0, 2**31))

@@ -63,7 +63,7 @@ def attempt_with(mover: JerkyMover, *, resolution_rad: float) -> Attempt:
     return Attempt(replace(cell(mover.answer), mover=mover, kinematics=arm))
 
 
-def feel(mover: JerkyMover, *, resolution_rad: float = 1.5e-3):  # type: ignore[no-untyped-def]
+def feel(mover: JerkyMover, *, resolution_rad: float = 1.5e-3):
     goal = shifted(AT_HOME, (LENGTH_M, 0.0, 0.0))
     attempt = attempt_with(mover, resolution_rad=resolution_rad)
     return meet(attempt, goal, name="feel", speed_m_per_s=0.02, stop_n=1.3)

@@ -115,4 +115,4 @@ def test_the_cubic_correction_is_used_in_place_of_the_lens() -> None:
 @pytest.mark.parametrize("wrong", [[1.0, 2.0, 3.0], [[1.0, 2.0]], np.zeros((2, 2, 3))])
 def test_points_of_a_wrong_shape_are_refused(wrong: object) -> None:
     with pytest.raises(InvalidRequest, match=r"\(N, 3\)"):
-        project(wrong, LENS)  # type: ignore[arg-type]
+        project(wrong, LENS)

@@ -16,7 +16,7 @@ from tests.perception.calibration.test_intrinsics import drawn
 
 
 def run(*words: object) -> tuple[int, str]:
-    done = CliRunner().invoke(_app(), ["calibrate", "board", *(str(word) for word in words)])  # type: ignore[arg-type]
+    done = CliRunner().invoke(_app(), ["calibrate", "board", *(str(word) for word in words)])
     return done.exit_code, done.output + (repr(done.exception) if done.exception else "")
 
 

@@ -68,7 +68,7 @@ def test_a_port_in_use_is_one_clear_message(write_cell: WriteCell, tmp_path: Pat
 
 
 def test_a_public_address_is_refused_while_there_are_no_keys(write_cell: WriteCell) -> None:
-    _assert_refused(_run("serve", "--cell", str(write_cell()), "--host", "0.0.0.0"), "0.0.0.0", "ssh -L")  # noqa: S104
+    _assert_refused(_run("serve", "--cell", str(write_cell()), "--host", "0.0.0.0"), "0.0.0.0", "ssh -L")  # noqa: S104 - what is refused
 
 
 def test_no_service_to_talk_to_is_one_clear_message() -> None:
@@ -212,8 +212,7 @@ def test_a_task_that_never_looks_up_does_not_keep_the_service_alive(
     try:
         eventually(is_ready)
         httpx2.post(f"{url}/v1/stubborn", trust_env=False, timeout=30)
-        tasks = lambda: httpx2.get(f"{url}/v1/tasks", trust_env=False, timeout=30).json()["tasks"]  # noqa: E731
-        eventually(lambda: tasks()[0]["state"] == "running")
+        eventually(lambda: httpx2.get(f"{url}/v1/tasks", trust_env=False).json()["tasks"][0]["state"] == "running")
         family = process.children(recursive=True)
         os.kill(process.pid, how)
         process.wait(60)

@@ -30,7 +30,7 @@ FOCAL = ("--focal", "180")
 
 
 def run(*words: object) -> Result:
-    return CliRunner().invoke(_app(), [str(word) for word in words])  # type: ignore[arg-type]
+    return CliRunner().invoke(_app(), [str(word) for word in words])
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ def _next(socket: ClientConnection) -> dict[str, object]:
 def test_samples_tell_the_whole_state(socket: ClientConnection) -> None:
     sample = _next(socket)
     assert sample["position_rad"] == pytest.approx([0.0, -1.2, 1.6, 0.0, 0.8, 0.0])
-    assert len(sample["wrench"]) == 6  # type: ignore[arg-type]
+    assert len(sample["wrench"]) == 6
     assert sample["is_latched"] is False
     assert sample["base_from_panel"] is None
 

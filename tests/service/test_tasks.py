@@ -201,7 +201,7 @@ def test_artefacts_stay_in_their_folder(bench: Bench, tmp_path: Path) -> None:
         assert not Artefact.is_name(name)
         with pytest.raises(NoSuchTask):
             bench.store.artefact_path(task.id, name)
-        assert bench.run(lambda context, name=name: context.artefact(name, b"", "x")).state is S.FAILED  # type: ignore[misc]
+        assert bench.run(lambda context, name=name: context.artefact(name, b"", "x")).state is S.FAILED
 
 
 def test_the_oldest_ended_tasks_are_forgotten_and_running_ones_never(bench: Bench) -> None:

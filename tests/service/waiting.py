@@ -18,7 +18,7 @@ def eventually(probe: Callable[[], T], *, timeout_s: float = 150.0) -> T:
         try:
             answer = probe()
         except FileNotFoundError:
-            answer = None  # type: ignore[assignment]  # not there yet
+            answer = None  # not there yet
         if answer:
             return answer
         if time.monotonic() > end_s:

@@ -51,6 +51,6 @@ def injector(device: Device) -> Any:
     """What `Rig.inject` wants, over the simulator's own fault injection."""
 
     def inject(fault: Fault | None) -> None:
-        device.inject_fault(fault)  # type: ignore[attr-defined]  # every simulated device has it
+        device.inject_fault(fault)  # every simulated device has it
 
     return inject

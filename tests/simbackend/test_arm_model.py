@@ -40,7 +40,7 @@ def test_forward_kinematics_agree_with_eaik(name: str, q: list[float]) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_the_engine_puts_the_flange_where_the_table_says(name: str, tmp_path: object) -> None:
     model = MODELS[name]()
-    path = tmp_path / "arm.urdf"  # type: ignore[operator]
+    path = tmp_path / "arm.urdf"
     path.write_text(urdf_of(model), encoding="ascii")
     client = pybullet.connect(pybullet.DIRECT)
     try:

@@ -104,17 +104,17 @@ def test_a_pressed_button_is_felt_counted_and_lights_its_lamp(finger: Finger) ->
     cell = finger.cell
     button = cell.cell.panel.object("start")
     touch, force = cell.connect("finger_touch"), cell.connect("wrist_ft")
-    finger.go(place(finger, "start", button.height_m + 0.03), 2.0)  # type: ignore[union-attr]
+    finger.go(place(finger, "start", button.height_m + 0.03), 2.0)
     lamp, pressed = finger.shown("run_lamp").state, finger.shown("start")
     free = force.read_wrench(deadline=cell.deadline()).value.force_n[2]
     assert touch.read_contacts(deadline=cell.deadline()).value == (False, False)
-    finger.go(place(finger, "start", button.height_m - 0.95 * button.travel_m), 1.0)  # type: ignore[union-attr]
+    finger.go(place(finger, "start", button.height_m - 0.95 * button.travel_m), 1.0)
     cell.clock.sleep(0.05)
     assert any(touch.read_contacts(deadline=cell.deadline()).value)
     push_n = free - force.read_wrench(deadline=cell.deadline()).value.force_n[2]
     assert 4.0 < push_n < 14.0  # the spring of the file, its tolerance, and what the pads add
     assert finger.shown("start").state == "pressed"
-    finger.go(place(finger, "start", button.height_m + 0.03), 1.0)  # type: ignore[union-attr]
+    finger.go(place(finger, "start", button.height_m + 0.03), 1.0)
     after = finger.shown("start")
     assert (after.state, after.value) == ("released", (pressed.value or 0.0) + 1.0)
     assert finger.shown("run_lamp").state != lamp
@@ -129,8 +129,8 @@ def test_the_lamp_of_the_button_shows_in_the_picture(finger: Finger) -> None:
     dark = camera.read_image(deadline=cell.deadline()).value.pixels.astype(int)
     lit = finger.shown("run_lamp").state == "on"
     button = cell.cell.panel.object("start")
-    for height_m, seconds in ((0.03, 2.0), (-0.95 * button.travel_m, 0.8), (0.03, 0.8)):  # type: ignore[union-attr]
-        finger.go(place(finger, "start", button.height_m + height_m), seconds)  # type: ignore[union-attr]
+    for height_m, seconds in ((0.03, 2.0), (-0.95 * button.travel_m, 0.8), (0.03, 0.8)):
+        finger.go(place(finger, "start", button.height_m + height_m), seconds)
     finger.go(np.array([0.12, -0.03, 0.30]), 2.0)
     bright = camera.read_image(deadline=cell.deadline()).value.pixels.astype(int)
     change = (dark - bright) if lit else (bright - dark)

@@ -64,7 +64,7 @@ def test_the_lens_and_the_load_are_near_their_records_and_not_on_them() -> None:
     true = Draws(8).lens("camera", lens)
     assert 0 < abs(true.fx_px - 460.0) < 460.0 * 0.0025
     assert true.fx_px / true.fy_px == 1.0
-    load = Draws(8).load("ft", ToolLoad(mass_kg=0.9, centre_of_mass_m=(0.0, 0.0, 0.09), bias=(0.0,) * 6))  # type: ignore[arg-type]
+    load = Draws(8).load("ft", ToolLoad(mass_kg=0.9, centre_of_mass_m=(0.0, 0.0, 0.09), bias=(0.0,) * 6))
     assert 0 < abs(load.mass_kg - 0.9) < 0.1
     assert all(b != 0.0 for b in load.bias)
 

@@ -45,7 +45,7 @@ PLATE = (0.60, 0.40)
 
 
 def overview(**options: object) -> tuple[np.ndarray, CameraView]:
-    image, intrinsics, pose = scene(tilt_deg=5.0, distance_m=0.66, pose_error=0.0, **options)  # type: ignore[arg-type]
+    image, intrinsics, pose = scene(tilt_deg=5.0, distance_m=0.66, pose_error=0.0, **options)
     return image, CameraView(intrinsics=intrinsics, camera_from_panel=pose)
 
 

@@ -187,7 +187,7 @@ def test_a_misplaced_light_shows_in_the_chi_square() -> None:
 )
 def test_bad_input_is_refused_by_name(points: Array, pixels: Array, covariance: object, words: str) -> None:
     with pytest.raises(InvalidRequest, match=words):
-        estimate(points, pixels, covariance, CAMERA)  # type: ignore[arg-type]
+        estimate(points, pixels, covariance, CAMERA)
 
 
 @pytest.mark.parametrize("points", [np.zeros((4, 3)), np.outer([0.0, 0.1, 0.2, 0.4], [1.0, 2.0, 3.0])])

@@ -125,7 +125,7 @@ def test_ends_of_a_scale_may_be_pointed_at(seen: tuple[np.ndarray, CameraView, O
     example = example_at(overview, corners_of(view, "pressure"))
     draft = PanelObjectDraft(kind="gauge", name="pressure", example=example, answers=answers)
     text = panel_text("taught", overview, find_border_lights(overview), [draft])
-    scale = parse_toml(text, Panel, source="taught").objects[0].scale  # type: ignore[union-attr]
+    scale = parse_toml(text, Panel, source="taught").objects[0].scale
     assert (scale.at_min, scale.at_max) == pytest.approx(tuple(angles), abs=0.05)
 
 
@@ -228,7 +228,7 @@ def _found(image: np.ndarray, knowledge: object) -> set[str]:
     overview = overview_of(image, plate_m=PLATE)
     from perception.vision.teach import check
 
-    hits = [c for c in check(image, knowledge, plate_m=PLATE, view=overview.view) if c.reason is None]  # type: ignore[arg-type]
+    hits = [c for c in check(image, knowledge, plate_m=PLATE, view=overview.view) if c.reason is None]
     return {
         thing.name
         for thing in panel().objects

@@ -54,7 +54,7 @@ class Rig:
         )
 
     def calibrate(self, what: str, **more: Any) -> dict[str, Any]:
-        return run_calibrations(self.session(), CalibrationRequest(what=what, **more))  # type: ignore[arg-type]
+        return run_calibrations(self.session(), CalibrationRequest(what=what, **more))
 
 
 @pytest.fixture(scope="module")

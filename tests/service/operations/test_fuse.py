@@ -21,7 +21,7 @@ from service.operations.sense import run_fuse
 def fused(body: dict[str, Any]) -> dict[str, Any]:
     """What a client gets; measurements that are given need no cell."""
     request = FuseRequest.model_validate_json(json.dumps(body))
-    answer: dict[str, Any] = json.loads(json.dumps(jsonable(run_fuse(None, request))))  # type: ignore[arg-type]
+    answer: dict[str, Any] = json.loads(json.dumps(jsonable(run_fuse(None, request))))
     return answer
 
 

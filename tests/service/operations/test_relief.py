@@ -82,7 +82,7 @@ def scan_of(depth: np.ndarray, *, seed: int = 3, projection: str = "pinhole") ->
     is_mixed = (far - near > JUMP_M) & (rng.random(depth.shape) < 0.5)
     depth = np.where(is_mixed, near + rng.random(depth.shape) * (far - near), depth)
     c = RangeScannerCapabilities(
-        projection=projection,  # type: ignore[arg-type]  # any text is tried
+        projection=projection,  # any text is tried
         width=SIDE,
         height=SIDE,
         fx=FOCAL_PX,

@@ -27,8 +27,8 @@ ROOT = Path(__file__).parents[3]
 CELL = load_cell(ROOT / "cells/bench.toml")
 LIGHTS = np.array([light.position_m for light in CELL.panel.lights])
 BASE_FROM_PANEL = transform_rpy((0.95, 0.03, 0.55), (1.5, 0.1, -1.6))
-X = CELL.calibration_of("wrist_camera").mount.pose().parent_from_child  # type: ignore[union-attr]
-LENS = CELL.calibration_of("wrist_camera").intrinsics.intrinsics()  # type: ignore[union-attr]
+X = CELL.calibration_of("wrist_camera").mount.pose().parent_from_child
+LENS = CELL.calibration_of("wrist_camera").intrinsics.intrinsics()
 
 
 def test_stations_look_at_the_middle_from_the_front() -> None:

@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 
 from perception.range.analyse import analyse
 from perception.range.batch import IMAGES_A_TASK, _client, analyse_files, recordings_in, tasks_of
-from perception.range.claim import claim_borders, claim_pixels
+from perception.range.beside import contested_pixels
+from perception.range.claim import claim_again, claim_pixels
 from perception.range.components import _merge_seam, _scan, merge_rounds, tile_rows
 from perception.range.geometry import geometry_of
 from perception.range.grid import _blocks
@@ -137,13 +138,20 @@ def _tiled_steps(depth: Array, sensor: PinholeSensor, labels: NDArray[np.int32])
     table[:, 2], table[:, 3] = -1.0, -0.6
     blocks = np.ascontiguousarray(labels[::2, ::2][:h, :w])
     out = np.empty((H, W), np.int32)
+    rows, columns = contested_pixels(labels, 1, 0, H)
+    names = np.empty_like(rows)
+
+    def share(row: int) -> int:
+        return int(rows.size * row // H)
+
     return [
         lambda a, b: geometry_of(depth[max(0, a - HALO_ROWS) : b + HALO_ROWS], sensor, scale_px=1.5),
         lambda a, b: _blocks(depth, packed, law, 2, x, y, z, sigma, count, a // 2, b // 2),
         lambda a, b: tangent_planes(x, y, z, count, sigma, True, 1, 5.0 / packed[1], normal, rms, a // 2, b // 2),
         lambda a, b: _scan(mask, linked, linked, parent, a, b),
         lambda a, b: claim_pixels(depth, packed, law, blocks, 2, kinds, table, out, a // 2, b // 2),
-        lambda a, b: claim_borders(depth, packed, law, labels, 1, kinds, table, out, a, b),
+        lambda a, b: contested_pixels(labels, 1, a, b),
+        lambda a, b: claim_again(depth, packed, law, labels, kinds, table, rows, columns, names, share(a), share(b)),
     ]
 
 

@@ -10,6 +10,7 @@ Each round leaves fewer free blocks, and rounds end when no surface is added.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,14 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.range import grow
-from perception.range.claim import bucket, claim_borders, claim_pixels
+from perception.range.beside import contested_pixels, pixels_around, renamed_pixels
+from perception.range.claim import bucket, claim_again, claim_pixels
 from perception.range.compete import Candidates, explain
 from perception.range.components import for_each_tile, label_components
 from perception.range.grid import Grid, block_size, build_grid, seen_from
 from perception.range.left_over import unexplained
 from perception.range.noise import WORST_SHARE, NoiseModel
 from perception.range.sensor import RangeSensorModel
-from perception.range.settle import settle
+from perception.range.settle import REACH_PX, settle
 from perception.range.surfaces import PLANE
 
 Array = NDArray[np.float64]
@@ -148,35 +150,45 @@ def _claimed(task: Task, noise: NoiseModel, blocks: Labels, found: Candidates, *
 
 
 def _reclaimed(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, newest: int) -> Labels:
-    """Labels after the pixels beside surfaces of label `newest` and later were judged again."""
-    kinds, table = found.arrays()
-    packed, law = task.packed, noise.packed()
-    after = np.empty_like(labels)
-    for_each_tile(
-        lambda top, bottom: claim_borders(task.depth_m, packed, law, labels, newest, kinds, table, after, top, bottom),
-        labels.shape[0],
-        task.tiles,
-        pool=task.pool,
-    )
-    return after
+    """`labels`, changed in place: the pixels beside surfaces of label `newest` and later are judged again."""
+    rows, columns = _contested(task, labels, newest)
+    judge = partial(claim_again, task.depth_m, task.packed, noise.packed(), labels, *found.arrays())
+    _judged(task, judge, labels, rows, columns)
+    return labels
 
 
 def settled(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, sweeps: int) -> Labels:
-    """Labels after `sweeps` in which pixels between two equally good surfaces follow their neighbours."""
-    kinds, table = found.arrays()
-    packed, law = task.packed, noise.packed()
+    """`labels`, changed in place by `sweeps` in which pixels between two equally good surfaces follow their neighbours."""
     slow = noise.slow_share(float(task.depths_m[2]))
-    earlier = np.full_like(labels, -1)
+    judge = partial(settle, task.depth_m, task.packed, noise.packed(), slow, labels, *found.arrays())
+    rows, columns = _contested(task, labels, 1)
     for _ in range(sweeps):
-        after = np.empty_like(labels)
-        for_each_tile(
-            partial(settle, task.depth_m, packed, law, slow, earlier, labels, kinds, table, after),
-            labels.shape[0],
-            task.tiles,
-            pool=task.pool,
-        )
-        earlier, labels = labels, after
+        moved = _judged(task, judge, labels, rows, columns)
+        # Around what did not move, every pixel would be judged as it was.
+        rows, columns = pixels_around(*moved, REACH_PX, labels.shape)
     return labels
+
+
+def _contested(task: Task, labels: Labels, newest: int) -> tuple[Labels, Labels]:
+    """`contested_pixels` of the whole image."""
+    parts: dict[int, tuple[Labels, Labels]] = {}
+
+    def look(top: int, bottom: int) -> None:
+        parts[top] = contested_pixels(labels, newest, top, bottom)
+
+    for_each_tile(look, labels.shape[0], task.tiles, pool=task.pool)
+    rows, columns = zip(*(parts[top] for top in sorted(parts)), strict=True)
+    return np.concatenate(rows), np.concatenate(columns)
+
+
+def _judged(
+    task: Task, judge: Callable[..., object], labels: Labels, rows: Labels, columns: Labels
+) -> tuple[Labels, Labels]:
+    """Have all the pixels judged by the labels as they are, then name them, in place; returns those that moved."""
+    names = np.empty_like(rows)
+    for_each_tile(partial(judge, rows, columns, names), rows.size, task.tiles, pool=task.pool)
+    moved: tuple[Labels, Labels] = renamed_pixels(labels, rows, columns, names)
+    return moved
 
 
 def _recover_planes(task: Task, grid: Grid, blocks: Labels, found: Candidates) -> float:

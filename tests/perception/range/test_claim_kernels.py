@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perception.range import claim, finish
+from perception.range import beside, claim, finish
 from perception.range.fit import PER_MEDIAN, SCALE_PRECISION, middle_scale
 from perception.range.noise import NoiseModel
 from perception.range.primitives import centre_and_radii, ellipsoid_of, named_covariance
@@ -90,9 +90,12 @@ def test_pixels_go_to_the_best_surface_of_the_blocks_around(sensor, tiles):
 @pytest.mark.parametrize("sensor", [PINHOLE, PARALLEL], ids=["pinhole", "orthographic"])
 def test_only_pixels_beside_a_new_surface_are_judged_again(sensor):
     depth, blocks = random_case(sensor, 2, size=1)
-    table, out, newest = competing_surfaces(), np.empty(depth.shape, np.int32), 3
-    for rows in ((0, 50), (50, 120)):
-        claim.claim_borders(depth, sensor.packed(), NOISE.packed(), blocks, newest, KINDS, table, out, *rows)
+    table, out, newest = competing_surfaces(), blocks.copy(), 3
+    rows, columns = beside.contested_pixels(blocks, newest, 0, 120)
+    names = np.full_like(rows, -1)
+    for ends in ((0, 50), (50, rows.size)):
+        claim.claim_again(depth, sensor.packed(), NOISE.packed(), blocks, KINDS, table, rows, columns, names, *ends)
+    beside.renamed_pixels(out, rows, columns, names)
     for v in range(120):
         for u in range(160):
             near = around(blocks, v, u)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from perception.range import settle
+from perception.range import beside, settle
 from perception.range.claim import CLAIM_SIGMAS, PLAIN_SIGMAS, misfit
 from tests.perception.range.scenes import PARALLEL, PINHOLE
 from tests.perception.range.test_claim_kernels import KINDS, NOISE, competing_surfaces, random_case
@@ -15,15 +16,14 @@ from tests.perception.range.test_claim_kernels import KINDS, NOISE, competing_su
 SLOW_SHARE = 0.4
 
 
-def swept(sensor, depth, labels, earlier, cuts=(0, 50, 120)):
-    """Labels after one compiled sweep in tiles between the rows `cuts`."""
-    out = np.full_like(labels, -1)
-    table = competing_surfaces()
-    for top, bottom in pairwise(cuts):
-        settle.settle(
-            depth, sensor.packed(), NOISE.packed(), SLOW_SHARE, earlier, labels, KINDS, table, out, top, bottom
-        )
-    return out
+def swept(sensor, depth, labels, rows, columns, cuts=(0.0, 0.4, 1.0)):
+    """Labels after one compiled sweep over those pixels, their list cut into parts; and which pixels moved."""
+    names, after = np.full_like(rows, -1), labels.copy()
+    ends = (np.array(cuts) * rows.size).astype(int).tolist()
+    judge = partial(settle.settle, depth, sensor.packed(), NOISE.packed(), SLOW_SHARE, labels, KINDS)
+    for first, last in pairwise(ends):
+        judge(competing_surfaces(), rows, columns, names, first, last)
+    return after, beside.renamed_pixels(after, rows, columns, names)
 
 
 def settled_label(sensor, depth, labels, v, u):
@@ -53,7 +53,7 @@ def settled_label(sensor, depth, labels, v, u):
 @pytest.mark.parametrize("sensor", [PINHOLE, PARALLEL], ids=["pinhole", "orthographic"])
 def test_a_sweep_is_its_definition(sensor):
     depth, labels = random_case(sensor, 4, size=1)
-    out = swept(sensor, depth, labels, np.full_like(labels, -1))
+    out, _ = swept(sensor, depth, labels, *beside.contested_pixels(labels, 1, 0, 120))
     assert (out != labels).any()
     rng = np.random.default_rng(0)
     for v, u in zip(rng.integers(0, 120, 1500), rng.integers(0, 160, 1500), strict=True):
@@ -62,9 +62,10 @@ def test_a_sweep_is_its_definition(sensor):
 
 def test_pixels_around_which_nothing_changed_need_not_be_judged_again():
     depth, labels = random_case(PINHOLE, 5, size=1)
-    never = np.full_like(labels, -1)
-    earlier = never
+    pixels = beside.contested_pixels(labels, 1, 0, 120)
     for _ in range(4):
-        after = swept(PINHOLE, depth, labels, earlier)
-        np.testing.assert_array_equal(after, swept(PINHOLE, depth, labels, never, cuts=(0, 120)))
-        earlier, labels = labels, after
+        after, moved = swept(PINHOLE, depth, labels, *pixels)
+        everywhere, _ = swept(PINHOLE, depth, labels, *beside.contested_pixels(labels, 1, 0, 120), cuts=(0.0, 1.0))
+        np.testing.assert_array_equal(after, everywhere)
+        np.testing.assert_array_equal(np.nonzero(after != labels), np.unique(moved, axis=1))
+        pixels, labels = beside.pixels_around(*moved, settle.REACH_PX, labels.shape), after

@@ -30,10 +30,10 @@ from numpy.typing import NDArray
 from perception.range.analyse import analyse
 from perception.range.batch import IMAGES_A_TASK, _client, analyse_files, recordings_in, tasks_of
 from perception.range.beside import contested_pixels
+from perception.range.blocks import mean_blocks
 from perception.range.claim import claim_again, claim_pixels
 from perception.range.components import _merge_seam, _scan, merge_rounds, tile_rows
 from perception.range.geometry import geometry_of
-from perception.range.grid import _blocks
 from perception.range.noise import estimate_noise
 from perception.range.sensor import PinholeSensor
 from perception.range.surfaces import SIZE
@@ -131,7 +131,7 @@ def _tiled_steps(depth: Array, sensor: PinholeSensor, labels: NDArray[np.int32])
     h, w = H // 2, W // 2
     x, y, z, sigma, rms = (np.full((h, w), np.nan) for _ in range(5))
     normal, count = np.full((h, w, 3), np.nan), np.zeros((h, w), np.int32)
-    _blocks(depth, packed, law, 2, x, y, z, sigma, count, 0, h)
+    mean_blocks(depth, packed, law, 2, x, y, z, sigma, count, 0, h)
     mask, linked, parent = np.ones((H, W), bool), np.ones((H, W), bool), np.arange(H * W, dtype=np.int32)
     n = int(labels.max())
     kinds, table = np.zeros(n + 1, np.int64), np.zeros((n + 1, SIZE))
@@ -146,7 +146,7 @@ def _tiled_steps(depth: Array, sensor: PinholeSensor, labels: NDArray[np.int32])
 
     return [
         lambda a, b: geometry_of(depth[max(0, a - HALO_ROWS) : b + HALO_ROWS], sensor, scale_px=1.5),
-        lambda a, b: _blocks(depth, packed, law, 2, x, y, z, sigma, count, a // 2, b // 2),
+        lambda a, b: mean_blocks(depth, packed, law, 2, x, y, z, sigma, count, a // 2, b // 2),
         lambda a, b: tangent_planes(x, y, z, count, sigma, True, 1, 5.0 / packed[1], normal, rms, a // 2, b // 2),
         lambda a, b: _scan(mask, linked, linked, parent, a, b),
         lambda a, b: claim_pixels(depth, packed, law, blocks, 2, kinds, table, out, a // 2, b // 2),

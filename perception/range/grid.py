@@ -5,8 +5,6 @@ blocks that straddle a jump keep only the larger side. Planes are linear in the 
 depth of an orthographic sensor, so one linear fit serves both.
 """
 
-# ruff: noqa: PLR0124 - compiled loops take plain arrays, and long
-# bodies and plain comparisons are what compiles fast.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
@@ -16,8 +14,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from perception.range.blocks import JUMP_SLOPE, mean_blocks
 from perception.range.components import for_each_tile
-from perception.range.noise import NoiseModel
+from perception.range.noise import NoiseModel, valid_sample
 from perception.range.sensor import RangeSensorModel
 from perception.range.surfaces import LEAN
 from perception.range.tangents import tangent_planes
@@ -25,11 +24,10 @@ from perception.range.tangents import tangent_planes
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-JUMP_SLOPE = 2.5  # a surface seen steeper than 68 degrees counts as a jump between blocks
 NORMAL_SIGMA_GOAL_RAD = 0.06  # tangent planes noisier than this are fitted over a wider window
 WIDEST_RADIUS = 3
 LARGE_SIDE_PX = 1024
-BLOCK_SAMPLES = 4  # along a block; larger blocks are sampled
+MIDDLE_SAMPLES = 1024
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -99,14 +97,16 @@ def build_grid(
     law = noise.packed()
     h, w = (-(-n // size_px) for n in depth_m.shape)
     x, y = np.empty((h, w)), np.empty((h, w))
-    z, sigma, rms = (np.full((h, w), np.nan) for _ in range(3))
-    normal, count = np.full((h, w, 3), np.nan), np.zeros((h, w), np.int32)
-    for_each_tile(lambda a, b: _blocks(depth_m, packed, law, size_px, x, y, z, sigma, count, a, b), h, tiles, pool=pool)
+    z, sigma, count = np.empty((h, w)), np.empty((h, w)), np.empty((h, w), np.int32)
+    for_each_tile(
+        lambda a, b: mean_blocks(depth_m, packed, law, size_px, x, y, z, sigma, count, a, b), h, tiles, pool=pool
+    )
     perspective = bool(packed[0] > 0)
-    known = z[np.isfinite(z)]
-    middle = float(np.median(known[:: max(1, known.size // 1024)])) if known.size else 1.0
+    known = valid_sample(z, MIDDLE_SAMPLES)
+    middle = float(np.median(known)) if known.size else 1.0
     radius, slope_sigma = _radius(noise, sensor, middle, size_px)
     slope = jump_slope / packed[1] * size_px
+    normal, rms = np.full((h, w, 3), np.nan), np.full((h, w), np.nan)
     for_each_tile(
         lambda a, b: tangent_planes(x, y, z, count, sigma, perspective, radius, slope, normal, rms, a, b),
         h,
@@ -161,91 +161,3 @@ def slow_share_at(noise, z):  # type: ignore[no-untyped-def]  # numba types it
     """Part of the variance at depth z that neighbouring pixels share; `noise` as `NoiseModel.packed`."""
     slow, sigma = noise[2] + noise[3] * z * z, sigma_at(noise, z)
     return slow * slow / max(sigma * sigma, 1e-30)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: ignore[no-untyped-def]  # numba types it
-    H, W = depth.shape
-    w = x.shape[1]
-    perspective = sen[0] > 0
-    hop = (b + BLOCK_SAMPLES - 1) // BLOCK_SAMPLES
-    full = ((b + hop - 1) // hop) ** 2
-    values = np.empty(full)
-    medians = np.empty(w)
-    for r in range(top, bottom):
-        y[r] = (r * b + 0.5 * (b - 1) - sen[4]) / sen[2]
-        for c in range(w):
-            x[r, c] = (c * b + 0.5 * (b - 1) - sen[3]) / sen[1]
-        if b == 1:
-            medians[:] = depth[r]
-        elif b <= BLOCK_SAMPLES and (r + 1) * b <= H:
-            _medians_of_four(depth[r * b], depth[(r + 1) * b - 1], b, medians)
-            if W % b:
-                medians[w - 1] = _median(depth, b, hop, r, w - 1, values)
-        else:
-            for c in range(w):
-                medians[c] = _median(depth, b, hop, r, c, values)
-        for c in range(w):
-            median = medians[c]
-            if not np.isfinite(median):
-                continue
-            pitch = (median if perspective else 1.0) / sen[1]
-            sig = sigma_at(noise, median)
-            tol = JUMP_SLOPE * pitch * b * 0.7 + 3.0 * sig
-            su, sv, sg, m = 0.0, 0.0, 0.0, 0.0
-            per_median = 1.0 / median
-            for v in range(r * b, min(r * b + b, H), hop):
-                for u in range(c * b, min(c * b + b, W), hop):
-                    d = depth[v, u] - median
-                    inside = abs(d) <= tol  # refuses NaN
-                    q = d * per_median if perspective else d
-                    # 1 / (1 + q) by its series: a division less a pixel
-                    sg += (q * (q * (q - 1.0) + 1.0) if perspective else -q) if inside else 0.0
-                    su += u if inside else 0.0
-                    sv += v if inside else 0.0
-                    m += 1.0 if inside else 0.0
-            x[r, c] = (su / m - sen[3]) / sen[1]
-            y[r, c] = (sv / m - sen[4]) / sen[2]
-            if 2 * m < full:
-                continue
-            z[r, c] = median / (1.0 - sg / m) if perspective else median - sg / m
-            count[r, c] = int(m)
-            z2 = median * median
-            slow = noise[2] + noise[3] * z2
-            fast = sig * sig - slow * slow
-            step = noise[4] + noise[5] * z2
-            # Code steps are shared by neighbours, so averaging gains little on them.
-            kept = max(fast / m, step * step / 24.0)
-            sigma[r, c] = np.sqrt(kept + slow * slow)
-
-
-@njit(cache=True, error_model="numpy", **LEAN)
-def _median(depth, b, hop, r, c, values):  # type: ignore[no-untyped-def]  # numba types it
-    """Lower median of a block's samples, a real value and never the empty middle of a jump; NaN if most are missing."""
-    n = 0
-    for v in range(r * b, min(r * b + b, depth.shape[0]), hop):
-        for u in range(c * b, min(c * b + b, depth.shape[1]), hop):
-            d = depth[v, u]
-            if np.isfinite(d):
-                k = n  # insertion sort: at most 16 values
-                while k > 0 and values[k - 1] > d:
-                    values[k] = values[k - 1]
-                    k -= 1
-                values[k] = d
-                n += 1
-    return values[(n - 1) // 2] if n > 0 and 2 * n >= values.shape[0] else np.nan
-
-
-@njit(cache=True, error_model="numpy", **LEAN)
-def _medians_of_four(upper, lower, b, out):  # type: ignore[no-untyped-def]  # numba types it
-    """Lower medians of the corners of blocks of b x b pixels, by a sorting network, missing readings last."""
-    for c in range(upper.shape[0] // b):
-        i, j = c * b, c * b + b - 1
-        p, q, s, t = upper[i], upper[j], lower[i], lower[j]
-        p, q = p if p == p else np.inf, q if q == q else np.inf
-        s, t = s if s == s else np.inf, t if t == t else np.inf
-        low_1, high_1, low_2, high_2 = min(p, q), max(p, q), min(s, t), max(s, t)
-        second, third = min(max(low_1, low_2), high_1, high_2), max(low_1, low_2, min(high_1, high_2))
-        # Of three or four readings the second, of two the first; one alone is too few.
-        median = min(low_1, low_2) if third == np.inf else second
-        out[c] = median if second < np.inf else np.nan

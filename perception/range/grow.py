@@ -17,6 +17,7 @@ GROW_SIGMAS = 3.0
 CURVED_RMS = 0.4  # in sigmas: how much a quadratic may gain over a plane before the plane is a strip of something bent
 CURVED_F = 4.0  # and how significant that gain must be (F ratio)
 SEED_LEVELS = 64
+LONE_BEND = 0.02
 SWEEPS = 3  # of growing a plane from one seed, each with the plane of the sweep before
 SAME_BLOCKS = 200  # of which no more than one may come or go in a sweep that is the last
 MOST_PLANES = 512
@@ -25,38 +26,71 @@ LOOSE_NORMAL = 0.5  # length of a normal that seeds a plane but does not count
 TAKEN = np.int32(2**31 - 1)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def seed_order(normal, rms, free, reach):  # type: ignore[no-untyped-def]  # numba types it
     """Free blocks with a tangent plane, flattest neighbourhood first (counting sort), as flat indices."""
     h, w = rms.shape
-    key = np.full(h * w, -1, np.int32)
-    counts = np.zeros(SEED_LEVELS + 1, np.int32)
+    normals, known = _framed_normals(normal, rms, free, reach)
+    cosine, bend, levels = np.empty(w), np.empty(w), np.empty((h, w), np.int32)
+    starts = np.zeros(SEED_LEVELS + 1, np.int64)
+    for r in range(h):
+        if not known[r]:
+            continue
+        bend[:] = 0.0
+        for i, j in ((2 * reach, reach), (0, reach), (reach, 2 * reach), (reach, 0)):
+            cosine[:] = 0.0
+            for k in range(3):
+                _add_product(normals[k, r + reach, reach : reach + w], normals[k, r + i, j : j + w], cosine)
+            _add_bend(cosine, bend)
+        _fill_levels(bend, rms[r], normals[0, r + reach, reach : reach + w], levels[r])
+        for c in range(w):
+            if levels[r, c] >= 0:
+                starts[levels[r, c] + 1] += 1
+    for k in range(SEED_LEVELS):
+        starts[k + 1] += starts[k]
+    out = np.empty(starts[SEED_LEVELS], np.int32)
+    for r in range(h):
+        for c in range(w if known[r] else 0):
+            level = levels[r, c]
+            if level >= 0:
+                out[starts[level]] = r * w + c
+                starts[level] += 1
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _framed_normals(normal, rms, free, reach):  # type: ignore[no-untyped-def]  # numba types it
+    """(3, h + 2 reach, w + 2 reach) components, NaN where a block has no normal, as all around; and which rows have any."""
+    h, w = rms.shape
+    out, known = np.full((3, h + 2 * reach, w + 2 * reach), np.nan), np.zeros(h, np.bool_)
     for r in range(h):
         for c in range(w):
-            if not free[r, c] or not np.isfinite(rms[r, c]):
-                continue
-            bend = 0.0
-            for s in range(4):
-                i = r + (reach if s == 0 else -reach if s == 1 else 0)
-                j = c + (reach if s == 2 else -reach if s == 3 else 0)
-                if i < 0 or j < 0 or i >= h or j >= w or not np.isfinite(rms[i, j]) or not free[i, j]:
-                    bend += 0.02
-                    continue
-                dot = 0.0
+            if free[r, c] and np.isfinite(rms[r, c]):
+                known[r] = True
                 for k in range(3):
-                    dot += normal[r, c, k] * normal[i, j, k]
-                bend += 1.0 - dot
-            level = int(min(SEED_LEVELS - 1.0, 12.0 * np.sqrt(bend * 25.0) + 4.0 * max(rms[r, c] - 1.0, 0.0)))
-            key[r * w + c] = level
-            counts[level + 1] += 1
-    for k in range(SEED_LEVELS):
-        counts[k + 1] += counts[k]
-    out = np.empty(counts[SEED_LEVELS], np.int32)
-    for i in range(h * w):
-        if key[i] >= 0:
-            out[counts[key[i]]] = i
-            counts[key[i]] += 1
-    return out
+                    out[k, r + reach, c + reach] = normal[r, c, k]
+    return out, known
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _add_product(a, b, out):  # type: ignore[no-untyped-def]  # numba types it
+    for c in range(out.shape[0]):
+        out[c] += a[c] * b[c]
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _add_bend(cosine, bend):  # type: ignore[no-untyped-def]  # numba types it
+    """How far a normal turns to a neighbour: 1 less the cosine; a neighbour that is missing (NaN) says little."""
+    for c in range(bend.shape[0]):
+        bend[c] += 1.0 - cosine[c] if cosine[c] == cosine[c] else LONE_BEND
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _fill_levels(bend, rms, known, levels):  # type: ignore[no-untyped-def]  # numba types it
+    """Level of each block, from 0 for a flat and quiet neighbourhood; -1 for a block without a normal."""
+    for c in range(bend.shape[0]):
+        level = min(SEED_LEVELS - 1.0, 12.0 * np.sqrt(max(25.0 * bend[c], 0.0)) + 4.0 * max(rms[c] - 1.0, 0.0))
+        levels[c] = np.int32(level if known[c] == known[c] else -1.0)
 
 
 @njit(cache=True, **LEAN)

@@ -100,7 +100,7 @@ def estimate_noise(depth_m: Array, sensor: RangeSensorModel, *, depths_m: Array 
 def coding_step(depth_m: Array) -> tuple[float, float]:
     """`(a, b)` of the step between neighbouring depth codes `a + b z^2`; (0, 0) for continuous depth."""
     # A sample decides quickly whether the depth is continuous; only coded depth is worth a full sort.
-    sample = _valid_sample(depth_m, CODE_SAMPLES)
+    sample = valid_sample(depth_m, CODE_SAMPLES)
     if sample.size < 16 or np.unique(sample).size > 0.7 * sample.size:
         return 0.0, 0.0
     values = depth_m[np.isfinite(depth_m)]
@@ -117,14 +117,14 @@ def coding_step(depth_m: Array) -> tuple[float, float]:
 
 def typical_depths_m(depth_m: Array) -> Array:
     """(5,) quantiles of the valid depths, metres: where a noise law is judged."""
-    sample = np.sort(_valid_sample(depth_m, TYPICAL_SAMPLES))
+    sample = np.sort(valid_sample(depth_m, TYPICAL_SAMPLES))
     if sample.size == 0:
         return np.ones(5)
     return np.asarray(sample[(np.array([0.1, 0.3, 0.5, 0.7, 0.9]) * (sample.size - 1)).astype(int)], float)
 
 
 @njit(cache=True)
-def _valid_sample(depth, most):  # type: ignore[no-untyped-def]  # numba types it
+def valid_sample(depth, most):  # type: ignore[no-untyped-def]  # numba types it
     """Every n-th of the valid depths in raster order, n so that about `most` remain."""
     flat = depth.ravel()
     valid = 0

@@ -18,7 +18,8 @@ GAP = 8  # empty blocks that end a run
 RUN = 128  # blocks at most
 X0, Y0, Z0, G0, BASE, SLOPE = (row * RUN for row in range(6))  # where the rows of the run's own blocks begin
 N, S, SX, SY, SG, SXX, SXY, SYY, SXG, SYG, SGG = (row * RUN for row in range(6, 17))  # sums over its neighbours
-SCRATCH = 17 * RUN
+NX, NY, NZ, RMS = (row * RUN for row in range(17, 21))  # the planes
+SCRATCH = 21 * RUN
 WIDE = RUN + 16  # a row of neighbours: room for a radius of eight blocks
 X, Y, Z, G, K = (row * WIDE for row in range(5))
 
@@ -42,7 +43,7 @@ def tangent_planes(  # type: ignore[no-untyped-def]  # numba types it
         start, end = _next_run(z[r], 0)
         while start < w:
             n = end - start
-            work[N:] = 0.0
+            work[N:NX] = 0.0
             _load_own(x[r, start:end], y[r, start:end], z[r, start:end], sigma[r, start:end], perspective, work)
             a, b = max(start - radius, 0), min(end + radius, w)
             for i in range(max(0, r - radius), min(h, r + radius + 1)):
@@ -50,7 +51,8 @@ def tangent_planes(  # type: ignore[no-untyped-def]  # numba types it
                 _load(x[i, a:b], y[i, a:b], z[i, a:b], count[i, a:b], perspective, a - start + radius, wide)
                 for shift in range(-radius, radius + 1):
                     _add(slope_per_block * max(abs(i - r), abs(shift)), n, radius + shift, wide, work)
-            _solve(n, least, perspective, sigma[r, start:end], normal[r, start:end], rms[r, start:end], work)
+            _solve(n, least, perspective, work)
+            _store(normal[r, start:end], rms[r, start:end], work)
             start, end = _next_run(z[r], end)
 
 
@@ -127,26 +129,38 @@ def _add(reach, n, at, wide, work):  # type: ignore[no-untyped-def]  # numba typ
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _solve(n, least, perspective, sigma, normal, rms, work):  # type: ignore[no-untyped-def]  # numba types it
-    """Slopes (p, q) of g over the window, the plane's normal towards the sensor, and what it leaves over in sigmas."""
+def _solve(n, least, perspective, work):  # type: ignore[no-untyped-def]  # numba types it
+    """Rows of the plane's normal towards the sensor and of what it leaves over in sigmas; NaN where it is not determined.
+
+    The window's sums, centred, give the slopes (p, q) of g.
+    """
+    p = 1.0 if perspective else 0.0
     for c in range(n):
-        blocks, s, sx, sy, sg = work[N + c], work[S + c], work[SX + c], work[SY + c], work[SG + c]
-        sxx, sxy = work[SXX + c] - sx * sx / s, work[SXY + c] - sx * sy / s
-        syy, sxg = work[SYY + c] - sy * sy / s, work[SXG + c] - sx * sg / s
-        syg, sgg = work[SYG + c] - sy * sg / s, work[SGG + c] - sg * sg / s
+        blocks, sx, sy, sg = work[N + c], work[SX + c], work[SY + c], work[SG + c]
+        per = 1.0 / work[S + c]
+        sxx, sxy = work[SXX + c] - sx * sx * per, work[SXY + c] - sx * sy * per
+        syy, sxg = work[SYY + c] - sy * sy * per, work[SXG + c] - sx * sg * per
+        syg, sgg = work[SYG + c] - sy * sg * per, work[SGG + c] - sg * sg * per
         det = sxx * syy - sxy * sxy
-        if not (blocks >= least and det > 1e-4 * sxx * syy and det > 0.0):
-            continue
-        p, q = (syy * sxg - sxy * syg) / det, (sxx * syg - sxy * sxg) / det
-        left = max(sgg - p * sxg - q * syg, 0.0) / s * blocks / max(blocks - 3.0, 1.0)
-        if perspective:
-            # g = p x + q y + c is the plane (p, q, c) . X = 1
-            x0, y0, z0 = work[X0 + c], work[Y0 + c], work[Z0 + c]
-            nx, ny, nz = p, q, work[G0 + c] + (sg - p * sx - q * sy) / s - p * x0 - q * y0
-            facing, scale = nx * x0 + ny * y0 + nz, z0 * z0
-        else:
-            nx, ny, nz, facing, scale = -p, -q, 1.0, 1.0, 1.0
-        rms[c] = np.sqrt(left) * scale / sigma[c]
-        length = np.sqrt(nx * nx + ny * ny + nz * nz)
-        inverse = -1.0 / length if facing > 0.0 else 1.0 / length
-        normal[c, 0], normal[c, 1], normal[c, 2] = nx * inverse, ny * inverse, nz * inverse
+        ok = (blocks >= least) & (det > 1e-4 * sxx * syy) & (det > 0.0)
+        per_det = 1.0 / det
+        a, b = (syy * sxg - sxy * syg) * per_det, (sxx * syg - sxy * sxg) * per_det
+        left = max(sgg - a * sxg - b * syg, 0.0) * per * blocks / max(blocks - 3.0, 1.0)
+        # g = a x + b y + c is the plane (a, b, c) . X = 1 seen in perspective, else (-a, -b, 1) . X = c.
+        x0, y0, z0 = work[X0 + c], work[Y0 + c], work[Z0 + c]
+        nz = work[G0 + c] + (sg - a * sx - b * sy) * per - a * x0 - b * y0 if perspective else 1.0
+        nx, ny = (a, b) if perspective else (-a, -b)
+        facing = p * (nx * x0 + ny * y0) + nz
+        inverse = (-1.0 if facing > 0.0 else 1.0) / np.sqrt(nx * nx + ny * ny + nz * nz)
+        scale = z0 * z0 if perspective else 1.0
+        work[NX + c] = nx * inverse if ok else np.nan
+        work[NY + c], work[NZ + c] = ny * inverse, nz * inverse
+        work[RMS + c] = np.sqrt(left) * scale * JUMP_SIGMAS / work[BASE + c]
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _store(normal, rms, work):  # type: ignore[no-untyped-def]  # numba types it
+    for c in range(rms.shape[0]):
+        if np.isfinite(work[NX + c]):
+            normal[c, 0], normal[c, 1], normal[c, 2] = work[NX + c], work[NY + c], work[NZ + c]
+            rms[c] = work[RMS + c]

@@ -54,6 +54,7 @@ SCALE_PRECISION = 0.004
 FALLS = 0.95  # of the scale before: so much at least it must fall for another round under Cauchy weights
 ROUGH_SAMPLES = 36
 ROUGH_LIMIT = 5.0
+ELLIPSOID_GIVE_UP = 14.0  # the mean square of what is simpler beyond which none is tried; a sphere is no close start
 LARGEST_RADIUS_M = 10.0
 LEAST_NORMALS = 10  # that tell where anything but a plane starts
 QUADRIC_PER_SAMPLE = 1.15  # a simple surface under white noise costs about 0.95 a sample, and its price
@@ -274,6 +275,15 @@ def _rough(kind, th, x, y, z, sigma, perspective, fixed, scratch):  # type: igno
 
 
 @njit(cache=True, error_model="numpy")
+def rough_mean_square(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """Mean square in sigmas, each at most `ROUGH_LIMIT` squared, that a rough fit from `th` leaves of samples (4, N)."""
+    few = np.ascontiguousarray(samples[:, :: max(1, samples.shape[1] // ROUGH_SAMPLES)])
+    free = np.zeros(9, np.bool_)
+    cost = _rough(np.int64(kind), th.copy(), few[0], few[1], few[2], few[3], perspective, free, new_scratch())
+    return cost / few.shape[1]
+
+
+@njit(cache=True, error_model="numpy")
 def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_samples, give_up):  # type: ignore[no-untyped-def]  # numba types it
     """Fit every kind in the (5,) mask `kinds` to one set of samples, `points` (N, 3).
 
@@ -312,8 +322,8 @@ def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_sampl
         s = cost / correlated_samples + FREEDOM[kind] * price
         if s < score[kind] and _is_sane(kind, th):
             ths[kind], mean2[kind], kept[kind], score[kind] = th, m, share, s
-    starts_near = rough[SPHERE] <= behind and best_rough <= give_up and starts[SPHERE, 3] < LARGEST_RADIUS_M
-    if kinds[QUADRIC] and starts_near:
+    is_near = rough[SPHERE] <= behind and best_rough <= ELLIPSOID_GIVE_UP * per_sample
+    if kinds[QUADRIC] and is_near and starts[SPHERE, 3] < LARGEST_RADIUS_M:
         # Nine parameters explain most things: they are tried when nothing simpler does.
         simple = np.min(score)
         if simple > n / correlated_samples * QUADRIC_PER_SAMPLE:

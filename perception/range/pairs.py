@@ -15,7 +15,7 @@ from perception.range.borders import step_and_turn
 from perception.range.finish import SLOW_NOISE_AREA_PX
 from perception.range.grid import slow_share_at
 from perception.range.starts import solve_positive, start_plane
-from perception.range.surfaces import PLANE, QUADRIC
+from perception.range.surfaces import PLANE, QUADRIC, SPHERE
 
 PIXELS, PATCHES, MEAN_SQUARE, TILT, SIZE_M = range(5)
 FIGURES = 5
@@ -36,7 +36,10 @@ SCRAP_SHARE = 0.1  # of the larger part
 PLAIN_MEAN_SQUARE = 1.6
 MOST_NOISE = 2.5  # times the model's variance, that two parts may show and still be joined on its strength
 CREASE_MEAN_SQUARE = 2.0  # times the limit, that a quadratic leaves over: no surface follows such a crease
-GIVE_UP = 10.0  # mean square of a rough fit, cut at five sigmas, that no full fit brings below the limits
+# Mean square of a rough fit, cut at five sigmas, that no full fit brings below the limits: where the crease is smooth or
+# both are flat; and beyond the limit, for two that are known well enough to tell.
+GIVE_UP = 10.0
+SLACK = 3.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -95,56 +98,55 @@ def judged(  # type: ignore[no-untyped-def]  # numba types it
     """
     shown = shown_noise(figures_a, figures_b)
     step, turn = step_and_turn(kind_a, a, kind_b, b, x, y, noise, perspective)
-    if step <= STEP_SIGMAS * np.sqrt(shown) and turn <= SHARPEST_TURN_RAD:
-        tolerated = max(SMOOTH_TURN_RAD, SMOOTH_SIGMAS * np.hypot(figures_a[TILT], figures_b[TILT]))
-        is_smooth = turn < min(tolerated, 0.5 * SHARPEST_TURN_RAD)
+    is_rounding = step <= ROUNDING_SIGMAS * np.sqrt(shown) and turn <= ROUNDING_TURN_RAD
+    is_rounding &= _is_strip(figures_a[PIXELS], figures_b[PIXELS], length_px)
+    tolerated = max(SMOOTH_TURN_RAD, SMOOTH_SIGMAS * np.hypot(figures_a[TILT], figures_b[TILT]))
+    is_smooth = turn < min(tolerated, 0.5 * SHARPEST_TURN_RAD)
+    may_join = step <= STEP_SIGMAS * np.sqrt(shown) and turn <= SHARPEST_TURN_RAD
+    # A rounded edge goes to its face in any case, and what it is by itself is not worth fits.
+    if may_join and (is_smooth or not is_rounding):
         samples, normals = np.concatenate((samples_a, samples_b), 1), np.concatenate((normals_a, normals_b))
         limit = shown * max(mean_square_limit(figures_a[PATCHES]), mean_square_limit(figures_b[PATCHES]))
         both_flat = kind_a == PLANE and kind_b == PLANE
         is_hopeless = both_flat and _is_creased(samples, perspective, CREASE_MEAN_SQUARE * limit)
         if is_smooth or not is_hopeless:
-            kind, th = (kind_a, a) if figures_a[PIXELS] >= figures_b[PIXELS] else (kind_b, b)
-            if kind != PLANE:
+            give_up = GIVE_UP if both_flat or is_smooth else limit + SLACK
+            with_quadric = QUADRIC in (kind_a, kind_b)
+            kinds = np.ones(5, np.bool_)
+            kinds[QUADRIC] = with_quadric
+            own, continued = (kind_a, a) if figures_a[PIXELS] >= figures_b[PIXELS] else (kind_b, b)
+            goes_on = own != PLANE and fit.rough_mean_square(own, continued, samples, perspective) <= give_up
+            if goes_on:
                 # Pieces of one bent surface: the larger's goes on over the smaller, and no other need be tried.
-                th = _continued(kind, th, samples, perspective)
-                gain = _gain(
-                    kind, th, kind_a, samples_a, figures_a, kind_b, samples_b, figures_b, is_smooth, perspective
+                continued = _continued(own, continued, samples, perspective)
+                gain, _ = _gain(
+                    own, continued, kind_a, samples_a, figures_a, kind_b, samples_b, figures_b, is_smooth, perspective
                 )
                 if gain > LEAST_GAIN:
-                    return gain, kind, th
-            with_quadric = QUADRIC in (kind_a, kind_b)
+                    return gain, own, continued
+                kinds[own] = own == SPHERE and with_quadric  # an ellipsoid starts from a sphere
             correlated = max(samples.shape[1] / (figures_a[PATCHES] + figures_b[PATCHES]), 1.0)
-            ths, there = _joint_fits(samples, normals, perspective, with_quadric, correlated)
+            ths, there = _joint_fits(samples, normals, perspective, kinds, correlated, give_up)
             if both_flat and not there[PLANE]:
-                ths[PLANE] = _continued(PLANE, a, samples, perspective)
-                there[PLANE] = True
-            best_kind, best_gain = -1, 0.0
-            for kind in range(5):
-                gain = 0.0
-                if there[kind]:
-                    gain = _gain(
-                        kind,
-                        ths[kind],
-                        kind_a,
-                        samples_a,
-                        figures_a,
-                        kind_b,
-                        samples_b,
-                        figures_b,
-                        is_smooth,
-                        perspective,
-                    )
+                goes_on, continued = True, _continued(PLANE, a, samples, perspective)
+            if goes_on:
+                ths[own], there[own] = continued, True
+            best_kind, best_gain, is_near = -1, -np.inf, False
+            for k in np.flatnonzero(there):
+                kind, th = int(k), ths[k]
+                gain, near = _gain(
+                    kind, th, kind_a, samples_a, figures_a, kind_b, samples_b, figures_b, is_smooth, perspective
+                )
+                is_near |= near
                 if gain > best_gain:
                     best_kind, best_gain = kind, gain
-            if best_kind >= 0:
-                return best_gain, best_kind, ths[best_kind].copy()
+            if best_gain > 0.0 or is_near:
+                return max(best_gain, LEAST_GAIN), best_kind, ths[best_kind].copy()
         if both_flat and turn < UNEVEN_TURN_RAD:
             th = start_plane(bend.points_of(samples, perspective))
             tolerance_m = UNEVEN_SHARE * min(figures_a[SIZE_M], figures_b[SIZE_M])
             if _is_uneven(th, samples_a, samples_b, tolerance_m, perspective):
                 return LEAST_GAIN, PLANE, th
-    is_rounding = step <= ROUNDING_SIGMAS * np.sqrt(shown) and turn <= ROUNDING_TURN_RAD
-    is_rounding &= _is_strip(figures_a[PIXELS], figures_b[PIXELS], length_px)
     if figures_a[PIXELS] >= figures_b[PIXELS]:
         return _swallowed(is_rounding, kind_a, a, figures_a, kind_b, b, samples_b, figures_b, noise, perspective)
     return _swallowed(is_rounding, kind_b, b, figures_b, kind_a, a, samples_a, figures_a, noise, perspective)
@@ -160,14 +162,12 @@ def _continued(kind, th, samples, perspective):  # type: ignore[no-untyped-def] 
 
 
 @njit(cache=True, error_model="numpy")
-def _joint_fits(samples, normals, perspective, with_quadric, correlated):  # type: ignore[no-untyped-def]  # numba types it
-    """Parameters (5, SIZE) of each kind on the samples of both regions, and which of them fit at all."""
-    kinds = np.ones(5, np.bool_)
-    kinds[QUADRIC] = with_quadric
+def _joint_fits(samples, normals, perspective, kinds, correlated, give_up):  # type: ignore[no-untyped-def]  # numba types it
+    """Parameters (5, SIZE) of each of `kinds` on the samples of both regions, and which of them fit at all."""
     points = bend.points_of(samples, perspective)
     x, y, z, sigma = samples[0], samples[1], samples[2], samples[3]
     ths, _, kept, score = fit.fit_kinds(
-        points, points, normals, x, y, z, sigma, perspective, kinds, correlated, GIVE_UP
+        points, points, normals, x, y, z, sigma, perspective, kinds, correlated, give_up
     )
     return ths, np.isfinite(score) & (kept > 0.5)
 
@@ -176,7 +176,10 @@ def _joint_fits(samples, normals, perspective, with_quadric, correlated):  # typ
 def _gain(  # type: ignore[no-untyped-def]  # numba types it
     kind, th, kind_a, samples_a, figures_a, kind_b, samples_b, figures_b, is_smooth, perspective
 ):
-    """How much cheaper the joint surface is than the two; 0 where it does not describe both."""
+    """How much cheaper the joint surface is than the two, minus infinity where it does not describe both.
+
+    And whether both meet without a crease and lie near it: then they are one, however dear.
+    """
     shown = shown_noise(figures_a, figures_b)
     patches_a, patches_b = figures_a[PATCHES], figures_b[PATCHES]
     apart = bend.schwarz_price(kind_a, patches_a) + bend.schwarz_price(kind_b, patches_b)
@@ -190,7 +193,7 @@ def _gain(  # type: ignore[no-untyped-def]  # numba types it
         near &= np.mean(e < SMOOTH_LIMIT) > SMOOTH_SHARE
         apart += figures[MEAN_SQUARE] * figures[PATCHES] / shown
         together += mean2 * figures[PATCHES] / shown
-    return max(apart - together, LEAST_GAIN if near else 0.0) if fits or near else 0.0
+    return apart - together if fits or near else -np.inf, near
 
 
 @njit(cache=True, error_model="numpy")

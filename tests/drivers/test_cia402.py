@@ -17,7 +17,8 @@ from drivers.cia402 import Cia402, Cia402Options
 from drivers.cia402_states import DriveState
 from drivers.emulators import cia402 as emulator
 from drivers.emulators.scripted import ScriptedArm
-from drivers.transport.canbus import CanFrame, CanOptions, RawCan, Slcan
+from drivers.tfmini_i import CanTfminiOptions
+from drivers.transport.canbus import CanFrame, RawCan, Slcan
 from drivers.transport.options import read_options
 from hal.conformance import ArmContract, Rig
 from hal.errors import CellError, ConfigError, DeviceFault, DeviceUnavailable, MotionRefused
@@ -46,7 +47,7 @@ class TestOverTcp(ArmContract):
 @pytest.mark.parametrize("channel", ["tcp://", "tcp://127.0.0.1", "tcp://:4000", "tcp://host:70000", "tcp://host:x"])
 def test_a_channel_that_is_no_address_is_a_fault_of_the_cell_file(channel: str) -> None:
     with pytest.raises(ConfigError, match="HOST:PORT"):
-        read_options(Context(name="arm"), {"channel": channel}, CanOptions)
+        read_options(Context(name="arm"), {"channel": channel}, CanTfminiOptions)
 
 
 frames = st.builds(CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8))

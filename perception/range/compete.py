@@ -49,15 +49,6 @@ class Candidates:
         return kinds, table
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Fit:
-    """A surface that explains `share` of the blocks it was fitted to."""
-
-    kind: int
-    parameters: Array
-    share: float
-
-
 def explain(
     grid: Grid, members: NDArray[np.int64], free: Flags, blocks: Labels, *, found: Candidates, least: int
 ) -> bool:
@@ -65,36 +56,49 @@ def explain(
 
     Extends `blocks` and `found`, clears `free`. Returns whether a surface of at least `least` blocks was found.
     """
-    whole = fit_best(grid, members)
-    options = [] if whole is None else [whole]
-    if whole is None or whole.share < WHOLE_SHARE:
-        options += _local_fits(grid, members)
-    best, best_gain, best_blocks = None, 0.0, np.empty(0, np.int32)
-    for option in options:
-        indices, total = _grown(grid, option, free, members)
-        if indices.size < least or total > GOOD_MEAN_SQUARE * indices.size:
-            continue
-        gain = grow.GROW_SIGMAS**2 * indices.size - total
-        if gain > best_gain:
-            best, best_gain, best_blocks = option, gain, indices
-    if best is None:
+    cos_limit = float(np.cos(max(0.5, 4.0 * grid.normal_sigma_rad)))
+    kind, parameters, mine = _explanation(
+        grid.x, grid.y, grid.z, grid.sigma, grid.normal, grid.rms, grid.perspective, grid.size_px**2, grid.slow_share,
+        cos_limit, free, members, least,
+    )  # fmt: skip
+    if kind < 0:
         return False
-    if best is not whole or best_blocks.size < 0.9 * members.size:
-        best = fit_best(grid, best_blocks.astype(np.int64)) or best
-    blocks.ravel()[best_blocks] = found.add(best.kind, best.parameters)
-    free.ravel()[best_blocks] = False
+    blocks.ravel()[mine] = found.add(kind, parameters)
+    free.ravel()[mine] = False
     return True
 
 
-def fit_best(grid: Grid, members: NDArray[np.int64]) -> Fit | None:
-    """The kind that explains these blocks most cheaply, or None when none does."""
-    kind, parameters, share = _fit_blocks(*_columns(grid), members)
-    return Fit(kind=kind, parameters=parameters, share=share) if kind >= 0 else None
-
-
-def _columns(grid: Grid) -> tuple[Array, Array, Array, Array, Array, bool, int, float]:
-    x, y, z, sigma = (a.ravel() for a in (grid.x, grid.y, grid.z, grid.sigma))
-    return x, y, z, sigma, grid.normal.reshape(-1, 3), grid.perspective, grid.size_px**2, grid.slow_share
+@njit(cache=True, error_model="numpy", nogil=True)
+def _explanation(  # type: ignore[no-untyped-def]  # numba types it
+    x, y, z, sigma, normal, rms, perspective, pixels, slow_share, cos_limit, free, members, least
+):
+    """Kind (-1 when there is none), parameters and blocks (flat) of the surface that explains most of `members`."""
+    h, w = z.shape
+    fx, fy, fz, fs, fn = x.ravel(), y.ravel(), z.ravel(), sigma.ravel(), normal.reshape(h * w, 3)
+    kinds, ths = np.full(1 + LOCAL_TRIES, -1), np.zeros((1 + LOCAL_TRIES, SIZE))
+    kinds[0], ths[0], share = _fit_blocks(fx, fy, fz, fs, fn, perspective, pixels, slow_share, members)
+    if kinds[0] < 0 or share < WHOLE_SHARE:
+        _fit_parts(
+            fx, fy, fz, fs, fn, perspective, pixels, slow_share, members, rms.ravel(), w, kinds[1:], ths[1:]
+        )  # fmt: skip
+    queue, mark = np.empty(h * w, np.int64), np.zeros(h * w, np.uint8)
+    best, best_gain, mine = -1, 0.0, queue[:0]
+    for k in range(kinds.shape[0]):
+        if kinds[k] < 0:
+            continue
+        count, total = grow.grow_surface(
+            kinds[k], ths[k], x, y, z, sigma, normal, rms, free, members, perspective, cos_limit, mark, k + 1, queue
+        )
+        gain = grow.GROW_SIGMAS**2 * count - total
+        if count >= least and total <= GOOD_MEAN_SQUARE * count and gain > best_gain:
+            best, best_gain, mine = k, gain, queue[:count].copy()
+    if best < 0:
+        return -1, ths[0], mine
+    if best > 0 or mine.shape[0] < 0.9 * members.shape[0]:
+        kind, th, _ = _fit_blocks(fx, fy, fz, fs, fn, perspective, pixels, slow_share, mine)
+        if kind >= 0:
+            return kind, th, mine
+    return kinds[best], ths[best].copy(), mine
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -131,53 +135,22 @@ def _fit_blocks(x, y, z, sigma, normal, perspective, pixels, slow_share, members
     return best, ths[best].copy(), kept[best]
 
 
-def _local_fits(grid: Grid, members: NDArray[np.int64]) -> list[Fit]:
-    """Fits to small neighbourhoods spread over a component that no single primitive explains."""
-    kinds, ths, shares = _fit_parts(*_columns(grid), members, grid.rms.ravel(), grid.z.shape[1])
-    return [Fit(kind=int(kinds[k]), parameters=ths[k], share=float(shares[k])) for k in np.flatnonzero(kinds >= 0)]
-
-
 @njit(cache=True, error_model="numpy", nogil=True)
 def _fit_parts(  # type: ignore[no-untyped-def]  # numba types it
-    x, y, z, sigma, normal, perspective, pixels, slow_share, members, rms, w
+    x, y, z, sigma, normal, perspective, pixels, slow_share, members, rms, w, kinds, ths
 ):
-    """`_fit_blocks` of the blocks around `LOCAL_TRIES` seeds that are evenly spread over `members`."""
-    kinds, ths, shares = np.full(LOCAL_TRIES, -1), np.zeros((LOCAL_TRIES, SIZE)), np.zeros(LOCAL_TRIES)
+    """`_fit_blocks` of the blocks around seeds that are evenly spread over `members`, into `kinds` and `ths`."""
     inside = members[np.isfinite(rms[members])]
-    if inside.shape[0] < LOCAL_TRIES + 2:
-        return kinds, ths, shares
+    tries = kinds.shape[0]
+    if inside.shape[0] < tries + 2:
+        return
     near = np.empty(members.shape[0], members.dtype)
-    for t in range(LOCAL_TRIES):
-        seed = inside[((t + 1) * (inside.shape[0] - 1)) // (LOCAL_TRIES + 1)]
+    for t in range(tries):
+        seed = inside[((t + 1) * (inside.shape[0] - 1)) // (tries + 1)]
         count = 0
         for k in range(members.shape[0]):
             row, column = members[k] // w - seed // w, members[k] % w - seed % w
             if row * row + column * column <= LOCAL_BLOCKS / np.pi:
                 near[count] = members[k]
                 count += 1
-        kinds[t], ths[t], shares[t] = _fit_blocks(x, y, z, sigma, normal, perspective, pixels, slow_share, near[:count])
-    return kinds, ths, shares
-
-
-def _grown(grid: Grid, option: Fit, free: Flags, members: NDArray[np.int64]) -> tuple[NDArray[np.int32], float]:
-    h, w = grid.z.shape
-    queue, mark = np.empty(h * w, np.int32), np.zeros(h * w, np.uint8)
-    cos_limit = float(np.cos(max(0.5, 4.0 * grid.normal_sigma_rad)))
-    count, total = grow.grow_surface(
-        option.kind,
-        option.parameters,
-        grid.x,
-        grid.y,
-        grid.z,
-        grid.sigma,
-        grid.normal,
-        grid.rms,
-        free,
-        members,
-        grid.perspective,
-        cos_limit,
-        mark,
-        1,
-        queue,
-    )
-    return queue[:count].copy(), float(total)
+        kinds[t], ths[t], _ = _fit_blocks(x, y, z, sigma, normal, perspective, pixels, slow_share, near[:count])

@@ -91,7 +91,7 @@ def _clip(triangle: Array, values: Array, near: float, corner: Array, out: Array
 
 
 @njit(cache=True, nogil=True)
-def _triangle(  # noqa: PLR0912, PLR0915  # a compiled kernel: one loop, no calls inside it
+def _triangle(
     corner: Array,
     values: Array,
     k: int,
@@ -104,32 +104,19 @@ def _triangle(  # noqa: PLR0912, PLR0915  # a compiled kernel: one loop, no call
     inverse_depth: Float32,
     image: Float32,
 ) -> None:
+    """Draw corners 0, k and k + 1 row by row."""
     height, width = inverse_depth.shape
     channels = image.shape[2]
-    x, y, w = scratch[0], scratch[1], scratch[2]
     index = (0, k, k + 1)
-    for i in range(3):
-        p = corner[index[i]]
-        w[i] = 1.0 / p[2]
-        x[i] = camera[0] * p[0] * w[i] + camera[2]
-        y[i] = camera[1] * p[1] * w[i] + camera[3]
-    # Camera axes have y down, so a front face, which turns left in space, turns right in the picture.
-    area = (x[2] - x[0]) * (y[1] - y[0]) - (x[1] - x[0]) * (y[2] - y[0])
+    x, y, w, plane = scratch[0], scratch[1], scratch[2], scratch[3:]
+    area = _project(corner, index, camera, x, y, w)
     if area <= 1e-9:
         return
     first = max(0, math.ceil(min(y[0], y[1], y[2])))
     last = min(height - 1, math.floor(max(y[0], y[1], y[2])))
     if first > last:
         return
-    # Rows of `plane`: value at pixel (0, 0), slope along x, slope along y; of 1/z and of each attribute over z.
-    plane = scratch[3:]
-    for a in range(1 + ATTRIBUTES):
-        f0 = w[0] if a == 0 else values[index[0], a - 1] * w[0]
-        f1 = w[1] if a == 0 else values[index[1], a - 1] * w[1]
-        f2 = w[2] if a == 0 else values[index[2], a - 1] * w[2]
-        dx = ((f2 - f0) * (y[1] - y[0]) - (f1 - f0) * (y[2] - y[0])) / area
-        dy = ((f1 - f0) * (x[2] - x[0]) - (f2 - f0) * (x[1] - x[0])) / area
-        plane[a, 0], plane[a, 1], plane[a, 2] = f0 - dx * x[0] - dy * y[0], dx, dy
+    _slopes(values, index, x, y, w, area, plane)
     w00, dwx, dwy = plane[0, 0], plane[0, 1], plane[0, 2]
     s00, dsx, dsy = plane[1, 0], plane[1, 1], plane[1, 2]
     u00, dux, duy = plane[2, 0], plane[2, 1], plane[2, 2]
@@ -138,28 +125,14 @@ def _triangle(  # noqa: PLR0912, PLR0915  # a compiled kernel: one loop, no call
     if surface >= 0:
         offset, tw, th = _level(values, index, area, table[surface], channels)
     for row in range(first, last + 1):
-        left, right = 0.0, width - 1.0
-        for i in range(3):
-            j = (i + 1) % 3
-            # Inside is where (p - p_i) x (p_j - p_i) >= 0.
-            ey = y[j] - y[i]
-            rest = (row - y[i]) * (x[j] - x[i])
-            if ey > 0.0:
-                left = max(left, x[i] + rest / ey)
-            elif ey < 0.0:
-                right = min(right, x[i] + rest / ey)
-            elif rest > 0.0:
-                right = -1.0
-        first_column, last_column = math.ceil(left - 1e-9), math.floor(right + 1e-9)
-        if channels == 0:
-            for column in range(first_column, last_column + 1):
-                inverse_depth[row, column] = max(inverse_depth[row, column], w00 + dwx * column + dwy * row)
-            continue
+        first_column, last_column = _columns(row, x, y, width)
         for column in range(first_column, last_column + 1):
             nearness = w00 + dwx * column + dwy * row
             if nearness <= inverse_depth[row, column]:
                 continue
             inverse_depth[row, column] = nearness
+            if channels == 0:
+                continue
             z = 1.0 / nearness
             shade = z * (s00 + dsx * column + dsy * row)
             if surface < 0:
@@ -168,16 +141,79 @@ def _triangle(  # noqa: PLR0912, PLR0915  # a compiled kernel: one loop, no call
                 continue
             u = z * (u00 + dux * column + duy * row) * tw - 0.5
             v = (1.0 - z * (v00 + dvx * column + dvy * row)) * th - 0.5
-            u = min(max(u, 0.0), tw - 1.0)
-            v = min(max(v, 0.0), th - 1.0)
-            u0, v0 = min(int(u), tw - 2), min(int(v), th - 2)
-            fu, fv = u - u0, v - v0
-            at = offset + (v0 * tw + u0) * channels
-            below = at + tw * channels
-            for c in range(channels):
-                top = texels[at + c] * (1.0 - fu) + texels[at + channels + c] * fu
-                low = texels[below + c] * (1.0 - fu) + texels[below + channels + c] * fu
-                image[row, column, c] = shade * albedo[c] * (top * (1.0 - fv) + low * fv) * BYTE
+            _texture(texels, offset, tw, th, u, v, shade, albedo, image, row, column)
+
+
+@njit(cache=True, nogil=True)
+def _project(corner: Array, index: tuple[int, int, int], camera: Array, x: Array, y: Array, w: Array) -> float:
+    """Fill pixel coordinates and 1/z of the three corners; twice the area in the picture, negative for a back."""
+    for i in range(3):
+        p = corner[index[i]]
+        w[i] = 1.0 / p[2]
+        x[i] = camera[0] * p[0] * w[i] + camera[2]
+        y[i] = camera[1] * p[1] * w[i] + camera[3]
+    # Camera axes have y down, so a front face, which turns left in space, turns right in the picture.
+    return float((x[2] - x[0]) * (y[1] - y[0]) - (x[1] - x[0]) * (y[2] - y[0]))
+
+
+@njit(cache=True, nogil=True)
+def _slopes(
+    values: Array, index: tuple[int, int, int], x: Array, y: Array, w: Array, area: float, plane: Array
+) -> None:
+    """Rows of `plane`: value at pixel (0, 0), slope along x, slope along y; of 1/z and of each attribute over z."""
+    for a in range(1 + ATTRIBUTES):
+        f0 = w[0] if a == 0 else values[index[0], a - 1] * w[0]
+        f1 = w[1] if a == 0 else values[index[1], a - 1] * w[1]
+        f2 = w[2] if a == 0 else values[index[2], a - 1] * w[2]
+        dx = ((f2 - f0) * (y[1] - y[0]) - (f1 - f0) * (y[2] - y[0])) / area
+        dy = ((f1 - f0) * (x[2] - x[0]) - (f2 - f0) * (x[1] - x[0])) / area
+        plane[a, 0], plane[a, 1], plane[a, 2] = f0 - dx * x[0] - dy * y[0], dx, dy
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _columns(row: int, x: Array, y: Array, width: int) -> tuple[int, int]:
+    """First and last pixel of a row inside the triangle; none when the first is beyond the last."""
+    left, right = 0.0, width - 1.0
+    for i in range(3):
+        j = (i + 1) % 3
+        # Inside is where (p - p_i) x (p_j - p_i) >= 0.
+        ey = y[j] - y[i]
+        rest = (row - y[i]) * (x[j] - x[i])
+        if ey > 0.0:
+            left = max(left, x[i] + rest / ey)
+        elif ey < 0.0:
+            right = min(right, x[i] + rest / ey)
+        elif rest > 0.0:
+            right = -1.0
+    return math.ceil(left - 1e-9), math.floor(right + 1e-9)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _texture(
+    texels: Bytes,
+    offset: int,
+    tw: int,
+    th: int,
+    u: float,
+    v: float,
+    shade: float,
+    albedo: Array,
+    image: Float32,
+    row: int,
+    column: int,
+) -> None:
+    """Fill a pixel's channels from the four texels around (u, v), in texels."""
+    channels = image.shape[2]
+    u = min(max(u, 0.0), tw - 1.0)
+    v = min(max(v, 0.0), th - 1.0)
+    u0, v0 = min(int(u), tw - 2), min(int(v), th - 2)
+    fu, fv = u - u0, v - v0
+    at = offset + (v0 * tw + u0) * channels
+    below = at + tw * channels
+    for c in range(channels):
+        top = texels[at + c] * (1.0 - fu) + texels[at + channels + c] * fu
+        low = texels[below + c] * (1.0 - fu) + texels[below + channels + c] * fu
+        image[row, column, c] = shade * albedo[c] * (top * (1.0 - fv) + low * fv) * BYTE
 
 
 @njit(cache=True, nogil=True)

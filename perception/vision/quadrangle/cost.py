@@ -1,4 +1,3 @@
-# ruff: noqa: PLR0915 - a compiled loop keeps one equation in one place
 # mypy: disallow-untyped-defs=False
 """Compiled inner loops of the four-light pose: reprojection chi-square, its derivatives and its local minimiser.
 
@@ -116,47 +115,54 @@ def expand(R, t, X, m, A, g, N, H):
             pv = A[i, 1] * Ju[a] + A[i, 2] * Jv[a]
             for b in range(a + 1):
                 N[a, b] += pu * Ju[b] + pv * Jv[b]
-        # Second order: Hq of the projection, then that of the rotation.
-        iz2 = iz * iz
-        hx = -lu * iz2
-        hy = -lv * iz2
-        hz = 2.0 * (lu * u + lv * v) * iz2
-        # Hq @ [-y]x, rows x, y, z; Hq has only its last row and column
-        # [-y]x = [[0, y2, -y1], [-y2, 0, y0], [y1, -y0, 0]]
-        m00 = hx * y1
-        m01 = -hx * y0
-        m10 = hy * y1
-        m11 = -hy * y0
-        m20 = -hy * y2 + hz * y1
-        m21 = hx * y2 - hz * y0
-        m22 = -hx * y1 + hy * y0
-        H[2, 0] += hx
-        H[2, 1] += hy
-        H[2, 2] += hz
-        H[3, 0] += m00
-        H[4, 0] += m01
-        H[3, 1] += m10
-        H[4, 1] += m11
-        H[3, 2] += m20
-        H[4, 2] += m21
-        H[5, 2] += m22
-        gx = lu * iz
-        gy = lv * iz
-        gz = -(lu * u + lv * v) * iz
-        dot = gx * y0 + gy * y1 + gz * y2
-        # ([-y]x)^T Hq [-y]x + (g y^T + y g^T)/2 - (g . y) I
-        H[3, 3] += -y2 * m10 + y1 * m20 + gx * y0 - dot
-        H[4, 3] += y2 * m00 - y0 * m20 + 0.5 * (gy * y0 + gx * y1)
-        H[5, 3] += -y1 * m00 + y0 * m10 + 0.5 * (gz * y0 + gx * y2)
-        H[4, 4] += y2 * m01 - y0 * m21 + gy * y1 - dot
-        H[5, 4] += -y1 * m01 + y0 * m11 + 0.5 * (gz * y1 + gy * y2)
-        H[5, 5] += gz * y2 - dot
+        bend(y0, y1, y2, iz, u, v, lu, lv, H)
     for a in range(6):
         for b in range(a + 1):
             H[a, b] += N[a, b]
             H[b, a] = H[a, b]
             N[b, a] = N[a, b]
     return total
+
+
+@jit
+def bend(y0, y1, y2, iz, u, v, lu, lv, H):
+    """Adds to H (lower triangle) what one point gives beyond Gauss-Newton: l_u d2u + l_v d2v.
+
+    Hq of the projection has only its last row and column; [-y]x = [[0, y2, -y1], [-y2, 0, y0], [y1, -y0, 0]].
+    """
+    iz2 = iz * iz
+    hx = -lu * iz2
+    hy = -lv * iz2
+    hz = 2.0 * (lu * u + lv * v) * iz2
+    H[2, 0] += hx
+    H[2, 1] += hy
+    H[2, 2] += hz
+    # Hq @ [-y]x, rows x, y, z
+    m00 = hx * y1
+    m01 = -hx * y0
+    m10 = hy * y1
+    m11 = -hy * y0
+    m20 = -hy * y2 + hz * y1
+    m21 = hx * y2 - hz * y0
+    m22 = -hx * y1 + hy * y0
+    H[3, 0] += m00
+    H[4, 0] += m01
+    H[3, 1] += m10
+    H[4, 1] += m11
+    H[3, 2] += m20
+    H[4, 2] += m21
+    H[5, 2] += m22
+    # ([-y]x)^T Hq [-y]x + (g y^T + y g^T)/2 - (g . y) I, with g the slope along the point
+    gx = lu * iz
+    gy = lv * iz
+    gz = -(lu * u + lv * v) * iz
+    dot = gx * y0 + gy * y1 + gz * y2
+    H[3, 3] += -y2 * m10 + y1 * m20 + gx * y0 - dot
+    H[4, 3] += y2 * m00 - y0 * m20 + 0.5 * (gy * y0 + gx * y1)
+    H[5, 3] += -y1 * m00 + y0 * m10 + 0.5 * (gz * y0 + gx * y2)
+    H[4, 4] += y2 * m01 - y0 * m21 + gy * y1 - dot
+    H[5, 4] += -y1 * m01 + y0 * m11 + 0.5 * (gz * y1 + gy * y2)
+    H[5, 5] += gz * y2 - dot
 
 
 @jit

@@ -1,4 +1,3 @@
-# ruff: noqa: PLR0912 - a compiled loop keeps one equation in one place
 # mypy: disallow-untyped-defs=False
 """Compiled whole of the four-light pose: minima with covariance, and how much of the posterior each of them holds."""
 
@@ -29,15 +28,7 @@ def solve(points, pixels, covariance, camera, near_sigmas2, Rs, ts, costs, Cs, m
     bad = prepare(pixels, covariance, camera, m, A)
     if bad >= 0:
         return bad, 0, 1
-    c = np.zeros(3)
-    for i in range(4):
-        for j in range(3):
-            c[j] += 0.25 * points[i, j]
-    size = 0.0
-    for i in range(4):
-        for j in range(3):
-            X[i, j] = points[i, j] - c[j]
-            size += X[i, j] ** 2
+    c, size = centred(points, X)
     normal, spread = plane_of(X)
     if not spread > 1e-6 * size:
         return 0, 0, 2
@@ -47,38 +38,14 @@ def solve(points, pixels, covariance, camera, near_sigmas2, Rs, ts, costs, Cs, m
         return 0, 0, 3
     while costs[count - 1] - costs[0] > WORTHLESS:  # among them runs that fled to infinity, where everything is flat
         count -= 1
-    F = sight_frame(ts[0])
-    best = times3(F, times3(Rs[0], normal))
-    side = 1.0 if best[2] > 0.0 else -1.0
-    best = mix3(side, best, 0.0, best)
-    area0 = gate = 0.0
-    over_there = 0.0
-    there_too = np.zeros(Rs.shape[0], np.bool_)
-    for k in range(count):
-        if not inverse6(Ns[k], Cs[k]):
-            return 0, 0, 4
-        # Laplace: mass of a minimum over all six parameters, relative to the best one's.
-        ratio = 1.0
-        if k == 0:
-            area0, gate = normal_spread(Rs[0], ts[0], Cs[0], normal)
-        else:
-            ratio = np.exp(-0.5 * (costs[k] - costs[0]) + 0.5 * (log_det6(Cs[k]) - log_det6(Cs[0])))
-        masses[k] = ratio
-        there_too[k] = k > 0 and opposite(
-            mix3(side, times3(F, times3(Rs[k], normal)), 0.0, best), best, MIRROR_TURN_COS
-        )
-        if there_too[k]:
-            over_there += ratio
+    if not weigh(Ns, costs, Cs, masses, count):
+        return 0, 0, 4
     minima = count
+    area, gate = normal_spread(Rs[0], ts[0], Cs[0], normal)
     if gate < near_sigmas2:
         here, there, R, t, cost = ring_mass(Rs[0], ts[0], costs[0], X, m, A, normal)
-        laplace = 2.0 * np.pi * area0
-        ratio = there / max(here, laplace)
-        if over_there > 0.0:  # share the better figure among the minima over there
-            for k in range(1, count):
-                if there_too[k]:
-                    masses[k] *= max(1.0, ratio / over_there)
-        elif ratio > 1e-4 and np.isfinite(cost):
+        ratio = there / max(here, 2.0 * np.pi * area)
+        if not share(ratio, Rs, ts[0], normal, masses, count) and ratio > 1e-4 and np.isfinite(cost):
             put2(Rs[count], R)
             put1(ts[count], t)
             costs[count], masses[count] = cost, ratio
@@ -91,3 +58,58 @@ def solve(points, pixels, covariance, camera, near_sigmas2, Rs, ts, costs, Cs, m
         move_origin(Cs[k], lever)
         put1(ts[k], mix3(1.0, ts[k], -1.0, lever))
     return count, minima, 0
+
+
+@jit
+def centred(points, X):
+    """Fills X (4, 3) with the points about their centroid; returns the centroid and the sum of squared distances."""
+    c = np.zeros(3)
+    for i in range(4):
+        for j in range(3):
+            c[j] += 0.25 * points[i, j]
+    size = 0.0
+    for i in range(4):
+        for j in range(3):
+            X[i, j] = points[i, j] - c[j]
+            size += X[i, j] ** 2
+    return c, size
+
+
+@jit
+def weigh(Ns, costs, Cs, masses, count):
+    """Fills covariances Cs and Laplace's masses over all six parameters, the best minimum's being 1.
+
+    Returns: whether every Ns is positive definite.
+    """
+    for k in range(count):
+        if not inverse6(Ns[k], Cs[k]):
+            return False
+        masses[k] = 1.0
+        if k > 0:
+            masses[k] = np.exp(-0.5 * (costs[k] - costs[0]) + 0.5 * (log_det6(Cs[k]) - log_det6(Cs[0])))
+    return True
+
+
+@jit
+def share(ratio, Rs, t, normal, masses, count):
+    """Gives the minima on the other side of the line of sight to t the mass `ratio` together, where that is more.
+
+    Returns: whether there is such a minimum with mass.
+    """
+    F = sight_frame(t)
+    best = times3(F, times3(Rs[0], normal))
+    side = 1.0 if best[2] > 0.0 else -1.0
+    best = mix3(side, best, 0.0, best)
+    is_there = np.zeros(count, np.bool_)
+    mass = 0.0
+    for k in range(1, count):
+        other = mix3(side, times3(F, times3(Rs[k], normal)), 0.0, best)
+        is_there[k] = opposite(other, best, MIRROR_TURN_COS)
+        if is_there[k]:
+            mass += masses[k]
+    if not mass > 0.0:
+        return False
+    for k in range(1, count):
+        if is_there[k]:
+            masses[k] *= max(1.0, ratio / mass)
+    return True

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +15,11 @@ from hal.calibration import ToolLoad
 from hal.clock import Clock, Deadline, PacedClock
 from hal.devices import Arm, ForceTorque, Gripper, Proximity, Touch
 from hal.errors import CellError, DeviceError, DeviceTimeout, StaleReading
-from hal.readings import Cause, Quality
+from hal.readings import Cause, Quality, Stamped
 from manipulation import kernels
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
 GRAVITY_M_PER_S2 = 9.80665
 RANGE_WAIT_S = 0.004
@@ -123,41 +125,21 @@ class Devices:
         """
         now_s = self.clock.now_s()
         deadline = Deadline(now_s + read_wait_s(self.clock), self.clock)
-        device = self.arm.name
-        try:
-            joints = self.arm.read_state(deadline=deadline).usable(now_s=now_s, max_age_s=self.max_age_s, device=device)
-            raw = np.zeros(6)
-            if self.force_torque is not None:
-                device = self.force_torque.name
-                wrench = self.force_torque.read_wrench(deadline=deadline).usable(
-                    now_s=now_s, max_age_s=self.max_age_s, device=device
-                )
-                raw[:3], raw[3:] = wrench.force_n, wrench.torque_nm
-            contacts: tuple[bool, ...] = ()
-            if self.touch is not None:
-                device = self.touch.name
-                contacts = self.touch.read_contacts(deadline=deadline).usable(
-                    now_s=now_s, max_age_s=self.max_age_s, device=device
-                )
-            if before is None:
-                device = self.gripper.name
-                grip = self.gripper.read_state(deadline=deadline).usable(
-                    now_s=now_s, max_age_s=self.max_age_s, device=device
-                )
-                width_m, is_moving, ranges = grip.width_m, grip.is_moving, []
-                for reader in self.proximities:
-                    device = reader.name
-                    ranges.append(reader.read(now_s))
-                seen = tuple(ranges)
-            else:
-                width_m, is_moving, seen = before.gripper_width_m, before.gripper_is_moving, before.proximity_m
-        except CellError as error:
-            named = error.details.get("device") if isinstance(error, DeviceError) else None
-            raise DeviceFailure(str(named or device), error.what) from error
-        if not math.isfinite(
-            joints.position_rad @ joints.position_rad + raw @ raw
-        ):  # a sum hides neither NaN nor infinity
-            raise DeviceFailure(device, "a reading is not finite")
+        joints = self._ask(self.arm.name, self.arm.read_state, now_s, deadline)
+        raw = np.zeros(6)
+        if self.force_torque is not None:
+            wrench = self._ask(self.force_torque.name, self.force_torque.read_wrench, now_s, deadline)
+            raw[:3], raw[3:] = wrench.force_n, wrench.torque_nm
+            _check_finite(self.force_torque.name, raw)
+        contacts: tuple[bool, ...] = ()
+        if self.touch is not None:
+            contacts = self._ask(self.touch.name, self.touch.read_contacts, now_s, deadline)
+        if before is None:
+            grip = self._ask(self.gripper.name, self.gripper.read_state, now_s, deadline)
+            width_m, is_moving, seen = grip.width_m, grip.is_moving, self._ranges_m(now_s)
+        else:
+            width_m, is_moving, seen = before.gripper_width_m, before.gripper_is_moving, before.proximity_m
+        _check_finite(self.arm.name, joints.position_rad)
         return Sample(
             stamp_s=now_s,
             position_rad=joints.position_rad,
@@ -168,6 +150,32 @@ class Devices:
             gripper_width_m=width_m,
             gripper_is_moving=is_moving,
         )
+
+    def _ask(self, device: str, read: Callable[..., Stamped[T]], now_s: float, deadline: Deadline) -> T:
+        try:
+            return read(deadline=deadline).usable(now_s=now_s, max_age_s=self.max_age_s, device=device)
+        except CellError as error:
+            raise _failure(device, error) from error
+
+    def _ranges_m(self, now_s: float) -> tuple[float, ...]:
+        ranges = []
+        for reader in self.proximities:
+            try:
+                ranges.append(reader.read(now_s))
+            except CellError as error:
+                raise _failure(reader.name, error) from error
+        return tuple(ranges)
+
+
+def _failure(device: str, error: CellError) -> DeviceFailure:
+    """By the name that the error itself gives, if it does: a device may stand for others."""
+    named = error.details.get("device") if isinstance(error, DeviceError) else None
+    return DeviceFailure(str(named or device), error.what)
+
+
+def _check_finite(device: str, values: Array) -> None:
+    if not math.isfinite(values @ values):  # a sum hides neither NaN nor infinity
+        raise DeviceFailure(device, "a reading is not finite")
 
 
 class ContactWrench:

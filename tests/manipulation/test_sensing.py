@@ -8,10 +8,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from hal.clock import PacedClock, SimClock, WallClock
+from hal.clock import Deadline, PacedClock, SimClock, WallClock
+from hal.devices import JointState, Wrench
 from hal.errors import DeviceTimeout, StaleReading
-from manipulation.sensing import ContactWrench, RangeReader, read_wait_s
-from tests.manipulation.rig import LOAD, SENSOR, FakeProximity, World
+from hal.readings import Stamped
+from manipulation.sensing import ContactWrench, DeviceFailure, Devices, RangeReader, read_wait_s
+from tests.manipulation.rig import (
+    LOAD,
+    SENSOR,
+    FakeArm,
+    FakeForceTorque,
+    FakeGripper,
+    FakeProximity,
+    FakeTouch,
+    World,
+)
 
 PATIENCE_S = 0.3
 
@@ -57,6 +68,36 @@ def test_a_tick_waits_long_for_a_device_only_where_the_world_waits_too() -> None
     picture_s, watchdog_s = 0.15, 0.1
     assert read_wait_s(PacedClock()) > picture_s
     assert read_wait_s(WallClock()) < watchdog_s
+
+
+class LostArm(FakeArm):
+    def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
+        return self.stamped(JointState(position_rad=np.full(6, np.nan), velocity_rad_per_s=np.zeros(6)))
+
+
+class BrokenForceTorque(FakeForceTorque):
+    def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:
+        return self.stamped(Wrench(force_n=np.zeros(3), torque_nm=np.array([0.0, np.inf, 0.0])))
+
+
+@pytest.mark.parametrize(
+    ("arm", "force_torque", "blamed"), [(LostArm, FakeForceTorque, "arm"), (FakeArm, BrokenForceTorque, "wrist_ft")]
+)
+def test_a_number_that_is_none_is_blamed_on_the_device_that_gave_it(
+    arm: type[FakeArm], force_torque: type[FakeForceTorque], blamed: str
+) -> None:
+    world = world_with_wall()
+    devices = Devices(
+        arm=arm("arm", world),
+        gripper=FakeGripper("gripper", world),
+        force_torque=force_torque("wrist_ft", world),
+        touch=FakeTouch("finger_touch", world),
+        proximities=(reader(world),),
+        clock=world.clock,
+        max_age_s=0.1,
+    )
+    with pytest.raises(DeviceFailure, match=f"{blamed}: a reading is not finite"):
+        devices.read()
 
 
 def test_nothing_in_range_is_an_answer() -> None:

@@ -81,16 +81,15 @@ class Agglomeration:
 
     def run(self) -> None:
         """Join pairs, the most gainful first."""
-        open_pairs = {pair: self._judged(pair) for pair in self.borders}
-        while True:
-            best = max((m for m in open_pairs.values() if m is not None), key=lambda m: (m.gain, m.pair), default=None)
-            if best is None:
-                return
-            kept, lost = self._join(best)
-            for pair in [p for p in open_pairs if kept in p or lost in p]:
-                del open_pairs[pair]
-            for pair in [p for p in self.borders if kept in p]:
-                open_pairs[pair] = self._judged(pair)
+        gainful = self._gainful(set(self.borders))
+        while gainful:
+            lost, changed = self._join(max(gainful.values(), key=lambda m: (m.gain, m.pair)))
+            gainful = {pair: merger for pair, merger in gainful.items() if lost not in pair and pair not in changed}
+            gainful |= self._gainful(changed)
+
+    def _gainful(self, pairs: set[tuple[int, int]]) -> dict[tuple[int, int], Merger]:
+        judged = {pair: self._judged(pair) for pair in pairs}
+        return {pair: merger for pair, merger in judged.items() if merger is not None}
 
     def _judged(self, pair: tuple[int, int]) -> Merger | None:
         """The joint description of a pair if it gains, else None."""
@@ -102,8 +101,11 @@ class Agglomeration:
         gain, kind, th = judged(*first, *second, border.x, border.y, border.length_px, self.law, self.perspective)
         return Merger(pair=pair, kind=kind, parameters=th, gain=gain) if gain > 0.0 else None
 
-    def _join(self, merger: Merger) -> tuple[int, int]:
-        """Replace the two parts by one; returns the label kept and the label lost."""
+    def _join(self, merger: Merger) -> tuple[int, set[tuple[int, int]]]:
+        """Replace the two parts by one; returns the label that is lost and the pairs that are to be judged again.
+
+        A part that took in a scrap, and is the surface it was, is what it was to neighbours that the scrap did not touch.
+        """
         a, b = merger.pair
         kept, lost = (a, b) if self.parts[a].pixels >= self.parts[b].pixels else (b, a)
         p, q = self.parts[kept], self.parts.pop(lost)
@@ -117,10 +119,13 @@ class Agglomeration:
         for label, owner in self.owner.items():
             if owner == lost:
                 self.owner[label] = kept
-        self._rewire(kept, lost)
-        return kept, lost
+        rewired = self._rewire(kept, lost)
+        is_same = merger.kind == p.kind and np.array_equal(merger.parameters, p.parameters)
+        return lost, rewired if is_same else {pair for pair in self.borders if kept in pair}
 
-    def _rewire(self, kept: int, lost: int) -> None:
+    def _rewire(self, kept: int, lost: int) -> set[tuple[int, int]]:
+        """The borders of the part that is lost go to the one that is kept; returns the pairs that have got more."""
+        rewired = set()
         for pair in [p for p in self.borders if lost in p]:
             border = self.borders.pop(pair)
             other = pair[0] if pair[1] == lost else pair[1]
@@ -128,6 +133,8 @@ class Agglomeration:
                 continue
             new = (min(kept, other), max(kept, other))
             self.borders[new] = self.borders[new].with_more(border) if new in self.borders else border
+            rewired.add(new)
+        return rewired
 
 
 def merge_touching(regions: Regions, kinds: list[int], parameters: list[Array]) -> list[int]:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from drivers.emulators.base import WireEmulator
+from drivers.transport.link import now_s
 from hal.clock import Deadline, WallClock
 from hal.conformance import Rig
 from hal.errors import CellError
@@ -20,6 +21,37 @@ CLOCK = WallClock()
 def soon(duration_s: float = 1.0) -> Deadline:
     """A deadline on the wall's clock."""
     return Deadline.after(CLOCK, duration_s)
+
+
+def later(duration_s: float = 1.0) -> float:
+    """The time, in seconds of the links' clock, until which something may last."""
+    return now_s() + duration_s
+
+
+class ScriptLink:
+    """A link whose far side is a list: each write moves the next answer into the receive buffer."""
+
+    name = "script"
+    byte_s = 0.0
+
+    def __init__(self, *answers: bytes) -> None:
+        self.answers = list(answers)
+        self.written: list[bytes] = []
+        self.ready = b""
+
+    def read(self, until_s: float) -> bytes:
+        chunk, self.ready = self.ready, b""
+        return chunk
+
+    def write(self, data: bytes, until_s: float) -> None:
+        self.written.append(data)
+        self.ready += self.answers.pop(0) if self.answers else b""
+
+    def is_present(self) -> bool:
+        return True
+
+    def close(self) -> None:
+        self.ready = b""
 
 
 def until(condition: Callable[[], bool], within_s: float = 5.0) -> None:

@@ -16,8 +16,7 @@ from hal.clock import PacedClock
 from hal.config import load_cell
 from hal.devices import DeviceKind
 from hal.registry import Context
-from tests.drivers.rigs import until
-from tests.drivers.test_transport import ScriptLink
+from tests.drivers.rigs import ScriptLink, until
 
 WIRE_CELL = Path(__file__).parents[2] / "cells" / "wire-ur.toml"
 

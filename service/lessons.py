@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from perception.vision.panel_teach import Question
+    from perception.vision.panel_questions import Question
     from perception.vision.teach import Example, Overview
 
 PixelNumber = Annotated[float, Field(ge=-1e5, le=1e5)]
@@ -74,7 +74,7 @@ class TeachRequest(Strict):
 
 def questions_of(kind: str) -> tuple[Question, ...]:
     """What the dialogue asks about an object of this kind."""
-    from perception.vision.panel_teach import questions
+    from perception.vision.panel_questions import questions
 
     return questions(kind)
 
@@ -139,7 +139,8 @@ def teach_panel(
     teachings: Teachings, pixels: NDArray[np.uint8], plate_m: tuple[float, float], lesson: PanelLesson
 ) -> dict[str, Any]:
     """Write a whole panel's file from clicks and answers; see `teach`."""
-    from perception.vision.panel_teach import PanelObjectDraft, find_border_lights, panel_text
+    from perception.vision.panel_lights import find_border_lights
+    from perception.vision.panel_teach import PanelObjectDraft, panel_text
     from perception.vision.teach import example_at, overview_of
 
     check_name(lesson.name)

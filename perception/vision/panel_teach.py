@@ -2,7 +2,6 @@
 
 The paper: "The user is directed through a question-answer sequence to acquire the description of [...] various objects
 and their subparts" (section II-A). Places and sizes come from the outlines under the clicks, the rest from the answers.
-Every question has an answer that stands when nothing is said.
 """
 
 from __future__ import annotations
@@ -14,35 +13,17 @@ from typing import Any
 import numpy as np
 
 from hal.errors import InvalidRequest
-from hal.panel import OBJECT_KINDS, Panel
+from hal.panel import Panel
 from hal.strict import validate
 from perception.toml_text import toml_document
-from perception.vision.features import PLATE_PX_PER_M
-from perception.vision.knowledge import NOTHING, Knowledge
-from perception.vision.sub_object import sub_objects
+from perception.vision.panel_lights import LightsFound
+from perception.vision.panel_questions import Question, questions
 from perception.vision.teach import Example, Overview, plate_points
 from perception.vision.view import Array
 
 CORNERS = ("upper_left", "upper_right", "lower_right", "lower_left")
-SIDES = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]], float)
-LIGHT_INSET_M = 0.015  # where lights are put when none are seen: the file says that it is a guess
-LIGHT_REACH_M = 0.06  # how far from its corner a border light may sit
-LIGHT_RADII_M = (0.003, 0.014)
-LIGHTS_AGREE_M = 0.006  # border lights sit alike in their corners
-SNAP_M = 0.006
-COLOURS = ("green", "red", "amber", "blue", "white")
 CAP_M = 0.012  # of a slider, along its track
 PIVOT_SHARE, NEEDLE_SHARE = 0.28, 0.6  # of a moving-coil meter's height
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Question:
-    """One step of the dialogue; `choices` is empty where any text or number will do. `default` stands if unanswered."""
-
-    key: str
-    text: str
-    choices: tuple[str, ...] = ()
-    default: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -53,113 +34,6 @@ class PanelObjectDraft:
     name: str
     example: Example
     answers: Mapping[str, str]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LightsFound:
-    """(4, 2) border lights on the plate, upper left first and clockwise; `are_seen` False: put there by a guess."""
-
-    places_m: Array
-    are_seen: bool
-
-
-NAME = Question(key="name", text="What is it called (a short name: small letters, digits, underscores)?")
-SCALE = (
-    Question(key="minimum", text="Which value stands at the low end of the scale?", default="0"),
-    Question(key="maximum", text="Which value stands at the high end?", default="10"),
-    Question(key="unit", text="In which unit?", default="bar"),
-)
-MARKS = "degrees clockwise from straight up, or x,y of a pixel on the mark"
-PLACES = "Its places: name=degrees clockwise from straight up, separated by commas?"
-
-
-def _pointer(low: str, high: str) -> tuple[Question, ...]:
-    return (
-        *SCALE,
-        Question(key="at_min", text=f"Where is the low end ({MARKS})?", default=low),
-        Question(key="at_max", text=f"Where is the high end ({MARKS})?", default=high),
-    )
-
-
-QUESTIONS: dict[str, tuple[Question, ...]] = {
-    "gauge": _pointer("-135", "135"),
-    "panel_meter": _pointer("-45", "45"),
-    "display": (
-        Question(key="digits", text="How many digits?", default="4"),
-        Question(key="decimals", text="How many of them after the point?", default="0"),
-        Question(key="style", text="Glowing or dark segments?", choices=("led", "lcd"), default="led"),
-        Question(key="unit", text="In which unit?"),
-        Question(key="minimum", text="What is the least that it can show?", default="0"),
-        Question(key="maximum", text="What is the most?", default="9999"),
-    ),
-    "lamp": (Question(key="colour", text="Which colour?", choices=COLOURS, default="green"),),
-    "button": (
-        Question(key="colour", text="Which colour?", choices=(*COLOURS, "black"), default="green"),
-        Question(key="latching", text="Does it stay in when pressed?", choices=("no", "yes"), default="no"),
-    ),
-    "toggle": (),
-    "rotary": (Question(key="states", text=PLACES, default="off=-45, on=45"),),
-    "slider": (
-        *SCALE,
-        Question(key="rises", text="Where does the value rise to?", choices=("right", "left", "up", "down"),
-                 default="right"),
-    ),
-    "lever": (Question(key="states", text=PLACES, default="closed=90, open=0"),),
-    "handwheel": (Question(key="spokes", text="How many spokes?", default="3"),),
-    "mushroom": (),
-}  # fmt: skip
-
-
-def kind_question(knowledge: Knowledge, suggested: str = "") -> Question:
-    """The first question about what was clicked."""
-    known = sorted({*OBJECT_KINDS, *(kind.name for kind in knowledge.kinds)} - {NOTHING})
-    return Question(key="kind", text="What kind of object is this?", choices=tuple(known), default=suggested)
-
-
-def questions(kind: str) -> tuple[Question, ...]:
-    """What must be known of one clicked object to write it into a panel file.
-
-    Raises:
-        InvalidRequest: a panel file knows no such kind.
-    """
-    if kind not in QUESTIONS:
-        raise InvalidRequest(
-            f"a panel file knows no {kind!r}: a kind without a reader can be found, not read",
-            hint=f"kinds of a panel file: {', '.join(OBJECT_KINDS)}",
-        )
-    return (NAME, *QUESTIONS[kind])
-
-
-def find_border_lights(overview: Overview, clicks_px: Sequence[tuple[float, float]] = ()) -> LightsFound:
-    """The four border lights: those clicked on, or the small circles that sit alike in the four corners.
-
-    Raises:
-        InvalidRequest: neither none nor four clicks.
-        NotFound: a click beside the plate.
-    """
-    if len(clicks_px) not in (0, 4):
-        raise InvalidRequest(
-            f"{len(clicks_px)} lights were clicked on", hint="click on all four border lights, or none"
-        )
-    half = np.array(overview.plate_m) / 2
-    low, high = LIGHT_RADII_M
-    round_ones = [
-        overview.on_plate(o.middle_px[None])[0]
-        for o in sub_objects(overview.ground)
-        if o.shape == "circle" and low <= o.size_px[0] / PLATE_PX_PER_M / 2 <= high
-    ]
-    circles = np.array(round_ones).reshape(-1, 2)
-    if len(clicks_px) == 4:
-        clicked = plate_points(overview.view, clicks_px, overview.plate_m)
-        places = np.array([_near(place, circles) for place in clicked])
-        return LightsFound(places_m=places[_clockwise(places)], are_seen=True)
-    corners = SIDES * half
-    found = [_in_corner(corner, circles) for corner in corners]
-    if all(place is not None for place in found):
-        insets = np.array([np.abs(corner - place) for corner, place in zip(corners, found, strict=True)])
-        if np.ptp(insets, axis=0).max() < LIGHTS_AGREE_M:
-            return LightsFound(places_m=np.array(found), are_seen=True)
-    return LightsFound(places_m=corners - SIDES * LIGHT_INSET_M, are_seen=False)
 
 
 def panel_text(name: str, overview: Overview, lights: LightsFound, objects: Sequence[PanelObjectDraft]) -> str:
@@ -301,26 +175,6 @@ def _reach_m(draft: PanelObjectDraft, overview: Overview) -> float:
         return max(example.size_m) / 2
     corners = overview.on_plate(example.outline.polygon_px)
     return float(np.abs(corners - example.clicks_m[-1]).max())
-
-
-def _in_corner(corner: Array, circles: Array) -> Array | None:
-    """The circle nearest to a corner of the plate, if one is near."""
-    away = np.abs(circles - corner).max(axis=1, initial=0.0)
-    near = np.flatnonzero(away < LIGHT_REACH_M)
-    return circles[near[int(away[near].argmin())]] if len(near) else None
-
-
-def _near(place: Array, circles: Array) -> Array:
-    """The middle of the circle that was clicked on, or the click."""
-    away = np.linalg.norm(circles - place, axis=1)
-    return np.asarray(circles[int(away.argmin())] if len(away) and away.min() < SNAP_M else place)
-
-
-def _clockwise(places: Array) -> list[int]:
-    """Order of four places: upper left, upper right, lower right, lower left."""
-    rows = np.argsort(-places[:, 1], kind="stable")
-    (a, b), (c, d) = (sorted(rows[k : k + 2], key=lambda i: float(places[i, 0])) for k in (0, 2))
-    return [int(a), int(b), int(d), int(c)]
 
 
 def _metres(place: Array) -> list[float]:

@@ -13,7 +13,8 @@ import pytest
 
 from hal.clock import Deadline, WallClock
 from hal.errors import ConfigError, DeviceFault, DeviceTimeout, DeviceUnavailable
-from hal.host import HostProcess, HostServer, Proxy, isolated_device
+from hal.host import HostServer, Proxy
+from hal.host_process import HostProcess, isolated_device
 from hal.readings import Stamped
 
 

@@ -13,13 +13,9 @@ from perception.vision.framing import check_upright, one_plate
 from perception.vision.image import as_gray
 from perception.vision.knowledge import NOTHING, shipped_knowledge
 from perception.vision.outline import footprint_m
-from perception.vision.panel_teach import (
-    PanelObjectDraft,
-    find_border_lights,
-    kind_question,
-    panel_text,
-    questions,
-)
+from perception.vision.panel_lights import find_border_lights
+from perception.vision.panel_questions import kind_question, questions
+from perception.vision.panel_teach import PanelObjectDraft, panel_text
 from perception.vision.taught import inspect_view
 from perception.vision.teach import Overview, example_at, likest, overview_of, teach, teach_example
 from perception.vision.view import CameraView

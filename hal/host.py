@@ -24,6 +24,7 @@ from hal.errors import CellError, DeviceTimeout, DeviceUnavailable
 
 ANSWER_MARGIN_S = 0.5  # what an answer may take beyond the deadline that went with the call
 CONNECT_TIMEOUT_S = 20.0
+SUPERVISED = "the supervisor restarts it; see `panelwright doctor` and the log"
 
 
 class HostServer:
@@ -116,7 +117,8 @@ def _answer(target: object, method: str, args: tuple[Any, ...], kwargs: dict[str
 class Proxy:
     """Stands for an object of another process. Threads may share it; their calls queue."""
 
-    def __init__(self, address: str, authkey: bytes, name: str, clock: Clock) -> None:
+    def __init__(self, address: str, authkey: bytes, name: str, clock: Clock, *, gone_hint: str = SUPERVISED) -> None:
+        self._gone_hint = gone_hint
         self._address = address
         self._authkey = authkey
         self._name = name
@@ -133,6 +135,9 @@ class Proxy:
         if attribute in self._methods:
             return lambda *args, **kwargs: self._call(attribute, args, kwargs)
         raise AttributeError(f"{self._name} has no {attribute!r}")
+
+    def __dir__(self) -> list[str]:
+        return sorted({*self._methods, *self._constants})  # what a host offers to other processes
 
     def disconnect(self) -> None:
         """Close this proxy's own connection; the far object lives on."""
@@ -189,7 +194,7 @@ class Proxy:
     def _lost(self, error: BaseException) -> DeviceUnavailable:
         return DeviceUnavailable(
             f"the process that holds {self._name} is gone ({type(error).__name__})",
-            hint="the supervisor restarts it; see `panelwright doctor` and the log",
+            hint=self._gone_hint,
             device=self._name,
         )
 
@@ -205,13 +210,15 @@ def serve(
     return HostServer(objects, address or new_address(), authkey or _inherited_key(), clock or WallClock())
 
 
-def connect(address: str, authkey: bytes | None, name: str, *, clock: Clock | None = None) -> Any:
-    """A proxy for the object called `name` behind `address`.
+def connect(
+    address: str, authkey: bytes | None, name: str, *, clock: Clock | None = None, gone_hint: str = SUPERVISED
+) -> Any:
+    """A proxy for the object called `name` behind `address`; `gone_hint` says what helps when its process has died.
 
     Raises:
         DeviceUnavailable: nobody serves there, or has no such object.
     """
-    return Proxy(address, authkey or _inherited_key(), name, clock or WallClock())
+    return Proxy(address, authkey or _inherited_key(), name, clock or WallClock(), gone_hint=gone_hint)
 
 
 def new_address() -> str:

@@ -11,8 +11,12 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+from hal.clock import WallClock
+from hal.config import Cell
 from hal.errors import CellError, ConfigError, DeviceTimeout, DeviceUnavailable
 from hal.host import CONNECT_TIMEOUT_S, connect, new_address, serve
+from hal.registry import Context
+from hal.registry import connect as connect_device
 
 
 class HostProcess:
@@ -97,23 +101,44 @@ def _run_host(
     os._exit(0)  # a driver's stuck thread must not keep the process
 
 
-def isolated_device(name: str, driver: str, options: dict[str, Any]) -> HostProcess:
-    """A process that holds one device under its own name; take it with `.proxy(name)`.
+class IsolatedDevice:
+    """A device in a process of its own, with the interface of its kind; to close it is to end the process."""
+
+    def __init__(self, context: Context, driver: str, options: dict[str, Any]) -> None:
+        self._process = HostProcess(_make_device, context.name, context.cell, driver, options, name=context.name)
+        hint = "its driver crashed (the log says how); connect it anew: PUT /v1/devices/NAME, or restart the service"
+        self._proxy = connect(self._process.address, None, context.name, gone_hint=hint)
+
+    def __getattr__(self, attribute: str) -> Any:
+        if attribute.startswith("_"):
+            raise AttributeError(attribute)
+        return getattr(self._proxy, attribute)
+
+    def __dir__(self) -> list[str]:
+        return dir(self._proxy)
+
+    def close(self) -> None:
+        """Close the device and end its process; a second call does nothing."""
+        self._proxy.disconnect()
+        self._process.close()
+
+
+def isolated_device(context: Context, driver: str, options: dict[str, Any]) -> IsolatedDevice:
+    """Connect a device in a process of its own.
 
     Raises:
-        ConfigError: a simulated driver shares its world with others and cannot be alone.
+        ConfigError: a simulated driver shares its world with others, and a clock that is not the wall's is no other
+            process's: neither can be isolated.
+        CellError: the device did not connect.
     """
-    if driver.startswith("sim:"):
-        raise ConfigError(
-            f"devices.{name}: {driver} cannot be isolated",
-            hint="remove isolate = true; the world already has a process of its own",
-            key=f"devices.{name}.isolate",
-        )
-    return HostProcess(_make_device, name, driver, options, name=f"device-{name}")
+    if not driver.startswith("sim:") and isinstance(context.clock, WallClock):
+        return IsolatedDevice(context, driver, options)
+    raise ConfigError(
+        f"devices.{context.name}: {driver} cannot be isolated in a cell with a simulated world",
+        hint="remove isolate = true; it is for cell.mode = 'real'",
+        key=f"devices.{context.name}.isolate",
+    )
 
 
-def _make_device(name: str, driver: str, options: dict[str, Any]) -> Mapping[str, object]:
-    from hal.registry import Context
-    from hal.registry import connect as connect_device
-
-    return {name: connect_device(Context(name=name), driver, options)}
+def _make_device(name: str, cell: Cell | None, driver: str, options: dict[str, Any]) -> Mapping[str, object]:
+    return {name: connect_device(Context(name=name, cell=cell), driver, options)}

@@ -57,12 +57,18 @@ def claims_of(driver: str, options: dict[str, Any]) -> tuple[Claim, ...]:
         return ()
 
 
-def clash(one: Claim, other: Claim) -> tuple[str, str] | None:
-    """Why two devices cannot both have what they claim, and the remedy; None when they can."""
+def clash(one: Claim, other: Claim, *, apart: bool = False) -> tuple[str, str] | None:
+    """Why two devices cannot both have what they claim, and the remedy; None when they can.
+
+    Args:
+        apart: they live in two processes, and a serial port is opened for one.
+    """
     if one.same_wire != other.same_wire:
         return None
     if one.bus is None or other.bus is None:
         return f"both want {one.wire}", "it serves one device: give one of them another"
+    if apart and one.wire.startswith("serial "):
+        return f"share {one.wire}, but one of them is isolated", "devices of one serial bus live in one process"
     if one.bus != other.bus:
         what = f"share {one.wire}, but one speaks {one.bus} and the other {other.bus}"
         return what, "one wire carries one protocol at one rate: correct the rate, or the port of one of them"

@@ -21,6 +21,7 @@ from hal.config import Cell, DeviceSection, load_cell
 from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, DeviceUnavailable
 from hal.garbage import set_aside
+from hal.host_process import isolated_device
 from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
 from hal.simulated import Fault
@@ -83,7 +84,8 @@ class CellRuntime:
 
             def connect(name: str, section: DeviceSection) -> Any:
                 context = Context(name=name, clock=clock, cell=cell, shared=shared)
-                return checked(name, connect_device(context, section.driver, section.options), section)
+                make = isolated_device if section.isolate else connect_device
+                return checked(name, make(context, section.driver, section.options), section)
 
             sections = {name: complete(name, section) for name, section in cell.file.devices.items()}
             seats = _connect_all(cell, sections, connect, closers)

@@ -47,14 +47,16 @@ def check_wires(cell: Cell, others: Mapping[str, DeviceSection] | None = None) -
     """
     others = others or {}
     emulated = cell.file.emulators.keys() - others.keys()  # their wires are made later
+    sections = {**cell.file.devices, **others}
+    isolated = {name: section.isolate for name, section in sections.items()}
     takes = [
         (name, claim)
-        for name, section in {**cell.file.devices, **others}.items()
+        for name, section in sections.items()
         if name not in emulated
         for claim in claims_of(section.driver, section.options)
     ]
     for (name, one), (other_name, other) in combinations(takes, 2):
-        found = clash(one, other)
+        found = clash(one, other, apart=isolated[name] or isolated[other_name])
         if found is not None and name != other_name:
             what, hint = found
             raise ConfigError(

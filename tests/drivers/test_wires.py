@@ -93,6 +93,18 @@ def test_another_name_of_the_same_port_does_not_hide_it(tmp_path: Path) -> None:
         check_wires(cell_of(("serial:tfmini", names[0]), ("serial:tfmini", names[1])))
 
 
+def test_an_isolated_device_shares_no_serial_bus() -> None:
+    """Its process opens the port for itself; a gateway takes several connections."""
+    for wire, is_fine in ((USB, False), (TCP, True)):
+        cell = cell_of(("modbus:ft300", wire), ("modbus:robotiq_2f", {**wire, "unit": 3, "baud": 19_200}))
+        alone = cell.file.devices["first"].model_copy(update={"isolate": True})
+        if is_fine:
+            check_wires(cell, {"first": alone})
+            continue
+        with pytest.raises(ConfigError, match="one of them is isolated"):
+            check_wires(cell, {"first": alone})
+
+
 def test_a_swap_is_checked_against_the_others_only() -> None:
     cell = cell_of(("serial:tfmini", USB), ("serial:bota", {"port": "/dev/ttyUSB1"}))
     same = cell.file.devices["first"]

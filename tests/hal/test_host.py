@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hal.clock import Deadline, WallClock
+from hal.clock import Deadline, PacedClock, WallClock
 from hal.errors import ConfigError, DeviceFault, DeviceTimeout, DeviceUnavailable
 from hal.host import HostServer, Proxy
 from hal.host_process import HostProcess, isolated_device
 from hal.readings import Stamped
+from hal.registry import Context
 
 
 class Calculator:
@@ -117,9 +118,10 @@ def test_an_error_while_starting_reaches_the_parent() -> None:
         HostProcess(make_broken)
 
 
-def test_a_simulated_device_cannot_be_alone() -> None:
-    with pytest.raises(ConfigError, match="cannot be isolated"):
-        isolated_device("arm", "sim:arm", {})
+def test_a_device_of_a_simulated_world_cannot_be_alone() -> None:
+    for driver, clock in (("sim:arm", WallClock()), ("serial:tfmini", PacedClock())):
+        with pytest.raises(ConfigError, match="cannot be isolated"):
+            isolated_device(Context(name="arm", clock=clock), driver, {})
 
 
 def test_a_closing_server_ends_the_threads_that_wait_for_its_clients(

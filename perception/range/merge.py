@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.range.borders import Border, borders_of
-from perception.range.pairs import PATCHES, PIXELS, described, figures_of, judged
+from perception.range.pairs import PIXELS, described, judged, united
 from perception.range.regions import Regions
 
 Array = NDArray[np.float64]
@@ -109,10 +109,9 @@ class Agglomeration:
         a, b = merger.pair
         kept, lost = (a, b) if self.parts[a].pixels >= self.parts[b].pixels else (b, a)
         p, q = self.parts[kept], self.parts.pop(lost)
-        samples, normals = _drawn(p, q)
-        patches = float(p.figures[PATCHES] + q.figures[PATCHES])
+        pieces = (p.samples, p.normals, p.figures, q.samples, q.normals, q.figures)
         surface = (merger.kind, merger.parameters)
-        figures = figures_of(*surface, samples, p.pixels + q.pixels, patches, self.pitch, self.perspective)
+        samples, normals, figures = united(*surface, *pieces, PART_SAMPLES, self.pitch, self.perspective)
         self.parts[kept] = Part(
             kind=merger.kind, parameters=merger.parameters, samples=samples, normals=normals, figures=figures
         )
@@ -153,15 +152,3 @@ def merge_touching(regions: Regions, kinds: list[int], parameters: list[Array]) 
     for label, part in graph.parts.items():
         kinds[label - 1], parameters[label - 1] = part.kind, part.parameters
     return [graph.owner[k] for k in range(1, len(kinds) + 1)]
-
-
-def _drawn(p: Part, q: Part) -> tuple[Array, Array]:
-    """Samples and normals of both parts, each by its share of the pixels, at most `PART_SAMPLES` and at least a fifth."""
-    share = min(max(q.pixels / (p.pixels + q.pixels), 0.2), 0.8)
-    picks = []
-    for part, wanted in ((p, 1.0 - share), (q, share)):
-        n = part.samples.shape[1]
-        count = min(n, max(1, round(wanted * PART_SAMPLES)))
-        picks.append(np.linspace(0, n - 1, count).astype(np.int64))
-    samples = np.concatenate([s.samples[:, i] for s, i in zip((p, q), picks, strict=True)], axis=1)
-    return np.ascontiguousarray(samples), np.concatenate([p.normals[picks[0]], q.normals[picks[1]]])

@@ -75,6 +75,37 @@ def figures_of(kind, th, samples, pixels, patches, pitch, perspective):  # type:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def united(  # type: ignore[no-untyped-def]  # numba types it
+    kind, th, samples_a, normals_a, figures_a, samples_b, normals_b, figures_b, most, pitch, perspective
+):
+    """Samples, normals and figures of two regions that are one surface now.
+
+    Each gives samples by its share of the pixels, a fifth of `most` at least, evenly spread over those that it has.
+    """
+    pixels, patches = figures_a[PIXELS] + figures_b[PIXELS], figures_a[PATCHES] + figures_b[PATCHES]
+    share = min(max(figures_b[PIXELS] / pixels, 0.2), 0.8)
+    from_a = min(samples_a.shape[1], max(1, round((1.0 - share) * most)))
+    from_b = min(samples_b.shape[1], max(1, round(share * most)))
+    samples, normals = np.empty((4, from_a + from_b)), np.empty((from_a + from_b, 3))
+    _spread(samples_a, normals_a, samples[:, :from_a], normals[:from_a])
+    _spread(samples_b, normals_b, samples[:, from_a:], normals[from_a:])
+    return samples, normals, figures_of(kind, th, samples, pixels, patches, pitch, perspective)
+
+
+@njit(cache=True, error_model="numpy")
+def _spread(samples, normals, few, few_normals):  # type: ignore[no-untyped-def]  # numba types it
+    """Fill `few` (4, n) and `few_normals` (n, 3) from samples and normals, evenly spread."""
+    n, last = few.shape[1], samples.shape[1] - 1
+    step = last / max(n - 1, 1)
+    for k in range(n):
+        i = last if k == n - 1 and n > 1 else int(k * step)
+        for a in range(4):
+            few[a, k] = samples[a, i]
+        for a in range(3):
+            few_normals[k, a] = normals[i, a]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def judged(  # type: ignore[no-untyped-def]  # numba types it
     kind_a,
     a,

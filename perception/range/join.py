@@ -19,6 +19,7 @@ JOINED_MEAN_SQUARE = 1.6
 ROUGH_STRIDE = 5  # of the samples of a first fit
 ROUGH_SHARE = 0.5  # of them must lie near it before all are fitted
 NEAR_SAMPLES = 16  # at least (a small piece: all it has) decide whether a surface passes near a piece
+LEAST_NEAR = 4
 NEAR_SIGMAS = 20.0
 SCRAP_SHARE = 0.1
 SCRAP_SIGMAS = 6.0
@@ -35,30 +36,46 @@ def join_pieces(regions: Regions, kinds: list[int], parameters: list[Array]) -> 
 
     Parameters of the surviving labels are updated in place.
     """
-    owner = list(range(1, len(kinds) + 1))
     if len(kinds) < 2:
-        return owner
-    pixels, packed, law = regions.pixels, regions.packed, regions.law
-    order = sorted((k for k in range(len(kinds)) if pixels[k]), key=lambda k: -pixels[k])
+        return list(range(1, len(kinds) + 1))
+    pixels = np.array(regions.pixels)
+    order = np.argsort(-pixels, kind="stable")[: np.count_nonzero(pixels)]
     thin = regions.few(PAIR_SAMPLES)
-    perspective = bool(packed[0] > 0)
-    near = _nearness(kinds, parameters, thin, perspective)
-    for position, big in enumerate(order):
+    starts = np.cumsum([0] + [few.shape[1] for few in thin])
+    ths = np.stack(parameters)
+    image = (regions.depth_m, regions.packed, regions.law, regions.labels)
+    owner = _joined(np.array(kinds), ths, np.concatenate(thin, axis=1), starts, pixels, order, *image)
+    parameters[:] = list(ths)
+    joined: list[int] = owner.tolist()
+    return joined
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _joined(kinds, ths, samples, starts, pixels, order, depth, sen, noise, labels):  # type: ignore[no-untyped-def]  # numba types it
+    """`join_pieces` of samples (4, N), piece k's from `starts[k]` on; the largest come first. Updates `ths`."""
+    perspective = sen[0] > 0
+    owner, before = np.arange(1, kinds.shape[0] + 1), ths.copy()
+    thin = [np.ascontiguousarray(samples[:, starts[k] : starts[k + 1]]) for k in range(kinds.shape[0])]
+    for position in range(order.shape[0]):
+        big = order[position]
         if owner[big] != big + 1:
             continue
         for small in order[position + 1 :]:
-            if owner[small] != small + 1 or not near[big, small]:
+            if owner[small] != small + 1 or not _passes_near(kinds[big], before[big], thin[small], perspective):
                 continue
-            large, little = ((kinds[k], parameters[k], thin[k], pixels[k]) for k in (big, small))
-            verdict, joint = related(*large, *little, law, perspective)
+            verdict, joint = related(
+                kinds[big], ths[big], thin[big], pixels[big],
+                kinds[small], ths[small], thin[small], pixels[small], noise, perspective,
+            )  # fmt: skip
             if verdict == APART:
                 continue
             if verdict == JOINED:
-                own = np.array([False, *(k in (big + 1, small + 1) for k in owner)])
-                if gap_between(regions.depth_m, packed, regions.labels, own, kinds[big], joint, thin[big], thin[small]):
+                own = np.zeros(owner.shape[0] + 1, np.bool_)
+                own[1:] = (owner == big + 1) | (owner == small + 1)
+                if gap_between(depth, sen, labels, own, kinds[big], joint, thin[big], thin[small]):
                     continue
-                parameters[big] = joint
-                thin[big] = np.concatenate([thin[big], thin[small]], axis=1)
+                ths[big] = joint
+                thin[big] = np.concatenate((thin[big], thin[small]), 1)
             owner[small] = big + 1
     return owner
 
@@ -80,14 +97,14 @@ def related(  # type: ignore[no-untyped-def]  # numba types it
         if turn < np.cos(LARGEST_TURN_RAD):
             return APART, th
     both = np.concatenate((samples, others), 1)
-    # What a piece leaves over by itself is bend, where noise is slow, and it is no less in the joint surface.
-    own = max(_trimmed(kind, th, samples, perspective)[1], _trimmed(other_kind, other, others, perspective)[1])
-    limit = JOINED_MEAN_SQUARE * (1.0 + slow_share_at(noise, np.median(both[2])) * max(own - 1.0, 0.0))
     rough = _fitted(kind, th, np.ascontiguousarray(both[:, ::ROUGH_STRIDE]), perspective, 1)
     for s in (samples, others):
         if _trimmed(kind, rough, s, perspective)[0] < ROUGH_SHARE:
             return APART, th
     joint = _fitted(kind, th, both, perspective, 3)
+    # What a piece leaves over by itself is bend, where noise is slow, and it is no less in the joint surface.
+    own = max(_trimmed(kind, th, samples, perspective)[1], _trimmed(other_kind, other, others, perspective)[1])
+    limit = JOINED_MEAN_SQUARE * (1.0 + slow_share_at(noise, np.median(both[2])) * max(own - 1.0, 0.0))
     for s in (samples, others):
         share, mean_square = _trimmed(kind, joint, s, perspective)
         if share < JOINED_SHARE or not mean_square <= limit:
@@ -133,30 +150,15 @@ def _trimmed(kind, th, s, perspective):  # type: ignore[no-untyped-def]  # numba
     return kept / max(e.shape[0], 1), total / kept if kept else np.inf
 
 
-def _nearness(kinds: list[int], parameters: list[Array], thin: list[Array], perspective: bool) -> NDArray[np.bool_]:
-    """(n, n) whether surface i, extended, passes near most of piece j: a cheap refusal before the joint fits."""
-    few = [s[:, :: max(1, s.shape[1] // NEAR_SAMPLES)] for s in thin]
-    starts = np.cumsum([0] + [s.shape[1] for s in few])
-    x, y, z, sigma = np.concatenate(few, axis=1)
-    return np.asarray(_near_matrix(np.array(kinds), np.stack(parameters), starts, x, y, z, sigma, perspective))
-
-
-@njit(cache=True)
-def _near_matrix(kinds, ths, starts, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]  # numba types it
-    n = kinds.shape[0]
-    near = np.zeros((n, n), np.bool_)
-    for i in range(n):
-        for j in range(n):
-            size = starts[j + 1] - starts[j]
-            if i == j or size < 4:
-                continue
-            inside = 0
-            for k in range(starts[j], starts[j + 1]):
-                zm = depth_on(kinds[i], ths[i], x[k], y[k], perspective)
-                if abs(z[k] - zm) < NEAR_SIGMAS * sigma[k]:
-                    inside += 1
-            near[i, j] = 2 * inside > size
-    return near
+@njit(cache=True, error_model="numpy")
+def _passes_near(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """Whether the surface, extended, passes near most of a piece: a cheap refusal before the joint fits."""
+    count, inside = 0, 0
+    for k in range(0, samples.shape[1], max(1, samples.shape[1] // NEAR_SAMPLES)):
+        z = depth_on(kind, th, samples[0, k], samples[1, k], perspective)
+        inside += abs(samples[2, k] - z) < NEAR_SIGMAS * samples[3, k]
+        count += 1
+    return count >= LEAST_NEAR and 2 * inside > count
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

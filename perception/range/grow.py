@@ -20,10 +20,23 @@ SEED_LEVELS = 64
 LONE_BEND = 0.02
 SWEEPS = 3  # of growing a plane from one seed, each with the plane of the sweep before
 SAME_BLOCKS = 200  # of which no more than one may come or go in a sweep that is the last
+SAME_PLANE = 0.1  # sigmas: a plane that moves less explains the same blocks
 MOST_PLANES = 512
 STEADY_RMS = 1.8  # what a tangent plane leaves over in sigmas, up to which its normal counts
 LOOSE_NORMAL = 0.5  # length of a normal that seeds a plane but does not count
 TAKEN = np.int32(2**31 - 1)
+BENT = np.int32(-1)  # a block whose support is no plane
+# Where the products of 1, p, q, pp, pq, qq stand among 1, p, q, pp, pq, qq, ppp, ppq, pqq, qqq, pppp, pppq, ppqq, pqqq, qqqq.
+MOMENTS = np.array(
+    [
+        [0, 1, 2, 3, 4, 5],
+        [1, 3, 4, 6, 7, 8],
+        [2, 4, 5, 7, 8, 9],
+        [3, 6, 7, 10, 11, 12],
+        [4, 7, 8, 11, 12, 13],
+        [5, 8, 9, 12, 13, 14],
+    ]
+)
 
 
 @njit(cache=True, error_model="numpy")
@@ -122,27 +135,28 @@ def plane_from_coefficients(m, perspective, th):  # type: ignore[no-untyped-def]
     th[0], th[1], th[2], th[3] = nx / length, ny / length, nz / length, d / length
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _quadratic_gain(idx, count, table, x0, y0, scale):  # type: ignore[no-untyped-def]  # numba types it
     """Sum of squares (in sigmas) left by a plane and by a quadratic over the blocks idx[:count] of a padded table."""
-    A, b, row = np.zeros((6, 6)), np.zeros(6), np.empty(6)
-    total = 0.0
-    g0 = table[idx[0], 2]
-    inverse = 1.0 / scale
+    M, b, total = np.zeros(15), np.zeros(6), 0.0
+    g0, per = table[idx[0], 2], 1.0 / scale
     for k in range(count):
         i = idx[k]
-        px, py = (table[i, 0] - x0) * inverse, (table[i, 1] - y0) * inverse
-        row[0], row[1], row[2], row[3], row[4], row[5] = 1.0, px, py, px * px, px * py, py * py
-        w, value = table[i, 3], table[i, 2] - g0
-        total += w * value * value
-        for a in range(6):
-            b[a] += w * row[a] * value
-            for e in range(a + 1):
-                A[a, e] += w * row[a] * row[e]
-    for a in range(6):
-        for e in range(a):
-            A[e, a] = A[a, e]
-        A[a, a] *= 1.0 + 1e-9
+        p, q, v, w = (table[i, 0] - x0) * per, (table[i, 1] - y0) * per, table[i, 2] - g0, table[i, 3]
+        pp, pq, qq, wv = p * p, p * q, q * q, w * v
+        wpp, wpq, wqq = w * pp, w * pq, w * qq
+        total += wv * v
+        for m, value in enumerate((w, w * p, w * q, wpp, wpq, wqq, wpp * p, wpp * q, wqq * p, wqq * q)):
+            M[m] += value
+        for m, value in enumerate((wpp * pp, wpp * pq, wpp * qq, wpq * qq, wqq * qq)):
+            M[10 + m] += value
+        for m, value in enumerate((wv, wv * p, wv * q, wv * pp, wv * pq, wv * qq)):
+            b[m] += value
+    A = np.empty((6, 6))
+    # Products of two of 1, p, q, pp, pq, qq, by where their moment stands.
+    for a, row in enumerate(MOMENTS):
+        for e in range(6):
+            A[a, e] = M[row[e]] * (1.0 + 1e-9 if a == e else 1.0)
     plane, full = b[:3].copy(), b.copy()
     if not solve_positive(A[:3, :3].copy(), plane, 3):
         return max(total, 0.0), max(total, 0.0)
@@ -152,7 +166,7 @@ def _quadratic_gain(idx, count, table, x0, y0, scale):  # type: ignore[no-untype
     return left, max(total - full @ b, 0.0)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def grow_planes(  # type: ignore[no-untyped-def]  # numba types it
     x, y, z, sigma, normal, rms, free, label, first_label, perspective, order, least, cos_limit, tried
 ):
@@ -161,33 +175,36 @@ def grow_planes(  # type: ignore[no-untyped-def]  # numba types it
     Blocks of supports that turned out curved are marked in `tried` so that they seed nothing again.
     """
     h, w = z.shape
-    table, mark, across = _padded(x, y, z, sigma, normal, rms, free, perspective)
-    ff, fl, ft = free.ravel(), label.ravel(), tried.ravel()
-    queue = np.empty(h * w, np.int32)
+    table, mark, place = _padded(x, y, z, sigma, normal, rms, free, perspective)
+    across = w + 2
+    owner = np.zeros(table.shape[0], np.int32)  # label, or BENT
+    queue, spans = np.empty(h * w, np.int32), np.empty((h * w, 2), np.int32)
     ths, counts, mean2 = np.zeros((MOST_PLANES, 16)), np.zeros(MOST_PLANES, np.int64), np.zeros(MOST_PLANES)
-    found = 0
-    stamp = 0
+    found, stamp = 0, 0
     m, S, th = np.zeros(3), np.zeros(9), np.zeros(16)
     for o in range(order.shape[0]):
-        seed = order[o]
-        if not ff[seed] or ft[seed] or found == MOST_PLANES:
+        start = place[order[o]]
+        if mark[start] == TAKEN or owner[start] != 0 or found == MOST_PLANES:
             continue
-        start = (seed // w + 1) * across + seed % w + 1
         if not _tangent(table[start], perspective, m):
             continue
         count = 0
         for sweep in range(SWEEPS):
             plane_from_coefficients(m, perspective, th)
-            before = count
-            stamp += 1
-            count = _grown(table, mark, across, start, stamp, sweep, m, th, perspective, cos_limit, queue, S)
+            before, a, b, c = count, m[0], m[1], m[2]
+            stamp += 2
+            if sweep == 0:
+                count = _grown(table, mark, across, start, stamp, m, th, perspective, cos_limit, queue, S)
+            else:
+                count = _filled(table, mark, across, start, stamp, m, th, cos_limit, queue, spans, S)
             if count < least or not solve3(S, m):
                 count = 0
                 break
-            if sweep > 0 and abs(count - before) * SAME_BLOCKS < count:
+            is_same = abs(count - before) * SAME_BLOCKS < count
+            if sweep > 0 and (is_same or _shift(m[0] - a, m[1] - b, m[2] - c, S, count) < SAME_PLANE):
                 break
         if count == 0:
-            ft[seed] = True
+            owner[start] = BENT
             continue
         plane_from_coefficients(m, perspective, th)
         x0, y0 = S[1] / S[0], S[2] / S[0]
@@ -197,21 +214,36 @@ def grow_planes(  # type: ignore[no-untyped-def]  # numba types it
         ratio = gain / max(bent / max(count - 6, 1), 0.3)
         is_bent = (flat - bent > CURVED_RMS * CURVED_RMS * count and ratio > CURVED_F) or flat > 3.0 * count
         for k in range(count):
-            i = queue[k]
-            at = (i // across - 1) * w + i % across - 1
-            if is_bent:
-                ft[at] = True
-                continue
-            ff[at] = False
-            fl[at] = first_label + found
-            mark[i] = TAKEN
+            owner[queue[k]] = BENT if is_bent else first_label + found
         if is_bent:
             continue
+        for k in range(count):
+            mark[queue[k]] = TAKEN
         ths[found] = th
         counts[found] = count
         mean2[found] = flat / max(count - 3, 1)
         found += 1
+    _hand_over(owner, place, free.ravel(), label.ravel(), tried.ravel())
     return ths[:found].copy(), counts[:found].copy(), mean2[:found].copy()
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _shift(a, b, c, S, count):  # type: ignore[no-untyped-def]  # numba types it
+    """Root mean square of a x + b y + c over `count` blocks of sums `S`, in sigmas."""
+    n, x, y = S[0], S[1] / S[0], S[2] / S[0]
+    xx, xy, yy = S[3] / n - x * x, S[4] / n - x * y, S[5] / n - y * y
+    square = (a * x + b * y + c) ** 2 + a * a * xx + 2.0 * a * b * xy + b * b * yy
+    return np.sqrt(max(square, 0.0) * n / count)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _hand_over(owner, place, free, label, tried):  # type: ignore[no-untyped-def]  # numba types it
+    for i in range(place.shape[0]):
+        mine = owner[place[i]]
+        if mine > 0:
+            label[i], free[i] = mine, False
+        elif mine == BENT:
+            tried[i] = True
 
 
 @njit(cache=True, error_model="numpy")
@@ -219,27 +251,29 @@ def _padded(x, y, z, sigma, normal, rms, free, perspective):  # type: ignore[no-
     """Blocks with a frame of taken ones around, one row of numbers each, so that growing needs no look at the rim.
 
     Returns (N, 8) x, y, g, its weight, normal (0 where it says nothing), z; marks (N,), `TAKEN` where a block is not
-    free; and the number of blocks across.
+    free; and where among the N each block stands (h w,).
     """
     h, w = z.shape
     across = w + 2
     table, mark = np.zeros(((h + 2) * across, 8)), np.full((h + 2) * across, TAKEN, np.int32)
+    place = np.empty(h * w, np.int32)
     for r in range(h):
         for c in range(w):
+            i = (r + 1) * across + c + 1
+            place[r * w + c] = i
             if not free[r, c]:
                 continue
-            i = (r + 1) * across + c + 1
             d = z[r, c]
-            s = sigma[r, c] / (d * d) if perspective else sigma[r, c]
+            weight = (d * d if perspective else 1.0) / sigma[r, c]
             mark[i] = 0
             table[i, 0], table[i, 1], table[i, 2] = x[r, c], y[r, c], 1.0 / d if perspective else d
-            table[i, 3], table[i, 7] = 1.0 / (s * s), d
+            table[i, 3], table[i, 7] = weight * weight, d
             if np.isfinite(rms[r, c]):
                 # The length of the normal says whether it counts: noisy ones do not hold a plane back.
                 size = 1.0 if rms[r, c] < STEADY_RMS else LOOSE_NORMAL
                 for k in range(3):
                     table[i, 4 + k] = size * normal[r, c, k]
-    return table, mark, across
+    return table, mark, place
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
@@ -258,52 +292,107 @@ def _tangent(block, perspective, m):  # type: ignore[no-untyped-def]  # numba ty
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _grown(table, mark, across, seed, stamp, sweep, m, th, perspective, cos_limit, queue, S):  # type: ignore[no-untyped-def]  # numba types it
-    """Blocks connected to `seed` that the plane g = m . (x, y, 1) explains, into `queue`; returns how many.
+def _add_block(block, S):  # type: ignore[no-untyped-def]  # numba types it
+    """One more row of the table into the sums that `solve3` reads."""
+    x, y, g, weight = block[0], block[1], block[2], block[3]
+    wx, wy = weight * x, weight * y
+    S[0] += weight
+    S[1] += wx
+    S[2] += wy
+    S[3] += wx * x
+    S[4] += wx * y
+    S[5] += wy * y
+    S[6] += weight * g
+    S[7] += wx * g
+    S[8] += wy * g
 
-    `S` receives their sums as `solve3` reads them. In the first sweep the plane follows the blocks as they come.
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _fits(block, a, b, c, th, limit, cos_limit):  # type: ignore[no-untyped-def]  # numba types it
+    """Whether the plane g = a x + b y + c, `th`, explains a row of the table, and its normal does not speak against it."""
+    e = block[2] - a * block[0] - b * block[1] - c
+    nx, ny, nz = block[4], block[5], block[6]
+    turn = th[0] * nx + th[1] * ny + th[2] * nz
+    return e * e * block[3] <= limit and (turn >= cos_limit or nx * nx + ny * ny + nz * nz <= 0.5)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _grown(table, mark, across, seed, stamp, m, th, perspective, cos_limit, queue, S):  # type: ignore[no-untyped-def]  # numba types it
+    """Blocks connected to `seed` that the plane explains, nearest first, into `queue`; returns how many.
+
+    The plane g = m . (x, y, 1) follows the blocks as they come: they must come from all sides.
+    `S` receives their sums as `solve3` reads them.
     """
     S[:] = 0.0
     queue[0] = seed
     mark[seed] = stamp
     count, head, refit_at = 1, 0, 8
     a, b, c = m[0], m[1], m[2]
-    limit = GROW_SIGMAS * GROW_SIGMAS
     while head < count:
         i = queue[head]
         head += 1
-        x, y, g, weight = table[i, 0], table[i, 1], table[i, 2], table[i, 3]
-        wx, wy = weight * x, weight * y
-        S[0] += weight
-        S[1] += wx
-        S[2] += wy
-        S[3] += wx * x
-        S[4] += wx * y
-        S[5] += wy * y
-        S[6] += weight * g
-        S[7] += wx * g
-        S[8] += wy * g
-        if sweep == 0:
-            if head == refit_at:
-                refit_at *= 2
-                if solve3(S, m):
-                    plane_from_coefficients(m, perspective, th)
-                    a, b, c = m[0], m[1], m[2]
-            limit = (GROW_SIGMAS + 2.0 / np.sqrt(head)) ** 2
+        _add_block(table[i], S)
+        if head == refit_at:
+            refit_at *= 2
+            if solve3(S, m):
+                plane_from_coefficients(m, perspective, th)
+                a, b, c = m[0], m[1], m[2]
+        limit = (GROW_SIGMAS + 2.0 / np.sqrt(head)) ** 2
         for side in range(4):
             j = i + (across if side == 0 else -across if side == 1 else 1 if side == 2 else -1)
-            if mark[j] >= stamp:
-                continue
-            e = table[j, 2] - a * table[j, 0] - b * table[j, 1] - c
-            if not e * e * table[j, 3] <= limit:
-                continue
-            nx, ny, nz = table[j, 4], table[j, 5], table[j, 6]
-            turn = th[0] * nx + th[1] * ny + th[2] * nz
-            if turn < cos_limit and nx * nx + ny * ny + nz * nz > 0.5:
-                continue
-            mark[j] = stamp
-            queue[count] = j
-            count += 1
+            if mark[j] < stamp and _fits(table[j], a, b, c, th, limit, cos_limit):
+                mark[j] = stamp
+                queue[count] = j
+                count += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _filled(table, mark, across, seed, stamp, m, th, cos_limit, queue, spans, S):  # type: ignore[no-untyped-def]  # numba types it
+    """All blocks connected to `seed` that the plane g = m . (x, y, 1) explains, a span of a row at a time.
+
+    As `_grown`, with the plane held. Blocks that it does not explain are marked `stamp` - 1, so that none is asked twice.
+    """
+    S[:] = 0.0
+    mark[seed] = stamp
+    count = _span(table, mark, seed, stamp, m, th, cos_limit, queue, 0, spans[0], S)
+    found, head = 1, 0
+    while head < found:
+        left, right = spans[head]
+        head += 1
+        for step in (-across, across):
+            j, end = left + step, right + step
+            while j < end:
+                if mark[j] < stamp - 1:
+                    if _fits(table[j], m[0], m[1], m[2], th, GROW_SIGMAS * GROW_SIGMAS, cos_limit):
+                        mark[j] = stamp
+                        count = _span(table, mark, j, stamp, m, th, cos_limit, queue, count, spans[found], S)
+                        j = spans[found, 1]
+                        found += 1
+                    else:
+                        mark[j] = stamp - 1
+                j += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _span(table, mark, at, stamp, m, th, cos_limit, queue, count, span, S):  # type: ignore[no-untyped-def]  # numba types it
+    """The blocks of one row that join the one at `at` on both sides, into `queue`, their ends [first, last) into `span`."""
+    a, b, c, limit = m[0], m[1], m[2], GROW_SIGMAS * GROW_SIGMAS
+    for step in (-1, 1):
+        j = at + step
+        while mark[j] < stamp - 1:
+            fits = _fits(table[j], a, b, c, th, limit, cos_limit)
+            mark[j] = stamp if fits else stamp - 1
+            if not fits:
+                break
+            j += step
+        span[0 if step < 0 else 1] = j
+    span[0] += 1
+    for i in range(span[0], span[1]):
+        queue[count] = i
+        count += 1
+        _add_block(table[i], S)
     return count
 
 

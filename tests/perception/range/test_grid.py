@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import label
 
+from perception.range import grow
 from perception.range.blocks import BLOCK_SAMPLES, JUMP_SLOPE
 from perception.range.grid import build_grid, seen_from
 from perception.range.grow import LONE_BEND, seed_order
@@ -114,3 +116,30 @@ def test_seeds_come_flattest_first_and_in_raster_order_where_equally_flat():
     expected = seeds[np.argsort(level.ravel()[seeds].astype(int), kind="stable")]
     assert expected.size > 100
     np.testing.assert_array_equal(seed_order(grid.normal, grid.rms, free, reach), expected)
+
+
+def test_a_span_fill_finds_the_blocks_that_growth_by_neighbours_finds():
+    """With the plane held, both ways of growing are the component of explained blocks around the seed."""
+    grid = build_grid(depth_with_a_jump_and_holes(), SENSORS[1], NOISE, 1)
+    h, w = grid.z.shape
+    free = np.isfinite(grid.z)
+    table, mark, place = grow._padded(
+        grid.x, grid.y, grid.z, grid.sigma, grid.normal, grid.rms, free, grid.perspective
+    )  # fmt: skip
+    rows = table[place].reshape(h, w, 8)
+    a, b, c = np.linalg.lstsq(np.stack([*rows[:, :30, :2][free[:, :30]].T, np.ones(free[:, :30].sum())], 1),
+                              rows[:, :30, 2][free[:, :30]], rcond=None)[0]  # fmt: skip
+    e = (rows[..., 2] - a * rows[..., 0] - b * rows[..., 1] - c) * np.sqrt(rows[..., 3])
+    th, m, cos_limit = np.zeros(16), np.array([a, b, c]), 0.9
+    grow.plane_from_coefficients(m, grid.perspective, th)
+    length = np.linalg.norm(rows[..., 4:7], axis=-1)
+    explained = free & (np.abs(e) <= grow.GROW_SIGMAS) & ((rows[..., 4:7] @ th[:3] >= cos_limit) | (length**2 <= 0.5))
+    parts, _ = label(explained)
+    seed = int(np.flatnonzero(parts.ravel() == np.argmax(np.bincount(parts[explained])))[0])
+    queue, spans, S = np.empty(h * w, np.int32), np.empty((h * w, 2), np.int32), np.zeros(9)
+    count = grow._filled(table, mark, w + 2, place[seed], 2, m, th, cos_limit, queue, spans, S)
+    expected = np.flatnonzero(parts.ravel() == parts.ravel()[seed])
+    assert count > 200
+    np.testing.assert_array_equal(np.sort(queue[:count]), np.sort(place[expected]))
+    x, _, g, weight = rows.reshape(-1, 8)[expected, :4].T
+    np.testing.assert_allclose(S[[0, 1, 6]], [weight.sum(), weight @ x, weight @ g], rtol=1e-9)

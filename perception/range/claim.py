@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from perception.range.beside import column_range, new_columns
+from perception.range.beside import WORD, column_range, flagged, new_columns
 from perception.range.grid import sigma_at
 from perception.range.rays import LOOSE
 from perception.range.surfaces import LEAN, PLANE, depth_on, normal_on
@@ -200,23 +200,35 @@ def misfit(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-de
 def fill_small_gaps(label, depth, sweeps):  # type: ignore[no-untyped-def]  # numba types it
     """Give each unlabelled valid pixel the label that at least 5 of its 8 neighbours agree on; `sweeps` times."""
     H, W = label.shape
+    words, columns = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
     for _ in range(sweeps):
         before = label.copy()
         for v in range(1, H - 1):
-            for u in range(1, W - 1):
-                if before[v, u] or not np.isfinite(depth[v, u]):
-                    continue
-                for i in range(9):
-                    k = before[v - 1 + i // 3, u - 1 + i % 3]
-                    if k == 0:
-                        continue
-                    n = 0
-                    for j in range(9):
-                        if before[v - 1 + j // 3, u - 1 + j % 3] == k:
-                            n += 1
-                    if n >= 5:
-                        label[v, u] = k
-                        break
+            _flag_gaps(before[v], depth[v], words.view(np.bool_))
+            for k in range(flagged(words, columns)):
+                if 0 < columns[k] < W - 1:
+                    label[v, columns[k]] = _agreed(before, v, columns[k])
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _flag_gaps(label, depth, flags):  # type: ignore[no-untyped-def]  # numba types it
+    for u in range(label.shape[0]):
+        flags[u] = (label[u] == 0) & (abs(depth[u]) < np.inf)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _agreed(label, v, u):  # type: ignore[no-untyped-def]  # numba types it
+    """The label that at least 5 of 8 neighbours bear, 0 without one."""
+    for i in range(4):  # five of eight miss no four of them
+        k = label[v - 1 + i // 3, u - 1 + i % 3]
+        if k == 0:
+            continue
+        n = 0
+        for j in range(9):
+            n += label[v - 1 + j // 3, u - 1 + j % 3] == k
+        if n >= 5:
+            return k
+    return 0
 
 
 @njit(cache=True)

@@ -8,12 +8,14 @@ Each grows with depth as `a + b z^2`, the law of triangulating sensors; laser sc
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from perception.range.sensor import RangeSensorModel
+from perception.range.surfaces import LEAN
 
 Array = NDArray[np.float64]
 
@@ -152,12 +154,19 @@ def _window_law(g: Array, perspective: bool, *, spacing_px: int, stride_px: int)
         return 0.0, 0.0
     rms *= WINDOW / np.sqrt(freedom)
     order = np.argsort(z)
-    bins = np.array_split(order, min(DEPTH_BINS, max(1, z.size // 24)))
+    z, rms = z[order], rms[order]
+    bins = min(DEPTH_BINS, max(1, z.size // 24))
+    ends = np.arange(bins + 1) * z.size // bins
     # rms^2 freedom / sigma^2 is chi-square: Wilson and Hilferty's quantile removes the bias of looking low.
     expected = (1.0 - 2.0 / (9.0 * freedom) + NORMAL_QUANTILE * np.sqrt(2.0 / (9.0 * freedom))) ** 1.5
-    low = np.array([np.partition(rms[b], int(QUANTILE * b.size))[int(QUANTILE * b.size)] for b in bins]) / expected
-    at = np.array([z[b].mean() for b in bins])
+    low = np.array([_low_quantile(rms[a:b]) for a, b in pairwise(ends.tolist())]) / expected
+    at = np.add.reduceat(z, ends[:-1]) / np.diff(ends)
     return _fit_law(at**2, low)
+
+
+def _low_quantile(values: Array) -> float:
+    k = int(QUANTILE * values.size)
+    return float(np.partition(values, k)[k])
 
 
 def _fit_law(z2: Array, values: Array) -> tuple[float, float]:
@@ -216,27 +225,46 @@ def window_rms(g, basis, spacing, stride, perspective):  # type: ignore[no-untyp
     extent = (side - 1) * spacing + 1
     count = ((H - extent) // stride + 1) * ((W - extent) // stride + 1)
     z_out, rms_out = np.empty(count), np.empty(count)
-    window = np.empty(side * side)
+    across = max((W - extent) // stride + 1, 0)
+    values, total, dot = np.empty((side * side, across)), np.empty(across), np.empty(across)
     n = 0
     for top in range(0, H - extent + 1, stride):
-        for left in range(0, W - extent + 1, stride):
-            middle = g[top + extent // 2, left + extent // 2]
-            total = 0.0
-            for i in range(side):
-                for j in range(side):
-                    value = g[top + i * spacing, left + j * spacing] - middle
-                    window[i * side + j] = value
-                    total += value * value
-            if not np.isfinite(total):
+        # All windows of a row at once: loops over them hold no branch.
+        middle = g[top + extent // 2, extent // 2 :: stride]
+        total[:] = 0.0
+        for k in range(side * side):
+            _load_sample(g[top + k // side * spacing, k % side * spacing :: stride], middle, values[k], total)
+        for m in range(basis.shape[0]):
+            dot[:] = 0.0
+            for k in range(side * side):
+                _add_multiple(basis[m, k], values[k], dot)
+            _subtract_square(dot, total)
+        for c in range(across):
+            if not np.isfinite(total[c]):
                 continue
-            for m in range(basis.shape[0]):
-                dot = 0.0
-                for k in range(side * side):
-                    dot += basis[m, k] * window[k]
-                total -= dot * dot
-            rms = np.sqrt(max(total, 0.0)) / side
-            z = 1.0 / middle if perspective else middle
+            rms = np.sqrt(max(total[c], 0.0)) / side
+            z = 1.0 / middle[c] if perspective else middle[c]
             z_out[n] = z
             rms_out[n] = rms * z * z if perspective else rms  # dz = z^2 dw
             n += 1
     return z_out[:n], rms_out[:n]
+
+
+@njit(cache=True, **LEAN)
+def _load_sample(samples, middle, values, total):  # type: ignore[no-untyped-def]  # numba types it
+    for c in range(values.shape[0]):
+        value = samples[c] - middle[c]
+        values[c] = value
+        total[c] += value * value
+
+
+@njit(cache=True, **LEAN)
+def _add_multiple(factor, values, out):  # type: ignore[no-untyped-def]  # numba types it
+    for c in range(out.shape[0]):
+        out[c] += factor * values[c]
+
+
+@njit(cache=True, **LEAN)
+def _subtract_square(values, out):  # type: ignore[no-untyped-def]  # numba types it
+    for c in range(out.shape[0]):
+        out[c] -= values[c] * values[c]

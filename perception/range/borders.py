@@ -9,9 +9,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from perception.range.beside import WORD, flagged
 from perception.range.claim import bucket
 from perception.range.grid import sigma_at
-from perception.range.surfaces import depth_on, normal_on
+from perception.range.surfaces import LEAN, depth_on, normal_on
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -75,6 +76,7 @@ def _contacts(labels, gap):  # type: ignore[no-untyped-def]  # numba types it
     above, above_at = np.zeros(W, np.int32), np.zeros(W, np.int32)
     # Pairs of one smaller label are a linked list: no label has many neighbours.
     newest, pairs, older = np.zeros(labels.max() + 1, np.int32), np.empty((64, 2), np.int32), np.empty(65, np.int32)
+    words, columns = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
     n, count = 0, 0
     for v in range(H):
         if n + 2 * W > ids.shape[0]:
@@ -83,19 +85,19 @@ def _contacts(labels, gap):  # type: ignore[no-untyped-def]  # numba types it
                 np.concatenate((us, np.empty_like(us))),
                 np.concatenate((vs, np.empty_like(vs))),
             )
-        left, left_at = 0, -1
-        for u in range(W):
-            label = labels[v, u]
-            if label == 0:
-                continue
-            if left == label and above[u] == label:
-                left_at, above_at[u] = u, v  # the inside of a region: nearly every pixel
-                continue
+        row = labels[v]
+        _flag_ends(row, above, words.view(np.bool_))
+        for at in range(flagged(words, columns)):
+            u = columns[at]
+            label, left_at = row[u], u - 1
+            while left_at >= 0 and row[left_at] == 0 and u - left_at <= gap:
+                left_at -= 1
             for side in range(2):
-                other, at = (left, u - left_at) if side == 0 else (above[u], v - above_at[u])
-                if other == label:
-                    continue
-                if other == 0 or at > gap + 1:
+                if side == 0:
+                    other, reach = row[left_at] if left_at >= 0 else 0, u - left_at
+                else:
+                    other, reach = above[u], v - above_at[u]
+                if other == label or other == 0 or reach > gap + 1:  # noqa: PLR1714 - numba knows no `in` of mixed integers
                     continue
                 a, b = min(other, label), max(other, label)
                 k = newest[a]
@@ -112,9 +114,26 @@ def _contacts(labels, gap):  # type: ignore[no-untyped-def]  # numba types it
                 us[n] = 0.5 * (left_at + u) if side == 0 else u
                 vs[n] = v if side == 0 else 0.5 * (above_at[u] + v)
                 n += 1
-            left, left_at = label, u
-            above[u], above_at[u] = label, v
+        _pass_row(row, v, above, above_at)
     return ids[:n].copy(), us[:n].copy(), vs[:n].copy(), pairs[:count].copy()
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _flag_ends(row, above, flags):  # type: ignore[no-untyped-def]  # numba types it
+    """Where a label is not that of the pixel to its left and of the last one above: nowhere inside of a region."""
+    flags[0] = row[0] > 0
+    for u in range(1, row.shape[0]):
+        flags[u] = (row[u] > 0) & ((row[u] != row[u - 1]) | (row[u] != above[u]))
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _pass_row(row, v, above, above_at):  # type: ignore[no-untyped-def]  # numba types it
+    """Row v becomes the last one above, where it bears labels."""
+    now = np.int32(v)
+    for u in range(row.shape[0]):
+        above_at[u] = now if row[u] > 0 else above_at[u]
+    for u in range(row.shape[0]):
+        above[u] = row[u] if row[u] > 0 else above[u]
 
 
 @njit(cache=True)

@@ -19,41 +19,28 @@ ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "driver-package"
 
 
-def run_pytest(folder: Path, *paths: Path) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *map(str, paths), str(ROOT)])}
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "-c",
-        os.devnull,
-        "--rootdir",
-        str(folder),
-    ]
-    return subprocess.run(
-        [*command, str(folder / "tests")], check=False, env=environment, capture_output=True, text=True, timeout=120
-    )
+TEMPLATES = {
+    DeviceKind.PROXIMITY: "serial",
+    DeviceKind.FORCE_TORQUE: "tcp",
+    DeviceKind.TOUCH: "serial",
+    DeviceKind.RANGE_SCANNER: "serial",
+    DeviceKind.LIGHTS: "tcp",
+}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "transport"),
-    [
-        (DeviceKind.PROXIMITY, "serial"),
-        (DeviceKind.FORCE_TORQUE, "tcp"),
-        (DeviceKind.TOUCH, "serial"),
-        (DeviceKind.RANGE_SCANNER, "serial"),
-        (DeviceKind.LIGHTS, "tcp"),
-    ],
-)
-def test_a_new_driver_is_clean_and_passes_the_kit(kind: DeviceKind, transport: str, tmp_path: Path) -> None:
-    runner = CliRunner()
-    arguments = ["new-driver", f"{kind}:acme_one", "--transport", transport, "--folder", str(tmp_path)]
-    told = runner.invoke(_app(), arguments)
-    assert told.exit_code == 0, told.output
+def run_pytest(*folders: Path, beside: tuple[Path, ...] = ()) -> subprocess.CompletedProcess[str]:
+    """The tests of packages that are not installed, in one process: its start costs more than they do.
+
+    Args:
+        beside: more folders to import from.
+    """
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*map(str, (*folders, *beside)), str(ROOT)])}
+    options = ["-v", "-p", "no:cacheprovider", "-c", os.devnull, "--rootdir", str(folders[0].parent)]
+    command = [sys.executable, "-m", "pytest", *options, *(str(folder / "tests") for folder in folders)]
+    return subprocess.run(command, check=False, env=environment, capture_output=True, text=True, timeout=120)
+
+
+def run_ruff(folder: Path) -> subprocess.CompletedProcess[str]:
     ruff = [
         str(Path(sys.executable).with_name("ruff")),
         "check",
@@ -61,15 +48,27 @@ def test_a_new_driver_is_clean_and_passes_the_kit(kind: DeviceKind, transport: s
         "--config",
         str(ROOT / "pyproject.toml"),
     ]
-    checked = subprocess.run(
-        [*ruff, "--ignore", "I001,S101", str(tmp_path)], capture_output=True, text=True, check=False
-    )
+    command = [*ruff, "--ignore", "I001,S101", str(folder)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.slow
+def test_new_drivers_of_all_kinds_are_clean_and_pass_the_kit(tmp_path: Path) -> None:
+    runner, folders = CliRunner(), []
+    for kind, transport in TEMPLATES.items():
+        folders.append(tmp_path / kind)
+        arguments = ["new-driver", f"{kind}:acme_{kind}", "--transport", transport, "--folder", str(folders[-1])]
+        told = runner.invoke(_app(), arguments)
+        assert told.exit_code == 0, told.output
+        written = {path.relative_to(folders[-1]): path.read_text() for path in folders[-1].rglob("*.*")}
+        assert {"README.md", "pyproject.toml"} <= {str(path) for path in written}
+        assert max(len(text.splitlines()) for text in written.values()) <= 120
+    checked = run_ruff(tmp_path)
     assert checked.returncode == 0, checked.stdout
-    done = run_pytest(tmp_path)
+    done = run_pytest(*folders)
     assert done.returncode == 0, done.stdout[-3000:]
-    written = {path.relative_to(tmp_path): path.read_text() for path in tmp_path.rglob("*.*") if path.is_file()}
-    assert {"README.md", "pyproject.toml"} <= {str(path) for path in written}
-    assert max(len(text.splitlines()) for text in written.values()) <= 120
+    for kind in TEMPLATES:
+        assert f"test_acme_{kind}.py" in done.stdout
 
 
 def test_in_this_tree_a_driver_has_its_places_and_is_registered(tmp_path: Path) -> None:
@@ -136,5 +135,5 @@ def test_the_example_package_registers_from_outside_and_passes_the_kit(tmp_path:
         for line in (f"[{group}]", *(f"{name} = {target}" for name, target in points.items()))
     ]
     (info / "entry_points.txt").write_text("\n".join(lines))
-    done = run_pytest(EXAMPLE, tmp_path)
+    done = run_pytest(EXAMPLE, beside=(tmp_path,))
     assert done.returncode == 0, done.stdout[-3000:]

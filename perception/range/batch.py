@@ -82,7 +82,7 @@ def batch_range(
         scheduler: "local" starts `workers` processes here; "tcp://host:port" uses a running dask scheduler, whose
             workers must see the folder under the same path.
         reading: what the files do not say, as for `load_recording`.
-        progress: called with images done and images in all: at the start and after each task.
+        progress: called with images done and images in all: after each task, and first with what an earlier run has done.
         kept: gives the results of an earlier run that still hold, and gets those of each task as it ends.
 
     Returns:
@@ -94,7 +94,7 @@ def batch_range(
     """
     recordings = recordings_in(folder)
     results = {} if kept is None else kept.of(recordings)
-    if progress:
+    if progress and results:
         progress(len(results), len(recordings))
     missing = [path for path in recordings if path.name not in results]
     if missing:

@@ -109,6 +109,7 @@ def test_a_lost_worker_costs_nothing_but_time(tmp_path):
         with pytest.raises(ProcessLookupError):
             os.kill(pids[0], 0)
     assert result == plain
+    assert seen[0][0] > 0, "the worker died after a task, not before the first"
     assert seen[-1] == (80, 80)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from fusion.batch import Batch
-from fusion.rows import rows
+from fusion.rows import NEAR, rows
 from fusion.vectors import Vec, across, cholesky, compiled, cross, inlined, turned, vec
 from hal.geometry import Array
 
@@ -102,7 +102,7 @@ def lift(b: Batch, R: Array, t: Array, about: Array, middle: Array, size: float,
     r, J, V, Z = np.empty(6), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, SIZE))
     centre, origin = (about[0], about[1], about[2]), (middle[0], middle[1], middle[2])
     for i in range(b.cls.size):
-        count = rows(b, i, R, t, False, r, J, V)
+        count = rows(b, i, R, t, NEAR, r, J, V)
         if b.cls[i] == 0:
             _prior_rows(b, centre, origin, size, Z)
         else:

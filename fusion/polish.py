@@ -10,9 +10,12 @@ import numpy as np
 
 from fusion.batch import Batch
 from fusion.exact import evaluate
-from fusion.rows import accumulate, descend, rows
-from fusion.vectors import cholesky, compiled, move, solve_lower, solve_upper
+from fusion.rows import FAR, NEAR, accumulate, descend, rows
+from fusion.vectors import cholesky, compiled, move, plain, solve_lower, solve_upper
 from hal.geometry import Array
+
+COARSE_STEPS, FINE_STEPS = plain(30), plain(20)
+ANYWHERE = plain(True)
 
 
 @compiled
@@ -31,14 +34,14 @@ def polish(  # noqa: PLR0912 - one flat loop, for the compiler
     fall = np.inf
     for k in range(steps):
         evaluate(b, R, t, k == 0, f, grad, direction)
-        accumulate(b, prior * use, R, t, False, H, g, work)
+        accumulate(b, prior * use, R, t, NEAR, H, g, work)
         for j in range(6):
             step[j] = -g[j]
         for i in range(n):
             if use[i] > 0.0:
                 for j in range(6):
                     step[j] -= 0.5 * grad[i, j]
-        accumulate(b, use, R, t, False, H, g, work)
+        accumulate(b, use, R, t, NEAR, H, g, work)
         size = 0.0
         for j in range(6):
             size = max(size, H[j, j])
@@ -57,12 +60,12 @@ def polish(  # noqa: PLR0912 - one flat loop, for the compiler
         if step[3] ** 2 + step[4] ** 2 + step[5] ** 2 > 1.0:
             break
         move(R, t, step)
-    evaluate(b, R, t, True, f, grad, direction)
-    accumulate(b, use, R, t, False, H, g, work)
+    evaluate(b, R, t, ANYWHERE, f, grad, direction)
+    accumulate(b, use, R, t, NEAR, H, g, work)
     for i in range(n):
         if b.cls[i] == 0:
             r = work[0]
-            rows(b, i, R, t, False, r, work[1:7], work[7:13])
+            rows(b, i, R, t, NEAR, r, work[1:7], work[7:13])
             f[i] = 0.0
             for j in range(6):
                 f[i] += r[j] ** 2
@@ -78,6 +81,6 @@ def solve_from(
 ) -> float:
     """Local solve from R, t (moved in place): coarse and fine Levenberg-Marquardt, then `polish`."""
     if far:
-        descend(b, use, R, t, True, 30, 1e-2)
-    descend(b, use, R, t, False, 20, 1e-9)
+        descend(b, use, R, t, FAR, COARSE_STEPS, 1e-2)
+    descend(b, use, R, t, NEAR, FINE_STEPS, 1e-9)
     return polish(b, use, R, t, 4, H, f, grad, direction)

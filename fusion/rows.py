@@ -26,6 +26,7 @@ from fusion.vectors import (
     form,
     inlined,
     move,
+    plain,
     rotation_vector,
     solve_lower,
     solve_upper,
@@ -36,6 +37,7 @@ from fusion.vectors import (
 from hal.geometry import Array
 
 HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
+NEAR, FAR = plain(False), plain(True)  # what `far` says: first steps from anywhere, or the last ones at the solution
 FLOOR = 1e-6  # share of the direction variance that is kept where u^T S u vanishes far from the solution
 
 
@@ -70,7 +72,7 @@ def _variance(p: float) -> float:
     return 1.0 / p if p > 1e-12 else 1e12
 
 
-@inlined
+@compiled
 def rows(b: Batch, i: int, R: Array, t: Array, far: bool, r: Array, J: Array, V: Array) -> int:
     """Fill residuals r (6,), Jacobian J (6, 6) and their covariance V (6, 6) of entry i; returns the number of rows.
 
@@ -163,7 +165,7 @@ def _prior_rows(b: Batch, R: Array, t: Array, r: Array, J: Array, V: Array) -> i
     return 6
 
 
-@inlined
+@compiled
 def whitened(b: Batch, i: int, R: Array, t: Array, far: bool, r: Array, J: Array, V: Array) -> int:
     """As `rows`, with r and J divided by the root of the covariance: f = |r|^2."""
     k = rows(b, i, R, t, far, r, J, V)
@@ -204,7 +206,7 @@ def log_volumes(b: Batch, R: Array, t: Array, out: Array) -> None:
     r, J, V = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     for i in range(b.cls.size):
         out[i] = 0.0
-        k = rows(b, i, R, t, False, r, J, V)
+        k = rows(b, i, R, t, NEAR, r, J, V)
         if b.cls[i] != 0 and cholesky(V, k):
             for j in range(k):
                 out[i] += min(0.0, math.log(V[j, j]) + HALF_LOG_2PI)
@@ -216,7 +218,7 @@ def whitened_all(b: Batch, R: Array, t: Array, r: Array, J: Array) -> None:
     own_r, own_j, V = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     r[:], J[:] = 0.0, 0.0
     for i in range(b.cls.size):
-        n = whitened(b, i, R, t, False, own_r, own_j, V)
+        n = whitened(b, i, R, t, NEAR, own_r, own_j, V)
         for k in range(n):
             r[i, k] = own_r[k]
             for c in range(6):
@@ -228,7 +230,7 @@ def informations(b: Batch, R: Array, t: Array, out: Array) -> None:
     """out (N, 6, 6) = J^T J of each entry alone."""
     r, J, V = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     for i in range(b.cls.size):
-        n = whitened(b, i, R, t, False, r, J, V)
+        n = whitened(b, i, R, t, NEAR, r, J, V)
         for p in range(6):
             for c in range(6):
                 s = 0.0
@@ -237,7 +239,7 @@ def informations(b: Batch, R: Array, t: Array, out: Array) -> None:
                 out[i, p, c] = s
 
 
-@inlined
+@compiled
 def accumulate(b: Batch, use: Array, R: Array, t: Array, far: bool, H: Array, g: Array, work: Array) -> float:
     """H (6, 6) lower = sum J^T J, g (6,) = sum J^T r over entries with use > 0; returns sum |r|^2.
 
@@ -262,7 +264,7 @@ def accumulate(b: Batch, use: Array, R: Array, t: Array, far: bool, H: Array, g:
     return cost
 
 
-@inlined
+@compiled
 def cost_of(b: Batch, use: Array, R: Array, t: Array, far: bool, work: Array) -> float:
     """sum |r|^2 over entries with use > 0."""
     r, J, V = work[0], work[1:7], work[7:13]

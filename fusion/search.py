@@ -12,15 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.batch import Batch
-from fusion.rows import cost_of, descend, rows, values
-from fusion.vectors import cholesky, compiled, inlined, solve_lower, solve_upper, turned, vec
+from fusion.rows import FAR, NEAR, cost_of, descend, rows, values
+from fusion.vectors import cholesky, compiled, inlined, plain, solve_lower, solve_upper, turned, vec
 from hal.geometry import Array
 
 SUBSET_DOF = 7  # six unknowns and one to check them by; 8 finds clean subsets a third less often
 SUBSET_MOST = 8  # measurements in a subset
 ROTATIONS = 3
 DRAWS = SUBSET_MOST + 4 * ROTATIONS  # random numbers a hypothesis uses: picks and quaternions
-STEPS = 12
+STEPS, ANNEAL_STEPS = plain(12), plain(4)
+ANNEALED, AS_IT_IS = plain(True), plain(False)
 FIT_LIMIT = 60.0  # a subset that its own pose explains no better than this is not clean
 LEAST_GAIN = 1e-6  # of truncated error, below which two are equal
 ANNEAL = (8.0, 4.0, 2.0, 1.0)
@@ -35,7 +36,7 @@ def _rotation(R: Array, x: float, y: float, z: float, w: float) -> None:
     R[2, 0], R[2, 1], R[2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
 
 
-@inlined
+@compiled
 def place(b: Batch, use: Array, R: Array, t: Array) -> None:  # noqa: PLR0912 - one flat loop, for the compiler
     """t (3,) in place: the translation that fits the used entries best at rotation R, every row weighing the same.
 
@@ -65,7 +66,7 @@ def place(b: Batch, use: Array, R: Array, t: Array) -> None:  # noqa: PLR0912 - 
     for i in range(b.cls.size):
         if use[i] <= 0.0 or b.cls[i] == 0:
             continue
-        for k in range(rows(b, i, R, t, True, r, J, V)):
+        for k in range(rows(b, i, R, t, FAR, r, J, V)):
             for p in range(3):
                 x[p] -= J[k, p] * r[k]
                 for c in range(p + 1):
@@ -111,7 +112,7 @@ def _start(b: Batch, draws: Array, h: int, use: Array, R: Array, t: Array, work:
         c = SUBSET_MOST + 4 * k
         _rotation(R1, draws[h, c], draws[h, c + 1], draws[h, c + 2], draws[h, c + 3])
         place(b, use, R1, t1)
-        cost = cost_of(b, use, R1, t1, True, work)
+        cost = cost_of(b, use, R1, t1, FAR, work)
         if cost < least:
             least = cost
             R[:], t[:] = R1, t1
@@ -130,8 +131,8 @@ def hypotheses(b: Batch, draws: Array, Rs: Array, ts: Array, costs: Array) -> No
         else:
             _start(b, draws, h, use, R, t, work)
         costs[h] = np.inf
-        if descend(b, use, R, t, True, STEPS, 1e-2) < FIT_LIMIT:
-            values(b, R, t, False, f)
+        if descend(b, use, R, t, FAR, STEPS, 1e-2) < FIT_LIMIT:
+            values(b, R, t, NEAR, f)
             costs[h] = truncated(b, f)
 
 
@@ -161,7 +162,7 @@ def candidates(b: Batch, draws: Array, most: int, Rs: Array, ts: Array, costs: A
     for h in order[:most]:
         if costs[h] < np.inf:
             R[kept], t[kept] = Rs[h], ts[h]
-            cost[kept] = settle(b, R[kept], t[kept], f, True)
+            cost[kept] = settle(b, R[kept], t[kept], f, ANNEALED)
             number[kept] = 0
             for i in range(n):
                 if f[i] < b.gate[i]:
@@ -180,12 +181,12 @@ def settle(b: Batch, R: Array, t: Array, f: Array, annealed: bool) -> float:
     use, before = np.ones(n), np.ones(n)
     if annealed:
         for k in range(4):
-            values(b, R, t, False, f)
+            values(b, R, t, NEAR, f)
             for i in range(n):
                 use[i] = 1.0 if f[i] < ANNEAL[k] * b.gate[i] else 0.0
-            descend(b, use, R, t, False, 4, 1e-3)
+            descend(b, use, R, t, NEAR, ANNEAL_STEPS, 1e-3)
     for _ in range(12):
-        values(b, R, t, False, f)
+        values(b, R, t, NEAR, f)
         same = True
         for i in range(n):
             use[i] = 1.0 if f[i] < b.gate[i] else 0.0
@@ -193,8 +194,8 @@ def settle(b: Batch, R: Array, t: Array, f: Array, annealed: bool) -> float:
             before[i] = use[i]
         if same:
             break
-        descend(b, use, R, t, False, 12, 1e-8)
-    values(b, R, t, False, f)
+        descend(b, use, R, t, NEAR, STEPS, 1e-8)
+    values(b, R, t, NEAR, f)
     return truncated(b, f)
 
 
@@ -211,15 +212,15 @@ def readmit(b: Batch, R: Array, t: Array, cost: float) -> float:
     better = True
     while better:
         better = False
-        values(b, R, t, False, left_out)
+        values(b, R, t, NEAR, left_out)
         for i in range(n):
             if left_out[i] < b.gate[i]:
                 continue
             R1[:], t1[:] = R, t
             for k in range(n):
                 use[k] = 1.0 if left_out[k] < b.gate[k] or k == i else 0.0
-            descend(b, use, R1, t1, False, 12, 1e-6)
-            now = settle(b, R1, t1, f, False)
+            descend(b, use, R1, t1, NEAR, STEPS, 1e-6)
+            now = settle(b, R1, t1, f, AS_IT_IS)
             if now < cost - LEAST_GAIN:
                 R[:], t[:], cost, better = R1, t1, now, True
                 break

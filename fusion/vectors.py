@@ -11,10 +11,13 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba as nb
+import numpy as np
+from numba.extending import register_jitable
 
 from hal.geometry import Array
 
 F = TypeVar("F", bound=Callable[..., Any])
+T = TypeVar("T", bool, int)
 Vec = tuple[float, float, float]
 Sym = tuple[float, float, float, float, float, float]
 
@@ -25,8 +28,13 @@ def compiled(function: F) -> F:
 
 
 def inlined(function: F) -> F:
-    """A small helper that is compiled into its callers."""
-    return cast(F, nb.njit(cache=True, error_model="numpy", inline="never")(function))
+    """A small helper that is compiled into its callers only: called from Python it is Python."""
+    return register_jitable(error_model="numpy", nogil=True)(function)
+
+
+def plain(value: T) -> T:
+    """`value` as numpy's scalar. Numba compiles a `compiled` function once more for every Python constant in a call to it."""
+    return cast(T, np.asarray(value)[()])
 
 
 @inlined

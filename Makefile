@@ -5,7 +5,13 @@ PACKAGES := hal drivers simbackend perception fusion manipulation service benchm
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup demo serve test test-wire test-fast lint format bench-cell bench-missions bench-pose bench-fusion bench-range bench-vision bench-drivers clean
+# One line for every ten packages found, and what went wrong.
+PIP_IN_SHORT = awk ' \
+    /^Collecting/ { n++; if (n % 10 == 0) { print "setup: " n " packages found"; fflush() } } \
+    /^Installing collected/ { print "setup: installing " (n + 0) " packages"; fflush() } \
+    /^ERROR|^error/ { print }'
+
+.PHONY: help setup warm test-packages demo serve test test-wire test-fast lint lint-style lint-types lint-layers format bench-cell bench-missions bench-pose bench-fusion bench-range bench-vision bench-drivers clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 16
@@ -19,14 +25,20 @@ setup: .venv/ready  ## Make .venv with everything in it
 	    echo "  try    make PYTHON=/path/to/python3.11"; exit 2; }
 	@echo "setup: making .venv (about 130 packages, 2 GB, a minute or two)"
 	@$(PYTHON) -m venv .venv
-	@$(BIN)/python -m pip install --progress-bar off -c constraints.txt -e '.[test]' 2>&1 | awk ' \
-	    /^Collecting/ { n++; if (n % 10 == 0) { print "setup: " n " packages found"; fflush() } } \
-	    /^Installing collected/ { print "setup: installing " (n + 0) " packages"; fflush() } \
-	    /^ERROR|^error/ { print }'
+	@$(BIN)/python -m pip install --no-compile --progress-bar off -c constraints.txt -e . 2>&1 | $(PIP_IN_SHORT)
 	@$(BIN)/python -c 'import hal, numpy, cv2, pybullet' || { echo "error: the installation is not complete; the lines above say why"; exit 2; }
-	@$(BIN)/panelwright warm
+	@$(BIN)/python -m compileall -q -j 0 .venv/lib >/dev/null || true  # some packages carry files for other Pythons
+	@$(MAKE) --no-print-directory -j 2 warm test-packages
 	@touch $@
 	@echo "setup: ready"
+
+warm:  # hot loops are compiled while the packages that only tests need arrive
+	@$(BIN)/panelwright warm
+
+test-packages:  # the project itself is left as it is: it runs beside this
+	@$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["test"], sep="\n")' | \
+	    $(BIN)/python -m pip install --progress-bar off -c constraints.txt -r /dev/stdin 2>&1 | $(PIP_IN_SHORT)
+	@$(BIN)/python -c 'import hypothesis, playwright, pytest, schemathesis' || { echo "error: the test packages are not complete; the lines above say why"; exit 2; }
 
 demo: setup  ## Run the whole mission on the simulated cell and leave a report in runs/
 	@$(BIN)/panelwright demo
@@ -34,18 +46,25 @@ demo: setup  ## Run the whole mission on the simulated cell and leave a report i
 serve: setup  ## Start the service on http://127.0.0.1:8460
 	@$(BIN)/panelwright serve
 
-test: setup  ## Run all tests, two files at a time; PYTEST_OPTIONS go to pytest
-	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope --no-loadscope-reorder $(PYTEST_OPTIONS)
+test: setup  ## Run all tests, three files at a time (many wait for real time); PYTEST_OPTIONS go to pytest
+	@$(BIN)/python -m pytest --numprocesses 3 --dist loadscope --no-loadscope-reorder $(PYTEST_OPTIONS)
 
 test-wire: setup  ## Run only the missions over emulated wires
 	@$(BIN)/python -m pytest -m wire
 
 test-fast: setup  ## Run the tests without missions, browsers and scaffolds
-	@$(BIN)/python -m pytest --numprocesses 2 --dist loadscope --no-loadscope-reorder -m 'not slow and not wire'
+	@$(BIN)/python -m pytest --numprocesses 3 --dist loadscope --no-loadscope-reorder -m 'not slow and not wire'
 
-lint: setup  ## Style, types and layering
+lint: setup  ## Style, types and layering, side by side
+	@$(MAKE) --no-print-directory -j 3 --output-sync=target lint-style lint-types lint-layers
+
+lint-style:
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
+
+lint-types:
 	@$(BIN)/mypy
+
+lint-layers:
 	@$(BIN)/lint-imports
 
 format: setup  ## Put the code into shape

@@ -10,6 +10,6 @@ settings.load_profile("repeatable")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with long tests first: two processes that share the files then end together."""
+    """Files with long tests first: processes that share the files then end together."""
     long = {item.path for item in items if item.get_closest_marker("slow") or item.get_closest_marker("wire")}
     items.sort(key=lambda item: item.path not in long)

@@ -7,14 +7,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from fusion.measurement import NULL_RATIO, Measurement, constraints_of
 from hal.errors import InvalidRequest
 from hal.geometry import Array, UncertainPose
 
 GATE_PROBABILITY = 0.999  # a good measurement passes its gate with this probability (notes/fusion.md, "Robust")
-GATES = np.array([np.inf, *chi2.ppf(GATE_PROBABILITY, np.arange(1, 7))])
+GATES = np.array([np.inf, *(2.0 * gammaincinv(0.5 * np.arange(1, 7), GATE_PROBABILITY))])  # quantiles of chi-square
 FAR_M = 100.0  # no panel is this far away: such a number is in millimetres
 WIDE_M = 10.0  # no sensor is this poor
 SHARP_M = 1e-9  # and none this good

@@ -8,7 +8,9 @@ from collections.abc import Callable, Mapping
 def _imports() -> None:
     from importlib import import_module
 
-    import_module("service.operations.mission")  # everything that a mission computes, plans and draws with
+    # Everything that a mission computes, plans and draws with.
+    for name in ("service.operations.mission", "matplotlib.figure", "matplotlib.backends.backend_agg"):
+        import_module(name)
 
 
 def _vision() -> None:

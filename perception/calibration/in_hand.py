@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest
@@ -128,7 +128,7 @@ def calibrate_in_hand(
         state, minimum = _fit(kept, points_m, start, known)
         errors = [_chi_square(view, points_m, state, known) for view in kept]
         worst = int(np.argmax(errors))
-        if chi2.sf(errors[worst], 2 * len(points_m)) > OUTLIER_P or len(used) <= FEWEST_VIEWS:
+        if chdtrc(2 * len(points_m), errors[worst]) > OUTLIER_P or len(used) <= FEWEST_VIEWS:
             break
         del used[worst]
     rest = np.concatenate([_residual(views[k], points_m, state)[0] for k in used])

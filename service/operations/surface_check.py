@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from hal.devices import DeviceKind
 from hal.errors import NotFound, PerceptionError, Unreachable
@@ -129,7 +129,7 @@ def judged(
     off = at_m - thing.position_m
     C = panel_from_object.covariance[:2, :2] + position_m**2 * np.eye(2)
     chi_square = float(off @ np.linalg.solve(C, off))
-    is_elsewhere = bool(chi_square > chi2.ppf(1.0 - ELSEWHERE_P, 2))
+    is_elsewhere = bool(chi_square > chdtri(2, ELSEWHERE_P))
     shows_alike = _shows_alike(sighting, reading)
     off_m, sigma_m = float(np.linalg.norm(off)), float(np.sqrt(0.5 * np.trace(C)))
     seen = None if reading is None or reading.centre_m is None else reading.centre_m[:2]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
@@ -22,6 +21,8 @@ def panel_drawing(
     panel: Panel, camera_from_panel: RigidTransform, intrinsics: CameraIntrinsics, pixels: NDArray[np.uint8]
 ) -> bytes:
     """PNG of the image with plate, objects, lights and the panel's axes drawn where the pose puts them."""
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(8.0, 8.0 * intrinsics.height_px / intrinsics.width_px), dpi=100)
     pane = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     pane.imshow(pixels, cmap="gray", vmin=0, vmax=255, alpha=0.8)

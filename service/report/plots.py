@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
 from hal.motion import MotionReport
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Pixels = NDArray[np.uint8]
 INK, SOFT = "#1c2733", "#5a6b7b"
@@ -28,7 +29,7 @@ def png_of(pixels: Pixels) -> bytes:
 
 def lights_picture(image_off: Pixels, image_on: Pixels, centres_px: NDArray[Any], names: Sequence[str]) -> bytes:
     """On, off, and their difference with the four lights ringed."""
-    figure = Figure(figsize=(10.5, 3.1), dpi=100, layout="constrained")
+    figure = _sheet(3.1)
     panes = figure.subplots(1, 3)
     difference = image_on.astype(int) - image_off.astype(int)
     if difference.ndim == 3:
@@ -52,7 +53,7 @@ def lights_picture(image_off: Pixels, image_on: Pixels, centres_px: NDArray[Any]
 
 def range_picture(depth_m: NDArray[Any], residual_m: NDArray[Any]) -> bytes:
     """The range image and its distance from the fitted plane."""
-    figure = Figure(figsize=(10.5, 4.2), dpi=100, layout="constrained")
+    figure = _sheet(4.2)
     left, right = figure.subplots(1, 2)
     shown = left.imshow(depth_m, cmap="viridis")
     left.set_title("range, m", fontsize=9, color=INK)
@@ -69,7 +70,7 @@ def stations_picture(
     panel_from_camera: Sequence[NDArray[Any]], size_m: tuple[float, float], residuals_px: NDArray[Any]
 ) -> bytes:
     """Where a camera looked from, before the plate (4x4 each, panel frame), and what its pixels miss the fit by."""
-    figure = Figure(figsize=(10.5, 4.6), dpi=100, layout="constrained")
+    figure = _sheet(4.6)
     room = figure.add_subplot(1, 2, 1, projection="3d")
     x, y = size_m[0] / 2, size_m[1] / 2
     plate = np.array([[-x, -y], [x, -y], [x, y], [-x, y], [-x, -y]])
@@ -104,7 +105,7 @@ def stations_picture(
 
 def wrench_picture(motions: Sequence[MotionReport]) -> bytes:
     """Contact force and torque over the whole mission, with the names of the motions that pushed."""
-    figure = Figure(figsize=(10.5, 4.2), dpi=100, layout="constrained")
+    figure = _sheet(4.2)
     force, torque = figure.subplots(2, 1, sharex=True)
     times, wrench = _joined(motions, lambda m: m.log.wrench)
     for k, axis in enumerate("xyz"):
@@ -122,7 +123,7 @@ def wrench_picture(motions: Sequence[MotionReport]) -> bytes:
 
 def joints_picture(motions: Sequence[MotionReport]) -> bytes:
     """Joint angles over the whole mission."""
-    figure = Figure(figsize=(10.5, 3.4), dpi=100, layout="constrained")
+    figure = _sheet(3.4)
     pane = figure.subplots()
     times, joints = _joined(motions, lambda m: m.log.positions_rad)
     for k in range(joints.shape[1]):
@@ -143,6 +144,12 @@ def _joined(motions: Sequence[MotionReport], pick: Any) -> tuple[NDArray[Any], N
     return times[keep], values[keep]
 
 
+def _sheet(height_in: float) -> Figure:
+    from matplotlib.figure import Figure  # half a second that a start need not wait for
+
+    return Figure(figsize=(10.5, height_in), dpi=100, layout="constrained")
+
+
 def _finished(figure: Figure, panes: Sequence[Any]) -> bytes:
     for pane in panes:
         pane.spines[["top", "right"]].set_visible(False)
@@ -153,6 +160,8 @@ def _finished(figure: Figure, panes: Sequence[Any]) -> bytes:
 
 def figure_png(figure: Figure) -> bytes:
     """A finished figure as PNG bytes."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     stream = io.BytesIO()
     FigureCanvasAgg(figure).print_png(stream)  # type: ignore[no-untyped-call]  # matplotlib types it not
     return stream.getvalue()

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from benchmarks import range_matching, range_peers
 from benchmarks.range_sensors import SENSORS, table_top
+from benchmarks.range_soft import SCENES, VIEWS, soft_scene
 from perception.range import Surface, analyse
 from perception.range.primitives import Cone, Cylinder, Ellipsoid, Plane, Sphere
 from perception.range.recordings import load_recording, sensor_from_meta
@@ -255,7 +256,20 @@ def _sensor_lines(gen: ModuleType, score: ModuleType, seeds: int) -> list[Line]:
     return [
         _correct("simulated depth sensors, T 0.8", 0.70, summary),
         _correct("simulated depth sensors, T 0.9", 0.50, summary, "0.9"),
+        *_soft_lines(gen, score, numbers[: max(1, seeds // 10)]),
     ]
+
+
+def _soft_lines(gen: ModuleType, score: ModuleType, numbers: range) -> list[Line]:
+    """Cartons with bulged faces and rounded edges on a table, and a room with a sofa, by every sensor."""
+    out = []
+    for scene in SCENES:
+        summary, _ = _scored(score, [soft_scene(gen, scene, sensor, seed) for sensor in VIEWS for seed in numbers])
+        out += [
+            _correct(f"bulged and rounded, {scene}, T 0.8", 0.70, summary),
+            _correct(f"bulged and rounded, {scene}, T 0.9", 0.50, summary, "0.9"),
+        ]
+    return out
 
 
 def _time_lines(gen: ModuleType) -> list[Line]:

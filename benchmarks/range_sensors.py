@@ -8,6 +8,7 @@ structured light scatters by 0.07 px of disparity over 4 to 6 px, stereo by less
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from types import ModuleType
 from typing import Any
 
@@ -21,16 +22,32 @@ Case = dict[str, Any]
 SHAPE = (480, 640)
 LEAST_PIXELS = 400  # of a scored surface: a person who outlines surfaces by hand draws no smaller ones
 SENSORS = ("structured", "stereo", "tof")
+FINE = "fine"  # a sensor whose errors are far smaller than those of any real face: scanned or rendered depth
 TABLE_HEIGHT_MM = 720.0
 
 
 def table_top(gen: ModuleType, sensor: str, seed: int) -> Case:
     """A case in the scorer's form: boxes, cans and balls on a table, seen by one of `SENSORS` as if at hand's distance."""
     rng = np.random.default_rng([seed, SENSORS.index(sensor), 77])
-    model = _sensor_model(sensor)
     surfaces = _objects(gen, rng)
-    clean, labels = gen.cast(surfaces, model)
-    clean, truth = np.asarray(clean, float), np.where(np.isfinite(clean), labels, 0)
+    clean, labels = gen.cast(surfaces, sensor_model(sensor))
+    clean = np.asarray(clean, float)
+    return case_seen(clean, labels, surfaces, sensor=sensor, rng=rng, scene="table_top", seed=seed)
+
+
+def case_seen(
+    clean: Array,
+    labels: NDArray[Any],
+    surfaces: list[dict[str, Any]],
+    *,
+    sensor: str,
+    rng: np.random.Generator,
+    scene: str,
+    seed: int,
+) -> Case:
+    """A case in the scorer's form of exact depth in millimetres, not finite where nothing is, degraded by a sensor."""
+    model = sensor_model(sensor)
+    truth = np.where(np.isfinite(clean), labels, 0)
     depth = DEGRADE[sensor](clean, model["f"], rng)
     truth = np.where(np.isfinite(depth) | (truth > 0), truth, 0)
     kept: list[dict[str, Any]] = []
@@ -40,16 +57,17 @@ def table_top(gen: ModuleType, sensor: str, seed: int) -> Case:
         if not mine.any():
             continue
         entry = dict(surfaces[k - 1]) | {"id": len(kept) + 1, "pixels": int(mine.sum())}
-        entry["scored"] = entry["pixels"] >= LEAST_PIXELS
+        entry["scored"] = entry["pixels"] >= LEAST_PIXELS and entry["type"] != "other"
         out[mine] = entry["id"]
         kept.append(entry)
-    meta = {"scene": "table_top", "seed": seed, "sensor": model, "unit": "mm", "surfaces": kept}
+    meta = {"scene": scene, "seed": seed, "sensor": model, "unit": "mm", "surfaces": kept}
     meta = json.loads(json.dumps(meta, default=lambda o: o.tolist()))
     return {"depth": depth.astype(np.float32), "clean": clean.astype(np.float32), "labels": out, "meta": meta}
 
 
-def _sensor_model(sensor: str) -> dict[str, Any]:
-    focal = {"structured": 575.0, "stereo": 900.0, "tof": 500.0}[sensor]
+def sensor_model(sensor: str) -> dict[str, Any]:
+    """The pinhole of one of `SENSORS` as the case format writes it."""
+    focal = {"structured": 575.0, "stereo": 900.0, "tof": 500.0, "fine": 500.0}[sensor]
     return {"kind": "pinhole", "shape": list(SHAPE), "f": focal, "cx": 319.5, "cy": 239.5}
 
 
@@ -61,15 +79,20 @@ def _objects(gen: ModuleType, rng: np.random.Generator) -> list[dict[str, Any]]:
     edge = dict(kind="rect", u=np.array([1.0, 0.0, 0.0]), a=rng.uniform(400, 800), b=rng.uniform(300, 600))
     table = dict(type="plane", name="table", n=up, c=np.zeros(3), clip=edge)
     out = [floor, wall, table]
-    cells = [(x, y) for x in (-260, -90, 90, 260) for y in (-140, 60, 240)]
-    rng.shuffle(cells)
-    for k, (x, y) in enumerate(cells[: rng.integers(4, 9)]):
-        at = np.array([x + rng.uniform(-30, 30), y + rng.uniform(-30, 30), 0.0])
+    for k, at in enumerate(stands(rng)):
         out += _thing(gen, rng, at, k)
     tilt, distance = rng.uniform(0.6, 1.1), rng.uniform(800, 1350)
     R, t = gen.look(tilt, rng.uniform(-0.5, 0.5), distance, (0, 40, 30))
     roll = gen.rot([0, 0, 1], rng.uniform(-0.1, 0.1))
     return list(gen.to_camera(out, roll @ R, roll @ t))
+
+
+def stands(rng: np.random.Generator) -> Iterator[Array]:
+    """Four to eight places (3,) on a table at z = 0 where things stand without touching."""
+    cells = [(x, y) for x in (-260, -90, 90, 260) for y in (-140, 60, 240)]
+    rng.shuffle(cells)
+    for x, y in cells[: rng.integers(4, 9)]:
+        yield np.array([x + rng.uniform(-30, 30), y + rng.uniform(-30, 30), 0.0])
 
 
 def _thing(gen: ModuleType, rng: np.random.Generator, at: Array, k: int) -> list[dict[str, Any]]:
@@ -135,6 +158,14 @@ def time_of_flight(clean_mm: Array, focal_px: float, rng: np.random.Generator) -
     return np.asarray(out)
 
 
+def fine(clean_mm: Array, focal_px: float, rng: np.random.Generator) -> Array:
+    """A slow scanner, or a rendering: a third of a millimetre of white noise, whole millimetres."""
+    del focal_px
+    out = np.rint(clean_mm + rng.normal(0.0, 0.3, clean_mm.shape))
+    out[~np.isfinite(clean_mm)] = np.nan
+    return np.asarray(out)
+
+
 def _triangulated(
     clean_mm: Array,
     rng: np.random.Generator,
@@ -196,4 +227,4 @@ def _grazing(z_mm: Array, rng: np.random.Generator) -> NDArray[np.bool_]:
     return np.asarray(steep | (_field(rng, 6.0) > 3.6))
 
 
-DEGRADE = {"structured": structured_light, "stereo": stereo, "tof": time_of_flight}
+DEGRADE = {"structured": structured_light, "stereo": stereo, "tof": time_of_flight, FINE: fine}

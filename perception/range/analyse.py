@@ -13,10 +13,14 @@ from hal.errors import InvalidRequest, NotFound
 from perception.range import bend, finish, join, merge
 from perception.range.claim import fill_small_gaps
 from perception.range.compete import Candidates
+from perception.range.faces import whole_faces
 from perception.range.features import RangeFeature, features_of
+from perception.range.fillets import without_fillets
+from perception.range.grid import Grid
+from perception.range.grooves import cut_at_grooves
 from perception.range.noise import NoiseModel, estimate_noise, typical_depths_m
 from perception.range.primitives import Plane, Surface, SurfaceType
-from perception.range.regions import regions_of, renamed
+from perception.range.regions import Regions, regions_of, renamed
 from perception.range.segment import Task, segment, settled
 from perception.range.sensor import RangeSensorModel
 from perception.range.straight import doubt_about
@@ -95,8 +99,8 @@ def analyse(
     depths = typical_depths_m(depth)
     law = noise or estimate_noise(depth, sensor, depths_m=depths)
     task = Task(depth_m=depth, sensor=sensor, depths_m=depths, tiles=tiles, pool=pool)
-    labels, found, law = segment(task, law)
-    labels, surfaces = _finished(task, law, labels, found)
+    labels, found, law, grid = segment(task, law)
+    labels, surfaces = _finished(task, law, _grouped(task, law, grid, labels, found), found)
     return RangeScene(
         labels=labels,
         surfaces=surfaces,
@@ -158,21 +162,30 @@ def _check_scale(depth: Array, sensor: RangeSensorModel) -> None:
         )
 
 
-def _finished(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) -> tuple[Labels, tuple[Surface, ...]]:
-    depth, sensor = task.depth_m, task.sensor
-    count = len(found.kinds)
-    packed, law = sensor.packed(), noise.packed()
-    regions = regions_of(depth, packed, law, labels, count)
+def _grouped(task: Task, noise: NoiseModel, grid: Grid, labels: Labels, found: Candidates) -> Regions:
+    """Regions after pieces of one surface were joined, faces in pieces made whole, and planes cut at grooves."""
+    packed, law = task.packed, noise.packed()
+    regions = regions_of(task.depth_m, packed, law, labels, len(found.kinds))
     regions = regions.given_to(merge.merge_touching(regions, found.kinds, found.parameters))
-    owner = join.join_pieces(regions, found.kinds, found.parameters)
-    regions = regions.given_to(owner)
+    regions = regions.given_to(join.join_pieces(regions, found.kinds, found.parameters))
+    labels = whole_faces(task, grid, regions.labels, found)
+    labels = cut_at_grooves(task, law, grid, labels, found)
+    if labels is regions.labels:
+        return regions
+    return regions_of(task.depth_m, packed, law, labels, len(found.kinds))
+
+
+def _finished(task: Task, noise: NoiseModel, regions: Regions, found: Candidates) -> tuple[Labels, tuple[Surface, ...]]:
+    depth, sensor = task.depth_m, task.sensor
+    packed, law = task.packed, noise.packed()
     pixels, few = regions.pixels, regions.few(NAMING_SAMPLES)
-    keep = [k for k in range(count) if owner[k] == k + 1 and pixels[k] >= LEAST_KEPT_PIXELS]
-    keep.sort(key=lambda k: -pixels[k])
+    keep = sorted((k for k, n in enumerate(pixels) if n >= LEAST_KEPT_PIXELS), key=lambda k: -pixels[k])
     surfaces, final = [], Candidates()
-    names = np.zeros(count + 1, np.int32)
+    names = np.zeros(len(pixels) + 1, np.int32)
     for new, k in enumerate(keep, 1):
         kind, mine = found.kinds[k], regions.samples(k + 1)
+        mine[3] *= found.slack[k]
+        few[k][3] *= found.slack[k]
         surface, th = finish.refine_surface(new, kind, found.parameters[k], mine, sensor=sensor, noise=noise)
         # What the sensor has bent is named straight, but keeps the bent surface's pixels.
         final.add(kind, th)
@@ -182,6 +195,7 @@ def _finished(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) 
         surfaces.append(surface)
         names[k + 1] = new
     labels = settled(task, noise, renamed(regions.labels, names), final, sweeps=SETTLING_SWEEPS)
+    labels = without_fillets(depth, packed, law, labels, *final.arrays())
     labels, surfaces = finish.without_crumbs(labels, surfaces, max(LEAST_KEPT_PIXELS, CRUMB_SHARE * task.least_pixels))
     fill_small_gaps(labels, depth, 2)
     return labels, tuple(surfaces)

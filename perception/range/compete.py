@@ -29,15 +29,20 @@ GIVE_UP = 14.0  # a fit that keeps three quarters within three sigmas leaves 8 a
 
 @dataclass(slots=True, eq=False)
 class Candidates:
-    """Surfaces found so far; label k is `kinds[k - 1]`, `parameters[k - 1]`. Grows while segmentation runs."""
+    """Surfaces found so far; label k is `kinds[k - 1]`, `parameters[k - 1]`. Grows while segmentation runs.
+
+    `slack[k - 1]`: how many times the noise the surface tolerates, where its face is no better a primitive.
+    """
 
     kinds: list[int] = field(default_factory=list)
     parameters: list[Array] = field(default_factory=list)
+    slack: list[float] = field(default_factory=list)
 
-    def add(self, kind: int, parameters: Array) -> int:
+    def add(self, kind: int, parameters: Array, slack: float = 1.0) -> int:
         """Append a surface and return its label."""
         self.kinds.append(kind)
         self.parameters.append(parameters)
+        self.slack.append(slack)
         return len(self.kinds)
 
     def arrays(self) -> tuple[NDArray[np.int64], Array]:
@@ -66,6 +71,16 @@ def explain(
     blocks.ravel()[mine] = found.add(kind, parameters)
     free.ravel()[mine] = False
     return True
+
+
+def fit_best(grid: Grid, members: NDArray[np.int64], slack: float) -> tuple[int, Array, float]:
+    """Kind (-1 when none does), parameters and explained share of what describes these blocks within `slack` sigmas."""
+    x, y, z, sigma = (a.ravel() for a in (grid.x, grid.y, grid.z, slack * grid.sigma))
+    normal = grid.normal.reshape(-1, 3)
+    kind, th, share = _fit_blocks(
+        x, y, z, sigma, normal, grid.perspective, grid.size_px**2, grid.slow_share, members
+    )  # fmt: skip
+    return int(kind), th, float(share)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

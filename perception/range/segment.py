@@ -79,12 +79,12 @@ class Task:
         )
 
 
-def segment(task: Task, noise: NoiseModel) -> tuple[Labels, Candidates, NoiseModel]:
+def segment(task: Task, noise: NoiseModel) -> tuple[Labels, Candidates, NoiseModel, Grid]:
     """Segment a depth image.
 
     Returns:
         labels (H, W), 0 = none; the surfaces behind them; and the noise model, widened where the planes of the image
-        themselves scatter more than the given one says.
+        themselves scatter more than the given one says; and the grid of blocks.
     """
     found, grid, blocks, noise = _settled_planes(task, noise)
     size = grid.size_px
@@ -93,7 +93,7 @@ def segment(task: Task, noise: NoiseModel) -> tuple[Labels, Candidates, NoiseMod
     labels = _claimed(task, noise, blocks, found, size=size)
     if size > 1:
         labels = _finer(task, noise, labels, found, size=(size + 1) // 2)
-    return labels, found, noise
+    return labels, found, noise, grid
 
 
 def _settled_planes(task: Task, noise: NoiseModel) -> tuple[Candidates, Grid, Labels, NoiseModel]:

@@ -23,7 +23,8 @@ def warm_up() -> None:
     ridge = np.sqrt(np.maximum(0.02**2 - (u - 0.15) ** 2, 0.0))
     small = np.where(np.hypot(u - 0.1, v - 0.03) < 0.006, 0.01, 0.0)
     noise = np.random.default_rng(0).normal(0.0, 0.0003, u.shape)
-    depth = 0.6 + 0.1 * v - np.maximum(np.maximum(bump, ridge), small) + noise
+    groove = np.where(abs(v - 0.1) < 0.002, 0.005, 0.0)
+    depth = 0.6 + 0.1 * v - np.maximum(np.maximum(bump, ridge), small) + groove + noise
     sensors: tuple[RangeSensorModel, ...] = (pinhole, parallel)
     for sensor in sensors:
         scene = analyse(depth, sensor)

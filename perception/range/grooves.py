@@ -1,0 +1,212 @@
+"""Faces in one plane with a groove between them are two: cushions side by side, boxes pushed together, drawers.
+
+A groove that is narrower and shallower than the noise still shows along its whole length in what tangent planes leave
+over. A plane is cut where blocks that do so, and lie behind it, make most of a seam between two large parts of it.
+Things in front, and pixels without a reading, part nothing: the plane may go on behind them.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from perception.range.compete import Candidates
+from perception.range.faces import labels_of_blocks
+from perception.range.grid import Grid, sigma_at
+from perception.range.segment import Task
+from perception.range.surfaces import PLANE, depth_on
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Labels = NDArray[np.int32]
+
+ROUGHER = 1.35  # than its plane is in the median: a block that may hold a piece of a groove
+RMS_BINS, BINS_A_SIGMA = 64, 16.0
+LEAST_SHARE = 0.08  # of the plane's blocks, that a part must have
+LEAST_BLOCKS = 60
+SEAM_SHARE = 0.7  # of the blocks between two parts, that must be rough
+BEHIND_SIGMAS = 0.3  # of a block, that they lie behind in the median
+DEEP_SIGMAS = 3.5  # of a pixel, that makes a block rough by itself: a gap narrower than blocks
+IN_FRONT_SIGMAS = 3.0
+AROUND = np.ones((3, 3), np.uint8)
+
+
+def cut_at_grooves(task: Task, law: Array, grid: Grid, labels: Labels, found: Candidates) -> Labels:
+    """Labels (H, W) after planes with a groove across were cut; extends `found` by a copy of the plane for each part."""
+    size = grid.size_px
+    blocks = labels_of_blocks(labels, grid)
+    kinds, table = found.arrays()
+    rough = _rough(blocks, grid.rms, kinds, labels, task.depth_m, task.packed, law, size, table)
+    out = labels
+    for k in _suspects(blocks, rough > 0, kinds):
+        parts = _parts(grid, blocks == k, rough, table[k])
+        if parts is None:
+            continue
+        out = labels.copy() if out is labels else out
+        fine = np.repeat(np.repeat(parts, size, 0), size, 1)[: out.shape[0], : out.shape[1]]
+        for part in range(2, int(parts.max()) + 1):
+            out[(labels == k) & (fine == part)] = found.add(PLANE, table[k].copy(), found.slack[k - 1])
+    return out
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _rough(blocks, rms, kinds, labels, depth, sen, noise, size, table):  # type: ignore[no-untyped-def]  # numba types it
+    """(h, w) of the blocks of planes: 2 where a pixel lies deep behind, 1 where the tangent plane leaves much over, else 0."""
+    h, w = blocks.shape
+    H, W = labels.shape
+    perspective = sen[0] > 0
+    counts = np.zeros((kinds.shape[0], RMS_BINS), np.int32)
+    for r in range(h):
+        for c in range(w):
+            if np.isfinite(rms[r, c]):
+                counts[blocks[r, c], int(min(rms[r, c] * BINS_A_SIGMA, RMS_BINS - 1.0))] += 1
+    usual = np.zeros(kinds.shape[0])
+    for k in range(1, kinds.shape[0]):
+        middle, level, below = counts[k].sum() // 2, 0, counts[k, 0]
+        while below < middle:
+            level += 1
+            below += counts[k, level]
+        usual[k] = (level + 0.5) / BINS_A_SIGMA
+    out = np.zeros((h, w), np.uint8)
+    for r in range(h):
+        for c in range(w):
+            k = blocks[r, c]
+            if k == 0 or kinds[k] != PLANE:
+                continue
+            out[r, c] = not rms[r, c] < ROUGHER * usual[k]
+            for v in range(r * size, min(r * size + size, H)):
+                for u in range(c * size, min(c * size + size, W)):
+                    if labels[v, u] == k:
+                        continue  # a pixel that the plane explains
+                    zm = depth_on(PLANE, table[k], (u - sen[3]) / sen[1], (v - sen[4]) / sen[2], perspective)
+                    if depth[v, u] - zm > DEEP_SIGMAS * sigma_at(noise, zm):
+                        out[r, c] = 2
+    return out
+
+
+def _suspects(blocks: Labels, rough: Flags, kinds: NDArray[np.int64]) -> list[int]:
+    """Planes of whose inside two or more large parts remain when rough blocks are taken away."""
+    inner = _inside(blocks, rough, kinds)
+    count, marks, stats, _ = cv2.connectedComponentsWithStats(inner, connectivity=4, ltype=cv2.CV_32S)
+    if count < 3:
+        return []
+    least = np.maximum(LEAST_BLOCKS, LEAST_SHARE * np.bincount(blocks.ravel(), minlength=kinds.size))
+    large = []
+    for part in np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= LEAST_BLOCKS) + 1:
+        left, top, width, _, area = stats[part]
+        k = int(blocks[top, left + np.argmax(marks[top, left : left + width] == part)])
+        if area >= least[k]:
+            large.append(k)
+    return sorted({k for k in large if large.count(k) > 1})
+
+
+@njit(cache=True, nogil=True)
+def _inside(blocks, rough, kinds):  # type: ignore[no-untyped-def]  # numba types it
+    """(h, w) 1 where a block and all of its neighbours belong to one plane and are not rough."""
+    h, w = blocks.shape
+    out = np.zeros((h, w), np.uint8)
+    for r in range(1, h - 1):
+        for c in range(1, w - 1):
+            k = blocks[r, c]
+            if k == 0 or kinds[k] != PLANE:
+                continue
+            is_inside = True
+            for i in range(r - 1, r + 2):
+                for j in range(c - 1, c + 2):
+                    is_inside &= blocks[i, j] == k and not rough[i, j]
+            out[r, c] = is_inside
+    return out
+
+
+def _parts(grid: Grid, mine: Flags, rough: NDArray[np.uint8], th: Array) -> Labels | None:
+    """(h, w) parts 1, 2 ... of a plane's blocks, the largest first, None where it is one."""
+    rows, columns = np.flatnonzero(mine.any(1)), np.flatnonzero(mine.any(0))
+    box = np.s_[max(rows[0] - 1, 0) : rows[-1] + 2, max(columns[0] - 1, 0) : columns[-1] + 2]
+    mine, rough = mine[box], rough[box]
+    x, y, z, sigma = (a[box] for a in (grid.x, grid.y, grid.z, grid.sigma))
+    behind = _behind(th, x, y, z, sigma, grid.perspective)
+    is_passable = (mine & (rough == 0)) | ~np.isfinite(z) | (~mine & (behind < -IN_FRONT_SIGMAS))
+    behind[mine & (rough == 2)] = DEEP_SIGMAS
+    inner = cv2.erode(is_passable.view(np.uint8), AROUND, borderValue=0)
+    count, marks = cv2.connectedComponents(inner, connectivity=4)
+    large = np.bincount(marks[mine], minlength=count)
+    large[0] = 0
+    keep = np.flatnonzero(large >= max(LEAST_BLOCKS, LEAST_SHARE * mine.sum()))
+    if keep.size < 2:
+        return None
+    names = np.zeros(count, np.int32)
+    names[keep] = np.arange(1, keep.size + 1)
+    basins = names[marks]
+    _flood(basins, is_passable)
+    _flood(basins, is_passable | mine)
+    owner = _joined(_seams(basins, mine, rough > 0, behind), keep.size)
+    sizes = np.bincount(owner[basins[mine]], minlength=keep.size + 1)
+    sizes[0] = 0
+    order = [k for k in np.argsort(-sizes, kind="stable") if sizes[k] > 0]
+    if len(order) < 2:
+        return None
+    renamed = np.zeros(keep.size + 1, np.int32)
+    renamed[order] = np.arange(1, len(order) + 1)
+    out = np.zeros(grid.z.shape, np.int32)
+    out[box] = np.where(mine, np.maximum(renamed[owner[basins]], 1), 0)
+    return out
+
+
+def _seams(basins: Labels, mine: Flags, rough: Flags, behind: Array) -> dict[tuple[int, int], tuple[float, float]]:
+    """Of each pair of basins that meet: the rough share of their seam, and how far it lies behind in the median."""
+    near = cv2.dilate(rough.view(np.uint8), AROUND) > 0
+    found: dict[tuple[int, int], list[tuple[bool, float]]] = {}
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        met = mine[a] & mine[b] & (basins[a] != basins[b]) & (basins[a] > 0) & (basins[b] > 0)
+        places = zip(
+            basins[a][met], basins[b][met], near[a][met] & near[b][met], behind[a][met], behind[b][met], strict=True
+        )
+        for p, q, is_rough, d, e in places:
+            found.setdefault((min(p, q), max(p, q)), []).append((bool(is_rough), float(0.5 * (d + e))))
+    out = {}
+    for pair, seam in sorted(found.items()):
+        share, depth = np.mean([s[0] for s in seam]), np.nanmedian([s[1] for s in seam])
+        out[pair] = (float(share), float(depth))
+    return out
+
+
+def _joined(seams: dict[tuple[int, int], tuple[float, float]], count: int) -> Labels:
+    """(count + 1,) the basin that each belongs to, after those that meet without a groove were joined."""
+    owner = np.arange(count + 1, dtype=np.int32)
+    for (p, q), (share, depth) in seams.items():
+        if share < SEAM_SHARE or not depth > BEHIND_SIGMAS:
+            owner[owner == owner[q]] = owner[p]
+    return owner
+
+
+@njit(cache=True, error_model="numpy")
+def _behind(th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """(h, w) how far each block lies behind the plane, in sigmas."""
+    out = np.empty(z.shape)
+    for r in range(z.shape[0]):
+        for c in range(z.shape[1]):
+            out[r, c] = (z[r, c] - depth_on(PLANE, th, x[r, c], y[r, c], perspective)) / sigma[r, c]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _flood(basins, allowed):  # type: ignore[no-untyped-def]  # numba types it
+    """Spread the basins, breadth first, over the allowed blocks."""
+    h, w = basins.shape
+    queue = np.empty(h * w, np.int32)
+    count, head = 0, 0
+    for i in range(h * w):
+        if basins[i // w, i % w]:
+            queue[count] = i
+            count += 1
+    while head < count:
+        r, c = queue[head] // w, queue[head] % w
+        head += 1
+        for s in range(4):
+            i, j = r + (s == 0) - (s == 1), c + (s == 2) - (s == 3)
+            if 0 <= i < h and 0 <= j < w and basins[i, j] == 0 and allowed[i, j]:
+                basins[i, j] = basins[r, c]
+                queue[count] = i * w + j
+                count += 1

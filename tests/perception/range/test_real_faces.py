@@ -1,0 +1,143 @@
+"""Faces as real things have them: bulged, with rounded edges, side by side with a groove between."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from perception.range import PinholeSensor, analyse, faces, fillets
+from perception.range.surfaces import CONE, CYLINDER, PLANE, SIZE
+from tests.perception.range.scenes import PARALLEL, PINHOLE, noisy, plane_depth
+
+LARGE = PinholeSensor(width_px=320, height_px=240, fx_px=360.0, fy_px=360.0, cx_px=159.5, cy_px=119.5)
+FRONT = np.array([0.0, 0.0, -1.0])
+LAW = np.array([2e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+def the_one_over(labels: np.ndarray, face: np.ndarray) -> int:
+    """The label that has four fifths of a face, and four fifths of whose pixels it has; 0 without one."""
+    found, counts = np.unique(labels[face], return_counts=True)
+    best = int(found[counts.argmax()])
+    is_it = counts.max() >= 0.8 * face.sum() and counts.max() >= 0.8 * (labels == best).sum()
+    return best if is_it else 0
+
+
+def test_a_bulged_face_is_one():
+    v, u = np.mgrid[:240, :320]
+    wall = plane_depth(LARGE, FRONT, np.array([0.0, 0.0, 1.0]))
+    s, t = (u - 159.5) / 90.0, (v - 119.5) / 76.0
+    face = (abs(s) < 1) & (abs(t) < 1)
+    bulged = 0.8 - 0.01 * (1 + 0.5 * s + 0.3 * t - 0.6 * s * t) * (1 - s**2) * (1 - t**2)
+    labels = analyse(noisy(np.where(face, bulged, wall), 1e-4, 3), LARGE).labels
+    assert the_one_over(labels, face) > 0
+    assert the_one_over(labels, ~face) > 0
+
+
+@pytest.mark.parametrize(("depth_m", "is_parted"), [(0.006, True), (-0.1, False)])
+def test_a_groove_parts_a_plane_and_a_post_before_it_does_not(depth_m, is_parted):
+    plate = np.full((120, 160), 0.8)
+    plate[:, 79:82] += depth_m
+    plate[:10], plate[-10:] = 1.2, 1.2
+    labels = analyse(noisy(plate, 2e-3, 4), PINHOLE).labels
+    left, right = labels[20:100, 5:70], labels[20:100, 90:155]
+    assert (np.median(left) != np.median(right)) == is_parted
+    assert np.mean(left == np.median(left)) > 0.9
+    assert np.mean(right == np.median(right)) > 0.9
+
+
+def roof(radius_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Two planes at right angles that a rounded edge joins, square on: depth, labels, kinds and their parameters."""
+    pitch = PARALLEL.pixel_pitch_m
+    x = np.broadcast_to((np.arange(160) - 79.5) * pitch, (120, 160))
+    axis_z = 0.5 + radius_m * np.sqrt(2.0)
+    round_half = radius_m / np.sqrt(2.0)
+    arc = axis_z - np.sqrt(np.maximum(radius_m**2 - x**2, 0.0))
+    depth = np.where(abs(x) < round_half, arc, 0.5 + abs(x))
+    labels = np.where(abs(x) < round_half, 3, np.where(x < 0, 1, 2)).astype(np.int32)
+    table = np.zeros((4, SIZE))
+    for k, side in ((1, -1.0), (2, 1.0)):
+        normal = np.array([side, 0.0, -1.0]) / np.sqrt(2.0)
+        table[k, :3], table[k, 3] = normal, normal @ [0.0, 0.0, 0.5]
+    table[3, :8] = 0.0, 0.0, axis_z, 0.0, 1.0, 0.0, radius_m, 1.0
+    return depth, labels, np.array([0, PLANE, PLANE, CYLINDER]), table
+
+
+def test_a_rounded_edge_is_shared_by_its_faces():
+    depth, labels, kinds, table = roof(0.012)
+    after = fillets.without_fillets(depth, PARALLEL.packed(), LAW, labels, kinds, table)
+    assert (labels == 3).sum() > 900
+    assert set(np.unique(after)) == {1, 2}
+    np.testing.assert_array_equal(after[:, :80], 1)
+    np.testing.assert_array_equal(after[:, 80:], 2)
+
+
+def test_a_tube_before_a_wall_stays_a_tube():
+    depth, labels, kinds, table = roof(0.012)
+    tube = labels == 3
+    depth = np.where(tube, depth - 0.05, 0.56)
+    table[1, :4] = 0.0, 0.0, -1.0, -0.56
+    table[3, 2] -= 0.05
+    labels = np.where(tube, 3, 1).astype(np.int32)
+    after = fillets.without_fillets(depth, PARALLEL.packed(), LAW, labels, kinds, table)
+    np.testing.assert_array_equal(after, labels)
+
+
+def test_what_curves_away_slowly_is_the_faces_as_far_as_the_reach():
+    _, labels, kinds, table = roof(0.0)
+    labels[:] = np.where(np.arange(160) < 70, 1, 0)
+    slope = np.maximum(np.arange(160) - 69, 0) * PARALLEL.pixel_pitch_m
+    off = np.where(np.arange(120) < 60, 0.3, 1.5)[:, None] * slope  # of depth; 0.7 of it across a face at 45 degrees
+    fillets.spread_outwards(plane_of(table[1]) + off, PARALLEL.packed(), LAW, labels, kinds, table, 5)
+    inner = slice(3, 57)
+    np.testing.assert_array_equal(labels[inner, :75], 1)
+    np.testing.assert_array_equal(labels[inner, 75:], 0)
+    assert not labels[65:115, 72:].any()
+
+
+def plane_of(th: np.ndarray) -> np.ndarray:
+    """Depth of a plane n . X = d seen by parallel rays."""
+    v, u = np.mgrid[:120, :160]
+    x, y = (u - 79.5) * PARALLEL.pixel_pitch_m, (v - 59.5) * PARALLEL.pixel_pitch_m
+    return np.asarray((th[3] - th[0] * x - th[1] * y) / th[2])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_faces_shared_out_are_those_without_a_label_of_four_fifths(seed):
+    rng = np.random.default_rng(seed)
+    face = np.repeat(rng.integers(0, 9, (12, 1)), 20, 1).astype(np.int32)
+    labels = np.where(rng.random(face.shape) < rng.random((12, 1)), face + 1, rng.integers(0, 3, face.shape)).astype(
+        np.int32
+    )
+    wanted = []
+    for k in range(1, 9):
+        counts = np.bincount(labels[face == k], minlength=2)
+        if counts.sum() >= 10 and counts[1:].max() < faces.WHOLE_SHARE * counts.sum():
+            wanted.append(k)
+    assert list(faces._shared_out(face, 8, labels, 10)) == wanted
+
+
+def test_strips_are_told_from_discs():
+    labels = np.zeros((90, 120), np.int32)
+    labels[5:85, 10:16] = 1
+    v, u = np.mgrid[:90, :120]
+    labels[np.hypot(u - 70, v - 45) < 35] = 2
+    labels[45:75:5, 60:80:4] = 0
+    (half_width, length) = fillets._shapes(labels, 4)
+    assert half_width[1] == pytest.approx(480 / (2 * 80 + 2 * 4))
+    assert half_width[2] == pytest.approx(17.5, rel=0.15)
+    assert length[1] > 2 * fillets.LONG
+    assert length[2] < 0.7 * fillets.LONG
+    assert half_width[3] == length[3] == 0.0
+
+
+def test_a_cone_on_a_table_is_no_rounded_edge():
+    v, u = np.mgrid[:120, :160]
+    off = np.hypot((u - 79.5) * PARALLEL.pixel_pitch_m, (v - 59.5) * PARALLEL.pixel_pitch_m)
+    depth = np.minimum(0.5, 0.45 + 1.4 * off)
+    labels = np.where(depth < 0.5, 2, 1).astype(np.int32)
+    table = np.zeros((3, SIZE))
+    table[1, :4] = 0.0, 0.0, -1.0, -0.5
+    table[2, :7] = 0.0, 0.0, 0.45, 0.0, 0.0, 1.0, np.arctan(1 / 1.4)
+    kinds = np.array([0, PLANE, CONE])
+    after = fillets.without_fillets(depth, PARALLEL.packed(), LAW, labels, kinds, table)
+    np.testing.assert_array_equal(after, labels)

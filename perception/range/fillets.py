@@ -30,6 +30,7 @@ LEAST_SHARE = 0.4  # of the pixels of a strip between faces that do so: nets of 
 WHOLE_SHARE = 0.7  # of those of a strip beside one face
 LEAST_BORDER_PX = 6
 REACH = 0.025  # of the image's shorter side, over which unlabelled pixels beside a face may curve away from it
+LEAST_ROWS = 192  # in smaller images what is beside a face is mixed pixels of an outline, which models are matched by
 SLOPE = 0.5  # at which they may do so
 SIGMAS = 3.0
 
@@ -48,7 +49,8 @@ def without_fillets(
             owner = _nearer(depth_m, packed, mine, half_width[strip], np.array(faces), kinds, table)
             if np.mean(owner > 0) >= (LEAST_SHARE if len(faces) > 1 else WHOLE_SHARE):
                 out.ravel()[mine] = np.where(owner > 0, owner, strip)
-    spread_outwards(depth_m, packed, law, out, kinds, table, round(REACH * min(labels.shape)))
+    if min(labels.shape) >= LEAST_ROWS:
+        spread_outwards(depth_m, packed, law, out, kinds, table, round(REACH * min(labels.shape)))
     return out
 
 

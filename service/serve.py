@@ -6,11 +6,14 @@ import logging
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
+
+from pydantic.warnings import UnsupportedFieldAttributeWarning
 
 from hal.config import Cell
 from hal.errors import CellError
@@ -142,6 +145,8 @@ class Panelwright:
     def _begin(self) -> None:
         """Start the cell in the background: it needs seconds, while this process imports its web framework."""
         sys.setswitchinterval(SWITCH_S)
+        # FastAPI silences this one within `catch_warnings` only, which imports in the cell's thread meanwhile undo.
+        warnings.simplefilter("ignore", UnsupportedFieldAttributeWarning)
         threading.Thread(target=self._start_service, name="start-cell", daemon=True).start()
         from service.http.app import create_app, state_of_app
         from service.http.guard import Allowed

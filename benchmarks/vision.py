@@ -163,7 +163,7 @@ def taught_answer(job: Job, image: Image) -> dict[str, Any]:
 
 
 def _answer(entry: Job, reading: ObjectReading) -> dict[str, Any]:
-    """One object's answer. A refused display gives its likeliest number, with the little confidence that it has."""
+    """One object's answer. What is refused has no value; of a display its likeliest number, which is no answer."""
     out: dict[str, Any] = {
         "id": entry["id"],
         "cls": entry["cls"],
@@ -172,7 +172,7 @@ def _answer(entry: Job, reading: ObjectReading) -> dict[str, Any]:
         "reason": reading.reason,
     }
     if reading.possible:
-        out["text"] = reading.possible[0].text
+        out["likeliest"] = reading.possible[0].text
     if not reading.answered:
         return out
     if reading.text is not None:
@@ -211,9 +211,7 @@ def status_answer(status: Status, key: str) -> dict[str, Any]:
     """Answer of a `dial` or `display` job."""
     value = status.value if key == "reading" else status.text
     out = {"confidence": status.confidence, "reason": status.reason}
-    if status.possible:
-        value = status.possible[0].text
-    return out if value is None else {**out, key: value}
+    return {**out, key: value} if status.answered else out
 
 
 def answer(job: Job, folder: Path) -> dict[str, Any]:

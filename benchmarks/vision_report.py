@@ -109,11 +109,13 @@ def _table(truth: dict[str, Any], answers: dict[str, Any], score: ModuleType) ->
     for what, kinds, key in (("displays exact", ("display",), "display"), ("states right", STATES, "state")):
         right = [[r["error"] == 0 for r in rows if r["cls"] in kinds and r["level"] == level] for level in LEVELS]
         _line(what, [float(np.mean(x)) for x in right], PASS[key])
-    said = [
-        [r["error"] == 0 and not r["in_doubt"] for r in rows if r["cls"] == "display" and r["level"] == level]
+    likely = [
+        [r["error"] == 0 or r["likeliest_is_right"] for r in rows if r["cls"] == "display" and r["level"] == level]
         for level in LEVELS
     ]
-    print(f"{'  displays exact without those refused':52s} {' / '.join(f'{np.mean(x):.3g}' for x in said)}")
+    print(
+        f"{'displays, were the likeliest of refused ones given':52s} {' / '.join(f'{np.mean(x):.3g}' for x in likely)}"
+    )
     for kind, most, unit in (("slider", 2.0, 1.0), ("handwheel", 2.0, 3.6)):
         errors = [r["error"] * unit for r in rows if r["cls"] == kind]
         _line(
@@ -133,7 +135,7 @@ def _table(truth: dict[str, Any], answers: dict[str, Any], score: ModuleType) ->
 def _taught_rows(truth: dict[str, Any], answers: dict[str, Any], score: ModuleType) -> list[dict[str, Any]]:
     """One row a readable object: error in % of full scale, 0 or 100 for texts and states; a refusal counts as 100.
 
-    The likeliest number of a refused display counts as an answer, with the confidence that it has (`in_doubt`).
+    `likeliest_is_right`: of a refused display, which stays refused.
     """
     rows = []
     for name, t in truth.items():
@@ -158,7 +160,7 @@ def _taught_rows(truth: dict[str, Any], answers: dict[str, Any], score: ModuleTy
                     "cls": o["cls"],
                     "level": t["level"],
                     "answered": answered,
-                    "in_doubt": q.get("reason") is not None,
+                    "likeliest_is_right": "text" in o and score.norm(q.get("likeliest", "")) == score.norm(o["text"]),
                     "error": error,
                     "confidence": float(q.get("confidence", 0.0)),
                 }

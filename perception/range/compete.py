@@ -8,9 +8,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from perception.range import fit, grow
+from perception.range import fit
 from perception.range.finish import SLOW_NOISE_AREA_PX
 from perception.range.grid import Grid
+from perception.range.grow_surface import GROW_SIGMAS, grow_surface
 from perception.range.surfaces import QUADRIC, SIZE
 
 Array = NDArray[np.float64]
@@ -101,10 +102,10 @@ def _explanation(  # type: ignore[no-untyped-def]  # numba types it
     for k in range(kinds.shape[0]):
         if kinds[k] < 0:
             continue
-        count, total = grow.grow_surface(
+        count, total = grow_surface(
             kinds[k], ths[k], x, y, z, sigma, normal, rms, free, members, perspective, cos_limit, mark, k + 1, queue
         )
-        gain = grow.GROW_SIGMAS**2 * count - total
+        gain = GROW_SIGMAS**2 * count - total
         if count >= least and total <= GOOD_MEAN_SQUARE * count and gain > best_gain:
             best, best_gain, mine = k, gain, queue[:count].copy()
     if best < 0:

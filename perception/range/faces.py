@@ -13,17 +13,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from perception.range import grow
 from perception.range.compete import Candidates, fit_best
 from perception.range.components import label_components
 from perception.range.grid import Grid
+from perception.range.links import smooth_links
 from perception.range.segment import STEEP_SLOPE, Task
+from perception.range.tangents import STEADY_RMS
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 
 SHARP_RAD = 0.045  # normals noisier than this hide creases
-STEADY_RMS = 1.8  # what a tangent plane leaves over in sigmas, beyond which the block holds a crease
 TURN_RAD = 0.15  # between neighbouring blocks of one face
 WIDER = 2.0  # a try
 TRIES = 7
@@ -66,7 +66,7 @@ def _faces(task: Task, grid: Grid) -> tuple[Labels, int]:
     """(h, w) faces between creases, 0 = none, and their number; bridges up to two blocks wide join no faces."""
     core = np.isfinite(grid.z) & (grid.rms < STEADY_RMS)
     inner = cv2.erode(core.view(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
-    right, down = grow.smooth_links(
+    right, down = smooth_links(
         grid.z,
         grid.sigma,
         inner,

@@ -18,14 +18,16 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.range import grow
 from perception.range.beside import contested_pixels, pixels_around, renamed_pixels
 from perception.range.claim import bucket, claim_again, claim_pixels
 from perception.range.compete import Candidates, explain
 from perception.range.components import for_each_tile, label_components
 from perception.range.grid import Grid, block_size, build_grid, seen_from
+from perception.range.grow_planes import grow_planes
 from perception.range.left_over import unexplained
+from perception.range.links import smooth_links
 from perception.range.noise import WORST_SHARE, NoiseModel
+from perception.range.seeds import seed_order
 from perception.range.sensor import RangeSensorModel
 from perception.range.settle import REACH_PX, settle
 from perception.range.surfaces import PLANE
@@ -197,8 +199,8 @@ def _recover_planes(task: Task, grid: Grid, blocks: Labels, found: Candidates) -
     least = max(LEAST_FLAT_BLOCKS, round(task.least_pixels / grid.size_px**2))
     cos_limit = float(np.cos(max(0.26, 4.0 * grid.normal_sigma_rad)))
     tried = np.zeros(free.shape, np.bool_)
-    order = grow.seed_order(grid.normal, grid.rms, free, grid.radius + 1)
-    planes, counts, mean2 = grow.grow_planes(
+    order = seed_order(grid.normal, grid.rms, free, grid.radius + 1)
+    planes, counts, mean2 = grow_planes(
         grid.x,
         grid.y,
         grid.z,
@@ -227,7 +229,7 @@ def _recover_curved(task: Task, grid: Grid, blocks: Labels, found: Candidates, l
     turn_limit = float(np.cos(max(0.7, 5.0 * grid.normal_sigma_rad)))
     attempts = 0
     for _ in range(ROUNDS):
-        right, down = grow.smooth_links(
+        right, down = smooth_links(
             grid.z,
             grid.sigma,
             free,

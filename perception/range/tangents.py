@@ -14,6 +14,7 @@ from perception.range.surfaces import LEAN
 
 JUMP_SIGMAS = 4.0
 LEAST_SHARE = 0.4  # of the window's blocks must lie on the surface
+STEADY_RMS = 1.8  # what a tangent plane leaves over in sigmas, beyond which the block holds a crease or noise
 GAP = 8  # empty blocks that end a run
 RUN = 128  # blocks at most
 X0, Y0, Z0, G0, BASE, SLOPE = (row * RUN for row in range(6))  # where the rows of the run's own blocks begin

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import label
 
-from perception.range import grow
+from perception.range import grow_planes as grow
 from perception.range.blocks import BLOCK_SAMPLES, JUMP_SLOPE
+from perception.range.flat_fit import plane_from_coefficients
 from perception.range.grid import build_grid, seen_from
-from perception.range.grow import LONE_BEND, seed_order
 from perception.range.noise import NoiseModel
+from perception.range.seeds import LONE_BEND, seed_order
 from perception.range.sensor import OrthographicSensor, PinholeSensor
 from perception.range.tangents import JUMP_SIGMAS
 
@@ -131,7 +132,7 @@ def test_a_span_fill_finds_the_blocks_that_growth_by_neighbours_finds():
                               rows[:, :30, 2][free[:, :30]], rcond=None)[0]  # fmt: skip
     e = (rows[..., 2] - a * rows[..., 0] - b * rows[..., 1] - c) * np.sqrt(rows[..., 3])
     th, m, cos_limit = np.zeros(16), np.array([a, b, c]), 0.9
-    grow.plane_from_coefficients(m, grid.perspective, th)
+    plane_from_coefficients(m, grid.perspective, th)
     length = np.linalg.norm(rows[..., 4:7], axis=-1)
     explained = free & (np.abs(e) <= grow.GROW_SIGMAS) & ((rows[..., 4:7] @ th[:3] >= cos_limit) | (length**2 <= 0.5))
     parts, _ = label(explained)

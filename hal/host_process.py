@@ -1,22 +1,25 @@
-"""Child processes that hold objects: a driver whose library holds the interpreter lock gets one (`isolate = true`)."""
+"""Child processes that hold objects; `hal.isolated` keeps a device in one."""
 
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import multiprocessing
 import os
+import signal
+import threading
+import time
 from collections.abc import Callable, Mapping
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-from hal.clock import WallClock
-from hal.config import Cell
-from hal.errors import CellError, ConfigError, DeviceTimeout, DeviceUnavailable
+from hal.errors import CellError, DeviceTimeout, DeviceUnavailable
 from hal.host import CONNECT_TIMEOUT_S, connect, new_address, serve
-from hal.registry import Context
-from hal.registry import connect as connect_device
+
+LOOK_S = 0.1  # a start that is given up is noticed within this
+EXIT = "exit"  # detail of an error about a process that died: how it did
 
 
 class HostProcess:
@@ -25,9 +28,21 @@ class HostProcess:
     Args:
         make: importable function that makes the objects in the child; raises CellError when it cannot.
         args: its arguments; they are pickled.
+        give_up: set it from another thread to end the start, and the child with it.
+
+    Raises:
+        CellError: what `make` raised.
+        DeviceUnavailable: the child died while starting (`details[EXIT]` says how), or the start was given up.
+        DeviceTimeout: it was not ready in time.
     """
 
-    def __init__(self, make: Callable[..., Mapping[str, object]], *args: Any, name: str = "host") -> None:
+    def __init__(
+        self,
+        make: Callable[..., Mapping[str, object]],
+        *args: Any,
+        name: str = "host",
+        give_up: threading.Event | None = None,
+    ) -> None:
         self._context = multiprocessing.get_context("spawn")
         self._lifeline, child_end = self._context.Pipe()
         self.address = new_address()
@@ -36,7 +51,7 @@ class HostProcess:
         )
         self._process.start()
         child_end.close()
-        self._await_ready(name)
+        self._await_ready(name, give_up or threading.Event())
 
     @property
     def pid(self) -> int | None:
@@ -46,6 +61,12 @@ class HostProcess:
     def is_alive(self) -> bool:
         """Does the child run?"""
         return self._process.is_alive()
+
+    def await_end(self) -> str:
+        """Wait until the child ends, and say how: the name of a signal or an exit code. One thread may wait."""
+        wait([self._process.sentinel])
+        self._process.join(timeout=1.0)
+        return self._how_it_ended()
 
     def proxy(self, name: str) -> Any:
         """A proxy for the child's object called `name`."""
@@ -62,27 +83,39 @@ class HostProcess:
             Path(self.address).unlink(missing_ok=True)
             Path(self.address).parent.rmdir()
 
-    def _await_ready(self, name: str) -> None:
-        error: Exception | None = None
+    def _await_ready(self, name: str, give_up: threading.Event) -> None:
         try:
-            if not self._lifeline.poll(CONNECT_TIMEOUT_S):
-                error = DeviceTimeout(
-                    f"process {name} was not ready in {CONNECT_TIMEOUT_S:.0f} s",
-                    hint="the machine may be overloaded; see the log",
-                    device=name,
-                )
-            else:
-                error = self._lifeline.recv()
+            error = self._first_word(name, give_up)
         except EOFError:
-            error = DeviceUnavailable(f"process {name} died while starting", hint="see the log above", device=name)
+            self._process.join(timeout=1.0)
+            how = self._how_it_ended()
+            text = f"the process of {name} died while starting ({how})"
+            error = DeviceUnavailable(text, hint="its last words are in the log above", device=name, **{EXIT: how})
         if error is not None:
             self.close()
             raise error
+
+    def _first_word(self, name: str, give_up: threading.Event) -> CellError | None:
+        """What the child says once it is ready, or the error that it could not be."""
+        until_s = time.monotonic() + CONNECT_TIMEOUT_S
+        while not self._lifeline.poll(LOOK_S):
+            if give_up.is_set():
+                return DeviceUnavailable(f"{name} was closed while it started", hint="connect it again", device=name)
+            if time.monotonic() > until_s:
+                text = f"the process of {name} was not ready in {CONNECT_TIMEOUT_S:.0f} s"
+                return DeviceTimeout(text, hint="the machine may be overloaded; see the log", device=name)
+        word: CellError | None = self._lifeline.recv()
+        return word
+
+    def _how_it_ended(self) -> str:
+        code = self._process.exitcode
+        return signal.Signals(-code).name if code is not None and code < 0 else f"exit code {code}"
 
 
 def _run_host(
     make: Callable[..., Mapping[str, object]], args: tuple[Any, ...], address: str, lifeline: Connection
 ) -> None:
+    faulthandler.enable()  # a crash inside a vendor's library then says in the log which call it was
     try:
         objects = make(*args)
         server = serve(objects, address)
@@ -99,46 +132,3 @@ def _run_host(
             with contextlib.suppress(Exception):  # the process ends anyway, and every object gets its turn
                 close()
     os._exit(0)  # a driver's stuck thread must not keep the process
-
-
-class IsolatedDevice:
-    """A device in a process of its own, with the interface of its kind; to close it is to end the process."""
-
-    def __init__(self, context: Context, driver: str, options: dict[str, Any]) -> None:
-        self._process = HostProcess(_make_device, context.name, context.cell, driver, options, name=context.name)
-        hint = "its driver crashed (the log says how); connect it anew: PUT /v1/devices/NAME, or restart the service"
-        self._proxy = connect(self._process.address, None, context.name, gone_hint=hint)
-
-    def __getattr__(self, attribute: str) -> Any:
-        if attribute.startswith("_"):
-            raise AttributeError(attribute)
-        return getattr(self._proxy, attribute)
-
-    def __dir__(self) -> list[str]:
-        return dir(self._proxy)
-
-    def close(self) -> None:
-        """Close the device and end its process; a second call does nothing."""
-        self._proxy.disconnect()
-        self._process.close()
-
-
-def isolated_device(context: Context, driver: str, options: dict[str, Any]) -> IsolatedDevice:
-    """Connect a device in a process of its own.
-
-    Raises:
-        ConfigError: a simulated driver shares its world with others, and a clock that is not the wall's is no other
-            process's: neither can be isolated.
-        CellError: the device did not connect.
-    """
-    if not driver.startswith("sim:") and isinstance(context.clock, WallClock):
-        return IsolatedDevice(context, driver, options)
-    raise ConfigError(
-        f"devices.{context.name}: {driver} cannot be isolated in a cell with a simulated world",
-        hint="remove isolate = true; it is for cell.mode = 'real'",
-        key=f"devices.{context.name}.isolate",
-    )
-
-
-def _make_device(name: str, cell: Cell | None, driver: str, options: dict[str, Any]) -> Mapping[str, object]:
-    return {name: connect_device(Context(name=name, cell=cell), driver, options)}

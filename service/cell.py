@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import functools
 import json
 import logging
 import pickle
@@ -21,7 +22,7 @@ from hal.config import Cell, DeviceSection, load_cell
 from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, DeviceUnavailable
 from hal.garbage import set_aside
-from hal.host_process import isolated_device
+from hal.isolated import Report, isolated_device
 from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
 from hal.simulated import Fault
@@ -35,6 +36,7 @@ from service.seats import Connect, Seat, Swapper, checked, names_another_wire
 
 BEAT_S = 0.05
 CLOSE_TIMEOUT_S = 4.0
+NOTE = "note "  # begins a line for the journal
 SWITCH_S = 0.0005  # the control thread waits no longer than this for a thread that answers the service
 log = logging.getLogger(__name__)
 
@@ -56,6 +58,7 @@ class CellRuntime:
         is_latched: Callable[[], bool],
         swapped: Mapping[str, DeviceSection] | None = None,
         runs_dir: Path | None = None,
+        report: Report = lambda _kind, _data: None,
     ) -> CellRuntime:
         """Start emulators, connect all devices at once, then start the control thread.
 
@@ -63,6 +66,7 @@ class CellRuntime:
             is_latched: read by the control thread each tick.
             swapped: what takes the place of sections of the cell file, as an earlier run had it.
             runs_dir: where `panelwright calibrate` keeps records; motion uses those, devices the cell file's own.
+            report: told what becomes of drivers in processes of their own.
 
         Raises:
             CellError: what could not be connected, all of it in one error; everything else is closed again.
@@ -84,7 +88,7 @@ class CellRuntime:
 
             def connect(name: str, section: DeviceSection) -> Any:
                 context = Context(name=name, clock=clock, cell=cell, shared=shared)
-                make = isolated_device if section.isolate else connect_device
+                make = functools.partial(isolated_device, report=report) if section.isolate else connect_device
                 return checked(name, make(context, section.driver, section.options), section)
 
             sections = {name: complete(name, section) for name, section in cell.file.devices.items()}
@@ -232,6 +236,19 @@ def error_from_line(line: str) -> CellError:
     return error
 
 
+def note_to_line(kind: str, data: dict[str, Any]) -> str:
+    """Something for the journal, on its way to the supervisor."""
+    return NOTE + json.dumps([kind, data])
+
+
+def note_from_line(line: str) -> tuple[str, dict[str, Any]] | None:
+    """The inverse of `note_to_line`; None for any other line."""
+    if not line.startswith(NOTE):
+        return None
+    kind, data = json.loads(line.removeprefix(NOTE))
+    return kind, data
+
+
 def main() -> None:
     """Entry point of the cell process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the supervisor's business; the pipe tells when it ends
@@ -257,7 +274,13 @@ def _run(order: CellOrder, lifeline: Lifeline, is_latched: Callable[[], bool], e
     swapped = {name: validate(block, DeviceSection, source=f"devices.{name}") for name, block in order.swapped.items()}
     cell = load_cell(Path(order.cell_path), seed=order.seed)
     runs_dir = None if order.runs_dir is None else Path(order.runs_dir)
-    runtime = CellRuntime.start(cell, is_latched=is_latched, swapped=swapped, runs_dir=runs_dir)
+    runtime = CellRuntime.start(
+        cell,
+        is_latched=is_latched,
+        swapped=swapped,
+        runs_dir=runs_dir,
+        report=lambda kind, data: lifeline.write_line(note_to_line(kind, data)),
+    )
     server = serve(runtime.objects, order.address, bytes.fromhex(order.authkey), clock=runtime.clock)
     set_aside()
     lifeline.write_line("ready")

@@ -13,11 +13,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceTimeout, DeviceUnavailable, MotionRefused
-from service.cell import CellOrder, CellRuntime, error_from_line
+from hal.isolated import Report
+from service.cell import CellOrder, CellRuntime, error_from_line, note_from_line
 from service.child import Child
 from service.connection import CellConnection, LocalConnection, RemoteConnection
 from service.latch import Beat, Latch, LatchState
@@ -28,9 +29,6 @@ MAX_RESTARTS = 3
 BEAT_TIMEOUT_S = 10.0  # the beat thread shares its interpreter with numba's compiler, which holds the lock for seconds
 WATCH_S = 0.1
 log = logging.getLogger(__name__)
-
-Report = Callable[[str, dict[str, Any]], None]
-"""Called with each thing worth recording: a kind and plain data."""
 
 
 class StopHost(Protocol):
@@ -214,7 +212,9 @@ class Supervisor:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _start_inline(self) -> None:
-        runtime = CellRuntime.start(self.cell, is_latched=self.latch.is_set, runs_dir=self._runs_dir)
+        runtime = CellRuntime.start(
+            self.cell, is_latched=self.latch.is_set, runs_dir=self._runs_dir, report=self._report
+        )
         self._local = LocalConnection(self.cell, runtime.objects, close=runtime.close)
         self._is_ready.set()
 
@@ -225,6 +225,10 @@ class Supervisor:
         errors: list[CellError] = []
 
         def on_line(line: str) -> None:
+            note = note_from_line(line)
+            if note is not None:
+                self._report(*note)
+                return
             if line.startswith("error "):
                 errors.append(error_from_line(line))
             answered.set()

@@ -14,7 +14,8 @@ import pytest
 from hal.clock import Deadline, PacedClock, WallClock
 from hal.errors import ConfigError, DeviceFault, DeviceTimeout, DeviceUnavailable
 from hal.host import HostServer, Proxy
-from hal.host_process import HostProcess, isolated_device
+from hal.host_process import HostProcess
+from hal.isolated import isolated_device
 from hal.readings import Stamped
 from hal.registry import Context
 

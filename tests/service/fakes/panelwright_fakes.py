@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import subprocess
 import sys
 import threading
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,7 +36,8 @@ from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
 from hal.simulated import Fault
 
-OPTIONS = {"fail", "crash_at_connect", "child_pid_file", "immortal"}  # immortal: works on after `close`
+# immortal: works on after `close`. trouble: a file that says `crash` or `away` for as long as it is there
+OPTIONS = {"fail", "crash_at_connect", "child_pid_file", "immortal", "trouble"}
 
 
 class FakeDevice:
@@ -53,6 +56,8 @@ class FakeDevice:
         if options.get("crash_at_connect"):
             raise ZeroDivisionError("planted defect")
         self.name = context.name
+        self._trouble = Path(options.get("trouble", "/dev/null"))
+        self._meet_trouble()
         self._clock = context.clock
         self._is_immortal = bool(options.get("immortal"))
         self._sequence = 0
@@ -86,7 +91,15 @@ class FakeDevice:
         self._fault = fault
         self._thawed.clear() if fault is Fault.FROZEN else self._thawed.set()
 
+    def _meet_trouble(self) -> None:
+        kind = self._trouble.read_text() if self._trouble.exists() else ""
+        if kind == "crash":
+            ctypes.string_at(0)  # a library in C that follows a bad pointer
+        if kind == "away":
+            raise DeviceUnavailable(f"{self.name} is not on its port", hint="plug it in", device=self.name)
+
     def _stamped(self, value: Any) -> Stamped[Any]:
+        self._meet_trouble()
         if self._closed or self._fault is Fault.DISCONNECTED:
             raise DeviceUnavailable(f"{self.name} is disconnected", hint="plug it in", device=self.name)
         if self._fault is Fault.SILENT:

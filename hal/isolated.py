@@ -1,0 +1,188 @@
+"""A device in a process of its own (`isolate = true`), which is started again when its driver crashes."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from hal.clock import WallClock
+from hal.config import Cell
+from hal.devices import DeviceKind, Health
+from hal.errors import CellError, ConfigError, DeviceUnavailable
+from hal.host import connect
+from hal.host_process import EXIT, HostProcess
+from hal.readings import Cause, Quality
+from hal.registry import Context
+from hal.registry import connect as connect_device
+
+FIRST_PAUSE_S = 0.5  # before the first restart; twice as long before each further one
+LONGEST_PAUSE_S = 5.0
+MAX_RESTARTS = 3  # of a driver that crashes again and again, within
+CRASHES_COUNT_S = 60.0
+SOON = "nothing to do: it connects again by itself; the log says how the driver crashed"
+BY_HAND = "mend it (the log says how the driver crashed), then connect it: PUT /v1/devices/NAME, or restart the service"
+CLEAR_THE_HAND = "when nothing is between the jaws connect it again: PUT /v1/devices/NAME, or restart the service"
+log = logging.getLogger(__name__)
+
+Report = Callable[[str, dict[str, Any]], None]
+"""Called with each thing worth recording: a kind and plain data."""
+
+
+class IsolatedDevice:
+    """A device in a process of its own, with the interface of its kind; to close it is to end the process.
+
+    When the process ends by itself, every call raises `DeviceUnavailable` at once, and the driver is started again
+    after 0.5 s, then 1 s, and so on up to 5 s. One that cannot connect is tried for ever, since its device may be
+    unplugged; one that crashes for the fourth time within a minute stays down. Motion power does not come back by
+    itself: an arm waits for `enable`, and a gripper, whose jaws may move when it is connected, is not started again.
+
+    Args:
+        report: told `driver-down`, `driver-restarted` and `driver-stays-down`, from a thread of this object.
+        pause_s: before the first restart.
+        max_restarts: of a driver that crashes again and again within a minute.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        driver: str,
+        options: dict[str, Any],
+        *,
+        report: Report = lambda _kind, _data: None,
+        pause_s: float = FIRST_PAUSE_S,
+        max_restarts: int = MAX_RESTARTS,
+    ) -> None:
+        self._pause_s = pause_s
+        self._max_restarts = max_restarts
+        self._name = context.name
+        self._driver = driver
+        self._order = (context.name, context.cell, driver, options)
+        self._report = report
+        self._is_closed = threading.Event()
+        self._mine = threading.local()
+        self._down: tuple[str, str] | None = None  # what and hint, while there is no process
+        self._crashes_s: list[float] = []
+        self._restarts = 0
+        self._process = self._begin()
+        self._constants = self._proxy()  # knows the names also while the process is down
+        self._watcher = threading.Thread(target=self._watch, name=f"watch-{self._name}", daemon=True)
+        self._watcher.start()
+
+    def __getattr__(self, attribute: str) -> Any:
+        if attribute.startswith("_"):
+            raise AttributeError(attribute)
+        value = getattr(self._constants, attribute)
+        return (lambda *args, **kwargs: self._call(attribute, *args, **kwargs)) if callable(value) else value
+
+    def __dir__(self) -> list[str]:
+        return dir(self._constants)
+
+    def health(self) -> Health:
+        """State of the device, or of its driver while that is down; returns at once."""
+        try:
+            health: Health = self._call("health")
+        except DeviceUnavailable as gone:
+            lost = Health(connected=False, quality=Quality.INVALID, cause=Cause.COMM)
+            return replace(lost, detail=gone.what, reconnects=self._restarts)
+        return replace(health, reconnects=health.reconnects + self._restarts)
+
+    def close(self) -> None:
+        """Close the device and end its process; a second call does nothing."""
+        self._is_closed.set()
+        self._process.close()
+        self._watcher.join()  # a start that is under way is given up
+        self._process.close()
+        self._down = (f"{self._name} is closed", "connect it again")
+
+    def _call(self, method: str, *args: Any, **kwargs: Any) -> Any:
+        down = self._down
+        if down is not None:
+            raise DeviceUnavailable(down[0], hint=down[1], device=self._name)
+        return getattr(self._proxy(), method)(*args, **kwargs)
+
+    def _proxy(self) -> Any:
+        """A connection of the calling thread's own, so that one slow read delays nobody else, `health` least of all."""
+        process = self._process
+        if getattr(self._mine, "process", None) is not process:
+            self._mine.proxy = connect(process.address, None, self._name, gone_hint=SOON)
+            self._mine.process = process
+        return self._mine.proxy
+
+    def _begin(self) -> HostProcess:
+        return HostProcess(_make_device, *self._order, name=self._name, give_up=self._is_closed)
+
+    def _watch(self) -> None:
+        while True:
+            how = self._process.await_end()
+            if self._is_closed.is_set() or not self._comes_back(how):
+                return
+
+    def _comes_back(self, how: str) -> bool:
+        """Bury the process and start another one; False when it is not to be."""
+        crashed = f"the driver of {self._name}, {self._driver}, has crashed ({how})"
+        log.error("%s", crashed)
+        self._report("driver-down", {"device": self._name, "driver": self._driver, "exit": how})
+        self._process.close()
+        if self._constants.kind == DeviceKind.GRIPPER:
+            return self._stay_down(f"{crashed}; jaws may move when it connects, so that is left to you", CLEAR_THE_HAND)
+        pause_s, last = self._pause_s, crashed
+        self._crashes_s.append(time.monotonic())
+        while not self._crashes_too_often():
+            self._down = (f"{last}; it is started again in {pause_s:g} s", SOON)
+            if self._is_closed.wait(pause_s):
+                return False
+            try:
+                self._process = self._begin()
+            except CellError as error:
+                if self._is_closed.is_set():
+                    return False
+                last = f"{crashed} and does not connect again yet: {error.what}"
+                if EXIT in error.details:
+                    self._crashes_s.append(time.monotonic())
+                pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
+                continue
+            self._restarts += 1
+            self._down = None
+            log.warning("%s is connected again", self._name)
+            self._report("driver-restarted", {"device": self._name, "restarts": self._restarts})
+            return True
+        times = len(self._crashes_s)
+        return self._stay_down(f"{last}; {times} crashes within {CRASHES_COUNT_S:.0f} s, so it stays down", BY_HAND)
+
+    def _crashes_too_often(self) -> bool:
+        since_s = time.monotonic() - CRASHES_COUNT_S
+        self._crashes_s = [moment_s for moment_s in self._crashes_s if moment_s > since_s]
+        return len(self._crashes_s) > self._max_restarts
+
+    def _stay_down(self, what: str, hint: str) -> bool:
+        self._down = (what, hint.replace("NAME", self._name))
+        log.error("%s", what)
+        self._report("driver-stays-down", {"device": self._name, "why": what})
+        return False
+
+
+def isolated_device(
+    context: Context, driver: str, options: dict[str, Any], *, report: Report = lambda _kind, _data: None
+) -> IsolatedDevice:
+    """Connect a device in a process of its own; see `IsolatedDevice`.
+
+    Raises:
+        ConfigError: a simulated driver shares its world with others, and a clock that is not the wall's is no other
+            process's: neither can be isolated.
+        CellError: the device did not connect.
+    """
+    if not driver.startswith("sim:") and isinstance(context.clock, WallClock):
+        return IsolatedDevice(context, driver, options, report=report)
+    raise ConfigError(
+        f"devices.{context.name}: {driver} cannot be isolated in a cell with a simulated world",
+        hint="remove isolate = true; it is for cell.mode = 'real'",
+        key=f"devices.{context.name}.isolate",
+    )
+
+
+def _make_device(name: str, cell: Cell | None, driver: str, options: dict[str, Any]) -> Mapping[str, object]:
+    return {name: connect_device(Context(name=name, cell=cell), driver, options)}

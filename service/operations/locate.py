@@ -20,7 +20,7 @@ from service.operations.evidence import LightEvidence, PlaneEvidence
 from service.operations.eyes import LightPair, Look, Scan, base_from, look_with_lights, scan
 from service.operations.requests import PanelPoseRequest
 from service.operations.session import Session
-from service.operations.travel import go_to_camera_view
+from service.operations.travel import go_to_camera_view, leave_the_panel
 from service.operations.views import overview_poses
 
 Array = NDArray[np.float64]
@@ -56,6 +56,8 @@ class ScannedPlane:
 def go_to_overview(session: Session) -> None:
     """Drive the camera to where it sees the whole panel."""
     known = session.memory.base_from_panel
+    if known is None:
+        leave_the_panel(session)
     slack_m = 0.01 if known is not None else 0.6 * session.cell.file.workspace.position_tolerance_m
     pose = believed_panel(session).parent_from_child
     lens = session.lens()

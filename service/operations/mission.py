@@ -26,7 +26,7 @@ from service.operations.requests import ActionBody, MissionRequest
 from service.operations.sense import feel, fuse_and_remember, fused_json, light_evidence
 from service.operations.session import Session
 from service.operations.surface_check import OVERVIEW, SurfaceCheck, check_surfaces, need_its_place, view_surfaces
-from service.operations.travel import park
+from service.operations.travel import leave_the_panel, park
 from service.problem import problem_of
 from service.report.drawing import panel_drawing
 from service.report.plots import joints_picture, lights_picture, png_of, range_picture, wrench_picture
@@ -97,9 +97,10 @@ def _report(record: MissionRecord, folder: Path) -> bool:
 
 
 def _run(session: Session, record: MissionRecord, request: MissionRequest) -> None:
-    session.memory.forget()  # another panel may stand there: a mission believes nothing that it has not seen
     with _step(session, "overview", 0.0, 0.06) as part:
         part.progress(0.0, "drive to the overview")
+        leave_the_panel(part)
+        session.memory.forget()  # another panel may stand there: a mission believes nothing that it has not seen
         go_to_overview(part)
     with _step(session, "lights", 0.06, 0.10) as part:
         first = locate(part)

@@ -157,7 +157,9 @@ class Session:
         record = self.cell.calibration_of(name)
         if record.intrinsics is None:
             raise ConfigError(
-                f"calibration of {name} has no [intrinsics]", hint=f"run `panelwright calibrate {name}`", device=name
+                f"calibration of {name} has no [intrinsics]",
+                hint=f"run `panelwright calibrate camera --device {name}`",
+                device=name,
             )
         return record.intrinsics.intrinsics()
 

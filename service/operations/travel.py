@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,8 @@ from hal.panel import Lever
 from manipulation.collision import CollisionModel
 from manipulation.kinematics import Kinematics
 from manipulation.shapes import Box
+from manipulation.skills.outcome import SkillFailure
+from manipulation.skills.steps import Attempt, retreat
 from manipulation.skills.steps import park as park_arm
 from manipulation.timing import SpeedLimits
 from manipulation.workcell import Workcell
@@ -26,6 +30,7 @@ Array = NDArray[np.float64]
 ENOUGH_CONDITIONING = 0.06  # smallest singular value over the largest: below it, small moves need fast wrists
 CLEAR_M = 0.004
 MOST_TRIES = 24
+MOST_STEPS_BACK = 6  # of 50 mm: further than the room of an unlocated panel reaches
 
 
 def go_to_camera_view(session: Session, base_from_camera: Iterable[RigidTransform], *, name: str) -> MotionReport:
@@ -88,6 +93,33 @@ def park(session: Session) -> None:
     park_arm(workcell(session))
 
 
+def leave_the_panel(session: Session) -> None:
+    """Go away if the arm stands where the panel may be, as after a deed: with no belief no way can be planned there.
+
+    With a located panel it parks; otherwise, as after a restart in the middle of work, it backs off along the fingers.
+
+    Raises:
+        Unreachable: it did not get away.
+    """
+    if _stands_clear(session):
+        return
+    if session.memory.base_from_panel is not None:
+        park(session)
+        return
+    cell = workcell(session)
+    retreat(cell)
+    attempt = Attempt(cell)
+    for _ in range(MOST_STEPS_BACK):
+        if _stands_clear(session):
+            return
+        with suppress(SkillFailure):  # something strong in the way: the next look tells
+            attempt.leave()
+    raise Unreachable(
+        f"the arm stands where the panel may be, and {MOST_STEPS_BACK} steps back along its fingers did not free it",
+        hint="drive it away from the panel by its own control, then send this again",
+    )
+
+
 def workcell(session: Session) -> Workcell:
     """What skills work with, from what is known now; an unlocated panel takes all the room that it may stand in."""
     file = session.cell.file
@@ -127,6 +159,13 @@ def lever_angles(session: Session) -> Mapping[str, float]:
         for state in lever.states
         if state.name == readings[lever.name].state
     }
+
+
+def _stands_clear(session: Session) -> bool:
+    """Is the arm outside all the room that an unlocated panel may take?"""
+    cell = replace(workcell(session), obstacles=(_where_the_panel_may_be(session),))
+    state = session.mover.state()
+    return cell.collision(width_m=state.gripper_width_m).is_clear(state.position_rad, margin_m=CLEAR_M)
 
 
 def _where_the_panel_may_be(session: Session) -> Box:

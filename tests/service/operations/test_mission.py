@@ -18,12 +18,14 @@ from hal.simulated import Fault, ObjectTruth, Truth
 from service.cell import CellRuntime
 from service.connection import LocalConnection
 from service.operations.context import CellMemory, OperationContext
+from service.operations.inspect import look_close
 from service.operations.judge import judge
 from service.operations.locate import go_to_overview, locate, scan_plate
 from service.operations.mission import run_mission
 from service.operations.requests import ActionBody, MissionRequest
 from service.operations.session import Session
 from service.operations.surface_check import CLOSER, OVERVIEW, check_surfaces, need_its_place, view_surfaces
+from service.operations.travel import go_to_joints
 from service.task_model import Task
 from service.tasks import TaskContext
 
@@ -73,6 +75,13 @@ def lie(truth: Truth) -> Truth:
     return replace(truth, base_from_panel_matrix=matrix, objects=wrong, initial=wrong)
 
 
+def stand_close(session: Session) -> None:
+    """Drive to where a deed ends: the second look at a control."""
+    go_to_overview(session)
+    locate(session)
+    look_close(session, session.panel.object("setpoint").point_m, ("setpoint",))
+
+
 def test_a_planted_wrong_truth_changes_nothing_but_the_judgement(tmp_path: Path) -> None:
     request = MissionRequest(actions=(ActionBody(object="setpoint", value=65.0),), touches=3)
     for name in ("honest", "planted"):
@@ -118,6 +127,8 @@ def test_a_wheel_beside_its_place_in_the_file_is_looked_at_again_stated_and_not_
 @pytest.mark.parametrize("device", ["wrist_camera", "range_scanner"])
 def test_a_device_that_dies_ends_the_mission_by_name_and_nothing_is_lost(tmp_path: Path, device: str) -> None:
     with mission_context(tmp_path, seed=4) as context:
+        if device == "range_scanner":
+            stand_close(Session(context=context))  # as after a deed: the mission gets away from there
         context.connection.device(device).inject_fault(Fault.DISCONNECTED)
         with pytest.raises(CellError) as caught:
             run_mission(context, MissionRequest())
@@ -128,6 +139,16 @@ def test_a_device_that_dies_ends_the_mission_by_name_and_nothing_is_lost(tmp_pat
     assert report["steps"] and not report["succeeded"]
     park = load_cell(ROOT / "cells/bench.toml").file.workspace.park_rad
     np.testing.assert_allclose(state.position_rad, park, atol=0.01)
+
+
+def test_an_arm_that_stands_at_the_panel_and_knows_of_none_gets_away(tmp_path: Path) -> None:
+    with mission_context(tmp_path, seed=4) as context:
+        session = Session(context=context)
+        stand_close(session)
+        session.memory.forget()  # as after a restart of the service
+        home = np.array(session.cell.file.workspace.park_rad)
+        assert not go_to_joints(session, home, name="home")  # nothing can be planned from in there
+        go_to_overview(session)
 
 
 def test_a_frozen_camera_is_found_out(tmp_path: Path) -> None:

@@ -39,7 +39,6 @@ class HostServer:
 
     def __init__(self, objects: Mapping[str, object], address: str, authkey: bytes, clock: Clock) -> None:
         self._objects = objects
-        self._authkey = authkey
         self._clock = clock
         self._listener = Listener(address, "AF_UNIX", backlog=64, authkey=authkey)
         self._is_closed = threading.Event()
@@ -57,8 +56,8 @@ class HostServer:
         if self._is_closed.is_set():
             return
         self._is_closed.set()
-        with contextlib.suppress(OSError, EOFError, multiprocessing.AuthenticationError):
-            Client(self.address, "AF_UNIX", authkey=self._authkey).close()  # wakes `accept`
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as bell:
+            bell.connect(self.address)  # wakes `accept`; a `Client` would wait for ever for one that has ended
         self._thread.join(timeout=1.0)
         self._listener.close()
         for connection in list(self._connections):
@@ -80,7 +79,7 @@ class HostServer:
             channel.send(None if target is None else _describe(target))
             while target is not None and not self._is_closed.is_set():
                 method, args, kwargs = channel.receive()
-                channel.send(_answer(target, method, args, kwargs))
+                _send(channel, _answer(target, method, args, kwargs))
         except (EOFError, OSError):
             pass  # the client went away; its calls go with it
         finally:
@@ -112,6 +111,15 @@ def _answer(target: object, method: str, args: tuple[Any, ...], kwargs: dict[str
         return "error", error
     except Exception as error:  # a defect on this side must reach the caller, not end the server
         return "defect", f"{type(error).__name__}: {error}"
+
+
+def _send(channel: Channel, answer: tuple[str, Any]) -> None:
+    try:
+        channel.send(answer)
+    except (EOFError, OSError):
+        raise
+    except Exception as error:  # it cannot be pickled, so nothing of it is on its way yet
+        channel.send(("defect", f"its answer cannot leave the process: {type(error).__name__}: {error}"))
 
 
 class Proxy:
@@ -153,6 +161,7 @@ class Proxy:
             self._drop()
             raise self._lost(error) from error
         if described is None:
+            self._drop()
             raise DeviceUnavailable(
                 f"the host has no object called {self._name!r}",
                 hint="check the names in the cell file",
@@ -162,34 +171,51 @@ class Proxy:
         return methods, constants
 
     def _call(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        deadline = kwargs.get("deadline")
-        with self._lock:
-            if self._channel is None:
-                self._open()
-            assert self._channel is not None  # noqa: S101 - narrowing: `_open` made it or raised
-            try:
-                self._channel.send((method, args, kwargs))
-                if isinstance(deadline, Deadline) and not self._channel.poll(deadline.remaining_s() + ANSWER_MARGIN_S):
-                    self._drop()  # a late answer must never be taken for the next one
-                    raise DeviceTimeout(
-                        f"{self._name}.{method} did not answer before its deadline",
-                        hint="its process may be busy or hung; see `panelwright devices`",
-                        device=self._name,
-                    )
-                outcome, value = self._channel.receive()
-            except (OSError, EOFError) as error:
-                self._drop()
-                raise self._lost(error) from error
+        given = kwargs.get("deadline")
+        deadline = given if isinstance(given, Deadline) else None
+        if not self._lock.acquire(timeout=-1.0 if deadline is None else deadline.remaining_s() + ANSWER_MARGIN_S):
+            raise self._late(method, "an earlier call holds it up")
+        try:
+            outcome, value = self._exchange(method, args, kwargs, deadline)
+        finally:
+            self._lock.release()
         if outcome == "value":
             return value
         if outcome == "error":
             raise value
         raise RuntimeError(f"{self._name}.{method} failed in its own process: {value}")
 
+    def _exchange(
+        self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], deadline: Deadline | None
+    ) -> tuple[str, Any]:
+        if self._channel is None:
+            self._open()
+        channel = self._channel
+        assert channel is not None  # noqa: S101 - narrowing: `_open` made it or raised
+        try:
+            channel.send((method, args, kwargs))
+            if deadline is not None and not channel.poll(deadline.remaining_s() + ANSWER_MARGIN_S):
+                raise self._late(method, "its process may be busy or hung")
+            outcome, value = channel.receive()
+        except (OSError, EOFError) as error:
+            self._drop()
+            raise self._lost(error) from error
+        except BaseException:  # late, or interrupted by Ctrl-C: what comes yet must never be taken for the next answer
+            self._drop()
+            raise
+        return outcome, value
+
     def _drop(self) -> None:
         if self._channel is not None:
             self._channel.close()
         self._channel = None
+
+    def _late(self, method: str, why: str) -> DeviceTimeout:
+        return DeviceTimeout(
+            f"{self._name}.{method} did not answer before its deadline",
+            hint=f"{why}; see `panelwright devices`",
+            device=self._name,
+        )
 
     def _lost(self, error: BaseException) -> DeviceUnavailable:
         return DeviceUnavailable(

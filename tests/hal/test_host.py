@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +41,9 @@ class Calculator:
 
     def hang(self, *, deadline: Deadline) -> None:
         deadline.clock.sleep(30.0)
+
+    def lock(self) -> object:
+        return threading.Lock()
 
     def close(self) -> None:
         """Nothing to release."""
@@ -94,6 +99,47 @@ def test_a_hung_object_is_a_timeout_and_the_next_call_is_answered(host: HostProc
     assert proxy.double(np.ones(1)).value[0] == 2.0
 
 
+def test_an_answer_that_cannot_travel_is_a_defect_and_the_host_lives(host: HostProcess) -> None:
+    proxy = host.proxy("calculator")
+    with pytest.raises(RuntimeError, match="cannot leave the process"):
+        proxy.lock()
+    assert proxy.double(np.ones(1)).value[0] == 2.0
+
+
+def test_an_interrupted_call_does_not_leave_its_answer_to_the_next(host: HostProcess) -> None:
+    class CtrlC(WallClock):
+        """Interrupts once the request has left: when the time for its answer is asked for."""
+
+        asked = 0
+
+        def now_s(self) -> float:
+            self.asked += 1
+            if self.asked > 2:  # before: the wait for the proxy, and the time that travels with the request
+                raise KeyboardInterrupt
+            return 0.0
+
+    proxy = host.proxy("calculator")
+    with pytest.raises(KeyboardInterrupt):
+        proxy.remaining(deadline=Deadline(5.0, CtrlC()))
+    assert proxy.double(np.ones(1)).value[0] == 2.0
+
+
+def test_a_call_behind_a_slow_one_ends_at_its_own_deadline(host: HostProcess) -> None:
+    proxy = host.proxy("calculator")
+
+    def hang() -> None:
+        with suppress(DeviceTimeout, DeviceUnavailable):  # whichever comes first: its deadline, or the host's end
+            proxy.hang(deadline=Deadline.after(WallClock(), 5.0))
+
+    slow = threading.Thread(target=hang, daemon=True)
+    slow.start()
+    while not proxy._lock.locked():
+        slow.join(0.001)
+    with pytest.raises(DeviceTimeout, match="remaining"):
+        proxy.remaining(deadline=Deadline.after(WallClock(), 0.01))
+    assert slow.is_alive()  # it did not have to wait for the slow one's end
+
+
 def test_constants_are_known_and_unknown_names_are_not(host: HostProcess) -> None:
     proxy = host.proxy("calculator")
     assert proxy.name == "calculator"
@@ -143,3 +189,16 @@ def test_a_closing_server_ends_the_threads_that_wait_for_its_clients(
         with pytest.raises(DeviceUnavailable):
             proxy.double(np.zeros(1))
     assert not faults
+
+
+def test_a_server_closes_even_if_nobody_accepts_any_more(tmp_path: Path) -> None:
+    server = HostServer(make(), str(tmp_path / "socket"), b"key", WallClock())
+    server._is_closed.set()  # as `close` does while the thread is between two connections: it ends without another look
+    with socket.socket(socket.AF_UNIX) as bell:
+        bell.connect(server.address)
+    server._thread.join(30.0)
+    server._is_closed.clear()
+    closing = threading.Thread(target=server.close, daemon=True)
+    closing.start()
+    closing.join(30.0)
+    assert not closing.is_alive()

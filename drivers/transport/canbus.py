@@ -21,6 +21,7 @@ from hal.wires import Claim
 
 SLCAN_RATES = {rate: code for code, rate in enumerate((10, 20, 50, 100, 125, 250, 500, 800, 1000))}  # kbit/s
 RAW = struct.Struct("<IB3x8s")
+NO_DATA = 0xE0000000  # flags of extended identifiers, remote requests and error frames (linux/can.h)
 LONGEST_LINE = 32
 TCP = "tcp://"
 
@@ -130,9 +131,9 @@ class RawCan:
         return RAW.pack(frame.id, len(frame.data), frame.data)
 
     def feed(self, chunk: bytes) -> list[CanFrame]:
-        """The socket gives whole frames."""
+        """The socket gives whole frames; those that are no data of an 11-bit identifier are others' business."""
         whole = chunk[: len(chunk) // RAW.size * RAW.size]
-        return [CanFrame(id_ & 0x7FF, data[:length]) for id_, length, data in RAW.iter_unpack(whole)]
+        return [CanFrame(id_, data[:length]) for id_, length, data in RAW.iter_unpack(whole) if not id_ & NO_DATA]
 
 
 def tcp_address(channel: str) -> tuple[str, int] | None:
@@ -167,7 +168,11 @@ def open_socketcan(interface: str, *, device: str) -> Link:
     """
     try:
         sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-        sock.bind((interface,))
+        try:
+            sock.bind((interface,))
+        except OSError:
+            sock.close()
+            raise
     except (OSError, AttributeError) as error:
         raise DeviceUnavailable(
             f"{device}: CAN interface {interface!r} cannot be opened: {error}",

@@ -10,6 +10,7 @@ import json
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -66,13 +67,34 @@ class CaptureLink:
         self._write_line({"t": round(now_s() - self._start_s, 6), "dir": direction, "hex": data.hex()})
 
     def _write_line(self, line: dict[str, Any]) -> None:
-        self._file.write(json.dumps(line) + "\n")
+        with suppress(ValueError):  # closed by the owner thread meanwhile: the link inside says so
+            self._file.write(json.dumps(line) + "\n")
 
 
 def inside(link: Link, kind: type[L]) -> L | None:
     """The link itself, or the one that is captured, if it is of that kind: for what only some links can do."""
     found = link.inner if isinstance(link, CaptureLink) else link
     return found if isinstance(found, kind) else None
+
+
+def captured(opener: Callable[[], Link], path: Path, device: str) -> Callable[[], Link]:
+    """What opens the link and the file that its traffic goes to.
+
+    Raises (what is returned):
+        DeviceUnavailable: the link cannot be opened, or the file not be written.
+    """
+
+    def opened() -> Link:
+        link = opener()
+        try:
+            return CaptureLink(link, path)
+        except OSError as error:
+            link.close()  # or the next attempt would find the port taken, by us
+            what = f"{device}: the capture {path} cannot be written: {error.strerror or error}"
+            hint = "name a file in a folder that exists and may be written to"
+            raise DeviceUnavailable(what, hint=hint, device=device) from error
+
+    return opened
 
 
 @dataclass(frozen=True, slots=True)

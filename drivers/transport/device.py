@@ -108,19 +108,22 @@ class WireDevice(Generic[T]):
         """The newest sample, at most `max_age_s` old; waits for one until the deadline.
 
         Args:
-            not_before_s: on the cell's clock; only a sample that was valid then or later will do.
+            not_before_s: on the cell's clock; only a sample that was valid then or later will do, whatever its age.
 
         Raises:
             DeviceTimeout: none came in time. DeviceUnavailable: the link is down. DeviceFault: the device says so.
         """
         self.require_open()
-        oldest_s = self.context.clock.now_s() - self.max_age_s if not_before_s is None else not_before_s
-        started_s = now_s()
+        clock, started_s, until_s = self.context.clock, now_s(), wall_until(deadline)
         errors_since_s = -math.inf if not_before_s is None else started_s
-        sample = self.mailbox.wait(oldest_host_s=oldest_s, until_s=wall_until(deadline), errors_since_s=errors_since_s)
-        if sample is None:
-            raise self.timeout(now_s() - started_s)
-        return sample
+        while True:
+            oldest_s = clock.now_s() - self.max_age_s if not_before_s is None else not_before_s
+            sample = self.mailbox.wait(oldest_host_s=oldest_s, until_s=until_s, errors_since_s=errors_since_s)
+            if sample is None:
+                raise self.timeout(now_s() - started_s)
+            # One that was held up on the wire may have been young enough when the wait began, and be too old by now.
+            if not_before_s is not None or sample.age_s(clock.now_s()) <= self.max_age_s:
+                return sample
 
     def require_open(self) -> None:
         """Refuse to work after `close`."""

@@ -22,8 +22,9 @@ class FdLink:
         self.received = 0  # bytes so far: tells a dead line from one whose bytes nobody understands
         self._write_lock = threading.Lock()
         self._close_lock = threading.Lock()
-        self._poll_in = select.poll()
+        self._poll_in, self._poll_out = select.poll(), select.poll()
         self._poll_in.register(fd, select.POLLIN)
+        self._poll_out.register(fd, select.POLLOUT)
 
     @property
     def name(self) -> str:
@@ -74,7 +75,7 @@ class FdLink:
                 rest = rest[os.write(self._fd, rest) :]
             except BlockingIOError:
                 wait_s = until_s - now_s()
-                if wait_s <= 0.0 or not select.select([], [self._fd], [], wait_s)[1]:
+                if wait_s <= 0.0 or not self._poll_out.poll(wait_s * 1e3):
                     raise NoAnswer(f"{self._name}: the port takes no more bytes") from None
 
     def is_present(self) -> bool:

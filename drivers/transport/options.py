@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 
-from drivers.transport.capture import CaptureLink, replay_opener
+from drivers.transport.capture import captured, replay_opener
 from drivers.transport.link import Link
 from drivers.transport.serial_link import open_serial
 from drivers.transport.socket_link import open_tcp, open_udp
@@ -143,5 +143,5 @@ def opener_with_files(options: Captured, device: str, opener: Callable[[], Link]
     if replay is not None:
         return replay_opener(replay, device)
     if capture is not None:
-        return lambda: CaptureLink(opener(), capture)
+        return captured(opener, capture, device)
     return opener

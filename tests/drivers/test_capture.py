@@ -1,6 +1,7 @@
 """What a driver has read over a wire is read again from a file: same samples, whatever the protocol."""
 
 import json
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -25,6 +26,7 @@ from drivers.emulators import (
     ur,
 )
 from drivers.transport.capture import CaptureLink, ReplayLink, read_capture, replay_opener
+from drivers.transport.fd_link import FdLink
 from drivers.transport.link import Link, LinkLost, drain, now_s
 from hal.devices import RangeImage
 from hal.errors import CellError, ConfigError, DeviceUnavailable
@@ -214,6 +216,24 @@ def test_a_file_that_is_no_capture_is_refused_with_its_line(text: str, tmp_path:
     path.write_text(text)
     with pytest.raises(ConfigError, match="line 1"):
         read_capture(path)
+
+
+def test_a_capture_that_cannot_be_written_says_so_and_leaves_the_port_free(tmp_path: Path) -> None:
+    emulator = tfmini.start(scripted.ScriptedProximity(), {})
+    with closing(emulator):
+        options = {**emulator.address, "capture": str(tmp_path / "no_such_folder" / "wire.jsonl")}
+        with pytest.raises(DeviceUnavailable, match=r"capture .*no_such_folder.* cannot be written"):
+            connect(Context(name="finger"), "serial:tfmini", options)
+
+
+def test_a_link_that_was_closed_meanwhile_is_lost_and_no_defect_when_it_is_captured(tmp_path: Path) -> None:
+    ours, theirs = socket.socketpair()
+    with closing(theirs):
+        ours.setblocking(False)
+        link = CaptureLink(FdLink(ours.detach(), "socket"), tmp_path / "wire.jsonl")
+        link.close()
+        with pytest.raises(LinkLost):
+            link.write(b"x", now_s())
 
 
 def test_a_missing_capture_is_an_error_of_the_options(tmp_path: Path) -> None:

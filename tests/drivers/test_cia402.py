@@ -18,7 +18,7 @@ from drivers.cia402_states import DriveState
 from drivers.emulators import cia402 as emulator
 from drivers.emulators.scripted import ScriptedArm
 from drivers.tfmini_i import CanTfminiOptions
-from drivers.transport.canbus import CanFrame, RawCan, Slcan
+from drivers.transport.canbus import RAW, CanFrame, RawCan, Slcan
 from drivers.transport.options import read_options
 from hal.conformance import ArmContract, Rig
 from hal.errors import CellError, ConfigError, DeviceFault, DeviceUnavailable, MotionRefused
@@ -65,6 +65,14 @@ def test_slcan_lines_survive_any_chunking(sent: list[CanFrame], cut: int) -> Non
 def test_kernel_frames_round_trip(sent: list[CanFrame]) -> None:
     codec = RawCan()
     assert codec.feed(b"".join(codec.encode(frame) for frame in sent)) == sent
+
+
+@pytest.mark.parametrize("flag", [0x80000000, 0x40000000, 0x20000000])
+def test_extended_remote_and_error_frames_of_the_kernel_are_not_taken_for_data(flag: int) -> None:
+    codec = RawCan()
+    own = CanFrame(0x181, b"123456")
+    foreign = RAW.pack(flag | own.id, 6, b"654321")
+    assert codec.feed(foreign + codec.encode(own) + foreign) == [own]
 
 
 def test_noise_and_a_false_header_before_a_line_cost_nothing() -> None:

@@ -11,10 +11,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from perception.range.beside import WORD, flagged
 from perception.range.borders import borders_of, step_and_turn
 from perception.range.grid import sigma_at
 from perception.range.regions import regions_of
-from perception.range.surfaces import PLANE, depth_on, normal_on
+from perception.range.surfaces import LEAN, PLANE, depth_on, normal_on
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
@@ -38,9 +39,8 @@ SIGMAS = 3.0
 def without_fillets(
     depth_m: Array, packed: Array, law: Array, labels: Labels, kinds: NDArray[np.int64], table: Array
 ) -> Labels:
-    """(H, W) labels after rounded edges went to their faces; labels index `kinds` and `table` from 1."""
+    """(H, W) `labels`, changed in place: rounded edges go to their faces; labels index `kinds` and `table` from 1."""
     half_width, length = _shapes(labels, kinds.shape[0])
-    out = labels.copy()
     beside = _strips(packed, law, labels, kinds, table, half_width, length)
     if beside:
         regions = regions_of(depth_m, packed, law, labels, kinds.shape[0] - 1)
@@ -48,16 +48,18 @@ def without_fillets(
             mine = regions.indices[regions.starts[strip] : regions.starts[strip + 1]]
             owner = _nearer(depth_m, packed, mine, half_width[strip], np.array(faces), kinds, table)
             if np.mean(owner > 0) >= (LEAST_SHARE if len(faces) > 1 else WHOLE_SHARE):
-                out.ravel()[mine] = np.where(owner > 0, owner, strip)
+                labels.ravel()[mine] = np.where(owner > 0, owner, strip)
     if min(labels.shape) >= LEAST_ROWS:
-        spread_outwards(depth_m, packed, law, out, kinds, table, round(REACH * min(labels.shape)))
-    return out
+        spread_outwards(depth_m, packed, law, labels, kinds, table, round(REACH * min(labels.shape)))
+    return labels
 
 
 def _strips(
     packed: Array, law: Array, labels: Labels, kinds: NDArray[np.int64], table: Array, half_width: Array, length: Array
 ) -> dict[int, list[int]]:
     """The faces beside each strip that continues them: two or more, or one that it leaves gently towards an outline."""
+    if not np.any((length >= LONG) & (half_width <= NARROWER * half_width.max())):
+        return {}
     perspective = bool(packed[0] > 0)
     beside: dict[int, list[int]] = {}
     gentle: set[int] = set()
@@ -83,25 +85,57 @@ def _shapes(labels, count):  # type: ignore[no-untyped-def]  # numba types it
     """
     H, W = labels.shape
     pixels, rim = np.zeros(count), np.zeros(count)
+    words, columns = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
     for v in range(H):
-        v1, v2, v3, v4 = max(v - 1, 0), max(v - 2, 0), min(v + 1, H - 1), min(v + 2, H - 1)
-        for u in range(W):
-            k = labels[v, u]
-            if k == 0:
-                continue
-            pixels[k] += 1.0
-            if 0 < u < W - 1 and labels[v, u - 1] == labels[v, u + 1] == labels[v1, u] == labels[v3, u] == k:
-                continue  # the inside of a region: nearly every pixel
-            u1, u2, u3, u4 = max(u - 1, 0), max(u - 2, 0), min(u + 1, W - 1), min(u + 2, W - 1)
-            is_rim = (labels[v, u1] != k and labels[v, u2] != k) or (labels[v, u3] != k and labels[v, u4] != k)
-            is_rim |= (labels[v1, u] != k and labels[v2, u] != k) or (labels[v3, u] != k and labels[v4, u] != k)
-            rim[k] += is_rim
+        above, below = labels[max(v - 1, 0)], labels[min(v + 1, H - 1)]
+        _flag_rims(labels[max(v - 2, 0)], above, labels[v], below, labels[min(v + 2, H - 1)], words.view(np.bool_))
+        _flag_sides(labels[v], words.view(np.bool_))
+        for i in range(flagged(words, columns)):
+            rim[labels[v, columns[i]]] += 1.0
+        _flag_changes(labels[v], words.view(np.bool_))
+        start = 0
+        for i in range(flagged(words, columns)):
+            pixels[labels[v, start]] += columns[i] - start
+            start = columns[i]
+        pixels[labels[v, start]] += W - start
     out = np.zeros((2, count))
-    for k in range(count):
+    for k in range(1, count):
         if pixels[k] > 0:
             out[0, k] = pixels[k] / rim[k]
             out[1, k] = rim[k] / out[0, k]
     return out
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _flag_rims(above_2, above, own, below, below_2, flags):  # type: ignore[no-untyped-def]  # numba types it
+    """Labelled pixels with two in a row of another label above or below."""
+    for u in range(own.shape[0]):
+        k = own[u]
+        is_top, is_bottom = (above[u] != k) & (above_2[u] != k), (below[u] != k) & (below_2[u] != k)
+        flags[u] = (k > 0) & (is_top | is_bottom)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _flag_sides(own, flags):  # type: ignore[no-untyped-def]  # numba types it
+    """And those with two in a row of another label to the left or right; beyond its ends the row goes on."""
+    last = own.shape[0] - 1
+    for u in range(last - 3):
+        k = own[u + 2]
+        is_left, is_right = (own[u + 1] != k) & (own[u] != k), (own[u + 3] != k) & (own[u + 4] != k)
+        flags[u + 2] |= (k > 0) & (is_left | is_right)
+    for u in (0, 1, last - 1, last):
+        k = own[u]
+        is_left = (own[max(u - 1, 0)] != k) & (own[max(u - 2, 0)] != k)
+        is_right = (own[min(u + 1, last)] != k) & (own[min(u + 2, last)] != k)
+        flags[u] |= (k > 0) & (is_left | is_right)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _flag_changes(own, flags):  # type: ignore[no-untyped-def]  # numba types it
+    """Where a pixel's label is not that of the one to its left."""
+    flags[0] = False
+    for u in range(1, own.shape[0]):
+        flags[u] = own[u] != own[u - 1]
 
 
 @njit(cache=True, error_model="numpy")
@@ -136,7 +170,7 @@ def _nearer(depth, sen, indices, half_width, faces, kinds, table):  # type: igno
 def spread_outwards(depth, sen, noise, labels, kinds, table, reach):  # type: ignore[no-untyped-def]  # numba types it
     """Give unlabelled pixels, ring by ring up to `reach`, to the surface beside them that they leave slowly; in place."""
     flat, fd, W = labels.ravel(), depth.ravel(), depth.shape[1]
-    ring = _first_ring(labels, fd)
+    ring = _first_ring(labels, depth)
     for sweep in range(1, reach + 1):
         chosen = np.zeros(ring.shape[0], np.int32)
         for k in range(ring.shape[0]):
@@ -150,20 +184,27 @@ def spread_outwards(depth, sen, noise, labels, kinds, table, reach):  # type: ig
 
 
 @njit(cache=True, nogil=True)
-def _first_ring(labels, fd):  # type: ignore[no-untyped-def]  # numba types it
+def _first_ring(labels, depth):  # type: ignore[no-untyped-def]  # numba types it
     """Flat indices of the unlabelled pixels with a reading beside labelled ones."""
     H, W = labels.shape
-    flat = labels.ravel()
-    ring, count = np.empty(1024, np.int32), 0
+    words, columns = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
+    ring, count = np.empty(4 * W, np.int32), 0
     for v in range(1, H - 1):
-        for i in range(v * W + 1, v * W + W - 1):
-            if flat[i] or not np.isfinite(fd[i]) or not flat[i - 1] | flat[i + 1] | flat[i - W] | flat[i + W]:
-                continue
-            if count == ring.shape[0]:
-                ring = np.concatenate((ring, np.empty_like(ring)))
-            ring[count] = i
-            count += 1
+        if count + W > ring.shape[0]:
+            ring = np.concatenate((ring, ring))
+        _flag_outlines(labels[v - 1], labels[v], labels[v + 1], words.view(np.bool_))
+        for i in range(flagged(words, columns)):
+            if np.isfinite(depth[v, columns[i]]):
+                ring[count] = v * W + columns[i]
+                count += 1
     return ring[:count].copy()
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _flag_outlines(above, own, below, flags):  # type: ignore[no-untyped-def]  # numba types it
+    """Unlabelled pixels beside labelled ones, but for the ends of the row."""
+    for u in range(1, own.shape[0] - 1):
+        flags[u] = (own[u] == 0) & ((own[u - 1] | own[u + 1] | above[u] | below[u]) != 0)
 
 
 @njit(cache=True, nogil=True)
@@ -188,10 +229,12 @@ def _slowest_left(i, W, fd, sen, noise, flat, kinds, table, slope):  # type: ign
     perspective = sen[0] > 0
     x, y, z = (i % W - sen[3]) / sen[1], (i // W - sen[4]) / sen[2], fd[i]
     best, label = SIGMAS * sigma_at(noise, z) + slope * (z if perspective else 1.0), 0
+    last = 0
     for step in (-1, 1, -W, W):
         f = flat[i + step]
-        if f <= 0 or f == label:
+        if f <= 0 or f == label or f == last:  # noqa: PLR1714, SIM109 - numba knows no `in` of mixed integers
             continue
+        last = f
         off = _off(kinds[f], table[f], x, y, z, perspective)
         if off < best:
             best, label = off, f

@@ -12,11 +12,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from perception.range.beside import WORD, column_range, flagged, new_columns
 from perception.range.compete import Candidates
 from perception.range.faces import labels_of_blocks
 from perception.range.grid import Grid, sigma_at
 from perception.range.segment import Task
-from perception.range.surfaces import PLANE, depth_on
+from perception.range.surfaces import LEAN, PLANE, depth_on
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -30,18 +31,19 @@ SEAM_SHARE = 0.7  # of the blocks between two parts, that must be rough
 BEHIND_SIGMAS = 0.3  # of a block, that they lie behind in the median
 DEEP_SIGMAS = 3.5  # of a pixel, that makes a block rough by itself: a gap narrower than blocks
 IN_FRONT_SIGMAS = 3.0
+NO_PLANE = np.int32(2**31 - 1)
 AROUND = np.ones((3, 3), np.uint8)
 
 
 def cut_at_grooves(task: Task, law: Array, grid: Grid, labels: Labels, found: Candidates) -> Labels:
     """Labels (H, W) after planes with a groove across were cut; extends `found` by a copy of the plane for each part."""
     size = grid.size_px
-    blocks = labels_of_blocks(labels, grid)
     kinds, table = found.arrays()
-    rough = _rough(blocks, grid.rms, kinds, labels, task.depth_m, task.packed, law, size, table)
+    planes, sizes = planes_of_blocks(labels_of_blocks(labels, grid), kinds)
+    rough = rough_blocks(planes, grid.rms, labels, task.depth_m, task.packed, law, size, table)
     out = labels
-    for k in _suspects(blocks, rough > 0, kinds):
-        parts = _parts(grid, blocks == k, rough, table[k])
+    for k in _suspects(planes, rough, sizes):
+        parts = _parts(grid, planes == k, rough, table[k])
         if parts is None:
             continue
         out = labels.copy() if out is labels else out
@@ -52,72 +54,119 @@ def cut_at_grooves(task: Task, law: Array, grid: Grid, labels: Labels, found: Ca
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _rough(blocks, rms, kinds, labels, depth, sen, noise, size, table):  # type: ignore[no-untyped-def]  # numba types it
+def planes_of_blocks(blocks, kinds):  # type: ignore[no-untyped-def]  # numba types it
+    """(h, w) `blocks` with 0 for all but planes, and how many blocks each plane has."""
+    planes, sizes = np.zeros_like(blocks), np.zeros(kinds.shape[0], np.int32)
+    flat, out = blocks.ravel(), planes.ravel()
+    for i in range(flat.shape[0]):
+        k = flat[i]
+        if k > 0 and kinds[k] == PLANE:
+            out[i] = k
+            sizes[k] += 1
+    return planes, sizes
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def rough_blocks(planes, rms, labels, depth, sen, noise, size, table):  # type: ignore[no-untyped-def]  # numba types it
     """(h, w) of the blocks of planes: 2 where a pixel lies deep behind, 1 where the tangent plane leaves much over, else 0."""
-    h, w = blocks.shape
+    h, w = planes.shape
     H, W = labels.shape
     perspective = sen[0] > 0
-    counts = np.zeros((kinds.shape[0], RMS_BINS), np.int32)
+    limit = ROUGHER * _usual_rms(planes, rms, table.shape[0])
+    out = np.zeros((h, w), np.uint8)
+    own, words, columns = np.zeros(W, np.int32), np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
     for r in range(h):
         for c in range(w):
-            if np.isfinite(rms[r, c]):
-                counts[blocks[r, c], int(min(rms[r, c] * BINS_A_SIGMA, RMS_BINS - 1.0))] += 1
-    usual = np.zeros(kinds.shape[0])
-    for k in range(1, kinds.shape[0]):
+            k = planes[r, c]
+            out[r, c] = k > 0 and not rms[r, c] < limit[k]
+            for u in range(c * size, min(c * size + size, W)):
+                own[u] = k
+        for v in range(r * size, min(r * size + size, H)):
+            _flag_others(labels[v], own, words.view(np.bool_))
+            for i in range(flagged(words, columns)):
+                u = columns[i]
+                zm = depth_on(PLANE, table[own[u]], (u - sen[3]) / sen[1], (v - sen[4]) / sen[2], perspective)
+                if depth[v, u] - zm > DEEP_SIGMAS * sigma_at(noise, zm):
+                    out[r, u // size] = 2
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _usual_rms(planes, rms, count):  # type: ignore[no-untyped-def]  # numba types it
+    """(count,) the median of what tangent planes leave over, of the blocks of each plane."""
+    counts, usual = np.zeros((count, RMS_BINS), np.int32), np.zeros(count)
+    for r in range(planes.shape[0]):
+        for c in range(planes.shape[1]):
+            if rms[r, c] < np.inf:
+                counts[planes[r, c], int(min(rms[r, c] * BINS_A_SIGMA, RMS_BINS - 1.0))] += 1
+    for k in range(1, count):
         middle, level, below = counts[k].sum() // 2, 0, counts[k, 0]
         while below < middle:
             level += 1
             below += counts[k, level]
         usual[k] = (level + 0.5) / BINS_A_SIGMA
-    out = np.zeros((h, w), np.uint8)
-    for r in range(h):
-        for c in range(w):
-            k = blocks[r, c]
-            if k == 0 or kinds[k] != PLANE:
-                continue
-            out[r, c] = not rms[r, c] < ROUGHER * usual[k]
-            for v in range(r * size, min(r * size + size, H)):
-                for u in range(c * size, min(c * size + size, W)):
-                    if labels[v, u] == k:
-                        continue  # a pixel that the plane explains
-                    zm = depth_on(PLANE, table[k], (u - sen[3]) / sen[1], (v - sen[4]) / sen[2], perspective)
-                    if depth[v, u] - zm > DEEP_SIGMAS * sigma_at(noise, zm):
-                        out[r, c] = 2
-    return out
+    return usual
 
 
-def _suspects(blocks: Labels, rough: Flags, kinds: NDArray[np.int64]) -> list[int]:
+@njit(cache=True, error_model="numpy", **LEAN)
+def _flag_others(labels, own, flags):  # type: ignore[no-untyped-def]  # numba types it
+    """Where a pixel of a plane's block is not the plane's."""
+    for u in range(labels.shape[0]):
+        flags[u] = (own[u] > 0) & (labels[u] != own[u])
+
+
+def _suspects(planes: Labels, rough: NDArray[np.uint8], sizes: Labels) -> list[int]:
     """Planes of whose inside two or more large parts remain when rough blocks are taken away."""
-    inner = _inside(blocks, rough, kinds)
-    count, marks, stats, _ = cv2.connectedComponentsWithStats(inner, connectivity=4, ltype=cv2.CV_32S)
+    count, marks = cv2.connectedComponents(inside(planes, rough), connectivity=4)
     if count < 3:
         return []
-    least = np.maximum(LEAST_BLOCKS, LEAST_SHARE * np.bincount(blocks.ravel(), minlength=kinds.size))
-    large = []
-    for part in np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= LEAST_BLOCKS) + 1:
-        left, top, width, _, area = stats[part]
-        k = int(blocks[top, left + np.argmax(marks[top, left : left + width] == part)])
-        if area >= least[k]:
-            large.append(k)
-    return sorted({k for k in large if large.count(k) > 1})
+    areas, owners = _parts_of_planes(marks, planes, count)
+    least = np.maximum(LEAST_BLOCKS, LEAST_SHARE * sizes)
+    large = np.bincount(owners[(areas >= least[owners]) & (owners > 0)], minlength=sizes.size)
+    suspects: list[int] = np.flatnonzero(large > 1).tolist()
+    return suspects
 
 
 @njit(cache=True, nogil=True)
-def _inside(blocks, rough, kinds):  # type: ignore[no-untyped-def]  # numba types it
+def inside(planes, rough):  # type: ignore[no-untyped-def]  # numba types it
     """(h, w) 1 where a block and all of its neighbours belong to one plane and are not rough."""
-    h, w = blocks.shape
-    out = np.zeros((h, w), np.uint8)
+    h, w = planes.shape
+    out, own = np.zeros((h, w), np.uint8), np.zeros((h, w), np.int32)
+    for r in range(h):
+        _fill_smooth(planes[r], rough[r], own[r])
+    least, most = new_columns(w)
     for r in range(1, h - 1):
-        for c in range(1, w - 1):
-            k = blocks[r, c]
-            if k == 0 or kinds[k] != PLANE:
-                continue
-            is_inside = True
-            for i in range(r - 1, r + 2):
-                for j in range(c - 1, c + 2):
-                    is_inside &= blocks[i, j] == k and not rough[i, j]
-            out[r, c] = is_inside
+        column_range(own, r, least, most)
+        _fill_inside(own[r], least, most, out[r])
     return out
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _fill_smooth(planes, rough, own):  # type: ignore[no-untyped-def]  # numba types it
+    """The planes of one row of blocks, `NO_PLANE` for a block that is rough or of none."""
+    for c in range(own.shape[0]):
+        own[c] = planes[c] if (planes[c] > 0) & (rough[c] == 0) else NO_PLANE
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _fill_inside(own, least, most, out):  # type: ignore[no-untyped-def]  # numba types it
+    """From `column_range` of `own`: where it and all around are one plane."""
+    for c in range(1, own.shape[0] - 1):
+        low, high = min(least[c], least[c + 1], least[c + 2]), max(most[c], most[c + 1], most[c + 2])
+        out[c] = (own[c] != NO_PLANE) & (high == own[c]) & (low == np.uint32(own[c] - np.int32(1)))
+
+
+@njit(cache=True, nogil=True)
+def _parts_of_planes(marks, planes, count):  # type: ignore[no-untyped-def]  # numba types it
+    """(count,) blocks of each mark, and the plane that it lies in; 0 for mark 0."""
+    areas, owners = np.zeros(count, np.int32), np.zeros(count, np.int32)
+    for r in range(marks.shape[0]):
+        for c in range(marks.shape[1]):
+            k = marks[r, c]
+            if k > 0:
+                areas[k] += 1
+                owners[k] = planes[r, c]
+    return areas, owners
 
 
 def _parts(grid: Grid, mine: Flags, rough: NDArray[np.uint8], th: Array) -> Labels | None:
@@ -157,18 +206,21 @@ def _parts(grid: Grid, mine: Flags, rough: NDArray[np.uint8], th: Array) -> Labe
 def _seams(basins: Labels, mine: Flags, rough: Flags, behind: Array) -> dict[tuple[int, int], tuple[float, float]]:
     """Of each pair of basins that meet: the rough share of their seam, and how far it lies behind in the median."""
     near = cv2.dilate(rough.view(np.uint8), AROUND) > 0
-    found: dict[tuple[int, int], list[tuple[bool, float]]] = {}
+    own = np.where(mine, basins, 0)
+    count = int(own.max()) + 1
+    parts = []
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        met = mine[a] & mine[b] & (basins[a] != basins[b]) & (basins[a] > 0) & (basins[b] > 0)
-        places = zip(
-            basins[a][met], basins[b][met], near[a][met] & near[b][met], behind[a][met], behind[b][met], strict=True
-        )
-        for p, q, is_rough, d, e in places:
-            found.setdefault((min(p, q), max(p, q)), []).append((bool(is_rough), float(0.5 * (d + e))))
+        met = (own[a] != own[b]) & (own[a] > 0) & (own[b] > 0)
+        p, q = own[a][met], own[b][met]
+        parts.append((np.minimum(p, q) * count + np.maximum(p, q), near[a][met] & near[b][met],
+                      0.5 * (behind[a][met] + behind[b][met])))  # fmt: skip
+    pairs, is_rough, depth = (np.concatenate(p) for p in zip(*parts, strict=True))
     out = {}
-    for pair, seam in sorted(found.items()):
-        share, depth = np.mean([s[0] for s in seam]), np.nanmedian([s[1] for s in seam])
-        out[pair] = (float(share), float(depth))
+    for pair in np.unique(pairs).tolist():
+        seam = pairs == pair
+        known = depth[seam & np.isfinite(depth)]
+        middle = float(np.median(known)) if known.size else np.nan
+        out[divmod(pair, count)] = (float(np.mean(is_rough[seam])), middle)
     return out
 
 

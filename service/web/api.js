@@ -11,8 +11,17 @@ export class ProblemError extends Error {
   }
 }
 
+// A browser's "Failed to fetch" tells nobody what to do.
+export async function ask(path, options) {
+  try {
+    return await fetch(path, options);
+  } catch {
+    throw new ProblemError({ detail: "The service does not answer", hint: "Is panelwright serve still running?" }, 0);
+  }
+}
+
 export async function get(path) {
-  return answered(await fetch(path, { cache: "no-store" }));
+  return answered(await ask(path, { cache: "no-store" }));
 }
 
 // The same, asked again until there is an answer: what a page cannot do without.
@@ -28,16 +37,16 @@ export async function insist(path) {
 
 export async function post(path, body) {
   const json = body === undefined ? {} : { headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
-  return answered(await fetch(path, { method: "POST", ...json }));
+  return answered(await ask(path, { method: "POST", ...json }));
 }
 
 // A file as it is: its type says what it is.
 export async function upload(path, data) {
-  return answered(await fetch(path, { method: "POST", headers: { "Content-Type": data.type }, body: data }));
+  return answered(await ask(path, { method: "POST", headers: { "Content-Type": data.type }, body: data }));
 }
 
 export async function remove(path) {
-  return answered(await fetch(path, { method: "DELETE" }));
+  return answered(await ask(path, { method: "DELETE" }));
 }
 
 // The task when it has ended well, however long that takes; a failed one is an Error as any other problem is.

@@ -18,9 +18,11 @@ async function watchService() {
     const response = await fetch("/readyz", { cache: "no-store" });
     const ready = await response.json();
     const sick = ready.processes.find((process) => process.detail) || {};
+    document.body.classList.remove("lost");
     banner.hidden = ready.is_ready;
     banner.textContent = `The cell is not ready. ${sick.detail || "It is starting."}`;
   } catch {
+    document.body.classList.add("lost"); // what is shown is what was known last
     banner.hidden = false;
     banner.textContent = "The service does not answer. Is panelwright serve still running?";
   }

@@ -6,7 +6,10 @@ export function startDevices() {
 }
 
 async function list() {
-  const { devices } = await get("/v1/devices");
+  const { devices } = await get("/v1/devices").catch((lost) => {
+    document.querySelector("#devices-line").textContent = "not known now";
+    throw lost;
+  });
   const good = devices.filter((device) => device.health.connected && device.health.quality === "valid").length;
   document.querySelector("#devices-line").textContent = `${good} of ${devices.length} good`;
   document.querySelector("#devices").replaceChildren(...devices.map(item));
@@ -25,7 +28,7 @@ function item(device) {
   const words = document.createElement("span");
   words.className = "quiet right";
   const cause = health.cause === "none" ? "" : ` (${health.cause})`;
-  words.textContent = health.connected ? `${quality}${cause} · ${health.samples} samples` : "disconnected";
+  words.textContent = health.connected ? `${quality}${cause} · ${health.samples} ${health.samples === 1 ? "sample" : "samples"}` : "disconnected";
   words.title = health.detail;
   line.append(dot, name, words);
   return line;

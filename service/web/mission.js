@@ -1,6 +1,6 @@
 // Starts missions, follows the running task by server-sent events, lists tasks, links the last report.
 import { FINAL, get, post, repeat } from "./api.js";
-import { isLatched } from "./stop.js";
+import { isClear, isLatched } from "./stop.js";
 
 const $ = (selector) => document.querySelector(selector);
 let followed = null; // id of the task whose events we show
@@ -28,7 +28,7 @@ async function run() {
 }
 
 function enable() {
-  $("#start").disabled = !canRun || isActive || isLatched();
+  $("#start").disabled = !canRun || isActive || !isClear();
   $("#start").title = isLatched() ? "The stop is latched: reset it first" : "";
 }
 
@@ -47,6 +47,7 @@ function follow(task) {
     events.close();
     isActive = false;
     if (event.detail) addStep(event.time_s, event.state, event.detail, "bad");
+    if (event.state === "failed") get(`/v1/tasks/${task.id}`).then((ended) => addStep(event.time_s, "try", ended.problem.hint)).catch(() => {});
     enable();
     findReport().catch(() => {});
   };
@@ -102,6 +103,7 @@ function row(task) {
     line.append(box);
   }
   line.children[3].className = "step";
+  if (task.problem) line.children[3].append(Object.assign(document.createElement("p"), { className: "quiet", textContent: task.problem.hint }));
   return line;
 }
 

@@ -6,6 +6,7 @@ const line = document.querySelector("#stop-line");
 const reset = document.querySelector("#reset");
 const PATIENCE_MS = 5000; // after this the slower way to stop no longer delays a reset
 let count = 0;
+let changedS = 0; // when what is shown came about: a service that was started anew counts from the beginning
 let stopping = 0; // presses of which one way is still under way: it would latch again what was reset before it arrives
 
 // `stopUrl` is a promise: the button works from the first moment, and the stop process is told once its port is known.
@@ -32,6 +33,7 @@ export function startStop(stopUrl) {
 }
 
 export const isLatched = () => box.dataset.latched === "yes";
+export const isClear = () => box.dataset.latched === "no";
 
 const after = (ms) => new Promise((done) => setTimeout(done, ms));
 
@@ -41,14 +43,23 @@ function allowReset() {
 }
 
 async function look() {
-  show(await get("/v1/stop"));
+  try {
+    show(await get("/v1/stop"));
+  } catch {
+    tell("unknown", "NO ANSWER: use the hardware stop");
+  }
 }
 
 function show(state) {
-  if (state.count < count) return; // an answer that was overtaken
-  count = state.count;
-  box.dataset.latched = state.is_latched ? "yes" : "no";
-  line.textContent = state.is_latched ? `STOPPED · ${state.source}` : "clear to move";
-  reset.hidden = stopping > 0 || !state.is_latched;
-  document.dispatchEvent(new CustomEvent("latch", { detail: state.is_latched }));
+  if (state.count < count && state.changed_time_s <= changedS) return; // an answer that was overtaken
+  [count, changedS] = [state.count, state.changed_time_s];
+  if (state.is_latched) tell("yes", `STOPPED · ${state.source}`);
+  else tell("no", "clear to move");
+}
+
+function tell(latched, words) {
+  box.dataset.latched = latched;
+  line.textContent = words;
+  reset.hidden = stopping > 0 || latched !== "yes";
+  document.dispatchEvent(new CustomEvent("latch"));
 }

@@ -1,5 +1,5 @@
 // The image to click on: uploaded, stored, or taken by a camera of the cell; its clicks, and the outline drawn over it.
-import { get, upload } from "./api.js";
+import { ProblemError, ask, get, upload } from "./api.js";
 
 const MOST_CLICKS = 3;
 const SVG = "http://www.w3.org/2000/svg";
@@ -47,8 +47,8 @@ function taker(name, keep, attempt) {
   const button = document.createElement("button");
   button.textContent = `Take from ${name.replaceAll("_", " ")}`;
   button.addEventListener("click", () => attempt(async () => {
-    const answer = await fetch(`/v1/devices/${name}/reading?format=png`, { cache: "no-store" });
-    if (!answer.ok) throw new Error((await answer.json()).detail);
+    const answer = await ask(`/v1/devices/${name}/reading?format=png`, { cache: "no-store" });
+    if (!answer.ok) throw new ProblemError(await answer.json(), answer.status);
     await keep(await answer.blob());
   }));
   return button;

@@ -1,5 +1,5 @@
 // The live picture: asked for at a modest rate, only while somebody can see it, and slower while a task needs the cell.
-import { get, repeat } from "./api.js";
+import { ProblemError, ask, get, repeat } from "./api.js";
 
 const picture = document.querySelector("#picture");
 const line = document.querySelector("#picture-line");
@@ -33,16 +33,20 @@ function choose(name) {
 async function show() {
   if (!chosen || !isSeen) return;
   const name = chosen;
-  const response = await fetch(`/v1/devices/${name}/reading?format=png&max_age_s=0.5`, { cache: "no-store" });
-  if (name !== chosen) return;
-  if (!response.ok) {
-    const problem = await response.json();
-    line.textContent = `${problem.detail} · ${problem.hint}`;
+  try {
+    const response = await ask(`/v1/devices/${name}/reading?format=png&max_age_s=0.5`, { cache: "no-store" });
+    if (name !== chosen) return;
+    if (!response.ok) throw new ProblemError(await response.json(), response.status);
+    draw(name, await response.blob());
+  } catch (problem) {
+    line.textContent = `${problem.message} · ${problem.hint || ""}`;
     picture.style.opacity = 0.35; // an old picture must not pass for a new one
-    return;
   }
+}
+
+function draw(name, blob) {
   const old = picture.src;
-  picture.src = URL.createObjectURL(await response.blob());
+  picture.src = URL.createObjectURL(blob);
   picture.style.opacity = 1;
   if (old.startsWith("blob:")) URL.revokeObjectURL(old);
   line.textContent = `${name} · ${new Date().toTimeString().slice(0, 8)}`;

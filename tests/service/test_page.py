@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -169,7 +170,25 @@ def test_the_escape_key_stops_and_a_narrow_screen_still_shows_the_button(page: A
     assert served_page.service.supervisor.latch.is_set()
 
 
-def test_an_unreachable_service_is_said(page: Any, served_page: Panelwright) -> None:
-    page.route("**/readyz", lambda route: route.abort())
+def test_an_unreachable_service_is_said_and_nothing_old_passes_for_new(page: Any, served_page: Panelwright) -> None:
+    page.route("**/*", lambda route: route.abort())
     page.wait_for_selector("#banner:not([hidden])")
     assert "does not answer" in page.text_content("#banner")
+    _until(page, "document.querySelector('#stop-box').dataset.latched === 'unknown'")
+    assert "hardware stop" in page.text_content("#stop-line")
+    assert page.is_disabled("#start")
+    _until(page, "document.querySelector('#devices-line').textContent === 'not known now'")
+    _until(page, "document.querySelector('#picture').style.opacity === '0.35'")
+    page.unroute_all()
+    page.wait_for_selector("#banner", state="hidden")
+
+
+def test_a_stop_of_a_service_that_was_started_anew_is_no_old_news(page: Any, served_page: Panelwright) -> None:
+    """It counts its stops from the beginning."""
+    fresh = {"is_latched": False, "count": 0, "changed_time_s": time.time() + 60.0, "source": "anew", "stop_url": ""}
+    served_page.service.supervisor.stop("a test")
+    _until(page, "document.querySelector('#stop-box').dataset.latched === 'yes'")
+    page.route("**/v1/stop", lambda route: route.fulfill(json=fresh))
+    _until(page, "document.querySelector('#stop-box').dataset.latched === 'no'")
+    page.wait_for_selector("#start:not([disabled])")
+    page.unroute_all()

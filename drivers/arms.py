@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import threading
-from typing import Annotated, Any
+from collections.abc import Sequence
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from drivers.points import require_same_number
 from hal.devices import ArmCapabilities, DhLink
 from hal.errors import InvalidRequest, MotionRefused
 from hal.strict import Strict
@@ -39,6 +41,24 @@ class KinematicsOptions(Strict):
     acceleration_rad_per_s2: tuple[Positive, ...]
     tip_speed_m_per_s: Positive
     link_radius_m: tuple[Positive, ...]
+
+    @model_validator(mode="after")
+    def _one_entry_a_joint(self) -> Self:
+        lists = (self.links, self.lower_rad, self.upper_rad, self.velocity_rad_per_s, self.acceleration_rad_per_s2)
+        require_same_number("links, limits and link_radius_m", *lists, self.link_radius_m)
+        if any(low >= high for low, high in zip(self.lower_rad, self.upper_rad, strict=True)):
+            raise ValueError("each of lower_rad must be below its upper_rad")
+        return self
+
+
+def require_stations(what: str, stations: Sequence[int], k: KinematicsOptions) -> None:
+    """One station a joint, each a different one.
+
+    Raises:
+        ValueError: it is not so; `what` is the key that lists them.
+    """
+    if len(stations) != len(k.links) or len(set(stations)) != len(stations):
+        raise ValueError(f"{what} must be {len(k.links)} different ones, as kinematics has {len(k.links)} links")
 
 
 def kinematics_of(c: ArmCapabilities) -> dict[str, Any]:

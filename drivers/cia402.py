@@ -11,12 +11,12 @@ import struct
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from drivers.arms import Array, KinematicsOptions, SetPointFilter, capabilities
+from drivers.arms import Array, KinematicsOptions, SetPointFilter, capabilities, require_stations
 from drivers.cia402_setup import PROBES, SDO_REQUEST, SDO_S, SdoClient, SetUp, upload_request
 from drivers.cia402_states import DISABLE, FAULT_RESET, QUICK_STOP, DriveState, state_of, towards_enabled
 from drivers.cia402_sync import SyncCount
@@ -53,6 +53,13 @@ class Cia402Options(CanOptions):
     realtime_priority: Annotated[int, Field(ge=0, le=99)] = 10
     degrees_per_increment: Annotated[float, Field(gt=0)] = 0.001
     kinematics: KinematicsOptions
+
+    @model_validator(mode="after")
+    def _one_node_a_joint(self) -> Self:
+        require_stations("nodes", self.nodes, self.kinematics)
+        if self.host_node in self.nodes:
+            raise ValueError(f"host_node {self.host_node} is one of the drives' nodes")
+        return self
 
     @property
     def stations(self) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from zipfile import BadZipFile
 
 import cv2
 import numpy as np
@@ -95,7 +96,7 @@ class DepthCamera(FilePlayer[RangeImage]):
         path, o = self._files[index % len(self._files)], self._options
         try:
             depth_m = _read(path, o.unit_m)
-        except (OSError, ValueError, IndexError) as error:
+        except (OSError, ValueError, IndexError, EOFError, BadZipFile) as error:
             raise self._fault(f"{path} is no depth picture: {error}") from error
         if depth_m.ndim != 2 or (index > 0 and depth_m.shape != self._shape):
             raise self._fault(f"{path} has shape {depth_m.shape}")
@@ -114,8 +115,10 @@ def _read(path: Path, unit_m: float) -> NDArray[np.float64]:
             raise ValueError("not a PNG of 16 bits")
         return np.asarray(raw, dtype=np.float64) * unit_m
     loaded = np.load(path, allow_pickle=False)
-    array = loaded if isinstance(loaded, np.ndarray) else loaded[loaded.files[0]]
-    return np.asarray(array, dtype=np.float64)
+    if isinstance(loaded, np.ndarray):
+        return np.asarray(loaded, dtype=np.float64)
+    with loaded:
+        return np.asarray(loaded[loaded.files[0]], dtype=np.float64)
 
 
 @takes(DepthCameraOptions)

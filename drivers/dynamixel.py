@@ -10,13 +10,14 @@ import math
 import struct
 from collections import deque
 from contextlib import suppress
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from drivers.arms import Array, KinematicsOptions, SetPointFilter, capabilities
+from drivers.arms import Array, KinematicsOptions, SetPointFilter, capabilities, require_stations
 from drivers.dxl2_client import BusOptions, DynamixelClient, dynamixel_bus
+from drivers.points import require_same_number
 from drivers.transport.bus import PolledDevice
 from drivers.transport.device import wall_until
 from drivers.transport.link import BadAnswer, NoAnswer, Refused, WireError, now_s
@@ -44,12 +45,18 @@ class DynamixelOptions(BusOptions):
     """Options of `serial:dynamixel`; `directions` turns joints round, `zero_counts` is where each joint is at 0 rad."""
 
     ids: tuple[Annotated[int, Field(ge=0, le=252)], ...] = (1, 2, 3, 4, 5, 6)
-    directions: tuple[int, ...] | None = None
+    directions: tuple[Literal[-1, 1], ...] | None = None
     zero_counts: tuple[int, ...] | None = None
     rate_hz: Annotated[float, Field(gt=0, le=500)] = 100.0
     watchdog_s: Annotated[float, Field(ge=0.02, le=2.5)] = 0.1
     is_fast: bool = True
     kinematics: KinematicsOptions
+
+    @model_validator(mode="after")
+    def _one_servo_a_joint(self) -> Self:
+        require_stations("ids", self.ids, self.kinematics)
+        require_same_number("ids, directions and zero_counts", self.ids, self.directions, self.zero_counts)
+        return self
 
     @property
     def servos(self) -> tuple[int, ...]:

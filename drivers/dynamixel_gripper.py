@@ -6,20 +6,20 @@ the grip. Torque comes on when the device is connected, and never again by itsel
 
 from __future__ import annotations
 
-import math
 import struct
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from drivers.dxl2_client import BusOptions, DynamixelClient, dynamixel_bus
+from drivers.grippers import require_finite, require_stroke
 from drivers.transport.bus import PolledDevice
 from drivers.transport.link import Refused, now_s
 from drivers.transport.options import read_options
 from drivers.transport.timebase import HostTime, Unwrapper
 from hal.clock import Deadline
 from hal.devices import DeviceKind, GripperCapabilities, GripperState
-from hal.errors import DeviceFault, DeviceTimeout, DeviceUnavailable, InvalidRequest
+from hal.errors import DeviceFault, DeviceTimeout, DeviceUnavailable
 from hal.readings import Stamped
 from hal.registry import Context, takes
 
@@ -51,6 +51,11 @@ class GripperOptions(BusOptions):
     newtons_per_ampere: Annotated[float, Field(gt=0)] = 60.0
     max_force_n: Annotated[float, Field(gt=0)] = 60.0
     activate: bool = True
+
+    @model_validator(mode="after")
+    def _has_a_stroke(self) -> Self:
+        require_stroke(self.open_count, self.closed_count)
+        return self
 
     @property
     def servos(self) -> tuple[int, ...]:
@@ -88,8 +93,7 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
         Raises:
             InvalidRequest: not finite. DeviceFault: torque is off.
         """
-        if not all(math.isfinite(v) for v in (width_m, force_n, speed_m_per_s)):
-            raise InvalidRequest(f"{self.name}: width, force and speed must be finite", hint="send numbers")
+        require_finite(self.name, width_m, force_n, speed_m_per_s)
         o = self._options
         goal = self._count(min(max(width_m, 0.0), o.stroke_m))
         force_n = min(max(force_n, 0.0), o.max_force_n)

@@ -94,12 +94,13 @@ class Lms200(LineScanner):
         self._set_mode(link, bytes([BAUD_CODES[o.baud]]))
         self._set_baud(link, o.baud)
         answer = self._ask(link, struct.pack("<BHH", VARIANT, o.field_deg, o.step_hundredths_deg), VARIANT | 0x80)
-        if answer[1] != 1:
-            raise Refused(
-                f"{o.field_deg} deg in steps of {o.step_hundredths_deg / 100} deg are refused", code=answer[1]
-            )
+        if answer[1:2] != b"\x01":
+            what = f"{o.field_deg} deg in steps of {o.step_hundredths_deg / 100} deg are refused"
+            raise Refused(what, code=int.from_bytes(answer[1:2]))
         self._set_mode(link, bytes([SET_UP]) + PASSWORD)
         config = bytearray(self._ask(link, bytes([READ_CONFIG]), READ_CONFIG | 0x80)[1:-1])
+        if len(config) <= UNIT_BYTE:
+            raise NoAnswer(f"its configuration has {len(config)} bytes; is it an LMS 200?")
         if config[UNIT_BYTE] != MILLIMETRES:
             config[UNIT_BYTE] = MILLIMETRES
             self._ask(link, bytes([WRITE_CONFIG]) + bytes(config), WRITE_CONFIG | 0x80, SET_UP_S)
@@ -167,7 +168,9 @@ class Lms200(LineScanner):
 
 
 def decode_scan(payload: bytes) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Metres out of a B0 answer; codes from 1FF7h on and zero are NaN."""
+    """Metres out of a B0 answer, empty when it is cut short; codes from 1FF7h on and zero are NaN."""
+    if len(payload) < 3:
+        return np.empty(0)
     word = payload[1] | payload[2] << 8
     count, unit_m = word & 0x3FF, 0.001 if word >> 14 == MILLIMETRES else 0.01
     if len(payload) < 3 + 2 * count:

@@ -7,10 +7,11 @@ later says so and waits to be connected again.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from drivers.grippers import require_finite, require_stroke
 from drivers.transport.bus import PolledDevice
 from drivers.transport.link import Refused, now_s
 from drivers.transport.modbus import ModbusMaster
@@ -18,7 +19,7 @@ from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
 from drivers.transport.options import read_options
 from hal.clock import Deadline
 from hal.devices import DeviceKind, GripperCapabilities, GripperState
-from hal.errors import CellError, DeviceFault, DeviceTimeout, DeviceUnavailable, InvalidRequest
+from hal.errors import CellError, DeviceFault, DeviceTimeout, DeviceUnavailable
 from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context, takes
 
@@ -38,8 +39,6 @@ FAULTS = {
     14: "too much current",
     15: "automatic release done",
 }
-
-
 PASSING_FAULTS = (7, 9)  # end with activation and with the next command: no reason to refuse a connection to do so
 VALID = (Quality.VALID, Cause.NONE)
 
@@ -57,6 +56,13 @@ class GripperOptions(ModbusOptions):
     max_speed_m_per_s: Annotated[float, Field(gt=0)] = 0.15
     activate: bool = True
     activation_s: Annotated[float, Field(gt=0, le=30)] = 8.0
+
+    @model_validator(mode="after")
+    def _has_ranges(self) -> Self:
+        require_stroke(self.open_count, self.closed_count)
+        if self.min_force_n >= self.max_force_n or self.min_speed_m_per_s >= self.max_speed_m_per_s:
+            raise ValueError("min_force_n and min_speed_m_per_s must be below max_force_n and max_speed_m_per_s")
+        return self
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,8 +125,7 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
     def command(self, *, width_m: float, force_n: float, speed_m_per_s: float, deadline: Deadline) -> float:
         """Start to move; returns the width that the nearest count stands for."""
         o = self._options
-        if not all(abs(v) < float("inf") for v in (width_m, force_n, speed_m_per_s)):
-            raise InvalidRequest(f"{self.name}: width, force and speed must be finite", hint="send numbers")
+        require_finite(self.name, width_m, force_n, speed_m_per_s)
         goal = self._count(min(max(width_m, 0.0), o.stroke_m))
         force = _part(force_n, o.min_force_n, o.max_force_n)
         speed = _part(speed_m_per_s, o.min_speed_m_per_s, o.max_speed_m_per_s)

@@ -158,6 +158,8 @@ class Scip(LineScanner):
             number = {key: int(parameters[key]) for key in ("AMIN", "AMAX", "AFRT", "ARES", "DMIN", "DMAX", "SCAN")}
         except (KeyError, ValueError) as error:
             raise NoAnswer(f"the scanner's parameters lack {error}; is it a SCIP 2.0 scanner?") from None
+        if number["ARES"] < 1 or number["SCAN"] < 1:
+            raise NoAnswer(f"the scanner says ARES {number['ARES']}, SCAN {number['SCAN']}: no scanner turns like that")
         step_rad = math.tau / number["ARES"] * self._options.cluster
         return Beams(
             count=(number["AMAX"] - number["AMIN"]) // self._options.cluster + 1,
@@ -169,7 +171,7 @@ class Scip(LineScanner):
         )
 
     def _ask(self, link: Link, command: str, *good: str) -> Message:
-        """Send a command and wait for its answer, twice if need be."""
+        """Send a command and wait for its answer, up to three times."""
         for _ in range(3):
             link.write(command.encode() + b"\n", now_s() + ANSWER_S)
             until_s = now_s() + ANSWER_S

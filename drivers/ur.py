@@ -9,15 +9,16 @@ from __future__ import annotations
 import threading
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from drivers import rtde
 from drivers.arms import Array, KinematicsOptions, SetPointFilter, capabilities, ur10e
+from drivers.rtde_session import ANSWER_S, RtdeSession
 from drivers.transport.device import wall_until
-from drivers.transport.link import Link, LinkLost, NoAnswer, Refused, WireError, drain, now_s
+from drivers.transport.link import Link, LinkLost, WireError, drain, now_s
 from drivers.transport.options import CONNECT_TIMEOUT_S, PortNumber, read_options, tcp_opener
 from drivers.transport.socket_link import open_tcp
 from drivers.transport.stream import StreamDevice
@@ -37,7 +38,6 @@ RUNNING, PLAYING = 7, 2
 SAFE_MODES = (1, 2)  # normal, reduced
 CONTROL_RATE_HZ = 500  # of the controller, whatever rate RTDE has
 PROGRAM_START_S = 1.0
-ANSWER_S = 0.5
 MOVING_RAD_PER_S = 1e-3
 
 
@@ -52,6 +52,12 @@ class UrOptions(rtde.RtdeOptions):
     servo_gain: Annotated[int, Field(ge=100, le=2000)] = 500
     lookahead_s: Annotated[float, Field(ge=0.03, le=0.2)] = 0.05
     watchdog_s: Annotated[float, Field(ge=0.02, le=2)] = 0.1
+
+    @model_validator(mode="after")
+    def _has_six_joints(self) -> Self:
+        if len(self.kinematics.links) != JOINTS:
+            raise ValueError(f"kinematics: an arm of this maker has {JOINTS} joints, not {len(self.kinematics.links)}")
+        return self
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,9 +100,7 @@ class Ur(StreamDevice[JointState]):
         super().__init__(context, open_link=opener, link_name=name, max_age_s=max(5.0 / options.rate_hz, 0.02))
         self._options = options
         self._filter = SetPointFilter(context.name, options.kinematics, command_rate_hz=options.rate_hz)
-        self._parser = rtde.PackageParser()
-        self._outputs: rtde.Recipe | None = None
-        self._inputs: rtde.Recipe | None = None
+        self._session = RtdeSession(answer_s=self.patience * ANSWER_S)
         self._host = HostTime()
         self._last_device_s = 0.0
         self._modes = Modes(robot=0, safety=0, runtime=0)
@@ -150,40 +154,16 @@ class Ur(StreamDevice[JointState]):
         self._run_script(f"stopj({self._options.brake_rad_per_s2})\n", deadline)
 
     def start(self, link: Link) -> None:
-        """Agree on version 2, set up both recipes, start the stream; motion stays off."""
+        """Set up recipes and stream; motion stays off."""
         self._filter.begin(None)
-        self._parser = rtde.PackageParser()
-        if self._ask(link, rtde.package("V", b"\x00\x02"), "V")[:1] != b"\x01":
-            raise Refused("the controller does not speak RTDE version 2", code=2)
-        self._outputs = self._recipe(link, rtde.outputs_request(OUTPUTS, self._options.rate_hz), "O", OUTPUTS)
-        self._inputs = self._recipe(link, rtde.package("I", ",".join(INPUTS).encode()), "I", INPUTS)
-        if self._ask(link, rtde.package("S"), "S")[:1] != b"\x01":
-            raise Refused("the controller does not start the stream", code=0)
-        self._parser.data_size = rtde.HEADER.size + 1 + self._outputs.packing.size
+        self._session.begin(link, outputs=OUTPUTS, rate_hz=self._options.rate_hz, inputs=INPUTS)
         self._host.reset()
         self._last_device_s = 0.0
 
-    def _recipe(self, link: Link, request: bytes, kind: str, names: tuple[str, ...]) -> rtde.Recipe:
-        answer = self._ask(link, request, kind)
-        try:
-            return rtde.recipe(answer[0], names, rtde.split_names(answer[1:]))
-        except (rtde.RecipeRefused, ValueError) as error:
-            raise Refused(f"recipe refused: {error}", code=0) from None
-
-    def _ask(self, link: Link, request: bytes, kind: str) -> bytes:
-        link.write(request, now_s() + self.patience * ANSWER_S)
-        until_s = now_s() + self.patience * ANSWER_S
-        while chunk := link.read(until_s):
-            for got, payload in self._parser.feed(chunk):
-                if got == kind and rtde.package(got, payload) != request:  # texts may come in between; echoes are ours
-                    return payload
-        raise NoAnswer(f"no answer to RTDE request {kind!r}")
-
     def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Publish each data package; keep the script port from filling up."""
-        for kind, payload in self._parser.feed(chunk):
-            if kind == "U" and self._outputs is not None and payload[0] == self._outputs.id:
-                self._take(self._outputs.unpack(payload), arrived_s)
+        for values in self._session.take(chunk):
+            self._take(values, arrived_s)
         if self._scripting.acquire(blocking=False):  # whoever writes a script drains the port himself
             try:
                 self._drain_script()
@@ -199,8 +179,6 @@ class Ur(StreamDevice[JointState]):
         device_s = float(values["timestamp"])
         period_s = 1.0 / self._options.rate_hz
         steps = round((device_s - self._last_device_s) / period_s) if self._last_device_s else 1
-        if device_s == self._last_device_s:
-            return  # the same package twice
         self._last_device_s = device_s
         self._modes = Modes(robot=values["robot_mode"], safety=values["safety_mode"], runtime=values["runtime_state"])
         self._was_playing = self._was_playing or self._modes.runtime == PLAYING
@@ -229,8 +207,7 @@ class Ur(StreamDevice[JointState]):
             with suppress(Exception):
                 self._run_script(f"stopj({self._options.brake_rad_per_s2})\n", Deadline.after(WallClock(), 0.05))
         super().release()
-        if self._script is not None:
-            self._script.close()
+        self._close_script()
 
     def _is_healthy(self) -> bool:
         return self._modes.robot == RUNNING and self._modes.safety in SAFE_MODES
@@ -257,7 +234,7 @@ class Ur(StreamDevice[JointState]):
         raise MotionRefused(f"{self.name}: the servo program {what}", hint=hint, device=self.name)
 
     def _send_registers(self, position_rad: Array, deadline: Deadline) -> None:
-        link, inputs = self.port.link, self._inputs
+        link, inputs = self.port.link, self._session.inputs
         try:
             if link is None or inputs is None:
                 raise LinkLost("RTDE is down")
@@ -272,11 +249,16 @@ class Ur(StreamDevice[JointState]):
             try:
                 self._write_script(text, until_s)
             except WireError:
-                self._script = None  # the port hung up since the last program
+                self._close_script()  # the port hung up since the last program
                 try:
                     self._write_script(text, until_s)
                 except WireError as error:
                     raise self.translate(error) from error
+
+    def _close_script(self) -> None:
+        script, self._script = self._script, None
+        if script is not None:
+            script.close()
 
     def _write_script(self, text: str, until_s: float) -> None:
         if self._script is None:

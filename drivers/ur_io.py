@@ -17,8 +17,9 @@ from pydantic import Field, model_validator
 
 from drivers import rtde
 from drivers.points import require_same_number, wanted_lights
+from drivers.rtde_session import ANSWER_S, RtdeSession
 from drivers.transport.device import wall_until
-from drivers.transport.link import Link, LinkLost, NoAnswer, Refused, WireError, now_s
+from drivers.transport.link import Link, LinkLost, WireError, now_s
 from drivers.transport.options import Seconds, read_options, tcp_opener
 from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import HostTime
@@ -29,7 +30,6 @@ from hal.registry import Context, takes
 
 OUTPUTS = ("timestamp", "actual_digital_input_bits", "actual_digital_output_bits")
 INPUTS = ("standard_digital_output_mask", "standard_digital_output")
-ANSWER_S = 0.5
 CLOSE_S = 0.08
 Bits = tuple[bool, ...]
 Output = Annotated[int, Field(ge=0, le=7)]
@@ -80,52 +80,18 @@ class UrIo(StreamDevice[Bits]):
         opener, name = tcp_opener(options, context.name)
         super().__init__(context, open_link=opener, link_name=name, max_age_s=max(5.0 / options.rate_hz, 0.05))
         self._rate_hz = options.rate_hz
-        self._parser = rtde.PackageParser()
-        self._points: rtde.Recipe | None = None
-        self._orders: rtde.Recipe | None = None
+        self._session = RtdeSession(answer_s=self.patience * ANSWER_S)
         self._host = HostTime()
-        self._last_s = -math.inf
 
     def start(self, link: Link) -> None:
-        """Agree on version 2, set up the recipes, start the stream."""
-        self._parser = rtde.PackageParser()
-        if self._ask(link, rtde.package("V", b"\x00\x02"), "V")[:1] != b"\x01":
-            raise Refused("the controller does not speak RTDE version 2", code=2)
-        self._points = self._recipe(link, rtde.outputs_request(OUTPUTS, self._rate_hz), "O", OUTPUTS)
-        if self.inputs:
-            self._orders = self._recipe(link, rtde.package("I", ",".join(self.inputs).encode()), "I", self.inputs)
-        if self._ask(link, rtde.package("S"), "S")[:1] != b"\x01":
-            raise Refused("the controller does not start the stream", code=0)
-        self._parser.data_size = rtde.HEADER.size + 1 + self._points.packing.size
+        """Set up recipes and stream."""
+        self._session.begin(link, outputs=OUTPUTS, rate_hz=self._rate_hz, inputs=self.inputs)
         self._host.reset()
-        self._last_s = -math.inf
-
-    def _recipe(self, link: Link, request: bytes, kind: str, names: tuple[str, ...]) -> rtde.Recipe:
-        answer = self._ask(link, request, kind)
-        try:
-            return rtde.recipe(answer[0], names, rtde.split_names(answer[1:]))
-        except (rtde.RecipeRefused, ValueError, IndexError) as error:
-            raise Refused(f"recipe refused: {error}", code=0) from None
-
-    def _ask(self, link: Link, request: bytes, kind: str) -> bytes:
-        link.write(request, now_s() + ANSWER_S)
-        until_s = now_s() + ANSWER_S
-        while chunk := link.read(until_s):
-            for got, payload in self._parser.feed(chunk):
-                if got == kind and rtde.package(got, payload) != request:  # texts may come between; echoes are ours
-                    return payload
-        raise NoAnswer(f"no answer to RTDE request {kind!r}")
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Publish each package that is newer than the last."""
-        for kind, payload in self._parser.feed(chunk):
-            if kind != "U" or self._points is None or payload[0] != self._points.id:
-                continue
-            values: dict[str, Any] = self._points.unpack(payload)
+        for values in self._session.take(chunk):
             device_s = float(values["timestamp"])
-            if not math.isfinite(device_s) or device_s == self._last_s:
-                continue  # the same package twice
-            self._last_s = device_s
             self.publish(
                 self.meaning(values["actual_digital_input_bits"], values["actual_digital_output_bits"]),
                 valid_s=self._host.host_s(device_s=device_s, arrived_s=arrived_s),
@@ -200,12 +166,13 @@ class UrLights(UrIo):
         super().release()
 
     def _switch(self, link: Link, wanted: Bits, until_s: float) -> None:
-        if self._orders is None:
+        orders = self._session.inputs
+        if orders is None:
             raise LinkLost("the controller is not set up")
         mask = sum(1 << output for output in self._options.outputs)
         word = sum(1 << output for output, is_on in zip(self._options.outputs, wanted, strict=True) if is_on)
         with self._writing:
-            link.write(self._orders.pack([mask, word]), until_s)
+            link.write(orders.pack([mask, word]), until_s)
 
 
 class UrTouch(UrIo):

@@ -49,6 +49,37 @@ def test_another_device_on_the_port_or_a_wrong_id_is_said_with_device_port_and_r
 
 
 ARM = kinematics_of(scripted.ScriptedArm().capabilities())
+SHORT_ARM = {**ARM, "lower_rad": ARM["lower_rad"][:5]}
+
+
+@pytest.mark.parametrize(
+    ("driver", "options", "says"),
+    [
+        ("ur:rtde", {"host": "127.0.0.1", "kinematics": SHORT_ARM}, "same number of entries"),
+        ("ur:rtde", {"host": "127.0.0.1", "kinematics": {**ARM, "lower_rad": ARM["upper_rad"]}}, "below its upper_rad"),
+        (
+            "ur:rtde",
+            {"host": "127.0.0.1", "kinematics": {k: v[:5] if isinstance(v, list) else v for k, v in ARM.items()}},
+            "6 joints, not 5",
+        ),
+        ("can:cia402", {"channel": "/dev/null", "kinematics": ARM, "nodes": [1, 2, 3]}, "nodes must be 6 different"),
+        ("can:cia402", {"channel": "/dev/null", "kinematics": ARM, "host_node": 3}, "host_node 3"),
+        ("serial:dynamixel", {"port": "/dev/null", "kinematics": ARM, "ids": [1, 2, 3, 4, 5, 5]}, "ids must be 6"),
+        ("serial:dynamixel", {"port": "/dev/null", "kinematics": ARM, "directions": [1, -1]}, "directions"),
+        ("serial:dynamixel", {"port": "/dev/null", "kinematics": ARM, "directions": [1, 1, 1, 1, 1, 0]}, "directions"),
+        ("serial:dynamixel_gripper", {"port": "/dev/null", "open_count": 9, "closed_count": 9}, "must differ"),
+        ("modbus:robotiq_2f", {"port": "/dev/null", "open_count": 9, "closed_count": 9}, "must differ"),
+        ("modbus:robotiq_2f", {"port": "/dev/null", "min_force_n": 235.0}, "below max_force_n"),
+    ],
+)
+def test_options_that_contradict_each_other_are_refused_before_a_port_is_opened(
+    driver: str, options: dict[str, Any], says: str
+) -> None:
+    with pytest.raises(ConfigError, match=says) as caught:
+        connect(Context(name="thing"), driver, options)
+    assert "devices.thing.options" in caught.value.what
+
+
 SERIAL: dict[str, dict[str, Any]] = {
     "serial:tfmini": {},
     "modbus:tfmini": {},

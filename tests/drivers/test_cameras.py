@@ -141,6 +141,15 @@ def test_a_broken_or_odd_picture_is_a_fault_that_names_it(folder: Path) -> None:
         device.read_image(deadline=soon())
 
 
+@pytest.mark.parametrize("name", ["a.png", "a.npy", "a.npz"])
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 no archive", b"\x93NUMPY\x01\x00"])
+def test_a_damaged_depth_picture_is_a_fault_that_names_the_file(name: str, content: bytes, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(content)
+    lens = {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0}
+    with pytest.raises(DeviceFault, match=rf"{name} is no depth picture"):
+        connect(Context(name="depth"), "files:depth", {"path": str(tmp_path), **lens})
+
+
 def test_depth_formats_agree_and_limits_cut(tmp_path: Path) -> None:
     depth_m = np.array([[0.0, 0.05, 1.234], [2.0, 9.0, 20.0]])
     cv2.imwrite(str(tmp_path / "a.png"), np.round(depth_m * 1000).astype(np.uint16))

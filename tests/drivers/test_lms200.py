@@ -82,6 +82,11 @@ def test_codes_are_no_distances_and_units_are_the_telegrams() -> None:
     np.testing.assert_allclose(decode_scan(payload), [1.0, 1.0])  # centimetres; flags above 13 bits do not count
 
 
+@pytest.mark.parametrize("length", range(1, 6))
+def test_a_scan_that_is_cut_short_has_no_ranges(length: int) -> None:
+    assert len(decode_scan(bytes([0xB0, 2, 0x40, 1, 0])[:length])) == 0
+
+
 def test_a_fatal_status_is_a_fault() -> None:
     far_side = emulator.start(ScriptedScanner(), {"fault": "status", "every": 3})
     with wired(far_side, DRIVER) as device, pytest.raises(DeviceFault, match="fatal"):

@@ -13,11 +13,13 @@ from hypothesis import strategies as st
 from drivers.emulators import scip as emulator
 from drivers.emulators.beams import line_m
 from drivers.emulators.scripted import ScriptedScanner, scripted_scan
-from drivers.scip import ScipParser, checked, decode_number, decode_ranges_mm
+from drivers.scip import Scip, ScipOptions, ScipParser, checked, decode_number, decode_ranges_mm
 from drivers.transport.checks import sum_scip
+from drivers.transport.link import NoAnswer
 from hal.conformance import RangeScannerContract, Rig
 from hal.devices import RangeImage, RangeScannerCapabilities
 from hal.errors import DeviceFault
+from hal.registry import Context
 from tests.drivers.rigs import count_good, soon, until, wired, wired_rig
 
 FAST = {"scans_per_minute": 2400}
@@ -87,6 +89,13 @@ def test_the_geometry_is_the_scanners_own() -> None:
     assert c.first_angle_rad == pytest.approx(-math.radians(135))
     assert c.step_angle_rad == pytest.approx(math.radians(0.25))
     assert c.max_range_m == 30.0
+
+
+@pytest.mark.parametrize("key", ["ARES", "SCAN"])
+def test_a_scanner_that_says_it_does_not_turn_is_no_scanner(key: str) -> None:
+    told = {"AMIN": "0", "AMAX": "9", "AFRT": "5", "ARES": "10", "DMIN": "20", "DMAX": "4000", "SCAN": "600", key: "0"}
+    with pytest.raises(NoAnswer, match=f"{key} 0"):
+        Scip(Context(name="scanner"), ScipOptions(host="127.0.0.1"))._geometry(told)
 
 
 def test_a_scan_began_after_the_call() -> None:

@@ -1,0 +1,78 @@
+"""A client's side of an RTDE connection, the same for all that hang on a controller: handshake, recipes, data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from drivers import rtde
+from drivers.transport.link import Link, NoAnswer, Refused, now_s
+
+ANSWER_S = 0.5
+
+
+class RtdeSession:
+    """Sets up the recipes on a fresh link and turns its bytes into values.
+
+    Args:
+        answer_s: how long an answer is waited for.
+
+    Attributes:
+        inputs: recipe of what is sent to the controller; None before `begin` has asked for one.
+    """
+
+    def __init__(self, *, answer_s: float = ANSWER_S) -> None:
+        self._answer_s = answer_s
+        self._parser = rtde.PackageParser()
+        self._outputs: rtde.Recipe | None = None
+        self._last_s = -math.inf
+        self.inputs: rtde.Recipe | None = None
+
+    def begin(self, link: Link, *, outputs: Sequence[str], rate_hz: float, inputs: Sequence[str] = ()) -> None:
+        """Agree on version 2, set up the recipes, start the stream.
+
+        Args:
+            outputs: variables of the data packages; `timestamp` is one of them.
+
+        Raises:
+            Refused: another version, or a variable that the controller does not give. NoAnswer, LinkLost.
+        """
+        self._parser, self._last_s = rtde.PackageParser(), -math.inf
+        if self._ask(link, rtde.package("V", b"\x00\x02"), "V")[:1] != b"\x01":
+            raise Refused("the controller does not speak RTDE version 2", code=2)
+        self._outputs = self._recipe(link, rtde.outputs_request(outputs, rate_hz), "O", outputs)
+        if inputs:
+            self.inputs = self._recipe(link, rtde.package("I", ",".join(inputs).encode()), "I", inputs)
+        if self._ask(link, rtde.package("S"), "S")[:1] != b"\x01":
+            raise Refused("the controller does not start the stream", code=0)
+        self._parser.data_size = rtde.HEADER.size + 1 + self._outputs.packing.size
+
+    def take(self, chunk: bytes) -> list[dict[str, Any]]:
+        """Values by name of each data package that is complete now; one with the time of the last is the same again."""
+        found = []
+        for kind, payload in self._parser.feed(chunk):
+            if kind != "U" or self._outputs is None or payload[0] != self._outputs.id:
+                continue
+            values: dict[str, Any] = self._outputs.unpack(payload)
+            device_s = float(values["timestamp"])
+            if math.isfinite(device_s) and device_s != self._last_s:
+                self._last_s = device_s
+                found.append(values)
+        return found
+
+    def _recipe(self, link: Link, request: bytes, kind: str, names: Sequence[str]) -> rtde.Recipe:
+        answer = self._ask(link, request, kind)
+        try:
+            return rtde.recipe(answer[0], names, rtde.split_names(answer[1:]))
+        except (rtde.RecipeRefused, ValueError, IndexError) as error:
+            raise Refused(f"recipe refused: {error}", code=0) from None
+
+    def _ask(self, link: Link, request: bytes, kind: str) -> bytes:
+        link.write(request, now_s() + self._answer_s)
+        until_s = now_s() + self._answer_s
+        while chunk := link.read(until_s):
+            for got, payload in self._parser.feed(chunk):
+                if got == kind and rtde.package(got, payload) != request:  # texts may come in between; echoes are ours
+                    return payload
+        raise NoAnswer(f"no answer to RTDE request {kind!r}")

@@ -90,6 +90,11 @@ def _fault(item: Any, model: type[BaseModel]) -> tuple[str, str, str]:
     return key, f"{item['msg']} (given: {given[:60]})", "see the file reference in docs/ for type, unit and range"
 
 
+def unknown_key_hint(model: type[BaseModel], location: tuple[int | str, ...]) -> str:
+    """What helps against an unknown key at `location` of data for `model`: the nearest known key, or all of them."""
+    return _did_you_mean(str(location[-1]), _fields_at(model, list(location[:-1])))
+
+
 def _path_in_file(location: tuple[Any, ...], model: type[BaseModel]) -> list[Any]:
     # A discriminated union puts its tag into the path, where a reader of the file sees none.
     tags = {tag for m in _reachable(model) if (tag := _tag_of(m))}

@@ -79,7 +79,7 @@ class Service:
         """Start the operation `verb` as a task.
 
         Raises:
-            InvalidRequest: no such verb.
+            InvalidRequest: no such verb, or a request that makes no sense in this cell.
             LeaseError: another client holds the cell.
             Stopped: it would move, and the stop is latched.
             DeviceUnavailable: the cell is not up.
@@ -88,6 +88,7 @@ class Service:
         operation = self.operations.get(verb)
         if operation is None:
             raise InvalidRequest(f"there is no verb {verb!r}", hint=f"verbs: {', '.join(self.operations)}")
+        operation.check(self.cell, request)
         moves = operation.may_move(request)
         holder = self.lease.check(lease_token) if moves else None
         self._check_cell()

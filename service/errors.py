@@ -19,6 +19,14 @@ class NoSuchTask(InvalidRequest):
     """No task or artefact has that name."""
 
 
+class NoSuchMission(NoSuchTask):
+    """No mission has left a file of that name."""
+
+
+class NoSuchDevice(NoSuchTask):
+    """The cell file has no device of that name."""
+
+
 class NotPossibleNow(CellError):
     """The thing exists, but its state does not allow this."""
 

@@ -8,11 +8,14 @@ from typing import Any, TypeVar
 
 from fastapi import Request
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
+from hal.strict import unknown_key_hint
 from service.http.problems import BadBody, FieldFault, path_of, refuse_body
 
 B = TypeVar("B", bound=BaseModel)
 MAX_FAULTS = 20
+UNKNOWN_KEY = "extra_forbidden"
 
 
 def strict_body(model: type[B]) -> Callable[[Request], Awaitable[B]]:
@@ -37,22 +40,28 @@ def parse(data: bytes, model: type[B]) -> B:
     try:
         body = model.model_validate_json(data, strict=True)
     except ValidationError as error:
-        raise _refused(error) from None
+        raise _refused(error, model) from None
     if not _is_finite(body.model_dump()):
         raise refuse_body(422, "a number is not finite", hint="send finite numbers")
     return body
 
 
-def _refused(error: ValidationError) -> BadBody:
-    items = error.errors(include_input=False, include_url=False, include_context=False)[:MAX_FAULTS]
-    faults = [FieldFault(path=path_of(("body", *item["loc"])), message=_printable(item["msg"])) for item in items]
+def _refused(error: ValidationError, model: type[BaseModel]) -> BadBody:
+    found = error.errors(include_input=False, include_url=False, include_context=False)
+    # A misspelt key leaves its right one missing: the misspelling is what to mend, so it comes first.
+    items = sorted(found, key=lambda item: item["type"] != UNKNOWN_KEY)[:MAX_FAULTS]
+    faults = [FieldFault(path=path_of(("body", *item["loc"])), message=_words(item)) for item in items]
     status = 400 if items[0]["type"] == "json_invalid" else 422
-    first = faults[0]
-    return refuse_body(status, f"{first.path}: {first.message}", hint="see /openapi.json for the body", faults=faults)
+    first, hint = faults[0], "see /openapi.json for the body"
+    if items[0]["type"] == UNKNOWN_KEY:
+        hint = unknown_key_hint(model, items[0]["loc"])
+    return refuse_body(status, f"{first.path}: {first.message}", hint=hint, faults=faults)
 
 
-def _printable(text: str) -> str:
-    return text.encode("utf-8", "replace").decode()[:300]
+def _words(item: ErrorDetails) -> str:
+    if item["type"] == UNKNOWN_KEY:
+        return "unknown key"
+    return item["msg"].removeprefix("Value error, ").encode("utf-8", "replace").decode()[:300]
 
 
 def _is_finite(value: Any) -> bool:

@@ -13,6 +13,7 @@ from starlette.responses import JSONResponse, Response
 from hal.errors import CellError, InvalidRequest, Unsupported
 from service.connection import check_name
 from service.core import Service
+from service.errors import NoSuchDevice
 from service.http.body import body_schema, strict_body
 from service.http.models import DeviceDetail, DeviceList, DeviceView, FaultRequest, HealthView, ReadingView, SwapRequest
 from service.http.problems import RESPONSES
@@ -42,7 +43,7 @@ async def list_devices(state: State) -> DeviceList:
 
 @router.get("/{name}", summary="One device with capabilities and mount", operation_id="show_device")
 async def show_device(state: State, name: Name) -> DeviceDetail:
-    check_name(state.service.cell, name)
+    _check(state, name)
     return await state.in_thread(functools.partial(_detail, state.service, name))
 
 
@@ -61,7 +62,7 @@ async def read_device(
         float, Query(ge=0.0, le=60.0, allow_inf_nan=False, description="a reading so young is not read again")
     ] = 0.0,
 ) -> Response:
-    check_name(state.service.cell, name)
+    _check(state, name)
     desk = state.readings
     headers = {"Cache-Control": "no-store"}
     if form is Format.PNG:
@@ -94,7 +95,7 @@ async def swap_device(
     Refused while a motion runs if the device has a part in motions; after a swap of the arm its drives are off until the
     next motion. The cell file is not changed: after a restart of the service it holds again.
     """
-    check_name(state.service.cell, name)
+    _check(state, name)
     state.service.lease.check(lease_token)
     await state.in_thread(functools.partial(_swap, state, name, request))
     return await state.in_thread(functools.partial(_detail, state.service, name))
@@ -112,9 +113,17 @@ async def inject_fault(
     request: Annotated[FaultRequest, DependsOn(strict_body(FaultRequest))],
     lease_token: LeaseToken = None,
 ) -> DeviceView:
-    check_name(state.service.cell, name)
+    _check(state, name)
     state.service.lease.check(lease_token)
     return await state.act(functools.partial(_inject, state.service, name, request))
+
+
+def _check(state: AppState, name: str) -> None:
+    """Raise `NoSuchDevice`, which is a 404 as for everything else that a path names."""
+    try:
+        check_name(state.service.cell, name)
+    except InvalidRequest as error:
+        raise NoSuchDevice(error.what, hint=error.hint) from None
 
 
 def _swap(state: AppState, name: str, request: SwapRequest) -> None:

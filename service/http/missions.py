@@ -9,7 +9,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path
 from starlette.responses import FileResponse
 
-from service.errors import NoSuchTask
+from service.errors import NoSuchMission
 from service.http.models import MissionList, MissionView
 from service.http.problems import RESPONSES
 from service.http.state import State
@@ -39,7 +39,7 @@ async def fetch_mission_file(
     root = state.service.runs_dir.resolve()
     path = (root / mission / name).resolve() if PLAIN.fullmatch(mission) and PLAIN.fullmatch(name) else None
     if path is None or path.parent.parent != root or not path.is_file():
-        raise NoSuchTask("there is no such file of a mission", hint="GET /v1/missions lists them")
+        raise NoSuchMission("there is no such file of a mission", hint="GET /v1/missions lists them")
     # Reports carry their own styles and pictures and run no scripts.
     policy = "default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline' 'self'; frame-ancestors 'none'"
     return FileResponse(path, headers={"Content-Security-Policy": policy, "Cache-Control": "no-store"})

@@ -47,16 +47,17 @@ class TaskView(BaseModel):
 
     @classmethod
     def of(cls, task: Task) -> TaskView:
-        """The view of a task."""
+        """The view of a task. What it ended with shows once it has ended, which is once that is on disk."""
+        state = task.state
         return cls(
             id=task.id,
             verb=task.verb,
-            state=task.state,
+            state=state,
             fraction=task.fraction,
             step=task.step,
             request=task.request,
-            result=task.result,
-            problem=task.problem,
+            result=task.result if state.is_final else None,
+            problem=task.problem if state.is_final else None,
             artefacts=[
                 ArtefactView(
                     name=item.name,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from service.operations import requests
+from service.operations import requests, targets
 from service.operations.context import CellMemory, Operation, OperationContext
 
 __all__ = ["OPERATIONS", "CellMemory", "Operation", "OperationContext"]
@@ -74,6 +74,7 @@ OPERATIONS: dict[str, Operation] = {
             run=_in_session("inspect", "run_inspect"),
             summary="Read instruments, lamps, switches and valves from close up",
             example={"objects": ["pressure", "main_valve"]},
+            check=targets.check_inspect,
             is_still=_is_stored,
         ),
         Operation(
@@ -89,6 +90,7 @@ OPERATIONS: dict[str, Operation] = {
             run=_in_session("manipulate", "run_manipulate"),
             summary="Work one control and look whether it worked",
             example={"object": "main_valve", "state": "open"},
+            check=targets.check_manipulate,
         ),
         Operation(
             name="missions",
@@ -96,6 +98,7 @@ OPERATIONS: dict[str, Operation] = {
             run=_mission,
             summary="Run the whole mission and write its report",
             example={"touches": 4},
+            check=targets.check_mission,
         ),
         Operation(
             name="calibrations",

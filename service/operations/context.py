@@ -10,6 +10,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from hal.config import Cell
 from hal.geometry import UncertainPose
 from service.connection import CellConnection
 from service.tasks import TaskContext
@@ -66,6 +67,7 @@ class Operation:
         example: a body that works on the shipped cell.
         moves: whether it may move the arm (needs the lease when one is held, and excludes other motion tasks).
         is_still: tells of requests for which it does not, although it may.
+        check: raises `InvalidRequest` for a request that makes no sense in this cell, before there is a task.
     """
 
     name: str
@@ -75,6 +77,7 @@ class Operation:
     example: dict[str, Any] = field(default_factory=dict)
     moves: bool = True
     is_still: Callable[[Any], bool] = field(default=lambda _request: False)
+    check: Callable[[Cell, Any], None] = field(default=lambda _cell, _request: None)
 
     def may_move(self, request: BaseModel) -> bool:
         """May the arm move for this request?"""

@@ -21,6 +21,7 @@ from service.operations.beliefs import forget_reading, known_readings
 from service.operations.inspect import ensure_located, look_close
 from service.operations.requests import ActionBody, ManipulateRequest
 from service.operations.session import Session
+from service.operations.targets import target_of
 from service.operations.travel import workcell
 from service.report.plots import png_of
 from service.report.record import Action, Picture
@@ -45,7 +46,7 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
     thing = session.panel.object(body.object)
-    target = _target(thing, body)
+    target = target_of(thing, body)
     eye = _Eye(session, thing, verify)
     before = eye.before()
     report = _perform(session, thing, target, eye, before)
@@ -154,41 +155,6 @@ def _perform(session: Session, thing: PanelObject, target: str, eye: _Eye, befor
         f"{thing.name} is a {thing.kind}, which cannot be worked",
         hint="levers, sliders, toggles, rotaries, wheels, buttons and mushrooms can",
     )
-
-
-def _target(thing: PanelObject, body: ActionBody) -> str:
-    """What shall be reached, as text; the usual deed of its kind when nothing is asked."""
-    match thing:
-        case Slider():
-            if body.value is None or not thing.scale.minimum <= body.value <= thing.scale.maximum:
-                scale = thing.scale
-                raise InvalidRequest(
-                    f"{thing.name} needs a value from {scale.minimum:g} to {scale.maximum:g} {scale.unit}",
-                    hint="send {'object': ..., 'value': ...}",
-                )
-            return f"{body.value:g}"
-        case Handwheel():
-            if body.angle_rad is None:
-                raise InvalidRequest(f"{thing.name} needs angle_rad", hint="send {'object': ..., 'angle_rad': ...}")
-            return f"{body.angle_rad:g}"
-        case Lever() | Rotary():
-            return _one_of(thing.name, body.state, tuple(state.name for state in thing.states))
-        case Toggle():
-            return _one_of(thing.name, body.state, ("on", "off"))
-        case Mushroom():
-            return _one_of(thing.name, body.state or "pressed", ("pressed",))
-        case Button():
-            return _one_of(thing.name, body.state or "on", ("on", "off", "pressed", "released"))
-    raise InvalidRequest(
-        f"{thing.name} is a {thing.kind}, which cannot be worked",
-        hint="levers, sliders, toggles, rotaries, wheels, buttons and mushrooms can",
-    )
-
-
-def _one_of(name: str, state: str | None, states: tuple[str, ...]) -> str:
-    if state not in states:
-        raise InvalidRequest(f"{name} has no state {state!r}", hint=f"states: {', '.join(states)}")
-    return state
 
 
 def _witness(session: Session, thing: PanelObject) -> PanelObject:

@@ -27,6 +27,19 @@ def test_a_verb_that_ends_in_time_answers_200_with_its_result(client: httpx2.Cli
     assert client.get(task["artefacts"][0]["url"]).text == "a"
 
 
+def test_a_request_that_makes_no_sense_here_never_becomes_a_task(client: httpx2.Client) -> None:
+    before = len(client.get("/v1/tasks").json()["tasks"])
+    answer = client.post("/v1/echo", json={"text": "SHOUT"})
+    assert (answer.status_code, answer.json()["hint"]) == (422, "lower the voice")
+    assert len(client.get("/v1/tasks").json()["tasks"]) == before
+
+
+def test_an_unknown_key_is_answered_with_the_nearest_known_one(client: httpx2.Client) -> None:
+    problem = client.post("/v1/echo", json={"nubmer": 3.0}).json()
+    assert problem["detail"] == "body.nubmer: unknown key"
+    assert problem["hint"] == "did you mean 'number'?"
+
+
 def test_a_verb_that_takes_longer_answers_202_and_says_where_to_look(client: httpx2.Client) -> None:
     answer = client.post("/v1/wait", json={})
     assert answer.status_code == 202
@@ -117,7 +130,7 @@ def test_devices_show_their_health(client: httpx2.Client) -> None:
 
 def test_an_unknown_device_gets_the_nearest_name(client: httpx2.Client) -> None:
     answer = client.get("/v1/devices/wrist_camra/reading")
-    assert answer.status_code == 422
+    assert answer.status_code == 404
     assert "wrist_camera" in answer.json()["hint"]
 
 

@@ -199,7 +199,7 @@ def test_what_a_swap_may_not_change_or_do_is_refused(http: httpx2.Client) -> Non
         answer = http.put(SENSOR, json=sent)
         assert answer.status_code == 422
         assert says in answer.json()["detail"], answer.text
-    assert http.put("/v1/devices/nobody", json={"driver": "fake:proximity"}).status_code == 422
+    assert http.put("/v1/devices/nobody", json={"driver": "fake:proximity"}).status_code == 404
 
 
 def test_only_the_holder_of_the_lease_swaps(http: httpx2.Client) -> None:

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from hal.clock import Deadline
-from hal.errors import DeviceTimeout
+from hal.config import Cell
+from hal.errors import DeviceTimeout, InvalidRequest
 from hal.motion import Hold
 from hal.strict import Strict
 from service.operations.context import Operation, OperationContext
@@ -39,6 +40,11 @@ def echo(context: OperationContext, request: EchoRequest) -> dict[str, Any]:
     context.task.progress(0.75, "speaking", request.text)
     context.task.artefact("said.txt", request.text.encode(), "text/plain")
     return {"text": request.text, "number": request.number, "nothing": float("nan")}
+
+
+def refuse_shouting(_cell: Cell, request: EchoRequest) -> None:
+    if request.text.isupper():
+        raise InvalidRequest("no shouting", hint="lower the voice")
 
 
 def hold(context: OperationContext, request: HoldRequest) -> dict[str, Any]:
@@ -77,7 +83,15 @@ def measure(context: OperationContext, request: EchoRequest) -> dict[str, Any]:
 OPERATIONS = {
     operation.name: operation
     for operation in (
-        Operation(name="echo", request_model=EchoRequest, run=echo, summary="Echo", example={"text": "a"}, moves=False),
+        Operation(
+            name="echo",
+            request_model=EchoRequest,
+            run=echo,
+            summary="Echo",
+            example={"text": "a"},
+            moves=False,
+            check=refuse_shouting,
+        ),
         Operation(name="hold", request_model=HoldRequest, run=hold, summary="Hold", example={"seconds": 0.1}),
         Operation(name="wait", request_model=HoldRequest, run=wait, summary="Wait", example={"seconds": 0.1}),
         Operation(

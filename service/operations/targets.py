@@ -1,0 +1,82 @@
+"""What a deed shall reach; asked before anything moves, so that a request that makes no sense moves nothing."""
+
+from __future__ import annotations
+
+from hal.config import Cell
+from hal.errors import InvalidRequest
+from hal.panel import Button, Handwheel, Lever, Mushroom, PanelObject, Rotary, Slider, Toggle
+from service.operations.requests import ActionBody, InspectRequest, ManipulateRequest, MissionRequest
+
+
+def target_of(thing: PanelObject, body: ActionBody) -> str:
+    """What shall be reached, as text; the usual deed of its kind when nothing is asked.
+
+    Raises:
+        InvalidRequest: the object cannot be worked, or has no such state or value.
+    """
+    match thing:
+        case Slider():
+            _only(thing, body, "value")
+            return _number(thing, body.value, thing.scale.minimum, thing.scale.maximum, thing.scale.unit, "value")
+        case Handwheel():
+            _only(thing, body, "angle_rad")
+            return _number(thing, body.angle_rad, thing.minimum_rad, thing.maximum_rad, "rad", "angle_rad")
+        case Lever() | Rotary():
+            _only(thing, body, "state")
+            return _one_of(thing, body.state, tuple(state.name for state in thing.states))
+        case Toggle():
+            _only(thing, body, "state")
+            return _one_of(thing, body.state, ("on", "off"))
+        case Mushroom():
+            _only(thing, body, "state")
+            return _one_of(thing, body.state or "pressed", ("pressed",))
+        case Button():
+            _only(thing, body, "state")
+            return _one_of(thing, body.state or "on", ("on", "off", "pressed", "released"))
+    raise InvalidRequest(
+        f"{thing.name} is a {thing.kind}, which cannot be worked",
+        hint="levers, sliders, toggles, rotaries, wheels, buttons and mushrooms can",
+    )
+
+
+def check_manipulate(cell: Cell, request: ManipulateRequest) -> None:
+    """Raise `InvalidRequest` for a deed that makes no sense on the cell's panel."""
+    target_of(cell.panel.object(request.object), request)
+
+
+def check_mission(cell: Cell, request: MissionRequest) -> None:
+    """Raise `InvalidRequest` when one of the deeds makes no sense on the cell's panel."""
+    for body in request.actions or ():
+        target_of(cell.panel.object(body.object), body)
+
+
+def check_inspect(cell: Cell, request: InspectRequest) -> None:
+    """Raise `InvalidRequest` for an object that the cell's panel does not have, unless a stored image is asked about."""
+    if request.image is None:
+        for name in request.objects or ():
+            cell.panel.object(name)
+
+
+def _only(thing: PanelObject, body: ActionBody, key: str) -> None:
+    """Raise unless what is asked for is asked for under `key`: what is meant must not be guessed."""
+    for other in {"state", "value", "angle_rad"} - {key}:
+        if getattr(body, other) is not None:
+            hint = f"send {{'object': '{thing.name}', '{key}': ...}}"
+            raise InvalidRequest(f"{thing.name} is a {thing.kind}: it takes {key}, not {other}", hint=hint)
+
+
+def _number(thing: PanelObject, asked: float | None, low: float, high: float, unit: str, key: str) -> str:
+    if asked is None or not low <= asked <= high:
+        raise InvalidRequest(
+            f"{thing.name} needs {key} from {low:g} to {high:g} {unit}".rstrip(),
+            hint=f"send {{'object': '{thing.name}', '{key}': ...}}",
+        )
+    return f"{asked:g}"
+
+
+def _one_of(thing: PanelObject, state: str | None, states: tuple[str, ...]) -> str:
+    if state is None:
+        raise InvalidRequest(f"{thing.name} needs a state", hint=f"states: {', '.join(states)}")
+    if state not in states:
+        raise InvalidRequest(f"{thing.name} has no state {state!r}", hint=f"states: {', '.join(states)}")
+    return state

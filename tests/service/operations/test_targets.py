@@ -1,0 +1,60 @@
+"""A request that makes no sense is refused before anything moves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hal.config import load_cell
+from hal.errors import InvalidRequest
+from service.operations import OPERATIONS
+from service.operations.requests import ActionBody
+from service.operations.targets import target_of
+
+CELL = load_cell(Path(__file__).parents[3] / "cells/bench.toml")
+
+
+@pytest.mark.parametrize(
+    ("body", "target"),
+    [
+        ({"object": "setpoint", "value": 40.0}, "40"),
+        ({"object": "bypass", "angle_rad": 0.5}, "0.5"),
+        ({"object": "main_valve", "state": "open"}, "open"),
+        ({"object": "pump", "state": "on"}, "on"),
+        ({"object": "emergency"}, "pressed"),
+        ({"object": "start"}, "on"),
+    ],
+)
+def test_a_deed_says_what_it_shall_reach(body: dict[str, Any], target: str) -> None:
+    assert target_of(CELL.panel.object(body["object"]), ActionBody(**body)) == target
+
+
+NONSENSE = [
+    ({"object": "setpiont", "value": 4.0}, "no object called", "'setpoint'"),
+    ({"object": "setpoint", "value": 400.0}, "value from 0 to 100 %", "'value'"),
+    ({"object": "setpoint"}, "value from 0 to 100 %", "'value'"),
+    ({"object": "bypass", "angle_rad": 50.0}, "angle_rad from", "'angle_rad'"),
+    ({"object": "main_valve", "state": "ajar"}, "no state 'ajar'", "open"),
+    ({"object": "main_valve"}, "needs a state", "open"),
+    ({"object": "emergency", "value": 3.0}, "takes state, not value", "'state'"),
+    ({"object": "pressure", "value": 3.0}, "cannot be worked", "levers"),
+]
+
+
+@pytest.mark.parametrize(("body", "why", "hint"), NONSENSE)
+def test_nonsense_is_refused_by_both_verbs_that_work_controls(body: dict[str, Any], why: str, hint: str) -> None:
+    for verb, request in (("manipulate", body), ("missions", {"actions": (ActionBody(**body),)})):
+        operation = OPERATIONS[verb]
+        with pytest.raises(InvalidRequest, match=why) as refused:
+            operation.check(CELL, operation.request_model(**request))
+        assert hint in refused.value.hint
+
+
+def test_an_object_to_read_must_be_on_the_panel_unless_an_image_of_another_one_is_sent() -> None:
+    operation = OPERATIONS["inspect"]
+    with pytest.raises(InvalidRequest, match="presure"):
+        operation.check(CELL, operation.request_model(objects=("presure",)))
+    operation.check(CELL, operation.request_model(objects=("presure",), image="0" * 24))
+    operation.check(CELL, operation.request_model())

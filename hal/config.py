@@ -111,6 +111,14 @@ class Cell(Strict):
         """Names of the devices of a kind, in the order of the file."""
         return tuple(name for name, device in self.file.devices.items() if device.kind is kind)
 
+    def calibration_path(self, name: str) -> Path:
+        """The file of the calibration record called `name`.
+
+        Raises:
+            ConfigError: its folder is gone.
+        """
+        return _locate(self.file.cell.calibrations, self.path, "cell.calibrations") / f"{name}.toml"
+
     def calibration_of(self, device: str) -> CalibrationRecord:
         """The calibration record of a mounted device.
 
@@ -143,10 +151,10 @@ def load_cell(path: Path, *, seed: int | None = None) -> Cell:
     if seed is not None:
         file = file.model_copy(update={"cell": file.cell.model_copy(update={"seed": seed})})
     panel = load_panel(_locate(file.cell.panel, path, "cell.panel"))
-    folder = _locate(file.cell.calibrations, path, "cell.calibrations")
     names = {device.mount.calibration for device in file.devices.values() if device.mount is not None}
-    records = {name: load_calibration(folder / f"{name}.toml") for name in sorted(names)}
-    return Cell.model_construct(path=path, file=file, panel=panel, calibrations=records)
+    bare = Cell.model_construct(path=path, file=file, panel=panel, calibrations={})
+    records = {name: load_calibration(bare.calibration_path(name)) for name in sorted(names)}
+    return bare.model_copy(update={"calibrations": records})
 
 
 def _locate(text: str, cell_path: Path, key: str) -> Path:

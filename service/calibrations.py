@@ -76,7 +76,7 @@ class Calibrations:
             if section.mount is None:
                 continue
             name = section.mount.calibration
-            path = measured.get(name, self._cell.path.parent / self._cell.file.cell.calibrations / f"{name}.toml")
+            path = measured.get(name) or self._cell.calibration_path(name)
             older = tuple(sorted((self.folder / OLDER).glob(f"{name}.v*.toml"), key=lambda p: p.stat().st_mtime_ns))
             found.append(
                 Calibrated(

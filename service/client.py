@@ -68,7 +68,7 @@ class Client:
         connection, answer = self._ask(method, path, body, headers or {})
         try:
             data = answer.read()
-        except OSError as error:
+        except (OSError, http.client.HTTPException) as error:  # it may end in the middle of its answer
             raise self._lost(error) from error
         finally:
             connection.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import weakref
 from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from typing import Any, Protocol, cast
@@ -136,7 +137,7 @@ class RemoteConnection:
         self._lock = threading.Lock()
         self._connect: Connect | None = None
         self._generation = 0
-        self._proxies: list[tuple[str, Any]] = []
+        self._proxies: list[tuple[str, weakref.ref[Any]]] = []  # each lives as long as its thread
         self._mine = threading.local()
         self._swaps: dict[str, int] = {}
 
@@ -179,7 +180,7 @@ class RemoteConnection:
         self.cell.file.devices[name] = section
         with self._lock:
             self._swaps[name] = self._swaps.get(name, 0) + 1
-            self._proxies = [item for item in self._proxies if item[0] != name]
+            self._proxies = [(other, proxy) for other, proxy in self._proxies if other != name]
 
     def close(self) -> None:
         """Close all proxies."""
@@ -190,8 +191,9 @@ class RemoteConnection:
             self._connect = connect
             self._generation += 1
             old, self._proxies = self._proxies, []
-        for _, proxy in old:
-            _close_link(proxy)
+        for _, reference in old:
+            if (proxy := reference()) is not None:
+                _close_link(proxy)
 
     def _proxy(self, name: str) -> Any:
         mine = self._mine.__dict__
@@ -211,7 +213,8 @@ class RemoteConnection:
         proxy = connect(name)
         mine[name] = (swaps, proxy)
         with self._lock:
-            self._proxies.append((name, proxy))
+            self._proxies = [item for item in self._proxies if item[1]() is not None]
+            self._proxies.append((name, weakref.ref(proxy)))
         return proxy
 
 

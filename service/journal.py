@@ -6,6 +6,7 @@ of events costs one flush of the disk.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import queue
@@ -54,7 +55,7 @@ class _Entry:
     text: str
     wall_time_s: float
     monotonic_s: float
-    done: Future[int]
+    done: Future[None]
 
 
 class Journal:
@@ -130,7 +131,7 @@ class Journal:
         self._waiting.put(None)
         self._thread.join(APPEND_TIMEOUT_S)
 
-    def _put(self, kind: str, data: dict[str, Any]) -> Future[int]:
+    def _put(self, kind: str, data: dict[str, Any]) -> Future[None]:
         if self._is_closed or not self._thread.is_alive():
             raise JournalError("the journal is closed", hint="restart the service")
         entry = _Entry(
@@ -143,8 +144,9 @@ class Journal:
         self._waiting.put(entry)
         return entry.done
 
-    def _reader(self) -> _Reader:
-        return _Reader(self.path)
+    def _reader(self) -> contextlib.closing[sqlite3.Connection]:
+        uri = self.path.absolute().as_uri()  # a folder may be called "50% off?"
+        return contextlib.closing(sqlite3.connect(f"{uri}?mode=ro", uri=True))
 
     def _write(self, ready: Future[None]) -> None:
         try:
@@ -173,19 +175,6 @@ class Journal:
             except queue.Empty:
                 return group, False
         return group, True
-
-
-class _Reader:
-    """A read-only connection for one `with` block."""
-
-    def __init__(self, path: Path) -> None:
-        self._db = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
-
-    def __enter__(self) -> sqlite3.Connection:
-        return self._db
-
-    def __exit__(self, *_: object) -> None:
-        self._db.close()
 
 
 def _opened(path: Path) -> sqlite3.Connection:
@@ -219,13 +208,13 @@ def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry], previous: s
             newest = digest
         db.execute("COMMIT")
     except sqlite3.Error as error:
-        if db.in_transaction:
+        with contextlib.suppress(sqlite3.Error):  # a disk that takes no commit may take no rollback; callers are told
             db.execute("ROLLBACK")
         for entry in group:
             entry.done.set_exception(_error(path, error))
         return previous
     for entry in group:
-        entry.done.set_result(0)
+        entry.done.set_result(None)
     return newest
 
 

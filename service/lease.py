@@ -111,7 +111,10 @@ class LeaseDesk:
         """
         self.expire()
         with self._lock:
-            if token is not None and not secrets.compare_digest(token.encode(), self._token.encode()):
+            is_holders = self._holder is not None and secrets.compare_digest(
+                (token or "").encode(), self._token.encode()
+            )
+            if token is not None and not is_holders:
                 raise StaleEpoch("this lease has ended", hint="acquire it again: POST /v1/lease", epoch=self._epoch)
             if token is None and self._holder is not None:
                 raise LeaseError(

@@ -94,7 +94,7 @@ class TaskStore:
     Args:
         folder: artefacts go to `folder/<task id>/`.
         recorder: the journal; a task is acknowledged after its record is on disk.
-        stop_motion: ends the running motion; called first, and again until a cancelled task has ended.
+        stop_motion: ends the running motion; called at once, and again until a cancelled task has ended.
         max_queued: more waiting tasks than this are refused with `Busy`.
         keep: so many finished tasks stay in memory.
     """
@@ -206,7 +206,7 @@ class TaskStore:
         return path, found
 
     def cancel(self, task_id: str, *, reason: str = "asked for") -> Task:
-        """End a task: the arm is stopped first, then the task is told.
+        """End a task: it is told, so that it begins no further motion, and the arm is stopped until it has ended.
 
         Raises:
             NoSuchTask: never heard of it.
@@ -296,6 +296,8 @@ class TaskStore:
             self._stop_motion()
         except CellError as error:
             log.warning("stopping the motion of a cancelled task: %s", error)
+        except Exception:  # a defect below must not end the attempts: the arm may still move
+            log.exception("stopping the motion of a cancelled task")
 
     def _with_key(self, key: str | None, verb: str, request: dict[str, Any]) -> Task | None:
         earlier = next((t for t in self._tasks.values() if key is not None and t.key == key), None)

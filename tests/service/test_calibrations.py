@@ -7,7 +7,7 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from hal.calibration import LoadRecord, MountRecord
+from hal.calibration import LoadRecord, MountRecord, load_calibration
 from hal.config import Cell, load_cell
 from hal.errors import ConfigError
 from perception.calibration.records import renewed
@@ -42,6 +42,12 @@ def test_what_was_measured_lies_over_the_cell_file_and_leaves_it_alone(cell: Cel
     assert calibrations.applied().calibration_of("wrist_camera").mount == MOVED
     assert calibrations.applied().calibration_of("wrist_ft") == cell.calibration_of("wrist_ft")
     assert load_cell(cell.path).calibration_of("wrist_camera") == cell.calibration_of("wrist_camera")
+
+
+def test_the_path_of_a_record_is_the_file_that_was_read(tmp_path: Path) -> None:
+    shipped = load_cell(Path(__file__).parents[2] / "cells" / "bench.toml")
+    entries = Calibrations.of_runs(tmp_path, shipped).all()
+    assert [load_calibration(entry.path) for entry in entries] == [entry.record for entry in entries] != []
 
 
 def test_every_version_is_kept_and_the_newest_can_be_taken_back(cell: Cell, tmp_path: Path) -> None:

@@ -75,6 +75,14 @@ def test_every_change_breaks_the_chain(tmp_path: Path, change: str) -> None:
         journal.verify()
 
 
+def test_a_folder_may_have_any_name(tmp_path: Path) -> None:
+    (folder := tmp_path / "50%25 off? #1").mkdir()
+    journal = Journal(folder / "j.sqlite")
+    journal.append("tick", {})
+    assert journal.verify() == len(journal.records()) == 1
+    journal.close()
+
+
 def test_a_closed_journal_refuses(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "j.sqlite")
     journal.close()

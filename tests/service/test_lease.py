@@ -48,6 +48,13 @@ def test_a_token_without_a_lease_is_stale() -> None:
         lease.check(grant.token)
 
 
+def test_an_empty_token_is_nobodys() -> None:
+    lease, _, _ = desk()
+    for use in (lease.check, lease.heartbeat, lease.release):
+        with pytest.raises(StaleEpoch):
+            use("")
+
+
 def test_heartbeats_keep_it_and_silence_ends_it() -> None:
     lease, clock, losses = desk()
     grant = lease.acquire("alice")

@@ -14,7 +14,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from hal.errors import ConfigError, InvalidRequest
+from hal.errors import ConfigError, DeviceUnavailable, InvalidRequest
 from service.client import Client
 from service.commands import demo, devices, tasks, teach
 from service.commands import serve as serving
@@ -60,10 +60,12 @@ def test_what_is_no_address_is_refused(url: str) -> None:
 
 
 class Stranger(BaseHTTPRequestHandler):
-    """Some other program's web page."""
+    """Some other program's web page, and one that ends in the middle of its answer."""
 
     def do_GET(self) -> None:
         self.send_response(200)
+        if self.path == "/cut-off":
+            self.send_header("Content-Length", "1000")
         self.end_headers()
         self.wfile.write(b"<h1>hello</h1>")
 
@@ -85,6 +87,11 @@ def stranger() -> Iterator[str]:
 def test_another_program_on_that_port_is_refused(stranger: str) -> None:
     with pytest.raises(ConfigError, match="no panelwright"):
         Client(url=stranger).get("/v1/devices")
+
+
+def test_an_answer_that_ends_in_its_middle_is_a_lost_service(stranger: str) -> None:
+    with pytest.raises(DeviceUnavailable, match="IncompleteRead"):
+        Client(url=stranger).get("/cut-off")
 
 
 def test_devices_of_the_stop_port_are_no_empty_table(served: Panelwright) -> None:

@@ -229,9 +229,10 @@ def test_close_ends_everything(bench: Bench) -> None:
         bench.store.start("test", {}, lambda _: None, moves=False)
 
 
-def test_an_error_while_stopping_does_not_hinder_the_cancel(tmp_path: Path) -> None:
+@pytest.mark.parametrize("error", [MotionError("no arm", hint="none"), RuntimeError("a defect")])
+def test_an_error_while_stopping_does_not_hinder_the_cancel(error: Exception, tmp_path: Path) -> None:
     def broken() -> None:
-        raise MotionError("no arm", hint="none")
+        raise error
 
     store = TaskStore(tmp_path, recorder=Recorder(), stop_motion=broken)
     task = store.start("test", {}, _until_cancelled, moves=True)

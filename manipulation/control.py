@@ -110,6 +110,7 @@ class Controller:
         self._newest: Sample | None = None
         self._faults: tuple[str, ...] = ()
         self._is_moving = False
+        self._is_closing = False
 
     # -- life ------------------------------------------------------------------------------------------------------
 
@@ -120,6 +121,7 @@ class Controller:
 
     def close(self) -> None:
         """Cancel what runs, stop the arm, end the thread; a second call does nothing."""
+        self._is_closing = True  # a motion that begins at this moment clears `_cancel`
         self._cancel.set()
         self._thread.close()
 
@@ -238,7 +240,7 @@ class Controller:
             self._safety.force_limit_n,
             look,
             is_latched=self._is_latched,
-            is_cancelled=self._cancel.is_set,
+            is_cancelled=lambda: self._is_closing or self._cancel.is_set(),
         )
         ticks = 0
         over_since_s: float | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import queue
 import threading
@@ -16,6 +17,7 @@ from hal.lockstep import share_core
 T = TypeVar("T")
 
 JOIN_S = 2.0
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,8 +30,8 @@ class ControlThread:
     """Jobs in the order in which they come; errors go to the caller, the thread lives on.
 
     Args:
-        beat: called again and again while there is no job; None lets the thread sleep until one comes (in lockstep with
-            a simulated world, where nothing happens between motions).
+        beat: called again and again while there is no job; one that raises ends the thread. None lets the thread sleep
+            until a job comes (in lockstep with a simulated world, where nothing happens between motions).
         at_end: called by the thread as its last act.
     """
 
@@ -71,17 +73,25 @@ class ControlThread:
     def _loop(self) -> None:
         if self._beat is None:
             share_core(os.getpid())
-        while not self._is_closing:
-            try:
-                job = self._jobs.get(block=self._beat is None)
-            except queue.Empty:
-                job = None
-            if job is not None:
-                _do(job)
-            elif self._beat is not None:
-                self._beat()
+        try:
+            while not self._is_closing:
+                self._turn()
+        except Exception:  # of a beat: nobody knows any more what holds the arm
+            log.exception("the control thread ends")
+        with self._gate:
+            self._is_closing = True
         self._refuse_rest()
         self._at_end()
+
+    def _turn(self) -> None:
+        try:
+            job = self._jobs.get(block=self._beat is None)
+        except queue.Empty:
+            job = None
+        if job is not None:
+            _do(job)
+        elif self._beat is not None:
+            self._beat()
 
     def _refuse_rest(self) -> None:
         # Callers that asked while the thread closed get an answer too.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+import logging
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from hal.clock import Clock, Deadline, WallClock
 from hal.devices import Arm
 from hal.errors import CellError
-from manipulation.sensing import DeviceFailure, command_wait_s, read_wait_s
+from manipulation.sensing import command_wait_s, failure_of, read_wait_s
 
 Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
 
 
 class Drives:
@@ -33,8 +34,8 @@ class Drives:
         """
         try:
             self._arm.enable(deadline=Deadline.after(self._clock, command_wait_s(self._clock)))
-        except CellError as error:
-            raise DeviceFailure(self._arm.name, error.what) from error
+        except Exception as error:
+            raise failure_of(self._arm.name, error) from error
         self.are_on = True
 
     def switch_off(self) -> None:
@@ -45,8 +46,12 @@ class Drives:
 
     def stop(self) -> None:
         """Ask the arm to stop, whatever is known of it; an arm that does not hear stops by its own watchdog."""
-        with suppress(CellError):
+        try:
             self._arm.stop(deadline=Deadline.after(self._clock, command_wait_s(self._clock)))
+        except CellError:
+            pass
+        except Exception:  # a defect of its driver: whoever stops goes on with what else there is to end
+            log.exception("stopping %s", self._arm.name)
 
     def send(self, position_rad: Array) -> Array:
         """Send a set-point (n,), rad; returns what the arm took.
@@ -57,8 +62,8 @@ class Drives:
         try:
             deadline = Deadline(self._clock.now_s() + read_wait_s(self._clock), self._clock)
             return self._arm.command_position(position_rad, deadline=deadline)
-        except CellError as error:
-            raise DeviceFailure(self._arm.name, error.what) from error
+        except Exception as error:
+            raise failure_of(self._arm.name, error) from error
 
     def begin_rhythm(self) -> None:
         """Count periods from now."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from manipulation import kernels
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
+log = logging.getLogger(__name__)
 
 GRAVITY_M_PER_S2 = 9.80665
 RANGE_WAIT_S = 0.004
@@ -154,21 +156,27 @@ class Devices:
     def _ask(self, device: str, read: Callable[..., Stamped[T]], now_s: float, deadline: Deadline) -> T:
         try:
             return read(deadline=deadline).usable(now_s=now_s, max_age_s=self.max_age_s, device=device)
-        except CellError as error:
-            raise _failure(device, error) from error
+        except Exception as error:
+            raise failure_of(device, error) from error
 
     def _ranges_m(self, now_s: float) -> tuple[float, ...]:
         ranges = []
         for reader in self.proximities:
             try:
                 ranges.append(reader.read(now_s))
-            except CellError as error:
-                raise _failure(reader.name, error) from error
+            except Exception as error:
+                raise failure_of(reader.name, error) from error
         return tuple(ranges)
 
 
-def _failure(device: str, error: CellError) -> DeviceFailure:
-    """By the name that the error itself gives, if it does: a device may stand for others."""
+def failure_of(device: str, error: Exception) -> DeviceFailure:
+    """By the name that the error itself gives, if it does: a device may stand for others.
+
+    A defect of a driver is a failure of its device: it must end a motion as gently as a loose cable does.
+    """
+    if not isinstance(error, CellError):
+        log.error("%s: its driver failed", device, exc_info=error)
+        return DeviceFailure(device, f"its driver failed: {type(error).__name__}: {error}")
     named = error.details.get("device") if isinstance(error, DeviceError) else None
     return DeviceFailure(str(named or device), error.what)
 

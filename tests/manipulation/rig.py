@@ -53,6 +53,7 @@ class World:
     commands: list[np.ndarray] = field(default_factory=list)
     silent: set[str] = field(default_factory=set)
     frozen: set[str] = field(default_factory=set)
+    defective: set[str] = field(default_factory=set)
     before_step: Callable[[], None] = lambda: None
     ticks: int = 0
     stops: int = 0
@@ -107,6 +108,8 @@ class _Device:
     def stamped(self, value):
         if self.name in self.world.silent:
             raise DeviceTimeout(f"{self.name} silent", hint="check power", device=self.name)
+        if self.name in self.world.defective:
+            raise ZeroDivisionError("a defect of the driver")
         now_s = self.world.clock.now_s()
         if self.name not in self.world.frozen:
             self._frozen_at_s = now_s

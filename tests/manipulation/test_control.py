@@ -197,6 +197,20 @@ def test_a_device_that_fails_in_motion_stops_the_arm_and_is_named(rig: Rig, devi
     assert np.abs(rig.world.velocity).max() < 1e-3
 
 
+@pytest.mark.parametrize("device", ["arm", "gripper", "wrist_ft", "finger_touch", "proximity_left"])
+def test_a_defect_of_a_driver_stops_the_arm_as_gently_as_a_failing_device(rig: Rig, device: str) -> None:
+    def fail() -> None:
+        if rig.world.ticks == 300:
+            rig.world.defective.add(device)
+
+    rig.world.before_step = fail
+    report = rig.controller.execute(forwards(0.1))
+    assert report.outcome is MotionOutcome.FAULT
+    assert device in report.cause and "ZeroDivisionError" in report.cause
+    assert rig.world.ticks < 300 + 120
+    assert np.abs(rig.world.velocity).max() < 1e-3
+
+
 def test_a_device_that_is_dead_before_the_start_moves_nothing(rig: Rig) -> None:
     rig.world.silent.add("wrist_ft")
     report = rig.controller.execute(forwards(0.1))
@@ -234,6 +248,21 @@ def test_cancel_ends_the_motion(rig: Rig) -> None:
     report = rig.controller.execute(forwards(0.1))
     assert report.outcome is MotionOutcome.CANCELLED
     assert rig.controller.execute(Hold(name="still", duration_s=0.02)).outcome is MotionOutcome.COMPLETED
+
+
+def test_a_motion_that_begins_while_the_controller_closes_is_cancelled_too(rig: Rig) -> None:
+    closing = threading.Thread(target=rig.controller.close)
+
+    def close() -> None:
+        if rig.world.ticks == 150:
+            closing.start()
+            assert rig.controller._cancel.wait(10.0)
+            rig.controller._cancel.clear()  # as `execute` does, if it comes between the cancel and the thread's end
+
+    rig.world.before_step = close
+    report = rig.controller.execute(forwards(0.1))
+    closing.join(10.0)
+    assert report.outcome is MotionOutcome.CANCELLED
 
 
 def test_set_points_never_break_the_limits_even_when_a_path_asks_for_it(rig: Rig) -> None:

@@ -45,6 +45,21 @@ def test_it_beats_until_it_is_closed_and_then_ends_once() -> None:
     assert ended == ["control"]
 
 
+def test_a_beat_that_fails_ends_the_thread_and_whoever_asks_is_refused() -> None:
+    may_fail, ended = threading.Event(), threading.Event()
+
+    def beat() -> None:
+        if may_fail.wait(PATIENCE_S):
+            raise ZeroDivisionError("a defect")
+
+    thread = ControlThread(beat=beat, at_end=ended.set)
+    thread.start()
+    may_fail.set()
+    assert ended.wait(PATIENCE_S)
+    with pytest.raises(MotionRefused, match="does not run"):
+        thread.do(quiet)
+
+
 def test_before_start_and_after_close_it_refuses() -> None:
     thread = ControlThread(beat=None, at_end=quiet)
     with pytest.raises(MotionRefused, match="does not run"):

@@ -20,7 +20,7 @@ from perception.range.grid import Grid
 from perception.range.grooves import cut_at_grooves
 from perception.range.noise import NoiseModel, estimate_noise, typical_depths_m
 from perception.range.primitives import Plane, Surface, SurfaceType
-from perception.range.regions import Regions, regions_of, renamed
+from perception.range.regions import Regions, regions_of
 from perception.range.segment import Task, segment, settled
 from perception.range.sensor import RangeSensorModel
 from perception.range.straight import doubt_about
@@ -184,8 +184,9 @@ def _finished(task: Task, noise: NoiseModel, regions: Regions, found: Candidates
     names = np.zeros(len(pixels) + 1, np.int32)
     for new, k in enumerate(keep, 1):
         kind, mine = found.kinds[k], regions.samples(k + 1)
-        mine[3] *= found.slack[k]
-        few[k][3] *= found.slack[k]
+        if found.slack[k] != 1.0:
+            mine[3] *= found.slack[k]
+            few[k][3] *= found.slack[k]
         surface, th = finish.refine_surface(new, kind, found.parameters[k], mine, sensor=sensor, noise=noise)
         # What the sensor has bent is named straight, but keeps the bent surface's pixels.
         final.add(kind, th)
@@ -194,7 +195,7 @@ def _finished(task: Task, noise: NoiseModel, regions: Regions, found: Candidates
             surface, _ = finish.refine_surface(new, straight, start, mine, sensor=sensor, noise=noise)
         surfaces.append(surface)
         names[k + 1] = new
-    labels = settled(task, noise, renamed(regions.labels, names), final, sweeps=SETTLING_SWEEPS)
+    labels = settled(task, noise, regions.renamed(names), final, sweeps=SETTLING_SWEEPS)
     labels = without_fillets(depth, packed, law, labels, *final.arrays())
     labels, surfaces = finish.without_crumbs(labels, surfaces, max(LEAST_KEPT_PIXELS, CRUMB_SHARE * task.least_pixels))
     fill_small_gaps(labels, depth, 2)

@@ -232,16 +232,6 @@ def _agreed(label, v, u):  # type: ignore[no-untyped-def]  # numba types it
 
 
 @njit(cache=True)
-def pixels_of(label, count):  # type: ignore[no-untyped-def]  # numba types it
-    """How many pixels each of the labels 1 to `count` has, (count,)."""
-    flat = label.ravel()
-    sizes = np.zeros(count + 1, np.int64)
-    for i in range(flat.shape[0]):
-        sizes[flat[i]] += 1
-    return sizes[1:]
-
-
-@njit(cache=True)
 def bucket(label, count):  # type: ignore[no-untyped-def]  # numba types it
     """Flat pixel indices grouped by label: label k owns indices[starts[k] : starts[k + 1]]; starts is (count + 2,).
 

@@ -15,6 +15,7 @@ from perception.range.beside import WORD, flagged
 from perception.range.borders import borders_of, step_and_turn
 from perception.range.grid import sigma_at
 from perception.range.regions import regions_of
+from perception.range.runs import pixels_of
 from perception.range.surfaces import LEAN, PLANE, depth_on, normal_on
 
 Array = NDArray[np.float64]
@@ -45,7 +46,7 @@ def without_fillets(
     if beside:
         regions = regions_of(depth_m, packed, law, labels, kinds.shape[0] - 1)
         for strip, faces in beside.items():
-            mine = regions.indices[regions.starts[strip] : regions.starts[strip + 1]]
+            mine = regions.places(strip)
             owner = _nearer(depth_m, packed, mine, half_width[strip], np.array(faces), kinds, table)
             if np.mean(owner > 0) >= (LEAST_SHARE if len(faces) > 1 else WHOLE_SHARE):
                 labels.ravel()[mine] = np.where(owner > 0, owner, strip)
@@ -84,7 +85,7 @@ def _shapes(labels, count):  # type: ignore[no-untyped-def]  # numba types it
     length over the width for a long strip.
     """
     H, W = labels.shape
-    pixels, rim = np.zeros(count), np.zeros(count)
+    pixels, rim = pixels_of(labels, count - 1), np.zeros(count)
     words, columns = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
     for v in range(H):
         above, below = labels[max(v - 1, 0)], labels[min(v + 1, H - 1)]
@@ -92,12 +93,6 @@ def _shapes(labels, count):  # type: ignore[no-untyped-def]  # numba types it
         _flag_sides(labels[v], words.view(np.bool_))
         for i in range(flagged(words, columns)):
             rim[labels[v, columns[i]]] += 1.0
-        _flag_changes(labels[v], words.view(np.bool_))
-        start = 0
-        for i in range(flagged(words, columns)):
-            pixels[labels[v, start]] += columns[i] - start
-            start = columns[i]
-        pixels[labels[v, start]] += W - start
     out = np.zeros((2, count))
     for k in range(1, count):
         if pixels[k] > 0:
@@ -128,14 +123,6 @@ def _flag_sides(own, flags):  # type: ignore[no-untyped-def]  # numba types it
         is_left = (own[max(u - 1, 0)] != k) & (own[max(u - 2, 0)] != k)
         is_right = (own[min(u + 1, last)] != k) & (own[min(u + 2, last)] != k)
         flags[u] |= (k > 0) & (is_left | is_right)
-
-
-@njit(cache=True, error_model="numpy", **LEAN)
-def _flag_changes(own, flags):  # type: ignore[no-untyped-def]  # numba types it
-    """Where a pixel's label is not that of the one to its left."""
-    flags[0] = False
-    for u in range(1, own.shape[0]):
-        flags[u] = own[u] != own[u - 1]
 
 
 @njit(cache=True, error_model="numpy")

@@ -9,7 +9,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from perception.range import fit
-from perception.range.claim import pixels_of
 from perception.range.noise import NoiseModel
 from perception.range.primitives import (
     COVARIANCE_OVER,
@@ -19,6 +18,7 @@ from perception.range.primitives import (
     named_covariance,
     primitive_of,
 )
+from perception.range.runs import pixels_of
 from perception.range.sensor import RangeSensorModel
 from perception.range.starts import solve_positive
 from perception.range.surfaces import FREEDOM, QUADRIC
@@ -112,7 +112,8 @@ def _inverse(H, p, fixed):  # type: ignore[no-untyped-def]  # numba types it
 
 def without_crumbs(labels: Labels, surfaces: list[Surface], least: float) -> tuple[Labels, list[Surface]]:
     """Labels and surfaces, numbered anew, without those that their neighbours have left fewer than `least` pixels."""
-    kept = [s for s, pixels in zip(surfaces, pixels_of(labels, len(surfaces)), strict=True) if pixels >= least]
+    pixels = pixels_of(labels, len(surfaces)).tolist()
+    kept = [s for s in surfaces if pixels[s.label] >= least]
     if len(kept) == len(surfaces):
         return labels, surfaces
     renamed = np.zeros(len(surfaces) + 1, np.int32)

@@ -1,7 +1,7 @@
 """The pixels of each region of a label image, as fits read them.
 
 Samples are (4, N): ray coordinates x and y, depth z and its standard deviation, metres. Only the places of pixels are
-kept; samples are made where they are wanted, for most steps need a few of a region.
+kept, as runs of rows; samples are made where they are wanted, for most steps need a few of a region.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from perception.range.claim import bucket
 from perception.range.rays import LOOSE
+from perception.range.runs import painted, places_of, runs_of
+from perception.range.surfaces import LEAN
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
@@ -23,7 +24,7 @@ Labels = NDArray[np.int32]
 class Regions:
     """Labels 1 to `count` of a depth image (H, W) in metres; `packed` and `law` of its sensor and its noise.
 
-    Label k owns the flat pixel indices `indices[starts[k] : starts[k + 1]]`, in raster order.
+    Label k owns `runs[starts[k] : starts[k + 1]]` and `sizes[k]` pixels, as `runs_of` tells them.
     """
 
     depth_m: Array
@@ -31,81 +32,90 @@ class Regions:
     law: Array
     labels: Labels
     starts: NDArray[np.int64]
-    indices: NDArray[np.int32]
+    runs: Labels
+    sizes: NDArray[np.int64]
 
     @property
     def pixels(self) -> list[int]:
         """How many pixels each label has; entry 0 is label 1."""
-        sizes: list[int] = np.diff(self.starts[1:]).tolist()
+        sizes: list[int] = self.sizes[1:].tolist()
         return sizes
 
     def few(self, most: int) -> list[Array]:
         """At most `most` samples of each label, evenly spread over its pixels; the same choice every time."""
-        out, sizes = _spread_samples(self.depth_m, self.packed, self.law, self.starts, self.indices, most)
-        return [np.ascontiguousarray(s[:, :n]) for s, n in zip(out, sizes.tolist(), strict=True)]
+        sizes = np.minimum(self.sizes[1:], most).tolist()
+        out = _spread_samples(self.depth_m, self.packed, self.law, self.starts, self.runs, self.sizes, most)
+        return [np.ascontiguousarray(s[:, :n]) for s, n in zip(out, sizes, strict=True)]
 
     def samples(self, label: int) -> Array:
-        """Samples of all pixels of a label."""
-        mine = self.indices[self.starts[label] : self.starts[label + 1]]
-        return np.asarray(_samples_at(self.depth_m, self.packed, self.law, mine))
+        """Samples of all pixels of a label, in raster order."""
+        mine = self.runs[self.starts[label] : self.starts[label + 1]]
+        return np.asarray(_samples_of(self.depth_m, self.packed, self.law, mine, self.sizes[label]))
+
+    def places(self, label: int) -> Labels:
+        """Flat pixel indices of a label, in raster order."""
+        return np.asarray(places_of(self.runs[self.starts[label] : self.starts[label + 1]], self.labels.shape[1]))
+
+    def renamed(self, names: Labels) -> Labels:
+        """(H, W) labels after k is called `names[k]`."""
+        labels = np.zeros_like(self.labels)
+        painted(self.starts, self.runs, names, labels)
+        return labels
 
     def given_to(self, owner: list[int]) -> Regions:
         """The regions after label k has gone to `owner[k - 1]`."""
         if owner == list(range(1, len(owner) + 1)):
             return self
-        labels = renamed(self.labels, np.array([0, *owner], np.int32))
+        labels = self.renamed(np.array([0, *owner], np.int32))
         return regions_of(self.depth_m, self.packed, self.law, labels, len(owner))
 
 
 def regions_of(depth_m: Array, packed: Array, law: Array, labels: Labels, count: int) -> Regions:
     """The pixels of labels 1 to `count`."""
-    starts, indices = bucket(labels, count)
-    return Regions(depth_m=depth_m, packed=packed, law=law, labels=labels, starts=starts, indices=indices)
+    starts, runs, sizes = runs_of(labels, count)
+    return Regions(depth_m=depth_m, packed=packed, law=law, labels=labels, starts=starts, runs=runs, sizes=sizes)
 
 
-@njit(cache=True, nogil=True)
-def renamed(labels, names):  # type: ignore[no-untyped-def]  # numba types it
-    """(H, W) labels after k is called `names[k]`."""
-    out = np.empty_like(labels)
-    flat, new = labels.ravel(), out.ravel()
-    for i in range(flat.shape[0]):
-        new[i] = names[flat[i]]
+@njit(cache=True, error_model="numpy", nogil=True)
+def _spread_samples(depth, sen, noise, starts, runs, sizes, most):  # type: ignore[no-untyped-def]  # numba types it
+    """(count, 4, most) samples of each label, as many as it has at most."""
+    count = sizes.shape[0] - 1
+    out = np.empty((count, 4, most))
+    for k in range(count):
+        n = min(sizes[k + 1], most)
+        step = (sizes[k + 1] - 1) / max(n - 1, 1)
+        run, passed = starts[k + 1], 0
+        for j in range(n):
+            at = int(j * step + 0.5)
+            while at - passed >= runs[run, 2] - runs[run, 1]:
+                passed += runs[run, 2] - runs[run, 1]
+                run += 1
+            v, u = runs[run, 0], runs[run, 1] + at - passed
+            out[k, 0, j], out[k, 1, j], out[k, 2, j] = (u - sen[3]) / sen[1], (v - sen[4]) / sen[2], depth[v, u]
+        _fill_sigmas(out[k, 2, :n], noise, out[k, 3, :n])
     return out
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _spread_samples(depth, sen, noise, starts, indices, most):  # type: ignore[no-untyped-def]  # numba types it
-    """(count, 4, most) samples and how many of them each label has."""
-    count = starts.shape[0] - 2
-    out, sizes = np.empty((count, 4, most)), np.empty(count, np.int64)
-    W = depth.shape[1]
-    for k in range(count):
-        first, n = starts[k + 1], starts[k + 2] - starts[k + 1]
-        sizes[k] = min(n, most)
-        step = (n - 1) / max(sizes[k] - 1, 1)
-        for j in range(sizes[k]):
-            i = indices[first + int(j * step + 0.5)]
-            out[k, 0, j], out[k, 1, j] = (i % W - sen[3]) / sen[1], (i // W - sen[4]) / sen[2]
-            out[k, 2, j] = depth[i // W, i % W]
-        _fill_sigmas(out[k, 2, : sizes[k]], noise, out[k, 3, : sizes[k]])
-    return out, sizes
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _samples_at(depth, sen, noise, indices):  # type: ignore[no-untyped-def]  # numba types it
-    """(4, N) samples of the pixels at flat `indices` (N,) in raster order."""
-    n, W = indices.shape[0], depth.shape[1]
-    flat = depth.ravel()
-    out = np.empty((4, n))
-    per_x, row, start, y = 1.0 / sen[1], -1, 0, 0.0
-    for k in range(n):
-        i = indices[k]
-        if i - start >= W or row < 0:
-            row = i // W
-            start, y = row * W, (row - sen[4]) / sen[2]
-        out[0, k], out[1, k], out[2, k] = (i - start - sen[3]) * per_x, y, flat[i]
+def _samples_of(depth, sen, noise, runs, pixels):  # type: ignore[no-untyped-def]  # numba types it
+    """(4, pixels) samples of the pixels of runs (R, 3)."""
+    out, n = np.empty((4, pixels)), 0
+    for i in range(runs.shape[0]):
+        v, first, end = runs[i, 0], runs[i, 1], runs[i, 2]
+        last = n + end - first
+        _fill_columns(first, 1.0 / sen[1], sen[3], out[0, n:last])
+        out[1, n:last] = (v - sen[4]) / sen[2]
+        out[2, n:last] = depth[v, first:end]
+        n = last
     _fill_sigmas(out[2], noise, out[3])
     return out
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _fill_columns(first, per_x, middle, x):  # type: ignore[no-untyped-def]  # numba types it
+    """Ray coordinates x of columns `first` and on."""
+    for k in range(x.shape[0]):
+        x[k] = (float(np.int32(first + k)) - middle) * per_x
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)

@@ -76,6 +76,13 @@ def flagged(words, places):  # type: ignore[no-untyped-def]  # numba types it
     return n
 
 
+@njit(cache=True, error_model="numpy", **LEAN)
+def flag_free(labels, flags):  # type: ignore[no-untyped-def]  # numba types it
+    """Where a row of labels has none."""
+    for u in range(labels.shape[0]):
+        flags[u] = labels[u] == 0
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 def pixels_around(rows, columns, reach, shape):  # type: ignore[no-untyped-def]  # numba types it
     """Every pixel of an image of that shape that is at most `reach` rows and columns from one of those given, once."""

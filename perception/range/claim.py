@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from perception.range.beside import WORD, column_range, flagged, new_columns
+from perception.range.beside import WORD, column_range, flag_free, flagged, new_columns
 from perception.range.grid import sigma_at
 from perception.range.rays import LOOSE
 from perception.range.surfaces import LEAN, PLANE, depth_on, normal_on
@@ -204,16 +204,10 @@ def fill_small_gaps(label, depth, sweeps):  # type: ignore[no-untyped-def]  # nu
     for _ in range(sweeps):
         before = label.copy()
         for v in range(1, H - 1):
-            _flag_gaps(before[v], depth[v], words.view(np.bool_))
+            flag_free(before[v], words.view(np.bool_))
             for k in range(flagged(words, columns)):
-                if 0 < columns[k] < W - 1:
+                if 0 < columns[k] < W - 1 and np.isfinite(depth[v, columns[k]]):
                     label[v, columns[k]] = _agreed(before, v, columns[k])
-
-
-@njit(cache=True, error_model="numpy", **LEAN)
-def _flag_gaps(label, depth, flags):  # type: ignore[no-untyped-def]  # numba types it
-    for u in range(label.shape[0]):
-        flags[u] = (label[u] == 0) & (abs(depth[u]) < np.inf)
 
 
 @njit(cache=True, error_model="numpy", **LEAN)

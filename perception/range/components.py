@@ -99,10 +99,10 @@ def _scan(mask, link_right, link_down, parent, top, bottom):  # type: ignore[no-
             if not mask[v, u]:
                 continue
             i = v * W + u
-            if u + 1 < W and link_right[v, u] and mask[v, u + 1]:
-                unite(parent, i, i + 1)
-            if v + 1 < bottom and link_down[v, u] and mask[v + 1, u]:
-                unite(parent, i, i + W)
+            if u > 0 and link_right[v, u - 1] and mask[v, u - 1]:
+                parent[i] = parent[i - 1]
+            if v > top and link_down[v - 1, u] and mask[v - 1, u] and parent[i - W] != parent[i]:
+                unite(parent, i - W, i)
 
 
 @njit(cache=True, nogil=True)
@@ -125,11 +125,10 @@ def _relabel(mask, parent):  # type: ignore[no-untyped-def]  # numba types it
             if not mask[v, u]:
                 continue
             i = v * W + u
-            root = find(parent, i)
-            if root == i:
+            if parent[i] == i:
                 found += 1
                 flat[i] = found
             else:
-                flat[i] = flat[root]  # roots come first in raster order, so theirs is already known
+                flat[i] = flat[parent[i]]  # parents come first in raster order, so theirs is already known
             sizes[flat[i]] += 1
     return label, sizes[: found + 1].copy()

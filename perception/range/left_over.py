@@ -6,7 +6,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from perception.range.beside import WORD
 from perception.range.components import find, unite
+from perception.range.runs import row_ends
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
@@ -27,41 +29,64 @@ def unexplained(
 @njit(cache=True, nogil=True)
 def _patches(depth, labels, least, align):  # type: ignore[no-untyped-def]  # numba types it
     H, W = depth.shape
-    parent, free, count = np.full(H * W, np.int32(-1)), np.empty(H * W, np.int32), 0
-    for v in range(H):
-        for u in range(W):
-            if labels[v, u] != 0 or not np.isfinite(depth[v, u]):
-                continue
-            i = v * W + u
-            parent[i] = i
-            free[count] = i
-            count += 1
-            if u > 0 and parent[i - 1] >= 0:
-                unite(parent, i, i - 1)
-            if v > 0 and parent[i - W] >= 0:
-                unite(parent, i, i - W)  # and with it both of the upper corners
-                continue
-            if v > 0 and u > 0 and parent[i - W - 1] >= 0:
-                unite(parent, i, i - W - 1)
-            if v > 0 and u + 1 < W and parent[i - W + 1] >= 0:
-                unite(parent, i, i - W + 1)
-    sizes = np.zeros(H * W, np.int32)
-    for k in range(count):
-        sizes[find(parent, free[k])] += 1
-    top, left, bottom, right, kept = H, W, 0, 0, 0
-    for k in range(count):
-        i = free[k]
-        if sizes[find(parent, i)] < least:
-            continue
-        free[kept] = i
-        kept += 1
-        v, u = i // W, i % W
-        top, bottom, left, right = min(top, v), max(bottom, v + 1), min(left, u), max(right, u + 1)
-    if kept == 0:
+    runs, begins = _free_runs(depth, labels)
+    parent = _connected(runs, begins)
+    sizes, kept = np.zeros(runs.shape[0], np.int64), np.zeros(runs.shape[0], np.bool_)
+    for i in range(runs.shape[0]):
+        sizes[find(parent, i)] += runs[i, 2] - runs[i, 1]
+    top, left, bottom, right = H, W, 0, 0
+    for i in range(runs.shape[0]):
+        kept[i] = sizes[find(parent, i)] >= least
+        if kept[i]:
+            v, first, end = runs[i]
+            top, bottom, left, right = min(top, v), max(bottom, v + 1), min(left, first), max(right, end)
+    if bottom == 0:
         return 0, 0, np.empty((0, 0))
     top, left = top // align * align, left // align * align
     part = np.full((bottom - top, right - left), np.nan)
-    for k in range(kept):
-        v, u = free[k] // W, free[k] % W
-        part[v - top, u - left] = depth[v, u]
+    for i in range(runs.shape[0]):
+        if kept[i]:
+            v, first, end = runs[i]
+            part[v - top, first - left : end - left] = depth[v, first:end]
     return top, left, part
+
+
+@njit(cache=True, error_model="numpy")
+def _free_runs(depth, labels):  # type: ignore[no-untyped-def]  # numba types it
+    """Runs of unlabelled pixels with a reading (R, 3): row, first column, the one after the last; where each row's begin."""
+    H, W = depth.shape
+    words, ends = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 2, np.int32)
+    runs, begins, n = np.empty((4 * max(H, W), 3), np.int32), np.zeros(H + 1, np.int64), 0
+    for v in range(H):
+        if n + W > runs.shape[0]:
+            runs = np.concatenate((runs, runs))
+        u = 0
+        for i in range(row_ends(labels[v], words, ends)):
+            u = ends[i] if labels[v, u] else u
+            while u < ends[i]:
+                first = u
+                while u < ends[i] and np.isfinite(depth[v, u]):
+                    u += 1
+                if u > first:
+                    runs[n, 0], runs[n, 1], runs[n, 2] = v, first, u
+                    n += 1
+                else:
+                    u += 1
+        begins[v + 1] = n
+    return runs[:n].copy(), begins
+
+
+@njit(cache=True)
+def _connected(runs, begins):  # type: ignore[no-untyped-def]  # numba types it
+    """(R,) the parent of each run: those of neighbouring rows that touch, be it at a corner, have one root."""
+    parent = np.arange(runs.shape[0])
+    for v in range(1, begins.shape[0] - 1):
+        above = begins[v - 1]
+        for i in range(begins[v], begins[v + 1]):
+            while above < begins[v] and runs[above, 2] < runs[i, 1]:
+                above += 1
+            j = above
+            while j < begins[v] and runs[j, 1] <= runs[i, 2]:
+                unite(parent, i, j)
+                j += 1
+    return parent

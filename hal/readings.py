@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Generic, TypeVar
 
 from hal.errors import StaleReading
 
 T = TypeVar("T")
-U = TypeVar("U")
 
 
 class Quality(StrEnum):
@@ -31,7 +30,6 @@ class Cause(StrEnum):
     OUT_OF_RANGE = "out-of-range"
     SATURATED = "saturated"
     DEVICE = "device"
-    INTERPOLATED = "interpolated"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,7 +75,3 @@ class Stamped(Generic[T]):
                 cause=str(Cause.STALE),
             )
         return self.value
-
-    def with_value(self, value: U) -> Stamped[U]:
-        """The same stamps around another value."""
-        return replace(self, value=value)  # type: ignore[arg-type,return-value]  # replace() cannot change T

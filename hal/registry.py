@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib.metadata import EntryPoint, entry_points
@@ -12,7 +13,8 @@ from typing import Any, TypeVar
 from hal.clock import Clock, WallClock
 from hal.config import Cell
 from hal.devices import Device
-from hal.errors import CellError, ConfigError
+from hal.emulation import EmulatorFactory
+from hal.errors import ConfigError
 from hal.strict import Strict
 
 DEVICES = "panelwright.devices"
@@ -44,10 +46,11 @@ class Shared:
     def close(self) -> None:
         """Close everything in reverse order; a second call does nothing."""
         with self._lock:
-            things = list(self._things.values())[::-1]
+            things = list(self._things.values())
             self._things.clear()
-        for thing in things:
-            thing.close()
+        with ExitStack() as stack:  # calls in reverse order, each whatever the one before did
+            for thing in things:
+                stack.callback(thing.close)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -94,9 +97,14 @@ def device_factory(driver: str) -> Factory:
     return factory
 
 
-def emulator_factory(name: str) -> Any:
-    """The emulator registered under `name`: `start(backing: Device, options) -> Emulator` (see `hal.emulation`)."""
-    return _load(EMULATORS, name, "emulator")
+def emulator_factory(name: str) -> EmulatorFactory:
+    """The emulator registered under `name`.
+
+    Raises:
+        ConfigError: as `device_factory`.
+    """
+    factory: EmulatorFactory = _load(EMULATORS, name, "emulator")
+    return factory
 
 
 def installed_drivers() -> tuple[str, ...]:
@@ -130,5 +138,3 @@ def connect(context: Context, driver: str, options: dict[str, Any], *, key: str 
             raise
         file = f"{context.cell.path}: " if context.cell is not None else ""
         raise ConfigError(f"{file}{place}: {error.what}", hint=error.hint, **error.details) from error
-    except CellError:
-        raise

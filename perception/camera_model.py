@@ -18,7 +18,6 @@ from hal.errors import InvalidRequest
 Array = NDArray[np.float64]
 
 NEWTON_STEPS = 20  # quadratic convergence reaches 1e-15 in 4 to 6 for |k1| <= 0.3; the rest serves the image corners
-CUBIC_TERMS = 10
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

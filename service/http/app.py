@@ -131,8 +131,6 @@ def _document(app: FastAPI, bodies: list[type[BaseModel]]) -> dict[str, Any]:
         OutlineRequest,
         TeachRequest,
         Problem,
-        OutlineRequest,
-        TeachRequest,
     ]
     _, extra = models_json_schema(
         [(model, "validation") for model in models], ref_template="#/components/schemas/{model}"

@@ -108,7 +108,7 @@ def as_json(name: str, kind: DeviceKind, snapshot: Snapshot) -> dict[str, Any]:
         "kind": str(kind),
         "value": described(stamped.value),
         "host_time_s": stamped.host_time_s,
-        "device_time_s": stamped.device_time_s,
+        "device_time_s": jsonable(stamped.device_time_s),
         "age_s": jsonable(snapshot.age_s),
         "sequence": stamped.sequence,
         "quality": str(stamped.quality),

@@ -60,6 +60,9 @@ class Sampler:
             return json.dumps(await self._state.in_thread(self._sample))
         except CellError as error:  # too many reads wait: say so and go on
             return json.dumps({"problem": error.what})
+        except Exception as error:  # a defect below must not leave all listeners waiting for ever
+            log.exception("sampling the state")
+            return json.dumps({"problem": f"the state cannot be read: {type(error).__name__}"})
 
     def _sample(self) -> dict[str, Any]:
         service = self._state.service

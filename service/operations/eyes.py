@@ -106,8 +106,8 @@ def look_with_lights(session: Session) -> LightPair:
     wait_s = max(SETTLE_S, lights.capabilities().settle_s)
     _switch(session, name, lights, (False,) * channels, wait_s)
     off = look(session)
-    _switch(session, name, lights, (True,) * channels, wait_s)
     try:
+        _switch(session, name, lights, (True,) * channels, wait_s)
         on = look(session)
     finally:
         lights.set_on((False,) * channels, deadline=deadline())

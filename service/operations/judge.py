@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtri
 
 from hal.devices import DeviceKind
-from hal.errors import Unsupported
+from hal.errors import InvalidRequest, Unsupported
 from hal.geometry import difference
 from hal.panel import Panel, PanelObject
 from hal.simulated import ObjectTruth, Truth
@@ -27,8 +27,11 @@ def judge(connection: CellConnection, folder: Path) -> dict[str, Any]:
     """Add `judge` to the report in `folder` and draw it again; returns that part.
 
     Raises:
+        InvalidRequest: there is no such report.
         Unsupported: the cell is not simulated, so nobody knows the truth.
     """
+    if not (folder / "report.json").is_file():
+        raise InvalidRequest(f"there is no report of a mission {folder.name!r}", hint="GET /v1/missions lists them")
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     verdict = compare(report, truth_of(connection), connection.cell.panel)
     write_json(folder, {**report, "judge": verdict})
@@ -108,8 +111,7 @@ def agrees(
     if value is None or truth.value is None:
         return False
     if spec.kind == "handwheel":
-        turn = 2 * np.pi / spec.spokes if spec.spokes < 2 else 2 * np.pi
-        return bool(abs((value - truth.value + turn / 2) % turn - turn / 2) <= WHEEL_RAD)
+        return bool(abs((value - truth.value + np.pi) % (2 * np.pi) - np.pi) <= WHEEL_RAD)
     scale = getattr(spec, "scale", None)
     span = scale.maximum - scale.minimum if scale is not None else 1.0
     return bool(abs(value - truth.value) <= GAUGE_SHARE * span)

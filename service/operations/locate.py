@@ -17,7 +17,7 @@ from perception.vision.lights.assign import AssignedLights, assign_lights
 from perception.vision.quadrangle import QuadranglePose, estimate
 from service.operations.beliefs import believed_panel, expected_panel
 from service.operations.evidence import LightEvidence, PlaneEvidence
-from service.operations.eyes import LightPair, Look, Scan, base_from, look_with_lights, scan
+from service.operations.eyes import LightPair, Look, Scan, look_with_lights, scan
 from service.operations.requests import PanelPoseRequest
 from service.operations.session import Session
 from service.operations.travel import go_to_camera_view, leave_the_panel
@@ -25,7 +25,6 @@ from service.operations.views import overview_poses
 
 Array = NDArray[np.float64]
 WRONG_FIT_P = 1e-4  # a worse fit than one in ten thousand means a wrong lamp, panel file or lens
-GATE_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -246,8 +245,3 @@ def _light_evidence(session: Session, look: Look, pixels: Array, covariances: Ar
         )
         for light, pixel, covariance in zip(session.panel.lights, pixels, covariances, strict=True)
     )
-
-
-def camera_from_panel_now(session: Session, camera: str) -> UncertainPose:
-    """Where the panel is believed to stand, seen from a camera at the arm's present place."""
-    return compose(base_from(session, camera).inverse(), session.known_panel())

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from hal.errors import InvalidRequest, PerceptionError, Unreachable
+from hal.errors import PerceptionError, Unreachable
 from hal.panel import Button, Handwheel, Lever, Mushroom, PanelObject, Rotary, Slider, Toggle
 from manipulation.skills.button import button
 from manipulation.skills.handwheel import handwheel
 from manipulation.skills.lever import lever
 from manipulation.skills.mushroom import mushroom
-from manipulation.skills.outcome import ObjectState, Outcome, SkillReport, Verify
+from manipulation.skills.outcome import ObjectState, SkillReport, Verify
 from manipulation.skills.rotary import rotary
 from manipulation.skills.slider import slider
 from manipulation.skills.toggle import toggle
@@ -21,7 +21,7 @@ from service.operations.beliefs import forget_reading, known_readings
 from service.operations.inspect import ensure_located, look_close
 from service.operations.requests import ActionBody, ManipulateRequest
 from service.operations.session import Session
-from service.operations.targets import target_of
+from service.operations.targets import target_of, unworkable
 from service.operations.travel import workcell
 from service.report.plots import png_of
 from service.report.record import Action, Picture
@@ -50,7 +50,7 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
     eye = _Eye(session, thing, verify)
     before = eye.before()
     report = _perform(session, thing, target, eye, before)
-    reached = report.outcome is Outcome.DONE
+    reached = report.is_done
     return Deed(
         action=Action(
             object=thing.name,
@@ -151,10 +151,7 @@ def _perform(session: Session, thing: PanelObject, target: str, eye: _Eye, befor
             return mushroom(cell, thing.name, verify=verify)
         case Button():
             return button(cell, thing.name, expected=target, verify=verify)
-    raise InvalidRequest(
-        f"{thing.name} is a {thing.kind}, which cannot be worked",
-        hint="levers, sliders, toggles, rotaries, wheels, buttons and mushrooms can",
-    )
+    raise unworkable(thing)
 
 
 def _witness(session: Session, thing: PanelObject) -> PanelObject:

@@ -33,10 +33,7 @@ def target_of(thing: PanelObject, body: ActionBody) -> str:
         case Button():
             _only(thing, body, "state")
             return _one_of(thing, body.state or "on", ("on", "off", "pressed", "released"))
-    raise InvalidRequest(
-        f"{thing.name} is a {thing.kind}, which cannot be worked",
-        hint="levers, sliders, toggles, rotaries, wheels, buttons and mushrooms can",
-    )
+    raise unworkable(thing)
 
 
 def check_manipulate(cell: Cell, request: ManipulateRequest) -> None:
@@ -80,3 +77,11 @@ def _one_of(thing: PanelObject, state: str | None, states: tuple[str, ...]) -> s
     if state not in states:
         raise InvalidRequest(f"{thing.name} has no state {state!r}", hint=f"states: {', '.join(states)}")
     return state
+
+
+def unworkable(thing: PanelObject) -> InvalidRequest:
+    """The refusal to work an object that only shows something."""
+    return InvalidRequest(
+        f"{thing.name} is a {thing.kind}, which cannot be worked",
+        hint="levers, sliders, toggles, rotaries, wheels, buttons and mushrooms can",
+    )

@@ -83,7 +83,6 @@ class MissionRecord:
     seed: int
     now_s: Callable[[], float]
     started_wall: float = field(default_factory=time.time)
-    started_mono_s: float = field(default_factory=time.monotonic)
     steps: list[Step] = field(default_factory=list)
     readings: list[Reading] = field(default_factory=list)
     actions: list[Action] = field(default_factory=list)

@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -66,7 +67,7 @@ def test_beyond_the_range_is_saturated(driver: str) -> None:
     class Overloaded(ScriptedForceTorque):
         def read_wrench(self, *, deadline: Any) -> Stamped[Wrench]:
             sample = super().read_wrench(deadline=deadline)
-            return sample.with_value(Wrench(force_n=np.array([320.0, 0, 0]), torque_nm=np.zeros(3)))
+            return replace(sample, value=Wrench(force_n=np.array([320.0, 0, 0]), torque_nm=np.zeros(3)))
 
     with wired(emulator.start(Overloaded(), {}), driver) as device:
         sample = device.read_wrench(deadline=soon())

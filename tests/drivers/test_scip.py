@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -120,7 +121,7 @@ def test_codes_below_twenty_millimetres_are_no_distances() -> None:
             sample = super().read_range(deadline=deadline)
             depth_m = sample.value.depth_m.copy()
             depth_m[:, ::2] = 0.007
-            return sample.with_value(RangeImage(depth_m=depth_m))
+            return replace(sample, value=RangeImage(depth_m=depth_m))
 
     with wired(emulator.start(Blind(), FAST), DRIVER) as device:
         depth_m = device.read_range(deadline=soon()).value.depth_m

@@ -178,3 +178,24 @@ def test_shared_things_are_made_once_and_closed_in_reverse() -> None:
     shared.close()
     shared.close()
     assert closed == ["b", "a"]
+
+
+def test_what_a_cell_shares_is_closed_whole_and_in_reverse_even_if_something_fails() -> None:
+    closed: list[str] = []
+
+    class Thing:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def close(self) -> None:
+            closed.append(self.name)
+            if self.name == "second":
+                raise OSError("a port that refuses even to close")
+
+    shared = Shared()
+    for name in ("first", "second", "third"):
+        assert shared.get(name, lambda name=name: Thing(name)) is shared.peek(name)
+    with pytest.raises(OSError, match="refuses"):
+        shared.close()
+    assert closed == ["third", "second", "first"]
+    shared.close()

@@ -15,8 +15,6 @@ from PIL import Image as Picture
 from service.serve import Panelwright
 from tests.service.waiting import eventually
 
-MOVING = ("running", "cancelling")
-
 
 def test_a_verb_that_ends_in_time_answers_200_with_its_result(client: httpx2.Client) -> None:
     answer = client.post("/v1/echo?wait_s=10", json={"text": "a", "point_m": [1, 2, 3]})

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any, cast
 
 import httpx2
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
+from service.http.state import AppState
+from service.http.stream import Sampler
 from service.serve import Panelwright
 from tests.service.waiting import eventually
 
@@ -46,6 +50,15 @@ def test_listeners_share_samples_and_a_sleeping_one_holds_nobody_up(served: Pane
         stamps = [_next(awake)["stamp_s"] for _ in range(10)]
         assert stamps == sorted(stamps)
         assert _next(another)["position_rad"] == _next(awake)["position_rad"]
+
+
+def test_a_defect_below_is_told_to_listeners_and_does_not_end_the_stream() -> None:
+    class Broken:
+        async def in_thread(self, _work: Callable[[], Any]) -> Any:
+            raise ZeroDivisionError
+
+    told = json.loads(asyncio.run(Sampler(cast(AppState, Broken()))._text()))
+    assert told == {"problem": "the state cannot be read: ZeroDivisionError"}
 
 
 def test_what_a_listener_says_is_ignored(socket: ClientConnection) -> None:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from hal.errors import InvalidRequest
 from hal.geometry import perturbed, to_json, transform_rpy
 from hal.panel import load_panel
 from hal.simulated import ObjectTruth, Truth
-from service.operations.judge import AFTER, agrees, compare
+from service.connection import CellConnection
+from service.operations.judge import AFTER, agrees, compare, judge
 
 PANEL = load_panel(Path(__file__).parents[3] / "panels/bench.toml")
 POSE = transform_rpy((0.95, 0.0, 0.55), (1.57, 0.0, -1.57))
@@ -110,3 +112,8 @@ def test_right_means_two_per_cent_of_the_scale_or_the_very_state(
     now = {thing.name: thing for thing in truth().objects}[name]
     answer = {"value": None, "state": None, "text": None, **said}
     assert agrees(PANEL.object(name), now, **answer) is is_right
+
+
+def test_a_mission_without_a_report_is_refused_before_anything_is_asked(tmp_path: Path) -> None:
+    with pytest.raises(InvalidRequest, match="no report of a mission '20261120T231502'"):
+        judge(cast(CellConnection, None), tmp_path / "20261120T231502")

@@ -21,6 +21,7 @@ from benchmarks.vision_axes import axes, random_state, shipped_panel
 from benchmarks.vision_dials import read_drawn
 from benchmarks.vision_dials import summary as dial_lines
 from benchmarks.vision_drawing import camera, draw_panel, looking_at
+from benchmarks.vision_held_out import held_out_lines
 from benchmarks.vision_reliability import Answer, draw_reliability, reliability_lines
 from hal.errors import CellError
 from hal.geometry import certain
@@ -62,6 +63,7 @@ def report(data: Path) -> int:
     print("\n".join(dial_lines(drawn)))
     answers += [Answer(confidence=r.confidence, right=r.error <= 2.0) for r in drawn if r.error is not None]
     display_lines()
+    print("\n" + "\n".join(held_out_lines()))
     answers += axes()
     print("\n".join(reliability_lines("all of these readings", answers)))
     draw_reliability(answers, ROOT / "runs" / "vision_reliability.png")

@@ -177,6 +177,7 @@ def _axis(
         rival_ratio=min(1.0, stray * 2),
         rival_rad=angle + np.pi,
         supported=1.0 - stray,
+        shown=1.0 - stray,
         is_dark=False,
         unknown=0.0,
     )

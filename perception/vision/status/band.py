@@ -1,4 +1,4 @@
-"""Cables in front of an object: bands that come in over its border on one side and leave on another.
+"""Cables in front of an object: bands that come in over its border at one place and leave at another.
 
 Where a cable crosses a dark window its gray may be the window's, on the plate just outside it is plain; where its gray is
 the plate's it is plain in the window. So a closed path around the object and one just inside its border are searched for
@@ -8,6 +8,8 @@ one gray all along, straight or with one bend.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import cv2
@@ -15,17 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.vision.patch import Patch, sample_at
-from perception.vision.status.cover import OUTSIDE, Crossing, border_crossings, smoothed
+from perception.vision.status.cover import OUTSIDE, Crossing, border_crossings, followed_in, smoothed
 from perception.vision.view import Array
 
 SAME_GRAY = 16.0  # levels along a band; real cables shine a little
 GROUND_SHARE = 0.5  # of what a band within the window stands out by
+WHOLLY = 0.97  # of it: nothing is left to refine
 ALONG_SHARE = 0.72  # of the band's axis that must have its gray
 INSET = 0.09  # of the smaller side, from the border to the path within: clear of a frame, and no digits yet
 MOST_WIDTH = 0.5  # of the object's smaller side: wider things are not looked past
 BENDS = (0.0, -0.3, 0.3, -0.6, 0.6, -1.0, 1.0, -1.6, 1.6, -2.3, 2.3)  # of the band's width, sideways
 INK_EDGE_PX = 4.0
+OWN_ASIDE, OWN_RAD = 0.6, np.deg2rad(12.0)  # of a band's width from the object's middle; from one of its directions
 BENT_AT = (0.5, 0.3, 0.7)  # of its length
+FINER = ((0.14, 0.3), (0.07, 0.15))  # steps of place and size about the best bend
+MERGED = 1.7  # times the other end's width: something lies beside the cable there
 
 
 def hidden_by_bands(
@@ -56,12 +62,114 @@ def hidden_by_bands(
     ):
         # Within the window its ground is what the band must not be taken for.
         tolerance = min(SAME_GRAY, GROUND_SHARE * min(a.by, b.by)) if within else SAME_GRAY
-        line = _joined(smooth, a, b, least_side, tolerance)
+        line = None if a.side == b.side else _joined(smooth, a, b, least_side, tolerance)
         if line is not None:
-            points, width = line
-            width += INK_EDGE_PX if ((a.gray + b.gray) / 2 < ground - SAME_GRAY / 2) == dark_ink else 0.0
-            cv2.polylines(mask, [np.round(points * 16).astype(np.int32)], False, 1, max(1, round(width)), cv2.LINE_8, 4)
+            width = line.width_px + (
+                INK_EDGE_PX if ((a.gray + b.gray) / 2 < ground - SAME_GRAY / 2) == dark_ink else 0.0
+            )
+            cv2.polylines(
+                mask, [np.round(line.points_px * 16).astype(np.int32)], False, 1, max(1, round(width)), cv2.LINE_8, 4
+            )
     return mask > 0 if mask.any() else None
+
+
+def lying_across(
+    patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool
+) -> NDArray[np.bool_] | None:
+    """(H, W) mask of what lies across an object in the patch; None when nothing does.
+
+    Cables first, as bands of one gray; what else comes in over the border is followed by its gray (`covered`), which leaks
+    into a frame or a pointer of the same gray where a band does not.
+
+    Args:
+        half_width_m, half_height_m, is_round: as `covered`.
+    """
+    smooth = smoothed(patch)
+    ends = border_crossings(
+        patch, half_width_m=half_width_m, half_height_m=half_height_m, is_round=is_round, smooth=smooth
+    )
+    if not ends:
+        return None
+    least_side = 2 * min(half_width_m, half_height_m) * patch.px_per_m
+    bands, rest = _bands_between(smooth, ends, least_side, is_round=is_round)
+    leaked = followed_in(
+        patch, rest, smooth=smooth, half_width_m=half_width_m, half_height_m=half_height_m, is_round=is_round
+    )
+    found = _drawn(bands, patch.gray.shape)
+    if leaked is not None:
+        found |= leaked
+    return found if found.any() else None
+
+
+def cables_across(patch: Patch, *, radius_m: float, own_rad: Array) -> NDArray[np.bool_] | None:
+    """(H, W) mask of the cables that cross a disc about the object's middle; None when none does.
+
+    Args:
+        radius_m: of the disc, clear of the object's ends.
+        own_rad: (N,) directions, clockwise from up, in which the object itself has bands through its middle.
+    """
+    smooth = smoothed(patch)
+    ends = border_crossings(
+        patch, half_width_m=radius_m, half_height_m=radius_m, is_round=True, beyond=0.0, smooth=smooth
+    )
+    if len(ends) < 2:
+        return None
+    least_side = 2 * radius_m * patch.px_per_m
+    found, _ = _bands_between(smooth, ends, least_side, is_round=True)
+    middle = np.array(patch.pixel_of(0.0, 0.0))
+    bands = [band for band in found if not _is_own(band, middle, own_rad)]
+    return _drawn(bands, patch.gray.shape) if bands else None
+
+
+def _is_own(band: _Band, middle_px: Array, own_rad: Array) -> bool:
+    """Whether a band may be a part of the object: through its middle, in one of its own directions."""
+    first, last = band.points_px[0], band.points_px[-1]
+    along = (last - first) / max(float(np.linalg.norm(last - first)), 1e-9)
+    to_middle = middle_px - first
+    aside = abs(float(along[0] * to_middle[1] - along[1] * to_middle[0]))
+    turn = np.arctan2(along[0], -along[1]) - own_rad
+    near = np.abs((turn + np.pi / 2) % np.pi - np.pi / 2).min()
+    return bool(aside < OWN_ASIDE * band.width_px and near < OWN_RAD)
+
+
+def _bands_between(
+    smooth: NDArray[np.uint8], ends: Sequence[Crossing], least_side_px: float, *, is_round: bool
+) -> tuple[list[_Band], list[Crossing]]:
+    """The bands that join crossings, surest first and every end in one, and the crossings that are left."""
+    found = []
+    for (i, a), (k, b) in combinations(enumerate(ends), 2):
+        if a.side != b.side or is_round:
+            tolerance = min(SAME_GRAY, GROUND_SHARE * min(a.by, b.by))  # else the plate beside would pass for it
+            tried = (_joined(smooth, *pair, least_side_px, tolerance) for pair in _narrowed(a, b))
+            found += [(band.share, i, k, band) for band in tried if band is not None]
+    joined: set[int] = set()
+    bands = []
+    for _, i, k, band in sorted(found, key=lambda item: -item[0]):
+        if joined.isdisjoint((i, k)):
+            bands.append(band)
+            joined |= {n for n in (i, k) if ends[n].length_px <= MERGED * band.width_px}
+    return bands, [end for n, end in enumerate(ends) if n not in joined]
+
+
+def _drawn(bands: Sequence[_Band], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """(H, W) mask of bands with their blurred edges."""
+    mask = np.zeros(shape, np.uint8)
+    for band in bands:
+        points, thick = np.round(band.points_px * 16).astype(np.int32), max(1, round(band.width_px + INK_EDGE_PX))
+        cv2.polylines(mask, [points], False, 1, thick, cv2.LINE_8, 4)
+    return mask > 0
+
+
+def _narrowed(a: Crossing, b: Crossing) -> list[tuple[Crossing, Crossing]]:
+    """The pair itself, or, where one end is much wider, pairs with parts of that end: a word or another cable is beside."""
+    a, b = (a, b) if a.length_px <= b.length_px else (b, a)
+    if b.length_px <= MERGED * a.length_px:
+        return [(a, b)]
+    room = b.length_px / 2
+    return [
+        (a, replace(b, middle_px=b.middle_px + shift * b.tangent, length_px=a.length_px, gray=a.gray))
+        for shift in np.arange(-room, room + 1e-6, 0.4 * a.length_px)
+    ]
 
 
 def _ground(patch: Patch, half_width_m: float, half_height_m: float) -> float:
@@ -72,9 +180,9 @@ def _ground(patch: Patch, half_width_m: float, half_height_m: float) -> float:
 
 def _joined(
     smooth: NDArray[np.uint8], a: Crossing, b: Crossing, least_side_px: float, tolerance: float
-) -> tuple[Array, float] | None:
-    """(3, 2) axis and width in px of the band between two places on the border; None when there is none."""
-    if a.side == b.side or abs(a.gray - b.gray) > 2 * SAME_GRAY or a.is_darker != b.is_darker:
+) -> _Band | None:
+    """The band between two places on the border; None when there is none."""
+    if abs(a.gray - b.gray) > 2 * SAME_GRAY or a.is_darker != b.is_darker:
         return None
     along = b.middle_px - a.middle_px
     length = float(np.linalg.norm(along))
@@ -87,24 +195,56 @@ def _joined(
         return None
     across = np.array([-along[1], along[0]]) * width
     t = np.linspace(0.0, 1.0, max(12, round(length / 1.5)))
-    wanted = a.gray + t * (b.gray - a.gray)
-    shapes = list(product(BENT_AT, BENDS))
-    middles = np.array([a.middle_px + at * (b.middle_px - a.middle_px) + bend * across for at, bend in shapes])
-    knots = np.array([at for at, _ in shapes])[:, None]
-    first, second = np.minimum(t / knots, 1.0), np.maximum((t - knots) / (1.0 - knots), 0.0)  # along either leg
-    axes = (
-        a.middle_px
-        + first[..., None] * (middles - a.middle_px)[:, None]
-        + second[..., None] * (b.middle_px - middles)[:, None]
-    )
-    sides = np.array([-0.2, 0.0, 0.2])[:, None] * across * (min(widths) / width)
-    points = axes[:, None] + sides[:, None]  # (shapes, sides, along, 2)
-    flat = points.reshape(len(shapes), -1, 2)
-    off = np.abs(sample_at(smooth, flat[..., 0], flat[..., 1]) - np.tile(wanted, len(sides)))
-    shares = np.count_nonzero(off < tolerance, axis=1) / off.shape[1]
-    k = int(
-        (shares + 0.01 * np.array([bend == 0.0 for _, bend in shapes])).argmax()
-    )  # straight unless a bend is better
-    if shares[k] < ALONG_SHARE:
+    band = _Search(smooth=smooth, a=a, b=b, across=across, t=t, core=min(widths) / width, tolerance=tolerance)
+    at, bend, share = band.best(list(product(BENT_AT, BENDS)))
+    for step, size in FINER if share < WHOLLY else ():
+        near = [(at + i * step, bend + k * size) for i, k in product((0, -1, 1), repeat=2)]
+        at, bend, share = band.best([(place, by) for place, by in near if 0.1 < place < 0.9])
+    if share < ALONG_SHARE:
         return None
-    return np.array([a.middle_px, middles[k], b.middle_px]), width
+    return _Band(points_px=band.points([(at, bend)])[0], width_px=width, share=share)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Band:
+    """A cable: (3, 2) its axis, its width, and the share of it that has its gray."""
+
+    points_px: Array
+    width_px: float
+    share: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Search:
+    """Straight and bent bands between two crossings, by the share of their core that has the crossings' gray."""
+
+    smooth: NDArray[np.uint8]
+    a: Crossing
+    b: Crossing
+    across: Array
+    t: Array
+    core: float
+    tolerance: float
+
+    def points(self, shapes: list[tuple[float, float]]) -> Array:
+        """(N, 3, 2) axes of bands that are bent at a share of their length by so many widths."""
+        a, b = self.a.middle_px, self.b.middle_px
+        return np.array([[a, a + at * (b - a) + bend * self.across, b] for at, bend in shapes])
+
+    def best(self, shapes: list[tuple[float, float]]) -> tuple[float, float, float]:
+        """Place and size of the best bend, and the share of that band; straight unless a bend is better."""
+        t, axes = self.t, self.points(shapes)
+        knots = np.array([at for at, _ in shapes])[:, None]
+        first, second = np.minimum(t / knots, 1.0), np.maximum((t - knots) / (1.0 - knots), 0.0)  # along either leg
+        axis = (
+            axes[:, :1]
+            + first[..., None] * (axes[:, 1] - axes[:, 0])[:, None]
+            + second[..., None] * (axes[:, 2] - axes[:, 1])[:, None]
+        )
+        sides = np.array([-0.2, 0.0, 0.2])[:, None] * self.across * self.core
+        flat = (axis[:, None] + sides[:, None]).reshape(len(shapes), -1, 2)  # shapes, sides times along, 2
+        wanted = self.a.gray + t * (self.b.gray - self.a.gray)
+        off = np.abs(sample_at(self.smooth, flat[..., 0], flat[..., 1]) - np.tile(wanted, len(sides)))
+        shares = np.count_nonzero(off < self.tolerance, axis=1) / off.shape[1]
+        k = int((shares + 0.01 * np.array([bend == 0.0 for _, bend in shapes])).argmax())
+        return (*shapes[k], float(shares[k]))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from perception.vision.patch import Patch, sample_at
 from perception.vision.view import Array
 
 CORE = (-0.5, 0.0, 0.5)  # of the half width
 FLANK = (1.7, 2.1)
+LEAST_KNOWN = 0.35  # of a bar's stations
 
 
 def bar_contrast(
@@ -22,6 +23,7 @@ def bar_contrast(
     quantile: float = 0.3,
     flank: tuple[float, float] = FLANK,
     beside_m: float = 0.0,
+    hidden: NDArray[np.bool_] | None = None,
 ) -> Array:
     """(N,) signed contrast (gray levels) of a bar from the object's middle towards each angle, clockwise from up.
 
@@ -31,6 +33,7 @@ def bar_contrast(
 
     Args:
         height_m: height above the plate of the bar's ends (inner, outer), or one height, or None for the patch's plane.
+        hidden: (H, W) what something lies across: such stations say nothing, and a bar that is mostly hidden has no contrast.
         beside_m: how far to the right of the line from the middle the bar lies, parallel to it.
     """
     angle = np.atleast_1d(np.asarray(angles_rad, float))
@@ -52,6 +55,12 @@ def bar_contrast(
     core = values[:, :, :3].mean(axis=2)
     left = core - values[:, :, 3:5].mean(axis=2)
     right = core - values[:, :, 5:7].mean(axis=2)
+    if hidden is not None and hidden.any():
+        lost = sample_at(hidden.astype(np.uint8), place[..., 0].reshape(shape), place[..., 1].reshape(shape)) > 0.2
+        lost = lost.reshape(len(angle), count, len(offsets))
+        no_core, no_left, no_right = (lost[:, :, part].any(axis=2) for part in (slice(3), slice(3, 5), slice(5, 7)))
+        left, right = np.where(no_left, right, left), np.where(no_right, left, right)  # one flank tells alone
+        left = np.where(no_core | no_left & no_right, np.nan, left)
     bright = np.maximum(np.minimum(left, right), 0.0)
     dark = np.maximum(np.minimum(-left, -right), 0.0)
     b, d = _low(bright, quantile), _low(dark, quantile)
@@ -59,7 +68,13 @@ def bar_contrast(
 
 
 def _low(stations: Array, quantile: float) -> Array:
-    """Mean of the lower half around a quantile: smoother than the quantile itself."""
-    ordered = np.sort(stations, axis=1)
-    top = max(2, round(stations.shape[1] * 2 * quantile))
-    return np.asarray(ordered[:, :top].mean(axis=1))
+    """Mean of the lower half around a quantile of the known stations: smoother than the quantile itself."""
+    ordered = np.sort(stations, axis=1)  # what is not known comes last
+    if not np.isnan(ordered[:, -1]).any():
+        top = max(2, round(stations.shape[1] * 2 * quantile))
+        return np.asarray(ordered[:, :top].mean(axis=1))
+    count = np.count_nonzero(~np.isnan(ordered), axis=1)
+    top = np.clip(np.round(count * 2 * quantile), 2, None).astype(int)
+    first = np.arange(stations.shape[1]) < np.minimum(top, count)[:, None]
+    mean = np.where(first, np.nan_to_num(ordered), 0.0).sum(axis=1) / np.maximum(np.minimum(top, count), 1)
+    return np.where(count >= LEAST_KNOWN * stations.shape[1], mean, 0.0)

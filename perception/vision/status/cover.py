@@ -6,6 +6,7 @@ gray is followed. What reaches deep into the object from there covers it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -23,6 +24,8 @@ STANDS_OUT = (
 )
 STANDS_OUT_SHARE, LEAST_STANDS_OUT = 0.12, 5.0
 LARGEST_SHARE = 0.4  # of the object: what follows the gray of a cable and fills more has leaked into the object
+RIM_PX = 4.0
+LEAKED = 4.0  # times the way in along the border: what follows a frame has leaked into it
 OUTSIDE = 0.06  # of an object's larger half size: how far beyond its border the path runs
 DEEP = 0.35  # of the object's smaller half size: labels and ticks do not reach that far in
 
@@ -60,14 +63,33 @@ def covered(patch: Patch, *, half_width_m: float, half_height_m: float, is_round
     )
     if not found:
         return None
+    return followed_in(
+        patch, found, smooth=smooth, half_width_m=half_width_m, half_height_m=half_height_m, is_round=is_round
+    )
+
+
+def followed_in(
+    patch: Patch, found: Sequence[Crossing], *, smooth: Image, half_width_m: float, half_height_m: float, is_round: bool
+) -> NDArray[np.bool_] | None:  # fmt: skip
+    """(H, W) mask of what can be followed by its gray from crossings deep into the object; None when nothing can.
+
+    Args:
+        smooth: what `smoothed` makes of the patch.
+        half_width_m, half_height_m, is_round: as `covered`.
+    """
+    if not found:
+        return None
     depth = _depth(patch, half_width_m, half_height_m, is_round)
     least = DEEP * min(half_width_m, half_height_m) * patch.px_per_m
     mask = np.zeros(patch.gray.shape, bool)
+    rim = depth <= RIM_PX
     for crossing in found:
         u, v = crossing.middle_px
         region = _followed(smooth, (round(float(u)), round(float(v))))
         within = region & (depth > 0)
         if within.sum() > LARGEST_SHARE * (depth > 0).sum() or not within.any():
+            continue
+        if is_round and np.count_nonzero(within & rim) > LEAKED * RIM_PX * max(crossing.length_px, RIM_PX):
             continue
         if float(depth[within].max()) >= least:
             mask |= region

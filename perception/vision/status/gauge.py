@@ -7,13 +7,14 @@ import numpy as np
 from hal.panel import Gauge, Scale
 from perception.vision.patch import Patch
 from perception.vision.reading import Status, gated, probability, refused
-from perception.vision.status.cover import covered
+from perception.vision.status.band import lying_across
 from perception.vision.status.pointer import PointerFit, find_pointer, wrapped
 
 POINTER_FROM, POINTER_TO = 0.25, 0.60  # share of the radius over which every gauge pointer has ink and no numeral is
 FINE_TO = 0.72
 STOP_RAD = np.deg2rad(6.0)  # a pointer rests that far beyond its scale at most
 LEAST_SEEN = 0.25  # share of a face
+LEAST_SHOWN = 0.52  # of the pointer's radii: beside a cable, a numeral alone would have as much
 
 
 def read_gauge(patch: Patch, spec: Gauge) -> Status:
@@ -22,7 +23,7 @@ def read_gauge(patch: Patch, spec: Gauge) -> Status:
     seen = _seen(patch, R)
     fit = find_pointer(
         patch,
-        cover=covered(patch, half_width_m=R, half_height_m=R, is_round=True),
+        cover=lying_across(patch, half_width_m=R, half_height_m=R, is_round=True),
         pivot_m=(0.0, 0.0),
         inner_m=POINTER_FROM * R,
         outer_m=POINTER_TO * R,
@@ -72,6 +73,7 @@ def pointer_confidence(fit: PointerFit, seen: float) -> float:
             (np.log(fit.strength), np.log(9.0), 0.15),
             (0.55 - fit.rival_ratio, 0.0, 0.03),
             (fit.supported, 0.72, 0.03),
+            (fit.shown, LEAST_SHOWN, 0.02),
             (1.0 if fit.is_dark else seen, 0.35, 0.08),
             (0.35 - fit.unknown, 0.0, 0.05),
         ]

@@ -5,17 +5,23 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hal.panel import Lever
 from perception.vision.patch import Patch
 from perception.vision.reading import Status, refused
+from perception.vision.status.band import cables_across
 from perception.vision.status.bar import bar_contrast
 from perception.vision.status.choice import choose, contrast_noise
+from perception.vision.view import Array
 
 BAR_FROM, BAR_TO = 0.40, 0.92  # share of the length: outside the hub, inside the tip
 FLANK = (1.35, 1.6)  # of the half width: pipes and flanges lie close by
 BESIDE = np.linspace(-1.5, 1.5, 13)  # of the half width: a shadow falls to one side
 SHADOW_SHARE = 0.4  # of the bar's width that its shadow has
+CLEAR_OF_TIP = 1.25  # of the length: pipes end there too, as a rule
+BEYOND = (1.12, 1.30)  # of the length: clear of the tip, and still in the patch
+GOES_ON = 2.0  # how much what goes on counts: a flange or a pipe's end lies there at times
 SWEEP_RAD = np.deg2rad(np.arange(-30.0, 30.5, 1.0))
 BETWEEN_RAD = 0.16  # a quarter-turn valve that is 9 degrees off its stop is neither open nor closed
 ANGLE_SIGMA_RAD = 0.02
@@ -27,9 +33,11 @@ def read_lever(patch: Patch, spec: Lever) -> Status:
     L = spec.length_m
     angles = np.array([state.angle_rad for state in spec.states])
     tried = (angles[:, None] + WOBBLE_RAD).ravel()
+    hidden = cables_across(patch, radius_m=CLEAR_OF_TIP * L, own_rad=angles)
     contrast = bar_contrast(
-        patch, tried, along_m=(BAR_FROM * L, BAR_TO * L), half_width_m=spec.width_m / 2, flank=FLANK
+        patch, tried, along_m=(BAR_FROM * L, BAR_TO * L), half_width_m=spec.width_m / 2, flank=FLANK, hidden=hidden
     )
+    contrast = _that_ends(patch, spec, tried, contrast, hidden)
     evidence = np.abs(contrast).reshape(len(angles), -1).max(axis=1)
     r = np.linspace(BAR_FROM, BAR_TO, 8)[:, None] * L
     seen = patch.seen(r * np.sin(angles), r * np.cos(angles))
@@ -37,7 +45,7 @@ def read_lever(patch: Patch, spec: Lever) -> Status:
     if not status.answered:
         return status
     nominal = float(angles[int(np.argmax(evidence))])
-    angle = _bar_angle(patch, spec, nominal)
+    angle = _bar_angle(patch, spec, nominal, hidden)
     # Seen aslant, the bar's walls turn its image by up to the lean of its height over its length.
     lean_m = float(np.linalg.norm(patch.parallax_px_per_m)) * spec.height_m / patch.px_per_m
     if abs(angle - nominal) <= BETWEEN_RAD + lean_m / spec.length_m:
@@ -45,6 +53,24 @@ def read_lever(patch: Patch, spec: Lever) -> Status:
     if _is_parallel(patch, spec, nominal):
         return replace(status, value=nominal, unit="rad", uncertainty=BETWEEN_RAD)
     return refused(f"the lever stands between its states, at {angle:.2f} rad: turn it to its stop", unit="rad")
+
+
+def _that_ends(
+    patch: Patch, spec: Lever, angles_rad: Array, contrast: Array, hidden: NDArray[np.bool_] | None
+) -> Array:
+    """(N,) contrasts of bars less what goes on beyond their tips: a handle ends there, a cable does not."""
+    L = spec.length_m
+    lost = ~patch.inside if hidden is None else hidden | ~patch.inside  # beyond the image its border repeats
+    goes_on = np.stack([
+        bar_contrast(
+            patch, angles_rad, along_m=(BEYOND[0] * L, BEYOND[1] * L), half_width_m=half_width_m, quantile=0.5,
+            flank=FLANK, beside_m=beside_m, hidden=lost,
+        )
+        for half_width_m in (spec.width_m / 2, SHADOW_SHARE * spec.width_m / 2)
+        for beside_m in (-0.5 * spec.width_m, 0.0, 0.5 * spec.width_m)
+    ])  # fmt: skip
+    like = np.maximum(goes_on * np.sign(contrast) - contrast_noise(patch), 0.0).max(axis=0)
+    return np.asarray(np.sign(contrast) * np.maximum(np.abs(contrast) - GOES_ON * like, 0.0))
 
 
 def _is_parallel(patch: Patch, spec: Lever, nominal: float) -> bool:
@@ -65,12 +91,14 @@ def _is_parallel(patch: Patch, spec: Lever, nominal: float) -> bool:
     return parallel > turned
 
 
-def _bar_angle(patch: Patch, spec: Lever, nominal: float) -> float:
+def _bar_angle(patch: Patch, spec: Lever, nominal: float, hidden: NDArray[np.bool_] | None) -> float:
     """Where the bar really points, near a state: the direction that shows it best."""
     L = spec.length_m
     tried = nominal + SWEEP_RAD
     contrast = np.abs(
-        bar_contrast(patch, tried, along_m=(BAR_FROM * L, BAR_TO * L), half_width_m=spec.width_m / 2, flank=FLANK)
+        bar_contrast(
+            patch, tried, along_m=(BAR_FROM * L, BAR_TO * L), half_width_m=spec.width_m / 2, flank=FLANK, hidden=hidden
+        )
     )
     smooth = np.convolve(contrast, np.ones(5) / 5.0, "same")
     return float(tried[2 + int(np.argmax(smooth[2:-2]))])

@@ -41,7 +41,8 @@ class PointerFit:
         contrast: ink at the pointer, gray levels.
         rival_ratio: score of the best other direction over this one's.
         rival_rad: where that is.
-        supported: share of the radii with clear ink.
+        supported: share of the radii with clear ink, of those that can be seen.
+        shown: the same of all radii.
         is_dark: pointer darker than the face.
         unknown: share of the directions that something lies across.
     """
@@ -53,6 +54,7 @@ class PointerFit:
     rival_ratio: float
     rival_rad: float
     supported: float
+    shown: float
     is_dark: bool
     unknown: float
 
@@ -88,10 +90,8 @@ def find_pointer(
     hidden = _hidden(patch, cover, pivot_m, radii, angles)
     if hidden.any():
         shown = np.where(hidden, np.nan, polar)
-        with np.errstate(all="ignore"):
-            polar = np.where(hidden, np.nan_to_num(np.nanmedian(shown, axis=1, keepdims=True)), polar).astype(
-                np.float32
-            )
+        shown[hidden.all(axis=1)] = 0.0
+        polar = np.where(hidden, np.nanmedian(shown, axis=1, keepdims=True), polar).astype(np.float32)
     rows = (radii >= inner_m) & (radii <= outer_m)
     if rows.sum() < 4:
         return None
@@ -197,6 +197,8 @@ def _rough(
     others = np.where(apart > RIVAL_APART_RAD, score, 0.0)
     rival = int(others.argmax())
     column = ink[:, max(0, top - 1) : top + 2].max(axis=1)
+    known = ~hidden[:, top]
+    clear = column > 0.35 * np.median(column[known]) + noise
     return PointerFit(
         angle_rad=float(angles[top]),
         sigma_rad=ROUGH_SIGMA_RAD,
@@ -204,7 +206,8 @@ def _rough(
         contrast=peak,
         rival_ratio=float(others[rival]) / peak,
         rival_rad=float(angles[rival]),
-        supported=float((column > 0.35 * np.median(column) + noise).mean()),
+        supported=float(clear[known].mean()),
+        shown=float((clear & known).mean()),
         is_dark=is_dark,
         unknown=float((hidden.mean(axis=0) > 0.5).mean()),
     )

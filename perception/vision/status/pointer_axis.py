@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from perception.vision.view import Array
 
-NUMERAL = 1.6  # times the ink of the typical row
+NUMERAL, PLAIN = 1.8, 35.0  # times the ink of a row at that percentile: numerals and ticks may be beside half of them
 HALF_LEVEL = 0.3  # of a row's strongest ink: less is the pointer's blur
 OWN_WIDTH = (35.0, 0.6)  # percentile of the rows' widths; what is looked at to either side of the axis, over it
 ROUNDS, WEIGHINGS = 3, 5
@@ -34,7 +34,7 @@ def row_centres(
         for j in range(columns):
             if abs(offset[j] - middle[i]) < half[i]:
                 top[i] = max(top[i], ink[i, j])
-    most = NUMERAL * np.median(top)
+    most = NUMERAL * np.percentile(top[top > 0.0], PLAIN) if top.max() > 0.0 else 0.0
     step = abs(offset[1] - offset[0])
     centre, mass, width = np.zeros(rows), np.zeros(rows), np.zeros(rows)
     for i in range(rows):

@@ -42,7 +42,7 @@ def reference_axis(
     for _ in range(3):
         shown = np.where(near, ink, 0.0)
         top = shown.max(axis=1, keepdims=True)
-        top = np.where(top > 1.6 * np.median(top), 0.0, top)
+        top = np.where(top > 1.8 * np.percentile(top[top > 0], 35.0), 0.0, top)
         shown = np.maximum(np.where(top > 0, shown, 0.0) - 0.3 * top, 0.0)
         mass = shown.sum(axis=1)
         there = mass > 0

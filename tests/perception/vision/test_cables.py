@@ -1,0 +1,127 @@
+"""Cables across round faces and levers: what they hide is known, and they are no pointer and no handle."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from benchmarks.panel_scene import draw_scene
+from benchmarks.vision_held_out import found_blind, read_scene
+from hal.panel import Gauge, Lever, Scale, State
+from perception.vision.patch import Patch
+from perception.vision.status.band import cables_across, lying_across
+from perception.vision.status.bar import bar_contrast
+from perception.vision.status.gauge import read_gauge
+from perception.vision.status.lever import read_lever
+
+SIZE, PX_PER_M, RADIUS_M = 240, 3000.0, 0.031
+MIDDLE = SIZE // 2
+SCALE = Scale(minimum=0.0, maximum=10.0, unit="bar", at_min=-np.deg2rad(135.0), at_max=np.deg2rad(135.0))
+GAUGE = Gauge(kind="gauge", name="g", position_m=(0.0, 0.0), radius_m=RADIUS_M, scale=SCALE)
+LEVER = Lever(
+    kind="lever", name="inlet", position_m=(0.0, 0.0), length_m=0.029, width_m=0.008,
+    states=(State(name="closed", angle_rad=0.0), State(name="open", angle_rad=float(np.pi / 2))),
+)  # fmt: skip
+
+
+def patch_of(picture: NDArray[np.uint8], noise: float = 1.5) -> Patch:
+    rough = np.random.default_rng(0).normal(0.0, noise, picture.shape)
+    gray = np.clip(np.round(cv2.GaussianBlur(picture, (0, 0), 1.2) + rough), 0, 255).astype(np.uint8)
+    return Patch(
+        gray=gray, colour=None, inside=np.ones(gray.shape, bool), px_per_m=PX_PER_M, image_px_per_m=PX_PER_M / 1.5,
+        origin_px=np.array([MIDDLE, MIDDLE], float), parallax_px_per_m=np.zeros(2), growth_per_m=0.0, plane_z_m=0.0,
+    )  # fmt: skip
+
+
+def towards(angle_rad: float, reach_px: float) -> tuple[int, int]:
+    return round(MIDDLE + reach_px * np.sin(angle_rad)), round(MIDDLE - reach_px * np.cos(angle_rad))
+
+
+def dark_face(value: float) -> NDArray[np.uint8]:
+    """A black gauge with a white pointer on a bright plate."""
+    picture = np.full((SIZE, SIZE), 170, np.uint8)
+    cv2.circle(picture, (MIDDLE, MIDDLE), round(RADIUS_M * PX_PER_M), 30, -1, cv2.LINE_AA)
+    angle = SCALE.place_of(value)
+    cv2.line(picture, towards(angle, -15), towards(angle, 68), 230, 5, cv2.LINE_AA)
+    return picture
+
+
+def hung(picture: NDArray[np.uint8], xs: tuple[int, int, int], gray: int) -> NDArray[np.uint8]:
+    """A cable from top to bottom with a bend, through three columns."""
+    points = np.array([[xs[0], -5], [xs[1], MIDDLE], [xs[2], SIZE + 5]])
+    cv2.polylines(picture, [points], False, gray, 12, cv2.LINE_AA)
+    return picture
+
+
+@pytest.mark.parametrize("xs", [(80, 90, 82), (150, 185, 140), (70, 112, 150)])
+@pytest.mark.parametrize("value", [5.0, 6.0])
+def test_a_pointer_beside_a_cable_is_read(value: float, xs: tuple[int, int, int]) -> None:
+    status = read_gauge(patch_of(hung(dark_face(value), xs, 85)), GAUGE)
+    assert status.value is None or status.value == pytest.approx(value, abs=0.2)
+    if xs[1] != 112:  # that one lies over the pivot: to refuse is right there
+        assert status.answered
+
+
+def test_a_bent_cable_is_masked_and_little_else() -> None:
+    xs = (150, 185, 140)
+    drawn = hung(np.zeros((SIZE, SIZE), np.uint8), xs, 1) > 0
+    found = lying_across(
+        patch_of(hung(dark_face(3.0), xs, 85)), half_width_m=RADIUS_M, half_height_m=RADIUS_M, is_round=True
+    )
+    assert found is not None
+    v, u = np.indices(found.shape)
+    face = np.hypot(u - MIDDLE, v - MIDDLE) < 0.95 * RADIUS_M * PX_PER_M
+    assert found[drawn & face].mean() > 0.95 and found[face].mean() < 2.0 * drawn[face].mean()
+
+
+def test_a_cable_of_the_faces_own_gray_does_not_hide_the_face() -> None:
+    """Its gray would lead a search by gray all over the face and its rim."""
+    status = read_gauge(patch_of(hung(dark_face(6.0), (80, 84, 150), 34), noise=4.0), GAUGE)
+    assert status.value == pytest.approx(6.0, abs=0.1)
+
+
+def lever(angle_rad: float) -> NDArray[np.uint8]:
+    picture = np.full((SIZE, SIZE), 170, np.uint8)
+    cv2.line(picture, (MIDDLE, MIDDLE), towards(angle_rad, 0.029 * PX_PER_M - 12), 75, 24, cv2.LINE_AA)
+    return picture
+
+
+@pytest.mark.parametrize("xs", [(112, 120, 124), (126, 116, 110), (118, 118, 118)])
+def test_a_cable_over_the_hub_is_no_handle(xs: tuple[int, int, int]) -> None:
+    status = read_lever(patch_of(hung(lever(np.pi / 2), xs, 40)), LEVER)
+    assert status.state in ("open", None)
+    bare = read_lever(patch_of(hung(np.full((SIZE, SIZE), 170, np.uint8), xs, 40)), LEVER)
+    assert not bare.answered, "a cable alone is no lever"
+
+
+def test_a_handle_that_a_cable_crosses_is_read() -> None:
+    patch = patch_of(hung(lever(np.pi / 2), (150, 160, 180), 40))
+    assert read_lever(patch, LEVER).state == "open"
+
+
+def test_a_pipe_through_the_middle_is_the_objects_own() -> None:
+    upright, across = hung(np.full((SIZE, SIZE), 170, np.uint8), (120, 120, 120), 110), np.array([0.0, np.pi / 2])
+    assert cables_across(patch_of(upright), radius_m=0.036, own_rad=across) is None
+    assert cables_across(patch_of(upright), radius_m=0.036, own_rad=across + np.pi / 4) is not None
+
+
+def test_a_bar_is_told_by_its_known_stations() -> None:
+    patch = patch_of(lever(0.0))
+    hidden = np.zeros((SIZE, SIZE), bool)
+    hidden[45:60] = True
+    patch.gray[hidden] = 75  # what lies across has the bar's gray
+    bar = {"along_m": (0.012, 0.026), "half_width_m": 0.004}
+    seen = bar_contrast(patch, 0.0, hidden=hidden, **bar)[0]
+    assert seen == pytest.approx(-95.0, abs=5.0)
+    assert abs(bar_contrast(patch, 0.0, **bar)[0]) < 0.5 * abs(seen)
+    assert bar_contrast(patch, 0.0, hidden=np.ones_like(hidden), **bar)[0] == 0.0
+
+
+def test_an_easy_drawn_panel_is_read_and_recognised() -> None:
+    scene = draw_scene(1000, "easy")
+    rows = read_scene(scene)
+    assert len(rows) >= 11 and all(row.is_right for row in rows)
+    found, given, there = found_blind(scene)
+    assert found >= 0.75 * there and found <= given

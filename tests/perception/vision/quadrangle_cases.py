@@ -52,10 +52,10 @@ def view(rng: np.random.Generator, shape: str, *, tilt_deg: float, range_m: floa
 
 
 def pixels_of(points_m: Array, R: Array, t: Array) -> Array:
-    """(N, 2) pixels of `CAMERA`; NaN behind it."""
-    q = points_m @ R.T + t
-    z = np.where(q[:, 2:] > 0, q[:, 2:], np.nan)
-    return np.asarray(q[:, :2] / z * [CAMERA.fx_px, CAMERA.fy_px] + [CAMERA.cx_px, CAMERA.cy_px])
+    """(..., N, 2) pixels of `CAMERA` for (..., 3, 3) and (..., 3); NaN behind it."""
+    q = points_m @ R.swapaxes(-1, -2) + t[..., None, :]
+    z = np.where(q[..., 2:] > 0, q[..., 2:], np.nan)
+    return np.asarray(q[..., :2] / z * [CAMERA.fx_px, CAMERA.fy_px] + [CAMERA.cx_px, CAMERA.cy_px])
 
 
 def angle_deg(A: Array, B: Array) -> float:

@@ -151,10 +151,21 @@ def load_cell(path: Path, *, seed: int | None = None) -> Cell:
     if seed is not None:
         file = file.model_copy(update={"cell": file.cell.model_copy(update={"seed": seed})})
     panel = load_panel(_locate(file.cell.panel, path, "cell.panel"))
-    names = {device.mount.calibration for device in file.devices.values() if device.mount is not None}
     bare = Cell.model_construct(path=path, file=file, panel=panel, calibrations={})
-    records = {name: load_calibration(bare.calibration_path(name)) for name in sorted(names)}
+    records: dict[str, CalibrationRecord] = {}
+    for device, section in file.devices.items():
+        if section.mount is not None and section.mount.calibration not in records:
+            records[section.mount.calibration] = _record(bare, device, section.mount.calibration)
     return bare.model_copy(update={"calibrations": records})
+
+
+def _record(cell: Cell, device: str, name: str) -> CalibrationRecord:
+    path = cell.calibration_path(name)
+    try:
+        return load_calibration(path)
+    except ConfigError as error:
+        key = f"devices.{device}.mount.calibration"
+        raise ConfigError(f"{cell.path}: {key}: {error.what}", hint=error.hint, **error.details) from error
 
 
 def _locate(text: str, cell_path: Path, key: str) -> Path:

@@ -128,13 +128,22 @@ def _load(group: str, name: str, what: str) -> Any:
         ) from error
 
 
+def _in_file(details: dict[str, Any], cell: Cell | None) -> dict[str, Any]:
+    """`file` and `key` of a fault in a driver's options, which know the table they stand in and not its file."""
+    if cell is None or "key" not in details or "file" not in details:
+        return details
+    return {**details, "file": str(cell.path), "key": f"{details['file']}.{details['key']}"}
+
+
 def connect(context: Context, driver: str, options: dict[str, Any], *, key: str = "") -> Device:
     """Connect one device; a fault names the device and the key in the cell file."""
     try:
         return device_factory(driver)(context, options)
     except ConfigError as error:
         place = key or f"devices.{context.name}"
-        if str(error).startswith(place):
-            raise
         file = f"{context.cell.path}: " if context.cell is not None else ""
+        if str(error).startswith(place):  # it names its key, but not the file that the key is in
+            raise ConfigError(
+                f"{file}{error.what}", hint=error.hint, **_in_file(error.details, context.cell)
+            ) from error
         raise ConfigError(f"{file}{place}: {error.what}", hint=error.hint, **error.details) from error

@@ -35,8 +35,9 @@ def read_text(path: Path, what: str) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")  # editors on Windows put a mark before the first key
     except FileNotFoundError:
-        near = get_close_matches(path.name, [p.name for p in path.parent.glob("*.toml")], n=1)
-        hint = f"did you mean {path.parent / near[0]}?" if near else f"give the path of a {what} (TOML)"
+        # Their endings are alike and would make any two names look near.
+        near = get_close_matches(path.stem, [p.stem for p in path.parent.glob("*.toml")], n=1, cutoff=0.5)
+        hint = f"did you mean {path.parent / near[0]}.toml?" if near else f"give the path of a {what} (TOML)"
         raise ConfigError(f"{what} {path} does not exist", hint=hint, file=str(path)) from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(
@@ -87,6 +88,8 @@ def _fault(item: Any, model: type[BaseModel]) -> tuple[str, str, str]:
     if item["type"] == "missing":
         return key, "is missing", f"add {key}; the reference is in docs/"
     given = repr(item.get("input"))
+    if item["type"] == "value_error":
+        return key, item["msg"].removeprefix("Value error, "), "see the file reference in docs/"
     return key, f"{item['msg']} (given: {given[:60]})", "see the file reference in docs/ for type, unit and range"
 
 

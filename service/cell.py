@@ -186,6 +186,9 @@ def gathered(failed: Mapping[str, CellError], *, total: int, cell: Cell) -> Cell
     if len(errors) == 1:
         return errors[0]
     is_config = all(isinstance(error, ConfigError) for error in errors)
+    same = {error.what.replace(f"devices.{name}: ", "") for name, error in failed.items()}
+    if is_config and len(same) == 1:  # a fault of what they share: the simulated world
+        return ConfigError(same.pop(), hint=errors[0].hint)
     kind: type[CellError] = ConfigError if is_config else DeviceUnavailable
     return kind(
         f"{len(errors)} of the {total} devices in {cell.path} did not connect",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 
@@ -14,6 +15,7 @@ def main() -> None:
             f"panelwright needs Python 3.11, this is {found}\n  try    run `make setup` with Python 3.11\n"
         )
         raise SystemExit(2)
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # what it warns of comes as an error of ours, with a remedy
     from hal.errors import CellError
     from service.commands.leaving import leave
     from service.errors import of_file
@@ -46,14 +48,16 @@ def _app() -> Callable[[], None]:
     from service.commands.range import batch, range_image
     from service.commands.serve import serve
     from service.commands.teach import teach
+    from service.commands.version import root
     from service.commands.warm import warm
 
     app = typer.Typer(
-        help="A robot cell that inspects and works industrial control panels.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         add_completion=False,
     )
+
+    app.callback()(root)
     app.command()(serve)
     app.command()(demo)
     app.command()(doctor)

@@ -123,8 +123,9 @@ class Client:
         return host, port
 
     def _lost(self, error: Exception) -> DeviceUnavailable:
+        why = getattr(error, "strerror", None) or str(error) or type(error).__name__
         return DeviceUnavailable(
-            f"no panelwright answers at {self.url} ({type(error).__name__})",
+            f"no panelwright answers at {self.url}: {why}",
             hint="start one with `panelwright serve`, or name its address with --url",
         )
 

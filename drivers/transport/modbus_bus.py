@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from drivers.transport.bus import Bus
 from drivers.transport.link import Link
 from drivers.transport.modbus import RTU_GAP_S, ModbusMaster, ModbusRtu, ModbusTcp
-from drivers.transport.options import EitherOptions, Seconds, either_opener
+from drivers.transport.options import EitherOptions, PortNumber, Seconds, either_opener
 from hal.registry import Context
 from hal.wires import Claim
 
 
 class ModbusOptions(EitherOptions):
-    """Keys of every Modbus device."""
+    """Keys of every Modbus device: `host` for TCP, or a path as `port` for RTU."""
 
+    port: str | PortNumber = 502
     shared_as: ClassVar[str | None] = None
 
     unit: Annotated[int, Field(ge=1, le=247)] = 1
@@ -24,6 +25,12 @@ class ModbusOptions(EitherOptions):
     timeout_s: Seconds = 0.1
     gap_s: Annotated[float, Field(ge=0, le=0.1)] = RTU_GAP_S
     max_age_s: Seconds = 0.1
+
+    @model_validator(mode="after")
+    def _is_somewhere(self) -> Self:
+        if self.host is None and "port" not in self.model_fields_set:
+            raise ValueError("say where the device is: host for Modbus TCP, or the path of a serial port as port")
+        return self
 
     def claim(self) -> Claim:
         """The unit, on a bus for many."""

@@ -1,9 +1,10 @@
 """Range recordings on disk: npz, npy, PNG and TIFF, decoded to metres with their sensor.
 
 npz: `depth` (float or integer) and JSON text `meta` with `unit` ("m" or "mm"), `sensor` ({"kind": "pinhole", "shape",
-"f", "fy", "cx", "cy"} or {"kind": "ortho", "shape", "pitch"}; pitch in the unit), or `K` = fx, fy, cx, cy with depth in
-millimetres. Where `depth` is absent, 8-bit codes `u8` are decoded with `meta.u8` (`near`, `far`, 0 near .. 255 far).
-npy, PNG and TIFF: the bare image; what it does not say comes from a `Reading`.
+"f", "fy", "cx", "cy"} or {"kind": "ortho", "shape", "pitch"}; pitch in the unit), or `K` = fx, fy, cx, cy or
+the 3x3 matrix, with depth in millimetres. Where `depth` is absent, 8-bit codes `u8` are decoded with `meta.u8` (`near`,
+`far`, 0 near .. 255 far).
+npy, PNG, TIFF, and npz with `depth` alone: the bare image; what it does not say comes from a `Reading`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,17 @@ SUFFIXES = (".npz", ".npy", ".png", ".tif", ".tiff")
 UNITS_M = {"m": 1.0, "mm": 0.001}
 DEFAULT_CODE_M = 0.001  # what a code of a 16-bit depth image usually stands for
 DEFAULT_FOCAL_PER_WIDTH = 0.9  # structured-light cameras see about 58 degrees across
-UNREADABLE = (OSError, ValueError, KeyError, TypeError, IndexError, EOFError, zipfile.BadZipFile, zlib.error)
+UNREADABLE = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    IndexError,
+    EOFError,
+    MemoryError,  # a header may claim any size
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,13 +130,20 @@ def load_recording(
 
 def assumptions(path: Path, reading: Reading) -> tuple[str, ...]:
     """What is taken for granted when `path` is loaded with `reading`: plain sentences."""
-    bare = path.suffix.lower() != ".npz"
     out = []
-    if bare and reading.sensor((1, 1)) is None:
+    if _is_bare(path) and reading.sensor((1, 1)) is None:
         out.append("no sensor is given: a pinhole of 58 degrees across is assumed, so sizes may be off by its error")
     if path.suffix.lower() == ".png" and reading.scale_m is None and reading.window is None:
         out.append("no scale is given: a code is taken for 1 mm, 0 for no reading")
     return tuple(out)
+
+
+def _is_bare(path: Path) -> bool:
+    """Does the file hold an image and nothing about its sensor?"""
+    if path.suffix.lower() != ".npz":
+        return True
+    with np.load(path, allow_pickle=False) as data:
+        return not {"meta", "K"} & set(data.files)
 
 
 def assumed_sensor(shape: tuple[int, int]) -> PinholeSensor:
@@ -140,6 +158,8 @@ Loaded = tuple[Array, RangeSensorModel | None]
 
 def _loader(path: Path) -> Callable[[Path, Reading, bool], Loaded]:
     suffix = path.suffix.lower()
+    if path.is_dir():
+        raise InvalidRequest(f"{path} is a folder", hint="`panelwright batch range FOLDER` analyses all of one")
     if suffix == ".npz":
         return _load_npz
     if suffix == ".npy":
@@ -151,8 +171,10 @@ def _loader(path: Path) -> Callable[[Path, Reading, bool], Loaded]:
 
 def _load_picture(path: Path, reading: Reading, codes: bool) -> Loaded:  # noqa: ARG001 - a picture holds one image
     raw = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
-    if raw is None or raw.ndim != 2:
-        raise ValueError("not a picture of one channel")
+    if raw is None:
+        raise ValueError("no picture, or not all of it is there")
+    if raw.ndim != 2:
+        raise ValueError(f"a picture of {raw.shape[2]} channels, and depth has one")
     return _decoded(raw, reading), None
 
 
@@ -178,6 +200,10 @@ def _load_npz(path: Path, reading: Reading, codes: bool) -> Loaded:
     if path.stat().st_size and not zipfile.is_zipfile(path):
         raise ValueError("it is no zip archive, or not all of it is there")
     with np.load(path, allow_pickle=False) as data:
+        if not {"depth", "u8"} & set(data.files):
+            raise ValueError(f"it holds {', '.join(data.files) or 'nothing'}, and neither depth nor u8")
+        if not {"meta", "K"} & set(data.files) and "depth" in data.files:
+            return _decoded(data["depth"], reading), None
         meta = json.loads(str(data["meta"])) if "meta" in data.files else _meta_of_intrinsics(data)
         unit = UNITS_M[meta.get("unit", "mm")]
         depth = _depth(data, meta, unit, reading, codes)
@@ -199,7 +225,8 @@ def _depth(data: Any, meta: dict[str, Any], unit: float, reading: Reading, codes
 def _meta_of_intrinsics(data: Any) -> dict[str, Any]:
     if "K" not in data.files:
         return {"unit": "mm"}
-    fx, fy, cx, cy = (float(v) for v in data["K"])
+    K = np.asarray(data["K"], float)
+    fx, fy, cx, cy = (K[0, 0], K[1, 1], K[0, 2], K[1, 2]) if K.shape == (3, 3) else (float(v) for v in K)
     shape = list(data["depth"].shape)
     return {"unit": "mm", "sensor": {"kind": "pinhole", "shape": shape, "f": fx, "fy": fy, "cx": cx, "cy": cy}}
 

@@ -86,16 +86,20 @@ def picture(scene: RangeScene) -> NDArray[np.uint8]:
     scale = max(1, PICTURE_PX // max(labels.shape))
     image = np.kron(colours(len(scene.surfaces))[labels], np.ones((scale, scale, 1), np.uint8))
     for surface in scene.surfaces:
-        v, u = np.nonzero(labels == surface.label)
-        if v.size * scale**2 < LEAST_WRITTEN_PX:
+        inside = np.pad((labels == surface.label).astype(np.uint8), 1)
+        if int(inside.sum()) * scale**2 < LEAST_WRITTEN_PX:
             continue
-        k = int(np.argmin((u - np.median(u)) ** 2 + (v - np.median(v)) ** 2))
-        _write(image, f"{surface.label} {str(surface.type)[:3]}", scale * int(u[k]), scale * int(v[k]))
+        # Where the surface is widest: its middle may lie on another one that stands before it.
+        _, radius_px, _, (u, v) = cv2.minMaxLoc(cv2.distanceTransform(inside, cv2.DIST_L2, 3))
+        _write(image, surface, scale * (u - 1), scale * (v - 1), room_px=2.0 * scale * radius_px)
     return image
 
 
-def _write(image: NDArray[np.uint8], text: str, u_px: int, v_px: int) -> None:
-    """White letters with a dark rim, so that they can be read on every colour."""
+def _write(image: NDArray[np.uint8], surface: Surface, u_px: int, v_px: int, *, room_px: float) -> None:
+    """White letters with a dark rim, so that they can be read on every colour; the type in short where it is narrow."""
+    text = f"{surface.label} {surface.type}"
+    if cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.4, 1)[0][0] > room_px:
+        text = f"{surface.label} {str(surface.type)[:3]}"
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.4, 1)
     at = (u_px - width // 2, v_px + height // 2)
     for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +19,7 @@ if TYPE_CHECKING:
     from hal.config import Cell  # imports scipy: a client's command shall not wait for that
 
 ROOT = Path(__file__).parents[2]
+PATIENCE_S = 4.0
 LOG_WIDTH = 160  # where there is no terminal: a table cut at 80 columns loses the names of the devices
 console = Console(
     highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else LOG_WIDTH
@@ -28,6 +32,19 @@ CellOption = Annotated[
 SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Replaces the seed of the cell file.")]
 DEFAULT_CELL = Path("cells/bench.toml")
 UrlDefault = DEFAULT_URL
+
+
+@contextmanager
+def patience(after_s: float = PATIENCE_S) -> Iterator[None]:
+    """Says once what takes so long when the work inside does: compiling, after an installation or an update."""
+    words = "still at work: after an update hot loops are compiled once, for a minute or two (`panelwright warm`)"
+    timer = threading.Timer(after_s, console.print, args=(words,), kwargs={"style": "dim", "markup": False})
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def client_of(url: str) -> Client:

@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from hal.errors import CellError, InvalidRequest
-from service.commands.common import console
+from service.commands.common import console, patience
 from service.commands.leaving import INTERRUPTED, one_interrupt
 
 if TYPE_CHECKING:
@@ -56,9 +56,10 @@ def range_image(
 
     reading = _reading(scale, near, far, focal, centre, pitch)
     library = () if models is None else shipped_models() if models == "shipped" else load_models(Path(models))
-    depth, sensor = load_recording(file, reading=reading)
-    scene = analyse(depth, sensor)
-    matches = match_models(scene, depth, library) if library else ()
+    with patience():
+        depth, sensor = load_recording(file, reading=reading)
+        scene = analyse(depth, sensor)
+        matches = match_models(scene, depth, library) if library else ()
     assumed = assumptions(file, reading)
     _print_surfaces(scene)
     _print_matches(matches)

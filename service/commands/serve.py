@@ -51,13 +51,14 @@ def run_to_end(panelwright: Panelwright) -> NoReturn:
     Raises:
         CellError: the cell could not start.
     """
-    code = 0
+    code, why = 0, ""
     try:
         panelwright.run()
     except KeyboardInterrupt:
-        console.print("panelwright: stopped by Ctrl-C; arm stopped, processes ended")
+        why = " by Ctrl-C"
     except SystemExit as end:
-        code = end.code if isinstance(end.code, int) else 1
+        code, why = (end.code if isinstance(end.code, int) else 1), " by SIGTERM"
+    console.print(f"panelwright: stopped{why}; arm stopped, processes ended")
     leave(code)
 
 

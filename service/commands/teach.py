@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hal.errors import InvalidRequest
-from service.commands.common import console
+from service.commands.common import console, patience
 
 if TYPE_CHECKING:
     import numpy as np
@@ -77,9 +77,11 @@ def teach(
         return
     from service.dialogue import Dialogue
 
-    talk = Dialogue.about(Terminal(), teachings, pixels, plate_m)
+    with patience():
+        talk = Dialogue.about(Terminal(), teachings, pixels, plate_m)
     if check:
-        talk.show_found()
+        with patience():
+            talk.show_found()
     else:
         talk.run()
 
@@ -90,7 +92,8 @@ def _by_clicks(
     from service.lessons import teach_kind
 
     clicks_px = tuple(_pair(text, "--click") for text in clicks)
-    taught = teach_kind(teachings, pixels, plate_m, kind=kind, clicks_px=clicks_px)
+    with patience():
+        taught = teach_kind(teachings, pixels, plate_m, kind=kind, clicks_px=clicks_px)
     if not taught["added"]:
         console.print(f"{kind} looks like that already: nothing was written", markup=False)
         return

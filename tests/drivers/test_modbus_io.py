@@ -9,6 +9,7 @@ from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 
 from drivers.emulators import modbus_io as emulator
 from drivers.emulators.scripted import ScriptedLights, ScriptedProximity, ScriptedTouch
+from drivers.modbus_io import LightsOptions
 from hal.conformance import LightsContract, ProximityContract, Rig, TouchContract
 from hal.errors import ConfigError, DeviceFault, DeviceTimeout
 from hal.readings import Cause, Quality
@@ -152,6 +153,12 @@ def test_the_switch_knows_near_and_says_nothing_of_far() -> None:
 def test_wrong_wiring_is_refused(driver: str, options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         connect(Context(name="io"), driver, {"host": "127.0.0.1", "port": 502, **options})
+
+
+def test_a_host_alone_is_modbus_tcp_at_its_usual_port_and_no_address_is_refused() -> None:
+    assert LightsOptions(host="10.0.0.30").wire == "tcp 10.0.0.30:502"
+    with pytest.raises(ConfigError, match=r"options: .*say where the device is"):
+        connect(Context(name="io"), "modbus:lights", {})
 
 
 def test_pymodbus_proves_the_emulator(transport: str) -> None:

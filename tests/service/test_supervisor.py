@@ -13,6 +13,7 @@ from hal.clock import Deadline
 from hal.config import load_cell
 from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, DeviceUnavailable, InvalidRequest, MotionRefused, Unsupported
+from service.cell import CellRuntime, gathered
 from service.supervisor import Supervisor
 from tests.service.conftest import WriteCell
 from tests.service.waiting import eventually
@@ -54,6 +55,35 @@ def test_all_faults_of_connecting_come_in_one_error(write_cell: WriteCell, inlin
     assert "no answer from 10.0.0.9" in text
     assert "planted defect" in text
     assert "Traceback" not in text
+
+
+def test_what_devices_share_is_said_once_and_faults_of_their_own_by_name(write_cell: WriteCell) -> None:
+    cell = load_cell(write_cell())
+    shared = {name: ConfigError(f"c.toml: devices.{name}: no such arm", hint="t3") for name in ("arm", "gripper")}
+    assert gathered(shared, total=4, cell=cell).what == "c.toml: no such arm"
+    own: dict[str, CellError] = {name: DeviceUnavailable("no answer", hint="plug it in") for name in ("arm", "gripper")}
+    assert set(gathered(own, total=4, cell=cell).details) == {"arm", "gripper"}
+
+
+def test_a_fault_in_options_names_file_and_key(write_cell: WriteCell) -> None:
+    path = write_cell(mode="real")
+    path.write_text(
+        path.read_text().replace('"fake:lights"\noptions = {  }', '"modbus:lights"\noptions = { unit = 900 }')
+    )
+    with pytest.raises(ConfigError) as refused:
+        CellRuntime.start(load_cell(path), is_latched=lambda: False)
+    assert str(path) in refused.value.what
+    assert refused.value.details["key"] == "devices.panel_lights.options.unit"
+
+
+def test_a_calibration_that_is_not_there_names_the_device_that_wants_it(write_cell: WriteCell) -> None:
+    path = write_cell()
+    path.write_text(path.read_text().replace('calibration = "wrist_camera"', 'calibration = "wrist_camra"'))
+    with pytest.raises(
+        ConfigError, match=r"cell.toml: devices.wrist_camera.mount.calibration: .*wrist_camra"
+    ) as refused:
+        load_cell(path)
+    assert "wrist_camera.toml" in refused.value.hint
 
 
 def test_an_unknown_driver_names_file_key_and_neighbour(write_cell: WriteCell) -> None:

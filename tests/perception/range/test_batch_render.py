@@ -18,7 +18,7 @@ from perception.range.batch import analyse_files, batch_range, recordings_in, ta
 from perception.range.batch_results import write_results
 from perception.range.features import corner_point, crease_line
 from perception.range.polar import PolarScan, depth_image, fitting_view, sweep_points
-from perception.range.recordings import load_recording
+from perception.range.recordings import Reading, assumptions, load_recording
 from perception.range.render import MARK, picture, scene_json, write_ply, write_png
 from tests.perception.range.scenes import PINHOLE, ball_on_table, nearest, noisy, plane_depth
 
@@ -55,6 +55,37 @@ def test_what_is_no_recording_is_refused(tmp_path):
     for name in ("x.npz", "x.png", "missing.npz"):
         with pytest.raises(InvalidRequest):
             load_recording(tmp_path / name)
+
+
+def test_the_reason_of_a_refusal_names_what_is_wrong_with_the_file(tmp_path):
+    depth = np.full((20, 30), 0.8)
+    np.savez(tmp_path / "other.npz", a=depth)
+    cv2.imwrite(str(tmp_path / "colour.png"), np.zeros((20, 30, 3), np.uint8))
+    whole = cv2.imencode(".png", np.arange(600, dtype=np.uint16).reshape(20, 30))[1].tobytes()
+    (tmp_path / "cut.png").write_bytes(whole[: len(whole) // 2])
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000, 10000000), }".ljust(117) + b"\n"
+    (tmp_path / "huge.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+    for name, why in (
+        ("other.npz", "holds a, and neither depth nor u8"),
+        ("colour.png", "3 channels"),
+        ("cut.png", "not all of it is there"),
+        ("huge.npy", "Unable to allocate"),
+        ("", "is a folder"),
+    ):
+        with pytest.raises(InvalidRequest, match=why):
+            load_recording(tmp_path / name)
+
+
+def test_an_npz_of_depth_alone_is_a_bare_image_and_k_may_be_the_matrix(tmp_path):
+    depth, matrix = np.full((20, 30), 0.8), np.array([[50.0, 0.0, 15.0], [0.0, 51.0, 10.0], [0.0, 0.0, 1.0]])
+    np.savez(tmp_path / "bare.npz", depth=depth)
+    np.savez(tmp_path / "matrix.npz", depth=1000.0 * depth, K=matrix)
+    np.testing.assert_array_equal(load_recording(tmp_path / "bare.npz")[0], depth)
+    assert "no sensor is given" in assumptions(tmp_path / "bare.npz", Reading())[0]
+    assert not assumptions(tmp_path / "matrix.npz", Reading())
+    metres, sensor = load_recording(tmp_path / "matrix.npz")
+    np.testing.assert_allclose(metres, depth)
+    assert (sensor.fx_px, sensor.fy_px, sensor.cx_px, sensor.cy_px) == (50.0, 51.0, 15.0, 10.0)
 
 
 def test_tasks_hold_at_least_the_wanted_number(tmp_path):

@@ -11,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from hal.strict import Strict, load_toml
 
@@ -51,6 +51,9 @@ class Scale(Strict):
             raise ValueError("maximum must be greater than minimum")
         if self.at_max == self.at_min:
             raise ValueError("at_max must differ from at_min")
+        steps = [(p1 - p0, v1 - v0) for (p0, v0), (p1, v1) in pairwise(self._points())]
+        if any(place == 0.0 or value == 0.0 or (value > 0.0) != (steps[0][1] > 0.0) for place, value in steps):
+            raise ValueError("the values of a scale and its table must all rise, or all fall, from place to place")
         return self
 
     def value_at(self, place: float) -> float:
@@ -78,6 +81,15 @@ class State(Strict):
 
     name: Name
     angle_rad: float = 0.0
+
+
+def _all_different(states: tuple[State, ...]) -> tuple[State, ...]:
+    if len({state.name for state in states}) != len(states):
+        raise ValueError("two states have the same name")
+    return states
+
+
+States = Annotated[tuple[State, ...], Field(min_length=2), AfterValidator(_all_different)]
 
 
 class ObjectBase(Strict):
@@ -127,6 +139,12 @@ class Display(ObjectBase):
     minimum: float = 0.0
     maximum: float = 9999.0
 
+    @model_validator(mode="after")
+    def _has_a_range(self) -> Display:
+        if self.maximum <= self.minimum:
+            raise ValueError("maximum must be greater than minimum")
+        return self
+
 
 class Lamp(ObjectBase):
     """Indicator lamp with states `on` and `off`."""
@@ -167,7 +185,7 @@ class Rotary(ObjectBase):
     kind: Literal["rotary"] = "rotary"
     radius_m: Positive
     height_m: Positive = 0.018
-    states: Annotated[tuple[State, ...], Field(min_length=2)]
+    states: States
     torque_nm: Positive = 0.15
 
 
@@ -189,7 +207,7 @@ class Lever(ObjectBase):
     length_m: Positive = 0.070
     width_m: Positive = 0.014
     height_m: Positive = 0.030
-    states: Annotated[tuple[State, ...], Field(min_length=2)]
+    states: States
     torque_nm: Positive = 2.0
 
 
@@ -204,6 +222,12 @@ class Handwheel(ObjectBase):
     minimum_rad: float = -6.2832
     maximum_rad: float = 6.2832
     torque_nm: Positive = 0.8
+
+    @model_validator(mode="after")
+    def _can_turn(self) -> Handwheel:
+        if self.maximum_rad <= self.minimum_rad:
+            raise ValueError("maximum_rad must be greater than minimum_rad")
+        return self
 
 
 class Mushroom(ObjectBase):

@@ -120,6 +120,30 @@ def test_a_button_lights_lamps_only(cell_path: Path, lit: str) -> None:
         load_panel(panel)
 
 
+GAUGE = 'kind = "gauge"\nradius_m = 0.03\nscale = {{ minimum = 0.0, maximum = 10.0, unit = "bar", {} }}'
+LEVER_STATES = 'kind = "lever"\nstates = [{ name = "open" }, { name = "open", angle_rad = 1.57 }]'
+
+
+@pytest.mark.parametrize(
+    ("thing", "says"),
+    [
+        (GAUGE.format("at_min = -1.0, at_max = 1.0, table = [[-1.0, 3.0]]"), "must all rise, or all fall"),
+        (GAUGE.format("at_min = -1.0, at_max = 1.0, table = [[0.0, 3.0], [0.5, 3.0]]"), "must all rise, or all fall"),
+        (GAUGE.format("at_min = 1.0, at_max = -1.0, table = [[0.0, 12.0]]"), "must all rise, or all fall"),
+        (LEVER_STATES, "two states have the same name"),
+        ('kind = "handwheel"\nminimum_rad = 1.0\nmaximum_rad = 1.0', "maximum_rad must be greater"),
+        ('kind = "display"\nwidth_m = 0.04\nheight_m = 0.02\ndigits = 4\nminimum = 9.0\nmaximum = 1.0', "greater than"),
+    ],
+)
+def test_an_object_that_cannot_be_is_refused_and_not_found_out_when_it_is_read(
+    cell_path: Path, thing: str, says: str
+) -> None:
+    panel = cell_path.parents[1] / "panels/tiny.toml"
+    panel.write_text(f'{PANEL}[[objects]]\nname = "thing"\nposition_m = [0.1, 0.0]\n{thing}\n')
+    with pytest.raises(ConfigError, match=says):
+        load_panel(panel)
+
+
 def test_a_missing_file_names_the_nearest_one(cell_path: Path) -> None:
     with pytest.raises(ConfigError, match="does not exist") as caught:
         load_cell(cell_path.with_name("tyni.toml"))

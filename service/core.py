@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import logging
 import socket
 import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from pydantic import BaseModel
 
@@ -63,7 +64,11 @@ class Service:
         self.tasks = TaskStore(state_dir / "tasks", recorder=self.journal, stop_motion=self._stop_motion)
         self.lease = LeaseDesk(ttl_s=cell.file.safety.lease_ttl_s, on_loss=self.tasks.cancel_moving, report=self.note)
         self._is_closing = threading.Event()
-        self._restore_tasks()
+        self._folder_lock = (state_dir / "lock").open("w")  # held until the process ends, however it does
+        if _is_alone(self._folder_lock):
+            self._restore_tasks()
+        else:  # their tasks are none of ours, and those that run have not been aborted
+            log.warning("another panelwright writes to %s too: tasks of earlier runs are not shown", runs_dir)
 
     def start(self) -> None:
         """Start the cell and wait until it is ready.
@@ -140,6 +145,7 @@ class Service:
         self.supervisor.close()
         self.note("service-end", {})
         self.journal.close()
+        self._folder_lock.close()
 
     def stop_quietly(self, source: str) -> None:
         """Latch the stop and never fail; for the way out."""
@@ -189,6 +195,15 @@ class Service:
                 _bring_to_end(tasks[data["task"]], data, record.wall_time_s)
         for task in tasks.values():
             self.tasks.restore(task)
+
+
+def _is_alone(lock: IO[str]) -> bool:
+    """Take the lock of a folder; False when another service has it."""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
 
 
 def _bring_to_end(task: Task, data: dict[str, Any], ended_s: float) -> None:

@@ -1,7 +1,7 @@
 """The journal: what was asked, started, stopped and ended, in SQLite, each row chained to the one before by its hash.
 
 One thread writes. `append` returns when the row is on disk; rows that wait together share one commit, so that a burst
-of events costs one flush of the disk.
+of events costs one flush of the disk. Two services on one folder (a demo beside `serve`) keep one chain.
 """
 
 from __future__ import annotations
@@ -151,7 +151,6 @@ class Journal:
     def _write(self, ready: Future[None]) -> None:
         try:
             db = _opened(self.path)
-            previous = _last_hash(db)
         except (sqlite3.Error, OSError) as error:
             ready.set_exception(_error(self.path, error))
             return
@@ -159,7 +158,7 @@ class Journal:
         is_last = False
         while not is_last:
             group, is_last = self._next_group()
-            previous = _commit(db, self.path, group, previous)
+            _commit(db, self.path, group)
         db.close()
 
     def _next_group(self) -> tuple[list[_Entry], bool]:
@@ -191,13 +190,13 @@ def _last_hash(db: sqlite3.Connection) -> str:
     return str(row[0]) if row is not None else FIRST_HASH
 
 
-def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry], previous: str) -> str:
-    """Write a group in one transaction and tell its callers; returns the newest hash on disk."""
+def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry]) -> None:
+    """Write a group in one transaction and tell its callers."""
     if not group:
-        return previous
-    newest = previous
+        return
     try:
         db.execute("BEGIN IMMEDIATE")
+        newest = _last_hash(db)  # under the lock, for another service may have written since
         for entry in group:
             digest = _hash(newest, entry.wall_time_s, entry.monotonic_s, entry.kind, entry.text)
             row = (entry.wall_time_s, entry.monotonic_s, entry.kind, entry.text, newest, digest)
@@ -212,10 +211,9 @@ def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry], previous: s
             db.execute("ROLLBACK")
         for entry in group:
             entry.done.set_exception(_error(path, error))
-        return previous
+        return
     for entry in group:
         entry.done.set_result(None)
-    return newest
 
 
 def _hash(previous: str, wall_time_s: float, monotonic_s: float, kind: str, text: str) -> str:

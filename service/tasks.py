@@ -280,7 +280,8 @@ class TaskStore:
         try:
             self._recorder.append("task-ended", {**ended, "artefacts": jsonable(task.artefacts)})
         except CellError as error:
-            log.error("the end of task %s was not recorded: %s", task.id, error)
+            level = logging.INFO if self._is_closed else logging.ERROR  # after the end the next start tells of it
+            log.log(level, "the end of task %s was not recorded: %s", task.id, error)
 
     def _stop_until_ended(self, task: Task) -> None:
         self._quiet_stop()

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from service.client import ApiError, Client
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console, read_cell
-from service.commands.leaving import leave
+from service.commands.leaving import INTERRUPTED, leave, one_interrupt
 from service.commands.tasks import follow
 
 
@@ -37,19 +37,20 @@ def demo(
     panelwright = Panelwright(loaded, Options(port=port, runs_dir=runs, inline=inline))
     console.print(f"cell [bold]{loaded.name}[/], seed {loaded.file.cell.seed}: starting")
     code = 1
-    try:
-        panelwright.start()
-        console.print(f"ready after {time.monotonic() - started_s:.1f} s at {panelwright.url}")
-        code = 0 if _mission(Client(url=panelwright.url), runs, judge=judge) else 1
-    except KeyboardInterrupt:
-        console.print("stopped by Ctrl-C: arm stopped, processes ended")
-        code = 130
-    finally:
-        panelwright.close()
-    if code == 130:
-        _tell_what_is_left(runs, since_unix_s)
-    console.print(f"{time.monotonic() - started_s:.1f} s in all")
-    leave(code)
+    with one_interrupt():
+        try:
+            panelwright.start()
+            console.print(f"ready after {time.monotonic() - started_s:.1f} s at {panelwright.url}")
+            code = 0 if _mission(Client(url=panelwright.url), runs, judge=judge) else 1
+        except KeyboardInterrupt:
+            console.print("Ctrl-C: stopping the arm and ending all processes")
+            code = INTERRUPTED
+        finally:
+            panelwright.close()
+        if code == INTERRUPTED:
+            _tell_what_is_left(runs, since_unix_s)
+        console.print(f"{time.monotonic() - started_s:.1f} s in all")
+        leave(code)
 
 
 def _mission(client: Client, runs: Path, *, judge: bool) -> bool:

@@ -60,6 +60,28 @@ def test_a_task_that_was_cut_off_is_aborted_and_not_taken_up(write_cell: WriteCe
         second.close()
 
 
+def test_a_second_service_on_the_same_folder_aborts_nothing_and_keeps_the_chain(
+    write_cell: WriteCell, tmp_path: Path
+) -> None:
+    """Somebody runs `panelwright demo` beside `panelwright serve`."""
+    cell, runs = write_cell(robot=True), tmp_path / "runs"
+    first = _service(cell, runs)
+    task = first.submit("hold", HoldRequest())
+    eventually(lambda: task.state is TaskState.RUNNING)
+    second = _service(cell, runs)
+    try:
+        assert second.tasks.all() == []
+        assert second.submit("echo", EchoRequest()).wait(20.0)
+        first.tasks.cancel(task.id)
+        assert task.wait(20.0)
+        ends = [r.data["state"] for r in first.journal.records(kinds=("task-ended",)) if r.data["task"] == task.id]
+        assert ends == ["cancelled"]
+        assert first.journal.verify() > 0
+    finally:
+        second.close()
+        first.close()
+
+
 def test_starts_stops_and_resets_are_on_record(write_cell: WriteCell, tmp_path: Path) -> None:
     service = _service(write_cell(), tmp_path / "runs")
     service.supervisor.stop("test")

@@ -38,55 +38,66 @@ def toggle(cell: Workcell, name: str, target: str, *, verify: Verify | None = No
         raise InvalidRequest(f"a toggle has no state {target!r}", hint="on (up) or off (down)")
     up = 1.0 if target == "on" else -1.0
 
-    def stroke(attempt: Attempt) -> float:
-        half = max(cell.hand.closed_half_m)
-        reach = PIVOT_M + GRIP_RATIO * thing.bat_length_m
-        x, y = thing.position_m
-        # The bat leans away from the target; come down beyond it.
-        lean = thing.bat_length_m * np.sin(thing.tilt_rad) + thing.bat_radius_m
-        start, end = y - up * (lean + half + SIDE_M), y + up * (BEYOND_M - half)
-        ways = [
-            [
-                panel_from_grip((x, start, reach + thing.bat_length_m + STANDOFF_M), turn),
-                panel_from_grip((x, start, reach), turn),
-                panel_from_grip((x, end, reach), turn),
-            ]
-            for turn in (0.0, np.pi, np.pi / 2, -np.pi / 2)
-        ]
-        attempt.begin(ways, may_touch=(name,), width_m=0.0, name=name)
-        down = attempt.advance(thing.bat_length_m + STANDOFF_M, name="approach")
-        if down.tripped is not None and _left_m(attempt, reach) > 0.004:
-            raise SkillFailure(Outcome.MISSED, "the fingertip landed on something before it was beside the bat")
-        if down.tripped is not None:
-            attempt.advance(-0.002, name="lift off", speed_m_per_s=0.03)
-        sweep = cell.panel_pose.rotation.apply([0.0, end - start, 0.0])
-        here = attempt.pose()
-        goal = shifted(here, here.rotation.inv().apply(sweep))
-        # The bat's own effort acts at its tip; the fingertip pushes lower down.
-        stop_n = EFFORT_SPREAD * thing.force_n / GRIP_RATIO + END_N
-        # Only against the sweep: what wedges the finger up along the leaning bat is no effort of the bat.
-        x, y, z = here.rotation.inv().apply(-sweep / np.linalg.norm(sweep))
-        against = (float(x), float(y), float(z))
-        guard = Guard(name="end stop", quantity=Quantity.FORCE, limit=stop_n, axis=against, ticks=1)
-        report = attempt.straight(
-            goal, name="sweep", speed_m_per_s=SWEEP_M_PER_S, guards=(guard,), compliance=SOFT_PUSH
-        )
-        moved = float((report.base_from_tool.translation - here.translation) @ sweep / np.linalg.norm(sweep))
-        past = float(moved - (abs(end - start) - BEYOND_M))
-        if past < -0.004:
-            raise SkillFailure(Outcome.STIFF, f"the bat did not give way at {stop_n:.0f} N", reached=past)
-        attempt.leave()
-        return past
-
-    def _left_m(attempt: Attempt, reach: float) -> float:
-        return float((cell.panel_pose.inv() * attempt.pose()).translation[2]) - reach
-
     return perform(
         cell,
-        stroke,
+        lambda attempt: _throw(attempt, thing, up),
         skill="toggle",
         object_name=name,
         target=target,
         is_reached=lambda seen: seen.state == target,
         verify=verify,
     )
+
+
+def _throw(attempt: Attempt, thing: Toggle, up: float) -> float:
+    """Come down beside the bat and sweep it over, `up` 1 or -1; returns how far past the pivot the face came, m."""
+    half = max(attempt.cell.hand.closed_half_m)
+    # The bat leans away from the target; come down beyond it.
+    lean = thing.bat_length_m * np.sin(thing.tilt_rad) + thing.bat_radius_m
+    y = thing.position_m[1]
+    start, end = y - up * (lean + half + SIDE_M), y + up * (BEYOND_M - half)
+    _come_down(attempt, thing, start, end)
+    stop_n = stop_force_n(thing)
+    moved = _sweep(attempt, end - start, stop_n)
+    past = float(moved - (abs(end - start) - BEYOND_M))
+    if past < -0.004:
+        raise SkillFailure(Outcome.STIFF, f"the bat did not give way at {stop_n:.0f} N", reached=past)
+    attempt.leave()
+    return past
+
+
+def stop_force_n(thing: Toggle) -> float:
+    """Force that tells the bat stands on its stop, N: its own effort acts at its tip, the fingertip pushes lower down."""
+    return EFFORT_SPREAD * thing.force_n / GRIP_RATIO + END_N
+
+
+def _come_down(attempt: Attempt, thing: Toggle, start_m: float, end_m: float) -> None:
+    """The fingertip beside the bat, at panel height `start_m`, from where the sweep to `end_m` is free."""
+    reach = PIVOT_M + GRIP_RATIO * thing.bat_length_m
+    x, above = thing.position_m[0], reach + thing.bat_length_m + STANDOFF_M
+    ways = [
+        [panel_from_grip(point, turn) for point in ((x, start_m, above), (x, start_m, reach), (x, end_m, reach))]
+        for turn in (0.0, np.pi, np.pi / 2, -np.pi / 2)
+    ]
+    attempt.begin(ways, may_touch=(thing.name,), width_m=0.0, name=thing.name)
+    down = attempt.advance(thing.bat_length_m + STANDOFF_M, name="approach")
+    if down.tripped is None:
+        return
+    left_m = float((attempt.cell.panel_pose.inv() * attempt.pose()).translation[2]) - reach
+    if left_m > 0.004:
+        raise SkillFailure(Outcome.MISSED, "the fingertip landed on something before it was beside the bat")
+    attempt.advance(-0.002, name="lift off", speed_m_per_s=0.03)
+
+
+def _sweep(attempt: Attempt, way_m: float, stop_n: float) -> float:
+    """Push along the panel's y axis until the bat stands on its stop; returns how far the fingertip came, m."""
+    here = attempt.pose()
+    sweep = attempt.cell.panel_pose.rotation.apply([0.0, way_m, 0.0])
+    unit = sweep / np.linalg.norm(sweep)
+    # Only against the sweep: what wedges the finger up along the leaning bat is no effort of the bat.
+    x, y, z = here.rotation.inv().apply(-unit)
+    against = (float(x), float(y), float(z))
+    guard = Guard(name="end stop", quantity=Quantity.FORCE, limit=stop_n, axis=against, ticks=1)
+    goal = shifted(here, here.rotation.inv().apply(sweep))
+    report = attempt.straight(goal, name="sweep", speed_m_per_s=SWEEP_M_PER_S, guards=(guard,), compliance=SOFT_PUSH)
+    return float((report.base_from_tool.translation - here.translation) @ unit)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -21,9 +21,9 @@ class Possible:
     probability: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Status:
-    """A reader's answer. At most one of `value`, `state` and `text` leads; a refusal has none of them, and a `reason`.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Answer:
+    """At most one of `value`, `state` and `text` leads; a refusal has none of them, and a `reason`.
 
     Attributes:
         value: in `unit`; a display has its text's number here too.
@@ -48,9 +48,14 @@ class Status:
         return self.reason is None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Status(Answer):
+    """What a reader says of the object in its patch."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ObjectReading:
-    """One object of a taught panel in one image.
+class ObjectReading(Answer):
+    """One object of a taught panel in one image, with what it says.
 
     Attributes:
         present: whether something that looks like the object is where the panel file says.
@@ -58,7 +63,6 @@ class ObjectReading:
         centre_m: (3,) its place in the panel frame by this image (plate height), None without a camera pose.
         centre_covariance_m2: (3, 3) of `centre_m`, panel axes.
         outline_px: (N, 2) contour in the image, for drawing and for the robot's look.
-        value, unit, uncertainty, state, text, confidence, reason, possible: as in `Status`.
     """
 
     name: str
@@ -68,19 +72,15 @@ class ObjectReading:
     outline_px: Array
     centre_m: Array | None = None
     centre_covariance_m2: Array | None = None
-    value: float | None = None
-    unit: str = ""
-    uncertainty: float | None = None
-    state: str | None = None
-    text: str | None = None
-    confidence: float = 0.0
-    reason: str | None = None
-    possible: tuple[Possible, ...] = ()
 
     @property
     def answered(self) -> bool:
         """Whether the object was read."""
         return self.present and self.reason is None
+
+    def saying(self, status: Status) -> ObjectReading:
+        """The object, found where it should be, with what its reader says of it."""
+        return replace(self, present=True, **{field.name: getattr(status, field.name) for field in fields(Answer)})
 
 
 def refused(reason: str, *, confidence: float = 0.0, unit: str = "", possible: tuple[Possible, ...] = ()) -> Status:

@@ -199,18 +199,7 @@ def _inspect_one(
     else:
         last = None if before is None else before.value
         status = plausible(read_patch(patch, spec, digits_taught=digits_taught, before=last), spec, before)
-    return replace(
-        reading,
-        present=True,
-        value=status.value,
-        unit=status.unit,
-        uncertainty=status.uncertainty,
-        state=status.state,
-        text=status.text,
-        confidence=status.confidence,
-        reason=status.reason,
-        possible=status.possible,
-    )
+    return reading.saying(status)
 
 
 def _absence(patch: Patch, edge_share: float, noise: float) -> str | None:

@@ -176,23 +176,21 @@ def _grouped(task: Task, noise: NoiseModel, grid: Grid, labels: Labels, found: C
 
 
 def _finished(task: Task, noise: NoiseModel, regions: Regions, found: Candidates) -> tuple[Labels, tuple[Surface, ...]]:
-    depth, sensor = task.depth_m, task.sensor
-    packed, law = task.packed, noise.packed()
+    depth, packed, law = task.depth_m, task.packed, noise.packed()
     pixels, few = regions.pixels, regions.few(NAMING_SAMPLES)
     keep = sorted((k for k, n in enumerate(pixels) if n >= LEAST_KEPT_PIXELS), key=lambda k: -pixels[k])
     surfaces, final = [], Candidates()
     names = np.zeros(len(pixels) + 1, np.int32)
     for new, k in enumerate(keep, 1):
-        kind, mine = found.kinds[k], regions.samples(k + 1)
-        if found.slack[k] != 1.0:
-            mine[3] *= found.slack[k]
-            few[k][3] *= found.slack[k]
-        surface, th = finish.refine_surface(new, kind, found.parameters[k], mine, sensor=sensor, noise=noise)
+        kind, slack = found.kinds[k], found.slack[k]
+        few[k][3] *= slack
+        mine = (regions.runs_of(k + 1), regions)
+        surface, th = finish.refine_surface(new, kind, found.parameters[k], *mine, noise=noise, slack=slack)
         # What the sensor has bent is named straight, but keeps the bent surface's pixels.
         final.add(kind, th)
         straight, start = bend.straightened(kind, th, few[k], law, bool(packed[0] > 0))
         if straight != kind:
-            surface, _ = finish.refine_surface(new, straight, start, mine, sensor=sensor, noise=noise)
+            surface, _ = finish.refine_surface(new, straight, start, *mine, noise=noise, slack=slack)
         surfaces.append(surface)
         names[k + 1] = new
     labels = settled(task, noise, regions.renamed(names), final, sweeps=SETTLING_SWEEPS)

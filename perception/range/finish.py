@@ -8,7 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from perception.range import fit
+from perception.range.fit import fit_robust
+from perception.range.last_step import last_step
 from perception.range.noise import NoiseModel
 from perception.range.primitives import (
     COVARIANCE_OVER,
@@ -18,8 +19,8 @@ from perception.range.primitives import (
     named_covariance,
     primitive_of,
 )
+from perception.range.regions import Regions, spread
 from perception.range.runs import pixels_of
-from perception.range.sensor import RangeSensorModel
 from perception.range.starts import solve_positive
 from perception.range.surfaces import FREEDOM, QUADRIC
 
@@ -30,6 +31,7 @@ COARSE_SAMPLES = 300  # a refined start on these leaves the full fit one step
 MIDDLE_STRIDE = 4  # of these, every fourth tells where a surface lies
 SLOW_NOISE_AREA_PX = 150.0  # pixels that share one value of the slow noise; sets how little averaging gains on it
 STEP_AREA_PX = 16.0
+NO_SHIFT = 1e-9  # pixels: rounds up what is whole but for the last bit
 FREE = np.zeros(9, np.bool_)
 
 
@@ -37,16 +39,24 @@ def refine_surface(
     label: int,
     kind: int,
     th: Array,
-    samples: Array,
+    runs: Labels,
+    regions: Regions,
     *,
-    sensor: RangeSensorModel,
     noise: NoiseModel,
+    slack: float = 1.0,
     fixed: NDArray[np.bool_] = FREE,
 ) -> tuple[Surface, Array]:
-    """The surface after the ray-depth fit to all its pixels, samples (4, N) as in `regions`, and its parameters."""
-    perspective = bool(sensor.packed()[0] > 0)
-    n = samples.shape[1]
-    th, H, inverse, middles, kept, used = refined(kind, th, samples, perspective, fixed)
+    """The surface after the ray-depth fit to all its pixels, and its parameters.
+
+    Args:
+        runs: (R, 3) as `Regions.runs_of` gives them.
+        slack: how many times the noise is tolerated.
+        fixed: (9,) tangent parameters that a prior holds.
+    """
+    perspective = bool(regions.packed[0] > 0)
+    image = (regions.depth_m, regions.packed, regions.law)
+    n = int(np.sum(runs[:, 2] - runs[:, 1]))
+    th, H, inverse, middles, kept, used = refined(kind, th, *image, slack, runs, n, fixed)
     misfit = float(np.sqrt(kept / max(used - FREEDOM[kind], 1)))
     x, y, depth, sigma = middles.tolist()
     loss = averaging_loss(noise, depth)
@@ -68,23 +78,20 @@ def refine_surface(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def refined(kind, th, samples, perspective, fixed):  # type: ignore[no-untyped-def]  # numba types it
-    """The fit to samples (4, N): robust on a few that are evenly spread, then one step on all.
+def refined(kind, th, depth, sen, noise, slack, runs, pixels, fixed):  # type: ignore[no-untyped-def]  # numba types it
+    """The fit to the `pixels` of runs (R, 3): robust on a few that are evenly spread, then one step on all.
 
     Returns:
         parameters, information matrix (9, 9), its inverse (p, p) or None, medians (4,) of x, y, z and sigma,
-        squared residuals of the kept samples, samples kept.
+        squared residuals of the kept pixels, pixels kept.
     """
-    x, y, z, sigma = samples[0], samples[1], samples[2], samples[3]
-    n = x.shape[0]
-    if n == 0:
+    if pixels == 0:
         return th, np.zeros((9, 9)), None, np.full(4, np.nan), 0.0, 0
-    few = np.empty((4, min(n, COARSE_SAMPLES)))
-    for k in range(few.shape[1]):
-        i = (k * (n - 1)) // max(few.shape[1] - 1, 1)
-        few[0, k], few[1, k], few[2, k], few[3, k] = x[i], y[i], z[i], sigma[i]
-    th, _, _, _, _ = fit.fit_robust(kind, th, few[0], few[1], few[2], few[3], perspective, fixed, 1)
-    th, H, kept, used = fit.last_step(kind, th, x, y, z, sigma, perspective, fixed)
+    few = np.empty((4, min(pixels, COARSE_SAMPLES)))
+    spread(depth, sen, noise, runs, pixels, NO_SHIFT, few)
+    few[3] *= slack
+    th, _, _, _, _ = fit_robust(kind, th, few[0], few[1], few[2], few[3], sen[0] > 0, fixed, 1)
+    th, H, kept, used = last_step(kind, th, depth, sen, noise, slack, runs, fixed)
     middles = np.empty(4)
     for a in range(4):
         middles[a] = np.median(few[a, ::MIDDLE_STRIDE].copy())

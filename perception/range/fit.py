@@ -99,7 +99,7 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed, scr
     held = min(held, LOADED)
     damping, is_fresh = 1e-4, True
     for _ in range(steps):
-        _damped(H, g, fixed, damping, p, A, step)
+        damped(H, g, fixed, damping, p, A, step)
         if not solve_positive(A, step, p):
             damping *= 10.0
             if damping > 1e6:
@@ -134,35 +134,8 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed, scr
     return cost, used, ERRED if is_fresh and held == LOADED else held
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def last_step(kind, th, x, y, z, sigma, perspective, fixed):  # type: ignore[no-untyped-def]  # numba types it
-    """One Gauss-Newton step on all samples from a start that is good already, in a single pass over them.
-
-    The matrix and the trim are those of the start; the cost after the step follows from the quadratic model.
-
-    Returns:
-        parameters, information matrix (9, 9), squared residuals of the kept samples, samples kept.
-    """
-    p = FREEDOM[kind]
-    H, g, frame = np.zeros((9, 9)), np.zeros(9), np.zeros(6)
-    frame_of(kind, th, frame)
-    cost, used = normal_equations(
-        kind, th, frame, x, y, z, sigma, perspective, 0.0, TRIM_SIGMAS, H, g, np.empty(SCRATCH), NOTHING
-    )
-    kept = max(cost - (x.shape[0] - used) * TRIM_SIGMAS * TRIM_SIGMAS, 0.0)
-    A, step = np.empty((p, p)), np.empty(p)
-    _damped(H, g, fixed, 0.0, p, A, step)
-    if used <= p or not solve_positive(A, step, p):
-        return th, H, kept, used
-    for a in range(p):
-        kept -= 0.0 if fixed[a] else g[a] * step[a]
-    moved = np.empty(SIZE)
-    step_into(kind, th, frame, step, moved)
-    return moved, H, max(kept, 0.0), used
-
-
 @njit(cache=True, error_model="numpy", **LEAN)
-def _damped(H, g, fixed, damping, p, A, step):  # type: ignore[no-untyped-def]  # numba types it
+def damped(H, g, fixed, damping, p, A, step):  # type: ignore[no-untyped-def]  # numba types it
     """The system of one step into `A` (p, p) and `step` (p,): fixed parameters stay where they are."""
     for a in range(p):
         for b in range(p):

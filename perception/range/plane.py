@@ -14,6 +14,7 @@ from perception.range.finish import refine_surface
 from perception.range.grid import Grid, block_size, build_grid
 from perception.range.noise import NoiseModel, estimate_noise
 from perception.range.primitives import Surface
+from perception.range.regions import regions_of
 from perception.range.sensor import RangeSensorModel
 from perception.range.surfaces import PLANE, SIZE
 
@@ -172,11 +173,8 @@ def _fitted(depth: Array, sensor: RangeSensorModel, noise: NoiseModel, plane: Ar
     for _ in range(2):
         with np.errstate(invalid="ignore"):
             inliers = np.abs(points @ th[:3] - th[3]) <= INLIER_SIGMAS * sigma
-        z = depth[inliers]
-        packed = sensor.packed()
-        v, u = np.nonzero(inliers)
-        samples = np.stack([(u - packed[3]) / packed[1], (v - packed[4]) / packed[2], z, sigma[inliers]])
-        surface, th = refine_surface(1, PLANE, th, samples, sensor=sensor, noise=noise)
+        own = regions_of(depth, sensor.packed(), noise.packed(), inliers.astype(np.int32), 1)
+        surface, th = refine_surface(1, PLANE, th, own.runs_of(1), own, noise=noise)
     valid = int(np.isfinite(depth).sum())
     share = float(inliers.sum()) / valid
     if share < LEAST_SHARE:

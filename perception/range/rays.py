@@ -330,11 +330,9 @@ def normal_equations(  # type: ignore[no-untyped-def]  # numba types it
     `scale` > 0: Cauchy weights of that width in sigmas; 0: samples beyond `trim` sigmas are left out. `held`: what `work`
     holds already of at most CHUNK samples; afterwards it holds the samples and row ERROR.
     """
-    p = FREEDOM[kind]
     H[:] = 0.0
     g[:] = 0.0
     cost, used = 0.0, 0.0
-    c2 = scale * scale * CAUCHY_WIDTH * CAUCHY_WIDTH
     count = x.shape[0]
     for first in range(0, count, CHUNK):
         n = min(CHUNK, count - first)
@@ -342,18 +340,32 @@ def normal_equations(  # type: ignore[no-untyped-def]  # numba types it
             load_rows(x, y, z, sigma, first, n, work)
         if held != FILLED:
             fill_rows(kind, th, frame, n, perspective, work)
-        if scale > 0.0:
-            hits = _cauchy_weights(n, c2, work)
-            more = c2 * _sum_of_logarithms(work[:n])
-        else:
-            more, hits = _trim_weights(n, trim, work)
+        more, hits = add_equations(kind, n, scale, trim, work, H, g)
         cost += more
         used += hits
-        _add_products(p, n, work, H, g)
+    mirror(FREEDOM[kind], H)
+    return cost, int(used)
+
+
+@njit(cache=True, error_model="numpy", **LEAN, nogil=True)
+def add_equations(kind, n, scale, trim, work, H, g):  # type: ignore[no-untyped-def]  # numba types it
+    """Add the `n` filled rays in `work` to the lower triangle of `H` and to `g`; returns their cost and how many count."""
+    if scale > 0.0:
+        c2 = scale * scale * CAUCHY_WIDTH * CAUCHY_WIDTH
+        used = _cauchy_weights(n, c2, work)
+        cost = c2 * _sum_of_logarithms(work[:n])
+    else:
+        cost, used = _trim_weights(n, trim, work)
+    _add_products(FREEDOM[kind], n, work, H, g)
+    return cost, used
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def mirror(p, H):  # type: ignore[no-untyped-def]  # numba types it
+    """Fill the upper triangle of the first p rows of `H` from the lower one."""
     for a in range(p):
         for b in range(a):
             H[b, a] = H[a, b]
-    return cost, int(used)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

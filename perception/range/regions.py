@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from perception.range.rays import LOOSE
 from perception.range.runs import painted, places_of, runs_of
-from perception.range.surfaces import LEAN
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
@@ -47,14 +46,13 @@ class Regions:
         out = _spread_samples(self.depth_m, self.packed, self.law, self.starts, self.runs, self.sizes, most)
         return [np.ascontiguousarray(s[:, :n]) for s, n in zip(out, sizes, strict=True)]
 
-    def samples(self, label: int) -> Array:
-        """Samples of all pixels of a label, in raster order."""
-        mine = self.runs[self.starts[label] : self.starts[label + 1]]
-        return np.asarray(_samples_of(self.depth_m, self.packed, self.law, mine, self.sizes[label]))
+    def runs_of(self, label: int) -> Labels:
+        """The runs (R, 3) of a label, in raster order: row, first column, and the one after the last."""
+        return self.runs[self.starts[label] : self.starts[label + 1]]
 
     def places(self, label: int) -> Labels:
         """Flat pixel indices of a label, in raster order."""
-        return np.asarray(places_of(self.runs[self.starts[label] : self.starts[label + 1]], self.labels.shape[1]))
+        return np.asarray(places_of(self.runs_of(label), self.labels.shape[1]))
 
     def renamed(self, names: Labels) -> Labels:
         """(H, W) labels after k is called `names[k]`."""
@@ -81,41 +79,26 @@ def _spread_samples(depth, sen, noise, starts, runs, sizes, most):  # type: igno
     """(count, 4, most) samples of each label, as many as it has at most."""
     count = sizes.shape[0] - 1
     out = np.empty((count, 4, most))
-    for k in range(count):
-        n = min(sizes[k + 1], most)
-        step = (sizes[k + 1] - 1) / max(n - 1, 1)
-        run, passed = starts[k + 1], 0
-        for j in range(n):
-            at = int(j * step + 0.5)
-            while at - passed >= runs[run, 2] - runs[run, 1]:
-                passed += runs[run, 2] - runs[run, 1]
-                run += 1
-            v, u = runs[run, 0], runs[run, 1] + at - passed
-            out[k, 0, j], out[k, 1, j], out[k, 2, j] = (u - sen[3]) / sen[1], (v - sen[4]) / sen[2], depth[v, u]
-        _fill_sigmas(out[k, 2, :n], noise, out[k, 3, :n])
+    for k in range(1, count + 1):
+        mine = runs[starts[k] : starts[k + 1]]
+        spread(depth, sen, noise, mine, sizes[k], 0.5, out[k - 1, :, : min(sizes[k], most)])
     return out
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _samples_of(depth, sen, noise, runs, pixels):  # type: ignore[no-untyped-def]  # numba types it
-    """(4, pixels) samples of the pixels of runs (R, 3)."""
-    out, n = np.empty((4, pixels)), 0
-    for i in range(runs.shape[0]):
-        v, first, end = runs[i, 0], runs[i, 1], runs[i, 2]
-        last = n + end - first
-        _fill_columns(first, 1.0 / sen[1], sen[3], out[0, n:last])
-        out[1, n:last] = (v - sen[4]) / sen[2]
-        out[2, n:last] = depth[v, first:end]
-        n = last
+def spread(depth, sen, noise, runs, pixels, shift, out):  # type: ignore[no-untyped-def]  # numba types it
+    """Fill `out` (4, n) with samples that are evenly spread over the `pixels` of runs (R, 3), `shift` 0 to 1 of a pixel on."""
+    n = out.shape[1]
+    step = (pixels - 1) / max(n - 1, 1)
+    run, passed = 0, 0
+    for j in range(n):
+        at = int(j * step + shift)
+        while at - passed >= runs[run, 2] - runs[run, 1]:
+            passed += runs[run, 2] - runs[run, 1]
+            run += 1
+        v, u = runs[run, 0], runs[run, 1] + at - passed
+        out[0, j], out[1, j], out[2, j] = (u - sen[3]) / sen[1], (v - sen[4]) / sen[2], depth[v, u]
     _fill_sigmas(out[2], noise, out[3])
-    return out
-
-
-@njit(cache=True, error_model="numpy", **LEAN)
-def _fill_columns(first, per_x, middle, x):  # type: ignore[no-untyped-def]  # numba types it
-    """Ray coordinates x of columns `first` and on."""
-    for k in range(x.shape[0]):
-        x[k] = (float(np.int32(first + k)) - middle) * per_x
 
 
 @njit(cache=True, error_model="numpy", fastmath=LOOSE)

@@ -10,13 +10,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perception.range import beside, claim, finish
-from perception.range.fit import PER_MEDIAN, SCALE_PRECISION, middle_scale
+from perception.range.fit import PER_MEDIAN, SCALE_PRECISION, TRIM_SIGMAS, middle_scale
+from perception.range.last_step import last_step
 from perception.range.noise import NoiseModel
 from perception.range.primitives import centre_and_radii, ellipsoid_of, named_covariance
 from perception.range.rays import MISS_SIGMAS
 from perception.range.regions import regions_of
+from perception.range.sensor import OrthographicSensor
 from perception.range.starts import principal_axes
-from perception.range.surfaces import CYLINDER, PLANE, QUADRIC, SIZE, SPHERE
+from perception.range.surfaces import (
+    CYLINDER,
+    FREEDOM,
+    GRAZING_COSINE,
+    PLANE,
+    QUADRIC,
+    SIZE,
+    SPHERE,
+    depth_and_jacobian,
+    depths_on,
+    frame_of,
+    step_into,
+)
 from tests.perception.range.scenes import PARALLEL, PINHOLE
 
 NOISE = NoiseModel(white=(0.0005, 0.0002), correlated=(0.0, 0.0003), step=(0.0004, 0.0))
@@ -113,12 +127,44 @@ def test_samples_of_each_label_come_in_raster_order(sensor):
     regions = regions_of(depth, packed, NOISE.packed(), labels, 4)
     for k, few in enumerate(regions.few(100), 1):
         v, u = np.nonzero(labels == k)
-        mine = regions.samples(k)
-        expected = [(u - packed[3]) / packed[1], (v - packed[4]) / packed[2], depth[v, u], NOISE.sigma_m(depth[v, u])]
-        np.testing.assert_allclose(mine, expected, rtol=1e-12, atol=1e-15)
+        np.testing.assert_array_equal(regions.places(k), v * depth.shape[1] + u)
         assert regions.pixels[k - 1] == v.size and few.shape == (4, 100)
         spread = np.rint(np.linspace(0, v.size - 1, 100)).astype(int)
-        np.testing.assert_allclose(few, mine[:, spread], rtol=1e-12, atol=1e-15)
+        v, u = v[spread], u[spread]
+        expected = [(u - packed[3]) / packed[1], (v - packed[4]) / packed[2], depth[v, u], NOISE.sigma_m(depth[v, u])]
+        np.testing.assert_allclose(few, expected, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("sensor", [PINHOLE, PARALLEL], ids=["pinhole", "orthographic"])
+@pytest.mark.parametrize("kind", [PLANE, SPHERE])
+def test_the_last_step_over_runs_is_that_of_the_normal_equations_of_all_pixels(sensor, kind):
+    th, free, slack, rng = competing_surfaces()[kind + 1], np.zeros(9, bool), 1.5, np.random.default_rng(5)
+    packed, (v, u) = sensor.packed(), np.mgrid[:120, :160]
+    x, y, depth = (u - packed[3]) / packed[1], (v - packed[4]) / packed[2], np.empty(u.shape)
+    depths_on(kind, th, x.ravel(), y.ravel(), bool(packed[0] > 0), depth.ravel())
+    labels = (np.isfinite(depth) & (rng.random(depth.shape) < 0.9)).astype(np.int32)
+    depth += 2.0 * NOISE.sigma_m(0.6) * rng.normal(size=depth.shape)
+    inside = labels == 1
+    x, y, z = x[inside], y[inside], depth[inside]
+    p, J, e = int(FREEDOM[kind]), [], []
+    frame, row = np.zeros(6), np.zeros(9)
+    frame_of(kind, th, frame)
+    for k, sigma in enumerate(slack * NOISE.sigma_m(z)):
+        zm, cosine = depth_and_jacobian(kind, th, frame, x[k], y[k], bool(packed[0] > 0), row)
+        weight = min(1.0, cosine / GRAZING_COSINE) / sigma
+        if abs((z[k] - zm) * weight) <= TRIM_SIGMAS:
+            J.append(row[:p] * weight)
+            e.append((z[k] - zm) * weight)
+    regions = regions_of(depth, packed, NOISE.packed(), labels, 1)
+    moved, H, kept, used = last_step(kind, th, depth, packed, NOISE.packed(), slack, regions.runs_of(1), free)
+    J, e = np.array(J), np.array(e)
+    step, left, *_ = np.linalg.lstsq(J, e, rcond=None)
+    expected = np.zeros(SIZE)
+    step_into(kind, th, frame, step, expected)
+    assert used == len(e) > 500
+    np.testing.assert_allclose(H[:p, :p], J.T @ J, rtol=1e-6, atol=1e-6 * np.trace(J.T @ J))
+    np.testing.assert_allclose(moved, expected, atol=1e-7)
+    assert kept == pytest.approx(float(left[0]), rel=1e-6)
 
 
 def test_regions_given_to_others_are_those_of_the_new_labels():
@@ -172,23 +218,26 @@ def test_an_ellipsoids_shape_and_its_covariance_are_those_of_plain_differences()
 def test_a_sphere_is_refined_to_its_bound_and_its_covariance_is_the_inverse_information():
     """20 noisy images of one ball: errors over sigma spread like a unit normal, also with a radius held by a prior."""
     rng = np.random.default_rng(5)
-    u, v = np.meshgrid(np.linspace(-0.1, 0.1, 60), np.linspace(-0.1, 0.1, 60))
-    keep = np.hypot(u, v) < 0.09
-    x, y, sigma = u[keep], v[keep], np.full(keep.sum(), 1e-3)
+    sensor = OrthographicSensor(width_px=60, height_px=60, pixel_pitch_m=0.2 / 59)
+    noise = NoiseModel(white=(1e-3, 0.0), correlated=(0.0, 0.0), step=(0.0, 0.0))
+    x, y = np.meshgrid(np.linspace(-0.1, 0.1, 60), np.linspace(-0.1, 0.1, 60))
+    labels = (np.hypot(x, y) < 0.09).astype(np.int32)
     truth = np.array([0.0, 0.0, 0.6, 0.1])
-    surface = 0.6 - np.sqrt(0.01 - x**2 - y**2)
+    surface = 0.6 - np.sqrt(np.maximum(0.01 - x**2 - y**2, 0.0))
     free, held = np.zeros(9, bool), np.arange(9) == 3
     scores = []
     for _ in range(20):
         start = np.zeros(SIZE)
         start[:5] = [0.002, -0.001, 0.601, 0.1, 1.0]
-        z = surface + sigma * rng.normal(size=x.size)
-        th, H, covariance, middles, kept, used = finish.refined(SPHERE, start, np.stack([x, y, z, sigma]), False, free)
+        z = surface + 1e-3 * rng.normal(size=x.shape)
+        own = regions_of(z, sensor.packed(), noise.packed(), labels, 1)
+        image = (z, own.packed, own.law, 1.0, own.runs_of(1), own.pixels[0])
+        th, H, covariance, middles, kept, used = finish.refined(SPHERE, start, *image, free)
         np.testing.assert_allclose(covariance @ H[:4, :4], np.eye(4), atol=1e-8)
         assert kept / used == pytest.approx(0.97, abs=0.1)
         np.testing.assert_allclose(middles[:2], 0.0, atol=0.02)
         scores.append((th[:4] - truth) / np.sqrt(np.diag(covariance)))
-        th, _, covariance, *_ = finish.refined(SPHERE, start, np.stack([x, y, z, sigma]), False, held)
+        th, _, covariance, *_ = finish.refined(SPHERE, start, *image, held)
         assert th[3] == 0.1 and not covariance[3].any() and covariance[0, 0] > 0
     assert 0.6 < np.std(scores) < 1.5
 

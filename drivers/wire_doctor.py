@@ -14,10 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import serial.tools.list_ports
-
 from drivers.transport.device import WireDevice
-from drivers.transport.serial_link import STABLE_NAMES, SYSFS, latency_timer_ms, port_owner
+from drivers.transport.serial_link import SYSFS, latency_timer_ms, port_owner, serial_ports
 from hal.clock import Deadline, WallClock
 from hal.config import Cell
 from hal.errors import CellError, ConfigError, DeviceUnavailable
@@ -55,8 +53,7 @@ class Finding:
 
 def examine(cell: Cell) -> Iterator[Finding]:
     """Every serial port of this machine, then every device of the cell that has a wire of its own."""
-    paths = sorted(str(path) for path in STABLE_NAMES.glob("*")) if STABLE_NAMES.is_dir() else []
-    for path in paths or sorted(port.device for port in serial.tools.list_ports.comports()):
+    for path in serial_ports():
         yield examine_port(path)
     for name, section in cell.file.devices.items():
         wire = serial_path(section.options)

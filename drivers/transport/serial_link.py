@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import serial
+import serial.tools.list_ports
 
 from drivers.transport.fd_link import FdLink
 from drivers.transport.link import LinkLost
@@ -138,9 +139,17 @@ def _diagnose(path: str, error: Exception) -> tuple[str, str]:
 
 
 def _ports_now() -> str:
-    stable = sorted(str(p) for p in STABLE_NAMES.glob("*")) if STABLE_NAMES.is_dir() else []
-    ports = stable or sorted(str(p) for pattern in USUAL_PORTS for p in Path("/dev").glob(pattern))
+    ports = _stable_names() or sorted(str(p) for pattern in USUAL_PORTS for p in Path("/dev").glob(pattern))
     return ", ".join(ports) or "none"
+
+
+def serial_ports() -> list[str]:
+    """Every serial port of this machine: by its stable name, or as pyserial finds it where there are none."""
+    return _stable_names() or sorted(port.device for port in serial.tools.list_ports.comports())
+
+
+def _stable_names() -> list[str]:
+    return sorted(str(path) for path in STABLE_NAMES.glob("*")) if STABLE_NAMES.is_dir() else []
 
 
 def port_owner(path: str) -> str | None:

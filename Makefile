@@ -23,7 +23,7 @@ setup: .venv/ready  ## Make .venv with everything in it
 	    echo "  try    install python3.11 and python3.11-venv, or give its path: make PYTHON=/path/to/python3.11"; exit 2; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { echo "error: $(PYTHON) is $$($(PYTHON) --version 2>&1), not 3.11."; \
 	    echo "  try    make PYTHON=/path/to/python3.11"; exit 2; }
-	@echo "setup: making .venv (about 130 packages, 2 GB, a minute or two)"
+	@echo "setup: making .venv (about 120 packages, 2 GB, some minutes, mostly compiling)"
 	@$(PYTHON) -m venv .venv
 	@$(BIN)/python -m pip install --no-compile --progress-bar off -c constraints.txt -e . 2>&1 | $(PIP_IN_SHORT)
 	@$(BIN)/python -c 'import hal, numpy, cv2, pybullet' || { echo "error: the installation is not complete; the lines above say why"; exit 2; }

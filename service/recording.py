@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,9 @@ class About:
     options: dict[str, Any]
 
 
-def record(cell: Cell, name: str, path: Path, *, duration_s: float, timeout_s: float) -> Iterator[dict[str, Any]]:
+def record(
+    cell: Cell, name: str, path: Path, *, duration_s: float, timeout_s: float
+) -> Generator[dict[str, Any], None, None]:
     """Write all traffic of the device `name` into `path` for some time; yields its samples and errors meanwhile.
 
     Args:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from drivers.transport.link import Link, LinkLost, now_s
+from drivers.transport.link import Link, RecordingEnded, now_s
 from hal.errors import ConfigError, DeviceUnavailable
 
 EARLY_S = 0.01  # a replay is never quite in step; what is due so soon was there when the recorded driver looked
@@ -188,7 +188,7 @@ class ReplayLink:
                     self._events.pop()
                     if event.is_read:
                         return event.data
-            raise LinkLost(f"{self._name} is at its end")
+            raise RecordingEnded(f"{self._name} is at its end")
 
     def write(self, data: bytes, until_s: float) -> None:  # noqa: ARG002  # a file takes anything at once
         """Let go what was read after the same bytes had been written."""

@@ -7,7 +7,7 @@ import threading
 from abc import abstractmethod
 from typing import Any, ClassVar, Generic, TypeVar
 
-from drivers.transport.link import LinkLost, Refused, now_s
+from drivers.transport.link import LinkLost, RecordingEnded, Refused, now_s
 from drivers.transport.mailbox import Mailbox
 from drivers.transport.port import Port
 from hal.clock import Deadline, PacedClock
@@ -162,9 +162,10 @@ class WireDevice(Generic[T]):
                 f"{self.name}: {error}", hint="look the code up in the device's manual", code=error.code, **where
             )
         if isinstance(error, LinkLost):
-            return DeviceUnavailable(
-                f"{self.name} is disconnected: {error}", hint="plug it in; it reconnects by itself", **where
-            )
+            hint = "plug it in; it reconnects by itself"
+            if isinstance(error, RecordingEnded):
+                hint = "this was all that was recorded"
+            return DeviceUnavailable(f"{self.name} is disconnected: {error}", hint=hint, **where)
         return DeviceTimeout(f"{self.name}: {error}", hint=self._silence_hint(), counts=self.wire_counts(), **where)
 
     def heard_bytes(self) -> int | None:
@@ -222,8 +223,9 @@ class WireDevice(Generic[T]):
             return
         why, counts, error, hint = self._last_error, self.wire_counts(), self.mailbox.error(), self._silence_hint()
         self.close()
+        why = (error.what if error else why).removeprefix(f"{self.name}: ").removeprefix("no valid data ")
         raise DeviceUnavailable(
-            f"{self.name} gives no valid data: {error.what if error else why} ({counts})",
+            f"{self.name} gives no valid data: {why}" + ("" if " samples, " in why else f" ({counts})"),
             hint=error.hint if error else hint,
             device=self.name,
             link=self.link_name(),

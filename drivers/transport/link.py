@@ -20,6 +20,10 @@ class LinkLost(WireError):
     """The port has gone: end of file, I/O error, its name vanished or names another device."""
 
 
+class RecordingEnded(LinkLost):
+    """A recording that is read in the place of a wire holds no more."""
+
+
 class NoAnswer(WireError):
     """Nothing valid came in time."""
 

@@ -153,7 +153,7 @@ def _check_scale(depth: Array, sensor: RangeSensorModel) -> None:
     if abs(middle) > 200.0:
         raise InvalidRequest(
             f"median depth is {middle:.0f} m: the image is probably in millimetres",
-            hint="divide by 1000, or decode codes with their scale",
+            hint="divide by 1000, or say the scale of a unit (--scale 0.001)",
             median_depth_m=middle,
         )
     if sensor.packed()[0] > 0 and middle < 1e-3:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +18,7 @@ from rich.table import Column, Table
 from hal.errors import CellError, ConfigError, InvalidRequest
 from service.client import Client
 from service.commands.common import Url, UrlDefault, client_of, console, find_cell
+from service.commands.leaving import one_interrupt
 
 if TYPE_CHECKING:
     from service.watching import Row
@@ -118,8 +119,12 @@ def record_device(
     from service.recording import record
 
     tally = Tally(jsonl=jsonl)
-    for item in record(load_cell(find_cell(cell)), name, out, duration_s=seconds, timeout_s=timeout_s):
-        tally.take(item)
+    err_console.print(f"recording {name} for {seconds:g} s; Ctrl-C ends it earlier")
+    items = record(load_cell(find_cell(cell)), name, out, duration_s=seconds, timeout_s=timeout_s)
+    with one_interrupt(), suppress(KeyboardInterrupt):
+        for item in items:
+            tally.take(item)
+    items.close()  # the device lets go, and the file is whole
     err_console.print(f"{tally}; wrote {out} ({out.stat().st_size / 1024:.0f} KiB)")
     err_console.print(f"see it again: panelwright devices replay {out}")
 
@@ -135,6 +140,7 @@ def replay_device(
     from service.recording import replay
 
     tally = Tally(jsonl=jsonl)
+    err_console.print(f"replaying {recording} at the pace of the recording")
     for item in replay(recording, timeout_s=timeout_s):
         tally.take(item)
     err_console.print(str(tally))

@@ -112,7 +112,10 @@ def read_image(image: Path) -> NDArray[np.uint8]:
         data = image.read_bytes()
     except OSError as error:
         raise InvalidRequest(f"{image} cannot be read: {error.strerror}", hint="check the path") from None
-    return decode(data)
+    try:
+        return decode(data)
+    except InvalidRequest as error:
+        raise InvalidRequest(f"{image}: {error.what}", hint=error.hint) from None
 
 
 def _pair(text: str, option: str) -> tuple[float, float]:

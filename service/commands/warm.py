@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, wait
 from multiprocessing import get_context
 
 from service.commands.common import DEFAULT_CELL, CellOption, console, read_cell
 
 PROCESSES = 2
+REMINDER_S = 20.0
 
 
 def warm(cell: CellOption = DEFAULT_CELL) -> None:
@@ -35,5 +36,11 @@ def warm(cell: CellOption = DEFAULT_CELL) -> None:
         finally:
             supervisor.close()
         report("control and simulation")
+        waiting = set(stages)
+        while waiting:
+            _, waiting = wait(waiting, timeout=REMINDER_S)
+            names = [name for name, stage in zip(STAGES, stages, strict=True) if stage in waiting]
+            if names:
+                console.print(f"warm: at work on {', '.join(names)} ({time.monotonic() - started_s:.0f} s)")
         for stage in stages:
             stage.result()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 import pytest
 
@@ -12,7 +13,22 @@ from drivers.transport.link import now_s
 from drivers.transport.mailbox import Mailbox
 from hal.errors import CellError, DeviceFault, DeviceTimeout
 from hal.readings import Stamped
-from tests.drivers.rigs import later
+from tests.drivers.rigs import later, until
+
+
+@contextmanager
+def reading(box: Mailbox[int]) -> Iterator[list[int | None]]:
+    """A reader in a thread of its own; its value is there at the end, at the latest after 30 s."""
+    got: list[int | None] = []
+
+    def read() -> None:
+        sample = box.wait(oldest_host_s=0.0, until_s=later(60.0))
+        got.append(None if sample is None else sample.value)
+
+    thread = threading.Thread(target=read, daemon=True)
+    thread.start()
+    yield got
+    thread.join(30.0)
 
 
 def test_the_mailbox_gives_the_newest_and_counts_what_a_slow_reader_lost() -> None:
@@ -41,22 +57,17 @@ def test_silence_is_the_answer_only_when_the_readers_time_is_over() -> None:
     box.fail(DeviceTimeout("silent for 0.3 s", hint="check power"))
     with pytest.raises(DeviceTimeout, match="silent"):
         box.wait(oldest_host_s=0.0, until_s=now_s())
-    got: list[Stamped[int] | None] = []
-    reader = threading.Thread(target=lambda: got.append(box.wait(oldest_host_s=0.0, until_s=later(5.0))))
-    reader.start()
-    box.publish(Stamped(value=3, host_time_s=1.0, sequence=1))
-    reader.join(5.0)
-    assert got[0] is not None and got[0].value == 3
+    with reading(box) as got:
+        box.publish(Stamped(value=3, host_time_s=1.0, sequence=1))
+    assert got == [3]
 
 
 def test_a_waiting_reader_wakes_with_the_sample() -> None:
     box: Mailbox[int] = Mailbox()
-    got: list[Stamped[int] | None] = []
-    reader = threading.Thread(target=lambda: got.append(box.wait(oldest_host_s=0.0, until_s=later(5.0))))
-    reader.start()
-    box.publish(Stamped(value=7, host_time_s=1.0, sequence=1))
-    reader.join(5.0)
-    assert got[0] is not None and got[0].value == 7
+    with reading(box) as got:
+        until(lambda: len(box._bells) > 0)
+        box.publish(Stamped(value=7, host_time_s=1.0, sequence=1))
+    assert got == [7]
 
 
 @pytest.fixture
@@ -117,11 +128,9 @@ def test_news_that_comes_between_a_readers_look_and_its_wait_is_not_missed() -> 
                 self.publish(Stamped(value=5, host_time_s=1.0, sequence=1))
             return seen
 
-    box, got = NewsComesLate(), list[Stamped[int] | None]()
-    reader = threading.Thread(target=lambda: got.append(box.wait(oldest_host_s=0.0, until_s=later(60.0))), daemon=True)
-    reader.start()
-    reader.join(30.0)
-    assert [sample.value for sample in got if sample] == [5]
+    with reading(NewsComesLate()) as got:
+        pass
+    assert got == [5]
 
 
 def test_a_failure_wakes_all_readers() -> None:

@@ -78,6 +78,42 @@ def test_a_take_over_tells_what_was_lost() -> None:
         lease.check(old.token)
 
 
+def test_what_has_lapsed_is_not_taken_over_but_lost_before() -> None:
+    lease, clock, losses = desk()
+    lease.acquire("alice")
+    clock.sleep(TTL_S)
+    lease.take_over("bob")
+    assert losses == ["the lease of alice lapsed: no heartbeat for 2 s"]
+
+
+def test_holder_epoch_and_what_is_left_are_told() -> None:
+    lease, clock, _ = desk()
+    assert lease.holder() == (None, 0, 0.0)
+    lease.acquire("alice")
+    clock.sleep(0.5)
+    assert lease.holder() == ("alice", 1, pytest.approx(TTL_S - 0.5))
+    assert lease.heartbeat(lease.take_over("bob").token).epoch == lease.holder()[1] == 2
+
+
+def test_every_grant_and_its_end_are_reported_with_the_epoch() -> None:
+    told: list[tuple[str, dict[str, Any]]] = []
+    clock = SimClock()
+    lease = LeaseDesk(ttl_s=TTL_S, clock=clock, report=lambda kind, data: told.append((kind, data)))
+    lease.acquire("alice")
+    lease.release(lease.take_over("bob").token)
+    lease.acquire("carol")
+    clock.sleep(TTL_S)
+    lease.acquire("dave")
+    assert told == [
+        ("lease-acquired", {"holder": "alice", "before": None, "epoch": 1}),
+        ("lease-taken-over", {"holder": "bob", "before": "alice", "epoch": 2}),
+        ("lease-released", {"holder": "bob", "epoch": 2}),
+        ("lease-acquired", {"holder": "carol", "before": None, "epoch": 3}),
+        ("lease-lapsed", {"holder": "carol", "epoch": 3}),
+        ("lease-acquired", {"holder": "dave", "before": None, "epoch": 4}),
+    ]
+
+
 def test_a_release_is_no_loss() -> None:
     lease, _, losses = desk()
     lease.release(lease.acquire("alice").token)

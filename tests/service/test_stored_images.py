@@ -173,8 +173,7 @@ def _bare(image: np.ndarray, view: CameraView) -> np.ndarray:
     return out
 
 
-@pytest.mark.parametrize("mode", [{"mode": "blind", "plate_m": PLATE}, {"mode": "blind"}])
-@pytest.mark.parametrize(
+SHOWING_NO_PANEL = pytest.mark.parametrize(
     ("change", "kind", "words"),
     [
         (np.zeros_like, "not-observable", "black"),
@@ -184,6 +183,10 @@ def _bare(image: np.ndarray, view: CameraView) -> np.ndarray:
     ],
     ids=["black", "saturated", "nothing", "two"],
 )
+
+
+@pytest.mark.parametrize("mode", [{"mode": "blind", "plate_m": PLATE}, {"mode": "blind"}])
+@SHOWING_NO_PANEL
 def test_blind_recognition_refuses_what_shows_no_panel_or_two(
     web: httpx2.Client, shown: Shown, mode: dict[str, Any], change: Callable[[np.ndarray], np.ndarray], kind: str,
     words: str,

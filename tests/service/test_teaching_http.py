@@ -14,7 +14,17 @@ from hal.strict import parse_toml
 from perception.vision.knowledge import KindRecord
 from service.serve import Panelwright
 from tests.perception.vision.bench_panel import panel
-from tests.service.test_stored_images import PLATE, Shown, corners, house, is_problem, shown, store, web
+from tests.service.test_stored_images import (
+    PLATE,
+    SHOWING_NO_PANEL,
+    Shown,
+    corners,
+    house,
+    is_problem,
+    shown,
+    store,
+    web,
+)
 
 __all__ = ["house", "shown", "web"]  # fixtures
 
@@ -119,16 +129,7 @@ def test_one_kind_and_one_panel_are_shown(web: httpx2.Client, house: Panelwright
 
 
 @pytest.mark.parametrize("lesson", ["outline", "kind", "panel"])
-@pytest.mark.parametrize(
-    ("change", "kind", "words"),
-    [
-        (np.zeros_like, "not-observable", "black"),
-        (lambda image: np.full_like(image, 255), "not-observable", "saturated"),
-        (lambda image: np.full_like(image, 90), "not-found", "no plate"),
-        (lambda image: np.hstack([image, image]), "ambiguous", "two panels"),
-    ],
-    ids=["black", "saturated", "nothing", "two"],
-)
+@SHOWING_NO_PANEL
 def test_images_that_teach_nothing_are_refused_with_the_reason(
     web: httpx2.Client, shown: Shown, lesson: str, change: Callable[[np.ndarray], np.ndarray], kind: str, words: str
 ) -> None:

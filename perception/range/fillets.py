@@ -16,6 +16,7 @@ from perception.range.borders import borders_of, step_and_turn
 from perception.range.grid import sigma_at
 from perception.range.regions import regions_of
 from perception.range.runs import pixels_of
+from perception.range.seams import is_seam_grooved
 from perception.range.surfaces import LEAN, PLANE, depth_on, normal_on
 
 Array = NDArray[np.float64]
@@ -31,6 +32,7 @@ NEAR_SHARE = 0.5  # of the strip's width, that it may lie off its faces
 LEAST_SHARE = 0.4  # of the pixels of a strip between faces that do so: nets of edges take thin faces along
 WHOLE_SHARE = 0.7  # of those of a strip beside one face
 LEAST_BORDER_PX = 6
+ALONG_SHARE = 0.15  # of a strip's rim: one that has less of it at a face touches that by its end only
 REACH = 0.025  # of the image's shorter side, over which unlabelled pixels beside a face may curve away from it
 LEAST_ROWS = 192  # in smaller images what is beside a face is mixed pixels of an outline, which models are matched by
 SLOPE = 0.5  # at which they may do so
@@ -42,7 +44,7 @@ def without_fillets(
 ) -> Labels:
     """(H, W) `labels`, changed in place: rounded edges go to their faces; labels index `kinds` and `table` from 1."""
     half_width, length = _shapes(labels, kinds.shape[0])
-    beside = _strips(packed, law, labels, kinds, table, half_width, length)
+    beside = _strips(depth_m, packed, law, labels, kinds, table, half_width, length)
     if beside:
         regions = regions_of(depth_m, packed, law, labels, kinds.shape[0] - 1)
         for strip, faces in beside.items():
@@ -56,7 +58,14 @@ def without_fillets(
 
 
 def _strips(
-    packed: Array, law: Array, labels: Labels, kinds: NDArray[np.int64], table: Array, half_width: Array, length: Array
+    depth_m: Array,
+    packed: Array,
+    law: Array,
+    labels: Labels,
+    kinds: NDArray[np.int64],
+    table: Array,
+    half_width: Array,
+    length: Array,
 ) -> dict[int, list[int]]:
     """The faces beside each strip that continues them: two or more, or one that it leaves gently towards an outline."""
     if not np.any((length >= LONG) & (half_width <= NARROWER * half_width.max())):
@@ -67,11 +76,16 @@ def _strips(
     for (a, b), border in borders_of(labels, packed).items():
         strip, face = (a, b) if half_width[a] < half_width[b] else (b, a)
         is_strip = length[strip] >= LONG and half_width[strip] <= NARROWER * half_width[face]
-        if border.length_px < LEAST_BORDER_PX or not is_strip:
+        least_px = max(LEAST_BORDER_PX, ALONG_SHARE * length[strip] * half_width[strip])
+        if border.length_px < least_px or not is_strip:
             continue
         surfaces = (int(kinds[a]), table[a], int(kinds[b]), table[b])
         step, turn = step_and_turn(*surfaces, border.x, border.y, law, perspective)
-        if step <= STEP_SIGMAS and turn <= (FLAT_TURN_RAD if kinds[strip] == PLANE else TURN_RAD):
+        is_continued = step <= STEP_SIGMAS and turn <= (FLAT_TURN_RAD if kinds[strip] == PLANE else TURN_RAD)
+        both = np.isin(np.arange(kinds.size), (strip, face))
+        is_flat = kinds[strip] == PLANE == kinds[face]
+        image = (depth_m, packed, law, labels)
+        if is_continued and not (is_flat and is_seam_grooved(*image, both, table[face], border.x, border.y)):
             beside.setdefault(strip, []).append(face)
             gentle |= {strip} if turn <= GENTLE_RAD else set()
     return {strip: faces for strip, faces in beside.items() if len(faces) > 1 or strip in gentle}

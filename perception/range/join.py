@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from perception.range import bend, fit
 from perception.range.grid import slow_share_at
 from perception.range.regions import Regions
+from perception.range.seams import crosses_groove, is_grooved_at
 from perception.range.surfaces import PLANE, depth_on
 
 Array = NDArray[np.float64]
@@ -26,6 +27,7 @@ SCRAP_SIGMAS = 6.0
 LARGEST_TURN_RAD = 0.2
 SIGHT_LINES = 5
 GAP_SIGMAS = 6.0
+TOUCHING_PX = 8
 GROOVE_PX = 2  # a single pixel may be a gross error
 BEHIND_SHARE = 0.15  # more of the sight line than this seen behind the surface: a gap, not an occluder
 APART, SCRAP, JOINED = 0, 1, 2
@@ -72,7 +74,7 @@ def _joined(kinds, ths, samples, starts, pixels, order, depth, sen, noise, label
             if verdict == JOINED:
                 own = np.zeros(owner.shape[0] + 1, np.bool_)
                 own[1:] = (owner == big + 1) | (owner == small + 1)
-                if gap_between(depth, sen, labels, own, kinds[big], joint, thin[big], thin[small]):
+                if gap_between(depth, sen, noise, labels, own, kinds[big], joint, thin[big], thin[small]):
                     continue
                 ths[big] = joint
                 thin[big] = np.concatenate((thin[big], thin[small]), 1)
@@ -162,7 +164,7 @@ def _passes_near(kind, th, samples, perspective):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def gap_between(depth, sen, labels, own, kind, th, a, b):  # type: ignore[no-untyped-def]  # numba types it
+def gap_between(depth, sen, noise, labels, own, kind, th, a, b):  # type: ignore[no-untyped-def]  # numba types it
     """Whether the sensor sees past the surface on most of the shortest lines between two pieces of samples (4, N).
 
     `own` says which `labels` (H, W) belong to the pieces: what lies between them shows a groove, however narrow.
@@ -180,12 +182,12 @@ def gap_between(depth, sen, labels, own, kind, th, a, b):  # type: ignore[no-unt
     gaps = 0
     for m in lines:
         n = nearest[m]
-        gaps += _is_gap(depth, sen, labels, own, kind, th, a[0, m], a[1, m], b[0, n], b[1, n], slack)
+        gaps += _is_gap(depth, sen, noise, labels, own, kind, th, a[0, m], a[1, m], b[0, n], b[1, n], slack)
     return 2 * gaps > lines.shape[0]
 
 
 @njit(cache=True, error_model="numpy")
-def _is_gap(depth, sen, labels, own, kind, th, ax, ay, bx, by, slack):  # type: ignore[no-untyped-def]  # numba types it
+def _is_gap(depth, sen, noise, labels, own, kind, th, ax, ay, bx, by, slack):  # type: ignore[no-untyped-def]  # numba types it
     """Whether much of the line from ray a to ray b lies behind the surface, or `GROOVE_PX` in a row of neither piece."""
     H, W = depth.shape
     perspective = sen[0] > 0
@@ -202,4 +204,13 @@ def _is_gap(depth, sen, labels, own, kind, th, ax, ay, bx, by, slack):  # type: 
         run = run + 1 if past > slack and not own[labels[v, u]] else 0
         if run == GROOVE_PX:
             return True
-    return behind > BEHIND_SHARE * (count - 1)
+    if behind > BEHIND_SHARE * (count - 1):
+        return True
+    if kind != PLANE:
+        return False
+    u, v = ax * sen[1] + sen[3], ay * sen[2] + sen[4]
+    if crosses_groove(depth, sen, noise, labels, own, th, u, v, du / count, dv / count, count):
+        return True
+    # Where pieces touch, the line between them may lie along what parts them.
+    is_touching = count <= TOUCHING_PX
+    return is_touching and is_grooved_at(depth, sen, noise, labels, own, th, u + 0.5 * du, v + 0.5 * dv)

@@ -16,12 +16,15 @@ from numpy.typing import NDArray
 from perception.range.borders import Border, borders_of
 from perception.range.pairs import PIXELS, described, judged, united
 from perception.range.regions import Regions
+from perception.range.seams import is_seam_grooved
+from perception.range.surfaces import PLANE
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 PART_SAMPLES = 80
 LEAST_BORDER_PX = 6
+TIP_SHARE = 0.35  # of the side of a square of the smaller region: two that touch by less may have anything between them
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,13 +64,12 @@ class Agglomeration:
         pixels: list[int],
         *,
         borders: dict[tuple[int, int], Border],
-        law: Array,
-        pitch: float,
-        perspective: bool,
+        image: tuple[Array, Array, Array, Ints],
     ) -> None:
-        self.law = law
-        self.pitch = pitch
-        self.perspective = perspective
+        self.image = image
+        _, packed, self.law, _ = image
+        self.pitch = pitch = 1.0 / float(packed[1])
+        self.perspective = perspective = bool(packed[0] > 0)
         self.parts: dict[int, Part] = {}
         for k, few in enumerate(samples, 1):
             if few.size:
@@ -97,9 +99,19 @@ class Agglomeration:
         border = self.borders[pair]
         if a is None or b is None or border.length_px < LEAST_BORDER_PX:
             return None
+        if border.length_px < TIP_SHARE * np.sqrt(min(a.pixels, b.pixels)):
+            return None
         first, second = ((p.kind, p.parameters, p.samples, p.normals, p.figures) for p in (a, b))
         gain, kind, th = judged(*first, *second, border.x, border.y, border.length_px, self.law, self.perspective)
-        return Merger(pair=pair, kind=kind, parameters=th, gain=gain) if gain > 0.0 else None
+        if not gain > 0.0:
+            return None
+        if kind == PLANE and is_seam_grooved(*self.image, self._members(pair), th, border.x, border.y):
+            return None
+        return Merger(pair=pair, kind=kind, parameters=th, gain=gain)
+
+    def _members(self, pair: tuple[int, int]) -> NDArray[np.bool_]:
+        """Of each label, and of none (0), whether it belongs to a part of the pair."""
+        return np.array([False, *(owner in pair for owner in self.owner.values())])
 
     def _join(self, merger: Merger) -> tuple[int, set[tuple[int, int]]]:
         """Replace the two parts by one; returns the label that is lost and the pairs that are to be judged again.
@@ -144,9 +156,7 @@ def merge_touching(regions: Regions, kinds: list[int], parameters: list[Array]) 
         regions.few(PART_SAMPLES),
         regions.pixels,
         borders=borders_of(regions.labels, regions.packed),
-        law=regions.law,
-        pitch=1.0 / float(regions.packed[1]),
-        perspective=bool(regions.packed[0] > 0),
+        image=(regions.depth_m, regions.packed, regions.law, regions.labels),
     )
     graph.run()
     for label, part in graph.parts.items():

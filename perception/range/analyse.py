@@ -95,8 +95,7 @@ def analyse(
         InvalidRequest: wrong shape or type, a sensor of another size, or depth that cannot be metres.
         NotFound: fewer than 16 valid pixels.
     """
-    depth = checked_depth(depth_m, sensor)
-    depths = typical_depths_m(depth)
+    depth, depths = checked_depth(depth_m, sensor)
     law = noise or estimate_noise(depth, sensor, depths_m=depths)
     task = Task(depth_m=depth, sensor=sensor, depths_m=depths, tiles=tiles, pool=pool)
     labels, found, law, grid = segment(task, law)
@@ -110,8 +109,11 @@ def analyse(
     )
 
 
-def checked_depth(depth_m: ArrayLike, sensor: RangeSensorModel) -> Array:
-    """The depth image as (H, W) float64 with NaN for every kind of missing reading; see `analyse` for errors."""
+def checked_depth(depth_m: ArrayLike, sensor: RangeSensorModel) -> tuple[Array, Array]:
+    """The depth image as (H, W) float64 with NaN for every kind of missing reading, and its `typical_depths_m`.
+
+    See `analyse` for errors.
+    """
     raw = np.asarray(depth_m)
     if raw.ndim != 2 or raw.dtype.kind not in "fiu":
         raise InvalidRequest(
@@ -131,8 +133,9 @@ def checked_depth(depth_m: ArrayLike, sensor: RangeSensorModel) -> Array:
         raise NotFound(
             f"only {valid} of {depth.size} pixels hold a depth", hint="check range, exposure and the invalid value"
         )
-    _check_scale(depth, sensor)
-    return depth
+    depths = typical_depths_m(depth)
+    _check_scale(float(depths[2]), sensor)
+    return depth, depths
 
 
 @njit(cache=True)
@@ -148,8 +151,7 @@ def _drop_missing(depth, least):  # type: ignore[no-untyped-def]  # numba types 
     return valid
 
 
-def _check_scale(depth: Array, sensor: RangeSensorModel) -> None:
-    middle = float(typical_depths_m(depth)[2])
+def _check_scale(middle: float, sensor: RangeSensorModel) -> None:
     if abs(middle) > 200.0:
         raise InvalidRequest(
             f"median depth is {middle:.0f} m: the image is probably in millimetres",

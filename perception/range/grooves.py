@@ -203,8 +203,8 @@ def _parts(grid: Grid, mine: Flags, rough: NDArray[np.uint8], th: Array) -> Labe
     return out
 
 
-def _seams(basins: Labels, mine: Flags, rough: Flags, behind: Array) -> dict[tuple[int, int], tuple[float, float]]:
-    """Of each pair of basins that meet: the rough share of their seam, and how far it lies behind in the median."""
+def _seams(basins: Labels, mine: Flags, rough: Flags, behind: Array) -> dict[tuple[int, int], bool]:
+    """Of each pair of basins that meet: whether their seam is a groove, rough and behind the plane in the median."""
     near = cv2.dilate(rough.view(np.uint8), AROUND) > 0
     own = np.where(mine, basins, 0)
     count = int(own.max()) + 1
@@ -212,23 +212,23 @@ def _seams(basins: Labels, mine: Flags, rough: Flags, behind: Array) -> dict[tup
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         met = (own[a] != own[b]) & (own[a] > 0) & (own[b] > 0)
         p, q = own[a][met], own[b][met]
-        parts.append((np.minimum(p, q) * count + np.maximum(p, q), near[a][met] & near[b][met],
-                      0.5 * (behind[a][met] + behind[b][met])))  # fmt: skip
+        pair = np.minimum(p, q) * count + np.maximum(p, q)
+        parts.append((pair, near[a][met] & near[b][met], 0.5 * (behind[a][met] + behind[b][met])))
     pairs, is_rough, depth = (np.concatenate(p) for p in zip(*parts, strict=True))
     out = {}
     for pair in np.unique(pairs).tolist():
         seam = pairs == pair
         known = depth[seam & np.isfinite(depth)]
-        middle = float(np.median(known)) if known.size else np.nan
-        out[divmod(pair, count)] = (float(np.mean(is_rough[seam])), middle)
+        is_groove = np.count_nonzero(is_rough[seam]) >= SEAM_SHARE * np.count_nonzero(seam) and known.size > 0
+        out[divmod(pair, count)] = bool(is_groove and np.median(known) > BEHIND_SIGMAS)
     return out
 
 
-def _joined(seams: dict[tuple[int, int], tuple[float, float]], count: int) -> Labels:
+def _joined(seams: dict[tuple[int, int], bool], count: int) -> Labels:
     """(count + 1,) the basin that each belongs to, after those that meet without a groove were joined."""
     owner = np.arange(count + 1, dtype=np.int32)
-    for (p, q), (share, depth) in seams.items():
-        if share < SEAM_SHARE or not depth > BEHIND_SIGMAS:
+    for (p, q), is_groove in seams.items():
+        if not is_groove:
             owner[owner == owner[q]] = owner[p]
     return owner
 
@@ -249,12 +249,14 @@ def _flood(basins, allowed):  # type: ignore[no-untyped-def]  # numba types it
     h, w = basins.shape
     queue = np.empty(h * w, np.int32)
     count, head = 0, 0
-    for i in range(h * w):
-        if basins[i // w, i % w]:
-            queue[count] = i
-            count += 1
+    for r in range(h):
+        for c in range(w):
+            if basins[r, c]:
+                queue[count] = r * w + c
+                count += 1
     while head < count:
-        r, c = queue[head] // w, queue[head] % w
+        r = queue[head] // w
+        c = queue[head] - r * w
         head += 1
         for s in range(4):
             i, j = r + (s == 0) - (s == 1), c + (s == 2) - (s == 3)

@@ -149,7 +149,7 @@ def _window_law(g: Array, perspective: bool, *, spacing_px: int, stride_px: int)
     if min(g.shape) <= (WINDOW - 1) * spacing_px:
         return 0.0, 0.0
     freedom = WINDOW * WINDOW - BASIS.shape[0]
-    z, rms = window_rms(g, BASIS, spacing_px, stride_px, perspective)
+    z, _, rms = window_rms(g, BASIS, BASIS.shape[0], spacing_px, stride_px, perspective)
     if z.size == 0:
         return 0.0, 0.0
     rms *= WINDOW / np.sqrt(freedom)
@@ -218,15 +218,19 @@ BASIS = quadratics(WINDOW)
 
 
 @njit(cache=True)
-def window_rms(g, basis, spacing, stride, perspective):  # type: ignore[no-untyped-def]  # numba types it
-    """Depth at the middle of each complete window, and the rms in metres that a quadratic leaves over in it."""
+def window_rms(g, basis, first, spacing, stride, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """Depth at the middle of each complete window, and the rms in metres that the first polynomials leave, and that all do.
+
+    `basis` as `quadratics`, `first` of them; equal where `first` is all.
+    """
     H, W = g.shape
     side = int(np.sqrt(basis.shape[1]) + 0.5)
     extent = (side - 1) * spacing + 1
     count = ((H - extent) // stride + 1) * ((W - extent) // stride + 1)
-    z_out, rms_out = np.empty(count), np.empty(count)
+    z_out, first_out, rms_out = np.empty(count), np.empty(count), np.empty(count)
     across = max((W - extent) // stride + 1, 0)
     values, total, dot = np.empty((side * side, across)), np.empty(across), np.empty(across)
+    some = np.empty(across)
     n = 0
     for top in range(0, H - extent + 1, stride):
         # All windows of a row at once: loops over them hold no branch.
@@ -239,15 +243,18 @@ def window_rms(g, basis, spacing, stride, perspective):  # type: ignore[no-untyp
             for k in range(side * side):
                 _add_multiple(basis[m, k], values[k], dot)
             _subtract_square(dot, total)
+            if m < first:
+                some[:] = total
         for c in range(across):
             if not np.isfinite(total[c]):
                 continue
-            rms = np.sqrt(max(total[c], 0.0)) / side
             z = 1.0 / middle[c] if perspective else middle[c]
             z_out[n] = z
-            rms_out[n] = rms * z * z if perspective else rms  # dz = z^2 dw
+            flat, rms = np.sqrt(max(some[c], 0.0)) / side, np.sqrt(max(total[c], 0.0)) / side
+            first_out[n] = flat * z * z if perspective else flat  # dz = z^2 dw
+            rms_out[n] = rms * z * z if perspective else rms
             n += 1
-    return z_out[:n], rms_out[:n]
+    return z_out[:n], first_out[:n], rms_out[:n]
 
 
 @njit(cache=True, **LEAN)

@@ -64,9 +64,9 @@ def fit_plane_near(
         InvalidRequest: the image, sensor or expectation is not usable.
         NotFound: no plane of at least 5 % of the image lies near the expectation.
     """
-    depth = checked_depth(depth_m, sensor)
+    depth, depths = checked_depth(depth_m, sensor)
     expected, through = _checked_expectation(point_m, normal, sigma_offset_m, sigma_angle_rad)
-    law = noise or estimate_noise(depth, sensor)
+    law = noise or estimate_noise(depth, sensor, depths_m=depths)
     middle = float(np.nanmedian(depth))
     grid = build_grid(depth, sensor, law, block_size((depth.shape[0], depth.shape[1]), law, sensor, middle))
     points, sigma, normals = _block_points(grid)

@@ -60,7 +60,6 @@ def _bends(g: Array, is_inverse: bool) -> Array:
     """For each complete window the log-likelihood that a quadratic gains over a plane, in the linear quantity g."""
     if min(g.shape) < SIDE:
         return np.zeros(0)
-    z, flat = window_rms(g, BASIS[:3], 1, SIDE // 2, is_inverse)
-    _, bent = window_rms(g, BASIS, 1, SIDE // 2, is_inverse)
+    z, flat, bent = window_rms(g, BASIS, 3, 1, SIDE // 2, is_inverse)
     floor = (PRECISION * z) ** 2
     return np.asarray(0.5 * SIDE * SIDE * np.log((flat**2 + floor) / (bent**2 + floor)))

@@ -89,6 +89,24 @@ def test_repeated_bytes_at_the_same_moment_are_one_frame_and_line_time_counts() 
     assert [frame for frame, _ in times.stamped([b"a"], arrived_s=5.01, byte_s=1e-4)] == [b"a"]
 
 
+def test_what_was_learned_of_a_talker_is_forgotten_when_its_wire_is_opened_anew() -> None:
+    times, jitter_s = FrameTimes(period_s=0.01, frame_bytes=9), np.random.default_rng(5).uniform(0.0, 0.008, 300)
+    for number, late_s in enumerate(jitter_s):
+        times.stamped([b"%d" % number], arrived_s=0.01 * number + late_s, byte_s=0.0)
+    times.reset()
+    arrived_s = [100.0 + 0.01 * i + (0.004 if i == 5 else 0.0) for i in range(10)]
+    stamps_s = [times.stamped([b"%d" % i], arrived_s=now_s, byte_s=0.0)[0][1] for i, now_s in enumerate(arrived_s)]
+    assert stamps_s == pytest.approx([100.0 + 0.01 * i for i in range(10)]), "steady from now on, and one came late"
+
+
+@pytest.mark.parametrize(("told_s", "true_s"), [(0.01, 0.002), (0.002, 0.01)])
+def test_a_period_that_was_told_wrong_makes_no_stamp_older_than_one_such_period(told_s: float, true_s: float) -> None:
+    times = FrameTimes(period_s=told_s, frame_bytes=9)
+    for i in range(2000):
+        [(_, stamp_s)] = times.stamped([b"%d" % i], arrived_s=true_s * i, byte_s=0.0)
+        assert true_s * i - 1.25 * told_s <= stamp_s <= true_s * i + 1e-9
+
+
 def opened_anew(device_first_s: float, arrived_first_s: float) -> float:
     """Stamp of the first frame after a loss; before it the device's clock was 100 s behind the host's."""
     host = HostTime()

@@ -99,6 +99,7 @@ def reading_json(session: Session, reading: ObjectReading) -> dict[str, Any]:
 def run_inspect(session: Session, request: InspectRequest) -> dict[str, Any]:
     """The verb `inspect`."""
     if request.image is not None:
+        session.progress(0.1, "look at the stored image")
         return read_stored(session, request)
     names = panel_object_or_all(session.panel, request.objects)
     ensure_located(session.part(0.0, 0.3))
@@ -111,6 +112,7 @@ def run_recognise_taught(session: Session, request: RecogniseRequest) -> dict[st
     names = panel_object_or_all(session.panel, request.objects)
     if request.move:
         ensure_located(session.part(0.0, 0.5))
+        session.progress(0.5, "drive to the overview")
         go_to_overview(session)
         settle(session)
     session.progress(0.8, "recognise")

@@ -75,6 +75,7 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
 def run_manipulate(session: Session, request: ManipulateRequest) -> dict[str, Any]:
     """The verb `manipulate`."""
     ensure_located(session.part(0.0, 0.3))
+    session.progress(0.3, f"work {request.object}")
     deed = work(session.part(0.3, 1.0), request, verify=request.verify)
     pictures = []
     if deed.picture is not None:

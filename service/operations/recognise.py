@@ -22,6 +22,7 @@ from service.report.surfaces import surfaces_picture
 def run_recognise(session: Session, request: RecogniseRequest) -> dict[str, Any]:
     """Objects of the panel file or of any panel in the image, and surfaces in the range image, as asked."""
     if request.image is not None:
+        session.progress(0.1, "look at the stored image")
         return blind_in_stored(session, request) if request.mode == "blind" else read_stored(session, request)
     answer: dict[str, Any] = {}
     if "vision" in request.use:
@@ -34,8 +35,10 @@ def run_recognise(session: Session, request: RecogniseRequest) -> dict[str, Any]
 def _blind(session: Session, request: RecogniseRequest) -> dict[str, Any]:
     """Which kinds of object are where in this image, without a panel file."""
     if request.move:
+        session.progress(0.1, "drive to the overview")
         go_to_overview(session)
         settle(session)
+    session.progress(0.5, "recognise")
     seen = look(session, request.camera)
     return blind_answer(
         session, seen.pixels, (session.panel.width_m, session.panel.height_m), focal_px=seen.intrinsics.fx_px
@@ -46,6 +49,7 @@ def _by_range(session: Session, request: RecogniseRequest) -> dict[str, Any]:
     """The surfaces of one range image, and the objects of the panel file whose surfaces are among them."""
     if request.move and "vision" not in request.use:
         ensure_located(session.part(0.0, 0.6))
+        session.progress(0.6, "drive to the overview")
         go_to_overview(session)
         settle(session)
     session.progress(0.9, "scan")

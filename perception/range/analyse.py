@@ -186,13 +186,12 @@ def _finished(task: Task, noise: NoiseModel, regions: Regions, found: Candidates
     for new, k in enumerate(keep, 1):
         kind, slack = found.kinds[k], found.slack[k]
         few[k][3] *= slack
-        mine = (regions.runs_of(k + 1), regions)
-        surface, th = finish.refine_surface(new, kind, found.parameters[k], *mine, noise=noise, slack=slack)
+        surface, th = finish.refine_surface(new, kind, found.parameters[k], regions, k + 1, noise=noise, slack=slack)
         # What the sensor has bent is named straight, but keeps the bent surface's pixels.
         final.add(kind, th)
         straight, start = bend.straightened(kind, th, few[k], law, bool(packed[0] > 0))
         if straight != kind:
-            surface, _ = finish.refine_surface(new, straight, start, *mine, noise=noise, slack=slack)
+            surface, _ = finish.refine_surface(new, straight, start, regions, k + 1, noise=noise, slack=slack)
         surfaces.append(surface)
         names[k + 1] = new
     labels = settled(task, noise, regions.renamed(names), final, sweeps=SETTLING_SWEEPS)

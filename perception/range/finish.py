@@ -39,8 +39,8 @@ def refine_surface(
     label: int,
     kind: int,
     th: Array,
-    runs: Labels,
     regions: Regions,
+    own: int,
     *,
     noise: NoiseModel,
     slack: float = 1.0,
@@ -49,14 +49,14 @@ def refine_surface(
     """The surface after the ray-depth fit to all its pixels, and its parameters.
 
     Args:
-        runs: (R, 3) as `Regions.runs_of` gives them.
+        own: the label of those pixels in `regions`.
         slack: how many times the noise is tolerated.
         fixed: (9,) tangent parameters that a prior holds.
     """
     perspective = bool(regions.packed[0] > 0)
     image = (regions.depth_m, regions.packed, regions.law)
-    n = int(np.sum(runs[:, 2] - runs[:, 1]))
-    th, H, inverse, middles, kept, used = refined(kind, th, *image, slack, runs, n, fixed)
+    n = int(regions.sizes[own])
+    th, H, inverse, middles, kept, used = refined(kind, th, *image, slack, regions.runs_of(own), n, fixed)
     misfit = float(np.sqrt(kept / max(used - FREEDOM[kind], 1)))
     x, y, depth, sigma = middles.tolist()
     loss = averaging_loss(noise, depth)

@@ -174,7 +174,7 @@ def _fitted(depth: Array, sensor: RangeSensorModel, noise: NoiseModel, plane: Ar
         with np.errstate(invalid="ignore"):
             inliers = np.abs(points @ th[:3] - th[3]) <= INLIER_SIGMAS * sigma
         own = regions_of(depth, sensor.packed(), noise.packed(), inliers.astype(np.int32), 1)
-        surface, th = refine_surface(1, PLANE, th, own.runs_of(1), own, noise=noise)
+        surface, th = refine_surface(1, PLANE, th, own, 1, noise=noise)
     valid = int(np.isfinite(depth).sum())
     share = float(inliers.sum()) / valid
     if share < LEAST_SHARE:

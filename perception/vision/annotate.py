@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import cv2
@@ -16,6 +16,7 @@ from perception.vision.reading import ObjectReading
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 RIM = 3  # a dark one keeps a bright text readable on a bright panel
 GREEN, AMBER, RED = (40, 220, 60), (255, 190, 0), (255, 60, 60)
+Colour = tuple[int, int, int]
 
 
 def draw_annotated(image: NDArray[Any], readings: Iterable[ObjectReading]) -> Image:
@@ -24,19 +25,26 @@ def draw_annotated(image: NDArray[Any], readings: Iterable[ObjectReading]) -> Im
     Args:
         image: gray or RGB uint8; not changed.
     """
+    drawn = [reading for reading in readings if np.isfinite(reading.outline_px).all()]
+    texts = [f"{reading.name}: {said(reading)}" for reading in drawn]
+    colours = [GREEN if reading.answered else AMBER if reading.present else RED for reading in drawn]
+    return draw_outlines(image, [reading.outline_px for reading in drawn], texts, colours)
+
+
+def draw_outlines(
+    image: NDArray[Any], outlines_px: Sequence[NDArray[Any]], texts: Sequence[str], colours: Sequence[Colour]
+) -> Image:
+    """RGB uint8 (H, W, 3): closed outlines, (N, 2) px each, with a text beside each that covers no other."""
     check_image(image)
     rgb = np.repeat(image[:, :, None], 3, axis=2) if image.ndim == 2 else image[:, :, :3].copy()
     picture: Image = np.ascontiguousarray(rgb)
     scale = max(0.4, picture.shape[1] / 1600)
-    drawn = [reading for reading in readings if np.isfinite(reading.outline_px).all()]
-    contours = [np.round(reading.outline_px).astype(np.int32).reshape(-1, 1, 2) for reading in drawn]
-    texts = [f"{reading.name}: {said(reading)}" for reading in drawn]
+    contours = [np.round(outline).astype(np.int32).reshape(-1, 1, 2) for outline in outlines_px]
     labels = place_labels(
         [Box(*cv2.boundingRect(contour)) for contour in contours],
         [_size(text, scale) for text in texts],
         (picture.shape[1], picture.shape[0]),
     )
-    colours = [GREEN if reading.answered else AMBER if reading.present else RED for reading in drawn]
     for contour, colour in zip(contours, colours, strict=True):
         cv2.polylines(picture, [contour], True, colour, max(1, round(scale)), cv2.LINE_AA)
     for text, label, colour in zip(texts, labels, colours, strict=True):
@@ -63,7 +71,7 @@ def _size(text: str, scale: float) -> tuple[int, int]:
     return width + RIM, height + below
 
 
-def _write(picture: Image, text: str, place: Box, colour: tuple[int, int, int], scale: float) -> None:
+def _write(picture: Image, text: str, place: Box, colour: Colour, scale: float) -> None:
     _, below = cv2.getTextSize(text, FONT, scale, RIM)
     foot = (place.x + RIM // 2, place.y + place.height - below)
     cv2.putText(picture, text, foot, FONT, scale, (0, 0, 0), RIM, cv2.LINE_AA)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +21,6 @@ from service.report.plots import png_of
 from service.teachings import Teachings
 
 if TYPE_CHECKING:
-    from perception.vision.blind import Candidate
     from perception.vision.view import View
 
 Pixels = NDArray[np.uint8]
@@ -83,10 +81,14 @@ def blind_answer(
     session: Session, pixels: Pixels, plate_m: tuple[float, float], *, focal_px: float | None
 ) -> dict[str, Any]:
     """All candidates, refused ones with their reasons, and a picture of the others."""
+    from perception.vision.annotate import GREEN, draw_outlines
     from perception.vision.blind import recognise
 
     found = recognise(pixels, _stores(session)[1].knowledge(), plate_m=plate_m, focal_px=focal_px)
-    picture = png_of(shown(_drawn(pixels, [c for c in found if c.reason is None])))
+    taken = [candidate for candidate in found if candidate.reason is None]
+    texts = [f"{candidate.kind} {candidate.confidence:.2f}" for candidate in taken]
+    outlined = draw_outlines(pixels, [candidate.box_px for candidate in taken], texts, [GREEN] * len(taken))
+    picture = png_of(shown(outlined))
     return {
         "candidates": list(found),
         "pictures": [session.context.task.artefact("blind.png", picture, "image/png")],
@@ -172,17 +174,3 @@ def _lens(session: Session, request: StoredLook, gray: Pixels) -> CameraIntrinsi
             hint="name the camera that took it, give its `lens`, or leave both out",
         )
     return lens
-
-
-def _drawn(pixels: Pixels, candidates: Sequence[Candidate]) -> Pixels:
-    """The image with an outline and a name at every candidate, RGB."""
-    picture = cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB) if pixels.ndim == 2 else pixels.copy()
-    thick = max(1, round(picture.shape[1] / 800))
-    for candidate in candidates:
-        box = np.rint(candidate.box_px).astype(np.int32).reshape(-1, 1, 2)
-        cv2.polylines(picture, [box], True, (40, 220, 60), thick, cv2.LINE_AA)
-        u, v = (int(x) for x in box.reshape(-1, 2).min(axis=0))
-        text = f"{candidate.kind} {candidate.confidence:.2f}"
-        at = (max(u, 0), max(v - 4, 10 * thick))
-        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45 * thick, (40, 220, 60), thick, cv2.LINE_AA)
-    return np.asarray(picture, np.uint8)

@@ -37,6 +37,9 @@ MARGIN = 1.25  # of the footprint: readers look at the plate around the object t
 LAMP_MARGIN = 2.0
 MIN_SUPPORT = 0.25  # share of the model's edges that must be found for the panel to be this one
 MIN_EDGE_SHARE = 0.2  # the same for one object
+# Kinds whose reading, when sure, is proof of the object where its outline has the plate's gray, and from which confidence on.
+TELLING, TELLS = frozenset({"gauge", "panel_meter", "display", "rotary"}), 0.9
+NO_OUTLINE = "the object's outline is not where it should be: check the panel file, or something covers it"
 MIN_RESOLUTION_PX = 10.0  # smaller objects cannot be read
 JUMP = 0.25  # of the scale: a larger change since the last reading needs a confident reading
 JUMP_CONFIDENCE = 0.9
@@ -191,28 +194,27 @@ def _inspect_one(
     if not (np.isfinite(centre_px).all() and -0.5 <= centre_px[0] < width and -0.5 <= centre_px[1] < height):
         return replace(reading, reason="the object is outside the image: move the camera")
     patch = patch_of(gray if colour is None else colour, gray, view, spec, shift)
-    absent = _absence(patch, registration.edge_share.get(spec.name, float("nan")), noise)
-    if absent is not None:
-        return replace(reading, reason=absent)
+    if patch.inside.mean() < 0.5:
+        return replace(reading, reason="most of the object is outside the image: move the camera")
+    if _is_bare(patch, noise):
+        return replace(reading, reason="nothing but bare plate where the object should be")
+    is_outlined = not registration.edge_share.get(spec.name, float("nan")) < MIN_EDGE_SHARE
+    if not is_outlined and spec.kind not in TELLING:
+        return replace(reading, reason=NO_OUTLINE)
     if 2 * max(footprint_m(spec)[:2]) * patch.image_px_per_m < MIN_RESOLUTION_PX:
         status = refused("the object is too small in this image: come closer")
     else:
         last = None if before is None else before.value
         status = plausible(read_patch(patch, spec, digits_taught=digits_taught, before=last), spec, before)
+    if not is_outlined and not (status.answered and status.confidence >= TELLS):
+        return replace(reading, reason=NO_OUTLINE)
     return reading.saying(status)
 
 
-def _absence(patch: Patch, edge_share: float, noise: float) -> str | None:
-    """Why the object is taken as not there; None when it is."""
-    if patch.inside.mean() < 0.5:
-        return "most of the object is outside the image: move the camera"
+def _is_bare(patch: Patch, noise: float) -> bool:
+    """Whether the patch shows nothing that stands out from the noise."""
     smooth = cv2.GaussianBlur(patch.gray, (0, 0), 1.5)
-    contrast = float(np.percentile(smooth, 97)) - float(np.percentile(smooth, 3))
-    if contrast < 1.5 * noise + 6.0:
-        return "nothing but bare plate where the object should be"
-    if edge_share < MIN_EDGE_SHARE:
-        return "the object's outline is not where it should be: check the panel file, or something covers it"
-    return None
+    return float(np.percentile(smooth, 97)) - float(np.percentile(smooth, 3)) < 1.5 * noise + 6.0
 
 
 def plausible(status: Status, spec: PanelObject, before: ObjectReading | None) -> Status:

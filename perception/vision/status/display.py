@@ -25,6 +25,7 @@ from perception.vision.status.glyphs import CLOSE, LIT, NAMES, Number, likelihoo
 from perception.vision.status.ink import segment_ink, without_border
 from perception.vision.status.levels import loop_levels, segment_levels, with_hidden_ends, without_frames
 from perception.vision.status.point import Point, find_point
+from perception.vision.status.stray import stray_ink
 from perception.vision.view import Array
 
 MARGIN = 0.09  # share of the smaller side that a frame may take
@@ -36,6 +37,9 @@ SAME_COMB = 0.05  # of the digit height
 WORTH_WEIGHT = 8.0  # nats a character that a comb of e times the worth may fit worse
 TEMPERATURE = 2.0  # what is wrong with one segment is wrong with its neighbours too: they count half
 KNOWN_FREE, FREE = 0.35, 0.5  # how far the digits may sit from the middle, over the width
+
+STRAY, STRAY_SCALE = 0.045, 0.003  # ink off the strokes, see `stray_ink`
+TWO_SURE = 0.881  # the most that two pieces of evidence give
 
 MOST_NAMED, NAMED = 4, 0.1  # numbers that a refusal names: at most; the share of the likelihood that each has
 MOST_POSSIBLE = 10  # numbers that a refusal lists for programs
@@ -211,7 +215,9 @@ def _answer(
     weights = np.array([score / TEMPERATURE + _expected(value, before, high - low) for _, value, score in possible])
     share = np.exp(weights - weights.max())
     share /= share.sum()
-    trust = (point.probability if point else 1.0) * probability([(found.explained, 0.3, 0.06)]) / 0.732
+    stray = stray_ink(found.ink, found.comb, found.lit_levels)
+    trust = probability([(found.explained, 0.3, 0.06), (-stray, -STRAY, STRAY_SCALE)]) / TWO_SURE
+    trust *= point.probability if point else 1.0
     rivals = _ranked([(text, value) for text, value, _ in possible], share, trust)
     best = rivals[0]
     if best.probability < ANSWER_AT:

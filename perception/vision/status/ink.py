@@ -11,6 +11,7 @@ from perception.vision.image import Image
 from perception.vision.status.comb_jit import Float32
 
 HEADROOM = 0.5  # of a lit segment: where less is left below white, nothing can be told
+SHOWS = 0.3  # of a lit segment: so much stands out that it is no noise
 KERNEL = 0.30  # of the picture's height: wider than any stroke, narrower than what light does
 SATURATED = 252
 BORDER_ROUNDS = 4
@@ -43,7 +44,9 @@ def segment_ink(gray: Image, is_dark: bool, hidden: NDArray[np.bool_] | None = N
         background = cv2.morphologyEx(filled, cv2.MORPH_OPEN, kernel)
         ink = cv2.subtract(filled, background).astype(np.float32)
     if not is_dark:
-        seen = seen * (SATURATED - background > HEADROOM * level_at(ink, 0.98)).astype(np.float32)
+        lit = level_at(ink, 0.98)
+        # Where glare leaves little room below white, a stroke that shows is one; that none shows says nothing.
+        seen = seen * ((SATURATED - background > HEADROOM * lit) | (ink > SHOWS * lit)).astype(np.float32)
     ink = np.maximum(ink - level_at(ink[seen > 0] if lost.any() else ink, 0.35), 0.0) * seen
     return np.asarray(ink, np.float32), seen
 

@@ -39,7 +39,7 @@ TEMPERATURE = 2.0  # what is wrong with one segment is wrong with its neighbours
 KNOWN_FREE, FREE = 0.35, 0.5  # how far the digits may sit from the middle, over the width
 
 STRAY, STRAY_SCALE = 0.045, 0.003  # ink off the strokes, see `stray_ink`
-TWO_SURE = 0.881  # the most that two pieces of evidence give
+SURE = 0.732  # the most that one piece of evidence gives
 
 MOST_NAMED, NAMED = 4, 0.1  # numbers that a refusal names: at most; the share of the likelihood that each has
 MOST_POSSIBLE = 10  # numbers that a refusal lists for programs
@@ -89,15 +89,16 @@ def read_display(patch: Patch, spec: Display, *, digits_taught: bool = True, bef
     return read_window(
         gray, digits=spec.digits if digits_taught else None, decimals=spec.decimals if digits_taught else None,
         dark=spec.style == "lcd", unit=spec.unit, limits=(spec.minimum, spec.maximum), hidden=hidden, before=before,
+        bare=True,
     )  # fmt: skip
 
 
 def read_window(
     gray: Image, *, digits: int | None, decimals: int | None, dark: bool | None, unit: str = "",
     limits: tuple[float, float] | None = None, hidden: NDArray[np.bool_] | None = None, before: float | None = None,
-    framed: bool = False,
+    framed: bool = False, bare: bool = False,
 ) -> Status:  # fmt: skip
-    """Text of an upright window that shows nothing but the digits.
+    """Text of an upright window of digits.
 
     Args:
         digits, decimals, dark: what is known; None lets the picture decide.
@@ -105,6 +106,7 @@ def read_window(
         hidden: (H, W) True where something lies across the window.
         before: the previous reading.
         framed: the picture shows a frame all round.
+        bare: nothing but digits is in the window: what their number leaves over of the ink speaks against it.
     """
     gray, hidden = _working_size(gray, hidden)
     polarities = (True, False) if dark is None else (dark,)
@@ -115,7 +117,8 @@ def read_window(
         return refused("no digits stand out: come closer, or change the angle or the light", unit=unit)
     best = max(found, key=lambda d: d.explained * apartness(d.comb.gap) - CELL_COST * d.comb.count)
     point = find_point(best.ink, best.seen, best.comb, best.lit_levels) if decimals is None else None
-    return _answer(best, point, unit, decimals, limits, before, covered=hidden is not None and bool(hidden.any()))
+    is_covered = hidden is not None and bool(hidden.any())
+    return _answer(best, point, unit, decimals, limits, before, covered=is_covered, bare=bare)
 
 
 def _decoded(
@@ -199,7 +202,7 @@ def _explained(ink: Float32, comb: Comb, lit_levels: Array) -> float:
 
 def _answer(
     found: Decoded, point: Point | None, unit: str, decimals: int | None, limits: tuple[float, float] | None, before: float | None,
-    *, covered: bool,
+    *, covered: bool, bare: bool,
 ) -> Status:  # fmt: skip
     """The likeliest number within the range, or why there is none."""
     texts = [(_with_point(n.characters, point, decimals), n.log_likelihood) for n in found.listed]
@@ -215,9 +218,10 @@ def _answer(
     weights = np.array([score / TEMPERATURE + _expected(value, before, high - low) for _, value, score in possible])
     share = np.exp(weights - weights.max())
     share /= share.sum()
-    stray = stray_ink(found.ink, found.comb, found.lit_levels)
-    trust = probability([(found.explained, 0.3, 0.06), (-stray, -STRAY, STRAY_SCALE)]) / TWO_SURE
-    trust *= point.probability if point else 1.0
+    trust = (point.probability if point else 1.0) * probability([(found.explained, 0.3, 0.06)]) / SURE
+    if bare:
+        stray = stray_ink(found.ink, found.comb, found.lit_levels)
+        trust *= probability([(-stray, -STRAY, STRAY_SCALE)]) / SURE
     rivals = _ranked([(text, value) for text, value, _ in possible], share, trust)
     best = rivals[0]
     if best.probability < ANSWER_AT:

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from hal.errors import CellError
-from hal.panel import Panel
+from hal.panel import Lever, Panel, PanelObject
 from hal.strict import validate
 from perception.vision.blind import recognise
 from perception.vision.dial import read_dial
@@ -48,11 +48,20 @@ def panel_of_job(job: Job) -> Panel:
         for k, (sx, sy) in enumerate(((-1, 1), (1, 1), (1, -1), (-1, -1)))
     ]
     objects = [_object(entry, job["panel_mm"]) for entry in job["layout"]]
-    return validate(
+    panel = validate(
         {"schema": 1, "name": "job", "width_m": width, "height_m": height, "lights": light, "objects": objects},
         Panel,
         source=str(job["id"]),
     )
+    return panel.model_copy(update={"objects": tuple(_by_meaning(thing) for thing in panel.objects)})
+
+
+def _by_meaning(thing: PanelObject) -> PanelObject:
+    """A lever whose opposite stops have one name: a panel file names every state once, a job only what it means."""
+    if not isinstance(thing, Lever):
+        return thing
+    states = tuple(state.model_copy(update={"name": state.name.split("_")[0]}) for state in thing.states)
+    return thing.model_copy(update={"states": states})
 
 
 def view_of_job(job: Job) -> PlaneView:
@@ -118,7 +127,7 @@ def _object(entry: Job, panel_mm: list[float]) -> dict[str, Any]:
         case "lever":
             along = (90.0, 270.0) if entry["pipe_horizontal"] else (0.0, 180.0)
             states = [
-                {"name": "open" if a in along else "closed", "angle_rad": float(np.deg2rad(a))}
+                {"name": f"{'open' if a in along else 'closed'}_{a:g}", "angle_rad": float(np.deg2rad(a))}
                 for a in (0.0, 90.0, 180.0, 270.0)
             ]
             return {**base, "length_m": part["length"] * w, "width_m": part["width"] * w, "states": states}

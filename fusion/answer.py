@@ -18,6 +18,7 @@ from fusion.inliers import ProvenSet, best_set
 from fusion.measurement import Measurement
 from fusion.minima import Minimum
 from fusion.observability import FreeDirection
+from fusion.solve import LocalSolution
 from hal.geometry import Array, UncertainPose
 
 EVIDENCE_NEEDED = math.log(1000.0)  # for agreement against chance, once something was rejected
@@ -158,29 +159,15 @@ def judged(
     Raises:
         Contradiction: the best set could agree by chance.
     """
-    f = np.zeros(len(given))
-    own = index >= 0
-    f[index[own]] = best.local.values[own]
-    for repeat, first in repeats.items():
-        f[repeat] = f[first]
-    rejected = _rejected(b, best, index, given) + [
-        Rejected(
-            index=i, label=given[i].label, value=float(f[i]), limit=0.0, reason=f"duplicate of measurement {first}"
-        )
-        for i, first in repeats.items()
-    ]
-    evidence = log_evidence(b, best.used, best.local)
-    mismatched = [r for r in rejected if r.reason == "mismatch"]
-    if mismatched and evidence < EVIDENCE_NEEDED + EVIDENCE_PER_MISMATCH * len(mismatched):
-        raise Contradiction.among(int(best.used.sum()), len(b.cls), [(r.index, r.label, r.value) for r in mismatched])
     local = best.local
+    values, rejected, evidence = weighed(b, best.used, local, index, given, repeats)
     return FusedPose(
         pose=local.base_from_object,
         covariance=local.covariance,
         chi_square=local.chi_square,
         dof=local.dof,
-        values=f,
-        rejected=tuple(sorted(rejected, key=lambda r: r.index)),
+        values=values,
+        rejected=rejected,
         unobservable=local.unobservable,
         alternatives=() if local.unobservable else _alternatives(best, others, index),
         evidence=evidence,
@@ -191,17 +178,50 @@ def judged(
     )
 
 
-def _rejected(b: Batch, best: Minimum, index: NDArray[np.int64], given: Sequence[Measurement]) -> list[Rejected]:
-    return [
+def weighed(
+    b: Batch,
+    used: NDArray[np.bool_],
+    local: LocalSolution,
+    index: NDArray[np.int64],
+    given: Sequence[Measurement],
+    repeats: dict[int, int],
+) -> tuple[Array, tuple[Rejected, ...], float]:
+    """What an answer says of its measurements: value of each (N,), those not used, and the evidence for the others.
+
+    Args:
+        b: packed measurements; `index` says which of `given` each entry is, -1 for the prior.
+        used: which entries the `local` solution stems from.
+        given: all measurements of the caller.
+        repeats: index of each duplicate, and of the measurement that it repeats.
+
+    Raises:
+        Contradiction: the measurements used could agree by chance.
+    """
+    values = np.zeros(len(given))
+    own = index >= 0
+    values[index[own]] = local.values[own]
+    for repeat, first in repeats.items():
+        values[repeat] = values[first]
+    mismatched = [
         Rejected(
             index=int(index[k]),
             label=given[index[k]].label if index[k] >= 0 else "prior pose",
-            value=float(best.local.values[k]),
+            value=float(local.values[k]),
             limit=float(b.gate[k]),
             reason="mismatch",
         )
-        for k in np.flatnonzero(~best.used)
+        for k in np.flatnonzero(~used)
     ]
+    evidence = log_evidence(b, used, local)
+    if mismatched and evidence < EVIDENCE_NEEDED + EVIDENCE_PER_MISMATCH * len(mismatched):
+        raise Contradiction.among(int(used.sum()), len(b.cls), [(r.index, r.label, r.value) for r in mismatched])
+    repeated = [
+        Rejected(
+            index=i, label=given[i].label, value=float(values[i]), limit=0.0, reason=f"duplicate of measurement {first}"
+        )
+        for i, first in repeats.items()
+    ]
+    return values, tuple(sorted([*mismatched, *repeated], key=lambda r: r.index)), evidence
 
 
 def _alternatives(best: Minimum, others: Sequence[Minimum], index: NDArray[np.int64]) -> tuple[Alternative, ...]:

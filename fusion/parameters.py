@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from fusion.answer import FusedPose, Rejected, ShapeEstimate
-from fusion.batch import Batch, pack
-from fusion.evidence import log_evidence
+from fusion.answer import FusedPose, ShapeEstimate, weighed
+from fusion.batch import Batch, duplicates, pack
+from fusion.features import Kind
 from fusion.measurement import Measurement, SensingClass
 from fusion.observability import covariance_and_freedom
 from fusion.rows import whitened_all
@@ -33,17 +33,21 @@ LARGEST_TURN_RAD = 0.3
 DIFFERENCE = 1e-6  # share of a parameter's sigma
 
 
-def fuse_shape(measurements: Sequence[Measurement], shape: Shape, prior: UncertainPose) -> FusedPose:
+def fuse_shape(given: Sequence[Measurement], shape: Shape, prior: UncertainPose) -> FusedPose:
     """Pose and parameters of a shape from measurements of its parts, some of them perhaps wrong.
 
     Args:
-        measurements: those with a `part` follow the shape; others keep their feature.
+        given: measurements; those with a `part` follow the shape, others keep their feature.
         shape: the family, with what is believed of its parameters.
         prior: a believed pose, good enough to say which side of the object was sensed.
 
     Raises:
         InvalidRequest: a measurement makes no sense or names no part of the shape.
+        Contradiction: those that agree could do so by chance.
     """
+    repeats = duplicates(given)
+    distinct = [i for i in range(len(given)) if i not in repeats]
+    measurements = [given[i] for i in distinct]
     everything = np.ones(len(measurements) + 1)
     found = [_descended(measurements, shape, prior, weigh, everything) for weigh in (_level, _forgiving)]
     if not all(made[2].all() for made in found):
@@ -54,7 +58,21 @@ def fuse_shape(measurements: Sequence[Measurement], shape: Shape, prior: Uncerta
             half[-1] = 1.0
             found.append(_descended(measurements, shape, prior, _forgiving, half))
     pose, values, used, _ = min(found, key=lambda made: made[3])
-    return _answer(measurements, shape, prior, pose, values, used)
+    b, f, H, _ = _system(measurements, shape, prior, pose, values, np.asarray(used, float))
+    local, joint = _local(b, f, H, pose, used)
+    found_values, rejected, evidence = weighed(b, used, local, np.array([*distinct, -1]), given, repeats)
+    return FusedPose(
+        pose=pose,
+        covariance=local.covariance,
+        chi_square=local.chi_square,
+        dof=local.dof,
+        values=found_values,
+        rejected=rejected,
+        unobservable=local.unobservable,
+        alternatives=(),
+        evidence=evidence,
+        shape=ShapeEstimate(names=shape.names, values=values, covariance=joint[6:, 6:]),
+    )
 
 
 def _level(f: Array, gate: Array, scale: float) -> Array:
@@ -137,9 +155,7 @@ def _placed(
             made.append(m)
             continue
         feature = shape.feature(m.part, values, object_from_base.apply(m.mu_m))
-        sensed = (int(m.cls) - 1) // 3
-        cls = SensingClass(3 * sensed + ["point", "line", "plane"].index(feature.kind) + 1)
-        if cls != m.cls:
+        if m.cls != SensingClass.of(list(Kind)[(m.cls - 1) // 3], feature.kind):
             raise InvalidRequest(
                 f"measurement {i} is {m.cls.words}, but part {m.part!r} is a {feature.kind}",
                 hint="make it with the part's own feature", index=i, reason="wrong class",
@@ -156,16 +172,9 @@ def _rows(b: Batch, R: Array, t: Array) -> tuple[Array, Array]:
     return r, J
 
 
-def _answer(
-    measurements: Sequence[Measurement],
-    shape: Shape,
-    prior: UncertainPose,
-    pose: RigidTransform,
-    values: Array,
-    used: NDArray[np.bool_],
-) -> FusedPose:
-    b, f, H, _ = _system(measurements, shape, prior, pose, values, np.asarray(used, float))
-    joint = np.linalg.inv(H)
+def _local(b: Batch, f: Array, H: Array, pose: RigidTransform, used: NDArray[np.bool_]) -> tuple[LocalSolution, Array]:
+    """The solution as one of the pose alone, and the covariance (6 + P, 6 + P) of pose and parameters."""
+    joint = np.asarray(np.linalg.inv(H), float)
     information = np.linalg.inv(joint[:6, :6])
     R = matrix_of(pose)
     covariance, free = covariance_and_freedom(information, *middle_and_size(b, used, R))
@@ -173,20 +182,4 @@ def _answer(
         rotation=R, translation_m=np.array(pose.translation), covariance=covariance, information=information, values=f,
         chi_square=float(f[used].sum()), dof=int(b.dof[used].sum()) - 6, unobservable=free,
     )  # fmt: skip
-    labels = [*(m.label for m in measurements), "prior pose"]
-    index = [*range(len(measurements)), -1]
-    return FusedPose(
-        pose=pose,
-        covariance=covariance,
-        chi_square=local.chi_square,
-        dof=local.dof,
-        values=f[:-1],
-        rejected=tuple(
-            Rejected(index=index[k], label=labels[k], value=float(f[k]), limit=float(b.gate[k]), reason="mismatch")
-            for k in np.flatnonzero(~used)
-        ),
-        unobservable=free,
-        alternatives=(),
-        evidence=log_evidence(b, used, local),
-        shape=ShapeEstimate(names=shape.names, values=values, covariance=np.asarray(joint[6:, 6:], float)),
-    )
+    return local, joint

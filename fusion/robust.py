@@ -44,8 +44,8 @@ def fuse(
         seed: of the random subsets; the same input and seed give the same answer.
 
     Raises:
-        InvalidRequest: a measurement makes no sense (`details["index"]`, `details["reason"]`), there is none, or there are
-            too many for branch and bound.
+        InvalidRequest: a measurement makes no sense (`details["index"]`, `details["reason"]`), there is none, there are too
+            many for branch and bound, or a shape comes without a prior pose or with something to prove.
         Contradiction: no set of measurements agrees by more than chance; `details` names those outside the best set.
     """
     if not len(measurements) and prior is None:
@@ -53,6 +53,11 @@ def fuse(
     if shape is not None:
         if prior is None:
             raise InvalidRequest("a shape needs a believed pose", hint="give `prior`, for example from the camera")
+        if certify or prove_set_within_s is not None:
+            raise InvalidRequest(
+                "nothing can be proven of a shape with unknown measures",
+                hint="leave out `certify` and `prove_set_within_s`",
+            )
         return fuse_shape(measurements, shape, prior)
     repeats = duplicates(measurements)
     index = np.array([*range(len(measurements)), *([-1] if prior is not None else [])])

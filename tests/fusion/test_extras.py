@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform
 
-from examples.cylinder_radius import arc_case, box_case, cylinder_case
+from examples.cylinder_radius import arc_case, box_case, cylinder_case, sensed_point
 from examples.table2 import outlines, remark
 from fusion import fuse, incremental, warm_up
 from fusion.batch import pack
 from fusion.certify import certificate, quadratic_forms
 from fusion.draw import Drawing, box_outlines, circle_outline, seen, sight_of, svg
 from fusion.dual import minimiser, seen_from
+from fusion.errors import Contradiction
+from fusion.measurement import Measurement
 from fusion.plan import Candidate, Tolerance, next_best, plan
 from fusion.reference import residual
 from fusion.relaxation import constraints, relaxed
@@ -22,7 +26,7 @@ from fusion.shapes import Box, Cylinder
 from fusion.simulate import CODES, Problem, problem
 from fusion.solve import solve
 from hal.errors import InvalidRequest
-from hal.geometry import difference, matrix_of, transform
+from hal.geometry import UncertainPose, difference, matrix_of, transform
 
 
 def mixture(count: int, seed: int, bad: int = 0) -> Problem:
@@ -254,6 +258,46 @@ def test_a_box_is_measured_with_its_pose() -> None:
 def test_a_shape_needs_a_believed_pose() -> None:
     with pytest.raises(InvalidRequest, match="believed pose"):
         fuse(mixture(4, 15).measurements, shape=Box(size_m=(0.1, 0.1, 0.1)))
+
+
+@pytest.mark.parametrize("proof", [{"certify": True}, {"prove_set_within_s": 1.0}])
+def test_what_cannot_be_proven_of_a_shape_is_refused_not_left_out(proof: dict[str, float]) -> None:
+    touches, prior, guess = touched_box()
+    with pytest.raises(InvalidRequest, match="nothing can be proven"):
+        fuse(touches, prior=prior, shape=guess, **proof)  # type: ignore[arg-type]  # one of two options
+
+
+def touched_box() -> tuple[list[Measurement], UncertainPose, Box]:
+    """Two touches on each face of a box at the origin, on its true faces; a believed pose; the box as it is believed."""
+    guess = Box(size_m=(0.2, 0.1, 0.04))
+    half, touches = np.array(guess.size_m) / 2, []
+    for part in ("+x", "-x", "+y", "-y", "+z", "-z"):
+        k, sign = "xyz".index(part[1]), 1.0 if part[0] == "+" else -1.0
+        for along in (-0.5, 0.6):
+            on_face = along * half
+            on_face[k] = sign * half[k]
+            rng = np.random.default_rng(len(touches))
+            touches.append(sensed_point(guess, part, on_face, RigidTransform.identity(), 3e-4, rng))
+    prior = UncertainPose(parent_from_child=RigidTransform.identity(), covariance=1e-4 * np.eye(6))
+    return touches, prior, guess
+
+
+def test_a_touch_that_is_given_twice_says_no_more_of_a_shape_than_once() -> None:
+    touches, prior, guess = touched_box()
+    once, twice = fuse(touches, prior=prior, shape=guess), fuse([touches[0], *touches], prior=prior, shape=guess)
+    assert twice.covariance == pytest.approx(once.covariance)
+    assert twice.chi_square == pytest.approx(once.chi_square)
+    assert [(r.index, r.reason) for r in twice.rejected] == [(1, "duplicate of measurement 0")]
+    assert twice.values[1:] == pytest.approx(once.values)
+    assert twice.values[0] == twice.values[1]
+
+
+def test_touches_of_a_shape_that_agree_only_by_chance_are_refused() -> None:
+    touches, prior, guess = touched_box()
+    rng = np.random.default_rng(7)
+    strewn = [replace(m, mu_m=m.mu_m + rng.uniform(-0.5, 0.5, 3)) for m in touches]
+    with pytest.raises(Contradiction):
+        fuse(strewn, prior=prior, shape=guess)
 
 
 def test_a_shape_knows_its_parts() -> None:

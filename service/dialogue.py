@@ -179,10 +179,13 @@ class Dialogue:
 
     def show_found(self) -> None:
         """What is found in the image with what is known now."""
+        lines = []
         for found in check(self.pixels, self.teachings.knowledge(), plate_m=self.overview.plate_m):
             x, y = found.centre_px
             verdict = f"refused: {found.reason}" if found.reason else f"confidence {found.confidence:.2f}"
-            self.talk.say(f"{found.kind} at {x:.0f},{y:.0f} px  {verdict}")
+            lines.append(f"{found.kind} at {x:.0f},{y:.0f} px  {verdict}")
+        for line in dict.fromkeys(lines):  # two refused candidates may differ in nothing that a person sees
+            self.talk.say(line)
 
     def _show_read(self, name: str) -> None:
         from perception.vision.annotate import said

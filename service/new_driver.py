@@ -39,7 +39,7 @@ def parse_kind(what: str) -> tuple[DeviceKind, str]:
 
 
 def write_driver(kind: DeviceKind, name: str, *, transport: str, folder: Path, package: str | None) -> Written:
-    """Write all files; nothing is written when one of them exists.
+    """Write all files, or none.
 
     Args:
         folder: panelwright's own tree, whose `pyproject.toml` then gets the entry points, or any other folder, which
@@ -55,13 +55,15 @@ def write_driver(kind: DeviceKind, name: str, *, transport: str, folder: Path, p
     taken = [path for path in files if (folder / path).exists()]
     if taken:
         raise ConfigError(f"{folder / taken[0]} exists already", hint="choose another name; nothing was written")
+    project, registered = folder / "pyproject.toml", ""
+    if is_tree:
+        lines = templates.entry_points(name, transport)
+        registered = with_lines(project.read_text(encoding="utf-8"), lines, project)
     for path, text in files.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_text(text, encoding="utf-8")
-    project = folder / "pyproject.toml"
     if is_tree:
-        lines = templates.entry_points(name, transport)
-        project.write_text(with_lines(project.read_text(encoding="utf-8"), lines, project), encoding="utf-8")
+        project.write_text(registered, encoding="utf-8")
     tests = next(path for path in files if path.name.startswith("test_"))
     return Written(
         files=tuple(folder / path for path in files),

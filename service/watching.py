@@ -85,6 +85,7 @@ class Watch:
         now, samples, errors = self._now_s(), int(health["samples"]), int(health["errors"])
         before_s, samples_before, errors_before = self._before.get(name, (now, samples, errors))
         self._before[name] = now, samples, errors
+        is_later = now > before_s and samples >= samples_before  # a device opened anew counts from zero
         value, age_s = self._value(view, kind)
         return Row(
             name=name,
@@ -92,7 +93,7 @@ class Watch:
             health=_health_word(health),
             is_connected=health["connected"],
             value=value,
-            rate_hz=(samples - samples_before) / (now - before_s) if now > before_s else None,
+            rate_hz=(samples - samples_before) / (now - before_s) if is_later else None,
             age_s=age_s,
             samples=samples,
             errors=errors,

@@ -13,7 +13,7 @@ from drivers.scaffold import new_driver
 from hal.devices import DeviceKind
 from hal.errors import ConfigError
 from service.cli import _app
-from service.new_driver import parse_kind, with_lines, write_driver
+from service.new_driver import parse_kind, write_driver
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "driver-package"
@@ -89,10 +89,13 @@ def test_in_this_tree_a_driver_has_its_places_and_is_registered(tmp_path: Path) 
         write_driver(DeviceKind.RANGE_SCANNER, "acme", transport="tcp", folder=tmp_path, package=None)
 
 
-def test_a_project_without_the_tables_says_what_to_do(tmp_path: Path) -> None:
+def test_a_project_without_the_tables_says_what_to_do_and_nothing_is_written(tmp_path: Path) -> None:
+    (tmp_path / "drivers" / "emulators").mkdir(parents=True)
+    (tmp_path / "pyproject.toml").write_text("[project]\n")
     with pytest.raises(ConfigError, match="has no table") as caught:
-        with_lines("[project]\n", {"[x]": "y"}, tmp_path / "pyproject.toml")
+        write_driver(DeviceKind.RANGE_SCANNER, "acme", transport="serial", folder=tmp_path, package=None)
     assert "by hand" in caught.value.hint
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["pyproject.toml"]
 
 
 @pytest.mark.parametrize("name", ["Acme", "9a", "a-b", ""])

@@ -118,6 +118,17 @@ def test_a_row_has_value_age_rate_and_the_errors_since_the_last_look() -> None:
     assert (second.rate_hz, second.errors, second.errors_since, second.reconnects) == (100.0, 4, 1, 2)
 
 
+def test_a_device_that_was_opened_anew_has_no_rate_yet() -> None:
+    service, moments = FakeService(), iter([10.0, 12.0, 13.0])
+    watch = Watch(service, now_s=lambda: next(moments))
+    watch.look()
+    service.samples, service.errors = 20, 0
+    (anew,) = watch.look()
+    assert (anew.rate_hz, anew.errors_since) == (None, 0)
+    service.samples = 120
+    assert watch.look()[0].rate_hz == 100.0
+
+
 def test_what_went_wrong_stands_in_the_place_of_the_value() -> None:
     service = FakeService()
     service.reading = DeviceUnavailable("left is disconnected", hint="plug it in")

@@ -11,7 +11,7 @@ from typing import Any
 from hal.clock import Clock, WallClock
 from hal.config import Cell
 from hal.devices import DeviceKind
-from hal.errors import ConfigError
+from hal.errors import CellError, ConfigError
 from hal.registry import Context, connect
 from service.direct_read import only_device, samples_of
 from service.jsonable import jsonable
@@ -38,7 +38,7 @@ def record(
         timeout_s: deadline of each reading.
 
     Raises:
-        ConfigError: the cell has no such device, the device no wire, or the file exists.
+        ConfigError: the cell has no such device, the device no wire, or the file exists or cannot be written.
         DeviceError: it did not connect.
     """
     if path.exists():
@@ -46,12 +46,17 @@ def record(
     with only_device(cell, name, {"capture": str(path)}) as (connect_it, clock, options):
         section = cell.file.devices[name]
         line = {"dir": ABOUT, "device": name, "kind": section.kind, "driver": section.driver, "options": options}
-        path.write_text(json.dumps(jsonable(line)) + "\n")
+        header = json.dumps(jsonable(line)) + "\n"
+        try:
+            path.write_text(header, encoding="ascii")
+        except OSError as error:
+            raise ConfigError(f"{path} cannot be written: {error}", hint="name a file in a folder of yours") from error
         try:
             device = connect_it()
-        except ConfigError as error:
-            path.unlink()
-            if "capture" not in error.what:
+        except CellError as error:
+            if path.stat().st_size == len(header):  # no traffic to keep: the next attempt finds the name free
+                path.unlink()
+            if not isinstance(error, ConfigError) or "capture" not in error.what:
                 raise
             what = f"{name}: {section.driver} has no wire that could be recorded"
             hint = f"`panelwright devices read {name} --jsonl` writes down its readings"

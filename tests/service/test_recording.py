@@ -72,6 +72,21 @@ def test_a_device_without_a_wire_and_a_file_that_exists_are_refused(wired_cell: 
     assert path.read_text() == "mine\n"
 
 
+def test_a_device_that_does_not_connect_leaves_the_name_of_the_recording_free(
+    write_cell: WriteCell, tmp_path: Path
+) -> None:
+    cell, path = load_cell(write_cell(mode="real", extra=WIRED.replace("PORT", "/dev/none"))), tmp_path / "x.jsonl"
+    for _ in range(2):
+        with pytest.raises(DeviceUnavailable):
+            list(record(cell, "left", path, duration_s=0.1, timeout_s=0.1))
+    assert not path.exists()
+
+
+def test_a_recording_into_a_folder_that_is_not_there_is_refused(wired_cell: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be written"):
+        list(record(load_cell(wired_cell), "left", tmp_path / "none" / "x.jsonl", duration_s=0.1, timeout_s=0.1))
+
+
 @pytest.mark.parametrize(
     "text", ["", "nonsense\n", "{}\n", '{"device": "a", "kind": "b", "driver": "c", "options": {}}\n']
 )

@@ -81,13 +81,15 @@ def _strips(
             continue
         surfaces = (int(kinds[a]), table[a], int(kinds[b]), table[b])
         step, turn = step_and_turn(*surfaces, border.x, border.y, law, perspective)
-        is_continued = step <= STEP_SIGMAS and turn <= (FLAT_TURN_RAD if kinds[strip] == PLANE else TURN_RAD)
-        both = np.isin(np.arange(kinds.size), (strip, face))
-        is_flat = kinds[strip] == PLANE == kinds[face]
-        image = (depth_m, packed, law, labels)
-        if is_continued and not (is_flat and is_seam_grooved(*image, both, table[face], border.x, border.y)):
-            beside.setdefault(strip, []).append(face)
-            gentle |= {strip} if turn <= GENTLE_RAD else set()
+        if step > STEP_SIGMAS or turn > (FLAT_TURN_RAD if kinds[strip] == PLANE else TURN_RAD):
+            continue
+        if kinds[strip] == PLANE == kinds[face]:
+            both = np.zeros(kinds.size, np.bool_)
+            both[[strip, face]] = True
+            if is_seam_grooved(depth_m, packed, law, labels, both, table[face], border.x, border.y):
+                continue
+        beside.setdefault(strip, []).append(face)
+        gentle |= {strip} if turn <= GENTLE_RAD else set()
     return {strip: faces for strip, faces in beside.items() if len(faces) > 1 or strip in gentle}
 
 

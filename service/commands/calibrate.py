@@ -16,7 +16,7 @@ from rich.table import Table
 from service.client import Client
 from service.commands.board import board
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, client_of, console, read_cell
-from service.commands.leaving import leave
+from service.commands.leaving import INTERRUPTED, leave, one_interrupt
 from service.commands.tasks import follow
 
 app = typer.Typer(
@@ -92,19 +92,22 @@ def _run(what: str, cell: Path, seed: int | None, runs: Path, url: str | None, b
     panelwright = Panelwright(loaded, Options(port=0, runs_dir=runs))
     console.print(f"cell [bold]{loaded.name}[/], {loaded.file.cell.mode}, seed {loaded.file.cell.seed}: starting")
     code = 1
-    try:
-        panelwright.start()
-        client = Client(url=panelwright.url)
-        stop = client.get("/v1/stop")
-        if stop["is_latched"] and not request["dry_run"]:  # as in `demo`: to run it is to say that the cell is clear
-            client.post("/v1/stop/reset", {"seen_count": stop["count"]})
-        code = 0 if _follow(client, request) else 1
-    except KeyboardInterrupt:
-        console.print("stopped by Ctrl-C: arm stopped, nothing written")
-        code = 130
-    finally:
-        panelwright.close()
-    leave(code)
+    with one_interrupt():
+        try:
+            panelwright.start()
+            client = Client(url=panelwright.url)
+            stop = client.get("/v1/stop")
+            if (
+                stop["is_latched"] and not request["dry_run"]
+            ):  # as in `demo`: to run it is to say that the cell is clear
+                client.post("/v1/stop/reset", {"seen_count": stop["count"]})
+            code = 0 if _follow(client, request) else 1
+        except KeyboardInterrupt:
+            console.print("stopped by Ctrl-C: arm stopped, nothing written")
+            code = INTERRUPTED
+        finally:
+            panelwright.close()
+        leave(code)
 
 
 def _follow(client: Client, request: dict[str, Any]) -> bool:

@@ -16,6 +16,8 @@ from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, consol
 from service.commands.leaving import INTERRUPTED, leave, one_interrupt
 from service.commands.tasks import follow
 
+JUDGE_S = 30  # most that is waited for a verdict
+
 
 def demo(
     *,
@@ -62,15 +64,24 @@ def _mission(client: Client, runs: Path, *, judge: bool) -> bool:
     console.print(_actions(result["actions"]))
     missions = client.get("/v1/missions")["missions"]
     if judge and missions:
-        try:
-            console.print(_verdict(client.post("/v1/judge?wait_s=30", {"mission": missions[0]["name"]})["result"]))
-        except ApiError as error:  # the report is worth showing even when nobody can judge it
-            console.print(escape(error.for_people()))
+        console.print(judged(client, missions[0]["name"]))
     if missions:
         console.print(f"report: [bold]{runs / missions[0]['name'] / 'report.html'}[/]")
     lag_s = client.get("/v1/info")["event_loop_lag_p99_s"]
     console.print(f"event-loop lag of the last minute: {1e3 * lag_s:.1f} ms (p99)")
     return bool(result["succeeded"])
+
+
+def judged(client: Client, mission: str) -> str:
+    """What the judge says of a mission, or why nobody can judge it: the report is worth showing even then."""
+    try:
+        task = client.post(f"/v1/judge?wait_s={JUDGE_S}", {"mission": mission})
+    except ApiError as error:
+        return escape(error.for_people())
+    if task["result"] is not None:
+        return _verdict(task["result"])
+    problem = task["problem"] or {"detail": f"no verdict within {JUDGE_S} s", "hint": f"see task {task['id']}"}
+    return escape(f"judge: {problem['detail']}; try: {problem['hint']}")
 
 
 def _tell_what_is_left(runs: Path, since_unix_s: float) -> None:

@@ -9,11 +9,13 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx2
 import psutil
 import pytest
 
+from service.commands.demo import judged
 from tests.service.conftest import WriteCell
 from tests.service.waiting import eventually
 
@@ -220,3 +222,25 @@ def test_a_task_that_never_looks_up_does_not_keep_the_service_alive(
     finally:
         if _runs(process):
             process.kill()
+
+
+class OneAnswer:
+    """A client to whom every POST is answered by the same task."""
+
+    def __init__(self, task: dict[str, Any]) -> None:
+        self._task = task
+
+    def post(self, _path: str, _body: Any) -> Any:
+        return self._task
+
+
+@pytest.mark.parametrize(
+    ("problem", "words"),
+    [
+        ({"detail": "this cell has no simulated arm", "hint": "use sim:arm"}, "no simulated arm; try: use sim:arm"),
+        (None, "no verdict within 30 s; try: see task t1"),
+    ],
+)
+def test_a_demo_that_nobody_can_judge_says_why(problem: dict[str, str] | None, words: str) -> None:
+    client: Any = OneAnswer({"id": "t1", "result": None, "problem": problem})
+    assert words in judged(client, "m1")

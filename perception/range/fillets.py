@@ -83,7 +83,7 @@ def _strips(
         step, turn = step_and_turn(*surfaces, border.x, border.y, law, perspective)
         if step > STEP_SIGMAS or turn > (FLAT_TURN_RAD if kinds[strip] == PLANE else TURN_RAD):
             continue
-        if kinds[strip] == PLANE == kinds[face]:
+        if kinds[face] == PLANE:
             both = np.zeros(kinds.size, np.bool_)
             both[[strip, face]] = True
             if is_seam_grooved(depth_m, packed, law, labels, both, table[face], border.x, border.y):

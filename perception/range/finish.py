@@ -22,7 +22,7 @@ from perception.range.primitives import (
 from perception.range.regions import Regions, spread
 from perception.range.runs import pixels_of
 from perception.range.starts import solve_positive
-from perception.range.surfaces import FREEDOM, QUADRIC
+from perception.range.surfaces import FREEDOM, QUADRIC, depth_on
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
@@ -32,6 +32,7 @@ MIDDLE_STRIDE = 4  # of these, every fourth tells where a surface lies
 SLOW_NOISE_AREA_PX = 150.0  # pixels that share one value of the slow noise; sets how little averaging gains on it
 STEP_AREA_PX = 16.0
 NO_SHIFT = 1e-9  # pixels: rounds up what is whole but for the last bit
+FARTHEST_SIGMAS = 50.0  # that the last step may move a surface where it was fitted already
 FREE = np.zeros(9, np.bool_)
 
 
@@ -91,10 +92,16 @@ def refined(kind, th, depth, sen, noise, slack, runs, pixels, fixed):  # type: i
     spread(depth, sen, noise, runs, pixels, NO_SHIFT, few)
     few[3] *= slack
     th, _, _, _, _ = fit_robust(kind, th, few[0], few[1], few[2], few[3], sen[0] > 0, fixed, 1)
-    th, H, kept, used = last_step(kind, th, depth, sen, noise, slack, runs, fixed)
     middles = np.empty(4)
     for a in range(4):
         middles[a] = np.median(few[a, ::MIDDLE_STRIDE].copy())
+    start = th
+    th, H, kept, used = last_step(kind, start, depth, sen, noise, slack, runs, fixed)
+    # Over a face that hardly bends, a step straight ahead may pass through flat and end on the far side of the sensor.
+    before = depth_on(kind, start, middles[0], middles[1], sen[0] > 0)
+    after = depth_on(kind, th, middles[0], middles[1], sen[0] > 0)
+    if np.isfinite(before) and not abs(after - before) < FARTHEST_SIGMAS * middles[3]:
+        th = start
     return th, H, _inverse(H, FREEDOM[kind], fixed), middles, kept, used
 
 

@@ -21,6 +21,7 @@ BESIDE = np.linspace(-1.5, 1.5, 13)  # of the half width: a shadow falls to one 
 SHADOW_SHARE = 0.4  # of the bar's width that its shadow has
 CLEAR_OF_TIP = 1.25  # of the length: pipes end there too, as a rule
 BEYOND = (1.12, 1.30)  # of the length: clear of the tip, and still in the patch
+ASIDE = (-0.5, 0.0, 0.5)  # of the width: where it may go on
 GOES_ON = 2.0  # how much what goes on counts: a flange or a pipe's end lies there at times
 SWEEP_RAD = np.deg2rad(np.arange(-30.0, 30.5, 1.0))
 BETWEEN_RAD = 0.16  # a quarter-turn valve that is 9 degrees off its stop is neither open nor closed
@@ -59,18 +60,24 @@ def _that_ends(
     patch: Patch, spec: Lever, angles_rad: Array, contrast: Array, hidden: NDArray[np.bool_] | None
 ) -> Array:
     """(N,) contrasts of bars less what goes on beyond their tips: a handle ends there, a cable does not."""
-    L = spec.length_m
+    L, noise = spec.length_m, contrast_noise(patch)
+    shows = np.abs(contrast) > 1.5 * noise  # the others are no evidence anyway
+    if not shows.any():
+        return contrast
     lost = ~patch.inside if hidden is None else hidden | ~patch.inside  # beyond the image its border repeats
     goes_on = np.stack([
         bar_contrast(
-            patch, angles_rad, along_m=(BEYOND[0] * L, BEYOND[1] * L), half_width_m=half_width_m, quantile=0.5,
-            flank=FLANK, beside_m=beside_m, hidden=lost,
+            patch, angles_rad[shows], along_m=(BEYOND[0] * L, BEYOND[1] * L), half_width_m=half_width_m, quantile=0.5,
+            flank=FLANK, beside_m=share * spec.width_m, hidden=lost if lost.any() else None,
         )
         for half_width_m in (spec.width_m / 2, SHADOW_SHARE * spec.width_m / 2)
-        for beside_m in (-0.5 * spec.width_m, 0.0, 0.5 * spec.width_m)
+        for share in ASIDE
     ])  # fmt: skip
-    like = np.maximum(goes_on * np.sign(contrast) - contrast_noise(patch), 0.0).max(axis=0)
-    return np.asarray(np.sign(contrast) * np.maximum(np.abs(contrast) - GOES_ON * like, 0.0))
+    sign = np.sign(contrast[shows])
+    like = np.maximum(goes_on * sign - noise, 0.0).max(axis=0)
+    out = contrast.copy()
+    out[shows] = sign * np.maximum(np.abs(contrast[shows]) - GOES_ON * like, 0.0)
+    return out
 
 
 def _is_parallel(patch: Patch, spec: Lever, nominal: float) -> bool:

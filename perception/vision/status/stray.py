@@ -36,14 +36,14 @@ def stray_ink(ink: Float32, comb: Comb, lit_levels: Array) -> float:
     smooth = np.asarray(cv2.GaussianBlur(ink, (0, 0), NOISE * height), float)
     written = max(int((lit_levels > 0).any(axis=1).sum()), 1)
     typical = float((smooth[strokes > 0] ** 2).sum()) / written
-    rows, columns = np.indices(ink.shape)
-    y = (rows - top) / height
-    off = (strokes == 0) & (y > ROWS[0]) & (y < ROWS[1])
-    upright = columns - slant * (top + height / 2 - rows)
+    first, last = max(0, int(np.ceil(top + ROWS[0] * height))), max(0, int(np.ceil(top + ROWS[1] * height)))
+    part, off = smooth[first:last], strokes[first:last] == 0
+    lean = slant * (top + height / 2 - np.arange(first, first + len(part)))
+    upright = np.arange(ink.shape[1]) - lean[:, None]
     room = min((pitch - width) / 2, BESIDE * height)
     worst = 0.0
     for start in left + pitch * np.arange(comb.count):
-        rest = smooth[off & (upright > start - room) & (upright < start + width + room)]
+        rest = part[off & (upright > start - room) & (upright < start + width + room)]
         if rest.size:  # in a dark picture noise lifts the ink everywhere: strokes stand out from that
             worst = max(worst, float((np.maximum(rest - np.median(rest), 0.0) ** 2).sum()))
     return worst / max(typical, 1e-6)

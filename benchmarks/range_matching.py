@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.range import RangeScene, analyse
-from perception.range.match import Match, match_models
-from perception.range.models import shipped_models
+from perception.range.matching.match import Match, match_models
+from perception.range.matching.models import shipped_models
 from perception.range.recordings import sensor_from_meta
 
 Array = NDArray[np.float64]

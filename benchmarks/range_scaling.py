@@ -29,15 +29,15 @@ from numpy.typing import NDArray
 
 from perception.range.analyse import analyse
 from perception.range.batch import IMAGES_A_TASK, _client, analyse_files, recordings_in, tasks_of
-from perception.range.beside import contested_pixels
-from perception.range.blocks import mean_blocks
-from perception.range.claim import claim_again, claim_pixels
 from perception.range.components import _merge_seam, _scan, merge_rounds, tile_rows
+from perception.range.fitting.surfaces import SIZE
 from perception.range.geometry import geometry_of
 from perception.range.noise import estimate_noise
+from perception.range.segmentation.beside import contested_pixels
+from perception.range.segmentation.blocks import mean_blocks
+from perception.range.segmentation.claim import claim_again, claim_pixels
+from perception.range.segmentation.tangents import tangent_planes
 from perception.range.sensor import PinholeSensor
-from perception.range.surfaces import SIZE
-from perception.range.tangents import tangent_planes
 from perception.range.warm import warm_up
 
 Array = NDArray[np.float64]

@@ -10,18 +10,18 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from hal.errors import InvalidRequest, NotFound
-from perception.range import bend, finish, join, merge
-from perception.range.claim import fill_small_gaps
-from perception.range.compete import Candidates
-from perception.range.faces import whole_faces
 from perception.range.features import RangeFeature, features_of
-from perception.range.fillets import without_fillets
-from perception.range.grid import Grid
-from perception.range.grooves import cut_at_grooves
 from perception.range.noise import NoiseModel, estimate_noise, typical_depths_m
 from perception.range.primitives import Plane, Surface, SurfaceType
-from perception.range.regions import Regions, regions_of
-from perception.range.segment import Task, segment, settled
+from perception.range.segmentation import bend, finish, join, merge
+from perception.range.segmentation.claim import fill_small_gaps
+from perception.range.segmentation.compete import Candidates
+from perception.range.segmentation.faces import whole_faces
+from perception.range.segmentation.fillets import without_fillets
+from perception.range.segmentation.grid import Grid
+from perception.range.segmentation.grooves import cut_at_grooves
+from perception.range.segmentation.regions import Regions, regions_of
+from perception.range.segmentation.segment import Task, segment, settled
 from perception.range.sensor import RangeSensorModel
 from perception.range.straight import doubt_about
 

@@ -17,8 +17,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from perception.range.filters import gaussian, remove_gross_errors
+from perception.range.fitting.rays import LOOSE
 from perception.range.noise import NoiseModel, estimate_noise
-from perception.range.rays import LOOSE
 from perception.range.sensor import RangeSensorModel
 
 Array = NDArray[np.float64]

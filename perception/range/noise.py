@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from perception.range.fitting.surfaces import LEAN
 from perception.range.sensor import RangeSensorModel
-from perception.range.surfaces import LEAN
 
 Array = NDArray[np.float64]
 

@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 from hal.errors import InvalidRequest, NotFound
 from perception.range.analyse import checked_depth
 from perception.range.features import RangeFeature, plane_feature
-from perception.range.finish import refine_surface
-from perception.range.grid import Grid, block_size, build_grid
+from perception.range.fitting.surfaces import PLANE, SIZE
 from perception.range.noise import NoiseModel, estimate_noise
 from perception.range.primitives import Surface
-from perception.range.regions import regions_of
+from perception.range.segmentation.finish import refine_surface
+from perception.range.segmentation.grid import Grid, block_size, build_grid
+from perception.range.segmentation.regions import regions_of
 from perception.range.sensor import RangeSensorModel
-from perception.range.surfaces import PLANE, SIZE
 
 Array = NDArray[np.float64]
 

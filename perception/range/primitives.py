@@ -9,8 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from perception.range.starts import principal_axes
-from perception.range.surfaces import CONE, CYLINDER, PLANE, QUADRIC, SIZE, SPHERE, frame_of, step_into
+from perception.range.fitting.starts import principal_axes
+from perception.range.fitting.surfaces import CONE, CYLINDER, PLANE, QUADRIC, SIZE, SPHERE, frame_of, step_into
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hal.geometry import to_json
 from perception.range.analyse import RangeScene
-from perception.range.match import Match
+from perception.range.matching.match import Match
 from perception.range.primitives import Surface
 
 Array = NDArray[np.float64]

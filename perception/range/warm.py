@@ -6,8 +6,8 @@ import numpy as np
 
 from perception.range.analyse import analyse
 from perception.range.geometry import local_geometry
-from perception.range.match import match_models
-from perception.range.models import shipped_models
+from perception.range.matching.match import match_models
+from perception.range.matching.models import shipped_models
 from perception.range.plane import fit_plane_near
 from perception.range.sensor import OrthographicSensor, PinholeSensor, RangeSensorModel
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from perception.range import RangeScene, Surface
     from perception.range.batch_results import BatchResult, KeptResults
-    from perception.range.match import Match
+    from perception.range.matching.match import Match
     from perception.range.recordings import Reading
 
 batch = typer.Typer(help="Folders of recordings on many workers (dask).", no_args_is_help=True)
@@ -49,8 +49,8 @@ def range_image(
 ) -> None:
     """Analyse one range image: NAME.surfaces.json, .png (coloured) and .ply (coloured points)."""
     from perception.range import analyse
-    from perception.range.match import match_models
-    from perception.range.models import load_models, shipped_models
+    from perception.range.matching.match import match_models
+    from perception.range.matching.models import load_models, shipped_models
     from perception.range.recordings import assumptions, load_recording
     from perception.range.render import MARK, match_json, scene_json, write_ply, write_png
 

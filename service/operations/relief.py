@@ -14,8 +14,8 @@ from hal.errors import Unsupported
 from hal.geometry import UncertainPose, compose, point_covariance
 from hal.panel import Handwheel, Mushroom, Panel
 from perception.range import PinholeSensor, RangeScene, Surface, analyse
-from perception.range.match import Match, match_models
-from perception.range.models import ComponentModel
+from perception.range.matching.match import Match, match_models
+from perception.range.matching.models import ComponentModel
 from service.operations.eyes import Scan
 from service.operations.locate import pose_json
 from service.operations.relief_models import models_of

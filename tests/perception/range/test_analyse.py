@@ -7,7 +7,7 @@ import pytest
 
 from hal.errors import CellError, InvalidRequest, NotFound
 from perception.range import Cylinder, Sphere, SurfaceType, analyse
-from perception.range.finish import without_crumbs
+from perception.range.segmentation.finish import without_crumbs
 from tests.perception.range.scenes import PARALLEL, PINHOLE, ball_on_table, noisy, plane_depth
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perception.range.bend import scrap_gain, simplest, straightened, turn_of
-from perception.range.join import join_pieces
-from perception.range.merge import merge_touching
+from perception.range.fitting.surfaces import CONE, CYLINDER, PLANE, SIZE, SPHERE, depths_on
 from perception.range.noise import NoiseModel
-from perception.range.regions import regions_of
-from perception.range.surfaces import CONE, CYLINDER, PLANE, SIZE, SPHERE, depths_on
+from perception.range.segmentation.bend import scrap_gain, simplest, straightened, turn_of
+from perception.range.segmentation.join import join_pieces
+from perception.range.segmentation.merge import merge_touching
+from perception.range.segmentation.regions import regions_of
 
 WHITE = NoiseModel(white=(0.002, 0.0), correlated=(0.0, 0.0), step=(0.0, 0.0))
 SLOW = NoiseModel(white=(0.001, 0.0), correlated=(0.004, 0.0), step=(0.0, 0.0))

@@ -9,16 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perception.range import beside, claim, finish
-from perception.range.fit import PER_MEDIAN, SCALE_PRECISION, TRIM_SIGMAS, middle_scale
-from perception.range.last_step import last_step
-from perception.range.noise import NoiseModel
-from perception.range.primitives import centre_and_radii, ellipsoid_of, named_covariance
-from perception.range.rays import MISS_SIGMAS
-from perception.range.regions import regions_of
-from perception.range.sensor import OrthographicSensor
-from perception.range.starts import principal_axes
-from perception.range.surfaces import (
+from perception.range.fitting.fit import PER_MEDIAN, SCALE_PRECISION, TRIM_SIGMAS, middle_scale
+from perception.range.fitting.last_step import last_step
+from perception.range.fitting.rays import MISS_SIGMAS
+from perception.range.fitting.starts import principal_axes
+from perception.range.fitting.surfaces import (
     CYLINDER,
     FREEDOM,
     GRAZING_COSINE,
@@ -31,6 +26,11 @@ from perception.range.surfaces import (
     frame_of,
     step_into,
 )
+from perception.range.noise import NoiseModel
+from perception.range.primitives import centre_and_radii, ellipsoid_of, named_covariance
+from perception.range.segmentation import beside, claim, finish
+from perception.range.segmentation.regions import regions_of
+from perception.range.sensor import OrthographicSensor
 from tests.perception.range.scenes import PARALLEL, PINHOLE
 
 NOISE = NoiseModel(white=(0.0005, 0.0002), correlated=(0.0, 0.0003), step=(0.0004, 0.0))

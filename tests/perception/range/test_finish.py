@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perception.range.finish import refine_surface
+from perception.range.fitting.surfaces import CYLINDER, SIZE, depths_on
 from perception.range.noise import NoiseModel
-from perception.range.regions import regions_of
-from perception.range.surfaces import CYLINDER, SIZE, depths_on
+from perception.range.segmentation.finish import refine_surface
+from perception.range.segmentation.regions import regions_of
 
 SHAPE = (120, 160)
 PACKED = np.array([1.0, 240.0, 240.0, 79.5, 59.5])

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import label
 
-from perception.range import grow_planes as grow
-from perception.range.blocks import BLOCK_SAMPLES, JUMP_SLOPE
-from perception.range.flat_fit import plane_from_coefficients
-from perception.range.grid import build_grid, seen_from
 from perception.range.noise import NoiseModel
-from perception.range.seeds import LONE_BEND, seed_order
+from perception.range.segmentation import grow_planes as grow
+from perception.range.segmentation.blocks import BLOCK_SAMPLES, JUMP_SLOPE
+from perception.range.segmentation.flat_fit import plane_from_coefficients
+from perception.range.segmentation.grid import build_grid, seen_from
+from perception.range.segmentation.seeds import LONE_BEND, seed_order
+from perception.range.segmentation.tangents import JUMP_SIGMAS
 from perception.range.sensor import OrthographicSensor, PinholeSensor
-from perception.range.tangents import JUMP_SIGMAS
 
 NOISE = NoiseModel(white=(0.0004, 0.0002), correlated=(0.0, 0.0001), step=(0.0008, 0.0))
 SHAPE = (46, 301)  # no multiple of a block or of a run of them

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from perception.range.borders import PAIR_POINTS, WIDEST_GAP_PX, borders_of
-from perception.range.claim import bucket
-from perception.range.left_over import unexplained
+from perception.range.segmentation.borders import PAIR_POINTS, WIDEST_GAP_PX, borders_of
+from perception.range.segmentation.claim import bucket
+from perception.range.segmentation.left_over import unexplained
 
 PACKED = np.array([1.0, 100.0, 120.0, 7.5, 4.0])
 

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import perception.range
+import perception.range.matching
 from hal.errors import ConfigError
 from perception.range import PinholeSensor, analyse
-from perception.range.match import match_models
-from perception.range.models import MotionKind, load_models, models_from
+from perception.range.matching.match import match_models
+from perception.range.matching.models import MotionKind, load_models, models_from
 from tests.perception.range.scenes import plane_depth, rays, sphere_depth
 
-LIBRARY = Path(perception.range.__file__).parent / "components.toml"
+LIBRARY = Path(perception.range.matching.__file__).parent / "components.toml"
 SENSOR = PinholeSensor(width_px=240, height_px=200, fx_px=500.0, fy_px=500.0, cx_px=119.5, cy_px=99.5)
 NORMAL = np.array([0.15, 0.2, -1.0]) / np.linalg.norm([0.15, 0.2, -1.0])
 MIDDLE = np.array([0.0, 0.0, 0.6])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perception.range import rays
-from perception.range.surfaces import (
+from perception.range.fitting import rays
+from perception.range.fitting.surfaces import (
     CONE,
     CYLINDER,
     FREEDOM,

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perception.range import PinholeSensor, analyse, faces, fillets
-from perception.range.surfaces import CONE, CYLINDER, PLANE, SIZE
+from perception.range import PinholeSensor, analyse
+from perception.range.fitting.surfaces import CONE, CYLINDER, PLANE, SIZE
+from perception.range.segmentation import faces, fillets
 from tests.perception.range.scenes import PARALLEL, PINHOLE, noisy, plane_depth
 
 LARGE = PinholeSensor(width_px=320, height_px=240, fx_px=360.0, fy_px=360.0, cx_px=159.5, cy_px=119.5)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perception.range import fillets
-from perception.range.join import join_pieces
-from perception.range.merge import merge_touching
+from perception.range.fitting.surfaces import PLANE, SIZE
 from perception.range.noise import NoiseModel
-from perception.range.regions import Regions, regions_of
-from perception.range.seams import is_seam_grooved
-from perception.range.surfaces import PLANE, SIZE
+from perception.range.segmentation import fillets
+from perception.range.segmentation.join import join_pieces
+from perception.range.segmentation.merge import merge_touching
+from perception.range.segmentation.regions import Regions, regions_of
+from perception.range.segmentation.seams import is_seam_grooved
 
 SHAPE = (240, 320)
 PACKED = np.array([1.0, 240.0, 240.0, 159.5, 119.5])

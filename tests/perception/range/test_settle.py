@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from perception.range import beside, settle
-from perception.range.claim import CLAIM_SIGMAS, PLAIN_SIGMAS, misfit
+from perception.range.segmentation import beside, settle
+from perception.range.segmentation.claim import CLAIM_SIGMAS, PLAIN_SIGMAS, misfit
 from tests.perception.range.scenes import PARALLEL, PINHOLE
 from tests.perception.range.test_claim_kernels import KINDS, NOISE, competing_surfaces, random_case
 

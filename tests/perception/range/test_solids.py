@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perception.range import PinholeSensor
-from perception.range.hypotheses import candidate_of
-from perception.range.models import ComponentModel, models_from, shipped_models
-from perception.range.search import Try, climb, growths_of, refined, ways_of
-from perception.range.solids import boxes_of, hit, render, solid_of
-from perception.range.verify import BEHIND, COVERED, FRONT, HITS, RING, View, explained
+from perception.range.matching.hypotheses import candidate_of
+from perception.range.matching.models import ComponentModel, models_from, shipped_models
+from perception.range.matching.search import Try, climb, growths_of, refined, ways_of
+from perception.range.matching.solids import boxes_of, hit, render, solid_of
+from perception.range.matching.verify import BEHIND, COVERED, FRONT, HITS, RING, View, explained
 
 SENSOR = PinholeSensor(width_px=120, height_px=100, fx_px=260.0, fy_px=260.0, cx_px=59.5, cy_px=49.5)
 SIGMA_M = 0.0004

@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from hal.errors import NotFound
 from hal.geometry import UncertainPose
 from hal.panel import Handwheel, Mushroom
-from perception.range.match import Match
+from perception.range.matching.match import Match
 from perception.vision.reading import ObjectReading
 from service.operations.relief import Sighting
 from service.operations.surface_check import CLOSER, OVERVIEW, SurfaceCheck, after_both, judged, need_its_place

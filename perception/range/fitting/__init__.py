@@ -1,0 +1,1 @@
+"""Surfaces fitted to depths along rays: one surface at a time, compiled."""

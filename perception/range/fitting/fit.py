@@ -1,0 +1,337 @@
+"""Fits of primitives on depth residuals along each ray.
+
+Orthogonal distances bias a radius by about sigma^2 / (2 r) and more at grazing rays; the sensor errs along its ray, so
+the residual is `(z_measured - z_surface) / sigma(z)`. Robust start (Cauchy weights under a falling scale), then a trim
+at `TRIM_SIGMAS` and plain least squares (Levenberg's damping, Marquardt's scaling).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.fitting.rays import (
+    CHUNK,
+    ERRED,
+    ERROR,
+    FILLED,
+    LOADED,
+    MISS_SIGMAS,
+    NOTHING,
+    SCRATCH,
+    error_row,
+    fill_rows,
+    load_rows,
+    normal_equations,
+    residuals,
+)
+from perception.range.fitting.starts import (
+    is_ellipsoid,
+    normal_axis,
+    quadric_of_sphere,
+    solve_positive,
+    start_cone,
+    start_cylinder,
+    start_plane,
+    start_sphere,
+)
+from perception.range.fitting.surfaces import (
+    CONE,
+    CYLINDER,
+    FREEDOM,
+    LEAN,
+    PLANE,
+    QUADRIC,
+    SIZE,
+    SPHERE,
+    frame_of,
+    step_into,
+)
+
+TRIM_SIGMAS = 3.0
+PER_MEDIAN = 1.4826  # standard deviations of a normal law per median of its absolute value
+SCALE_PRECISION = 0.004
+FALLS = 0.95  # of the scale before: so much at least it must fall for another round under Cauchy weights
+ROUGH_SAMPLES = 36
+ROUGH_LIMIT = 5.0
+ELLIPSOID_GIVE_UP = 14.0  # the mean square of what is simpler beyond which none is tried; a sphere is no close start
+LARGEST_RADIUS_M = 10.0
+LEAST_NORMALS = 10  # that tell where anything but a plane starts
+QUADRIC_PER_SAMPLE = 1.15  # a simple surface under white noise costs about 0.95 a sample, and its price
+STEP_GOAL = 1e-3  # of a standard deviation of each parameter: a step that small changes nothing that matters
+
+
+@njit(cache=True, error_model="numpy")
+def new_scratch():  # type: ignore[no-untyped-def]  # numba types it
+    """What a fit works in: rows of `rays`, two systems (9, 9) and (9,), that of a step, two frames, and a trial."""
+    return (
+        np.empty(SCRATCH),
+        np.empty((9, 9)),
+        np.empty(9),
+        np.empty((9, 9)),
+        np.empty(9),
+        np.empty((9, 9)),
+        np.empty(9),
+        np.empty(6),
+        np.empty(6),
+        np.empty(SIZE),
+    )
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed, scratch, held):  # type: ignore[no-untyped-def]  # numba types it
+    """Minimise the ray residuals from `th`, which is moved.
+
+    Args:
+        x, y, z, sigma: (N,) samples; coordinates as in `Grid`.
+        scale: > 0: width of the Cauchy weights in sigmas; 0: trim at `trim` and plain least squares.
+        fixed: (9,) bool, tangent parameters that a prior holds.
+        scratch: as `new_scratch`; its first system is the information matrix afterwards.
+        held: of the samples and `th` what `scratch` holds, as `normal_equations`.
+
+    Returns:
+        cost, samples used, and what `scratch` holds of the samples and the parameters found.
+    """
+    work, H, g, H2, g2, A, step, frame, new_frame, trial = scratch
+    p = FREEDOM[kind]
+    frame_of(kind, th, frame)
+    cost, used = normal_equations(kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g, work, held)
+    held = min(held, LOADED)
+    damping, is_fresh = 1e-4, True
+    for _ in range(steps):
+        damped(H, g, fixed, damping, p, A, step)
+        if not solve_positive(A, step, p):
+            damping *= 10.0
+            if damping > 1e6:
+                break
+            continue
+        small = 0.0
+        for a in range(p):
+            small = max(small, abs(step[a]) * np.sqrt(H[a, a]))
+        step_into(kind, th, frame, step, trial)
+        frame_of(kind, trial, new_frame)
+        new_cost, new_used = normal_equations(
+            kind, trial, new_frame, x, y, z, sigma, perspective, scale, trim, H2, g2, work, held
+        )
+        is_fresh = new_cost <= cost and new_used >= p
+        if is_fresh:
+            cost, used = new_cost, new_used
+            for i in range(SIZE):
+                th[i] = trial[i]
+            for i in range(6):
+                frame[i] = new_frame[i]
+            for a in range(p):
+                g[a] = g2[a]
+                for b in range(p):
+                    H[a, b] = H2[a, b]
+            damping = max(damping * 0.2, 1e-9)
+            if small < STEP_GOAL * 30.0:
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e6 or small < STEP_GOAL:
+                break
+    return cost, used, ERRED if is_fresh and held == LOADED else held
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def damped(H, g, fixed, damping, p, A, step):  # type: ignore[no-untyped-def]  # numba types it
+    """The system of one step into `A` (p, p) and `step` (p,): fixed parameters stay where they are."""
+    for a in range(p):
+        for b in range(p):
+            A[a, b] = 0.0 if fixed[a] or fixed[b] else H[a, b]
+        A[a, a] = A[a, a] * (1.0 + damping) + 1e-12 if not fixed[a] else 1.0
+        step[a] = 0.0 if fixed[a] else g[a]
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _load(x, y, z, sigma, work):  # type: ignore[no-untyped-def]  # numba types it
+    """Loads the samples into `work` if they have room there; returns what it holds then."""
+    if x.shape[0] > CHUNK:
+        return NOTHING
+    load_rows(x, y, z, sigma, 0, x.shape[0], work)
+    return LOADED
+
+
+@njit(cache=True, error_model="numpy")
+def _errors(kind, th, x, y, z, sigma, perspective, scratch, held):  # type: ignore[no-untyped-def]  # numba types it
+    """Residuals (N,) in sigmas, in `scratch` if the samples are; and what that holds then."""
+    work, frame, n = scratch[0], scratch[7], x.shape[0]
+    if held == NOTHING:
+        e = np.empty(n)
+        residuals(kind, th, x, y, z, sigma, perspective, e)
+        return e, held
+    if held == LOADED:
+        frame_of(kind, th, frame)
+        fill_rows(kind, th, frame, n, perspective, work)
+        error_row(n, work)
+        held = FILLED
+    return work[ERROR : ERROR + n], held
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def middle_scale(e):  # type: ignore[no-untyped-def]  # numba types it
+    """Robust residual scale, 1.48 times the (upper) median of |e|, at least 1; NaN is a ray that misses. Overwrites e (N,).
+
+    Good to `SCALE_PRECISION`: the value that halves the samples is closed in on by counting, which needs no branch;
+    sorting them out by a pivot costs ten times as much.
+    """
+    n = e.shape[0]
+    most = 0.0
+    for i in range(n):
+        e[i] = abs(e[i]) if np.isfinite(e[i]) else MISS_SIGMAS
+        most = max(most, e[i])
+    low = middle = 1.0 / PER_MEDIAN
+    while True:
+        within = 0
+        for i in range(n):
+            within += e[i] <= middle
+        if 2 * within > n:
+            most = middle
+        else:
+            low = middle
+        if most <= low * (1.0 + 2.0 * SCALE_PRECISION):
+            return max(0.5 * PER_MEDIAN * (low + most), 1.0)
+        middle = 0.5 * (low + most)
+
+
+@njit(cache=True, error_model="numpy")
+def fit_robust(kind, th, x, y, z, sigma, perspective, fixed, rounds):  # type: ignore[no-untyped-def]  # numba types it
+    """Refine under Cauchy weights whose scale falls with the residuals; ends with the trimmed fit.
+
+    Returns parameters, information matrix, mean squared residual of the kept samples, share kept, trimmed cost.
+    """
+    th, scratch = th.copy(), new_scratch()
+    # A constant would have all that is called compiled once more.
+    mean2, kept, cost = _robust(np.int64(kind), th, x, y, z, sigma, perspective, fixed, np.int64(rounds), scratch)
+    return th, scratch[1], mean2, kept, cost
+
+
+@njit(cache=True, error_model="numpy")
+def _robust(kind, th, x, y, z, sigma, perspective, fixed, rounds, scratch):  # type: ignore[no-untyped-def]  # numba types it
+    """`fit_robust` that moves `th`; the first system of `scratch` is the information matrix."""
+    n = x.shape[0]
+    held, is_last, before, cost, used = _load(x, y, z, sigma, scratch[0]), rounds == 0, np.inf, 0.0, 0
+    for turn in range(rounds + 1):
+        scale, steps = 0.0, 3
+        if not is_last:
+            e, held = _errors(kind, th, x, y, z, sigma, perspective, scratch, held)
+            middle = middle_scale(e)
+            is_last = middle > FALLS * before  # the same weights once more would find the same surface
+            if not is_last:
+                scale, steps, before = middle, 4, middle
+        cost, used, held = refine(
+            kind, th, x, y, z, sigma, perspective, steps, scale, TRIM_SIGMAS, fixed, scratch, held
+        )
+        if is_last:
+            break
+        is_last = scale <= 1.05 or turn + 1 == rounds
+    kept = cost - (n - used) * TRIM_SIGMAS * TRIM_SIGMAS
+    return max(kept, 0.0) / max(used - FREEDOM[kind], 1), used / max(n, 1), cost
+
+
+@njit(cache=True, error_model="numpy")
+def _rough(kind, th, x, y, z, sigma, perspective, fixed, scratch):  # type: ignore[no-untyped-def]  # numba types it
+    """Moves `th` by a few robust steps; the sum of squared residuals then, each at most `ROUGH_LIMIT` squared."""
+    held, steps = _load(x, y, z, sigma, scratch[0]), 2
+    e, held = _errors(kind, th, x, y, z, sigma, perspective, scratch, held)
+    for _ in range(2):
+        scale = middle_scale(e)
+        _, _, held = refine(kind, th, x, y, z, sigma, perspective, steps, scale, TRIM_SIGMAS, fixed, scratch, held)
+        e, held = _errors(kind, th, x, y, z, sigma, perspective, scratch, held)
+        if scale < 1.5:
+            break
+    cost = 0.0
+    for i in range(e.shape[0]):
+        cost += min(e[i] * e[i], ROUGH_LIMIT * ROUGH_LIMIT) if np.isfinite(e[i]) else ROUGH_LIMIT * ROUGH_LIMIT
+    return cost
+
+
+@njit(cache=True, error_model="numpy")
+def rough_mean_square(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """Mean square in sigmas, each at most `ROUGH_LIMIT` squared, that a rough fit from `th` leaves of samples (4, N)."""
+    few = np.ascontiguousarray(samples[:, :: max(1, samples.shape[1] // ROUGH_SAMPLES)])
+    free = np.zeros(9, np.bool_)
+    cost = _rough(np.int64(kind), th.copy(), few[0], few[1], few[2], few[3], perspective, free, new_scratch())
+    return cost / few.shape[1]
+
+
+@njit(cache=True, error_model="numpy")
+def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_samples, give_up):  # type: ignore[no-untyped-def]  # numba types it
+    """Fit every kind in the (5,) mask `kinds` to one set of samples, `points` (N, 3).
+
+    `P` and `N` (M, 3) are those points that have a tangent plane, and its normal; only starts use them. All starts
+    run a few robust steps on a quarter of the samples; those that may still win are fitted to the end, and none whose
+    squared residuals, each at most `ROUGH_LIMIT` squared, still have a mean beyond `give_up`.
+
+    Returns per kind: parameters (5, SIZE), mean squared residual, share kept, and the criterion
+    `trimmed cost / correlated_samples + p ln n` by which kinds compete (Schwarz), infinite where a kind does not fit.
+    """
+    ths = np.zeros((5, SIZE))
+    mean2, kept, score = np.full(5, np.inf), np.zeros(5), np.full(5, np.inf)
+    n = x.shape[0]
+    price = np.log(max(n / correlated_samples, 2.0))
+    free, scratch, rounds = np.zeros(9, np.bool_), new_scratch(), np.array([2, 2, 2, 2, 3])
+    last = np.int64(QUADRIC)  # no constant: `fit_robust` says why
+    stride = max(1, n // ROUGH_SAMPLES)
+    rx, ry, rz, rs = x[::stride].copy(), y[::stride].copy(), z[::stride].copy(), sigma[::stride].copy()
+    per_sample = rx.shape[0] / correlated_samples
+    starts, rough, best_rough = np.zeros((QUADRIC, SIZE)), np.full(QUADRIC, np.inf), np.inf
+    for kind in range(QUADRIC):
+        if kind == CONE and best_rough < 1.3 * per_sample:
+            break  # cones are for components that nothing simpler explains
+        if kinds[kind] and _start(kind, points, P, N, starts[kind]):
+            cost = _rough(kind, starts[kind], rx, ry, rz, rs, perspective, free, scratch)
+            rough[kind] = cost / correlated_samples
+            best_rough = min(best_rough, rough[kind])
+    # A start that is clearly behind after the rough fit is not going to win.
+    behind = 2.0 * best_rough + 0.5 * per_sample
+    give_up = give_up * per_sample
+    for kind in range(QUADRIC):
+        if not rough[kind] <= min(behind, give_up):
+            continue
+        th = starts[kind].copy()
+        m, share, cost = _robust(kind, th, x, y, z, sigma, perspective, free, rounds[kind], scratch)
+        s = cost / correlated_samples + FREEDOM[kind] * price
+        if s < score[kind] and _is_sane(kind, th):
+            ths[kind], mean2[kind], kept[kind], score[kind] = th, m, share, s
+    is_near = rough[SPHERE] <= behind and best_rough <= ELLIPSOID_GIVE_UP * per_sample
+    if kinds[QUADRIC] and is_near and starts[SPHERE, 3] < LARGEST_RADIUS_M:
+        # Nine parameters explain most things: they are tried when nothing simpler does.
+        simple = np.min(score)
+        if simple > n / correlated_samples * QUADRIC_PER_SAMPLE:
+            th = quadric_of_sphere(starts[SPHERE])
+            m, share, cost = _robust(last, th, x, y, z, sigma, perspective, free, rounds[last], scratch)
+            if is_ellipsoid(th):
+                ths[QUADRIC], mean2[QUADRIC], kept[QUADRIC] = th, m, share
+                score[QUADRIC] = cost / correlated_samples + 9 * price
+    return ths, mean2, kept, score
+
+
+@njit(cache=True, error_model="numpy")
+def _start(kind, points, P, N, th):  # type: ignore[no-untyped-def]  # numba types it
+    """Fill `th` with an algebraic start of a simple kind; whether there is one."""
+    if kind == PLANE:
+        th[:] = start_plane(points)
+        return True
+    if P.shape[0] < LEAST_NORMALS:
+        return False
+    if kind == SPHERE:
+        start, exists = start_sphere(P, N)
+    elif kind == CYLINDER:
+        start, exists = start_cylinder(P, N, normal_axis(N, False))
+    else:
+        start, exists = start_cone(P, N, normal_axis(N, True))
+    th[:] = start
+    return exists
+
+
+@njit(cache=True, error_model="numpy")
+def _is_sane(kind, th):  # type: ignore[no-untyped-def]  # numba types it
+    if kind == CYLINDER:
+        return th[6] < LARGEST_RADIUS_M
+    if kind == SPHERE:
+        return th[3] < LARGEST_RADIUS_M
+    if kind == CONE:
+        return 0.03 < th[6] < 1.45
+    return True

@@ -1,0 +1,141 @@
+"""The last step of a fit, on all pixels of a region: read from the image run by run, a chunk of rays at a time.
+
+Nothing but the image is read: what a region of a hundred thousand pixels holds is never written down.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.fitting.fit import TRIM_SIGMAS, damped
+from perception.range.fitting.rays import CHUNK, LOOSE, SCRATCH, SIGMA, X, Y, Z, add_equations, fill_rows, mirror
+from perception.range.fitting.starts import solve_positive
+from perception.range.fitting.surfaces import FREEDOM, GRAZING_COSINE, LEAN, PLANE, SIZE, frame_of, step_into
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def last_step(kind, th, depth, sen, noise, slack, runs, fixed):  # type: ignore[no-untyped-def]  # numba types it
+    """One Gauss-Newton step on the pixels of runs (R, 3) from a start that is good already, in a single pass over them.
+
+    The matrix and the trim are those of the start; the cost after the step follows from the quadratic model.
+    `slack`: how many times the noise is tolerated.
+
+    Returns:
+        parameters, information matrix (9, 9), squared residuals of the kept pixels, pixels kept.
+    """
+    p = FREEDOM[kind]
+    H, g = np.zeros((9, 9)), np.zeros(9)
+    kept, used = _equations(kind, th, depth, sen, noise, slack, runs, H, g)
+    A, step = np.empty((p, p)), np.empty(p)
+    damped(H, g, fixed, 0.0, p, A, step)
+    if used <= p or not solve_positive(A, step, p):
+        return th, H, kept, used
+    for a in range(p):
+        kept -= 0.0 if fixed[a] else g[a] * step[a]
+    frame, moved = np.zeros(6), np.empty(SIZE)
+    frame_of(kind, th, frame)
+    step_into(kind, th, frame, step, moved)
+    return moved, H, max(kept, 0.0), used
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _equations(kind, th, depth, sen, noise, slack, runs, H, g):  # type: ignore[no-untyped-def]  # numba types it
+    """Gauss-Newton matrix and gradient of the pixels within the trim; their squared residuals, and how many they are."""
+    frame, work = np.zeros(6), np.empty(SCRATCH)
+    frame_of(kind, th, frame)
+    perspective = sen[0] > 0
+    cost, used, n, pixels = 0.0, 0.0, 0, 0
+    last = runs.shape[0] - 1
+    for i in range(runs.shape[0]):
+        v, first, end = runs[i, 0], runs[i, 1], runs[i, 2]
+        pixels += end - first
+        while first < end:
+            m = min(end - first, CHUNK - n)
+            _load(depth[v, first : first + m], first, v, sen, work[n:])
+            n, first = n + m, first + m
+            if n == CHUNK or (i == last and first == end):
+                _fill_variances(n, noise, slack, work)
+                if kind == PLANE:
+                    more, hits = _add_plane(th, frame, n, perspective, work, H, g)
+                else:
+                    _take_roots(n, work)
+                    fill_rows(kind, th, frame, n, perspective, work)
+                    more, hits = add_equations(kind, n, 0.0, TRIM_SIGMAS, work, H, g)
+                cost, used, n = cost + more, used + hits, 0
+    mirror(FREEDOM[kind], H)
+    return max(cost - (pixels - used) * TRIM_SIGMAS * TRIM_SIGMAS, 0.0), int(used)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _load(depth, first, row, sen, work):  # type: ignore[no-untyped-def]  # numba types it
+    """The pixels of a run that begins at column `first` as samples."""
+    per_x, y = 1.0 / sen[1], (row - sen[4]) / sen[2]
+    n = depth.shape[0]
+    for k in range(n):
+        work[X + k] = (float(np.int32(first + k)) - sen[3]) * per_x
+    for k in range(n):
+        work[Y + k] = y
+    for k in range(n):
+        work[Z + k] = depth[k]
+
+
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
+def _add_plane(th, frame, n, perspective, work, H, g):  # type: ignore[no-untyped-def]  # numba types it
+    """`fill_rows` and `add_equations` of a plane in one loop that takes no root: most pixels lie on planes.
+
+    Row SIGMA holds variances. With the weight w, squared, min(1, (c / GRAZING_COSINE)^2) / sigma^2, sums of w^2 J'J, w^2 J'r.
+    """
+    p, limit = 1.0 if perspective else 0.0, TRIM_SIGMAS * TRIM_SIGMAS
+    nx, ny, nz, d = th[0], th[1], th[2], th[3]
+    e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
+    h00, h10, h11, h20, h21, h22, g0, g1, g2, cost, used = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(n):
+        x, y, z = work[X + i], work[Y + i], work[Z + i]
+        dx, dy = p * x, p * y
+        ox, oy = x - dx, y - dy
+        facing = nx * dx + ny * dy + nz
+        is_met = abs(facing) > 1e-6
+        k = -1.0 / (facing if is_met else 1.0)
+        zm = (nx * ox + ny * oy - d) * k
+        square = GRAZING_COSINE * GRAZING_COSINE * (dx * dx + dy * dy + 1.0)
+        w2 = min(square, facing * facing) / (square * work[SIGMA + i])
+        r = z - zm
+        misfit = r * r * w2
+        kept = is_met & (misfit <= limit)
+        w2 = w2 if kept else 0.0
+        px, py = ox + zm * dx, oy + zm * dy
+        a, b = k * (px * e0 + py * e1 + zm * e2), k * (px * f0 + py * f1 + zm * f2)
+        wa, wb, wk = w2 * a, w2 * b, w2 * k
+        h00, h10, h11 = h00 + wa * a, h10 + wb * a, h11 + wb * b
+        h20, h21, h22 = h20 - wk * a, h21 - wk * b, h22 + wk * k
+        g0, g1, g2 = g0 + wa * r, g1 + wb * r, g2 - wk * r
+        cost += misfit if kept else limit
+        used += 1.0 if kept else 0.0
+    H[0, 0] += h00
+    H[1, 0] += h10
+    H[1, 1] += h11
+    H[2, 0] += h20
+    H[2, 1] += h21
+    H[2, 2] += h22
+    g[0] += g0
+    g[1] += g1
+    g[2] += g2
+    return cost, used
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _take_roots(n, work):  # type: ignore[no-untyped-def]  # numba types it
+    for k in range(n):
+        work[SIGMA + k] = np.sqrt(work[SIGMA + k])
+
+
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
+def _fill_variances(n, noise, slack, work):  # type: ignore[no-untyped-def]  # numba types it
+    """Squares of `sigma_at` of the loaded depths, without a branch, into row SIGMA."""
+    a, b, c, d, e, f = noise[0], noise[1], noise[2], noise[3], noise[4], noise[5]
+    for k in range(n):
+        z = work[Z + k]
+        z2 = z * z
+        white, slow, step = a + b * z2, c + d * z2, e + f * z2
+        work[SIGMA + k] = slack * slack * (max(white * white, step * step * (1.0 / 12.0)) + slow * slow)

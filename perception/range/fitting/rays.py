@@ -1,0 +1,383 @@
+"""Many rays against one surface: the loops of `surfaces.depth_and_jacobian` with every constant taken out.
+
+Samples are worked on in chunks whose rows stay in the first-level cache, and the bodies hold no branch, so that the
+compiler turns four or eight rays into one instruction: 6 ns a ray with its derivatives, 80 ns for the plain function.
+`surfaces` stays the reference; a test holds the two together.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.fitting.surfaces import CONE, CYLINDER, FREEDOM, GRAZING_COSINE, LEAN, PLANE, SPHERE, frame_of
+
+CHUNK = 160  # what `merge` fits at once
+ROWS = [row * CHUNK for row in range(18)]  # where each row of the scratch array begins
+DEPTH, COSINE = ROWS[:2]
+D0, D1, D2, D3, D4, D5, D6, D7, D8 = ROWS[2:11]  # derivatives of depth by the surface's free directions
+WEIGHT, RESIDUAL = ROWS[11:13]
+X, Y, Z, SIGMA = ROWS[13:17]  # the samples
+ERROR = ROWS[17]  # residuals before they are weighed; NaN where a ray misses
+SCRATCH = len(ROWS) * CHUNK
+LANES = 16  # rows are padded with zeros to this many samples: sums then need no remainder loop
+MISS_SIGMAS = 6.0  # a ray that misses the surface costs as much as a residual of this size
+CAUCHY_WIDTH = 2.0
+FARTHEST = 1e15  # sigmas; eight squares of it still multiply to a finite number
+# What `work` holds already: the samples, row ERROR of the surface, all of its rows.
+NOTHING, LOADED, ERRED, FILLED = range(4)
+LOOSE = {"reassoc", "contract", "nsz", "arcp"}  # sums may be reordered; NaN keeps its meaning
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def load_rows(x, y, z, sigma, first, n, work):  # type: ignore[no-untyped-def]  # numba types it
+    """Samples first .. first + n into `work`.
+
+    Loops that compute from several arrays ask at run time whether these may overlap, and round otherwise when they lie
+    side by side in memory. Within one array at fixed places there is nothing to ask: the same input, the same bits.
+    """
+    x, y, z, sigma = x[first:], y[first:], z[first:], sigma[first:]
+    for i in range(n):
+        work[X + i] = x[i]
+    for i in range(n):
+        work[Y + i] = y[i]
+    for i in range(n):
+        work[Z + i] = z[i]
+    for i in range(n):
+        work[SIGMA + i] = sigma[i]
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def fill_rows(kind, th, frame, n, perspective, work):  # type: ignore[no-untyped-def]  # numba types it
+    """Depth, cosine of incidence and derivatives (as `depth_and_jacobian`) of the `n` loaded samples into `work`.
+
+    `work` (SCRATCH,) holds rows of CHUNK numbers; n <= CHUNK. Depth is NaN where a ray misses.
+    """
+    p = 1.0 if perspective else 0.0
+    if kind == PLANE:
+        _plane(th, frame, n, p, work)
+    elif kind == SPHERE:
+        _sphere(th, n, p, work)
+    elif kind == CYLINDER:
+        _cylinder(th, frame, n, p, work)
+    elif kind == CONE:
+        _cone(th, frame, n, p, work)
+    else:
+        _quadric(th, n, p, work)
+
+
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
+def _plane(th, frame, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
+    nx, ny, nz, d = th[0], th[1], th[2], th[3]
+    e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
+    for i in range(n):
+        xi, yi = work[X + i], work[Y + i]
+        dx, dy = p * xi, p * yi
+        ox, oy = xi - dx, yi - dy
+        facing = nx * dx + ny * dy + nz
+        k = -1.0 / facing
+        z = (nx * ox + ny * oy - d) * k if abs(facing) > 1e-6 else np.nan
+        px, py = ox + z * dx, oy + z * dy
+        work[DEPTH + i] = z
+        work[COSINE + i] = abs(facing) / np.sqrt(dx * dx + dy * dy + 1.0)
+        work[D0 + i] = k * (px * e0 + py * e1 + z * e2)
+        work[D1 + i] = k * (px * f0 + py * f1 + z * f2)
+        work[D2 + i] = -k
+
+
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
+def _sphere(th, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
+    cx, cy, cz, r = th[0], th[1], th[2], th[3]
+    side = 1.0 if th[4] > 0 else -1.0
+    inverse_r = 1.0 / r
+    for i in range(n):
+        xi, yi = work[X + i], work[Y + i]
+        dx, dy = p * xi, p * yi
+        wx, wy = xi - dx - cx, yi - dy - cy
+        a = dx * dx + dy * dy + 1.0
+        b = dx * wx + dy * wy - cz
+        c = wx * wx + wy * wy + cz * cz - r * r
+        z = (-b - side * np.sqrt(b * b - a * c)) / a
+        nx, ny, nz = (wx + z * dx) * inverse_r, (wy + z * dy) * inverse_r, (z - cz) * inverse_r
+        facing = nx * dx + ny * dy + nz
+        k = 1.0 / facing
+        work[DEPTH + i] = z if abs(facing) > 1e-6 else np.nan
+        work[COSINE + i] = abs(facing) / np.sqrt(a)
+        work[D0 + i] = k * nx
+        work[D1 + i] = k * ny
+        work[D2 + i] = k * nz
+        work[D3 + i] = k
+
+
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
+def _cylinder(th, frame, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
+    cx, cy, cz, ax, ay, az, r = th[0], th[1], th[2], th[3], th[4], th[5], th[6]
+    e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
+    side = 1.0 if th[7] > 0 else -1.0
+    inverse_r = 1.0 / r
+    for i in range(n):
+        xi, yi = work[X + i], work[Y + i]
+        dx, dy = p * xi, p * yi
+        wx, wy = xi - dx - cx, yi - dy - cy
+        da = dx * ax + dy * ay + az
+        wa = wx * ax + wy * ay - cz * az
+        d2 = dx * dx + dy * dy + 1.0
+        a = d2 - da * da
+        b = dx * wx + dy * wy - cz - da * wa
+        c = wx * wx + wy * wy + cz * cz - wa * wa - r * r
+        z = (-b - side * np.sqrt(b * b - a * c)) / a
+        h = wa + z * da
+        # The normal of a point on the surface needs no root: its distance from the axis is the radius.
+        nx = (wx + z * dx - h * ax) * inverse_r
+        ny = (wy + z * dy - h * ay) * inverse_r
+        nz = (z - cz - h * az) * inverse_r
+        facing = nx * dx + ny * dy + nz
+        k = 1.0 / facing
+        n1, n2 = k * (nx * e0 + ny * e1 + nz * e2), k * (nx * f0 + ny * f1 + nz * f2)
+        work[DEPTH + i] = z if abs(facing) > 1e-6 else np.nan
+        work[COSINE + i] = abs(facing) / np.sqrt(d2)
+        work[D0 + i] = n1
+        work[D1 + i] = n2
+        work[D2 + i] = h * n1
+        work[D3 + i] = h * n2
+        work[D4 + i] = k
+
+
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
+def _cone(th, frame, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
+    cx, cy, cz, ax, ay, az = th[0], th[1], th[2], th[3], th[4], th[5]
+    e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
+    outside = th[7] > 0
+    ca, sa = np.cos(th[6]), np.sin(th[6])
+    square = ca * ca
+    for i in range(n):
+        xi, yi = work[X + i], work[Y + i]
+        dx, dy = p * xi, p * yi
+        wx, wy = xi - dx - cx, yi - dy - cy
+        da = dx * ax + dy * ay + az
+        wa = wx * ax + wy * ay - cz * az
+        d2 = dx * dx + dy * dy + 1.0
+        a = square * d2 - da * da
+        b = square * (dx * wx + dy * wy - cz) - da * wa
+        c = square * (wx * wx + wy * wy + cz * cz) - wa * wa
+        root = np.sqrt(b * b - a * c)
+        one, two = (-b - root) / a, (-b + root) / a
+        near, far = min(one, two), max(one, two)
+        near = near if wa + near * da > 0.0 else np.nan  # the other sheet of the double cone
+        far = far if wa + far * da > 0.0 else np.nan
+        wanted, other = (near, far) if outside else (far, near)
+        z = other if np.isnan(wanted) else wanted
+        h = wa + z * da
+        qx, qy, qz = wx + z * dx, wy + z * dy, z - cz
+        gx, gy, gz = qx - h * ax, qy - h * ay, qz - h * az
+        rho = np.sqrt(gx * gx + gy * gy + gz * gz) + 1e-30
+        scale = ca / rho
+        nx, ny, nz = scale * gx - sa * ax, scale * gy - sa * ay, scale * gz - sa * az
+        facing = nx * dx + ny * dy + nz
+        k = -1.0 / facing
+        tilt = -k * (scale * h + sa)
+        work[DEPTH + i] = z if abs(facing) > 1e-6 and abs(a) > 1e-15 else np.nan
+        work[COSINE + i] = abs(facing) / np.sqrt(d2)
+        work[D0 + i] = -k * nx
+        work[D1 + i] = -k * ny
+        work[D2 + i] = -k * nz
+        work[D3 + i] = tilt * (qx * e0 + qy * e1 + qz * e2)
+        work[D4 + i] = tilt * (qx * f0 + qy * f1 + qz * f2)
+        work[D5 + i] = -k * (rho * sa + h * ca)
+
+
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
+def _quadric(th, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
+    s = 1.0 / th[3]
+    cx, cy, cz = th[0] * s, th[1] * s, th[2] * s
+    qxx, qyy, qzz, qxy, qxz, qyz, qx, qy, qz, q0 = (
+        th[4], th[5], th[6], th[7], th[8], th[9], th[10], th[11], th[12], th[13],
+    )  # fmt: skip
+    for i in range(n):
+        xi, yi = work[X + i], work[Y + i]
+        dx, dy, dz = p * xi * s, p * yi * s, s
+        wx, wy, wz = xi * s - dx - cx, yi * s - dy - cy, -cz
+        # Gradients at the origin of the ray and along it; the quadric is c + 2 b z + a z^2 there.
+        ux, uy, uz = 2.0 * qxx * dx + qxy * dy + qxz * dz, 2.0 * qyy * dy + qxy * dx + qyz * dz, 0.0
+        uz = 2.0 * qzz * dz + qxz * dx + qyz * dy
+        a = 0.5 * (ux * dx + uy * dy + uz * dz)
+        b = 0.5 * (ux * wx + uy * wy + uz * wz + qx * dx + qy * dy + qz * dz)
+        c = (
+            wx * (qxx * wx + qxy * wy + qxz * wz + qx)
+            + wy * (qyy * wy + qyz * wz + qy)
+            + wz * (qzz * wz + qz)
+            + q0
+        )  # fmt: skip
+        root = np.sqrt(b * b - a * c)
+        root = -root if a < 0.0 else root
+        z = (-b - root) / a if abs(a) > 1e-14 * (abs(b) + 1e-30) else -0.5 * c / b + 0.0 * root
+        wx, wy, wz = wx + z * dx, wy + z * dy, wz + z * dz
+        gx = 2.0 * qxx * wx + qxy * wy + qxz * wz + qx
+        gy = 2.0 * qyy * wy + qxy * wx + qyz * wz + qy
+        gz = 2.0 * qzz * wz + qxz * wx + qyz * wy + qz
+        slope = gx * dx + gy * dy + gz * dz
+        d2 = dx * dx + dy * dy + dz * dz
+        cosine = abs(slope) / np.sqrt(d2 * (gx * gx + gy * gy + gz * gz) + 1e-300)
+        k = -1.0 / slope
+        zz = wz * wz
+        work[DEPTH + i] = z if cosine * np.sqrt(d2) > 1e-6 * s and abs(slope) > 1e-12 else np.nan
+        work[COSINE + i] = cosine
+        work[D0 + i] = k * (wx * wx - zz)
+        work[D1 + i] = k * (wy * wy - zz)
+        work[D2 + i] = k * wx * wy
+        work[D3 + i] = k * wx * wz
+        work[D4 + i] = k * wy * wz
+        work[D5 + i] = k * wx
+        work[D6 + i] = k * wy
+        work[D7 + i] = k * wz
+        work[D8 + i] = k
+
+
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
+def error_row(n, work):  # type: ignore[no-untyped-def]  # numba types it
+    """Row ERROR of the filled rows: residuals in sigmas, lessened at grazing rays; NaN where the ray misses."""
+    for i in range(n):
+        w = min(1.0, work[COSINE + i] * (1.0 / GRAZING_COSINE)) / work[SIGMA + i]
+        work[ERROR + i] = (work[Z + i] - work[DEPTH + i]) * w
+
+
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
+def _cauchy_weights(n, c2, work):  # type: ignore[no-untyped-def]  # numba types it
+    """Rows WEIGHT and RESIDUAL under Cauchy weights, 1 + ratio in row DEPTH; returns the number of samples that hit."""
+    used = 0.0
+    for i in range(n):
+        zm = work[DEPTH + i]
+        w = min(1.0, work[COSINE + i] * (1.0 / GRAZING_COSINE)) / work[SIGMA + i]
+        e = (work[Z + i] - zm) * w
+        work[ERROR + i] = e
+        hit = abs(e) < FARTHEST
+        e2 = e * e if hit else MISS_SIGMAS * MISS_SIGMAS
+        ratio = 1.0 + e2 / c2
+        root = 1.0 / np.sqrt(ratio)
+        work[DEPTH + i] = ratio
+        work[WEIGHT + i] = root * w if hit else 0.0
+        work[RESIDUAL + i] = root * e if hit else 0.0
+        used += 1.0 if hit else 0.0
+    return used
+
+
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
+def _sum_of_logarithms(values):  # type: ignore[no-untyped-def]  # numba types it
+    """Sum of ln(values): the logarithm of a product of eight is one logarithm in place of eight."""
+    total = 0.0
+    n = values.shape[0]
+    whole = n // 8 * 8
+    for i in range(0, whole, 8):
+        v = values[i : i + 8]
+        total += np.log(((v[0] * v[1]) * (v[2] * v[3])) * ((v[4] * v[5]) * (v[6] * v[7])))
+    for i in range(whole, n):
+        total += np.log(values[i])
+    return total
+
+
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
+def _trim_weights(n, trim, work):  # type: ignore[no-untyped-def]  # numba types it
+    """Rows WEIGHT and RESIDUAL under a trim; returns cost and number of samples kept."""
+    used, cost = 0.0, 0.0
+    for i in range(n):
+        zm = work[DEPTH + i]
+        w = min(1.0, work[COSINE + i] * (1.0 / GRAZING_COSINE)) / work[SIGMA + i]
+        e = (work[Z + i] - zm) * w
+        work[ERROR + i] = e
+        kept = abs(e) <= trim
+        cost += e * e if kept else trim * trim
+        work[WEIGHT + i] = w if kept else 0.0
+        work[RESIDUAL + i] = e if kept else 0.0
+        used += 1.0 if kept else 0.0
+    return cost, used
+
+
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
+def _dot(a, b):  # type: ignore[no-untyped-def]  # numba types it
+    total = 0.0
+    for i in range(a.shape[0]):
+        total += a[i] * b[i]
+    return total
+
+
+@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
+def _weighted(row, weight):  # type: ignore[no-untyped-def]  # numba types it
+    for i in range(row.shape[0]):
+        row[i] = row[i] * weight[i] if weight[i] > 0.0 else 0.0
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _add_products(p, n, work, H, g):  # type: ignore[no-untyped-def]  # numba types it
+    """Add J' W J to the lower triangle of `H` and J' W e to `g` from the rows of one chunk."""
+    padded = (n + LANES - 1) // LANES * LANES
+    work[WEIGHT + n : WEIGHT + padded] = 0.0
+    work[RESIDUAL + n : RESIDUAL + padded] = 0.0
+    weight, e = work[WEIGHT : WEIGHT + padded], work[RESIDUAL : RESIDUAL + padded]
+    for a in range(p):
+        mine = work[D0 + a * CHUNK : D0 + a * CHUNK + padded]
+        _weighted(mine, weight)
+        g[a] += _dot(mine, e)
+        for b in range(a + 1):
+            H[a, b] += _dot(mine, work[D0 + b * CHUNK : D0 + b * CHUNK + padded])
+
+
+@njit(cache=True, error_model="numpy", **LEAN, nogil=True)
+def normal_equations(  # type: ignore[no-untyped-def]  # numba types it
+    kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g, work, held
+):
+    """Gauss-Newton matrix `H` (9, 9) and gradient `g` (9,) of the ray residuals of samples (N,); cost and used samples.
+
+    `scale` > 0: Cauchy weights of that width in sigmas; 0: samples beyond `trim` sigmas are left out. `held`: what `work`
+    holds already of at most CHUNK samples; afterwards it holds the samples and row ERROR.
+    """
+    H[:] = 0.0
+    g[:] = 0.0
+    cost, used = 0.0, 0.0
+    count = x.shape[0]
+    for first in range(0, count, CHUNK):
+        n = min(CHUNK, count - first)
+        if held == NOTHING:
+            load_rows(x, y, z, sigma, first, n, work)
+        if held != FILLED:
+            fill_rows(kind, th, frame, n, perspective, work)
+        more, hits = add_equations(kind, n, scale, trim, work, H, g)
+        cost += more
+        used += hits
+    mirror(FREEDOM[kind], H)
+    return cost, int(used)
+
+
+@njit(cache=True, error_model="numpy", **LEAN, nogil=True)
+def add_equations(kind, n, scale, trim, work, H, g):  # type: ignore[no-untyped-def]  # numba types it
+    """Add the `n` filled rays in `work` to the lower triangle of `H` and to `g`; returns their cost and how many count."""
+    if scale > 0.0:
+        c2 = scale * scale * CAUCHY_WIDTH * CAUCHY_WIDTH
+        used = _cauchy_weights(n, c2, work)
+        cost = c2 * _sum_of_logarithms(work[:n])
+    else:
+        cost, used = _trim_weights(n, trim, work)
+    _add_products(FREEDOM[kind], n, work, H, g)
+    return cost, used
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def mirror(p, H):  # type: ignore[no-untyped-def]  # numba types it
+    """Fill the upper triangle of the first p rows of `H` from the lower one."""
+    for a in range(p):
+        for b in range(a):
+            H[b, a] = H[a, b]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def residuals(kind, th, x, y, z, sigma, perspective, out):  # type: ignore[no-untyped-def]  # numba types it
+    """Fill `out` (N,) with residuals in sigmas, lessened at grazing rays; NaN where the ray misses."""
+    frame, work = np.zeros(6), np.empty(SCRATCH)
+    frame_of(kind, th, frame)
+    count = x.shape[0]
+    for first in range(0, count, CHUNK):
+        n = min(CHUNK, count - first)
+        load_rows(x, y, z, sigma, first, n, work)
+        fill_rows(kind, th, frame, n, perspective, work)
+        error_row(n, work)
+        for i in range(n):
+            out[first + i] = work[ERROR + i]

@@ -1,0 +1,250 @@
+"""Where fits start: algebraic surfaces through points and normals, and the small linear algebra that they need."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.fitting.surfaces import LEAN, SIZE, tangent_frame
+
+MOST_SWEEPS = 12  # of Jacobi rotations; a 3x3 matrix settles in four or five
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def solve_positive(A, b, p):  # type: ignore[no-untyped-def]  # numba types it
+    """Solve A x = b by Cholesky, overwriting both; False when A is not positive definite."""
+    for i in range(p):
+        top = A[i, i]
+        for j in range(i + 1):
+            s = A[i, j]
+            for k in range(j):
+                s -= A[i, k] * A[j, k]
+            if i == j:
+                if s <= 1e-13 * top:
+                    return False
+                A[i, i] = np.sqrt(s)
+            else:
+                A[i, j] = s / A[j, j]
+    for i in range(p):
+        s = b[i]
+        for k in range(i):
+            s -= A[i, k] * b[k]
+        b[i] = s / A[i, i]
+    for i in range(p - 1, -1, -1):
+        s = b[i]
+        for k in range(i + 1, p):
+            s -= A[k, i] * b[k]
+        b[i] = s / A[i, i]
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def principal_axes(S):  # type: ignore[no-untyped-def]  # numba types it
+    """Eigenvalues (3,), smallest first, and eigenvectors (3, 3) in columns, of a symmetric matrix.
+
+    Cyclic Jacobi rotations (Golub and Van Loan, 8.5): a tenth of what a call of LAPACK costs at this size.
+    """
+    A, V = S.copy(), np.eye(3)
+    size = abs(A[0, 0]) + abs(A[1, 1]) + abs(A[2, 2])
+    for _ in range(MOST_SWEEPS):
+        off = abs(A[0, 1]) + abs(A[0, 2]) + abs(A[1, 2])
+        if off <= 1e-16 * size:
+            break
+        for i in range(2):
+            for j in range(i + 1, 3):
+                if A[i, j] == 0.0:
+                    continue
+                theta = (A[j, j] - A[i, i]) / (2.0 * A[i, j])
+                t = 1.0 / (abs(theta) + np.sqrt(theta * theta + 1.0))
+                t = t if theta >= 0.0 else -t
+                c = 1.0 / np.sqrt(t * t + 1.0)
+                s = t * c
+                for k in range(3):
+                    A[k, i], A[k, j] = c * A[k, i] - s * A[k, j], s * A[k, i] + c * A[k, j]
+                for k in range(3):
+                    A[i, k], A[j, k] = c * A[i, k] - s * A[j, k], s * A[i, k] + c * A[j, k]
+                for k in range(3):
+                    V[k, i], V[k, j] = c * V[k, i] - s * V[k, j], s * V[k, i] + c * V[k, j]
+    order = np.argsort(np.diag(A))
+    values, vectors = np.empty(3), np.empty((3, 3))
+    for k in range(3):
+        values[k] = A[order[k], order[k]]
+        vectors[:, k] = V[:, order[k]]
+    return values, vectors
+
+
+@njit(cache=True, error_model="numpy")
+def centroid(P):  # type: ignore[no-untyped-def]  # numba types it
+    """Mean of points (N, 3)."""
+    c = np.zeros(3)
+    n = P.shape[0]
+    for i in range(n):
+        for a in range(3):
+            c[a] += P[i, a]
+    for a in range(3):
+        c[a] /= n
+    return c
+
+
+@njit(cache=True, error_model="numpy")
+def scatter(P, c):  # type: ignore[no-untyped-def]  # numba types it
+    """(3, 3) sum of (P_i - c)(P_i - c)'."""
+    S = np.zeros((3, 3))
+    for i in range(P.shape[0]):
+        x, y, z = P[i, 0] - c[0], P[i, 1] - c[1], P[i, 2] - c[2]
+        S[0, 0] += x * x
+        S[1, 1] += y * y
+        S[2, 2] += z * z
+        S[0, 1] += x * y
+        S[0, 2] += x * z
+        S[1, 2] += y * z
+    S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
+    return S
+
+
+@njit(cache=True, error_model="numpy")
+def start_plane(P):  # type: ignore[no-untyped-def]  # numba types it
+    """Plane through points (N, 3) by principal axes."""
+    th = np.zeros(SIZE)
+    c = centroid(P)
+    _, V = principal_axes(scatter(P, c))
+    side = -1.0 if V[2, 0] > 0 else 1.0  # towards the sensor, but for planes that the ray only grazes
+    for a in range(3):
+        th[a] = side * V[a, 0]
+        th[3] += th[a] * c[a]
+    return th
+
+
+@njit(cache=True, error_model="numpy")
+def _least_squares(rows, values):  # type: ignore[no-untyped-def]  # numba types it
+    """Solve rows (N, m) x = values (N,) by normal equations; (x, solved)."""
+    n, m = rows.shape
+    A, b = np.zeros((m, m)), np.zeros(m)
+    for i in range(n):
+        for j in range(m):
+            r = rows[i, j]
+            b[j] += r * values[i]
+            for k in range(j + 1):
+                A[j, k] += r * rows[i, k]
+    for j in range(m):
+        for k in range(j):
+            A[k, j] = A[j, k]
+        A[j, j] = A[j, j] * (1.0 + 1e-9) + 1e-18
+    return b, solve_positive(A, b, m)
+
+
+@njit(cache=True, error_model="numpy")
+def _side(P, N, th, axis):  # type: ignore[no-untyped-def]  # numba types it
+    """+1 when the normals point away from the centre or axis of `th`, -1 when towards it."""
+    outward = 0.0
+    for i in range(P.shape[0]):
+        x, y, z = P[i, 0] - th[0], P[i, 1] - th[1], P[i, 2] - th[2]
+        h = x * axis[0] + y * axis[1] + z * axis[2]
+        outward += N[i, 0] * (x - h * axis[0]) + N[i, 1] * (y - h * axis[1]) + N[i, 2] * (z - h * axis[2])
+    return 1.0 if outward >= 0 else -1.0
+
+
+@njit(cache=True, error_model="numpy")
+def start_sphere(P, N):  # type: ignore[no-untyped-def]  # numba types it
+    """Algebraic sphere |X|^2 = 2 c . X + k about the centroid; side from the normals."""
+    th = np.zeros(SIZE)
+    c = centroid(P)
+    n = P.shape[0]
+    rows, values = np.ones((n, 4)), np.zeros(n)
+    for i in range(n):
+        for a in range(3):
+            d = P[i, a] - c[a]
+            rows[i, a] = 2.0 * d
+            values[i] += d * d
+    b, ok = _least_squares(rows, values)
+    if not ok:
+        return th, False
+    square = b[3]
+    for a in range(3):
+        th[a] = c[a] + b[a]
+        square += b[a] * b[a]
+    th[3] = np.sqrt(max(square, 1e-12))
+    th[4] = _side(P, N, th, np.zeros(3))
+    return th, True
+
+
+@njit(cache=True, error_model="numpy")
+def normal_axis(N, centred):  # type: ignore[no-untyped-def]  # numba types it
+    """Direction that the normals avoid (cylinder), or along which they are constant (cone, centred)."""
+    _, V = principal_axes(scatter(N, centroid(N) if centred else np.zeros(3)))
+    return V[:, 0].copy()
+
+
+@njit(cache=True, error_model="numpy")
+def start_cylinder(P, N, axis):  # type: ignore[no-untyped-def]  # numba types it
+    """Circle (algebraic) of the points seen along `axis`."""
+    th = np.zeros(SIZE)
+    e = tangent_frame(axis[0], axis[1], axis[2])
+    c = centroid(P)
+    n = P.shape[0]
+    rows, values = np.ones((n, 3)), np.zeros(n)
+    for i in range(n):
+        x, y, z = P[i, 0] - c[0], P[i, 1] - c[1], P[i, 2] - c[2]
+        p, q = x * e[0] + y * e[1] + z * e[2], x * e[3] + y * e[4] + z * e[5]
+        rows[i, 0], rows[i, 1] = 2.0 * p, 2.0 * q
+        values[i] = p * p + q * q
+    b, ok = _least_squares(rows, values)
+    if not ok:
+        return th, False
+    for a in range(3):
+        th[a] = c[a] + b[0] * e[a] + b[1] * e[3 + a]
+        th[3 + a] = axis[a]
+    th[6] = np.sqrt(max(b[2] + b[0] * b[0] + b[1] * b[1], 1e-12))
+    th[7] = _side(P, N, th, axis)
+    return th, True
+
+
+@njit(cache=True, error_model="numpy")
+def start_cone(P, N, axis):  # type: ignore[no-untyped-def]  # numba types it
+    """Apex from n . X = n . apex; the angle from n . axis = -sin(angle)."""
+    th = np.zeros(SIZE)
+    c = centroid(P)
+    n = P.shape[0]
+    values = np.zeros(n)
+    along = 0.0
+    for i in range(n):
+        for a in range(3):
+            values[i] += N[i, a] * (P[i, a] - c[a])
+            along += N[i, a] * axis[a] / n
+    b, ok = _least_squares(N, values)
+    if not ok:
+        return th, False
+    inward = 1.0 if b[0] * axis[0] + b[1] * axis[1] + b[2] * axis[2] < 0 else -1.0
+    for a in range(3):
+        th[a] = c[a] + b[a]
+        th[3 + a] = inward * axis[a]
+    th[6] = min(max(np.arcsin(min(abs(along), 0.999)), 0.02), 1.5)
+    th[7] = _side(P, N, th, th[3:6])
+    return th, True
+
+
+@njit(cache=True, error_model="numpy")
+def quadric_of_sphere(th):  # type: ignore[no-untyped-def]  # numba types it
+    """The sphere as a quadric centred on it: the start of an ellipsoid fit."""
+    out = np.zeros(SIZE)
+    out[:3] = th[:3]
+    out[3] = max(th[3], 1e-6)
+    out[4], out[5], out[6], out[13] = 1.0, 1.0, 1.0, -1.0
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def is_ellipsoid(th):  # type: ignore[no-untyped-def]  # numba types it
+    """Whether the quadric is a real ellipsoid of sane proportions (longest radius at most 8 times the shortest)."""
+    A = np.array(
+        [[th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]]
+    )
+    b = 0.5 * th[10:13]
+    w, V = principal_axes(A)
+    if w[0] <= 1e-3:
+        return False
+    t = np.empty(3)
+    for k in range(3):
+        t[k] = V[0, k] * b[0] + V[1, k] * b[1] + V[2, k] * b[2]
+    rest = t[0] * t[0] / w[0] + t[1] * t[1] / w[1] + t[2] * t[2] / w[2] - th[13]
+    return rest > 0 and w[2] < 64.0 * w[0]

@@ -1,0 +1,158 @@
+"""Finding the components of a model library in an analysed scene.
+
+Pieces of the scene suggest poses of models (`hypotheses`), each is moved to where it explains most of the depth image
+(`search`, `verify`), the best ones share the pixels out among themselves, and `placing` says how well each is placed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from hal.geometry import UncertainPose
+from perception.range.analyse import RangeScene
+from perception.range.matching.hypotheses import candidate_of, pieces_of
+from perception.range.matching.models import ComponentModel, MotionKind
+from perception.range.matching.placing import placed_covariance
+from perception.range.matching.search import Try, climb, refined, tries_of
+from perception.range.matching.verify import BEHIND, COVERED, HITS, RING, View, explained
+from perception.range.primitives import Plane, Surface
+
+Array = NDArray[np.float64]
+
+LEAST_SCORE = 45.0  # of a match; a pixel that agrees counts 3
+LEAST_PIXELS = 20
+LEAST_SEEN = 0.3  # of the pixels that the model covers
+LEAST_AGREEING = 0.78  # of those that nothing hides
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Match:
+    """A component found.
+
+    Attributes:
+        model: name of the model.
+        sensor_from_object: pose and covariance; where `free` names a direction its variance is what one turn allows.
+        labels: model surface name to surface label of the scene, for those that the segmentation has, too.
+        state: position of the moving part along or about `motion_axis` (m or rad); None without one.
+        state_sigma: its standard deviation.
+        free: directions that the data do not fix, e.g. "turn about z".
+        score: log-likelihood over that of the bare panel; higher is surer.
+        seen: share of the pixels that the model covers where the image agrees with it.
+    """
+
+    model: str
+    sensor_from_object: UncertainPose
+    labels: dict[str, int]
+    state: float | None
+    state_sigma: float | None
+    free: tuple[str, ...]
+    score: float
+    seen: float
+
+
+def match_models(
+    scene: RangeScene, depth_m: Array, models: Sequence[ComponentModel], *, panel: Surface | None = None
+) -> tuple[Match, ...]:
+    """Components on a panel, best first; each pixel belongs to at most one.
+
+    Args:
+        scene: result of `analyse`.
+        depth_m: (H, W) the image that the scene came from.
+        models: the library.
+        panel: the plane that components stand on; the scene's largest plane by default.
+
+    Raises:
+        NotFound: no panel is given and the scene shows no plane.
+    """
+    base = panel or scene.largest_plane()
+    view = view_of(scene, depth_m, base)
+    pieces = pieces_of(scene, view)
+    tries = [t for model in models for t in tries_of(candidate_of(model), pieces, view)]
+    tries = [refined(t, view) for t in tries]
+    out: list[Match] = []
+    while True:
+        tries = [t for t in tries if t.score >= LEAST_SCORE]
+        if not tries:
+            return tuple(out)
+        best = max(tries, key=lambda t: t.score)
+        tries.remove(best)
+        evidence = explained(best.candidate.solid, best.q, view)
+        if not _holds(evidence.counts):
+            continue
+        out.append(_finished(best, scene, base, view))
+        view.depth_m[evidence.pixels] = np.nan
+        tries = [climb(t.candidate, t.q, view) for t in tries]
+
+
+def view_of(scene: RangeScene, depth_m: Array, base: Surface) -> View:
+    """The image as hypotheses are held against it, with the panel's frame: z its outward normal, x the sensor's x."""
+    plane = base.primitive
+    if not isinstance(plane, Plane):
+        raise TypeError(f"surface {base.label} is a {base.type}, not a plane")
+    depth = np.where(np.isfinite(depth_m), depth_m, np.nan).astype(float)
+    z = plane.normal
+    x = np.array([1.0, 0.0, 0.0]) - z[0] * z
+    x /= np.linalg.norm(x)
+    rays = scene.sensor.points(np.ones_like(depth))
+    if scene.sensor.packed()[0] > 0:
+        panel = float(z @ plane.point_m) / (rays @ z)
+    else:
+        panel = (float(z @ plane.point_m) - rays[..., :2] @ z[:2]) / z[2]
+    return View(
+        depth_m=depth,
+        panel_m=panel,
+        sigma_m=np.asarray(scene.noise.sigma_m(np.where(np.isfinite(depth), depth, 1.0))),
+        packed=scene.sensor.packed(),
+        R=np.stack([x, np.cross(z, x), z], axis=1),
+        p=plane.point_m.copy(),
+    )
+
+
+def _holds(counts: Array) -> bool:
+    against = counts[BEHIND] + counts[RING]
+    return bool(
+        counts[HITS] >= LEAST_PIXELS
+        and counts[HITS] >= LEAST_SEEN * counts[COVERED]
+        and counts[HITS] >= LEAST_AGREEING * (counts[HITS] + against)
+    )
+
+
+def _finished(t: Try, scene: RangeScene, base: Surface, view: View) -> Match:
+    model = t.candidate.model
+    evidence = explained(t.candidate.solid, t.q, view)
+    x, y, yaw, state = t.q[:4]
+    sensor_from_panel = RigidTransform.from_components(view.p, Rotation.from_matrix(view.R))
+    panel_from_object = RigidTransform.from_components(np.array([x, y, 0.0]), Rotation.from_euler("z", yaw))
+    covariance, state_sigma = placed_covariance(t, view, base)
+    if model.motion == MotionKind.TURN:
+        state = (yaw - model.low) % (model.high - model.low) + model.low
+    return Match(
+        model=model.name,
+        sensor_from_object=UncertainPose(
+            parent_from_child=sensor_from_panel * panel_from_object, covariance=covariance
+        ),
+        labels=_labels(model, scene, evidence.rows, evidence.pixels),
+        state=None if model.motion == MotionKind.NONE else float(state),
+        state_sigma=None if model.motion == MotionKind.NONE else state_sigma,
+        free=() if model.turns else ("turn about z",),
+        score=t.score,
+        seen=float(evidence.counts[HITS] / max(evidence.counts[COVERED], 1.0)),
+    )
+
+
+def _labels(
+    model: ComponentModel, scene: RangeScene, rows: NDArray[np.int64], pixels: NDArray[np.bool_]
+) -> dict[str, int]:
+    """For each surface of the model the scene's surface that most of its explained pixels belong to."""
+    out: dict[str, int] = {}
+    for k, surface in enumerate(model.surfaces):
+        votes = np.bincount(scene.labels[pixels & (rows == k)], minlength=1)
+        votes[0] = 0
+        if votes.max(initial=0) > 0:
+            out[surface.name] = int(votes.argmax())
+    return out

@@ -1,0 +1,252 @@
+"""Models of components as rays see them: bounded primitives in the object's frame, compiled.
+
+A solid is a table of rows, one a surface:
+
+    0       form, as `FORMS` counts them
+    1-3     a point of it: middle of a face, cylinder, ball or ring, apex of a cone
+    4-6     unit axis or normal          7-9     unit direction of a rectangle's first side
+    10, 11  radius and half length (cylinder), half sides (rectangle), tangent of the half angle (cone),
+            radius (disc, sphere), radius of the ring and of its tube (torus)
+    10-12   radii along the object's axes (ellipsoid)
+    13, 14  least and greatest z of what is kept of a sphere or cone
+    15      1 when it belongs to the part that slides
+
+Only nearest hits count, so that one surface of a solid hides another.
+"""
+
+# ruff: noqa: PLR0912 - compiled loops take plain arrays, and one branch a form is clearest.
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from perception.range.matching.models import ComponentModel, Form, ModelSurface, MotionKind
+
+Array = NDArray[np.float64]
+
+DISC, RECTANGLE, CYLINDER, CONE, SPHERE, ELLIPSOID, TORUS = range(7)
+WIDTH = 16
+MOVES = 15
+TRACE_STEPS = 24
+TRACE_END_M = 1e-5
+FREE_LENGTH = 4.0  # radii of a cylinder whose length the model does not tell
+
+
+def solid_of(model: ComponentModel) -> Array:
+    """(S, 16) rows of the model's surfaces in their order."""
+    return np.stack([_row(s) for s in model.surfaces])
+
+
+def boxes_of(model: ComponentModel, *, with_travel: bool = False) -> Array:
+    """(S, 2, 3) corners of a box in the object's frame that holds each surface, its size at its largest.
+
+    `with_travel` takes in every state of the sliding part; without it the part stands at 0.
+    """
+    rows = solid_of(model)
+    out = np.empty((len(rows), 2, 3))
+    for k, (surface, row) in enumerate(zip(model.surfaces, rows, strict=True)):
+        reach = _reach(row)
+        low, high = row[1:4] - reach, row[1:4] + reach
+        low[2], high[2] = max(low[2], row[13]), min(high[2], row[14])
+        shifts = _shifts(model, surface) if with_travel else [np.zeros(3)]
+        out[k, 0] = np.min([low + s for s in shifts], axis=0) - surface.tolerance_m
+        out[k, 1] = np.max([high + s for s in shifts], axis=0) + surface.tolerance_m
+    return out
+
+
+def _shifts(model: ComponentModel, surface: ModelSurface) -> list[Array]:
+    if model.motion != MotionKind.SLIDE or not surface.moves:
+        return [np.zeros(3)]
+    return [model.motion_axis * model.low, model.motion_axis * model.high]
+
+
+def _reach(row: Array) -> Array:
+    """(3,) half extent of a surface about its point along the object's axes."""
+    form, axis = int(row[0]), row[4:7]
+    across = np.sqrt(np.maximum(1.0 - axis**2, 0.0))
+    if form == RECTANGLE:
+        other = np.cross(axis, row[7:10])
+        return np.asarray(np.abs(row[7:10]) * row[10] + np.abs(other) * row[11])
+    if form == CYLINDER:
+        return np.asarray(np.abs(axis) * row[11] + across * row[10])
+    if form == CONE:
+        far = float(np.max(np.abs(row[13:15] - row[3])))
+        return np.asarray(np.abs(axis) * far + across * far * row[10])
+    if form == ELLIPSOID:
+        return row[10:13].copy()
+    if form == TORUS:
+        return np.asarray(across * row[10] + row[11])
+    return np.asarray((across if form == DISC else 1.0) * row[10])
+
+
+def _row(s: ModelSurface) -> Array:
+    row = np.zeros(WIDTH)
+    row[1:4], row[4:7], row[7:10] = s.point_m, s.direction, s.along
+    row[13], row[14] = s.between_m
+    row[MOVES] = float(s.moves)
+    if s.type == Form.PLANE:
+        row[0] = RECTANGLE if s.sides_m is not None else DISC
+        row[10:12] = (0.5 * s.sides_m[0], 0.5 * s.sides_m[1]) if s.sides_m is not None else (s.size_m, 0.0)
+    elif s.type == Form.CYLINDER:
+        row[0] = CYLINDER
+        row[10:12] = s.size_m, 0.5 * s.length_m if s.length_m > 0 else FREE_LENGTH * s.size_m
+    elif s.type == Form.CONE:
+        row[0], row[10] = CONE, np.tan(s.half_angle_rad)
+    elif s.type == Form.SPHERE:
+        row[0], row[10] = SPHERE, s.size_m
+    elif s.type == Form.ELLIPSOID:
+        row[0], row[10:13] = ELLIPSOID, s.radii_m
+    else:
+        row[0], row[10], row[11] = TORUS, s.size_m, s.tube_m
+    return row
+
+
+@njit(cache=True, error_model="numpy")
+def hit(row, grow, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]  # numba types it
+    """Depth along the ray o + t d where it first meets the surface grown by `grow`; infinite where it does not."""
+    form = int(row[0])
+    wx, wy, wz = ox - row[1], oy - row[2], oz - row[3]
+    ax, ay, az = row[4], row[5], row[6]
+    if form <= RECTANGLE:
+        facing = ax * dx + ay * dy + az * dz
+        if abs(facing) < 1e-9:
+            return np.inf
+        t = -(ax * wx + ay * wy + az * wz) / facing
+        px, py, pz = wx + t * dx, wy + t * dy, wz + t * dz
+        if form == DISC:
+            r = row[10] + grow
+            return t if px * px + py * py + pz * pz <= r * r else np.inf
+        a = px * row[7] + py * row[8] + pz * row[9]
+        b = np.sqrt(max(px * px + py * py + pz * pz - a * a, 0.0))
+        return t if abs(a) <= row[10] + grow and b <= row[11] + grow else np.inf
+    if form == TORUS:
+        return _ring(row[10] + grow, row[11], ax, ay, az, wx, wy, wz, dx, dy, dz)
+    if form == ELLIPSOID:
+        u, v, w = 1.0 / row[10], 1.0 / row[11], 1.0 / row[12]
+        wx, wy, wz, dx, dy, dz = wx * u, wy * v, wz * w, dx * u, dy * v, dz * w
+        A, B = dx * dx + dy * dy + dz * dz, dx * wx + dy * wy + dz * wz
+        disc = B * B - A * (wx * wx + wy * wy + wz * wz - 1.0)
+        return (-B - np.sqrt(disc)) / A if disc >= 0.0 else np.inf
+    A, B, C = dx * dx + dy * dy + dz * dz, dx * wx + dy * wy + dz * wz, wx * wx + wy * wy + wz * wz
+    if form == SPHERE:
+        r = row[10] + grow
+        C -= r * r
+    else:
+        if form == CONE:
+            # A cone grown by g is the same cone with its apex g / tan(angle) back.
+            back = grow / row[10]
+            wx, wy, wz = wx + back * ax, wy + back * ay, wz + back * az
+            B, C = dx * wx + dy * wy + dz * wz, wx * wx + wy * wy + wz * wz
+        da, wa = dx * ax + dy * ay + dz * az, wx * ax + wy * ay + wz * az
+        k = 1.0 + row[10] * row[10] if form == CONE else 1.0
+        r = 0.0 if form == CONE else row[10] + grow
+        A, B, C = A - k * da * da, B - k * da * wa, C - k * wa * wa - r * r
+    disc = B * B - A * C
+    if disc < 0.0 or A == 0.0:
+        return np.inf
+    root = np.sqrt(disc)
+    near, far = (-B - root) / A, (-B + root) / A
+    if near > far:
+        near, far = far, near
+    for t in (near, far):
+        z = oz + t * dz
+        if form == CYLINDER:
+            if abs((wx + t * dx) * ax + (wy + t * dy) * ay + (wz + t * dz) * az) <= row[11]:
+                return t
+        elif row[13] <= z <= row[14] and (
+            form == SPHERE or (wx + t * dx) * ax + (wy + t * dy) * ay + (wz + t * dz) * az > 0.0
+        ):
+            return t
+    return np.inf
+
+
+@njit(cache=True, error_model="numpy")
+def _ring(R, r, ax, ay, az, wx, wy, wz, dx, dy, dz):  # type: ignore[no-untyped-def]  # numba types it
+    """A torus met by steps of its distance (sphere tracing; Hart, The Visual Computer 12, 1996)."""
+    A, B = dx * dx + dy * dy + dz * dz, dx * wx + dy * wy + dz * wz
+    disc = B * B - A * (wx * wx + wy * wy + wz * wz - (R + r) * (R + r))
+    if disc < 0.0:
+        return np.inf
+    root = np.sqrt(disc)
+    t, end = (-B - root) / A, (-B + root) / A
+    # The tube lies between two planes: from where the ray enters that slab to where it leaves.
+    da, wa = dx * ax + dy * ay + dz * az, wx * ax + wy * ay + wz * az
+    if abs(da) > 1e-6:
+        first, last = (-r - wa) / da, (r - wa) / da
+        t, end = max(t, min(first, last)), min(end, max(first, last))
+    elif abs(wa) > r:
+        return np.inf
+    step = 1.0 / np.sqrt(A)
+    for _ in range(TRACE_STEPS):
+        if t > end:
+            return np.inf
+        px, py, pz = wx + t * dx, wy + t * dy, wz + t * dz
+        h = px * ax + py * ay + pz * az
+        q = np.sqrt(max(px * px + py * py + pz * pz - h * h, 0.0)) - R
+        away = np.sqrt(q * q + h * h) - r
+        if away < TRACE_END_M:
+            return t
+        t += away * step
+    return np.inf
+
+
+@njit(cache=True, error_model="numpy")
+def window_of(box, shift, R, p, sen, margin, limit, window):  # type: ignore[no-untyped-def]  # numba types it
+    """Fill `window` (u0, v0, u1, v1) with what a box (2, 3) of the object's frame covers, clipped to `limit`."""
+    u0, v0, u1, v1 = 1e9, 1e9, -1e9, -1e9
+    for corner in range(8):
+        x = box[corner & 1, 0] + shift[0]
+        y = box[(corner >> 1) & 1, 1] + shift[1]
+        z = box[corner >> 2, 2] + shift[2]
+        X = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + p[0]
+        Y = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + p[1]
+        if sen[0] > 0.0:
+            Z = max(R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + p[2], 1e-3)
+            X, Y = X / Z, Y / Z
+        u, v = X * sen[1] + sen[3], Y * sen[2] + sen[4]
+        u0, v0, u1, v1 = min(u0, u), min(v0, v), max(u1, u), max(v1, v)
+    window[0] = int(min(max(np.floor(u0) - margin, limit[0]), limit[2]))
+    window[1] = int(min(max(np.floor(v0) - margin, limit[1]), limit[3]))
+    window[2] = int(min(max(np.ceil(u1) + margin + 1, window[0]), limit[2]))
+    window[3] = int(min(max(np.ceil(v1) + margin + 1, window[1]), limit[3]))
+
+
+@njit(cache=True, error_model="numpy")
+def render(rows, boxes, grow, shift, R, p, sen, window, stride, depth, index):  # type: ignore[no-untyped-def]  # numba types it
+    """Fill `depth` (infinite where nothing is met) and `index` (row number or -1) over a window of the image.
+
+    Args:
+        rows, grow: the solid, and what to add to the size of each row, m.
+        boxes: (S, 2, 3) corners of a box that holds each row, object frame.
+        shift: (3,) where the sliding part stands, object frame.
+        R, p: sensor_from_object.
+        sen: `RangeSensorModel.packed()`.
+        window: u0, v0, u1, v1 (exclusive); every `stride`-th pixel is drawn, packed densely into the outputs.
+    """
+    h, w = (window[3] - window[1] + stride - 1) // stride, (window[2] - window[0] + stride - 1) // stride
+    depth[:h, :w] = np.inf
+    index[:h, :w] = -1
+    part, away = np.empty(4, np.int64), np.empty(3)
+    for s in range(rows.shape[0]):
+        for a in range(3):
+            away[a] = shift[a] * rows[s, MOVES]
+        window_of(boxes[s], away, R, p, sen, 1, window, part)
+        for j in range((part[1] - window[1] + stride - 1) // stride, (part[3] - window[1] + stride - 1) // stride):
+            y = (window[1] + j * stride - sen[4]) / sen[2]
+            for i in range((part[0] - window[0] + stride - 1) // stride, (part[2] - window[0] + stride - 1) // stride):
+                x = (window[0] + i * stride - sen[3]) / sen[1]
+                if sen[0] > 0.0:
+                    ex, ey, ez, fx, fy = -p[0], -p[1], -p[2], x, y
+                else:
+                    ex, ey, ez, fx, fy = x - p[0], y - p[1], -p[2], 0.0, 0.0
+                ox = R[0, 0] * ex + R[1, 0] * ey + R[2, 0] * ez - away[0]
+                oy = R[0, 1] * ex + R[1, 1] * ey + R[2, 1] * ez - away[1]
+                oz = R[0, 2] * ex + R[1, 2] * ey + R[2, 2] * ez - away[2]
+                dx = R[0, 0] * fx + R[1, 0] * fy + R[2, 0]
+                dy = R[0, 1] * fx + R[1, 1] * fy + R[2, 1]
+                dz = R[0, 2] * fx + R[1, 2] * fy + R[2, 2]
+                t = hit(rows[s], grow[s], ox, oy, oz, dx, dy, dz)
+                if t < depth[j, i]:
+                    depth[j, i] = t
+                    index[j, i] = s

@@ -1,0 +1,310 @@
+"""How well a model in a pose explains a depth image, pixel by pixel, and the pose near by that explains it best.
+
+A pixel that the model covers is explained (measured and drawn depth agree), hidden (something nearer is measured) or
+contradicted (the sensor sees through the model). Its gain is the log-likelihood under the model, floored as gross
+errors are, less the one under the bare panel; hidden pixels cost little, because anything may stand in front. Beyond
+the outline, depth that goes on smoothly from an explained pixel contradicts too: the thing is larger than the model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from perception.range.matching.solids import MOVES, render, window_of
+
+Array = NDArray[np.float64]
+
+HIT = 3.0  # log-likelihood of a pixel that agrees, over one of a gross error
+HIDDEN = -0.4
+MIXED = -0.4  # half of the beams at a jump say anything between its sides: as likely there as a gross error
+SEEN_THROUGH = -3.0
+GOES_ON = -2.0
+RING_PX = 2
+SLACK_M = 0.0002  # by which real components differ from their models beside sizes and heights
+SLOPE_SHARE = 0.3  # of the depth step to the next pixel: nobody places an outline better
+STEEPEST_M = 0.004
+TRIES = 4
+HITS, BEHIND, RING, FRONT, COVERED, BETWEEN = range(6)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class View:
+    """What hypotheses are held against.
+
+    Attributes:
+        depth_m: (H, W), NaN where nothing is known or a better match owns the pixel.
+        panel_m: (H, W) depth of the bare panel.
+        sigma_m: (H, W) noise.
+        packed: of the sensor.
+        R, p: (3, 3) and (3,) sensor_from_panel.
+    """
+
+    depth_m: Array
+    panel_m: Array
+    sigma_m: Array
+    packed: Array
+    R: Array
+    p: Array
+
+    @property
+    def pitch_m(self) -> float:
+        """Distance between neighbouring pixels on the panel."""
+        return float((self.p[2] if self.packed[0] > 0 else 1.0) / self.packed[1])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Solid:
+    """A model ready to be held against a view: rows of `solids`, boxes about them, tolerances, how its part slides."""
+
+    rows: Array
+    boxes: Array
+    tolerance_m: Array
+    slide: Array
+
+
+@njit(cache=True, error_model="numpy")
+def _placed(boxes, slide, q, R0, p0, sen, limit, R, p, window):  # type: ignore[no-untyped-def]  # numba types it
+    """Pose of the hypothesis into `R`, `p`, and what of the image the solid covers into `window`, with a margin."""
+    c, s = np.cos(q[2]), np.sin(q[2])
+    for a in range(3):
+        R[a, 0] = c * R0[a, 0] + s * R0[a, 1]
+        R[a, 1] = c * R0[a, 1] - s * R0[a, 0]
+        R[a, 2] = R0[a, 2]
+        p[a] = p0[a] + q[0] * R0[a, 0] + q[1] * R0[a, 1]
+    box = np.empty((2, 3))
+    for a in range(3):
+        # Rows that do not slide are held by the wider box, too: one box keeps this quick.
+        box[0, a] = boxes[:, 0, a].min() + min(slide[a] * q[3], 0.0)
+        box[1, a] = boxes[:, 1, a].max() + max(slide[a] * q[3], 0.0)
+    window_of(box, np.zeros(3), R, p, sen, RING_PX + 1, limit, window)
+
+
+@njit(cache=True, error_model="numpy")
+def _lifts(m, k, window, stride, h, w, z, sigma, tolerance, is_free, lift):  # type: ignore[no-untyped-def]  # numba types it
+    """Mean residual of each row within its tolerance: how much higher or lower this component is than its model."""
+    S = lift.shape[0]
+    weight, total = np.zeros(S), np.zeros(S)
+    for j in range(h):
+        for i in range(w):
+            s = k[j, i]
+            if s < 0 or not is_free[s]:
+                continue
+            v, u = window[1] + j * stride, window[0] + i * stride
+            if v < 0 or u < 0 or v >= z.shape[0] or u >= z.shape[1]:
+                continue
+            r = z[v, u] - m[j, i]
+            if abs(r) < tolerance[s] + 3.0 * sigma[v, u]:
+                g = 1.0 / (sigma[v, u] * sigma[v, u])
+                weight[s] += g
+                total[s] += g * r
+    for s in range(S):
+        prior = 4.0 / (tolerance[s] * tolerance[s] + 1e-12)
+        lift[s] = min(max(total[s] / (weight[s] + prior), -tolerance[s]), tolerance[s])
+
+
+@njit(cache=True, error_model="numpy")
+def judged(rows, boxes, tolerance, slide, q, z, panel, sigma, sen, R0, p0, stride, rim, m, k, lift, hits, counts):  # type: ignore[no-untyped-def]  # numba types it
+    """Gain of the hypothesis q = (x, y, yaw, state, growth of each row) over the bare panel.
+
+    Args:
+        z, panel, sigma: images of `View`.
+        stride: every how manieth pixel is looked at; with 1, `rim` may ask for what goes on beyond the outline, too.
+        m, k, hits: scratch of the image's size: drawn depth, row and whether explained, packed as `render` does.
+        lift: (S,) filled with how much deeper than drawn each row was found.
+        counts: (6,) filled with pixels explained, seen through, going on, hidden, covered at all, and mixed with what
+            is beside.
+    """
+    H, W = z.shape
+    S = rows.shape[0]
+    R, p, window = np.empty((3, 3)), np.empty(3), np.empty(4, np.int64)
+    limit = np.array([-W // 2, -H // 2, W + W // 2, H + H // 2])
+    _placed(boxes, slide, q, R0, p0, sen, limit, R, p, window)
+    h, w = (window[3] - window[1] + stride - 1) // stride, (window[2] - window[0] + stride - 1) // stride
+    counts[:] = 0.0
+    if h <= 0 or w <= 0:
+        return -1e3
+    shift = slide * q[3]
+    render(rows, boxes, q[4:], shift, R, p, sen, window, stride, m, k)
+    slides_up = abs(slide[2]) > 0.5
+    is_free = np.empty(S, np.bool_)
+    for s in range(S):
+        is_free[s] = tolerance[s] > 0.0 and not (slides_up and rows[s, MOVES] > 0.0)
+    _lifts(m, k, window, stride, h, w, z, sigma, tolerance, is_free, lift)
+    score = _priors(q, tolerance, is_free, lift)
+    for j in range(h):
+        for i in range(w):
+            s = k[j, i]
+            hits[j, i] = 0
+            if s < 0:
+                continue
+            counts[COVERED] += 1.0
+            v, u = window[1] + j * stride, window[0] + i * stride
+            if v < 0 or u < 0 or v >= H or u >= W or not np.isfinite(z[v, u]):
+                score += HIDDEN
+                continue
+            least = sigma[v, u] * sigma[v, u] + SLACK_M * SLACK_M
+            slope = SLOPE_SHARE * min(_slope(m, k, j, i, h, w) / stride, STEEPEST_M)
+            wide = least + slope * slope
+            r, b = z[v, u] - m[j, i] - lift[s], z[v, u] - panel[v, u]
+            gain = HIT - 0.5 * r * r / wide - 0.5 * np.log(wide / least)
+            floor, kind = (HIDDEN, FRONT) if r < 0.0 else (SEEN_THROUGH, BEHIND)
+            if gain > 0.0:
+                hits[j, i], kind = 1, HITS
+            elif r > 0.0 and z[v, u] < _deepest_beside(m, k, j, i, h, w, panel[v, u]) - 3.0 * sigma[v, u]:
+                floor, kind = MIXED, BETWEEN
+            counts[kind] += 1.0
+            score += max(gain, floor) - max(HIT - 0.5 * b * b / least, 0.0)
+    if rim:
+        score += GOES_ON * _going_on(m, k, window, h, w, z, panel, sigma, hits, counts)
+    return score * stride * stride
+
+
+@njit(cache=True, error_model="numpy")
+def _priors(q, tolerance, is_free, lift):  # type: ignore[no-untyped-def]  # numba types it
+    """Log-likelihood of heights and sizes that differ from the model's: a tolerance is two standard deviations."""
+    out = 0.0
+    for s in range(tolerance.shape[0]):
+        if not is_free[s]:
+            lift[s] = 0.0
+        t = 0.5 * tolerance[s] + 1e-9
+        out -= 0.5 * ((lift[s] / t) ** 2 + (q[4 + s] / t) ** 2)
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _slope(m, k, j, i, h, w):  # type: ignore[no-untyped-def]  # numba types it
+    """Depth step to the next pixel of the same row of the solid, down or sideways, the larger."""
+    out = 0.0
+    if i > 0 and k[j, i - 1] == k[j, i]:
+        out = abs(m[j, i] - m[j, i - 1])
+    elif i + 1 < w and k[j, i + 1] == k[j, i]:
+        out = abs(m[j, i] - m[j, i + 1])
+    if j > 0 and k[j - 1, i] == k[j, i]:
+        out = max(out, abs(m[j, i] - m[j - 1, i]))
+    elif j + 1 < h and k[j + 1, i] == k[j, i]:
+        out = max(out, abs(m[j, i] - m[j + 1, i]))
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _deepest_beside(m, k, j, i, h, w, panel):  # type: ignore[no-untyped-def]  # numba types it
+    """Depth of the deepest thing drawn in or beside a pixel: of what a beam there may have mixed with its own."""
+    out = m[j, i]
+    for b in range(max(j - 1, 0), min(j + 2, h)):
+        for a in range(max(i - 1, 0), min(i + 2, w)):
+            out = max(out, m[b, a] if k[b, a] >= 0 else panel)
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _going_on(m, k, window, h, w, z, panel, sigma, hits, counts):  # type: ignore[no-untyped-def]  # numba types it
+    """Pixels beyond the outline, or before the model, whose depth goes on smoothly from explained ones.
+
+    What hides a part stands off it: before the model without a jump there is a larger thing, and no occluder.
+    """
+    for j in range(h):
+        for i in range(w):
+            if k[j, i] >= 0 and hits[j, i] != 0:
+                continue
+            v, u = window[1] + j, window[0] + i
+            if v < 0 or u < 0 or v >= z.shape[0] or u >= z.shape[1]:
+                continue
+            depth, s = z[v, u], sigma[v, u]
+            if not depth < panel[v, u] - 4.0 * s or (k[j, i] >= 0 and depth > m[j, i] - 2.0 * s):
+                continue
+            for dj, di in ((RING_PX, 0), (-RING_PX, 0), (0, RING_PX), (0, -RING_PX)):
+                a, b = j + dj, i + di
+                if a < 0 or b < 0 or a >= h or b >= w or k[a, b] < 0 or hits[a, b] == 0:
+                    continue
+                step = 0.0
+                if 0 <= a + dj < h and 0 <= b + di < w and k[a + dj, b + di] == k[a, b]:
+                    step = abs(m[a + dj, b + di] - m[a, b])
+                if abs(depth - z[window[1] + a, window[0] + b]) < 3.0 * s + SLACK_M + min(step, STEEPEST_M):
+                    counts[RING] += 1.0
+                    break
+    return counts[RING]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def climbed(rows, boxes, tolerance, slide, q, ways, low, high, levels, z, panel, sigma, sen, R0, p0, stride, rim):  # type: ignore[no-untyped-def]  # numba types it
+    """Move `q` to the best hypothesis near by and give its gain: along one of the `ways` at a time, halved each level.
+
+    Args:
+        ways: (M, 4 + S) steps tried forwards and backwards.
+        low, high: (4 + S,) bounds of the hypothesis.
+        levels: how often the steps are halved; 0 only judges.
+    """
+    H, W = z.shape
+    n = (2 * H + stride) // stride, (2 * W + stride) // stride
+    m, k, hits = np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)
+    lift, counts = np.empty(rows.shape[0]), np.empty(6)
+    best = judged(rows, boxes, tolerance, slide, q, z, panel, sigma, sen, R0, p0, stride, rim, m, k, lift, hits, counts)
+    size = 1.0
+    for _ in range(levels):
+        for _ in range(TRIES):
+            start = best
+            for c in range(ways.shape[0]):
+                for sign in (size, -size):
+                    moved = np.minimum(np.maximum(q + sign * ways[c], low), high)
+                    now = judged(
+                        rows,
+                        boxes,
+                        tolerance,
+                        slide,
+                        moved,
+                        z,
+                        panel,
+                        sigma,
+                        sen,
+                        R0,
+                        p0,
+                        stride,
+                        rim,
+                        m,
+                        k,
+                        lift,
+                        hits,
+                        counts,
+                    )
+                    if now > best + 1e-9:
+                        best = now
+                        q[:] = moved
+                        break
+            if best <= start:
+                break
+        size *= 0.5
+    return best
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Explained:
+    """What a hypothesis explains: (6,) `counts` as in `judged`, (H, W) row drawn or -1, and the pixels that agree."""
+
+    counts: Array
+    rows: NDArray[np.int64]
+    pixels: NDArray[np.bool_]
+
+
+def explained(solid: Solid, q: Array, view: View) -> Explained:
+    """The pixels of the image that the hypothesis q = (x, y, yaw, state, growth of each row) covers and explains."""
+    H, W = view.depth_m.shape
+    n = 2 * H + 1, 2 * W + 1
+    m, k, hits = np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)
+    lift, counts = np.empty(len(solid.rows)), np.empty(6)
+    judged(
+        solid.rows, solid.boxes, solid.tolerance_m, solid.slide, q, view.depth_m, view.panel_m, view.sigma_m,
+        view.packed, view.R, view.p, 1, True, m, k, lift, hits, counts,
+    )  # fmt: skip
+    R, p, window = np.empty((3, 3)), np.empty(3), np.empty(4, np.int64)
+    limit = np.array([-W // 2, -H // 2, W + W // 2, H + H // 2])
+    _placed(solid.boxes, solid.slide, q, view.R, view.p, view.packed, limit, R, p, window)
+    u0, v0, u1, v1 = np.clip(window, 0, [W, H, W, H])
+    part = slice(v0 - window[1], v1 - window[1]), slice(u0 - window[0], u1 - window[0])
+    rows, pixels = np.full((H, W), -1, np.int64), np.zeros((H, W), bool)
+    rows[v0:v1, u0:u1] = k[part]
+    pixels[v0:v1, u0:u1] = hits[part] > 0
+    return Explained(counts=counts, rows=rows, pixels=pixels)

@@ -1,0 +1,118 @@
+"""Pixels that lie beside another surface than their own: the few of an image whose label is worth a second look."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.fitting.surfaces import LEAN
+
+WORD = 8  # flags that are looked at together
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def contested_pixels(labels, newest, top, bottom):  # type: ignore[no-untyped-def]  # numba types it
+    """Pixels whose 3x3 neighbourhood holds another surface than theirs, and one of label `newest` or later.
+
+    Looks at the rows [top, bottom) of `labels` (H, W) int32; returns rows and columns (N,) int32, in raster order.
+    """
+    W = labels.shape[1]
+    least, most = new_columns(W)
+    words = np.zeros(W // WORD + 1, np.uint64)
+    rows, columns = np.empty(4 * W, np.int32), np.empty(4 * W, np.int32)
+    n = 0
+    for v in range(top, bottom):
+        if n + W >= rows.shape[0]:
+            rows, columns = np.concatenate((rows, rows)), np.concatenate((columns, columns))
+        column_range(labels, v, least, most)
+        _flag_contested(labels[v], least, most, np.int32(newest), words.view(np.bool_))
+        count = flagged(words, columns[n:])
+        rows[n : n + count] = v
+        n += count
+    return rows[:n].copy(), columns[:n].copy()
+
+
+@njit(cache=True, error_model="numpy")
+def new_columns(width):  # type: ignore[no-untyped-def]  # numba types it
+    """What `column_range` fills, (width + 2,) each: no surface lies before the first column and after the last."""
+    return np.full(width + 2, np.uint32(0xFFFFFFFF)), np.zeros(width + 2, np.int32)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def column_range(labels, v, least, most):  # type: ignore[no-untyped-def]  # numba types it
+    """Of each column of the three rows around row v: the least label, less one so that none counts as most; the largest."""
+    one, last = np.int32(1), labels.shape[0] - 1
+    above, own, below = labels[max(v - 1, 0)], labels[v], labels[min(v + 1, last)]
+    low, high = least[1:-1], most[1:-1]
+    for u in range(own.shape[0]):
+        high[u] = max(above[u], own[u], below[u])
+        low[u] = min(np.uint32(above[u] - one), np.uint32(own[u] - one), np.uint32(below[u] - one))
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _flag_contested(own, least, most, newest, flags):  # type: ignore[no-untyped-def]  # numba types it
+    """Where the three columns around hold another surface than the pixel's own, and one of label `newest` or later."""
+    one = np.int32(1)
+    for u in range(own.shape[0]):
+        k = own[u]
+        low, high = min(least[u], least[u + 1], least[u + 2]), max(most[u], most[u + 1], most[u + 2])
+        flags[u] = ((high != k) | ((k > 0) & (low != np.uint32(k - one)))) & (high >= newest)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def flagged(words, places):  # type: ignore[no-untyped-def]  # numba types it
+    """Where the flags in `words` are set, ascending, into `places`, which has room for one more; returns how many.
+
+    Few are, so eight are passed at once where none of them is.
+    """
+    flags = words.view(np.bool_)
+    n = 0
+    for k in range(words.shape[0]):
+        if words[k] == 0:
+            continue
+        for i in range(WORD * k, WORD * k + WORD):
+            places[n] = i
+            n += flags[i]
+    return n
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def flag_free(labels, flags):  # type: ignore[no-untyped-def]  # numba types it
+    """Where a row of labels has none."""
+    for u in range(labels.shape[0]):
+        flags[u] = labels[u] == 0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def pixels_around(rows, columns, reach, shape):  # type: ignore[no-untyped-def]  # numba types it
+    """Every pixel of an image of that shape that is at most `reach` rows and columns from one of those given, once."""
+    H, W = shape
+    seen = np.zeros((H, W), np.bool_)
+    side = 2 * reach + 1
+    out_rows, out_columns = (
+        np.empty(rows.shape[0] * side * side, np.int32),
+        np.empty(rows.shape[0] * side * side, np.int32),
+    )
+    n = 0
+    for k in range(rows.shape[0]):
+        for v in range(max(rows[k] - reach, 0), min(rows[k] + reach + 1, H)):
+            for u in range(max(columns[k] - reach, 0), min(columns[k] + reach + 1, W)):
+                if not seen[v, u]:
+                    seen[v, u] = True
+                    out_rows[n], out_columns[n] = v, u
+                    n += 1
+    return out_rows[:n].copy(), out_columns[:n].copy()
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def renamed_pixels(labels, rows, columns, names):  # type: ignore[no-untyped-def]  # numba types it
+    """Give the pixels their new names, in place; returns rows and columns of those that had another one."""
+    moved_rows, moved_columns = np.empty_like(rows), np.empty_like(columns)
+    n = 0
+    for k in range(rows.shape[0]):
+        v, u = rows[k], columns[k]
+        if labels[v, u] != names[k]:
+            labels[v, u] = names[k]
+            moved_rows[n], moved_columns[n] = v, u
+            n += 1
+    return moved_rows[:n], moved_columns[:n]

@@ -1,0 +1,182 @@
+"""Mean depth of small blocks of pixels, each on the side of a jump that holds its median.
+
+A run of blocks is worked on in rows of one scratch array at fixed places, without a branch (`tangents` says why).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.fitting.surfaces import LEAN
+
+JUMP_SLOPE = 2.5  # a surface seen steeper than 68 degrees counts as a jump between blocks
+BLOCK_SAMPLES = 4  # along a block; larger blocks are sampled
+MOST_SAMPLES = BLOCK_SAMPLES**2
+RUN = 128  # blocks at most
+MEDIAN, PER_Z, NEAR, FAST, SLOW, STEP = (row * RUN for row in range(6))  # where each row begins
+M, SU, SV, SQ = (row * RUN for row in range(6, 10))  # sums over the samples near the median
+SAMPLES = 10 * RUN
+SCRATCH = SAMPLES + MOST_SAMPLES * RUN
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def mean_blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: ignore[no-untyped-def]  # numba types it
+    """Blocks of b x b pixels of `depth` (H, W), rows [top, bottom) of them, into (h, w) arrays as in `Grid`.
+
+    `count`: how many samples of a block lie within noise and slope of its median; where these are less than half, as
+    where most readings are missing, `z` and `sigma` are NaN.
+    """
+    w = x.shape[1]
+    hop = (b + BLOCK_SAMPLES - 1) // BLOCK_SAMPLES
+    side = (b + hop - 1) // hop
+    work, values = np.empty(SCRATCH), np.empty(MOST_SAMPLES)
+    for r in range(top, bottom):
+        for start in range(0, w, RUN):
+            end = min(start + RUN, w)
+            _load(depth, b, hop, side, r, start, end - start, work)
+            _medians(depth, b, hop, side, r, start, end - start, work, values)
+            work[M:SAMPLES] = 0.0
+            if _is_any_known(end - start, work):
+                _sums(sen, noise, b, hop, side, end - start, work)
+            _place(sen, b, r, start, x[r, start:end], y[r, start:end], work)
+            _means(sen, side, z[r, start:end], sigma[r, start:end], count[r, start:end], work)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _load(depth, b, hop, side, r, start, n, work):  # type: ignore[no-untyped-def]  # numba types it
+    """The samples of `n` blocks, one row for each place in a block; NaN beyond the image."""
+    H, W = depth.shape
+    for i in range(side):
+        row = depth[min(r * b + i * hop, H - 1)]
+        for j in range(side):
+            out = work[SAMPLES + (i * side + j) * RUN :]
+            first = start * b + j * hop
+            inside = min(n, (W - first + b - 1) // b) if r * b + i * hop < H else 0
+            for c in range(inside):
+                out[c] = row[first + c * b]
+            for c in range(inside, n):
+                out[c] = np.nan
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _medians(depth, b, hop, side, r, start, n, work, values):  # type: ignore[no-untyped-def]  # numba types it
+    """Row MEDIAN: of four samples or less by a network, of the corners alone where the samples are nine or sixteen."""
+    H, W = depth.shape
+    if side == 1:
+        for c in range(n):
+            work[MEDIAN + c] = work[SAMPLES + c]
+        return
+    whole = min(n, W // b - start) if hop == 1 and (r + 1) * b <= H else 0
+    _medians_of_four(side, whole, work)
+    for c in range(whole, n):
+        work[MEDIAN + c] = _median(side, c, work, values)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _medians_of_four(side, n, work):  # type: ignore[no-untyped-def]  # numba types it
+    """Lower medians of the corners of `n` whole blocks, by a sorting network, missing readings last."""
+    at_q, at_s = SAMPLES + (side - 1) * RUN, SAMPLES + side * (side - 1) * RUN
+    at_t = SAMPLES + (side * side - 1) * RUN
+    for c in range(n):
+        p, q, s, t = work[SAMPLES + c], work[at_q + c], work[at_s + c], work[at_t + c]
+        p, q = p if p == p else np.inf, q if q == q else np.inf  # noqa: PLR0124 - NaN is not itself
+        s, t = s if s == s else np.inf, t if t == t else np.inf  # noqa: PLR0124
+        low_1, high_1, low_2, high_2 = min(p, q), max(p, q), min(s, t), max(s, t)
+        second, third = min(max(low_1, low_2), high_1, high_2), max(low_1, low_2, min(high_1, high_2))
+        # Of three or four readings the second, of two the first; one alone is too few.
+        median = min(low_1, low_2) if third == np.inf else second
+        work[MEDIAN + c] = median if second < np.inf else np.nan
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _median(side, c, work, values):  # type: ignore[no-untyped-def]  # numba types it
+    """Lower median of a block's samples, a real value and never the empty middle of a jump; NaN if most are missing."""
+    n = 0
+    for m in range(side * side):
+        d = work[SAMPLES + m * RUN + c]
+        if np.isfinite(d):
+            k = n  # insertion sort: at most 16 values
+            while k > 0 and values[k - 1] > d:
+                values[k] = values[k - 1]
+                k -= 1
+            values[k] = d
+            n += 1
+    return values[(n - 1) // 2] if n > 0 and 2 * n >= side * side else np.nan
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _is_any_known(n, work):  # type: ignore[no-untyped-def]  # numba types it
+    """Whether any of the first `n` medians is a depth."""
+    known = False
+    for c in range(n):
+        known |= work[MEDIAN + c] == work[MEDIAN + c]
+    return known
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _sums(sen, noise, b, hop, side, n, work):  # type: ignore[no-untyped-def]  # numba types it
+    perspective = sen[0] > 0
+    _reach(noise, JUMP_SLOPE * 0.7 * b / sen[1], perspective, n, work)
+    for k in range(side * side):
+        _add(work[SAMPLES + k * RUN :], k // side * hop, k % side * hop, n, work)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _reach(noise, slope, perspective, n, work):  # type: ignore[no-untyped-def]  # numba types it
+    """Variances of one pixel at the medians, and in row NEAR how far from it a sample of the same surface may lie."""
+    for c in range(n):
+        median = work[MEDIAN + c]
+        z2 = median * median
+        white, slow, step = noise[0] + noise[1] * z2, noise[2] + noise[3] * z2, noise[4] + noise[5] * z2
+        fast = max(white * white, step * step / 12.0)
+        work[FAST + c], work[SLOW + c], work[STEP + c] = fast, slow * slow, step * step
+        work[NEAR + c] = slope * (median if perspective else 1.0) + 3.0 * np.sqrt(fast + slow * slow)
+        work[PER_Z + c] = 1.0 / median if perspective else 0.0
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _add(samples, row, column, n, work):  # type: ignore[no-untyped-def]  # numba types it
+    """One sample of each block, at that row and column of it, into the sums over those near the median.
+
+    Planes are linear in 1 / z: with q = d / median, 1 / (1 + q) = 1 - q + q^2 - q^3 is summed less 1, over -q.
+    """
+    u, v = float(column), float(row)
+    for c in range(n):
+        d = samples[c] - work[MEDIAN + c]
+        near = abs(d) <= work[NEAR + c]  # refuses NaN
+        q = d * work[PER_Z + c]
+        work[SQ + c] += d * (1.0 - q * (1.0 - q)) if near else 0.0
+        work[SU + c] += u if near else 0.0
+        work[SV + c] += v if near else 0.0
+        work[M + c] += 1.0 if near else 0.0
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _place(sen, b, r, start, x, y, work):  # type: ignore[no-untyped-def]  # numba types it
+    """Where the samples near the median lie on average, or the middle of a block that has none."""
+    middle = 0.5 * (b - 1)
+    for c in range(x.shape[0]):
+        m = work[M + c]
+        x[c] = (float(np.int32(start + c)) * b + (work[SU + c] / m if m > 0.0 else middle) - sen[3]) / sen[1]
+    for c in range(y.shape[0]):
+        m = work[M + c]
+        y[c] = (r * b + (work[SV + c] / m if m > 0.0 else middle) - sen[4]) / sen[2]
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _means(sen, side, z, sigma, count, work):  # type: ignore[no-untyped-def]  # numba types it
+    """Depth, its standard deviation, and how many samples they rest on."""
+    perspective, full = sen[0] > 0, side * side
+    for c in range(z.shape[0]):
+        median, m = work[MEDIAN + c], work[M + c]
+        mean = work[SQ + c] / m
+        depth = median / (1.0 - mean * work[PER_Z + c]) if perspective else median + mean
+        z[c] = depth if 2.0 * m >= full else np.nan
+    for c in range(sigma.shape[0]):
+        m = work[M + c]
+        # Code steps are shared by neighbours, so averaging gains little on them.
+        kept = max(work[FAST + c] / m, work[STEP + c] / 24.0)
+        sigma[c] = np.sqrt(kept + work[SLOW + c]) if 2.0 * m >= full else np.nan
+    for c in range(count.shape[0]):
+        count[c] = int(work[M + c]) if 2.0 * work[M + c] >= full else 0

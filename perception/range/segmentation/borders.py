@@ -1,0 +1,165 @@
+"""Where two regions touch, and what their models say there: a step, a crease, or one smooth surface cut in two."""
+
+# bodies and plain comparisons are what compiles fast.
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from perception.range.fitting.surfaces import LEAN, depth_on, normal_on
+from perception.range.segmentation.beside import WORD, flagged
+from perception.range.segmentation.claim import bucket
+from perception.range.segmentation.grid import sigma_at
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+WIDEST_GAP_PX = 3  # unlabelled pixels that a border may hold: one block of pixels that no model claimed
+PAIR_POINTS = 24
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Border:
+    """Up to `PAIR_POINTS` places (x, y) along the border of two regions, and its whole length in pixels."""
+
+    x: Array
+    y: Array
+    length_px: int
+
+    def with_more(self, other: Border) -> Border:
+        """Both borders as one."""
+        return Border(
+            x=np.concatenate([self.x, other.x]),
+            y=np.concatenate([self.y, other.y]),
+            length_px=self.length_px + other.length_px,
+        )
+
+
+def borders_of(labels: Ints, packed: Array) -> dict[tuple[int, int], Border]:
+    """Every pair of labels (a < b) that touch in (H, W) `labels`, with places on their border as ray coordinates."""
+    pairs, lengths, x, y = _borders(labels, WIDEST_GAP_PX, packed)
+    out = {}
+    for k in np.lexsort((pairs[:, 1], pairs[:, 0])).tolist():
+        a, b = pairs[k].tolist()
+        length = int(lengths[k])
+        count = min(length, PAIR_POINTS)
+        out[a, b] = Border(x=x[k, :count], y=y[k, :count], length_px=length)
+    return out
+
+
+@njit(cache=True)
+def _borders(labels, gap, sen):  # type: ignore[no-untyped-def]  # numba types it
+    """Pairs (P, 2) of labels that touch, how many contacts each has, and x and y (P, PAIR_POINTS) of some of them."""
+    ids, us, vs, pairs = _contacts(labels, gap)
+    starts, order = bucket(ids, pairs.shape[0])
+    lengths = starts[2:] - starts[1:-1]
+    x, y = np.empty((pairs.shape[0], PAIR_POINTS)), np.empty((pairs.shape[0], PAIR_POINTS))
+    for k in range(pairs.shape[0]):
+        count = min(lengths[k], PAIR_POINTS)
+        for j in range(count):
+            i = order[starts[k + 1] + (j * lengths[k]) // count]
+            x[k, j], y[k, j] = (us[i] - sen[3]) / sen[1], (vs[i] - sen[4]) / sen[2]
+    return pairs, lengths, x, y
+
+
+@njit(cache=True)
+def _contacts(labels, gap):  # type: ignore[no-untyped-def]  # numba types it
+    """Contacts along rows and columns, over at most `gap` zeros, in raster order.
+
+    Returns the number of the pair (from 1) and the place of each, and the (P, 2) pairs, a < b, as they were met.
+    """
+    H, W = labels.shape
+    ids, us, vs = np.empty(8 * W, np.int32), np.empty(8 * W), np.empty(8 * W)
+    above, above_at = np.zeros(W, np.int32), np.zeros(W, np.int32)
+    # Pairs of one smaller label are a linked list: no label has many neighbours.
+    newest, pairs, older = np.zeros(labels.max() + 1, np.int32), np.empty((64, 2), np.int32), np.empty(65, np.int32)
+    words, columns = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
+    n, count = 0, 0
+    for v in range(H):
+        if n + 2 * W > ids.shape[0]:
+            ids, us, vs = (
+                np.concatenate((ids, np.empty_like(ids))),
+                np.concatenate((us, np.empty_like(us))),
+                np.concatenate((vs, np.empty_like(vs))),
+            )
+        row = labels[v]
+        _flag_ends(row, above, words.view(np.bool_))
+        for at in range(flagged(words, columns)):
+            u = columns[at]
+            label, left_at = row[u], u - 1
+            while left_at >= 0 and row[left_at] == 0 and u - left_at <= gap:
+                left_at -= 1
+            for side in range(2):
+                if side == 0:
+                    other, reach = row[left_at] if left_at >= 0 else 0, u - left_at
+                else:
+                    other, reach = above[u], v - above_at[u]
+                if other == label or other == 0 or reach > gap + 1:  # noqa: PLR1714 - numba knows no `in` of mixed integers
+                    continue
+                a, b = min(other, label), max(other, label)
+                k = newest[a]
+                while k > 0 and pairs[k - 1, 1] != b:
+                    k = older[k]
+                if k == 0:
+                    if count == pairs.shape[0]:
+                        pairs = np.concatenate((pairs, np.empty_like(pairs)))
+                        older = np.concatenate((older, np.empty_like(older)))
+                    pairs[count, 0], pairs[count, 1] = a, b
+                    count += 1
+                    k, older[count], newest[a] = count, newest[a], count
+                ids[n] = k
+                us[n] = 0.5 * (left_at + u) if side == 0 else u
+                vs[n] = v if side == 0 else 0.5 * (above_at[u] + v)
+                n += 1
+        _pass_row(row, v, above, above_at)
+    return ids[:n].copy(), us[:n].copy(), vs[:n].copy(), pairs[:count].copy()
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _flag_ends(row, above, flags):  # type: ignore[no-untyped-def]  # numba types it
+    """Where a label is not that of the pixel to its left and of the last one above: nowhere inside of a region."""
+    flags[0] = row[0] > 0
+    for u in range(1, row.shape[0]):
+        flags[u] = (row[u] > 0) & ((row[u] != row[u - 1]) | (row[u] != above[u]))
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _pass_row(row, v, above, above_at):  # type: ignore[no-untyped-def]  # numba types it
+    """Row v becomes the last one above, where it bears labels."""
+    now = np.int32(v)
+    for u in range(row.shape[0]):
+        above_at[u] = now if row[u] > 0 else above_at[u]
+    for u in range(row.shape[0]):
+        above[u] = row[u] if row[u] > 0 else above[u]
+
+
+@njit(cache=True)
+def step_and_turn(kind_a, a, kind_b, b, x, y, noise, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """Median step in sigmas and median turn in radians between two surfaces at the rays (x, y).
+
+    A ray that misses one of the surfaces counts as an endless step; a turn is read where both are met.
+    """
+    n = x.shape[0]
+    steps, turns = np.empty(n), np.empty(n)
+    met = 0
+    for i in range(n):
+        za, zb = depth_on(kind_a, a, x[i], y[i], perspective), depth_on(kind_b, b, x[i], y[i], perspective)
+        if not np.isfinite(za + zb):
+            steps[i] = np.inf
+            continue
+        steps[i] = abs(za - zb) / sigma_at(noise, min(za, zb))
+        ax, ay, az = normal_on(kind_a, a, x[i] * za if perspective else x[i], y[i] * za if perspective else y[i], za)
+        bx, by, bz = normal_on(kind_b, b, x[i] * zb if perspective else x[i], y[i] * zb if perspective else y[i], zb)
+        facing_a = ax * x[i] + ay * y[i] + az if perspective else az
+        facing_b = bx * x[i] + by * y[i] + bz if perspective else bz
+        dot = ax * bx + ay * by + az * bz
+        if facing_a * facing_b < 0.0:
+            dot = -dot
+        turns[met] = np.arccos(min(1.0, max(-1.0, dot)))
+        met += 1
+    if met == 0:
+        return np.inf, np.inf
+    return np.median(steps), np.median(turns[:met])

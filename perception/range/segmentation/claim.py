@@ -1,0 +1,258 @@
+"""From blocks back to pixels: every pixel goes to the neighbouring surface that explains its depth best."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.fitting.rays import LOOSE
+from perception.range.fitting.surfaces import LEAN, PLANE, depth_on, normal_on
+from perception.range.segmentation.beside import WORD, column_range, flag_free, flagged, new_columns
+from perception.range.segmentation.grid import sigma_at
+
+CLAIM_SIGMAS = 3.5
+PLAIN_SIGMAS = 1.0  # a pixel that its own block's surface explains so well is not offered to the others
+MAX_CANDIDATES = 8
+SEVERAL = np.int32(-1)  # surfaces compete
+EASED = 0.4  # the least part of a misfit that a grazing ray leaves
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def claim_pixels(depth, sen, noise, blocks, size, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]  # numba types it
+    """Label each pixel of `depth` (H, W) with the best surface among those of the 3x3 blocks around it.
+
+    Writes the rows of blocks [top, bottom) of `out` (H, W) int32: label, or 0 beyond `CLAIM_SIGMAS`. Labels index
+    `kinds` and `ths` from 1.
+    """
+    w = blocks.shape[1]
+    perspective = sen[0] > 0
+    least, most = new_columns(w)
+    only, near = np.empty(w, np.int32), np.empty(MAX_CANDIDATES, np.int32)
+    for r in range(top, bottom):
+        column_range(blocks, r, least, most)
+        _only_labels(least, most, only)
+        _claim_first(depth, sen, noise, blocks[r], only, size, r, kinds, ths, out)
+        for c in range(w):
+            if only[c] == SEVERAL:
+                n = _labels_around(blocks, r, c, near)
+                _claim_rest(depth, sen, noise, size, r, c, near, n, kinds, ths, perspective, out)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _only_labels(least, most, only):  # type: ignore[no-untyped-def]  # numba types it
+    """The one label that the 3x3 blocks around each block hold, 0 where they hold none, from `column_range`."""
+    one = np.int32(1)
+    for c in range(only.shape[0]):
+        low, high = min(least[c], least[c + 1], least[c + 2]), max(most[c], most[c + 1], most[c + 2])
+        only[c] = high if (high == 0) | (low == np.uint32(high - one)) else SEVERAL
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _claim_first(depth, sen, noise, own, only, size, r, kinds, ths, out):  # type: ignore[no-untyped-def]  # numba types it
+    """Offer the pixels of the r-th row of blocks to the only surface there is, or to their `own` block's.
+
+    Among several surfaces a pixel that its own one does not explain plainly is left `SEVERAL`.
+    """
+    H, W = depth.shape
+    w = own.shape[0]
+    perspective = sen[0] > 0
+    c = 0
+    while c < w:
+        start, label, mine = c, only[c], own[c]
+        while c < w and only[c] == label and (label != SEVERAL or own[c] == mine):
+            c += 1
+        first, end = start * size, min(c * size, W)
+        k, limit, otherwise = (mine, PLAIN_SIGMAS, SEVERAL) if label == SEVERAL else (label, CLAIM_SIGMAS, 0)
+        for v in range(r * size, min(r * size + size, H)):
+            if k == 0:
+                out[v, first:end] = otherwise
+            elif kinds[k] == PLANE:
+                _claim_run(
+                    depth[v, first:end],
+                    ths[k],
+                    k,
+                    first,
+                    v,
+                    sen,
+                    noise,
+                    perspective,
+                    limit,
+                    otherwise,
+                    out[v, first:end],
+                )
+            else:
+                y = (v - sen[4]) / sen[2]
+                for u in range(first, end):
+                    z, x = depth[v, u], (u - sen[3]) / sen[1]
+                    e = misfit_of(k, kinds, ths, x, y, z, sigma_at(noise, z), perspective)
+                    out[v, u] = k if e < limit else otherwise
+
+
+@njit(cache=True, error_model="numpy", fastmath=LOOSE, **LEAN)
+def _claim_run(depth, th, label, first, v, sen, noise, perspective, limit, otherwise, out):  # type: ignore[no-untyped-def]  # numba types it
+    """Pixels first, first + 1, ... of row v that a plane explains within `limit` sigmas, without branch or root."""
+    p = 1.0 if perspective else 0.0
+    y = (v - sen[4]) / sen[2]
+    per_x = 1.0 / sen[1]
+    dy = p * y
+    at = th[3] - th[1] * (y - dy)
+    along = th[1] * dy + th[2]
+    square = limit * limit
+    mine, other = np.int32(label), np.int32(otherwise)
+    for i in range(out.shape[0]):
+        x = (first + i - sen[3]) * per_x
+        dx = p * x
+        z = depth[i]
+        facing = th[0] * dx + along
+        e = z * facing - (at - th[0] * (x - dx))  # times `facing`: no division
+        z2 = z * z
+        white, slow, step = noise[0] + noise[1] * z2, noise[2] + noise[3] * z2, noise[4] + noise[5] * z2
+        variance = max(white * white, step * step * (1.0 / 12.0)) + slow * slow
+        out[i] = mine if e * e < square * variance * (facing * facing) else other
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _claim_rest(depth, sen, noise, size, r, c, near, n, kinds, ths, perspective, out):  # type: ignore[no-untyped-def]  # numba types it
+    """The pixels of one block that are left to compete for, among the surfaces near[:n]."""
+    H, W = depth.shape
+    for v in range(r * size, min(r * size + size, H)):
+        for u in range(c * size, min(c * size + size, W)):
+            if out[v, u] == SEVERAL:
+                x, y = (u - sen[3]) / sen[1], (v - sen[4]) / sen[2]
+                out[v, u] = _best_of(depth[v, u], x, y, noise, near, n, kinds, ths, perspective)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _best_of(z, x, y, noise, near, n, kinds, ths, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """The label among near[:n] whose surface explains the depth best, 0 when none does within `CLAIM_SIGMAS`."""
+    best, label = CLAIM_SIGMAS, 0
+    if not np.isfinite(z):
+        return label
+    sigma = sigma_at(noise, z)
+    for m in range(n):
+        e = misfit_of(near[m], kinds, ths, x, y, z, sigma, perspective)
+        if e < best:
+            best, label = e, near[m]
+    return label
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def claim_again(depth, sen, noise, labels, kinds, ths, rows, columns, out, first, last):  # type: ignore[no-untyped-def]  # numba types it
+    """Judge again the pixels at `rows`, `columns` (N,) among the surfaces of their 3x3 pixels; writes out[first:last].
+
+    Where earlier surfaces meet they have competed for every pixel already (`claim_pixels`): this is for new ones.
+    """
+    perspective = sen[0] > 0
+    near = np.empty(9, np.int32)
+    for k in range(first, last):
+        v, u = rows[k], columns[k]
+        x, y = (u - sen[3]) / sen[1], (v - sen[4]) / sen[2]
+        n = _labels_around(labels, v, u, near)
+        out[k] = _best_of(depth[v, u], x, y, noise, near, n, kinds, ths, perspective)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _labels_around(labels, v, u, near):  # type: ignore[no-untyped-def]  # numba types it
+    """The labels of a 3x3 neighbourhood into `near`, each once, in raster order; returns how many."""
+    h, w = labels.shape
+    n = 0
+    for i in range(max(0, v - 1), min(h, v + 2)):
+        for j in range(max(0, u - 1), min(w, u + 2)):
+            k = labels[i, j]
+            new = k > 0
+            for m in range(n):
+                if near[m] == k:
+                    new = False
+            if new and n < near.shape[0]:
+                near[n] = k
+                n += 1
+    return n
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def misfit_of(k, kinds, ths, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """`misfit` of surface k of a table: planes, which most are, in a line."""
+    if kinds[k] != PLANE:
+        return misfit(kinds[k], ths[k], x, y, z, sigma, perspective)
+    p = 1.0 if perspective else 0.0
+    facing = p * (ths[k, 0] * x + ths[k, 1] * y) + ths[k, 2]
+    if not abs(facing) >= 1e-9:
+        return np.inf
+    return abs(z - (ths[k, 3] - (1.0 - p) * (ths[k, 0] * x + ths[k, 1] * y)) / facing) / sigma
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def misfit(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """|z - surface| in sigmas, eased at grazing rays where half a pixel moves the depth far; infinite on a miss."""
+    zm = depth_on(kind, th, x, y, perspective)
+    if not np.isfinite(zm):
+        return np.inf
+    e = abs(z - zm) / sigma
+    if e < CLAIM_SIGMAS or kind == PLANE or e * EASED >= CLAIM_SIGMAS:
+        return e
+    px, py = (x * zm, y * zm) if perspective else (x, y)
+    nx, ny, nz = normal_on(kind, th, px, py, zm)
+    facing = abs(nx * x + ny * y + nz) / np.sqrt(x * x + y * y + 1.0) if perspective else abs(nz)
+    return e * max(EASED, min(1.0, 2.0 * facing))
+
+
+@njit(cache=True, error_model="numpy")
+def fill_small_gaps(label, depth, sweeps):  # type: ignore[no-untyped-def]  # numba types it
+    """Give each unlabelled valid pixel the label that at least 5 of its 8 neighbours agree on; `sweeps` times."""
+    H, W = label.shape
+    words, columns = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
+    for _ in range(sweeps):
+        before = label.copy()
+        for v in range(1, H - 1):
+            flag_free(before[v], words.view(np.bool_))
+            for k in range(flagged(words, columns)):
+                if 0 < columns[k] < W - 1 and np.isfinite(depth[v, columns[k]]):
+                    label[v, columns[k]] = _agreed(before, v, columns[k])
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _agreed(label, v, u):  # type: ignore[no-untyped-def]  # numba types it
+    """The label that at least 5 of 8 neighbours bear, 0 without one."""
+    for i in range(4):  # five of eight miss no four of them
+        k = label[v - 1 + i // 3, u - 1 + i % 3]
+        if k == 0:
+            continue
+        n = 0
+        for j in range(9):
+            n += label[v - 1 + j // 3, u - 1 + j % 3] == k
+        if n >= 5:
+            return k
+    return 0
+
+
+@njit(cache=True)
+def bucket(label, count):  # type: ignore[no-untyped-def]  # numba types it
+    """Flat pixel indices grouped by label: label k owns indices[starts[k] : starts[k + 1]]; starts is (count + 2,).
+
+    Label 0 owns nothing: unlabelled pixels are left out.
+    """
+    flat = label.ravel()
+    n = flat.shape[0]
+    starts = np.zeros(count + 2, np.int64)
+    # Neighbours mostly share their label: sums wait until it changes.
+    own, first = np.int64(0), 0
+    for i in range(n):
+        if flat[i] != own:
+            starts[own + 1] += i - first
+            own, first = np.int64(flat[i]), i
+    starts[own + 1] += n - first
+    starts[1] = 0
+    for k in range(count + 1):
+        starts[k + 1] += starts[k]
+    place = starts.copy()
+    indices = np.empty(starts[count + 1], np.int32)
+    own, at = np.int64(0), 0
+    for i in range(n):
+        if flat[i] != own:
+            place[own] = at
+            own = np.int64(flat[i])
+            at = place[own]
+        if own > 0:
+            indices[at] = i
+            at += 1
+    return starts, indices

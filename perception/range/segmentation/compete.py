@@ -1,0 +1,172 @@
+"""Models compete for one smooth component: every primitive is offered, the cheapest that explains it wins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from perception.range.fitting import fit
+from perception.range.fitting.surfaces import QUADRIC, SIZE
+from perception.range.segmentation.finish import SLOW_NOISE_AREA_PX
+from perception.range.segmentation.grid import Grid
+from perception.range.segmentation.grow_surface import GROW_SIGMAS, grow_surface
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int32]
+Flags = NDArray[np.bool_]
+
+FIT_SAMPLES = 90
+GOOD_MEAN_SQUARE = 2.0
+GOOD_SHARE = 0.75
+WHOLE_SHARE = 0.85  # a fit to the whole component that explains less has rivals grown from parts of it
+LOCAL_BLOCKS = 45
+LOCAL_TRIES = 5
+FEW_BLOCKS_FOR_QUADRIC = 60
+GIVE_UP = 14.0  # a fit that keeps three quarters within three sigmas leaves 8 at most, once it has converged
+
+
+@dataclass(slots=True, eq=False)
+class Candidates:
+    """Surfaces found so far; label k is `kinds[k - 1]`, `parameters[k - 1]`. Grows while segmentation runs.
+
+    `slack[k - 1]`: how many times the noise the surface tolerates, where its face is no better a primitive.
+    """
+
+    kinds: list[int] = field(default_factory=list)
+    parameters: list[Array] = field(default_factory=list)
+    slack: list[float] = field(default_factory=list)
+
+    def add(self, kind: int, parameters: Array, slack: float = 1.0) -> int:
+        """Append a surface and return its label."""
+        self.kinds.append(kind)
+        self.parameters.append(parameters)
+        self.slack.append(slack)
+        return len(self.kinds)
+
+    def arrays(self) -> tuple[NDArray[np.int64], Array]:
+        """Kinds (n + 1,) and parameters (n + 1, 16), entry 0 unused, for compiled loops."""
+        kinds = np.zeros(len(self.kinds) + 1, np.int64)
+        table = np.zeros((len(self.kinds) + 1, SIZE))
+        for k, (kind, th) in enumerate(zip(self.kinds, self.parameters, strict=True), 1):
+            kinds[k], table[k] = kind, th
+        return kinds, table
+
+
+def explain(
+    grid: Grid, members: NDArray[np.int64], free: Flags, blocks: Labels, *, found: Candidates, least: int
+) -> bool:
+    """Find the surface that explains most of the component `members` (flat block indices) and take its blocks.
+
+    Extends `blocks` and `found`, clears `free`. Returns whether a surface of at least `least` blocks was found.
+    """
+    cos_limit = float(np.cos(max(0.5, 4.0 * grid.normal_sigma_rad)))
+    kind, parameters, mine = _explanation(
+        grid.x, grid.y, grid.z, grid.sigma, grid.normal, grid.rms, grid.perspective, grid.size_px**2, grid.slow_share,
+        cos_limit, free, members, least,
+    )  # fmt: skip
+    if kind < 0:
+        return False
+    blocks.ravel()[mine] = found.add(kind, parameters)
+    free.ravel()[mine] = False
+    return True
+
+
+def fit_best(grid: Grid, members: NDArray[np.int64], slack: float) -> tuple[int, Array, float]:
+    """Kind (-1 when none does), parameters and explained share of what describes these blocks within `slack` sigmas."""
+    x, y, z, sigma = (a.ravel() for a in (grid.x, grid.y, grid.z, slack * grid.sigma))
+    normal = grid.normal.reshape(-1, 3)
+    kind, th, share = _fit_blocks(
+        x, y, z, sigma, normal, grid.perspective, grid.size_px**2, grid.slow_share, members
+    )  # fmt: skip
+    return int(kind), th, float(share)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _explanation(  # type: ignore[no-untyped-def]  # numba types it
+    x, y, z, sigma, normal, rms, perspective, pixels, slow_share, cos_limit, free, members, least
+):
+    """Kind (-1 when there is none), parameters and blocks (flat) of the surface that explains most of `members`."""
+    h, w = z.shape
+    fx, fy, fz, fs, fn = x.ravel(), y.ravel(), z.ravel(), sigma.ravel(), normal.reshape(h * w, 3)
+    kinds, ths = np.full(1 + LOCAL_TRIES, -1), np.zeros((1 + LOCAL_TRIES, SIZE))
+    kinds[0], ths[0], share = _fit_blocks(fx, fy, fz, fs, fn, perspective, pixels, slow_share, members)
+    if kinds[0] < 0 or share < WHOLE_SHARE:
+        _fit_parts(
+            fx, fy, fz, fs, fn, perspective, pixels, slow_share, members, rms.ravel(), w, kinds[1:], ths[1:]
+        )  # fmt: skip
+    queue, mark = np.empty(h * w, np.int64), np.zeros(h * w, np.uint8)
+    best, best_gain, mine = -1, 0.0, queue[:0]
+    for k in range(kinds.shape[0]):
+        if kinds[k] < 0:
+            continue
+        count, total = grow_surface(
+            kinds[k], ths[k], x, y, z, sigma, normal, rms, free, members, perspective, cos_limit, mark, k + 1, queue
+        )
+        gain = GROW_SIGMAS**2 * count - total
+        if count >= least and total <= GOOD_MEAN_SQUARE * count and gain > best_gain:
+            best, best_gain, mine = k, gain, queue[:count].copy()
+    if best < 0:
+        return -1, ths[0], mine
+    if best > 0 or mine.shape[0] < 0.9 * members.shape[0]:
+        kind, th, _ = _fit_blocks(fx, fy, fz, fs, fn, perspective, pixels, slow_share, mine)
+        if kind >= 0:
+            return kind, th, mine
+    return kinds[best], ths[best].copy(), mine
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fit_blocks(x, y, z, sigma, normal, perspective, pixels, slow_share, members):  # type: ignore[no-untyped-def]  # numba types it
+    """Kind (-1 when none explains them), parameters (16,) and explained share of the blocks `members` (flat)."""
+    count = members.shape[0]
+    if count < 5:
+        return -1, np.zeros(SIZE), 0.0
+    # Evenly spread over the region; a fixed choice keeps results equal from run to run.
+    n = min(count, FIT_SAMPLES)
+    points, P, N = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    few = np.empty((4, n))
+    known = 0
+    for k in range(n):
+        i = members[k if count == n else (k * (count - 1)) // (n - 1)]
+        scale = z[i] if perspective else 1.0
+        few[0, k], few[1, k], few[2, k], few[3, k] = x[i], y[i], z[i], sigma[i]
+        points[k, 0], points[k, 1], points[k, 2] = x[i] * scale, y[i] * scale, z[i]
+        if np.isfinite(normal[i, 0]):
+            P[known], N[known] = points[k], normal[i]
+            known += 1
+    kinds = np.ones(5, np.bool_)
+    kinds[QUADRIC] = count >= FEW_BLOCKS_FOR_QUADRIC
+    # Slow noise covers samples together: so many count as one.
+    patches = max(count * pixels / SLOW_NOISE_AREA_PX, 1.0)
+    correlated = 1.0 + slow_share * max(n / patches - 1.0, 0.0)
+    ths, mean2, kept, score = fit.fit_kinds(
+        points, P[:known], N[:known], few[0], few[1], few[2], few[3], perspective, kinds, correlated, GIVE_UP
+    )
+    best, least = -1, np.inf
+    for k in range(5):
+        if mean2[k] < GOOD_MEAN_SQUARE and kept[k] > GOOD_SHARE and score[k] < least:
+            best, least = k, score[k]
+    return best, ths[best].copy(), kept[best]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fit_parts(  # type: ignore[no-untyped-def]  # numba types it
+    x, y, z, sigma, normal, perspective, pixels, slow_share, members, rms, w, kinds, ths
+):
+    """`_fit_blocks` of the blocks around seeds that are evenly spread over `members`, into `kinds` and `ths`."""
+    inside = members[np.isfinite(rms[members])]
+    tries = kinds.shape[0]
+    if inside.shape[0] < tries + 2:
+        return
+    near = np.empty(members.shape[0], members.dtype)
+    for t in range(tries):
+        seed = inside[((t + 1) * (inside.shape[0] - 1)) // (tries + 1)]
+        count = 0
+        for k in range(members.shape[0]):
+            row, column = members[k] // w - seed // w, members[k] % w - seed % w
+            if row * row + column * column <= LOCAL_BLOCKS / np.pi:
+                near[count] = members[k]
+                count += 1
+        kinds[t], ths[t], _ = _fit_blocks(x, y, z, sigma, normal, perspective, pixels, slow_share, near[:count])

@@ -1,0 +1,244 @@
+"""Rounded edges belong to the faces that they join, as people outline them.
+
+A rounded edge is a surface of its own to a sensor that is fine enough, but nobody calls it one. It is a strip much
+narrower than its neighbours, which it continues without a step and without a crease, and it lies close to them: a
+quarter circle of radius r leaves two faces by 0.41 r and is 1.57 r wide. Each of its pixels goes to the nearer face.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from perception.range.fitting.surfaces import LEAN, PLANE, depth_on, normal_on
+from perception.range.segmentation.beside import WORD, flagged
+from perception.range.segmentation.borders import borders_of, step_and_turn
+from perception.range.segmentation.grid import sigma_at
+from perception.range.segmentation.regions import regions_of
+from perception.range.segmentation.runs import pixels_of
+from perception.range.segmentation.seams import is_seam_grooved
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int32]
+
+NARROWER = 0.6  # than the faces beside it
+LONG = 22.0  # as `_shapes` says it: three times as long as wide
+STEP_SIGMAS = 3.0
+TURN_RAD = 1.0  # a surface through a net of rounded edges meets its faces at any angle below a right one
+FLAT_TURN_RAD = 0.5
+GENTLE_RAD = 0.7
+NEAR_SHARE = 0.5  # of the strip's width, that it may lie off its faces
+LEAST_SHARE = 0.4  # of the pixels of a strip between faces that do so: nets of edges take thin faces along
+WHOLE_SHARE = 0.7  # of those of a strip beside one face
+LEAST_BORDER_PX = 6
+ALONG_SHARE = 0.15  # of a strip's rim: one that has less of it at a face touches that by its end only
+REACH = 0.025  # of the image's shorter side, over which unlabelled pixels beside a face may curve away from it
+LEAST_ROWS = 192  # in smaller images what is beside a face is mixed pixels of an outline, which models are matched by
+SLOPE = 0.5  # at which they may do so
+SIGMAS = 3.0
+
+
+def without_fillets(
+    depth_m: Array, packed: Array, law: Array, labels: Labels, kinds: NDArray[np.int64], table: Array
+) -> Labels:
+    """(H, W) `labels`, changed in place: rounded edges go to their faces; labels index `kinds` and `table` from 1."""
+    half_width, length = _shapes(labels, kinds.shape[0])
+    beside = _strips(depth_m, packed, law, labels, kinds, table, half_width, length)
+    if beside:
+        regions = regions_of(depth_m, packed, law, labels, kinds.shape[0] - 1)
+        for strip, faces in beside.items():
+            mine = regions.places(strip)
+            owner = _nearer(depth_m, packed, mine, half_width[strip], np.array(faces), kinds, table)
+            if np.mean(owner > 0) >= (LEAST_SHARE if len(faces) > 1 else WHOLE_SHARE):
+                labels.ravel()[mine] = np.where(owner > 0, owner, strip)
+    if min(labels.shape) >= LEAST_ROWS:
+        spread_outwards(depth_m, packed, law, labels, kinds, table, round(REACH * min(labels.shape)))
+    return labels
+
+
+def _strips(
+    depth_m: Array,
+    packed: Array,
+    law: Array,
+    labels: Labels,
+    kinds: NDArray[np.int64],
+    table: Array,
+    half_width: Array,
+    length: Array,
+) -> dict[int, list[int]]:
+    """The faces beside each strip that continues them: two or more, or one that it leaves gently towards an outline."""
+    if not np.any((length >= LONG) & (half_width <= NARROWER * half_width.max())):
+        return {}
+    perspective = bool(packed[0] > 0)
+    beside: dict[int, list[int]] = {}
+    gentle: set[int] = set()
+    for (a, b), border in borders_of(labels, packed).items():
+        strip, face = (a, b) if half_width[a] < half_width[b] else (b, a)
+        is_strip = length[strip] >= LONG and half_width[strip] <= NARROWER * half_width[face]
+        least_px = max(LEAST_BORDER_PX, ALONG_SHARE * length[strip] * half_width[strip])
+        if border.length_px < least_px or not is_strip:
+            continue
+        surfaces = (int(kinds[a]), table[a], int(kinds[b]), table[b])
+        step, turn = step_and_turn(*surfaces, border.x, border.y, law, perspective)
+        if step > STEP_SIGMAS or turn > (FLAT_TURN_RAD if kinds[strip] == PLANE else TURN_RAD):
+            continue
+        if kinds[face] == PLANE:
+            both = np.zeros(kinds.size, np.bool_)
+            both[[strip, face]] = True
+            if is_seam_grooved(depth_m, packed, law, labels, both, table[face], border.x, border.y):
+                continue
+        beside.setdefault(strip, []).append(face)
+        gentle |= {strip} if turn <= GENTLE_RAD else set()
+    return {strip: faces for strip, faces in beside.items() if len(faces) > 1 or strip in gentle}
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _shapes(labels, count):  # type: ignore[no-untyped-def]  # numba types it
+    """(2, count) of each label: pixels over those at its rim, half the width of a strip; and its rim over that.
+
+    A hole of one pixel, a gross error, has no rim. The latter is 12.6 for a disc, 16 for a square and four times the
+    length over the width for a long strip.
+    """
+    H, W = labels.shape
+    pixels, rim = pixels_of(labels, count - 1), np.zeros(count)
+    words, columns = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
+    for v in range(H):
+        above, below = labels[max(v - 1, 0)], labels[min(v + 1, H - 1)]
+        _flag_rims(labels[max(v - 2, 0)], above, labels[v], below, labels[min(v + 2, H - 1)], words.view(np.bool_))
+        _flag_sides(labels[v], words.view(np.bool_))
+        for i in range(flagged(words, columns)):
+            rim[labels[v, columns[i]]] += 1.0
+    out = np.zeros((2, count))
+    for k in range(1, count):
+        if pixels[k] > 0:
+            out[0, k] = pixels[k] / rim[k]
+            out[1, k] = rim[k] / out[0, k]
+    return out
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _flag_rims(above_2, above, own, below, below_2, flags):  # type: ignore[no-untyped-def]  # numba types it
+    """Labelled pixels with two in a row of another label above or below."""
+    for u in range(own.shape[0]):
+        k = own[u]
+        is_top, is_bottom = (above[u] != k) & (above_2[u] != k), (below[u] != k) & (below_2[u] != k)
+        flags[u] = (k > 0) & (is_top | is_bottom)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _flag_sides(own, flags):  # type: ignore[no-untyped-def]  # numba types it
+    """And those with two in a row of another label to the left or right; beyond its ends the row goes on."""
+    last = own.shape[0] - 1
+    for u in range(last - 3):
+        k = own[u + 2]
+        is_left, is_right = (own[u + 1] != k) & (own[u] != k), (own[u + 3] != k) & (own[u + 4] != k)
+        flags[u + 2] |= (k > 0) & (is_left | is_right)
+    for u in (0, 1, last - 1, last):
+        k = own[u]
+        is_left = (own[max(u - 1, 0)] != k) & (own[max(u - 2, 0)] != k)
+        is_right = (own[min(u + 1, last)] != k) & (own[min(u + 2, last)] != k)
+        flags[u] |= (k > 0) & (is_left | is_right)
+
+
+@njit(cache=True, error_model="numpy")
+def _off(kind, th, x, y, z, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """How far a pixel lies off a surface, across the surface, metres; infinite where its ray misses."""
+    zm = depth_on(kind, th, x, y, perspective)
+    if not np.isfinite(zm):
+        return np.inf
+    nx, ny, nz = normal_on(kind, th, x * zm if perspective else x, y * zm if perspective else y, zm)
+    return abs(z - zm) * (abs(nx * x + ny * y + nz) if perspective else abs(nz))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _nearer(depth, sen, indices, half_width, faces, kinds, table):  # type: ignore[no-untyped-def]  # numba types it
+    """Of each pixel the face that it lies nearest to, 0 where it is farther than the strip allows."""
+    W = depth.shape[1]
+    perspective = sen[0] > 0
+    owner = np.zeros(indices.shape[0], np.int32)
+    flat = depth.ravel()
+    for k in range(indices.shape[0]):
+        i = indices[k]
+        x, y, z = (i % W - sen[3]) / sen[1], (i // W - sen[4]) / sen[2], flat[i]
+        limit = NEAR_SHARE * 2.0 * half_width / sen[1] * (z if perspective else 1.0)
+        for f in faces:
+            off = _off(kinds[f], table[f], x, y, z, perspective)
+            if off < limit:
+                owner[k], limit = f, off
+    return owner
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def spread_outwards(depth, sen, noise, labels, kinds, table, reach):  # type: ignore[no-untyped-def]  # numba types it
+    """Give unlabelled pixels, ring by ring up to `reach`, to the surface beside them that they leave slowly; in place."""
+    flat, fd, W = labels.ravel(), depth.ravel(), depth.shape[1]
+    ring = _first_ring(labels, depth)
+    for sweep in range(1, reach + 1):
+        chosen = np.zeros(ring.shape[0], np.int32)
+        for k in range(ring.shape[0]):
+            chosen[k] = _slowest_left(ring[k], W, fd, sen, noise, flat, kinds, table, SLOPE * sweep / sen[1])
+        for k in range(ring.shape[0]):
+            # What is refused is not asked again: farther out more would be allowed.
+            flat[ring[k]] = chosen[k] if chosen[k] else -1
+        ring = _next_ring(ring[chosen > 0], depth.shape, fd, flat)
+    for i in range(flat.shape[0]):
+        flat[i] = max(flat[i], 0)
+
+
+@njit(cache=True, nogil=True)
+def _first_ring(labels, depth):  # type: ignore[no-untyped-def]  # numba types it
+    """Flat indices of the unlabelled pixels with a reading beside labelled ones."""
+    H, W = labels.shape
+    words, columns = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
+    ring, count = np.empty(4 * W, np.int32), 0
+    for v in range(1, H - 1):
+        if count + W > ring.shape[0]:
+            ring = np.concatenate((ring, ring))
+        _flag_outlines(labels[v - 1], labels[v], labels[v + 1], words.view(np.bool_))
+        for i in range(flagged(words, columns)):
+            if np.isfinite(depth[v, columns[i]]):
+                ring[count] = v * W + columns[i]
+                count += 1
+    return ring[:count].copy()
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _flag_outlines(above, own, below, flags):  # type: ignore[no-untyped-def]  # numba types it
+    """Unlabelled pixels beside labelled ones, but for the ends of the row."""
+    for u in range(1, own.shape[0] - 1):
+        flags[u] = (own[u] == 0) & ((own[u - 1] | own[u + 1] | above[u] | below[u]) != 0)
+
+
+@njit(cache=True, nogil=True)
+def _next_ring(ring, shape, fd, flat):  # type: ignore[no-untyped-def]  # numba types it
+    """The free pixels with a reading beside those of a ring, marked -1 in `flat` so that each comes once."""
+    H, W = shape
+    new, count = np.empty(4 * ring.shape[0], np.int32), 0
+    for i in ring:
+        for step in (-1, 1, -W, W):
+            j = i + step
+            v, u = j // W, j % W
+            if flat[j] == 0 and 0 < v < H - 1 and 0 < u < W - 1 and np.isfinite(fd[j]):
+                flat[j] = -1
+                new[count] = j
+                count += 1
+    return new[:count].copy()
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _slowest_left(i, W, fd, sen, noise, flat, kinds, table, slope):  # type: ignore[no-untyped-def]  # numba types it
+    """The label beside pixel i whose surface it lies nearest to, 0 where all are farther than noise and `slope` allow."""
+    perspective = sen[0] > 0
+    x, y, z = (i % W - sen[3]) / sen[1], (i // W - sen[4]) / sen[2], fd[i]
+    best, label = SIGMAS * sigma_at(noise, z) + slope * (z if perspective else 1.0), 0
+    last = 0
+    for step in (-1, 1, -W, W):
+        f = flat[i + step]
+        if f <= 0 or f == label or f == last:  # noqa: PLR1714, SIM109 - numba knows no `in` of mixed integers
+            continue
+        last = f
+        off = _off(kinds[f], table[f], x, y, z, perspective)
+        if off < best:
+            best, label = off, f
+    return label

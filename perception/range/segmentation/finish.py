@@ -1,0 +1,157 @@
+"""Last refinement of each region on its own pixels, with covariance and figures of fit; what is too small goes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from perception.range.fitting.fit import fit_robust
+from perception.range.fitting.last_step import last_step
+from perception.range.fitting.starts import solve_positive
+from perception.range.fitting.surfaces import FREEDOM, QUADRIC, depth_on
+from perception.range.noise import NoiseModel
+from perception.range.primitives import (
+    COVARIANCE_OVER,
+    TYPE_OF_KIND,
+    Surface,
+    frame_vectors,
+    named_covariance,
+    primitive_of,
+)
+from perception.range.segmentation.regions import Regions, spread
+from perception.range.segmentation.runs import pixels_of
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int32]
+
+COARSE_SAMPLES = 300  # a refined start on these leaves the full fit one step
+MIDDLE_STRIDE = 4  # of these, every fourth tells where a surface lies
+SLOW_NOISE_AREA_PX = 150.0  # pixels that share one value of the slow noise; sets how little averaging gains on it
+STEP_AREA_PX = 16.0
+NO_SHIFT = 1e-9  # pixels: rounds up what is whole but for the last bit
+FARTHEST_SIGMAS = 50.0  # that the last step may move a surface where it was fitted already
+FREE = np.zeros(9, np.bool_)
+
+
+def refine_surface(
+    label: int,
+    kind: int,
+    th: Array,
+    regions: Regions,
+    own: int,
+    *,
+    noise: NoiseModel,
+    slack: float = 1.0,
+    fixed: NDArray[np.bool_] = FREE,
+) -> tuple[Surface, Array]:
+    """The surface after the ray-depth fit to all its pixels, and its parameters.
+
+    Args:
+        own: the label of those pixels in `regions`.
+        slack: how many times the noise is tolerated.
+        fixed: (9,) tangent parameters that a prior holds.
+    """
+    perspective = bool(regions.packed[0] > 0)
+    image = (regions.depth_m, regions.packed, regions.law)
+    n = int(regions.sizes[own])
+    th, H, inverse, middles, kept, used = refined(kind, th, *image, slack, regions.runs_of(own), n, fixed)
+    misfit = float(np.sqrt(kept / max(used - FREEDOM[kind], 1)))
+    x, y, depth, sigma = middles.tolist()
+    loss = averaging_loss(noise, depth)
+    covariance = (_pseudo_inverse(H, kind, fixed) if inverse is None else inverse) * (max(misfit**2, 0.05) * loss)
+    middle = np.array([x * depth, y * depth, depth] if perspective else [x, y, depth])
+    surface = Surface(
+        label=label,
+        type=TYPE_OF_KIND[kind],
+        primitive=primitive_of(kind, th, middle),
+        covariance=named_covariance(kind, th, covariance),
+        covariance_over=COVARIANCE_OVER[kind],
+        frame=frame_vectors(kind, th) if kind != QUADRIC else np.eye(3)[:2],
+        pixels=n,
+        rms_m=misfit * sigma if n else 0.0,
+        misfit=misfit,
+        middle_m=middle,
+    )
+    return surface, th
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def refined(kind, th, depth, sen, noise, slack, runs, pixels, fixed):  # type: ignore[no-untyped-def]  # numba types it
+    """The fit to the `pixels` of runs (R, 3): robust on a few that are evenly spread, then one step on all.
+
+    Returns:
+        parameters, information matrix (9, 9), its inverse (p, p) or None, medians (4,) of x, y, z and sigma,
+        squared residuals of the kept pixels, pixels kept.
+    """
+    if pixels == 0:
+        return th, np.zeros((9, 9)), None, np.full(4, np.nan), 0.0, 0
+    few = np.empty((4, min(pixels, COARSE_SAMPLES)))
+    spread(depth, sen, noise, runs, pixels, NO_SHIFT, few)
+    few[3] *= slack
+    th, _, _, _, _ = fit_robust(kind, th, few[0], few[1], few[2], few[3], sen[0] > 0, fixed, 1)
+    middles = np.empty(4)
+    for a in range(4):
+        middles[a] = np.median(few[a, ::MIDDLE_STRIDE].copy())
+    start = th
+    th, H, kept, used = last_step(kind, start, depth, sen, noise, slack, runs, fixed)
+    # Over a face that hardly bends, a step straight ahead may pass through flat and end on the far side of the sensor.
+    before = depth_on(kind, start, middles[0], middles[1], sen[0] > 0)
+    after = depth_on(kind, th, middles[0], middles[1], sen[0] > 0)
+    if np.isfinite(before) and not abs(after - before) < FARTHEST_SIGMAS * middles[3]:
+        th = start
+    return th, H, _inverse(H, FREEDOM[kind], fixed), middles, kept, used
+
+
+@njit(cache=True, error_model="numpy")
+def _inverse(H, p, fixed):  # type: ignore[no-untyped-def]  # numba types it
+    """(p, p) inverse over the free parameters, zero elsewhere; None when they are not all determined."""
+    A, b, out, scale = np.empty((p, p)), np.empty(p), np.zeros((p, p)), np.empty(p)
+    for i in range(p):
+        scale[i] = 1.0 / np.sqrt(max(H[i, i], 1e-300))
+    for k in range(p):
+        for i in range(p):
+            for j in range(p):
+                held = fixed[i] or fixed[j]
+                A[i, j] = (1.0 if i == j else 0.0) if held else H[i, j] * scale[i] * scale[j]
+            b[i] = 1.0 if i == k and not fixed[k] else 0.0
+        if not solve_positive(A, b, p):
+            return None
+        for i in range(p):
+            out[i, k] = b[i] * scale[i] * scale[k]
+    return out
+
+
+def without_crumbs(labels: Labels, surfaces: list[Surface], least: float) -> tuple[Labels, list[Surface]]:
+    """Labels and surfaces, numbered anew, without those that their neighbours have left fewer than `least` pixels."""
+    pixels = pixels_of(labels, len(surfaces)).tolist()
+    kept = [s for s in surfaces if pixels[s.label] >= least]
+    if len(kept) == len(surfaces):
+        return labels, surfaces
+    renamed = np.zeros(len(surfaces) + 1, np.int32)
+    renamed[[s.label for s in kept]] = np.arange(1, len(kept) + 1)
+    return renamed[labels], [replace(s, label=new) for new, s in enumerate(kept, 1)]
+
+
+def averaging_loss(noise: NoiseModel, depth_m: float) -> float:
+    """How many times larger a parameter's variance is than for white noise of the same size (>= 1)."""
+    z2 = depth_m * depth_m
+    white = (noise.white[0] + noise.white[1] * z2) ** 2
+    slow = (noise.correlated[0] + noise.correlated[1] * z2) ** 2
+    step = (noise.step[0] + noise.step[1] * z2) ** 2 / 12.0
+    step = max(step - white, 0.0)
+    total = white + slow + step
+    return float((white + SLOW_NOISE_AREA_PX * slow + STEP_AREA_PX * step) / max(total, 1e-30))
+
+
+def _pseudo_inverse(H: Array, kind: int, fixed: NDArray[np.bool_]) -> Array:
+    """(p, p) inverse of an information matrix that leaves a direction free: what is determined keeps its variance."""
+    p = int(FREEDOM[kind])
+    free = np.flatnonzero(~fixed[:p])
+    out = np.zeros((p, p))
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(H)[free], 1e-300))
+    inner = np.linalg.pinv(H[np.ix_(free, free)] * np.outer(scale, scale), rcond=1e-12, hermitian=True)
+    out[np.ix_(free, free)] = inner * np.outer(scale, scale)
+    return out

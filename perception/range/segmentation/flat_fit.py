@@ -1,0 +1,104 @@
+"""Planes from sums over blocks, and whether a quadratic describes the same blocks clearly better.
+
+All are linear in g = 1 / z (pinhole) or g = z (parallel rays): a plane is g = a x + b y + c over ray coordinates x, y.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.fitting.starts import solve_positive
+from perception.range.fitting.surfaces import LEAN
+
+BEND_RMS = 0.4  # in sigmas: how much a quadratic may gain over a plane before the plane is a strip of something bent
+BEND_F = 4.0  # and how significant that gain must be (F ratio)
+WORST_MEAN_SQUARE = 3.0  # in sigmas: what leaves more over its plane is no plane
+# Where the products of 1, p, q, pp, pq, qq stand among 1, p, q, pp, pq, qq, ppp, ppq, pqq, qqq, pppp, pppq, ppqq, pqqq, qqqq.
+MOMENTS = np.array(
+    [
+        [0, 1, 2, 3, 4, 5],
+        [1, 3, 4, 6, 7, 8],
+        [2, 4, 5, 7, 8, 9],
+        [3, 6, 7, 10, 11, 12],
+        [4, 7, 8, 11, 12, 13],
+        [5, 8, 9, 12, 13, 14],
+    ]
+)
+
+
+@njit(cache=True, **LEAN)
+def solve3(S, out):  # type: ignore[no-untyped-def]  # numba types it
+    """Coefficients (a, b, c) of g = a x + b y + c from sums (n, x, y, xx, xy, yy, g, xg, yg); False if degenerate."""
+    n = S[0]
+    if n <= 0.0:
+        return False
+    mx, my, mg = S[1] / n, S[2] / n, S[6] / n
+    sxx, sxy, syy = S[3] / n - mx * mx, S[4] / n - mx * my, S[5] / n - my * my
+    sxg, syg = S[7] / n - mx * mg, S[8] / n - my * mg
+    det = sxx * syy - sxy * sxy
+    if det <= 1e-6 * sxx * syy or det <= 0.0:
+        return False
+    out[0] = (syy * sxg - sxy * syg) / det
+    out[1] = (sxx * syg - sxy * sxg) / det
+    out[2] = mg - out[0] * mx - out[1] * my
+    return True
+
+
+@njit(cache=True, **LEAN)
+def plane_from_coefficients(m, perspective, th):  # type: ignore[no-untyped-def]  # numba types it
+    """PLANE parameters, normal towards the sensor, from g = a x + b y + c."""
+    if perspective:
+        nx, ny, nz, d = m[0], m[1], m[2], 1.0  # (a, b, c) . X = 1 and z > 0: this normal points away
+    else:
+        nx, ny, nz, d = -m[0], -m[1], 1.0, m[2]
+    length = -np.sqrt(nx * nx + ny * ny + nz * nz)
+    th[0], th[1], th[2], th[3] = nx / length, ny / length, nz / length, d / length
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def moved_rms(a, b, c, S, count):  # type: ignore[no-untyped-def]  # numba types it
+    """Root mean square of a x + b y + c over `count` blocks of sums `S`, in sigmas."""
+    n, x, y = S[0], S[1] / S[0], S[2] / S[0]
+    xx, xy, yy = S[3] / n - x * x, S[4] / n - x * y, S[5] / n - y * y
+    square = (a * x + b * y + c) ** 2 + a * a * xx + 2.0 * a * b * xy + b * b * yy
+    return np.sqrt(max(square, 0.0) * n / count)
+
+
+@njit(cache=True, error_model="numpy")
+def squares_left(idx, count, table, x0, y0, scale):  # type: ignore[no-untyped-def]  # numba types it
+    """Sum of squares (in sigmas) left by a plane and by a quadratic over the blocks idx[:count] of a padded table."""
+    M, b, total = np.zeros(15), np.zeros(6), 0.0
+    g0, per = table[idx[0], 2], 1.0 / scale
+    for k in range(count):
+        i = idx[k]
+        p, q, v, w = (table[i, 0] - x0) * per, (table[i, 1] - y0) * per, table[i, 2] - g0, table[i, 3]
+        pp, pq, qq, wv = p * p, p * q, q * q, w * v
+        wpp, wpq, wqq = w * pp, w * pq, w * qq
+        total += wv * v
+        for m, value in enumerate((w, w * p, w * q, wpp, wpq, wqq, wpp * p, wpp * q, wqq * p, wqq * q)):
+            M[m] += value
+        for m, value in enumerate((wpp * pp, wpp * pq, wpp * qq, wpq * qq, wqq * qq)):
+            M[10 + m] += value
+        for m, value in enumerate((wv, wv * p, wv * q, wv * pp, wv * pq, wv * qq)):
+            b[m] += value
+    A = np.empty((6, 6))
+    # Products of two of 1, p, q, pp, pq, qq, by where their moment stands.
+    for a, row in enumerate(MOMENTS):
+        for e in range(6):
+            A[a, e] = M[row[e]] * (1.0 + 1e-9 if a == e else 1.0)
+    plane, full = b[:3].copy(), b.copy()
+    if not solve_positive(A[:3, :3].copy(), plane, 3):
+        return max(total, 0.0), max(total, 0.0)
+    left = max(total - plane @ b[:3], 0.0)
+    if not solve_positive(A, full, 6):
+        return left, left
+    return left, max(total - full @ b, 0.0)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def is_bent(flat, quadratic, count):  # type: ignore[no-untyped-def]  # numba types it
+    """Whether `count` blocks are no plane, from the sums of squares that a plane and a quadratic leave over them."""
+    ratio = (flat - quadratic) / 3.0 / max(quadratic / max(count - 6, 1), 0.3)
+    is_better = flat - quadratic > BEND_RMS * BEND_RMS * count and ratio > BEND_F
+    return is_better or flat > WORST_MEAN_SQUARE * count

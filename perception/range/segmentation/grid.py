@@ -1,0 +1,163 @@
+"""The image as a grid of small blocks with a tangent plane each.
+
+Averaging b x b pixels and fitting a plane to the neighbouring blocks is the regularisation that the noise asks for;
+blocks that straddle a jump keep only the larger side. Planes are linear in the inverse depth of a pinhole and in the
+depth of an orthographic sensor, so one linear fit serves both.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from perception.range.components import for_each_tile
+from perception.range.fitting.surfaces import LEAN
+from perception.range.noise import NoiseModel, valid_sample
+from perception.range.segmentation.blocks import JUMP_SLOPE, mean_blocks
+from perception.range.segmentation.tangents import tangent_planes
+from perception.range.sensor import RangeSensorModel
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+NORMAL_SIGMA_GOAL_RAD = 0.06  # tangent planes noisier than this are fitted over a wider window
+WIDEST_RADIUS = 3
+LARGE_SIDE_PX = 1024
+MIDDLE_SAMPLES = 1024
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Grid:
+    """Blocks of an image, (h, w) arrays; NaN depth marks an empty block.
+
+    `x`, `y` are coordinates on the plane z = 1 (pinhole) or metres (orthographic), `z` metres, `sigma` the standard
+    deviation of `z`, `normal` (h, w, 3) towards the sensor, `rms` what the tangent plane leaves over in sigmas,
+    `slow_share` the part of the variance that neighbours share.
+    """
+
+    size_px: int
+    radius: int
+    perspective: bool
+    x: Array
+    y: Array
+    z: Array
+    sigma: Array
+    normal: Array
+    rms: Array
+    normal_sigma_rad: float
+    slow_share: float
+
+
+def block_size(shape: tuple[int, int], noise: NoiseModel, sensor: RangeSensorModel, depth_m: float) -> int:
+    """Pixels along a block: 1 below 192 rows, 2 below 384, then 3, or 4 where the noise asks for steadier tangent planes.
+
+    Above 1024 rows blocks grow with the image, so that the number of blocks, and with it memory, stays bounded.
+    """
+    if min(shape) < 192:
+        return 1
+    if min(shape) < 384:
+        return 2
+    coarse = -(-min(shape) // LARGE_SIDE_PX)
+    if slope_sigma_rad(noise, sensor, depth_m, side_px=15 * coarse) <= NORMAL_SIGMA_GOAL_RAD:
+        return 3 * coarse
+    return 4 * coarse
+
+
+def slope_sigma_rad(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float, *, side_px: int) -> float:
+    """Standard deviation of the slope of a plane fitted to a square window: sigma / (pitch sqrt(sum u^2)) and more."""
+    pitch = sensor.pitch_m(depth_m)
+    slow = noise.correlated[0] + noise.correlated[1] * depth_m**2
+    step = noise.step[0] + noise.step[1] * depth_m**2
+    white = max(float(noise.sigma_m(depth_m)) ** 2 - slow**2, 0.0) ** 0.5 * np.sqrt(12.0) / (pitch * side_px**2)
+    # White noise averages out; slow noise and steps do not, they tilt a short window as a whole.
+    return float(np.hypot(white, np.hypot(0.7 * slow, 0.3 * step) / (pitch * side_px)))
+
+
+def build_grid(
+    depth_m: Array,
+    sensor: RangeSensorModel,
+    noise: NoiseModel,
+    size_px: int,
+    *,
+    jump_slope: float = JUMP_SLOPE,
+    corner_px: tuple[int, int] = (0, 0),
+    tiles: int = 1,
+    pool: ThreadPoolExecutor | None = None,
+) -> Grid:
+    """Blocks of `size_px` pixels of an (H, W) depth image and their tangent planes; the window radius follows noise.
+
+    Neighbours steeper than `jump_slope` (metres of depth per metre across) are apart. `corner_px`: row and column of
+    the sensor at which the image begins, for a part of a larger one.
+    """
+    packed = seen_from(sensor, corner_px)
+    law = noise.packed()
+    h, w = (-(-n // size_px) for n in depth_m.shape)
+    x, y = np.empty((h, w)), np.empty((h, w))
+    z, sigma, count = np.empty((h, w)), np.empty((h, w)), np.empty((h, w), np.int32)
+    for_each_tile(
+        lambda a, b: mean_blocks(depth_m, packed, law, size_px, x, y, z, sigma, count, a, b), h, tiles, pool=pool
+    )
+    perspective = bool(packed[0] > 0)
+    known = valid_sample(z, MIDDLE_SAMPLES)
+    middle = float(np.median(known)) if known.size else 1.0
+    radius, slope_sigma = _radius(noise, sensor, middle, size_px)
+    slope = jump_slope / packed[1] * size_px
+    normal, rms = np.full((h, w, 3), np.nan), np.full((h, w), np.nan)
+    for_each_tile(
+        lambda a, b: tangent_planes(x, y, z, count, sigma, perspective, radius, slope, normal, rms, a, b),
+        h,
+        tiles,
+        pool=pool,
+    )
+    return Grid(
+        size_px=size_px,
+        radius=radius,
+        perspective=perspective,
+        x=x,
+        y=y,
+        z=z,
+        sigma=sigma,
+        normal=normal,
+        rms=rms,
+        normal_sigma_rad=slope_sigma,
+        slow_share=noise.slow_share(middle),
+    )
+
+
+def seen_from(sensor: RangeSensorModel, corner_px: tuple[int, int]) -> Array:
+    """(5,) packed sensor of the part of its image that begins at row and column `corner_px`."""
+    packed = sensor.packed()
+    packed[3] -= corner_px[1]
+    packed[4] -= corner_px[0]
+    return packed
+
+
+def _radius(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float, size_px: int) -> tuple[int, float]:
+    """Smallest window radius whose slope is known to the goal, and the slope's sigma there."""
+    sigma = np.inf
+    for radius in range(1, WIDEST_RADIUS + 1):
+        sigma = slope_sigma_rad(noise, sensor, depth_m, side_px=(2 * radius + 1) * size_px)
+        if sigma <= NORMAL_SIGMA_GOAL_RAD:
+            return radius, sigma
+    return WIDEST_RADIUS, sigma
+
+
+@njit(cache=True, **LEAN)
+def sigma_at(noise, z):  # type: ignore[no-untyped-def]  # numba types it
+    """Standard deviation of one pixel at depth z, metres; `noise` as `NoiseModel.packed`."""
+    z2 = z * z
+    white = noise[0] + noise[1] * z2
+    slow = noise[2] + noise[3] * z2
+    step = noise[4] + noise[5] * z2
+    return np.sqrt(max(white * white, step * step / 12.0) + slow * slow)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def slow_share_at(noise, z):  # type: ignore[no-untyped-def]  # numba types it
+    """Part of the variance at depth z that neighbouring pixels share; `noise` as `NoiseModel.packed`."""
+    slow, sigma = noise[2] + noise[3] * z * z, sigma_at(noise, z)
+    return slow * slow / max(sigma * sigma, 1e-30)

@@ -1,0 +1,242 @@
+"""Planes grown over the grid from flat seeds.
+
+A plane grows while its own model explains the next block, so it stops at a crease however gentle the normals change
+there. One that grew on a curved surface betrays itself: a quadratic explains its support clearly better.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.fitting.surfaces import LEAN
+from perception.range.segmentation.flat_fit import is_bent, moved_rms, plane_from_coefficients, solve3, squares_left
+from perception.range.segmentation.grow_surface import GROW_SIGMAS
+from perception.range.segmentation.tangents import STEADY_RMS
+
+SWEEPS = 3  # of growing a plane from one seed, each with the plane of the sweep before
+SAME_BLOCKS = 200  # of which no more than one may come or go in a sweep that is the last
+SAME_PLANE = 0.1  # sigmas: a plane that moves less explains the same blocks
+MOST_PLANES = 512
+LOOSE_NORMAL = 0.5  # length of a normal that seeds a plane but does not count
+TAKEN = np.int32(2**31 - 1)
+BENT = np.int32(-1)  # a block whose support is no plane
+
+
+@njit(cache=True, error_model="numpy")
+def grow_planes(  # type: ignore[no-untyped-def]  # numba types it
+    x, y, z, sigma, normal, rms, free, label, first_label, perspective, order, least, cos_limit, tried
+):
+    """Planes over the free blocks; writes labels and returns parameters (M, 16), block counts (M,), mean squares (M,).
+
+    Blocks of supports that turned out curved are marked in `tried` so that they seed nothing again.
+    """
+    h, w = z.shape
+    table, mark, place = _padded(x, y, z, sigma, normal, rms, free, perspective)
+    across = w + 2
+    owner = np.zeros(table.shape[0], np.int32)  # label, or BENT
+    queue, spans = np.empty(h * w, np.int32), np.empty((h * w, 2), np.int32)
+    ths, counts, mean2 = np.zeros((MOST_PLANES, 16)), np.zeros(MOST_PLANES, np.int64), np.zeros(MOST_PLANES)
+    found, stamp = 0, 0
+    m, S, th = np.zeros(3), np.zeros(9), np.zeros(16)
+    for o in range(order.shape[0]):
+        start = place[order[o]]
+        if mark[start] == TAKEN or owner[start] != 0 or found == MOST_PLANES:
+            continue
+        if not _tangent(table[start], perspective, m):
+            continue
+        count = 0
+        for sweep in range(SWEEPS):
+            plane_from_coefficients(m, perspective, th)
+            before, a, b, c = count, m[0], m[1], m[2]
+            stamp += 2
+            if sweep == 0:
+                count = _grown(table, mark, across, start, stamp, m, th, perspective, cos_limit, queue, S)
+            else:
+                count = _filled(table, mark, across, start, stamp, m, th, cos_limit, queue, spans, S)
+            if count < least or not solve3(S, m):
+                count = 0
+                break
+            is_same = abs(count - before) * SAME_BLOCKS < count
+            if sweep > 0 and (is_same or moved_rms(m[0] - a, m[1] - b, m[2] - c, S, count) < SAME_PLANE):
+                break
+        if count == 0:
+            owner[start] = BENT
+            continue
+        plane_from_coefficients(m, perspective, th)
+        x0, y0 = S[1] / S[0], S[2] / S[0]
+        scale = np.sqrt(max(S[3] / S[0] - x0 * x0 + S[5] / S[0] - y0 * y0, 1e-30))
+        flat, quadratic = squares_left(queue, count, table, x0, y0, scale)
+        bent = is_bent(flat, quadratic, count)
+        for k in range(count):
+            owner[queue[k]] = BENT if bent else first_label + found
+        if bent:
+            continue
+        for k in range(count):
+            mark[queue[k]] = TAKEN
+        ths[found] = th
+        counts[found] = count
+        mean2[found] = flat / max(count - 3, 1)
+        found += 1
+    _hand_over(owner, place, free.ravel(), label.ravel(), tried.ravel())
+    return ths[:found].copy(), counts[:found].copy(), mean2[:found].copy()
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _hand_over(owner, place, free, label, tried):  # type: ignore[no-untyped-def]  # numba types it
+    for i in range(place.shape[0]):
+        mine = owner[place[i]]
+        if mine > 0:
+            label[i], free[i] = mine, False
+        elif mine == BENT:
+            tried[i] = True
+
+
+@njit(cache=True, error_model="numpy")
+def _padded(x, y, z, sigma, normal, rms, free, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """Blocks with a frame of taken ones around, one row of numbers each, so that growing needs no look at the rim.
+
+    Returns (N, 8) x, y, g, its weight, normal (0 where it says nothing), z; marks (N,), `TAKEN` where a block is not
+    free; and where among the N each block stands (h w,).
+    """
+    h, w = z.shape
+    across = w + 2
+    table, mark = np.zeros(((h + 2) * across, 8)), np.full((h + 2) * across, TAKEN, np.int32)
+    place = np.empty(h * w, np.int32)
+    for r in range(h):
+        for c in range(w):
+            i = (r + 1) * across + c + 1
+            place[r * w + c] = i
+            if not free[r, c]:
+                continue
+            d = z[r, c]
+            weight = (d * d if perspective else 1.0) / sigma[r, c]
+            mark[i] = 0
+            table[i, 0], table[i, 1], table[i, 2] = x[r, c], y[r, c], 1.0 / d if perspective else d
+            table[i, 3], table[i, 7] = weight * weight, d
+            if np.isfinite(rms[r, c]):
+                # The length of the normal says whether it counts: noisy ones do not hold a plane back.
+                size = 1.0 if rms[r, c] < STEADY_RMS else LOOSE_NORMAL
+                for k in range(3):
+                    table[i, 4 + k] = size * normal[r, c, k]
+    return table, mark, place
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _tangent(block, perspective, m):  # type: ignore[no-untyped-def]  # numba types it
+    """Coefficients of the tangent plane of one row of the table into `m`; False where its ray grazes it."""
+    x, y, nx, ny, nz = block[0], block[1], block[4], block[5], block[6]
+    if perspective:
+        d = (nx * x + ny * y + nz) * block[7]
+        if abs(d) < 1e-9 * (abs(nx) + abs(ny) + abs(nz)):
+            return False
+        m[0], m[1], m[2] = nx / d, ny / d, nz / d
+        return True
+    m[0], m[1] = -nx / nz, -ny / nz
+    m[2] = block[2] - m[0] * x - m[1] * y
+    return True
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _add_block(block, S):  # type: ignore[no-untyped-def]  # numba types it
+    """One more row of the table into the sums that `solve3` reads."""
+    x, y, g, weight = block[0], block[1], block[2], block[3]
+    wx, wy = weight * x, weight * y
+    S[0] += weight
+    S[1] += wx
+    S[2] += wy
+    S[3] += wx * x
+    S[4] += wx * y
+    S[5] += wy * y
+    S[6] += weight * g
+    S[7] += wx * g
+    S[8] += wy * g
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _fits(block, a, b, c, th, limit, cos_limit):  # type: ignore[no-untyped-def]  # numba types it
+    """Whether the plane g = a x + b y + c, `th`, explains a row of the table, and its normal does not speak against it."""
+    e = block[2] - a * block[0] - b * block[1] - c
+    nx, ny, nz = block[4], block[5], block[6]
+    turn = th[0] * nx + th[1] * ny + th[2] * nz
+    return e * e * block[3] <= limit and (turn >= cos_limit or nx * nx + ny * ny + nz * nz <= 0.5)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _grown(table, mark, across, seed, stamp, m, th, perspective, cos_limit, queue, S):  # type: ignore[no-untyped-def]  # numba types it
+    """Blocks connected to `seed` that the plane explains, nearest first, into `queue`; returns how many.
+
+    The plane g = m . (x, y, 1) follows the blocks as they come: they must come from all sides.
+    `S` receives their sums as `solve3` reads them.
+    """
+    S[:] = 0.0
+    queue[0] = seed
+    mark[seed] = stamp
+    count, head, refit_at = 1, 0, 8
+    a, b, c = m[0], m[1], m[2]
+    while head < count:
+        i = queue[head]
+        head += 1
+        _add_block(table[i], S)
+        if head == refit_at:
+            refit_at *= 2
+            if solve3(S, m):
+                plane_from_coefficients(m, perspective, th)
+                a, b, c = m[0], m[1], m[2]
+        limit = (GROW_SIGMAS + 2.0 / np.sqrt(head)) ** 2
+        for side in range(4):
+            j = i + (across if side == 0 else -across if side == 1 else 1 if side == 2 else -1)
+            if mark[j] < stamp and _fits(table[j], a, b, c, th, limit, cos_limit):
+                mark[j] = stamp
+                queue[count] = j
+                count += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _filled(table, mark, across, seed, stamp, m, th, cos_limit, queue, spans, S):  # type: ignore[no-untyped-def]  # numba types it
+    """All blocks connected to `seed` that the plane g = m . (x, y, 1) explains, a span of a row at a time.
+
+    As `_grown`, with the plane held. Blocks that it does not explain are marked `stamp` - 1, so that none is asked twice.
+    """
+    S[:] = 0.0
+    mark[seed] = stamp
+    count = _span(table, mark, seed, stamp, m, th, cos_limit, queue, 0, spans[0], S)
+    found, head = 1, 0
+    while head < found:
+        left, right = spans[head]
+        head += 1
+        for step in (-across, across):
+            j, end = left + step, right + step
+            while j < end:
+                if mark[j] < stamp - 1:
+                    if _fits(table[j], m[0], m[1], m[2], th, GROW_SIGMAS * GROW_SIGMAS, cos_limit):
+                        mark[j] = stamp
+                        count = _span(table, mark, j, stamp, m, th, cos_limit, queue, count, spans[found], S)
+                        j = spans[found, 1]
+                        found += 1
+                    else:
+                        mark[j] = stamp - 1
+                j += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _span(table, mark, at, stamp, m, th, cos_limit, queue, count, span, S):  # type: ignore[no-untyped-def]  # numba types it
+    """The blocks of one row that join the one at `at` on both sides, into `queue`, their ends [first, last) into `span`."""
+    a, b, c, limit = m[0], m[1], m[2], GROW_SIGMAS * GROW_SIGMAS
+    for step in (-1, 1):
+        j = at + step
+        while mark[j] < stamp - 1:
+            fits = _fits(table[j], a, b, c, th, limit, cos_limit)
+            mark[j] = stamp if fits else stamp - 1
+            if not fits:
+                break
+            j += step
+        span[0 if step < 0 else 1] = j
+    span[0] += 1
+    for i in range(span[0], span[1]):
+        queue[count] = i
+        count += 1
+        _add_block(table[i], S)
+    return count

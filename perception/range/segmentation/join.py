@@ -1,0 +1,217 @@
+"""Joining pieces of one surface that something in front has parted."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from perception.range.fitting import fit
+from perception.range.fitting.surfaces import PLANE, depth_on
+from perception.range.segmentation import bend
+from perception.range.segmentation.grid import slow_share_at
+from perception.range.segmentation.regions import Regions
+from perception.range.segmentation.seams import crosses_groove, is_grooved_at
+
+Array = NDArray[np.float64]
+
+PAIR_SAMPLES = 150
+JOINED_SHARE = 0.85
+JOINED_MEAN_SQUARE = 1.6
+ROUGH_STRIDE = 5  # of the samples of a first fit
+ROUGH_SHARE = 0.7  # of them must lie near it before all are fitted
+NEAR_SAMPLES = 16  # at least (a small piece: all it has) decide whether a surface passes near a piece
+LEAST_NEAR = 4
+NEAR_SIGMAS = 20.0
+SCRAP_SHARE = 0.1
+SCRAP_SIGMAS = 6.0
+LARGEST_TURN_RAD = 0.2
+SIGHT_LINES = 5
+GAP_SIGMAS = 6.0
+TOUCHING_PX = 8
+GROOVE_PX = 2  # a single pixel may be a gross error
+BEHIND_SHARE = 0.15  # more of the sight line than this seen behind the surface: a gap, not an occluder
+APART, SCRAP, JOINED = 0, 1, 2
+
+
+def join_pieces(regions: Regions, kinds: list[int], parameters: list[Array]) -> list[int]:
+    """For each surface (label k at k - 1) the label that it belongs to after joining, itself when it stays alone.
+
+    Parameters of the surviving labels are updated in place.
+    """
+    if len(kinds) < 2:
+        return list(range(1, len(kinds) + 1))
+    pixels = np.array(regions.pixels)
+    order = np.argsort(-pixels, kind="stable")[: np.count_nonzero(pixels)]
+    thin = regions.few(PAIR_SAMPLES)
+    starts = np.cumsum([0] + [few.shape[1] for few in thin])
+    ths = np.stack(parameters)
+    image = (regions.depth_m, regions.packed, regions.law, regions.labels)
+    owner = _joined(np.array(kinds), ths, np.concatenate(thin, axis=1), starts, pixels, order, *image)
+    parameters[:] = list(ths)
+    joined: list[int] = owner.tolist()
+    return joined
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _joined(kinds, ths, samples, starts, pixels, order, depth, sen, noise, labels):  # type: ignore[no-untyped-def]  # numba types it
+    """`join_pieces` of samples (4, N), piece k's from `starts[k]` on; the largest come first. Updates `ths`."""
+    perspective = sen[0] > 0
+    owner, before = np.arange(1, kinds.shape[0] + 1), ths.copy()
+    thin = [np.ascontiguousarray(samples[:, starts[k] : starts[k + 1]]) for k in range(kinds.shape[0])]
+    for position in range(order.shape[0]):
+        big = order[position]
+        if owner[big] != big + 1:
+            continue
+        for small in order[position + 1 :]:
+            if owner[small] != small + 1 or not _passes_near(kinds[big], before[big], thin[small], perspective):
+                continue
+            verdict, joint = related(
+                kinds[big], ths[big], thin[big], pixels[big],
+                kinds[small], ths[small], thin[small], pixels[small], noise, perspective,
+            )  # fmt: skip
+            if verdict == APART:
+                continue
+            if verdict == JOINED:
+                own = np.zeros(owner.shape[0] + 1, np.bool_)
+                own[1:] = (owner == big + 1) | (owner == small + 1)
+                if gap_between(depth, sen, noise, labels, own, kinds[big], joint, thin[big], thin[small]):
+                    continue
+                ths[big] = joint
+                thin[big] = np.concatenate((thin[big], thin[small]), 1)
+            owner[small] = big + 1
+    return owner
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def related(  # type: ignore[no-untyped-def]  # numba types it
+    kind, th, samples, pixels, other_kind, other, others, other_pixels, noise, perspective
+):
+    """What a smaller piece is to a larger one: nothing, a scrap of it, or a piece of one surface, whose parameters follow.
+
+    Samples are (4, N) as in `bend`.
+    """
+    if other_pixels <= SCRAP_SHARE * pixels and _is_scrap(
+        kind, th, other_kind, other, others, other_pixels, noise, perspective
+    ):
+        return SCRAP, th
+    if kind == PLANE and other_kind == PLANE:
+        turn = th[0] * other[0] + th[1] * other[1] + th[2] * other[2]
+        if turn < np.cos(LARGEST_TURN_RAD):
+            return APART, th
+    both = np.concatenate((samples, others), 1)
+    rough = _fitted(kind, th, np.ascontiguousarray(both[:, ::ROUGH_STRIDE]), perspective, 1)
+    for s in (samples, others):
+        if _trimmed(kind, rough, s, perspective)[0] < ROUGH_SHARE:
+            return APART, th
+    joint = _fitted(kind, th, both, perspective, 3)
+    # What a piece leaves over by itself is bend, where noise is slow, and it is no less in the joint surface.
+    own = max(_trimmed(kind, th, samples, perspective)[1], _trimmed(other_kind, other, others, perspective)[1])
+    limit = JOINED_MEAN_SQUARE * (1.0 + slow_share_at(noise, np.median(both[2])) * max(own - 1.0, 0.0))
+    for s in (samples, others):
+        share, mean_square = _trimmed(kind, joint, s, perspective)
+        if share < JOINED_SHARE or not mean_square <= limit:
+            return APART, th
+    return JOINED, joint
+
+
+@njit(cache=True, error_model="numpy")
+def _is_scrap(kind, th, own_kind, own, samples, pixels, noise, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """Whether a small piece lies so close along a large surface that it is only a dent in it, or a bit of its rim."""
+    if bend.scrap_gain(kind, th, own_kind, own, samples, pixels, noise, perspective) > 0.0:
+        return True
+    if kind == PLANE and own_kind != PLANE:
+        return False
+    if kind == PLANE and th[0] * own[0] + th[1] * own[1] + th[2] * own[2] < np.cos(LARGEST_TURN_RAD):
+        return False
+    hit, near = 0, 0
+    for i in range(samples.shape[1]):
+        z = depth_on(kind, th, samples[0, i], samples[1, i], perspective)
+        if np.isfinite(z):
+            hit += 1
+            near += abs(samples[2, i] - z) < SCRAP_SIGMAS * samples[3, i]
+    # Rays just outside the outline miss; those that hit decide, when they are the larger part.
+    return 2 * hit > samples.shape[1] and near > JOINED_SHARE * hit
+
+
+@njit(cache=True, error_model="numpy")
+def _fitted(kind, th, s, perspective, rounds):  # type: ignore[no-untyped-def]  # numba types it
+    free = np.zeros(9, np.bool_)
+    th, _, _, _, _ = fit.fit_robust(kind, th, s[0], s[1], s[2], s[3], perspective, free, rounds)
+    return th
+
+
+@njit(cache=True, error_model="numpy")
+def _trimmed(kind, th, s, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """Share of the samples within the trim, and their mean squared residual in squared sigmas."""
+    e = bend.residual_sizes(kind, th, s, perspective)
+    kept, total = 0, 0.0
+    for i in range(e.shape[0]):
+        if e[i] < fit.TRIM_SIGMAS:
+            kept += 1
+            total += e[i] * e[i]
+    return kept / max(e.shape[0], 1), total / kept if kept else np.inf
+
+
+@njit(cache=True, error_model="numpy")
+def _passes_near(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """Whether the surface, extended, passes near most of a piece: a cheap refusal before the joint fits."""
+    count, inside = 0, 0
+    for k in range(0, samples.shape[1], max(1, samples.shape[1] // NEAR_SAMPLES)):
+        z = depth_on(kind, th, samples[0, k], samples[1, k], perspective)
+        inside += abs(samples[2, k] - z) < NEAR_SIGMAS * samples[3, k]
+        count += 1
+    return count >= LEAST_NEAR and 2 * inside > count
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def gap_between(depth, sen, noise, labels, own, kind, th, a, b):  # type: ignore[no-untyped-def]  # numba types it
+    """Whether the sensor sees past the surface on most of the shortest lines between two pieces of samples (4, N).
+
+    `own` says which `labels` (H, W) belong to the pieces: what lies between them shows a groove, however narrow.
+    """
+    nearest, distance = np.empty(a.shape[1], np.int64), np.empty(a.shape[1])
+    for m in range(a.shape[1]):
+        least = np.inf
+        for n in range(b.shape[1]):
+            d2 = (a[0, m] - b[0, n]) ** 2 + (a[1, m] - b[1, n]) ** 2
+            if d2 < least:
+                nearest[m], least = n, d2
+        distance[m] = least
+    slack = GAP_SIGMAS * np.median(a[3])
+    lines = np.argsort(distance)[:SIGHT_LINES]
+    gaps = 0
+    for m in lines:
+        n = nearest[m]
+        gaps += _is_gap(depth, sen, noise, labels, own, kind, th, a[0, m], a[1, m], b[0, n], b[1, n], slack)
+    return 2 * gaps > lines.shape[0]
+
+
+@njit(cache=True, error_model="numpy")
+def _is_gap(depth, sen, noise, labels, own, kind, th, ax, ay, bx, by, slack):  # type: ignore[no-untyped-def]  # numba types it
+    """Whether much of the line from ray a to ray b lies behind the surface, or `GROOVE_PX` in a row of neither piece."""
+    H, W = depth.shape
+    perspective = sen[0] > 0
+    du, dv = (bx - ax) * sen[1], (by - ay) * sen[2]
+    count = max(int(max(abs(du), abs(dv))), 1)
+    behind, run = 0, 0
+    for k in range(1, count):
+        u = min(max(int(np.rint(ax * sen[1] + sen[3] + du * k / count)), 0), W - 1)
+        v = min(max(int(np.rint(ay * sen[2] + sen[4] + dv * k / count)), 0), H - 1)
+        seen = depth[v, u]
+        past = seen - depth_on(kind, th, (u - sen[3]) / sen[1], (v - sen[4]) / sen[2], perspective)
+        step = 3.0 / sen[1] * (abs(seen) if perspective else 1.0)
+        behind += past > max(slack, step)
+        run = run + 1 if past > slack and not own[labels[v, u]] else 0
+        if run == GROOVE_PX:
+            return True
+    if behind > BEHIND_SHARE * (count - 1):
+        return True
+    if kind != PLANE:
+        return False
+    u, v = ax * sen[1] + sen[3], ay * sen[2] + sen[4]
+    if crosses_groove(depth, sen, noise, labels, own, th, u, v, du / count, dv / count, count):
+        return True
+    # Where pieces touch, the line between them may lie along what parts them.
+    is_touching = count <= TOUCHING_PX
+    return is_touching and is_grooved_at(depth, sen, noise, labels, own, th, u + 0.5 * du, v + 0.5 * dv)

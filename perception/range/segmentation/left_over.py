@@ -1,0 +1,92 @@
+"""What no surface explains yet: unlabelled patches that are large enough to hold one."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from perception.range.components import find, unite
+from perception.range.segmentation.beside import WORD
+from perception.range.segmentation.runs import row_ends
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int32]
+
+
+def unexplained(
+    depth_m: Array, labels: Labels, least_pixels: int, *, align_px: int
+) -> tuple[tuple[int, int], Array] | None:
+    """The least part of the image that holds every unlabelled patch of at least `least_pixels`, None without any.
+
+    Patches are connected over sides and corners. Returns the part's first row and column, multiples of `align_px`, and
+    its depth, NaN outside of those patches.
+    """
+    top, left, part = _patches(depth_m, labels, least_pixels, align_px)
+    return ((top, left), part) if part.size else None
+
+
+@njit(cache=True, nogil=True)
+def _patches(depth, labels, least, align):  # type: ignore[no-untyped-def]  # numba types it
+    H, W = depth.shape
+    runs, begins = _free_runs(depth, labels)
+    parent = _connected(runs, begins)
+    sizes, kept = np.zeros(runs.shape[0], np.int64), np.zeros(runs.shape[0], np.bool_)
+    for i in range(runs.shape[0]):
+        sizes[find(parent, i)] += runs[i, 2] - runs[i, 1]
+    top, left, bottom, right = H, W, 0, 0
+    for i in range(runs.shape[0]):
+        kept[i] = sizes[find(parent, i)] >= least
+        if kept[i]:
+            v, first, end = runs[i]
+            top, bottom, left, right = min(top, v), max(bottom, v + 1), min(left, first), max(right, end)
+    if bottom == 0:
+        return 0, 0, np.empty((0, 0))
+    top, left = top // align * align, left // align * align
+    part = np.full((bottom - top, right - left), np.nan)
+    for i in range(runs.shape[0]):
+        if kept[i]:
+            v, first, end = runs[i]
+            part[v - top, first - left : end - left] = depth[v, first:end]
+    return top, left, part
+
+
+@njit(cache=True, error_model="numpy")
+def _free_runs(depth, labels):  # type: ignore[no-untyped-def]  # numba types it
+    """Runs of unlabelled pixels with a reading (R, 3): row, first column, the one after the last; where each row's begin."""
+    H, W = depth.shape
+    words, ends = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 2, np.int32)
+    runs, begins, n = np.empty((4 * max(H, W), 3), np.int32), np.zeros(H + 1, np.int64), 0
+    for v in range(H):
+        if n + W > runs.shape[0]:
+            runs = np.concatenate((runs, runs))
+        u = 0
+        for i in range(row_ends(labels[v], words, ends)):
+            u = ends[i] if labels[v, u] else u
+            while u < ends[i]:
+                first = u
+                while u < ends[i] and np.isfinite(depth[v, u]):
+                    u += 1
+                if u > first:
+                    runs[n, 0], runs[n, 1], runs[n, 2] = v, first, u
+                    n += 1
+                else:
+                    u += 1
+        begins[v + 1] = n
+    return runs[:n].copy(), begins
+
+
+@njit(cache=True)
+def _connected(runs, begins):  # type: ignore[no-untyped-def]  # numba types it
+    """(R,) the parent of each run: those of neighbouring rows that touch, be it at a corner, have one root."""
+    parent = np.arange(runs.shape[0])
+    for v in range(1, begins.shape[0] - 1):
+        above = begins[v - 1]
+        for i in range(begins[v], begins[v + 1]):
+            while above < begins[v] and runs[above, 2] < runs[i, 1]:
+                above += 1
+            j = above
+            while j < begins[v] and runs[j, 1] <= runs[i, 2]:
+                unite(parent, i, j)
+                j += 1
+    return parent

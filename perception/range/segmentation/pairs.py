@@ -1,0 +1,304 @@
+"""Two touching regions, compiled: whether one surface describes both more cheaply than two do.
+
+A region is its kind, parameters, (4, N) samples, their (N, 3) normals on its surface, and FIGURES: its pixels, how many
+independent values of the noise these hold, what the surface leaves over in squared sigmas, how far noise may have
+turned it, radians, and the side of a square of its size, metres.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.fitting import fit
+from perception.range.fitting.starts import solve_positive, start_plane
+from perception.range.fitting.surfaces import PLANE, QUADRIC, SPHERE
+from perception.range.segmentation import bend
+from perception.range.segmentation.borders import step_and_turn
+from perception.range.segmentation.finish import SLOW_NOISE_AREA_PX
+from perception.range.segmentation.grid import slow_share_at
+
+PIXELS, PATCHES, MEAN_SQUARE, TILT, SIZE_M = range(5)
+FIGURES = 5
+STEP_SIGMAS = 3.0
+SHARPEST_TURN_RAD = 1.2  # between facets of one narrow cylinder; an edge of a box turns by 1.57
+SMOOTH_TURN_RAD = 0.05
+SMOOTH_SIGMAS = 3.0
+SMOOTH_SHARE = 0.8  # of both parts within `SMOOTH_LIMIT` of the joint surface, when no crease parts them
+SMOOTH_LIMIT = 5.0
+LEAST_SHARE = 0.85
+UNEVEN_TURN_RAD = 0.25  # between facets of one face
+ROUNDING_PX = 4.0  # wide at most, by which an edge of a face is rounded
+ROUNDING_TURN_RAD = 0.6
+ROUNDING_SIGMAS = 2.0
+UNEVEN_SHARE = 0.02  # of the smaller facet's size
+LEAST_GAIN = 1e-3
+SCRAP_SHARE = 0.1  # of the larger part
+PLAIN_MEAN_SQUARE = 1.6
+MOST_NOISE = 2.5  # times the model's variance, that two parts may show and still be joined on its strength
+CREASE_MEAN_SQUARE = 2.0  # times the limit, that a quadratic leaves over: no surface follows such a crease
+# Mean square of a rough fit, cut at five sigmas, that no full fit brings below the limits: where the crease is smooth or
+# both are flat; and beyond the limit, for two that are known well enough to tell.
+GIVE_UP = 10.0
+SLACK = 3.0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def described(kind, th, samples, pixels, pitch, noise, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """A region by itself, as the simplest surface that describes it: kind, parameters, normals and figures.
+
+    `pitch`: between pixels, in ray coordinates.
+    """
+    patches = max(pixels / (1.0 + slow_share_at(noise, np.median(samples[2])) * (SLOW_NOISE_AREA_PX - 1.0)), 1.0)
+    kind, th = bend.simplest(kind, th, samples, perspective, patches)
+    normals = bend.surface_normals(kind, th, samples, perspective)
+    return kind, th, normals, figures_of(kind, th, samples, pixels, patches, pitch, perspective)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def figures_of(kind, th, samples, pixels, patches, pitch, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """(FIGURES,) of a region; its tilt is sigma / (spread sqrt(patches)), the slope of a plane through noisy values."""
+    out = np.empty(FIGURES)
+    out[PIXELS], out[PATCHES] = pixels, patches
+    e = bend.residual_sizes(kind, th, samples, perspective)
+    out[MEAN_SQUARE] = bend.cut_mean_square(e, fit.TRIM_SIGMAS)
+    points = bend.points_of(samples, perspective)
+    n = points.shape[0]
+    mx, my = np.mean(points[:, 0]), np.mean(points[:, 1])
+    xx, xy, yy = 0.0, 0.0, 0.0
+    for i in range(n):
+        dx, dy = points[i, 0] - mx, points[i, 1] - my
+        xx, xy, yy = xx + dx * dx, xy + dx * dy, yy + dy * dy
+    least = 0.5 * (xx + yy - np.sqrt((xx - yy) ** 2 + 4.0 * xy * xy)) / max(n - 1, 1)
+    out[TILT] = np.median(samples[3]) / np.sqrt(max(least, 1e-12) * patches)
+    out[SIZE_M] = np.sqrt(pixels) * pitch * (np.median(samples[2]) if perspective else 1.0)
+    return out
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def united(  # type: ignore[no-untyped-def]  # numba types it
+    kind, th, samples_a, normals_a, figures_a, samples_b, normals_b, figures_b, most, pitch, perspective
+):
+    """Samples, normals and figures of two regions that are one surface now.
+
+    Each gives samples by its share of the pixels, a fifth of `most` at least, evenly spread over those that it has.
+    """
+    pixels, patches = figures_a[PIXELS] + figures_b[PIXELS], figures_a[PATCHES] + figures_b[PATCHES]
+    share = min(max(figures_b[PIXELS] / pixels, 0.2), 0.8)
+    from_a = min(samples_a.shape[1], max(1, round((1.0 - share) * most)))
+    from_b = min(samples_b.shape[1], max(1, round(share * most)))
+    samples, normals = np.empty((4, from_a + from_b)), np.empty((from_a + from_b, 3))
+    _spread(samples_a, normals_a, samples[:, :from_a], normals[:from_a])
+    _spread(samples_b, normals_b, samples[:, from_a:], normals[from_a:])
+    return samples, normals, figures_of(kind, th, samples, pixels, patches, pitch, perspective)
+
+
+@njit(cache=True, error_model="numpy")
+def _spread(samples, normals, few, few_normals):  # type: ignore[no-untyped-def]  # numba types it
+    """Fill `few` (4, n) and `few_normals` (n, 3) from samples and normals, evenly spread."""
+    n, last = few.shape[1], samples.shape[1] - 1
+    step = last / max(n - 1, 1)
+    for k in range(n):
+        i = last if k == n - 1 and n > 1 else int(k * step)
+        for a in range(4):
+            few[a, k] = samples[a, i]
+        for a in range(3):
+            few_normals[k, a] = normals[i, a]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def judged(  # type: ignore[no-untyped-def]  # numba types it
+    kind_a,
+    a,
+    samples_a,
+    normals_a,
+    figures_a,
+    kind_b,
+    b,
+    samples_b,
+    normals_b,
+    figures_b,
+    x,
+    y,
+    length_px,
+    noise,
+    perspective,
+):
+    """Gain of the best joint description of two regions that touch at the rays (x, y), its kind and parameters.
+
+    A gain of 0 or less: they stay two.
+    """
+    shown = shown_noise(figures_a, figures_b)
+    step, turn = step_and_turn(kind_a, a, kind_b, b, x, y, noise, perspective)
+    is_rounding = step <= ROUNDING_SIGMAS * np.sqrt(shown) and turn <= ROUNDING_TURN_RAD
+    is_rounding &= _is_strip(figures_a[PIXELS], figures_b[PIXELS], length_px)
+    tolerated = max(SMOOTH_TURN_RAD, SMOOTH_SIGMAS * np.hypot(figures_a[TILT], figures_b[TILT]))
+    is_smooth = turn < min(tolerated, 0.5 * SHARPEST_TURN_RAD)
+    may_join = step <= STEP_SIGMAS * np.sqrt(shown) and turn <= SHARPEST_TURN_RAD
+    # A rounded edge goes to its face in any case, and what it is by itself is not worth fits.
+    if may_join and (is_smooth or not is_rounding):
+        samples, normals = np.concatenate((samples_a, samples_b), 1), np.concatenate((normals_a, normals_b))
+        limit = shown * max(mean_square_limit(figures_a[PATCHES]), mean_square_limit(figures_b[PATCHES]))
+        both_flat = kind_a == PLANE and kind_b == PLANE
+        is_hopeless = both_flat and _is_creased(samples, perspective, CREASE_MEAN_SQUARE * limit)
+        if is_smooth or not is_hopeless:
+            give_up = GIVE_UP if both_flat or is_smooth else limit + SLACK
+            with_quadric = QUADRIC in (kind_a, kind_b)
+            kinds = np.ones(5, np.bool_)
+            kinds[QUADRIC] = with_quadric
+            own, continued = (kind_a, a) if figures_a[PIXELS] >= figures_b[PIXELS] else (kind_b, b)
+            goes_on = own != PLANE and fit.rough_mean_square(own, continued, samples, perspective) <= give_up
+            if goes_on:
+                # Pieces of one bent surface: the larger's goes on over the smaller, and no other need be tried.
+                continued = _continued(own, continued, samples, perspective)
+                gain, _ = _gain(
+                    own, continued, kind_a, samples_a, figures_a, kind_b, samples_b, figures_b, is_smooth, perspective
+                )
+                if gain > LEAST_GAIN:
+                    return gain, own, continued
+                kinds[own] = own == SPHERE and with_quadric  # an ellipsoid starts from a sphere
+            correlated = max(samples.shape[1] / (figures_a[PATCHES] + figures_b[PATCHES]), 1.0)
+            ths, there = _joint_fits(samples, normals, perspective, kinds, correlated, give_up)
+            if both_flat and not there[PLANE]:
+                goes_on, continued = True, _continued(PLANE, a, samples, perspective)
+            if goes_on:
+                ths[own], there[own] = continued, True
+            best_kind, best_gain, is_near = -1, -np.inf, False
+            for k in np.flatnonzero(there):
+                kind, th = int(k), ths[k]
+                gain, near = _gain(
+                    kind, th, kind_a, samples_a, figures_a, kind_b, samples_b, figures_b, is_smooth, perspective
+                )
+                is_near |= near
+                if gain > best_gain:
+                    best_kind, best_gain = kind, gain
+            if best_gain > 0.0 or is_near:
+                return max(best_gain, LEAST_GAIN), best_kind, ths[best_kind].copy()
+        if both_flat and turn < UNEVEN_TURN_RAD:
+            th = start_plane(bend.points_of(samples, perspective))
+            tolerance_m = UNEVEN_SHARE * min(figures_a[SIZE_M], figures_b[SIZE_M])
+            if _is_uneven(th, samples_a, samples_b, tolerance_m, perspective):
+                return LEAST_GAIN, PLANE, th
+    if figures_a[PIXELS] >= figures_b[PIXELS]:
+        return _swallowed(is_rounding, kind_a, a, figures_a, kind_b, b, samples_b, figures_b, noise, perspective)
+    return _swallowed(is_rounding, kind_b, b, figures_b, kind_a, a, samples_a, figures_a, noise, perspective)
+
+
+@njit(cache=True, error_model="numpy")
+def _continued(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """The surface refined on the samples of both regions."""
+    free = np.zeros(9, np.bool_)
+    x, y, z, sigma = samples[0], samples[1], samples[2], samples[3]
+    th, _, _, _, _ = fit.fit_robust(kind, th, x, y, z, sigma, perspective, free, 3)
+    return th
+
+
+@njit(cache=True, error_model="numpy")
+def _joint_fits(samples, normals, perspective, kinds, correlated, give_up):  # type: ignore[no-untyped-def]  # numba types it
+    """Parameters (5, SIZE) of each of `kinds` on the samples of both regions, and which of them fit at all."""
+    points = bend.points_of(samples, perspective)
+    x, y, z, sigma = samples[0], samples[1], samples[2], samples[3]
+    ths, _, kept, score = fit.fit_kinds(
+        points, points, normals, x, y, z, sigma, perspective, kinds, correlated, give_up
+    )
+    return ths, np.isfinite(score) & (kept > 0.5)
+
+
+@njit(cache=True, error_model="numpy")
+def _gain(  # type: ignore[no-untyped-def]  # numba types it
+    kind, th, kind_a, samples_a, figures_a, kind_b, samples_b, figures_b, is_smooth, perspective
+):
+    """How much cheaper the joint surface is than the two, minus infinity where it does not describe both.
+
+    And whether both meet without a crease and lie near it: then they are one, however dear.
+    """
+    shown = shown_noise(figures_a, figures_b)
+    patches_a, patches_b = figures_a[PATCHES], figures_b[PATCHES]
+    apart = bend.schwarz_price(kind_a, patches_a) + bend.schwarz_price(kind_b, patches_b)
+    together = bend.schwarz_price(kind, patches_a + patches_b)
+    fits, near = True, is_smooth
+    for side in range(2):
+        samples, figures = (samples_a, figures_a) if side == 0 else (samples_b, figures_b)
+        e = bend.residual_sizes(kind, th, samples, perspective)
+        mean2 = bend.cut_mean_square(e, fit.TRIM_SIGMAS)
+        fits &= mean2 <= shown * mean_square_limit(figures[PATCHES]) and np.mean(e < fit.TRIM_SIGMAS) >= LEAST_SHARE
+        near &= np.mean(e < SMOOTH_LIMIT) > SMOOTH_SHARE
+        apart += figures[MEAN_SQUARE] * figures[PATCHES] / shown
+        together += mean2 * figures[PATCHES] / shown
+    return apart - together if fits or near else -np.inf, near
+
+
+@njit(cache=True, error_model="numpy")
+def _is_strip(pixels_a, pixels_b, length_px):  # type: ignore[no-untyped-def]  # numba types it
+    """Whether the smaller region is a narrow strip along its border with a much larger one."""
+    less = min(pixels_a, pixels_b)
+    return less < ROUNDING_PX * length_px and less < SCRAP_SHARE * max(pixels_a, pixels_b)
+
+
+@njit(cache=True, error_model="numpy")
+def _is_uneven(th, samples_a, samples_b, tolerance_m, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    """Whether two facets leave the plane `th` by less than things that are called flat do: upholstery, cardboard."""
+    for side in range(2):
+        samples = samples_a if side == 0 else samples_b
+        e = bend.residual_sizes(PLANE, th, samples, perspective) * samples[3]
+        if not np.mean(e < tolerance_m) > SMOOTH_SHARE:
+            return False
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _swallowed(is_rounding, kind, th, figures, own_kind, own, samples, own_figures, noise, perspective):  # type: ignore[no-untyped-def]  # numba types it
+    if is_rounding:
+        return LEAST_GAIN, kind, th
+    if own_figures[PIXELS] > SCRAP_SHARE * figures[PIXELS]:
+        return 0.0, kind, th
+    return bend.scrap_gain(kind, th, own_kind, own, samples, own_figures[PIXELS], noise, perspective), kind, th
+
+
+@njit(cache=True, error_model="numpy")
+def _is_creased(samples, perspective, limit):  # type: ignore[no-untyped-def]  # numba types it
+    """Whether even a quadratic in x and y leaves more than `limit` squared sigmas a sample over.
+
+    It follows whatever is smooth and turns by no more than `SHARPEST_TURN_RAD`, so it spares the fits of surfaces.
+    """
+    n = samples.shape[1]
+    A, b, row = np.zeros((6, 6)), np.zeros(6), np.empty(6)
+    mx, my = np.mean(samples[0]), np.mean(samples[1])
+    scale = 1.0 / max(np.std(samples[0]), np.std(samples[1]), 1e-12)
+    g0 = 1.0 / samples[2, 0] if perspective else samples[2, 0]
+    total = 0.0
+    for i in range(n):
+        u, v, z = (samples[0, i] - mx) * scale, (samples[1, i] - my) * scale, samples[2, i]
+        row[0], row[1], row[2], row[3], row[4], row[5] = 1.0, u, v, u * u, u * v, v * v
+        # Planes are straight in 1 / z under perspective; sigma goes with it.
+        value = (1.0 / z if perspective else z) - g0
+        sigma = samples[3, i] / (z * z) if perspective else samples[3, i]
+        w = 1.0 / (sigma * sigma)
+        total += w * value * value
+        for j in range(6):
+            b[j] += w * row[j] * value
+            for k in range(j + 1):
+                A[j, k] += w * row[j] * row[k]
+    for j in range(6):
+        for k in range(j):
+            A[k, j] = A[j, k]
+    x = b.copy()
+    if not solve_positive(A, x, 6):
+        return False
+    for j in range(6):
+        total -= x[j] * b[j]
+    return total > limit * max(n - 6, 1)
+
+
+@njit(cache=True, error_model="numpy")
+def shown_noise(figures_a, figures_b):  # type: ignore[no-untyped-def]  # numba types it
+    """How many times the noise model's variance two regions show by themselves; slanted faces scatter more."""
+    na, nb = figures_a[PATCHES], figures_b[PATCHES]
+    shown = (figures_a[MEAN_SQUARE] * na + figures_b[MEAN_SQUARE] * nb) / (na + nb)
+    return min(max(1.0, shown), MOST_NOISE)
+
+
+@njit(cache=True, error_model="numpy")
+def mean_square_limit(patches):  # type: ignore[no-untyped-def]  # numba types it
+    """What a right surface stays below in 97 of 100 cases: 1 + 2 sqrt(2 / n) of a mean of n squares, and a floor."""
+    return max(PLAIN_MEAN_SQUARE, 1.0 + 2.0 * np.sqrt(2.0 / patches))

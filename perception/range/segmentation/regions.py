@@ -1,0 +1,111 @@
+"""The pixels of each region of a label image, as fits read them.
+
+Samples are (4, N): ray coordinates x and y, depth z and its standard deviation, metres. Only the places of pixels are
+kept, as runs of rows; samples are made where they are wanted, for most steps need a few of a region.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from perception.range.fitting.rays import LOOSE
+from perception.range.segmentation.runs import painted, places_of, runs_of
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Regions:
+    """Labels 1 to `count` of a depth image (H, W) in metres; `packed` and `law` of its sensor and its noise.
+
+    Label k owns `runs[starts[k] : starts[k + 1]]` and `sizes[k]` pixels, as `runs_of` tells them.
+    """
+
+    depth_m: Array
+    packed: Array
+    law: Array
+    labels: Labels
+    starts: NDArray[np.int64]
+    runs: Labels
+    sizes: NDArray[np.int64]
+
+    @property
+    def pixels(self) -> list[int]:
+        """How many pixels each label has; entry 0 is label 1."""
+        sizes: list[int] = self.sizes[1:].tolist()
+        return sizes
+
+    def few(self, most: int) -> list[Array]:
+        """At most `most` samples of each label, evenly spread over its pixels; the same choice every time."""
+        sizes = np.minimum(self.sizes[1:], most).tolist()
+        out = _spread_samples(self.depth_m, self.packed, self.law, self.starts, self.runs, self.sizes, most)
+        return [np.ascontiguousarray(s[:, :n]) for s, n in zip(out, sizes, strict=True)]
+
+    def runs_of(self, label: int) -> Labels:
+        """The runs (R, 3) of a label, in raster order: row, first column, and the one after the last."""
+        return self.runs[self.starts[label] : self.starts[label + 1]]
+
+    def places(self, label: int) -> Labels:
+        """Flat pixel indices of a label, in raster order."""
+        return np.asarray(places_of(self.runs_of(label), self.labels.shape[1]))
+
+    def renamed(self, names: Labels) -> Labels:
+        """(H, W) labels after k is called `names[k]`."""
+        labels = np.zeros_like(self.labels)
+        painted(self.starts, self.runs, names, labels)
+        return labels
+
+    def given_to(self, owner: list[int]) -> Regions:
+        """The regions after label k has gone to `owner[k - 1]`."""
+        if owner == list(range(1, len(owner) + 1)):
+            return self
+        labels = self.renamed(np.array([0, *owner], np.int32))
+        return regions_of(self.depth_m, self.packed, self.law, labels, len(owner))
+
+
+def regions_of(depth_m: Array, packed: Array, law: Array, labels: Labels, count: int) -> Regions:
+    """The pixels of labels 1 to `count`."""
+    starts, runs, sizes = runs_of(labels, count)
+    return Regions(depth_m=depth_m, packed=packed, law=law, labels=labels, starts=starts, runs=runs, sizes=sizes)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _spread_samples(depth, sen, noise, starts, runs, sizes, most):  # type: ignore[no-untyped-def]  # numba types it
+    """(count, 4, most) samples of each label, as many as it has at most."""
+    count = sizes.shape[0] - 1
+    out = np.empty((count, 4, most))
+    for k in range(1, count + 1):
+        mine = runs[starts[k] : starts[k + 1]]
+        spread(depth, sen, noise, mine, sizes[k], 0.5, out[k - 1, :, : min(sizes[k], most)])
+    return out
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def spread(depth, sen, noise, runs, pixels, shift, out):  # type: ignore[no-untyped-def]  # numba types it
+    """Fill `out` (4, n) with samples that are evenly spread over the `pixels` of runs (R, 3), `shift` 0 to 1 of a pixel on."""
+    n = out.shape[1]
+    step = (pixels - 1) / max(n - 1, 1)
+    run, passed = 0, 0
+    for j in range(n):
+        at = int(j * step + shift)
+        while at - passed >= runs[run, 2] - runs[run, 1]:
+            passed += runs[run, 2] - runs[run, 1]
+            run += 1
+        v, u = runs[run, 0], runs[run, 1] + at - passed
+        out[0, j], out[1, j], out[2, j] = (u - sen[3]) / sen[1], (v - sen[4]) / sen[2], depth[v, u]
+    _fill_sigmas(out[2], noise, out[3])
+
+
+@njit(cache=True, error_model="numpy", fastmath=LOOSE)
+def _fill_sigmas(z, noise, out):  # type: ignore[no-untyped-def]  # numba types it
+    """`sigma_at` of many depths, without a branch."""
+    a, b, c, d, e, f = noise[0], noise[1], noise[2], noise[3], noise[4], noise[5]
+    for i in range(z.shape[0]):
+        z2 = z[i] * z[i]
+        white, slow, step = a + b * z2, c + d * z2, e + f * z2
+        out[i] = np.sqrt(max(white * white, step * step / 12.0) + slow * slow)

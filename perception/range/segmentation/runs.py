@@ -1,0 +1,96 @@
+"""Label images as runs of rows: a region of a thousand pixels is a few dozen runs, and loops over one hold no branch."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.fitting.surfaces import LEAN
+from perception.range.segmentation.beside import WORD, flagged
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _flag_changes(own, flags):  # type: ignore[no-untyped-def]  # numba types it
+    """Where a pixel's label is not that of the one to its left."""
+    flags[0] = False
+    for u in range(1, own.shape[0]):
+        flags[u] = own[u] != own[u - 1]
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def row_ends(own, words, ends):  # type: ignore[no-untyped-def]  # numba types it
+    """Where the runs of equal labels in a row (W,) end, into `ends` (W + 2,); returns how many there are.
+
+    `words`: flags (W // 8 + 1,) to work in, zeros at first.
+    """
+    _flag_changes(own, words.view(np.bool_))
+    count = flagged(words, ends)
+    ends[count] = own.shape[0]
+    return count + 1
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def runs_of(labels, count):  # type: ignore[no-untyped-def]  # numba types it
+    """The runs of labels 1 to `count` in the rows of (H, W) `labels`, grouped by label, in raster order.
+
+    Returns `starts` (count + 2,): label k owns runs[starts[k] : starts[k + 1]]; the runs (R, 3): row, first column and
+    the one after the last; and how many pixels each label has (count + 1,), entry 0 unused.
+    """
+    H, W = labels.shape
+    words, ends = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 2, np.int32)
+    met, n = np.empty((4 * max(H, W), 4), np.int32), 0
+    starts, pixels = np.zeros(count + 2, np.int64), np.zeros(count + 1, np.int64)
+    for v in range(H):
+        if n + W > met.shape[0]:
+            met = np.concatenate((met, met))
+        first = 0
+        for i in range(row_ends(labels[v], words, ends)):
+            k = labels[v, first]
+            if k > 0:
+                met[n, 0], met[n, 1], met[n, 2], met[n, 3] = k, v, first, ends[i]
+                starts[k + 1] += 1
+                pixels[k] += ends[i] - first
+                n += 1
+            first = ends[i]
+    for k in range(count + 1):
+        starts[k + 1] += starts[k]
+    place, runs = starts.copy(), np.empty((n, 3), np.int32)
+    for i in range(n):
+        k = met[i, 0]
+        for a in range(3):
+            runs[place[k], a] = met[i, 1 + a]
+        place[k] += 1
+    return starts, runs, pixels
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def painted(starts, runs, names, labels):  # type: ignore[no-untyped-def]  # numba types it
+    """Write label `names[k]` over the runs of each k into `labels` (H, W), which is zero."""
+    for k in range(1, names.shape[0]):
+        for i in range(starts[k], starts[k + 1]):
+            labels[runs[i, 0], runs[i, 1] : runs[i, 2]] = names[k]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def places_of(runs, width):  # type: ignore[no-untyped-def]  # numba types it
+    """Flat pixel indices (N,) of runs (R, 3) in an image of that width."""
+    out, n = np.empty(np.sum(runs[:, 2] - runs[:, 1]), np.int32), 0
+    for i in range(runs.shape[0]):
+        for u in range(runs[i, 1], runs[i, 2]):
+            out[n] = runs[i, 0] * width + u
+            n += 1
+    return out
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def pixels_of(labels, count):  # type: ignore[no-untyped-def]  # numba types it
+    """How many pixels each of the labels 1 to `count` has, (count + 1,); entry 0: the unlabelled ones."""
+    W = labels.shape[1]
+    words, ends = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 2, np.int32)
+    pixels = np.zeros(count + 1, np.int64)
+    for v in range(labels.shape[0]):
+        first = 0
+        for i in range(row_ends(labels[v], words, ends)):
+            pixels[labels[v, first]] += ends[i] - first
+            first = ends[i]
+    return pixels

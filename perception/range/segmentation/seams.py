@@ -1,0 +1,71 @@
+"""Grooves on the way from one region to another: what a sensor sees clearly behind a plane that goes on beyond.
+
+Faces that lie in one plane, cushions or boxes side by side, are two when a groove parts them, be it two pixels wide.
+Labels need not end there: a rounded rim beyond the groove often lies as near to the other face's plane as to its own.
+So lines across a seam go on well beyond it, and what lies in front, or gives no reading, tells nothing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.fitting.surfaces import PLANE, depth_on
+from perception.range.segmentation.grid import sigma_at
+
+BEYOND = 0.05  # of the image's shorter side, that a line goes on beyond a seam: rims are rounded
+DEEP_SIGMAS = 4.0
+DEEP_PX = 2  # in a row: one may be a gross error
+FLANK_SIGMAS = 3.0
+FLANK_PX = 3  # on the surface, on either side
+SHARE = 0.33  # of the places on a seam
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def is_seam_grooved(depth, sen, noise, labels, own, th, x, y):  # type: ignore[no-untyped-def]  # numba types it
+    """Whether at most of the rays (x, y) on a seam a groove crosses the row or the column of the image there.
+
+    `own` says which of `labels` (H, W) belong to the two that meet at the seam: a groove lies between their pixels, and
+    is neither's.
+    """
+    grooves = 0
+    for k in range(x.shape[0]):
+        u, v = x[k] * sen[1] + sen[3], y[k] * sen[2] + sen[4]
+        grooves += is_grooved_at(depth, sen, noise, labels, own, th, u, v)
+    return grooves > SHARE * x.shape[0]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def is_grooved_at(depth, sen, noise, labels, own, th, u, v):  # type: ignore[no-untyped-def]  # numba types it
+    """Whether a groove crosses the row or the column of the image at pixel (u, v)."""
+    image = (depth, sen, noise, labels, own, th, u, v)
+    return crosses_groove(*image, 0.0, 1.0, 0) or crosses_groove(*image, 1.0, 0.0, 0)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def crosses_groove(depth, sen, noise, labels, own, th, u0, v0, du, dv, count):  # type: ignore[no-untyped-def]  # numba types it
+    """Whether the line from pixel (u0, v0), `count` times (du, dv) long, or its ends prolonged, pass a groove in the plane `th`."""
+    H, W = depth.shape
+    perspective = sen[0] > 0
+    reach = int(BEYOND * min(H, W) + 0.5)
+    flank, run, after, is_passed = 0, 0, 0, False
+    for k in range(-reach, count + reach + 1):
+        u, v = int(np.rint(u0 + k * du)), int(np.rint(v0 + k * dv))
+        if not (0 <= u < W and 0 <= v < H and np.isfinite(depth[v, u])):
+            run = 0
+            continue
+        x, y = (u - sen[3]) / sen[1], (v - sen[4]) / sen[2]
+        zm = depth_on(PLANE, th, x, y, perspective)
+        # Across the plane: along a ray that grazes it, a fraction of a pixel is many sigmas.
+        facing = abs(th[0] * x + th[1] * y + th[2]) if perspective else abs(th[2])
+        e = (depth[v, u] - zm) * facing / sigma_at(noise, zm)
+        run = run + 1 if e > DEEP_SIGMAS and not own[labels[v, u]] else 0
+        if run == DEEP_PX and flank >= FLANK_PX:
+            is_passed, after = True, 0
+        if not e > -DEEP_SIGMAS:
+            flank, is_passed = 0, False  # something in front, or a ray that misses
+        elif e < FLANK_SIGMAS and own[labels[v, u]]:
+            flank, after = flank + 1, after + 1
+            if is_passed and after == FLANK_PX:
+                return True
+    return False

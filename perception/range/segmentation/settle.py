@@ -1,0 +1,108 @@
+"""Pixels that two surfaces explain about equally go where their neighbours are.
+
+Near a crease, and on the whole ring where a wrong plane cuts a ball, the depth of one pixel cannot tell two surfaces
+apart, least of all under slow noise, which pixels share. So a pixel's residual competes with the labels around it
+(iterated conditional modes; Besag, J. R. Stat. Soc. B 48(3), 1986).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.fitting.surfaces import LEAN
+from perception.range.segmentation.claim import CLAIM_SIGMAS, PLAIN_SIGMAS, misfit_of
+from perception.range.segmentation.grid import sigma_at
+
+REACH_PX = 2  # neighbours of 5 x 5
+SIDE_PX = 2 * REACH_PX + 1
+OWN = SIDE_PX * SIDE_PX // 2  # the pixel itself among them
+PATCH = 32  # places for them in row order; zeros fill the last vector
+SHARED_PX = 25.0  # they share one value of the slow noise
+NEIGHBOUR_WEIGHT = 3.0  # in units of half a squared residual, for a pixel whose neighbours all bear the other label
+TOP_LABEL = np.int32(2**31 - 1)
+SAFE_NEIGHBOURS = 5  # of eight: as many as a pixel beside a straight border has; with them, one that fits well stays
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def settle(depth, sen, noise, slow_share, labels, kinds, ths, rows, columns, out, first, last):  # type: ignore[no-untyped-def]  # numba types it
+    """Judge again the pixels at `rows`, `columns` (N,) of `labels` (H, W); writes labels out[first:last].
+
+    A pixel that no other label touches keeps its own.
+    """
+    patch = np.zeros(PATCH, np.int32)
+    perspective, per_x, per_y = sen[0] > 0, 1.0 / sen[1], 1.0 / sen[2]
+    evidence = 0.5 / (1.0 + slow_share * (SHARED_PX - 1.0))
+    for n in range(first, last):
+        v, u = rows[n], columns[n]
+        own, z = labels[v, u], depth[v, u]
+        out[n] = own
+        _copy_patch(labels, v, u, patch)
+        same, other = _beside(patch, own)
+        if other == 0 or not np.isfinite(z):
+            continue
+        x, y, sigma = (u - sen[3]) * per_x, (v - sen[4]) * per_y, sigma_at(noise, z)
+        e = misfit_of(own, kinds, ths, x, y, z, sigma, perspective) if own > 0 else np.inf
+        if e < PLAIN_SIGMAS and same >= SAFE_NEIGHBOURS:
+            continue
+        patch[OWN] = 0
+        voters, mine = PATCH - _count(patch, np.int32(0)), _count(patch, own) if own > 0 else 0
+        per_vote = NEIGHBOUR_WEIGHT / voters
+        best = np.inf
+        if e < CLAIM_SIGMAS and mine > 0:
+            best = evidence * e * e + NEIGHBOUR_WEIGHT - per_vote * mine
+        left, rival = voters - mine, TOP_LABEL
+        while left > 0:
+            rival = _largest_below(patch, own, rival)
+            votes = _count(patch, rival)
+            left -= votes
+            least_cost = NEIGHBOUR_WEIGHT - per_vote * votes
+            if least_cost >= best:
+                continue  # not even a perfect fit would win
+            e = misfit_of(rival, kinds, ths, x, y, z, sigma, perspective)
+            cost = evidence * e * e + least_cost
+            if e < CLAIM_SIGMAS and cost < best:
+                best, out[n] = cost, rival
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _copy_patch(labels, v, u, patch):  # type: ignore[no-untyped-def]  # numba types it
+    """The labels around one pixel into `patch`, 0 beyond the image."""
+    H, W = labels.shape
+    inside = REACH_PX <= v < H - REACH_PX and REACH_PX <= u < W - REACH_PX
+    top, left = v - REACH_PX, u - REACH_PX
+    for i in range(SIDE_PX):
+        for j in range(SIDE_PX):
+            is_there = inside or (0 <= top + i < H and 0 <= left + j < W)
+            patch[SIDE_PX * i + j] = labels[top + i, left + j] if is_there else 0
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _beside(patch, own):  # type: ignore[no-untyped-def]  # numba types it
+    """How many of the eight nearest neighbours bear the pixel's own label, and how many another one."""
+    same, other = -1, 0
+    for i in range(REACH_PX - 1, REACH_PX + 2):
+        for j in range(REACH_PX - 1, REACH_PX + 2):
+            k = patch[SIDE_PX * i + j]
+            same += k == own
+            other += (k != own) & (k > 0)
+    return same, other
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _count(patch, label):  # type: ignore[no-untyped-def]  # numba types it
+    """How many places bear the label."""
+    n = np.int32(0)
+    for i in range(PATCH):
+        n += np.int32(patch[i] == label)
+    return n
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _largest_below(patch, own, bound):  # type: ignore[no-untyped-def]  # numba types it
+    """The largest label below `bound` that is not the pixel's own; 0 without one."""
+    most = np.int32(0)
+    for i in range(PATCH):
+        k = patch[i]
+        most = max(most, k if (k < bound) & (k != own) else np.int32(0))
+    return most

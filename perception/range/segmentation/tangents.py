@@ -1,0 +1,167 @@
+"""Tangent planes of all blocks of a grid, a run of blocks at a time.
+
+A run is worked on in rows of one scratch array at fixed places, and the loops hold no branch: only so does the compiler
+prove that nothing overlaps, and turn four blocks into one instruction. The neighbours of a run lie in rows that are wider
+by the window, so that each row of blocks is fetched once for all shifts.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from perception.range.fitting.surfaces import LEAN
+
+JUMP_SIGMAS = 4.0
+LEAST_SHARE = 0.4  # of the window's blocks must lie on the surface
+STEADY_RMS = 1.8  # what a tangent plane leaves over in sigmas, beyond which the block holds a crease or noise
+GAP = 8  # empty blocks that end a run
+RUN = 128  # blocks at most
+X0, Y0, Z0, G0, BASE, SLOPE = (row * RUN for row in range(6))  # where the rows of the run's own blocks begin
+N, S, SX, SY, SG, SXX, SXY, SYY, SXG, SYG, SGG = (row * RUN for row in range(6, 17))  # sums over its neighbours
+NX, NY, NZ, RMS = (row * RUN for row in range(17, 21))  # the planes
+SCRATCH = 21 * RUN
+WIDE = RUN + 16  # a row of neighbours: room for a radius of eight blocks
+X, Y, Z, G, K = (row * WIDE for row in range(5))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def tangent_planes(  # type: ignore[no-untyped-def]  # numba types it
+    x, y, z, count, sigma, perspective, radius, slope_per_block, normal, rms, top, bottom
+):
+    """Plane of least squares through the blocks around each block, within a jump of it; writes rows [top, bottom).
+
+    Args:
+        x, y, z, count, sigma: (h, w) as in `Grid`, NaN depth where a block is empty; `count` weighs a block.
+        radius: of the window in blocks.
+        slope_per_block: metres of depth per block (and per metre of depth, if perspective) that are no jump yet.
+        normal, rms: (h, w, 3) and (h, w) outputs, filled with NaN; left so where no plane is determined.
+    """
+    h, w = z.shape
+    least = max(5.0, np.floor((2 * radius + 1) ** 2 * LEAST_SHARE))
+    work, wide = np.zeros(SCRATCH), np.empty(5 * WIDE)
+    for r in range(top, bottom):
+        start, end = _next_run(z[r], 0)
+        while start < w:
+            n = end - start
+            work[N:NX] = 0.0
+            _load_own(x[r, start:end], y[r, start:end], z[r, start:end], sigma[r, start:end], perspective, work)
+            a, b = max(start - radius, 0), min(end + radius, w)
+            for i in range(max(0, r - radius), min(h, r + radius + 1)):
+                wide[Z : G + WIDE] = np.nan  # beyond the image there is no neighbour
+                _load(x[i, a:b], y[i, a:b], z[i, a:b], count[i, a:b], perspective, a - start + radius, wide)
+                for shift in range(-radius, radius + 1):
+                    _add(slope_per_block * max(abs(i - r), abs(shift)), n, radius + shift, wide, work)
+            _solve(n, least, perspective, work)
+            _store(normal[r, start:end], rms[r, start:end], work)
+            start, end = _next_run(z[r], end)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _next_run(z, start):  # type: ignore[no-untyped-def]  # numba types it
+    """[start, end) of the next run of known depths that no gap of `GAP` empty blocks parts; (w, w) when there is none."""
+    w = z.shape[0]
+    while start < w and not np.isfinite(z[start]):
+        start += 1
+    end, last = start, start
+    while end < w and end - last < GAP and end - start < RUN:
+        if np.isfinite(z[end]):
+            last = end
+        end += 1
+    return start, min(last + 1, w)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _load_own(x, y, z, sigma, perspective, work):  # type: ignore[no-untyped-def]  # numba types it
+    n = x.shape[0]
+    for c in range(n):
+        work[X0 + c], work[Y0 + c], work[Z0 + c] = x[c], y[c], z[c]
+        work[G0 + c] = 1.0 / z[c] if perspective else z[c]
+        work[BASE + c] = JUMP_SIGMAS * sigma[c]
+        work[SLOPE + c] = z[c] if perspective else 1.0
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _load(x, y, z, count, perspective, at, wide):  # type: ignore[no-untyped-def]  # numba types it
+    """One row of neighbours into `wide`, the first at `at`."""
+    n = x.shape[0]
+    to_x, to_y, to_z, to_g, to_k = wide[X + at :], wide[Y + at :], wide[Z + at :], wide[G + at :], wide[K + at :]
+    for c in range(n):
+        to_x[c] = x[c]
+    for c in range(n):
+        to_y[c] = y[c]
+    for c in range(n):
+        to_z[c] = z[c]
+    for c in range(n):
+        to_k[c] = count[c]
+    if perspective:
+        for c in range(n):
+            to_g[c] = 1.0 / z[c]
+    else:
+        for c in range(n):
+            to_g[c] = z[c]
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _add(reach, n, at, wide, work):  # type: ignore[no-untyped-def]  # numba types it
+    """Sums of 1, k, and k times x, y, g, xx, xy, yy, xg, yg, gg over one neighbour of every block, if it is near.
+
+    The neighbour of the first block is the one at `at` of the rows of `wide`.
+    """
+    x, y, z, g, count = wide[X + at :], wide[Y + at :], wide[Z + at :], wide[G + at :], wide[K + at :]
+    for c in range(n):
+        near = abs(z[c] - work[Z0 + c]) <= work[BASE + c] + work[SLOPE + c] * reach  # refuses NaN
+        k = count[c] if near else 0.0
+        dg = g[c] - work[G0 + c] if near else 0.0
+        dx = x[c] - work[X0 + c] if near else 0.0
+        dy = y[c] - work[Y0 + c] if near else 0.0
+        kx, ky, kg = k * dx, k * dy, k * dg
+        work[N + c] += 1.0 if near else 0.0
+        work[S + c] += k
+        work[SX + c] += kx
+        work[SY + c] += ky
+        work[SG + c] += kg
+        work[SXX + c] += kx * dx
+        work[SXY + c] += kx * dy
+        work[SYY + c] += ky * dy
+        work[SXG + c] += kx * dg
+        work[SYG + c] += ky * dg
+        work[SGG + c] += kg * dg
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _solve(n, least, perspective, work):  # type: ignore[no-untyped-def]  # numba types it
+    """Rows of the plane's normal towards the sensor and of what it leaves over in sigmas; NaN where it is not determined.
+
+    The window's sums, centred, give the slopes (p, q) of g.
+    """
+    p = 1.0 if perspective else 0.0
+    for c in range(n):
+        blocks, sx, sy, sg = work[N + c], work[SX + c], work[SY + c], work[SG + c]
+        per = 1.0 / work[S + c]
+        sxx, sxy = work[SXX + c] - sx * sx * per, work[SXY + c] - sx * sy * per
+        syy, sxg = work[SYY + c] - sy * sy * per, work[SXG + c] - sx * sg * per
+        syg, sgg = work[SYG + c] - sy * sg * per, work[SGG + c] - sg * sg * per
+        det = sxx * syy - sxy * sxy
+        ok = (blocks >= least) & (det > 1e-4 * sxx * syy) & (det > 0.0)
+        per_det = 1.0 / det
+        a, b = (syy * sxg - sxy * syg) * per_det, (sxx * syg - sxy * sxg) * per_det
+        left = max(sgg - a * sxg - b * syg, 0.0) * per * blocks / max(blocks - 3.0, 1.0)
+        # g = a x + b y + c is the plane (a, b, c) . X = 1 seen in perspective, else (-a, -b, 1) . X = c.
+        x0, y0, z0 = work[X0 + c], work[Y0 + c], work[Z0 + c]
+        nz = work[G0 + c] + (sg - a * sx - b * sy) * per - a * x0 - b * y0 if perspective else 1.0
+        nx, ny = (a, b) if perspective else (-a, -b)
+        facing = p * (nx * x0 + ny * y0) + nz
+        inverse = (-1.0 if facing > 0.0 else 1.0) / np.sqrt(nx * nx + ny * ny + nz * nz)
+        scale = z0 * z0 if perspective else 1.0
+        work[NX + c] = nx * inverse if ok else np.nan
+        work[NY + c], work[NZ + c] = ny * inverse, nz * inverse
+        work[RMS + c] = np.sqrt(left) * scale * JUMP_SIGMAS / work[BASE + c]
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _store(normal, rms, work):  # type: ignore[no-untyped-def]  # numba types it
+    for c in range(rms.shape[0]):
+        if np.isfinite(work[NX + c]):
+            normal[c, 0], normal[c, 1], normal[c, 2] = work[NX + c], work[NY + c], work[NZ + c]
+            rms[c] = work[RMS + c]

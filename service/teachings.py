@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from hal.errors import ConfigError, InvalidRequest
 from hal.panel import Panel, load_panel
+from hal.whole_file import write_whole
 from service.errors import NoSuchTask
 
 if TYPE_CHECKING:
@@ -125,9 +126,7 @@ class Teachings:
         folder = self.folder / "panels"
         with self._lock:
             folder.mkdir(parents=True, exist_ok=True)
-            path = folder / f"{name}.toml"
-            path.write_text(text, encoding="utf-8")
-        return path
+            return write_whole(folder / f"{name}.toml", text)
 
     def forget(self, group: str, name: str) -> None:
         """Delete a taught kind or panel; a shipped kind of that name is in use again.

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hal.errors import InvalidRequest
+from hal.whole_file import write_whole
 from perception.range.recordings import Reading
 
 PART = ".part"
@@ -54,7 +55,7 @@ class KeptResults:
         self.goes_on = bool(self._lines)
         self._stamps: dict[str, list[int]] = {}
         fresh = [json.dumps(self._asked), *(json.dumps(line) for line in self._lines.values())]
-        _write_whole(self.part, fresh)  # without the line that an abrupt end may have cut
+        write_whole(self.part, _lines(fresh))  # without the line that an abrupt end may have cut
 
     def of(self, recordings: Iterable[Path]) -> dict[str, BatchResult]:
         """The earlier results that still hold, by name: those of unchanged recordings that gave a scene."""
@@ -91,13 +92,11 @@ class KeptResults:
 
 def write_results(path: Path, results: Sequence[BatchResult]) -> None:
     """One JSON object a line: name, scene or error. Whole or not at all."""
-    _write_whole(path, [json.dumps(asdict(result)) for result in results])
+    write_whole(path, _lines(json.dumps(asdict(result)) for result in results))
 
 
-def _write_whole(path: Path, lines: Sequence[str]) -> None:
-    fresh = path.with_name(path.name + ".new")
-    fresh.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    fresh.replace(path)
+def _lines(lines: Iterable[str]) -> str:
+    return "\n".join(lines) + "\n"
 
 
 def _stamp(path: Path) -> list[int]:

@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 
 from hal.errors import ConfigError
 from hal.strict import Strict, load_toml
+from hal.whole_file import write_whole
 from perception.vision.features import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
 from perception.vision.view import Array
 
@@ -137,7 +138,6 @@ def spread_of(kinds: Iterable[Kind]) -> Array:
 
 def write_kind(kind: Kind, folder: Path) -> Path:
     """Write one kind's file and return its path."""
-    path = folder / f"{kind.name}.toml"
     lines = [
         f"# What a {kind.name.replace('_', ' ')} looks like: rows over the distance from its middle, "
         f"{RADII_M[0] * 1e3:g} to {RADII_M[-1] * 1e3:g} mm, in hundredths.",
@@ -154,8 +154,7 @@ def write_kind(kind: Kind, folder: Path) -> Path:
         tables = look[len(GROUPS) * len(RADII_M) :].reshape(len(AROUND_GROUPS), DIRECTIONS, RINGS)
         for name, table in zip(AROUND_GROUPS, tables, strict=True):
             lines.append(f"{name} = [{', '.join(_written(row) for row in table)}]")
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path
+    return write_whole(folder / f"{kind.name}.toml", "\n".join(lines) + "\n")
 
 
 def _is_other(path: Path) -> bool:

@@ -8,6 +8,7 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from hal.whole_file import write_whole
 from service.jsonable import jsonable
 from service.report.record import MissionRecord
 
@@ -28,9 +29,7 @@ def write_report(record: MissionRecord, folder: Path) -> Path:
 
 def write_json(folder: Path, summary: dict[str, Any]) -> None:
     """Replace `report.json` in one step, so that a reader never sees half of it."""
-    part = folder / "report.json.part"
-    part.write_text(json.dumps(summary, indent=1, allow_nan=False), encoding="utf-8")
-    part.replace(folder / "report.json")
+    write_whole(folder / "report.json", json.dumps(summary, indent=1, allow_nan=False))
 
 
 def render(folder: Path) -> Path:
@@ -42,6 +41,4 @@ def render(folder: Path) -> Path:
     environment.filters["deg"] = lambda radians: f"{57.29577951308232 * radians:.3f}"
     environment.filters["seconds"] = lambda s: f"{s:.2f}"
     html = environment.get_template("report.html.jinja").render(r=summary, titles=titles)
-    path = folder / "report.html"
-    path.write_text(html, encoding="utf-8")
-    return path
+    return write_whole(folder / "report.html", html)

@@ -62,14 +62,19 @@ def _mission(client: Client, runs: Path, *, judge: bool) -> bool:
     task = follow(client, client.post("/v1/missions", {})["id"])
     result = task["result"] or {"actions": [], "succeeded": False}
     console.print(_actions(result["actions"]))
-    missions = client.get("/v1/missions")["missions"]
-    if judge and missions:
-        console.print(judged(client, missions[0]["name"]))
-    if missions:
-        console.print(f"report: [bold]{runs / missions[0]['name'] / 'report.html'}[/]")
+    mission = reported(client.get("/v1/missions")["missions"], task["id"])
+    if mission is not None:
+        if judge:
+            console.print(judged(client, mission))
+        console.print(f"report: [bold]{runs / mission / 'report.html'}[/]")
     lag_s = client.get("/v1/info")["event_loop_lag_p99_s"]
     console.print(f"event-loop lag of the last minute: {1e3 * lag_s:.1f} ms (p99)")
     return bool(result["succeeded"])
+
+
+def reported(missions: list[dict[str, Any]], task_id: str) -> str | None:
+    """Name of the mission that was this task; None when it ended before there was anything to report."""
+    return next((mission["name"] for mission in missions if mission["name"].endswith(f"-{task_id}")), None)
 
 
 def judged(client: Client, mission: str) -> str:

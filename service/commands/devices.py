@@ -64,8 +64,7 @@ def read_device(
         return
     client = client_of(url)
     if save is not None:
-        save.write_bytes(client.fetch("GET", f"/v1/devices/{name}/reading?format={_form_of(save)}"))
-        console.print(f"wrote {save}")
+        _keep(save, client.fetch("GET", f"/v1/devices/{name}/reading?format={_form_of(save)}"))
         return
     for _ in range(samples):
         reading = client.get(f"/v1/devices/{name}/reading")
@@ -73,6 +72,14 @@ def read_device(
             sys.stdout.write(json.dumps(reading) + "\n")
         else:
             console.print_json(json.dumps(reading))
+
+
+def _keep(save: Path, data: bytes) -> None:
+    try:
+        save.write_bytes(data)
+    except OSError as error:
+        raise InvalidRequest(f"{save} cannot be written: {error.strerror}", hint="choose another --save") from None
+    console.print(f"wrote {save}")
 
 
 def _form_of(save: Path) -> str:

@@ -15,7 +15,7 @@ import httpx2
 import psutil
 import pytest
 
-from service.commands.demo import judged
+from service.commands.demo import judged, reported
 from tests.service.conftest import WriteCell
 from tests.service.waiting import eventually
 
@@ -244,3 +244,9 @@ class OneAnswer:
 def test_a_demo_that_nobody_can_judge_says_why(problem: dict[str, str] | None, words: str) -> None:
     client: Any = OneAnswer({"id": "t1", "result": None, "problem": problem})
     assert words in judged(client, "m1")
+
+
+def test_a_demo_names_the_report_of_its_own_mission_only() -> None:
+    missions = [{"name": "20260102T000000-t9"}, {"name": "20260101T000000-t1"}]
+    assert reported(missions, "t1") == "20260101T000000-t1"
+    assert reported(missions, "t2") is None

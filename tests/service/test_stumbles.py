@@ -148,6 +148,12 @@ def test_what_is_saved_is_what_the_suffix_says(served: Panelwright, tmp_path: Pa
         assert (tmp_path / name).read_bytes().startswith(head)
 
 
+def test_a_folder_that_is_not_there_is_said_in_words(served: Panelwright, tmp_path: Path) -> None:
+    words = ["read", "wrist_camera", "--url", served.url, "--save", str(tmp_path / "away" / "x.png")]
+    done = CliRunner().invoke(devices.app, words)
+    assert isinstance(done.exception, InvalidRequest) and "cannot be written: No such file" in done.exception.what
+
+
 def test_a_log_of_watching_has_every_look(served: Panelwright) -> None:
     done = CliRunner().invoke(devices.app, ["watch", "--url", served.url, "--count", "3", "--period-s", "0.1"])
     assert done.output.count("finger_proximity") == 3, done.output

@@ -23,7 +23,7 @@ SHARE = 0.33  # of the places on a seam
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def is_seam_grooved(depth, sen, noise, labels, own, th, x, y):  # type: ignore[no-untyped-def]  # numba types it
-    """Whether at most of the rays (x, y) on a seam a groove crosses the row or the column of the image there.
+    """Whether at more than `SHARE` of the rays (x, y) on a seam a groove crosses the row or the column of the image there.
 
     `own` says which of `labels` (H, W) belong to the two that meet at the seam: a groove lies between their pixels, and
     is neither's.

@@ -33,7 +33,6 @@ class KeptResults:
     Attributes:
         part: path of OUT.part.
         goes_on: an earlier run has left results there.
-        done: recordings of this batch with a result, taken over or new.
     """
 
     def __init__(self, out: Path, folder: Path, reading: Reading, *, afresh: bool = False) -> None:
@@ -48,10 +47,12 @@ class KeptResults:
             InvalidRequest: an earlier run left results of another folder or another reading.
         """
         self.part = out.with_name(out.name + PART)
-        self.done = 0
         self._out = out
         self._asked = json.loads(json.dumps({"folder": str(folder.resolve()), "reading": asdict(reading)}))
-        self._lines = {} if afresh else self._earlier()
+        earlier = {} if afresh else self._written()
+        self._lines = {
+            name: line for name, line in earlier.items() if line["error"] is None
+        }  # the others are tried again
         self.goes_on = bool(self._lines)
         self._stamps: dict[str, list[int]] = {}
         fresh = [json.dumps(self._asked), *(json.dumps(line) for line in self._lines.values())]
@@ -62,23 +63,25 @@ class KeptResults:
         self._stamps = {path.name: _stamp(path) for path in recordings}
         lines = [line for name, line in self._lines.items() if line["stamp"] == self._stamps.get(name)]
         found = (BatchResult(name=line["name"], scene=line["scene"], error=line["error"]) for line in lines)
-        held = {result.name: result for result in found if result.error is None}
-        self.done = len(held)
-        return held
+        return {result.name: result for result in found}
+
+    @property
+    def done(self) -> int:
+        """Recordings of this batch with a result, taken over or new, by what is written: Ctrl-C parts it from any count."""
+        return sum(line["stamp"] == self._stamps.get(name) for name, line in self._written().items())
 
     def add(self, results: Sequence[BatchResult]) -> None:
         """Keep the results of a task."""
         lines = [json.dumps({**asdict(result), "stamp": self._stamps[result.name]}) + "\n" for result in results]
         with self.part.open("a", encoding="utf-8") as file:
             file.write("".join(lines))
-        self.done += len(results)
 
     def finish(self, results: Sequence[BatchResult]) -> None:
         """Write all results to OUT, in the order given, and drop what was kept on the way."""
         write_results(self._out, results)
         self.part.unlink()
 
-    def _earlier(self) -> dict[str, dict[str, Any]]:
+    def _written(self) -> dict[str, dict[str, Any]]:
         if not self.part.exists():
             return {}
         asked, *lines = [_object(text) for text in self.part.read_text(encoding="utf-8").splitlines()] or [None]

@@ -64,6 +64,14 @@ def test_a_line_that_an_abrupt_end_has_cut_costs_only_itself(folder: Path) -> No
     assert set(kept_in(folder).of(folder.iterdir())) == {result.name for result in GOOD}
 
 
+def test_what_is_told_as_done_is_what_is_written(folder: Path) -> None:
+    """Ctrl-C may come between a write and a count of it, as it did in a test of the whole command once."""
+    kept = stopped_batch(folder)
+    lines = kept.part.read_text().splitlines(keepends=True)
+    kept.part.write_text("".join(lines[:-1]))
+    assert kept.done == 3
+
+
 def test_results_of_another_batch_are_neither_mixed_in_nor_lost(folder: Path) -> None:
     part = stopped_batch(folder).part
     before = part.read_text()

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.display_drawing import LEVELS, PHOTOGRAPHS, DisplayCase, draw_photograph, draw_taught
 from hal.panel import Display
-from perception.vision.photo_display import read_photograph
+from perception.vision.photographs.photo_display import read_photograph
 from perception.vision.reading import Status
 from perception.vision.status.display import read_display
 from perception.vision.taught import patch_of

@@ -20,12 +20,12 @@ import numpy as np
 from hal.errors import CellError
 from hal.panel import Lever, Panel, PanelObject
 from hal.strict import validate
-from perception.vision.blind import recognise
-from perception.vision.dial import read_dial
+from perception.vision.finding.blind import recognise
 from perception.vision.image import Image, as_gray, decode
 from perception.vision.knowledge import Knowledge, shipped_knowledge
 from perception.vision.lights import assign_lights, find_lights
-from perception.vision.photo_display import read_photograph
+from perception.vision.photographs.dial import read_dial
+from perception.vision.photographs.photo_display import read_photograph
 from perception.vision.reading import ObjectReading, Status
 from perception.vision.taught import inspect_view
 from perception.vision.view import PlaneView

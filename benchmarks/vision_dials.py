@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from perception.vision.dial import read_dial
 from perception.vision.image import Image
+from perception.vision.photographs.dial import read_dial
 
 CANVAS_PX = 800
 SMALLEST_PX, LARGEST_PX = 40.0, 300.0

@@ -20,11 +20,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.vision.blind import PLATE_M, Candidate, candidate_places, chosen, lay_out
-from perception.vision.features import PLATE_PX_PER_M, WEIGHTS, Ground, look_at
+from perception.vision.finding.blind import PLATE_M, Candidate, candidate_places, chosen, lay_out
+from perception.vision.finding.features import PLATE_PX_PER_M, WEIGHTS, Ground, look_at
+from perception.vision.finding.match import CLIP
+from perception.vision.finding.plate import find_plate
 from perception.vision.knowledge import NOTHING, Kind, Knowledge, spread_of, write_kind
-from perception.vision.match import CLIP
-from perception.vision.plate import find_plate
 from perception.vision.view import Array, PlaneView
 
 DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "vision" / "synth_dev"

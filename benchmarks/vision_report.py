@@ -26,10 +26,10 @@ from benchmarks.vision_reliability import Answer, draw_reliability, reliability_
 from hal.errors import CellError
 from hal.geometry import certain
 from hal.panel import PanelObject
-from perception.vision.blind import recognise
+from perception.vision.finding.blind import recognise
+from perception.vision.finding.segment import grow_regions
 from perception.vision.image import Image
 from perception.vision.knowledge import shipped_knowledge
-from perception.vision.segment import grow_regions
 from perception.vision.taught import patch_of, read_patch
 from perception.vision.view import CameraView
 

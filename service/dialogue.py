@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from hal.errors import CellError, InvalidRequest
 from hal.panel import OBJECT_KINDS
-from perception.vision.panel_lights import find_border_lights
-from perception.vision.panel_questions import Question, kind_question, questions
-from perception.vision.panel_teach import PanelObjectDraft, object_row, panel_text
-from perception.vision.teach import Example, Overview, check, example_at, likest, overview_of, teach_example
+from perception.vision.teaching.panel_lights import find_border_lights
+from perception.vision.teaching.panel_questions import Question, kind_question, questions
+from perception.vision.teaching.panel_teach import PanelObjectDraft, object_row, panel_text
+from perception.vision.teaching.teach import Example, Overview, check, example_at, likest, overview_of, teach_example
 from service.teachings import Teachings, check_name
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from perception.vision.knowledge import Knowledge
-    from perception.vision.panel_lights import LightsFound
+    from perception.vision.teaching.panel_lights import LightsFound
 
 T = TypeVar("T")
 MOST_TRIES = 5  # a script that goes on giving the same wrong answer must end

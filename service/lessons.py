@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from perception.vision.panel_questions import Question
-    from perception.vision.teach import Example, Overview
+    from perception.vision.teaching.panel_questions import Question
+    from perception.vision.teaching.teach import Example, Overview
 
 PixelNumber = Annotated[float, Field(ge=-1e5, le=1e5)]
 Click = tuple[PixelNumber, PixelNumber]
@@ -74,7 +74,7 @@ class TeachRequest(Strict):
 
 def questions_of(kind: str) -> tuple[Question, ...]:
     """What the dialogue asks about an object of this kind."""
-    from perception.vision.panel_questions import questions
+    from perception.vision.teaching.panel_questions import questions
 
     return questions(kind)
 
@@ -85,7 +85,7 @@ def find_outline(images: ImageStore, teachings: Teachings, request: OutlineReque
     Raises:
         NoSuchImage, InvalidRequest, NotObservable, NotFound, Ambiguous: says what is wrong and what helps.
     """
-    from perception.vision.teach import example_at, overview_of
+    from perception.vision.teaching.teach import example_at, overview_of
 
     overview = overview_of(images.pixels(request.image), plate_m=request.plate_m)
     return described(overview, example_at(overview, request.clicks_px), teachings)
@@ -116,7 +116,7 @@ def teach_kind(
 ) -> dict[str, Any]:
     """Teach one example of a kind and keep it; see `teach`."""
     from perception.vision.knowledge import NOTHING
-    from perception.vision.teach import example_at, overview_of, teach_example
+    from perception.vision.teaching.teach import example_at, overview_of, teach_example
 
     check_name(kind)
     overview = overview_of(pixels, plate_m=plate_m)
@@ -139,9 +139,9 @@ def teach_panel(
     teachings: Teachings, pixels: NDArray[np.uint8], plate_m: tuple[float, float], lesson: PanelLesson
 ) -> dict[str, Any]:
     """Write a whole panel's file from clicks and answers; see `teach`."""
-    from perception.vision.panel_lights import find_border_lights
-    from perception.vision.panel_teach import PanelObjectDraft, panel_text
-    from perception.vision.teach import example_at, overview_of
+    from perception.vision.teaching.panel_lights import find_border_lights
+    from perception.vision.teaching.panel_teach import PanelObjectDraft, panel_text
+    from perception.vision.teaching.teach import example_at, overview_of
 
     check_name(lesson.name)
     overview = overview_of(pixels, plate_m=plate_m)
@@ -167,7 +167,7 @@ def teach_panel(
 
 def described(overview: Overview, example: Example, teachings: Teachings) -> dict[str, Any]:
     """An example for people and pages: its outline in the image, and what it is taken for now."""
-    from perception.vision.teach import likest
+    from perception.vision.teaching.teach import likest
 
     if example.outline is None:
         raise InvalidRequest("nothing was pointed at", hint="click on an object")

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from hal.errors import ConfigError
 from hal.strict import Strict, load_toml
 from hal.whole_file import write_whole
-from perception.vision.features import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
+from perception.vision.finding.features import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
 from perception.vision.view import Array
 
 NOTHING = "nothing"

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.vision import lights, quadrangle
-from perception.vision.dial import read_dial
-from perception.vision.photo_display import read_photograph
+from perception.vision.photographs.dial import read_dial
+from perception.vision.photographs.photo_display import read_photograph
 from perception.vision.status.display import read_window
 
 DIGIT_PX = (72, 40)  # height and width

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from perception.vision.panel_questions import Question
+    from perception.vision.teaching.panel_questions import Question
     from service.teachings import Teachings
 
 MOST_PLATE_M = 10.0

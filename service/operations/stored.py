@@ -36,7 +36,7 @@ def read_stored(session: Session, request: RecogniseRequest | InspectRequest) ->
         InvalidRequest, NotObservable, NotFound, Ambiguous: the image cannot be answered for; says why and what helps.
     """
     from perception.vision.annotate import draw_annotated
-    from perception.vision.framing import check_upright
+    from perception.vision.finding.framing import check_upright
     from perception.vision.image import as_gray
     from perception.vision.taught import inspect_view
 
@@ -62,7 +62,7 @@ def blind_in_stored(session: Session, request: RecogniseRequest) -> dict[str, An
     Raises:
         as `read_stored`.
     """
-    from perception.vision.framing import one_plate
+    from perception.vision.finding.framing import one_plate
     from perception.vision.image import as_gray
 
     pixels = _stores(session)[0].pixels(request.image or "")
@@ -82,7 +82,7 @@ def blind_answer(
 ) -> dict[str, Any]:
     """All candidates, refused ones with their reasons, and a picture of the others."""
     from perception.vision.annotate import GREEN, draw_outlines
-    from perception.vision.blind import recognise
+    from perception.vision.finding.blind import recognise
 
     found = recognise(pixels, _stores(session)[1].knowledge(), plate_m=plate_m, focal_px=focal_px)
     taken = [candidate for candidate in found if candidate.reason is None]
@@ -140,7 +140,7 @@ def _stores(session: Session) -> tuple[ImageStore, Teachings]:
 
 def _view(session: Session, request: StoredLook, gray: Pixels, panel: Panel) -> View:
     """Where the panel is: as the caller says, or by its border, through the lens if that is known."""
-    from perception.vision.framing import one_plate
+    from perception.vision.finding.framing import one_plate
     from perception.vision.quadrangle import estimate
     from perception.vision.view import CameraView
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 from hal.calibration import CameraIntrinsics
 from hal.panel import Panel
 from perception.camera_model import project
-from perception.vision.outline import contour_m
+from perception.vision.registration.outline import contour_m
 from service.report.plots import figure_png
 
 PLATE, OBJECT, LIGHT = "#2ec4b6", "#ff9f1c", "#ffe066"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from perception.vision import warm as vision
-from perception.vision.photo_display import read_photograph
+from perception.vision.photographs.photo_display import read_photograph
 from service.warm import STAGES, run_stage
 
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from hal.panel import Slider
 from perception.vision.image import WHITE_LEVEL
-from perception.vision.outline import footprint_m
 from perception.vision.patch import Patch, sample_at
 from perception.vision.reading import Status, gated, probability, refused
+from perception.vision.registration.outline import footprint_m
 from perception.vision.status.choice import contrast_noise
 from perception.vision.status.cover import covered
 from perception.vision.view import Array

@@ -1,0 +1,191 @@
+"""Circles in the plate's rectified picture, by votes.
+
+Every edge pixel names the centres that its gradient points at, for every radius (D. H. Ballard, Pattern Recognition
+13(2), 1981). A candidate is then verified on the outline itself: the share of it that has an edge along the normal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import hypot
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from perception.vision.finding.shapes import Edges, Float32
+from perception.vision.view import Array
+
+SMALL_PX = 24.0
+CIRCLE_SAMPLES = 40
+CIRCLES_TRIED = 90
+LEAST_COVERAGE = 0.45
+HOPELESS_COVERAGE = 0.25
+ALIGNED = 0.8  # cosine between an edge's gradient and the outline's normal
+STEPS_LARGE_PX = np.array([3.0, 1.5, 0.7])  # of the search about a vote's peak, whose cells are larger for large radii
+STEPS_SMALL_PX = STEPS_LARGE_PX[1:]
+TURNS = np.linspace(0, 2 * np.pi, CIRCLE_SAMPLES, endpoint=False)
+NORMALS = np.column_stack([np.sin(TURNS), -np.cos(TURNS)])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Circle:
+    """A circle in picture pixels; `coverage` is the share of its outline that is an edge."""
+
+    u: float
+    v: float
+    radius: float
+    coverage: float
+
+
+def find_circles(edges: Edges, *, least_px: float, most_px: float) -> list[Circle]:
+    """Verified circles with radii between `least_px` and `most_px`, best first, near-duplicates removed."""
+    v, u = np.nonzero(edges.thin)
+    gx, gy = edges.along_x[v, u], edges.along_y[v, u]
+    length = np.hypot(gx, gy)
+    points = (u.astype(np.float64), v.astype(np.float64), gx / length, gy / length)
+    found = []
+    # The direction of an edge errs by a few degrees, so the votes of large circles spread: count them in larger cells.
+    for low, high, step, cell in ((least_px, SMALL_PX, 1.0, 2), (max(least_px, SMALL_PX), most_px, 2.0, 4)):
+        radii = np.arange(round(low), round(high) + 1, step)
+        if len(radii) < 3:
+            continue
+        height, width = edges.strong.shape
+        votes = np.zeros((len(radii), height // cell + 2, width // cell + 2), np.float32)
+        _vote(votes, *points, radii, cell)
+        _pool(votes, radii)
+        for u0, v0, r0 in _peaks(votes, radii, cell):
+            circle = _verified_circle(edges, u0, v0, r0)
+            if circle is not None:
+                found.append(circle)
+    return _distinct(found)
+
+
+def _pool(votes: Float32, radii: Array) -> None:
+    """In place: votes summed over neighbouring places and radii, over the circumference."""
+    for plane in votes:
+        cv2.GaussianBlur(plane, (0, 0), 0.9, dst=plane)
+    _average(votes, radii.astype(np.float32))
+
+
+def _peaks(votes: Float32, radii: Array, cell: int) -> list[tuple[float, float, float]]:
+    """The strongest local maxima over place and radius."""
+    best = votes.max(axis=0)
+    local = (best >= cv2.dilate(best, np.ones((3, 3), np.uint8))) & (best > 0.5)
+    v, u = np.nonzero(local)
+    order = np.argsort(best[v, u])[::-1][:CIRCLES_TRIED]
+    out = []
+    for i in order:
+        profile = votes[:, v[i], u[i]].copy()
+        for _ in range(2):  # a second radius about the same middle: rims and rings are concentric
+            k = int(profile.argmax())
+            if profile[k] < 0.5:
+                break
+            out.append((float(u[i] * cell), float(v[i] * cell), float(radii[k])))
+            profile[max(0, k - 3) : k + 4] = 0.0
+    return out
+
+
+def _verified_circle(edges: Edges, u0: float, v0: float, r0: float) -> Circle | None:
+    """Best circle near a guess, if enough of its outline is an edge."""
+    steps = STEPS_LARGE_PX if r0 >= SMALL_PX else STEPS_SMALL_PX
+    maps = (edges.along_x, edges.along_y, edges.strength, edges.strong)
+    u, v, radius, coverage = _climbed(*maps, NORMALS, steps, u0, v0, r0)
+    return Circle(u=u, v=v, radius=radius, coverage=coverage) if coverage >= LEAST_COVERAGE else None
+
+
+def circle_coverage(edges: Edges, circles: Array) -> Array:
+    """(N,) share of the outline of (N, 3) circles (u, v, r) that has an edge along the normal, in plain numpy."""
+    nx, ny = NORMALS.T
+    u = np.round(circles[:, :1] + circles[:, 2:] * nx).astype(int)
+    v = np.round(circles[:, 1:2] + circles[:, 2:] * ny).astype(int)
+    height, width = edges.strong.shape
+    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    u, v = np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)
+    s = edges.strength[v, u]
+    aligned = np.abs(edges.along_x[v, u] * nx + edges.along_y[v, u] * ny) > ALIGNED * s
+    return np.asarray((inside & edges.strong[v, u] & aligned).mean(axis=1))
+
+
+def _distinct(circles: list[Circle]) -> list[Circle]:
+    kept: list[Circle] = []
+    for c in sorted(circles, key=lambda c: c.coverage, reverse=True):
+        if not any(abs(c.radius - k.radius) < 2 and hypot(c.u - k.u, c.v - k.v) < 4 for k in kept):
+            kept.append(c)
+    return kept
+
+
+@njit(cache=True)
+def _average(planes: Float32, radii: Float32) -> None:  # pragma: no cover
+    """In place: mean of every plane and its two neighbours, the outermost as they are, over the radius."""
+    count, height, width = planes.shape
+    before, here = planes[0].copy(), planes[0].copy()
+    for k in range(count):
+        inner = 0 < k < count - 1
+        share = np.float32(1.0 / (3.0 * radii[k]))
+        above = planes[k + 1 if inner else k]
+        for y in range(height):
+            for x in range(width):
+                value = planes[k, y, x]
+                here[y, x] = value
+                planes[k, y, x] = ((before[y, x] if inner else value) + value + above[y, x]) * share
+        before, here = here, before
+
+
+@njit(cache=True)
+def _vote(
+    votes: Float32, u: Array, v: Array, nx: Array, ny: Array, radii: Array, cell: int
+) -> None:  # pragma: no cover
+    """One vote a radius on either side of every edge pixel; radius by radius, so that one plane stays in the cache."""
+    _, height, width = votes.shape
+    share = 1.0 / cell  # cells are powers of two: exactly as dividing, and quicker
+    for k in range(len(radii)):
+        plane = votes[k]
+        reach = radii[k] * share
+        for i in range(len(u)):
+            x0, y0, dx, dy = u[i] * share + 0.5, v[i] * share + 0.5, reach * nx[i], reach * ny[i]
+            for sign in (-1.0, 1.0):
+                x, y = int(x0 + sign * dx), int(y0 + sign * dy)
+                if 0 <= x < width and 0 <= y < height:
+                    plane[y, x] += 1.0
+
+
+@njit(cache=True)
+def _covered(
+    gx: Float32, gy: Float32, strength: Float32, strong: NDArray[np.bool_], normals: Array, u: float, v: float, r: float
+) -> float:  # pragma: no cover
+    """`circle_coverage` of one circle."""
+    height, width = strong.shape
+    hits = 0
+    for i in range(len(normals)):
+        x, y = int(np.rint(u + r * normals[i, 0])), int(np.rint(v + r * normals[i, 1]))
+        if x < 0 or y < 0 or x >= width or y >= height or not strong[y, x]:
+            continue
+        if abs(gx[y, x] * normals[i, 0] + gy[y, x] * normals[i, 1]) > ALIGNED * strength[y, x]:
+            hits += 1
+    return hits / len(normals)
+
+
+@njit(cache=True)
+def _climbed(
+    gx: Float32, gy: Float32, strength: Float32, strong: NDArray[np.bool_], normals: Array, steps: Array,
+    u: float, v: float, r: float,
+) -> tuple[float, float, float, float]:  # pragma: no cover  # fmt: skip
+    """(u, v, r, coverage) of the best of 27 neighbours a step, in ever smaller steps, until nothing is better."""
+    score = -1.0
+    for step in steps:
+        best, best_u, best_v, best_r = -1.0, u, v, r
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                for k in range(-1, 2):
+                    a, b, c = u + i * step, v + j * step, r + k * step
+                    found = _covered(gx, gy, strength, strong, normals, a, b, c)
+                    if found > best:
+                        best, best_u, best_v, best_r = found, a, b, c
+        if best <= score:
+            break
+        score, u, v, r = best, best_u, best_v, best_r
+        if score < HOPELESS_COVERAGE:
+            break
+    return u, v, r, score

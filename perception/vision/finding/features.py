@@ -1,0 +1,145 @@
+"""What a place on the plate looks like, told in numbers that a person can check.
+
+Around a middle, on circles of growing radius, whichever way the object is turned: relative gray (median), unevenness
+(inner 70 % range), and edge strength (median and strong). Then, towards eight directions of the upright plate, relative
+gray and edges on rings: a toggle's plate is taller than wide, a display wider than high. Logarithms of ratios to the
+plate's own gray, so exposure and light cancel; medians and directions, so a cable or a highlight spoils a few numbers and
+not all. For closed regions: the paper's size, height, width, aspect and Fourier shape
+descriptors (C. T. Zahn and R. Z. Roskies, IEEE Trans. Computers 21(3), 1972, in the complex form of G. H. Granlund, 1972).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from perception.vision.finding.shapes import Edges
+from perception.vision.image import Image
+from perception.vision.patch import sample_at
+from perception.vision.view import Array
+
+PLATE_PX_PER_M = 1500.0  # resolution of the rectified plate
+RADII_M = np.arange(0.0015, 0.045, 0.003)
+ANGLES = (np.arange(32) + 0.5) * 2 * np.pi / 32
+AROUND_PX = (
+    np.stack([np.outer(RADII_M, np.sin(ANGLES)), -np.outer(RADII_M, np.cos(ANGLES))]).reshape(2, -1) * PLATE_PX_PER_M
+)
+RANKS = (5, 16, 27)  # of 32: 15, 50 and 85 %
+AT_ONCE = 64  # places: what lies between stays in the cache, and in memory that the process already has
+GROUPS = ("gray", "uneven", "edge", "strong_edge")
+DIRECTIONS = 8  # clockwise from straight up
+RINGS = len(RADII_M) // 2  # two radii each; the outermost is left to neighbours
+EACH = len(ANGLES) // DIRECTIONS
+# (angles, DIRECTIONS) mean over two radii and the angles about a direction
+TOWARDS = np.roll(np.kron(np.eye(DIRECTIONS), np.full((EACH, 1), 0.5 / EACH)), -(EACH // 2), axis=0).astype(np.float32)
+AROUND_GROUPS = ("gray_around", "edge_around")
+LENGTH = len(GROUPS) * len(RADII_M) + len(AROUND_GROUPS) * DIRECTIONS * RINGS
+# What is the same whichever way a thing is turned counts as much as what lies in which direction: twice a number.
+WEIGHTS = np.repeat([2.0, 1.0], [len(GROUPS) * len(RADII_M), len(AROUND_GROUPS) * DIRECTIONS * RINGS])
+EDGE_GAIN = 40.0
+DESCRIPTORS = 12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Ground:
+    """The rectified plate, its edges and the gray that it would have without objects."""
+
+    picture: NDArray[np.float32]
+    edges: Edges
+    plate_gray: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegionShape:
+    """The paper's spatial features of a closed region.
+
+    Attributes:
+        area_px, width_px, height_px: size; width and height of the upright box.
+        aspect: longer over shorter side of the smallest enclosing rectangle.
+        descriptors: magnitudes of the contour's Fourier coefficients 2..13 over that of the first: no place, size, turn.
+    """
+
+    area_px: float
+    width_px: float
+    height_px: float
+    aspect: float
+    descriptors: tuple[float, ...]
+
+
+def plate_gray(picture: Image) -> NDArray[np.float32]:
+    """(H, W) gray of the plate itself: a median wide enough to overlook every object."""
+    small = cv2.resize(picture, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    framed = cv2.copyMakeBorder(small, 24, 24, 24, 24, cv2.BORDER_REFLECT)
+    median = cv2.GaussianBlur(cv2.medianBlur(framed, 49)[24:-24, 24:-24], (0, 0), 3.0)
+    return np.asarray(cv2.resize(median, picture.shape[::-1]), np.float32)
+
+
+def look_at(ground: Ground, places_px: ArrayLike) -> Array:
+    """(N, LENGTH) looks of (N, 2) places (u, v) of the rectified plate: `GROUPS`, then `AROUND_GROUPS`."""
+    places = np.asarray(places_px, float).reshape(-1, 2)
+    parts = [_looks(ground, places[k : k + AT_ONCE]) for k in range(0, len(places), AT_ONCE)]
+    return np.concatenate(parts).astype(float) if parts else np.zeros((0, LENGTH))
+
+
+def _looks(ground: Ground, places: Array) -> NDArray[np.float32]:
+    u, v = places[:, :1] + AROUND_PX[0], places[:, 1:] + AROUND_PX[1]
+    shape = (len(places), len(RADII_M), len(ANGLES))
+    gray = sample_at(ground.picture, u, v).reshape(shape)
+    edge = sample_at(ground.edges.strength, u, v).reshape(shape)
+    height, width = ground.picture.shape
+    at_u = np.clip(places[:, 0], 0, width - 1).astype(int)
+    at_v = np.clip(places[:, 1], 0, height - 1).astype(int)
+    level = ground.plate_gray[at_v, at_u][:, None]
+    gray_around = np.log((_around(gray) + 6.0) / (level + 10.0))
+    edge_around = np.log1p(EDGE_GAIN * _around(edge) / (level + 4.0))
+    gray.sort(axis=2)
+    edge.sort(axis=2)
+    low, middle, high = (np.log((gray[:, :, k] + 6.0) / (level + 10.0)) for k in RANKS)
+    edge_middle, edge_high = (np.log1p(EDGE_GAIN * edge[:, :, k] / (level + 4.0)) for k in RANKS[1:])
+    return np.concatenate([middle, high - low, edge_middle, edge_high, gray_around, edge_around], axis=1)
+
+
+def half_turned(looks: Array) -> Array:
+    """(N, LENGTH) what `look_at` gives of the same places when the picture is turned by half a turn."""
+    plain = len(GROUPS) * len(RADII_M)
+    tables = looks[:, plain:].reshape(len(looks), len(AROUND_GROUPS), DIRECTIONS, RINGS)
+    return np.concatenate([looks[:, :plain], np.roll(tables, DIRECTIONS // 2, axis=2).reshape(len(looks), -1)], axis=1)
+
+
+def _around(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, DIRECTIONS * RINGS) means of (N, radii, angles) values, direction by direction."""
+    rings = values[:, : 2 * RINGS].reshape(len(values), RINGS, 2, -1).sum(axis=2)
+    return np.asarray((rings @ TOWARDS).transpose(0, 2, 1).reshape(len(values), -1))
+
+
+def region_shape(mask: NDArray[np.bool_]) -> RegionShape | None:
+    """Shape of the largest part of a mask; None for less than 8 pixels."""
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not contours:
+        return None
+    contour = max(contours, key=cv2.contourArea).reshape(-1, 2).astype(np.int32)
+    area = float(cv2.contourArea(contour))
+    if area < 8.0:
+        return None
+    _, _, width, height = cv2.boundingRect(contour)
+    (_, _), (a, b), _ = cv2.minAreaRect(contour)
+    return RegionShape(
+        area_px=area,
+        width_px=float(width),
+        height_px=float(height),
+        aspect=float(max(a, b) / max(min(a, b), 1e-9)),
+        descriptors=_fourier(contour),
+    )
+
+
+def _fourier(contour: NDArray[np.int32]) -> tuple[float, ...]:
+    closed = np.vstack([contour, contour[:1]]).astype(float)
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(closed, axis=0).T))])
+    s = np.linspace(0.0, length[-1], 128, endpoint=False)
+    z = np.interp(s, length, closed[:, 0]) + 1j * np.interp(s, length, closed[:, 1])
+    spectrum = np.abs(np.fft.fft(z))
+    first = max(float(spectrum[1]), float(spectrum[-1]), 1e-9)
+    return tuple(float(spectrum[k] + spectrum[-k]) / first for k in range(2, 2 + DESCRIPTORS))

@@ -1,0 +1,104 @@
+"""Is there one panel in the image, and is it the right way up? What cannot be answered for is refused before reading."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.errors import Ambiguous, NotFound
+from hal.geometry import UncertainPose, transform
+from hal.panel import Panel
+from perception.vision.finding.plate import Plate, find_plate
+from perception.vision.image import Image
+from perception.vision.registration.register import register
+from perception.vision.view import CameraView, PlaneView, View
+
+COARSE_WIDTH_PX = 240
+LEAST_SHARE = 0.06  # of the image: smaller plates show no objects
+SECOND_SHARE = 0.3  # of the largest region's area: a second panel that could as well be meant
+RECTANGLE_FILL = 0.85  # of its smallest enclosing rectangle that a plate's region fills
+ASPECT_RATIO = 1.3  # by which a plate seen aslant may differ from its proportions
+HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+TURNED_LEAD = 0.15  # share of the objects' edges that must speak for upside down before it is said
+
+
+def one_plate(gray: Image, plate_m: tuple[float, float], *, focal_px: float | None = None) -> Plate:
+    """The plate of the one panel that fills the image.
+
+    Raises:
+        NotFound: none does.
+        Ambiguous: two panels are in view.
+    """
+    if _panels_in(gray, plate_m[0] / plate_m[1]) > 1:
+        raise Ambiguous(
+            "two panels are in view, and either may be meant",
+            hint="show one panel: come closer, or cut the other one off the image",
+        )
+    plate = find_plate(gray, *plate_m, focal_px=focal_px)
+    if plate is None:
+        raise NotFound(
+            "no plate fills the image", hint="take an overview of one panel, upright, with its border in view"
+        )
+    return plate
+
+
+def check_upright(gray: Image, view: View, panel: Panel) -> None:
+    """Refuse a panel that fits better upside down.
+
+    Raises:
+        NotFound: it does; nothing could be read where the panel file has it.
+    """
+    upright, turned = (_objects_share(gray, v, panel) for v in (view, upside_down(view)))
+    if turned > upright + TURNED_LEAD:
+        raise NotFound(
+            f"panel {panel.name!r} is upside down in this image: {turned:.0%} of its objects' edges are found that way,"
+            f" {upright:.0%} upright",
+            hint="turn the image or the camera by 180 degrees",
+        )
+
+
+def upside_down(view: View) -> View:
+    """The same plate turned by half a turn about its middle."""
+    if isinstance(view, PlaneView):
+        return PlaneView(px_from_plate=view.px_from_plate @ HALF_TURN, corners_m=view.corners_m, sigma_px=view.sigma_px)
+    if isinstance(view, CameraView):
+        pose = view.camera_from_panel
+        turned = pose.parent_from_child * transform(HALF_TURN, np.zeros(3))
+        return CameraView(
+            intrinsics=view.intrinsics,
+            camera_from_panel=UncertainPose(parent_from_child=turned, covariance=pose.covariance),
+        )
+    raise TypeError(f"no half turn of a {type(view).__name__}")
+
+
+def _objects_share(gray: Image, view: View, panel: Panel) -> float:
+    """Share of the edges of the panel's objects that the image shows; NaN, which compares as no, where none has any."""
+    shares = np.array(list(register(gray, view, panel).edge_share.values()))
+    shares = shares[np.isfinite(shares)]
+    return float(shares.mean()) if len(shares) else float("nan")
+
+
+def _panels_in(gray: Image, aspect: float) -> int:
+    """How many regions of the image look like whole plates of that aspect, none much smaller than the largest."""
+    shrink = max(1.0, gray.shape[1] / COARSE_WIDTH_PX)
+    small = np.asarray(cv2.resize(gray, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA), np.uint8)
+    smooth = cv2.medianBlur(small, 5)
+    _, bright = cv2.threshold(smooth, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    return max(_plates_among(np.asarray(mask, np.uint8), aspect) for mask in (bright, 255 - bright))
+
+
+def _plates_among(mask: NDArray[np.uint8], aspect: float) -> int:
+    """Of the outer contours, those of a size with the largest that are plates; objects on a plate are holes in it."""
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outlines = [np.asarray(contour, np.int32) for contour in contours]
+    areas = np.array([cv2.contourArea(outline) for outline in outlines])
+    least = max(SECOND_SHARE * areas.max(initial=0.0), LEAST_SHARE * mask.size)
+    return sum(_is_plate(outlines[k], aspect) for k in np.flatnonzero(areas >= least))
+
+
+def _is_plate(contour: NDArray[np.int32], aspect: float) -> bool:
+    (_, _), (a, b), angle = cv2.minAreaRect(contour)
+    width, height = (a, b) if abs(angle) < 45 else (b, a)
+    is_filled = cv2.contourArea(contour) >= RECTANGLE_FILL * a * b
+    return bool(is_filled and 1 / ASPECT_RATIO < width / max(height, 1.0) / aspect < ASPECT_RATIO)

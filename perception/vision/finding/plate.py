@@ -1,0 +1,250 @@
+"""The plate in an overview: four robust lines around what differs from the room, and the view straight onto it.
+
+A rigid plate before a typical camera is laid through the lines and follows the image's edges, so a side that the image
+cuts off is where the other three put it. Where the edges do not confirm a visible side (glare or shadow misled its line),
+the plate is laid again without that line, from further off, and freely, as a steep tilt before a wider lens wants it; what
+is confirmed best stands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.vision.finding.plate_pose import rigid_plate
+from perception.vision.image import Image
+from perception.vision.registration.outline import Outline, rectangle
+from perception.vision.registration.register import EdgeImage, confirmed, edge_image, follow_edges
+from perception.vision.view import Array, PlaneView, homography
+
+COARSE_WIDTH_PX = 160
+TYPICAL_FOCAL = 1.25  # of the longer image side: a lens of 44 degrees; completes a side that is cut off
+LEAST_SHARE = 0.25  # of the image: a smaller plate is not an overview
+SIDE_POINTS = 40
+WINDOWS_PX = (12.0, 8.0, 5.0, 3.0, 2.0)
+FAR_WINDOWS_PX = (30.0, 20.0, *WINDOWS_PX)  # for a plate whose lines were misled
+START_SIGMA_PX, FAR_SIGMA_PX = 6.0, 15.0
+FREE_WINDOWS_PX = (5.0, 3.0, 2.0)  # of the last step, which allows for a lens and a focal length that are not typical
+FREE_SIGMA_PX = 2.0
+CONFIRMED = 0.7  # share of a side's visible edge
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Plate:
+    """A plate found in an image.
+
+    Attributes:
+        view: plate metres (origin in the middle, y up) to pixels.
+        sides_seen: top, right, bottom, left: whether the image shows that side.
+    """
+
+    view: PlaneView
+    sides_seen: tuple[bool, bool, bool, bool]
+
+
+def find_plate(gray: Image, width_m: float, height_m: float, *, focal_px: float | None = None) -> Plate | None:
+    """The plate of known size that fills most of the image, upright within 45 degrees; None when there is none."""
+    shrink = max(1.0, gray.shape[1] / COARSE_WIDTH_PX)
+    small = np.asarray(cv2.resize(gray, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA), np.uint8)
+    mask = _plate_mask(small)
+    if mask.mean() < LEAST_SHARE:
+        return None
+    lines = [_side(mask, side) for side in range(4)]
+    w, h = width_m / 2, height_m / 2
+    search = _Search(
+        image=edge_image(gray), outline=rectangle(0.0, 0.0, 0.0, width_m=width_m, height_m=height_m, count=SIDE_POINTS),
+        corners_m=np.array([[-w, h], [w, h], [w, -h], [-w, -h]]), coarse_shape=mask.shape, shrink=shrink,
+        focal_px=focal_px or TYPICAL_FOCAL * max(gray.shape),
+    )  # fmt: skip
+    found = search.best(lines)
+    if found is None:
+        return None
+    top, right, bottom, left = (line is not None for line in lines)
+    return Plate(view=found, sides_seen=(top, right, bottom, left))
+
+
+_Attempt = tuple[list[Array | None], tuple[float, ...], float]  # lines, windows in pixels, sigma in pixels
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Search:
+    """What every attempt to lay the plate through coarse lines needs."""
+
+    image: EdgeImage
+    outline: Outline
+    corners_m: Array
+    coarse_shape: tuple[int, ...]
+    shrink: float
+    focal_px: float
+
+    def best(self, lines: list[Array | None]) -> PlaneView | None:
+        """The plate that the image's edges confirm best; None when the lines make none."""
+        view = self._laid(lines, WINDOWS_PX, START_SIGMA_PX)
+        found = [] if view is None else [(self._score(view), view)]
+        if view is None or self._least_confirmed(view) < CONFIRMED:
+            attempts: list[_Attempt] = [(lines, FAR_WINDOWS_PX, FAR_SIGMA_PX)]
+            for side in range(4):
+                fewer = [None if k == side else line for k, line in enumerate(lines)]
+                attempts.append((fewer, WINDOWS_PX, START_SIGMA_PX))
+            laid = [self._free(lines), *(self._laid(*attempt) for attempt in attempts)]
+            found += [(self._score(view), view) for view in laid if view is not None]
+        return max(found, key=lambda f: f[0])[1] if found else None
+
+    def _laid(self, lines: list[Array | None], windows_px: tuple[float, ...], sigma_px: float) -> PlaneView | None:
+        """The plate through the lines, moved onto the image's edges: first as a rigid one, then freely."""
+        corners_px = self._corners_px(lines)
+        if corners_px is None:
+            return None
+        rows, columns = self.image.smooth.shape
+        rigid = rigid_plate(
+            self.corners_m, corners_px, focal_px=self.focal_px, sigma_px=sigma_px,
+            middle_px=np.array([columns - 1.0, rows - 1.0]) / 2,
+        )  # fmt: skip
+        rigid = follow_edges(self.image, rigid, self.outline, windows_px)
+        free = PlaneView(px_from_plate=rigid.px_from_plate, corners_m=self.corners_m, sigma_px=FREE_SIGMA_PX)
+        return follow_edges(self.image, free, self.outline, FREE_WINDOWS_PX)
+
+    def _free(self, lines: list[Array | None]) -> PlaneView | None:
+        """The plate through four lines, as no rigid one: a lens that is not typical shows at a steep tilt."""
+        corners_px = self._corners_px(lines) if all(line is not None for line in lines) else None
+        if corners_px is None:
+            return None
+        H = homography(self.corners_m, corners_px)
+        view = PlaneView(px_from_plate=H, corners_m=self.corners_m, sigma_px=START_SIGMA_PX)
+        return follow_edges(self.image, view, self.outline, WINDOWS_PX)
+
+    def _corners_px(self, lines: list[Array | None]) -> Array | None:
+        """(4, 2) corners in the image itself; None when the lines make none."""
+        width, height = self.corners_m.max(axis=0) * 2
+        corners = _corners(lines, self.coarse_shape, float(width / height), self.focal_px / self.shrink)
+        return None if corners is None else (corners + 0.5) * self.shrink - 0.5
+
+    def _score(self, view: PlaneView) -> int:
+        """Samples of the border that an edge confirms, less visible ones that none does."""
+        visible, near = confirmed(self.image, view, self.outline)
+        return 2 * int(near.sum()) - int(visible.sum())
+
+    def _least_confirmed(self, view: PlaneView) -> float:
+        """Share of the visible samples with an edge, on the worst side of which enough is visible."""
+        visible, near = (mask.reshape(4, -1).sum(axis=1) for mask in confirmed(self.image, view, self.outline))
+        return float(np.where(visible >= SIDE_POINTS // 5, near / np.maximum(visible, 1), 1.0).min())
+
+
+def _plate_mask(small: Image) -> NDArray[np.bool_]:
+    """Largest bright or dark region around the middle of the picture."""
+    smooth = cv2.GaussianBlur(small, (0, 0), 1.5)
+    # Logarithms: a plate keeps its ratio to the room where the light fades. Glare and white faces are held back.
+    level = np.log(smooth.astype(np.float32) + 4.0)
+    held = np.minimum(level, float(np.median(level)) + 0.2)
+    low, high = float(np.percentile(held, 1)), float(held.max())
+    coded = np.clip((held - low) / max(high - low, 1e-3) * 255.0, 0, 255).astype(np.uint8)
+    _, bright = cv2.threshold(coded, 0, 1, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    middle = bright[bright.shape[0] // 4 : -bright.shape[0] // 4, bright.shape[1] // 4 : -bright.shape[1] // 4]
+    mask = bright if middle.mean() >= 0.5 else 1 - bright
+    mask = cv2.morphologyEx(np.pad(mask, 12), cv2.MORPH_CLOSE, np.ones((13, 13), np.uint8))[12:-12, 12:-12]
+    mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((7, 7), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
+    if count < 2:
+        return np.zeros(mask.shape, bool)
+    return np.asarray(labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()))
+
+
+def _side(mask: NDArray[np.bool_], side: int) -> Array | None:
+    """(a, b, c) of the line a x + b y = c along the top, right, bottom or left border; None when the image cuts it off."""
+    turned = mask if side in (0, 2) else mask.T
+    columns = np.flatnonzero(turned.any(axis=0))
+    if len(columns) < 12:
+        return None
+    columns = columns[len(columns) // 12 : -len(columns) // 12]
+    last = turned.shape[0] - 1
+    first = turned[:, columns].argmax(axis=0) if side in (0, 3) else last - turned[::-1, columns].argmax(axis=0)
+    free = (first > 1) & (first < last - 1)
+    if free.mean() < 0.35:
+        return None
+    x, y = columns[free].astype(float), first[free].astype(float) + (-0.5 if side in (0, 3) else 0.5)
+    slope, start = _robust_line(x, y)
+    line = np.array([-slope, 1.0, start])
+    return line if side in (0, 2) else line[[1, 0, 2]]
+
+
+def _robust_line(x: Array, y: Array) -> tuple[float, float]:
+    """Slope and intercept by least squares with Cauchy weights from a median start."""
+    half = len(x) // 2
+    pairs = (y[half : half * 2] - y[:half]) / np.maximum(x[half : half * 2] - x[:half], 1e-9)
+    slope = float(np.median(pairs))
+    start = float(np.median(y - slope * x))
+    for _ in range(8):
+        r = y - slope * x - start
+        w = 1.0 / (1.0 + (r / max(1.5 * float(np.median(np.abs(r))), 0.4)) ** 2)
+        A = np.column_stack([x, np.ones_like(x)])
+        slope, start = np.linalg.solve(A.T @ (w[:, None] * A), A.T @ (w * y))
+    return float(slope), float(start)
+
+
+def _corners(lines: list[Array | None], shape: tuple[int, ...], aspect: float, focal: float) -> Array | None:
+    """(4, 2) corners, upper left first and clockwise; a missing side is placed by the known proportions."""
+    seen = sum(line is not None for line in lines)
+    if seen < 2:
+        return None
+    height, width = shape
+    border = [
+        np.array([0.0, 1.0, -0.5]),
+        np.array([1.0, 0.0, width - 0.5]),
+        np.array([0.0, 1.0, height - 0.5]),
+        np.array([1.0, 0.0, -0.5]),
+    ]
+    full = [line if line is not None else edge for line, edge in zip(lines, border, strict=True)]
+    corners = np.array([_cut(full[3], full[0]), _cut(full[0], full[1]), _cut(full[1], full[2]), _cut(full[2], full[3])])
+    if not np.isfinite(corners).all():
+        return None
+    missing = [k for k, line in enumerate(lines) if line is None]
+    if len(missing) == 1:
+        return _completed(
+            corners, missing[0], middle=np.array([width - 1.0, height - 1.0]) / 2, focal=focal, aspect=aspect
+        )
+    return corners
+
+
+def _completed(corners: Array, missing: int, *, middle: Array, focal: float, aspect: float) -> Array | None:
+    """Corners of a rectangle of known proportions of which one side is cut off.
+
+    The two sides that meet the missing one meet in the vanishing point of their direction d; the opposite side lies in
+    the plane with normal m. The other direction is m x d, so the whole plane is known.
+    """
+    order = np.roll(np.arange(4), -missing)  # the missing side runs from order[0] to order[1]
+    far_a, far_b, near_b, near_a = corners[order]
+    ratio = (
+        aspect if missing in (1, 3) else 1.0 / aspect
+    )  # of the sides that meet the missing one over the opposite one
+    a, b = (np.append(p - middle, focal) for p in (near_a, near_b))
+    m = np.cross(a, b)
+    d = np.cross(np.cross(a, np.append(far_a - middle, focal)), np.cross(b, np.append(far_b - middle, focal)))
+    d = d / np.linalg.norm(d)
+    across = np.cross(m, d)
+    across = across / np.linalg.norm(across)
+    # b lies on the ray of near_b with b - a along `across`: a + length * across = t * ray_b, with a at depth 1.
+    solved = np.linalg.lstsq(np.column_stack([across, -b]), -a, rcond=None)[0]
+    length = abs(float(solved[0])) * ratio
+    towards = (
+        1.0
+        if float(np.dot((a + 0.1 * length * d)[:2] / (a + 0.1 * length * d)[2] - a[:2] / a[2], far_a - near_a)) > 0
+        else -1.0
+    )
+    out = corners.copy()
+    for index, start in ((order[0], a), (order[1], b * float(solved[1]))):
+        point = start + towards * length * d
+        if point[2] <= 0:
+            return None
+        out[index] = middle + focal * point[:2] / point[2]
+    return out
+
+
+def _cut(first: Array, second: Array) -> Array:
+    """Crossing of two lines; NaN for parallel ones."""
+    A = np.array([first[:2], second[:2]])
+    if abs(float(np.linalg.det(A))) < 1e-9:
+        return np.full(2, np.nan)
+    return np.asarray(np.linalg.solve(A, [first[2], second[2]]))

@@ -1,0 +1,1 @@
+"""Photographs of devices that no panel file describes: one dial, one display."""

@@ -1,0 +1,288 @@
+"""One dial that fills the picture, with nothing taught but the ends of its scale: photographs of meters and gauges.
+
+The pointer may differ from the face in colour rather than in brightness, so it is looked for in several channels of the
+picture and the clearest one is believed.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.panel import Scale
+from perception.vision.finding.circles import find_circles
+from perception.vision.finding.shapes import find_edges
+from perception.vision.image import WHITE_LEVEL, Image, as_gray
+from perception.vision.patch import Patch
+from perception.vision.reading import Status, gated, limited, refused
+from perception.vision.status.gauge import pointer_confidence, status_of_pointer
+from perception.vision.status.pointer import PointerFit, find_pointer, unroll, wrapped
+
+SIDE_PX = 220
+NUMERALS_FROM, TIP_AT = 0.45, 0.72  # share of the radius: beyond any round hub, within every pointer
+LEAST_CONNECTED = 0.7  # of the way to the hub: a pointer comes from it, a glare or a numeral does not
+SAME_RAD = np.deg2rad(6.0)
+CLEARER_BY = 0.5  # than the best pointer elsewhere, as `_clearness` counts
+LEAST_SIDE_PX = 90
+BRIGHT_FACE = 205  # gray level
+HALO = 0.24  # of the radius: what a saturated spot is widened by
+UNSEEN_RIM = 0.48  # of the picture: the radius where no outline is found
+PIVOT_OFF = 0.08  # of the radius: seen aslant, the outline found is not about the pivot
+LEAST_SEPARATION = 3.2  # spreads of the face: two halves of one blurred gray lie 2.7 apart
+LEAST_COLOUR = 5.0  # of Lab: less is the noise of a camera or of JPEG
+LEAST_HUB = 0.18  # of the radius: a drop's hub is wider than any needle's
+SCALE_END_RAD = np.deg2rad(135.0)  # three quarters of a turn is what almost all round gauges use
+
+
+def read_dial(
+    image: NDArray[Any], *, minimum: float, maximum: float, circular: bool, ends_rad: tuple[float, float] | None = None
+) -> Status:
+    """Value of the dial that fills the picture.
+
+    Args:
+        image: gray or RGB uint8, cropped to the dial.
+        circular: the scale is a full turn that begins straight up.
+        ends_rad: pointer angles at minimum and maximum of a scale that is not; three quarters of a turn by default.
+
+    Raises:
+        InvalidRequest, NotObservable: bad image.
+    """
+    fits = _pointers(image)
+    if not fits:
+        return refused("no pointer stands out on the dial: come closer or add light")
+    fit = max(fits, key=_clearness)
+    if circular:
+        value = minimum + (fit.angle_rad % (2 * np.pi)) / (2 * np.pi) * (maximum - minimum)
+        sigma = fit.sigma_rad / (2 * np.pi) * (maximum - minimum)
+        status = Status(value=float(value), uncertainty=float(sigma), confidence=pointer_confidence(fit, 1.0))
+    else:
+        low, high = ends_rad or (-SCALE_END_RAD, SCALE_END_RAD)
+        scale = Scale(minimum=minimum, maximum=maximum, unit="", at_min=low, at_max=high)
+        status = status_of_pointer(fit, scale, 1.0)
+    return gated(limited(status, _agreement(fit, fits)))
+
+
+def _pointers(image: NDArray[Any]) -> list[PointerFit]:
+    """What looks like a pointer, in every channel of the picture and of either polarity; a drop leaves no question."""
+    gray = as_gray(image)
+    scale = SIDE_PX / max(image.shape[:2])
+    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    picture = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=interpolation), np.uint8)
+    u, v, radius = _dial_circle(gray, scale)
+    drop = _drop(picture, u, v, radius)
+    if drop is not None:
+        return [drop]
+    gray = as_gray(picture)
+    glare = _glare(gray, u, v, radius)
+    fits = []
+    y, x = np.mgrid[: gray.shape[0], : gray.shape[1]]
+    for channel, least in _channels(picture, gray, np.hypot(x - u, y - v) < radius):
+        patch = _patch(channel, u, v)
+        for dark in (True, False):
+            fit = find_pointer(
+                patch, pivot_m=(0.0, 0.0), inner_m=NUMERALS_FROM * radius, outer_m=TIP_AT * radius,
+                fine_m=(0.35 * radius, 0.78 * radius), width_rad=np.deg2rad(50.0), quantile=0.4, dark=dark,
+                prior_pivot_px=0.02 * radius, cover=glare,
+            )  # fmt: skip
+            if fit is None or fit.contrast < least:
+                continue
+            if _reaches_hub(patch, fit.angle_rad, radius) >= LEAST_CONNECTED:
+                fits.append(fit)
+    return fits
+
+
+def _agreement(best: PointerFit, fits: list[PointerFit]) -> float:
+    """Most confidence that the channels leave: less than an answer needs where a clear one points elsewhere."""
+    others = [f for f in fits if abs(wrapped(np.array(f.angle_rad - best.angle_rad))) > SAME_RAD]
+    rival = max((_clearness(f) for f in others), default=-np.inf)
+    return float(1.0 / (1.0 + np.exp(-(_clearness(best) - rival - CLEARER_BY) / 0.3)))
+
+
+def _drop(image: Image, u: float, v: float, radius: float) -> PointerFit | None:
+    """A wide hub with one tip, in a colour or gray of its own: its axis runs from the one to the other.
+
+    The axis does not need the dial's middle, so a pointer seen from the side is read right.
+    """
+    planes: list[NDArray[Any]] = [as_gray(image)]
+    if image.ndim == 3:
+        lab = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_RGB2LAB)
+        planes += [lab[:, :, 1], lab[:, :, 2]]
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    disc = np.hypot(x - u, y - v) < 0.86 * radius
+    best: tuple[float, NDArray[np.bool_]] | None = None
+    for plane in planes:
+        part = cv2.GaussianBlur(plane.astype(np.float32), (0, 0), 1.5)
+        for sign in (1.0, -1.0):
+            region, separation = _region(sign * part, disc, (round(u), round(v)))
+            if region is not None and (best is None or separation > best[0]):
+                best = separation, region
+    if best is None:
+        return None
+    region = best[1] | _glare_within(planes[0], best[1], radius)
+    return _axis(region, (u, v), radius, best[0])
+
+
+def _region(
+    channel: NDArray[np.float32], disc: NDArray[np.bool_], middle: tuple[int, int]
+) -> tuple[NDArray[np.bool_] | None, float]:
+    """The coloured region about the middle and how many spreads of the face it stands out by; None if it is no pointer."""
+    values = channel[disc]
+    low, high = float(np.percentile(values, 1)), float(np.percentile(values, 99))
+    if high - low < 12.0:
+        return None, 0.0
+    coded = np.clip((channel - low) / (high - low) * 255, 0, 255).astype(np.uint8)
+    threshold, _ = cv2.threshold(coded[disc][None], 0, 1, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    mask = ((coded > threshold) & disc).astype(np.uint8)
+    mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
+    if count < 2:
+        return None, 0.0
+    biggest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
+    region = labels == biggest
+    share = float(region.sum() / disc.sum())
+    near = region[max(0, middle[1] - 12) : middle[1] + 13, max(0, middle[0] - 12) : middle[0] + 13].any()
+    face = channel[disc & ~region]
+    spread = 1.4826 * float(np.median(np.abs(face - np.median(face)))) + 1.0
+    separation = (float(np.median(channel[region])) - float(np.median(face))) / spread
+    return (region, separation) if 0.03 < share < 0.4 and near and separation > LEAST_SEPARATION else (None, 0.0)
+
+
+def _axis(
+    region: NDArray[np.bool_], middle: tuple[float, float], radius: float, separation: float
+) -> PointerFit | None:
+    """The axis of a drop: a wide hub about the dial's middle with one tip; None for any other pointer."""
+    inner = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
+    core = np.argwhere(inner > 0.93 * inner.max())
+    hub = core.mean(axis=0)[::-1]
+    points = np.argwhere(region)[:, ::-1] - hub
+    away = np.hypot(points[:, 0], points[:, 1])
+    hub_radius, reach = float(inner.max()), float(np.percentile(away, 99.7))
+    if reach < 1.4 * hub_radius or reach < 0.4 * radius:
+        return None  # a disc points nowhere
+    if hub_radius < LEAST_HUB * radius or np.hypot(*(hub - middle)) > 0.25 * radius:
+        return None  # a thick place off the middle is a counterweight or a letter
+    far = points[away > max(1.15 * hub_radius, 0.55 * reach)]
+    direction = far.mean(axis=0)
+    angle = float(np.arctan2(direction[0], -direction[1]))
+    spread = np.abs((np.arctan2(far[:, 0], -far[:, 1]) - angle + np.pi) % (2 * np.pi) - np.pi)
+    stray = float((spread > np.deg2rad(35.0)).mean())
+    return PointerFit(
+        angle_rad=angle,
+        sigma_rad=float(np.arctan(1.0 / reach)),
+        strength=3.0 * separation,
+        contrast=separation,
+        rival_ratio=min(1.0, stray * 2),
+        rival_rad=angle + np.pi,
+        supported=1.0 - stray,
+        shown=1.0 - stray,
+        is_dark=False,
+        unknown=0.0,
+    )
+
+
+def _glare_within(gray: NDArray[Any], region: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+    """(H, W) spots of glare on a pointer that all but its outline surrounds: they are the pointer, whatever they look like."""
+    corners = cv2.convexHull(np.argwhere(region)[:, ::-1].astype(np.int32))
+    hull = cv2.fillConvexPoly(np.zeros(region.shape, np.uint8), corners, 1) > 0
+    count, labels = cv2.connectedComponents((gray >= WHITE_LEVEL).astype(np.uint8))
+    beyond = np.unique(labels[~hull])
+    inside = [k for k in range(1, count) if k not in beyond]
+    thick = float(cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5).max())
+    if not inside or thick < 0.6 * LEAST_HUB * radius:  # a glare beside a needle makes no drop of it
+        return np.zeros(region.shape, bool)
+    return hull & _with_halo(np.isin(labels, inside), radius)
+
+
+def _clearness(fit: PointerFit) -> float:
+    return float(np.log(fit.strength) + 3.0 * (1.0 - fit.rival_ratio) + 2.0 * fit.supported)
+
+
+def _dial_circle(gray: Image, scale: float) -> tuple[float, float, float]:
+    """Middle and radius, both times `scale`, of the largest round outline about the picture's middle, or of the picture.
+
+    A small picture is looked at in about its own size: blown up, its edges would be too faint.
+    """
+    own = np.clip(max(gray.shape), LEAST_SIDE_PX, SIDE_PX) / max(gray.shape)
+    interpolation = cv2.INTER_AREA if own < 1 else cv2.INTER_CUBIC
+    picture = np.asarray(cv2.resize(gray, None, fx=own, fy=own, interpolation=interpolation), np.uint8)
+    height, width = picture.shape
+    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+    most = 0.52 * max(width, height)
+    circles = [
+        c
+        for c in find_circles(find_edges(picture, sigma_px=1.5), least_px=0.55 * most, most_px=most)
+        if np.hypot(c.u - middle[0], c.v - middle[1]) < 0.12 * most
+    ]
+    ratio = scale / own
+    if not circles:
+        return float(middle[0]) * ratio, float(middle[1]) * ratio, UNSEEN_RIM * min(width, height) * ratio
+    best = max(circles, key=lambda c: c.coverage * c.radius)
+    return best.u * ratio, best.v * ratio, best.radius * ratio
+
+
+def _glare(gray: Image, u: float, v: float, radius: float) -> NDArray[np.bool_] | None:
+    """(H, W) saturated spots, with their halos, that do not come from the dial's middle as a pointer does; None where there
+    are none, or where the face is so bright that a saturated part of it need not be a glare."""
+    y, x = np.mgrid[: gray.shape[0], : gray.shape[1]]
+    away = np.hypot(x - u, y - v)
+    face = float(np.median(gray[away < radius]))
+    if face > BRIGHT_FACE:
+        return None
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((gray >= WHITE_LEVEL).astype(np.uint8))
+    middle = np.unique(labels[away < 0.2 * radius])
+    least, most = (share * np.pi * radius**2 for share in (0.002, 0.15))
+    spots = [k for k in range(1, count) if k not in middle and least < stats[k, cv2.CC_STAT_AREA] < most]
+    if not spots:
+        return None
+    return _with_halo(np.isin(labels, spots), radius)
+
+
+def _with_halo(spots: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+    """(H, W) spots of glare as wide as they change the picture."""
+    size = round(HALO * radius) | 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    return np.asarray(cv2.dilate(spots.astype(np.uint8), kernel) > 0)
+
+
+def _reaches_hub(patch: Patch, angle_rad: float, radius: float) -> float:
+    """Share of the way from the hub to the numerals that looks like the pointer further out rather than like the face."""
+    turn = np.linspace(-np.pi, np.pi, 180)
+    outer = np.linspace(NUMERALS_FROM, TIP_AT, 12) * radius
+    inner = np.linspace(0.15, NUMERALS_FROM, 12) * radius
+    face = np.median(unroll(patch, (0.0, 0.0), outer, turn, None), axis=1)
+    beside = angle_rad + np.deg2rad(np.array([-2.0, 0.0, 2.0]))
+    pointer = unroll(patch, (0.0, 0.0), outer, beside, None).mean(axis=1)
+    contrast = float(np.median(pointer - face))
+    if contrast == 0:
+        return 0.0
+    # The pivot may lie off the dial's middle: the way in is a strip, as wide as that.
+    off = np.linspace(-PIVOT_OFF, PIVOT_OFF, 9) * radius
+    x = inner[:, None] * np.sin(angle_rad) + off * np.cos(angle_rad)
+    y = inner[:, None] * np.cos(angle_rad) - off * np.sin(angle_rad)
+    way = (patch.sample(x, y) - float(np.median(face))) / contrast
+    return float((way.max(axis=1) > 0.5).mean())
+
+
+def _channels(image: Image, gray: Image, disc: NDArray[np.bool_]) -> list[tuple[Image, float]]:
+    """Pictures in which a pointer may stand out, darker or brighter than the face, and the least contrast there."""
+    channels = [(gray, 0.0)]
+    if image.ndim == 3:
+        lab = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_RGB2LAB).astype(np.float32)
+        for k in (1, 2):
+            part = cv2.GaussianBlur(lab[:, :, k], (0, 0), 1.0)
+            low, high = np.percentile(part[disc], [2, 99.5])
+            if high - low >= 12.0:
+                gain = 220.0 / (high - low)
+                coded = np.clip((part - low) * gain + 10, 0, 255).astype(np.uint8)
+                channels.append((coded, LEAST_COLOUR * gain))
+    return channels
+
+
+def _patch(channel: Image, u: float, v: float) -> Patch:
+    return Patch(
+        gray=channel, colour=None, inside=np.ones(channel.shape, bool), px_per_m=1.0, image_px_per_m=1.0,
+        origin_px=np.array([u, v]), parallax_px_per_m=np.zeros(2), growth_per_m=0.0, plane_z_m=0.0,
+    )  # fmt: skip

@@ -1,0 +1,112 @@
+"""Seven-segment displays in photographs: a crop, or a scene in which the display must be found first."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.vision.image import Image, as_gray
+from perception.vision.photographs.digit_search import DigitRow, find_digit_rows
+from perception.vision.reading import Status, gated, limited, refused
+from perception.vision.status.comb_jit import slant_energies
+from perception.vision.status.display import read_window
+from perception.vision.status.glyphs import lit_segments
+
+DIGIT_WINDOW_PX = 64
+SCENE_PX = 640  # larger sides are reduced to this for the search
+ROWS_TRIED = 4
+ROOM_ABOVE, ROOM_BESIDE = 0.5, 1.6  # round a row's cells, over the digit height
+TURNS = np.tan(np.deg2rad(np.arange(-8.0, 8.1, 1.0)))  # looked for
+RIVAL = 0.3  # how much another text read nearby takes from the confidence
+FRAME = 0.08  # of a crop's height that a frame may take
+
+
+def read_photograph(image: NDArray[Any], *, scene: bool) -> Status:
+    """Text of the display in a photograph.
+
+    Args:
+        image: gray or RGB uint8.
+        scene: False when the image is cropped to the display.
+
+    Raises:
+        InvalidRequest, NotObservable: bad image.
+    """
+    gray = as_gray(image)
+    answers = [
+        (share, read_window(_straight(_scaled(window)), digits=None, decimals=None, dark=dark, framed=framed))
+        for window, dark, share in (_rows(gray) if scene else _crops(gray))
+        for framed in (True, False)
+    ]
+    if not answers:
+        return refused("no display is found in the picture: crop it, or come closer")
+    return _agreed(answers)
+
+
+def _agreed(answers: list[tuple[float, Status]]) -> Status:
+    """The answer that says most, less sure for every rival; the likeliest refusal where nothing was read.
+
+    Args:
+        answers: with the weight of the place where each was read.
+    """
+    weighed = [
+        (share * answer.confidence * float(np.sqrt(lit_segments(answer.text))), answer)
+        for share, answer in answers
+        if answer.text is not None
+    ]
+    if not weighed:
+        return max((answer for _, answer in answers), key=lambda answer: answer.confidence)
+    most, best = max(weighed, key=lambda pair: pair[0])
+    rivals: dict[str, float] = {}
+    for weight, answer in weighed:
+        if answer.text is not None and answer.text != best.text:
+            rivals[answer.text] = max(weight, rivals.get(answer.text, 0.0))
+    return gated(limited(best, best.confidence * most / (most + RIVAL * sum(rivals.values()))))
+
+
+def _crops(gray: Image) -> list[tuple[Image, bool | None, float]]:
+    """The whole crop, and the window inside its frame; polarity unknown, weight 1."""
+    inset = round(FRAME * len(gray))
+    inner = gray[inset : gray.shape[0] - inset, inset : gray.shape[1] - inset]
+    return [(part, None, 1.0) for part in ((gray, inner) if min(gray.shape) > 4 * inset + 24 else (gray,))]
+
+
+def _rows(gray: Image) -> list[tuple[Image, bool | None, float]]:
+    """The likeliest rows of digits in a scene, with a little room round them, their polarity and weight."""
+    scale = min(1.0, SCENE_PX / max(gray.shape))
+    small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else gray
+    rows = find_digit_rows(np.asarray(small, np.uint8))[:ROWS_TRIED]
+    found = [(_window(gray, row, scale), row.is_dark, float(np.sqrt(row.score / rows[0].score))) for row in rows]
+    return [place for place in found if min(place[0].shape) >= 12]
+
+
+def _window(gray: Image, row: DigitRow, scale: float) -> Image:
+    above, beside = ROOM_ABOVE * row.height, ROOM_BESIDE * row.height
+    x0, x1 = (max(0, round(x / scale)) for x in (row.left - beside, row.right + beside))
+    y0, y1 = (max(0, round(y / scale)) for y in (row.top - above, row.bottom + above))
+    return gray[y0:y1, x0:x1]
+
+
+def _scaled(window: Image) -> Image:
+    factor = DIGIT_WINDOW_PX / window.shape[0]
+    how = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(window, None, fx=factor, fy=factor, interpolation=how), np.uint8)
+
+
+def _straight(window: Image) -> Image:
+    """The window sheared so that its flat edges, of the digits and of the frame, are level.
+
+    The shear stands for a turn: what it leaves of that, a lean of the uprights, the reader looks for itself.
+    """
+    edges = np.abs(cv2.Sobel(cv2.GaussianBlur(window, (0, 0), 1.0), cv2.CV_32F, 0, 1))
+    energies = slant_energies(np.ascontiguousarray(edges.T), TURNS)
+    turn = -float(TURNS[int(energies.argmax())])
+    if turn == 0.0:
+        return window
+    shear = np.array([[1.0, 0.0, 0.0], [turn, 1.0, -turn * (window.shape[1] - 1) / 2]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(
+        cv2.warpAffine(window, shear, window.shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8
+    )

@@ -1,0 +1,246 @@
+"""Panel model to image: every model edge looks along its normal for an image edge, and the view follows them all.
+
+The scheme is that of C. Harris and C. Stennett, RAPID, BMVC 1990, with a shrinking search window, a prior from the
+known pose, and Cauchy weights (Huber, Robust Statistics, 1981) so that labels, shadows and cables do not pull.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from hal.panel import Panel
+from perception.vision.image import Image
+from perception.vision.registration.edge_search import strongest_edges
+from perception.vision.registration.outline import Outline, edges_of, plate_edges
+from perception.vision.view import Array, View
+
+WINDOWS_PX = (8.0, 5.0, 3.0, 2.0)  # search to either side; the pose is known to a few pixels
+LAST_LOOK_PX, NEAR_PX = 2.5, 2.0  # search at the end, and how near an edge confirms the model
+LEAST_NOISE = 0.3  # gray levels: the rounding
+SMOOTHING_SIGMA_PX = 0.8
+SLOPE_NOISE = 0.35  # of the central difference after that smoothing, over the image's noise
+EDGE_TO_NOISE = 4.0  # an edge counts when its slope exceeds that many sigmas of the slope's noise
+NORMAL_STEP_M = 1e-3
+MEASUREMENT_SIGMA_PX = 0.5
+GROWTH_SIGMA_PX = 2.0
+EDGE_BIAS_SIGMA_PX = 0.8  # a drawn or real cast shadow moves a whole outline by about 1 px
+REGISTERED_SIGMA_PX = 0.15  # of the panel as a whole
+MIN_VISIBLE = 16  # fewer edge samples in the image say nothing about the panel
+
+
+V = TypeVar("V", bound=View)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Registration:
+    """The view after registration and how well the model's edges were found.
+
+    Attributes:
+        view: the moved view.
+        covariance: of the motion parameters, after registration.
+        support: share of the visible model edges with an image edge within 2 px; NaN when too few are in view.
+        rms_px: of the supporting edges.
+        shift_px: per object name, the (2,) local shift on top of the view; zero where it could not be measured.
+        shift_sigma_px: per object name, one sigma of that shift's coordinates.
+        edge_share: per object name, the share of its own edges found; NaN for kinds without fixed edges.
+    """
+
+    view: View
+    covariance: Array
+    support: float
+    rms_px: float
+    shift_px: dict[str, Array]
+    shift_sigma_px: dict[str, float]
+    edge_share: dict[str, float]
+
+
+def register(gray: Image, view: View, panel: Panel) -> Registration:
+    """Move `view` so that the panel's edges lie on the image's.
+
+    Args:
+        gray: (H, W) uint8, as the camera saw it (distorted).
+        view: prediction, good to a few pixels.
+    """
+    image = edge_image(gray)
+    smooth, slope_noise = image.smooth, image.slope_noise
+    own = {thing.name: edges for thing in panel.objects if (edges := edges_of(thing)) is not None}
+    everything = _joined([plate_edges(panel), *own.values()])
+    covariance = np.diag(view.prior_sigma**2)
+    reference = view
+    delta = np.zeros(len(view.prior_sigma))
+    for window in WINDOWS_PX:
+        motion = _motion(reference, delta, everything.points_m)
+        delta, covariance = _step(
+            smooth, slope_noise, reference, delta, edges=everything, window_px=window, motion=motion
+        )
+    moved = reference.moved(delta)
+    found = _look(smooth, slope_noise, moved, everything, LAST_LOOK_PX)
+    near = found.ok & (np.abs(found.offset_px) <= NEAR_PX)
+    built_m = panel.tolerances.position_m
+    local = {name: _local_shift(smooth, slope_noise, moved, edges, built_m) for name, edges in own.items()}
+    return Registration(
+        view=moved,
+        covariance=covariance,
+        support=float(near.sum() / found.visible.sum()) if found.visible.sum() >= MIN_VISIBLE else float("nan"),
+        rms_px=float(np.sqrt(np.mean(found.offset_px[near] ** 2))) if near.any() else float("nan"),
+        shift_px={name: shift for name, (shift, _, _) in local.items()},
+        shift_sigma_px={name: sigma for name, (_, sigma, _) in local.items()},
+        edge_share={name: share for name, (_, _, share) in local.items()},
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EdgeImage:
+    """An image as edges are looked for in it: `smooth` (H, W) gray, and one sigma of a slope's noise."""
+
+    smooth: NDArray[np.float32]
+    slope_noise: float
+
+
+def edge_image(gray: Image) -> EdgeImage:
+    """Made once an image; `follow_edges` and `confirmed` may then be called often."""
+    smooth = np.asarray(cv2.GaussianBlur(gray.astype(np.float32), (0, 0), SMOOTHING_SIGMA_PX), np.float32)
+    slope_noise = SLOPE_NOISE * noise_sigma(gray)
+    return EdgeImage(smooth=smooth, slope_noise=slope_noise)
+
+
+def follow_edges(image: EdgeImage, view: V, outline: Outline, windows_px: Sequence[float]) -> V:
+    """`view` moved so that one outline lies on the image's edges; the view itself when too few are found."""
+    delta = np.zeros(len(view.prior_sigma))
+    motion = _motion(view, delta, outline.points_m)  # of a plane: hardly changes within a dozen pixels
+    for window in windows_px:
+        delta, _ = _step(image.smooth, image.slope_noise, view, delta, edges=outline, window_px=window, motion=motion)
+    return view.moved(delta)
+
+
+def confirmed(image: EdgeImage, view: View, outline: Outline) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(N,) which samples of the outline the image shows, and which of them have an edge within `NEAR_PX`."""
+    found = _look(image.smooth, image.slope_noise, view, outline, LAST_LOOK_PX)
+    return found.visible, found.ok & (np.abs(found.offset_px) <= NEAR_PX)
+
+
+def noise_sigma(gray: Image) -> float:
+    """Standard deviation of the pixel noise: J. Immerkaer, CVIU 64(2), 1996, with the median for the mean."""
+    if min(gray.shape) < 3:
+        return LEAST_NOISE
+    counts = _response_counts(gray[::2] if gray.size > 1_000_000 else gray)
+    median = int(np.searchsorted(np.cumsum(counts), (counts.sum() + 1) // 2))
+    return float(max(median / 0.6745 / 6.0, LEAST_NOISE))
+
+
+@njit(cache=True)
+def _response_counts(gray: Image) -> NDArray[np.int64]:  # pragma: no cover
+    """How often every magnitude of the response to [1 -2 1; -2 4 -2; 1 -2 1] occurs inside the image."""
+    height, width = gray.shape
+    counts = np.zeros(8 * 255 + 1, np.int64)
+    for v in range(1, height - 1):
+        for u in range(1, width - 1):
+            before = np.int32(gray[v - 1, u - 1]) - 2 * np.int32(gray[v, u - 1]) + np.int32(gray[v + 1, u - 1])
+            here = np.int32(gray[v - 1, u]) - 2 * np.int32(gray[v, u]) + np.int32(gray[v + 1, u])
+            after = np.int32(gray[v - 1, u + 1]) - 2 * np.int32(gray[v, u + 1]) + np.int32(gray[v + 1, u + 1])
+            counts[abs(before - 2 * here + after)] += 1
+    return counts
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Found:
+    offset_px: Array
+    normals_px: Array
+    visible: NDArray[np.bool_]
+    ok: NDArray[np.bool_]
+
+
+def _look(smooth: NDArray[np.float32], slope_noise: float, view: View, edges: Outline, window_px: float) -> _Found:
+    """The strongest image edge along every model normal: signed offset in px."""
+    points = view.project(edges.points_m)
+    ahead = view.project(
+        edges.points_m + NORMAL_STEP_M * np.column_stack([edges.normals, np.zeros(len(edges.normals))])
+    )
+    normals = ahead - points
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals / np.where(length > 0, length, 1.0)
+    offset, slope, visible = strongest_edges(smooth, points, normals, window_px)
+    ok = visible & (slope > EDGE_TO_NOISE * slope_noise + 0.5)
+    return _Found(offset_px=offset, normals_px=normals, visible=visible, ok=ok)
+
+
+def _ahead(view: View, edges: Outline) -> Array:
+    """(N, 2) what a step along every normal is in the image, px."""
+    step = NORMAL_STEP_M * np.column_stack([edges.normals, np.zeros(len(edges.normals))])
+    return view.project(edges.points_m + step) - view.project(edges.points_m)
+
+
+def _step(
+    smooth: NDArray[np.float32], slope_noise: float, reference: View, delta: Array, *, edges: Outline, window_px: float,
+    motion: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Two Gauss-Newton steps on the edges found in one window; `motion` (N, 2, P) is what `_motion` gives."""
+    sigma = reference.prior_sigma
+    information = np.diag(1.0 / sigma**2)
+    for _ in range(2):
+        view = reference.moved(delta)
+        found = _look(smooth, slope_noise, view, edges, window_px)
+        if found.ok.sum() < len(delta):
+            return delta, np.diag(sigma**2)
+        n = found.normals_px[found.ok]
+        J = (motion[found.ok] * n[:, :, None]).sum(axis=1)
+        r = found.offset_px[found.ok]
+        scale = max(1.4826 * float(np.median(np.abs(r))), MEASUREMENT_SIGMA_PX)
+        w = 1.0 / (1.0 + (r / (1.5 * scale)) ** 2) / scale**2
+        N = J.T @ (w[:, None] * J) + information
+        delta = delta + np.linalg.solve(N, J.T @ (w * r) - information @ delta)
+    return delta, np.asarray(np.linalg.inv(N), float)
+
+
+def _motion(reference: View, delta: Array, points_m: Array) -> Array:
+    """(N, 2, P) what the projected points do per unit of every motion parameter, by differences."""
+    base = reference.moved(delta).project(points_m)
+    out = np.empty((len(points_m), 2, len(delta)))
+    for k, sigma in enumerate(reference.prior_sigma):
+        bump = np.zeros(len(delta))
+        bump[k] = 1e-3 * sigma
+        out[:, :, k] = (reference.moved(delta + bump).project(points_m) - base) / bump[k]
+    return out
+
+
+def _local_shift(
+    smooth: NDArray[np.float32], slope_noise: float, view: View, edges: Outline, built_m: float
+) -> tuple[Array, float, float]:
+    """An object's own (2,) shift in px, its sigma, and the share of its edges found near the model.
+
+    `built_m` is one sigma of the object's place on the plate. The object's own edges carry a common error that more of
+    them do not average out: a cast shadow or a side wall moves all edges of one side.
+    """
+    scale_px_per_m = float(np.nanmedian(np.linalg.norm(_ahead(view, edges), axis=1))) / NORMAL_STEP_M
+    reach_px = edges.reach_m * scale_px_per_m
+    prior_px = float(np.hypot(REGISTERED_SIGMA_PX, built_m * scale_px_per_m))
+    found = _look(smooth, slope_noise, view, edges, float(np.clip(1.5 + reach_px, 4.0, 9.0)))
+    visible = int(found.visible.sum())
+    if found.ok.sum() < 6:
+        return np.zeros(2), prior_px, 0.0 if visible >= 6 else float("nan")
+    r = found.offset_px[found.ok]
+    # The third unknown is growth: a bezel or a printed ring may be the stronger edge, all around the object.
+    J = np.column_stack([found.normals_px[found.ok], np.ones(len(r))])
+    prior = np.diag([1e-6, 1e-6, 1 / (GROWTH_SIGMA_PX + reach_px) ** 2])
+    solution, N = np.array([0.0, 0.0, float(np.median(r))]), prior
+    for _ in range(4):
+        e = r - J @ solution
+        scale = max(1.4826 * float(np.median(np.abs(e))), 0.3)
+        w = 1.0 / (1.0 + (e / (1.5 * scale)) ** 2) / scale**2 / 2.0  # neighbouring samples share their noise
+        N = J.T @ (w[:, None] * J) + prior
+        solution = np.linalg.solve(N, J.T @ (w * r))
+    share = float((np.abs(r - J @ solution) < 1.5).sum() / max(1, visible))
+    measured = np.linalg.inv(N)[:2, :2] + np.eye(2) * EDGE_BIAS_SIGMA_PX**2
+    gain = np.linalg.inv(np.eye(2) / prior_px**2 + np.linalg.inv(measured))
+    return gain @ np.linalg.solve(measured, solution[:2]), float(np.sqrt(np.trace(gain) / 2)), share
+
+
+def _joined(outlines: list[Outline]) -> Outline:
+    return Outline(points_m=np.vstack([o.points_m for o in outlines]), normals=np.vstack([o.normals for o in outlines]))

@@ -1,0 +1,81 @@
+"""The border lights of a new panel: clicked on, or found in the four corners of its plate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hal.errors import InvalidRequest
+from perception.vision.finding.features import PLATE_PX_PER_M
+from perception.vision.teaching.sub_object import sub_objects
+from perception.vision.teaching.teach import Overview, plate_points
+from perception.vision.view import Array
+
+SIDES = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]], float)
+LIGHT_INSET_M = 0.015  # where lights are put when none are seen: the file says that it is a guess
+LIGHT_REACH_M = 0.06  # how far from its corner a border light may sit
+LIGHT_RADII_M = (0.003, 0.014)
+LIGHTS_AGREE_M = 0.006  # border lights sit alike in their corners
+SNAP_M = 0.006
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LightsFound:
+    """(4, 2) border lights on the plate, upper left first and clockwise; `are_seen` False: put there by a guess."""
+
+    places_m: Array
+    are_seen: bool
+
+
+def find_border_lights(overview: Overview, clicks_px: Sequence[tuple[float, float]] = ()) -> LightsFound:
+    """The four border lights: those clicked on, or the small circles that sit alike in the four corners.
+
+    Raises:
+        InvalidRequest: neither none nor four clicks.
+        NotFound: a click beside the plate.
+    """
+    if len(clicks_px) not in (0, 4):
+        raise InvalidRequest(
+            f"{len(clicks_px)} lights were clicked on", hint="click on all four border lights, or none"
+        )
+    half = np.array(overview.plate_m) / 2
+    low, high = LIGHT_RADII_M
+    round_ones = [
+        overview.on_plate(o.middle_px[None])[0]
+        for o in sub_objects(overview.ground)
+        if o.shape == "circle" and low <= o.size_px[0] / PLATE_PX_PER_M / 2 <= high
+    ]
+    circles = np.array(round_ones).reshape(-1, 2)
+    if len(clicks_px) == 4:
+        clicked = plate_points(overview.view, clicks_px, overview.plate_m)
+        places = np.array([_near(place, circles) for place in clicked])
+        return LightsFound(places_m=places[_clockwise(places)], are_seen=True)
+    corners = SIDES * half
+    found = [_in_corner(corner, circles) for corner in corners]
+    if all(place is not None for place in found):
+        insets = np.array([np.abs(corner - place) for corner, place in zip(corners, found, strict=True)])
+        if np.ptp(insets, axis=0).max() < LIGHTS_AGREE_M:
+            return LightsFound(places_m=np.array(found), are_seen=True)
+    return LightsFound(places_m=corners - SIDES * LIGHT_INSET_M, are_seen=False)
+
+
+def _in_corner(corner: Array, circles: Array) -> Array | None:
+    """The circle nearest to a corner of the plate, if one is near."""
+    away = np.abs(circles - corner).max(axis=1, initial=0.0)
+    near = np.flatnonzero(away < LIGHT_REACH_M)
+    return circles[near[int(away[near].argmin())]] if len(near) else None
+
+
+def _near(place: Array, circles: Array) -> Array:
+    """The middle of the circle that was clicked on, or the click."""
+    away = np.linalg.norm(circles - place, axis=1)
+    return np.asarray(circles[int(away.argmin())] if len(away) and away.min() < SNAP_M else place)
+
+
+def _clockwise(places: Array) -> list[int]:
+    """Order of four places: upper left, upper right, lower right, lower left."""
+    rows = np.argsort(-places[:, 1], kind="stable")
+    (a, b), (c, d) = (sorted(rows[k : k + 2], key=lambda i: float(places[i, 0])) for k in (0, 2))
+    return [int(a), int(b), int(d), int(c)]

@@ -1,0 +1,271 @@
+"""Teaching: one image and at most three clicks make a new kind, or a further look of a known one.
+
+A further look is only taken when it takes nothing away from another kind: every look that the others were taught keeps
+its own kind as the likest. `check` shows what the system now finds. Whole panels: `panel_teach`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hal.errors import Ambiguous, InvalidRequest, NotFound
+from perception.vision.finding.blind import PLATE_M, Candidate, candidate_places, chosen, lay_out, recognise
+from perception.vision.finding.features import PLATE_PX_PER_M, Ground, look_at
+from perception.vision.finding.framing import one_plate
+from perception.vision.finding.match import distances
+from perception.vision.image import as_gray
+from perception.vision.knowledge import NOTHING, Kind, Knowledge
+from perception.vision.teaching.sub_object import SubObject, outline_at
+from perception.vision.view import Array, View, homography
+
+SNAP_M = 0.004  # a click is taken to the middle of the sub-object that lies that near
+ABOUT_M = 0.012  # further middles of the same object: hub and face of a gauge are not quite concentric
+SAME_LOOK = 0.10  # a look this near to one already taught teaches nothing
+ROBBED = 0.2  # a taught look that near to the new one could be taken for it
+NOTHING_SIZE_M = (0.010, 0.010)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Overview:
+    """An image of one panel, laid straight: made once, taught from as often as wanted."""
+
+    view: View
+    ground: Ground
+    plate_m: tuple[float, float]
+
+    def on_ground(self, points_m: ArrayLike) -> Array:
+        """(N, 2) plate points (m, origin in the middle, y up) as pixels of the rectified plate."""
+        points = np.asarray(points_m, float)
+        half = np.array(self.plate_m) / 2
+        return np.asarray(np.column_stack([points[:, 0] + half[0], half[1] - points[:, 1]]) * PLATE_PX_PER_M)
+
+    def on_plate(self, points_px: ArrayLike) -> Array:
+        """The inverse of `on_ground`."""
+        points = np.asarray(points_px, float) / PLATE_PX_PER_M
+        return np.column_stack([points[:, 0] - self.plate_m[0] / 2, self.plate_m[1] / 2 - points[:, 1]])
+
+    def in_image(self, points_m: ArrayLike) -> Array:
+        """(N, 2) pixels of the image under plate points."""
+        points = np.asarray(points_m, float)
+        return self.view.project(np.column_stack([points, np.zeros(len(points))]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Example:
+    """What was clicked on.
+
+    Attributes:
+        clicks_m: (1..3, 2) on the plate.
+        centre_m: (2,) middle of the sub-object, on the plate (origin in its middle, y up).
+        outline: what was found about it on the rectified plate; None only for `nothing`.
+        outline_px: (N, 2) the same in the image; (0, 2) where there is none.
+        size_m: width and height of the outline on the plate.
+        look: (LENGTH,) see `features`.
+    """
+
+    clicks_m: Array
+    centre_m: Array
+    outline: SubObject | None
+    outline_px: Array
+    size_m: tuple[float, float]
+    look: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Lesson:
+    """What a teaching step made of it.
+
+    Attributes:
+        knowledge: with the new look.
+        kind: the kind that was taught.
+        example: what was clicked on.
+        is_new_kind: whether the kind did not exist before.
+        added: False when the look was known already.
+    """
+
+    knowledge: Knowledge
+    kind: Kind
+    example: Example
+    is_new_kind: bool
+    added: bool
+
+    @property
+    def centre_m(self) -> Array:
+        """(2,) where on the plate (origin in its middle, y up)."""
+        return self.example.centre_m
+
+
+def teach(
+    image: NDArray[Any], knowledge: Knowledge, *, kind: str, clicks_px: Sequence[tuple[float, float]],
+    size_m: tuple[float, float] | None = None, plate_m: tuple[float, float] = PLATE_M, view: View | None = None,
+    source: str = "",
+) -> Lesson:  # fmt: skip
+    """Teach that there is a `kind` at the clicked place.
+
+    Args:
+        clicks_px: one click in the middle, or two on opposite corners, or three: two corners and the middle, where
+            that is not half way.
+        size_m: width and height on the plate; from the outline found or the kind if left out.
+        source: a remark for the knowledge file.
+
+    Raises:
+        InvalidRequest: no or too many clicks.
+        NotFound: no plate, the click is not on it, or nothing is there.
+        Ambiguous: two panels are in view, or the look would take examples away from another kind; says which.
+    """
+    overview = overview_of(image, plate_m=plate_m, view=view)
+    return teach_example(
+        example_at(overview, clicks_px, needs_outline=kind != NOTHING),
+        knowledge, kind=kind, size_m=size_m, source=source,
+    )  # fmt: skip
+
+
+def overview_of(image: NDArray[Any], *, plate_m: tuple[float, float] = PLATE_M, view: View | None = None) -> Overview:
+    """The image of one panel, ready to be taught from.
+
+    Raises:
+        InvalidRequest, NotObservable: bad image.
+        NotFound, Ambiguous: no plate in it, or two.
+    """
+    gray = as_gray(image)
+    view = view or one_plate(gray, plate_m).view
+    return Overview(view=view, ground=lay_out(gray, view, plate_m), plate_m=plate_m)
+
+
+def example_at(overview: Overview, clicks_px: Sequence[tuple[float, float]], *, needs_outline: bool = True) -> Example:
+    """The object at one to three clicks.
+
+    Raises:
+        InvalidRequest: no or too many clicks.
+        NotFound: a click beside the plate, or nothing there.
+    """
+    if not 1 <= len(clicks_px) <= 3:
+        raise InvalidRequest(f"{len(clicks_px)} clicks", hint="click the middle, or two opposite corners, or both")
+    clicks_m = plate_points(overview.view, clicks_px, overview.plate_m)
+    clicks = overview.on_ground(clicks_m)
+    outline = outline_at(overview.ground, clicks) if needs_outline else None
+    middle = clicks[0] if len(clicks) == 1 else clicks[:2].mean(axis=0) if len(clicks) == 2 else clicks[2]
+    place = _snapped(middle, candidate_places(overview.ground.edges))
+    empty = np.zeros((0, 2))
+    outline_px = overview.in_image(overview.on_plate(outline.polygon_px)) if outline is not None else empty
+    return Example(
+        clicks_m=clicks_m,
+        centre_m=overview.on_plate(place[None])[0],
+        outline=outline,
+        outline_px=outline_px,
+        size_m=_size_m(clicks_m, outline),
+        look=look_at(overview.ground, place[None])[0],
+    )
+
+
+def teach_example(
+    example: Example, knowledge: Knowledge, *, kind: str, size_m: tuple[float, float] | None = None, source: str = ""
+) -> Lesson:
+    """Add an example to a kind; see `teach`.
+
+    Raises:
+        Ambiguous: the look would take examples away from another kind; says which.
+    """
+    known, look = knowledge.kind(kind), example.look
+    if known is not None and float(distances(look[None], _only(knowledge, known))[0, 0]) < SAME_LOOK:
+        return Lesson(knowledge=knowledge, kind=known, example=example, is_new_kind=False, added=False)
+    robbed = robbed_kinds(knowledge, kind, look)
+    if robbed:
+        raise Ambiguous(
+            f"this {kind} looks so much like {', '.join(robbed)} that it would be taken for it",
+            hint="take the image closer or with other light, or check what you clicked on",
+            kinds=list(robbed),
+        )
+    size_m = size_m or (known.size_m if known is not None else example.size_m)
+    grown = knowledge.with_look(kind, size_m, look, taught_by=source)
+    made = grown.kind(kind)
+    if made is None:
+        raise AssertionError("a look was added to it")
+    return Lesson(knowledge=grown, kind=made, example=example, is_new_kind=known is None, added=True)
+
+
+def likest(overview: Overview, example: Example, knowledge: Knowledge) -> Candidate | None:
+    """What the example is taken for now, with the reason if it is refused; None: unlike everything taught."""
+    places = candidate_places(overview.ground.edges)
+    middle = overview.on_ground(example.centre_m[None])[0]
+    if example.outline is not None:
+        places = np.vstack([places, middle, example.outline.middle_px])
+    near = places[np.linalg.norm(places - middle, axis=1) < ABOUT_M * PLATE_PX_PER_M]
+    looks = look_at(overview.ground, near)
+    found = chosen(overview.ground, near, looks, knowledge, overview.view, overview.plate_m)
+    return found[0] if found else None
+
+
+def robbed_kinds(knowledge: Knowledge, kind: str, look: Array) -> tuple[str, ...]:
+    """Kinds of which a taught look would be liker to the new look than to the rest of its own kind."""
+    new = Kind(name=kind, size_m=NOTHING_SIZE_M, looks=look[None])
+    robbed = []
+    for other in knowledge.kinds:
+        if other.name == kind:
+            continue
+        to_new = distances(other.looks, _only(knowledge, new))[:, 0]
+        for k in np.flatnonzero(to_new < ROBBED):
+            if to_new[k] < _to_own_kind(knowledge, other, int(k)):
+                robbed.append(other.name)
+                break
+    return tuple(robbed)
+
+
+def _to_own_kind(knowledge: Knowledge, kind: Kind, index: int) -> float:
+    """How far one look of a kind is from the kind's others; infinity for an only one."""
+    if len(kind.looks) < 2:
+        return float("inf")
+    rest = Kind(name=kind.name, size_m=kind.size_m, looks=np.delete(kind.looks, index, axis=0))
+    return float(distances(kind.looks[index][None], _only(knowledge, rest))[0, 0])
+
+
+def check(
+    image: NDArray[Any], knowledge: Knowledge, *, plate_m: tuple[float, float] = PLATE_M, view: View | None = None
+) -> tuple[Candidate, ...]:
+    """What the system finds now: the objects first, then what it refuses and why."""
+    return recognise(image, knowledge, plate_m=plate_m, view=view)
+
+
+def plate_points(view: View, clicks_px: ArrayLike, plate_m: tuple[float, float]) -> Array:
+    """(N, 2) plate points (m, origin in the middle, y up) under pixels.
+
+    Raises:
+        NotFound: a click lies beside the plate.
+    """
+    w, h = plate_m[0] / 2, plate_m[1] / 2
+    corners = np.array([[-w, h], [w, h], [w, -h], [-w, -h]])
+    plate_from_px = homography(view.project(np.column_stack([corners, np.zeros(4)])), corners)
+    clicks = np.asarray(clicks_px, float)
+    u = np.column_stack([clicks, np.ones(len(clicks))]) @ plate_from_px.T
+    points = u[:, :2] / u[:, 2:]
+    if (np.abs(points) > [w, h]).any():
+        raise NotFound("a click lies beside the plate", hint="click on the object")
+    return np.asarray(points)
+
+
+def _size_m(clicks_m: Array, outline: SubObject | None) -> tuple[float, float]:
+    """Of the outline; of `nothing` what the clicks span."""
+    if outline is not None:
+        width, height = outline.size_px / PLATE_PX_PER_M
+        return float(width), float(height)
+    if len(clicks_m) < 2:
+        return NOTHING_SIZE_M
+    width, height = np.maximum(np.abs(clicks_m[0] - clicks_m[1]), 1e-3)
+    return float(width), float(height)
+
+
+def _snapped(place: Array, candidates: Array) -> Array:
+    if not len(candidates):
+        return place
+    away = np.linalg.norm(candidates - place, axis=1)
+    nearest = int(away.argmin())
+    return np.asarray(candidates[nearest] if away[nearest] < SNAP_M * PLATE_PX_PER_M else place)
+
+
+def _only(knowledge: Knowledge, kind: Kind) -> Knowledge:
+    return Knowledge(kinds=(kind,), spread=knowledge.spread)

@@ -1,0 +1,85 @@
+"""The paper's direct route, and the compiled three-point solver under it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hal.errors import InvalidRequest, NotObservable
+from perception.vision.quadrangle.cost import chi_square, expand, rotation_of
+from perception.vision.quadrangle.direct import direct_poses, three_light_poses
+from perception.vision.quadrangle.three_point import real_cubic_root
+from tests.perception.vision.quadrangle.quadrangle_cases import CAMERA, RECTANGLE, SHAPES, angle_deg, pixels_of, view
+
+FULL = sorted(name for name in SHAPES if name != "three in a row")
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**31), shape=st.sampled_from(FULL), tilt_deg=st.floats(1.0, 70.0))
+def test_every_three_light_pose_meets_its_pixels_and_one_is_the_truth(seed: int, shape: str, tilt_deg: float) -> None:
+    true = view(np.random.default_rng(seed), shape, tilt_deg=tilt_deg)
+    poses = three_light_poses(true.points_m[:3], true.pixels[:3], CAMERA)
+    assert 1 <= len(poses) <= 4
+    nearest = min(angle_deg(R, true.R) for R, _ in poses)
+    assert nearest < 0.5  # near a double root the solution is only as good as the square root of the rounding
+    if nearest < 1e-3:
+        for R, t in poses:
+            np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
+            assert np.abs(pixels_of(true.points_m[:3], R, t) - true.pixels[:3]).max() < 1.0
+
+
+def test_the_fourth_light_picks_the_true_pose() -> None:
+    rng = np.random.default_rng(11)
+    right = 0
+    for _ in range(60):
+        true = view(rng, "rectangle", tilt_deg=float(rng.uniform(10, 60)))
+        best = direct_poses(true.points_m, true.pixels, CAMERA)[0]
+        right += angle_deg(best.rotation, true.R) < 0.1 and best.fourth_error_px < 0.05
+    assert right >= 58
+
+
+def test_the_direct_route_reports_how_far_the_fourth_light_is_off() -> None:
+    true = view(np.random.default_rng(1), "rectangle", tilt_deg=30.0)
+    pixels = true.pixels + np.array([[0, 0], [0, 0], [0, 0], [9.0, 0.0]])
+    assert direct_poses(true.points_m, pixels, CAMERA)[0].fourth_error_px == pytest.approx(9.0, abs=0.1)
+
+
+def test_three_lights_on_a_line_are_refused() -> None:
+    true = view(np.random.default_rng(1), "three in a row", tilt_deg=30.0)
+    with pytest.raises(NotObservable, match="one line"):
+        direct_poses(true.points_m, true.pixels, CAMERA)
+
+
+def test_wrong_shapes_are_refused() -> None:
+    with pytest.raises(InvalidRequest, match=r"\(4, 3\)"):
+        direct_poses(RECTANGLE[:3], np.ones((4, 2)), CAMERA)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.floats(-50, 50), st.floats(-50, 50), st.floats(-50, 50))
+def test_the_cubic_root_is_the_largest_real_one(b: float, c: float, d: float) -> None:
+    root = real_cubic_root(b, c, d)
+    real = [r.real for r in np.roots([1.0, b, c, d]) if abs(r.imag) < 1e-6 * (1 + abs(r))]
+    assert min(abs(root - r) for r in real) < 1e-4 * (1 + abs(root))
+
+
+def test_gradient_and_hessian_agree_with_finite_differences() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        X, m = 0.1 * rng.normal(size=(4, 3)), 0.1 * rng.normal(size=(4, 2))
+        A = np.tile([3e3, 5e2, 2e3], (4, 1))
+        R, t = rotation_of(rng.normal(size=3)), np.array([0.1, 0.05, 1.0])
+        g, N, H = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
+        cost = expand(R, t, X, m, A, g, N, H)
+
+        def at(x: np.ndarray, R: np.ndarray = R, t: np.ndarray = t, rest: tuple = (X, m, A)) -> float:
+            return float(chi_square(rotation_of(x[3:]) @ R, t + x[:3], *rest))
+
+        e = 1e-4 * np.eye(6)
+        assert cost == pytest.approx(at(np.zeros(6)))
+        numeric_g = np.array([at(a) - at(-a) for a in e]) / 4e-4
+        numeric_h = np.array([[at(a + b) - at(a - b) - at(b - a) + at(-a - b) for a in e] for b in e]) / 8e-8
+        np.testing.assert_allclose(g, numeric_g, atol=1e-5 * np.abs(g).max())
+        np.testing.assert_allclose(H, numeric_h, atol=1e-5 * np.abs(H).max())

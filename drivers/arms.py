@@ -120,7 +120,8 @@ def capabilities(
 class SetPointFilter:
     """The last check before the drive: shape, finiteness, limits, and no jump from the last set-point.
 
-    Any thread may close it: a lost link does, while the control thread has a set-point in hand.
+    Any thread may close it: a stop or a lost link does, while the control thread has a set-point in hand or is just
+    enabling the drives.
     """
 
     def __init__(self, name: str, k: KinematicsOptions, *, command_rate_hz: float) -> None:
@@ -130,12 +131,41 @@ class SetPointFilter:
         self._period_s = 1.0 / command_rate_hz
         self._last: Array | None = None
         self._last_s = 0.0
+        self._closings = 0
         self._passing = threading.Lock()
 
-    def begin(self, measured_rad: Array | None) -> None:
-        """Commands start from here; None refuses all commands."""
+    @property
+    def closings(self) -> int:
+        """How often it was closed; who enables the drives looks before he begins."""
+        return self._closings
+
+    def check_not_closed_since(self, closings: int) -> None:
+        """Raise `MotionRefused` when it was closed after `closings` was looked at."""
+        if self._closings != closings:
+            raise MotionRefused(
+                f"{self._name}: stopped, or its link lost, while the drives were being enabled",
+                hint="look at the arm, then command again",
+                device=self._name,
+            )
+
+    def begin(self, measured_rad: Array, *, closings: int) -> None:
+        """Set-points start from here.
+
+        Args:
+            closings: as it was when the enabling began: a stop since then must win, or the arm would move after it.
+
+        Raises:
+            MotionRefused: closed meanwhile.
+        """
         with self._passing:
+            self.check_not_closed_since(closings)
             self._last = measured_rad
+
+    def close(self) -> None:
+        """Refuse all set-points, also those of an enabling that has begun."""
+        with self._passing:
+            self._last = None
+            self._closings += 1
 
     @property
     def is_open(self) -> bool:

@@ -111,7 +111,7 @@ class Cia402(StreamDevice[JointState]):
         self._targets = dict.fromkeys(options.nodes, 0)
         self._is_wanted = False  # operation enabled is wanted
         self._is_reset = False  # a fault reset was asked for
-        self._commands = threading.Lock()
+        self._commands = threading.RLock()
         self._next_sync_s = 0.0
         self._syncs = self._published = 0
         self._sync_s = [0.0] * MOST_KNOWN
@@ -133,18 +133,22 @@ class Cia402(StreamDevice[JointState]):
 
         Raises:
             DeviceFault: a drive stays in fault. DeviceTimeout: it does not get there in time.
+            MotionRefused: stopped meanwhile.
         """
+        closings = self._filter.closings
         measured = self.newest(deadline).value.position_rad
         with self._commands:
+            self._filter.check_not_closed_since(closings)
             self._targets = self._increments(measured)
             self._is_reset = self._is_wanted = True
         rest, until_s = threading.Event(), wall_until(deadline)
         while not self._all_in(DriveState.OPERATION_ENABLED):
+            self._filter.check_not_closed_since(closings)
             if now_s() >= until_s:
-                self._is_wanted = False
+                self._switch_off()
                 raise self._not_enabled()
             rest.wait(0.5 / self._options.rate_hz)
-        self._filter.begin(measured)
+        self._filter.begin(measured, closings=closings)
 
     def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:  # noqa: ARG002  # nothing waits
         """The targets of the next SYNC."""
@@ -285,8 +289,9 @@ class Cia402(StreamDevice[JointState]):
         return all(axis.state is state for axis in self._axes.values())
 
     def _switch_off(self) -> None:
-        self._is_wanted = self._is_reset = False
-        self._filter.begin(None)
+        with self._commands:  # an `enable` that has looked whether it may must not want the drives on after this
+            self._is_wanted = self._is_reset = False
+            self._filter.close()
 
     def _not_enabled(self) -> DeviceFault | DeviceTimeout:
         states = ", ".join(f"{node}: {axis.state}" for node, axis in self._axes.items())

@@ -93,11 +93,16 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
         return self.newest(deadline)
 
     def enable(self, *, deadline: Deadline) -> None:
-        """Torque on with the measured position as goal; arms the bus watchdogs."""
+        """Torque on with the measured position as goal; arms the bus watchdogs.
+
+        Raises:
+            MotionRefused: stopped meanwhile; the torque holds the arm where it is.
+        """
+        closings = self._filter.closings
         measured = self.newest(deadline).value.position_rad
         self._pending.clear()
         self.call(lambda client, until_s: self._torque_on(client, measured, until_s), deadline)
-        self._filter.begin(measured)
+        self._filter.begin(measured, closings=closings)
 
     def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:
         """One goal for all servos in one packet; on a bus that stays busy it goes out before the next poll."""
@@ -122,7 +127,7 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
         """Hold where the arm is: torque stays on, so that it does not fall; goals are refused until `enable`."""
         self.require_open()
         was_open = self._filter.is_open
-        self._filter.begin(None)
+        self._filter.close()
         self._pending.clear()
         if was_open:
             here = self._goals(self.newest(deadline).value.position_rad)
@@ -130,7 +135,7 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
 
     def set_up(self, client: DynamixelClient) -> None:
         """Each servo must answer; motion stays off until `enable`."""
-        self._filter.begin(None)
+        self._filter.close()
         for id_, mode in self._read_modes(client).items():
             if mode != POSITION_MODE:
                 raise Refused(f"servo {id_} is in mode {mode}, not {POSITION_MODE} (position)", code=mode)
@@ -185,7 +190,7 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
     def fail(self, error: Exception) -> None:
         """A servo's error report or a lost bus takes the motion with it."""
         if not isinstance(error, NoAnswer | BadAnswer):
-            self._filter.begin(None)
+            self._filter.close()
         super().fail(error)
 
     def _torque_on(self, client: DynamixelClient, measured: Array, until_s: float) -> None:

@@ -126,7 +126,9 @@ class Ur(StreamDevice[JointState]):
 
         Raises:
             DeviceFault: the robot is not running, or stopped by its safety system; a person must see to it.
+            MotionRefused: stopped meanwhile.
         """
+        closings = self._filter.closings
         measured = self.newest(deadline).value.position_rad
         self._require_healthy()
         with self._commands:
@@ -134,7 +136,11 @@ class Ur(StreamDevice[JointState]):
             self._send_registers(measured, deadline)  # before the program: its first target is where the arm stands
             self._run_script(servo_program(self._options), deadline)
             self._was_playing, self._enabled_s = False, now_s()
-            self._filter.begin(measured)
+            try:
+                self._filter.begin(measured, closings=closings)
+            except MotionRefused:
+                self._brake(deadline)  # the program may have come after the stop's own
+                raise
 
     def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:
         """One set-point into the registers, with a beat of the heart."""
@@ -150,12 +156,15 @@ class Ur(StreamDevice[JointState]):
     def stop(self, *, deadline: Deadline) -> None:
         """Brake: `stopj` replaces the servo program."""
         self.require_open()
-        self._filter.begin(None)
+        self._filter.close()
+        self._brake(deadline)
+
+    def _brake(self, deadline: Deadline) -> None:
         self._run_script(f"stopj({self._options.brake_rad_per_s2})\n", deadline)
 
     def start(self, link: Link) -> None:
         """Set up recipes and stream; motion stays off."""
-        self._filter.begin(None)
+        self._filter.close()
         self._session.begin(link, outputs=OUTPUTS, rate_hz=self._options.rate_hz, inputs=INPUTS)
         self._host.reset()
         self._last_device_s = 0.0
@@ -197,15 +206,15 @@ class Ur(StreamDevice[JointState]):
 
     def lost(self, error: Exception) -> None:
         """A lost link takes the motion with it."""
-        self._filter.begin(None)
+        self._filter.close()
         super().lost(error)
 
     def release(self) -> None:
         """Brake if the arm was enabled, then let go."""
         if self._filter.is_open:
-            self._filter.begin(None)
+            self._filter.close()
             with suppress(Exception):
-                self._run_script(f"stopj({self._options.brake_rad_per_s2})\n", Deadline.after(WallClock(), 0.05))
+                self._brake(Deadline.after(WallClock(), 0.05))
         super().release()
         self._close_script()
 
@@ -214,7 +223,7 @@ class Ur(StreamDevice[JointState]):
 
     def _require_healthy(self) -> None:
         if not self._is_healthy():
-            self._filter.begin(None)
+            self._filter.close()
             raise DeviceFault(
                 f"{self.name} is not ready: robot mode {self._modes.robot}, safety mode {self._modes.safety}",
                 hint="look at the pendant: power on, release the brakes, unlock a protective stop",
@@ -230,7 +239,7 @@ class Ur(StreamDevice[JointState]):
             what, hint = "does not start", "set the robot to remote control"
         else:
             return
-        self._filter.begin(None)
+        self._filter.close()
         raise MotionRefused(f"{self.name}: the servo program {what}", hint=hint, device=self.name)
 
     def _send_registers(self, position_rad: Array, deadline: Deadline) -> None:

@@ -1,16 +1,20 @@
-"""The last check of set-points before the drives."""
+"""The last check of set-points before the drives, and what a stop is worth that comes while they are enabled."""
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
 from drivers.arms import KinematicsOptions, SetPointFilter, kinematics_of
+from drivers.emulators import cia402, dynamixel, ur
 from drivers.emulators.scripted import ScriptedArm
+from hal.clock import Deadline, SimClock
 from hal.errors import InvalidRequest, MotionRefused
+from tests.drivers.rigs import soon, until, wired
 
 HERE = np.zeros(6)
 
@@ -34,8 +38,8 @@ class Interrupting:
 
 def test_a_link_that_is_lost_while_a_set_point_passes_leaves_the_drives_off() -> None:
     filter_ = make_filter()
-    filter_.begin(HERE)
-    lose = threading.Thread(target=lambda: filter_.begin(None))
+    filter_.begin(HERE, closings=0)
+    lose = threading.Thread(target=filter_.close)
     filter_._velocity = Interrupting(filter_._velocity, lose)  # loses the link inside the check
     np.testing.assert_allclose(filter_.passed(HERE, 1.0), HERE)
     lose.join()
@@ -46,9 +50,47 @@ def test_a_link_that_is_lost_while_a_set_point_passes_leaves_the_drives_off() ->
 
 def test_a_leap_is_cut_to_what_the_joints_can_do_and_nonsense_is_refused() -> None:
     filter_ = make_filter()
-    filter_.begin(HERE)
+    filter_.begin(HERE, closings=0)
     sent = filter_.passed(np.full(6, 3.0), 1.0)
     assert np.all(sent > 0.0) and np.all(sent < 1.0)
     for wanted in (np.full(6, np.nan), np.zeros(5)):
         with pytest.raises(InvalidRequest, match="finite joint angles"):
             filter_.passed(wanted, 1.01)
+
+
+class StoppingClock(SimClock):
+    """Calls `stop` when it is asked for the time for the n-th time: at a known place inside the call that asks."""
+
+    def __init__(self, stop: Callable[[], None], *, at: int) -> None:
+        super().__init__()
+        self._stop, self._left = stop, at
+
+    def now_s(self) -> float:
+        self._left -= 1
+        if self._left == 0:
+            self._stop()
+        return super().now_s()
+
+
+@pytest.mark.parametrize(
+    ("emulator", "driver", "at"),
+    [
+        *[(ur, "ur:rtde", at) for at in (1, 2, 3)],
+        *[(cia402, "can:cia402", at) for at in (1, 2)],
+        *[(dynamixel, "serial:dynamixel", at) for at in (1, 2)],
+    ],
+)
+def test_a_stop_that_comes_while_the_drives_are_enabled_wins(emulator: Any, driver: str, at: int) -> None:
+    arm = ScriptedArm()
+    with wired(emulator.start(arm, {}), driver) as device:
+        clock = StoppingClock(lambda: device.stop(deadline=soon()), at=at)
+        with pytest.raises(MotionRefused, match="while the drives were being enabled"):
+            device.enable(deadline=Deadline(2.0, clock))
+        assert clock._left <= 0, "the stop came inside"
+        with pytest.raises(MotionRefused, match="the drives are off"):
+            device.command_position(arm.position_rad, deadline=soon())
+        if emulator is not dynamixel:  # its torque stays on, so that the arm does not fall
+            until(lambda: not arm.is_enabled)
+        assert arm.commands == 0
+        device.enable(deadline=soon())
+        device.command_position(arm.position_rad, deadline=soon())

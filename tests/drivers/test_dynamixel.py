@@ -95,7 +95,7 @@ def test_after_a_stop_no_pending_set_point_goes_out() -> None:
         here = device.read_state(deadline=soon()).value.position_rad
         with device.bus._lock:
             device.command_position(here + 0.02, deadline=soon(0.02))
-            device._filter.begin(None)
+            device._filter.close()
         device.newest(soon(), not_before_s=soon(0.0).at_s + 0.1)
         np.testing.assert_allclose(arm.position_rad, here, atol=RAD_PER_COUNT)
 

@@ -181,11 +181,11 @@ class Controller:
 
     def _hold(self) -> None:
         """One tick between motions on a wall clock: the arm stays, its watchdog quiet, the state fresh."""
+        if self._is_latched():  # before the devices: one of them may be dead, and the drives must go off all the same
+            self._drives.switch_off()
         with suppress(DeviceFailure):
             sample = self._read()
-            if self._is_latched():
-                self._drives.switch_off()
-            elif self._drives.are_on:
+            if self._drives.are_on:
                 self._send(self._filter.last_rad)
             self._newest = sample
         self._drives.pass_tick()

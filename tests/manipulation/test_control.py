@@ -231,6 +231,17 @@ def test_the_latch_stops_a_motion_and_refuses_the_next(rig: Rig) -> None:
         rig.controller.execute(forwards(0.1))
 
 
+@pytest.mark.parametrize("dead", ["arm", "gripper", "wrist_ft", "finger_touch", "proximity_left"])
+def test_a_stop_between_motions_switches_the_drives_off_though_a_device_is_dead(rig: Rig, dead: str) -> None:
+    assert rig.controller.execute(Hold(name="still", duration_s=0.02)).outcome is MotionOutcome.COMPLETED
+    assert rig.world.enabled
+    rig.world.silent.add(dead)
+    rig.world.clock.sleep(1.0)  # longer than anybody's patience
+    rig.latched[0] = True
+    rig.controller._hold()  # what the control thread does each tick on a wall clock
+    assert not rig.world.enabled
+
+
 def test_after_a_stop_the_first_set_point_is_the_measured_position(rig: Rig) -> None:
     rig.world.before_step = lambda: rig.latched.__setitem__(0, rig.world.ticks == 200)
     rig.controller.execute(forwards(0.1))

@@ -8,14 +8,16 @@ import socket
 import threading
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
 from pydantic import BaseModel
 
 from hal.config import Cell, DeviceSection
-from hal.errors import CellError, DeviceUnavailable, InvalidRequest, Stopped
+from hal.errors import CellError, DeviceUnavailable, InvalidRequest, LeaseError, Stopped
 from service.calibrations import Calibrations
+from service.errors import NotPossibleNow
 from service.gate import GatedConnection
 from service.journal import Journal
 from service.lease import LeaseDesk
@@ -26,7 +28,7 @@ from service.task_model import Artefact, Task, TaskState
 from service.tasks import TaskContext, TaskStore
 
 RESTORED_TASKS = 100
-LEASE_LOOK_S = 0.05
+LOOK_S = 0.05
 log = logging.getLogger(__name__)
 
 
@@ -77,7 +79,7 @@ class Service:
             CellError: it could not start.
         """
         self.note("service-start", {"cell": self.cell.name, "mode": self.cell.file.cell.mode})
-        threading.Thread(target=self._watch_lease, name="watch-lease", daemon=True).start()
+        threading.Thread(target=self._watch, name="watch", daemon=True).start()
         self.supervisor.start()
 
     def submit(self, verb: str, request: BaseModel, *, lease_token: str | None = None, key: str | None = None) -> Task:
@@ -97,14 +99,19 @@ class Service:
         moves = operation.may_move(request)
         holder = self.lease.check(lease_token) if moves else None
         self._check_cell()
-        if moves and self.supervisor.latch.is_set():
-            raise stopped(self.supervisor.latch.state().source)
+        latch = self.supervisor.latch.state()
+        if moves and latch.is_latched:
+            raise stopped(latch.source)
 
         def work(task: TaskContext) -> Any:
+            def check_may_move() -> None:
+                task.check_cancelled()
+                self._check_not_stopped_since(latch.count)
+
             return operation.run(
                 OperationContext(
                     connection=GatedConnection(
-                        self.supervisor.connection, task.check_cancelled, cell=self.calibrations.applied()
+                        self.supervisor.connection, check_may_move, cell=self.calibrations.applied()
                     ),
                     task=task,
                     runs_dir=self.runs_dir,
@@ -114,7 +121,19 @@ class Service:
             )
 
         plain = request.model_dump(mode="json")
-        return self.tasks.start(verb, plain, work, moves=moves, holder=holder, key=key)
+        task = self.tasks.start(verb, plain, work, moves=moves, holder=holder, key=key)
+        if moves:
+            self._confirm(task, lease_token)
+        return task
+
+    def _confirm(self, task: Task, lease_token: str | None) -> None:
+        """Look at the lease again: who took it over before the task was listed could not cancel it."""
+        try:
+            self.lease.check(lease_token)
+        except LeaseError as error:
+            with suppress(NotPossibleNow):
+                self.tasks.cancel(task.id, reason=error.what)
+            raise
 
     def swap_device(self, name: str, section: DeviceSection) -> None:
         """Another driver or other options for a device, until the service ends; see `service.seats.Swapper`.
@@ -161,13 +180,22 @@ class Service:
             raise self.supervisor.problem
         raise DeviceUnavailable("the cell is starting", hint="GET /readyz tells when it is up", device="cell")
 
+    def _check_not_stopped_since(self, count: int) -> None:
+        """A stop that came while the arm stood, and its reset, leave nothing in the latch but a higher count."""
+        if self.supervisor.latch.state().count != count:
+            raise Stopped(
+                "the software stop was pressed after this task was asked for",
+                hint="look at the cell, then command again: a reset alone moves nothing",
+            )
+
     def _stop_motion(self) -> None:
         if self.supervisor.is_ready:
             self.supervisor.connection.mover.cancel()
 
-    def _watch_lease(self) -> None:
-        while not self._is_closing.wait(LEASE_LOOK_S):
+    def _watch(self) -> None:
+        while not self._is_closing.wait(LOOK_S):
             self.lease.expire()
+            self.supervisor.note_stop()
 
     def note(self, kind: str, data: dict[str, Any]) -> None:
         """Record something without waiting for it."""

@@ -1,4 +1,4 @@
-"""A task's view of the cell: as the cell, but a cancelled task can start no further motion."""
+"""A task's view of the cell: as the cell, but a task that was cancelled or stopped can start no further motion."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class GatedMover:
         """Run the motion.
 
         Raises:
-            Cancelled: the task was cancelled; nothing moved.
+            Cancelled, Stopped: the task was, perhaps between two motions; nothing moved.
         """
         self.check()
         return self.mover.execute(motion)
@@ -35,7 +35,8 @@ class GatedMover:
         self.mover.cancel()
 
     def tare(self) -> Array:
-        """Zero the contact wrench."""
+        """Zero the contact wrench; refused as a motion is."""
+        self.check()
         return self.mover.tare()
 
     def state(self) -> RobotState:

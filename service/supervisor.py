@@ -114,6 +114,8 @@ class Supervisor:
         self._is_ready = threading.Event()
         self._is_closing = threading.Event()
         self._lock = threading.RLock()
+        self._noted = self.latch.state().count
+        self._noting = threading.Lock()
 
     @property
     def connection(self) -> CellConnection:
@@ -141,21 +143,35 @@ class Supervisor:
         Raises:
             CellError: it could not start; says why.
         """
+        begun = self.latch.state().count
         try:
             self._start_inline() if self.inline else self._start_child()
         except CellError as error:
             self._problem = error
             raise
-        if self.cell.file.cell.mode == "sim":
-            self.reset("supervisor: a simulated cell starts ready", seen_count=self.latch.state().count)
+        if self.cell.file.cell.mode == "sim" and self.latch.state().count == begun:  # nobody stopped it meanwhile
+            self.reset("supervisor: a simulated cell starts ready", seen_count=begun)
         if not self.inline:
             threading.Thread(target=self._watch, name="watch-cell", daemon=True).start()
 
     def stop(self, source: str) -> LatchState:
         """Latch the software stop."""
         state = self._stop.stop(source)
-        self._report("stop", {"source": source, "count": state.count})
+        self.note_stop()
         return state
+
+    def note_stop(self) -> None:
+        """Report the newest stop, once: the stop port writes the latch and tells nobody.
+
+        To be called again and again; of stops that come faster than the calls only the last one is told.
+        """
+        with self._noting:
+            state = self.latch.state()
+            if state.count <= self._noted:
+                return
+            self._noted = state.count
+        if state.is_latched:
+            self._report("stop", {"source": state.source, "count": state.count})
 
     def reset(self, source: str, *, seen_count: int) -> LatchState:
         """Clear the latch. This alone moves nothing.
@@ -163,6 +179,7 @@ class Supervisor:
         Raises:
             MotionRefused: somebody stopped again meanwhile, or the stop process is down or silent (no stop, no motion).
         """
+        self.note_stop()  # before its traces are gone
         if not self._stop.is_alive():
             raise MotionRefused("the stop process is down, so nothing may move", hint="restart `panelwright serve`")
         if not self._stop.reset(source, seen_count=seen_count):

@@ -207,7 +207,8 @@ class Service:
     def _restore_tasks(self) -> None:
         """Take up the tasks of earlier runs from the journal."""
         tasks: dict[str, Task] = {}
-        records = self.journal.records(kinds=("task-queued", "task-ended"), limit=2 * RESTORED_TASKS)
+        kinds = ("task-queued", "task-started", "task-ended")
+        records = self.journal.records(kinds=kinds, limit=len(kinds) * RESTORED_TASKS)
         for record in records:
             data = record.data
             if record.kind == "task-queued":
@@ -219,7 +220,11 @@ class Service:
                     holder=data["holder"],
                     created_s=record.wall_time_s,
                 )
-            elif data["task"] in tasks:
+            elif data["task"] not in tasks:
+                continue
+            elif record.kind == "task-started":
+                tasks[data["task"]].state, tasks[data["task"]].started_s = TaskState.RUNNING, record.wall_time_s
+            else:
                 _bring_to_end(tasks[data["task"]], data, record.wall_time_s)
         for task in tasks.values():
             self.tasks.restore(task)

@@ -196,12 +196,17 @@ def _warm() -> None:
 
 
 def exit_on_sigterm() -> None:
-    """Let SIGTERM unwind like Ctrl-C: its default would skip all cleaning up, also when uvicorn raises it again."""
+    """Let SIGTERM unwind like Ctrl-C: its default would skip all cleaning up, also when uvicorn raises it again.
+
+    The end of a terminal counts as SIGTERM, unless `nohup` wants it ignored.
+    """
 
     def leave(_signal: int, _frame: FrameType | None) -> None:
         raise SystemExit(128 + signal.SIGTERM)
 
     signal.signal(signal.SIGTERM, leave)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, lambda _signal, _frame: signal.raise_signal(signal.SIGTERM))
 
 
 def _shipped() -> Mapping[str, Operation]:

@@ -252,6 +252,7 @@ class TaskStore:
             self._record_end(task)  # cancelled while it waited
             return
         try:
+            self._recorder.append("task-started", {"task": task.id})
             result = jsonable(work(TaskContext(task, self._folder / task.id)))
         except Cancelled as error:
             self._end(task, TaskState.CANCELLED, error=error)

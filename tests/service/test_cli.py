@@ -132,13 +132,14 @@ def served_alone(write_cell: WriteCell, tmp_path: Path) -> Iterator[Served]:
     served.client.close()
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
 def test_no_end_of_the_service_leaves_an_orphan(served_alone: Served, how: signal.Signals) -> None:
     assert len(served_alone.family) >= 2, "a cell and a stop process at least"
     os.kill(served_alone.process.pid, how)
     served_alone.process.wait(90)
     eventually(lambda: not served_alone.survivors())
     assert "Traceback" not in served_alone.log.read_text()
+    assert (how is signal.SIGKILL) is ("processes ended" not in served_alone.log.read_text())
 
 
 def test_ctrl_c_ends_open_streams_too(served_alone: Served) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from hal.config import load_cell
 from service.core import Service
 from service.task_model import TaskState
@@ -55,6 +57,8 @@ def test_a_task_that_was_cut_off_is_aborted_and_not_taken_up(write_cell: WriteCe
         assert again.state is TaskState.FAILED
         assert again.problem is not None
         assert again.problem["type"] == "urn:panelwright:aborted"
+        assert f"the service ended while task {task.id} was running" in again.problem["detail"]
+        assert again.started_s == pytest.approx(task.started_s, abs=60.0)
         assert second.tasks.moving() is None
     finally:
         second.close()

@@ -187,9 +187,19 @@ def test_what_cannot_be_recorded_does_not_start(bench: Bench) -> None:
     assert not bench.store.all()
 
 
+def test_what_waited_until_the_disk_was_full_does_not_start_either(bench: Bench) -> None:
+    may_end, ran = threading.Event(), []
+    bench.store.start("test", {}, lambda _: may_end.wait(10.0), moves=True)
+    waiting = bench.store.start("test", {}, lambda _: ran.append(1), moves=True)
+    bench.recorder.is_full = True
+    may_end.set()
+    assert waiting.wait(10.0)
+    assert waiting.state is S.FAILED and not ran
+
+
 def test_start_and_end_are_recorded_before_they_show(bench: Bench) -> None:
     task = bench.run(lambda _: {"x": 1})
-    assert [kind for kind, _ in bench.recorder.records] == ["task-queued", "task-ended"]
+    assert [kind for kind, _ in bench.recorder.records] == ["task-queued", "task-started", "task-ended"]
     assert bench.recorder.records[1][1]["task"] == task.id
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from hal.errors import InvalidRequest
 from hal.panel import Button
 from manipulation.skills.outcome import SkillReport, Verify
 from manipulation.skills.press import press
+from manipulation.skills.subject import subject_of
 from manipulation.workcell import Workcell
 
 
@@ -21,9 +21,7 @@ def button(cell: Workcell, name: str, *, expected: str | None = None, verify: Ve
         InvalidRequest: it is not a button.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    thing = cell.panel.object(name)
-    if not isinstance(thing, Button):
-        raise InvalidRequest(f"{name} is a {thing.kind}, not a button", hint="see the panel file")
+    thing = subject_of(cell, name, Button, "button")
     return press(
         cell,
         thing,

@@ -14,6 +14,7 @@ from hal.panel import Handwheel
 from manipulation.skills.contact import against_turn, centre_between
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
 from manipulation.skills.steps import STANDOFF_M, Attempt, perform
+from manipulation.skills.subject import Whereabouts, subject_of
 from manipulation.stroke import arc
 from manipulation.workcell import Workcell, panel_from_grip
 
@@ -60,32 +61,22 @@ def handwheel(
         InvalidRequest: not a wheel, a target beyond its stops, or nobody knows its angle.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    thing = cell.panel.object(name)
-    if not isinstance(thing, Handwheel):
-        raise InvalidRequest(f"{name} is a {thing.kind}, not a handwheel", hint="see the panel file")
+    thing = subject_of(cell, name, Handwheel, "handwheel")
     if not thing.minimum_rad <= target_rad <= thing.maximum_rad:
         raise InvalidRequest(
             f"{target_rad:.2f} rad is beyond the stops of {name}",
             hint=f"{thing.minimum_rad:.2f} to {thing.maximum_rad:.2f} rad",
         )
-    known = current if current is not None else (verify() if verify is not None else None)
-    where = [known.angle_rad if known is not None else None]
+    where = Whereabouts(lambda seen: seen.angle_rad, what=f"the angle of {name}", current=current, verify=verify)
     tries = itertools.count()
 
     def stroke(attempt: Attempt) -> float:
         grip_n = grip_force_n(thing, tries=next(tries))
-        if where[0] is None:
-            raise InvalidRequest(f"the angle of {name} is not known", hint="read it first, or give `current`")
-        while abs(target_rad - where[0]) > 0.3 * TOLERANCE_RAD:
-            part = float(np.clip(target_rad - where[0], -LONGEST_RAD, LONGEST_RAD))
-            where[0] += _carry(attempt, thing, where[0], part, grip_n)
-        return where[0]
-
-    def look() -> ObjectState | None:
-        seen = verify() if verify is not None else None
-        if seen is not None and seen.angle_rad is not None:
-            where[0] = seen.angle_rad
-        return seen
+        angle_rad = where.known
+        while abs(target_rad - angle_rad) > 0.3 * TOLERANCE_RAD:
+            part = float(np.clip(target_rad - angle_rad, -LONGEST_RAD, LONGEST_RAD))
+            angle_rad = where.moved_to(angle_rad + _carry(attempt, thing, angle_rad, part, grip_n))
+        return angle_rad
 
     return perform(
         cell,
@@ -94,7 +85,7 @@ def handwheel(
         object_name=name,
         target=f"{target_rad:.3f} rad",
         is_reached=lambda seen: surely_within(seen.angle_rad, target_rad, TOLERANCE_RAD, sigma=seen.sigma),
-        verify=look if verify is not None else None,
+        verify=where.verify,
     )
 
 

@@ -14,6 +14,7 @@ from hal.panel import Lever
 from manipulation.skills.contact import against_turn, centre_between
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.steps import STANDOFF_M, Attempt, perform
+from manipulation.skills.subject import Whereabouts, subject_of
 from manipulation.stroke import arc
 from manipulation.workcell import Workcell, panel_from_grip
 
@@ -73,28 +74,20 @@ def lever(
         InvalidRequest: not a lever, no such state, or nobody knows where the bar is.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    thing = cell.panel.object(name)
-    if not isinstance(thing, Lever):
-        raise InvalidRequest(f"{name} is a {thing.kind}, not a lever", hint="see the panel file")
+    thing = subject_of(cell, name, Lever, "lever")
     angles = {state.name: state.angle_rad for state in thing.states}
     if target not in angles:
         raise InvalidRequest(f"{name} has no state {target!r}", hint=f"states: {', '.join(angles)}")
     goal = angles[target]
-    known = current if current is not None else (verify() if verify is not None else None)
-    where = [_angle_of(known, angles)]
+    where = Whereabouts(
+        lambda seen: _angle_of(seen, angles), what=f"the angle of {name}", current=current, verify=verify
+    )
 
     def stroke(attempt: Attempt) -> float:
-        if where[0] is None:
-            raise InvalidRequest(f"the angle of {name} is not known", hint="read it first, or give `current`")
-        turn = _Turn(start_rad=where[0], goal_rad=goal)
+        turn = _Turn(start_rad=where.known, goal_rad=goal)
         if abs(turn.span_rad) < np.radians(2.0):
             return turn.start_rad
         return _turn_lever(attempt, thing, turn)
-
-    def look() -> ObjectState | None:
-        seen = verify() if verify is not None else None
-        where[0] = _angle_of(seen, angles) if seen is not None else where[0]
-        return seen
 
     return perform(
         cell,
@@ -103,13 +96,11 @@ def lever(
         object_name=name,
         target=target,
         is_reached=lambda seen: _is_at(seen, target, goal),
-        verify=look if verify is not None else None,
+        verify=where.verify,
     )
 
 
-def _angle_of(seen: ObjectState | None, angles: dict[str, float]) -> float | None:
-    if seen is None:
-        return None
+def _angle_of(seen: ObjectState, angles: dict[str, float]) -> float | None:
     if seen.angle_rad is not None:
         return seen.angle_rad
     return angles.get(seen.state) if seen.state is not None else None

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from hal.errors import InvalidRequest
 from hal.panel import Mushroom
 from manipulation.skills.outcome import SkillReport, Verify
 from manipulation.skills.press import press
+from manipulation.skills.subject import subject_of
 from manipulation.workcell import Workcell
 
 
@@ -16,9 +16,7 @@ def mushroom(cell: Workcell, name: str, *, verify: Verify | None = None) -> Skil
         InvalidRequest: it is not a mushroom.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    thing = cell.panel.object(name)
-    if not isinstance(thing, Mushroom):
-        raise InvalidRequest(f"{name} is a {thing.kind}, not a mushroom", hint="see the panel file")
+    thing = subject_of(cell, name, Mushroom, "mushroom")
     return press(
         cell,
         thing,

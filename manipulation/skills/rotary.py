@@ -11,6 +11,7 @@ from hal.panel import Rotary
 from manipulation.skills.contact import centre_between
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.steps import STANDOFF_M, Attempt, perform
+from manipulation.skills.subject import Whereabouts, subject_of
 from manipulation.stroke import arc
 from manipulation.workcell import Workcell, panel_from_grip
 
@@ -46,40 +47,26 @@ def rotary(
         InvalidRequest: not a selector, no such state, or nobody knows where it points.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    thing = cell.panel.object(name)
-    if not isinstance(thing, Rotary):
-        raise InvalidRequest(f"{name} is a {thing.kind}, not a rotary selector", hint="see the panel file")
+    thing = subject_of(cell, name, Rotary, "rotary selector")
     angles = {state.name: state.angle_rad for state in thing.states}
     if target not in angles:
         raise InvalidRequest(f"{name} has no state {target!r}", hint=f"states: {', '.join(angles)}")
-    known = current if current is not None else (verify() if verify is not None else None)
-    where = [_resting_angle(known, angles)]
-
-    def stroke(attempt: Attempt) -> float:
-        if where[0] is None:
-            raise InvalidRequest(f"the position of {name} is not known", hint="read it first, or give `current`")
-        return _turn(attempt, thing, where[0], angles[target])
-
-    def look() -> ObjectState | None:
-        seen = verify() if verify is not None else None
-        where[0] = _resting_angle(seen, angles) if seen is not None else where[0]
-        return seen
-
+    where = Whereabouts(
+        lambda seen: _resting_angle(seen, angles), what=f"the position of {name}", current=current, verify=verify
+    )
     return perform(
         cell,
-        stroke,
+        lambda attempt: _turn(attempt, thing, where.known, angles[target]),
         skill="rotary",
         object_name=name,
         target=target,
         is_reached=lambda seen: _is_at(seen, target, angles[target]),
-        verify=look if verify is not None else None,
+        verify=where.verify,
     )
 
 
-def _resting_angle(seen: ObjectState | None, angles: dict[str, float]) -> float | None:
+def _resting_angle(seen: ObjectState, angles: dict[str, float]) -> float | None:
     """A selector rests in a detent: the state's own angle is better than a measured one."""
-    if seen is None:
-        return None
     if seen.state in angles:
         return angles[str(seen.state)]
     return seen.angle_rad

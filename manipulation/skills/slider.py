@@ -13,6 +13,7 @@ from hal.panel import Slider
 from manipulation.skills.contact import force_at_rest_n, meet
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
 from manipulation.skills.steps import STANDOFF_M, Attempt, perform
+from manipulation.skills.subject import Whereabouts, subject_of
 from manipulation.stroke import shifted
 from manipulation.workcell import Workcell, panel_from_grip
 
@@ -62,31 +63,18 @@ def slider(
         InvalidRequest: not a slider, a value off its scale, or nobody knows where the cap is.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    thing = cell.panel.object(name)
-    if not isinstance(thing, Slider):
-        raise InvalidRequest(f"{name} is a {thing.kind}, not a slider", hint="see the panel file")
+    thing = subject_of(cell, name, Slider, "slider")
     scale = thing.scale
     if not scale.minimum <= target <= scale.maximum:
         raise InvalidRequest(
             f"{target} {scale.unit} is off the scale of {name}", hint=f"{scale.minimum} to {scale.maximum} {scale.unit}"
         )
-    known = current if current is not None else (verify() if verify is not None else None)
-    where = [known.value if known is not None else None]
+    where = Whereabouts(lambda seen: seen.value, what=f"the value of {name}", current=current, verify=verify)
     allowed = tolerance if tolerance is not None else TOLERANCE_RATIO * (scale.maximum - scale.minimum)
 
     def stroke(attempt: Attempt) -> float:
-        if where[0] is None:
-            raise InvalidRequest(f"the value of {name} is not known", hint="read it first, or give `current`")
-        push = _Push(start_m=scale.place_of(where[0]), goal_m=scale.place_of(target))
-        moved = _push(attempt, thing, push)
-        where[0] = scale.value_at(push.start_m + moved)
-        return where[0]
-
-    def look() -> ObjectState | None:
-        seen = verify() if verify is not None else None
-        if seen is not None and seen.value is not None:
-            where[0] = seen.value
-        return seen
+        push = _Push(start_m=scale.place_of(where.known), goal_m=scale.place_of(target))
+        return where.moved_to(scale.value_at(push.start_m + _push(attempt, thing, push)))
 
     return perform(
         cell,
@@ -95,7 +83,7 @@ def slider(
         object_name=name,
         target=f"{target:g} {scale.unit}".strip(),
         is_reached=lambda seen: surely_within(seen.value, target, allowed, sigma=seen.sigma),
-        verify=look if verify is not None else None,
+        verify=where.verify,
     )
 
 

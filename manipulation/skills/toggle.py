@@ -10,6 +10,7 @@ from hal.panel import Toggle
 from manipulation.skills.contact import SOFT_PUSH
 from manipulation.skills.outcome import Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.steps import STANDOFF_M, Attempt, perform
+from manipulation.skills.subject import subject_of
 from manipulation.stroke import shifted
 from manipulation.workcell import Workcell, panel_from_grip
 
@@ -31,9 +32,7 @@ def toggle(cell: Workcell, name: str, target: str, *, verify: Verify | None = No
         InvalidRequest: not a toggle, or no such state.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    thing = cell.panel.object(name)
-    if not isinstance(thing, Toggle):
-        raise InvalidRequest(f"{name} is a {thing.kind}, not a toggle", hint="see the panel file")
+    thing = subject_of(cell, name, Toggle, "toggle")
     if target not in ("on", "off"):
         raise InvalidRequest(f"a toggle has no state {target!r}", hint="on (up) or off (down)")
     up = 1.0 if target == "on" else -1.0

@@ -287,7 +287,7 @@ class Controller:
     def _come_to_rest(self, end: Ending) -> None:
         """Decelerate at the limit, then hold; only the arm is listened to, since another device may be what failed."""
         if end.device is not None:
-            self._faults = (f"{end.device}: {end.cause}",)
+            self._faults = (end.cause,)
         try:
             while True:
                 self._send(self._filter.apply(self._filter.last_rad))

@@ -48,7 +48,7 @@ class DeviceFailure(Exception):
     """A device could not be used in this tick; `device` names it."""
 
     def __init__(self, device: str, cause: str) -> None:
-        super().__init__(f"{device}: {cause}")
+        super().__init__(cause if cause.startswith(device) else f"{device}: {cause}")  # drivers name themselves
         self.device = device
         self.cause = cause
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import logging
 import queue
 import sqlite3
 import threading
@@ -22,6 +23,8 @@ from service.errors import JournalError
 
 FIRST_HASH = "0" * 64
 MAX_GROUP = 200
+MAX_KEPT = 1000  # notes that wait for room on the disk
+log = logging.getLogger(__name__)
 APPEND_TIMEOUT_S = 10.0
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS journal (
@@ -55,7 +58,7 @@ class _Entry:
     text: str
     wall_time_s: float
     monotonic_s: float
-    done: Future[None]
+    done: Future[None] | None  # None: nobody waits for it
 
 
 class Journal:
@@ -84,7 +87,9 @@ class Journal:
             JournalError: the disk is full or read-only, or the journal is closed.
         """
         try:
-            self._put(kind, data).result(APPEND_TIMEOUT_S)
+            done: Future[None] = Future()
+            self._put(kind, data, done)
+            done.result(APPEND_TIMEOUT_S)
         except TimeoutError as error:
             raise JournalError(
                 f"the journal {self.path} did not take a record in {APPEND_TIMEOUT_S:.0f} s",
@@ -92,9 +97,9 @@ class Journal:
             ) from error
 
     def note(self, kind: str, data: dict[str, Any]) -> None:
-        """Record soon, without waiting; for what nobody's permission hangs on."""
+        """Record soon, without waiting; for what nobody's permission hangs on. On a full disk it waits for room."""
         if not self._is_closed:
-            self._put(kind, data)
+            self._put(kind, data, None)
 
     def records(self, *, kinds: tuple[str, ...] = (), limit: int = 1000) -> list[Record]:
         """The newest records of the given kinds (all when empty), oldest first."""
@@ -131,7 +136,7 @@ class Journal:
         self._waiting.put(None)
         self._thread.join(APPEND_TIMEOUT_S)
 
-    def _put(self, kind: str, data: dict[str, Any]) -> Future[None]:
+    def _put(self, kind: str, data: dict[str, Any], done: Future[None] | None) -> None:
         if self._is_closed or not self._thread.is_alive():
             raise JournalError("the journal is closed", hint="restart the service")
         entry = _Entry(
@@ -139,10 +144,9 @@ class Journal:
             text=json.dumps(data, separators=(",", ":"), allow_nan=False),
             wall_time_s=time.time(),
             monotonic_s=time.monotonic(),
-            done=Future(),
+            done=done,
         )
         self._waiting.put(entry)
-        return entry.done
 
     def _reader(self) -> contextlib.closing[sqlite3.Connection]:
         uri = self.path.absolute().as_uri()  # a folder may be called "50% off?"
@@ -155,10 +159,10 @@ class Journal:
             ready.set_exception(_error(self.path, error))
             return
         ready.set_result(None)
-        is_last = False
+        is_last, kept = False, list[_Entry]()
         while not is_last:
             group, is_last = self._next_group()
-            _commit(db, self.path, group)
+            kept = _commit(db, self.path, [*kept, *group])
         db.close()
 
     def _next_group(self) -> tuple[list[_Entry], bool]:
@@ -190,10 +194,10 @@ def _last_hash(db: sqlite3.Connection) -> str:
     return str(row[0]) if row is not None else FIRST_HASH
 
 
-def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry]) -> None:
-    """Write a group in one transaction and tell its callers."""
+def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry]) -> list[_Entry]:
+    """Write a group in one transaction and tell its callers; returns the notes that found no room."""
     if not group:
-        return
+        return []
     try:
         db.execute("BEGIN IMMEDIATE")
         newest = _last_hash(db)  # under the lock, for another service may have written since
@@ -209,11 +213,17 @@ def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry]) -> None:
     except sqlite3.Error as error:
         with contextlib.suppress(sqlite3.Error):  # a disk that takes no commit may take no rollback; callers are told
             db.execute("ROLLBACK")
+        notes = [entry for entry in group if entry.done is None]
+        if notes:
+            log.error("not recorded yet: %s: %s", ", ".join(entry.kind for entry in notes), error)
         for entry in group:
-            entry.done.set_exception(_error(path, error))
-        return
+            if entry.done is not None:
+                entry.done.set_exception(_error(path, error))
+        return notes[-MAX_KEPT:]
     for entry in group:
-        entry.done.set_result(None)
+        if entry.done is not None:
+            entry.done.set_result(None)
+    return []
 
 
 def _hash(previous: str, wall_time_s: float, monotonic_s: float, kind: str, text: str) -> str:

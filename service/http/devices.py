@@ -140,7 +140,9 @@ def _swap(state: AppState, name: str, request: SwapRequest) -> None:
 def _inject(service: Service, name: str, request: FaultRequest) -> DeviceView:
     device = service.supervisor.connection.device(name)
     if service.cell.file.cell.mode == "real" or not hasattr(device, "inject_fault"):
-        raise Unsupported(f"{name} is real, so faults cannot be injected", hint="use a simulated cell", device=name)
+        raise Unsupported(
+            f"{name} is not simulated by itself, so faults cannot be injected", hint="use a simulated cell", device=name
+        )
     device.inject_fault(request.fault, magnitude=request.magnitude)
     service.note("fault-injected", {"device": name, "fault": request.fault, "magnitude": request.magnitude})
     return _view(service, name)

@@ -137,12 +137,17 @@ def install(app: FastAPI) -> None:
         headers = dict(error.headers) if error.headers else None
         return problem_response(error.status_code, name, str(error.detail), hint="see /openapi.json", headers=headers)
 
+    @app.exception_handler(OSError)
+    async def _file(request: Request, error: OSError) -> Response:
+        known = of_file(error)
+        if known is None:
+            raise error  # a defect
+        log.error("%s %s: %s", request.method, request.url.path, known.what)  # a full disk, say
+        return error_response(known)
+
     @app.exception_handler(Exception)
     async def _defect(request: Request, error: Exception) -> Response:
         log.error("%s %s failed by a defect", request.method, request.url.path, exc_info=error)
-        known = of_file(error)
-        if known is not None:  # a full disk, say
-            return error_response(known)
         what = f"the service failed by a defect: {type(error).__name__}"
         return problem_response(500, "defect", what, hint="the log has more; please report it", retry=Retry.NEVER)
 

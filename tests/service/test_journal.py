@@ -103,12 +103,14 @@ def test_a_failed_commit_reaches_its_caller_and_the_chain_goes_on(tmp_path: Path
     journal.append("good", {})
     with sqlite3.connect(tmp_path / "j.sqlite") as db:
         db.execute("CREATE TRIGGER full BEFORE INSERT ON journal BEGIN SELECT RAISE(ABORT, 'disk full'); END")
+    journal.note("stop", {"why": "pressed while the disk was full"})
     with pytest.raises(JournalError, match="disk full"):
         journal.append("bad", {})
     with sqlite3.connect(tmp_path / "j.sqlite") as db:
         db.execute("DROP TRIGGER full")
     journal.append("good again", {})
-    assert journal.verify() == 2
+    assert [record.kind for record in journal.records()] == ["good", "stop", "good again"]
+    assert journal.verify() == 3
     journal.close()
 
 

@@ -204,7 +204,10 @@ def test_a_mount_on_a_frame_that_is_not_there_is_refused_before_anything_starts(
 
 
 def test_an_image_for_which_there_is_no_room_leaves_nothing_and_says_so(
-    client: httpx2.Client, served: Panelwright, monkeypatch: pytest.MonkeyPatch
+    client: httpx2.Client,
+    served: Panelwright,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     def fill(path: Path, data: bytes) -> int:
         with path.open("wb") as file:
@@ -217,6 +220,8 @@ def test_an_image_for_which_there_is_no_room_leaves_nothing_and_says_so(
         answer = client.post("/v1/images", content=picture, headers={"Content-Type": "image/png"})
     assert (answer.status_code, answer.json()["type"]) == (503, "urn:panelwright:file-fault")
     assert not list(served.service.runs_dir.rglob("*.part"))
+    assert "No space left" in caplog.text
+    assert "Traceback" not in caplog.text, "a full disk is no defect of ours"
 
 
 def test_a_mission_whose_report_finds_no_room_keeps_its_result(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from manipulation.control import Controller
 from manipulation.skills.outcome import ObjectState
 from manipulation.timing import SpeedLimits
 from manipulation.workcell import Workcell
+from service.motion import controller_of, flange_from
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -96,36 +97,15 @@ def open_bench(
         context = Context(name=name, clock=clock, cell=file, shared=shared)
         made[name] = connect(context, section.driver, dict(section.options))
     latched = [False]
-    record, gripper = file.calibration_of("wrist_ft"), file.calibration_of("gripper")
-    assert record.mount is not None and record.load is not None and gripper.mount is not None
-    grip = gripper.mount.pose().parent_from_child
-    controller = Controller(
-        made["arm"],
-        made["gripper"],
-        made["wrist_ft"],
-        made["finger_touch"],
-        [made[name] for name in file.names_of(DeviceKind.PROXIMITY)],
-        clock=clock,
-        safety=file.file.safety,
-        load=record.load.load(),
-        flange_from_sensor=record.mount.pose().parent_from_child,
-        is_latched=lambda: latched[0],
-        flange_from_grip=grip,
-        rate_hz=file.file.cell.control_rate_hz,
-    )
-    controller.start()
+    controller = controller_of(file, made, clock=clock, is_latched=lambda: latched[0])
     rng = np.random.default_rng([seed, 1])
-    directions = rng.standard_normal((2, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    error = np.concatenate([error_m * directions[0], error_rad * directions[1]])
     true = RigidTransform.from_matrix(made["arm"].truth().base_from_panel_matrix)
-    covariance = np.diag([error_m**2 / 3] * 3 + [error_rad**2 / 3] * 3) + 1e-12 * np.eye(6)
     cell = Workcell(
         mover=controller,
         kinematics=controller.kinematics,
         panel=file.panel,
-        base_from_panel=UncertainPose(parent_from_child=perturbed(true, error), covariance=covariance),
-        flange_from_grip=grip,
+        base_from_panel=_believed(true, error_m, error_rad, rng),
+        flange_from_grip=flange_from(file, made["gripper"]),
         limits=SpeedLimits(tip_m_per_s=speed, joint_ratio=0.8, acceleration_ratio=0.6),
         park_rad=np.asarray(file.file.workspace.park_rad),
         floor_z_m=file.file.workspace.floor_z_m,
@@ -137,3 +117,12 @@ def open_bench(
     angles = {name: float(bench.truth(name).value or 0.0) for name in levers}
     bench.cell = replace(cell, angles_rad=angles)
     return bench
+
+
+def _believed(true: RigidTransform, error_m: float, error_rad: float, rng: np.random.Generator) -> UncertainPose:
+    """The pose off by an error of that size, in a random direction."""
+    directions = rng.standard_normal((2, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    error = np.concatenate([error_m * directions[0], error_rad * directions[1]])
+    covariance = np.diag([error_m**2 / 3] * 3 + [error_rad**2 / 3] * 3) + 1e-12 * np.eye(6)
+    return UncertainPose(parent_from_child=perturbed(true, error), covariance=covariance)

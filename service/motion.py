@@ -125,14 +125,23 @@ class MotionPort:
 def start_controller(
     cell: Cell, devices: Mapping[str, Any], *, clock: Clock, is_latched: Callable[[], bool]
 ) -> MotionPort:
-    """The control thread over the first arm, gripper, force/torque and touch sensor and all proximity sensors.
+    """The control thread over the cell's devices, as many clients see it; errors are those of `controller_of`."""
+    return MotionPort(
+        lambda: controller_of(cell, devices, clock=clock, is_latched=is_latched), clock=clock, is_latched=is_latched
+    )
+
+
+def controller_of(
+    cell: Cell, devices: Mapping[str, Any], *, clock: Clock, is_latched: Callable[[], bool]
+) -> Controller:
+    """A running control thread over the first arm, gripper, force/torque and touch sensor and all proximity sensors.
 
     Raises:
         ConfigError: a part that motion needs is missing from the cell file.
     """
     from manipulation.control import Controller
 
-    gripper = _first(cell, devices, DeviceKind.GRIPPER)
+    arm, gripper = _first(cell, devices, DeviceKind.ARM), _first(cell, devices, DeviceKind.GRIPPER)
     if gripper is None:
         raise ConfigError(
             f"{cell.path}: a cell with an arm needs a gripper",
@@ -141,32 +150,27 @@ def start_controller(
             key="devices",
         )
     wrist = _first(cell, devices, DeviceKind.FORCE_TORQUE)
-
-    def start() -> Controller:
-        arm = _first(cell, devices, DeviceKind.ARM)
-        _check_joints(cell, arm)
-        controller = Controller(
-            arm,
-            gripper,
-            wrist,
-            _first(cell, devices, DeviceKind.TOUCH),
-            tuple(devices[name] for name in cell.names_of(DeviceKind.PROXIMITY)),
-            clock=clock,
-            safety=cell.file.safety,
-            load=_load(cell, wrist),
-            flange_from_sensor=_flange_from(cell, wrist),
-            is_latched=is_latched,
-            flange_from_grip=_flange_from(cell, gripper),
-            rate_hz=cell.file.cell.control_rate_hz,
-        )
-        try:
-            controller.start()
-        except CellError:
-            controller.close()
-            raise
-        return controller
-
-    return MotionPort(start, clock=clock, is_latched=is_latched)
+    _check_joints(cell, arm)
+    controller = Controller(
+        arm,
+        gripper,
+        wrist,
+        _first(cell, devices, DeviceKind.TOUCH),
+        tuple(devices[name] for name in cell.names_of(DeviceKind.PROXIMITY)),
+        clock=clock,
+        safety=cell.file.safety,
+        load=_load(cell, wrist),
+        flange_from_sensor=flange_from(cell, wrist),
+        is_latched=is_latched,
+        flange_from_grip=flange_from(cell, gripper),
+        rate_hz=cell.file.cell.control_rate_hz,
+    )
+    try:
+        controller.start()
+    except CellError:
+        controller.close()
+        raise
+    return controller
 
 
 def _check_joints(cell: Cell, arm: Any) -> None:
@@ -184,7 +188,7 @@ def _first(cell: Cell, devices: Mapping[str, Any], kind: DeviceKind) -> Any:
     return devices[names[0]] if names else None
 
 
-def _flange_from(cell: Cell, device: Any) -> RigidTransform:
+def flange_from(cell: Cell, device: Any) -> RigidTransform:
     """Pose of a device on the flange by its calibration record; the flange itself when it has no mount."""
     if device is None or cell.file.devices[device.name].mount is None:
         return identity()

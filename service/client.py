@@ -13,6 +13,7 @@ from hal.errors import CellError, ConfigError, DeviceUnavailable, Retry
 
 DEFAULT_URL = "http://127.0.0.1:8460"
 FINAL = ("succeeded", "failed", "cancelled")
+STOP_WAIT_S = 1.0  # then the stop process is asked, which no work of the service delays
 
 
 class ApiError(CellError):
@@ -58,6 +59,29 @@ class Client:
     def post(self, path: str, body: Any = None, *, headers: dict[str, str] | None = None) -> Any:
         """The JSON answer to a POST; errors as for `get`."""
         return _json(self.fetch("POST", path, body, headers=headers))
+
+    def stop(self) -> Any:
+        """Latch the software stop: by the service or, when it does not answer at once, by its stop process.
+
+        The stop process is looked for on the next port, where `serve` puts it; where `--stop-port` put it elsewhere, make a
+        client of that address.
+
+        Raises:
+            ApiError: the service answered with a problem.
+            DeviceUnavailable: neither of them answers.
+        """
+        host, port = self._address()
+        try:
+            return Client(url=self.url, timeout_s=STOP_WAIT_S).post("/v1/stop")
+        except DeviceUnavailable as error:
+            name = f"[{host}]" if ":" in host else host
+            try:
+                return Client(url=f"http://{name}:{(port or 80) + 1}", timeout_s=STOP_WAIT_S).post("/v1/stop")
+            except CellError:
+                raise DeviceUnavailable(
+                    f"{error.what}; nor does a stop process on the next port",
+                    hint="use the hardware stop; or name the stop port, as `panelwright serve` printed it, with --url",
+                ) from error
 
     def put(self, path: str, body: Any) -> Any:
         """The JSON answer to a PUT; errors as for `get`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import socket
 import threading
@@ -54,11 +55,22 @@ class InlineStop:
         return None
 
     def close(self) -> None:
-        """End the thread and close the port."""
-        if self._server is not None:
-            self._loop.call_soon_threadsafe(self._server.close)
+        """End the thread and close the port; a second call does nothing."""
+        if not self._thread.is_alive():
+            return
+        ended = asyncio.run_coroutine_threadsafe(self._end(), self._loop)
+        with contextlib.suppress(TimeoutError):
+            ended.result(1.0)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(1.0)
+
+    async def _end(self) -> None:
+        if self._server is not None:
+            self._server.close()
+        serving = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in serving:
+            task.cancel()
+        await asyncio.gather(*serving, return_exceptions=True)
 
 
 class ProcessStop:

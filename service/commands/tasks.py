@@ -24,7 +24,7 @@ def list_tasks(url: Url = UrlDefault) -> None:
     table = Table("id", "verb", "state", "progress", "step", "age", box=None, pad_edge=False)
     for task in client_of(url).get("/v1/tasks")["tasks"]:
         style = state_style(task["state"])
-        age_s = time.time() - task["created_s"]
+        age_s = max(0.0, time.time() - task["created_s"])  # the wall clock may have been set back
         row = (task["id"], task["verb"], f"[{style}]{task['state']}[/]", f"{100 * task['fraction']:.0f} %")
         table.add_row(*row, escape(task["step"]), f"{age_s:.0f} s")
     console.print(table)
@@ -91,5 +91,5 @@ def stop(
         seen = client.get("/v1/stop")["count"]
         state = client.post("/v1/stop/reset", {"seen_count": seen})
     else:
-        state = client.post("/v1/stop")
+        state = client.stop()
     console.print("the stop is [red]latched[/]" if state["is_latched"] else "the stop is clear")

@@ -3,8 +3,7 @@
 `python -m benchmarks.vision_knowledge FOLDER` prints recall, precision and calibration of three folds of the overviews
 beside the repository, then writes one TOML a kind, taught on all of them, into FOLDER. The shipped files were made this
 way: one look an object at its true middle, the looks of places that are no object, and of both only those that the ones
-kept so far do not tell with a margin (P. E. Hart, the condensed nearest neighbour rule, IEEE Trans. Inf. Theory 14(3),
-1968).
+kept so far do not tell with a margin (`perception.vision.teaching.condense`).
 """
 
 from __future__ import annotations
@@ -21,18 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.vision.finding.blind import PLATE_M, Candidate, candidate_places, chosen, lay_out
-from perception.vision.finding.features import PLATE_PX_PER_M, WEIGHTS, Ground, look_at
-from perception.vision.finding.match import CLIP
+from perception.vision.finding.features import PLATE_PX_PER_M, Ground, look_at
 from perception.vision.finding.plate import find_plate
 from perception.vision.knowledge import NOTHING, Kind, Knowledge, spread_of, write_kind
+from perception.vision.teaching.condense import worth_keeping
 from perception.vision.view import Array, PlaneView
 
 DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "vision" / "synth_dev"
 FOLDS = 3
 LEVELS = 3  # come in turn in the folder: folds of every third overview would each hold out one level entirely
 ELSEWHERE_PX = 7.0  # a place further from every object's middle is none
-OBJECT_MARGIN, NOTHING_MARGIN = 0.2, 0.03  # by which a look must be nearer to its own kind than to others
-PASSES = 3
 STEP = 0.01  # looks are written with two decimals
 NO_SIZE_M = (0.01, 0.01)
 SLIDER_M = (0.05, 0.05)  # flat and upright ones share a kind
@@ -84,7 +81,7 @@ def knowledge_of(taught: Sequence[Lesson]) -> Knowledge:
         )
         for name in sorted(set(names.tolist()))
     ]
-    kept = _condensed(looks / spread_of(kinds), names, weights=WEIGHTS)
+    kept = worth_keeping(looks, names, spread_of(kinds))
     rounded = np.round(looks[kept] / STEP) * STEP
     short = tuple(replace(kind, looks=rounded[names[kept] == kind.name]) for kind in kinds)
     return Knowledge(kinds=short, spread=spread_of(short))
@@ -110,34 +107,6 @@ def _size_m(taught: Sequence[Lesson], name: str) -> tuple[float, float]:
         return SLIDER_M
     width, height = np.median(np.array(sizes), axis=0) / 1000 if sizes else NO_SIZE_M
     return float(width), float(height)
-
-
-def _condensed(scaled: Array, names: NDArray[np.str_], *, weights: Array | None = None) -> NDArray[np.int64]:
-    """Indices of the looks to keep: those that the others kept do not name with the margin of their kind."""
-    share = np.ones(scaled.shape[1]) if weights is None else weights
-    share = share / share.sum()
-    own, other = np.full(len(scaled), np.inf), np.full(len(scaled), np.inf)
-    margin = np.where(names == NOTHING, NOTHING_MARGIN, OBJECT_MARGIN)
-    kept: list[int] = []
-
-    def keep(i: int) -> None:
-        distance = np.minimum(np.abs(scaled - scaled[i]), CLIP) @ share
-        same = names == names[i]
-        own[same] = np.minimum(own[same], distance[same])
-        other[~same] = np.minimum(other[~same], distance[~same])
-        kept.append(i)
-
-    for name in sorted(set(names.tolist())):
-        keep(int(np.flatnonzero(names == name)[0]))
-    order = np.random.default_rng(0).permutation(len(scaled))
-    for _ in range(PASSES):
-        before = len(kept)
-        for i in order:
-            if own[i] > 0 and own[i] > other[i] - margin[i]:
-                keep(int(i))
-        if len(kept) == before:
-            break
-    return np.array(kept)
 
 
 def judged(lesson: Lesson, knowledge: Knowledge) -> tuple[list[tuple[float, bool]], int]:

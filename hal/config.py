@@ -24,6 +24,7 @@ class CellSection(Strict):
     mode: Literal["sim", "real", "mixed"]
     panel: str
     calibrations: str
+    knowledge: str | None = None
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     control_rate_hz: Annotated[float, Field(ge=50, le=1000)] = 500.0
 
@@ -119,6 +120,16 @@ class Cell(Strict):
         """
         return _locate(self.file.cell.calibrations, self.path, "cell.calibrations") / f"{name}.toml"
 
+    @property
+    def knowledge_path(self) -> Path | None:
+        """Folder of looks that this cell's own panel adds to the shipped ones; None for none.
+
+        Raises:
+            ConfigError: it is gone.
+        """
+        folder = self.file.cell.knowledge
+        return None if folder is None else _locate(folder, self.path, "cell.knowledge")
+
     def calibration_of(self, device: str) -> CalibrationRecord:
         """The calibration record of a mounted device.
 
@@ -152,6 +163,7 @@ def load_cell(path: Path, *, seed: int | None = None) -> Cell:
         file = file.model_copy(update={"cell": file.cell.model_copy(update={"seed": seed})})
     panel = load_panel(_locate(file.cell.panel, path, "cell.panel"))
     bare = Cell.model_construct(path=path, file=file, panel=panel, calibrations={})
+    _ = bare.knowledge_path  # told now, not at the first look
     records: dict[str, CalibrationRecord] = {}
     for device, section in file.devices.items():
         if section.mount is not None and section.mount.calibration not in records:

@@ -45,6 +45,7 @@ def _app() -> Callable[[], None]:
     from service.commands.demo import demo
     from service.commands.develop import conform, emulate, new_driver
     from service.commands.doctor import doctor
+    from service.commands.learn import learn
     from service.commands.range import batch, range_image
     from service.commands.serve import serve
     from service.commands.teach import teach
@@ -67,6 +68,7 @@ def _app() -> Callable[[], None]:
     app.command()(conform)
     app.command()(warm)
     app.command()(teach)
+    app.command()(learn)
     app.add_typer(calibrate.app, name="calibrate")
     app.command("range")(range_image)
     app.add_typer(batch, name="batch")

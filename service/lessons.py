@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field, model_validator
 
 from hal.errors import InvalidRequest
+from hal.panel import Panel
 from hal.strict import Strict
 from service.images import ImageStore
 from service.operations.requests import ImageId, ObjectName, PlateSize
@@ -16,8 +19,10 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from perception.vision.teaching.from_panel import PanelLooks
     from perception.vision.teaching.panel_questions import Question
     from perception.vision.teaching.teach import Example, Overview
+    from perception.vision.view import View
 
 PixelNumber = Annotated[float, Field(ge=-1e5, le=1e5)]
 Click = tuple[PixelNumber, PixelNumber]
@@ -163,6 +168,39 @@ def teach_panel(
         "toml": text,
         "lights_are_seen": lights.are_seen,
     }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Learned:
+    """What an overview of a known panel taught, and the files of the kinds that learned something."""
+
+    panel: str
+    looks: PanelLooks
+    files: tuple[Path, ...]
+
+    def told(self) -> dict[str, Any]:
+        """The same in words and numbers: objects by name, looks by kind."""
+        return {
+            "panel": self.panel,
+            "added": self.looks.added,
+            "taught_by": [each.thing.name for each in self.looks.shown],
+            "left_out": self.looks.left_out,
+            "known_before": list(self.looks.known_before),
+            "known_now": list(self.looks.known_now),
+            "files": [str(path) for path in self.files],
+        }
+
+
+def learn_panel(teachings: Teachings, pixels: NDArray[np.uint8], view: View, panel: Panel) -> Learned:
+    """Let a known panel teach its own looks from one overview, and keep them.
+
+    Raises:
+        InvalidRequest, NotObservable, NotFound, Ambiguous: the overview teaches nothing; says why and what helps.
+    """
+    from perception.vision.teaching.from_panel import teach_from_panel
+
+    looks = teach_from_panel(pixels, view, panel, teachings.knowledge(), source="panelwright learn")
+    return Learned(panel=panel.name, looks=looks, files=tuple(teachings.write_kind(kind) for kind in looks.kinds))
 
 
 def described(overview: Overview, example: Example, teachings: Teachings) -> dict[str, Any]:

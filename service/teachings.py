@@ -1,4 +1,4 @@
-"""What users taught: kinds and panels as readable TOML in one folder, before the shipped ones."""
+"""What users taught: kinds and panels as readable TOML in one folder, before the shipped ones and those of the cell."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 import threading
 import tomllib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +17,7 @@ from hal.whole_file import write_whole
 from service.errors import NoSuchTask
 
 if TYPE_CHECKING:
+    from hal.config import Cell
     from perception.vision.knowledge import Kind, Knowledge
 
 FOLDER = "knowledge"
@@ -39,15 +40,23 @@ class KindSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KnowledgeFile:
-    """One TOML file of the knowledge; `is_taught` False: shipped with the system."""
+    """One TOML file of the knowledge; `is_taught` False: shipped with the system.
+
+    `of_cell`: the file with the looks that the cell's own panel adds to it.
+    """
 
     name: str
     path: Path
     is_taught: bool
+    of_cell: Path | None = None
 
     def text(self) -> str:
-        """Its TOML."""
-        return self.path.read_text(encoding="utf-8")
+        """Its TOML, with the looks of the cell's own panel at its end."""
+        text = self.path.read_text(encoding="utf-8")
+        if self.of_cell is None:
+            return text
+        _, mark, looks = self.of_cell.read_text(encoding="utf-8").partition("\n[[looks]]")
+        return f"{text}\n# of the cell's own panel\n{mark}{looks}"
 
     def summary(self) -> KindSummary:
         """What a kind's file says, without the numbers of its looks.
@@ -55,31 +64,38 @@ class KnowledgeFile:
         Raises:
             ConfigError: it is malformed.
         """
-        return _summary(self.path, self.path.stat().st_mtime_ns)
+        own = _summary(self.path, self.path.stat().st_mtime_ns)
+        if self.of_cell is None:
+            return own
+        added = _summary(self.of_cell, self.of_cell.stat().st_mtime_ns)
+        return replace(own, looks=own.looks + added.looks)
 
 
 class Teachings:
-    """Kinds in `folder/*.toml`, panels in `folder/panels/*.toml`."""
+    """Kinds in `folder/*.toml`, panels in `folder/panels/*.toml`; `of_cell` holds looks that add to the shipped kinds."""
 
     _lock = threading.Lock()  # of all of this process: two lessons at once must not lose one
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, of_cell: Path | None = None) -> None:
         self.folder = folder
+        self.of_cell = of_cell
 
     @classmethod
-    def of_runs(cls, runs_dir: Path) -> Teachings:
-        """Where a service keeps them."""
-        return cls(runs_dir / FOLDER)
+    def of_runs(cls, runs_dir: Path, cell: Cell) -> Teachings:
+        """Where a service keeps them, over what its cell file names."""
+        return cls(runs_dir / FOLDER, of_cell=cell.knowledge_path)
 
     def knowledge(self) -> Knowledge:
-        """The shipped kinds, each replaced by the folder's own of that name.
+        """The shipped kinds with the looks of the cell's own panel, each replaced by the folder's own of that name.
 
         Raises:
-            ConfigError: a file of the folder is malformed; names it.
+            ConfigError: a file of a folder is malformed; names it.
         """
         from perception.vision.knowledge import Knowledge
 
         shipped = _kinds_in(SHIPPED, _stamps(SHIPPED))
+        if self.of_cell is not None:
+            shipped = _with_looks_in(self.of_cell, _stamps(self.of_cell), _stamps(SHIPPED))
         if not any(self.folder.glob("*.toml")):
             return shipped
         taught = _kinds_in(self.folder, _stamps(self.folder)).kinds
@@ -91,6 +107,13 @@ class Teachings:
         """Files of all kinds in use, by name."""
         files = {path.stem: KnowledgeFile(name=path.stem, path=path, is_taught=False) for path in _toml(SHIPPED)}
         files.pop("proportions", None)  # how parts lie in a panel meter: no kind
+        for path in () if self.of_cell is None else _toml(self.of_cell):
+            known = files.get(path.stem)
+            files[path.stem] = (
+                KnowledgeFile(name=path.stem, path=path, is_taught=False)
+                if known is None
+                else replace(known, of_cell=path)
+            )
         files |= {path.stem: KnowledgeFile(name=path.stem, path=path, is_taught=True) for path in _toml(self.folder)}
         return [files[name] for name in sorted(files)]
 
@@ -163,6 +186,14 @@ def _kinds_in(folder: Path, stamps: tuple[tuple[str, int, int], ...]) -> Knowled
     from perception.vision.knowledge import load_knowledge
 
     return load_knowledge(folder)
+
+
+@lru_cache(maxsize=8)
+def _with_looks_in(
+    folder: Path, stamps: tuple[tuple[str, int, int], ...], shipped: tuple[tuple[str, int, int], ...]
+) -> Knowledge:
+    """The shipped kinds with the looks of a cell's folder."""
+    return _kinds_in(SHIPPED, shipped).with_looks_of(_kinds_in(folder, stamps).kinds)
 
 
 @lru_cache(maxsize=256)

@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from hal.errors import ConfigError
@@ -33,6 +34,9 @@ Around = Annotated[tuple[RingRow, ...], Field(min_length=DIRECTIONS, max_length=
 class LookRecord(Strict):
     """One example: relative gray, unevenness, edges and strong edges over the distance from the middle, hundredths.
 
+    `middle_m`: from the place that looks so to the object's middle, x right and y up, where a part of the object or its
+    label shows better than its middle.
+
     `gray_around` and `edge_around` have a row a direction, clockwise from straight up; left out, every direction is as
     `gray` and `edge` are all around.
     """
@@ -43,6 +47,7 @@ class LookRecord(Strict):
     strong_edge: Row
     gray_around: Around | None = None
     edge_around: Around | None = None
+    middle_m: tuple[float, float] = (0.0, 0.0)
 
     @property
     def look(self) -> Array:
@@ -79,12 +84,28 @@ class Kind:
         name: as in the panel file where readers exist, else free.
         size_m: (width, height) of a typical one, m.
         looks: (N, LENGTH), one row an example.
+        middles_m: (N, 2) from the place that looks so to the object's middle, x right, y up; None: that is the middle.
     """
 
     name: str
     size_m: tuple[float, float]
     looks: Array
     taught_by: str = ""
+    middles_m: Array | None = None
+
+    def of(self, rows: NDArray[Any]) -> Kind:
+        """The kind with some of its looks only."""
+        middles_m = None if self.middles_m is None else self.middles_m[rows]
+        return replace(self, looks=self.looks[rows], middles_m=middles_m)
+
+    def joined(self, other: Kind) -> Kind:
+        """The kind with another one's looks after its own."""
+        middles_m = None
+        if self.middles_m is not None or other.middles_m is not None:
+            middles_m = np.vstack(
+                [np.zeros((len(k.looks), 2)) if k.middles_m is None else k.middles_m for k in (self, other)]
+            )
+        return replace(self, looks=np.vstack([self.looks, other.looks]), middles_m=middles_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -100,12 +121,23 @@ class Knowledge:
 
     def with_look(self, name: str, size_m: tuple[float, float], look: Array, *, taught_by: str = "") -> Knowledge:
         """The knowledge with one more look; a new name makes a new kind."""
-        known = self.kind(name)
+        return self.grown(Kind(name=name, size_m=size_m, looks=look[None], taught_by=taught_by))
+
+    def grown(self, more: Kind) -> Knowledge:
+        """The knowledge with further looks of a kind, which may be new."""
+        known = self.kind(more.name)
         if known is None:
-            kind = Kind(name=name, size_m=size_m, looks=look[None], taught_by=taught_by)
-            return replace(self, kinds=(*self.kinds, kind))
-        grown = replace(known, looks=np.vstack([known.looks, look]))
-        return replace(self, kinds=tuple(grown if kind is known else kind for kind in self.kinds))
+            return replace(self, kinds=(*self.kinds, more))
+        return replace(self, kinds=tuple(kind.joined(more) if kind is known else kind for kind in self.kinds))
+
+    def with_looks_of(self, kinds: Iterable[Kind]) -> Knowledge:
+        """The knowledge with these kinds' looks beside its own; a new name makes a new kind, a known look adds nothing."""
+        grown = self
+        for kind in kinds:
+            known = grown.kind(kind.name)
+            seen = set() if known is None else {look.tobytes() for look in known.looks}
+            grown = grown.grown(kind.of(np.array([look.tobytes() not in seen for look in kind.looks])))
+        return grown
 
 
 def shipped_knowledge() -> Knowledge:
@@ -147,8 +179,10 @@ def write_kind(kind: Kind, folder: Path) -> Path:
     ]
     if kind.taught_by:
         lines.append(f'taught_by = "{kind.taught_by}"')
-    for look in kind.looks:
+    for k, look in enumerate(kind.looks):
         lines.append("\n[[looks]]")
+        if kind.middles_m is not None and kind.middles_m[k].any():
+            lines.append("middle_m = [{:.4f}, {:.4f}]".format(*kind.middles_m[k]))
         rows = look[: len(GROUPS) * len(RADII_M)].reshape(len(GROUPS), -1)
         lines += [f"{name} = {_written(row)}" for name, row in zip(GROUPS, rows, strict=True)]
         tables = look[len(GROUPS) * len(RADII_M) :].reshape(len(AROUND_GROUPS), DIRECTIONS, RINGS)
@@ -162,11 +196,13 @@ def _is_other(path: Path) -> bool:
 
 
 def _kind(record: KindRecord) -> Kind:
+    middles_m = np.array([look.middle_m for look in record.looks])
     return Kind(
         name=record.name,
         size_m=(record.width_m, record.height_m),
         looks=np.array([look.look for look in record.looks]).reshape(-1, LENGTH),
         taught_by=record.taught_by,
+        middles_m=middles_m if middles_m.any() else None,
     )
 
 

@@ -16,7 +16,7 @@ from rich.table import Table
 from service.client import Client
 from service.commands.board import board
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, client_of, console, read_cell
-from service.commands.leaving import INTERRUPTED, leave, one_interrupt
+from service.commands.own_cell import ServiceUrl, run_on_cell
 from service.commands.tasks import follow
 
 app = typer.Typer(
@@ -28,7 +28,6 @@ Poses = Annotated[int, typer.Option(min=4, max=40, help="Stations to measure fro
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Only plan the stations: nothing moves, nothing is written.")]
 Runs = Annotated[Path, typer.Option(help="Folder of the records: RUNS/calibrations/CELL.")]
 Device = Annotated[str | None, typer.Option(help="Which device; else the first of its kind in the cell file.")]
-ServiceUrl = Annotated[str | None, typer.Option("--url", help="Use this running service instead of starting the cell.")]
 RUNS = Path("runs")
 
 
@@ -83,31 +82,9 @@ def list_records(
 def _run(what: str, cell: Path, seed: int | None, runs: Path, url: str | None, body: dict[str, Any]) -> None:
     """One calibration as a task, on a running service or on a cell of our own; ends the process with its code."""
     request = {"what": what, **{key: value for key, value in body.items() if value is not None}}
-    if url is not None:
-        raise typer.Exit(0 if _follow(client_of(url), request) else 1)
-    from service.serve import Options, Panelwright, exit_on_sigterm
-
-    loaded = read_cell(cell, seed)
-    exit_on_sigterm()
-    panelwright = Panelwright(loaded, Options(port=0, runs_dir=runs))
-    console.print(f"cell [bold]{loaded.name}[/], {loaded.file.cell.mode}, seed {loaded.file.cell.seed}: starting")
-    code = 1
-    with one_interrupt():
-        try:
-            panelwright.start()
-            client = Client(url=panelwright.url)
-            stop = client.get("/v1/stop")
-            if (
-                stop["is_latched"] and not request["dry_run"]
-            ):  # as in `demo`: to run it is to say that the cell is clear
-                client.post("/v1/stop/reset", {"seen_count": stop["count"]})
-            code = 0 if _follow(client, request) else 1
-        except KeyboardInterrupt:
-            console.print("stopped by Ctrl-C: arm stopped, nothing written")
-            code = INTERRUPTED
-        finally:
-            panelwright.close()
-        leave(code)
+    run_on_cell(
+        lambda client: _follow(client, request), cell=cell, seed=seed, runs=runs, url=url, moves=not body["dry_run"]
+    )
 
 
 def _follow(client: Client, request: dict[str, Any]) -> bool:

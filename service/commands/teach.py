@@ -55,25 +55,37 @@ def teach(
     click: Annotated[
         list[str] | None, typer.Option(help="X,Y in pixels; the middle, or two opposite corners, then the middle.")
     ] = None,
+    from_panel: Annotated[
+        Path | None,
+        typer.Option(help="Panel file of the panel in the image: it teaches its own looks, without a click."),
+    ] = None,
     check: Annotated[bool, typer.Option("--check", help="Only show what is found with what was taught.")] = False,
     dialogue: Annotated[
         bool, typer.Option("--dialogue", help="Ask for everything, also when no person sits at the terminal.")
     ] = False,
 ) -> None:
-    """Teach by clicks (--kind), by questions and answers (alone), or show with --check what is found now."""
+    """Teach by clicks (--kind), by a panel file (--from-panel), by questions and answers (alone), or show with --check what is
+    found now.
+    """
     from service.teachings import Teachings
 
     plate_m = _pair(plate, "--plate")
     if min(plate_m) <= 0 or max(plate_m) > MOST_PLATE_M:
         raise InvalidRequest(f"no plate is {plate} m", hint="for example --plate 0.60,0.40")
-    if sum((check, kind is not None, dialogue)) > 1:
-        raise InvalidRequest("give one of --kind, --check and --dialogue", hint="teach first, then check")
-    if not (check or kind is not None or dialogue or sys.stdin.isatty()):
-        raise InvalidRequest("nobody is there to ask", hint="give --kind, --check, or --dialogue with answers on stdin")
+    ways = (check, kind is not None, dialogue, from_panel is not None)
+    if sum(ways) > 1:
+        raise InvalidRequest("give one of --kind, --from-panel, --check and --dialogue", hint="teach first, then check")
+    if not (any(ways) or sys.stdin.isatty()):
+        raise InvalidRequest(
+            "nobody is there to ask", hint="give --kind, --from-panel, --check, or --dialogue with answers on stdin"
+        )
     pixels = read_image(image)
     teachings = Teachings(folder)
     if kind is not None:
         _by_clicks(teachings, pixels, plate_m, kind=kind, clicks=click or [])
+        return
+    if from_panel is not None:
+        _by_panel(teachings, pixels, from_panel)
         return
     from service.dialogue import Dialogue
 
@@ -98,6 +110,21 @@ def _by_clicks(
         console.print(f"{kind} looks like that already: nothing was written", markup=False)
         return
     console.print(f"wrote {taught['path']}", markup=False)
+
+
+def _by_panel(teachings: Teachings, pixels: NDArray[np.uint8], panel_file: Path) -> None:
+    from hal.panel import load_panel
+    from perception.vision.finding.framing import check_upright, one_plate
+    from perception.vision.image import as_gray
+    from service.commands.learn import tell
+    from service.lessons import learn_panel
+
+    panel, gray = load_panel(panel_file), as_gray(pixels)
+    with patience():
+        view = one_plate(gray, (panel.width_m, panel.height_m)).view
+        check_upright(gray, view, panel)
+        learned = learn_panel(teachings, pixels, view, panel)
+    tell(learned.told())
 
 
 def read_image(image: Path) -> NDArray[np.uint8]:

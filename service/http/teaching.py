@@ -181,7 +181,7 @@ def _named(known: Sequence[V], name: str) -> V:
 
 
 def _teachings(state: AppState) -> Teachings:
-    return Teachings.of_runs(state.service.runs_dir)
+    return Teachings.of_runs(state.service.runs_dir, state.service.cell)
 
 
 def _knowledge(state: AppState, *, with_text: bool) -> KnowledgeView:

@@ -69,6 +69,14 @@ OPERATIONS: dict[str, Operation] = {
             is_still=_is_stored,
         ),
         Operation(
+            name="learn",
+            request_model=requests.LearnRequest,
+            run=_in_session("learn", "run_learn"),
+            summary="Let the located panel teach its own looks: blind recognition then knows its objects",
+            example={"move": True},
+            is_still=_is_stored,
+        ),
+        Operation(
             name="inspect",
             request_model=requests.InspectRequest,
             run=_in_session("inspect", "run_inspect"),

@@ -102,6 +102,12 @@ class InspectRequest(StoredLook):
     close_up: Annotated[bool, Field(description="drive to close-ups; false reads the overview only")] = True
 
 
+class LearnRequest(StoredLook):
+    """Learn what the panel's objects look like, from an overview of the cell's camera or a stored one."""
+
+    move: Annotated[bool, Field(description="locate the panel and drive to the overview first")] = True
+
+
 SENSING = Literal[
     "point-point", "point-line", "point-plane", "line-point", "line-line", "line-plane", "plane-point", "plane-line",
     "plane-plane",

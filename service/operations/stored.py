@@ -36,17 +36,13 @@ def read_stored(session: Session, request: RecogniseRequest | InspectRequest) ->
         InvalidRequest, NotObservable, NotFound, Ambiguous: the image cannot be answered for; says why and what helps.
     """
     from perception.vision.annotate import draw_annotated
-    from perception.vision.finding.framing import check_upright
     from perception.vision.image import as_gray
     from perception.vision.taught import inspect_view
 
-    pixels = _stores(session)[0].pixels(request.image or "")
     panel = panel_of(session, request.panel)
     names = panel_object_or_all(panel, request.objects)
-    gray = as_gray(pixels)
-    view = _view(session, request, gray, panel)
-    check_upright(gray, view, panel)
-    readings = inspect_view(pixels, gray, view, panel, names=names)
+    pixels, view = stored_view(session, request, panel)
+    readings = inspect_view(pixels, as_gray(pixels), view, panel, names=names)
     picture = shown(draw_annotated(pixels, readings))
     return {
         "panel": panel.name,
@@ -135,7 +131,23 @@ def shown(picture: Pixels) -> Pixels:
 
 def _stores(session: Session) -> tuple[ImageStore, Teachings]:
     runs = session.context.runs_dir
-    return ImageStore(runs), Teachings.of_runs(runs)
+    return ImageStore(runs), Teachings.of_runs(runs, session.cell)
+
+
+def stored_view(session: Session, request: StoredLook, panel: Panel) -> tuple[Pixels, View]:
+    """The stored image of an upright panel, and where the panel is in it.
+
+    Raises:
+        as `read_stored`.
+    """
+    from perception.vision.finding.framing import check_upright
+    from perception.vision.image import as_gray
+
+    pixels = _stores(session)[0].pixels(request.image or "")
+    gray = as_gray(pixels)
+    view = _view(session, request, gray, panel)
+    check_upright(gray, view, panel)
+    return pixels, view
 
 
 def _view(session: Session, request: StoredLook, gray: Pixels, panel: Panel) -> View:

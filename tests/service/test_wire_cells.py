@@ -88,7 +88,11 @@ lights_lamp = "run_lamp"
 def before_small_panel(folder: Path, cell: str, control: str) -> Path:
     """The shipped cell file with another panel."""
     text = (ROOT / f"cells/{cell}.toml").read_text()
-    for path, mine in (("panels/bench.toml", "panel.toml"), ("cells/calibrations", "calibrations")):
+    for path, mine in (
+        ("panels/bench.toml", "panel.toml"),
+        ("cells/calibrations", "calibrations"),
+        ("cells/knowledge/bench", str(ROOT / "cells/knowledge/bench")),
+    ):
         assert text.count(f'"{path}"') == 1
         text = text.replace(path, mine)
     shutil.copytree(ROOT / "cells/calibrations", folder / "calibrations")

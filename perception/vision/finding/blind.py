@@ -19,7 +19,7 @@ from hal.errors import NotFound
 from perception.vision.finding.circles import find_circles
 from perception.vision.finding.components import components
 from perception.vision.finding.features import PLATE_PX_PER_M, Ground, half_turned, look_at, plate_gray
-from perception.vision.finding.match import Prepared, nearest, nothing_column, prepared
+from perception.vision.finding.match import Prepared, nearest, nearest_look, nothing_column, prepared
 from perception.vision.finding.plate import find_plate
 from perception.vision.finding.shapes import Edges, direction_maps, find_edges, find_rectangles, find_slots
 from perception.vision.image import Image, as_gray
@@ -50,6 +50,7 @@ class Candidate:
         kind: the likest kind.
         confidence: 0 to 1.
         centre_px, centre_m: (2,) middle in the image, and on the plate (origin in its middle, y up).
+        place_m: (2,) the place on the plate that looks so: `centre_m`, or a part of the object that shows better.
         box_px: (4, 2) a typical object's outline there.
         distance: to the likest look; `rival`: the next kind and its distance.
         reason: why it is refused; None for an object.
@@ -59,6 +60,7 @@ class Candidate:
     confidence: float
     centre_px: Array
     centre_m: Array
+    place_m: Array
     box_px: Array
     distance: float
     rival: tuple[str, float]
@@ -117,7 +119,7 @@ def uprightness(
     objects = [c for c in found if c.reason is None]
     if not objects:
         return 0.0
-    middles = np.array([c.centre_m for c in objects]) * [1.0, -1.0] + np.array(plate_m) / 2
+    middles = np.array([c.place_m for c in objects]) * [1.0, -1.0] + np.array(plate_m) / 2
     looks = look_at(ground, middles * PLATE_PX_PER_M)
     known = prepared(knowledge)
     columns = [[kind.name for kind in knowledge.kinds].index(c.kind) for c in objects]
@@ -186,23 +188,34 @@ def chosen(
             break  # sorted: nothing better follows
         if near[i] > FURTHEST:
             continue
-        u, v = places[i]
-        reach = max(knowledge.kinds[best[i]].size_m) * PLATE_PX_PER_M
-        if any(max(abs(u - a), abs(v - b)) < 0.475 * max(reach, c) for a, b, c in taken):
+        likest = knowledge.kinds[best[i]]
+        if likest.middles_m is None and _is_taken(places[i], max(likest.size_m) * PLATE_PX_PER_M, taken):
             continue
-        middle = _centred(ground, places[i], known, int(best[i]))
-        seen = nearest(look_at(ground, middle[None]), known)[0]
+        place = _centred(ground, places[i], known, int(best[i]))
+        look = look_at(ground, place[None])
+        seen = nearest(look, known)[0]
         to_other = float(seen[nothing]) if nothing is not None else np.inf
         if nothing is not None:
             seen[nothing] = np.inf
         kind = knowledge.kinds[int(seen.argmin())]
-        candidate = _candidate(middle, names, seen, to_other, kind.size_m, view, plate_m)
+        middle = place
+        if kind.middles_m is not None:
+            across, up = kind.middles_m[nearest_look(look[0], kind, knowledge.spread)]
+            middle = place + np.array([across, -up]) * PLATE_PX_PER_M
+            if _is_taken(middle, max(kind.size_m) * PLATE_PX_PER_M, taken):
+                continue
+        candidate = _candidate(place, middle, names, seen, to_other, kind.size_m, view, plate_m)
         if candidate.reason is None:
             taken.append((middle[0], middle[1], max(kind.size_m) * PLATE_PX_PER_M))
             accepted.append(candidate)
         else:
             refused.append(candidate)
     return (*accepted, *refused)
+
+
+def _is_taken(place: Array, reach: float, taken: Sequence[tuple[float, float, float]]) -> bool:
+    """Whether a thing of that reach overlaps one that stands."""
+    return any(max(abs(place[0] - a), abs(place[1] - b)) < 0.475 * max(reach, c) for a, b, c in taken)
 
 
 def _refusal(near: float, confidence: float, rival: str) -> str | None:
@@ -229,8 +242,8 @@ def _centred(ground: Ground, place: Array, known: Prepared, kind: int) -> Array:
 
 
 def _candidate(
-    place: Array, names: list[str], kinds: Array, to_nothing: float, size: tuple[float, float], view: View,
-    plate_m: tuple[float, float],
+    place: Array, middle: Array, names: list[str], kinds: Array, to_nothing: float, size: tuple[float, float],
+    view: View, plate_m: tuple[float, float],
 ) -> Candidate:  # fmt: skip
     order = np.argsort(kinds)
     first, second = int(order[0]), int(order[min(1, len(order) - 1)])
@@ -238,7 +251,7 @@ def _candidate(
     rival, to_rival = (names[second], to_second) if to_second < to_nothing else (NOTHING, to_nothing)
     lead = to_rival - float(kinds[first])
     confidence = float(1.0 / (1.0 + np.exp(-np.clip((lead - EVEN) / SCALE, -8.0, 8.0))))
-    x, y = place[0] / PLATE_PX_PER_M - plate_m[0] / 2, plate_m[1] / 2 - place[1] / PLATE_PX_PER_M
+    place_m, (x, y) = (_on_plate(at, plate_m) for at in (place, middle))
     w, h = size[0] / 2, size[1] / 2
     box = np.array([[x - w, y + h, 0], [x + w, y + h, 0], [x + w, y - h, 0], [x - w, y - h, 0], [x, y, 0]])
     px = view.project(box)
@@ -247,8 +260,14 @@ def _candidate(
         confidence=confidence,
         centre_px=px[4],
         centre_m=np.array([x, y]),
+        place_m=place_m,
         box_px=px[:4],
         distance=float(kinds[first]),
         rival=(rival, to_rival),
         reason=_refusal(float(kinds[first]), confidence, rival),
     )
+
+
+def _on_plate(place: Array, plate_m: tuple[float, float]) -> Array:
+    """(2,) point on the plate of a pixel of the rectified plate."""
+    return np.array([place[0] / PLATE_PX_PER_M - plate_m[0] / 2, plate_m[1] / 2 - place[1] / PLATE_PX_PER_M])

@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from perception.vision.finding.features import WEIGHTS
-from perception.vision.knowledge import NOTHING, Knowledge
+from perception.vision.knowledge import NOTHING, Kind, Knowledge
 from perception.vision.view import Array
 
 CLIP = 3.0  # one number counts for three spreads at most: glare or a cable spoils some numbers, whatever is there
@@ -56,6 +56,12 @@ def nearest(looks: Array, known: Prepared, *, kind: int | None = None) -> Array:
     first = known.first if kind is None else known.first[kind : kind + 2]
     scaled = (looks / known.unit).astype(np.float32)
     return np.asarray(_nearest(scaled, known.columns, first, CLIPS), float) / float(WEIGHTS.sum())
+
+
+def nearest_look(look: Array, kind: Kind, spread: Array) -> int:
+    """Which look of a kind is nearest to a (LENGTH,) look."""
+    difference = np.minimum(np.abs(kind.looks - look) / spread, CLIP)
+    return int((difference @ WEIGHTS).argmin())
 
 
 def distances_reference(looks: Array, knowledge: Knowledge) -> Array:

@@ -125,7 +125,10 @@ def teach(
     )  # fmt: skip
 
 
-def overview_of(image: NDArray[Any], *, plate_m: tuple[float, float] = PLATE_M, view: View | None = None) -> Overview:
+def overview_of(
+    image: NDArray[Any], *, plate_m: tuple[float, float] = PLATE_M, view: View | None = None,
+    focal_px: float | None = None,
+) -> Overview:  # fmt: skip
     """The image of one panel, ready to be taught from.
 
     Raises:
@@ -133,7 +136,7 @@ def overview_of(image: NDArray[Any], *, plate_m: tuple[float, float] = PLATE_M, 
         NotFound, Ambiguous: no plate in it, or two.
     """
     gray = as_gray(image)
-    view = view or one_plate(gray, plate_m).view
+    view = view or one_plate(gray, plate_m, focal_px=focal_px).view
     return Overview(view=view, ground=lay_out(gray, view, plate_m), plate_m=plate_m)
 
 
@@ -237,15 +240,20 @@ def plate_points(view: View, clicks_px: ArrayLike, plate_m: tuple[float, float])
     Raises:
         NotFound: a click lies beside the plate.
     """
+    points = under_pixels(view, clicks_px, plate_m)
+    if (np.abs(points) > [plate_m[0] / 2, plate_m[1] / 2]).any():
+        raise NotFound("a click lies beside the plate", hint="click on the object")
+    return points
+
+
+def under_pixels(view: View, pixels: ArrayLike, plate_m: tuple[float, float]) -> Array:
+    """(N, 2) points of the plate's plane (m, origin in the plate's middle, y up) under pixels, beside the plate too."""
     w, h = plate_m[0] / 2, plate_m[1] / 2
     corners = np.array([[-w, h], [w, h], [w, -h], [-w, -h]])
     plate_from_px = homography(view.project(np.column_stack([corners, np.zeros(4)])), corners)
-    clicks = np.asarray(clicks_px, float)
-    u = np.column_stack([clicks, np.ones(len(clicks))]) @ plate_from_px.T
-    points = u[:, :2] / u[:, 2:]
-    if (np.abs(points) > [w, h]).any():
-        raise NotFound("a click lies beside the plate", hint="click on the object")
-    return np.asarray(points)
+    seen = np.asarray(pixels, float)
+    u = np.column_stack([seen, np.ones(len(seen))]) @ plate_from_px.T
+    return np.asarray(u[:, :2] / u[:, 2:])
 
 
 def _size_m(clicks_m: Array, outline: SubObject | None) -> tuple[float, float]:

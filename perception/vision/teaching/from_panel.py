@@ -1,0 +1,225 @@
+"""A known panel teaches its own looks: its file and a view of it say what is where, so nobody has to click.
+
+Every object that is there teaches one look, at the sub-object nearest to its middle, which is where blind recognition will
+look. Where none lies at the middle, as with a lever, the look says how the middle lies from the sub-object: the paper's
+relations. Sub-objects that belong to no object teach what is none. Only looks that others do not tell are kept (`condense`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.errors import NotFound
+from hal.panel import Panel, PanelObject
+from perception.vision.finding.blind import Candidate, candidate_places, chosen
+from perception.vision.finding.features import PLATE_PX_PER_M, look_at
+from perception.vision.image import as_gray
+from perception.vision.knowledge import NOTHING, UNIT, Kind, Knowledge
+from perception.vision.reading import ObjectReading
+from perception.vision.registration.outline import footprint_m
+from perception.vision.registration.register import register
+from perception.vision.taught import inspect_view
+from perception.vision.teaching.condense import worth_keeping
+from perception.vision.teaching.teach import NOTHING_SIZE_M, SNAP_M, Overview, overview_of, under_pixels
+from perception.vision.view import Array, CameraView, View
+
+PART_M = (
+    0.0067  # a sub-object this near to an object's middle is that object's, whichever of them blind recognition takes
+)
+FOOT_TO_TOP = np.array([0.0, 0.5, 1.0])  # what stands out of the plate appears between its foot and its top
+NOT_DISTINCT = "nothing there stands out as a whole: come closer, or change the angle or the light"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Shown:
+    """An object of the panel in the overview.
+
+    Attributes:
+        place_px: (2,) of the rectified plate: the sub-object that taught.
+        middle_m: (2,) from there to the object's middle on the plate; zero where the sub-object lies there.
+        centre_px, box_px: (2,) and (4, 2), the object in the image.
+    """
+
+    thing: PanelObject
+    place_px: Array
+    middle_m: Array
+    centre_px: Array
+    box_px: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PanelLooks:
+    """What one overview of a known panel taught.
+
+    Attributes:
+        knowledge: with the new looks.
+        added: how many looks every kind that learned something got.
+        shown: the objects that taught, in the order of the panel file.
+        left_out: why each other object did not teach, by name.
+        known_before, known_now: names of the objects that blind recognition finds in this overview without and with
+            what was learned. The second says that it was learned, not how well it does on other overviews.
+    """
+
+    knowledge: Knowledge
+    added: dict[str, int]
+    shown: tuple[Shown, ...]
+    left_out: dict[str, str]
+    known_before: tuple[str, ...]
+    known_now: tuple[str, ...]
+
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """The kinds that learned something."""
+        return tuple(kind for kind in self.knowledge.kinds if kind.name in self.added)
+
+
+def teach_from_panel(
+    image: NDArray[Any], view: View, panel: Panel, knowledge: Knowledge, *, source: str = ""
+) -> PanelLooks:
+    """Learn what the objects of a known panel look like in an overview of it.
+
+    Args:
+        image: overview, gray or RGB uint8, the plate's border in view.
+        view: where the panel is, good to a few pixels.
+        source: a remark for the files of new kinds.
+
+    Raises:
+        InvalidRequest, NotObservable: bad image.
+        NotFound, Ambiguous: no plate or two in the image, it does not show this panel there, or none of its objects.
+    """
+    gray = as_gray(image)
+    focal_px = view.intrinsics.fx_px if isinstance(view, CameraView) else None
+    overview = overview_of(gray, plate_m=(panel.width_m, panel.height_m), focal_px=focal_px)
+    registered = register(gray, view, panel).view
+    readings = inspect_view(image, gray, registered, panel)
+    places = candidate_places(overview.ground.edges)
+    shown, left_out = _objects(overview, registered, panel, readings, places)
+    if not shown:
+        raise NotFound(
+            f"none of panel {panel.name!r}'s objects shows in the image: {next(iter(left_out.values()), 'it has none')}",
+            hint="take an overview that shows the whole panel in focus and in even light",
+        )
+    grown, added = _grown(overview, shown, _of_nothing(overview, registered, panel, shown, places), knowledge, source)
+    before, now = (_recognised(overview, places, shown, known) for known in (knowledge, grown))
+    return PanelLooks(knowledge=grown, added=added, shown=shown, left_out=left_out, known_before=before, known_now=now)
+
+
+def _objects(
+    overview: Overview, view: View, panel: Panel, readings: Sequence[ObjectReading], places: Array
+) -> tuple[tuple[Shown, ...], dict[str, str]]:
+    """The objects that can teach, and why the others cannot."""
+    shown: list[Shown] = []
+    left_out: dict[str, str] = {}
+    for thing, reading in zip(panel.objects, readings, strict=True):
+        if not reading.present:
+            left_out[thing.name] = reading.reason or "it is not seen"
+            continue
+        shift_px = reading.centre_px - view.project([thing.point_m])[0]
+        found = _nearest_sub_object(overview, view, thing, shift_px, places)
+        if found is None:
+            left_out[thing.name] = NOT_DISTINCT
+            continue
+        place, middle_m = found
+        (left, top), (right, bottom) = _box(overview, view, thing, shift_px)
+        corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+        shown.append(
+            Shown(
+                thing=thing,
+                place_px=place,
+                middle_m=middle_m,
+                centre_px=overview.in_image(overview.on_plate(place[None]) + middle_m)[0],
+                box_px=overview.in_image(overview.on_plate(corners)),
+            )
+        )
+    return tuple(shown), left_out
+
+
+def _nearest_sub_object(
+    overview: Overview, view: View, thing: PanelObject, shift_px: Array, places: Array
+) -> tuple[Array, Array] | None:
+    """The sub-object at the object's middle; else, as for a slider or a lever, the nearest in its box, and how the middle
+    lies from it.
+    """
+    x, y = thing.position_m
+    stem = np.column_stack([np.tile([x, y], (3, 1)), footprint_m(thing)[2] * FOOT_TO_TOP])
+    line = _on_ground(overview, view.project(stem) + shift_px)
+    away = np.linalg.norm(places[:, None] - line, axis=2)
+    is_near = away.min(axis=1) < SNAP_M * PLATE_PX_PER_M
+    if is_near.any():
+        return np.asarray(places[int(np.where(is_near, away[:, 1], np.inf).argmin())]), np.zeros(2)
+    low, high = _box(overview, view, thing, shift_px)
+    is_near = ((places >= low) & (places <= high)).all(axis=1)
+    if not is_near.any():
+        return None
+    place = places[int(np.where(is_near, away[:, 1], np.inf).argmin())]
+    middle_m = overview.on_plate(line[1:2])[0] - overview.on_plate(place[None])[0]
+    return np.asarray(place), np.round(middle_m, 4)
+
+
+def _box(overview: Overview, view: View, thing: PanelObject, shift_px: Array) -> Array:
+    """(2, 2) lowest and highest u and v of the object's box, foot to top, on the rectified plate."""
+    half_width, half_height, height = footprint_m(thing)
+    corners = np.array([[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (0.0, 1.0)])
+    box = corners * [half_width, half_height, height] + [*thing.position_m, 0.0]
+    at = _on_ground(overview, view.project(box) + shift_px)
+    return np.stack([at.min(axis=0), at.max(axis=0)])
+
+
+def _on_ground(overview: Overview, pixels: Array) -> Array:
+    """(N, 2) pixels of the image as pixels of the rectified plate."""
+    return overview.on_ground(under_pixels(overview.view, pixels, overview.plate_m))
+
+
+def _of_nothing(overview: Overview, view: View, panel: Panel, shown: Sequence[Shown], places: Array) -> Array:
+    """(N, LENGTH) looks of the sub-objects that are no object, nor where one may be that did not show."""
+    middles = np.array([each.place_px for each in shown])
+    away = np.linalg.norm(places[:, None] - middles, axis=2).min(axis=1)
+    is_nothing = away > PART_M * PLATE_PX_PER_M
+    names = {each.thing.name for each in shown}
+    for thing in panel.objects:
+        if thing.name not in names:
+            low, high = _box(overview, view, thing, np.zeros(2))
+            is_nothing &= ~((places >= low) & (places <= high)).all(axis=1)
+    return look_at(overview.ground, places[is_nothing])
+
+
+def _grown(
+    overview: Overview, shown: Sequence[Shown], nothing: Array, knowledge: Knowledge, source: str
+) -> tuple[Knowledge, dict[str, int]]:
+    """The knowledge with what it does not tell yet, and how many looks every kind got."""
+    own = look_at(overview.ground, np.array([each.place_px for each in shown]))
+    looks = np.round(np.vstack([own, nothing]) * UNIT) / UNIT  # as the files have them
+    names = np.array([each.thing.kind for each in shown] + [NOTHING] * len(nothing))
+    added: dict[str, int] = {}
+    grown = knowledge
+    for k in np.sort(worth_keeping(looks, names, knowledge.spread, known=knowledge)):
+        name = str(names[k])
+        size_m, middles_m = NOTHING_SIZE_M, None
+        if name != NOTHING:
+            half_width, half_height, _ = footprint_m(shown[k].thing)
+            size_m = (2.0 * half_width, 2.0 * half_height)
+            middles_m = shown[k].middle_m[None] if shown[k].middle_m.any() else None
+        grown = grown.grown(
+            Kind(name=name, size_m=size_m, looks=looks[k : k + 1], taught_by=source, middles_m=middles_m)
+        )
+        added[name] = added.get(name, 0) + 1
+    return grown, added
+
+
+def _recognised(overview: Overview, places: Array, shown: Sequence[Shown], knowledge: Knowledge) -> tuple[str, ...]:
+    """Names of the objects that are recognised blind in this overview."""
+    looks = look_at(overview.ground, places)
+    found = chosen(overview.ground, places, looks, knowledge, overview.view, overview.plate_m)
+    return tuple(each.thing.name for each in shown if any(_is(each, candidate) for candidate in found))
+
+
+def _is(shown: Shown, candidate: Candidate) -> bool:
+    if candidate.reason is not None or candidate.kind != shown.thing.kind:
+        return False
+    reach_px = 0.5 * float(np.ptp(shown.box_px, axis=0).max())
+    return bool(np.linalg.norm(candidate.centre_px - shown.centre_px) < reach_px)

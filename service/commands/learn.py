@@ -1,0 +1,50 @@
+"""`panelwright learn`: the cell looks at its own panel, and blind recognition knows the panel's objects from then on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from service.client import Client
+from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console
+from service.commands.own_cell import ServiceUrl, run_on_cell
+from service.commands.tasks import follow
+
+
+def learn(
+    *,
+    cell: CellOption = DEFAULT_CELL,
+    seed: SeedOption = None,
+    runs: Annotated[Path, typer.Option(help="Folder of what is taught: RUNS/knowledge.")] = Path("runs"),
+    url: ServiceUrl = None,
+) -> None:
+    """Locate the panel and learn from one overview what its objects look like, without a click.
+
+    Again when something shows that did not before (a lamp is lit, a lever is open): only what is not known yet is added.
+    """
+    run_on_cell(_learn, cell=cell, seed=seed, runs=runs, url=url)
+
+
+def _learn(client: Client) -> bool:
+    result = follow(client, client.post("/v1/learn", {})["id"])["result"]
+    if result is None:
+        return False
+    tell(result)
+    return True
+
+
+def tell(learned: dict[str, Any]) -> None:
+    """What an overview of a known panel taught (`service.lessons.Learned.told`), for people."""
+    added, seen = learned["added"], len(learned["taught_by"])
+    looks = ", ".join(f"{name} {count}" for name, count in sorted(added.items())) or "none, everything was known"
+    console.print(f"panel [bold]{learned['panel']}[/]: {seen} objects looked at; new looks: {looks}")
+    console.print(
+        f"recognised blind in this overview: {len(learned['known_before'])} of {seen} before, {len(learned['known_now'])} now"
+    )
+    for name, why in learned["left_out"].items():
+        console.print(escape(f"  {name} taught nothing: {why}"))
+    if files := [Path(file) for file in learned["files"]]:
+        console.print(escape(f"written  {files[0].parent}: {', '.join(file.name for file in files)}"))

@@ -1,0 +1,49 @@
+"""One task on a running service, or on a cell that is started for it and ended after it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+
+from service.client import Client
+from service.commands.common import client_of, console, read_cell
+from service.commands.leaving import INTERRUPTED, leave, one_interrupt
+
+ServiceUrl = Annotated[str | None, typer.Option("--url", help="Use this running service instead of starting the cell.")]
+
+
+def run_on_cell(
+    work: Callable[[Client], bool], *, cell: Path, seed: int | None, runs: Path, url: str | None, moves: bool = True
+) -> NoReturn:
+    """Do `work` and end the process: 0 when it says that it succeeded, else 1.
+
+    Args:
+        cell, seed, runs: of a cell of our own, where no `url` names a running service.
+        moves: clear the stop of the own cell first.
+    """
+    if url is not None:
+        raise typer.Exit(0 if work(client_of(url)) else 1)
+    from service.serve import Options, Panelwright, exit_on_sigterm
+
+    loaded = read_cell(cell, seed)
+    exit_on_sigterm()
+    panelwright = Panelwright(loaded, Options(port=0, runs_dir=runs))
+    console.print(f"cell [bold]{loaded.name}[/], {loaded.file.cell.mode}, seed {loaded.file.cell.seed}: starting")
+    code = 1
+    with one_interrupt():
+        try:
+            panelwright.start()
+            client = Client(url=panelwright.url)
+            stop = client.get("/v1/stop")
+            if stop["is_latched"] and moves:  # as in `demo`: to run it is to say that the cell is clear
+                client.post("/v1/stop/reset", {"seen_count": stop["count"]})
+            code = 0 if work(client) else 1
+        except KeyboardInterrupt:
+            console.print("stopped by Ctrl-C: arm stopped, nothing written")
+            code = INTERRUPTED
+        finally:
+            panelwright.close()
+        leave(code)

@@ -1,0 +1,66 @@
+"""The verb `learn`: the panel's own overview teaches what its objects look like; blind recognition then knows them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from hal.geometry import compose
+from service.lessons import learn_panel
+from service.operations.eyes import look, settle
+from service.operations.inspect import ensure_located
+from service.operations.locate import go_to_overview
+from service.operations.requests import LearnRequest
+from service.operations.session import Session
+from service.operations.stored import Pixels, panel_of, shown, stored_view
+from service.report.plots import png_of
+from service.teachings import Teachings
+
+if TYPE_CHECKING:
+    from hal.panel import Panel
+    from perception.vision.teaching.from_panel import PanelLooks
+    from perception.vision.view import View
+
+
+def run_learn(session: Session, request: LearnRequest) -> dict[str, Any]:
+    """Learn the looks of the panel's objects from an overview of now, or from a stored one.
+
+    Raises:
+        NoSuchImage, NoSuchKnowledge: unknown image or panel.
+        InvalidRequest, NotObservable, NotFound, Ambiguous: the overview teaches nothing; says why and what helps.
+    """
+    from perception.vision.view import CameraView
+
+    if request.image is not None:
+        session.progress(0.1, "look at the stored image")
+        panel = panel_of(session, request.panel)
+        return _learn(session, *stored_view(session, request, panel), panel)
+    if request.move:
+        ensure_located(session.part(0.0, 0.5))
+        session.progress(0.5, "drive to the overview")
+        go_to_overview(session)
+    settle(session)
+    session.progress(0.8, "look")
+    seen = look(session, request.camera)
+    pose = compose(seen.base_from_camera.inverse(), session.known_panel())
+    live = CameraView(intrinsics=seen.intrinsics, camera_from_panel=pose)
+    return _learn(session, seen.pixels, live, session.panel)
+
+
+def _learn(session: Session, pixels: Pixels, view: View, panel: Panel) -> dict[str, Any]:
+    session.progress(0.9, "learn")
+    teachings = Teachings.of_runs(session.context.runs_dir, session.cell)
+    learned = learn_panel(teachings, pixels, view, panel)
+    picture = png_of(shown(_drawn(pixels, learned.looks)))
+    return {**learned.told(), "pictures": [session.context.task.artefact("learned.png", picture, "image/png")]}
+
+
+def _drawn(pixels: Pixels, looks: PanelLooks) -> Pixels:
+    """The overview with the objects that taught: green are recognised blind now, amber are not."""
+    from perception.vision.annotate import AMBER, GREEN, draw_outlines
+
+    return draw_outlines(
+        pixels,
+        [each.box_px for each in looks.shown],
+        [f"{each.thing.name}: {each.thing.kind}" for each in looks.shown],
+        [GREEN if each.thing.name in looks.known_now else AMBER for each in looks.shown],
+    )

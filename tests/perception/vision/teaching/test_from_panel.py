@@ -1,0 +1,114 @@
+"""A known panel teaches its own looks: what blind recognition says before and after, and what teaches nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hal.errors import NotFound
+from hal.geometry import UncertainPose, perturbed
+from hal.panel import Lamp, Panel
+from perception.vision.finding.blind import Candidate, recognise
+from perception.vision.knowledge import NOTHING, Knowledge, load_knowledge, shipped_knowledge, write_kind
+from perception.vision.registration.outline import footprint_m
+from perception.vision.teaching.from_panel import PanelLooks, teach_from_panel
+from perception.vision.view import CameraView
+from tests.perception.vision.bench_panel import panel, scene
+
+PLATE_M = (0.60, 0.40)
+
+
+def learned(known_panel: Panel, **more: float) -> PanelLooks:
+    image, intrinsics, pose = scene(tilt_deg=4.0, distance_m=0.66, **more)
+    return teach_from_panel(
+        image, CameraView(intrinsics=intrinsics, camera_from_panel=pose), known_panel, shipped_knowledge()
+    )
+
+
+@pytest.fixture(scope="module")
+def lesson() -> PanelLooks:
+    return learned(panel())
+
+
+def right(knowledge: Knowledge) -> tuple[set[str], list[Candidate]]:
+    """Names of the objects that are found in another overview with other states, and the accepted candidates."""
+    image, _, _ = scene(
+        tilt_deg=11.0, azimuth_deg=200.0, distance_m=0.7, shown={"pressure": 2.0, "mode": "low", "drain": -0.4}, seed=5
+    )
+    given = [c for c in recognise(image, knowledge, plate_m=PLATE_M) if c.reason is None]
+    names = {
+        thing.name
+        for thing in panel().objects
+        for c in given
+        if c.kind == thing.kind and np.linalg.norm(c.centre_m - thing.position_m) < max(footprint_m(thing)[:2])
+    }
+    return names, given
+
+
+def test_what_one_overview_taught_is_found_in_another(lesson: PanelLooks) -> None:
+    before, _ = right(shipped_knowledge())
+    now, given = right(lesson.knowledge)
+    assert "emergency" not in before and "emergency" in now
+    assert len(now) >= len(panel().objects) - 1 and len(now) >= len(before)
+    assert len(given) == len(now), "nothing is named that is not there"
+
+
+def test_the_lesson_says_what_it_did(lesson: PanelLooks) -> None:
+    assert lesson.added["mushroom"] == 1 and lesson.added[NOTHING] > 0
+    assert {kind.name for kind in lesson.kinds} == set(lesson.added)
+    assert [each.thing.name for each in lesson.shown] == [thing.name for thing in panel().objects]
+    assert set(lesson.known_before) < set(lesson.known_now) and not lesson.left_out
+    shipped = shipped_knowledge()
+    for kind in lesson.knowledge.kinds:
+        known = shipped.kind(kind.name)
+        assert len(kind.looks) == lesson.added.get(kind.name, 0) + (0 if known is None else len(known.looks))
+
+
+def test_the_same_overview_teaches_nothing_twice(lesson: PanelLooks) -> None:
+    image, intrinsics, pose = scene(tilt_deg=4.0, distance_m=0.66)
+    view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+    assert teach_from_panel(image, view, panel(), lesson.knowledge).added == {}
+
+
+def test_the_pose_need_not_be_exact(lesson: PanelLooks) -> None:
+    off = learned(panel(), pose_error=2.0)
+    assert off.known_now == lesson.known_now
+
+
+def test_an_object_that_is_not_there_teaches_nothing_and_its_place_is_not_nothing() -> None:
+    ghost = Lamp(name="ghost", position_m=(0.13, -0.15), radius_m=0.010)
+    taught = learned(panel().model_copy(update={"objects": (*panel().objects, ghost)}))
+    assert list(taught.left_out) == ["ghost"] and "bare plate" in taught.left_out["ghost"]
+    assert "ghost" not in taught.known_now and len(taught.shown) == len(panel().objects)
+
+
+def test_a_panel_that_is_not_where_the_pose_has_it_teaches_nothing() -> None:
+    image, intrinsics, pose = scene(tilt_deg=4.0, distance_m=0.66)
+    elsewhere = UncertainPose(
+        parent_from_child=perturbed(pose.parent_from_child, np.array([0.06, 0.05, 0.0, 0.0, 0.0, 0.2])),
+        covariance=pose.covariance,
+    )
+    view = CameraView(intrinsics=intrinsics, camera_from_panel=elsewhere)
+    with pytest.raises(NotFound, match="does not show panel"):
+        teach_from_panel(image, view, panel(), shipped_knowledge())
+
+
+def test_what_is_written_is_what_was_learned(lesson: PanelLooks, tmp_path: Path) -> None:
+    for kind in lesson.kinds:
+        write_kind(kind, tmp_path)
+    for kind in load_knowledge(tmp_path).kinds:
+        made = lesson.knowledge.kind(kind.name)
+        assert made is not None
+        np.testing.assert_array_equal(kind.looks, made.looks)
+
+
+def test_looks_are_added_once_and_new_names_make_new_kinds(lesson: PanelLooks) -> None:
+    shipped = shipped_knowledge()
+    grown = shipped.with_looks_of(lesson.kinds)
+    assert {kind.name: len(kind.looks) for kind in grown.kinds} == {
+        kind.name: len(kind.looks) for kind in lesson.knowledge.kinds
+    }
+    assert grown.with_looks_of(lesson.kinds).kinds[0].looks.shape == grown.kinds[0].looks.shape
+    np.testing.assert_array_equal(grown.spread, shipped.spread)

@@ -1,0 +1,64 @@
+"""The simulated cell and its own panel, inline: blind with the shipped looks, after one lesson, and as it is shipped."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.vision_simulated import judged, without_looks
+from hal.config import Cell, load_cell
+from hal.errors import NotFound
+from service.cell import CellRuntime
+from service.connection import LocalConnection
+from service.operations.context import CellMemory, OperationContext
+from service.operations.learn import run_learn
+from service.operations.recognise import run_recognise
+from service.operations.requests import LearnRequest, RecogniseRequest
+from service.operations.session import Session
+from service.task_model import Task
+from service.tasks import TaskContext
+
+ROOT = Path(__file__).parents[3]
+SEED = 31
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+
+@pytest.fixture(scope="module")
+def runtime() -> Iterator[CellRuntime]:
+    started = CellRuntime.start(load_cell(ROOT / "cells/bench.toml", seed=SEED), is_latched=lambda: False)
+    yield started
+    started.close()
+
+
+def session(runtime: CellRuntime, cell: Cell, folder: Path, memory: CellMemory) -> Session:
+    task = TaskContext(Task(id="test", verb="learn", request={}, moves=True), folder / "artefacts")
+    local = LocalConnection(cell, runtime.objects, close=runtime.close)
+    return Session(
+        context=OperationContext(connection=local, task=task, runs_dir=folder / "runs", state=memory),
+    )
+
+
+def blind(session: Session, cell: Cell) -> Any:
+    found = run_recognise(session, RecogniseRequest(mode="blind"))["candidates"]
+    rows = [{"reason": c.reason, "centre_m": c.centre_m, "kind": c.kind, "confidence": c.confidence} for c in found]
+    return judged(cell, SEED, rows)
+
+
+def test_one_overview_teaches_the_cell_its_panel(runtime: CellRuntime, tmp_path: Path) -> None:
+    cell, memory = without_looks(runtime.cell), CellMemory()
+    before = blind(session(runtime, cell, tmp_path, memory), cell)
+    with pytest.raises(NotFound, match="not been located"):
+        run_learn(session(runtime, cell, tmp_path, CellMemory()), LearnRequest(move=False))
+    taught = run_learn(session(runtime, cell, tmp_path, memory), LearnRequest())
+    assert len(taught["taught_by"]) == len(cell.panel.objects) and not taught["left_out"]
+    now = blind(session(runtime, cell, tmp_path, memory), cell)
+    assert len(before.missed) >= 4 and len(now.missed) <= 1
+    assert all(answer.is_right for answer in now.answers)
+
+
+def test_the_shipped_cell_knows_its_panel_untaught(runtime: CellRuntime, tmp_path: Path) -> None:
+    seen = blind(session(runtime, runtime.cell, tmp_path, CellMemory()), runtime.cell)
+    assert len(seen.missed) <= 1 and all(answer.is_right for answer in seen.answers)

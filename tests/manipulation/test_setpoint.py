@@ -1,0 +1,172 @@
+"""What the checks before a motion let through and refuse, each at its bound, and what the last filter sends."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from hal.errors import MotionRefused
+from hal.geometry import perturbed
+from hal.motion import CartesianPath, DeclaredMotion, GripperMotion, Hold, JointTrajectory
+from manipulation.kinematics import Kinematics
+from manipulation.sensing import DeviceFailure
+from manipulation.setpoint import SetPointFilter, check, flange_matrix
+from tests.manipulation.arms import T3
+from tests.manipulation.rig import GRIP, HOME, tool_pose
+
+ARM = Kinematics.of(T3)
+DT_S = 0.002
+POSE = tool_pose(HOME)
+NAN = float("nan")
+
+TRAJECTORY = JointTrajectory(
+    name="joints",
+    times_s=np.array([0.0, 1.0]),
+    positions_rad=np.array([HOME, HOME + 0.1]),
+    velocities_rad_per_s=np.zeros((2, 6)),
+)
+PATH = CartesianPath(name="path", flange_from_tool=GRIP, times_s=np.array([0.0, 1.0]), base_from_tool=(POSE, POSE))
+HOLD = Hold(name="hold", duration_s=1.0)
+GRASP = GripperMotion(name="grasp", width_m=0.01, force_n=1.0)
+
+
+def with_joint(array: np.ndarray, row: int, value: float) -> np.ndarray:
+    """A copy with another number for the last joint of a row."""
+    out = array.copy()
+    out[row, -1] = value
+    return out
+
+
+def shifted(*six: float) -> CartesianPath:
+    """The path begun beside the tool: m, then rad."""
+    return replace(PATH, base_from_tool=(perturbed(POSE, np.array(six)), POSE))
+
+
+UPPER, LOWER = T3.upper_rad[-1], T3.lower_rad[-1]
+FASTEST = T3.velocity_rad_per_s[-1]
+POSITIONS, STILL = TRAJECTORY.positions_rad, TRAJECTORY.velocities_rad_per_s
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        TRAJECTORY,
+        replace(TRAJECTORY, positions_rad=with_joint(POSITIONS, 1, UPPER)),
+        replace(TRAJECTORY, positions_rad=with_joint(POSITIONS, 1, LOWER)),
+        replace(TRAJECTORY, velocities_rad_per_s=with_joint(STILL, 1, -1.04 * FASTEST)),
+        replace(TRAJECTORY, positions_rad=POSITIONS + 0.049),
+        PATH,
+        shifted(0.0029, 0.0029, 0.0, 0.0, 0.0, 0.0),
+        shifted(0.0, 0.0, 0.0, 0.049, 0.0, 0.0),
+        replace(HOLD, duration_s=0.0),
+        replace(HOLD, duration_s=60.0),
+        replace(GRASP, width_m=0.0, force_n=0.0, speed_m_per_s=0.0, timeout_s=0.0),
+    ],
+)
+def test_what_can_be_meant_is_let_through(motion: DeclaredMotion) -> None:
+    check(motion, ARM, HOME)
+
+
+@pytest.mark.parametrize(
+    ("motion", "says"),
+    [
+        (replace(TRAJECTORY, positions_rad=POSITIONS[:, :5]), "for times and joints"),
+        (replace(TRAJECTORY, positions_rad=POSITIONS[:1]), "for times and joints"),
+        (replace(TRAJECTORY, velocities_rad_per_s=STILL[:1]), "for times and joints"),
+        (replace(TRAJECTORY, times_s=np.array([0.0, NAN])), "times must be finite"),
+        (replace(TRAJECTORY, times_s=np.array([0.0, 0.0])), "times must be finite"),
+        (replace(TRAJECTORY, times_s=np.array([1.0, 2.0])), "times must be finite"),
+        (replace(TRAJECTORY, times_s=np.array([-1.0, 1.0])), "times must be finite"),
+        (replace(TRAJECTORY, positions_rad=with_joint(POSITIONS, 1, NAN)), "is not finite"),
+        (replace(TRAJECTORY, velocities_rad_per_s=with_joint(STILL, 1, NAN)), "is not finite"),
+        (replace(TRAJECTORY, positions_rad=with_joint(POSITIONS, 1, UPPER + 1e-4)), "outside the joint range"),
+        (replace(TRAJECTORY, positions_rad=with_joint(POSITIONS, 1, LOWER - 1e-4)), "outside the joint range"),
+        (replace(TRAJECTORY, velocities_rad_per_s=with_joint(STILL, 0, -1.06 * FASTEST)), "above the joint limit"),
+        (replace(TRAJECTORY, positions_rad=POSITIONS - 0.051), "starts 0.051 rad away"),
+        (replace(PATH, times_s=np.array([0.0]), base_from_tool=(POSE,)), "times must be finite"),
+        (replace(PATH, base_from_tool=(POSE,)), "1 poses for 2 times"),
+        (replace(PATH, base_from_tool=(POSE, RigidTransform.from_translation([NAN, 0.0, 0.0]))), "is not finite"),
+        (shifted(0.0036, 0.0036, 0.0, 0.0, 0.0, 0.0), "starts 5.1 mm"),
+        (shifted(0.0, 0.0, 0.0, 0.0, 0.051, 0.0), "0.051 rad from the tool"),
+        (replace(HOLD, duration_s=-0.001), "a hold of"),
+        (replace(HOLD, duration_s=60.1), "a hold of"),
+        (replace(HOLD, duration_s=NAN), "a hold of"),
+        *((replace(GRASP, **{key: bad}), "negative or not finite")
+          for key in ("width_m", "force_n", "speed_m_per_s", "timeout_s") for bad in (-1e-6, NAN)),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_meant_is_refused_with_the_reason_and_the_motion_named(
+    motion: DeclaredMotion, says: str
+) -> None:
+    with pytest.raises(MotionRefused, match=f"motion '{motion.name}' refused: .*{says}") as caught:
+        check(motion, ARM, HOME)
+    assert caught.value.details["motion"] == motion.name
+
+
+def made_filter(**given: Any) -> SetPointFilter:
+    out = SetPointFilter(ARM, flange_matrix(GRIP), given.get("tip_limit_m_per_s", 10.0), DT_S)
+    out.begin_at(given.get("start", HOME))
+    return out
+
+
+def test_the_filter_begins_at_rest_at_the_measured_joints_or_at_their_limit() -> None:
+    beyond = np.full(6, 3.0)
+    made = made_filter(start=beyond)
+    np.testing.assert_array_equal(made.last_rad, np.full(6, UPPER))
+    assert made.is_at_rest
+    np.testing.assert_array_equal(made_filter(start=-beyond).last_rad, np.full(6, LOWER))
+
+
+def test_the_filter_keeps_count_of_what_was_really_sent() -> None:
+    made = made_filter()
+    made.sent(HOME + 1e-4)
+    np.testing.assert_allclose(made.velocity_rad_per_s, 0.05)
+    np.testing.assert_array_equal(made.last_rad, HOME + 1e-4)
+    assert not made.is_at_rest
+    made.sent(HOME + 1e-4)
+    assert made.is_at_rest
+    made.sent(HOME - 1e-4)
+    assert not made.is_at_rest, "backwards is a motion too"
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_leap_becomes_a_ramp_that_uses_speed_and_acceleration_to_their_limits(sign: float) -> None:
+    made, velocity, acceleration = made_filter(), np.array(T3.velocity_rad_per_s), np.array(T3.acceleration_rad_per_s2)
+    for tick in range(1, 150):
+        made.sent(made.apply(HOME + sign * 1.0))
+        expected = np.minimum(velocity, tick * acceleration * DT_S)
+        np.testing.assert_allclose(made.velocity_rad_per_s, sign * expected, atol=1e-9)
+
+
+def test_what_stays_within_the_limits_is_sent_as_it_is() -> None:
+    made, ways = made_filter(), 0.05 * (1.0 - np.cos(np.linspace(0.0, np.pi, 300)))
+    for way in ways:
+        made.sent(made.apply(HOME + way))
+        np.testing.assert_allclose(made.last_rad, HOME + way, atol=1e-12)
+
+
+def test_the_filter_sends_nothing_beyond_the_joint_range_nor_above_the_speed_of_the_tip() -> None:
+    made = made_filter(start=np.full(6, UPPER - 0.001))
+    for _ in range(300):
+        made.sent(made.apply(np.full(6, 4.0)))
+    np.testing.assert_allclose(made.last_rad, UPPER)
+    made = made_filter(tip_limit_m_per_s=0.05)
+    tips = [tool_pose(HOME).translation]
+    for _ in range(100):
+        made.sent(made.apply(HOME + 0.5))
+        tips.append(tool_pose(made.last_rad).translation)
+    fastest = np.linalg.norm(np.diff(tips, axis=0), axis=1).max() / DT_S
+    assert 0.049 <= fastest <= 0.0505
+
+
+@pytest.mark.parametrize("bad", [NAN, float("inf")])
+def test_a_set_point_that_is_no_number_is_a_failure_of_the_controller(bad: float) -> None:
+    wanted = HOME.copy()
+    wanted[3] = bad
+    with pytest.raises(DeviceFailure, match="not finite") as caught:
+        made_filter().apply(wanted)
+    assert caught.value.device == "controller"

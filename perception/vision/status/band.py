@@ -30,6 +30,8 @@ BENDS = (0.0, -0.3, 0.3, -0.6, 0.6, -1.0, 1.0, -1.6, 1.6, -2.3, 2.3)  # of the b
 INK_EDGE_PX = 4.0
 OWN_ASIDE, OWN_RAD = 0.6, np.deg2rad(12.0)  # of a band's width from the object's middle; from one of its directions
 BENT_AT = (0.5, 0.3, 0.7)  # of its length
+CORE = 0.2  # of the width, to either side of the axis: where a band's gray is looked at
+CENTRED = ((0.1, 0.3), (0.1, 0.15), (0.05, 0.08), (0.05, 0.04))
 FINER = ((0.14, 0.3), (0.07, 0.15))  # steps of place and size about the best bend
 MERGED = 1.7  # times the other end's width: something lies beside the cable there
 
@@ -195,14 +197,30 @@ def _joined(
         return None
     across = np.array([-along[1], along[0]]) * width
     t = np.linspace(0.0, 1.0, max(12, round(length / 1.5)))
-    band = _Search(smooth=smooth, a=a, b=b, across=across, t=t, core=min(widths) / width, tolerance=tolerance)
+    core = CORE * min(widths)
+    band = _Search(smooth=smooth, a=a, b=b, across=across, t=t, half_px=core, tolerance=tolerance)
     at, bend, share = band.best(list(product(BENT_AT, BENDS)))
     for step, size in FINER if share < WHOLLY else ():
         near = [(at + i * step, bend + k * size) for i, k in product((0, -1, 1), repeat=2)]
         at, bend, share = band.best([(place, by) for place, by in near if 0.1 < place < 0.9])
     if share < ALONG_SHARE:
         return None
+    if bend == 0.0:
+        return _Band(points_px=band.points([(at, bend)])[0], width_px=width, share=share)
+    # Square to its legs it has another width than to the chord; many bends hold a thick cable's core, but one holds all.
+    width = min(_width(a, band, at, bend), _width(b, band, at, bend))
+    whole = replace(band, half_px=max(CORE * width, width / 2 - INK_EDGE_PX))
+    for step, size in CENTRED:
+        near = [(at + i * step, bend + k * size) for i, k in product((0, -1, 1), repeat=2)]
+        at, bend, _ = whole.best([(place, by) for place, by in near if 0.1 < place < 0.9])
     return _Band(points_px=band.points([(at, bend)])[0], width_px=width, share=share)
+
+
+def _width(end: Crossing, band: _Search, at: float, bend: float) -> float:
+    """Width of a bent band at one of its ends, square to its leg there."""
+    _, knee, _ = band.points([(at, bend)])[0]
+    leg = (knee - end.middle_px) / max(float(np.linalg.norm(knee - end.middle_px)), 1e-9)
+    return end.length_px * abs(float(leg[0] * end.tangent[1] - leg[1] * end.tangent[0]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -216,14 +234,20 @@ class _Band:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Search:
-    """Straight and bent bands between two crossings, by the share of their core that has the crossings' gray."""
+    """Straight and bent bands between two crossings, by the share of what lies about their axis that has the crossings' gray.
+
+    Attributes:
+        across: (2,) square to the chord, as long as the band seems wide: bends are measured by it.
+        t: (N,) places looked at along the band, 0 to 1.
+        half_px: how far to either side of the axis is looked.
+    """
 
     smooth: NDArray[np.uint8]
     a: Crossing
     b: Crossing
     across: Array
     t: Array
-    core: float
+    half_px: float
     tolerance: float
 
     def points(self, shapes: list[tuple[float, float]]) -> Array:
@@ -241,10 +265,12 @@ class _Search:
             + first[..., None] * (axes[:, 1] - axes[:, 0])[:, None]
             + second[..., None] * (axes[:, 2] - axes[:, 1])[:, None]
         )
-        sides = np.array([-0.2, 0.0, 0.2])[:, None] * self.across * self.core
-        flat = (axis[:, None] + sides[:, None]).reshape(len(shapes), -1, 2)  # shapes, sides times along, 2
+        legs = axes[:, 1:] - axes[:, :-1]  # shapes, 2, 2
+        normals = np.stack([-legs[..., 1], legs[..., 0]], axis=-1) / np.linalg.norm(legs, axis=-1, keepdims=True)
+        aside = self.half_px * np.where((t < knots)[..., None], normals[:, :1], normals[:, 1:])
+        flat = np.concatenate([axis - aside, axis, axis + aside], axis=1)
         wanted = self.a.gray + t * (self.b.gray - self.a.gray)
-        off = np.abs(sample_at(self.smooth, flat[..., 0], flat[..., 1]) - np.tile(wanted, len(sides)))
+        off = np.abs(sample_at(self.smooth, flat[..., 0], flat[..., 1]) - np.tile(wanted, 3))
         shares = np.count_nonzero(off < self.tolerance, axis=1) / off.shape[1]
         k = int((shares + 0.01 * np.array([bend == 0.0 for _, bend in shapes])).argmax())
         return (*shapes[k], float(shares[k]))

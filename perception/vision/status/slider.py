@@ -13,14 +13,15 @@ from perception.vision.image import WHITE_LEVEL
 from perception.vision.patch import Patch, sample_at
 from perception.vision.reading import Status, gated, probability, refused
 from perception.vision.registration.outline import footprint_m
+from perception.vision.status.band import lying_across
 from perception.vision.status.choice import contrast_noise
-from perception.vision.status.cover import covered
 from perception.vision.view import Array
 
 SLOT = 0.2  # of the cap's width: half of the slot and what blurs it
 EDGE_BOX = 0.22  # of the cap's length: a line across its middle is further from its edges
 LEAST_OPEN = 0.4  # of a box that must not be covered
 SLACK = 0.12  # of the cap's length: by how much a cap may differ from its drawing
+BEYOND, MOST_BEYOND = 0.8, 0.4  # of the cap's width from the track; share that may be as dark there
 SIDES = np.linspace(-0.40, 0.40, 17)  # of the cap's width: inside the cap
 
 
@@ -157,18 +158,22 @@ def _uncovered(patch: Patch, spec: Slider, s: Array, profile: Array, lean_m: flo
     lean_px = float(np.linalg.norm(patch.parallax_px_per_m)) * spec.cap_size_m[2]
     room_m = 0.004 + lean_px / patch.px_per_m
     width, height, _ = footprint_m(spec)
-    cover = covered(patch, half_width_m=width + room_m, half_height_m=height + room_m, is_round=False)
+    cover = lying_across(patch, half_width_m=width + room_m, half_height_m=height + room_m, is_round=False)
     if cover is None:
         return np.ones_like(s)
     open_ = _open(patch, cover, spec.angle_rad, s, 0.4 * spec.cap_size_m[1])
-    is_cap = _is_cap(profile, s, open_, spec.cap_size_m[0] + abs(lean_m))
+    beyond = [_profile(patch, spec.angle_rad, s, np.array([k * spec.cap_size_m[1]])) for k in (-BEYOND, BEYOND)]
+    is_cap = _is_cap(profile, np.maximum(*beyond), s, open_, spec.cap_size_m[0] + abs(lean_m))
     return np.ones_like(s) if is_cap else open_
 
 
-def _is_cap(profile: Array, s: Array, open_: Array, width_m: float) -> bool:
+def _is_cap(profile: Array, beyond: Array, s: Array, open_: Array, width_m: float) -> bool:
     """Is what seems to lie across the track the cap itself? A dark cap runs into printed ticks of the same gray.
 
-    The cap is as long as the panel file says, and it is the only thing that stands out there.
+    The cap is as long as the panel file says, it is the only thing that stands out there, and it ends on both sides.
+
+    Args:
+        profile, beyond: (N,) gray along the track on the cap's sides, and the brighter of what lies beyond them.
     """
     shut = open_ < 0.5
     if not shut.any():
@@ -180,6 +185,8 @@ def _is_cap(profile: Array, s: Array, open_: Array, width_m: float) -> bool:
     touched = [run for run in runs if len(run) > 2 and shut[run].any()]
     others = [run for run in runs if len(run) > 2 and not shut[run].any()]
     if len(touched) != 1 or others:
+        return False
+    if float((beyond[touched[0]] < level).mean()) > MOST_BEYOND:
         return False
     length_m = float(s[touched[0][-1]] - s[touched[0][0]])
     return abs(length_m - width_m) < 0.3 * width_m

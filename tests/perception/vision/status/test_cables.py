@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -11,17 +13,23 @@ from benchmarks.display_drawing import draw_taught
 from benchmarks.display_report import read_case
 from benchmarks.panel_scene import draw_scene
 from benchmarks.vision_held_out import found_blind, read_scene
-from hal.panel import Gauge, Lever, Scale, State
+from hal.panel import Gauge, Lever, Scale, Slider, State
 from perception.vision.patch import Patch
 from perception.vision.status.band import cables_across, lying_across
 from perception.vision.status.bar import bar_contrast
 from perception.vision.status.comb import Comb
-from perception.vision.status.gauge import read_gauge
+from perception.vision.status.gauge import read_gauge, status_of_pointer
 from perception.vision.status.lever import read_lever
+from perception.vision.status.pointer import PointerFit
+from perception.vision.status.slider import read_slider
 from perception.vision.status.stray import stray_ink
 
 SIZE, PX_PER_M, RADIUS_M = 240, 3000.0, 0.031
 MIDDLE = SIZE // 2
+SLIDER = Slider(
+    kind="slider", name="s", position_m=(0.0, 0.0), angle_rad=0.0, travel_m=0.04, cap_size_m=(0.018, 0.02, 0.0001),
+    scale=Scale(minimum=0.0, maximum=100.0, unit="%", at_min=-0.02, at_max=0.02),
+)  # fmt: skip
 SCALE = Scale(minimum=0.0, maximum=10.0, unit="bar", at_min=-np.deg2rad(135.0), at_max=np.deg2rad(135.0))
 GAUGE = Gauge(kind="gauge", name="g", position_m=(0.0, 0.0), radius_m=RADIUS_M, scale=SCALE)
 LEVER = Lever(
@@ -78,6 +86,49 @@ def test_a_bent_cable_is_masked_and_little_else() -> None:
     v, u = np.indices(found.shape)
     face = np.hypot(u - MIDDLE, v - MIDDLE) < 0.95 * RADIUS_M * PX_PER_M
     assert found[drawn & face].mean() > 0.95 and found[face].mean() < 2.0 * drawn[face].mean()
+
+
+@pytest.mark.parametrize("knee", [(85, 125), (95, 95), (100, 150)])
+def test_a_thick_bent_cable_is_masked_to_its_edges(knee: tuple[int, int]) -> None:
+    """A strip left over beside the mask would pass for a pointer."""
+    cable = np.zeros((SIZE, SIZE), np.uint8)
+    cv2.polylines(cable, [np.array([[-5, 60], knee, [100, SIZE + 5]])], False, 1, 36, cv2.LINE_8)
+    picture = np.full((SIZE, SIZE), 170, np.uint8)
+    cv2.circle(picture, (MIDDLE, MIDDLE), round(RADIUS_M * PX_PER_M), 225, -1, cv2.LINE_AA)
+    picture[cable > 0] = 20
+    found = lying_across(patch_of(picture), half_width_m=RADIUS_M, half_height_m=RADIUS_M, is_round=True)
+    assert found is not None
+    v, u = np.indices(found.shape)
+    face = np.hypot(u - MIDDLE, v - MIDDLE) < 0.95 * RADIUS_M * PX_PER_M
+    assert found[(cable > 0) & face].mean() > 0.97 and found[face & (cable == 0)].mean() < 0.12
+
+
+def test_a_pointer_of_an_uncertain_direction_is_refused() -> None:
+    fit = PointerFit(
+        angle_rad=0.3, sigma_rad=0.09, strength=40.0, contrast=90.0, rival_ratio=0.1, rival_rad=2.0, supported=1.0,
+        shown=1.0, is_dark=True, unknown=0.0,
+    )  # fmt: skip
+    assert status_of_pointer(replace(fit, sigma_rad=0.01), SCALE, 1.0).answered
+    told = status_of_pointer(fit, SCALE, 1.0)
+    assert not told.answered and "0.09 rad" in (told.reason or "")
+
+
+def slider(cap_middle: int, hose: tuple[int, int] | None) -> NDArray[np.uint8]:
+    """A dark cap, 54 px long, on a slot, and a hose of the cap's length across: its middle above and below the track."""
+    picture = np.full((SIZE, SIZE), 170, np.uint8)
+    cv2.rectangle(picture, (20, MIDDLE - 3), (220, MIDDLE + 3), 25, -1)
+    cv2.rectangle(picture, (cap_middle - 27, MIDDLE - 30), (cap_middle + 27, MIDDLE + 30), 35, -1)
+    if hose is not None:
+        cv2.line(picture, (hose[0], -5), (hose[1], SIZE + 5), 20, 52)
+    return picture
+
+
+def test_a_hose_as_wide_as_the_cap_is_no_cap() -> None:
+    clear = read_slider(patch_of(slider(90, None)), SLIDER)
+    assert clear.value == pytest.approx(100 * (90 - 60) / 120, abs=1.0)
+    for hose in ((72, 76), (66, 70), (108, 112), (80, 84)):
+        told = read_slider(patch_of(slider(90, hose)), SLIDER)
+        assert told.value is None or told.value == pytest.approx(clear.value, abs=2.0)
 
 
 def test_a_cable_of_the_faces_own_gray_does_not_hide_the_face() -> None:

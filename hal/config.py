@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -55,6 +56,27 @@ class EmulatorSection(Strict):
     options: dict[str, Any] = {}
 
 
+class CableSection(Strict):
+    """`[[simulation.cables]]`: a cable before the panel, straight from each point to the next."""
+
+    path_m: Annotated[tuple[Vector3, ...], Field(min_length=2, max_length=50)]
+    """Panel frame."""
+    radius_m: Annotated[float, Field(ge=0.001, le=0.05)] = 0.003
+    gray: Annotated[float, Field(ge=0, le=1)] = 0.08
+
+    @model_validator(mode="after")
+    def _goes_on(self) -> CableSection:
+        if any(a == b for a, b in pairwise(self.path_m)):
+            raise ValueError("path_m names a point twice in a row; remove one of them")
+        return self
+
+
+class SimulationSection(Strict):
+    """`[simulation]`: what the panel file does not know of and a simulated world has nevertheless."""
+
+    cables: Annotated[tuple[CableSection, ...], Field(max_length=20)] = ()
+
+
 class SafetySection(Strict):
     """`[safety]`"""
 
@@ -83,15 +105,18 @@ class CellFile(Strict):
     devices: Annotated[dict[Name, DeviceSection], Field(min_length=1)]
     workspace: WorkspaceSection
     safety: SafetySection = SafetySection()
+    simulation: SimulationSection = SimulationSection()
     emulators: dict[Name, EmulatorSection] = {}
 
     @model_validator(mode="after")
-    def _emulators_have_devices(self) -> CellFile:
+    def _stand_ins_have_their_place(self) -> CellFile:
         for name in self.emulators:
             if name not in self.devices:
                 raise ValueError(f"emulators.{name} stands for no device; devices: {', '.join(self.devices)}")
         if self.emulators and self.cell.mode == "real":
             raise ValueError("emulators need cell.mode = 'mixed' or 'sim'")
+        if self.simulation.cables and self.cell.mode == "real":
+            raise ValueError("simulation.cables need cell.mode = 'mixed' or 'sim'")
         return self
 
 

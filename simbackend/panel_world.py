@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from scipy.spatial.transform import RigidTransform
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from hal.config import Cell
+from hal.config import CableSection, Cell
 from hal.panel import (
     Button,
     Handwheel,
@@ -79,6 +81,8 @@ class PanelWorld:
             self._load_light(light, jitter)
         for built in self.built.values():
             self._load_object(built)
+        for k, cable in enumerate(cell.file.simulation.cables):
+            self._load_cable(k, cable)
         self._keep_apart()
         self.scene = self._draw_up()
         self.lamps_on = {name: built.is_on for name, built in self.built.items() if isinstance(built.thing, Lamp)}
@@ -117,6 +121,23 @@ class PanelWorld:
         self.bodies["_plate"] = engine.createMultiBody(0, solid, look, *_pose(pose))
         picture = Quad(pixels=textures.plate(panel), size_m=(panel.width_m, panel.height_m), centre_m=(0, 0, 0))
         self._pictures.append((picture, self.base_from_panel))
+
+    def _load_cable(self, number: int, cable: CableSection) -> None:
+        """Stiff rods from point to point, round at the joints."""
+        engine, radius = self.engine, cable.radius_m
+        colour = [cable.gray] * 3 + [1]
+        ball = engine.createCollisionShape(engine.GEOM_SPHERE, radius=radius)
+        round_look = engine.createVisualShape(engine.GEOM_SPHERE, radius=radius, rgbaColor=colour)
+        points = self.base_from_panel.apply(np.array(cable.path_m))
+        for k, point in enumerate(points):
+            self.bodies[f"_cable{number}_end{k}"] = engine.createMultiBody(0, ball, round_look, point.tolist())
+        for k, (a, b) in enumerate(pairwise(points)):
+            length = float(np.linalg.norm(b - a))
+            rod = engine.createCollisionShape(engine.GEOM_CYLINDER, radius=radius, height=length)
+            look = engine.createVisualShape(engine.GEOM_CYLINDER, radius=radius, length=length, rgbaColor=colour)
+            turn, _ = Rotation.align_vectors([b - a], [[0.0, 0.0, length]])
+            place = ((a + b) / 2).tolist()
+            self.bodies[f"_cable{number}_rod{k}"] = engine.createMultiBody(0, rod, look, place, turn.as_quat().tolist())
 
     def _keep_apart(self) -> None:
         """Let the bodies of room and panel touch the arm and nothing else."""

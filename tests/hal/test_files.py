@@ -110,6 +110,23 @@ def test_a_wrong_key_or_value_is_named(cell_path: Path, old: str, new: str, key:
     assert error.retry is Retry.AFTER_FIX
 
 
+CABLE = "[[simulation.cables]]\npath_m = {}\n"
+
+
+@pytest.mark.parametrize(
+    ("path_m", "mode", "says"),
+    [
+        ("[[0, 0, 0.05]]", "sim", "at least 2"),
+        ("[[0, 0, 0.05], [0, 0.1, 0.05], [0, 0.1, 0.05]]", "sim", "a point twice in a row"),
+        ("[[0, 0, 0.05], [0, 0.1, 0.05]]", "real", "simulation.cables need cell.mode"),
+    ],
+)
+def test_a_cable_that_cannot_hang_is_refused(cell_path: Path, path_m: str, mode: str, says: str) -> None:
+    cell_path.write_text(CELL.replace('mode = "sim"', f'mode = "{mode}"') + CABLE.format(path_m))
+    with pytest.raises(ConfigError, match=says):
+        load_cell(cell_path)
+
+
 @pytest.mark.parametrize("lit", ["start", "pressure", "lamp_2"])
 def test_a_button_lights_lamps_only(cell_path: Path, lit: str) -> None:
     """Any other object would fail in the simulator, where nobody thinks of the panel file."""

@@ -20,6 +20,11 @@ class Possible:
     value: float
     probability: float
 
+    @property
+    def half_digit(self) -> float:
+        """Half of what the last digit counts: the number's own uncertainty."""
+        return 0.5 * 10.0 ** -len(self.text.partition(".")[2])
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Answer:

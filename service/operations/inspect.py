@@ -1,30 +1,33 @@
-"""Reading the panel: an overview to find the objects, close-ups to read them."""
+"""Reading the panel: an overview to find the objects, close-ups to read them, and looks past what hides them."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.errors import NotFound
+from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import compose
 from hal.panel import PanelObject
 from perception.vision.annotate import draw_annotated, said
 from perception.vision.reading import ObjectReading
+from perception.vision.several_looks import joined
 from perception.vision.taught import inspect as inspect_image
-from service.operations.beliefs import READINGS, known_readings
+from service.operations.beliefs import READINGS, forget_reading, known_readings
 from service.operations.eyes import Look, look, settle
 from service.operations.locate import go_to_overview, locate
 from service.operations.requests import InspectRequest, RecogniseRequest
 from service.operations.session import Session, panel_object_or_all
 from service.operations.stored import read_stored, reading_row_json
 from service.operations.travel import go_to_camera_view
-from service.operations.views import close_up_groups, close_up_poses
+from service.operations.views import SIDES, close_up_groups, close_up_poses, side_poses
 from service.report.plots import png_of
 from service.report.record import Reading
+
+MOST_UNREAD = 4  # more than these at once: the light or the lens, and no cable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -57,7 +60,7 @@ def inspect_close(session: Session, names: Collection[str]) -> Inspection:
         closer = look_close(session, centre_m, group)
         readings |= closer.readings
         pictures += closer.pictures
-    return Inspection(readings=readings, pictures=tuple(pictures))
+    return look_past(session, Inspection(readings=readings, pictures=tuple(pictures)))
 
 
 def look_close(session: Session, centre_m: Iterable[float], names: Collection[str]) -> Inspection:
@@ -66,6 +69,39 @@ def look_close(session: Session, centre_m: Iterable[float], names: Collection[st
     go_to_camera_view(session, close_up_poses(pose, tuple(centre_m)), name=f"close-up of {', '.join(names)}"[:60])
     settle(session)
     return inspect_here(session, names)
+
+
+def look_past(session: Session, found: Inspection) -> Inspection:
+    """What is there and could not be read is looked at again from the sides, until it can be."""
+    unread = [reading for reading in found.readings.values() if reading.present and not reading.answered]
+    if len(unread) > MOST_UNREAD:
+        return found
+    readings, pictures = dict(found.readings), list(found.pictures)
+    for reading in unread:
+        looks = [reading]
+        for closer in _from_the_sides(session, reading.name):
+            looks.append(closer.readings[reading.name])
+            pictures += closer.pictures
+            if joined(looks).answered:
+                break
+        readings[reading.name] = joined(looks)
+        forget_reading(session, reading.name)  # one look alone may have said what the others contradict
+    _remember(session, readings.values())
+    return Inspection(readings=readings, pictures=tuple(pictures))
+
+
+def _from_the_sides(session: Session, name: str) -> Iterator[Inspection]:
+    """Close-ups of one object from each side that the arm reaches and the panel shows at."""
+    point_m = session.panel.object(name).point_m
+    for side in SIDES:
+        session.progress(1.0, "look past what hides it", name)
+        poses = side_poses(session.known_panel().parent_from_child, point_m, side)
+        try:
+            go_to_camera_view(session, poses, name=f"{name} from the side")
+            settle(session)
+            yield inspect_here(session, (name,))
+        except (PerceptionError, Unreachable):
+            continue
 
 
 def reading_row(reading: ObjectReading, when: str) -> Reading:

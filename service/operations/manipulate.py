@@ -18,7 +18,7 @@ from manipulation.skills.toggle import toggle
 from perception.vision.annotate import said
 from perception.vision.reading import ObjectReading
 from service.operations.beliefs import forget_reading, known_readings
-from service.operations.inspect import ensure_located, look_close
+from service.operations.inspect import ensure_located, look_close, look_past
 from service.operations.requests import ActionBody, ManipulateRequest
 from service.operations.session import Session
 from service.operations.targets import target_of, unworkable
@@ -113,13 +113,14 @@ class _Eye:
 
     def _look(self) -> ObjectReading | None:
         try:
-            found = look_close(self._session, self._witness.point_m, (self._witness.name,))
+            straight = look_close(self._session, self._witness.point_m, (self._witness.name,))
+            found = look_past(self._session, straight)
         except (PerceptionError, Unreachable):
             return None  # "cannot tell" is an answer; the outcome will be `unverified`
         self.picture = Picture(
             name=f"after-{self._thing.name}",
             title=f"second look at {self._witness.name}",
-            png=png_of(found.pictures[0]),
+            png=png_of(found.pictures[-1]),
         )
         reading = found.readings[self._witness.name]
         return reading if reading.present and reading.answered else None

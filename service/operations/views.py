@@ -15,6 +15,8 @@ from hal.panel import Panel, PanelObject
 
 FILL = 0.85  # share of the image that the target may fill: pose and mount are not exact
 CLOSE_UP_M = 0.30  # at 460 px focal length a 36 mm gauge face is 110 px wide
+SIDES = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))  # turns about the panel's x and y: right, left, above, below
+SIDE_RAD = (0.42, 0.32)  # readers stand a tilt of 0.5; a cable 30 mm before a display moves by 13 mm
 REACH_M = 0.045  # half size that a close-up leaves round an object's middle
 
 
@@ -64,6 +66,17 @@ def close_up_poses(base_from_panel: RigidTransform, point_m: Sequence[float]) ->
     for distance_m in (CLOSE_UP_M, 0.34, 0.38):
         for tilt in ((0.0, 0.0), (0.12, 0.0), (-0.12, 0.0), (0.0, 0.12), (0.0, -0.12), (0.22, 0.0), (-0.22, 0.0)):
             for roll in (0.0, math.pi / 2, -math.pi / 2, math.pi):
+                yield facing(base_from_panel, point_m, distance_m, roll_rad=roll, tilt_rad=tilt)
+
+
+def side_poses(
+    base_from_panel: RigidTransform, point_m: Sequence[float], side: tuple[float, float]
+) -> Iterator[RigidTransform]:
+    """Camera poses that look at a panel point from one of the `SIDES`, past what hides it from straight ahead."""
+    for distance_m in (CLOSE_UP_M, 0.34, 0.38):
+        for lean_rad in SIDE_RAD:
+            for roll in (0.0, math.pi / 2, -math.pi / 2, math.pi):
+                tilt = (lean_rad * side[0], lean_rad * side[1])
                 yield facing(base_from_panel, point_m, distance_m, roll_rad=roll, tilt_rad=tilt)
 
 

@@ -233,9 +233,8 @@ def _answer(
             else f"the evidence is too weak{maybe}: come closer, change the angle or the light"
         )
         return refused(why, confidence=best.probability, unit=unit, possible=rivals[:MOST_POSSIBLE])
-    half_digit = 0.5 * 10.0 ** -(len(best.text.split(".")[1]) if "." in best.text else 0)
     return Status(
-        value=best.value, unit=unit, uncertainty=half_digit, text=best.text, confidence=min(best.probability, 0.97)
+        value=best.value, unit=unit, uncertainty=best.half_digit, text=best.text, confidence=min(best.probability, 0.97)
     )
 
 

@@ -1,0 +1,78 @@
+"""One reading from several looks at an object: what hides it from one side seldom does from another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from perception.vision.reading import ANSWER_AT, ObjectReading, Status
+
+UNLISTED = 0.01  # probability of a number that a look does not list: it may have been wrong
+MOST_CONFIDENT = 0.9  # of a number that no look alone could tell
+SIGMAS = 5.0  # two values may lie so far apart
+
+
+def joined(looks: Sequence[ObjectReading]) -> ObjectReading:
+    """What the looks say together.
+
+    The surest answer holds unless another look contradicts it. Without an answer, numbers that each look of a display leaves
+    open are weighed together: what one allows and the others do not is out.
+
+    Args:
+        looks: of one object, the straightest first; at least one.
+    """
+    answers = [look for look in looks if look.answered]
+    if not answers:
+        return _from_what_is_left(looks)
+    best = max(answers, key=lambda look: look.confidence)
+    against = next((look for look in looks if not _allows(look, best)), None)
+    if against is None:
+        return best
+    return best.saying(
+        Status(
+            unit=best.unit,
+            possible=against.possible,
+            reason=f"two looks contradict each other ({_said(best)} and {_said(against)}): look again, or change the light",
+        )
+    )
+
+
+def _allows(look: ObjectReading, answer: ObjectReading) -> bool:
+    """Whether what a look says can be true when `answer` is."""
+    if look.answered:
+        if look.text is not None or look.state is not None:
+            return (look.text, look.state) == (answer.text, answer.state)
+        if look.value is None or answer.value is None:
+            return True
+        sigma = math.hypot(look.uncertainty or 0.0, answer.uncertainty or 0.0)
+        return abs(look.value - answer.value) <= SIGMAS * sigma
+    listed = {number.text: number.probability for number in look.possible}
+    return answer.text in listed or sum(listed.values()) < ANSWER_AT
+
+
+def _from_what_is_left(looks: Sequence[ObjectReading]) -> ObjectReading:
+    """The number that all looks of a display leave, or the refusal of the first look at which the object showed."""
+    first = next((look for look in looks if look.present), looks[0])
+    lists = [{number.text: number.probability for number in look.possible} for look in looks if look.possible]
+    if len(lists) < 2:
+        return first
+    numbers = {number.text: number for look in looks for number in look.possible}
+    likelihood = {text: math.prod(listed.get(text, UNLISTED) for listed in lists) for text in numbers}
+    best = max(likelihood, key=lambda text: likelihood[text])
+    trust = min(sum(listed.values()) for listed in lists)
+    confidence = min(trust * likelihood[best] / sum(likelihood.values()), MOST_CONFIDENT)
+    if confidence < ANSWER_AT:
+        return first
+    number = numbers[best]
+    return first.saying(
+        Status(
+            value=number.value, unit=first.unit, uncertainty=number.half_digit, text=number.text, confidence=confidence
+        )
+    )
+
+
+def _said(look: ObjectReading) -> str:
+    """A look's answer in a word."""
+    if look.answered:
+        return look.text or look.state or f"{look.value:.4g} {look.unit}".strip()
+    return " or ".join(number.text for number in look.possible)

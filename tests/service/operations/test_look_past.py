@@ -1,0 +1,100 @@
+"""What a cable hides from straight ahead is read from the side, on the simulated cell."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hal.config import CableSection, Cell, SimulationSection, load_cell
+from hal.errors import Unreachable
+from perception.vision.reading import ObjectReading
+from service.cell import CellRuntime
+from service.connection import LocalConnection
+from service.operations import inspect
+from service.operations.beliefs import forget_reading, known_readings
+from service.operations.context import CellMemory, OperationContext
+from service.operations.inspect import Inspection, inspect_close
+from service.operations.locate import go_to_overview, locate
+from service.operations.session import Session
+from service.task_model import Task
+from service.tasks import TaskContext
+
+ROOT = Path(__file__).parents[3]
+pytestmark = pytest.mark.timeout(300)
+CABLE = CableSection(path_m=((0.06, 0.3, 0.05), (0.098, 0.118, 0.03), (0.16, 0.0, 0.05)), radius_m=0.005)
+
+
+def cabled(cell: Cell) -> Cell:
+    """The bench cell with a cable before its display."""
+    return cell.model_copy(
+        update={"file": cell.file.model_copy(update={"simulation": SimulationSection(cables=(CABLE,))})}
+    )
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    """Before the located panel, seed 3."""
+    folder = tmp_path_factory.mktemp("look-past")
+    cell = cabled(load_cell(ROOT / "cells/bench.toml", seed=3))
+    runtime = CellRuntime.start(cell, is_latched=lambda: False)
+    try:
+        session = Session(
+            context=OperationContext(
+                connection=LocalConnection(cell, runtime.objects, close=runtime.close),
+                task=TaskContext(Task(id="test", verb="inspect", request={}, moves=True), folder / "artefacts"),
+                runs_dir=folder / "runs",
+                state=CellMemory(),
+            )
+        )
+        go_to_overview(session)
+        locate(session)
+        yield session
+    finally:
+        runtime.close()
+
+
+def truth_of(session: Session, name: str) -> Any:
+    """What the object truly shows."""
+    arm = session.connection.device("arm")
+    return next(thing for thing in arm.truth().objects if thing.name == name)
+
+
+def straight_look(session: Session) -> Inspection:
+    """From straight ahead, by one who has never read the display: the last number would decide between two."""
+    forget_reading(session, "temperature")
+    return inspect.look_close(session, session.panel.object("temperature").point_m, ("temperature",))
+
+
+def test_a_display_behind_a_cable_is_read_from_the_side(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    forget_reading(session, "temperature")
+    with monkeypatch.context() as patch:
+        patch.setattr(inspect, "SIDES", ())
+        straight = inspect_close(session, ("temperature", "flow"))
+    assert not straight.readings["temperature"].answered and straight.readings["flow"].answered
+    found = inspect_close(session, ("temperature", "flow"))
+    reading = found.readings["temperature"]
+    assert reading.text == truth_of(session, "temperature").text
+    assert len(found.pictures) > len(straight.pictures), "every look leaves its picture"
+    assert known_readings(session)["temperature"] is reading
+
+
+def test_a_side_that_the_arm_cannot_reach_is_left_out(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise Unreachable("no way there", hint="none")
+
+    first = straight_look(session)
+    monkeypatch.setattr(inspect, "go_to_camera_view", refuse)
+    found = inspect.look_past(session, first)
+    assert found.readings["temperature"].reason == first.readings["temperature"].reason
+    assert found.pictures == first.pictures
+    assert "temperature" not in known_readings(session)
+
+
+def test_many_unread_objects_are_no_cables_work(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = straight_look(session)
+    unread: ObjectReading = first.readings["temperature"]
+    monkeypatch.setattr(inspect, "MOST_UNREAD", 0)
+    assert inspect.look_past(session, first) is first and not unread.answered

@@ -155,7 +155,7 @@ def _draw(brush: Brush, thing: PanelObject, shown: Shown) -> None:
                     brush.disc(x, y, thing.height_m, share * thing.radius_m, gray)
         case Button() | Mushroom():
             x, y = thing.position_m
-            z = thing.height_m - (thing.travel_m if shown == "pressed" else 0.0)
+            z = thing.height_m - (thing.pressed_depth_m if shown == "pressed" else 0.0)
             brush.disc(x, y, 0.0, thing.radius_m + 0.003, INK if isinstance(thing, Button) else 215)
             for k in range(8):
                 brush.disc(x, y, z * k / 8, thing.radius_m, 90)

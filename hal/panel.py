@@ -155,6 +155,10 @@ class Lamp(ObjectBase):
     height_m: NotNegative = 0.006
 
 
+LATCHED_SHARE = 0.6
+"""Of its travel: how far a cap that latches stays in."""
+
+
 class Button(ObjectBase):
     """Push button; `latching` ones stay in. States `pressed` and `released`."""
 
@@ -167,6 +171,11 @@ class Button(ObjectBase):
     latching: bool = False
     colour: Literal["red", "green", "amber", "blue", "white", "black"] = "green"
     lights_lamp: Name | None = None
+
+    @property
+    def pressed_depth_m(self) -> float:
+        """How much lower the cap is where it is read as pressed: held down, or latched."""
+        return LATCHED_SHARE * self.travel_m if self.latching else self.travel_m
 
 
 class Toggle(ObjectBase):
@@ -239,6 +248,11 @@ class Mushroom(ObjectBase):
     travel_m: Positive = 0.006
     spring_n_per_m: Positive = 2000.0
     preload_n: NotNegative = 8.0
+
+    @property
+    def pressed_depth_m(self) -> float:
+        """How much lower a latched head is."""
+        return LATCHED_SHARE * self.travel_m
 
 
 PanelObject = Annotated[

@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from hal.panel import LATCHED_SHARE
+
 JOINT = 0
 DAMPING_N_S_PER_M = 4.0
 TURN_DAMPING_NM_S_PER_RAD = 0.05
@@ -100,7 +102,7 @@ class Spring:
     @property
     def latched_depth_m(self) -> float:
         """How far a latched cap stays in."""
-        return 0.6 * self.travel_m
+        return LATCHED_SHARE * self.travel_m
 
     def _switch(self, x: float) -> None:
         # Closes at 80 % of the travel and opens at 70 %: a switch without hysteresis would chatter.

@@ -171,7 +171,7 @@ def _shown(sighting: Sighting) -> str | None:
     if state is None:
         return None
     if isinstance(thing, Mushroom):
-        return "pressed" if state < -0.5 * thing.travel_m else "released"
+        return "pressed" if state < -0.5 * thing.pressed_depth_m else "released"
     return f"{np.degrees(state):.0f} deg (modulo {360 / thing.spokes:.0f})"
 
 

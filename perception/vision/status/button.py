@@ -43,13 +43,14 @@ def read_cap(patch: Patch, spec: Button | Mushroom) -> Status:
 
 def _by_height(patch: Patch, spec: Button | Mushroom) -> float | None:
     """Log odds of `released` from the measured height."""
-    low, high = spec.height_m - spec.travel_m, spec.height_m
     foot = 0.0 if spec.kind == "button" else None  # a mushroom's head moves as a whole
-    cap = cap_height(patch, radius_m=spec.radius_m, low_m=low, high_m=high, foot_m=foot)
+    lowest, high = spec.height_m - spec.travel_m, spec.height_m
+    cap = cap_height(patch, radius_m=spec.radius_m, low_m=lowest, high_m=high, foot_m=foot)
     if cap is None:
         return None
-    sigma_m = np.hypot(cap.sigma_m, MODEL_SHARE * (high - low))  # neither cap nor travel is known better than that
-    return float((cap.height_m - (low + high) / 2) * (high - low) / sigma_m**2)
+    depth = spec.pressed_depth_m
+    sigma_m = np.hypot(cap.sigma_m, MODEL_SHARE * depth)  # neither cap nor travel is known better than that
+    return float((cap.height_m - (high - depth / 2)) * depth / sigma_m**2)
 
 
 def _by_shade(patch: Patch, radius_m: float) -> float:

@@ -21,6 +21,7 @@ RESOLVED = (
     1.5  # widths of an edge: a wall that shows narrower than that runs into the face, and its foot cannot be told
 )
 SHARP_PX, PULL = 1.8, 1.0  # edges wider than sharp ones are pulled by their neighbours: the excess times that, px
+RING, RING_SHARE, RING_NEAR_PX = (1.08, 1.5), 0.5, 1.6  # radii over the cap's; share of it that must show; image px
 PLACE_SIGMA_M = 3e-4  # building tolerance of the cap's place
 RADIUS_SIGMA_M = 1.5e-4
 
@@ -56,6 +57,8 @@ def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, fo
     reach = np.where(is_face, outward * (high_m - low_m) / 2, 0.0) + slack
     offset, found, width_px = _edges(patch, radius_m, a, middle, expected, reach)
     ok = found & use
+    if foot_m is not None:
+        ok &= ~_on_ring(patch, radius_m, a, outward, offset + outward * middle)
     if ok.sum() < 0.4 * use.sum() or (ok & is_face).sum() < 6:
         return None
     if foot_m is not None and (~is_face).sum() > 8 and (ok & ~is_face).sum() < 0.4 * (~is_face).sum():
@@ -81,6 +84,26 @@ def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, fo
         sigma_m=float(np.hypot(np.sqrt(np.linalg.inv(N)[0, 0]), pull_m)),
         found=float(ok.mean()),
     )
+
+
+def _on_ring(patch: Patch, radius_m: float, a: Array, outward: Array, at_plate_m: Array) -> NDArray[np.bool_]:
+    """(N,) which edges of the face are those of a ring round the cap, printed or flat: of the cap's gray, it hides the cap's.
+
+    The ring's outer edge shows all along the side where height does not move the cap over it.
+
+    Args:
+        outward: (N,) how far height moves the face's edge outward, m per m.
+        at_plate_m: (N,) how far beyond the cap's radius every edge would lie on the plate.
+    """
+    seen = a[outward <= np.median(outward)]
+    r = radius_m * np.linspace(*RING, 24)
+    values = patch.sample(np.sin(seen)[:, None] * r, np.cos(seen)[:, None] * r, 0.0)
+    slope = np.abs(np.diff(values, axis=1))
+    radius = r[slope.argmax(axis=1)] + (r[1] - r[0]) / 2
+    beyond = float(np.median(radius)) - radius_m
+    near_m = RING_NEAR_PX / patch.image_px_per_m
+    is_ring = float((np.abs(radius - radius_m - beyond) < near_m).mean()) > RING_SHARE
+    return np.asarray((outward > 0) & is_ring & (np.abs(at_plate_m - beyond) < near_m), bool)
 
 
 def _edges(

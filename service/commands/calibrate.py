@@ -16,8 +16,7 @@ from rich.table import Table
 from service.client import Client
 from service.commands.board import board
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, client_of, console, read_cell
-from service.commands.own_cell import ServiceUrl, run_on_cell
-from service.commands.tasks import follow
+from service.commands.own_cell import ServiceUrl, run_on_cell, run_task
 
 app = typer.Typer(
     help="Calibrate: the arm drives through poses, measures, and keeps a versioned, dated record with its quality.",
@@ -88,7 +87,7 @@ def _run(what: str, cell: Path, seed: int | None, runs: Path, url: str | None, b
 
 
 def _follow(client: Client, request: dict[str, Any]) -> bool:
-    task = follow(client, client.post("/v1/calibrations", request)["id"])
+    task = run_task(client, "/v1/calibrations", request)
     result = task["result"]
     if result is None:
         return False

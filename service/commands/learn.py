@@ -10,8 +10,7 @@ from rich.markup import escape
 
 from service.client import Client
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console
-from service.commands.own_cell import ServiceUrl, run_on_cell
-from service.commands.tasks import follow
+from service.commands.own_cell import ServiceUrl, run_on_cell, run_task
 
 
 def learn(
@@ -29,7 +28,7 @@ def learn(
 
 
 def _learn(client: Client) -> bool:
-    result = follow(client, client.post("/v1/learn", {})["id"])["result"]
+    result = run_task(client, "/v1/learn", {})["result"]
     if result is None:
         return False
     tell(result)

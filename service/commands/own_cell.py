@@ -3,16 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 
-from service.client import Client
+from service.client import ApiError, Client
 from service.commands.common import client_of, console, read_cell
 from service.commands.leaving import INTERRUPTED, leave, one_interrupt
+from service.commands.tasks import follow
 
 ServiceUrl = Annotated[str | None, typer.Option("--url", help="Use this running service instead of starting the cell.")]
+
+
+def run_task(client: Client, path: str, request: dict[str, Any]) -> dict[str, Any]:
+    """Start a task and follow it; returns it when it has ended.
+
+    Raises:
+        KeyboardInterrupt: after the task was cancelled: who presses Ctrl-C in view of an arm wants it to stand.
+    """
+    task_id = client.post(path, request)["id"]
+    try:
+        return follow(client, task_id)
+    except KeyboardInterrupt:
+        with suppress(ApiError):  # it has ended
+            task = client.post(f"/v1/tasks/{task_id}/cancel")
+            console.print(f"Ctrl-C: task {task_id} {task['state']}, the arm stops")
+        raise
 
 
 def run_on_cell(
@@ -25,7 +43,11 @@ def run_on_cell(
         moves: clear the stop of the own cell first.
     """
     if url is not None:
-        raise typer.Exit(0 if work(client_of(url)) else 1)
+        with one_interrupt():
+            try:
+                raise typer.Exit(0 if work(client_of(url)) else 1)
+            except KeyboardInterrupt:
+                raise typer.Exit(INTERRUPTED) from None
     from service.serve import Options, Panelwright, exit_on_sigterm
 
     loaded = read_cell(cell, seed)

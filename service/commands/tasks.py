@@ -13,6 +13,7 @@ from rich.table import Table
 
 from service.client import Client
 from service.commands.common import Url, UrlDefault, client_of, console, state_style
+from service.commands.leaving import INTERRUPTED
 
 app = typer.Typer(help="List, show, watch and cancel tasks of a running service.", no_args_is_help=True)
 TaskId = Annotated[str, typer.Argument(help="Id of the task, as `task list` shows it.")]
@@ -39,7 +40,11 @@ def show_task(task_id: TaskId, url: Url = UrlDefault) -> None:
 @app.command("watch")
 def watch_task(task_id: TaskId, url: Url = UrlDefault) -> None:
     """Follow a task to its end."""
-    task = follow(client_of(url), task_id)
+    try:
+        task = follow(client_of(url), task_id)
+    except KeyboardInterrupt:
+        console.print(f"task {task_id} goes on: `panelwright task cancel {task_id}` stops the arm and ends it")
+        raise typer.Exit(INTERRUPTED) from None
     raise typer.Exit(0 if task["state"] == "succeeded" else 1)
 
 

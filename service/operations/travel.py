@@ -48,6 +48,7 @@ def go_to_first(session: Session, base_from_flange: Iterable[RigidTransform], *,
 
     Raises:
         Unreachable: none of them; says what is in the way of the last one.
+        Cancelled: the task was cancelled meanwhile.
     """
     cell = workcell(session)
     state = session.mover.state()
@@ -55,6 +56,7 @@ def go_to_first(session: Session, base_from_flange: Iterable[RigidTransform], *,
     reason, tries = "no arm configuration reaches any of the poses", 0
     for pose in base_from_flange:
         for goal in _goals(model, pose, state.position_rad):
+            session.context.task.check_cancelled()  # a search that finds no way takes ten seconds
             tries += 1
             try:
                 trajectory = cell.transfer(state.position_rad, goal, width_m=state.gripper_width_m, name=name)

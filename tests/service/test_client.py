@@ -1,15 +1,17 @@
-"""The stop of the small client, when the service does not answer."""
+"""Stopping from the command line: when the service does not answer, and by Ctrl-C."""
 
 from __future__ import annotations
 
 import socket
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
 from hal.errors import ConfigError, DeviceUnavailable
 from service.client import Client
+from service.commands.own_cell import run_task
 from service.latch import Latch
 from service.stop_host import InlineStop, bound_socket
 
@@ -57,3 +59,25 @@ def test_where_nobody_stops_a_person_must(hung: tuple[socket.socket, socket.sock
     with pytest.raises(DeviceUnavailable, match="nor does a stop process") as refusal:
         _client_of(service).stop()
     assert "hardware stop" in refusal.value.hint
+
+
+class Interrupted:
+    """A client whose person presses Ctrl-C as soon as the task runs."""
+
+    def __init__(self) -> None:
+        self.posted: list[str] = []
+
+    def post(self, path: str, _body: Any = None) -> Any:
+        self.posted.append(path)
+        return {"id": "7", "state": "cancelled"}
+
+    def get(self, _path: str) -> Any:
+        raise KeyboardInterrupt
+
+
+def test_ctrl_c_ends_a_task_on_a_running_service_too(capsys: pytest.CaptureFixture[str]) -> None:
+    client = Interrupted()
+    with pytest.raises(KeyboardInterrupt):
+        run_task(cast("Client", client), "/v1/calibrations", {"what": "tool"})
+    assert client.posted == ["/v1/calibrations", "/v1/tasks/7/cancel"]
+    assert "the arm stops" in capsys.readouterr().out

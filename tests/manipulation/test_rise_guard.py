@@ -47,3 +47,14 @@ def test_a_stop_is_found_within_its_rise() -> None:
     found_s = trips_at_s(lambda t: 40.0 + slope_n_per_s * max(t - 1.0, 0.0), rise_n=8.0)
     assert found_s is not None
     assert 1.0 + 8.0 / slope_n_per_s <= found_s <= 1.0 + 8.0 / slope_n_per_s + 0.02
+
+
+def test_a_stop_soon_after_the_start_is_found_as_fast() -> None:
+    slope_n_per_s = 90.0
+    found_s = trips_at_s(lambda t: 40.0 + slope_n_per_s * max(t - 0.25, 0.0), rise_n=8.0)
+    assert found_s is not None
+    assert found_s <= 0.25 + 8.0 / slope_n_per_s + 0.02
+
+
+def test_friction_that_grows_over_a_second_is_no_end_stop() -> None:
+    assert trips_at_s(lambda t: 40.0 + 30.0 * t, rise_n=8.0) is None

@@ -33,7 +33,7 @@ def demo(
     """Run the whole mission and leave a report; exit code 1 when an action was not confirmed."""
     from service.serve import Options, Panelwright, exit_on_sigterm
 
-    started_s, since_unix_s = time.monotonic(), time.time()
+    started_s, before = time.monotonic(), reports(runs)
     loaded = read_cell(cell, seed)
     exit_on_sigterm()
     panelwright = Panelwright(loaded, Options(port=port, runs_dir=runs, inline=inline))
@@ -50,7 +50,8 @@ def demo(
         finally:
             panelwright.close()
         if code == INTERRUPTED:
-            _tell_what_is_left(runs, since_unix_s)
+            for report in sorted(reports(runs) - before):  # a mission that was broken off tells what it had measured
+                console.print(f"report of what was measured: [bold]{report}[/]")
         console.print(f"{time.monotonic() - started_s:.1f} s in all")
         leave(code)
 
@@ -89,11 +90,9 @@ def judged(client: Client, mission: str) -> str:
     return escape(f"judge: {problem['detail']}; try: {problem['hint']}")
 
 
-def _tell_what_is_left(runs: Path, since_unix_s: float) -> None:
-    """A mission that was broken off has a report of what it had measured."""
-    for report in runs.glob("*/report.html"):
-        if report.stat().st_mtime >= since_unix_s:
-            console.print(f"report of what was measured: [bold]{report}[/]")
+def reports(runs: Path) -> set[Path]:
+    """All reports of a folder."""
+    return set(runs.glob("*/report.html"))
 
 
 def _actions(actions: list[dict[str, Any]]) -> Table:

@@ -50,8 +50,7 @@ def demo(
         finally:
             panelwright.close()
         if code == INTERRUPTED:
-            for report in sorted(reports(runs) - before):  # a mission that was broken off tells what it had measured
-                console.print(f"report of what was measured: [bold]{report}[/]")
+            _tell_what_is_left(runs, before)
         console.print(f"{time.monotonic() - started_s:.1f} s in all")
         leave(code)
 
@@ -93,6 +92,12 @@ def judged(client: Client, mission: str) -> str:
 def reports(runs: Path) -> set[Path]:
     """All reports of a folder."""
     return set(runs.glob("*/report.html"))
+
+
+def _tell_what_is_left(runs: Path, before: set[Path]) -> None:
+    """A mission that was broken off has a report of what it had measured."""
+    for report in sorted(reports(runs) - before):
+        console.print(f"report of what was measured: [bold]{report}[/]")
 
 
 def _actions(actions: list[dict[str, Any]]) -> Table:

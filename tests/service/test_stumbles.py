@@ -187,11 +187,12 @@ def test_nothing_is_called_ready_that_ends_already(monkeypatch: pytest.MonkeyPat
 def test_a_demo_that_is_broken_off_names_the_report_of_what_it_measured(tmp_path: Path) -> None:
     for name in ("before", "now"):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "report.html").write_text("")
-    since_unix_s = (tmp_path / "now" / "report.html").stat().st_mtime
-    os.utime(tmp_path / "before" / "report.html", (since_unix_s - 60.0, since_unix_s - 60.0))
+    (tmp_path / "before" / "report.html").write_text("")
+    before = demo.reports(tmp_path)
+    (tmp_path / "now" / "report.html").write_text("")
+    os.utime(tmp_path / "now" / "report.html", (0.0, 0.0))  # the machine's clock was set back meanwhile
     with demo.console.capture() as seen:
-        demo._tell_what_is_left(tmp_path, since_unix_s)
+        demo._tell_what_is_left(tmp_path, before)
     assert str(tmp_path / "now") in seen.get()
     assert str(tmp_path / "before") not in seen.get()
 

@@ -16,10 +16,11 @@ from hal.geometry import UncertainPose, matrix_of
 from hal.panel import Display, Panel, PanelObject, Scale
 from perception.camera_model import check_size, rays
 from perception.vision.image import Image, as_gray
+from perception.vision.noise import noise_sigma
 from perception.vision.patch import Patch, rectify
 from perception.vision.reading import ObjectReading, Status, refused
 from perception.vision.registration.outline import contour_m, footprint_m
-from perception.vision.registration.register import Registration, noise_sigma, register
+from perception.vision.registration.register import Registration, register
 from perception.vision.status.button import read_button
 from perception.vision.status.display import read_display
 from perception.vision.status.gauge import read_gauge

@@ -14,9 +14,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from perception.vision.image import Image
+from perception.vision.noise import noise_sigma
 from perception.vision.view import Array
 
-TOLERANCE = 9.0  # gray levels: three sigmas of a noisy 8-bit camera
+TOLERANCE = 9.0  # gray levels, at least
+NOISES = 6.0  # sigmas of the pixel noise: fewer leave thousands of single pixels, as bright parts are noisier than the median
+ROWS_APART = 4  # for the noise
+
+Moments = tuple[np.int64, np.int64, np.int64]  # count, sum and sum of squares of gray levels
 SPREADS = 2.0  # of the region's own standard deviation
 
 
@@ -39,9 +44,16 @@ class Regions:
     box_px: Array
 
 
-def grow_regions(gray: Image, *, tolerance: float = TOLERANCE) -> Regions:
-    """Segment a gray image (H, W) uint8."""
-    labels, sums = _grow(np.ascontiguousarray(gray), tolerance)
+def grow_regions(gray: Image, *, tolerance: float | None = None) -> Regions:
+    """Segment a gray image (H, W) uint8.
+
+    Args:
+        tolerance: gray levels that a pixel may leave its region's mean by; None: by the image's own noise.
+    """
+    gray = np.ascontiguousarray(gray)
+    if tolerance is None:
+        tolerance = max(TOLERANCE, NOISES * noise_sigma(gray, rows_apart=ROWS_APART))
+    labels, sums = _grow(gray, tolerance)
     count = sums[:, 0]
     mean = sums[:, 1] / count
     box = np.column_stack([sums[:, 5], sums[:, 7], sums[:, 6] - sums[:, 5] + 1, sums[:, 8] - sums[:, 7] + 1])
@@ -60,7 +72,9 @@ def _root(parent: NDArray[np.int32], k: int) -> int:  # pragma: no cover
 
 
 @njit(cache=True, inline="always")
-def _fits(n: float, total: float, squares: float, value: float, tolerance: float) -> bool:  # pragma: no cover
+def _fits(
+    n: np.int64, total: np.int64, squares: np.int64, value: np.int64, tolerance: float
+) -> bool:  # pragma: no cover
     """Whether a gray value belongs to a region: |I - mean| <= max(tolerance, SPREADS * sigma), no roots."""
     d = abs(value * n - total)  # n |I - mean|: no division on the common path
     if d <= tolerance * n:
@@ -68,6 +82,20 @@ def _fits(n: float, total: float, squares: float, value: float, tolerance: float
     if d > 3.0 * tolerance * n:
         return False
     return bool(d * d <= SPREADS * SPREADS * (squares * n - total * total))
+
+
+@njit(cache=True, inline="always")
+def _moments(region: Array) -> Moments:  # pragma: no cover
+    """Count, sum and sum of squares of a region's gray levels: whole numbers, which add faster."""
+    return np.int64(region[0]), np.int64(region[1]), np.int64(region[2])
+
+
+@njit(cache=True, inline="always")
+def _begin(sums: Array, parent: NDArray[np.int32], k: int, u: int, v: int) -> None:  # pragma: no cover
+    """A region without pixels yet, from this place on."""
+    parent[k] = k
+    sums[k] = 0.0
+    sums[k, 5], sums[k, 6], sums[k, 7] = u, u, v
 
 
 @njit(cache=True, inline="always")
@@ -85,9 +113,7 @@ def _joined(sums: Array, parent: NDArray[np.int32], a: int, b: int) -> int:  # p
 
 
 @njit(cache=True, inline="always")
-def _flush(
-    sums: Array, k: int, moments: tuple[float, float, float], row: int, first: int, end: int
-) -> None:  # pragma: no cover
+def _flush(sums: Array, k: int, moments: Moments, row: int, first: int, end: int) -> None:  # pragma: no cover
     """Write back the gray moments of region `k`, and add the places of its run [first, end) in a row."""
     count = end - first
     region = sums[k]
@@ -105,22 +131,24 @@ def _grow(gray: Image, tolerance: float) -> tuple[NDArray[np.int32], Array]:  # 
     pixels have the same region above and to the left, and cost one comparison."""
     height, width = gray.shape
     labels = np.empty((height, width), np.int32)
+    nothing = np.full(width, -1, np.int32)
     parent = np.empty(height * width // 16 + 16, np.int32)
     sums = np.empty((len(parent), 9))
     made = 0
     for v in range(height):
         left = -1
         above = up_root = -1  # raw label above and its root: looked up again only when the label changes
-        n = total = squares = 0.0
+        n = total = squares = np.int64(0)
         first = 0
+        grays, row, row_above = gray[v], labels[v], labels[v - 1] if v > 0 else nothing
         for u in range(width):
-            value = float(gray[v, u])
-            if v > 0 and labels[v - 1, u] != above:
-                above = labels[v - 1, u]
+            value = np.int64(grays[u])
+            if row_above[u] != above:
+                above = row_above[u]
                 up_root = _root(parent, above)
             if up_root == left and left >= 0 and _fits(n, total, squares, value, tolerance):
-                n, total, squares = n + 1.0, total + value, squares + value * value
-                labels[v, u] = left
+                n, total, squares = n + 1, total + value, squares + value * value
+                row[u] = left
                 continue
             up = up_root if up_root != left else -1
             if up >= 0 and not _fits(sums[up, 0], sums[up, 1], sums[up, 2], value, tolerance):
@@ -131,7 +159,8 @@ def _grow(gray: Image, tolerance: float) -> tuple[NDArray[np.int32], Array]:  # 
                 if -tolerance <= mean_up - mean_left <= tolerance:
                     _flush(sums, left, (n, total, squares), v, first, u)
                     left = up_root = _joined(sums, parent, up, left)
-                    n, total, squares, first = sums[left, 0], sums[left, 1], sums[left, 2], u
+                    n, total, squares = _moments(sums[left])
+                    first = u
                 elif abs(value - mean_up) <= abs(value - mean_left):
                     goes_on = False
             if not goes_on:
@@ -139,19 +168,17 @@ def _grow(gray: Image, tolerance: float) -> tuple[NDArray[np.int32], Array]:  # 
                     _flush(sums, left, (n, total, squares), v, first, u)
                 if up >= 0:
                     left = up
-                    n, total, squares = sums[up, 0], sums[up, 1], sums[up, 2]
+                    n, total, squares = _moments(sums[up])
                 else:
                     if made == len(parent):
                         parent, sums = _enlarged(parent, sums)
                     left = made
                     made += 1
-                    parent[left] = left
-                    sums[left] = 0.0
-                    sums[left, 5], sums[left, 6], sums[left, 7] = u, u, v
-                    n = total = squares = 0.0
+                    _begin(sums, parent, left, u, v)
+                    n = total = squares = np.int64(0)
                 first = u
-            n, total, squares = n + 1.0, total + value, squares + value * value
-            labels[v, u] = left
+            n, total, squares = n + 1, total + value, squares + value * value
+            row[u] = left
         _flush(sums, left, (n, total, squares), v, first, width)
     return _numbered(labels, parent[:made], sums)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from perception.vision.finding.components import components
 from perception.vision.image import Image
-from perception.vision.registration.register import noise_sigma
+from perception.vision.noise import noise_sigma
 
 Float32 = NDArray[np.float32]
 DirectionMaps = tuple[NDArray[np.bool_], NDArray[np.bool_]]  # flat edges, upright edges

@@ -16,7 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from perception.vision.image import Image
-from perception.vision.registration.register import noise_sigma
+from perception.vision.noise import noise_sigma
 from perception.vision.status.comb import LIT_SHARES
 from perception.vision.status.comb_jit import Float32, cell_boxes
 from perception.vision.view import Array

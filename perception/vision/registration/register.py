@@ -12,18 +12,17 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hal.panel import Panel
 from perception.vision.image import Image
+from perception.vision.noise import noise_sigma
 from perception.vision.registration.edge_search import strongest_edges
 from perception.vision.registration.outline import Outline, edges_of, plate_edges
 from perception.vision.view import Array, View
 
 WINDOWS_PX = (8.0, 5.0, 3.0, 2.0)  # search to either side; the pose is known to a few pixels
 LAST_LOOK_PX, NEAR_PX = 2.5, 2.0  # search at the end, and how near an edge confirms the model
-LEAST_NOISE = 0.3  # gray levels: the rounding
 SMOOTHING_SIGMA_PX = 0.8
 SLOPE_NOISE = 0.35  # of the central difference after that smoothing, over the image's noise
 EDGE_TO_NOISE = 4.0  # an edge counts when its slope exceeds that many sigmas of the slope's noise
@@ -124,29 +123,6 @@ def confirmed(image: EdgeImage, view: View, outline: Outline) -> tuple[NDArray[n
     """(N,) which samples of the outline the image shows, and which of them have an edge within `NEAR_PX`."""
     found = _look(image.smooth, image.slope_noise, view, outline, LAST_LOOK_PX)
     return found.visible, found.ok & (np.abs(found.offset_px) <= NEAR_PX)
-
-
-def noise_sigma(gray: Image) -> float:
-    """Standard deviation of the pixel noise: J. Immerkaer, CVIU 64(2), 1996, with the median for the mean."""
-    if min(gray.shape) < 3:
-        return LEAST_NOISE
-    counts = _response_counts(gray[::2] if gray.size > 1_000_000 else gray)
-    median = int(np.searchsorted(np.cumsum(counts), (counts.sum() + 1) // 2))
-    return float(max(median / 0.6745 / 6.0, LEAST_NOISE))
-
-
-@njit(cache=True)
-def _response_counts(gray: Image) -> NDArray[np.int64]:  # pragma: no cover
-    """How often every magnitude of the response to [1 -2 1; -2 4 -2; 1 -2 1] occurs inside the image."""
-    height, width = gray.shape
-    counts = np.zeros(8 * 255 + 1, np.int64)
-    for v in range(1, height - 1):
-        for u in range(1, width - 1):
-            before = np.int32(gray[v - 1, u - 1]) - 2 * np.int32(gray[v, u - 1]) + np.int32(gray[v + 1, u - 1])
-            here = np.int32(gray[v - 1, u]) - 2 * np.int32(gray[v, u]) + np.int32(gray[v + 1, u])
-            after = np.int32(gray[v - 1, u + 1]) - 2 * np.int32(gray[v, u + 1]) + np.int32(gray[v + 1, u + 1])
-            counts[abs(before - 2 * here + after)] += 1
-    return counts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -9,7 +9,7 @@ import pytest
 from perception.vision.finding.circles import CIRCLE_SAMPLES, NORMALS, _covered, circle_coverage, find_circles
 from perception.vision.finding.components import components
 from perception.vision.finding.shapes import find_edges
-from perception.vision.registration.register import noise_sigma
+from perception.vision.noise import noise_sigma
 
 
 @pytest.mark.parametrize("diagonal", [False, True])

@@ -99,7 +99,9 @@ class InspectRequest(StoredLook):
     """Read instruments, lamps, switches and valves from close up, or in a stored image."""
 
     objects: Annotated[tuple[ObjectName, ...], Field(max_length=200)] | None = None
-    close_up: Annotated[bool, Field(description="drive to close-ups; false reads the overview only")] = True
+    close_up: Annotated[
+        bool, Field(description="drive to close-ups, and aside of what they cannot read; false reads the overview only")
+    ] = True
 
 
 class LearnRequest(StoredLook):

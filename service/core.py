@@ -228,6 +228,7 @@ class Service:
                 _bring_to_end(tasks[data["task"]], data, record.wall_time_s)
         for task in tasks.values():
             self.tasks.restore(task)
+        self.tasks.sweep()
 
 
 def _is_alone(lock: IO[str]) -> bool:

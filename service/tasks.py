@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import secrets
+import shutil
 import threading
 import time
 from collections import OrderedDict
@@ -96,7 +97,7 @@ class TaskStore:
         recorder: the journal; a task is acknowledged after its record is on disk.
         stop_motion: ends the running motion; called at once, and again until a cancelled task has ended.
         max_queued: more waiting tasks than this are refused with `Busy`.
-        keep: so many finished tasks stay in memory.
+        keep: so many finished tasks stay in memory; the artefacts of older ones are removed.
     """
 
     def __init__(
@@ -148,7 +149,8 @@ class TaskStore:
             task = Task(id=secrets.token_hex(8), verb=verb, request=request, moves=moves, holder=holder, key=key)
             task.on_change = self._changed
             self._tasks[task.id] = task
-            self._forget_old()
+            forgotten = self._forget_old()
+        self._remove_artefacts(forgotten)
         try:
             self._recorder.append("task-queued", {"task": task.id, "verb": verb, "request": request, "holder": holder})
         except CellError:
@@ -170,7 +172,13 @@ class TaskStore:
             self._record_end(task)
         with self._lock:
             self._tasks.setdefault(task.id, task)
-            self._forget_old()
+            forgotten = self._forget_old()
+        self._remove_artefacts(forgotten)
+
+    def sweep(self) -> None:
+        """Remove artefacts of tasks that nobody can ask for any more; called when those of earlier runs are restored."""
+        if self._folder.is_dir():
+            self._remove_artefacts([path.name for path in self._folder.iterdir() if path.name not in self._tasks])
 
     def get(self, task_id: str) -> Task:
         """The task called `task_id`.
@@ -318,10 +326,16 @@ class TaskStore:
         if queued >= self._max_queued:
             raise Busy(f"{queued} tasks wait already", hint="wait for one to end or cancel one", queued=queued)
 
-    def _forget_old(self) -> None:
+    def _forget_old(self) -> list[str]:
         ended = [task.id for task in self._tasks.values() if task.state.is_final]
-        for task_id in ended[: max(0, len(ended) - self._keep)]:
+        forgotten = ended[: max(0, len(ended) - self._keep)]
+        for task_id in forgotten:
             del self._tasks[task_id]
+        return forgotten
+
+    def _remove_artefacts(self, task_ids: list[str]) -> None:
+        for task_id in task_ids:
+            shutil.rmtree(self._folder / task_id, ignore_errors=True)
 
     def _changed(self, task: Task) -> None:
         for listener in list(self._listeners):

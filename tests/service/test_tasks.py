@@ -222,6 +222,16 @@ def test_the_oldest_ended_tasks_are_forgotten_and_running_ones_never(bench: Benc
     assert bench.store.get(running.id) is running
 
 
+def test_what_forgotten_tasks_left_goes_from_the_disk_too(bench: Bench, tmp_path: Path) -> None:
+    (tmp_path / "of-an-earlier-run").mkdir()
+    bench.store.sweep()
+    tasks = [bench.run(lambda context: context.artefact("a.txt", b"x", "text/plain")) for _ in range(10)]
+    bench.run(lambda _: None)
+    kept = {task.id for task in bench.store.all()}
+    assert len(kept) < len(tasks)
+    assert {path.name for path in tmp_path.iterdir()} == {task.id for task in tasks} & kept
+
+
 def test_an_unfinished_task_of_an_earlier_run_counts_as_aborted(bench: Bench) -> None:
     bench.store.restore(Task(id="old", verb="missions", request={}, moves=True, state=S.RUNNING))
     task = bench.store.get("old")

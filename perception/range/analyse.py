@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hal.errors import InvalidRequest, NotFound
 from perception.range.features import RangeFeature, features_of
+from perception.range.fitting.surfaces import PLANE
 from perception.range.noise import NoiseModel, estimate_noise, typical_depths_m
 from perception.range.primitives import Plane, Surface, SurfaceType
 from perception.range.segmentation import bend, finish, join, merge
@@ -185,11 +186,13 @@ def _finished(task: Task, noise: NoiseModel, regions: Regions, found: Candidates
     names = np.zeros(len(pixels) + 1, np.int32)
     for new, k in enumerate(keep, 1):
         kind, slack = found.kinds[k], found.slack[k]
-        few[k][3] *= slack
         surface, th = finish.refine_surface(new, kind, found.parameters[k], regions, k + 1, noise=noise, slack=slack)
         # What the sensor has bent is named straight, but keeps the bent surface's pixels.
         final.add(kind, th)
-        straight, start = bend.straightened(kind, th, few[k], law, bool(packed[0] > 0))
+        straight, start = kind, th
+        if kind != PLANE:
+            few[k][3] *= slack
+            straight, start = bend.straightened(kind, th, few[k], law, bool(packed[0] > 0))
         if straight != kind:
             surface, _ = finish.refine_surface(new, straight, start, regions, k + 1, noise=noise, slack=slack)
         surfaces.append(surface)

@@ -233,18 +233,8 @@ def window_rms(g, basis, first, spacing, stride, perspective):  # type: ignore[n
     some = np.empty(across)
     n = 0
     for top in range(0, H - extent + 1, stride):
-        # All windows of a row at once: loops over them hold no branch.
         middle = g[top + extent // 2, extent // 2 :: stride]
-        total[:] = 0.0
-        for k in range(side * side):
-            _load_sample(g[top + k // side * spacing, k % side * spacing :: stride], middle, values[k], total)
-        for m in range(basis.shape[0]):
-            dot[:] = 0.0
-            for k in range(side * side):
-                _add_multiple(basis[m, k], values[k], dot)
-            _subtract_square(dot, total)
-            if m < first:
-                some[:] = total
+        _squares_left(g[top:], middle, basis, first, spacing, stride, values, dot, some, total)
         for c in range(across):
             if not np.isfinite(total[c]):
                 continue
@@ -255,6 +245,26 @@ def window_rms(g, basis, first, spacing, stride, perspective):  # type: ignore[n
             rms_out[n] = rms * z * z if perspective else rms
             n += 1
     return z_out[:n], first_out[:n], rms_out[:n]
+
+
+@njit(cache=True, **LEAN)
+def _squares_left(g, middle, basis, first, spacing, stride, values, dot, some, total):  # type: ignore[no-untyped-def]  # numba types it
+    """Of the windows that begin in the first row of `g` what the first polynomials leave in `some`, and all in `total`.
+
+    All windows of a row at once: loops over them hold no branch.
+    """
+    side = int(np.sqrt(basis.shape[1]) + 0.5)
+    total[:] = 0.0
+    for k in range(side * side):
+        _load_sample(g[k // side * spacing, k % side * spacing :: stride], middle, values[k], total)
+    for m in range(basis.shape[0]):
+        dot[:] = 0.0
+        for k in range(side * side):
+            _add_multiple(basis[m, k], values[k], dot)
+        _subtract_square(dot, total)
+        if m == first - 1:
+            for c in range(total.shape[0]):
+                some[c] = total[c]
 
 
 @njit(cache=True, **LEAN)

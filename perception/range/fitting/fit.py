@@ -23,7 +23,7 @@ from perception.range.fitting.rays import (
     fill_rows,
     load_rows,
     normal_equations,
-    residuals,
+    residuals_by_chunks,
 )
 from perception.range.fitting.starts import (
     is_ellipsoid,
@@ -62,8 +62,8 @@ STEP_GOAL = 1e-3  # of a standard deviation of each parameter: a step that small
 
 
 @njit(cache=True, error_model="numpy")
-def new_scratch():  # type: ignore[no-untyped-def]  # numba types it
-    """What a fit works in: rows of `rays`, two systems (9, 9) and (9,), that of a step, two frames, and a trial."""
+def new_scratch(samples):  # type: ignore[no-untyped-def]  # numba types it
+    """What a fit works in: rows of `rays`, two systems (9, 9) and (9,), that of a step, two frames, a trial, residuals."""
     return (
         np.empty(SCRATCH),
         np.empty((9, 9)),
@@ -75,6 +75,7 @@ def new_scratch():  # type: ignore[no-untyped-def]  # numba types it
         np.empty(6),
         np.empty(6),
         np.empty(SIZE),
+        np.empty(samples),
     )
 
 
@@ -86,19 +87,20 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed, scr
         x, y, z, sigma: (N,) samples; coordinates as in `Grid`.
         scale: > 0: width of the Cauchy weights in sigmas; 0: trim at `trim` and plain least squares.
         fixed: (9,) bool, tangent parameters that a prior holds.
-        scratch: as `new_scratch`; its first system is the information matrix afterwards.
+        scratch: as `new_scratch`.
         held: of the samples and `th` what `scratch` holds, as `normal_equations`.
 
     Returns:
         cost, samples used, and what `scratch` holds of the samples and the parameters found.
     """
-    work, H, g, H2, g2, A, step, frame, new_frame, trial = scratch
+    work, H, g, H2, g2, A, step, frame, new_frame, trial, _ = scratch
     p = FREEDOM[kind]
     frame_of(kind, th, frame)
-    cost, used = normal_equations(kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g, work, held)
+    goes_on = steps > 0
+    cost, used = normal_equations(kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g, work, held, goes_on)
     held = min(held, LOADED)
     damping, is_fresh = 1e-4, True
-    for _ in range(steps):
+    for turn in range(steps):
         damped(H, g, fixed, damping, p, A, step)
         if not solve_positive(A, step, p):
             damping *= 10.0
@@ -108,10 +110,11 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed, scr
         small = 0.0
         for a in range(p):
             small = max(small, abs(step[a]) * np.sqrt(H[a, a]))
+        goes_on = turn + 1 < steps and not small < STEP_GOAL * 30.0
         step_into(kind, th, frame, step, trial)
         frame_of(kind, trial, new_frame)
         new_cost, new_used = normal_equations(
-            kind, trial, new_frame, x, y, z, sigma, perspective, scale, trim, H2, g2, work, held
+            kind, trial, new_frame, x, y, z, sigma, perspective, scale, trim, H2, g2, work, held, goes_on
         )
         is_fresh = new_cost <= cost and new_used >= p
         if is_fresh:
@@ -120,13 +123,13 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed, scr
                 th[i] = trial[i]
             for i in range(6):
                 frame[i] = new_frame[i]
+            if not goes_on:
+                break
             for a in range(p):
                 g[a] = g2[a]
                 for b in range(p):
                     H[a, b] = H2[a, b]
             damping = max(damping * 0.2, 1e-9)
-            if small < STEP_GOAL * 30.0:
-                break
         else:
             damping *= 10.0
             if damping > 1e6 or small < STEP_GOAL:
@@ -153,20 +156,18 @@ def _load(x, y, z, sigma, work):  # type: ignore[no-untyped-def]  # numba types 
     return LOADED
 
 
-@njit(cache=True, error_model="numpy")
-def _errors(kind, th, x, y, z, sigma, perspective, scratch, held):  # type: ignore[no-untyped-def]  # numba types it
-    """Residuals (N,) in sigmas, in `scratch` if the samples are; and what that holds then."""
+@njit(cache=True, error_model="numpy", **LEAN)
+def _fill_errors(kind, th, x, y, z, sigma, perspective, scratch, held):  # type: ignore[no-untyped-def]  # numba types it
+    """Residuals (N,) in sigmas into row ERROR if `scratch` holds the samples, else into its last array; and what it holds then."""
     work, frame, n = scratch[0], scratch[7], x.shape[0]
     if held == NOTHING:
-        e = np.empty(n)
-        residuals(kind, th, x, y, z, sigma, perspective, e)
-        return e, held
-    if held == LOADED:
+        residuals_by_chunks(kind, th, x, y, z, sigma, perspective, frame, work, scratch[10])
+    elif held == LOADED:
         frame_of(kind, th, frame)
         fill_rows(kind, th, frame, n, perspective, work)
         error_row(n, work)
         held = FILLED
-    return work[ERROR : ERROR + n], held
+    return held
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
@@ -199,23 +200,24 @@ def middle_scale(e):  # type: ignore[no-untyped-def]  # numba types it
 def fit_robust(kind, th, x, y, z, sigma, perspective, fixed, rounds):  # type: ignore[no-untyped-def]  # numba types it
     """Refine under Cauchy weights whose scale falls with the residuals; ends with the trimmed fit.
 
-    Returns parameters, information matrix, mean squared residual of the kept samples, share kept, trimmed cost.
+    Returns parameters and the trimmed cost.
     """
-    th, scratch = th.copy(), new_scratch()
+    th, scratch = th.copy(), new_scratch(x.shape[0])
     # A constant would have all that is called compiled once more.
-    mean2, kept, cost = _robust(np.int64(kind), th, x, y, z, sigma, perspective, fixed, np.int64(rounds), scratch)
-    return th, scratch[1], mean2, kept, cost
+    _, _, cost = _robust(np.int64(kind), th, x, y, z, sigma, perspective, fixed, np.int64(rounds), scratch)
+    return th, cost
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def _robust(kind, th, x, y, z, sigma, perspective, fixed, rounds, scratch):  # type: ignore[no-untyped-def]  # numba types it
-    """`fit_robust` that moves `th`; the first system of `scratch` is the information matrix."""
+    """`fit_robust` that moves `th`; mean squared residual of the kept samples, share kept, and trimmed cost."""
     n = x.shape[0]
+    e = scratch[0][ERROR : ERROR + n] if n <= CHUNK else scratch[10][:n]
     held, is_last, before, cost, used = _load(x, y, z, sigma, scratch[0]), rounds == 0, np.inf, 0.0, 0
     for turn in range(rounds + 1):
         scale, steps = 0.0, 3
         if not is_last:
-            e, held = _errors(kind, th, x, y, z, sigma, perspective, scratch, held)
+            held = _fill_errors(kind, th, x, y, z, sigma, perspective, scratch, held)
             middle = middle_scale(e)
             is_last = middle > FALLS * before  # the same weights once more would find the same surface
             if not is_last:
@@ -230,15 +232,17 @@ def _robust(kind, th, x, y, z, sigma, perspective, fixed, rounds, scratch):  # t
     return max(kept, 0.0) / max(used - FREEDOM[kind], 1), used / max(n, 1), cost
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def _rough(kind, th, x, y, z, sigma, perspective, fixed, scratch):  # type: ignore[no-untyped-def]  # numba types it
     """Moves `th` by a few robust steps; the sum of squared residuals then, each at most `ROUGH_LIMIT` squared."""
+    n = x.shape[0]
+    e = scratch[0][ERROR : ERROR + n] if n <= CHUNK else scratch[10][:n]
     held, steps = _load(x, y, z, sigma, scratch[0]), 2
-    e, held = _errors(kind, th, x, y, z, sigma, perspective, scratch, held)
+    held = _fill_errors(kind, th, x, y, z, sigma, perspective, scratch, held)
     for _ in range(2):
         scale = middle_scale(e)
         _, _, held = refine(kind, th, x, y, z, sigma, perspective, steps, scale, TRIM_SIGMAS, fixed, scratch, held)
-        e, held = _errors(kind, th, x, y, z, sigma, perspective, scratch, held)
+        held = _fill_errors(kind, th, x, y, z, sigma, perspective, scratch, held)
         if scale < 1.5:
             break
     cost = 0.0
@@ -251,8 +255,8 @@ def _rough(kind, th, x, y, z, sigma, perspective, fixed, scratch):  # type: igno
 def rough_mean_square(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """Mean square in sigmas, each at most `ROUGH_LIMIT` squared, that a rough fit from `th` leaves of samples (4, N)."""
     few = np.ascontiguousarray(samples[:, :: max(1, samples.shape[1] // ROUGH_SAMPLES)])
-    free = np.zeros(9, np.bool_)
-    cost = _rough(np.int64(kind), th.copy(), few[0], few[1], few[2], few[3], perspective, free, new_scratch())
+    free, scratch = np.zeros(9, np.bool_), new_scratch(few.shape[1])
+    cost = _rough(np.int64(kind), th.copy(), few[0], few[1], few[2], few[3], perspective, free, scratch)
     return cost / few.shape[1]
 
 
@@ -271,7 +275,7 @@ def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_sampl
     mean2, kept, score = np.full(5, np.inf), np.zeros(5), np.full(5, np.inf)
     n = x.shape[0]
     price = np.log(max(n / correlated_samples, 2.0))
-    free, scratch, rounds = np.zeros(9, np.bool_), new_scratch(), np.array([2, 2, 2, 2, 3])
+    free, scratch, rounds = np.zeros(9, np.bool_), new_scratch(n), np.array([2, 2, 2, 2, 3])
     last = np.int64(QUADRIC)  # no constant: `fit_robust` says why
     stride = max(1, n // ROUGH_SAMPLES)
     rx, ry, rz, rs = x[::stride].copy(), y[::stride].copy(), z[::stride].copy(), sigma[::stride].copy()

@@ -25,25 +25,23 @@ def last_step(kind, th, depth, sen, noise, slack, runs, fixed):  # type: ignore[
         parameters, information matrix (9, 9), squared residuals of the kept pixels, pixels kept.
     """
     p = FREEDOM[kind]
-    H, g = np.zeros((9, 9)), np.zeros(9)
-    kept, used = _equations(kind, th, depth, sen, noise, slack, runs, H, g)
+    H, g, frame = np.zeros((9, 9)), np.zeros(9), np.empty(6)
+    frame_of(kind, th, frame)
+    kept, used = _equations(kind, th, frame, depth, sen, noise, slack, runs, np.empty(SCRATCH), H, g)
     A, step = np.empty((p, p)), np.empty(p)
     damped(H, g, fixed, 0.0, p, A, step)
     if used <= p or not solve_positive(A, step, p):
         return th, H, kept, used
     for a in range(p):
         kept -= 0.0 if fixed[a] else g[a] * step[a]
-    frame, moved = np.zeros(6), np.empty(SIZE)
-    frame_of(kind, th, frame)
+    moved = np.empty(SIZE)
     step_into(kind, th, frame, step, moved)
     return moved, H, max(kept, 0.0), used
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _equations(kind, th, depth, sen, noise, slack, runs, H, g):  # type: ignore[no-untyped-def]  # numba types it
+@njit(cache=True, error_model="numpy", **LEAN, nogil=True)
+def _equations(kind, th, frame, depth, sen, noise, slack, runs, work, H, g):  # type: ignore[no-untyped-def]  # numba types it
     """Gauss-Newton matrix and gradient of the pixels within the trim; their squared residuals, and how many they are."""
-    frame, work = np.zeros(6), np.empty(SCRATCH)
-    frame_of(kind, th, frame)
     perspective = sen[0] > 0
     cost, used, n, pixels = 0.0, 0.0, 0, 0
     last = runs.shape[0] - 1

@@ -323,12 +323,13 @@ def _add_products(p, n, work, H, g):  # type: ignore[no-untyped-def]  # numba ty
 
 @njit(cache=True, error_model="numpy", **LEAN, nogil=True)
 def normal_equations(  # type: ignore[no-untyped-def]  # numba types it
-    kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g, work, held
+    kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g, work, held, step_follows
 ):
     """Gauss-Newton matrix `H` (9, 9) and gradient `g` (9,) of the ray residuals of samples (N,); cost and used samples.
 
     `scale` > 0: Cauchy weights of that width in sigmas; 0: samples beyond `trim` sigmas are left out. `held`: what `work`
-    holds already of at most CHUNK samples; afterwards it holds the samples and row ERROR.
+    holds already of at most CHUNK samples; afterwards it holds the samples and row ERROR. Without `step_follows` only cost
+    and used samples are found: `H` and `g` are zero.
     """
     H[:] = 0.0
     g[:] = 0.0
@@ -340,7 +341,9 @@ def normal_equations(  # type: ignore[no-untyped-def]  # numba types it
             load_rows(x, y, z, sigma, first, n, work)
         if held != FILLED:
             fill_rows(kind, th, frame, n, perspective, work)
-        more, hits = add_equations(kind, n, scale, trim, work, H, g)
+        more, hits = _weigh(n, scale, trim, work)
+        if step_follows:
+            _add_products(FREEDOM[kind], n, work, H, g)
         cost += more
         used += hits
     mirror(FREEDOM[kind], H)
@@ -350,14 +353,19 @@ def normal_equations(  # type: ignore[no-untyped-def]  # numba types it
 @njit(cache=True, error_model="numpy", **LEAN, nogil=True)
 def add_equations(kind, n, scale, trim, work, H, g):  # type: ignore[no-untyped-def]  # numba types it
     """Add the `n` filled rays in `work` to the lower triangle of `H` and to `g`; returns their cost and how many count."""
+    cost, used = _weigh(n, scale, trim, work)
+    _add_products(FREEDOM[kind], n, work, H, g)
+    return cost, used
+
+
+@njit(cache=True, error_model="numpy", **LEAN, nogil=True)
+def _weigh(n, scale, trim, work):  # type: ignore[no-untyped-def]  # numba types it
+    """Rows WEIGHT and RESIDUAL of the `n` filled rays in `work`; returns their cost and how many count."""
     if scale > 0.0:
         c2 = scale * scale * CAUCHY_WIDTH * CAUCHY_WIDTH
         used = _cauchy_weights(n, c2, work)
-        cost = c2 * _sum_of_logarithms(work[:n])
-    else:
-        cost, used = _trim_weights(n, trim, work)
-    _add_products(FREEDOM[kind], n, work, H, g)
-    return cost, used
+        return c2 * _sum_of_logarithms(work[:n]), used
+    return _trim_weights(n, trim, work)
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
@@ -371,7 +379,12 @@ def mirror(p, H):  # type: ignore[no-untyped-def]  # numba types it
 @njit(cache=True, error_model="numpy", nogil=True)
 def residuals(kind, th, x, y, z, sigma, perspective, out):  # type: ignore[no-untyped-def]  # numba types it
     """Fill `out` (N,) with residuals in sigmas, lessened at grazing rays; NaN where the ray misses."""
-    frame, work = np.zeros(6), np.empty(SCRATCH)
+    residuals_by_chunks(kind, th, x, y, z, sigma, perspective, np.empty(6), np.empty(SCRATCH), out)
+
+
+@njit(cache=True, error_model="numpy", **LEAN, nogil=True)
+def residuals_by_chunks(kind, th, x, y, z, sigma, perspective, frame, work, out):  # type: ignore[no-untyped-def]  # numba types it
+    """`residuals` that works in `frame` (6,) and `work` (SCRATCH,), and overwrites them."""
     frame_of(kind, th, frame)
     count = x.shape[0]
     for first in range(0, count, CHUNK):

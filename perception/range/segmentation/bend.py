@@ -112,7 +112,7 @@ def _is_near(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  #
 def _refined(kind, th, s, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """Parameters after a robust fit, and the mean of the squared residuals, each at most the trim's."""
     free = np.zeros(9, np.bool_)
-    th, _, _, _, cost = fit_robust(kind, th, s[0], s[1], s[2], s[3], perspective, free, 2)
+    th, cost = fit_robust(kind, th, s[0], s[1], s[2], s[3], perspective, free, 2)
     return th, cost / s.shape[1]
 
 

@@ -3,7 +3,7 @@
 # bodies and plain comparisons are what compiles fast.
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -21,8 +21,7 @@ WIDEST_GAP_PX = 3  # unlabelled pixels that a border may hold: one block of pixe
 PAIR_POINTS = 24
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Border:
+class Border(NamedTuple):
     """Up to `PAIR_POINTS` places (x, y) along the border of two regions, and its whole length in pixels."""
 
     x: Array
@@ -41,10 +40,9 @@ class Border:
 def borders_of(labels: Ints, packed: Array) -> dict[tuple[int, int], Border]:
     """Every pair of labels (a < b) that touch in (H, W) `labels`, with places on their border as ray coordinates."""
     pairs, lengths, x, y = _borders(labels, WIDEST_GAP_PX, packed)
+    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
     out = {}
-    for k in np.lexsort((pairs[:, 1], pairs[:, 0])).tolist():
-        a, b = pairs[k].tolist()
-        length = int(lengths[k])
+    for k, (a, b), length in zip(order.tolist(), pairs[order].tolist(), lengths[order].tolist(), strict=True):
         count = min(length, PAIR_POINTS)
         out[a, b] = Border(x=x[k, :count], y=y[k, :count], length_px=length)
     return out
@@ -75,7 +73,8 @@ def _contacts(labels, gap):  # type: ignore[no-untyped-def]  # numba types it
     ids, us, vs = np.empty(8 * W, np.int32), np.empty(8 * W), np.empty(8 * W)
     above, above_at = np.zeros(W, np.int32), np.zeros(W, np.int32)
     # Pairs of one smaller label are a linked list: no label has many neighbours.
-    newest, pairs, older = np.zeros(labels.max() + 1, np.int32), np.empty((64, 2), np.int32), np.empty(65, np.int32)
+    newest = np.zeros(labels.max() + 1, np.int32)
+    pairs, older = np.empty((4 * W, 2), np.int32), np.empty(4 * W + 1, np.int32)
     words, columns = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
     n, count = 0, 0
     for v in range(H):
@@ -85,37 +84,45 @@ def _contacts(labels, gap):  # type: ignore[no-untyped-def]  # numba types it
                 np.concatenate((us, np.empty_like(us))),
                 np.concatenate((vs, np.empty_like(vs))),
             )
-        row = labels[v]
-        _flag_ends(row, above, words.view(np.bool_))
-        for at in range(flagged(words, columns)):
-            u = columns[at]
-            label, left_at = row[u], u - 1
-            while left_at >= 0 and row[left_at] == 0 and u - left_at <= gap:
-                left_at -= 1
-            for side in range(2):
-                if side == 0:
-                    other, reach = row[left_at] if left_at >= 0 else 0, u - left_at
-                else:
-                    other, reach = above[u], v - above_at[u]
-                if other == label or other == 0 or reach > gap + 1:  # noqa: PLR1714 - numba knows no `in` of mixed integers
-                    continue
-                a, b = min(other, label), max(other, label)
-                k = newest[a]
-                while k > 0 and pairs[k - 1, 1] != b:
-                    k = older[k]
-                if k == 0:
-                    if count == pairs.shape[0]:
-                        pairs = np.concatenate((pairs, np.empty_like(pairs)))
-                        older = np.concatenate((older, np.empty_like(older)))
-                    pairs[count, 0], pairs[count, 1] = a, b
-                    count += 1
-                    k, older[count], newest[a] = count, newest[a], count
-                ids[n] = k
-                us[n] = 0.5 * (left_at + u) if side == 0 else u
-                vs[n] = v if side == 0 else 0.5 * (above_at[u] + v)
-                n += 1
-        _pass_row(row, v, above, above_at)
+        if count + 2 * W > pairs.shape[0]:
+            pairs, older = np.concatenate((pairs, np.empty_like(pairs))), np.concatenate((older, np.empty_like(older)))
+        _flag_ends(labels[v], above, words.view(np.bool_))
+        ends = columns[: flagged(words, columns)]
+        n, count = _add_contacts(labels[v], v, ends, gap, above, above_at, newest, pairs, older, count, ids, us, vs, n)
+        _pass_row(labels[v], v, above, above_at)
     return ids[:n].copy(), us[:n].copy(), vs[:n].copy(), pairs[:count].copy()
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _add_contacts(  # type: ignore[no-untyped-def]  # numba types it
+    row, v, ends, gap, above, above_at, newest, pairs, older, count, ids, us, vs, n
+):
+    """The contacts of row v in the columns `ends` after the `n` and the `count` pairs so far; returns both numbers then."""
+    for at in range(ends.shape[0]):
+        u = ends[at]
+        label, left_at = row[u], u - 1
+        while left_at >= 0 and row[left_at] == 0 and u - left_at <= gap:
+            left_at -= 1
+        for side in range(2):
+            if side == 0:
+                other, reach = row[left_at] if left_at >= 0 else 0, u - left_at
+            else:
+                other, reach = above[u], v - above_at[u]
+            if other == label or other == 0 or reach > gap + 1:  # noqa: PLR1714 - numba knows no `in` of mixed integers
+                continue
+            a, b = min(other, label), max(other, label)
+            k = newest[a]
+            while k > 0 and pairs[k - 1, 1] != b:
+                k = older[k]
+            if k == 0:
+                pairs[count, 0], pairs[count, 1] = a, b
+                count += 1
+                k, older[count], newest[a] = count, newest[a], count
+            ids[n] = k
+            us[n] = 0.5 * (left_at + u) if side == 0 else u
+            vs[n] = v if side == 0 else 0.5 * (above_at[u] + v)
+            n += 1
+    return n, count
 
 
 @njit(cache=True, error_model="numpy", **LEAN)

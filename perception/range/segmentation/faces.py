@@ -8,7 +8,6 @@ share out is described once more as a whole, under an error that widens until on
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from perception.range.segmentation.segment import STEEP_SLOPE, Task
 from perception.range.segmentation.tangents import STEADY_RMS
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 Labels = NDArray[np.int32]
 
 SHARP_RAD = 0.045  # normals noisier than this hide creases
@@ -65,7 +65,7 @@ def labels_of_blocks(labels: Labels, grid: Grid) -> Labels:
 def _faces(task: Task, grid: Grid) -> tuple[Labels, int]:
     """(h, w) faces between creases, 0 = none, and their number; bridges up to two blocks wide join no faces."""
     core = np.isfinite(grid.z) & (grid.rms < STEADY_RMS)
-    inner = cv2.erode(core.view(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
+    inner = _eroded(_eroded(core).T).T.copy()
     right, down = smooth_links(
         grid.z,
         grid.sigma,
@@ -79,6 +79,14 @@ def _faces(task: Task, grid: Grid) -> tuple[Labels, int]:
     )
     face, sizes = label_components(inner, right, down, tiles=task.tiles, pool=task.pool)
     return _regrown(face, core), sizes.size - 1
+
+
+def _eroded(core: Flags) -> Flags:
+    """Blocks of the core whose neighbours above and below, where there are any, belong to it too."""
+    inner = core.copy()
+    inner[1:] &= core[:-1]
+    inner[:-1] &= core[1:]
+    return inner
 
 
 @njit(cache=True, nogil=True)

@@ -141,7 +141,7 @@ def _flag_sides(own, flags):  # type: ignore[no-untyped-def]  # numba types it
         flags[u] |= (k > 0) & (is_left | is_right)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **LEAN)
 def _off(kind, th, x, y, z, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """How far a pixel lies off a surface, across the surface, metres; infinite where its ray misses."""
     zm = depth_on(kind, th, x, y, perspective)
@@ -226,7 +226,7 @@ def _next_ring(ring, shape, fd, flat):  # type: ignore[no-untyped-def]  # numba 
     return new[:count].copy()
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", **LEAN, nogil=True)
 def _slowest_left(i, W, fd, sen, noise, flat, kinds, table, slope):  # type: ignore[no-untyped-def]  # numba types it
     """The label beside pixel i whose surface it lies nearest to, 0 where all are farther than noise and `slope` allow."""
     perspective = sen[0] > 0

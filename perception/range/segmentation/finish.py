@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import sqrt
 
 import numpy as np
 from numba import njit
@@ -58,7 +59,7 @@ def refine_surface(
     image = (regions.depth_m, regions.packed, regions.law)
     n = int(regions.sizes[own])
     th, H, inverse, middles, kept, used = refined(kind, th, *image, slack, regions.runs_of(own), n, fixed)
-    misfit = float(np.sqrt(kept / max(used - FREEDOM[kind], 1)))
+    misfit = sqrt(kept / max(used - int(FREEDOM[kind]), 1))
     x, y, depth, sigma = middles.tolist()
     loss = averaging_loss(noise, depth)
     covariance = (_pseudo_inverse(H, kind, fixed) if inverse is None else inverse) * (max(misfit**2, 0.05) * loss)
@@ -91,7 +92,7 @@ def refined(kind, th, depth, sen, noise, slack, runs, pixels, fixed):  # type: i
     few = np.empty((4, min(pixels, COARSE_SAMPLES)))
     spread(depth, sen, noise, runs, pixels, NO_SHIFT, few)
     few[3] *= slack
-    th, _, _, _, _ = fit_robust(kind, th, few[0], few[1], few[2], few[3], sen[0] > 0, fixed, 1)
+    th, _ = fit_robust(kind, th, few[0], few[1], few[2], few[3], sen[0] > 0, fixed, 1)
     middles = np.empty(4)
     for a in range(4):
         middles[a] = np.median(few[a, ::MIDDLE_STRIDE].copy())

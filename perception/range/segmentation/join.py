@@ -137,7 +137,7 @@ def _is_scrap(kind, th, own_kind, own, samples, pixels, noise, perspective):  # 
 @njit(cache=True, error_model="numpy")
 def _fitted(kind, th, s, perspective, rounds):  # type: ignore[no-untyped-def]  # numba types it
     free = np.zeros(9, np.bool_)
-    th, _, _, _, _ = fit.fit_robust(kind, th, s[0], s[1], s[2], s[3], perspective, free, rounds)
+    th, _ = fit.fit_robust(kind, th, s[0], s[1], s[2], s[3], perspective, free, rounds)
     return th
 
 

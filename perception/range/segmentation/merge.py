@@ -9,6 +9,8 @@ is the error of the sensor, whatever the models say. `pairs` judges, compiled; t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +29,7 @@ LEAST_BORDER_PX = 6
 TIP_SHARE = 0.35  # of the side of a square of the smaller region: two that touch by less may have anything between them
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Part:
+class Part(NamedTuple):
     """A region while it is being joined: its surface, (4, N) samples, their (N, 3) normals, and figures (`pairs`)."""
 
     kind: int
@@ -99,10 +100,9 @@ class Agglomeration:
         border = self.borders[pair]
         if a is None or b is None or border.length_px < LEAST_BORDER_PX:
             return None
-        if border.length_px < TIP_SHARE * np.sqrt(min(a.pixels, b.pixels)):
+        if border.length_px < TIP_SHARE * sqrt(min(a.pixels, b.pixels)):
             return None
-        first, second = ((p.kind, p.parameters, p.samples, p.normals, p.figures) for p in (a, b))
-        gain, kind, th = judged(*first, *second, border.x, border.y, border.length_px, self.law, self.perspective)
+        gain, kind, th = judged(*a, *b, border.x, border.y, border.length_px, self.law, self.perspective)
         if not gain > 0.0:
             return None
         if kind == PLANE and is_seam_grooved(*self.image, self._members(pair), th, border.x, border.y):

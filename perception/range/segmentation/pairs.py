@@ -189,7 +189,7 @@ def _continued(kind, th, samples, perspective):  # type: ignore[no-untyped-def] 
     """The surface refined on the samples of both regions."""
     free = np.zeros(9, np.bool_)
     x, y, z, sigma = samples[0], samples[1], samples[2], samples[3]
-    th, _, _, _, _ = fit.fit_robust(kind, th, x, y, z, sigma, perspective, free, 3)
+    th, _ = fit.fit_robust(kind, th, x, y, z, sigma, perspective, free, 3)
     return th
 
 

@@ -95,9 +95,9 @@ def test_sums_are_those_of_numpy(kind, scale, perspective):
     z = np.nan_to_num(truth, nan=0.6) + sigma * rng.normal(size=300)
     z[::17] += 0.05
     H, g = np.ones((9, 9)), np.ones(9)
-    cost, used = rays.normal_equations(
-        kind, th, frame, x, y, z, sigma, perspective, scale, 3.0, H, g, np.empty(rays.SCRATCH), rays.NOTHING
-    )
+    given = (kind, th, frame, x, y, z, sigma, perspective, scale, 3.0, H, g, np.empty(rays.SCRATCH), rays.NOTHING)
+    assert rays.normal_equations(*given, False) == rays.normal_equations(*given, True)
+    cost, used = rays.normal_equations(*given, True)
 
     hit = np.isfinite(truth)
     w = np.where(hit, np.minimum(1.0, cosine / GRAZING_COSINE) / sigma, 0.0)
@@ -144,6 +144,6 @@ def test_sums_do_not_depend_on_where_the_samples_lie_in_memory():
         for part, values in zip(parts, samples, strict=True):
             part[:] = values
         H, g = np.zeros((9, 9)), np.zeros(9)
-        cost, _ = rays.normal_equations(SPHERE, th, frame, *parts, False, 0.0, 3.0, H, g, work, rays.NOTHING)
+        cost, _ = rays.normal_equations(SPHERE, th, frame, *parts, False, 0.0, 3.0, H, g, work, rays.NOTHING, True)
         seen.add((cost, H.tobytes(), g.tobytes()))
     assert len(seen) == 1

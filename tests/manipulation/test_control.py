@@ -99,6 +99,23 @@ def test_a_set_point_that_the_limits_hold_back_is_waited_for_and_what_is_left_is
     assert (np.abs(report.position_rad - goal).max() < 2e-3) == (leap_rad < 1.0)
 
 
+@pytest.mark.parametrize("stall_s", [0.02, 0.05, 0.2])
+def test_a_machine_that_stands_still_makes_a_motion_late_and_not_fast(rig: Rig, stall_s: float) -> None:
+    def stall() -> None:
+        if rig.world.ticks == 200:
+            rig.world.clock.set_now_s(rig.world.clock.now_s() + stall_s)
+
+    rig.world.before_step = stall
+    motion = forwards(0.05)
+    report = rig.controller.execute(motion)
+    assert report.outcome is MotionOutcome.COMPLETED
+    tips = np.array([tool_pose(q).translation for q in rig.world.commands])
+    assert np.linalg.norm(np.diff(tips, axis=0), axis=1).max() / 0.002 <= 1.7 * 0.06
+    assert np.diff(tips[:, 0]).min() >= -1e-9, "and it never goes back"
+    assert np.linalg.norm(difference(report.base_from_tool, motion.base_from_tool[-1])[:3]) < 1e-4
+    assert report.ended_s - report.started_s >= motion.times_s[-1] + stall_s - 0.002
+
+
 def test_contact_stops_an_approach_close_to_the_wall(rig: Rig) -> None:
     rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) + 0.03
     guard = Guard(name="contact", quantity=Quantity.FORCE, limit=8.0)

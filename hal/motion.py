@@ -140,7 +140,7 @@ class MotionLog:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionReport:
-    """What really happened. `tripped` names the guard; `cause` is a sentence for people."""
+    """What really happened. `tripped` names the guard, `device` what failed; `cause` is a sentence for people."""
 
     name: str
     outcome: MotionOutcome
@@ -154,6 +154,7 @@ class MotionReport:
     peak_force_n: float
     gripper_width_m: float | None
     log: MotionLog
+    device: str | None = None
 
     @property
     def duration_s(self) -> float:

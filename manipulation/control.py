@@ -357,6 +357,7 @@ class Controller:
             peak_force_n=recorder.peak_force_n,
             gripper_width_m=None if sample is None else sample.gripper_width_m,
             log=recorder.log(n),
+            device=end.device,
         )
 
     def _state_of(self, sample: Sample) -> RobotState:

@@ -66,8 +66,9 @@ class Attempt:
             case MotionOutcome.FAULT if report.tripped is not None:
                 raise SkillFailure(Outcome.FORCE_LIMIT, f"{motion.name}: {report.cause}")
             case MotionOutcome.FAULT:
-                device = report.cause.split(":", 1)[0]
-                raise DeviceFault(f"{motion.name}: {report.cause}", hint="run `panelwright devices`", device=device)
+                raise DeviceFault(
+                    f"{motion.name}: {report.cause}", hint="run `panelwright devices`", device=report.device
+                )
 
     def joints(self) -> Array:
         """Measured joints (n,)."""

@@ -29,13 +29,15 @@ GRIP = transform_rpy((0.0, 0.0, 0.21), (0.0, 0.0, 0.0))
 AT_HOME = Kinematics.of(T3).tool(HOME, GRIP)
 
 
-def report(outcome: MotionOutcome, *, cause: str = "", tripped: str | None = None) -> MotionReport:
+def report(
+    outcome: MotionOutcome, *, cause: str = "", tripped: str | None = None, device: str | None = None
+) -> MotionReport:
     log = MotionLog(
         times_s=np.empty(0), positions_rad=np.empty((0, 6)), wrench=np.empty((0, 6)), tip_m=np.empty((0, 3))
     )
     return MotionReport(
         name="m", outcome=outcome, tripped=tripped, cause=cause, started_s=0.0, ended_s=0.1, position_rad=HOME,
-        base_from_tool=AT_HOME, wrench=np.zeros(6), peak_force_n=3.0, gripper_width_m=0.04, log=log,
+        base_from_tool=AT_HOME, wrench=np.zeros(6), peak_force_n=3.0, gripper_width_m=0.04, log=log, device=device,
     )  # fmt: skip
 
 
@@ -168,7 +170,7 @@ def test_a_stiff_object_is_not_forced_again() -> None:
     [
         (report(MotionOutcome.STOPPED), Stopped),
         (report(MotionOutcome.CANCELLED), Cancelled),
-        (report(MotionOutcome.FAULT, cause="wrist_ft: silent"), DeviceFault),
+        (report(MotionOutcome.FAULT, cause="wrist_ft silent", device="wrist_ft"), DeviceFault),
         (report(MotionOutcome.FAULT, tripped="force_limit"), SkillFailure),
     ],
     ids=["stopped", "cancelled", "device", "force"],

@@ -208,7 +208,9 @@ def test_a_device_that_fails_in_motion_stops_the_arm_and_is_named(rig: Rig, devi
     rig.world.before_step = fail
     report = rig.controller.execute(forwards(0.1))
     assert report.outcome is MotionOutcome.FAULT
+    assert report.device == device
     assert report.cause.count(device) == 1, "named, and once"
+    assert rig.controller.state().faults == (report.cause,)
     after = rig.world.ticks
     assert after < 300 + 120
     assert np.abs(rig.world.velocity).max() < 1e-3
@@ -223,7 +225,7 @@ def test_a_defect_of_a_driver_stops_the_arm_as_gently_as_a_failing_device(rig: R
     rig.world.before_step = fail
     report = rig.controller.execute(forwards(0.1))
     assert report.outcome is MotionOutcome.FAULT
-    assert device in report.cause and "ZeroDivisionError" in report.cause
+    assert report.device == device and "ZeroDivisionError" in report.cause
     assert rig.world.ticks < 300 + 120
     assert np.abs(rig.world.velocity).max() < 1e-3
 

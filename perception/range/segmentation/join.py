@@ -101,7 +101,7 @@ def related(  # type: ignore[no-untyped-def]  # numba types it
             return APART, th
     both = np.concatenate((samples, others), 1)
     rough = _fitted(kind, th, np.ascontiguousarray(both[:, ::ROUGH_STRIDE]), perspective, 1)
-    for s in (samples, others):
+    for s in (others, samples):  # the smaller piece refuses more often
         if _trimmed(kind, rough, s, perspective)[0] < ROUGH_SHARE:
             return APART, th
     joint = _fitted(kind, th, both, perspective, 3)
@@ -156,12 +156,14 @@ def _trimmed(kind, th, s, perspective):  # type: ignore[no-untyped-def]  # numba
 @njit(cache=True, error_model="numpy")
 def _passes_near(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
     """Whether the surface, extended, passes near most of a piece: a cheap refusal before the joint fits."""
-    count, inside = 0, 0
-    for k in range(0, samples.shape[1], max(1, samples.shape[1] // NEAR_SAMPLES)):
+    n, step = samples.shape[1], max(1, samples.shape[1] // NEAR_SAMPLES)
+    count, far = (n + step - 1) // step, 0
+    for k in range(0, n, step):
         z = depth_on(kind, th, samples[0, k], samples[1, k], perspective)
-        inside += abs(samples[2, k] - z) < NEAR_SIGMAS * samples[3, k]
-        count += 1
-    return count >= LEAST_NEAR and 2 * inside > count
+        far += not abs(samples[2, k] - z) < NEAR_SIGMAS * samples[3, k]
+        if 2 * far >= count:
+            return False  # most pairs are: half of the samples tell
+    return count >= LEAST_NEAR
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

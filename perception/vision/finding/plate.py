@@ -1,9 +1,9 @@
 """The plate in an overview: four robust lines around what differs from the room, and the view straight onto it.
 
 A rigid plate before a typical camera is laid through the lines and follows the image's edges, so a side that the image
-cuts off is where the other three put it. Where the edges do not confirm a visible side (glare or shadow misled its line),
-the plate is laid again without that line, from further off, and freely, as a steep tilt before a wider lens wants it; what
-is confirmed best stands.
+cuts off is where the others put it; where they do not say, it begins at the image's border. Where the edges do not confirm a
+visible side (glare or shadow misled its line), the plate is laid again without that line, each also from further off, and
+freely, as a steep tilt before a wider lens wants it; what is confirmed best stands.
 """
 
 from __future__ import annotations
@@ -23,13 +23,17 @@ from perception.vision.view import Array, PlaneView, homography
 COARSE_WIDTH_PX = 160
 TYPICAL_FOCAL = 1.25  # of the longer image side: a lens of 44 degrees; completes a side that is cut off
 LEAST_SHARE = 0.25  # of the image: a smaller plate is not an overview
+LEAST_SIDE = 0.12  # of a side's length in the image that shows its edge; the rest is cut off
 SIDE_POINTS = 40
 WINDOWS_PX = (12.0, 8.0, 5.0, 3.0, 2.0)
 FAR_WINDOWS_PX = (30.0, 20.0, *WINDOWS_PX)  # for a plate whose lines were misled
 START_SIGMA_PX, FAR_SIGMA_PX = 6.0, 15.0
 FREE_WINDOWS_PX = (5.0, 3.0, 2.0)  # of the last step, which allows for a lens and a focal length that are not typical
 FREE_SIGMA_PX = 2.0
+LEAST_SIDES = 2  # that show as lines: one alone is anything's edge
+FILLED = 0.85  # of the image: then one line is enough, the other sides lie close to the image's border
 CONFIRMED = 0.7  # share of a side's visible edge
+LEAST_CONFIRMED = SIDE_POINTS // 4  # samples in all; in noise and in soft shades none is
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -53,6 +57,9 @@ def find_plate(gray: Image, width_m: float, height_m: float, *, focal_px: float 
     if mask.mean() < LEAST_SHARE:
         return None
     lines = [_side(mask, side) for side in range(4)]
+    seen = sum(line is not None for line in lines)
+    if not seen or (seen < LEAST_SIDES and mask.mean() < FILLED):
+        return None
     w, h = width_m / 2, height_m / 2
     search = _Search(
         image=edge_image(gray), outline=rectangle(0.0, 0.0, 0.0, width_m=width_m, height_m=height_m, count=SIDE_POINTS),
@@ -81,17 +88,18 @@ class _Search:
     focal_px: float
 
     def best(self, lines: list[Array | None]) -> PlaneView | None:
-        """The plate that the image's edges confirm best; None when the lines make none."""
+        """The plate that the image's edges confirm best; None when the lines make none, or hardly an edge confirms it."""
         view = self._laid(lines, WINDOWS_PX, START_SIGMA_PX)
         found = [] if view is None else [(self._score(view), view)]
         if view is None or self._least_confirmed(view) < CONFIRMED:
             attempts: list[_Attempt] = [(lines, FAR_WINDOWS_PX, FAR_SIGMA_PX)]
-            for side in range(4):
+            for side in (k for k, line in enumerate(lines) if line is not None):
                 fewer = [None if k == side else line for k, line in enumerate(lines)]
-                attempts.append((fewer, WINDOWS_PX, START_SIGMA_PX))
+                attempts += [(fewer, WINDOWS_PX, START_SIGMA_PX), (fewer, FAR_WINDOWS_PX, FAR_SIGMA_PX)]
             laid = [self._free(lines), *(self._laid(*attempt) for attempt in attempts)]
             found += [(self._score(view), view) for view in laid if view is not None]
-        return max(found, key=lambda f: f[0])[1] if found else None
+        best = max(found, key=lambda f: f[0])[1] if found else None
+        return best if best is not None and self._confirmed(best) >= LEAST_CONFIRMED else None
 
     def _laid(self, lines: list[Array | None], windows_px: tuple[float, ...], sigma_px: float) -> PlaneView | None:
         """The plate through the lines, moved onto the image's edges: first as a rigid one, then freely."""
@@ -126,6 +134,10 @@ class _Search:
         """Samples of the border that an edge confirms, less visible ones that none does."""
         visible, near = confirmed(self.image, view, self.outline)
         return 2 * int(near.sum()) - int(visible.sum())
+
+    def _confirmed(self, view: PlaneView) -> int:
+        """Samples of the border that an edge confirms."""
+        return int(confirmed(self.image, view, self.outline)[1].sum())
 
     def _least_confirmed(self, view: PlaneView) -> float:
         """Share of the visible samples with an edge, on the worst side of which enough is visible."""
@@ -162,7 +174,7 @@ def _side(mask: NDArray[np.bool_], side: int) -> Array | None:
     last = turned.shape[0] - 1
     first = turned[:, columns].argmax(axis=0) if side in (0, 3) else last - turned[::-1, columns].argmax(axis=0)
     free = (first > 1) & (first < last - 1)
-    if free.mean() < 0.35:
+    if free.mean() < LEAST_SIDE:
         return None
     x, y = columns[free].astype(float), first[free].astype(float) + (-0.5 if side in (0, 3) else 0.5)
     slope, start = _robust_line(x, y)
@@ -186,9 +198,6 @@ def _robust_line(x: Array, y: Array) -> tuple[float, float]:
 
 def _corners(lines: list[Array | None], shape: tuple[int, ...], aspect: float, focal: float) -> Array | None:
     """(4, 2) corners, upper left first and clockwise; a missing side is placed by the known proportions."""
-    seen = sum(line is not None for line in lines)
-    if seen < 2:
-        return None
     height, width = shape
     border = [
         np.array([0.0, 1.0, -0.5]),

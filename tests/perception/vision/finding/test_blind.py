@@ -42,6 +42,7 @@ from perception.vision.view import CameraView, PlaneView
 from tests.perception.vision.bench_panel import panel, scene
 
 PLATE = (0.60, 0.40)
+CORNERS_M = np.array([[-0.3, 0.2], [0.3, 0.2], [0.3, -0.2], [-0.3, -0.2]])
 
 
 def overview(**options: object) -> tuple[np.ndarray, CameraView]:
@@ -82,6 +83,28 @@ def test_a_plate_that_the_image_cuts_off_is_completed() -> None:
     assert plate is not None and not plate.sides_seen[1]
     corners = np.column_stack([plate.view.corners_m, np.zeros(4)])
     assert np.linalg.norm(plate.view.project(corners) - view.project(corners), axis=1).max() < 60.0
+
+
+@pytest.mark.parametrize("roll_deg", [0.0, 2.0])
+def test_a_plate_that_fills_the_image_but_for_one_side_is_found(roll_deg: float) -> None:
+    image, view = overview()
+    corners_m = np.column_stack([CORNERS_M, np.zeros(4)])
+    turn = cv2.getRotationMatrix2D((640.0, 480.0), roll_deg, 1.0)
+    turned = cv2.warpAffine(image, turn, (1280, 960), borderMode=cv2.BORDER_REPLICATE)
+    corners_px = view.project(corners_m) @ turn[:, :2].T + turn[:, 2]
+    low, high = np.round(corners_px.min(axis=0)).astype(int), np.round(corners_px.max(axis=0)).astype(int)
+    first = low - [40, -4]  # the left side shows, the other three are cut off or lie at the very border
+    cut = np.ascontiguousarray(turned[first[1] : high[1] - 4, first[0] : high[0] - 4])
+    plate = find_plate(cut, *PLATE, focal_px=1280.0)
+    assert plate is not None and plate.sides_seen[3]
+    off = plate.view.project(corners_m) - (corners_px - first)
+    assert np.linalg.norm(off, axis=1).max() < 0.04 * cut.shape[1]
+
+
+def test_one_edge_alone_is_no_plate() -> None:
+    horizon = np.full((480, 640), 60, np.uint8)
+    horizon[150:] = 190
+    assert find_plate(horizon, *PLATE) is None
 
 
 def test_a_picture_without_a_plate_is_refused() -> None:

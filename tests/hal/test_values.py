@@ -199,3 +199,17 @@ def test_what_a_cell_shares_is_closed_whole_and_in_reverse_even_if_something_fai
         shared.close()
     assert closed == ["third", "second", "first"]
     shared.close()
+
+
+@pytest.mark.parametrize("kind", [SimClock, PacedClock])
+def test_no_time_is_no_step_of_the_world(kind: type[SimClock] | type[PacedClock]) -> None:
+    steps: list[float] = []
+
+    def advance(duration_s: float) -> float:
+        steps.append(duration_s)
+        return 7.0
+
+    clock = kind(advance)
+    for duration_s in (0.0, -1.0):
+        clock.sleep(duration_s)
+    assert steps == []

@@ -92,6 +92,16 @@ def test_a_path_starts_at_the_measured_tool_and_has_closed_the_gap_after_a_quart
     assert run.is_over(tick(0.5))
 
 
+def test_a_path_that_shifts_and_turns_is_at_each_of_its_poses_in_time() -> None:
+    start = tool_pose(HOME)
+    poses = tuple(perturbed(start, np.array([0, 0, 0.02 * k, 0.2 * k, 0, 0])) for k in range(4))
+    times = np.array([0.0, 0.3, 0.6, 0.9])
+    motion = CartesianPath(name="path", flange_from_tool=GRIP, times_s=times, base_from_tool=poses)
+    joints = followed(PathRun(motion, ARM, HOME), 0.9, HOME)
+    for at_s, pose in zip(times, poses, strict=True):
+        np.testing.assert_allclose(difference(tool_pose(joints[round(at_s / DT_S)]), pose), 0.0, atol=1e-5)
+
+
 def test_a_compliant_path_yields_by_force_over_stiffness_along_the_tools_own_axis() -> None:
     soft = Compliance(
         stiffness=(1000.0, INF, INF, INF, INF, INF), damping=(200.0,) * 6, mass=(1.0,) * 6, max_offset_m=0.02

@@ -72,8 +72,11 @@ def close_up_poses(base_from_panel: RigidTransform, point_m: Sequence[float]) ->
 def side_poses(
     base_from_panel: RigidTransform, point_m: Sequence[float], side: tuple[float, float]
 ) -> Iterator[RigidTransform]:
-    """Camera poses that look at a panel point from one of the `SIDES`, past what hides it from straight ahead."""
-    for distance_m in (CLOSE_UP_M, 0.34, 0.38):
+    """Camera poses that look at a panel point from one of the `SIDES`, past what hides it from straight ahead.
+
+    From further off than a close-up: what hides it hangs before the panel, and aslant the fingers come nearer to that.
+    """
+    for distance_m in (0.34, 0.38, CLOSE_UP_M):
         for lean_rad in SIDE_RAD:
             for roll in (0.0, math.pi / 2, -math.pi / 2, math.pi):
                 tilt = (lean_rad * side[0], lean_rad * side[1])

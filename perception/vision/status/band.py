@@ -26,7 +26,23 @@ WHOLLY = 0.97  # of it: nothing is left to refine
 ALONG_SHARE = 0.72  # of the band's axis that must have its gray
 INSET = 0.09  # of the smaller side, from the border to the path within: clear of a frame, and no digits yet
 MOST_WIDTH = 0.5  # of the object's smaller side: wider things are not looked past
-BENDS = (0.0, -0.3, 0.3, -0.6, 0.6, -1.0, 1.0, -1.6, 1.6, -2.3, 2.3)  # of the band's width, sideways
+BENDS = (
+    0.0,
+    -0.3,
+    0.3,
+    -0.6,
+    0.6,
+    -1.0,
+    1.0,
+    -1.6,
+    1.6,
+    -2.3,
+    2.3,
+    -3.3,
+    3.3,
+    -4.5,
+    4.5,
+)  # of the band's width, sideways
 INK_EDGE_PX = 4.0
 OWN_ASIDE, OWN_RAD = 0.6, np.deg2rad(12.0)  # of a band's width from the object's middle; from one of its directions
 BENT_AT = (0.5, 0.3, 0.7)  # of its length
@@ -130,7 +146,7 @@ def _is_own(band: _Band, middle_px: Array, own_rad: Array) -> bool:
     to_middle = middle_px - first
     aside = abs(float(along[0] * to_middle[1] - along[1] * to_middle[0]))
     turn = np.arctan2(along[0], -along[1]) - own_rad
-    near = np.abs((turn + np.pi / 2) % np.pi - np.pi / 2).min()
+    near = np.abs((turn + np.pi / 2) % np.pi - np.pi / 2).min(initial=np.pi)
     return bool(aside < OWN_ASIDE * band.width_px and near < OWN_RAD)
 
 

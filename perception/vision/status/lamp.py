@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hal.panel import Lamp
 from perception.vision.image import WHITE_LEVEL, Image
 from perception.vision.patch import Patch, sample_at
 from perception.vision.reading import Status, gated, refused
+from perception.vision.status.band import cables_across
 from perception.vision.view import Array
 
+CORE, RIM, PLATE = (0.0, 0.15, 0.3), (0.5, 0.6, 0.7), (1.45, 1.6, 1.75)  # of the radius
+RING_PLACES, LEAST_SEEN = 108, 0.3  # places looked at in each; share that must not be hidden
+CLEAR_OF_BEZEL = 1.4  # of the radius
 LIT_RATIO = 0.85  # between an unlit lens (0.3 to 0.6 of a gray plate) and a lit one (above 1)
 
 
 def read_lamp(patch: Patch, spec: Lamp) -> Status:
     """State of a lamp. `patch` shows the plate plane or the lens."""
     light = patch.gray if patch.colour is None else patch.colour.max(axis=2)
-    a = np.linspace(0, 2 * np.pi, 36, endpoint=False)
-    core, rim, plate = (
-        _ring(patch, light, spec.radius_m, r, a) for r in ((0.0, 0.15, 0.3), (0.5, 0.6, 0.7), (1.45, 1.6, 1.75))
-    )
+    beyond_m = CLEAR_OF_BEZEL * spec.radius_m
+    hidden = cables_across(patch, radius_m=beyond_m, own_rad=np.empty(0))
+    core, rim, plate = (_ring(patch, light, spec.radius_m, r, hidden) for r in (CORE, RIM, PLATE))
+    if min(len(core), len(rim), len(plate)) < LEAST_SEEN * RING_PLACES:
+        return refused("something lies across the lamp: move it or look past it")
     around = float(np.median(plate))
     if around >= WHITE_LEVEL - 2 and core.mean() >= LIT_RATIO * WHITE_LEVEL:
         return refused("glare covers the lamp: change the angle or the light")  # a darker lens is unlit all the more
@@ -34,7 +40,12 @@ def read_lamp(patch: Patch, spec: Lamp) -> Status:
     return gated(Status(state="on" if evidence > 0 else "off", confidence=float(np.clip(2 * confidence - 1, 0, 1))))
 
 
-def _ring(patch: Patch, light: Image, radius_m: float, radii: tuple[float, ...], angles: Array) -> Array:
+def _ring(
+    patch: Patch, light: Image, radius_m: float, radii: tuple[float, ...], hidden: NDArray[np.bool_] | None
+) -> Array:
+    """(N,) brightness at places about the middle that nothing lies across."""
+    a = np.linspace(0, 2 * np.pi, RING_PLACES // len(radii), endpoint=False)
     r = np.array(radii)[:, None] * radius_m
-    u, v = patch.pixel_of(r * np.sin(angles), r * np.cos(angles))
-    return np.asarray(sample_at(light, u, v), float)
+    u, v = patch.pixel_of(r * np.sin(a), r * np.cos(a))
+    values = np.asarray(sample_at(light, u, v), float).ravel()
+    return values if hidden is None else values[(sample_at(hidden.astype(np.uint8), u, v) < 0.5).ravel()]

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.vision.patch import Patch
+from perception.vision.patch import Patch, sample_at
+from perception.vision.status.band import cables_across
 from perception.vision.status.choice import contrast_noise
 from perception.vision.view import Array
 
@@ -21,7 +22,8 @@ RESOLVED = (
     1.5  # widths of an edge: a wall that shows narrower than that runs into the face, and its foot cannot be told
 )
 SHARP_PX, PULL = 1.8, 1.0  # edges wider than sharp ones are pulled by their neighbours: the excess times that, px
-RING, RING_SHARE, RING_NEAR_PX = (1.08, 1.5), 0.5, 1.6  # radii over the cap's; share of it that must show; image px
+RING, RING_SHARE, RING_NEAR_PX = (1.08, 1.5), 0.5, 2.0  # radii over the cap's; share of it that must show; image px
+CLEAR_OF_RING = 1.6  # of the cap's radius: what crosses a circle of that size is no part of the button
 PLACE_SIGMA_M = 3e-4  # building tolerance of the cap's place
 RADIUS_SIGMA_M = 1.5e-4
 
@@ -56,6 +58,10 @@ def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, fo
     slack = 1.2 / patch.image_px_per_m
     reach = np.where(is_face, outward * (high_m - low_m) / 2, 0.0) + slack
     offset, found, width_px = _edges(patch, radius_m, a, middle, expected, reach)
+    beyond_m = CLEAR_OF_RING * radius_m
+    hidden = cables_across(patch, radius_m=beyond_m, own_rad=np.empty(0))
+    if hidden is not None:
+        found &= sample_at(hidden.astype(np.uint8), *_at(patch, radius_m + offset, a, middle)) < 0.5
     ok = found & use
     if foot_m is not None:
         ok &= ~_on_ring(patch, radius_m, a, outward, offset + outward * middle)
@@ -84,6 +90,11 @@ def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, fo
         sigma_m=float(np.hypot(np.sqrt(np.linalg.inv(N)[0, 0]), pull_m)),
         found=float(ok.mean()),
     )
+
+
+def _at(patch: Patch, r_m: Array, a: Array, z_m: float) -> tuple[Array, Array]:
+    """Patch coordinates of places about the middle, by radius and angle."""
+    return patch.pixel_of(r_m * np.sin(a), r_m * np.cos(a), z_m)
 
 
 def _on_ring(patch: Patch, radius_m: float, a: Array, outward: Array, at_plate_m: Array) -> NDArray[np.bool_]:

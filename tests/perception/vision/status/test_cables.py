@@ -13,12 +13,13 @@ from benchmarks.display_drawing import draw_taught
 from benchmarks.display_report import read_case
 from benchmarks.panel_scene import draw_scene
 from benchmarks.vision_held_out import found_blind, read_scene
-from hal.panel import Gauge, Lever, Scale, Slider, State
+from hal.panel import Gauge, Lamp, Lever, Scale, Slider, State
 from perception.vision.patch import Patch
 from perception.vision.status.band import cables_across, lying_across
 from perception.vision.status.bar import bar_contrast
 from perception.vision.status.comb import Comb
 from perception.vision.status.gauge import read_gauge, status_of_pointer
+from perception.vision.status.lamp import read_lamp
 from perception.vision.status.lever import read_lever
 from perception.vision.status.pointer import PointerFit
 from perception.vision.status.slider import read_slider
@@ -154,6 +155,25 @@ def test_a_cable_over_the_hub_is_no_handle(xs: tuple[int, int, int]) -> None:
 def test_a_handle_that_a_cable_crosses_is_read() -> None:
     patch = patch_of(hung(lever(np.pi / 2), (150, 160, 180), 40))
     assert read_lever(patch, LEVER).state == "open"
+
+
+def lens(radius_px: int, gray: int, xs: tuple[int, int, int] | None) -> Patch:
+    """A lamp's lens with a dark bezel on the plate, and a cable of that gray before it."""
+    picture = np.full((SIZE, SIZE), 150, np.uint8)
+    cv2.circle(picture, (MIDDLE, MIDDLE), round(1.2 * radius_px), 40, -1, cv2.LINE_AA)
+    cv2.circle(picture, (MIDDLE, MIDDLE), radius_px, gray, -1, cv2.LINE_AA)
+    return patch_of(picture if xs is None else hung(picture, xs, 60))
+
+
+@pytest.mark.parametrize(("gray", "state"), [(250, "on"), (60, "off")])
+def test_a_lamp_behind_a_cable_is_read_by_what_shows_of_it_or_not_at_all(gray: int, state: str) -> None:
+    lamp = Lamp(kind="lamp", name="alarm", position_m=(0.0, 0.0), radius_m=55 / PX_PER_M)
+    assert read_lamp(lens(55, gray, None), lamp).state == state
+    for xs in ((110, 120, 130), (100, 112, 118), (140, 150, 145), (60, 120, 180)):
+        assert read_lamp(lens(55, gray, xs), lamp).state in (state, None)
+    small = Lamp(kind="lamp", name="alarm", position_m=(0.0, 0.0), radius_m=14 / PX_PER_M)
+    told = read_lamp(lens(14, gray, (120, 120, 120)), small)
+    assert told.state is None and "across the lamp" in (told.reason or "")
 
 
 def test_a_pipe_through_the_middle_is_the_objects_own() -> None:

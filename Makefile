@@ -11,7 +11,7 @@ PIP_IN_SHORT = awk ' \
     /^Installing collected/ { print "setup: installing " (n + 0) " packages"; fflush() } \
     /^ERROR|^error/ { print }'
 
-.PHONY: help setup warm test-packages demo serve test test-wire test-fast lint lint-style lint-types lint-layers format bench-cell bench-missions bench-pose bench-fusion bench-range bench-vision bench-drivers clean
+.PHONY: help setup warm test-packages demo serve test test-wire test-fast lint lint-style lint-types lint-layers format bench-cell bench-missions bench-pose bench-fusion bench-range bench-vision bench-cables bench-drivers clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 16
@@ -69,6 +69,9 @@ lint-layers:
 
 format: setup  ## Put the code into shape
 	@$(BIN)/ruff format . && $(BIN)/ruff check --fix .
+
+bench-cables: setup  ## Read the simulated panel behind cables
+	@$(BIN)/python -m benchmarks.behind_cables
 
 bench-cell bench-missions bench-fusion bench-pose bench-range bench-vision bench-drivers: bench-%: setup  ## Measure, pass line beside figure
 	@$(BIN)/python -m benchmarks.$*

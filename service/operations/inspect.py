@@ -50,7 +50,12 @@ def inspect_here(session: Session, names: Collection[str], seen: Look | None = N
 
 
 def inspect_close(session: Session, names: Collection[str]) -> Inspection:
-    """Read objects from close-ups, as few as show them all."""
+    """Read objects from close-ups, and what they do not tell from the sides."""
+    return look_past(session, close_ups(session, names))
+
+
+def close_ups(session: Session, names: Collection[str]) -> Inspection:
+    """Read objects from as few close-ups as show them all."""
     objects = [session.panel.object(name) for name in names]
     groups = close_up_groups(objects, session.lens())
     readings: dict[str, ObjectReading] = {}
@@ -60,7 +65,7 @@ def inspect_close(session: Session, names: Collection[str]) -> Inspection:
         closer = look_close(session, centre_m, group)
         readings |= closer.readings
         pictures += closer.pictures
-    return look_past(session, Inspection(readings=readings, pictures=tuple(pictures)))
+    return Inspection(readings=readings, pictures=tuple(pictures))
 
 
 def look_close(session: Session, centre_m: Iterable[float], names: Collection[str]) -> Inspection:

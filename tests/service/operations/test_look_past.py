@@ -6,54 +6,29 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from hal.config import CableSection, Cell, SimulationSection, load_cell
+from benchmarks.behind_cables import drawn_cable, open_session, with_cables
+from hal.config import CableSection, load_cell
 from hal.errors import Unreachable
 from perception.vision.reading import ObjectReading
-from service.cell import CellRuntime
-from service.connection import LocalConnection
 from service.operations import inspect
 from service.operations.beliefs import forget_reading, known_readings
-from service.operations.context import CellMemory, OperationContext
 from service.operations.inspect import Inspection, inspect_close
-from service.operations.locate import go_to_overview, locate
 from service.operations.session import Session
-from service.task_model import Task
-from service.tasks import TaskContext
 
 ROOT = Path(__file__).parents[3]
 pytestmark = pytest.mark.timeout(300)
 CABLE = CableSection(path_m=((0.06, 0.3, 0.05), (0.098, 0.118, 0.03), (0.16, 0.0, 0.05)), radius_m=0.005)
 
 
-def cabled(cell: Cell) -> Cell:
-    """The bench cell with a cable before its display."""
-    return cell.model_copy(
-        update={"file": cell.file.model_copy(update={"simulation": SimulationSection(cables=(CABLE,))})}
-    )
-
-
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
-    """Before the located panel, seed 3."""
-    folder = tmp_path_factory.mktemp("look-past")
-    cell = cabled(load_cell(ROOT / "cells/bench.toml", seed=3))
-    runtime = CellRuntime.start(cell, is_latched=lambda: False)
-    try:
-        session = Session(
-            context=OperationContext(
-                connection=LocalConnection(cell, runtime.objects, close=runtime.close),
-                task=TaskContext(Task(id="test", verb="inspect", request={}, moves=True), folder / "artefacts"),
-                runs_dir=folder / "runs",
-                state=CellMemory(),
-            )
-        )
-        go_to_overview(session)
-        locate(session)
+    """Before the located panel, seed 3, a cable before its display."""
+    cell = with_cables(load_cell(ROOT / "cells/bench.toml", seed=3), CABLE)
+    with open_session(cell, tmp_path_factory.mktemp("look-past")) as session:
         yield session
-    finally:
-        runtime.close()
 
 
 def truth_of(session: Session, name: str) -> Any:
@@ -98,3 +73,11 @@ def test_many_unread_objects_are_no_cables_work(session: Session, monkeypatch: p
     unread: ObjectReading = first.readings["temperature"]
     monkeypatch.setattr(inspect, "MOST_UNREAD", 0)
     assert inspect.look_past(session, first) is first and not unread.answered
+
+
+def test_the_benchmarks_cables_hang_clear_of_the_plate_from_border_to_border() -> None:
+    for seed in range(20):
+        cable = drawn_cable(np.random.default_rng(seed), (0.3, 0.22))
+        ends = np.array(cable.path_m)[[0, -1]]
+        assert (np.abs(ends[:, :2]) > (0.3, 0.22)).any(axis=1).all()
+        assert min(z for _, _, z in cable.path_m) >= 0.028

@@ -1,0 +1,149 @@
+"""Reading the simulated panel with cables before it, from straight ahead and with looks from the sides.
+
+`python -m benchmarks.behind_cables [FIRST [COUNT]]`: two cables a cell, drawn by its seed; every object is looked at close, and
+what cannot be read from the sides too. Judged by the simulator's truth.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from hal.config import CableSection, Cell, SimulationSection, load_cell
+from hal.errors import CellError
+from hal.panel import PanelObject
+from hal.simulated import ObjectTruth
+from perception.vision.reading import ObjectReading
+from service.cell import CellRuntime
+from service.connection import LocalConnection
+from service.operations.context import CellMemory, OperationContext
+from service.operations.inspect import close_ups, look_past
+from service.operations.judge import agrees
+from service.operations.locate import go_to_overview, locate
+from service.operations.session import Session
+from service.task_model import Task
+from service.tasks import TaskContext
+
+BENCH = Path(__file__).resolve().parents[1] / "cells" / "bench.toml"
+FIRST, COUNT = 1000, 10
+ANSWERS = ("right", "wrong", "refused")
+
+
+def with_cables(cell: Cell, *cables: CableSection) -> Cell:
+    """The same cell with cables before its panel."""
+    return cell.model_copy(
+        update={"file": cell.file.model_copy(update={"simulation": SimulationSection(cables=cables)})}
+    )
+
+
+def drawn_cable(random: np.random.Generator, panel_half_m: tuple[float, float]) -> CableSection:
+    """A cable from border to border with one bend, thin or thick, dark or bright, 28 to 60 mm before the plate."""
+    w, h = panel_half_m
+    across = random.uniform(-0.85, 0.85, 3)
+    along = [-1.35, float(random.uniform(-0.6, 0.6)), 1.35]
+    radius_m = float(random.uniform(0.002, 0.007))
+    heights = np.maximum(random.uniform(0.012, 0.060, 3), 0.028 + radius_m)
+    upright = random.random() < 0.6
+    points = [
+        (w * (a if upright else b), h * (b if upright else a), z)
+        for a, b, z in zip(across, along, heights, strict=True)
+    ]
+    return CableSection(
+        path_m=tuple((float(x), float(y), float(z)) for x, y, z in points),
+        radius_m=radius_m,
+        gray=float(random.choice([0.05, 0.1, 0.3, 0.6])),
+    )
+
+
+@contextmanager
+def open_session(cell: Cell, folder: Path) -> Iterator[Session]:
+    """An inline cell with a task of its own, before its located panel.
+
+    Raises:
+        CellError: the panel was not found.
+    """
+    runtime = CellRuntime.start(cell, is_latched=lambda: False)
+    try:
+        session = Session(
+            context=OperationContext(
+                connection=LocalConnection(cell, runtime.objects, close=runtime.close),
+                task=TaskContext(Task(id="cables", verb="inspect", request={}, moves=True), folder / "artefacts"),
+                runs_dir=folder / "runs",
+                state=CellMemory(),
+            )
+        )
+        go_to_overview(session)
+        locate(session)
+        yield session
+    finally:
+        runtime.close()
+
+
+def verdict(reading: ObjectReading, spec: PanelObject, truth: ObjectTruth) -> str:
+    """`right`, `wrong` or `refused`."""
+    if not reading.answered:
+        return "refused"
+    is_right = agrees(spec, truth, value=reading.value, state=reading.state, text=reading.text)
+    return "right" if is_right else "wrong"
+
+
+def judge_cell(seed: int, folder: Path) -> tuple[Counter[str], Counter[str], list[str]]:
+    """Verdicts from straight ahead and after the looks from the sides, and a line a wrong answer."""
+    cell = load_cell(BENCH, seed=seed)
+    random = np.random.default_rng(seed)
+    half = (cell.panel.width_m / 2, cell.panel.height_m / 2)
+    cell = with_cables(cell, drawn_cable(random, half), drawn_cable(random, half))
+    straight: Counter[str] = Counter()
+    after: Counter[str] = Counter()
+    wrong = []
+    with open_session(cell, folder) as session:
+        first = close_ups(session, [thing.name for thing in cell.panel.objects])
+        found = look_past(session, first)
+        truth = {thing.name: thing for thing in session.connection.device("arm").truth().objects}
+        for spec in cell.panel.objects:
+            last = found.readings[spec.name]
+            straight[verdict(first.readings[spec.name], spec, truth[spec.name])] += 1
+            after[told := verdict(last, spec, truth[spec.name])] += 1
+            if told == "wrong":
+                shown = truth[spec.name]
+                said = last.text or last.state or last.value
+                wrong.append(
+                    f"{seed}: {spec.name} is {shown.text or shown.state or shown.value}, read {said} at {last.confidence:.2f}"
+                )
+    return straight, after, wrong
+
+
+def main(arguments: list[str]) -> int:
+    """Entry point; returns the exit status."""
+    first = int(arguments[0]) if arguments else FIRST
+    count = int(arguments[1]) if len(arguments) > 1 else COUNT
+    straight: Counter[str] = Counter()
+    after: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory() as folder:
+        for seed in range(first, first + count):
+            try:
+                ahead, aside, wrong = judge_cell(seed, Path(folder) / str(seed))
+            except CellError as error:  # a cable before a border light, or one that the arm ran into
+                print(f"{seed}: {error}")
+                continue
+            straight += ahead
+            after += aside
+            print(
+                f"{seed}: from ahead {ahead['right']} right, then {aside['right']} of {aside.total()}",
+                *wrong,
+                sep="\n  ",
+            )
+    for name, counts in (("from straight ahead", straight), ("with looks from the sides", after)):
+        print(f"{name:26s} " + ", ".join(f"{what} {counts[what] / max(counts.total(), 1):.3f}" for what in ANSWERS))
+    print(f"{straight.total()} objects of {count} cells from seed {first}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

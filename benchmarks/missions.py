@@ -77,6 +77,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("last", type=int, nargs="?", default=20)
     parser.add_argument("--cell", type=Path, default=ROOT / "cells/bench.toml")
     given = parser.parse_args(arguments)
+    if given.last < given.first:
+        parser.error(f"the seeds {given.first} to {given.last} are none: FIRST comes before LAST")
     print(f"{HEAD}\n|{' --- |' * 12}", flush=True)
     runs = []
     for seed in range(given.first, given.last + 1):

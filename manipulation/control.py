@@ -37,7 +37,7 @@ from manipulation.drives import Drives
 from manipulation.endings import Ending, Watch
 from manipulation.kinematics import Kinematics
 from manipulation.recorder import Recorder
-from manipulation.runs import Run, Tick, begin
+from manipulation.runs import GripperRun, Run, Tick, begin
 from manipulation.sensing import ContactWrench, DeviceFailure, Devices, RangeReader, Sample, ToolView
 from manipulation.setpoint import SetPointFilter, check, flange_matrix
 
@@ -268,6 +268,8 @@ class Controller:
                     continue
             except DeviceFailure as failure:
                 end = Ending(outcome=MotionOutcome.FAULT, cause=str(failure), device=failure.device)
+            if isinstance(run, GripperRun):
+                run.halt(sample, elapsed_s)
             self._come_to_rest(end)
             return end
 

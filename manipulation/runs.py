@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from hal.clock import Clock, Deadline
 from hal.devices import Gripper
+from hal.errors import CellError
 from hal.motion import CartesianPath, Compliance, GripperMotion, Hold, JointTrajectory
 from manipulation import kernels
 from manipulation.kinematics import Kinematics
@@ -23,6 +25,7 @@ TURN_ARM_M = 0.1  # a turn of 1 rad counts as this much way
 DAMPING = 1e-3  # of the damped least squares; strokes are chosen clear of singularities beforehand
 GRIP_START_S = 0.08  # a gripper needs this long to report that it moves
 GRIP_REST_S = 0.05
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,12 +165,28 @@ class HoldRun:
 class GripperRun:
     """The arm holds while the pads move; over when they rest."""
 
-    def __init__(self, motion: GripperMotion, gripper: Gripper, deadline: Deadline) -> None:
-        self._timeout_s = motion.timeout_s
+    def __init__(self, motion: GripperMotion, gripper: Gripper, clock: Clock) -> None:
+        self._motion, self._gripper, self._clock = motion, gripper, clock
         self._resting_since_s: float | None = None
-        gripper.command(
-            width_m=motion.width_m, force_n=motion.force_n, speed_m_per_s=motion.speed_m_per_s, deadline=deadline
+        self._move_to(motion.width_m)
+
+    def _move_to(self, width_m: float) -> None:
+        wanted = self._motion
+        deadline = Deadline.after(self._clock, command_wait_s(self._clock))
+        self._gripper.command(
+            width_m=width_m, force_n=wanted.force_n, speed_m_per_s=wanted.speed_m_per_s, deadline=deadline
         )
+
+    def halt(self, sample: Sample, elapsed_s: float) -> None:
+        """Let the pads stay where they are, unless they rest already: what ends a motion early is meant for them too."""
+        if not sample.gripper_is_moving and elapsed_s >= GRIP_START_S:
+            return
+        try:
+            self._move_to(sample.gripper_width_m)
+        except CellError:
+            pass  # it may be what has failed
+        except Exception:  # a defect of its driver: the arm must come to rest all the same
+            log.exception("halting %s", self._gripper.name)
 
     def wanted(self, tick: Tick) -> Array:
         """Where it is."""
@@ -180,7 +199,7 @@ class GripperRun:
         elif self._resting_since_s is None:
             self._resting_since_s = tick.elapsed_s
         rested = self._resting_since_s is not None and tick.elapsed_s - self._resting_since_s >= GRIP_REST_S
-        return rested or tick.elapsed_s >= self._timeout_s
+        return rested or tick.elapsed_s >= self._motion.timeout_s
 
 
 def begin(
@@ -199,7 +218,7 @@ def begin(
         case Hold():
             return HoldRun(motion)
         case GripperMotion():
-            return GripperRun(motion, gripper, Deadline.after(clock, command_wait_s(clock)))
+            return GripperRun(motion, gripper, clock)
 
 
 def _fade(elapsed_s: float) -> float:

@@ -151,6 +151,7 @@ class FakeGripper(_Device):
         return self.stamped(GripperState(width_m=self.world.width_m, force_n=0.0, is_moving=moving, is_holding=False))
 
     def command(self, *, width_m: float, force_n: float, speed_m_per_s: float, deadline: Deadline) -> float:
+        self.stamped(None)  # one that is silent or broken takes no command
         self.world.width_target_m = width_m
         return width_m
 

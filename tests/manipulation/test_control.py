@@ -347,6 +347,38 @@ def test_the_gripper_moves_while_the_arm_holds(rig: Rig) -> None:
     assert np.allclose(rig.world.q, HOME)
 
 
+@pytest.mark.parametrize("ticks", [0, 3, 100])
+@pytest.mark.parametrize("how", ["stop", "cancel"])
+def test_the_pads_stop_with_the_motion(rig: Rig, how: str, ticks: int) -> None:
+    begun = rig.world.ticks
+
+    def end() -> None:
+        if rig.world.ticks - begun == ticks:
+            rig.latched[0] = how == "stop"
+            rig.controller.cancel()
+
+    rig.world.before_step = end
+    report = rig.controller.execute(GripperMotion(name="close", width_m=0.0, force_n=20.0, speed_m_per_s=0.05))
+    assert report.outcome is (MotionOutcome.STOPPED if how == "stop" else MotionOutcome.CANCELLED)
+    where_m = rig.world.width_m
+    rig.world.clock.sleep(1.0)
+    assert abs(rig.world.width_m - where_m) < 0.002
+    assert rig.world.width_m > 0.02
+
+
+@pytest.mark.parametrize("fails", ["silent", "defective"])
+def test_a_gripper_that_does_not_hear_hinders_no_stop(rig: Rig, fails: str) -> None:
+    def break_and_stop() -> None:
+        if rig.world.ticks == 20:
+            getattr(rig.world, fails).add("gripper")
+            rig.latched[0] = True
+
+    rig.world.before_step = break_and_stop
+    motion = GripperMotion(name="close", width_m=0.0, force_n=20.0, speed_m_per_s=0.05)
+    assert rig.controller.execute(motion).outcome in (MotionOutcome.STOPPED, MotionOutcome.FAULT)
+    assert not rig.world.enabled
+
+
 def test_the_state_tells_joints_contacts_and_the_latch(rig: Rig) -> None:
     rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) - 0.001
     rig.latched[0] = True

@@ -186,7 +186,8 @@ class Session:
             case MotionOutcome.STOPPED:
                 return Stopped(what, hint="reset the stop (POST /v1/stop/reset), then command again")
             case MotionOutcome.FAULT:
-                return DeviceFault(what, hint="see the named device in GET /v1/devices", motion=report.name)
+                hint = "see the named device in GET /v1/devices"
+                return DeviceFault(what, hint=hint, motion=report.name, device=report.device)
             case MotionOutcome.CANCELLED:
                 return MotionError(what, hint="start the task again when ready", motion=report.name)
         return MotionError(what, hint="look at the wrench plot of the report", motion=report.name)

@@ -90,6 +90,7 @@ def test_a_device_that_dies_ends_the_mission_with_its_name_and_a_report(bench: B
     task = bench.ended(url)
     assert task["state"] == "failed"
     assert "wrist_ft" in task["problem"]["detail"]
+    assert task["problem"]["details"]["device"] == "wrist_ft"
     assert task["problem"]["hint"]
     reports = bench.client.get("/v1/missions").json()["missions"]
     report = bench.client.get(reports[0]["json_url"]).json()

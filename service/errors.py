@@ -40,7 +40,7 @@ class StaleEpoch(LeaseError):
 class Aborted(CellError):
     """The service ended while the task ran; the arm was stopped. The task was not taken up again."""
 
-    retry = Retry.SAFE
+    retry = Retry.AFTER_FIX  # the arm may stand in the middle of a deed: a person looks first
 
 
 class JournalError(CellError):

@@ -56,7 +56,7 @@ def test_a_task_that_was_cut_off_is_aborted_and_not_taken_up(write_cell: WriteCe
         again = second.tasks.get(task.id)
         assert again.state is TaskState.FAILED
         assert again.problem is not None
-        assert again.problem["type"] == "urn:panelwright:aborted"
+        assert (again.problem["type"], again.problem["retry"]) == ("urn:panelwright:aborted", "after-fix")
         assert f"the service ended while task {task.id} was running" in again.problem["detail"]
         assert again.started_s == pytest.approx(task.started_s, abs=60.0)
         assert second.tasks.moving() is None

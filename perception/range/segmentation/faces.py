@@ -17,14 +17,13 @@ from perception.range.segmentation.compete import Candidates, fit_best
 from perception.range.segmentation.grid import Grid
 from perception.range.segmentation.links import smooth_links
 from perception.range.segmentation.segment import STEEP_SLOPE, Task
-from perception.range.segmentation.tangents import STEADY_RMS
+from perception.range.segmentation.tangents import STEADY_RMS, TURN_RAD, bent_planes
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Labels = NDArray[np.int32]
 
 SHARP_RAD = 0.045  # normals noisier than this hide creases
-TURN_RAD = 0.15  # between neighbouring blocks of one face
 WIDER = 2.0  # a try
 TRIES = 7
 MODEL_ERROR = 0.012  # of the size of a face: one sigma
@@ -64,7 +63,11 @@ def labels_of_blocks(labels: Labels, grid: Grid) -> Labels:
 
 def _faces(task: Task, grid: Grid) -> tuple[Labels, int]:
     """(h, w) faces between creases, 0 = none, and their number; bridges up to two blocks wide join no faces."""
-    core = np.isfinite(grid.z) & (grid.rms < STEADY_RMS)
+    normal, rms = grid.normal.copy(), grid.rms.copy()
+    slope = STEEP_SLOPE * grid.size_px / task.packed[1]
+    blocks = (grid.x, grid.y, grid.z, grid.count, grid.sigma, grid.perspective, grid.radius)
+    bent_planes(*blocks, slope, normal, rms)
+    core = np.isfinite(grid.z) & (rms < STEADY_RMS)
     inner = _eroded(_eroded(core).T).T.copy()
     right, down = smooth_links(
         grid.z,
@@ -73,8 +76,8 @@ def _faces(task: Task, grid: Grid) -> tuple[Labels, int]:
         STEEP_SLOPE * grid.size_px,
         1.0 / task.packed[1],
         grid.perspective,
-        grid.normal,
-        grid.rms,
+        normal,
+        rms,
         float(np.cos(max(TURN_RAD, 5.0 * grid.normal_sigma_rad))),
     )
     face, sizes = label_components(inner, right, down, tiles=task.tiles, pool=task.pool)

@@ -34,9 +34,9 @@ MIDDLE_SAMPLES = 1024
 class Grid:
     """Blocks of an image, (h, w) arrays; NaN depth marks an empty block.
 
-    `x`, `y` are coordinates on the plane z = 1 (pinhole) or metres (orthographic), `z` metres, `sigma` the standard
-    deviation of `z`, `normal` (h, w, 3) towards the sensor, `rms` what the tangent plane leaves over in sigmas,
-    `slow_share` the part of the variance that neighbours share.
+    `x`, `y` are coordinates on the plane z = 1 (pinhole) or metres (orthographic), `z` metres over `count` samples,
+    `sigma` the standard deviation of `z`, `normal` (h, w, 3) towards the sensor, `rms` what the tangent plane leaves
+    over in sigmas, `slow_share` the part of the variance that neighbours share.
     """
 
     size_px: int
@@ -45,6 +45,7 @@ class Grid:
     x: Array
     y: Array
     z: Array
+    count: NDArray[np.int32]
     sigma: Array
     normal: Array
     rms: Array
@@ -120,6 +121,7 @@ def build_grid(
         x=x,
         y=y,
         z=z,
+        count=count,
         sigma=sigma,
         normal=normal,
         rms=rms,

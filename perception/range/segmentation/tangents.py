@@ -14,6 +14,9 @@ from perception.range.fitting.surfaces import LEAN
 
 JUMP_SIGMAS = 4.0
 LEAST_SHARE = 0.4  # of the window's blocks must lie on the surface
+TURN_RAD = 0.15  # between neighbouring blocks of one face
+WINDOW_BEND = 0.0745 * TURN_RAD  # rms of a parabola that turns so far over twice a length, by that length
+LEAST_FACING = 0.15  # beyond, normals are not known well enough
 STEADY_RMS = 1.8  # what a tangent plane leaves over in sigmas, beyond which the block holds a crease or noise
 GAP = 8  # empty blocks that end a run
 RUN = 128  # blocks at most
@@ -165,3 +168,70 @@ def _store(normal, rms, work):  # type: ignore[no-untyped-def]  # numba types it
         if np.isfinite(work[NX + c]):
             normal[c, 0], normal[c, 1], normal[c, 2] = work[NX + c], work[NY + c], work[NZ + c]
             rms[c] = work[RMS + c]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def bent_planes(x, y, z, count, sigma, perspective, radius, slope_per_block, normal, rms):  # type: ignore[no-untyped-def]  # numba types it
+    """Tangent planes as a face's may be that bends or is steeper than a jump; changes `normal` and `rms` in place.
+
+    What planes leave over is told in units of what a face may bend within their window, where that is more than steady
+    noise. Where `tangent_planes` found none, steeper neighbours count too: what lies on both sides of a jump is no
+    plane, so only one that leaves no more over than noise and bend is kept. Arguments as there.
+    """
+    h, w = z.shape
+    half = (radius + 0.5) * abs(x[0, 1] - x[0, 0])
+    work = np.zeros(SCRATCH)
+    for r in range(h):
+        for c in range(w):
+            if rms[r, c] < STEADY_RMS or not np.isfinite(z[r, c]):
+                continue
+            length = half * z[r, c] if perspective else half
+            if np.isfinite(rms[r, c]):
+                rms[r, c] = _beyond_bend(rms[r, c], normal[r, c], x[r, c], y[r, c], sigma[r, c], perspective, length)
+                continue
+            _fit_steep(x, y, z, count, sigma, perspective, radius, slope_per_block, r, c, work)
+            work[RMS] = _beyond_bend(work[RMS], work[NX:RMS:RUN], x[r, c], y[r, c], sigma[r, c], perspective, length)
+            if work[RMS] < STEADY_RMS:
+                _store(normal[r, c : c + 1], rms[r, c : c + 1], work)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _beyond_bend(rms, n, x, y, sigma, perspective, length):  # type: ignore[no-untyped-def]  # numba types it
+    """`rms` in units of the bend that a face with normal `n` may have within a window that is twice `length` metres wide.
+
+    A slanted face bends more for the same curvature: the window is longer on it, and depth runs along the ray.
+    """
+    facing = n[0] * x + n[1] * y + n[2] if perspective else n[2]
+    bend = WINDOW_BEND * length / max(facing * facing, LEAST_FACING**2)
+    return rms / max(1.0, bend / (STEADY_RMS * sigma))
+
+
+@njit(cache=True, error_model="numpy")
+def _fit_steep(x, y, z, count, sigma, perspective, radius, slope_per_block, r, c, work):  # type: ignore[no-untyped-def]  # numba types it
+    """The plane of one block, into the first places of `work`."""
+    h, w = z.shape
+    work[N:NX] = 0.0
+    _load_own(x[r, c : c + 1], y[r, c : c + 1], z[r, c : c + 1], sigma[r, c : c + 1], perspective, work)
+    for i in range(max(0, r - radius), min(h, r + radius + 1)):
+        for j in range(max(0, c - radius), min(w, c + radius + 1)):
+            reach = work[BASE] + work[SLOPE] * slope_per_block * max(abs(i - r), abs(j - c))
+            if abs(z[i, j] - z[r, c]) <= reach:
+                g = 1.0 / z[i, j] if perspective else z[i, j]
+                _add_one(count[i, j], x[i, j] - x[r, c], y[i, j] - y[r, c], g - work[G0], work)
+    _solve(1, max(5.0, np.floor((2 * radius + 1) ** 2 * LEAST_SHARE)), perspective, work)
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _add_one(k, dx, dy, dg, work):  # type: ignore[no-untyped-def]  # numba types it
+    """One neighbour into the sums of the first block."""
+    work[N] += 1.0
+    work[S] += k
+    work[SX] += k * dx
+    work[SY] += k * dy
+    work[SG] += k * dg
+    work[SXX] += k * dx * dx
+    work[SXY] += k * dx * dy
+    work[SYY] += k * dy * dy
+    work[SXG] += k * dx * dg
+    work[SYG] += k * dy * dg
+    work[SGG] += k * dg * dg

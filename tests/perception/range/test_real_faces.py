@@ -34,6 +34,19 @@ def test_a_bulged_face_is_one():
     assert the_one_over(labels, ~face) > 0
 
 
+@pytest.mark.parametrize(("bulge_m", "least_y"), [(0.003, 0.22), (0.003, 0.36), (0.009, 0.3)])
+def test_a_bulged_seat_seen_from_a_standing_eye_is_one(bulge_m, least_y):
+    sensor = PinholeSensor(width_px=640, height_px=480, fx_px=500.0, fy_px=500.0, cx_px=319.5, cy_px=239.5)
+    v, u = np.mgrid[:480, :640]
+    x, y = (u - 319.5) / 500.0, np.maximum((v - 239.5) / 500.0, 1e-3)
+    near, far = 0.45 / 0.47, 0.45 / least_y  # the seat lies 0.45 m below the eye: 65 to 78 degrees off square
+    s, t = 2.0 * (0.45 / y - near) / (far - near) - 1.0, x * 0.45 / y / 0.3
+    face = (abs(s) < 1) & (abs(t) < 1)
+    seat = (0.45 - bulge_m * (1 - s**2) * (1 - np.clip(t, -1, 1) ** 2)) / y
+    labels = analyse(noisy(np.where(face, seat, far + 0.02), 2e-4, 3), sensor).labels
+    assert the_one_over(labels, face) > 0
+
+
 @pytest.mark.parametrize(("depth_m", "is_parted"), [(0.006, True), (-0.1, False)])
 def test_a_groove_parts_a_plane_and_a_post_before_it_does_not(depth_m, is_parted):
     plate = np.full((120, 160), 0.8)

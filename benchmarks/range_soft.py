@@ -31,6 +31,7 @@ SCENES = ("table", "room")
 WALK_STEPS = 90
 WALK_SHARE = 0.8  # of the distance: displaced faces are up to a fifth nearer than the box's field says
 HIT_MM = 0.02
+EDGE_MM = 5.0  # as far below a face its label still goes, where edges bear none
 VIEWS = (*SENSORS, FINE)
 UP = np.array([0.0, 0.0, 1.0])
 STRAIGHT = np.eye(3)
@@ -78,6 +79,12 @@ class SoftBox:
         axis = (np.abs(p) - self.half).argmax(axis=1)
         return np.asarray(2 * axis + (p[np.arange(len(p)), axis] < 0))
 
+    def is_edge(self, p: Array) -> NDArray[np.bool_]:
+        """(N,) whether each surface point (N, 3) in the box's frame is rounded off its face by more than `EDGE_MM`."""
+        q = np.abs(p) - self.half
+        is_rounded = (q > -self.radius).sum(axis=1) > 1
+        return np.asarray(is_rounded & (q.max(axis=1) < -EDGE_MM) & (not self.is_cushion))
+
     def _displacement(self, p: Array) -> Array:
         face = self.faces(p)
         axis = face // 2
@@ -101,7 +108,7 @@ def soft_scene(gen: ModuleType, scene: str, sensor: str, seed: int) -> Case:
     clean, labels = gen.cast(surfaces, model)
     clean = np.where(np.isfinite(clean), clean, np.inf)
     for box in soft:
-        surfaces += _drawn(gen, box.moved(R, t), model, clean, labels, len(surfaces))
+        surfaces += drawn(gen, box.moved(R, t), model, clean, labels, len(surfaces))
     # Slivers of faces that end at an outline: nobody draws them, and each would turn the face it lies in into two.
     labels = np.where(np.bincount(labels.ravel())[labels] >= LEAST_PIXELS // 4, labels, 0)
     return case_seen(clean, labels, surfaces, sensor=sensor, rng=rng, scene=f"soft_{scene}", seed=seed)
@@ -125,10 +132,20 @@ def soft_box(
     )
 
 
-def _drawn(
-    gen: ModuleType, box: SoftBox, model: dict[str, Any], clean: Array, labels: Any, count: int
+def drawn(
+    gen: ModuleType,
+    box: SoftBox,
+    model: dict[str, Any],
+    clean: Array,
+    labels: Any,
+    count: int,
+    *,
+    are_edges_named: bool = True,
 ) -> list[dict[str, Any]]:
-    """Draw a box in the camera's frame into the images; returns its surfaces, which follow the `count` there are."""
+    """Draw a box in the camera's frame into the images; returns its surfaces, which follow the `count` there are.
+
+    Rounded edges get the nearest face's label; or, where `are_edges_named` is false, 0 beyond `EDGE_MM`.
+    """
     _, rays = gen.rays(model)
     reach = float(np.linalg.norm(box.half)) * 1.1
     length = np.linalg.norm(rays, axis=1)
@@ -150,7 +167,9 @@ def _drawn(
     front = z < clean.ravel()[near]
     near, z, ray = near[front], z[front], ray[front]
     clean.ravel()[near] = z
-    labels.ravel()[near] = count + 1 + box.faces(origin + z[:, None] * ray)
+    points = origin + z[:, None] * ray
+    is_named = are_edges_named | ~box.is_edge(points)
+    labels.ravel()[near] = np.where(is_named, count + 1 + box.faces(points), 0)
     out = []
     for k in range(1 if box.is_cushion else 6):
         n = box.turn[:, k // 2] * (1.0 if k % 2 == 0 else -1.0)
@@ -160,7 +179,7 @@ def _drawn(
     return out
 
 
-def _plane(name: str, n: Any, c: Any, **clip: Any) -> dict[str, Any]:
+def plane(name: str, n: Any, c: Any, **clip: Any) -> dict[str, Any]:
     out: dict[str, Any] = {"type": "plane", "name": name, "n": np.asarray(n, float), "c": np.asarray(c, float)}
     return out | ({"clip": clip} if clip else {})
 
@@ -168,9 +187,9 @@ def _plane(name: str, n: Any, c: Any, **clip: Any) -> dict[str, Any]:
 def _table(gen: ModuleType, rng: np.random.Generator) -> tuple[list[Any], list[SoftBox], tuple[float, ...], float]:
     """Floor, wall, table, and on it cartons, cans and balls: what a person puts before a depth sensor."""
     plain = [
-        _plane("floor", UP, [0, 0, -TABLE_HEIGHT_MM]),
-        _plane("wall", [0, -1, 0], [0, rng.uniform(900, 1600), 0]),
-        _plane(
+        plane("floor", UP, [0, 0, -TABLE_HEIGHT_MM]),
+        plane("wall", [0, -1, 0], [0, rng.uniform(900, 1600), 0]),
+        plane(
             "table",
             UP,
             [0, 0, 0],
@@ -200,11 +219,11 @@ def _table(gen: ModuleType, rng: np.random.Generator) -> tuple[list[Any], list[S
 def _room(gen: ModuleType, rng: np.random.Generator) -> tuple[list[Any], list[SoftBox], tuple[float, ...], float]:
     """Floor, two walls, a sofa, a cabinet, a picture and a lamp."""
     plain = [
-        _plane("floor", UP, [0, 0, 0]),
-        _plane("wall", [0, -1, 0], [0, 520, 0]),
-        _plane("side", [1, 0, 0], [-rng.uniform(1300, 1900), 0, 0]),
+        plane("floor", UP, [0, 0, 0]),
+        plane("wall", [0, -1, 0], [0, 520, 0]),
+        plane("side", [1, 0, 0], [-rng.uniform(1300, 1900), 0, 0]),
     ]
-    soft, end = _sofa(gen, rng)
+    soft, end = sofa(gen, rng)
     size = rng.uniform([300, 300, 400], [600, 450, 900])
     at = np.array([end + size[0] / 2 + rng.uniform(40, 200), 500 - size[1] / 2, size[2] / 2])
     plain += gen.box(at, size, STRAIGHT, "cabinet")
@@ -216,9 +235,14 @@ def _room(gen: ModuleType, rng: np.random.Generator) -> tuple[list[Any], list[So
     return plain, soft, (rng.uniform(-200, 200), 150.0, rng.uniform(450, 650)), rng.uniform(1900, 2700)
 
 
-def _sofa(gen: ModuleType, rng: np.random.Generator) -> tuple[list[SoftBox], float]:
-    """Base, arms, two or three seats and backs, up to two throw cushions; and how far it reaches to either side."""
+def sofa(gen: ModuleType, rng: np.random.Generator, *, is_single: bool = False) -> tuple[list[SoftBox], float]:
+    """Base, arms, two or three seats and backs, up to two throw cushions; and how far it reaches to either side.
+
+    Its back stands at y = 500. An armchair (`is_single`) has one seat.
+    """
     half_width, depth, seats = rng.uniform(650, 900), rng.uniform(800, 900), int(rng.integers(2, 4))
+    if is_single:
+        half_width, seats = 0.4 * half_width, 1
     base, seat, back, arm = rng.uniform(220, 280), rng.uniform(140, 190), rng.uniform(340, 430), rng.uniform(140, 220)
     radius, bulge = rng.uniform(10, 30), rng.uniform(0.008, 0.02)
 

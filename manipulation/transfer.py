@@ -19,7 +19,18 @@ Array = NDArray[np.float64]
 
 SEARCH_STEP_RAD = 0.02  # edges of the search; the answer is checked again at RECHECK_RAD
 CORNER_RAD = 0.25  # how far before a corner its rounding begins
-ATTEMPTS = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Effort:
+    """How long to look for a way: so many searches of so many nodes at most."""
+
+    searches: int
+    nodes: int
+
+
+THOROUGH = Effort(searches=4, nodes=4000)  # ten seconds where there is no way
+QUICK = Effort(searches=2, nodes=400)  # the searches of four missions took 24 nodes at most
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,7 +51,13 @@ class TransferPlanner:
     seed: int = 0
 
     def plan(
-        self, start_rad: Array, goal_rad: Array, *, name: str = "transfer", guards: tuple[Guard, ...] = ()
+        self,
+        start_rad: Array,
+        goal_rad: Array,
+        *,
+        name: str = "transfer",
+        guards: tuple[Guard, ...] = (),
+        effort: Effort = THOROUGH,
     ) -> JointTrajectory:
         """A timed free trajectory from rest at `start_rad` to rest at `goal_rad`, (n,) each.
 
@@ -56,9 +73,9 @@ class TransferPlanner:
             return self._timed(np.array([start_rad, goal_rad]), name, guards)
         kin = self.model.kinematics
         lower, upper = self._search_range(start_rad, goal_rad)
-        for attempt in range(ATTEMPTS):
+        for attempt in range(effort.searches):
             seed = self.seed + attempt
-            path = connect(start_rad, goal_rad, free=free, lower=lower, upper=upper, seed=seed)
+            path = connect(start_rad, goal_rad, free=free, lower=lower, upper=upper, seed=seed, max_nodes=effort.nodes)
             if path is None:
                 lower, upper = kin.lower_rad, kin.upper_rad
                 continue
@@ -66,7 +83,7 @@ class TransferPlanner:
             if rounded is not None:
                 return self._timed(rounded, name, guards)
         raise Unreachable(
-            f"{name}: no collision-free path was found in {ATTEMPTS} searches",
+            f"{name}: no collision-free path was found, by {effort.searches} x {effort.nodes} steps of search",
             hint=f"the tightest place of the straight way is between {self._in_the_way(start_rad, goal_rad, margin)}",
         )
 

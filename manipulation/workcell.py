@@ -18,7 +18,7 @@ from manipulation.kinematics import Kinematics
 from manipulation.shapes import Box, floor_box, panel_boxes
 from manipulation.timing import SpeedLimits
 from manipulation.tool import Hand
-from manipulation.transfer import TransferPlanner
+from manipulation.transfer import THOROUGH, Effort, TransferPlanner
 
 Array = NDArray[np.float64]
 
@@ -84,7 +84,9 @@ class Workcell:
             ignored += [(finger, "plate") for finger in FINGERS]
         return CollisionModel.build(self.kinematics, hand).with_boxes(boxes, ignored=ignored)
 
-    def transfer(self, start_rad: Array, goal_rad: Array, *, width_m: float, name: str) -> JointTrajectory:
+    def transfer(
+        self, start_rad: Array, goal_rad: Array, *, width_m: float, name: str, effort: Effort = THOROUGH
+    ) -> JointTrajectory:
         """A collision-free trajectory between two joint vectors.
 
         Raises:
@@ -96,7 +98,7 @@ class Workcell:
             limits=self.limits,
             seed=self.seed,
         )
-        return planner.plan(start_rad, goal_rad, name=name)
+        return planner.plan(start_rad, goal_rad, name=name, effort=effort)
 
     def choose(
         self, options: Sequence[Sequence[RigidTransform]], *, near_rad: Array, width_m: float, may_touch: Sequence[str]

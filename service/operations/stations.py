@@ -118,7 +118,7 @@ def visit(
     for flange in flanges:
         session.progress(0.1 + 0.8 * len(found) / count, f"{name}: station {len(found) + 1} of {count}", why)
         try:
-            go_to_first(session, [flange], name=f"{name} {len(found) + 1}")
+            go_to_first(session, [flange], name=f"{name} {len(found) + 1}", thorough=False)
             settle(session, REST_S)
             found.append(measure())
         except (Unreachable, NotFound, Ambiguous) as error:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from manipulation.skills.outcome import SkillFailure
 from manipulation.skills.steps import Attempt, retreat
 from manipulation.skills.steps import park as park_arm
 from manipulation.timing import SpeedLimits
+from manipulation.transfer import QUICK, THOROUGH, Effort
 from manipulation.workcell import Workcell
 from service.operations.beliefs import believed_panel, known_readings
 from service.operations.session import Session
@@ -29,7 +31,7 @@ from service.operations.session import Session
 Array = NDArray[np.float64]
 ENOUGH_CONDITIONING = 0.06  # smallest singular value over the largest: below it, small moves need fast wrists
 CLEAR_M = 0.004
-MOST_TRIES = 24
+MOST_TRIES, MOST_THOROUGH = 24, 3  # goals that are searched for quickly, and then thoroughly
 MOST_STEPS_BACK = 6  # of 50 mm: further than the room of an unlocated panel reaches
 
 
@@ -43,29 +45,42 @@ def go_to_camera_view(session: Session, base_from_camera: Iterable[RigidTransfor
     return go_to_first(session, (pose * flange_from_camera.inv() for pose in base_from_camera), name=name)
 
 
-def go_to_first(session: Session, base_from_flange: Iterable[RigidTransform], *, name: str) -> MotionReport:
+def go_to_first(
+    session: Session, base_from_flange: Iterable[RigidTransform], *, name: str, thorough: bool = True
+) -> MotionReport:
     """Drive the flange to the first of the poses that is reachable without collision.
+
+    A pose that a quick search finds a way to goes before one that needs a long search: where there is no way, a long one
+    takes ten seconds.
+
+    Args:
+        thorough: False where other poses would do as well: only quick searches.
 
     Raises:
         Unreachable: none of them; says what is in the way of the last one.
-        Cancelled: the task was cancelled meanwhile.
     """
     cell = workcell(session)
     state = session.mover.state()
     model = cell.collision(width_m=state.gripper_width_m)
-    reason, tries = "no arm configuration reaches any of the poses", 0
-    for pose in base_from_flange:
-        for goal in _goals(model, pose, state.position_rad):
-            session.context.task.check_cancelled()  # a search that finds no way takes ten seconds
-            tries += 1
-            try:
-                trajectory = cell.transfer(state.position_rad, goal, width_m=state.gripper_width_m, name=name)
-            except Unreachable as error:
-                reason = error.what
-                continue
-            return session.run(trajectory)
-        if tries > MOST_TRIES:
-            break
+    tried: list[Array] = []
+    reason = "no arm configuration reaches any of the poses"
+
+    def goals() -> Iterator[tuple[Array, Effort]]:
+        every = (goal for pose in base_from_flange for goal in _goals(model, pose, state.position_rad))
+        for goal in islice(every, MOST_TRIES):
+            tried.append(goal)
+            yield goal, QUICK
+        if thorough:
+            yield from ((goal, THOROUGH) for goal in tried[:MOST_THOROUGH])
+
+    for goal, effort in goals():
+        session.context.task.check_cancelled()
+        try:
+            way = cell.transfer(state.position_rad, goal, width_m=state.gripper_width_m, name=name, effort=effort)
+        except Unreachable as error:
+            reason = error.what
+            continue
+        return session.run(way)
     raise Unreachable(f"{name}: {reason}", hint="move the panel or the arm's foot; see workspace in the cell file")
 
 

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hal.clock import Deadline, SimClock
+from hal.clock import SimClock
 from hal.geometry import difference, perturbed
 from hal.motion import CartesianPath, Compliance, GripperMotion, Hold, JointTrajectory
 from manipulation.kinematics import Kinematics
 from manipulation.recorder import Recorder
 from manipulation.runs import Admittance, GripperRun, HoldRun, PathRun, Run, Tick, TrajectoryRun
-from manipulation.sensing import Sample
+from manipulation.sensing import Sample, command_wait_s
 from tests.manipulation.arms import T3
 from tests.manipulation.rig import GRIP, HOME, tool_pose
 
@@ -167,10 +167,12 @@ def test_a_hold_stays_where_it_is_for_its_time() -> None:
 
 
 def test_a_gripper_motion_is_over_when_the_pads_have_rested_since_they_could_have_begun() -> None:
-    pads, deadline = Pads(), Deadline.after(SimClock(), 1.0)
+    pads, clock = Pads(), SimClock()
     motion = GripperMotion(name="grasp", width_m=0.02, force_n=30.0, speed_m_per_s=0.05, timeout_s=1.0)
-    run = GripperRun(motion, pads, deadline)
-    assert pads.told == [{"width_m": 0.02, "force_n": 30.0, "speed_m_per_s": 0.05, "deadline": deadline}]
+    run = GripperRun(motion, pads, clock)
+    (told,) = pads.told
+    assert told.pop("deadline").remaining_s() == pytest.approx(command_wait_s(clock))
+    assert told == {"width_m": 0.02, "force_n": 30.0, "speed_m_per_s": 0.05}
     np.testing.assert_array_equal(run.wanted(tick(0.5, last_rad=HOME + 0.1)), HOME + 0.1)
 
     def over(at_s: float, *, pads_move: bool) -> bool:
@@ -188,7 +190,7 @@ def test_a_gripper_motion_is_over_when_the_pads_have_rested_since_they_could_hav
 
 def test_pads_that_never_rest_are_waited_for_until_the_timeout() -> None:
     motion = GripperMotion(name="grasp", width_m=0.02, force_n=30.0, timeout_s=1.0)
-    run = GripperRun(motion, Pads(), Deadline.after(SimClock(), 1.0))
+    run = GripperRun(motion, Pads(), SimClock())
     assert not run.is_over(tick(0.999, pads_move=True))
     assert run.is_over(tick(1.0, pads_move=True))
 

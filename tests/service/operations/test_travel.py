@@ -1,0 +1,69 @@
+"""Driving to the first of several poses: quick searches for all of them before a long one for any."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.behind_cables import open_session
+from hal.config import load_cell
+from hal.errors import Unreachable
+from manipulation.transfer import QUICK, THOROUGH, Effort
+from manipulation.workcell import Workcell
+from service.operations.session import Session
+from service.operations.travel import MOST_THOROUGH, MOST_TRIES, go_to_camera_view
+from service.operations.views import close_up_poses
+
+ROOT = Path(__file__).parents[3]
+pytestmark = pytest.mark.timeout(300)
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    """Before the located panel."""
+    with open_session(load_cell(ROOT / "cells/bench.toml", seed=3), tmp_path_factory.mktemp("travel")) as session:
+        yield session
+
+
+def efforts_of(session: Session, monkeypatch: pytest.MonkeyPatch, *, found_at: int) -> list[Effort]:
+    """The efforts of all searches when the one of that number finds a way; the arm drives it."""
+    asked: list[Effort] = []
+    transfer = Workcell.transfer
+
+    def search(cell: Workcell, *args: Any, effort: Effort, **kwargs: Any) -> Any:
+        asked.append(effort)
+        if len(asked) - 1 != found_at:
+            raise Unreachable("no way", hint="none")
+        return transfer(cell, *args, effort=effort, **kwargs)
+
+    monkeypatch.setattr(Workcell, "transfer", search)
+    poses = close_up_poses(session.known_panel().parent_from_child, (0.0, 0.0, 0.0))
+    go_to_camera_view(session, poses, name="a close-up")
+    return asked
+
+
+def test_the_next_pose_is_tried_before_a_long_search_for_the_first(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = session.mover.state().position_rad
+    assert efforts_of(session, monkeypatch, found_at=2) == [QUICK] * 3
+    assert np.abs(session.mover.state().position_rad - before).max() > 0.05
+
+
+def test_without_any_way_the_searches_end(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Effort] = []
+
+    def search(*_: Any, effort: Effort, **__: Any) -> Any:
+        asked.append(effort)
+        raise Unreachable("no way", hint="none")
+
+    monkeypatch.setattr(Workcell, "transfer", search)
+    poses = close_up_poses(session.known_panel().parent_from_child, (0.0, 0.0, 0.0))
+    with pytest.raises(Unreachable, match="a close-up: no way"):
+        go_to_camera_view(session, poses, name="a close-up")
+    assert 0 < asked.count(QUICK) <= MOST_TRIES
+    assert asked[asked.count(QUICK) :] == [THOROUGH] * min(MOST_THOROUGH, asked.count(QUICK))

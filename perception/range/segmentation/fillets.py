@@ -27,6 +27,7 @@ LONG = 22.0  # as `_shapes` says it: three times as long as wide
 STEP_SIGMAS = 3.0
 TURN_RAD = 1.0  # a surface through a net of rounded edges meets its faces at any angle below a right one
 FLAT_TURN_RAD = 0.5
+NARROW, NARROW_SIGMAS = 0.004, 4.0  # of the image's shorter side, half the width of what has no bend of its own to see
 GENTLE_RAD = 0.7
 NEAR_SHARE = 0.5  # of the strip's width, that it may lie off its faces
 LEAST_SHARE = 0.4  # of the pixels of a strip between faces that do so: nets of edges take thin faces along
@@ -50,8 +51,10 @@ def without_fillets(
         for strip, faces in beside.items():
             mine = regions.places(strip)
             owner = _nearer(depth_m, packed, mine, half_width[strip], np.array(faces), kinds, table)
-            if np.mean(owner > 0) >= (LEAST_SHARE if len(faces) > 1 else WHOLE_SHARE):
-                labels.ravel()[mine] = np.where(owner > 0, owner, strip)
+            share = np.mean(owner > 0)
+            if share >= (LEAST_SHARE if len(faces) > 1 else WHOLE_SHARE):
+                # What is left of a strip that has gone is no surface; of a net of edges it is a thin face.
+                labels.ravel()[mine] = np.where(owner > 0, owner, 0 if share >= WHOLE_SHARE else strip)
     if min(labels.shape) >= LEAST_ROWS:
         spread_outwards(depth_m, packed, law, labels, kinds, table, round(REACH * min(labels.shape)))
     return labels
@@ -70,7 +73,7 @@ def _strips(
     """The faces beside each strip that continues them: two or more, or one that it leaves gently towards an outline."""
     if not np.any((length >= LONG) & (half_width <= NARROWER * half_width.max())):
         return {}
-    perspective = bool(packed[0] > 0)
+    perspective, narrow_px = bool(packed[0] > 0), NARROW * min(labels.shape)
     beside: dict[int, list[int]] = {}
     gentle: set[int] = set()
     for (a, b), border in borders_of(labels, packed).items():
@@ -81,7 +84,7 @@ def _strips(
             continue
         surfaces = (int(kinds[a]), table[a], int(kinds[b]), table[b])
         step, turn = step_and_turn(*surfaces, border.x, border.y, law, perspective)
-        if step > STEP_SIGMAS or turn > (FLAT_TURN_RAD if kinds[strip] == PLANE else TURN_RAD):
+        if not _goes_on(step, turn, is_flat=kinds[strip] == PLANE, is_narrow=half_width[strip] < narrow_px):
             continue
         if kinds[face] == PLANE:
             both = np.zeros(kinds.size, np.bool_)
@@ -91,6 +94,13 @@ def _strips(
         beside.setdefault(strip, []).append(face)
         gentle |= {strip} if turn <= GENTLE_RAD else set()
     return {strip: faces for strip, faces in beside.items() if len(faces) > 1 or strip in gentle}
+
+
+def _goes_on(step: float, turn: float, *, is_flat: bool, is_narrow: bool) -> bool:
+    """Whether a strip continues a face; `step` in sigmas, `turn` in rad. A flat one that is wide enough is a bevel."""
+    if is_narrow:
+        return step <= NARROW_SIGMAS and turn <= TURN_RAD
+    return step <= STEP_SIGMAS and turn <= (FLAT_TURN_RAD if is_flat else TURN_RAD)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

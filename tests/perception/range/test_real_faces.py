@@ -85,6 +85,34 @@ def test_a_rounded_edge_is_shared_by_its_faces():
     np.testing.assert_array_equal(after[:, 80:], 2)
 
 
+@pytest.mark.parametrize(("share", "left"), [(0.2, 0), (0.5, 3)])
+def test_what_is_left_of_a_rounded_edge_that_has_gone_is_no_surface(share, left):
+    depth, labels, kinds, table = roof(0.012)
+    edge = labels == 3
+    off = edge & (np.arange(120) < share * 120)[:, None]
+    after = fillets.without_fillets(np.where(off, depth - 0.05, depth), PARALLEL.packed(), LAW, labels, kinds, table)
+    np.testing.assert_array_equal(after[off], left)  # a strip that mostly stays is a net of edges, or a thin face
+    assert np.isin(after[edge & ~off], (1, 2)).all()
+
+
+@pytest.mark.parametrize(
+    ("step", "turn", "is_flat", "is_narrow", "goes_on"),
+    [
+        (2.9, 0.4, True, False, True),
+        (2.9, 0.7, True, False, False),  # a bevel
+        (2.9, 0.7, False, False, True),
+        (3.5, 0.4, True, False, False),
+        (3.5, 0.9, True, True, True),  # too narrow for its bend to show
+        (4.5, 0.4, True, True, False),
+        (2.9, 1.2, True, True, False),
+    ],
+)
+def test_a_strip_goes_on_by_its_step_and_turn_as_far_as_its_width_lets_them_show(
+    step, turn, is_flat, is_narrow, goes_on
+):
+    assert fillets._goes_on(step, turn, is_flat=is_flat, is_narrow=is_narrow) == goes_on
+
+
 def test_a_tube_before_a_wall_stays_a_tube():
     depth, labels, kinds, table = roof(0.012)
     tube = labels == 3

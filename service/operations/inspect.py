@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -89,7 +89,10 @@ def look_past(session: Session, found: Inspection) -> Inspection:
             pictures += closer.pictures
             if joined(looks).answered:
                 break
-        readings[reading.name] = joined(looks)
+        told = joined(looks)
+        if not told.answered and len(looks) > 1:
+            told = replace(told, reason=f"{told.reason} ({len(looks) - 1} looks from the sides did not tell either)")
+        readings[reading.name] = told
         forget_reading(session, reading.name)  # one look alone may have said what the others contradict
     _remember(session, readings.values())
     return Inspection(readings=readings, pictures=tuple(pictures))

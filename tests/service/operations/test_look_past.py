@@ -68,6 +68,15 @@ def test_a_side_that_the_arm_cannot_reach_is_left_out(session: Session, monkeypa
     assert "temperature" not in known_readings(session)
 
 
+def test_a_cap_that_no_side_shows_says_how_often_it_was_looked_at(session: Session) -> None:
+    """The black cap in its black ring is pressed in this cell, and no look can tell."""
+    found = inspect_close(session, ("hold",))
+    reading = found.readings["hold"]
+    sides = len(found.pictures) - 1
+    assert truth_of(session, "hold").state == "pressed" and not reading.answered
+    assert sides > 0 and f"({sides} looks from the sides did not tell either)" in (reading.reason or "")
+
+
 def test_many_unread_objects_are_no_cables_work(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     first = straight_look(session)
     unread: ObjectReading = first.readings["temperature"]

@@ -26,8 +26,8 @@ from benchmarks.pose import table as pose_table
 from fusion import Measurement, SensingClass, fuse, warm_up
 from fusion.certify import certificate
 from fusion.distance import local_value, local_values
+from fusion.distance.reference import brute_force
 from fusion.errors import Contradiction
-from fusion.reference import brute_force
 from fusion.robust import used_entries
 from fusion.simulate import TABLE_II, problem
 from fusion.solve import solve

@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from benchmarks.fusion_problems import codes, is_near
 from fusion import Measurement
-from fusion.reference import residual
+from fusion.distance.reference import residual
 from fusion.simulate import problem
 from fusion.solve import solve, solve_from_many
 from hal.geometry import Array, difference, matrix_of, perturbed, transform

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
 from fusion.batch import pack
+from fusion.distance.rows import informations
 from fusion.features import Feature, Kind
 from fusion.measurement import Measurement, measurement
-from fusion.rows import informations
 from hal.errors import InvalidRequest
 from hal.geometry import Array, matrix_of, skew
 

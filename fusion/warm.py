@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusion.certify import quadratic_forms
-from fusion.dual import minimiser
+from fusion.certify.dual import minimiser
+from fusion.certify.proof import quadratic_forms
 from fusion.robust import fuse, used_entries
 from fusion.simulate import CODES, problem
 from fusion.solve import solve

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.answer import ShapeEstimate
 from fusion.features import Feature, Kind, unit
 from fusion.measurement import Measurement, SensingClass
-from fusion.robust import FusedPose, fuse
+from fusion.robust import FusedPose, ShapeEstimate, fuse
 from fusion.shapes import Box, Cylinder, FeatureSet, MovingPart, Shape
 from hal.devices import DeviceKind
 from hal.errors import MotionError, NotFound, Stopped

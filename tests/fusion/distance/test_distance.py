@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from fusion.distance import local_value, local_values, local_values_and_gradients
+from fusion.distance.reference import brute_force, residual
 from fusion.measurement import Measurement, SensingClass
-from fusion.reference import brute_force, residual
 from fusion.simulate import CODES, problem
 from hal.geometry import Array, matrix_of, perturbed, transform
 

@@ -1,9 +1,9 @@
 """A proof that no other pose fits better: the semidefinite relaxation of the fused problem (notes/fusion.md, "Certificate").
 
 At frozen covariances E = z^T Q z with z = (1, vec R, t, -R^T t), 16 numbers, for any mixture of the nine classes and any number of
-measurements (`fusion.lifted`). Shor's relaxation replaces z z^T by a positive semidefinite Z under 29 quadratic constraints
+measurements (`lifted`). Shor's relaxation replaces z z^T by a positive semidefinite Z under 29 quadratic constraints
 that every pose obeys. If the best Z has rank one, it is a pose, and no pose is better. Mostly the multipliers that prove this
-follow from the pose itself (`fusion.dual`); where they do not, clarabel (the `certify` extra) solves the relaxation.
+follow from the pose itself (`dual`); where they do not, clarabel (the `certify` extra) solves the relaxation.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from fusion.batch import Batch
-from fusion.dual import minimiser
-from fusion.lifted import lift
-from fusion.relaxation import SIZE, nearest_pose, relaxed
-from fusion.solve import LocalSolution, middle_and_size
+from fusion.certify.dual import minimiser
+from fusion.certify.lifted import lift
+from fusion.certify.relaxation import SIZE, nearest_pose, relaxed
+from fusion.solve.local import LocalSolution, middle_and_size
 from hal.geometry import Array, difference, transform
 
 TIGHT_GAP = 1e-3
@@ -80,7 +80,7 @@ def certificate(b: Batch, used: NDArray[np.bool_], local: LocalSolution) -> Cert
 
 
 def quadratic_forms(b: Batch, R: Array, t: Array, about: Array, middle: Array, size: float) -> Array:
-    """(N, 16, 16): z^T Q_i z is the error of each entry, its covariance frozen at the pose R, t; see `fusion.lifted.lift`."""
+    """(N, 16, 16): z^T Q_i z is the error of each entry, its covariance frozen at the pose R, t; see `lifted.lift`."""
     forms = np.empty((len(b.cls), SIZE, SIZE))
     lift(b, np.array(R, order="C"), np.array(t, order="C"), np.array(about), np.array(middle), size, forms)
     return forms

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion import search
 from fusion.batch import Batch
+from fusion.distance.rows import values
 from fusion.errors import Contradiction
-from fusion.rows import values
-from fusion.solve import LocalSolution, local_solution
+from fusion.robust import search
+from fusion.solve.local import LocalSolution, local_solution
 from hal.geometry import Array
 
 Flags = NDArray[np.bool_]

@@ -1,4 +1,4 @@
-"""Whitened residual rows of the nine classes and descent on their squared sum, compiled (notes/fusion.md, "Residual rows").
+"""Whitened residual rows of the nine classes, compiled (notes/fusion.md, "Residual rows").
 
 With e = R m + t - mu, the three kinds of row and their derivatives over (translation, rotation) are
 
@@ -6,7 +6,7 @@ With e = R m + t - mu, the three kinds of row and their derivatives over (transl
     B   n^T e        [n,    R m x n]
     D   n^T R w      [0,    R w x n]
 
-Classes 1, 2, 3, 5 and 9 are exact; 4, 6, 7 and 8 are first order in the direction error, and `fusion.exact` finishes them.
+Classes 1, 2, 3, 5 and 9 are exact; 4, 6, 7 and 8 are first order in the direction error, and `exact` finishes them.
 """
 
 from __future__ import annotations
@@ -25,11 +25,9 @@ from fusion.vectors import (
     dot,
     form,
     inlined,
-    move,
     plain,
     rotation_vector,
     solve_lower,
-    solve_upper,
     sym,
     turned,
     vec,
@@ -237,105 +235,3 @@ def informations(b: Batch, R: Array, t: Array, out: Array) -> None:
                 for k in range(n):
                     s += J[k, p] * J[k, c]
                 out[i, p, c] = s
-
-
-@compiled
-def accumulate(b: Batch, use: Array, R: Array, t: Array, far: bool, H: Array, g: Array, work: Array) -> float:
-    """H (6, 6) lower = sum J^T J, g (6,) = sum J^T r over entries with use > 0; returns sum |r|^2.
-
-    work: (13, 6) scratch.
-    """
-    r, J, V = work[0], work[1:7], work[7:13]
-    for j in range(6):
-        g[j] = 0.0
-        for k in range(6):
-            H[j, k] = 0.0
-    cost = 0.0
-    for i in range(b.cls.size):
-        if use[i] <= 0.0:
-            continue
-        n = whitened(b, i, R, t, far, r, J, V)
-        for k in range(n):
-            cost += r[k] * r[k]
-            for p in range(6):
-                g[p] += J[k, p] * r[k]
-                for c in range(p + 1):
-                    H[p, c] += J[k, p] * J[k, c]
-    return cost
-
-
-@compiled
-def cost_of(b: Batch, use: Array, R: Array, t: Array, far: bool, work: Array) -> float:
-    """sum |r|^2 over entries with use > 0."""
-    r, J, V = work[0], work[1:7], work[7:13]
-    cost = 0.0
-    for i in range(b.cls.size):
-        if use[i] <= 0.0:
-            continue
-        k = rows(b, i, R, t, far, r, J, V)
-        if b.cls[i] != 0:
-            if not cholesky(V, k):
-                continue
-            solve_lower(V, r, k)
-        for j in range(k):
-            cost += r[j] * r[j]
-    return cost
-
-
-@compiled
-def descend(b: Batch, use: Array, R: Array, t: Array, far: bool, steps: int, tolerance: float) -> float:  # noqa: PLR0912 - one flat loop, for the compiler
-    """Levenberg-Marquardt on sum |r|^2 over entries with use > 0; moves R (3, 3) and t (3,) in place, returns the cost.
-
-    The step is damped in proportion to the diagonal of J^T J (Marquardt), so metres and radians need no common scale.
-    Stops when the predicted fall is below `tolerance`.
-    """
-    H, L, g, step = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty(6)
-    H1, g1, work = np.empty((6, 6)), np.empty(6), np.empty((13, 6))
-    R1, t1 = np.empty((3, 3)), np.empty(3)
-    damping, swapped = (1e-3 if far else 1e-6), False
-    cost = accumulate(b, use, R, t, far, H, g, work)
-    for _ in range(steps):
-        size = 0.0
-        for j in range(6):
-            size = max(size, H[j, j])
-        for p in range(6):
-            for c in range(p):
-                L[p, c] = H[p, c]
-            L[p, p] = H[p, p] * (1.0 + damping) + 1e-12 * size
-            step[p] = -g[p]
-        if not cholesky(L, 6):
-            damping = max(10.0 * damping, 1e-6)
-            continue
-        solve_lower(L, step, 6)
-        fall = 0.0
-        for j in range(6):
-            fall += step[j] * step[j]
-        solve_upper(L, step, 6)
-        turn = step[3] ** 2 + step[4] ** 2 + step[5] ** 2
-        if turn > 1.0:  # beyond a radian the linearisation says nothing
-            for j in range(6):
-                step[j] /= turn**0.5
-        for p in range(3):
-            t1[p] = t[p]
-            for c in range(3):
-                R1[p, c] = R[p, c]
-        move(R1, t1, step)
-        # Most steps are taken, so the next system is built at once instead of the cost alone.
-        lower = accumulate(b, use, R1, t1, far, H1, g1, work)
-        if lower < cost:
-            R, R1, t, t1 = R1, R, t1, t
-            H, H1, g, g1 = H1, H, g1, g
-            swapped = not swapped
-            cost = lower
-            damping = max(0.1 * damping, 1e-9)
-            if fall < tolerance:
-                break
-        else:
-            if fall < tolerance:
-                break
-            damping = max(8.0 * damping, 1e-6)
-            if damping > 1e8:
-                break
-    if swapped:
-        R1[:], t1[:] = R, t
-    return cost

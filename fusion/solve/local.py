@@ -12,9 +12,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion.batch import Batch, pack
 from fusion.measurement import Measurement
-from fusion.observability import FreeDirection, covariance_and_freedom
-from fusion.polish import solve_from
-from fusion.search import place
+from fusion.solve.observability import FreeDirection, covariance_and_freedom
+from fusion.solve.placement import place
+from fusion.solve.polish import solve_from
 from hal.errors import InvalidRequest
 from hal.geometry import Array, UncertainPose
 

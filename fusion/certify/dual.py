@@ -16,7 +16,7 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fusion.relaxation import BACK, ROTATION, SIZE, TRANSLATION, constraints
+from fusion.certify.relaxation import BACK, ROTATION, SIZE, TRANSLATION, constraints
 from hal.geometry import Array, skew
 
 GAUSS_NEWTON_STEPS = 20

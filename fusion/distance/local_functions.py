@@ -1,7 +1,7 @@
 """The nine local pose functions: how badly a pose fits each measurement, exactly (paper eqs 10-13, Fig. 12).
 
 `f(X) = min over Y of g(Y)` under the class's constraint. Formulas: notes/fusion.md, table of section 2; the compiled code is in
-`fusion.exact`, a slow independent one in `fusion.reference`. At the true pose f follows chi-square with `Measurement.dof`.
+`exact`, a slow independent one in `reference`. At the true pose f follows chi-square with `Measurement.dof`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from fusion.batch import Batch, pack
-from fusion.exact import evaluate
+from fusion.distance.exact import evaluate
 from fusion.measurement import Measurement
 from hal.geometry import Array, matrix_of
 

@@ -2,7 +2,7 @@
 problems in which parameterized information is required", such as feature size).
 
 The features of a shape move with its parameters and with the place sensed. At each step they are set anew, the rows' derivatives
-over the pose are those of `fusion.rows` (moving along a tangent changes a distance to second order only), and those over the
+over the pose are those of `distance.rows` (moving along a tangent changes a distance to second order only), and those over the
 parameters are differences.
 """
 
@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from fusion.answer import FusedPose, ShapeEstimate, weighed
 from fusion.batch import Batch, duplicates, pack
+from fusion.distance.rows import whitened_all
 from fusion.features import Kind
 from fusion.measurement import Measurement, SensingClass
-from fusion.observability import covariance_and_freedom
-from fusion.rows import whitened_all
+from fusion.robust.answer import FusedPose, ShapeEstimate, weighed
 from fusion.shapes import Shape
-from fusion.solve import LocalSolution, middle_and_size
+from fusion.solve.local import LocalSolution, middle_and_size
+from fusion.solve.observability import covariance_and_freedom
 from hal.errors import InvalidRequest
 from hal.geometry import Array, UncertainPose, matrix_of, perturbed
 

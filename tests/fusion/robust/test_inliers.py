@@ -9,12 +9,13 @@ import pytest
 
 from fusion import fuse
 from fusion.batch import Batch, pack
-from fusion.certify import quadratic_forms
-from fusion.dual import minimiser
-from fusion.inliers import best_set
-from fusion.minima import minima
+from fusion.certify.dual import minimiser
+from fusion.certify.proof import quadratic_forms
+from fusion.robust.inliers import best_set
+from fusion.robust.minima import minima
 from fusion.simulate import CODES, problem
-from fusion.solve import LocalSolution, middle_and_size
+from fusion.solve import LocalSolution
+from fusion.solve.local import middle_and_size
 from hal.errors import InvalidRequest
 from hal.geometry import Array
 

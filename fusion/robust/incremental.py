@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.answer import FusedPose, Proofs, judged
 from fusion.batch import Batch, duplicates, pack
 from fusion.measurement import Measurement
-from fusion.minima import Minimum, finished, minima
+from fusion.robust.answer import FusedPose, Proofs, judged
+from fusion.robust.minima import Minimum, finished, minima
 from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose
 

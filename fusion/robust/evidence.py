@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.batch import Batch
-from fusion.rows import log_volumes
-from fusion.solve import LocalSolution
+from fusion.distance.rows import log_volumes
+from fusion.solve.local import LocalSolution
 
 POSE_VOLUME = 8.0 * math.pi**2  # of all rotations (as rotation vectors spread evenly), times one cubic metre
 

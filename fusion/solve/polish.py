@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from fusion.batch import Batch
-from fusion.exact import evaluate
-from fusion.rows import FAR, NEAR, accumulate, descend, rows
+from fusion.distance.exact import evaluate
+from fusion.distance.rows import FAR, NEAR, rows
+from fusion.solve.descent import accumulate, descend
 from fusion.vectors import cholesky, compiled, move, plain, solve_lower, solve_upper
 from hal.geometry import Array
 

@@ -7,18 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.answer import Alternative, FusedPose, Proofs, Rejected, judged
 from fusion.batch import Batch, duplicates, pack
-from fusion.inliers import MOST, too_many
 from fusion.measurement import Measurement
-from fusion.minima import minima
-from fusion.parameters import fuse_shape
+from fusion.robust.answer import FusedPose, Proofs, judged
+from fusion.robust.inliers import MOST, too_many
+from fusion.robust.minima import minima
+from fusion.robust.with_shape import fuse_shape
 from fusion.shapes import Shape
-from fusion.solve import LocalSolution, local_solution
+from fusion.solve.local import LocalSolution, local_solution
 from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose
-
-__all__ = ["Alternative", "FusedPose", "Rejected", "fuse", "used_entries"]
 
 
 def fuse(

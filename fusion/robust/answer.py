@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from fusion.batch import Batch
-from fusion.certify import Certificate, certificate
+from fusion.certify.proof import Certificate, certificate
 from fusion.errors import Contradiction
-from fusion.evidence import log_evidence
-from fusion.inliers import ProvenSet, best_set
 from fusion.measurement import Measurement
-from fusion.minima import Minimum
-from fusion.observability import FreeDirection
-from fusion.solve import LocalSolution
+from fusion.robust.evidence import log_evidence
+from fusion.robust.inliers import ProvenSet, best_set
+from fusion.robust.minima import Minimum
+from fusion.solve.local import LocalSolution
+from fusion.solve.observability import FreeDirection
 from hal.geometry import Array, UncertainPose
 
 EVIDENCE_NEEDED = math.log(1000.0)  # for agreement against chance, once something was rejected

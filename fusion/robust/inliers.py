@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from fusion.batch import Batch
-from fusion.certify import monomials, quadratic_forms
-from fusion.dual import minimiser
-from fusion.relaxation import nearest_pose, relaxed
-from fusion.solve import LocalSolution, middle_and_size
+from fusion.certify.dual import minimiser
+from fusion.certify.proof import monomials, quadratic_forms
+from fusion.certify.relaxation import nearest_pose, relaxed
+from fusion.solve.local import LocalSolution, middle_and_size
 from hal.errors import InvalidRequest
 from hal.geometry import Array, transform
 

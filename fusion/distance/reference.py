@@ -1,6 +1,6 @@
 """Slow and plain versions of the fast loops, to check them by: brute force, and the table of rows in numpy.
 
-Nothing here shares code with `fusion.exact`, `fusion.rows` or `fusion.polish`.
+Nothing here shares code with `exact`, `rows` or `fusion.solve.polish`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The error of frozen covariances as one quadratic form over z = (1, vec R, t, -R^T t), compiled (notes/fusion.md, "Certificate").
 
-With s = -R^T t the rows of `fusion.rows` are linear in z,
+With s = -R^T t the rows of `fusion.distance.rows` are linear in z,
 
     A = a^T m - a^T s - a^T R^T mu      B = n^T (R m + t - mu)      D = n^T R w.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from fusion.batch import Batch
-from fusion.rows import NEAR, rows
+from fusion.distance.rows import NEAR, rows
 from fusion.vectors import Vec, across, cholesky, compiled, cross, inlined, turned, vec
 from hal.geometry import Array
 
@@ -49,7 +49,7 @@ def _row_d(Z: Array, k: int, n: Vec, w: Vec) -> None:
 
 @inlined
 def _rows_of(b: Batch, i: int, R: Array, about: Vec, middle: Vec, size: float, Z: Array) -> None:
-    """Rows Z of entry i over z, in the order of `fusion.rows.rows`."""
+    """Rows Z of entry i over z, in the order of `distance.rows`."""
     c = b.cls[i]
     w, u = vec(b.w, i), turned(R, vec(b.w, i))
     m = (b.m[i, 0] - about[0], b.m[i, 1] - about[1], b.m[i, 2] - about[2])

@@ -7,18 +7,14 @@ import pytest
 from scipy.stats import chi2
 
 from fusion import fuse
-from fusion.evidence import log_evidence
 from fusion.features import Kind, point
 from fusion.measurement import measurement
 from fusion.robust import used_entries
+from fusion.robust.evidence import log_evidence
 from fusion.simulate import CODES, TABLE_II, Problem, problem
 from fusion.solve import solve, solve_from_many
 from hal.geometry import UncertainPose, difference, perturbed, transform
-
-
-def mixture(count: int, seed: int, bad: int = 0) -> Problem:
-    rng = np.random.default_rng(seed)
-    return problem([CODES[k] for k in rng.integers(len(CODES), size=count)], rng, bad=bad)
+from tests.fusion.mixtures import mixture
 
 
 def is_near(p: Problem, pose: transform) -> bool:

@@ -1,0 +1,13 @@
+"""Problems of mixed measurements with a known answer."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fusion.simulate import CODES, Problem, problem
+
+
+def mixture(count: int, seed: int, bad: int = 0) -> Problem:
+    """`count` measurements of random classes, `bad` of them of something else."""
+    rng = np.random.default_rng(seed)
+    return problem([CODES[k] for k in rng.integers(len(CODES), size=count)], rng, bad=bad)

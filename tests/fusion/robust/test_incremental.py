@@ -1,0 +1,41 @@
+"""One measurement more or less gives what fusing at once would have given."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fusion import fuse
+from fusion.robust import incremental
+from hal.errors import InvalidRequest
+from hal.geometry import difference
+from tests.fusion.mixtures import mixture
+
+
+def test_adding_and_removing_agree_with_fusing_at_once() -> None:
+    p = mixture(17, 5, bad=2)
+    grown = incremental.add(incremental.start(p.measurements[:16]), p.measurements[16])
+    assert np.abs(difference(fuse(p.measurements).pose, grown.answer.pose)).max() < 1e-6
+    shrunk = incremental.remove(grown, 4)
+    left = [m for i, m in enumerate(p.measurements) if i != 4]
+    assert np.abs(difference(fuse(left).pose, shrunk.answer.pose)).max() < 1e-6
+
+
+def test_a_bad_one_added_is_named_and_moves_nothing() -> None:
+    good, other = mixture(12, 6), mixture(12, 7)
+    before = incremental.start(good.measurements)
+    after = incremental.add(before, other.measurements[0])
+    assert 12 in {r.index for r in after.answer.rejected}
+    assert np.abs(difference(before.answer.pose, after.answer.pose)).max() < 1e-6
+
+
+def test_a_repeated_measurement_is_refused() -> None:
+    p = mixture(8, 8)
+    with pytest.raises(InvalidRequest) as caught:
+        incremental.add(incremental.start(p.measurements), p.measurements[2])
+    assert caught.value.details["index"] == 8
+
+
+def test_removing_what_is_not_there_is_refused() -> None:
+    with pytest.raises(InvalidRequest):
+        incremental.remove(incremental.start(mixture(8, 9).measurements), 8)

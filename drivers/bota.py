@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from drivers.ft300 import RangeOptions, capabilities
+from drivers.kinds.force_torque import RangeOptions, capabilities
 from drivers.transport.checks import crc_x25
 from drivers.transport.framing import Framer
 from drivers.transport.link import Link, NoAnswer, drain_until_quiet, now_s

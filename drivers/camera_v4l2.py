@@ -10,7 +10,7 @@ import cv2
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.camera_files import LensOptions, nominal, to_pixels
+from drivers.kinds.cameras import LensOptions, nominal, to_pixels
 from drivers.transport.device import PortDevice
 from drivers.transport.link import LinkLost, NoAnswer, now_s
 from drivers.transport.options import read_options

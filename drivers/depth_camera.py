@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.file_player import FilePlayer
+from drivers.kinds.file_player import FilePlayer
 from drivers.transport.options import read_options
 from hal.clock import Deadline
 from hal.devices import DeviceKind, RangeImage, RangeScannerCapabilities

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from drivers.kinds.force_torque import RangeOptions, capabilities
 from drivers.transport.bus import PolledDevice
 from drivers.transport.checks import crc_modbus
 from drivers.transport.framing import Framer
@@ -24,7 +25,6 @@ from hal.clock import Deadline
 from hal.devices import DeviceKind, ForceTorqueCapabilities, Wrench
 from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context, takes
-from hal.strict import Strict
 
 FRAME_BYTES = 16
 STREAM_RATE_HZ = 100.0
@@ -35,15 +35,6 @@ STOP_S, STOP_BURST = 0.6, 50  # FF bytes for about half a second end a stream
 LISTEN_S = 0.08  # the maker's code takes a line that was silent for so long as no stream
 STREAMING_FRAMES = 2
 ANSWER_S = 0.3
-
-
-class RangeOptions(Strict):
-    """The maker's figures (FT 300-S)."""
-
-    force_range_n: Annotated[float, Field(gt=0)] = 300.0
-    torque_range_nm: Annotated[float, Field(gt=0)] = 30.0
-    force_sigma_n: Annotated[float, Field(gt=0)] = 0.1
-    torque_sigma_nm: Annotated[float, Field(gt=0)] = 0.005
 
 
 class StreamOptions(SerialOptions, RangeOptions):
@@ -73,17 +64,6 @@ def wrench(counts: tuple[int, ...]) -> Wrench:
 def stream_framer() -> Framer:
     """`20 4E`, six counts, CRC; little-endian."""
     return Framer(b"\x20\x4e", FRAME_BYTES, lambda f: crc_modbus(f[:-2]) == f[-2] | f[-1] << 8)
-
-
-def capabilities(options: RangeOptions, rate_hz: float) -> ForceTorqueCapabilities:
-    """From the options."""
-    return ForceTorqueCapabilities(
-        force_range_n=options.force_range_n,
-        torque_range_nm=options.torque_range_nm,
-        force_sigma_n=options.force_sigma_n,
-        torque_sigma_nm=options.torque_sigma_nm,
-        rate_hz=rate_hz,
-    )
 
 
 def condition(value: Wrench, options: RangeOptions) -> tuple[Quality, Cause]:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from drivers.polar import Beams, LineScanner
+from drivers.kinds.line_scanners import Beams, LineScanner
 from drivers.transport.capture import inside
 from drivers.transport.checks import crc_sick
 from drivers.transport.framing import Framer

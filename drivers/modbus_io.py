@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 from pydantic import Field, model_validator
 
-from drivers.points import require_same_number, wanted_lights
+from drivers.kinds.digital_points import require_same_number, wanted_lights
 from drivers.transport.bus import PolledDevice
 from drivers.transport.link import WireError, now_s
 from drivers.transport.modbus import ModbusMaster

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from drivers.ft300 import RangeOptions, capabilities
+from drivers.kinds.force_torque import RangeOptions, capabilities
 from drivers.transport.link import Link, drain_until_quiet, now_s
 from drivers.transport.options import PortNumber, UdpOptions, read_options, udp_opener
 from drivers.transport.stream import StreamDevice

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
-from drivers.grippers import require_finite, require_stroke
+from drivers.kinds.grippers import require_finite, require_stroke
 from drivers.transport.bus import PolledDevice
 from drivers.transport.link import Refused, now_s
 from drivers.transport.modbus import ModbusMaster

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.polar import Beams, LineScanner, within
+from drivers.kinds.line_scanners import Beams, LineScanner, within
 from drivers.transport.checks import sum_scip
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.options import EitherOptions, PortNumber, either_opener, read_options

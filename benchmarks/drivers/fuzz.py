@@ -7,9 +7,13 @@ from collections.abc import Callable
 from typing import Any
 
 from benchmarks.drivers.report import line
-from drivers import bota, dxl2, ft300, lms200, rplidar, rplidar_express, rtde, scip, tfmini
+from drivers import bota, ft300, lms200, scip, tfmini
+from drivers.dynamixel import protocol
+from drivers.rplidar.express import CapsuleParser
+from drivers.rplidar.scanner import NodeParser
 from drivers.transport.canbus import RawCan, Slcan
 from drivers.transport.framing import Framer
+from drivers.ur import rtde
 
 INPUTS = 1_000_000
 Feed = Callable[[bytes], Any]
@@ -28,9 +32,9 @@ def parsers() -> dict[str, tuple[Feed, bytes]]:
         "ft300": (ft300.stream_framer().feed, b"\x20\x4e"),
         "bota": (bota.framer().feed, b"\xaa"),
         "lms200": (lms200.framer().feed, b"\x02\x80\x05\x00"),
-        "dynamixel": (dxl2.framer().feed, dxl2.HEADER),
-        "rplidar": (rplidar.NodeParser().feed, b"\x3e\x01\x02\x03\x04"),
-        "rplidar express": (rplidar_express.CapsuleParser().feed, b"\xa5\x5a"),
+        "dynamixel": (protocol.framer().feed, protocol.HEADER),
+        "rplidar": (NodeParser().feed, b"\x3e\x01\x02\x03\x04"),
+        "rplidar express": (CapsuleParser().feed, b"\xa5\x5a"),
         "scip": (lambda chunk: answers.feed(chunk, "MD"), b"MD0000\n99b\n"),
         "rtde": (rtde.PackageParser().feed, b"\x00\x10U"),
         "slcan": (Slcan().feed, b"t1812"),

@@ -9,11 +9,11 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from drivers.arms import kinematics_of
-from drivers.cia402_states import DriveState
+from drivers.cia402.states import DriveState
 from drivers.emulators.base import WireEmulator, time_of
 from drivers.emulators.faults import FaultOptions
 from drivers.emulators.ports import Peer, PtyPort, TcpPort
+from drivers.kinds.arms import kinematics_of
 from drivers.transport.canbus import CanFrame, Slcan
 from hal.devices import Arm, Device
 from hal.errors import CellError, Unsupported

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from drivers import dxl2
-from drivers.arms import kinematics_of
+from drivers.dynamixel import protocol
 from drivers.emulators.base import WireEmulator, time_of
 from drivers.emulators.faults import FaultOptions
 from drivers.emulators.ports import Peer, PtyPort
+from drivers.kinds.arms import kinematics_of
 from drivers.transport.checks import crc_dynamixel
 from hal.devices import Arm, Device
 from hal.errors import CellError, Unsupported
@@ -56,7 +56,7 @@ class Servo:
     @property
     def alert(self) -> int:
         """The alert bit while a hardware error stands."""
-        return dxl2.ALERT if self.table[HARDWARE_ERROR] else 0
+        return protocol.ALERT if self.table[HARDWARE_ERROR] else 0
 
 
 class DynamixelEmulator(WireEmulator):
@@ -66,7 +66,7 @@ class DynamixelEmulator(WireEmulator):
         super().__init__(PtyPort("dynamixel"), options, name="dynamixel")
         self._backing = backing
         self.servos = {i + 1: Servo(i + 1) for i in range(len(backing.capabilities().links))}
-        self._framer = dxl2.framer()
+        self._framer = protocol.framer()
         self._is_enabled = False
         self._is_new_goal = False
         self._device_s = 0.0
@@ -86,8 +86,8 @@ class DynamixelEmulator(WireEmulator):
     def on_bytes(self, peer: Peer, data: bytes) -> None:  # noqa: ARG002  # a line has one peer
         """Instructions; every packet feeds the watchdogs."""
         for frame in self._framer.feed(data):
-            packet = dxl2.decode(frame)
-            if packet.instruction == dxl2.STATUS:
+            packet = protocol.decode(frame)
+            if packet.instruction == protocol.STATUS:
                 continue
             for servo in self.servos.values():
                 servo.heard_s = self._device_s
@@ -105,44 +105,44 @@ class DynamixelEmulator(WireEmulator):
 
     def status_frame(self) -> bytes | None:
         """Instruction error of the first servo."""
-        return dxl2.encode(next(iter(self.servos)), dxl2.STATUS, bytes([INSTRUCTION]))
+        return protocol.encode(next(iter(self.servos)), protocol.STATUS, bytes([INSTRUCTION]))
 
-    def _obey(self, packet: dxl2.Packet) -> None:
+    def _obey(self, packet: protocol.Packet) -> None:
         p = packet.parameters
-        if packet.instruction in (dxl2.READ, dxl2.SYNC_READ, dxl2.FAST_SYNC_READ):
+        if packet.instruction in (protocol.READ, protocol.SYNC_READ, protocol.FAST_SYNC_READ):
             self._refresh()  # once: all servos of an answer show one moment
         match packet.instruction:
-            case dxl2.PING:
+            case protocol.PING:
                 for id_ in self._addressed(packet.id):
                     self._answer(id_, 0, bytes(self.servos[id_].table[0:2]) + bytes([self.servos[id_].table[6]]))
-            case dxl2.READ if packet.id in self.servos:
+            case protocol.READ if packet.id in self.servos:
                 address, length = struct.unpack("<HH", p)
                 self._answer(packet.id, 0, self._block(packet.id, address, length))
-            case dxl2.WRITE if packet.id in self.servos:
+            case protocol.WRITE if packet.id in self.servos:
                 error = self.servos[packet.id].write(int.from_bytes(p[:2], "little"), p[2:])
                 self._is_new_goal |= p[:2] == GOAL.to_bytes(2, "little") and not error
                 self._answer(packet.id, error)
-            case dxl2.SYNC_READ:
+            case protocol.SYNC_READ:
                 address, length = struct.unpack_from("<HH", p)
                 for id_ in p[4:]:
                     if id_ in self.servos:
                         self._answer(id_, 0, self._block(id_, address, length))
-            case dxl2.FAST_SYNC_READ:
+            case protocol.FAST_SYNC_READ:
                 self._fast_answer(p)
-            case dxl2.SYNC_WRITE:
+            case protocol.SYNC_WRITE:
                 self._sync_write(p)
-            case dxl2.REBOOT if packet.id in self.servos:
+            case protocol.REBOOT if packet.id in self.servos:
                 self.servos[packet.id] = Servo(packet.id)
                 self._answer(packet.id, 0)
             case _ if packet.id in self.servos:
                 self._answer(packet.id, INSTRUCTION)
 
     def _addressed(self, id_: int) -> list[int]:
-        return list(self.servos) if id_ == dxl2.BROADCAST else [id_] if id_ in self.servos else []
+        return list(self.servos) if id_ == protocol.BROADCAST else [id_] if id_ in self.servos else []
 
     def _answer(self, id_: int, error: int, data: bytes = b"") -> None:
         error |= self.servos[id_].alert
-        self.send(None, dxl2.encode(id_, dxl2.STATUS, bytes([error]) + data), protected=slice(4, None))
+        self.send(None, protocol.encode(id_, protocol.STATUS, bytes([error]) + data), protected=slice(4, None))
 
     def _fast_answer(self, parameters: bytes) -> None:
         """One packet for all, unstuffed, with a running CRC after each servo's block."""
@@ -150,7 +150,11 @@ class DynamixelEmulator(WireEmulator):
         ids = [id_ for id_ in parameters[4:] if id_ in self.servos]
         if len(ids) != len(parameters) - 4:
             return
-        frame = dxl2.HEADER + bytes([dxl2.BROADCAST]) + struct.pack("<HB", 1 + len(ids) * (4 + length), dxl2.STATUS)
+        frame = (
+            protocol.HEADER
+            + bytes([protocol.BROADCAST])
+            + struct.pack("<HB", 1 + len(ids) * (4 + length), protocol.STATUS)
+        )
         for id_ in ids:
             frame += bytes([self.servos[id_].alert, id_]) + self._block(id_, address, length)
             frame += struct.pack("<H", crc_dynamixel(frame))

@@ -6,7 +6,7 @@ import struct
 import time
 from typing import Any
 
-from drivers import dxl2
+from drivers.dynamixel import protocol
 from drivers.emulators.base import WireEmulator
 from drivers.emulators.dynamixel import GOAL, INSTRUCTION, STATE, TICK, TORQUE, Servo
 from drivers.emulators.faults import FaultOptions
@@ -30,7 +30,7 @@ class DynamixelGripperEmulator(WireEmulator):
     def __init__(self, backing: Gripper, options: FaultOptions) -> None:
         super().__init__(PtyPort("dynamixel-gripper"), options, name="dynamixel_gripper")
         self._backing = backing
-        self._framer = dxl2.framer()
+        self._framer = protocol.framer()
         self.servo = Servo(ID)
 
     @property
@@ -41,28 +41,28 @@ class DynamixelGripperEmulator(WireEmulator):
     def on_bytes(self, peer: Peer, data: bytes) -> None:  # noqa: ARG002  # a line has one peer
         """Instructions to the servo."""
         for frame in self._framer.feed(data):
-            packet = dxl2.decode(frame)
-            if packet.id == ID and packet.instruction != dxl2.STATUS:
+            packet = protocol.decode(frame)
+            if packet.id == ID and packet.instruction != protocol.STATUS:
                 error, answer = self._obey(packet)
                 self._answer(error, answer)
 
     def status_frame(self) -> bytes | None:
         """Instruction error."""
-        return dxl2.encode(ID, dxl2.STATUS, bytes([INSTRUCTION]))
+        return protocol.encode(ID, protocol.STATUS, bytes([INSTRUCTION]))
 
     def _answer(self, error: int, data: bytes) -> None:
         status = bytes([error | self.servo.alert])
-        self.send(None, dxl2.encode(ID, dxl2.STATUS, status + data), protected=slice(4, None))
+        self.send(None, protocol.encode(ID, protocol.STATUS, status + data), protected=slice(4, None))
 
-    def _obey(self, packet: dxl2.Packet) -> tuple[int, bytes]:
+    def _obey(self, packet: protocol.Packet) -> tuple[int, bytes]:
         p = packet.parameters
-        if packet.instruction == dxl2.PING:
+        if packet.instruction == protocol.PING:
             return 0, bytes(self.servo.table[0:2]) + bytes([self.servo.table[6]])
-        if packet.instruction == dxl2.READ:
+        if packet.instruction == protocol.READ:
             address, length = struct.unpack("<HH", p)
             self._refresh()
             return 0, bytes(self.servo.table[address : address + length])
-        if packet.instruction == dxl2.WRITE:
+        if packet.instruction == protocol.WRITE:
             address = int.from_bytes(p[:2], "little")
             error = self.servo.write(address, p[2:])
             if address == GOAL and not error and self.servo.table[TORQUE]:

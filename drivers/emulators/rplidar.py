@@ -11,8 +11,8 @@ from drivers.emulators.base import WireEmulator
 from drivers.emulators.beams import line_m
 from drivers.emulators.faults import FaultOptions
 from drivers.emulators.ports import Peer, PtyPort
-from drivers.rplidar import descriptor
-from drivers.rplidar_express import CABIN, CAPSULE_BYTES, POINTS
+from drivers.rplidar.express import CABIN, CAPSULE_BYTES, POINTS
+from drivers.rplidar.scanner import descriptor
 from drivers.transport.checks import xor_byte
 from hal.devices import Device, RangeScanner
 from hal.errors import Unsupported

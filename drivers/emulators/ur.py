@@ -15,11 +15,11 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from drivers import rtde
-from drivers.arms import kinematics_of
 from drivers.emulators.base import WireEmulator, time_of
 from drivers.emulators.faults import FaultOptions
 from drivers.emulators.ports import Peer, TcpPort
+from drivers.kinds.arms import kinematics_of
+from drivers.ur import rtde
 from hal.devices import Arm, Device, JointState
 from hal.errors import Unsupported
 from hal.strict import validate

@@ -6,10 +6,10 @@ import struct
 import time
 from typing import Any
 
-from drivers import rtde
 from drivers.emulators.base import WireEmulator
 from drivers.emulators.faults import FaultOptions
 from drivers.emulators.ports import Peer, TcpPort
+from drivers.ur import rtde
 from hal.devices import Device, Lights, Touch
 from hal.errors import Unsupported
 from hal.strict import validate

@@ -144,7 +144,7 @@ BEAMS = Beams(
 )
 ANGLES_RAD = BEAMS.first_rad + STEP_RAD * np.arange(BEAMS.count)
 """,
-        imports={**NUMPY, "drivers.polar": ("Beams", "LineScanner")},
+        imports={**NUMPY, "drivers.kinds.line_scanners": ("Beams", "LineScanner")},
         far_imports={**NUMPY, "drivers.emulators.beams": ("line_m",), "$driver": ("ANGLES_RAD",)},
     ),
     DeviceKind.LIGHTS: KindText(

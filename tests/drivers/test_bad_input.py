@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from drivers import rtde
-from drivers.arms import kinematics_of
 from drivers.emulators import ft300, modbus_io, robotiq_2f, rplidar, scripted, tfmini
 from drivers.emulators.ports import FarPort, PtyPort, TcpPort
+from drivers.kinds.arms import kinematics_of
+from drivers.ur import rtde
 from hal.errors import CellError, ConfigError, DeviceUnavailable
 from hal.registry import Context, connect
 from tests.drivers.rigs import soon, wired
@@ -138,7 +138,7 @@ class Chatter:
 def test_every_serial_driver_says_what_is_wrong_with_its_port(
     way: str, hint: str, caplog: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for driver_file in ("cia402", "dynamixel", "dynamixel_gripper", "lms200"):
+    for driver_file in ("cia402.arm", "dynamixel.arm", "dynamixel.gripper", "lms200"):
         monkeypatch.setattr(f"drivers.{driver_file}.CONNECT_S", 3.0)  # as long as the others try
     with ExitStack() as stack, ThreadPoolExecutor(len(SERIAL)) as pool:
         waiting = {}

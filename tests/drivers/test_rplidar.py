@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from drivers.emulators import rplidar as emulator
 from drivers.emulators.beams import line_m
 from drivers.emulators.scripted import ScriptedScanner, scripted_scan
-from drivers.rplidar import NodeParser, decode, descriptor, sectors, turns_back
-from drivers.rplidar_express import CAPSULE_BYTES, REQUEST, CapsuleParser, decode_capsule, is_capsule, is_first
+from drivers.rplidar.express import CAPSULE_BYTES, REQUEST, CapsuleParser, decode_capsule, is_capsule, is_first
+from drivers.rplidar.scanner import NodeParser, decode, descriptor, sectors, turns_back
 from drivers.transport.checks import xor_byte
 from hal.conformance import RangeScannerContract, Rig
 from hal.devices import RangeImage

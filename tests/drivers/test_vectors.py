@@ -7,15 +7,16 @@ from typing import Any
 
 import pytest
 
-from drivers import dxl2, rtde
-from drivers.cia402_states import state_of
+from drivers.cia402.states import state_of
+from drivers.dynamixel import protocol
 from drivers.robotiq_2f import decode_status, encode_command
-from drivers.rplidar import descriptor
+from drivers.rplidar.scanner import descriptor
 from drivers.scip import checked, decode_number
 from drivers.tfmini import command
 from drivers.transport.checks import crc_modbus, xor_byte
 from drivers.transport.link import NoAnswer, Refused, now_s
 from drivers.transport.modbus import ModbusMaster, ModbusRtu, ModbusTcp
+from drivers.ur import rtde
 from drivers.vendor_frames import cola_a, cola_b, cola_b_framer, decode_cola_a, decode_xarm, xarm
 
 FILE = Path(__file__).parents[3] / "shared" / "data" / "drivers" / "vectors.json"
@@ -138,12 +139,12 @@ def _tcp(answer: bytes) -> ModbusTcp:
 @of_kind("dxl2")
 def test_dynamixel(v: dict[str, Any]) -> None:
     frame, e = bytes.fromhex(v["hex"]), v["expect"]
-    assert dxl2.framer().feed(frame) == [frame]
-    packet = dxl2.decode(frame)
+    assert protocol.framer().feed(frame) == [frame]
+    packet = protocol.decode(frame)
     assert packet.id == e["id"]
-    assert dxl2.encode(packet.id, packet.instruction, packet.parameters) == frame
+    assert protocol.encode(packet.id, packet.instruction, packet.parameters) == frame
     if "error" in e:
-        assert (packet.instruction, packet.parameters[0]) == (dxl2.STATUS, e["error"])
+        assert (packet.instruction, packet.parameters[0]) == (protocol.STATUS, e["error"])
         data = packet.parameters[1:]
         if "value" in e:
             assert int.from_bytes(data, "little") == e["value"]
@@ -152,14 +153,14 @@ def test_dynamixel(v: dict[str, Any]) -> None:
         return
     assert packet.instruction == e["inst"]
     if "ids" in e:
-        assert dxl2.sync_read(e["address"], e["length"], e["ids"]) == frame
+        assert protocol.sync_read(e["address"], e["length"], e["ids"]) == frame
     elif "values" in e:
         values = {int(i): x.to_bytes(e["length"], "little") for i, x in e["values"].items()}
-        assert dxl2.sync_write(e["address"], e["length"], values) == frame
+        assert protocol.sync_write(e["address"], e["length"], values) == frame
     elif "items" in e:
-        assert dxl2.bulk_read([tuple(item) for item in e["items"]]) == frame
-    elif e["inst"] == dxl2.READ:
-        assert dxl2.read(e["id"], e["address"], e["length"]) == frame
+        assert protocol.bulk_read([tuple(item) for item in e["items"]]) == frame
+    elif e["inst"] == protocol.READ:
+        assert protocol.read(e["id"], e["address"], e["length"]) == frame
     elif "value" in e:
         assert struct.unpack_from("<H", packet.parameters)[0] == e["address"]
         assert int.from_bytes(packet.parameters[2:], "little") == e["value"]

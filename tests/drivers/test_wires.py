@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from drivers.arms import kinematics_of
 from drivers.emulators.scripted import ScriptedArm
+from drivers.kinds.arms import kinematics_of
 from hal.config import Cell, DeviceSection, load_cell
 from hal.devices import DeviceKind
 from hal.errors import ConfigError

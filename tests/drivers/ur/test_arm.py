@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers import rtde
 from drivers.emulators import ur as emulator
 from drivers.emulators.scripted import ScriptedArm
-from drivers.ur import OUTPUTS
+from drivers.ur import rtde
+from drivers.ur.arm import OUTPUTS
 from hal.conformance import ArmContract, Rig
 from hal.errors import CellError, DeviceFault, MotionRefused
 from tests.drivers.rigs import count_good, soon, until, wired, wired_rig

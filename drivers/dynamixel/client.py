@@ -12,7 +12,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from drivers import dxl2
+from drivers.dynamixel import protocol
 from drivers.transport.bus import Bus
 from drivers.transport.link import Link, NoAnswer, Refused, drain, drain_until_quiet, now_s
 from drivers.transport.options import SerialOptions, serial_opener
@@ -32,7 +32,7 @@ class Part:
     size: int
     order: tuple[int, ...] = ()
 
-    def fits(self, packet: dxl2.Packet) -> bool:
+    def fits(self, packet: protocol.Packet) -> bool:
         """Can this be the packet?"""
         if (packet.id, len(packet.parameters)) != (self.id, self.size):
             return False
@@ -72,7 +72,7 @@ class DynamixelClient:
     def __init__(self, link: Link, *, timeout_s: float) -> None:
         self._link = link
         self._timeout_s = timeout_s
-        self._framer = dxl2.framer()
+        self._framer = protocol.framer()
         self._unanswered: list[Shape] = []  # oldest first
         self._overtaken: deque[tuple[float, Shape]] = deque(maxlen=64)  # lost, and later ones were answered
         self._lost_in_a_row = 0
@@ -82,15 +82,15 @@ class DynamixelClient:
 
     def read(self, id_: int, address: int, length: int, until_s: float) -> bytes:
         """A block of one servo."""
-        return self._ask(dxl2.read(id_, address, length), (id_,), length, until_s)[id_]
+        return self._ask(protocol.read(id_, address, length), (id_,), length, until_s)[id_]
 
     def write(self, id_: int, address: int, data: bytes, until_s: float) -> None:
         """A block of one servo, acknowledged."""
-        self._ask(dxl2.write(id_, address, data), (id_,), 0, until_s)
+        self._ask(protocol.write(id_, address, data), (id_,), 0, until_s)
 
     def sync_read(self, ids: tuple[int, ...], address: int, length: int, until_s: float) -> dict[int, bytes]:
         """The same block of all servos, one packet each."""
-        return self._ask(dxl2.sync_read(address, length, ids), ids, length, until_s)
+        return self._ask(protocol.sync_read(address, length, ids), ids, length, until_s)
 
     def fast_sync_read(self, ids: tuple[int, ...], address: int, length: int, until_s: float) -> dict[int, bytes]:
         """The same block of all servos in one packet."""
@@ -99,9 +99,9 @@ class DynamixelClient:
         def request() -> tuple[bytes, Shape]:
             self._turn += 1
             turns = [ids[i:] + ids[:i] for i in ((self._turn + k) % len(ids) for k in range(len(ids)))]
-            shapes = [(Part(dxl2.BROADCAST, len(ids) * step, turn),) for turn in turns]
+            shapes = [(Part(protocol.BROADCAST, len(ids) * step, turn),) for turn in turns]
             shape = min(shapes, key=self._doubted_since_s)
-            return dxl2.sync_read(address, length, shape[0].order, fast=True), shape
+            return protocol.sync_read(address, length, shape[0].order, fast=True), shape
 
         data = self._exchange(request, ids, until_s)[0].parameters
         blocks = {data[at + 1]: data[at : at + step] for at in range(0, len(data), step)}
@@ -111,7 +111,7 @@ class DynamixelClient:
 
     def sync_write(self, address: int, length: int, values: dict[int, bytes], until_s: float) -> None:
         """A block of each servo; nobody answers."""
-        self._link.write(dxl2.sync_write(address, length, values), until_s)
+        self._link.write(protocol.sync_write(address, length, values), until_s)
 
     def _ask(self, request: bytes, ids: tuple[int, ...], length: int, until_s: float) -> dict[int, bytes]:
         shape = tuple(Part(id_, 1 + length) for id_ in ids)
@@ -122,7 +122,7 @@ class DynamixelClient:
 
     def _exchange(
         self, request: Callable[[], tuple[bytes, Shape]], ids: tuple[int, ...], until_s: float
-    ) -> list[dxl2.Packet]:
+    ) -> list[protocol.Packet]:
         """Ask again after a lost answer while there is time."""
         while True:
             try:
@@ -135,13 +135,13 @@ class DynamixelClient:
                 if until_s - now_s() < 0.5 * self._timeout_s:
                     raise
 
-    def _attempt(self, request: bytes, shape: Shape, ids: tuple[int, ...], until_s: float) -> list[dxl2.Packet]:
+    def _attempt(self, request: bytes, shape: Shape, ids: tuple[int, ...], until_s: float) -> list[protocol.Packet]:
         self._note_late(self._packets(drain(self._link)))
         self.asked_s = now_s()
         self._link.write(request, until_s)
         self._unanswered.append(shape)
-        found: list[dxl2.Packet] = []
-        odd: list[dxl2.Packet] = []
+        found: list[protocol.Packet] = []
+        odd: list[protocol.Packet] = []
         end_s = min(until_s, self.asked_s + self._timeout_s)
         while chunk := self._link.read(end_s):
             for packet in self._packets(chunk):
@@ -206,20 +206,20 @@ class DynamixelClient:
             self._unanswered.clear()
             return
         with suppress(Refused):  # an error report is an answer too
-            self._attempt(dxl2.read(id_, 0, free[0][0].size - 1), free[0], (id_,), until_s)
+            self._attempt(protocol.read(id_, 0, free[0][0].size - 1), free[0], (id_,), until_s)
         self._unanswered.clear()
 
-    def _note_late(self, packets: Iterable[dxl2.Packet]) -> None:
+    def _note_late(self, packets: Iterable[protocol.Packet]) -> None:
         """Answers to requests that were given up: neither they nor those before are waited for any longer."""
         for packet in packets:
             fits = [i for i, lost in enumerate(self._unanswered) if lost[-1].fits(packet)]
             if fits:
                 del self._unanswered[: fits[0] + 1]
 
-    def _packets(self, chunk: bytes) -> list[dxl2.Packet]:
+    def _packets(self, chunk: bytes) -> list[protocol.Packet]:
         """Status packets; others are the echo of our own."""
         packets = [_unpacked(frame) for frame in self._framer.feed(chunk)]
-        return [packet for packet in packets if packet.instruction == dxl2.STATUS]
+        return [packet for packet in packets if packet.instruction == protocol.STATUS]
 
 
 def dynamixel_bus(context: Context, options: BusOptions) -> Bus[DynamixelClient]:
@@ -233,15 +233,15 @@ def dynamixel_bus(context: Context, options: BusOptions) -> Bus[DynamixelClient]
 
 
 def _check(id_: int, error: int) -> None:
-    if error & ~dxl2.ALERT:
-        text = dxl2.ERRORS.get(error & ~dxl2.ALERT, "not in the manual")
-        raise Refused(f"servo {id_}: error {error & ~dxl2.ALERT} ({text})", code=error)
-    if error & dxl2.ALERT:
+    if error & ~protocol.ALERT:
+        text = protocol.ERRORS.get(error & ~protocol.ALERT, "not in the manual")
+        raise Refused(f"servo {id_}: error {error & ~protocol.ALERT} ({text})", code=error)
+    if error & protocol.ALERT:
         raise Refused(f"servo {id_}: hardware alert; only a reboot helps", code=error)
 
 
-def _unpacked(frame: bytes) -> dxl2.Packet:
+def _unpacked(frame: bytes) -> protocol.Packet:
     """Fast sync answers are not stuffed, so taking stuffing off could damage them."""
-    if frame[4] == dxl2.BROADCAST and frame[7] == dxl2.STATUS:
-        return dxl2.Packet(frame[4], frame[7], frame[8:])  # with the last CRC, so that all blocks have one size
-    return dxl2.decode(frame)
+    if frame[4] == protocol.BROADCAST and frame[7] == protocol.STATUS:
+        return protocol.Packet(frame[4], frame[7], frame[8:])  # with the last CRC, so that all blocks have one size
+    return protocol.decode(frame)

@@ -18,7 +18,7 @@ from hal.devices import DeviceKind
 from hal.registry import Context
 from tests.drivers.rigs import ScriptLink, until
 
-WIRE_CELL = Path(__file__).parents[2] / "cells" / "wire-ur.toml"
+WIRE_CELL = Path(__file__).parents[3] / "cells" / "wire-ur.toml"
 
 
 class Greedy:

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers import dxl2
-from drivers.dynamixel import RAD_PER_COUNT
+from drivers.dynamixel import protocol
+from drivers.dynamixel.arm import RAD_PER_COUNT
 from drivers.emulators import dynamixel as emulator
 from drivers.emulators.scripted import ScriptedArm
 from hal.conformance import ArmContract, Rig
@@ -33,13 +33,13 @@ class TestDynamixel(ArmContract):
     st.integers(0, 252), st.integers(1, 0x92), st.binary(max_size=60), st.lists(st.integers(min_value=0), max_size=6)
 )
 def test_packets_survive_stuffing_and_any_chunking(id_: int, inst: int, data: bytes, cuts: list[int]) -> None:
-    data = data.replace(b"\x00\x00", dxl2.STUFF)  # more headers inside than chance would bring
-    frame = dxl2.encode(id_, inst, data)
-    assert dxl2.HEADER not in frame[4:]
+    data = data.replace(b"\x00\x00", protocol.STUFF)  # more headers inside than chance would bring
+    frame = protocol.encode(id_, inst, data)
+    assert protocol.HEADER not in frame[4:]
     places = [0, *sorted(cut % (len(frame) + 1) for cut in cuts), len(frame)]
-    framer = dxl2.framer()
+    framer = protocol.framer()
     found = [f for a, b in pairwise(places) for f in framer.feed(frame[a:b])]
-    assert [dxl2.decode(f) for f in found] == [dxl2.Packet(id_, inst, data)]
+    assert [protocol.decode(f) for f in found] == [protocol.Packet(id_, inst, data)]
 
 
 @pytest.mark.parametrize("is_fast", [True, False])

@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from drivers import rtde
 from drivers.transport.link import Link, NoAnswer, Refused, now_s
+from drivers.ur import rtde
 
 ANSWER_S = 0.5
 

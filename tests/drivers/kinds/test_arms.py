@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.arms import KinematicsOptions, SetPointFilter, kinematics_of
 from drivers.emulators import cia402, dynamixel, ur
 from drivers.emulators.scripted import ScriptedArm
+from drivers.kinds.arms import KinematicsOptions, SetPointFilter, kinematics_of
 from hal.clock import Deadline, SimClock
 from hal.errors import InvalidRequest, MotionRefused
 from tests.drivers.rigs import soon, until, wired

@@ -15,9 +15,9 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from drivers.arms import Array, KinematicsOptions, SetPointFilter, capabilities, require_stations
-from drivers.dxl2_client import BusOptions, DynamixelClient, dynamixel_bus
-from drivers.points import require_same_number
+from drivers.dynamixel.client import BusOptions, DynamixelClient, dynamixel_bus
+from drivers.kinds.arms import Array, KinematicsOptions, SetPointFilter, capabilities, require_stations
+from drivers.kinds.digital_points import require_same_number
 from drivers.transport.bus import PolledDevice
 from drivers.transport.device import wall_until
 from drivers.transport.link import BadAnswer, NoAnswer, Refused, WireError, now_s

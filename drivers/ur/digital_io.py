@@ -15,14 +15,14 @@ from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Field, model_validator
 
-from drivers import rtde
-from drivers.points import require_same_number, wanted_lights
-from drivers.rtde_session import ANSWER_S, RtdeSession
+from drivers.kinds.digital_points import require_same_number, wanted_lights
 from drivers.transport.device import wall_until
 from drivers.transport.link import Link, LinkLost, WireError, now_s
 from drivers.transport.options import Seconds, read_options, tcp_opener
 from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import HostTime
+from drivers.ur import rtde
+from drivers.ur.session import ANSWER_S, RtdeSession
 from hal.clock import Deadline
 from hal.devices import DeviceKind, LightsCapabilities, TouchCapabilities
 from hal.readings import Stamped

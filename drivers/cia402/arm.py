@@ -16,10 +16,10 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from drivers.arms import Array, KinematicsOptions, SetPointFilter, capabilities, require_stations
-from drivers.cia402_setup import PROBES, SDO_REQUEST, SDO_S, SdoClient, SetUp, upload_request
-from drivers.cia402_states import DISABLE, FAULT_RESET, QUICK_STOP, DriveState, state_of, towards_enabled
-from drivers.cia402_sync import SyncCount
+from drivers.cia402.setup import PROBES, SDO_REQUEST, SDO_S, SdoClient, SetUp, upload_request
+from drivers.cia402.states import DISABLE, FAULT_RESET, QUICK_STOP, DriveState, state_of, towards_enabled
+from drivers.cia402.sync import SyncCount
+from drivers.kinds.arms import Array, KinematicsOptions, SetPointFilter, capabilities, require_stations
 from drivers.transport.canbus import CanCodec, CanFrame, CanOptions, can_opener
 from drivers.transport.device import wall_until
 from drivers.transport.link import Link, NoAnswer, Refused, drain, now_s

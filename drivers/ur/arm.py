@@ -14,15 +14,15 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from drivers import rtde
-from drivers.arms import Array, KinematicsOptions, SetPointFilter, capabilities, ur10e
-from drivers.rtde_session import ANSWER_S, RtdeSession
+from drivers.kinds.arms import Array, KinematicsOptions, SetPointFilter, capabilities, ur10e
 from drivers.transport.device import wall_until
 from drivers.transport.link import Link, LinkLost, WireError, drain, now_s
 from drivers.transport.options import CONNECT_TIMEOUT_S, PortNumber, read_options, tcp_opener
 from drivers.transport.socket_link import open_tcp
 from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import HostTime
+from drivers.ur import rtde
+from drivers.ur.session import ANSWER_S, RtdeSession
 from hal.clock import Deadline, WallClock
 from hal.devices import ArmCapabilities, DeviceKind, JointState
 from hal.errors import DeviceFault, MotionRefused

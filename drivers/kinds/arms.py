@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from drivers.points import require_same_number
+from drivers.kinds.digital_points import require_same_number
 from hal.devices import ArmCapabilities, DhLink
 from hal.errors import InvalidRequest, MotionRefused
 from hal.strict import Strict

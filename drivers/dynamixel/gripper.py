@@ -11,8 +11,8 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
-from drivers.dxl2_client import BusOptions, DynamixelClient, dynamixel_bus
-from drivers.grippers import require_finite, require_stroke
+from drivers.dynamixel.client import BusOptions, DynamixelClient, dynamixel_bus
+from drivers.kinds.grippers import require_finite, require_stroke
 from drivers.transport.bus import PolledDevice
 from drivers.transport.link import Refused, now_s
 from drivers.transport.options import read_options

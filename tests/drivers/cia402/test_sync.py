@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.cia402_setup import CONSUMER, MAPPINGS, SetUp
-from drivers.cia402_sync import PDOS, PROBE_S, SyncCount
+from drivers.cia402.setup import CONSUMER, MAPPINGS, SetUp
+from drivers.cia402.sync import PDOS, PROBE_S, SyncCount
 from drivers.transport.link import NoAnswer, Refused
 
 PERIOD_S = 0.01

@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.arms import kinematics_of
-from drivers.cia402 import Cia402, Cia402Options
-from drivers.cia402_states import DriveState
+from drivers.cia402.arm import Cia402, Cia402Options
+from drivers.cia402.states import DriveState
 from drivers.emulators import cia402 as emulator
 from drivers.emulators.scripted import ScriptedArm
+from drivers.kinds.arms import kinematics_of
 from drivers.tfmini_i import CanTfminiOptions
 from drivers.transport.canbus import RAW, CanFrame, RawCan, Slcan
 from drivers.transport.options import read_options
@@ -192,7 +192,7 @@ def test_a_drive_that_restarts_is_set_up_again_and_stays_off() -> None:
 @pytest.fixture
 def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """A connection that must fail is given up after 3 s; the drives are asked for what is wrong long before."""
-    monkeypatch.setattr("drivers.cia402.CONNECT_S", 3.0)
+    monkeypatch.setattr("drivers.cia402.arm.CONNECT_S", 3.0)
 
 
 @pytest.mark.usefixtures("hurried")

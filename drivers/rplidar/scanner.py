@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.polar import Beams, LineScanner, within
-from drivers.rplidar_express import CAPSULE_BYTES, EXPRESS_TYPE, REQUEST, CapsuleParser, Points, split_turns
+from drivers.kinds.line_scanners import Beams, LineScanner, within
+from drivers.rplidar.express import CAPSULE_BYTES, EXPRESS_TYPE, REQUEST, CapsuleParser, Points, split_turns
 from drivers.transport.capture import inside
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.options import SerialOptions, read_options, serial_opener

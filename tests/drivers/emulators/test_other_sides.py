@@ -1,7 +1,7 @@
 """Other people's clients against our emulators: no protocol may rest on this project's code alone.
 
 All of them come with the `test` extra; pymodbus, python-can and canopen prove the rest in test_modbus_io, test_ft300 and
-test_cia402. For LMS 200 there is the Debian package mrpt-apps; for Bota and TFmini there is none (libscrc: their sums).
+`cia402`. For LMS 200 there is the Debian package mrpt-apps; for Bota and TFmini there is none (libscrc: their sums).
 """
 
 from typing import Any

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers import dxl2
-from drivers.dxl2_client import DynamixelClient
+from drivers.dynamixel import protocol
+from drivers.dynamixel.client import DynamixelClient
 from drivers.transport.checks import crc_dynamixel
 from drivers.transport.link import Link, NoAnswer, Refused, now_s
 
@@ -26,14 +26,14 @@ class Bus:
     name, byte_s = "bus", 0.0
 
     def __init__(self, fate: Fate) -> None:
-        self.asked: list[dxl2.Packet] = []
+        self.asked: list[protocol.Packet] = []
         self._fate = fate
         self._coming: list[tuple[int, bytes]] = []
-        self._framer = dxl2.framer()
+        self._framer = protocol.framer()
 
     def write(self, data: bytes, until_s: float) -> None:
         for frame in self._framer.feed(data):
-            self.asked.append(packet := dxl2.decode(frame))
+            self.asked.append(packet := protocol.decode(frame))
             number = len(self.asked)
             self._coming += [(number + later, piece) for later, piece in self._fate(number, answer(packet, number))]
 
@@ -48,15 +48,15 @@ class Bus:
     def close(self) -> None: ...
 
 
-def answer(packet: dxl2.Packet, number: int) -> bytes:
+def answer(packet: protocol.Packet, number: int) -> bytes:
     _, length = struct.unpack_from("<HH", packet.parameters)
     block = bytes([number]) * length
-    if packet.instruction == dxl2.READ:
-        return dxl2.encode(packet.id, dxl2.STATUS, b"\0" + block)
+    if packet.instruction == protocol.READ:
+        return protocol.encode(packet.id, protocol.STATUS, b"\0" + block)
     ids = packet.parameters[4:]
-    if packet.instruction == dxl2.SYNC_READ:
-        return b"".join(dxl2.encode(id_, dxl2.STATUS, b"\0" + block) for id_ in ids)
-    frame = dxl2.HEADER + struct.pack("<BHB", dxl2.BROADCAST, 1 + len(ids) * (4 + length), dxl2.STATUS)
+    if packet.instruction == protocol.SYNC_READ:
+        return b"".join(protocol.encode(id_, protocol.STATUS, b"\0" + block) for id_ in ids)
+    frame = protocol.HEADER + struct.pack("<BHB", protocol.BROADCAST, 1 + len(ids) * (4 + length), protocol.STATUS)
     for id_ in ids:
         frame += bytes([0, id_]) + block
         frame += struct.pack("<H", crc_dynamixel(frame))
@@ -124,14 +124,14 @@ def test_halves_that_come_apart_are_one_answer_however_late_the_second_is() -> N
 
 
 def test_packets_that_fit_nothing_are_told() -> None:
-    other = dxl2.encode(9, dxl2.STATUS, b"\0\x01\x02")
+    other = protocol.encode(9, protocol.STATUS, b"\0\x01\x02")
     _, client = client_of(lambda _n, _whole: [(0, other)])
     with pytest.raises(NoAnswer, match=r"1 of 1 answers of servos 1 do not come; servo 9 sent 3 bytes"):
         client.read(1, 132, 4, now_s() + 0.0005)
 
 
 def test_an_error_report_in_place_of_an_answer_is_raised_at_once() -> None:
-    report = dxl2.encode(2, dxl2.STATUS, b"\x02")
+    report = protocol.encode(2, protocol.STATUS, b"\x02")
     bus, client = client_of(lambda n, whole: [(0, report if n == 1 else whole)])
     with pytest.raises(Refused, match=r"servo 2: error 2 \(instruction unknown\)"):
         client.fast_sync_read(IDS, 126, 10, soon())

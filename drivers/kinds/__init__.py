@@ -1,0 +1,1 @@
+"""What devices of one kind share, whatever wire leads to them."""

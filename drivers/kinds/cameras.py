@@ -1,0 +1,43 @@
+"""What cameras share: a nominal lens, and OpenCV's picture as the bytes that an `Image` holds."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from hal.calibration import CameraIntrinsics
+from hal.strict import Strict
+
+Pixels = NDArray[np.uint8]
+
+
+class LensOptions(Strict):
+    """Nominal lens of a camera that does not know its own; the calibration record has the true one."""
+
+    fx_px: Annotated[float, Field(gt=0)] | None = None
+    fy_px: Annotated[float, Field(gt=0)] | None = None
+
+
+def nominal(width_px: int, height_px: int, lens: LensOptions) -> CameraIntrinsics:
+    """The options' lens, or one of 53 degrees across, centred."""
+    fx_px = lens.fx_px or float(width_px)
+    return CameraIntrinsics(
+        width_px=width_px,
+        height_px=height_px,
+        fx_px=fx_px,
+        fy_px=lens.fy_px or fx_px,
+        cx_px=(width_px - 1) / 2.0,
+        cy_px=(height_px - 1) / 2.0,
+    )
+
+
+def to_pixels(bgr: NDArray[Any], *, is_colour: bool) -> Pixels:
+    """OpenCV's picture as RGB or gray bytes."""
+    if bgr.ndim == 2:
+        bgr = cv2.cvtColor(bgr, cv2.COLOR_GRAY2BGR)
+    code = cv2.COLOR_BGR2RGB if is_colour else cv2.COLOR_BGR2GRAY
+    return np.ascontiguousarray(cv2.cvtColor(bgr, code), dtype=np.uint8)

@@ -1,0 +1,30 @@
+"""What wrench sensors share: their measuring range as options, and what they say of themselves."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from hal.devices import ForceTorqueCapabilities
+from hal.strict import Strict
+
+
+class RangeOptions(Strict):
+    """Range and noise by the maker's figures; those of the FT 300-S unless given."""
+
+    force_range_n: Annotated[float, Field(gt=0)] = 300.0
+    torque_range_nm: Annotated[float, Field(gt=0)] = 30.0
+    force_sigma_n: Annotated[float, Field(gt=0)] = 0.1
+    torque_sigma_nm: Annotated[float, Field(gt=0)] = 0.005
+
+
+def capabilities(options: RangeOptions, rate_hz: float) -> ForceTorqueCapabilities:
+    """From the options."""
+    return ForceTorqueCapabilities(
+        force_range_n=options.force_range_n,
+        torque_range_nm=options.torque_range_nm,
+        force_sigma_n=options.force_sigma_n,
+        torque_sigma_nm=options.torque_sigma_nm,
+        rate_hz=rate_hz,
+    )

@@ -1,0 +1,1 @@
+"""Slamtec RPLIDAR: the scanner, and its express scans."""

@@ -296,7 +296,7 @@ class Controller:
             self._faults = (end.cause,)
         try:
             while True:
-                self._send(self._filter.apply(self._filter.last_rad))
+                self._send(self._filter.brake())
                 self._drives.pass_tick()
                 if self._filter.is_at_rest:
                     break

@@ -31,6 +31,7 @@ class SetPointFilter:
         self._tool = flange_from_tool
         self._tip_limit = tip_limit_m_per_s
         self._dt_s = dt_s
+        self._wanted_rad = np.zeros(len(kinematics.dh))
         self.last_rad = np.zeros(len(kinematics.dh))
         self.velocity_rad_per_s = np.zeros(len(kinematics.dh))
 
@@ -38,6 +39,7 @@ class SetPointFilter:
         """The first set-point after any resume is the measured position."""
         self.last_rad = np.clip(measured_rad, self._kinematics.lower_rad, self._kinematics.upper_rad)
         self.velocity_rad_per_s = np.zeros_like(measured_rad)
+        self._wanted_rad = self.last_rad
 
     def apply(self, wanted_rad: Array) -> Array:
         """The set-point that may be sent.
@@ -49,10 +51,17 @@ class SetPointFilter:
             raise DeviceFailure("controller", "a set-point was not finite")
         kin = self._kinematics
         out: Array = kernels.safe_step(
-            kin.dh, self._tool, wanted_rad, self.last_rad, self.velocity_rad_per_s, kin.velocity_rad_per_s,
-            kin.acceleration_rad_per_s2, kin.lower_rad, kin.upper_rad, self._tip_limit, self._dt_s,
+            kin.dh, self._tool, wanted_rad, self._wanted_rad, self.last_rad, self.velocity_rad_per_s,
+            kin.velocity_rad_per_s, kin.acceleration_rad_per_s2, kin.lower_rad, kin.upper_rad, self._tip_limit,
+            self._dt_s,
         )  # fmt: skip
+        self._wanted_rad = wanted_rad
         return out
+
+    def brake(self) -> Array:
+        """The set-point of a tick that only slows down, each joint as fast as it may."""
+        self._wanted_rad = self.last_rad
+        return self.apply(self.last_rad)
 
     def sent(self, position_rad: Array) -> None:
         """What the arm says that it sent to its drives."""

@@ -151,13 +151,24 @@ def test_admittance_settles_at_force_over_stiffness_and_rigid_axes_stay() -> Non
     assert state[0, 2] == 0.05  # a free axis drifts to its bound and stays there
 
 
-def test_a_set_point_never_breaks_speed_or_acceleration_limits() -> None:
+@given(speed=st.floats(0.0, 50.0))
+def test_the_way_to_rest_is_that_of_a_brake_tick_by_tick(speed: float) -> None:
+    left, way = speed - 1.0, 0.0
+    while left > 0.0:
+        way, left = way + left, left - 1.0
+    assert kernels.rest_way(speed, 1.0) == pytest.approx(way, abs=1e-9)
+    assert kernels.fastest_to_rest(speed + way, 1.0) == pytest.approx(speed, abs=1e-9)
+
+
+def test_a_set_point_never_breaks_range_speed_or_acceleration_limits() -> None:
     rng = np.random.default_rng(5)
     velocity, acceleration, dt = np.full(3, 1.0), np.full(3, 10.0), 0.002
-    q, v = np.zeros(3), np.zeros(3)
+    q, v, before, end = np.zeros(3), np.zeros(3), np.zeros(3), np.full(3, 0.05)
     for _ in range(2000):
-        new = kernels.limited_step(q + rng.normal(0, 0.1, 3), q, v, velocity, acceleration, dt)
-        now = (new - q) / dt
+        wanted = q + rng.normal(0, 0.1, 3)
+        new = kernels.limited_step(wanted, before, q, v, velocity, acceleration, -end, end, dt)
+        now, before = (new - q) / dt, wanted
+        assert np.all(np.abs(new) <= end + 1e-12)
         assert np.all(np.abs(now) <= velocity + 1e-9)
         assert np.all(np.abs(now - v) <= acceleration * dt + 1e-9)
         q, v = new, now

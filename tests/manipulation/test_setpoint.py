@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
 from hal.errors import MotionRefused
@@ -161,6 +165,89 @@ def test_the_filter_sends_nothing_beyond_the_joint_range_nor_above_the_speed_of_
         tips.append(tool_pose(made.last_rad).translation)
     fastest = np.linalg.norm(np.diff(tips, axis=0), axis=1).max() / DT_S
     assert 0.049 <= fastest <= 0.0505
+
+
+VELOCITY, ACCELERATION = np.array(T3.velocity_rad_per_s), np.array(T3.acceleration_rad_per_s2)
+FREE_TIP_M_PER_S = 10.0
+
+
+def driven(made: SetPointFilter, wanted: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (N + 1, 6) and accelerations (N, 6) that the filter makes of a course."""
+    ways, speeds = [made.last_rad], [made.velocity_rad_per_s]
+    for joints in wanted:
+        made.sent(made.apply(joints))
+        ways.append(made.last_rad)
+        speeds.append(made.velocity_rad_per_s)
+    assert (np.abs(speeds) <= VELOCITY * (1.0 + 1e-9)).all()
+    return np.array(ways), np.diff(speeds, axis=0) / DT_S
+
+
+@settings(max_examples=40)
+@given(leap=st.lists(st.floats(-0.8, 0.8), min_size=6, max_size=6), is_tip_limited=st.booleans())
+def test_behind_a_leap_the_arm_brakes_in_time_and_rests_where_it_was_wanted(
+    leap: list[float], is_tip_limited: bool
+) -> None:
+    goal = HOME + np.array(leap)
+    made = made_filter(tip_limit_m_per_s=0.25 if is_tip_limited else FREE_TIP_M_PER_S)
+    joints, accelerations = driven(made, itertools.repeat(goal, 3500))
+    np.testing.assert_allclose(joints[-2:], [goal, goal], atol=1e-9)
+    past_rad = ((joints - goal) * np.sign(leap)).max()
+    if is_tip_limited:  # joints that slow down together for the tip may run a little past; 0.3 rad without the brake
+        assert past_rad <= 0.1
+    else:
+        assert past_rad <= 1e-9
+        assert (np.abs(accelerations) <= ACCELERATION * (1.0 + 1e-6)).all()
+
+
+@settings(max_examples=40)
+@given(seed=st.integers(0, 10**6), held=st.integers(1, 200))
+def test_whatever_leaps_the_arm_keeps_its_range_and_never_brakes_harder_than_it_may(seed: int, held: int) -> None:
+    rng = np.random.default_rng(seed)
+    goals = np.repeat(rng.uniform(-4.0, 4.0, (1500 // held + 1, 6)), held, axis=0)
+    joints, accelerations = driven(made_filter(), goals)
+    assert (np.abs(joints) <= UPPER).all()
+    assert (np.abs(accelerations) <= ACCELERATION * (1.0 + 1e-6)).all()
+
+
+@settings(max_examples=40)
+@given(seed=st.integers(0, 10**6))
+def test_a_course_within_the_limits_is_sent_as_it_is_whatever_it_does(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    speed, course = np.zeros(6), [HOME]
+    for push in rng.uniform(-1.0, 1.0, (10, 6)).repeat(40, axis=0):
+        speed = np.clip(speed + push * ACCELERATION * DT_S, -VELOCITY, VELOCITY)
+        course.append(course[-1] + speed * DT_S)
+    assume(np.abs(course).max() < UPPER - 0.2)  # where it can still brake ahead of its range
+    joints, _ = driven(made_filter(), course[1:])
+    np.testing.assert_allclose(joints, course, atol=1e-9)
+
+
+def test_a_set_point_that_was_held_back_catches_up_with_a_course_that_slows_down_and_does_not_run_past() -> None:
+    ahead = HOME + 0.2 + 0.1 * (1.0 - np.cos(np.linspace(0.0, np.pi, 400)))[:, None] * np.ones(6)
+    joints, accelerations = driven(made_filter(), [*ahead, *itertools.repeat(ahead[-1], 300)])
+    assert (joints[1:] - ahead[-1]).max() <= 1e-9
+    np.testing.assert_allclose(joints[-1], ahead[-1], atol=1e-9)
+    assert (np.abs(accelerations) <= ACCELERATION * (1.0 + 1e-6)).all()
+
+
+@pytest.mark.parametrize("leap", [-1.0, 1.0])
+def test_a_brake_slows_every_joint_as_fast_as_it_may_whatever_was_wanted_last(leap: float) -> None:
+    made = made_filter()
+    driven(made, itertools.repeat(HOME + 1.0, 150))
+    made.sent(made.apply(HOME + leap))
+    while not made.is_at_rest:
+        before = made.velocity_rad_per_s
+        made.sent(made.brake())
+        expected = np.maximum(before - ACCELERATION * DT_S, 0.0)
+        np.testing.assert_allclose(made.velocity_rad_per_s, expected, atol=1e-9)
+
+
+def test_at_the_speed_limit_of_the_tip_no_joint_brakes_harder_than_it_may() -> None:
+    """Scaled to the limit alone, wrists that turned fast were braked seven times as hard as they may be."""
+    rng = np.random.default_rng(7)
+    goals = HOME + np.repeat(rng.uniform(-0.6, 0.6, (50, 6)), 30, axis=0)
+    _, accelerations = driven(made_filter(tip_limit_m_per_s=0.25), goals)
+    assert np.quantile(np.abs(accelerations) / ACCELERATION, 0.999) <= 1.0 + 1e-6
 
 
 @pytest.mark.parametrize("bad", [NAN, float("inf")])

@@ -2,6 +2,11 @@
 
 One thread writes. `append` returns when the row is on disk; rows that wait together share one commit, so that a burst
 of events costs one flush of the disk. Two services on one folder (a demo beside `serve`) keep one chain.
+
+The disk that it takes is bounded: a file that has grown too big hands its rows over to an older part
+(`journal-<first>-<last>.sqlite`), and the oldest part goes when there are too many. Rows are copied first and deleted
+afterwards, so that each is in one place at least; readers read all parts as one journal. A row of the chain says what
+went, so that `verify` can tell it from a theft.
 """
 
 from __future__ import annotations
@@ -15,28 +20,23 @@ import sqlite3
 import threading
 import time
 from concurrent.futures import Future
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from service.errors import JournalError
+from service.journal_parts import INSERT_ROW, SCHEMA, newest_first, parts_of, snapshot, write_part
 
 FIRST_HASH = "0" * 64
 MAX_GROUP = 200
 MAX_KEPT = 1000  # notes that wait for room on the disk
+PART_BYTES = 16_000_000  # some ten thousand rows
+KEEP_PARTS = 8  # with the live file some 150 MB
+MAX_ID = 2**62
+DROPPED = "journal-dropped"  # the kind of row that says up to where the oldest rows have gone
 log = logging.getLogger(__name__)
 APPEND_TIMEOUT_S = 10.0
-SCHEMA = """
-CREATE TABLE IF NOT EXISTS journal (
-    id INTEGER PRIMARY KEY,
-    wall_time_s REAL NOT NULL,
-    monotonic_s REAL NOT NULL,
-    kind TEXT NOT NULL,
-    data TEXT NOT NULL,
-    previous_hash TEXT NOT NULL,
-    hash TEXT NOT NULL UNIQUE
-)
-"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,14 +65,18 @@ class Journal:
     """An append-only record of the cell.
 
     Args:
-        path: SQLite file; made when missing.
+        path: SQLite file; made when missing. Older parts lie beside it.
+        part_bytes: a file with more than this hands its rows over to a new part.
+        keep_parts: so many older parts are kept.
 
     Raises:
         JournalError: it cannot be opened for writing.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, part_bytes: int = PART_BYTES, keep_parts: int = KEEP_PARTS) -> None:
         self.path = path
+        self._part_bytes, self._keep_parts = part_bytes, keep_parts
+        self._hand_over_at = part_bytes
         self._waiting: queue.SimpleQueue[_Entry | None] = queue.SimpleQueue()
         self._is_closed = False
         ready: Future[None] = Future()
@@ -103,30 +107,41 @@ class Journal:
 
     def records(self, *, kinds: tuple[str, ...] = (), limit: int = 1000) -> list[Record]:
         """The newest records of the given kinds (all when empty), oldest first."""
-        where = f"WHERE kind IN ({','.join('?' * len(kinds))})" if kinds else ""
-        sql = f"SELECT * FROM (SELECT * FROM journal {where} ORDER BY id DESC LIMIT ?) ORDER BY id"  # noqa: S608 - only ?s
-        with self._reader() as db:
-            return [_record(row) for row in db.execute(sql, (*kinds, limit))]
+        where = f"AND kind IN ({','.join('?' * len(kinds))})" if kinds else ""
+        sql = f"SELECT * FROM journal WHERE id < ? {where} ORDER BY id DESC LIMIT ?"  # noqa: S608 - only ?s
+        found: list[Record] = []
+        before = MAX_ID
+        for path in newest_first(self.path):
+            with snapshot(path) as db:
+                found += [_record(row) for row in db.execute(sql, (before, *kinds, limit - len(found)))]
+                before = min(before, _first_id(db) or MAX_ID)
+            if len(found) == limit:
+                break
+        return found[::-1]
 
     def verify(self) -> int:
-        """Walk the whole chain; returns the number of rows.
+        """Walk the whole chain, as far back as it is kept; returns the number of rows.
 
         Raises:
             JournalError: a row was changed, removed or inserted; names it.
         """
-        previous, expected_id = FIRST_HASH, 1
-        with self._reader() as db:
-            for row in db.execute("SELECT * FROM journal ORDER BY id"):
-                number, wall_s, mono_s, kind, text, said_previous, said = row
-                real = _hash(previous, wall_s, mono_s, kind, text)
-                if (number, said_previous, said) != (expected_id, previous, real):
-                    raise JournalError(
-                        f"{self.path}: the chain breaks at row {number}",
-                        hint="somebody changed the file; keep it and begin a new one",
-                        row=number,
-                    )
-                previous, expected_id = real, expected_id + 1
-        return expected_id - 1
+        dropped = self.records(kinds=(DROPPED,), limit=1)
+        previous, last_id = (dropped[0].data["hash"], dropped[0].data["id"]) if dropped else (FIRST_HASH, 0)
+        count = 0
+        with snapshot(self.path) as live, ExitStack() as files:  # before the parts are looked up
+            parts = [(path, files.enter_context(snapshot(path))) for path in parts_of(self.path)]
+            for path, db in (*parts, (self.path, live)):
+                for row in db.execute("SELECT * FROM journal WHERE id > ? ORDER BY id", (last_id,)):
+                    number, wall_s, mono_s, kind, text, said_previous, said = row
+                    real = _hash(previous, wall_s, mono_s, kind, text)
+                    if (number, said_previous, said) != (last_id + 1, previous, real):
+                        raise JournalError(
+                            f"{path}: the chain breaks at row {number}",
+                            hint="somebody changed the file; keep it and begin a new one",
+                            row=number,
+                        )
+                    previous, last_id, count = real, number, count + 1
+        return count
 
     def close(self) -> None:
         """Write what waits and close; a second call does nothing."""
@@ -148,10 +163,6 @@ class Journal:
         )
         self._waiting.put(entry)
 
-    def _reader(self) -> contextlib.closing[sqlite3.Connection]:
-        uri = self.path.absolute().as_uri()  # a folder may be called "50% off?"
-        return contextlib.closing(sqlite3.connect(f"{uri}?mode=ro", uri=True))
-
     def _write(self, ready: Future[None]) -> None:
         try:
             db = _opened(self.path)
@@ -163,7 +174,22 @@ class Journal:
         while not is_last:
             group, is_last = self._next_group()
             kept = _commit(db, self.path, [*kept, *group])
+            self._hand_over(db)
         db.close()
+
+    def _hand_over(self, db: sqlite3.Connection) -> None:
+        """Keep the live file small. What goes wrong here loses nothing and is tried again when it has grown further."""
+        size = _size_bytes(db)
+        if size <= self._hand_over_at:
+            return
+        self._hand_over_at = self._part_bytes
+        try:
+            hand_over(db, self.path, part_bytes=self._part_bytes, keep_parts=self._keep_parts)
+        except (sqlite3.Error, OSError) as error:
+            with contextlib.suppress(sqlite3.Error):
+                db.execute("ROLLBACK")
+            self._hand_over_at = size + self._part_bytes // 4
+            log.error("%s has %.0f MB and cannot be divided: %s", self.path, size / 1e6, error)
 
     def _next_group(self) -> tuple[list[_Entry], bool]:
         """All entries that wait now (at least one, unless the journal ends), and whether they are the last."""
@@ -185,6 +211,7 @@ def _opened(path: Path) -> sqlite3.Connection:
     db = sqlite3.connect(path, isolation_level=None)
     db.execute("PRAGMA journal_mode=WAL")
     db.execute("PRAGMA synchronous=FULL")  # NORMAL may lose the newest commits in a power cut
+    db.execute("PRAGMA journal_size_limit=4000000")  # the WAL is cut back after a large group
     db.execute(SCHEMA)
     return db
 
@@ -200,15 +227,8 @@ def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry]) -> list[_En
         return []
     try:
         db.execute("BEGIN IMMEDIATE")
-        newest = _last_hash(db)  # under the lock, for another service may have written since
         for entry in group:
-            digest = _hash(newest, entry.wall_time_s, entry.monotonic_s, entry.kind, entry.text)
-            row = (entry.wall_time_s, entry.monotonic_s, entry.kind, entry.text, newest, digest)
-            db.execute(
-                "INSERT INTO journal (wall_time_s, monotonic_s, kind, data, previous_hash, hash) VALUES (?,?,?,?,?,?)",
-                row,
-            )
-            newest = digest
+            _insert(db, entry)
         db.execute("COMMIT")
     except sqlite3.Error as error:
         with contextlib.suppress(sqlite3.Error):  # a disk that takes no commit may take no rollback; callers are told
@@ -224,6 +244,63 @@ def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry]) -> list[_En
         if entry.done is not None:
             entry.done.set_result(None)
     return []
+
+
+def _insert(db: sqlite3.Connection, entry: _Entry) -> None:
+    newest = _last_hash(db)  # under the lock, for another service may have written since
+    digest = _hash(newest, entry.wall_time_s, entry.monotonic_s, entry.kind, entry.text)
+    row = (None, entry.wall_time_s, entry.monotonic_s, entry.kind, entry.text, newest, digest)
+    db.execute(INSERT_ROW, row)
+
+
+def hand_over(db: sqlite3.Connection, path: Path, *, part_bytes: int, keep_parts: int) -> None:
+    """Move all rows but the newest, which the chain goes on from, to a new part; drop the oldest parts.
+
+    Raises:
+        sqlite3.Error, OSError: it could not be done; every row is still in one place at least.
+    """
+    db.execute("BEGIN IMMEDIATE")
+    if _size_bytes(db) <= part_bytes:  # another service did it meanwhile
+        db.execute("ROLLBACK")
+        return
+    first_id, last_id = db.execute("SELECT MIN(id), MAX(id) - 1 FROM journal").fetchone()
+    if first_id <= last_id:
+        rows = db.execute("SELECT * FROM journal WHERE id <= ? ORDER BY id", (last_id,))
+        write_part(path, rows, first_id=first_id, last_id=last_id)
+        db.execute("DELETE FROM journal WHERE id <= ?", (last_id,))
+    dropped = parts_of(path)[:-keep_parts]
+    if dropped:
+        _insert(db, _dropped(dropped))
+    db.execute("COMMIT")
+    for part in dropped:
+        part.unlink(missing_ok=True)
+
+
+def _dropped(parts: list[Path]) -> _Entry:
+    """The row that says which rows are gone."""
+    with snapshot(parts[-1]) as db:
+        number, digest = db.execute("SELECT id, hash FROM journal ORDER BY id DESC LIMIT 1").fetchone()
+    told = {"id": number, "hash": digest, "files": [part.name for part in parts]}
+    return _Entry(
+        kind=DROPPED,
+        text=json.dumps(told, separators=(",", ":")),
+        wall_time_s=time.time(),
+        monotonic_s=time.monotonic(),
+        done=None,
+    )
+
+
+def _first_id(db: sqlite3.Connection) -> int | None:
+    number: int | None = db.execute("SELECT MIN(id) FROM journal").fetchone()[0]
+    return number
+
+
+def _size_bytes(db: sqlite3.Connection) -> int:
+    """What the rows take; pages that are free do not count."""
+    pages, free, size = (
+        int(db.execute(f"PRAGMA {what}").fetchone()[0]) for what in ("page_count", "freelist_count", "page_size")
+    )
+    return (pages - free) * size
 
 
 def _hash(previous: str, wall_time_s: float, monotonic_s: float, kind: str, text: str) -> str:

@@ -75,6 +75,88 @@ def test_every_change_breaks_the_chain(tmp_path: Path, change: str) -> None:
         journal.verify()
 
 
+SMALL = 60_000  # some hundred rows of `filled`
+
+
+def filled(journal: Journal, numbers: range) -> None:
+    for i in numbers:
+        journal.append("tick", {"i": i, "text": "x" * 500})
+
+
+def files_of(journal: Journal) -> list[str]:
+    return sorted(path.name for path in journal.path.parent.iterdir() if path.suffix == ".sqlite")
+
+
+def test_a_journal_that_grows_is_divided_and_read_and_verified_as_one(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j.sqlite", part_bytes=SMALL, keep_parts=100)
+    filled(journal, range(400))
+    journal.close()
+    assert len(files_of(journal)) >= 4
+    assert max(path.stat().st_size for path in tmp_path.glob("*.sqlite")) < 1.5 * SMALL
+    journal = Journal(tmp_path / "j.sqlite", part_bytes=SMALL, keep_parts=100)
+    filled(journal, range(400, 420))
+    assert [record.data["i"] for record in journal.records()] == list(range(420))
+    assert [record.data["i"] for record in journal.records(kinds=("tick",), limit=250)] == list(range(170, 420))
+    assert [record.id for record in journal.records()] == list(range(1, 421))
+    assert journal.verify() == 420
+    journal.close()
+
+
+def test_the_disk_that_it_takes_is_bounded_and_the_chain_says_what_went(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j.sqlite", part_bytes=SMALL, keep_parts=2)
+    filled(journal, range(600))
+    journal.close()
+    assert len(files_of(journal)) == 3
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) < 4 * SMALL
+    kept = [record.data["i"] for record in journal.records(kinds=("tick",))]
+    assert kept == list(range(kept[0], 600))
+    gone = journal.records(kinds=("journal-dropped",))[-1].data
+    assert journal.records()[0].id == gone["id"] + 1
+    assert journal.verify() == len(journal.records())
+    (tmp_path / files_of(journal)[0]).unlink()
+    with pytest.raises(JournalError, match="chain breaks at row"):
+        journal.verify()
+
+
+def test_two_services_on_one_folder_divide_one_chain(tmp_path: Path) -> None:
+    both = [Journal(tmp_path / "j.sqlite", part_bytes=SMALL, keep_parts=100) for _ in range(2)]
+    for i in range(300):
+        filled(both[i % 2], range(i, i + 1))
+    assert [record.data["i"] for record in both[0].records()] == list(range(300))
+    for journal in both:
+        assert journal.verify() == 300
+        journal.close()
+
+
+def test_who_reads_while_it_is_divided_misses_nothing(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j.sqlite", part_bytes=SMALL, keep_parts=100)
+    filled(journal, range(10))
+    writer = threading.Thread(target=filled, args=(journal, range(10, 500)))
+    writer.start()
+    while writer.is_alive():
+        seen = [record.id for record in journal.records()]
+        assert seen == list(range(1, len(seen) + 1))
+        assert journal.verify() >= len(seen)
+    writer.join()
+    journal.close()
+
+
+def test_rows_that_could_only_be_copied_are_told_once_and_written_on(tmp_path: Path) -> None:
+    """As after a crash between the copy and the deletion."""
+    journal = Journal(tmp_path / "j.sqlite", part_bytes=SMALL, keep_parts=100)
+    with sqlite3.connect(tmp_path / "j.sqlite") as db:
+        db.execute("CREATE TRIGGER full BEFORE DELETE ON journal BEGIN SELECT RAISE(ABORT, 'disk full'); END")
+    filled(journal, range(200))
+    with sqlite3.connect(tmp_path / "j.sqlite") as db:
+        assert db.execute("SELECT COUNT(*) FROM journal").fetchone() == (200,)
+        db.execute("DROP TRIGGER full")
+    assert len(files_of(journal)) > 1
+    filled(journal, range(200, 400))
+    assert [record.data["i"] for record in journal.records()] == list(range(400))
+    assert journal.verify() == 400
+    journal.close()
+
+
 def test_a_folder_may_have_any_name(tmp_path: Path) -> None:
     (folder := tmp_path / "50%25 off? #1").mkdir()
     journal = Journal(folder / "j.sqlite")
@@ -117,7 +199,7 @@ def test_a_failed_commit_reaches_its_caller_and_the_chain_goes_on(tmp_path: Path
 def test_a_killed_writer_loses_nothing_that_it_acknowledged(tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path; from service.journal import Journal\n"
-        f"j = Journal(Path({str(tmp_path / 'j.sqlite')!r}))\n"
+        f"j = Journal(Path({str(tmp_path / 'j.sqlite')!r}), part_bytes=20_000, keep_parts=1000)\n"
         "i = 0\n"
         "while True:\n"
         "    j.append('tick', {'i': i}); print(i, flush=True); i += 1\n"
@@ -131,6 +213,6 @@ def test_a_killed_writer_loses_nothing_that_it_acknowledged(tmp_path: Path) -> N
         writer.wait()
         writer.stdout.close()
         journal = Journal(tmp_path / "j.sqlite")
-        journal.verify()
+        assert journal.verify() == len(journal.records(limit=10**6))
         assert journal.records(limit=1)[-1].data["i"] >= acknowledged
         journal.close()

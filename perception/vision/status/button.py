@@ -7,14 +7,17 @@ import numpy as np
 from hal.panel import Button, Mushroom
 from perception.vision.patch import Patch
 from perception.vision.reading import Status, gated, refused
-from perception.vision.status.press import cap_height, one_sided_shade, sheen
+from perception.vision.status.press import cap_height
+from perception.vision.status.shade import cap_shades
 
-SHADE_HALF, SHADE_SCALE = 0.06, 0.015  # a flush cap stays below 0.05, one that stands out reaches 0.1
+SHADE_HALF, SHADE_SCALE = (
+    0.06,
+    0.02,
+)  # .95 of 179 flush caps on drawn hard panels stay below 0.062, half of the others exceed 0.068
+SPOT_HALF, SPOT_SCALES = 0.065, (0.02, 0.012)  # .95 of flush caps stay below 0.050, .95 of the others exceed 0.057
+LEAST_SHADE, LEAST_SPOT, MOST = -3.0, -2.5, 6.0  # log odds: a cap may be matt, its shadow may fall on black
 MODEL_SHARE = 0.25
 UNSEEN = "the button cannot be seen (glare, shadow or cover): change the angle or the light"
-LEAST_SHADE = 0.04  # a fainter one has no side
-MOST_SHEEN = 4.0  # log odds
-SHEEN_HALF, SHEEN_SCALE = 0.08, 0.03
 
 
 def read_button(patch: Patch, spec: Button) -> Status:
@@ -53,9 +56,13 @@ def _by_height(patch: Patch, spec: Button | Mushroom) -> float | None:
     return float((cap.height_m - (high - depth / 2)) * depth / sigma_m**2)
 
 
-def _by_shade(patch: Patch, radius_m: float) -> float:
-    """Log odds of `released` from a shadow on one side and a sheen on the other."""
-    shade, towards_rad = one_sided_shade(patch, radius_m=radius_m, ring=(0.90, 1.05), outside=(1.12, 1.3))
-    # A faint shade does not say where the light is: its side is that of the noise, or of a middle that is a little off.
-    shine = sheen(patch, radius_m=radius_m, towards_rad=towards_rad if shade >= LEAST_SHADE else None)
-    return (shade - SHADE_HALF) / SHADE_SCALE + float(np.clip((shine - SHEEN_HALF) / SHEEN_SCALE, -2.0, MOST_SHEEN))
+def _by_shade(patch: Patch, radius_m: float) -> float | None:
+    """Log odds of `released` from a shadow on one side and a spot of shine; None when neither can be seen."""
+    seen = cap_shades(patch, radius_m)
+    odds = []
+    if np.isfinite(seen.shade):
+        odds.append(float(np.clip((seen.shade - SHADE_HALF) / SHADE_SCALE, LEAST_SHADE, MOST)))
+    if np.isfinite(seen.spot):
+        scale = SPOT_SCALES[seen.spot > SPOT_HALF]
+        odds.append(float(np.clip((seen.spot - SPOT_HALF) / scale, LEAST_SPOT, MOST)))
+    return sum(odds) if odds else None

@@ -1,14 +1,12 @@
-"""How far out a round cap stands: by parallax where the camera knows heights, and by the shadow or side it shows.
+"""How far out a round cap stands, by parallax: needs a camera that knows heights (without: `shade`).
 
 A cap at height z looks larger by z over the camera's distance and shifted by the parallax; its edge measures both.
-A cap that stands out also casts a shadow, or shows its side, on one side only: the ring around it is uneven.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -135,38 +133,3 @@ def _edges(
     steps = np.abs(np.diff(values, axis=1)).sum(axis=1)
     width = steps / np.maximum(strength, 1e-6) / patch.px_per_m * patch.image_px_per_m
     return expected_m + reach_m * t[best], found, float(np.median(width[found])) if found.any() else np.inf
-
-
-def one_sided_shade(
-    patch: Patch, *, radius_m: float, ring: tuple[float, float], outside: tuple[float, float]
-) -> tuple[float, float]:
-    """First harmonic of the brightness around a cap over its surroundings; direction of its bright side (rad).
-
-    `ring` and `outside` are shares of `radius_m`; the harmonic outside (a glare's gradient) is taken off.
-    """
-    a = np.linspace(0, 2 * np.pi, 72, endpoint=False)
-    inner, outer = (_around(patch, radius_m * np.linspace(*part, 4), a) for part in (ring, outside))
-    level = max(float(np.median(outer)), 8.0)
-    wave = np.exp(1j * a)
-    harmonic = 2 * (inner * wave).mean() / level - 2 * (np.clip(outer, 0.6 * level, None) * wave).mean() / level
-    return float(abs(harmonic)), float(np.angle(harmonic))
-
-
-def sheen(patch: Patch, *, radius_m: float, towards_rad: float | None) -> float:
-    """Brightest spot of a cap's face over the face's median, relative to the plate, if it lies on the side of the light.
-
-    Negative when the brightest spot lies on another side; `towards_rad` None: the side of the light is not known.
-    """
-    a = np.linspace(0, 2 * np.pi, 48, endpoint=False)
-    r = radius_m * np.linspace(0.1, 0.62, 7)
-    face = patch.sample(np.outer(r, np.sin(a)), np.outer(r, np.cos(a)))
-    level = max(float(np.median(_around(patch, radius_m * np.array([1.2, 1.3]), a))), 8.0)
-    smooth = cv2.blur(np.concatenate([face, face, face], axis=1), (7, 3))[:, len(a) : 2 * len(a)]
-    k = int(smooth.argmax()) % len(a)
-    height = float(smooth.max() - np.median(face)) / level
-    return height if towards_rad is None else height * float(np.cos(a[k] - towards_rad))
-
-
-def _around(patch: Patch, radii_m: Array, angles: Array) -> Array:
-    values = patch.sample(np.outer(radii_m, np.sin(angles)), np.outer(radii_m, np.cos(angles)))
-    return np.asarray(values.mean(axis=0), float)

@@ -57,3 +57,54 @@ def test_a_latched_cap_is_less_deep_than_one_that_is_held() -> None:
     assert BUTTON.pressed_depth_m == LATCHED_SHARE * BUTTON.travel_m
     stop = Mushroom(kind="mushroom", name="stop", position_m=(0.0, 0.0))
     assert stop.pressed_depth_m == LATCHED_SHARE * stop.travel_m
+
+
+def seen_straight(*, is_released: bool, cable_at_m: float | None = None, glare_at_m: float | None = None) -> Patch:
+    """A dark cap in a black ring and a bright collar, without heights; beside it a cable or a glare, at so much to the right."""
+    half = (SIZE - 1) / 2
+    picture = np.full((SIZE, SIZE), 140.0, np.float32)
+
+    def disc(x_m: float, y_m: float, radius_m: float, gray: float) -> None:
+        u, v = (round(16 * (half + k * PX_PER_M)) for k in (x_m, y_m))
+        cv2.circle(picture, (u, v), round(16 * radius_m * PX_PER_M), gray, -1, cv2.LINE_AA, 4)
+
+    R = BUTTON.radius_m
+    disc(0.0, 0.0, R, 165.0)
+    disc(0.0, 0.0, 0.85 * R, 35.0)
+    if is_released:
+        disc(0.1 * R, 0.12 * R, 0.82 * R, 30.0)
+        disc(0.0, 0.0, 0.77 * R, 70.0)
+        disc(-0.2 * R, -0.22 * R, 0.26 * R, 130.0)
+    else:
+        disc(0.0, 0.0, 0.75 * R, 60.0)
+    if glare_at_m is not None:
+        v, u = np.mgrid[:SIZE, :SIZE]
+        away = np.hypot(u - half - glare_at_m * PX_PER_M, v - half) / PX_PER_M
+        picture = 255 * ((picture / 255) ** 2.2 + np.exp(-0.5 * (away / 0.012) ** 2)) ** (1 / 2.2)
+    if cable_at_m is not None:
+        u = half + cable_at_m * PX_PER_M
+        ends = ((round(16 * (u - 12)), 0), (round(16 * (u + 12)), 16 * SIZE))
+        cv2.line(picture, *ends, 50.0, round(0.004 * PX_PER_M), cv2.LINE_AA, 4)
+    rough = np.random.default_rng(0).normal(0.0, 2.0, picture.shape)
+    gray = np.clip(np.round(cv2.GaussianBlur(picture, (0, 0), 1.5) + rough), 0, 255).astype(np.uint8)
+    return Patch(
+        gray=gray, colour=None, inside=np.ones(gray.shape, bool), px_per_m=PX_PER_M, image_px_per_m=PX_PER_M / 1.5,
+        origin_px=np.array([half, half]), parallax_px_per_m=np.zeros(2), growth_per_m=0.0, plane_z_m=0.0,
+    )  # fmt: skip
+
+
+def test_a_cap_seen_straight_on_shows_its_shadow_and_its_shine() -> None:
+    assert read_button(seen_straight(is_released=True), BUTTON).state == "released"
+    assert read_button(seen_straight(is_released=False), BUTTON).state == "pressed"
+
+
+@pytest.mark.parametrize("cable_at_m", [-0.014, -0.0115, 0.0115, 0.014])
+@pytest.mark.parametrize("is_released", [False, True])
+def test_a_cable_beside_a_cap_is_not_its_shadow(is_released: bool, cable_at_m: float) -> None:
+    truth = "released" if is_released else "pressed"
+    assert read_button(seen_straight(is_released=is_released, cable_at_m=cable_at_m), BUTTON).state in (truth, None)
+
+
+@pytest.mark.parametrize("glare_at_m", [-0.025, 0.02, 0.025])
+def test_a_glare_beside_a_flush_cap_is_not_its_shine(glare_at_m: float) -> None:
+    assert read_button(seen_straight(is_released=False, glare_at_m=glare_at_m), BUTTON).state in ("pressed", None)

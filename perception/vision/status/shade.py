@@ -1,0 +1,122 @@
+"""What a round cap that stands out shows from straight ahead: its shadow or side on one side, and a spot of shine on its face.
+
+Both are looked for round the cap by angle and radius. What something lies across, what is saturated and what is outside of the
+image says nothing; the light's own slope over face and plate is taken off first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.vision.image import WHITE_LEVEL
+from perception.vision.patch import Patch, sample_at
+from perception.vision.status.band import cables_across
+from perception.vision.view import Array
+
+ANGLES = np.linspace(0, 2 * np.pi, 72, endpoint=False)
+WAVES = np.column_stack([np.ones(len(ANGLES)), np.cos(ANGLES), np.sin(ANGLES)])
+FACE, RIM, RING, PLATE = (0.10, 0.62), (0.46, 0.62), (0.86, 1.06), (1.12, 1.32)  # of the cap's radius
+FACE_RADII = np.linspace(*FACE, 11)
+SPOT_TO = 0.46  # of the radius: a glare from beside the cap is brightest further out
+CLEAR_OF_RING = 1.4  # of the radius: what crosses a circle of that size is no part of the button
+BLUR_PX = 2.0  # of what lies across, beyond its mask
+LEAST_RING, LEAST_FACE = 0.4, 0.5  # share that must be known
+ODD_SIGMAS, ODD_SHARE = 4.0, 0.12  # the plate beside a cap is even but for what lies across it: noise, and of its gray
+HEADROOM = 25.0  # gray levels above a face, without which no shine shows
+ROUNDS = 4
+BLOB = (9, 3)  # angles and radii that a spot fills
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shades:
+    """Of a cap, over the gray of the plate round it; NaN where too little can be seen.
+
+    Attributes:
+        shade: first harmonic of the ring round the cap, beyond what face and plate have of it.
+        spot: how far the brightest spot of the face stands out from the face's smooth light.
+    """
+
+    shade: float
+    spot: float
+
+
+def cap_shades(patch: Patch, radius_m: float) -> Shades:
+    """Shadow and shine of a round cap of that radius about the patch's middle."""
+    hidden = cables_across(patch, radius_m=CLEAR_OF_RING * radius_m, own_rad=np.empty(0))
+    lost = ~patch.inside | (patch.gray >= WHITE_LEVEL)
+    if hidden is not None:
+        size = round(2 * BLUR_PX) + 1
+        lost |= cv2.dilate(hidden.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+        u, v = patch.pixel_of(*(radius_m * np.outer(FACE_RADII, wave) for wave in (np.sin(ANGLES), np.cos(ANGLES))))
+        if float(sample_at(hidden.astype(np.uint8), u, v).mean()) > 1.0 - LEAST_FACE:
+            return Shades(shade=np.nan, spot=np.nan)
+    unknown = np.asarray(lost, np.uint8)
+    ring, no_ring = _mean_round(patch, unknown, radius_m * np.linspace(*RING, 5))
+    plate, no_plate = _mean_round(patch, unknown, radius_m * np.linspace(*PLATE, 5))
+    rim, no_rim = _mean_round(patch, unknown, radius_m * np.linspace(*RIM, 4))
+    level = max(float(np.median(plate[~no_plate] if not no_plate.all() else plate)), 8.0)
+    spot = _spot(patch, unknown, radius_m) / level
+    if no_plate.mean() > 1.0 - LEAST_RING:
+        return Shades(shade=np.nan, spot=spot)
+    around = _wave(plate, ~no_plate)
+    off = WAVES @ around - plate
+    noise = max(1.4826 * float(np.median(np.abs(off[~no_plate]))), 1.0)
+    odd = no_plate | no_ring | (off > max(ODD_SIGMAS * noise, ODD_SHARE * level))
+    odd = odd | np.roll(odd, 1) | np.roll(odd, -1)
+    if odd.mean() > 1.0 - LEAST_RING:
+        return Shades(shade=np.nan, spot=spot)
+    within = around if no_rim.mean() > LEAST_FACE else _wave(rim, ~no_rim)
+    harmonic = (_wave(ring, ~odd) - (around + within) / 2)[1:]
+    return Shades(shade=float(np.linalg.norm(harmonic)) / level, spot=spot)
+
+
+def _spot(patch: Patch, unknown: NDArray[np.uint8], radius_m: float) -> float:
+    """How far the face's brightest spot stands out from a light that changes smoothly over the face, gray levels."""
+    x, y = np.outer(FACE_RADII, np.sin(ANGLES)), np.outer(FACE_RADII, np.cos(ANGLES))
+    u, v = patch.pixel_of(radius_m * x, radius_m * y)
+    gray = np.asarray(sample_at(patch.gray, u, v), float)
+    known = sample_at(unknown, u, v) < 0.5
+    if known.mean() < LEAST_FACE:
+        return np.nan
+    form = np.stack([np.ones_like(x), x, y, x**2 + y**2], axis=-1).reshape(-1, 4)
+    area = (known * FACE_RADII[:, None]).ravel()
+    weight, off = area, np.zeros_like(gray)
+    for _ in range(ROUNDS):
+        weighted = form * weight[:, None]
+        smooth = form @ np.linalg.solve(weighted.T @ form + 1e-9 * np.eye(4), weighted.T @ gray.ravel())
+        off = gray - smooth.reshape(gray.shape)
+        scale = max(1.4826 * float(np.median(np.abs(off[known]))), 1.0)
+        weight = area / (1.0 + (off.ravel() / (2 * scale)) ** 2)
+    turns = np.concatenate([np.stack([off * known, known.astype(float)])] * 3, axis=2)
+    total, count = (cv2.blur(part, BLOB)[:, len(ANGLES) : 2 * len(ANGLES)] for part in turns)
+    mean = np.where(count > 0.6, total / np.maximum(count, 0.1), -np.inf)
+    inner = FACE_RADII <= SPOT_TO
+    row, turn = np.unravel_index(int(mean[inner].argmax()), mean[inner].shape)
+    beyond = mean[-2:, (int(turn) + np.arange(-3, 4)) % len(ANGLES)]
+    beyond = beyond[np.isfinite(beyond)]
+    found = float(mean[row, turn]) - max(float(beyond.mean()) if len(beyond) else 0.0, 0.0)
+    is_blind = WHITE_LEVEL - float(np.median(gray[known])) < HEADROOM
+    return np.nan if is_blind or not np.isfinite(found) else found
+
+
+def _mean_round(patch: Patch, unknown: NDArray[np.uint8], radii_m: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """(angles,) mean gray over some radii, and where most of them are not known."""
+    u, v = patch.pixel_of(np.outer(radii_m, np.sin(ANGLES)), np.outer(radii_m, np.cos(ANGLES)))
+    return np.asarray(sample_at(patch.gray, u, v).mean(axis=0), float), sample_at(unknown, u, v).mean(axis=0) > 0.4
+
+
+def _wave(values: Array, known: NDArray[np.bool_]) -> Array:
+    """(3,) mean, cosine and sine of what is known of values round the cap, by reweighted least squares."""
+    base, y = WAVES[known], values[known]
+    weight, found = np.ones(len(y)), np.zeros(3)
+    for _ in range(ROUNDS):
+        weighted = base * weight[:, None]
+        found = np.linalg.solve(weighted.T @ base + 1e-9 * np.eye(3), weighted.T @ y)
+        off = y - base @ found
+        scale = max(1.4826 * float(np.median(np.abs(off))), 1.0)
+        weight = 1.0 / (1.0 + (off / (2 * scale)) ** 2)
+    return np.asarray(found)

@@ -18,7 +18,7 @@ from perception.vision.finding.shapes import find_edges
 from perception.vision.image import WHITE_LEVEL, Image, as_gray
 from perception.vision.patch import Patch
 from perception.vision.reading import Status, gated, limited, refused
-from perception.vision.status.gauge import pointer_confidence, status_of_pointer
+from perception.vision.status.gauge import RIVAL, SIGMA_RAD, pointer_confidence, status_of_pointer
 from perception.vision.status.pointer import PointerFit, find_pointer, unroll, wrapped
 
 SIDE_PX = 220
@@ -57,7 +57,11 @@ def read_dial(
     if circular:
         value = minimum + (fit.angle_rad % (2 * np.pi)) / (2 * np.pi) * (maximum - minimum)
         sigma = fit.sigma_rad / (2 * np.pi) * (maximum - minimum)
-        status = Status(value=float(value), uncertainty=float(sigma), confidence=pointer_confidence(fit, 1.0))
+        status = Status(
+            value=float(value),
+            uncertainty=float(sigma),
+            confidence=pointer_confidence(fit, 1.0, rival=RIVAL, sigma_rad=SIGMA_RAD),
+        )
     else:
         low, high = ends_rad or (-SCALE_END_RAD, SCALE_END_RAD)
         scale = Scale(minimum=minimum, maximum=maximum, unit="", at_min=low, at_max=high)

@@ -14,9 +14,13 @@ POINTER_FROM, POINTER_TO = 0.25, 0.60  # share of the radius over which every ga
 FINE_TO = 0.72
 STOP_RAD = np.deg2rad(6.0)  # a pointer rests that far beyond its scale at most
 LEAST_SEEN = 0.25  # share of a face
-MOST_SIGMA_RAD = (
-    0.03  # of 560 pointers on drawn hard panels read right, none is above 0.018; of two above, none is right
-)
+MOST_SIGMA_RAD = 0.03
+#: Of the score of a pointer that its best rival has, half and scale; numerals stand where a gauge's pointer is looked for.
+RIVAL = (
+    0.50,
+    0.03,
+)  # of 330 pointers on drawn panels read right .98 have less than 0.45; half of those read wrong have more than 0.6
+SIGMA_RAD = (0.026, 0.003)  # .99 of them have less than 0.026
 LEAST_SHOWN = 0.52  # of the pointer's radii: beside a cable, a numeral alone would have as much
 
 
@@ -44,8 +48,14 @@ def no_pointer(seen: float, unit: str) -> Status:
     return refused("no pointer stands out on the face: come closer or add light", unit=unit)
 
 
-def status_of_pointer(fit: PointerFit, scale: Scale, seen: float) -> Status:
-    """Value and confidence of a pointer on a scale, or the refusal of a pointer that is off the scale."""
+def status_of_pointer(
+    fit: PointerFit, scale: Scale, seen: float, *, rival: tuple[float, float] = RIVAL, sigma_rad: tuple[float, float] = SIGMA_RAD
+) -> Status:  # fmt: skip
+    """Value and confidence of a pointer on a scale, or the refusal of a pointer that is off the scale.
+
+    Args:
+        rival, sigma_rad: see `pointer_confidence`.
+    """
     lo, hi = sorted((scale.at_min, scale.at_max))
     middle = (lo + hi) / 2
     place = middle + float(wrapped(np.array(fit.angle_rad - middle)))
@@ -66,20 +76,27 @@ def status_of_pointer(fit: PointerFit, scale: Scale, seen: float) -> Status:
             value=float(value),
             unit=scale.unit,
             uncertainty=float(slope * fit.sigma_rad),
-            confidence=pointer_confidence(fit, seen),
+            confidence=pointer_confidence(fit, seen, rival=rival, sigma_rad=sigma_rad),
         )
     )
 
 
-def pointer_confidence(fit: PointerFit, seen: float) -> float:
-    """Confidence of a pointer from contrast, rival, support and visibility.
+def pointer_confidence(
+    fit: PointerFit, seen: float, *, rival: tuple[float, float], sigma_rad: tuple[float, float]
+) -> float:
+    """Confidence of a pointer from contrast, rival, support, straightness and visibility.
 
     A dark pointer shows on a saturated face as well: what saturation hides is missing from its support.
+
+    Args:
+        rival: share of the score that its best rival has: where half of the readings are wrong, and how soon that changes.
+        sigma_rad: the same of one sigma of its direction: what is no pointer is not straight.
     """
     return probability(
         [
-            (np.log(fit.strength), np.log(9.0), 0.15),
-            (0.55 - fit.rival_ratio, 0.0, 0.03),
+            (np.log(fit.strength), np.log(11.0), 0.15),
+            (rival[0] - fit.rival_ratio, 0.0, rival[1]),
+            (sigma_rad[0] - fit.sigma_rad, 0.0, sigma_rad[1]),
             (fit.supported, 0.72, 0.03),
             (fit.shown, LEAST_SHOWN, 0.02),
             (1.0 if fit.is_dark else seen, 0.35, 0.08),

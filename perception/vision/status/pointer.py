@@ -107,7 +107,7 @@ def find_pointer(
     offset = wrapped(angles - fit.angle_rad) if limits_rad is None else angles - fit.angle_rad
     fine = (radii >= fine_m[0]) & (radii <= fine_m[1])
     e_sigma = prior_pivot_px / patch.image_px_per_m
-    angle, variance = pointer_axis(ink[fine], radii[fine], offset, REFINE_RAD, e_sigma, patch.px_per_m)
+    angle, variance = pointer_axis(ink[fine], hidden[fine], radii[fine], offset, REFINE_RAD, e_sigma, patch.px_per_m)
     if np.isnan(angle):
         return replace(fit, sigma_rad=ROUGH_SIGMA_RAD)
     return replace(fit, angle_rad=fit.angle_rad + angle, sigma_rad=float(np.sqrt(CORRELATED * variance)))

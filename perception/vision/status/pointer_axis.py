@@ -13,19 +13,21 @@ HALF_LEVEL = 0.3  # of a row's strongest ink: less is the pointer's blur
 OWN_WIDTH = (35.0, 0.6)  # percentile of the rows' widths; what is looked at to either side of the axis, over it
 ROUNDS, WEIGHINGS = 3, 5
 LEAST_ROWS = 3
+BESIDE = 2  # columns: what is blurred by what is hidden
 PIVOTS_AT_MOST = 2.0  # weight of a row over the typical one's
 
 
 @njit(cache=True)
 def row_centres(
-    ink: NDArray[np.float32], offset: Array, middle: Array, half: Array
+    ink: NDArray[np.float32], hidden: NDArray[np.bool_], offset: Array, middle: Array, half: Array
 ) -> tuple[Array, Array, Array]:  # pragma: no cover
     """(rows,) centre of the ink (rad), its mass and its width (rad), within `half` of `middle` in every row.
 
-    A pointer is of one gray: rows where something stands out much more belong to a numeral or a tick beside it.
+    A pointer is of one gray: rows where something stands out much more belong to a numeral or a tick beside it. Where ink
+    goes on under what lies across, its centre is not the pointer's.
 
     Args:
-        ink: (rows, angles); offset: (angles,) rad.
+        ink, hidden: (rows, angles); offset: (angles,) rad.
         middle, half: (rows,) rad.
     """
     rows, columns = ink.shape
@@ -38,7 +40,7 @@ def row_centres(
     step = abs(offset[1] - offset[0])
     centre, mass, width = np.zeros(rows), np.zeros(rows), np.zeros(rows)
     for i in range(rows):
-        if top[i] <= 0.0 or top[i] > most:
+        if top[i] <= 0.0 or top[i] > most or _goes_under(ink[i], hidden[i], offset, middle[i], half[i], top[i]):
             continue
         moment = 0.0
         for j in range(columns):
@@ -49,6 +51,20 @@ def row_centres(
         centre[i] = moment / mass[i]
         width[i] = mass[i] * step / ((1.0 - HALF_LEVEL) * top[i])
     return centre, mass, width
+
+
+@njit(cache=True)
+def _goes_under(
+    ink: NDArray[np.float32], hidden: NDArray[np.bool_], offset: Array, middle: float, half: float, top: float
+) -> bool:  # pragma: no cover
+    """Whether the ink of a row that counts has something hidden beside it."""
+    columns = len(ink)
+    for j in range(columns):
+        if abs(offset[j] - middle) < half and ink[j] > HALF_LEVEL * top:
+            for k in range(max(0, j - BESIDE), min(columns, j + BESIDE + 1)):
+                if hidden[k]:
+                    return True
+    return False
 
 
 @njit(cache=True)
@@ -77,21 +93,27 @@ def fitted_line(
 
 @njit(cache=True)
 def pointer_axis(
-    ink: NDArray[np.float32], r: Array, offset: Array, reach_rad: float, e_sigma: float, px_per_m: float
+    ink: NDArray[np.float32],
+    hidden: NDArray[np.bool_],
+    r: Array,
+    offset: Array,
+    reach_rad: float,
+    e_sigma: float,
+    px_per_m: float,
 ) -> tuple[float, float]:  # pragma: no cover
     """Angle (rad, as `offset`) of the pointer near offset 0 and its variance; NaN where too few rows have ink.
 
     What touches the pointer (a numeral, a tick) widens some rows: each round looks within the pointer's own width only.
 
     Args:
-        ink: (rows, angles); r: (rows,) m; offset: (angles,) rad from the rough pointer.
+        ink, hidden: (rows, angles); r: (rows,) m; offset: (angles,) rad from the rough pointer.
         reach_rad: to either side that the first round looks.
         e_sigma: one sigma of the pivot's offset, m.
     """
     middle, half = np.zeros(len(r)), np.full(len(r), reach_rad)
     theta0, variance = np.nan, np.nan
     for _ in range(ROUNDS):
-        theta, mass, width = row_centres(ink, offset, middle, half)
+        theta, mass, width = row_centres(ink, hidden, offset, middle, half)
         there = mass > 0
         if there.sum() < LEAST_ROWS:
             return np.nan, np.nan

@@ -21,6 +21,7 @@ from perception.vision.status.comb import Comb
 from perception.vision.status.gauge import read_gauge, status_of_pointer
 from perception.vision.status.lamp import read_lamp
 from perception.vision.status.lever import read_lever
+from perception.vision.status.panel_meter import RIVAL, SIGMA_RAD
 from perception.vision.status.pointer import PointerFit
 from perception.vision.status.slider import read_slider
 from perception.vision.status.stray import stray_ink
@@ -112,6 +113,16 @@ def test_a_pointer_of_an_uncertain_direction_is_refused() -> None:
     assert status_of_pointer(replace(fit, sigma_rad=0.01), SCALE, 1.0).answered
     told = status_of_pointer(fit, SCALE, 1.0)
     assert not told.answered and "0.09 rad" in (told.reason or "")
+
+
+def test_a_rival_where_nothing_else_should_stand_makes_a_pointer_unsure() -> None:
+    """A meter has no numerals where its pointer is looked for; a gauge has."""
+    fit = PointerFit(
+        angle_rad=0.1, sigma_rad=0.005, strength=50.0, contrast=30.0, rival_ratio=0.3, rival_rad=0.5, supported=1.0,
+        shown=1.0, is_dark=True, unknown=0.1,
+    )  # fmt: skip
+    assert status_of_pointer(fit, SCALE, 1.0).confidence > 0.95
+    assert status_of_pointer(fit, SCALE, 1.0, rival=RIVAL, sigma_rad=SIGMA_RAD).confidence < 0.8
 
 
 def slider(cap_middle: int, hose: tuple[int, int] | None) -> NDArray[np.uint8]:

@@ -20,15 +20,15 @@ from hal.errors import CellError
 from hal.panel import PanelObject
 from hal.simulated import ObjectTruth
 from perception.vision.reading import ObjectReading
-from service.cell import CellRuntime
-from service.connection import LocalConnection
 from service.operations.context import CellMemory, OperationContext
 from service.operations.inspect import close_ups, look_past
 from service.operations.judge import agrees
 from service.operations.locate import go_to_overview, locate
 from service.operations.session import Session
-from service.task_model import Task
-from service.tasks import TaskContext
+from service.processes.cell import CellRuntime
+from service.processes.connection import LocalConnection
+from service.tasks.model import Task
+from service.tasks.store import TaskContext
 
 BENCH = Path(__file__).resolve().parents[1] / "cells" / "bench.toml"
 FIRST, COUNT = 1000, 10

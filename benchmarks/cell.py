@@ -22,8 +22,8 @@ from rich.table import Table
 
 from hal.config import load_cell
 from hal.motion import Hold
-from service.cell import CellRuntime
 from service.client import Client
+from service.processes.cell import CellRuntime
 from service.serve import Options, Panelwright
 
 ROOT = Path(__file__).resolve().parents[1]

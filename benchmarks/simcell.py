@@ -23,7 +23,7 @@ from manipulation.control import Controller
 from manipulation.skills.outcome import ObjectState
 from manipulation.timing import SpeedLimits
 from manipulation.workcell import Workcell
-from service.motion import controller_of, flange_from
+from service.processes.motion import controller_of, flange_from
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -16,16 +16,16 @@ from pydantic import BaseModel
 
 from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceUnavailable, InvalidRequest, LeaseError, Stopped
-from service.calibrations import Calibrations
+from service.commissioning.preflight import check_wires
 from service.errors import NotPossibleNow
-from service.gate import GatedConnection
-from service.journal import Journal
-from service.lease import LeaseDesk
+from service.memory.calibrations import Calibrations
 from service.operations.context import CellMemory, Operation, OperationContext
-from service.preflight import check_wires
-from service.supervisor import Supervisor
-from service.task_model import Artefact, Task, TaskState
-from service.tasks import TaskContext, TaskStore
+from service.processes.supervisor import Supervisor
+from service.tasks.gate import GatedConnection
+from service.tasks.journal import Journal
+from service.tasks.lease import LeaseDesk
+from service.tasks.model import Artefact, Task, TaskState
+from service.tasks.store import TaskContext, TaskStore
 
 RESTORED_TASKS = 100
 LOOK_S = 0.05
@@ -136,7 +136,7 @@ class Service:
             raise
 
     def swap_device(self, name: str, section: DeviceSection) -> None:
-        """Another driver or other options for a device, until the service ends; see `service.seats.Swapper`.
+        """Another driver or other options for a device, until the service ends; see `service.processes.seats.Swapper`.
 
         Raises:
             DeviceUnavailable: the cell is not up.

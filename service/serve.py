@@ -20,7 +20,7 @@ from hal.errors import CellError
 from hal.garbage import set_aside
 from service.core import Service
 from service.operations.context import Operation
-from service.stop_host import bound_socket
+from service.processes.stop_host import bound_socket
 
 if TYPE_CHECKING:
     from service.http.server import HttpServer

@@ -15,7 +15,7 @@ from benchmarks.drivers.stamps import part_stamps
 from benchmarks.drivers.swap import part_swap
 from benchmarks.drivers.wire import part_decode, part_latency, part_rtu
 from hal.garbage import set_aside
-from service.cell import SWITCH_S
+from service.processes.cell import SWITCH_S
 
 PARTS: dict[str, Callable[[float], None]] = {
     "latency": part_latency,

@@ -8,8 +8,8 @@ from pathlib import Path
 from benchmarks.drivers.report import CLOCK, line
 from hal.clock import Deadline
 from hal.config import load_cell
-from service.cell import CellRuntime
-from service.connection import PREFIX, SWAPPER
+from service.processes.cell import CellRuntime
+from service.processes.connection import PREFIX, SWAPPER
 
 CELL = Path(__file__).parents[2] / "cells/wire-ur.toml"
 ROUNDS = 3

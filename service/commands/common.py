@@ -65,7 +65,7 @@ def read_cell(path: Path, seed: int | None) -> Cell:
         ConfigError: file, panel, calibration or machine is not in order.
     """
     from hal.config import load_cell
-    from service.preflight import check_machine
+    from service.commissioning.preflight import check_machine
 
     cell = load_cell(find_cell(path), seed=seed)
     check_machine(cell)

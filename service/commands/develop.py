@@ -38,7 +38,7 @@ def conform(
     seed: SeedOption = None,
 ) -> None:
     """Try the promises of every device kind on the devices of a cell, and write a report (Markdown and JSON)."""
-    from service.conform import run
+    from service.commissioning.conform import run
 
     loaded = read_cell(cell, seed)
     for name in device or ():
@@ -67,7 +67,7 @@ def emulate(
 ) -> None:
     """Start the far side of a device's wire and say how to reach it, until Ctrl-C."""
     from hal.registry import Shared
-    from service.cell import clock_for, start_emulators
+    from service.processes.cell import clock_for, start_emulators
 
     shipped = sorted((ROOT / "cells").glob("wire-*.toml")) if world else [Path("cells/mixed.toml")]
     loaded, device = find_emulator(name, [cell] if cell is not None else shipped)
@@ -131,7 +131,7 @@ def new_driver(
     ] = None,
 ) -> None:
     """Write a driver that runs as it is: options, emulator, conformance test, page; then change what the manual says."""
-    from service.new_driver import parse_kind, write_driver
+    from service.commissioning.new_driver import parse_kind, write_driver
 
     kind, name = parse_kind(what)
     written = write_driver(kind, name, transport=transport, folder=folder, package=package)

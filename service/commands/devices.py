@@ -21,7 +21,7 @@ from service.commands.common import Url, UrlDefault, client_of, console, find_ce
 from service.commands.leaving import one_interrupt
 
 if TYPE_CHECKING:
-    from service.watching import Row
+    from service.commissioning.watching import Row
 
 app = typer.Typer(help="Look at devices, read, record and replay them.", invoke_without_command=True)
 err_console = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -96,7 +96,7 @@ def _form_of(save: Path) -> str:
 def _read_directly(cell: Path, name: str, *, samples: int, jsonl: bool, timeout_s: float) -> None:
     """Print samples and errors of one device; exit code 1 when there was no sample at all."""
     from hal.config import load_cell
-    from service.direct_read import as_line, read_lines
+    from service.commissioning.direct_read import as_line, read_lines
 
     good = 0
     for item in read_lines(load_cell(find_cell(cell)), name, samples=samples, timeout_s=timeout_s):
@@ -123,7 +123,7 @@ def record_device(
 ) -> None:
     """Write down all that a device and its driver say to each other."""
     from hal.config import load_cell
-    from service.recording import record
+    from service.commissioning.recording import record
 
     tally = Tally(jsonl=jsonl)
     err_console.print(f"recording {name} for {seconds:g} s; Ctrl-C ends it earlier")
@@ -144,7 +144,7 @@ def replay_device(
     timeout_s: TimeoutOption = 0.5,
 ) -> None:
     """Let the recorded device's driver read a recording in the place of the wire, at its pace."""
-    from service.recording import replay
+    from service.commissioning.recording import replay
 
     tally = Tally(jsonl=jsonl)
     err_console.print(f"replaying {recording} at the pace of the recording")
@@ -179,7 +179,7 @@ class Tally:
 
 
 def _write(item: dict[str, Any]) -> None:
-    from service.direct_read import as_line
+    from service.commissioning.direct_read import as_line
 
     sys.stdout.write(as_line(item))
     sys.stdout.flush()
@@ -196,7 +196,7 @@ def watch_devices(
     count: Annotated[int, typer.Option(min=0, help="Looks until the end; 0: until Ctrl-C.")] = 0,
 ) -> None:
     """Values, rates, ages and error counters of all devices, again and again."""
-    from service.watching import Watch
+    from service.commissioning.watching import Watch
 
     watch, looks = Watch(client_of(url), with_pictures=pictures), 0
     with Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext() as live:

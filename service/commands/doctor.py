@@ -15,7 +15,7 @@ def doctor(
     connect: Annotated[bool, typer.Option(help="Also start the cell and time its devices.")] = True,
 ) -> None:
     """Check Python, packages, ports, the cell file and its devices; exit code 1 when something is wrong."""
-    from service.doctor import examine
+    from service.commissioning.doctor import examine
 
     if not examine(cell, port, connect=connect):
         raise typer.Exit(1)

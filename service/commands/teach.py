@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from perception.vision.teaching.panel_questions import Question
-    from service.teachings import Teachings
+    from service.memory.teachings import Teachings
 
 MOST_PLATE_M = 10.0
 
@@ -26,7 +26,7 @@ class Terminal:
 
     def ask(self, question: Question) -> str:
         """One line of standard input; the question goes to standard output."""
-        from service.dialogue import NobodyAnswers
+        from service.memory.dialogue import NobodyAnswers
 
         choices = f" [{'/'.join(question.choices)}]" if question.choices else ""
         default = f" ({question.default})" if question.default else ""
@@ -67,7 +67,7 @@ def teach(
     """Teach by clicks (--kind), by a panel file (--from-panel), by questions and answers (alone), or show with --check what is
     found now.
     """
-    from service.teachings import Teachings
+    from service.memory.teachings import Teachings
 
     plate_m = _pair(plate, "--plate")
     if min(plate_m) <= 0 or max(plate_m) > MOST_PLATE_M:
@@ -87,7 +87,7 @@ def teach(
     if from_panel is not None:
         _by_panel(teachings, pixels, from_panel)
         return
-    from service.dialogue import Dialogue
+    from service.memory.dialogue import Dialogue
 
     with patience():
         talk = Dialogue.about(Terminal(), teachings, pixels, plate_m)
@@ -101,7 +101,7 @@ def teach(
 def _by_clicks(
     teachings: Teachings, pixels: NDArray[np.uint8], plate_m: tuple[float, float], *, kind: str, clicks: list[str]
 ) -> None:
-    from service.lessons import teach_kind
+    from service.memory.lessons import teach_kind
 
     clicks_px = tuple(_pair(text, "--click") for text in clicks)
     with patience():
@@ -117,7 +117,7 @@ def _by_panel(teachings: Teachings, pixels: NDArray[np.uint8], panel_file: Path)
     from perception.vision.finding.framing import check_upright, one_plate
     from perception.vision.image import as_gray
     from service.commands.learn import tell
-    from service.lessons import learn_panel
+    from service.memory.lessons import learn_panel
 
     panel, gray = load_panel(panel_file), as_gray(pixels)
     with patience():

@@ -14,7 +14,7 @@ REMINDER_S = 20.0
 
 def warm(cell: CellOption = DEFAULT_CELL) -> None:
     """Compile the hot loops and keep them on disk; `make setup` does this. Takes a minute or two, later seconds."""
-    from service.supervisor import Supervisor
+    from service.processes.supervisor import Supervisor
     from service.warm import STAGES, run_stage
 
     started_s = time.monotonic()

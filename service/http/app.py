@@ -38,7 +38,7 @@ from service.http.problems import Problem, install
 from service.http.query import check_query
 from service.http.readings import ReadingDesk
 from service.http.state import AppState
-from service.lessons import OutlineRequest, TeachRequest
+from service.memory.lessons import OutlineRequest, TeachRequest
 
 WEB = Path(__file__).parents[1] / "web"
 DESCRIPTION = f"""

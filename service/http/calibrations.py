@@ -8,9 +8,9 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Query
 from pydantic import BaseModel, Field
 
-from service.calibrations import Calibrated
 from service.http.problems import RESPONSES
 from service.http.state import AppState, State
+from service.memory.calibrations import Calibrated
 
 router = APIRouter(prefix="/v1/calibrations", tags=["calibrations"], responses=RESPONSES)
 DeviceName = Annotated[str, Path(max_length=64, examples=["wrist_camera"])]

@@ -13,8 +13,8 @@ from service.http.body import body_schema, strict_body
 from service.http.models import GrantView, LeaseRequest, LeaseView, ResetRequest, StopView
 from service.http.problems import RESPONSES
 from service.http.state import AppState, LeaseToken, State
-from service.latch import LatchState
-from service.lease import Grant
+from service.processes.latch import LatchState
+from service.tasks.lease import Grant
 
 router = APIRouter(prefix="/v1", responses=RESPONSES)
 OwnToken = Annotated[str, Header(alias="Lease-Token", max_length=200, description="token from POST /v1/lease")]

@@ -11,7 +11,6 @@ from fastapi import Depends as DependsOn
 from starlette.responses import JSONResponse, Response
 
 from hal.errors import CellError, InvalidRequest, Unsupported
-from service.connection import check_name
 from service.core import Service
 from service.errors import NoSuchDevice
 from service.http.body import body_schema, strict_body
@@ -19,8 +18,9 @@ from service.http.models import DeviceDetail, DeviceList, DeviceView, FaultReque
 from service.http.problems import RESPONSES
 from service.http.readings import as_json
 from service.http.state import AppState, LeaseToken, State
+from service.http.swap_files import with_recordings
 from service.jsonable import jsonable
-from service.swap_files import with_recordings
+from service.processes.connection import check_name
 
 router = APIRouter(prefix="/v1/devices", tags=["devices"], responses=RESPONSES)
 Name = Annotated[str, Path(max_length=64, examples=["wrist_camera"])]

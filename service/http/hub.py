@@ -6,8 +6,8 @@ import asyncio
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from service.task_model import Task
-from service.tasks import TaskStore
+from service.tasks.model import Task
+from service.tasks.store import TaskStore
 
 
 class Hub:

@@ -11,7 +11,7 @@ from hal.devices import DeviceKind
 from hal.simulated import Fault
 from hal.strict import Strict
 from service.jsonable import jsonable
-from service.task_model import Task, TaskEvent, TaskState
+from service.tasks.model import Task, TaskEvent, TaskState
 
 Finite = Annotated[float, Field(ge=-1e9, le=1e9)]
 Holder = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[ -~]+$", examples=["alice@console-2"])]

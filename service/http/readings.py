@@ -15,8 +15,8 @@ from hal.clock import Deadline
 from hal.devices import DeviceKind, Image, RangeImage
 from hal.errors import InvalidRequest
 from hal.readings import Stamped
-from service.connection import CellConnection
 from service.jsonable import jsonable
+from service.processes.connection import CellConnection
 
 READ_TIMEOUT_S = 2.0
 READS: dict[DeviceKind, str] = {

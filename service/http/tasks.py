@@ -16,7 +16,7 @@ from service.http.models import TaskList, TaskView, event_data
 from service.http.problems import RESPONSES
 from service.http.state import LeaseToken, State
 from service.http.verbs import Wait
-from service.task_model import Task, TaskState
+from service.tasks.model import Task, TaskState
 
 router = APIRouter(prefix="/v1/tasks", tags=["tasks"], responses=RESPONSES)
 TaskId = Annotated[str, Path(max_length=64, examples=["3f9c2a7be01d4c55"])]

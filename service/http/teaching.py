@@ -16,8 +16,8 @@ from service.http.body import body_schema, strict_body
 from service.http.images import store_of
 from service.http.problems import RESPONSES
 from service.http.state import AppState, State
-from service.lessons import OutlineRequest, TeachRequest, find_outline, questions_of, teach
-from service.teachings import KnowledgeFile, NoSuchKnowledge, Teachings
+from service.memory.lessons import OutlineRequest, TeachRequest, find_outline, questions_of, teach
+from service.memory.teachings import KnowledgeFile, NoSuchKnowledge, Teachings
 
 router = APIRouter(prefix="/v1/knowledge", tags=["knowledge"], responses=RESPONSES)
 PlainName = Annotated[str, Path(max_length=64, examples=["mushroom"])]

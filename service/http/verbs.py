@@ -14,7 +14,7 @@ from service.http.models import TaskView
 from service.http.problems import MEDIA, RESPONSES
 from service.http.state import IdempotencyKey, LeaseToken, State
 from service.operations.context import Operation
-from service.task_model import Task, TaskState
+from service.tasks.model import Task, TaskState
 
 Wait = Annotated[
     float, Query(ge=0.0, le=30.0, allow_inf_nan=False, description="wait so long for the end before answering")

@@ -15,7 +15,7 @@ from perception.calibration.in_hand import InHandCalibration
 from perception.calibration.records import record_of, renewed
 from perception.calibration.scanner import ScannerCalibration
 from perception.calibration.wrench import WrenchCalibration
-from service.calibrations import Calibrations
+from service.memory.calibrations import Calibrations
 from service.operations.calibrate_sensors import (
     beforehand,
     camera_stations,

@@ -12,8 +12,8 @@ from pydantic import BaseModel
 
 from hal.config import Cell
 from hal.geometry import UncertainPose
-from service.connection import CellConnection
-from service.tasks import TaskContext
+from service.processes.connection import CellConnection
+from service.tasks.store import TaskContext
 
 
 class CellMemory:

@@ -15,7 +15,7 @@ from hal.errors import InvalidRequest, Unsupported
 from hal.geometry import difference
 from hal.panel import Panel, PanelObject
 from hal.simulated import ObjectTruth, Truth
-from service.connection import CellConnection
+from service.processes.connection import CellConnection
 from service.report.write import render, write_json
 
 GAUGE_SHARE = 0.02  # of full scale: a reading further off is wrong

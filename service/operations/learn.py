@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from hal.geometry import compose
-from service.lessons import learn_panel
+from service.memory.lessons import learn_panel
+from service.memory.teachings import Teachings
 from service.operations.eyes import look, settle
 from service.operations.inspect import ensure_located
 from service.operations.locate import go_to_overview
@@ -13,7 +14,6 @@ from service.operations.requests import LearnRequest
 from service.operations.session import Session
 from service.operations.stored import Pixels, panel_of, shown, stored_view
 from service.report.plots import png_of
-from service.teachings import Teachings
 
 if TYPE_CHECKING:
     from hal.panel import Panel

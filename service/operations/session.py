@@ -13,8 +13,8 @@ from hal.frames import frame_tree
 from hal.geometry import UncertainPose, identity
 from hal.motion import Array, DeclaredMotion, MotionOutcome, MotionReport, Mover, RobotState
 from hal.panel import Panel
-from service.connection import CellConnection
 from service.operations.context import CellMemory, OperationContext
+from service.processes.connection import CellConnection
 from service.report.record import MissionRecord
 
 

@@ -14,11 +14,11 @@ from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose
 from hal.panel import Panel
 from perception.vision.reading import ObjectReading
-from service.images import ImageStore
+from service.memory.images import ImageStore
+from service.memory.teachings import Teachings
 from service.operations.requests import InspectRequest, RecogniseRequest, StoredLook
 from service.operations.session import Session, panel_object_or_all
 from service.report.plots import png_of
-from service.teachings import Teachings
 
 if TYPE_CHECKING:
     from perception.vision.view import View

@@ -13,7 +13,7 @@ from drivers.scaffold import new_driver
 from hal.devices import DeviceKind
 from hal.errors import ConfigError
 from service.cli import _app
-from service.new_driver import parse_kind, write_driver
+from service.commissioning.new_driver import parse_kind, write_driver
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "driver-package"

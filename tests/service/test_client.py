@@ -12,8 +12,8 @@ import pytest
 from hal.errors import ConfigError, DeviceUnavailable
 from service.client import Client
 from service.commands.own_cell import run_task
-from service.latch import Latch
-from service.stop_host import InlineStop, bound_socket
+from service.processes.latch import Latch
+from service.processes.stop_host import InlineStop, bound_socket
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 
 from hal.config import load_cell
 from service.core import Service
-from service.task_model import TaskState
+from service.tasks.model import TaskState
 from tests.service.conftest import WriteCell
 from tests.service.verbs import OPERATIONS, EchoRequest, FailRequest, HoldRequest
 from tests.service.waiting import eventually

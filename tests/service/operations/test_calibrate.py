@@ -14,18 +14,18 @@ from hal.calibration import load_calibration
 from hal.config import Cell, load_cell
 from hal.errors import Cancelled
 from hal.geometry import difference
-from service.calibrations import Calibrations
-from service.cell import CellRuntime
-from service.connection import LocalConnection
-from service.gate import GatedConnection
+from service.memory.calibrations import Calibrations
 from service.operations.calibrate import run_calibrations
 from service.operations.context import CellMemory, OperationContext
 from service.operations.eyes import settle
 from service.operations.requests import CalibrationRequest
 from service.operations.session import Session
 from service.operations.travel import kinematics
-from service.task_model import Task
-from service.tasks import TaskContext
+from service.processes.cell import CellRuntime
+from service.processes.connection import LocalConnection
+from service.tasks.gate import GatedConnection
+from service.tasks.model import Task
+from service.tasks.store import TaskContext
 from simbackend.draws import Draws
 
 ROOT = Path(__file__).parents[3]

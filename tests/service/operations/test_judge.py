@@ -12,8 +12,8 @@ from hal.errors import InvalidRequest
 from hal.geometry import perturbed, to_json, transform_rpy
 from hal.panel import load_panel
 from hal.simulated import ObjectTruth, Truth
-from service.connection import CellConnection
 from service.operations.judge import AFTER, agrees, compare, judge
+from service.processes.connection import CellConnection
 
 PANEL = load_panel(Path(__file__).parents[3] / "panels/bench.toml")
 POSE = transform_rpy((0.95, 0.0, 0.55), (1.57, 0.0, -1.57))

@@ -11,15 +11,15 @@ import pytest
 from benchmarks.vision_simulated import judged, without_looks
 from hal.config import Cell, load_cell
 from hal.errors import NotFound
-from service.cell import CellRuntime
-from service.connection import LocalConnection
 from service.operations.context import CellMemory, OperationContext
 from service.operations.learn import run_learn
 from service.operations.recognise import run_recognise
 from service.operations.requests import LearnRequest, RecogniseRequest
 from service.operations.session import Session
-from service.task_model import Task
-from service.tasks import TaskContext
+from service.processes.cell import CellRuntime
+from service.processes.connection import LocalConnection
+from service.tasks.model import Task
+from service.tasks.store import TaskContext
 
 ROOT = Path(__file__).parents[3]
 SEED = 31

@@ -15,8 +15,6 @@ import pytest
 from hal.config import load_cell
 from hal.errors import CellError, NotFound
 from hal.simulated import Fault, ObjectTruth, Truth
-from service.cell import CellRuntime
-from service.connection import LocalConnection
 from service.operations.context import CellMemory, OperationContext
 from service.operations.inspect import look_close
 from service.operations.judge import judge
@@ -26,8 +24,10 @@ from service.operations.requests import ActionBody, MissionRequest
 from service.operations.session import Session
 from service.operations.surface_check import CLOSER, OVERVIEW, check_surfaces, need_its_place, view_surfaces
 from service.operations.travel import go_to_joints
-from service.task_model import Task
-from service.tasks import TaskContext
+from service.processes.cell import CellRuntime
+from service.processes.connection import LocalConnection
+from service.tasks.model import Task
+from service.tasks.store import TaskContext
 
 ROOT = Path(__file__).parents[3]
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]

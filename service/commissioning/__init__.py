@@ -1,0 +1,1 @@
+"""What brings a machine and single devices of a cell into service: checks, conformance, reading, recording, new drivers."""

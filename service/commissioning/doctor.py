@@ -1,0 +1,150 @@
+"""What works on this machine, and what to do about the rest: the checks of `panelwright doctor`."""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, entry_points, version
+from pathlib import Path
+
+from rich.markup import escape
+
+from hal.clock import Deadline
+from hal.config import Cell, load_cell
+from hal.errors import CellError, ConfigError
+from hal.registry import installed_drivers
+from service.commands.common import console, find_cell
+from service.commissioning.preflight import check_machine, check_python, check_simulator
+from service.processes.stop_host import bound_socket
+
+PINNED = {"pybullet": "3.2.7", "numpy": "2.", "opencv-python-headless": "4."}
+READS = 20
+
+
+def examine(cell: Path, port: int, *, connect: bool) -> bool:
+    """Run all checks and print what they find; tells whether everything is in order."""
+    checks: list[tuple[str, Callable[[], str]]] = [
+        ("python", _python),
+        *((name, lambda name=name, wanted=wanted: _package(name, wanted)) for name, wanted in PINNED.items()),
+        ("simulator", _simulator),
+        ("drivers", lambda: ", ".join(installed_drivers())),
+        (f"port {port}", lambda: _ports(port)),
+        ("cell file", lambda: _cell_file(cell)),
+        ("runs folder", _writable),
+        ("timer", _timer),
+    ]
+    results = [_check(name, check) for name, check in checks]
+    if connect and all(results):
+        results.append(_wires(load_cell(find_cell(cell))))
+    if connect and all(results):
+        results.append(_check("devices", lambda: _devices(load_cell(find_cell(cell)))))
+    return all(results)
+
+
+def _check(name: str, check: Callable[[], str]) -> bool:
+    try:
+        words = check()
+    except CellError as error:
+        console.print(f"[red]wrong[/]  {name:<24} {escape(error.what)}\n{'':<31} try: {escape(error.hint)}")
+        for key, value in error.details.items():
+            console.print(f"{'':<31} {escape(key)}: {escape(str(value))}")
+        return False
+    console.print(f"[green]good[/]   {name:<24} {escape(words)}")
+    return True
+
+
+def _wires(cell: Cell) -> bool:
+    """What the installed drivers find out about ports and wires; they are found by name, as the drivers are."""
+    is_good = True
+    for point in entry_points(group="panelwright.doctor"):
+        for finding in point.load()(cell):
+            word = "[green]good[/] " if finding.is_good else "[red]wrong[/]"
+            console.print(f"{word}  {escape(finding.subject):<24} {escape(finding.what)}")
+            if finding.hint:
+                console.print(f"{'':<31} try: {escape(finding.hint)}")
+            is_good &= finding.is_good or finding.subject not in cell.file.devices
+    return is_good
+
+
+def _python() -> str:
+    check_python()
+    return f"{platform.python_version()} on {platform.system()} {platform.machine()}"
+
+
+def _package(name: str, wanted: str) -> str:
+    try:
+        found = version(name)
+    except PackageNotFoundError:
+        raise ConfigError(f"{name} is not installed", hint="run `make setup`") from None
+    if not found.startswith(wanted):
+        raise ConfigError(f"{name} is {found}, not {wanted}", hint="run `make setup`: it installs what fits together")
+    return found
+
+
+def _simulator() -> str:
+    check_simulator("the shipped cell")
+    return "PyBullet is there"
+
+
+def _ports(port: int) -> str:
+    for number in (port, port + 1):
+        bound_socket("127.0.0.1", number).close()
+    return f"{port} and {port + 1} are free"
+
+
+def _cell_file(path: Path) -> str:
+    cell = load_cell(find_cell(path))
+    check_machine(cell)
+    return f"{cell.name}: {len(cell.file.devices)} devices, panel {cell.panel.name} ({len(cell.panel.objects)} objects)"
+
+
+def _writable() -> str:
+    folder = Path("runs")
+    try:
+        folder.mkdir(exist_ok=True)
+        probe = folder / ".probe"
+        probe.write_bytes(b"")
+        probe.unlink()
+    except OSError as error:
+        raise ConfigError(
+            f"{folder.resolve()} cannot be written: {error}", hint="choose another with --runs"
+        ) from error
+    return str(folder.resolve())
+
+
+def _timer() -> str:
+    """How late 2 ms sleeps return: the floor under every control period."""
+    lates_s = []
+    for _ in range(200):
+        due_s = time.monotonic() + 0.002
+        time.sleep(0.002)
+        lates_s.append(time.monotonic() - due_s)
+    lates_s.sort()
+    return f"2 ms sleeps return late by {1e3 * lates_s[100]:.2f} ms (median), {1e3 * lates_s[197]:.2f} ms (p99)"
+
+
+def _devices(cell: Cell) -> str:
+    from service.http.readings import READS as METHODS
+    from service.processes.supervisor import Supervisor
+
+    supervisor = Supervisor(cell)
+    try:
+        started_s = time.monotonic()
+        supervisor.start()
+        console.print(f"       {'cell process':<24} ready in {time.monotonic() - started_s:.1f} s")
+        for name, section in cell.file.devices.items():
+            device = supervisor.connection.device(name)
+            times_s = []
+            for _ in range(READS):
+                read_s = time.monotonic()
+                getattr(device, METHODS[section.kind])(deadline=Deadline.after(supervisor.connection.clock, 2.0))
+                times_s.append(time.monotonic() - read_s)
+            times_s.sort()
+            median_ms, worst_ms = 1e3 * times_s[READS // 2], 1e3 * times_s[-1]
+            console.print(
+                f"       {name:<24} read in {median_ms:.1f} ms (median), {worst_ms:.1f} ms (worst of {READS})"
+            )
+    finally:
+        supervisor.close()
+    return f"all {len(cell.file.devices)} answer"

@@ -1,0 +1,116 @@
+"""Records the wire of one device of a cell, and plays such a recording back: without a service, without the device."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hal.clock import Clock, WallClock
+from hal.config import Cell
+from hal.devices import DeviceKind
+from hal.errors import CellError, ConfigError
+from hal.registry import Context, connect
+from service.commissioning.direct_read import only_device, samples_of
+from service.jsonable import jsonable
+
+ABOUT = "about"  # kind of the line that says whose traffic it is; the drivers pass over it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class About:
+    """Whose traffic a recording holds: what makes the same driver read it again."""
+
+    device: str
+    kind: DeviceKind
+    driver: str
+    options: dict[str, Any]
+
+
+def record(
+    cell: Cell, name: str, path: Path, *, duration_s: float, timeout_s: float
+) -> Generator[dict[str, Any], None, None]:
+    """Write all traffic of the device `name` into `path` for some time; yields its samples and errors meanwhile.
+
+    Args:
+        timeout_s: deadline of each reading.
+
+    Raises:
+        ConfigError: the cell has no such device, the device no wire, or the file exists or cannot be written.
+        DeviceError: it did not connect.
+    """
+    if path.exists():
+        raise ConfigError(f"{path} exists already", hint="choose another name, or remove it; nothing was written")
+    with only_device(cell, name, {"capture": str(path)}) as (connect_it, clock, options):
+        section = cell.file.devices[name]
+        line = {"dir": ABOUT, "device": name, "kind": section.kind, "driver": section.driver, "options": options}
+        header = json.dumps(jsonable(line)) + "\n"
+        try:
+            path.write_text(header, encoding="ascii")
+        except OSError as error:
+            raise ConfigError(f"{path} cannot be written: {error}", hint="name a file in a folder of yours") from error
+        try:
+            device = connect_it()
+        except CellError as error:
+            if path.stat().st_size == len(header):  # no traffic to keep: the next attempt finds the name free
+                path.unlink()
+            if not isinstance(error, ConfigError) or "capture" not in error.what:
+                raise
+            what = f"{name}: {section.driver} has no wire that could be recorded"
+            hint = f"`panelwright devices read {name} --jsonl` writes down its readings"
+            raise ConfigError(what, hint=hint, device=name) from error
+        try:
+            yield from _until(samples_of(device, name, section.kind, clock, timeout_s), clock, duration_s)
+        finally:
+            device.close()
+
+
+def replay(path: Path, *, timeout_s: float) -> Iterator[dict[str, Any]]:
+    """The samples and errors that the recorded driver makes of the recorded traffic, at its pace, to the end.
+
+    Raises:
+        ConfigError: the file is no recording of a device.
+        DeviceError: the driver finds nothing in it.
+    """
+    about, clock = read_about(path), WallClock()
+    device = connect(Context(name=about.device, clock=clock), about.driver, {**about.options, "replay": str(path)})
+    try:
+        for item in samples_of(device, about.device, about.kind, clock, timeout_s):
+            if item.get("error", {}).get("details", {}).get("recording") == "ended":
+                return
+            yield item
+    finally:
+        device.close()
+
+
+def read_about(path: Path) -> About:
+    """Whose traffic a file holds.
+
+    Raises:
+        ConfigError: it does not say.
+    """
+    hint = "give a file that `panelwright devices record` has written"
+    try:
+        with path.open(encoding="ascii") as file:
+            line = json.loads(file.readline())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path} cannot be read: {error}", hint=hint) from error
+    try:
+        return About(
+            device=str(line["device"]),
+            kind=DeviceKind(line["kind"]),
+            driver=str(line["driver"]),
+            options=dict(line["options"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ConfigError(f"{path} does not say whose traffic it holds ({error!r})", hint=hint) from error
+
+
+def _until(items: Iterator[dict[str, Any]], clock: Clock, duration_s: float) -> Iterator[dict[str, Any]]:
+    end_s = clock.now_s() + duration_s
+    for item in items:
+        yield item
+        if clock.now_s() >= end_s:
+            return

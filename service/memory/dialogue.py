@@ -1,0 +1,232 @@
+"""The paper's question-and-answer sequence: a person is led through teaching a kind or a whole panel.
+
+What is asked and what is made of it is all here; `Talk` is a terminal, or a script in tests. An answer that makes no sense
+is explained and asked again; nothing is written before the last answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Protocol, TypeVar
+
+from hal.errors import CellError, InvalidRequest
+from hal.panel import OBJECT_KINDS
+from perception.vision.teaching.panel_lights import find_border_lights
+from perception.vision.teaching.panel_questions import Question, kind_question, questions
+from perception.vision.teaching.panel_teach import PanelObjectDraft, object_row, panel_text
+from perception.vision.teaching.teach import Example, Overview, check, example_at, likest, overview_of, teach_example
+from service.memory.teachings import Teachings, check_name
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from perception.vision.knowledge import Knowledge
+    from perception.vision.teaching.panel_lights import LightsFound
+
+T = TypeVar("T")
+MOST_TRIES = 5  # a script that goes on giving the same wrong answer must end
+WHAT = Question(key="what", text="What do you teach?", choices=("kind", "panel"), default="kind")
+WHERE = Question(key="where", text="Where is it (pixels: x,y of its middle, or of two opposite corners: x,y x,y)?")
+MORE = Question(key="more", text="Is there another object?", choices=("no", "yes"), default="no")
+IS_IT = Question(key="outline", text="Is that the object?", choices=("yes", "no"), default="yes")
+PANEL_NAME = Question(key="panel", text="What is the panel called (small letters, digits, underscores)?")
+LIGHTS = Question(key="lights", text="Where are the four border lights (x,y x,y x,y x,y; nothing: I look for them)?")
+
+
+class Talk(Protocol):
+    """Somebody who answers."""
+
+    def ask(self, question: Question) -> str:
+        """The answer, stripped; empty for none.
+
+        Raises:
+            InvalidRequest: nobody answers any more.
+        """
+        ...
+
+    def say(self, text: str) -> None:
+        """Tell something."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Dialogue:
+    """One session over one image."""
+
+    talk: Talk
+    teachings: Teachings
+    pixels: NDArray[np.uint8]
+    overview: Overview
+
+    @classmethod
+    def about(
+        cls, talk: Talk, teachings: Teachings, pixels: NDArray[np.uint8], plate_m: tuple[float, float]
+    ) -> Dialogue:
+        """A dialogue about an image.
+
+        Raises:
+            InvalidRequest, NotObservable, NotFound, Ambiguous: the image shows no panel to teach from.
+        """
+        overview = overview_of(pixels, plate_m=plate_m)
+        return cls(talk=talk, teachings=teachings, pixels=pixels, overview=overview)
+
+    def run(self) -> None:
+        """Ask, teach, and show what is found now."""
+        what = self._until_good(lambda: self._answer(WHAT))
+        if what == "kind":
+            self._teach_kinds()
+        else:
+            self._teach_panel()
+
+    def _teach_kinds(self) -> None:
+        while True:
+            example, knowledge = self._example()
+            kind = self._until_good(partial(self._kind_name, example, knowledge))
+            lesson = teach_example(example, knowledge, kind=kind, source="panelwright teach, dialogue")
+            if lesson.added:
+                self.talk.say(f"wrote {self.teachings.write_kind(lesson.kind)}")
+            else:
+                self.talk.say(f"{kind} looks like that already: nothing was written")
+            if self._until_good(lambda: self._answer(MORE)) == "no":
+                break
+        self.show_found()
+
+    def _teach_panel(self) -> None:
+        name = self._until_good(lambda: self._name(PANEL_NAME))
+        lights = self._until_good(self._lights)
+        drafts: list[PanelObjectDraft] = []
+        while True:
+            drafts.append(self._object({draft.name for draft in drafts}))
+            if self._until_good(lambda: self._answer(MORE)) == "no":
+                break
+        text = panel_text(name, self.overview, lights, drafts)
+        self.talk.say(f"wrote {self.teachings.write_panel(name, text)}")
+        self._show_read(name)
+
+    def _object(self, taken: set[str]) -> PanelObjectDraft:
+        example, knowledge = self._example()
+        seen = likest(self.overview, example, knowledge)
+        suggested = seen.kind if seen is not None and seen.kind in OBJECT_KINDS else ""
+        question = Question(key="kind", text="What kind of object is it?", choices=OBJECT_KINDS, default=suggested)
+        kind = self._until_good(lambda: self._answer(question))
+        name_question, *rest = questions(kind)
+
+        def new_name() -> str:
+            name = self._name(name_question)
+            if name in taken:
+                raise InvalidRequest(f"there is a {name!r} already", hint="give another name")
+            return name
+
+        name = self._until_good(new_name)
+        answers: dict[str, str] = {}
+        for asked in rest:
+            answers[asked.key] = self._until_good(partial(self._object_answer, asked, kind, name, example, answers))
+        return PanelObjectDraft(kind=kind, name=name, example=example, answers=answers)
+
+    def _object_answer(
+        self, question: Question, kind: str, name: str, example: Example, answers: dict[str, str]
+    ) -> str:
+        """An answer that makes sense together with those before it."""
+        given = self._answer(question)
+        tried = {**answers, question.key: given}
+        object_row(PanelObjectDraft(kind=kind, name=name, example=example, answers=tried), self.overview)
+        return given
+
+    def _example(self) -> tuple[Example, Knowledge]:
+        while True:
+            example = self._until_good(lambda: example_at(self.overview, points_of(self.talk.ask(WHERE))))
+            knowledge = self.teachings.knowledge()
+            self.talk.say(describe(self.overview, example, knowledge))
+            if self._until_good(lambda: self._answer(IS_IT)) == "yes":
+                return example, knowledge
+
+    def _kind_name(self, example: Example, knowledge: Knowledge) -> str:
+        seen = likest(self.overview, example, knowledge)
+        known = kind_question(knowledge, seen.kind if seen is not None else "")
+        text = f"What kind of object is this ({', '.join(known.choices)}; another name makes a new kind)?"
+        return self._name(Question(key="kind", text=text, default=known.default))
+
+    def _lights(self) -> LightsFound:
+        found = find_border_lights(self.overview, points_of(self.talk.ask(LIGHTS), least=0))
+        if not found.are_seen:
+            self.talk.say("no border lights were seen: their places are a guess, measure them")
+        return found
+
+    def _name(self, question: Question) -> str:
+        name = self._answer(question)
+        check_name(name)
+        return name
+
+    def _answer(self, question: Question) -> str:
+        given = self.talk.ask(question) or question.default
+        if question.choices and given not in question.choices:
+            raise InvalidRequest(f"{given[:40]!r} is no choice", hint=f"one of: {', '.join(question.choices)}")
+        return given
+
+    def _until_good(self, step: Callable[[], T]) -> T:
+        """Repeat a step until its answer makes sense."""
+        for _ in range(MOST_TRIES - 1):
+            try:
+                return step()
+            except CellError as error:
+                if isinstance(error, NobodyAnswers):
+                    raise
+                self.talk.say(f"{error.what}; {error.hint}")
+        return step()
+
+    def show_found(self) -> None:
+        """What is found in the image with what is known now."""
+        lines = []
+        for found in check(self.pixels, self.teachings.knowledge(), plate_m=self.overview.plate_m):
+            x, y = found.centre_px
+            verdict = f"refused: {found.reason}" if found.reason else f"confidence {found.confidence:.2f}"
+            lines.append(f"{found.kind} at {x:.0f},{y:.0f} px  {verdict}")
+        for line in dict.fromkeys(lines):  # two refused candidates may differ in nothing that a person sees
+            self.talk.say(line)
+
+    def _show_read(self, name: str) -> None:
+        from perception.vision.annotate import said
+        from perception.vision.image import as_gray
+        from perception.vision.taught import inspect_view
+
+        panel = self.teachings.panel(name)
+        for reading in inspect_view(self.pixels, as_gray(self.pixels), self.overview.view, panel):
+            self.talk.say(f"{reading.name} ({reading.kind}): {reading.reason or said(reading)}")
+
+
+class NobodyAnswers(InvalidRequest):
+    """The answers ended before the questions."""
+
+
+def describe(overview: Overview, example: Example, knowledge: Knowledge) -> str:
+    """What was found at the clicks, in one sentence."""
+    shape = example.outline.shape if example.outline is not None else "place"
+    width, height = (1e3 * side for side in example.size_m)
+    x, y = overview.in_image(example.centre_m[None])[0]
+    taken = likest(overview, example, knowledge)
+    words = "it looks like nothing that I know"
+    if taken is not None:
+        doubt = " (but I would not swear to it)" if taken.reason else ""
+        words = f"I take it for: {taken.kind}, confidence {taken.confidence:.2f}{doubt}"
+    return f"found a {shape} of {width:.0f} x {height:.0f} mm about {x:.0f},{y:.0f} px; {words}"
+
+
+def points_of(text: str, *, least: int = 1) -> tuple[tuple[float, float], ...]:
+    """Pixels from "x,y x,y".
+
+    Raises:
+        InvalidRequest: no numbers, or too few.
+    """
+    try:
+        pairs = [tuple(float(part) for part in item.split(",")) for item in text.split()]
+        points = tuple((x, y) for x, y in pairs)
+    except ValueError:
+        raise InvalidRequest(f"{text[:40]!r} is not pixels", hint="for example 320,240 or 300,200 340,280") from None
+    if not all(abs(x) < 1e6 and abs(y) < 1e6 for x, y in points):  # false for NaN too
+        raise InvalidRequest("a pixel is out of range", hint="give finite numbers inside the image")
+    if len(points) < least:
+        raise InvalidRequest("no pixel was given", hint="for example 320,240")
+    return points

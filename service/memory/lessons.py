@@ -1,0 +1,222 @@
+"""Lessons as requests and as the dialogue has them: an image, clicks, a name, and for panels the answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field, model_validator
+
+from hal.errors import InvalidRequest
+from hal.panel import Panel
+from hal.strict import Strict
+from service.memory.images import ImageStore
+from service.memory.teachings import Teachings, check_name
+from service.operations.requests import ImageId, ObjectName, PlateSize
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from perception.vision.teaching.from_panel import PanelLooks
+    from perception.vision.teaching.panel_questions import Question
+    from perception.vision.teaching.teach import Example, Overview
+    from perception.vision.view import View
+
+PixelNumber = Annotated[float, Field(ge=-1e5, le=1e5)]
+Click = tuple[PixelNumber, PixelNumber]
+Clicks = Annotated[tuple[Click, ...], Field(min_length=1, max_length=3)]
+PlainName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}$")]
+Answer = Annotated[str, Field(max_length=400)]
+
+
+class OutlineRequest(Strict):
+    """What is at these clicks? The middle; two opposite corners; or both."""
+
+    image: ImageId
+    plate_m: Annotated[PlateSize, Field(description="width and height of the panel's plate")]
+    clicks_px: Clicks
+
+
+class ObjectLesson(Strict):
+    """One object of a new panel: what was clicked on, and the answers to GET /v1/knowledge/questions."""
+
+    kind: ObjectName
+    name: PlainName
+    clicks_px: Clicks
+    answers: Annotated[dict[ObjectName, Answer], Field(max_length=20)] = {}
+
+
+class PanelLesson(Strict):
+    """A whole new panel. Without `lights_px` the four border lights are looked for in the corners."""
+
+    name: PlainName
+    objects: Annotated[tuple[ObjectLesson, ...], Field(min_length=1, max_length=100)]
+    lights_px: Annotated[tuple[Click, ...], Field(max_length=4)] = ()
+
+
+class TeachRequest(Strict):
+    """Teach a kind (`kind` and `clicks_px`) or a whole panel (`panel`) from a stored image."""
+
+    image: ImageId
+    plate_m: Annotated[PlateSize, Field(description="width and height of the panel's plate")]
+    kind: Annotated[PlainName | None, Field(description="a new name makes a new kind")] = None
+    clicks_px: Annotated[tuple[Click, ...], Field(max_length=3)] = ()
+    size_m: Annotated[PlateSize | None, Field(description="of the kind; else that of the outline")] = None
+    panel: PanelLesson | None = None
+
+    @model_validator(mode="after")
+    def _is_one_lesson(self) -> TeachRequest:
+        if (self.kind is None) == (self.panel is None):
+            raise ValueError("give either `kind` with `clicks_px`, or `panel`")
+        if self.kind is not None and not self.clicks_px:
+            raise ValueError("a kind needs one to three clicks")
+        if self.panel is not None and (self.clicks_px or self.size_m):
+            raise ValueError("clicks_px and size_m belong to a kind; a panel's objects have their own")
+        return self
+
+
+def questions_of(kind: str) -> tuple[Question, ...]:
+    """What the dialogue asks about an object of this kind."""
+    from perception.vision.teaching.panel_questions import questions
+
+    return questions(kind)
+
+
+def find_outline(images: ImageStore, teachings: Teachings, request: OutlineRequest) -> dict[str, Any]:
+    """The outline at the clicks and what it is taken for; writes nothing.
+
+    Raises:
+        NoSuchImage, InvalidRequest, NotObservable, NotFound, Ambiguous: says what is wrong and what helps.
+    """
+    from perception.vision.teaching.teach import example_at, overview_of
+
+    overview = overview_of(images.pixels(request.image), plate_m=request.plate_m)
+    return described(overview, example_at(overview, request.clicks_px), teachings)
+
+
+def teach(images: ImageStore, teachings: Teachings, request: TeachRequest) -> dict[str, Any]:
+    """Learn what the request says and write it down.
+
+    Raises:
+        as `find_outline`; Ambiguous also when the lesson would make another kind worse; ConfigError: no panel comes out.
+    """
+    pixels = images.pixels(request.image)
+    if request.panel is not None:
+        return teach_panel(teachings, pixels, request.plate_m, request.panel)
+    return teach_kind(
+        teachings, pixels, request.plate_m, kind=request.kind or "", clicks_px=request.clicks_px, size_m=request.size_m
+    )
+
+
+def teach_kind(
+    teachings: Teachings,
+    pixels: NDArray[np.uint8],
+    plate_m: tuple[float, float],
+    *,
+    kind: str,
+    clicks_px: tuple[Click, ...],
+    size_m: tuple[float, float] | None = None,
+) -> dict[str, Any]:
+    """Teach one example of a kind and keep it; see `teach`."""
+    from perception.vision.knowledge import NOTHING
+    from perception.vision.teaching.teach import example_at, overview_of, teach_example
+
+    check_name(kind)
+    overview = overview_of(pixels, plate_m=plate_m)
+    example = example_at(overview, clicks_px, needs_outline=kind != NOTHING)
+    lesson = teach_example(example, teachings.knowledge(), kind=kind, size_m=size_m, source="panelwright teach")
+    path = teachings.write_kind(lesson.kind) if lesson.added else None
+    file = next(file for file in teachings.kinds() if file.name == kind)
+    return {
+        "what": "kind",
+        "name": kind,
+        "added": lesson.added,
+        "is_new": lesson.is_new_kind,
+        "path": None if path is None else str(path),
+        "toml": file.text(),
+        "outline": None if example.outline is None else described(overview, example, teachings),
+    }
+
+
+def teach_panel(
+    teachings: Teachings, pixels: NDArray[np.uint8], plate_m: tuple[float, float], lesson: PanelLesson
+) -> dict[str, Any]:
+    """Write a whole panel's file from clicks and answers; see `teach`."""
+    from perception.vision.teaching.panel_lights import find_border_lights
+    from perception.vision.teaching.panel_teach import PanelObjectDraft, panel_text
+    from perception.vision.teaching.teach import example_at, overview_of
+
+    check_name(lesson.name)
+    overview = overview_of(pixels, plate_m=plate_m)
+    lights = find_border_lights(overview, lesson.lights_px)
+    drafts = [
+        PanelObjectDraft(
+            kind=thing.kind, name=thing.name, example=example_at(overview, thing.clicks_px), answers=thing.answers
+        )
+        for thing in lesson.objects
+    ]
+    text = panel_text(lesson.name, overview, lights, drafts)
+    is_new = lesson.name not in {file.name for file in teachings.panels()}
+    return {
+        "what": "panel",
+        "name": lesson.name,
+        "added": True,
+        "is_new": is_new,
+        "path": str(teachings.write_panel(lesson.name, text)),
+        "toml": text,
+        "lights_are_seen": lights.are_seen,
+    }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Learned:
+    """What an overview of a known panel taught, and the files of the kinds that learned something."""
+
+    panel: str
+    looks: PanelLooks
+    files: tuple[Path, ...]
+
+    def told(self) -> dict[str, Any]:
+        """The same in words and numbers: objects by name, looks by kind."""
+        return {
+            "panel": self.panel,
+            "added": self.looks.added,
+            "taught_by": [each.thing.name for each in self.looks.shown],
+            "left_out": self.looks.left_out,
+            "known_before": list(self.looks.known_before),
+            "known_now": list(self.looks.known_now),
+            "files": [str(path) for path in self.files],
+        }
+
+
+def learn_panel(teachings: Teachings, pixels: NDArray[np.uint8], view: View, panel: Panel) -> Learned:
+    """Let a known panel teach its own looks from one overview, and keep them.
+
+    Raises:
+        InvalidRequest, NotObservable, NotFound, Ambiguous: the overview teaches nothing; says why and what helps.
+    """
+    from perception.vision.teaching.from_panel import teach_from_panel
+
+    looks = teach_from_panel(pixels, view, panel, teachings.knowledge(), source="panelwright learn")
+    return Learned(panel=panel.name, looks=looks, files=tuple(teachings.write_kind(kind) for kind in looks.kinds))
+
+
+def described(overview: Overview, example: Example, teachings: Teachings) -> dict[str, Any]:
+    """An example for people and pages: its outline in the image, and what it is taken for now."""
+    from perception.vision.teaching.teach import likest
+
+    if example.outline is None:
+        raise InvalidRequest("nothing was pointed at", hint="click on an object")
+    taken = likest(overview, example, teachings.knowledge())
+    return {
+        "shape": example.outline.shape,
+        "outline_px": example.outline_px.tolist(),
+        "centre_px": overview.in_image(example.centre_m[None])[0].tolist(),
+        "centre_m": example.centre_m.tolist(),
+        "size_m": list(example.size_m),
+        "taken_for": None if taken is None else taken.kind,
+        "confidence": None if taken is None else taken.confidence,
+        "reason": None if taken is None else taken.reason,
+    }

@@ -1,0 +1,315 @@
+"""The cell: devices, emulators, clock and control thread. A process of its own, or inline for tests."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import functools
+import json
+import logging
+import pickle
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hal.clock import Clock, PacedClock, SimClock, WallClock
+from hal.config import Cell, DeviceSection, load_cell
+from hal.devices import DeviceKind
+from hal.errors import CellError, ConfigError, DeviceUnavailable
+from hal.garbage import set_aside
+from hal.isolated import Report, isolated_device
+from hal.registry import Context, Shared, device_factory, emulator_factory
+from hal.registry import connect as connect_device
+from hal.simulated import Fault
+from hal.strict import validate
+from service.memory.calibrations import Calibrations
+from service.processes.child import Lifeline, kill_own_group
+from service.processes.connection import BEHIND, CLOCK, MOVER, PREFIX, SWAPPER
+from service.processes.latch import Beat, Latch
+from service.processes.motion import MotionPort, start_controller
+from service.processes.seats import Connect, Seat, Swapper, checked, names_another_wire
+
+BEAT_S = 0.05
+CLOSE_TIMEOUT_S = 4.0
+NOTE = "note "  # begins a line for the journal
+SWITCH_S = 0.0005  # the control thread waits no longer than this for a thread that answers the service
+log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class CellRuntime:
+    """A running cell. `objects` maps names to what is served: devices, the mover and the clock."""
+
+    cell: Cell
+    clock: Clock
+    objects: Mapping[str, Any]
+    _closers: list[Callable[[], None]] = field(default_factory=list)
+
+    @classmethod
+    def start(
+        cls,
+        cell: Cell,
+        *,
+        is_latched: Callable[[], bool],
+        swapped: Mapping[str, DeviceSection] | None = None,
+        runs_dir: Path | None = None,
+        report: Report = lambda _kind, _data: None,
+    ) -> CellRuntime:
+        """Start emulators, connect all devices at once, then start the control thread.
+
+        Args:
+            is_latched: read by the control thread each tick.
+            swapped: what takes the place of sections of the cell file, as an earlier run had it.
+            runs_dir: where `panelwright calibrate` keeps records; motion uses those, devices the cell file's own.
+            report: told what becomes of drivers in processes of their own.
+
+        Raises:
+            CellError: what could not be connected, all of it in one error; everything else is closed again.
+        """
+        emulated = {name: cell.file.devices[name] for name in cell.file.emulators}
+        cell.file.devices.update(swapped or {})
+        _import_drivers(cell)
+        clock = clock_for(cell)
+        shared = Shared()
+        closers: list[Callable[[], None]] = [shared.close]
+        try:
+            far_sides = start_emulators(cell, clock, shared, closers)
+
+            def complete(name: str, section: DeviceSection) -> DeviceSection:
+                own = emulated.get(name)
+                if own is None or section.driver != own.driver or names_another_wire(section, own):
+                    return section
+                return section.model_copy(update={"options": {**section.options, **far_sides[name].address}})
+
+            def connect(name: str, section: DeviceSection) -> Any:
+                context = Context(name=name, clock=clock, cell=cell, shared=shared)
+                make = functools.partial(isolated_device, report=report) if section.isolate else connect_device
+                return checked(name, make(context, section.driver, section.options), section)
+
+            sections = {name: complete(name, section) for name, section in cell.file.devices.items()}
+            seats = _connect_all(cell, sections, connect, closers)
+            objects: dict[str, Any] = {**seats, PREFIX + CLOCK: clock}
+            objects |= {PREFIX + BEHIND + name: far_side.backing for name, far_side in far_sides.items()}
+            motion: MotionPort | None = None
+            if cell.names_of(DeviceKind.ARM):
+                measured = cell if runs_dir is None else Calibrations.of_runs(runs_dir, cell).applied()
+                motion = start_controller(measured, seats, clock=clock, is_latched=is_latched)
+                objects[PREFIX + MOVER] = motion
+                closers.append(motion.close)
+            objects[PREFIX + SWAPPER] = Swapper(cell, connect=connect, complete=complete, seats=seats, motion=motion)
+        except BaseException:
+            _close_all(closers)
+            raise
+        return cls(cell=cell, clock=clock, objects=objects, _closers=closers)
+
+    def close(self) -> None:
+        """Stop the arm, then close devices, emulators and world; one that fails holds up nobody. Idempotent."""
+        closers, self._closers = self._closers, []
+        _close_all(closers)
+
+
+def _import_drivers(cell: Cell) -> None:
+    """Import every driver now, in one thread.
+
+    Some libraries (OpenCV) bend `sys.path` while they are imported; a process that a driver starts meanwhile in another
+    thread would inherit the bent path and not even find `typing`.
+    """
+    drivers = [section.driver for section in cell.file.devices.values()]
+    for driver in [*drivers, *(section.driver for section in cell.file.emulators.values())]:
+        with contextlib.suppress(ConfigError):  # it comes again, with its key, when the device is connected
+            device_factory(driver)
+
+
+def clock_for(cell: Cell) -> Clock:
+    """The clock of the cell's mode: simulated, wall, or wall beside a simulated world."""
+    clocks: dict[str, Callable[[], Clock]] = {"sim": SimClock, "mixed": PacedClock, "real": WallClock}
+    return clocks[cell.file.cell.mode]()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FarSide:
+    """An emulated wire: the options that make a driver find it, the device that answers behind it, and what breaks it."""
+
+    address: dict[str, Any]
+    backing: Any
+    inject: Callable[[Fault | None], None] | None
+
+
+def start_emulators(cell: Cell, clock: Clock, shared: Shared, closers: list[Callable[[], None]]) -> dict[str, FarSide]:
+    """Start the far side of each emulated wire."""
+    far_sides: dict[str, FarSide] = {}
+    for name, section in cell.file.emulators.items():
+        key = f"emulators.{name}"
+        context = Context(name=name, clock=clock, cell=cell, shared=shared)
+        backing = connect_device(context, section.driver, section.options, key=key)
+        closers.append(backing.close)
+        try:
+            emulator = emulator_factory(section.emulator)(backing, section.emulator_options)
+        except ConfigError as error:
+            raise ConfigError(f"{cell.path}: {key}: {error.what}", hint=error.hint, **error.details) from error
+        closers.append(emulator.close)
+        far_sides[name] = FarSide(emulator.address, backing, getattr(emulator, "inject", None))
+    return far_sides
+
+
+def _connect_all(
+    cell: Cell, sections: Mapping[str, DeviceSection], connect: Connect, closers: list[Callable[[], None]]
+) -> dict[str, Seat]:
+    with ThreadPoolExecutor(len(sections), thread_name_prefix="connect") as pool:
+        waiting = {name: pool.submit(connect, name, section) for name, section in sections.items()}
+    failed: dict[str, CellError] = {}
+    seats: dict[str, Seat] = {}
+    for name, future in waiting.items():
+        error = future.exception()
+        if error is None:
+            seats[name] = Seat(future.result())
+            closers.append(seats[name].close)
+        elif isinstance(error, CellError):
+            failed[name] = error
+        else:
+            text = f"its driver failed: {type(error).__name__}: {error}"
+            failed[name] = DeviceUnavailable(text, hint="report it to the driver's author", device=name)
+            log.error("devices.%s", name, exc_info=error)
+    if failed:
+        raise gathered(failed, total=len(sections), cell=cell)
+    return seats
+
+
+def gathered(failed: Mapping[str, CellError], *, total: int, cell: Cell) -> CellError:
+    """One error for all devices that did not connect; a single one stays itself."""
+    errors = list(failed.values())
+    if len(errors) == 1:
+        return errors[0]
+    is_config = all(isinstance(error, ConfigError) for error in errors)
+    same = {error.what.replace(f"devices.{name}: ", "") for name, error in failed.items()}
+    if is_config and len(same) == 1:  # a fault of what they share: the simulated world
+        return ConfigError(same.pop(), hint=errors[0].hint)
+    kind: type[CellError] = ConfigError if is_config else DeviceUnavailable
+    return kind(
+        f"{len(errors)} of the {total} devices in {cell.path} did not connect",
+        hint="mend each; `panelwright doctor` tries them again",
+        **{name: f"{error.what} (try: {error.hint})" for name, error in failed.items()},
+    )
+
+
+def _close_all(closers: Iterable[Callable[[], None]]) -> None:
+    for close in list(closers)[::-1]:
+        try:
+            close()
+        except Exception:  # each thing gets its turn, whatever the one before did
+            log.exception("closing the cell")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CellOrder:
+    """What the supervisor tells a new cell process, over a pipe that nobody else reads."""
+
+    cell_path: str
+    seed: int | None
+    latch_path: str
+    beat_path: str
+    address: str
+    authkey: str
+    runs_dir: str | None
+    swapped: dict[str, dict[str, Any]]
+
+    def to_line(self) -> str:
+        """One line of JSON."""
+        return json.dumps({name: getattr(self, name) for name in self.__slots__})
+
+    @classmethod
+    def from_line(cls, line: str) -> CellOrder:
+        """The inverse of `to_line`."""
+        return cls(**json.loads(line))
+
+
+def error_to_line(error: CellError) -> str:
+    """An error on its way to the supervisor."""
+    return "error " + base64.b64encode(pickle.dumps(error)).decode()
+
+
+def error_from_line(line: str) -> CellError:
+    """The inverse of `error_to_line`; only for lines of our own child."""
+    error: CellError = pickle.loads(base64.b64decode(line.removeprefix("error ")))  # noqa: S301 - our own child
+    return error
+
+
+def note_to_line(kind: str, data: dict[str, Any]) -> str:
+    """Something for the journal, on its way to the supervisor."""
+    return NOTE + json.dumps([kind, data])
+
+
+def note_from_line(line: str) -> tuple[str, dict[str, Any]] | None:
+    """The inverse of `note_to_line`; None for any other line."""
+    if not line.startswith(NOTE):
+        return None
+    kind, data = json.loads(line.removeprefix(NOTE))
+    return kind, data
+
+
+def main() -> None:
+    """Entry point of the cell process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the supervisor's business; the pipe tells when it ends
+    sys.setswitchinterval(SWITCH_S)
+    logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="cell: %(levelname)s %(name)s: %(message)s")
+    lifeline = Lifeline()
+    order = CellOrder.from_line(lifeline.read_line() or "{}")
+    beat = Beat(Path(order.beat_path))
+    _in_background(lambda: _beat(beat))
+    with Latch(Path(order.latch_path)) as latch:
+        is_orphan = threading.Event()
+        _in_background(lambda: _end_with_parent(lifeline, is_orphan))
+        try:
+            _run(order, lifeline, lambda: is_orphan.is_set() or latch.is_set(), is_orphan)
+        except CellError as error:
+            lifeline.write_line(error_to_line(error))
+    kill_own_group()
+
+
+def _run(order: CellOrder, lifeline: Lifeline, is_latched: Callable[[], bool], end: threading.Event) -> None:
+    from hal.host import serve
+
+    swapped = {name: validate(block, DeviceSection, source=f"devices.{name}") for name, block in order.swapped.items()}
+    cell = load_cell(Path(order.cell_path), seed=order.seed)
+    runs_dir = None if order.runs_dir is None else Path(order.runs_dir)
+    runtime = CellRuntime.start(
+        cell,
+        is_latched=is_latched,
+        swapped=swapped,
+        runs_dir=runs_dir,
+        report=lambda kind, data: lifeline.write_line(note_to_line(kind, data)),
+    )
+    server = serve(runtime.objects, order.address, bytes.fromhex(order.authkey), clock=runtime.clock)
+    set_aside()
+    lifeline.write_line("ready")
+    end.wait()
+    runtime.close()
+    with contextlib.suppress(OSError):
+        server.close()
+
+
+def _end_with_parent(lifeline: Lifeline, is_orphan: threading.Event) -> None:
+    lifeline.wait_for_end()
+    is_orphan.set()  # the control thread sees it at its next tick and stops the arm
+    threading.Event().wait(CLOSE_TIMEOUT_S)
+    kill_own_group()  # a driver that hangs in `close` must not keep the process
+
+
+def _beat(beat: Beat) -> None:
+    pause = threading.Event()
+    while True:
+        beat.beat()
+        pause.wait(BEAT_S)
+
+
+def _in_background(work: Callable[[], None]) -> None:
+    threading.Thread(target=work, daemon=True).start()
+
+
+if __name__ == "__main__":
+    main()

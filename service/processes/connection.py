@@ -1,0 +1,234 @@
+"""What the service holds of a cell: its devices, its mover and its clock, the same inline and across processes."""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Callable, Mapping
+from difflib import get_close_matches
+from typing import Any, Protocol, cast
+
+from hal.clock import Clock, Deadline, WallClock
+from hal.config import Cell, DeviceSection
+from hal.devices import DeviceKind
+from hal.errors import DeviceUnavailable, InvalidRequest, Unsupported
+from hal.motion import Mover
+
+CLOCK = "clock"  # names of the served objects that are no devices; `Name` in the cell file cannot contain a dot
+MOVER = "mover"
+PREFIX = "cell."
+SWAPPER = "swapper"
+BEHIND = "behind."  # the device behind the emulated wire of the device with this name
+
+SWAP_TIMEOUT_S = 20.0  # the most patient driver tries for six seconds, and the old one may have to be connected again
+
+
+class CellConnection(Protocol):
+    """A started cell. Safe to share between threads."""
+
+    @property
+    def cell(self) -> Cell:
+        """The cell file with everything it points to."""
+        ...
+
+    @property
+    def clock(self) -> Clock:
+        """The cell's clock: simulated seconds in a simulated cell. Use `now_s`; time passes by declared motions."""
+        ...
+
+    @property
+    def mover(self) -> Mover:
+        """The motion port.
+
+        Raises:
+            Unsupported: the cell has no arm.
+        """
+        ...
+
+    def device(self, name: str) -> Any:
+        """The device called `name` in the cell file, behind its HAL interface.
+
+        Raises:
+            InvalidRequest: no such device; says which name is near.
+            DeviceUnavailable: the cell process is down.
+        """
+        ...
+
+    def devices_of(self, kind: DeviceKind) -> dict[str, Any]:
+        """All devices of a kind by name, in the order of the cell file."""
+        ...
+
+    def behind_wires_of(self, kind: DeviceKind) -> dict[str, Any]:
+        """What answers behind the emulated wires of the devices of a kind; only the judge may look there."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the cell; a second call does nothing."""
+        ...
+
+
+def check_name(cell: Cell, name: str) -> None:
+    """Raise `InvalidRequest` unless the cell file has a device called `name`."""
+    names = list(cell.file.devices)
+    if name in names:
+        return
+    near = get_close_matches(name, names, n=1)
+    raise InvalidRequest(
+        f"cell {cell.name!r} has no device called {name!r}",
+        hint=f"did you mean {near[0]!r}?" if near else f"devices: {', '.join(names)}",
+    )
+
+
+def emulated(cell: Cell, kind: DeviceKind) -> list[str]:
+    """Names of the devices of a kind whose wires the cell emulates."""
+    return [name for name in cell.names_of(kind) if name in cell.file.emulators]
+
+
+class LocalConnection:
+    """A cell in this very process (`inline`)."""
+
+    def __init__(self, cell: Cell, objects: Mapping[str, Any], *, close: Callable[[], None]) -> None:
+        self.cell = cell
+        self._objects = objects
+        self._close = close
+
+    @property
+    def clock(self) -> Clock:
+        """The cell's clock."""
+        return cast(Clock, self._objects[PREFIX + CLOCK])
+
+    @property
+    def mover(self) -> Mover:
+        """The motion port."""
+        return _mover_or_raise(self.cell, self._objects.get(PREFIX + MOVER))
+
+    def device(self, name: str) -> Any:
+        """The device itself."""
+        check_name(self.cell, name)
+        return self._objects[name]
+
+    def devices_of(self, kind: DeviceKind) -> dict[str, Any]:
+        """The devices themselves."""
+        return {name: self._objects[name] for name in self.cell.names_of(kind)}
+
+    def behind_wires_of(self, kind: DeviceKind) -> dict[str, Any]:
+        """The backing devices themselves."""
+        return {name: self._objects[PREFIX + BEHIND + name] for name in emulated(self.cell, kind)}
+
+    def swap(self, name: str, section: DeviceSection) -> None:
+        """Another device for `name`; see `service.processes.seats.Swapper`."""
+        deadline = Deadline.after(WallClock(), SWAP_TIMEOUT_S)
+        self._objects[PREFIX + SWAPPER].swap(name, section.driver, section.options, deadline=deadline)
+
+    def close(self) -> None:
+        """Close the cell."""
+        self._close()
+
+
+Connect = Callable[[str], Any]
+"""Opens a proxy to a served object by name."""
+
+
+class RemoteConnection:
+    """A cell in another process. Each thread has proxies of its own, so that one slow read delays nobody else."""
+
+    def __init__(self, cell: Cell) -> None:
+        self.cell = cell
+        self._lock = threading.Lock()
+        self._connect: Connect | None = None
+        self._generation = 0
+        self._proxies: list[tuple[str, weakref.ref[Any]]] = []  # each lives as long as its thread
+        self._mine = threading.local()
+        self._swaps: dict[str, int] = {}
+
+    def attach(self, connect: Connect) -> None:
+        """A cell process is ready; proxies of an earlier one are dropped."""
+        self._switch(connect)
+
+    def detach(self) -> None:
+        """The cell process is gone."""
+        self._switch(None)
+
+    @property
+    def clock(self) -> Clock:
+        """The cell's clock."""
+        return cast(Clock, self._proxy(PREFIX + CLOCK))
+
+    @property
+    def mover(self) -> Mover:
+        """The motion port."""
+        has_arm = bool(self.cell.names_of(DeviceKind.ARM))
+        return _mover_or_raise(self.cell, self._proxy(PREFIX + MOVER) if has_arm else None)
+
+    def device(self, name: str) -> Any:
+        """A proxy of the device."""
+        check_name(self.cell, name)
+        return self._proxy(name)
+
+    def devices_of(self, kind: DeviceKind) -> dict[str, Any]:
+        """Proxies of the devices."""
+        return {name: self._proxy(name) for name in self.cell.names_of(kind)}
+
+    def behind_wires_of(self, kind: DeviceKind) -> dict[str, Any]:
+        """Proxies of the backing devices."""
+        return {name: self._proxy(PREFIX + BEHIND + name) for name in emulated(self.cell, kind)}
+
+    def swap(self, name: str, section: DeviceSection) -> None:
+        """Another device for `name`; see `service.processes.seats.Swapper`. Proxies of the old one are dropped."""
+        deadline = Deadline.after(WallClock(), SWAP_TIMEOUT_S)
+        self._proxy(PREFIX + SWAPPER).swap(name, section.driver, section.options, deadline=deadline)
+        self.cell.file.devices[name] = section
+        with self._lock:
+            self._swaps[name] = self._swaps.get(name, 0) + 1
+            self._proxies = [(other, proxy) for other, proxy in self._proxies if other != name]
+
+    def close(self) -> None:
+        """Close all proxies."""
+        self.detach()
+
+    def _switch(self, connect: Connect | None) -> None:
+        with self._lock:
+            self._connect = connect
+            self._generation += 1
+            old, self._proxies = self._proxies, []
+        for _, reference in old:
+            if (proxy := reference()) is not None:
+                _close_link(proxy)
+
+    def _proxy(self, name: str) -> Any:
+        mine = self._mine.__dict__
+        if mine.get("generation") != self._generation:
+            mine.clear()
+            mine["generation"] = self._generation
+        swaps = self._swaps.get(name, 0)
+        if name in mine and mine[name][0] == swaps:
+            return mine[name][1]
+        connect = self._connect
+        if connect is None:
+            raise DeviceUnavailable(
+                f"{name.removeprefix(PREFIX)} is unavailable: the cell process is not running",
+                hint="wait for its restart; `GET /readyz` and the terminal of `panelwright serve` say why",
+                device=name.removeprefix(PREFIX),
+            )
+        proxy = connect(name)
+        mine[name] = (swaps, proxy)
+        with self._lock:
+            self._proxies = [item for item in self._proxies if item[1]() is not None]
+            self._proxies.append((name, weakref.ref(proxy)))
+        return proxy
+
+
+def _close_link(proxy: Any) -> None:
+    """Close the wire of a proxy, not the device behind it."""
+    link = getattr(type(proxy), "disconnect", None)
+    if link is not None:
+        link(proxy)
+
+
+def _mover_or_raise(cell: Cell, mover: Any) -> Mover:
+    if mover is None:
+        raise Unsupported(
+            f"cell {cell.name!r} has no arm, so nothing can move",
+            hint="add a device of kind 'arm' to the cell file",
+        )
+    return cast(Mover, mover)

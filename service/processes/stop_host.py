@@ -1,0 +1,196 @@
+"""The service's hold on the stop port: in a process of its own, or in a thread of this one."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from hal.errors import ConfigError, MotionRefused
+from service.processes.child import Child
+from service.processes.latch import Latch, LatchState
+from service.processes.stop import StopServer
+
+STOP_ANSWER_S = 0.5  # then the latch is set from here
+RESET_ANSWER_S = 5.0  # a busy machine may take its time over this
+READY_S = 20.0
+MAX_RESTARTS = 3
+log = logging.getLogger(__name__)
+
+
+class InlineStop:
+    """The stop port in a thread of this process; for tests and debugging."""
+
+    def __init__(self, latch: Latch, listener: socket.socket | None, origins: tuple[str, ...]) -> None:
+        self._latch = latch
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="stop-port", daemon=True)
+        self._thread.start()
+        self._server: asyncio.Server | None = None
+        if listener is not None:
+            start = StopServer(latch, origins).start(listener)
+            self._server = asyncio.run_coroutine_threadsafe(start, self._loop).result(READY_S)
+
+    def stop(self, source: str) -> LatchState:
+        """Latch."""
+        return self._latch.set(source)
+
+    def reset(self, source: str, *, seen_count: int) -> bool:
+        """Clear, unless stopped again."""
+        return self._latch.reset(source, seen_count=seen_count)
+
+    def is_alive(self) -> bool:
+        """Does its thread run?"""
+        return self._thread.is_alive()
+
+    @property
+    def pid(self) -> int | None:
+        """No process of its own."""
+        return None
+
+    def close(self) -> None:
+        """End the thread and close the port; a second call does nothing."""
+        if not self._thread.is_alive():
+            return
+        ended = asyncio.run_coroutine_threadsafe(self._end(), self._loop)
+        with contextlib.suppress(TimeoutError):
+            ended.result(1.0)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(1.0)
+
+    async def _end(self) -> None:
+        if self._server is not None:
+            self._server.close()
+        serving = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in serving:
+            task.cancel()
+        await asyncio.gather(*serving, return_exceptions=True)
+
+
+class ProcessStop:
+    """The stop process, restarted when it dies. While it is down the latch stays set: no stop, no motion."""
+
+    def __init__(
+        self,
+        latch: Latch,
+        latch_path: Path,
+        listener: socket.socket | None,
+        origins: tuple[str, ...],
+        *,
+        report: Callable[[str, dict[str, Any]], None],
+    ) -> None:
+        self._latch = latch
+        self._latch_path = latch_path
+        self._listener = listener if listener is not None else _any_port()
+        self._origins = origins
+        self._report = report
+        self._restarts = 0
+        self._is_closing = False
+        self._is_ready = threading.Event()
+        self._child = self._begin()
+
+    def stop(self, source: str) -> LatchState:
+        """Latch, by the stop process when it answers, else directly."""
+        count = self._latch.state().count
+        is_told = self._child.is_alive() and self._child.write_line(f"stop {_line(source)}")
+        if not (is_told and self._has_changed(count, STOP_ANSWER_S)):
+            self._latch.set(source)
+        return self._latch.state()
+
+    def reset(self, source: str, *, seen_count: int) -> bool:
+        """Ask the stop process to clear the latch; it refuses when somebody stopped after `seen_count`.
+
+        Raises:
+            MotionRefused: it did not answer; an answer that comes later clears nothing.
+        """
+        self._is_ready.wait(READY_S)
+        is_told = self._child.write_line(f"reset {seen_count} {_line(source)}")
+        if not (is_told and self._has_changed(seen_count, RESET_ANSWER_S)):
+            self._latch.set("a reset without an answer")  # raises the count, so that the late one is refused
+            raise MotionRefused(
+                f"the stop process did not answer within {RESET_ANSWER_S:.0f} s, so the stop stays latched",
+                hint="look at the cell, then reset again; is the machine overloaded?",
+            )
+        return not self._latch.is_set()
+
+    def is_alive(self) -> bool:
+        """Does the process run?"""
+        return self._child.is_alive()
+
+    @property
+    def pid(self) -> int | None:
+        """Its process id."""
+        return self._child.pid
+
+    def close(self) -> None:
+        """End the process; it latches the stop when it goes."""
+        self._is_closing = True
+        self._child.end(grace_s=1.0)
+        self._listener.close()
+
+    def _begin(self) -> Child:
+        arguments = ["--fd", str(self._listener.fileno()), "--latch", str(self._latch_path)]
+        for origin in self._origins:
+            arguments += ["--origin", origin]
+        return Child(
+            "service.processes.stop",
+            arguments,
+            pass_fds=[self._listener.fileno()],
+            on_line=lambda _line: self._is_ready.set(),
+            on_exit=self._exited,
+        )
+
+    def _exited(self, code: int) -> None:
+        if self._is_closing:
+            return
+        self._is_ready.clear()
+        self._latch.set("the stop process died")
+        log.error("the stop process died with code %d; the stop is latched", code)
+        self._report("stop-process-down", {"code": code})
+        if self._restarts < MAX_RESTARTS:
+            self._restarts += 1
+            self._child = self._begin()
+
+    def _has_changed(self, count: int, within_s: float) -> bool:
+        end_s = time.monotonic() + within_s
+        pause = threading.Event()
+        while time.monotonic() < end_s:
+            if self._latch.state().count != count:
+                return True
+            pause.wait(0.0005)
+        return False
+
+
+def _line(text: str) -> str:
+    return text.replace("\n", " ").replace("\r", " ")
+
+
+def _any_port() -> socket.socket:
+    return bound_socket("127.0.0.1", 0)
+
+
+def bound_socket(host: str, port: int, *, option: str = "--port") -> socket.socket:
+    """A bound TCP socket; `port` 0 takes any free one. `option` is what chooses another.
+
+    Raises:
+        ConfigError: the port is taken or may not be used.
+    """
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, port))
+        listener.listen(512)  # at once: with SO_REUSEADDR only listening sockets exclude each other
+    except OSError as error:
+        listener.close()
+        raise ConfigError(
+            f"port {port} on {host} cannot be used: {error.strerror or error}",
+            hint=f"another panelwright may run; end it or choose another {option}",
+            port=port,
+        ) from error
+    return listener

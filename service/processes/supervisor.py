@@ -1,0 +1,331 @@
+"""Starts the stop process and the cell process, watches them, restarts them and never leaves one behind."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import secrets
+import shutil
+import socket
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from hal.config import Cell, DeviceSection
+from hal.errors import CellError, DeviceTimeout, DeviceUnavailable, MotionRefused
+from hal.isolated import Report
+from service.processes.cell import CellOrder, CellRuntime, error_from_line, note_from_line
+from service.processes.child import Child
+from service.processes.connection import CellConnection, LocalConnection, RemoteConnection
+from service.processes.latch import Beat, Latch, LatchState
+from service.processes.stop_host import InlineStop, ProcessStop
+
+START_TIMEOUT_S = 400.0  # the very first start compiles the control kernels beside much else, minutes on a busy machine
+MAX_RESTARTS = 3
+BEAT_TIMEOUT_S = 10.0  # the beat thread shares its interpreter with numba's compiler, which holds the lock for seconds
+WATCH_S = 0.1
+log = logging.getLogger(__name__)
+
+
+class StopHost(Protocol):
+    """Whoever writes the latch."""
+
+    def stop(self, source: str) -> LatchState:
+        """Latch; never fails."""
+        ...
+
+    def reset(self, source: str, *, seen_count: int) -> bool:
+        """Clear unless somebody stopped again after `seen_count`.
+
+        Raises:
+            MotionRefused: nobody answered.
+        """
+        ...
+
+    @property
+    def pid(self) -> int | None:
+        """Its process, when it has one of its own."""
+        ...
+
+    def is_alive(self) -> bool:
+        """Would a POST to the stop port be answered?"""
+        ...
+
+    def close(self) -> None:
+        """End; the latch stays set."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProcessHealth:
+    """State of one process."""
+
+    name: str
+    pid: int | None
+    is_alive: bool
+    restarts: int
+    detail: str = ""
+
+
+class Supervisor:
+    """Owner of a cell's processes.
+
+    Args:
+        cell: what to start.
+        stop_listener: bound socket of the stop port; None for no port (tests).
+        origins: web origins that may read answers of the stop port.
+        inline: cell and stop port in this process.
+        runs_dir: where calibrations are kept; None: only the cell file's own count.
+        report: told about starts, deaths, stops and resets.
+    """
+
+    def __init__(
+        self,
+        cell: Cell,
+        *,
+        stop_listener: socket.socket | None = None,
+        origins: tuple[str, ...] = (),
+        inline: bool = False,
+        runs_dir: Path | None = None,
+        report: Report = lambda _kind, _data: None,
+    ) -> None:
+        self.cell = cell
+        self.inline = inline
+        self._runs_dir = runs_dir
+        self._report = report
+        self._folder = Path(tempfile.mkdtemp(prefix="panelwright-"))
+        self.latch = Latch.create(self._folder / "latch")
+        self._beat = Beat(self._folder / "beat")
+        self._stop: StopHost = (
+            InlineStop(self.latch, stop_listener, origins)
+            if inline
+            else ProcessStop(self.latch, self._folder / "latch", stop_listener, origins, report=report)
+        )
+        self._remote = RemoteConnection(cell)
+        self._local: LocalConnection | None = None
+        self._child: Child | None = None
+        self._restarts = 0
+        self._swapped: dict[str, DeviceSection] = {}
+        self._problem: CellError | None = None
+        self._is_ready = threading.Event()
+        self._is_closing = threading.Event()
+        self._lock = threading.RLock()
+        self._noted = self.latch.state().count
+        self._noting = threading.Lock()
+
+    @property
+    def connection(self) -> CellConnection:
+        """The cell, wherever it runs. Its devices are unavailable while the cell process is down."""
+        return self._local or self._remote
+
+    @property
+    def folder(self) -> Path:
+        """Runtime folder: latch, beat and sockets; only this user can enter."""
+        return self._folder
+
+    @property
+    def is_ready(self) -> bool:
+        """Is the cell up?"""
+        return self._is_ready.is_set()
+
+    @property
+    def problem(self) -> CellError | None:
+        """Why the cell is not up, if it is known."""
+        return self._problem
+
+    def start(self) -> None:
+        """Start the cell and wait until it is ready. In a simulated cell the latch is then reset, explicitly.
+
+        Raises:
+            CellError: it could not start; says why.
+        """
+        begun = self.latch.state().count
+        try:
+            self._start_inline() if self.inline else self._start_child()
+        except CellError as error:
+            self._problem = error
+            raise
+        if self.cell.file.cell.mode == "sim" and self.latch.state().count == begun:  # nobody stopped it meanwhile
+            self.reset("supervisor: a simulated cell starts ready", seen_count=begun)
+        if not self.inline:
+            threading.Thread(target=self._watch, name="watch-cell", daemon=True).start()
+
+    def stop(self, source: str) -> LatchState:
+        """Latch the software stop."""
+        state = self._stop.stop(source)
+        self.note_stop()
+        return state
+
+    def note_stop(self) -> None:
+        """Report the newest stop, once: the stop port writes the latch and tells nobody.
+
+        To be called again and again; of stops that come faster than the calls only the last one is told.
+        """
+        with self._noting:
+            state = self.latch.state()
+            if state.count <= self._noted:
+                return
+            self._noted = state.count
+        if state.is_latched:
+            self._report("stop", {"source": state.source, "count": state.count})
+
+    def reset(self, source: str, *, seen_count: int) -> LatchState:
+        """Clear the latch. This alone moves nothing.
+
+        Raises:
+            MotionRefused: somebody stopped again meanwhile, or the stop process is down or silent (no stop, no motion).
+        """
+        self.note_stop()  # before its traces are gone
+        if not self._stop.is_alive():
+            raise MotionRefused("the stop process is down, so nothing may move", hint="restart `panelwright serve`")
+        if not self._stop.reset(source, seen_count=seen_count):
+            raise MotionRefused(
+                "the stop was pressed again, so it stays latched", hint="look at the cell, then reset again"
+            )
+        self._report("stop-reset", {"source": source, "count": seen_count})
+        return self.latch.state()
+
+    def swap(self, name: str, section: DeviceSection) -> None:
+        """Another device for `name`, also after a restart of the cell process; see `service.processes.seats.Swapper`."""
+        (self._local or self._remote).swap(name, section)
+        self._swapped[name] = section
+
+    def processes(self) -> tuple[ProcessHealth, ...]:
+        """State of the supervised processes."""
+        child = self._child
+        alive = self._local is not None or (child is not None and child.is_alive())
+        detail = self._problem.what if self._problem is not None else ""
+        return (
+            ProcessHealth(
+                name="cell",
+                pid=child.pid if child is not None else None,
+                is_alive=alive,
+                restarts=self._restarts,
+                detail=detail,
+            ),
+            ProcessHealth(name="stop", pid=self._stop.pid, is_alive=self._stop.is_alive(), restarts=0),
+        )
+
+    def close(self) -> None:
+        """Stop first, then end everything; bounded, idempotent."""
+        if self._is_closing.is_set():
+            return
+        self._is_closing.set()
+        self._stop.stop("the service ends")
+        self._is_ready.clear()
+        if self._local is not None:
+            self._local.close()
+        with self._lock:
+            child = self._child
+        if child is not None:
+            child.end()
+        self._remote.close()
+        self._stop.close()
+        self.latch.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _start_inline(self) -> None:
+        runtime = CellRuntime.start(
+            self.cell, is_latched=self.latch.is_set, runs_dir=self._runs_dir, report=self._report
+        )
+        self._local = LocalConnection(self.cell, runtime.objects, close=runtime.close)
+        self._is_ready.set()
+
+    def _start_child(self) -> None:
+        from hal.host import connect
+
+        answered = threading.Event()
+        errors: list[CellError] = []
+
+        def on_line(line: str) -> None:
+            note = note_from_line(line)
+            if note is not None:
+                self._report(*note)
+                return
+            if line.startswith("error "):
+                errors.append(error_from_line(line))
+            answered.set()
+
+        def on_exit(code: int) -> None:
+            if not errors:
+                text = f"the cell process ended with code {code}"
+                errors.append(DeviceUnavailable(text, hint="its last words are in the log above", device="cell"))
+            answered.set()
+
+        order = CellOrder(
+            cell_path=str(self.cell.path),
+            seed=self.cell.file.cell.seed,
+            latch_path=str(self._folder / "latch"),
+            beat_path=str(self._folder / "beat"),
+            address=str(self._folder / f"cell-{secrets.token_hex(4)}.sock"),
+            authkey=secrets.token_hex(32),
+            runs_dir=None if self._runs_dir is None else str(self._runs_dir.absolute()),
+            swapped={name: section.model_dump(mode="json") for name, section in self._swapped.items()},
+        )
+        child = self._begin_child(on_line, on_exit)
+        child.write_line(order.to_line())
+        if not answered.wait(START_TIMEOUT_S):
+            errors.append(
+                DeviceTimeout(
+                    f"the cell was not ready in {START_TIMEOUT_S:.0f} s",
+                    hint="a driver may hang; `panelwright doctor` tries each device",
+                    device="cell",
+                )
+            )
+        if errors:
+            child.end(grace_s=1.0)
+            raise errors[0]
+        clock = connect(order.address, bytes.fromhex(order.authkey), "cell.clock")
+        self._remote.attach(lambda name: connect(order.address, bytes.fromhex(order.authkey), name, clock=clock))
+        self._problem = None
+        self._is_ready.set()
+        self._report("cell-ready", {"pid": child.pid, "seconds": round(time.monotonic() - child.started_s, 3)})
+
+    def _begin_child(self, on_line: Callable[[str], None], on_exit: Callable[[int], None]) -> Child:
+        with self._lock:
+            if self._is_closing.is_set():
+                raise DeviceUnavailable("the service is ending", hint="start it again", device="cell")
+            self._child = Child("service.processes.cell", on_line=on_line, on_exit=on_exit)
+            return self._child
+
+    def _watch(self) -> None:
+        """Until the end: notice a dead or hung cell process, latch the stop, clear up after it, restart it."""
+        while not self._is_closing.wait(WATCH_S):
+            child = self._child
+            assert child is not None  # noqa: S101 - narrowing: the watch begins after the start
+            if child.is_alive() and self._beat.age_s() < BEAT_TIMEOUT_S:
+                continue
+            self._bury(child)
+            if self._restarts >= MAX_RESTARTS:
+                log.error("the cell died %d times and stays down", self._restarts + 1)
+                return
+            self._restarts += 1
+            with contextlib.suppress(CellError):
+                self._revive()
+
+    def _bury(self, child: Child) -> None:
+        why = "died" if not child.is_alive() else f"hung: no sign of life for {self._beat.age_s():.1f} s"
+        self._is_ready.clear()
+        self._stop.stop(f"the cell process {why}")
+        child.kill()  # its world too
+        self._remote.detach()
+        self._problem = DeviceUnavailable(
+            f"the cell process {why}",
+            hint="it is restarted up to three times; the stop stays latched until a reset",
+            device="cell",
+        )
+        log.error("the cell process (pid %d) %s", child.pid, why)
+        self._report("cell-down", {"pid": child.pid, "why": why})
+
+    def _revive(self) -> None:
+        try:
+            self._start_child()
+        except CellError as error:
+            self._problem = error
+            log.error("the cell did not restart: %s", error.for_people())
+            self._report("cell-restart-failed", {"why": error.what})
+            raise

@@ -1,0 +1,328 @@
+"""The journal: what was asked, started, stopped and ended, in SQLite, each row chained to the one before by its hash.
+
+One thread writes. `append` returns when the row is on disk; rows that wait together share one commit, so that a burst
+of events costs one flush of the disk. Two services on one folder (a demo beside `serve`) keep one chain.
+
+The disk that it takes is bounded: a file that has grown too big hands its rows over to an older part
+(`journal-<first>-<last>.sqlite`), and the oldest part goes when there are too many. Rows are copied first and deleted
+afterwards, so that each is in one place at least; readers read all parts as one journal. A row of the chain says what
+went, so that `verify` can tell it from a theft.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import logging
+import queue
+import sqlite3
+import threading
+import time
+from concurrent.futures import Future
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from service.errors import JournalError
+from service.tasks.journal_parts import INSERT_ROW, SCHEMA, newest_first, parts_of, snapshot, write_part
+
+FIRST_HASH = "0" * 64
+MAX_GROUP = 200
+MAX_KEPT = 1000  # notes that wait for room on the disk
+PART_BYTES = 16_000_000  # some ten thousand rows
+KEEP_PARTS = 8  # with the live file some 150 MB
+MAX_ID = 2**62
+DROPPED = "journal-dropped"  # the kind of row that says up to where the oldest rows have gone
+log = logging.getLogger(__name__)
+APPEND_TIMEOUT_S = 10.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Record:
+    """One row. `wall_time_s` is for people; `monotonic_s` orders what happened within one run."""
+
+    id: int
+    wall_time_s: float
+    monotonic_s: float
+    kind: str
+    data: dict[str, Any]
+    previous_hash: str
+    hash: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Entry:
+    kind: str
+    text: str
+    wall_time_s: float
+    monotonic_s: float
+    done: Future[None] | None  # None: nobody waits for it
+
+
+class Journal:
+    """An append-only record of the cell.
+
+    Args:
+        path: SQLite file; made when missing. Older parts lie beside it.
+        part_bytes: a file with more than this hands its rows over to a new part.
+        keep_parts: so many older parts are kept.
+
+    Raises:
+        JournalError: it cannot be opened for writing.
+    """
+
+    def __init__(self, path: Path, *, part_bytes: int = PART_BYTES, keep_parts: int = KEEP_PARTS) -> None:
+        self.path = path
+        self._part_bytes, self._keep_parts = part_bytes, keep_parts
+        self._hand_over_at = part_bytes
+        self._waiting: queue.SimpleQueue[_Entry | None] = queue.SimpleQueue()
+        self._is_closed = False
+        ready: Future[None] = Future()
+        self._thread = threading.Thread(target=self._write, args=(ready,), name="journal", daemon=True)
+        self._thread.start()
+        ready.result()
+
+    def append(self, kind: str, data: dict[str, Any]) -> None:
+        """Record durably; returns after the commit.
+
+        Raises:
+            JournalError: the disk is full or read-only, or the journal is closed.
+        """
+        try:
+            done: Future[None] = Future()
+            self._put(kind, data, done)
+            done.result(APPEND_TIMEOUT_S)
+        except TimeoutError as error:
+            raise JournalError(
+                f"the journal {self.path} did not take a record in {APPEND_TIMEOUT_S:.0f} s",
+                hint="the disk is too slow or hangs; nothing may move without a record",
+            ) from error
+
+    def note(self, kind: str, data: dict[str, Any]) -> None:
+        """Record soon, without waiting; for what nobody's permission hangs on. On a full disk it waits for room."""
+        if not self._is_closed:
+            self._put(kind, data, None)
+
+    def records(self, *, kinds: tuple[str, ...] = (), limit: int = 1000) -> list[Record]:
+        """The newest records of the given kinds (all when empty), oldest first."""
+        where = f"AND kind IN ({','.join('?' * len(kinds))})" if kinds else ""
+        sql = f"SELECT * FROM journal WHERE id < ? {where} ORDER BY id DESC LIMIT ?"  # noqa: S608 - only ?s
+        found: list[Record] = []
+        before = MAX_ID
+        for path in newest_first(self.path):
+            with snapshot(path) as db:
+                found += [_record(row) for row in db.execute(sql, (before, *kinds, limit - len(found)))]
+                before = min(before, _first_id(db) or MAX_ID)
+            if len(found) == limit:
+                break
+        return found[::-1]
+
+    def verify(self) -> int:
+        """Walk the whole chain, as far back as it is kept; returns the number of rows.
+
+        Raises:
+            JournalError: a row was changed, removed or inserted; names it.
+        """
+        dropped = self.records(kinds=(DROPPED,), limit=1)
+        previous, last_id = (dropped[0].data["hash"], dropped[0].data["id"]) if dropped else (FIRST_HASH, 0)
+        count = 0
+        with snapshot(self.path) as live, ExitStack() as files:  # before the parts are looked up
+            parts = [(path, files.enter_context(snapshot(path))) for path in parts_of(self.path)]
+            for path, db in (*parts, (self.path, live)):
+                for row in db.execute("SELECT * FROM journal WHERE id > ? ORDER BY id", (last_id,)):
+                    number, wall_s, mono_s, kind, text, said_previous, said = row
+                    real = _hash(previous, wall_s, mono_s, kind, text)
+                    if (number, said_previous, said) != (last_id + 1, previous, real):
+                        raise JournalError(
+                            f"{path}: the chain breaks at row {number}",
+                            hint="somebody changed the file; keep it and begin a new one",
+                            row=number,
+                        )
+                    previous, last_id, count = real, number, count + 1
+        return count
+
+    def close(self) -> None:
+        """Write what waits and close; a second call does nothing."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        self._waiting.put(None)
+        self._thread.join(APPEND_TIMEOUT_S)
+
+    def _put(self, kind: str, data: dict[str, Any], done: Future[None] | None) -> None:
+        if self._is_closed or not self._thread.is_alive():
+            raise JournalError("the journal is closed", hint="restart the service")
+        entry = _Entry(
+            kind=kind,
+            text=json.dumps(data, separators=(",", ":"), allow_nan=False),
+            wall_time_s=time.time(),
+            monotonic_s=time.monotonic(),
+            done=done,
+        )
+        self._waiting.put(entry)
+
+    def _write(self, ready: Future[None]) -> None:
+        try:
+            db = _opened(self.path)
+        except (sqlite3.Error, OSError) as error:
+            ready.set_exception(_error(self.path, error))
+            return
+        ready.set_result(None)
+        is_last, kept = False, list[_Entry]()
+        while not is_last:
+            group, is_last = self._next_group()
+            kept = _commit(db, self.path, [*kept, *group])
+            self._hand_over(db)
+        db.close()
+
+    def _hand_over(self, db: sqlite3.Connection) -> None:
+        """Keep the live file small. What goes wrong here loses nothing and is tried again when it has grown further."""
+        size = _size_bytes(db)
+        if size <= self._hand_over_at:
+            return
+        self._hand_over_at = self._part_bytes
+        try:
+            hand_over(db, self.path, part_bytes=self._part_bytes, keep_parts=self._keep_parts)
+        except (sqlite3.Error, OSError) as error:
+            with contextlib.suppress(sqlite3.Error):
+                db.execute("ROLLBACK")
+            self._hand_over_at = size + self._part_bytes // 4
+            log.error("%s has %.0f MB and cannot be divided: %s", self.path, size / 1e6, error)
+
+    def _next_group(self) -> tuple[list[_Entry], bool]:
+        """All entries that wait now (at least one, unless the journal ends), and whether they are the last."""
+        group: list[_Entry] = []
+        entry = self._waiting.get()
+        while entry is not None:
+            group.append(entry)
+            if len(group) == MAX_GROUP:
+                return group, False
+            try:
+                entry = self._waiting.get_nowait()
+            except queue.Empty:
+                return group, False
+        return group, True
+
+
+def _opened(path: Path) -> sqlite3.Connection:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    db = sqlite3.connect(path, isolation_level=None)
+    db.execute("PRAGMA journal_mode=WAL")
+    db.execute("PRAGMA synchronous=FULL")  # NORMAL may lose the newest commits in a power cut
+    db.execute("PRAGMA journal_size_limit=4000000")  # the WAL is cut back after a large group
+    db.execute(SCHEMA)
+    return db
+
+
+def _last_hash(db: sqlite3.Connection) -> str:
+    row = db.execute("SELECT hash FROM journal ORDER BY id DESC LIMIT 1").fetchone()
+    return str(row[0]) if row is not None else FIRST_HASH
+
+
+def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry]) -> list[_Entry]:
+    """Write a group in one transaction and tell its callers; returns the notes that found no room."""
+    if not group:
+        return []
+    try:
+        db.execute("BEGIN IMMEDIATE")
+        for entry in group:
+            _insert(db, entry)
+        db.execute("COMMIT")
+    except sqlite3.Error as error:
+        with contextlib.suppress(sqlite3.Error):  # a disk that takes no commit may take no rollback; callers are told
+            db.execute("ROLLBACK")
+        notes = [entry for entry in group if entry.done is None]
+        if notes:
+            log.error("not recorded yet: %s: %s", ", ".join(entry.kind for entry in notes), error)
+        for entry in group:
+            if entry.done is not None:
+                entry.done.set_exception(_error(path, error))
+        return notes[-MAX_KEPT:]
+    for entry in group:
+        if entry.done is not None:
+            entry.done.set_result(None)
+    return []
+
+
+def _insert(db: sqlite3.Connection, entry: _Entry) -> None:
+    newest = _last_hash(db)  # under the lock, for another service may have written since
+    digest = _hash(newest, entry.wall_time_s, entry.monotonic_s, entry.kind, entry.text)
+    row = (None, entry.wall_time_s, entry.monotonic_s, entry.kind, entry.text, newest, digest)
+    db.execute(INSERT_ROW, row)
+
+
+def hand_over(db: sqlite3.Connection, path: Path, *, part_bytes: int, keep_parts: int) -> None:
+    """Move all rows but the newest, which the chain goes on from, to a new part; drop the oldest parts.
+
+    Raises:
+        sqlite3.Error, OSError: it could not be done; every row is still in one place at least.
+    """
+    db.execute("BEGIN IMMEDIATE")
+    if _size_bytes(db) <= part_bytes:  # another service did it meanwhile
+        db.execute("ROLLBACK")
+        return
+    first_id, last_id = db.execute("SELECT MIN(id), MAX(id) - 1 FROM journal").fetchone()
+    if first_id <= last_id:
+        rows = db.execute("SELECT * FROM journal WHERE id <= ? ORDER BY id", (last_id,))
+        write_part(path, rows, first_id=first_id, last_id=last_id)
+        db.execute("DELETE FROM journal WHERE id <= ?", (last_id,))
+    dropped = parts_of(path)[:-keep_parts]
+    if dropped:
+        _insert(db, _dropped(dropped))
+    db.execute("COMMIT")
+    for part in dropped:
+        part.unlink(missing_ok=True)
+
+
+def _dropped(parts: list[Path]) -> _Entry:
+    """The row that says which rows are gone."""
+    with snapshot(parts[-1]) as db:
+        number, digest = db.execute("SELECT id, hash FROM journal ORDER BY id DESC LIMIT 1").fetchone()
+    told = {"id": number, "hash": digest, "files": [part.name for part in parts]}
+    return _Entry(
+        kind=DROPPED,
+        text=json.dumps(told, separators=(",", ":")),
+        wall_time_s=time.time(),
+        monotonic_s=time.monotonic(),
+        done=None,
+    )
+
+
+def _first_id(db: sqlite3.Connection) -> int | None:
+    number: int | None = db.execute("SELECT MIN(id) FROM journal").fetchone()[0]
+    return number
+
+
+def _size_bytes(db: sqlite3.Connection) -> int:
+    """What the rows take; pages that are free do not count."""
+    pages, free, size = (
+        int(db.execute(f"PRAGMA {what}").fetchone()[0]) for what in ("page_count", "freelist_count", "page_size")
+    )
+    return (pages - free) * size
+
+
+def _hash(previous: str, wall_time_s: float, monotonic_s: float, kind: str, text: str) -> str:
+    parts = json.dumps([previous, wall_time_s, monotonic_s, kind, text], separators=(",", ":"))
+    return hashlib.sha256(parts.encode()).hexdigest()
+
+
+def _record(row: tuple[Any, ...]) -> Record:
+    number, wall_s, mono_s, kind, text, previous, digest = row
+    return Record(
+        id=number,
+        wall_time_s=wall_s,
+        monotonic_s=mono_s,
+        kind=kind,
+        data=json.loads(text),
+        previous_hash=previous,
+        hash=digest,
+    )
+
+
+def _error(path: Path, error: Exception) -> JournalError:
+    return JournalError(
+        f"the journal {path} cannot be written: {error}",
+        hint="free disk space and check the rights of the folder; nothing may move without a record",
+    )

@@ -1,0 +1,342 @@
+"""Tasks: long work that a caller starts, watches and may cancel. One motion task at a time."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import shutil
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Protocol
+
+from hal.errors import Cancelled, CellError, InvalidRequest
+from service.errors import Aborted, Busy, Defect, NoSuchTask, NotPossibleNow, of_file
+from service.jsonable import jsonable
+from service.problem import problem_of
+from service.tasks.model import Artefact, Task, TaskEvent, TaskState
+
+__all__ = ["Artefact", "Recorder", "Task", "TaskContext", "TaskEvent", "TaskState", "TaskStore"]
+
+CANCEL_REPEAT_S = 0.05  # a cancel that falls between two motions must still meet the second
+MAX_ARTEFACT_BYTES = 64_000_000
+log = logging.getLogger(__name__)
+
+
+class Recorder(Protocol):
+    """Where tasks leave their traces (the journal)."""
+
+    def append(self, kind: str, data: dict[str, Any]) -> None:
+        """Record durably before returning; raises `JournalError`."""
+        ...
+
+
+class TaskContext:
+    """The side of a task that its operation sees."""
+
+    def __init__(self, task: Task, folder: Path) -> None:
+        self._task = task
+        self._folder = folder
+
+    @property
+    def id(self) -> str:
+        """Identity of the task."""
+        return self._task.id
+
+    @property
+    def is_cancelled(self) -> bool:
+        """Has somebody asked for the end of this task?"""
+        return self._task.cancel_asked.is_set()
+
+    def progress(self, fraction: float, step: str, detail: str = "") -> None:
+        """Tell watchers how far the work is (0 to 1) and what is being done.
+
+        Raises:
+            Cancelled: the task was cancelled.
+        """
+        self.check_cancelled()
+        self._task.add_event("progress", fraction=min(1.0, max(0.0, fraction)), step=step, detail=detail)
+
+    def check_cancelled(self) -> None:
+        """Raise `Cancelled` when somebody asked for the end of this task."""
+        if self.is_cancelled:
+            raise Cancelled(
+                f"task {self._task.id} was cancelled: {self._task.cancel_reason}",
+                hint="start it again when ready",
+                task=self._task.id,
+            )
+
+    def artefact(self, name: str, data: bytes, media_type: str) -> str:
+        """Keep a file with the task; returns its URL path.
+
+        Raises:
+            InvalidRequest: the name is no plain file name, or the file is too big.
+        """
+        if not Artefact.is_name(name) or len(data) > MAX_ARTEFACT_BYTES:
+            raise InvalidRequest(
+                f"artefact {name!r} has a bad name or more than {MAX_ARTEFACT_BYTES} bytes",
+                hint="letters, digits, dot, dash and underscore",
+            )
+        self._folder.mkdir(parents=True, exist_ok=True)
+        (self._folder / name).write_bytes(data)
+        self._task.add_artefact(Artefact(name=name, media_type=media_type, size_bytes=len(data)))
+        return f"/v1/tasks/{self._task.id}/artefacts/{name}"
+
+
+Work = Callable[[TaskContext], Any]
+
+
+class TaskStore:
+    """Starts, keeps and cancels tasks.
+
+    Args:
+        folder: artefacts go to `folder/<task id>/`.
+        recorder: the journal; a task is acknowledged after its record is on disk.
+        stop_motion: ends the running motion; called at once, and again until a cancelled task has ended.
+        max_queued: more waiting tasks than this are refused with `Busy`.
+        keep: so many finished tasks stay in memory; the artefacts of older ones are removed.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        recorder: Recorder,
+        stop_motion: Callable[[], None],
+        max_queued: int = 16,
+        keep: int = 200,
+    ) -> None:
+        self._folder = folder
+        self._recorder = recorder
+        self._stop_motion = stop_motion
+        self._max_queued = max_queued
+        self._keep = keep
+        self._lock = threading.Lock()
+        self._tasks: OrderedDict[str, Task] = OrderedDict()
+        self._listeners: set[Callable[[Task], None]] = set()
+        self._is_closed = False
+        # Moving tasks queue for one thread, so that two never command the arm; reading tasks do not wait for them.
+        self._lanes = {
+            True: ThreadPoolExecutor(1, thread_name_prefix="task-motion"),
+            False: ThreadPoolExecutor(2, thread_name_prefix="task-read"),
+        }
+
+    def start(
+        self,
+        verb: str,
+        request: dict[str, Any],
+        work: Work,
+        *,
+        moves: bool,
+        holder: str | None = None,
+        key: str | None = None,
+    ) -> Task:
+        """Queue a task. The same idempotency `key` with the same request gives the same task again.
+
+        Raises:
+            Busy: too many tasks wait.
+            InvalidRequest: the key was used for another request.
+            JournalError: the start cannot be recorded, so it does not happen.
+        """
+        with self._lock:
+            earlier = self._with_key(key, verb, request)
+            if earlier is not None:
+                return earlier
+            self._check_room()
+            task = Task(id=secrets.token_hex(8), verb=verb, request=request, moves=moves, holder=holder, key=key)
+            task.on_change = self._changed
+            self._tasks[task.id] = task
+            forgotten = self._forget_old()
+        self._remove_artefacts(forgotten)
+        try:
+            self._recorder.append("task-queued", {"task": task.id, "verb": verb, "request": request, "holder": holder})
+        except CellError:
+            with self._lock:
+                self._tasks.pop(task.id, None)
+            raise
+        task.add_event("state")
+        self._lanes[moves].submit(self._run, task, work)
+        return task
+
+    def restore(self, task: Task) -> None:
+        """Take up a task of an earlier service run, for reading only; one that never ended counts as aborted."""
+        if not task.state.is_final:
+            error = Aborted(
+                f"the service ended while task {task.id} was {task.state}", hint="look at the cell, then start it again"
+            )
+            task.problem = problem_of(error)
+            task.state = TaskState.FAILED
+            self._record_end(task)
+        with self._lock:
+            self._tasks.setdefault(task.id, task)
+            forgotten = self._forget_old()
+        self._remove_artefacts(forgotten)
+
+    def sweep(self) -> None:
+        """Remove artefacts of tasks that nobody can ask for any more; called when those of earlier runs are restored."""
+        if self._folder.is_dir():
+            self._remove_artefacts([path.name for path in self._folder.iterdir() if path.name not in self._tasks])
+
+    def get(self, task_id: str) -> Task:
+        """The task called `task_id`.
+
+        Raises:
+            NoSuchTask: never heard of it, or forgotten.
+        """
+        task = self._tasks.get(task_id)
+        if task is None:
+            raise NoSuchTask(f"there is no task {task_id!r}", hint="GET /v1/tasks lists the tasks that are kept")
+        return task
+
+    def all(self) -> list[Task]:
+        """All kept tasks, newest first."""
+        with self._lock:
+            return list(self._tasks.values())[::-1]
+
+    def moving(self) -> Task | None:
+        """The task that may move the arm now, or None."""
+        return next((t for t in self.all() if t.moves and t.state in (TaskState.RUNNING, TaskState.CANCELLING)), None)
+
+    def artefact_path(self, task_id: str, name: str) -> tuple[Path, Artefact]:
+        """File and description of an artefact.
+
+        Raises:
+            NoSuchTask: no such task or artefact.
+        """
+        task = self.get(task_id)
+        found = next((item for item in task.artefacts if item.name == name), None)
+        path = self._folder / task_id / name
+        if found is None or not path.is_file():
+            raise NoSuchTask(f"task {task_id} has no artefact {name!r}", hint="the task's `artefacts` lists them")
+        return path, found
+
+    def cancel(self, task_id: str, *, reason: str = "asked for") -> Task:
+        """End a task: it is told, so that it begins no further motion, and the arm is stopped until it has ended.
+
+        Raises:
+            NoSuchTask: never heard of it.
+            NotPossibleNow: it has ended already.
+        """
+        task = self.get(task_id)
+        if not task.ask_cancel(reason):
+            raise NotPossibleNow(
+                f"task {task_id} has {task.state} and cannot be cancelled", hint="nothing to do", state=str(task.state)
+            )
+        if task.state is TaskState.CANCELLING and task.moves:
+            self._stop_until_ended(task)
+        return task
+
+    def cancel_moving(self, reason: str) -> None:
+        """Cancel every task that moves or waits to move."""
+        for task in self.all():
+            if task.moves and task.ask_cancel(reason) and task.state is TaskState.CANCELLING:
+                self._stop_until_ended(task)
+
+    def subscribe(self, listener: Callable[[Task], None]) -> Callable[[], None]:
+        """Call `listener` after each change of any task, from any thread; returns what ends that."""
+        with self._lock:
+            self._listeners.add(listener)
+        return lambda: self._listeners.discard(listener)
+
+    def close(self, *, timeout_s: float = 3.0) -> None:
+        """Cancel everything and wait a bounded time; a second call does nothing."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        for task in self.all():
+            if not task.state.is_final and task.ask_cancel("the service ends") and task.moves:
+                self._quiet_stop()
+        for lane in self._lanes.values():
+            lane.shutdown(wait=False, cancel_futures=True)
+        end_s = time.monotonic() + timeout_s
+        for task in self.all():
+            task.wait(max(0.0, end_s - time.monotonic()))
+
+    def _run(self, task: Task, work: Work) -> None:
+        if not task.move_to(TaskState.RUNNING):
+            self._record_end(task)  # cancelled while it waited
+            return
+        try:
+            self._recorder.append("task-started", {"task": task.id})
+            result = jsonable(work(TaskContext(task, self._folder / task.id)))
+        except Cancelled as error:
+            self._end(task, TaskState.CANCELLED, error=error)
+        except CellError as error:
+            self._end(task, TaskState.FAILED, error=error)
+        except Exception as error:  # a defect of an operation ends its task, never the service
+            log.exception("task %s failed by a defect", task.id)
+            text = f"{task.verb} failed by a defect in the program: {type(error).__name__}: {error}"
+            defect = Defect(text, hint="the log has the traceback; please report it")
+            self._end(task, TaskState.FAILED, error=of_file(error) or defect)
+        else:
+            self._end(task, TaskState.SUCCEEDED, result=result)
+
+    def _end(self, task: Task, state: TaskState, *, error: CellError | None = None, result: Any = None) -> None:
+        if state is TaskState.CANCELLED and not task.cancel_asked.is_set():
+            state = TaskState.FAILED  # somebody below cancelled the motion, nobody the task
+        task.result = result
+        task.problem = problem_of(error) if error is not None else None
+        # Recorded before it shows: who sees the end may rely on finding it after a power cut.
+        self._record_end(task, state)
+        task.move_to(state)
+
+    def _record_end(self, task: Task, state: TaskState | None = None) -> None:
+        ended = {"task": task.id, "state": str(state or task.state), "result": task.result, "problem": task.problem}
+        ended |= {"fraction": task.fraction, "step": task.step, "started_s": task.started_s}
+        try:
+            self._recorder.append("task-ended", {**ended, "artefacts": jsonable(task.artefacts)})
+        except CellError as error:
+            level = logging.INFO if self._is_closed else logging.ERROR  # after the end the next start tells of it
+            log.log(level, "the end of task %s was not recorded: %s", task.id, error)
+
+    def _stop_until_ended(self, task: Task) -> None:
+        self._quiet_stop()
+
+        def repeat() -> None:
+            while not task.wait(CANCEL_REPEAT_S):
+                self._quiet_stop()
+
+        threading.Thread(target=repeat, name=f"cancel-{task.id}", daemon=True).start()
+
+    def _quiet_stop(self) -> None:
+        try:
+            self._stop_motion()
+        except CellError as error:
+            log.warning("stopping the motion of a cancelled task: %s", error)
+        except Exception:  # a defect below must not end the attempts: the arm may still move
+            log.exception("stopping the motion of a cancelled task")
+
+    def _with_key(self, key: str | None, verb: str, request: dict[str, Any]) -> Task | None:
+        earlier = next((t for t in self._tasks.values() if key is not None and t.key == key), None)
+        if earlier is not None and (earlier.verb, earlier.request) != (verb, request):
+            raise InvalidRequest(
+                "this Idempotency-Key was used for another request",
+                hint="use a fresh key for a new request",
+                task=earlier.id,
+            )
+        return earlier
+
+    def _check_room(self) -> None:
+        if self._is_closed:
+            raise Busy("the service is ending", hint="wait for its restart")
+        queued = sum(task.state is TaskState.QUEUED for task in self._tasks.values())
+        if queued >= self._max_queued:
+            raise Busy(f"{queued} tasks wait already", hint="wait for one to end or cancel one", queued=queued)
+
+    def _forget_old(self) -> list[str]:
+        ended = [task.id for task in self._tasks.values() if task.state.is_final]
+        forgotten = ended[: max(0, len(ended) - self._keep)]
+        for task_id in forgotten:
+            del self._tasks[task_id]
+        return forgotten
+
+    def _remove_artefacts(self, task_ids: list[str]) -> None:
+        for task_id in task_ids:
+            shutil.rmtree(self._folder / task_id, ignore_errors=True)
+
+    def _changed(self, task: Task) -> None:
+        for listener in list(self._listeners):
+            listener(task)

@@ -1,0 +1,75 @@
+"""The conformance kit runs on any cell, and reports what it found and what it could not try."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from drivers.emulators import tfmini
+from drivers.emulators.scripted import ScriptedProximity
+from tests.service.conftest import WriteCell
+
+ROOT = Path(__file__).parents[3]
+
+
+def conform(path: Path, report: Path, *arguments: str) -> tuple[subprocess.CompletedProcess[str], dict[str, Any], str]:
+    """Run the command; its outcome and both reports."""
+    command = ["conform", str(path), "--report", str(report), *arguments]
+    done = subprocess.run(
+        [sys.executable, "-m", "service.cli", *command], capture_output=True, text=True, timeout=240, check=False
+    )
+    assert f"{report}.md" in done.stdout, done.stdout + done.stderr
+    return done, json.loads(Path(f"{report}.json").read_text()), Path(f"{report}.md").read_text()
+
+
+def test_the_kit_runs_on_a_cell_file_and_reports_what_was_not_tried(write_cell: WriteCell, tmp_path: Path) -> None:
+    chosen = ("--device", "finger_proximity", "--level", "connect")
+    done, found, text = conform(write_cell(), tmp_path / "reports" / "fake", *chosen)
+    assert done.returncode == 0
+    assert "test_close_twice_is_once PASSED" in done.stdout
+    assert list(found["devices"]) == ["finger_proximity"]
+    outcomes = {p["promise"]: (p["outcome"], p["why"]) for p in found["devices"]["finger_proximity"]["promises"]}
+    assert outcomes["close twice is once"] == ("passed", "")
+    assert outcomes["later samples have later stamps and numbers"] == ("not tried", "level read was not asked for")
+    assert "| later samples have later stamps and numbers | read | not tried |" in text
+
+
+def test_the_kit_finds_a_broken_promise(write_cell: WriteCell, tmp_path: Path) -> None:
+    path = write_cell(options={"panel_lights": {"immortal": True}, "finger_proximity": {"fail": "no answer"}})
+    chosen = ("--device", "panel_lights", "--device", "finger_proximity", "--level", "connect")
+    done, found, text = conform(path, tmp_path / "fake", *chosen)
+    assert done.returncode == 1
+    assert "test_after_close_every_read_says_unavailable FAILED" in done.stdout
+    lights = {p["promise"]: p for p in found["devices"]["panel_lights"]["promises"]}
+    assert lights["after close every read says unavailable"]["outcome"] == "failed"
+    assert "DID NOT RAISE" in lights["after close every read says unavailable"]["why"]
+    absent = found["devices"]["finger_proximity"]["promises"]
+    assert {p["outcome"] for p in absent if p["outcome"] != "not tried"} == {"failed"}
+    assert all("no answer" in p["why"] for p in absent if p["outcome"] == "failed")
+    assert "did not connect" in text
+    assert found["counts"]["failed"] > 1
+
+
+def test_the_wire_of_an_emulated_device_is_broken_too(tmp_path: Path) -> None:
+    done, found, text = conform(ROOT / "cells" / "mixed.toml", tmp_path / "mixed", "--device", "proximity_left")
+    device = found["devices"]["proximity_left"]
+    assert done.returncode == 0, done.stdout[-3000:]
+    assert device["counts"] == {"passed": len(device["promises"])}, "the emulator vanishes and falls silent on demand"
+    assert device["link"].startswith("serial ")
+    assert "| proximity_left | proximity | serial:tfmini | emulator tfmini |" in text
+
+
+def test_a_real_device_that_cannot_be_broken_is_skipped_with_the_reason(write_cell: WriteCell, tmp_path: Path) -> None:
+    far_side = tfmini.start(ScriptedProximity(), {})
+    try:
+        port = far_side.address["port"]
+        extra = f'[devices.left]\nkind = "proximity"\ndriver = "serial:tfmini"\noptions = {{ port = "{port}" }}\n'
+        path = write_cell(mode="real", extra=extra)
+        _, found, _ = conform(path, tmp_path / "real", "--device", "left")
+    finally:
+        far_side.close()
+    skipped = {p["promise"]: p["why"] for p in found["devices"]["left"]["promises"] if p["outcome"] == "skipped"}
+    assert skipped["silence is a timeout and in time"] == "this rig has no way to make a device silent"

@@ -1,0 +1,165 @@
+"""The teach page in a real browser: upload, click, see the outline, name, save, check. Skipped without Chromium."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from service.serve import Panelwright
+from tests.perception.vision.bench_panel import panel
+from tests.service.http.test_page import CHROMIUM, FLAGS, PATIENCE_MS, _until
+from tests.service.memory.test_stored_images import Shown, house, shown
+from tests.service.waiting import eventually
+
+__all__ = ["house", "shown"]  # fixtures
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not CHROMIUM.exists(), reason="no Chromium: apt-get install chromium"),
+]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=str(CHROMIUM), args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def page(browser: Any, house: Panelwright, shown: Shown, tmp_path: Path) -> Iterator[Any]:
+    """The page with an image uploaded; every test has a page of its own, so that none begins with another's clicks."""
+    file = tmp_path / "panel.png"
+    cv2.imwrite(str(file), shown[0])
+    tab = browser.new_page(viewport={"width": 1400, "height": 1100})
+    tab.set_default_timeout(PATIENCE_MS)
+    faults: list[str] = []
+    tab.on("pageerror", lambda error: faults.append(str(error)))
+    tab.on("console", lambda line: faults.append(line.text) if "Content Security" in line.text else None)
+    tab.goto(f"{house.url}/teach.html")
+    tab.set_input_files("#file", str(file))
+    _until(tab, "document.querySelector('#picture').naturalWidth === 1280")
+    yield tab
+    assert not faults
+    tab.close()
+
+
+def _click(page: Any, shown: Shown, *places_m: tuple[float, float]) -> None:
+    """Click on points of the plate, as far as the page shows them."""
+    picture = page.locator("#picture")
+    for u, v in shown[1].project([[x, y, 0.0] for x, y in places_m]):
+        scale = picture.bounding_box()["width"] / shown[0].shape[1]
+        picture.click(position={"x": (u + 0.5) * scale, "y": (v + 0.5) * scale})  # once it no longer moves
+
+
+def _outlined(page: Any, button: str) -> None:
+    """Wait for the answer to the clicks: it must be an outline, and then the button works."""
+    _until(page, "!document.querySelector('#found').textContent.startsWith('Looking')")
+    assert page.is_enabled(button), page.text_content("#found")
+
+
+def _corners(name: str, half_m: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    x, y = panel().object(name).position_m
+    return (x - half_m, y + half_m), (x + half_m, y - half_m)
+
+
+def test_a_click_shows_the_outline_that_was_found(page: Any, shown: Shown) -> None:
+    _click(page, shown, panel().object("mode").position_m)
+    _until(page, "document.querySelector('#found').textContent.includes('rotary')")
+    assert "Found a circle" in page.text_content("#found")
+    points = page.get_attribute("#outline", "points").split()
+    middle = np.mean([[float(x) for x in point.split(",")] for point in points], axis=0)
+    assert np.allclose(middle, shown[1].project([panel().object("mode").point_m])[0], atol=10.0)
+    page.click("#clear")
+    _until(page, "!document.querySelector('#outline')")
+    assert page.is_disabled("#teach-kind")
+
+
+def test_a_new_kind_is_named_saved_and_found(page: Any, shown: Shown) -> None:
+    _click(page, shown, *_corners("emergency", 0.02))
+    _outlined(page, "#teach-kind")
+    page.fill("#kind", "mushroom")
+    page.click("#teach-kind")
+    _until(page, "document.querySelector('#saved').textContent.includes('the new kind mushroom')")
+    _until(page, "document.querySelector('#results').textContent.includes('mushroom')")
+    _until(page, "document.querySelector('#known').textContent.includes('mushroom')")
+    assert "/artefacts/blind.png" in page.get_attribute("#picture", "src")
+    page.click("#show-plain")
+    page.click("#known button")
+    _until(page, "!document.querySelector('#known').textContent.includes('mushroom')")
+
+
+def test_a_click_beside_the_panel_or_on_nothing_is_explained(page: Any, shown: Shown) -> None:
+    _click(page, shown, (0.12, -0.15))
+    _until(page, "document.querySelector('#found').classList.contains('bad')")
+    assert "nothing but plate" in page.text_content("#found")
+    assert page.is_disabled("#teach-kind")
+
+
+def test_a_whole_panel_is_put_together_saved_and_read(page: Any, shown: Shown) -> None:
+    page.click("#mode-panel")
+    page.fill("#panel-name", "pump_room")
+    gauge = panel().object("pressure")
+    _click(page, shown, gauge.position_m)
+    _outlined(page, "#add-object")
+    page.select_option("#object-kind", "gauge")
+    _until(page, "document.querySelector('[data-key=at_min]')")
+    page.fill("[data-key=name]", "pressure")
+    page.click(".pointed button >> nth=0")
+    _click(page, shown, (gauge.position_m[0] - 0.021, gauge.position_m[1] - 0.021))
+    assert "," in page.input_value("[data-key=at_min]")
+    page.click("#add-object")
+    _until(page, "document.querySelector('#objects').textContent.includes('pressure · gauge')")
+    _click(page, shown, *_corners("emergency", 0.02))
+    _outlined(page, "#add-object")
+    page.select_option("#object-kind", "mushroom")
+    _until(page, "document.querySelectorAll('#questions [data-key]').length === 1")
+    page.fill("[data-key=name]", "halt")
+    page.click("#add-object")
+    page.click("#save-panel")
+    _until(page, "document.querySelector('#saved').textContent.includes('Saved panel pump_room')")
+    _until(page, "document.querySelector('#results').textContent.includes('pressure · gauge6.')")
+    assert "/artefacts/annotated.png" in page.get_attribute("#picture", "src")
+
+
+def test_what_is_typed_stays_when_the_questions_of_another_kind_come_late(page: Any) -> None:
+    page.click("#mode-panel")
+    _until(page, "document.querySelector('[data-key=at_min]')")
+    held: list[Any] = []
+
+    def hold(route: Any) -> None:
+        held.append(route)
+
+    page.route("**/v1/knowledge/questions*", hold)
+    page.select_option("#object-kind", "display")
+    _until(page, "document.querySelector('#object-kind').value === 'display'")
+    page.fill("[data-key=name]", "level")
+    eventually(lambda: page.title() and held)  # asking lets the events of the browser in
+    held[0].continue_()
+    _until(page, "!document.querySelector('[data-key=at_min]')")
+    assert page.input_value("[data-key=name]") == "level"
+
+
+def test_what_is_no_image_is_explained(page: Any, tmp_path: Path) -> None:
+    bad = tmp_path / "bad.png"
+    bad.write_bytes(b"not an image")
+    page.set_input_files("#file", str(bad))
+    page.wait_for_selector("#complaint:not([hidden])")
+    assert "not an image" in page.text_content("#complaint")
+
+
+def test_the_stop_works_here_too_and_a_narrow_screen_shows_everything(page: Any, house: Panelwright) -> None:
+    page.set_viewport_size({"width": 420, "height": 900})
+    assert page.evaluate("document.documentElement.scrollWidth <= 420")
+    page.click("#stop")
+    _until(page, "document.querySelector('#stop-box').dataset.latched === 'yes'")
+    assert house.service.supervisor.latch.is_set()
+    page.click("#reset:not([hidden])")
+    _until(page, "document.querySelector('#stop-box').dataset.latched === 'no'")

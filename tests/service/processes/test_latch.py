@@ -1,0 +1,232 @@
+"""The stop latch: it starts latched, damage means latched, and only a reset that saw the newest stop clears it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from service.processes.latch import BODY_AT, CLEAR, SIZE, Beat, Latch
+from service.processes.stop import StopServer, obey
+
+
+def test_a_new_latch_is_latched(tmp_path: Path) -> None:
+    assert Latch.create(tmp_path / "latch").is_set()
+
+
+def test_a_reset_clears_and_a_stop_latches_again(tmp_path: Path) -> None:
+    latch = Latch.create(tmp_path / "latch")
+    assert latch.reset("test", seen_count=latch.state().count)
+    assert not latch.is_set()
+    latch.set("button")
+    assert latch.is_set()
+    assert latch.state().source == "button"
+
+
+def test_two_mappings_of_one_file_see_each_other(tmp_path: Path) -> None:
+    writer = Latch.create(tmp_path / "latch")
+    reader = Latch(tmp_path / "latch")
+    writer.reset("test", seen_count=writer.state().count)
+    assert not reader.is_set()
+    writer.set("x")
+    assert reader.is_set()
+
+
+def test_a_closed_latch_counts_as_latched(tmp_path: Path) -> None:
+    latch = Latch.create(tmp_path / "latch")
+    latch.reset("test", seen_count=latch.state().count)
+    latch.close()
+    assert latch.is_set()
+    assert latch.state().is_latched
+
+
+@given(flag=st.integers(0, 255))
+def test_every_byte_but_one_means_latched(tmp_path_factory: pytest.TempPathFactory, flag: int) -> None:
+    path = tmp_path_factory.mktemp("latch") / "latch"
+    memory = bytearray(SIZE)
+    memory[BODY_AT] = flag
+    path.write_bytes(bytes(memory))
+    assert Latch(path).is_set() == (flag != CLEAR)
+
+
+def test_a_writer_that_died_in_the_middle_reads_as_latched(tmp_path: Path) -> None:
+    path = tmp_path / "latch"
+    latch = Latch.create(path)
+    latch.reset("test", seen_count=latch.state().count)
+    torn = bytearray(path.read_bytes())
+    torn[0] |= 1  # an odd sequence: the record was being written
+    path.write_bytes(bytes(torn))
+    assert Latch(path).state().is_latched
+
+
+def test_a_long_or_broken_source_is_cut_not_refused(tmp_path: Path) -> None:
+    latch = Latch.create(tmp_path / "latch")
+    assert latch.set("ü" * 500).is_latched
+    assert latch.set("\ud800").is_latched
+
+
+def test_stops_of_several_threads_are_all_counted(tmp_path: Path) -> None:
+    latch = Latch.create(tmp_path / "latch")
+    before = latch.state().count
+    threads = [threading.Thread(target=lambda: [latch.set("press") for _ in range(500)]) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert latch.state().count == before + 2000
+
+
+def test_readers_never_see_a_mixed_record(tmp_path: Path) -> None:
+    latch = Latch.create(tmp_path / "latch")
+    end = threading.Event()
+
+    def write() -> None:
+        while not end.is_set():
+            count = latch.set("a" * 79).count
+            latch.reset("b" * 79, seen_count=count)
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    try:
+        for _ in range(3000):
+            state = Latch(tmp_path / "latch").state()
+            assert state.source in ("a" * 79, "b" * 79, "latch not readable", "start: latched until an explicit reset")
+            if state.source[0] == "b":
+                assert not state.is_latched
+    finally:
+        end.set()
+        writer.join()
+
+
+class LatchLife(RuleBasedStateMachine):
+    """Stops and resets in any order, against the obvious model."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        import tempfile
+
+        self.folder = tempfile.TemporaryDirectory()
+        self.latch = Latch.create(Path(self.folder.name) / "latch")
+        self.is_latched = True
+        self.seen = self.latch.state().count
+
+    @rule(source=st.text(max_size=100))
+    def stop(self, source: str) -> None:
+        self.latch.set(source)
+        self.is_latched = True
+
+    @rule()
+    def look(self) -> None:
+        self.seen = self.latch.state().count
+
+    @rule()
+    def reset(self) -> None:
+        is_newest = self.seen == self.latch.state().count
+        assert self.latch.reset("test", seen_count=self.seen) == is_newest
+        if is_newest:
+            self.is_latched = False
+
+    @invariant()
+    def agrees_with_the_model(self) -> None:
+        assert self.latch.is_set() == self.is_latched == self.latch.state().is_latched
+
+    def teardown(self) -> None:
+        self.latch.close()
+        self.folder.cleanup()
+
+
+TestLatchLife = LatchLife.TestCase
+
+
+def test_a_beat_grows_old(tmp_path: Path) -> None:
+    beat = Beat(tmp_path / "beat")
+    assert beat.age_s() > 1.0, "never beaten"
+    beat.beat()
+    assert beat.age_s() < 1.0
+
+
+def test_no_reader_in_another_process_ever_sees_half_a_beat(tmp_path: Path) -> None:
+    beat = Beat(tmp_path / "beat")
+    beat.beat()
+    writer = (
+        "import sys, pathlib; from service.processes.latch import Beat\n"
+        "b = Beat(pathlib.Path(sys.argv[1]))\nwhile True: b.beat()"
+    )
+    with subprocess.Popen([sys.executable, "-c", writer, str(tmp_path / "beat")]) as process:
+        oldest_s = max(beat.age_s() for _ in range(2_000_000))
+        process.kill()
+    assert oldest_s < 600.0, "a torn number looks hours old"
+
+
+def _answer(tmp_path: Path, request: str, origins: tuple[str, ...] = ()) -> tuple[int, dict[str, object], str, Latch]:
+    latch = Latch.create(tmp_path / "latch")
+    latch.reset("test", seen_count=latch.state().count)
+    text = StopServer(latch, origins).answer(request.encode(), "127.0.0.1").decode()
+    head, _, body = text.partition("\r\n\r\n")
+    return int(head.split()[1]), json.loads(body or "{}"), head, latch
+
+
+def test_post_stops_whatever_else_the_request_says(tmp_path: Path) -> None:
+    request = "POST /v1/stop?x=1 HTTP/1.1\r\nHost: evil\r\nOrigin: http://evil\r\nbroken header\r\n\r\n"
+    status, body, head, latch = _answer(tmp_path, request)
+    assert (status, body["is_latched"], latch.is_set()) == (200, True, True)
+    assert "Access-Control" not in head, "a stranger's page may stop, but not read"
+
+
+def test_only_our_own_page_may_read_the_answer(tmp_path: Path) -> None:
+    request = "GET /v1/stop HTTP/1.1\r\nOrigin: http://127.0.0.1:8460\r\n\r\n"
+    assert "Access-Control-Allow-Origin" in _answer(tmp_path, request, ("http://127.0.0.1:8460",))[2]
+
+
+@pytest.mark.parametrize(
+    ("request_line", "status"),
+    [("GET /v1/stop", 200), ("OPTIONS /v1/stop", 204), ("PUT /v1/stop", 405), ("POST /", 404), ("\0\xff", 404)],
+)
+def test_nothing_but_post_stops(tmp_path: Path, request_line: str, status: int) -> None:
+    found, _, _, latch = _answer(tmp_path, f"{request_line} HTTP/1.1\r\n\r\n")
+    assert found == status
+    assert not latch.is_set()
+
+
+def test_the_supervisors_lines_stop_and_reset(tmp_path: Path) -> None:
+    latch = Latch.create(tmp_path / "latch")
+    obey(latch, f"reset {latch.state().count} the supervisor\n")
+    assert not latch.is_set()
+    obey(latch, "stop a good reason\n")
+    assert latch.state().source == "a good reason"
+    obey(latch, "reset 0 too late\n")
+    assert latch.is_set()
+
+
+def test_slow_and_broken_clients_hold_nobody_up(tmp_path: Path) -> None:
+    """Half-open connections by the hundred, and a stop is still answered."""
+    import socket
+
+    latch = Latch.create(tmp_path / "latch")
+
+    async def scene() -> bytes:
+        listener = socket.socket()
+        listener.bind(("127.0.0.1", 0))
+        server = await StopServer(latch).start(listener)
+        port = listener.getsockname()[1]
+        idle = [await asyncio.open_connection("127.0.0.1", port) for _ in range(200)]
+        for _, writer in idle:
+            writer.write(b"POST /v1/st")
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(b"POST /v1/stop HTTP/1.1\r\n\r\n")
+        answer = await reader.read()
+        for _, open_writer in [*idle, (reader, writer)]:
+            open_writer.close()
+        server.close()
+        return answer
+
+    assert asyncio.run(scene()).startswith(b"HTTP/1.1 200")
+    assert "POST /v1/stop" in latch.state().source

@@ -1,0 +1,156 @@
+"""What a stop, its reset and a take-over are worth that come while the arm stands, between two motions of a task."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+
+from hal.config import load_cell
+from hal.errors import LeaseError
+from hal.motion import Hold
+from service.core import Service
+from service.operations.context import Operation, OperationContext
+from service.serve import Options, Panelwright
+from service.tasks.model import Task, TaskState
+from tests.service.conftest import WriteCell
+from tests.service.verbs import OPERATIONS, HoldRequest
+from tests.service.waiting import eventually
+
+PATIENCE_S = 20.0
+
+
+class Thinker:
+    """An operation that moves, thinks until it may go on, and moves again."""
+
+    def __init__(self) -> None:
+        self.thinks, self.may_go_on = threading.Event(), threading.Event()
+        self.moved = 0
+
+    def run(self, context: OperationContext, _request: HoldRequest) -> dict[str, Any]:
+        self._move(context)
+        self.thinks.set()
+        assert self.may_go_on.wait(PATIENCE_S)
+        self._move(context)
+        return {}
+
+    def _move(self, context: OperationContext) -> None:
+        context.connection.mover.execute(Hold(name="hold", duration_s=0.01))
+        self.moved += 1
+
+
+@pytest.fixture
+def thinker() -> Thinker:
+    return Thinker()
+
+
+@pytest.fixture
+def service(write_cell: WriteCell, tmp_path: Path, thinker: Thinker) -> Iterator[Service]:
+    think = Operation(name="think", request_model=HoldRequest, run=thinker.run, summary="Think")
+    service = Service(
+        load_cell(write_cell(robot=True)), {**OPERATIONS, "think": think}, runs_dir=tmp_path / "runs", inline=True
+    )
+    service.start()
+    yield service
+    thinker.may_go_on.set()
+    service.close()
+
+
+def stop_and_reset(service: Service) -> None:
+    service.supervisor.reset("test", seen_count=service.supervisor.stop("test").count)
+
+
+def refused(task: Task) -> str:
+    """What a task that has failed says."""
+    assert task.wait(PATIENCE_S)
+    assert task.state is TaskState.FAILED and task.problem is not None
+    assert task.problem["type"] == "urn:panelwright:stopped"
+    return str(task.problem["detail"])
+
+
+def test_a_task_that_thought_while_the_stop_was_pressed_and_reset_moves_no_more(
+    service: Service, thinker: Thinker
+) -> None:
+    task = service.submit("think", HoldRequest())
+    assert thinker.thinks.wait(PATIENCE_S)
+    stop_and_reset(service)
+    thinker.may_go_on.set()
+    assert "pressed after this task was asked for" in refused(task)
+    assert thinker.moved == 1
+    again = service.submit("think", HoldRequest())
+    assert again.wait(PATIENCE_S) and again.state is TaskState.SUCCEEDED, "a new command moves"
+
+
+def test_what_waited_in_the_queue_when_the_stop_was_pressed_does_not_move_after_the_reset(
+    service: Service, thinker: Thinker
+) -> None:
+    service.submit("think", HoldRequest())
+    waiting = service.submit("hold", HoldRequest(seconds=0.1))
+    assert thinker.thinks.wait(PATIENCE_S)
+    stop_and_reset(service)
+    thinker.may_go_on.set()
+    refused(waiting)
+
+
+def test_a_take_over_at_the_very_moment_of_a_command_wins(service: Service) -> None:
+    class Overtaken(HoldRequest):
+        def model_dump(self, **given: Any) -> dict[str, Any]:  # asked for between the look at the lease and the start
+            service.lease.take_over("bob")
+            return super().model_dump(**given)
+
+    alice = service.lease.acquire("alice")
+    with pytest.raises(LeaseError):
+        service.submit("hold", Overtaken(), lease_token=alice.token)
+    assert service.tasks.all()[0].wait(PATIENCE_S)
+    assert service.tasks.all()[0].state is TaskState.CANCELLED
+
+
+def kinds(service: Service) -> list[tuple[str, str]]:
+    """The stops and resets in the journal, with what they came from."""
+    return [(r.kind, r.data["source"]) for r in service.journal.records(kinds=("stop", "stop-reset"))]
+
+
+def test_a_stop_by_the_stop_port_is_in_the_journal(write_cell: WriteCell, tmp_path: Path) -> None:
+    options = Options(port=0, runs_dir=tmp_path / "runs", inline=True)
+    panelwright = Panelwright(load_cell(write_cell()), options, operations=OPERATIONS)
+    panelwright.start()
+    try:
+        service = panelwright.service
+        httpx2.post(panelwright.stop_url, timeout=PATIENCE_S, trust_env=False)
+        eventually(lambda: ("stop", "POST /v1/stop from 127.0.0.1") in kinds(service))
+        service.supervisor.reset("test", seen_count=service.supervisor.latch.state().count)
+        service.supervisor.latch.set("pressed, and reset at once")
+        service.supervisor.reset("test", seen_count=service.supervisor.latch.state().count)
+        eventually(lambda: len(kinds(service)) >= 5)
+        assert kinds(service)[-4:] == [
+            ("stop", "POST /v1/stop from 127.0.0.1"),
+            ("stop-reset", "test"),
+            ("stop", "pressed, and reset at once"),
+            ("stop-reset", "test"),
+        ]
+    finally:
+        panelwright.close()
+
+
+@pytest.mark.parametrize("is_pressed", [True, False])
+def test_a_stop_that_is_pressed_while_a_simulated_cell_starts_stays(
+    write_cell: WriteCell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_pressed: bool
+) -> None:
+    service = Service(load_cell(write_cell()), OPERATIONS, runs_dir=tmp_path / "runs", inline=True)
+    start: Callable[[], None] = service.supervisor._start_inline
+
+    def pressed_meanwhile() -> None:
+        start()
+        if is_pressed:
+            service.supervisor.stop("somebody")
+
+    monkeypatch.setattr(service.supervisor, "_start_inline", pressed_meanwhile)
+    try:
+        service.start()
+        assert service.supervisor.latch.is_set() is is_pressed
+    finally:
+        service.close()

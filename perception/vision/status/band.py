@@ -92,7 +92,7 @@ def hidden_by_bands(
 
 
 def lying_across(
-    patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool
+    patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool, through: bool = False
 ) -> NDArray[np.bool_] | None:
     """(H, W) mask of what lies across an object in the patch; None when nothing does.
 
@@ -100,7 +100,7 @@ def lying_across(
     into a frame or a pointer of the same gray where a band does not.
 
     Args:
-        half_width_m, half_height_m, is_round: as `covered`.
+        half_width_m, half_height_m, is_round, through: as `followed_in`.
     """
     smooth = smoothed(patch)
     ends = border_crossings(
@@ -111,8 +111,9 @@ def lying_across(
     least_side = 2 * min(half_width_m, half_height_m) * patch.px_per_m
     bands, rest = _bands_between(smooth, ends, least_side, is_round=is_round)
     leaked = followed_in(
-        patch, rest, smooth=smooth, half_width_m=half_width_m, half_height_m=half_height_m, is_round=is_round
-    )
+        patch, rest, smooth=smooth, half_width_m=half_width_m, half_height_m=half_height_m, is_round=is_round,
+        through=through,
+    )  # fmt: skip
     found = _drawn(bands, patch.gray.shape)
     if leaked is not None:
         found |= leaked

@@ -69,23 +69,28 @@ def covered(patch: Patch, *, half_width_m: float, half_height_m: float, is_round
 
 
 def followed_in(
-    patch: Patch, found: Sequence[Crossing], *, smooth: Image, half_width_m: float, half_height_m: float, is_round: bool
+    patch: Patch, found: Sequence[Crossing], *, smooth: Image, half_width_m: float, half_height_m: float, is_round: bool,
+    through: bool = False,
 ) -> NDArray[np.bool_] | None:  # fmt: skip
     """(H, W) mask of what can be followed by its gray from crossings deep into the object; None when nothing can.
 
     Args:
         smooth: what `smoothed` makes of the patch.
         half_width_m, half_height_m, is_round: as `covered`.
+        through: only what comes out at another side of a rectangle counts: labels lead into a slot and its ticks, and end there.
     """
     if not found:
         return None
+    places = np.round([crossing.middle_px for crossing in found]).astype(int)
+    sides = np.array([crossing.side for crossing in found])
     depth = _depth(patch, half_width_m, half_height_m, is_round)
     least = DEEP * min(half_width_m, half_height_m) * patch.px_per_m
     mask = np.zeros(patch.gray.shape, bool)
     rim = depth <= RIM_PX
-    for crossing in found:
-        u, v = crossing.middle_px
-        region = _followed(smooth, (round(float(u)), round(float(v))))
+    for crossing, (u, v) in zip(found, places.tolist(), strict=True):
+        region = _followed(smooth, (u, v))
+        if through and not (region[places[:, 1], places[:, 0]] & (sides != crossing.side)).any():
+            continue
         within = region & (depth > 0)
         if within.sum() > LARGEST_SHARE * (depth > 0).sum() or not within.any():
             continue

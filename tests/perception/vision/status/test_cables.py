@@ -143,6 +143,13 @@ def test_a_hose_as_wide_as_the_cap_is_no_cap() -> None:
         assert told.value is None or told.value == pytest.approx(clear.value, abs=2.0)
 
 
+@pytest.mark.parametrize("seed", [10035, 10280])
+def test_a_label_that_leads_into_the_slot_does_not_hide_the_track(seed: int) -> None:
+    """Followed by its gray, a faint word below a track is its slot and its cap; a cable comes out at another side."""
+    rows = [row for row in read_scene(draw_scene(seed, "hard")) if row.kind == "slider"]
+    assert rows and all(row.is_right for row in rows)
+
+
 def test_a_cable_of_the_faces_own_gray_does_not_hide_the_face() -> None:
     """Its gray would lead a search by gray all over the face and its rim."""
     status = read_gauge(patch_of(hung(dark_face(6.0), (80, 84, 150), 34), noise=4.0), GAUGE)

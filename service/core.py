@@ -64,7 +64,12 @@ class Service:
             cell, stop_listener=stop_listener, origins=origins, inline=inline, runs_dir=runs_dir, report=self.note
         )
         self.tasks = TaskStore(state_dir / "tasks", recorder=self.journal, stop_motion=self._stop_motion)
-        self.lease = LeaseDesk(ttl_s=cell.file.safety.lease_ttl_s, on_loss=self.tasks.cancel_moving, report=self.note)
+        self.lease = LeaseDesk(
+            ttl_s=cell.file.safety.lease_ttl_s,
+            on_loss=self.tasks.cancel_moving,
+            others=self.tasks.moving_for_others,
+            report=self.note,
+        )
         self._is_closing = threading.Event()
         self._folder_lock = (state_dir / "lock").open("w")  # held until the process ends, however it does
         if _is_alone(self._folder_lock):

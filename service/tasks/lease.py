@@ -30,6 +30,7 @@ class LeaseDesk:
     Args:
         ttl_s: without a heartbeat for so long, the lease lapses.
         on_loss: called with a reason when a holder lost the lease by lapse or take-over; stops what it started.
+        others: what moves, or waits to, and was not started by this holder (one sentence); None when nothing does.
         report: told about each grant, take-over, release and lapse.
     """
 
@@ -39,11 +40,13 @@ class LeaseDesk:
         ttl_s: float,
         clock: Clock | None = None,
         on_loss: Callable[[str], None] = lambda _reason: None,
+        others: Callable[[str], str | None] = lambda _holder: None,
         report: Callable[[str, dict[str, Any]], None] = lambda _kind, _data: None,
     ) -> None:
         self.ttl_s = ttl_s
         self._clock = clock or WallClock()
         self._on_loss = on_loss
+        self._others = others
         self._report = report
         self._lock = threading.RLock()
         self._epoch = 0
@@ -55,7 +58,7 @@ class LeaseDesk:
         """Take the free lease.
 
         Raises:
-            LeaseError: somebody holds it; `details["holder"]` says who.
+            LeaseError: somebody holds it, `details["holder"]` says who; or another one's task moves without it.
         """
         self.expire()
         with self._lock:
@@ -66,16 +69,22 @@ class LeaseDesk:
                     holder=self._holder,
                     epoch=self._epoch,
                 )
+            if (moving := self._others(holder)) is not None:
+                raise LeaseError(
+                    f"nobody holds the cell, but {moving}",
+                    hint="wait for its end, cancel it, or take over on purpose: POST /v1/lease/take-over",
+                    epoch=self._epoch,
+                )
             return self._grant(holder, "lease-acquired")
 
     def take_over(self, holder: str) -> Grant:
-        """Take the lease from whoever holds it; what that one started is stopped."""
+        """Take the lease from whoever holds it; what that one started, or anybody without a lease, is stopped."""
         self.expire()
         with self._lock:
-            before = self._holder
+            before, moving = self._holder, self._others(holder)
             grant = self._grant(holder, "lease-taken-over")
-        if before is not None:
-            self._on_loss(f"{holder} took the lease over from {before}")
+        if before is not None or moving is not None:
+            self._on_loss(f"{holder} took the lease over" + (f" from {before}" if before is not None else ""))
         return grant
 
     def heartbeat(self, token: str) -> Grant:

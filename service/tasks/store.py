@@ -200,6 +200,14 @@ class TaskStore:
         """The task that may move the arm now, or None."""
         return next((t for t in self.all() if t.moves and t.state in (TaskState.RUNNING, TaskState.CANCELLING)), None)
 
+    def moving_for_others(self, holder: str) -> str | None:
+        """The task that moves, or waits to, and was not started by this holder of the lease, in words; None without."""
+        for task in self.all():
+            if task.moves and not task.state.is_final and task.holder != holder:
+                who = task.holder or "somebody without a lease"
+                return f"{task.verb} (task {task.id}) of {who} is {task.state}"
+        return None
+
     def artefact_path(self, task_id: str, name: str) -> tuple[Path, Artefact]:
         """File and description of an artefact.
 

@@ -203,6 +203,26 @@ def test_a_take_over_ends_what_the_old_holder_started(client: httpx2.Client) -> 
     assert client.post("/v1/hold", json={}, headers={"Lease-Token": alice["token"]}).status_code == 409
 
 
+def test_who_takes_the_lease_does_not_share_the_arm_with_a_task_that_was_begun_without_one(
+    client: httpx2.Client,
+) -> None:
+    where = client.post("/v1/hold", json={}).headers["location"]
+    eventually(lambda: client.get(where).json()["state"] == "running")
+    refused = client.post("/v1/lease", json={"holder": "bob"})
+    assert (refused.status_code, refused.json()["type"]) == (409, "urn:panelwright:lease-error")
+    assert where.rpartition("/")[2] in refused.json()["detail"]
+    assert not client.get("/v1/lease").json()["is_held"]
+    bob = client.post("/v1/lease/take-over", json={"holder": "bob"}).json()
+    task = client.get(f"{where}?wait_s=10").json()
+    assert (task["state"], "bob took the lease over" in task["problem"]["detail"]) == ("cancelled", True)
+    again = client.post("/v1/hold", json={}, headers={"Lease-Token": bob["token"]}).headers["location"]
+    assert client.post("/v1/lease/release", headers={"Lease-Token": bob["token"]}).status_code == 200
+    assert client.post("/v1/lease", json={"holder": "alice"}).status_code == 409, "what bob left behind moves"
+    client.post(f"{again}/cancel?wait_s=10")
+    alice = client.post("/v1/lease", json={"holder": "alice"}).json()
+    assert client.post("/v1/lease/release", headers={"Lease-Token": alice["token"]}).status_code == 200
+
+
 def test_a_lapsed_lease_ends_the_motion(client: httpx2.Client) -> None:
     alice = client.post("/v1/lease", json={"holder": "alice"}).json()
     where = client.post("/v1/hold", json={}, headers={"Lease-Token": alice["token"]}).headers["location"]

@@ -114,6 +114,20 @@ def test_every_grant_and_its_end_are_reported_with_the_epoch() -> None:
     ]
 
 
+def test_while_another_ones_task_moves_the_lease_is_not_free_but_can_be_taken_over() -> None:
+    moving = {"alice": None, "bob": "missions (task 7) of somebody without a lease is running"}
+    losses = list[str]()
+    lease = LeaseDesk(ttl_s=TTL_S, clock=SimClock(), on_loss=losses.append, others=moving.get)
+    with pytest.raises(LeaseError, match=r"nobody holds the cell, but missions \(task 7\)") as caught:
+        lease.acquire("bob")
+    assert "take-over" in caught.value.hint
+    assert lease.holder() == (None, 0, 0.0)
+    lease.release(lease.acquire("alice").token)
+    assert not losses
+    lease.take_over("bob")
+    assert losses == ["bob took the lease over"]
+
+
 def test_a_release_is_no_loss() -> None:
     lease, _, losses = desk()
     lease.release(lease.acquire("alice").token)

@@ -223,6 +223,7 @@ class Service:
                     request=data["request"],
                     moves=True,
                     holder=data["holder"],
+                    key=data.get("key"),
                     created_s=record.wall_time_s,
                 )
             elif data["task"] not in tasks:

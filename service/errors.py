@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 
-from hal.errors import CellError, InvalidRequest, LeaseError, Retry
+from hal.errors import CellError, DeviceUnavailable, InvalidRequest, LeaseError, Retry
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
@@ -25,6 +25,12 @@ class NoSuchMission(NoSuchTask):
 
 class NoSuchDevice(NoSuchTask):
     """The cell file has no device of that name."""
+
+
+class DevicesUnavailable(DeviceUnavailable):
+    """Several devices did not connect; the details say why each, and what to do."""
+
+    retry = Retry.AFTER_FIX
 
 
 class NotPossibleNow(CellError):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import json
 import re
 from pathlib import Path as FilePath
 from typing import Annotated
@@ -49,19 +51,30 @@ def _missions(runs_dir: FilePath) -> list[MissionView]:
     if not runs_dir.is_dir():
         return []
     folders = [path for path in runs_dir.iterdir() if path.is_dir() and PLAIN.fullmatch(path.name)]
-    done = sorted((path for path in folders if (path / "report.json").is_file()), key=_age, reverse=True)
-    return [_mission(path) for path in done[:MAX_MISSIONS]]
+    done = [(_begun(path), path) for path in folders if (path / "report.json").is_file()]
+    return [_mission(path, begun) for begun, path in sorted(done, reverse=True)[:MAX_MISSIONS]]
 
 
-def _age(path: FilePath) -> float:
-    return (path / "report.json").stat().st_mtime
+def _begun(folder: FilePath) -> str:
+    """When the mission began, as its report says: the file's own time changes with a judgement or a copy."""
+    report = folder / "report.json"
+    return _started(report, report.stat().st_mtime_ns)
 
 
-def _mission(path: FilePath) -> MissionView:
+@functools.lru_cache(maxsize=10_000)
+def _started(report: FilePath, _changed_ns: int) -> str:
+    try:
+        return str(json.loads(report.read_text(encoding="utf-8"))["started"])
+    except (OSError, ValueError, LookupError, TypeError):
+        return ""  # no report of ours, or damaged: the oldest
+
+
+def _mission(path: FilePath, begun: str) -> MissionView:
     files = sorted(item.name for item in path.iterdir() if item.is_file() and PLAIN.fullmatch(item.name))
     base = f"/v1/missions/{path.name}"
     return MissionView(
         name=path.name,
+        started=begun or None,
         report_url=f"{base}/report.html" if "report.html" in files else None,
         json_url=f"{base}/report.json" if "report.json" in files else None,
         files=files,

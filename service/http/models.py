@@ -211,9 +211,10 @@ class ResetRequest(Strict):
 
 
 class MissionView(BaseModel):
-    """A finished mission's folder."""
+    """A finished mission's folder. `started`: when it began (UTC, ISO 8601), as its report says; missions sort by it."""
 
     name: str
+    started: str | None
     report_url: str | None
     json_url: str | None
     files: list[str]

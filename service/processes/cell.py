@@ -27,6 +27,7 @@ from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
 from hal.simulated import Fault
 from hal.strict import validate
+from service.errors import DevicesUnavailable
 from service.memory.calibrations import Calibrations
 from service.processes.child import Lifeline, kill_own_group
 from service.processes.connection import BEHIND, CLOCK, MOVER, PREFIX, SWAPPER
@@ -189,7 +190,7 @@ def gathered(failed: Mapping[str, CellError], *, total: int, cell: Cell) -> Cell
     same = {error.what.replace(f"devices.{name}: ", "") for name, error in failed.items()}
     if is_config and len(same) == 1:  # a fault of what they share: the simulated world
         return ConfigError(same.pop(), hint=errors[0].hint)
-    kind: type[CellError] = ConfigError if is_config else DeviceUnavailable
+    kind: type[CellError] = ConfigError if is_config else DevicesUnavailable
     return kind(
         f"{len(errors)} of the {total} devices in {cell.path} did not connect",
         hint="mend each; `panelwright doctor` tries them again",

@@ -152,7 +152,8 @@ class TaskStore:
             forgotten = self._forget_old()
         self._remove_artefacts(forgotten)
         try:
-            self._recorder.append("task-queued", {"task": task.id, "verb": verb, "request": request, "holder": holder})
+            asked = {"task": task.id, "verb": verb, "request": request, "holder": holder, "key": key}
+            self._recorder.append("task-queued", asked)
         except CellError:
             with self._lock:
                 self._tasks.pop(task.id, None)

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from hal.config import load_cell
+from hal.errors import InvalidRequest
 from service.core import Service
 from service.tasks.model import TaskState
 from tests.service.conftest import WriteCell
@@ -40,6 +41,25 @@ def test_ended_tasks_come_back_with_result_problem_progress_and_artefacts(
         assert failed.state is TaskState.FAILED
         assert failed.problem == bad.problem
         assert second.journal.verify() > 0
+    finally:
+        second.close()
+
+
+def test_who_asks_again_with_the_same_key_after_a_crash_gets_the_task_of_before_and_moves_nothing(
+    write_cell: WriteCell, tmp_path: Path
+) -> None:
+    cell, runs = write_cell(robot=True), tmp_path / "runs"
+    first = _service(cell, runs)
+    task = first.submit("hold", HoldRequest(), key="once")
+    eventually(lambda: task.state is TaskState.RUNNING)
+    first.journal.close()
+    first.close()
+    second = _service(cell, runs)
+    try:
+        again = second.submit("hold", HoldRequest(), key="once")
+        assert (again.id, again.state) == (task.id, TaskState.FAILED)
+        with pytest.raises(InvalidRequest):
+            second.submit("hold", HoldRequest(seconds=1.0), key="once")
     finally:
         second.close()
 

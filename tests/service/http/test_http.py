@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -265,6 +266,22 @@ def test_missions_list_only_finished_reports_and_serve_their_files(client: httpx
     mission = next(m for m in client.get("/v1/missions").json()["missions"] if m["name"] == folder.name)
     assert "done" in client.get(mission["report_url"]).text
     (folder / "report.json").unlink()
+
+
+def test_missions_are_sorted_by_when_they_began_not_by_when_their_files_were_touched(
+    client: httpx2.Client, served: Panelwright
+) -> None:
+    days = {"copied-in": 1, "20260103T000000-a": 3, "20260102T000000-b": 2, "damaged": 0}
+    for name, day in days.items():
+        (folder := served.service.runs_dir / name).mkdir()
+        told = {"started": f"2026-01-0{day}T00:00:00Z"} if day else []
+        (folder / "report.json").write_text(json.dumps(told))
+        os.utime(folder / "report.json", ns=(10**18 - day, 10**18 - day))
+    missions = client.get("/v1/missions").json()["missions"]
+    assert [m["name"] for m in missions if m["name"] in days] == sorted(days, key=days.__getitem__, reverse=True)
+    assert next(m["started"] for m in missions if m["name"] == "copied-in") == "2026-01-01T00:00:00Z"
+    for name in days:
+        (served.service.runs_dir / name / "report.json").unlink()
 
 
 def test_info_and_readiness(client: httpx2.Client, served: Panelwright) -> None:

@@ -62,7 +62,9 @@ def test_what_devices_share_is_said_once_and_faults_of_their_own_by_name(write_c
     shared = {name: ConfigError(f"c.toml: devices.{name}: no such arm", hint="t3") for name in ("arm", "gripper")}
     assert gathered(shared, total=4, cell=cell).what == "c.toml: no such arm"
     own: dict[str, CellError] = {name: DeviceUnavailable("no answer", hint="plug it in") for name in ("arm", "gripper")}
-    assert set(gathered(own, total=4, cell=cell).details) == {"arm", "gripper"}
+    all_of_them = gathered(own, total=4, cell=cell)
+    assert set(all_of_them.details) == {"arm", "gripper"}
+    assert (all_of_them.hint.startswith("mend each"), all_of_them.retry) == (True, "after-fix")
 
 
 def test_a_fault_in_options_names_file_and_key(write_cell: WriteCell) -> None:

@@ -8,6 +8,7 @@ const picture = $("#picture");
 let image = null; // the stored image that is shown
 let points = [];
 let pointed = null; // takes the next click instead of the outline
+let isElsewhere = false; // a picture is shown that is not of this image: a click on it has no meaning
 let listeners = [];
 
 export const chosenImage = () => image && image.id;
@@ -80,6 +81,7 @@ function clear() {
 
 function click(event) {
   if (!image) return;
+  if (isElsewhere) return showPicture(null);
   const box = picture.getBoundingClientRect();
   const x = ((event.clientX - box.left) / box.width) * image.width_px - 0.5;
   const y = ((event.clientY - box.top) / box.height) * image.height_px - 0.5;
@@ -95,11 +97,14 @@ function click(event) {
 
 const tell = () => listeners.forEach((listener) => listener(points));
 
-// Shows the stored image (or `url` in its place) with the clicks and an outline.
-export function showPicture(outline, url = image && image.url) {
-  if (!image) return;
+// Shows the stored image (or `url` in its place, `elsewhere` when it is not of that image) with the clicks and an outline.
+export function showPicture(outline, url = image && image.url, elsewhere = false) {
+  if (!url) return;
+  isElsewhere = elsewhere;
   if (!picture.src.endsWith(url)) picture.src = url;
   const marks = $("#marks");
+  $("#canvas").dataset.empty = "no";
+  if (!image) return marks.replaceChildren();
   marks.setAttribute("viewBox", `-0.5 -0.5 ${image.width_px} ${image.height_px}`);
   const unit = image.width_px / 800;
   const shapes = points.map(([x, y]) => shape("path", { d: `M${x - 7 * unit} ${y}h${14 * unit}M${x} ${y - 7 * unit}v${14 * unit}`, stroke: "#e8b04b" }, unit));

@@ -1,5 +1,6 @@
 // The teach page: choose an image, click on an object, see what was found, name it, save it, and look what is found now.
 import { finished, get, insist, post, remove } from "./api.js";
+import { startLearn } from "./teach-learn.js";
 import { startStop } from "./stop.js";
 import { chosenImage, clicks, onClicks, pointAt, showPicture, startImage } from "./teach-image.js";
 import { startPanel } from "./teach-panel.js";
@@ -7,6 +8,7 @@ import { startPanel } from "./teach-panel.js";
 const $ = (selector) => document.querySelector(selector);
 let outline = null; // what was found at the present clicks
 let lastPanel = null; // the panel that was saved last: checking reads it
+const MODES = ["kind", "panel", "looks"];
 let asked = 0; // clicks may come faster than answers: only the newest answer counts
 
 const plate = () => [Number($("#plate-width").value), Number($("#plate-height").value)];
@@ -46,12 +48,11 @@ function say(text, isBad = false) {
 }
 
 function enable() {
-  const isPanel = $("#mode-panel").ariaPressed === "true";
   $("#teach-kind").disabled = !outline;
   $("#check").disabled = !chosenImage();
-  $("#kind-form").hidden = isPanel;
-  $("#panel-form").hidden = !isPanel;
+  for (const mode of MODES) $(`#${mode}-form`).hidden = $(`#mode-${mode}`).ariaPressed !== "true";
   panel.enable(outline !== null);
+  learn.enable();
 }
 
 async function teachKind(event) {
@@ -108,6 +109,7 @@ async function listKnown() {
   const taught = [...known.panels.filter((p) => p.is_taught).map((p) => ["panels", p.name, `panel, ${count(p.objects.length, "object")}`]),
     ...known.kinds.filter((k) => k.is_taught).map((k) => ["kinds", k.name, `kind, ${count(k.looks, "look")}`])];
   const kinds = known.kinds.map((kind) => kind.name).filter((name) => name !== "nothing");
+  learn.offer(known.panels.map((one) => one.name));
   $("#kinds").replaceChildren(...kinds.map((name) => Object.assign(document.createElement("option"), { value: name })));
   $("#known-line").textContent = [count(kinds.length, "kind"), count(known.panels.length, "panel"), count(known.objects.length, "object")].join(" · ");
   $("#known").replaceChildren(...(taught.length ? taught.map(forgettable) : [line("Nothing taught here yet; shipped kinds only.")]));
@@ -150,13 +152,28 @@ async function attempt(work) {
   }
 }
 
+// What a panel taught by its own looks: shown as the check is, object by object.
+async function showLearned(result, isLive) {
+  const rows = result.taught_by.map((name) => pair(name, result.known_now.includes(name) ? "recognised now" : "not recognised yet"));
+  rows.push(...Object.entries(result.left_out).map(([name, why]) => {
+    const item = pair(name, "taught nothing");
+    item.append(Object.assign(document.createElement("span"), { className: "refused", textContent: why }));
+    return item;
+  }));
+  $("#results").replaceChildren(...rows);
+  showPicture(null, result.pictures[0], isLive);
+  $("#show-plain").hidden = !chosenImage();
+  await listKnown();
+}
+
 function choose(mode) {
-  for (const name of ["kind", "panel"]) $(`#mode-${name}`).ariaPressed = String(name === mode);
+  for (const name of MODES) $(`#mode-${name}`).ariaPressed = String(name === mode);
   enable();
 }
 
 startStop(insist("/v1/info").then((info) => info.stop_url));
 const panel = startPanel({ clicks, pointAt, save: savePanel, attempt });
+const learn = startLearn({ chosenImage, attempt, tell, show: showLearned });
 onClicks(look);
 startImage({ attempt, changed: enable });
 $("#kind-form").addEventListener("submit", teachKind);
@@ -165,6 +182,6 @@ $("#show-plain").addEventListener("click", () => {
   showPicture(outline ? outline.outline_px : null);
   $("#show-plain").hidden = true;
 });
-for (const mode of ["kind", "panel"]) $(`#mode-${mode}`).addEventListener("click", () => choose(mode));
+for (const mode of MODES) $(`#mode-${mode}`).addEventListener("click", () => choose(mode));
 enable();
 attempt(listKnown);

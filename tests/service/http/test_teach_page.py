@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from service.client import Client
 from service.serve import Panelwright
 from tests.perception.vision.bench_panel import panel
 from tests.service.http.test_page import CHROMIUM, FLAGS, PATIENCE_MS, _until
@@ -127,6 +128,38 @@ def test_a_whole_panel_is_put_together_saved_and_read(page: Any, shown: Shown) -
     _until(page, "document.querySelector('#saved').textContent.includes('Saved panel pump_room')")
     _until(page, "document.querySelector('#results').textContent.includes('pressure · gauge6.')")
     assert "/artefacts/annotated.png" in page.get_attribute("#picture", "src")
+
+
+def test_a_known_panel_teaches_its_looks_from_the_image(page: Any, house: Panelwright) -> None:
+    assert page.is_hidden("#learn-image")
+    page.click("#mode-looks")
+    _until(page, "document.querySelector('#known-panel').value === 'test'")
+    page.click("#learn-image")
+    _until(page, "document.querySelector('#saved').textContent.startsWith('Panel test: new looks: ')")
+    told, count = page.text_content("#saved"), len(panel().objects)
+    assert "mushroom 1" in told and f"Of {count} objects" in told and f"{count} now." in told
+    assert page.text_content("#results").count("recognised now") == count
+    assert "/artefacts/learned.png" in page.get_attribute("#picture", "src")
+    _until(page, "document.querySelector('#known').textContent.includes('mushroom')")
+    page.click("#learn-image")
+    _until(page, "document.querySelector('#saved').textContent.includes('all of it was known already')")
+    client = Client(url=house.url)
+    for kind in client.get("/v1/knowledge?toml=false")["kinds"]:
+        if kind["is_taught"]:
+            client.fetch("DELETE", f"/v1/knowledge/kinds/{kind['name']}")
+
+
+def test_a_drive_there_that_finds_no_panel_is_explained_and_a_latched_stop_forbids_it(page: Any) -> None:
+    """The cell of fakes sees no lights."""
+    page.click("#mode-looks")
+    page.click("#learn-here:not([disabled])")
+    page.wait_for_selector("#complaint:not([hidden])")
+    assert len(page.text_content("#complaint")) > 30
+    _until(page, "document.querySelector('#saved').textContent === 'Nothing was learned.'")
+    page.click("#stop")
+    page.wait_for_selector("#learn-here[disabled]")
+    page.click("#reset:not([hidden])")
+    page.wait_for_selector("#learn-here:not([disabled])")
 
 
 def test_what_is_typed_stays_when_the_questions_of_another_kind_come_late(page: Any) -> None:

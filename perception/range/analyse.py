@@ -11,10 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from hal.errors import InvalidRequest, NotFound
 from perception.range.features import RangeFeature, features_of
-from perception.range.fitting.surfaces import PLANE
 from perception.range.noise import NoiseModel, estimate_noise, typical_depths_m
 from perception.range.primitives import Plane, Surface, SurfaceType
-from perception.range.segmentation import bend, finish, join, merge
+from perception.range.segmentation import finish, join, merge
 from perception.range.segmentation.claim import fill_small_gaps
 from perception.range.segmentation.compete import Candidates
 from perception.range.segmentation.faces import whole_faces
@@ -31,7 +30,6 @@ Labels = NDArray[np.int32]
 
 LEAST_VALID_PIXELS = 16
 SETTLING_SWEEPS = 4
-NAMING_SAMPLES = 150
 LEAST_KEPT_PIXELS = 8
 CRUMB_SHARE = 0.5  # of the smallest surface that is looked for
 LARGEST_PIXELS = 2**26  # 8192 x 8192; 6.0 GB at most, measured
@@ -180,23 +178,14 @@ def _grouped(task: Task, noise: NoiseModel, grid: Grid, labels: Labels, found: C
 
 def _finished(task: Task, noise: NoiseModel, regions: Regions, found: Candidates) -> tuple[Labels, tuple[Surface, ...]]:
     depth, packed, law = task.depth_m, task.packed, noise.packed()
-    pixels, few = regions.pixels, regions.few(NAMING_SAMPLES)
-    keep = sorted((k for k, n in enumerate(pixels) if n >= LEAST_KEPT_PIXELS), key=lambda k: -pixels[k])
-    surfaces, final = [], Candidates()
-    names = np.zeros(len(pixels) + 1, np.int32)
-    for new, k in enumerate(keep, 1):
-        kind, slack = found.kinds[k], found.slack[k]
-        surface, th = finish.refine_surface(new, kind, found.parameters[k], regions, k + 1, noise=noise, slack=slack)
-        # What the sensor has bent is named straight, but keeps the bent surface's pixels.
+    pixels = regions.pixels
+    keep = sorted((k for k, n in enumerate(pixels, 1) if n >= LEAST_KEPT_PIXELS), key=lambda k: -pixels[k - 1])
+    surfaces, kinds, ths = finish.refine_surfaces(keep, found.kinds, found.parameters, found.slack, regions, noise)
+    final = Candidates()
+    for kind, th in zip(kinds, ths, strict=True):
         final.add(kind, th)
-        straight, start = kind, th
-        if kind != PLANE:
-            few[k][3] *= slack
-            straight, start = bend.straightened(kind, th, few[k], law, bool(packed[0] > 0))
-        if straight != kind:
-            surface, _ = finish.refine_surface(new, straight, start, regions, k + 1, noise=noise, slack=slack)
-        surfaces.append(surface)
-        names[k + 1] = new
+    names = np.zeros(len(pixels) + 1, np.int32)
+    names[keep] = np.arange(1, len(keep) + 1)
     labels = settled(task, noise, regions.renamed(names), final, sweeps=SETTLING_SWEEPS)
     labels = without_fillets(depth, packed, law, labels, *final.arrays())
     labels, surfaces = finish.without_crumbs(labels, surfaces, max(LEAST_KEPT_PIXELS, CRUMB_SHARE * task.least_pixels))
@@ -209,7 +198,7 @@ def _warnings(
 ) -> tuple[str, ...]:
     doubt = doubt_about(depth, sensor)
     out = [] if doubt is None else [f"the sensor model seems wrong: {doubt}"]
-    sigma = float(noise.sigma_m(middle))
+    sigma = noise.sigma_of(middle)
     if sigma > 2.0 * sensor.pitch_m(middle):
         out.append(f"noise of {1e3 * sigma:.1f} mm exceeds two pixels: small surfaces are lost")
     if noise.is_stepped:

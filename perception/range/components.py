@@ -28,6 +28,9 @@ def for_each_tile(
     work: Callable[[int, int], object], rows: int, tiles: int, *, pool: ThreadPoolExecutor | None
 ) -> None:
     """Call `work(top, bottom)` for every tile, on the pool's threads when one is given."""
+    if tiles == 1:
+        work(0, rows)
+        return
     ranges = tile_rows(rows, tiles)
     if pool is None or len(ranges) == 1:
         for top, bottom in ranges:

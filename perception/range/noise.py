@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from math import sqrt
 
 import numpy as np
 from numba import njit
@@ -45,10 +46,16 @@ class NoiseModel:
         white, slow, step = (a + b * z2 for a, b in (self.white, self.correlated, self.step))
         return np.asarray(np.sqrt(np.maximum(white**2, step**2 / 12.0) + slow**2))
 
+    def sigma_of(self, depth_m: float) -> float:
+        """`sigma_m` of one depth, without arrays."""
+        z2 = depth_m * depth_m
+        white, slow, step = (a + b * z2 for a, b in (self.white, self.correlated, self.step))
+        return sqrt(max(white**2, step**2 / 12.0) + slow**2)
+
     def slow_share(self, depth_m: float) -> float:
         """Part of the variance at `depth_m` that neighbouring pixels share, 0 to 1."""
         slow = self.correlated[0] + self.correlated[1] * depth_m**2
-        return float(slow**2 / max(float(self.sigma_m(depth_m)) ** 2, 1e-30))
+        return float(slow**2 / max(self.sigma_of(depth_m) ** 2, 1e-30))
 
     def packed(self) -> Array:
         """(6,) white, correlated and step pairs: what the compiled loops read."""

@@ -125,18 +125,30 @@ def primitive_of(kind: int, th: Array, middle_m: Array) -> Primitive:
     """The named primitive of a parameter vector (see `surfaces`); `middle_m` (3,) anchors planes and axes."""
     if kind == PLANE:
         normal = th[:3].copy()
-        return Plane(point_m=middle_m + (th[3] - normal @ middle_m) * normal, normal=normal)
+        return Plane(point_m=_along(middle_m, float(th[3]) - _dot(normal, middle_m), normal), normal=normal)
     if kind == SPHERE:
         return Sphere(centre_m=th[:3].copy(), radius_m=float(th[3]), seen_from_inside=bool(th[4] < 0))
     if kind == CYLINDER:
         axis = th[3:6].copy()
-        point = th[:3] + axis * (axis @ (middle_m - th[:3]))
+        point = _along(th[:3], _dot(axis, middle_m) - _dot(axis, th[:3]), axis)
         return Cylinder(point_m=point, axis=axis, radius_m=float(th[6]), seen_from_inside=bool(th[7] < 0))
     if kind == CONE:
         return Cone(
             apex_m=th[:3].copy(), axis=th[3:6].copy(), half_angle_rad=float(th[6]), seen_from_inside=bool(th[7] < 0)
         )
     return ellipsoid_of(th)
+
+
+def _dot(a: Array, b: Array) -> float:
+    """Product of two vectors (3,): at this size plain numbers are faster than arrays."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return float(ax * bx + ay * by + az * bz)
+
+
+def _along(point: Array, distance: float, direction: Array) -> Array:
+    """(3,) the point that far away in a direction."""
+    (x, y, z), (dx, dy, dz) = point.tolist(), direction.tolist()
+    return np.array([x + distance * dx, y + distance * dy, z + distance * dz])
 
 
 def ellipsoid_of(th: Array) -> Ellipsoid:

@@ -1,57 +1,26 @@
 """Where two regions touch, and what their models say there: a step, a crease, or one smooth surface cut in two."""
 
-# bodies and plain comparisons are what compiles fast.
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from perception.range.fitting.surfaces import LEAN, depth_on, normal_on
 from perception.range.segmentation.beside import WORD, flagged
 from perception.range.segmentation.claim import bucket
 from perception.range.segmentation.grid import sigma_at
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
-
 WIDEST_GAP_PX = 3  # unlabelled pixels that a border may hold: one block of pixels that no model claimed
 PAIR_POINTS = 24
 
 
-class Border(NamedTuple):
-    """Up to `PAIR_POINTS` places (x, y) along the border of two regions, and its whole length in pixels."""
-
-    x: Array
-    y: Array
-    length_px: int
-
-    def with_more(self, other: Border) -> Border:
-        """Both borders as one."""
-        return Border(
-            x=np.concatenate([self.x, other.x]),
-            y=np.concatenate([self.y, other.y]),
-            length_px=self.length_px + other.length_px,
-        )
-
-
-def borders_of(labels: Ints, packed: Array) -> dict[tuple[int, int], Border]:
-    """Every pair of labels (a < b) that touch in (H, W) `labels`, with places on their border as ray coordinates."""
-    pairs, lengths, x, y = _borders(labels, WIDEST_GAP_PX, packed)
-    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
-    out = {}
-    for k, (a, b), length in zip(order.tolist(), pairs[order].tolist(), lengths[order].tolist(), strict=True):
-        count = min(length, PAIR_POINTS)
-        out[a, b] = Border(x=x[k, :count], y=y[k, :count], length_px=length)
-    return out
-
-
 @njit(cache=True)
-def _borders(labels, gap, sen):  # type: ignore[no-untyped-def]  # numba types it
-    """Pairs (P, 2) of labels that touch, how many contacts each has, and x and y (P, PAIR_POINTS) of some of them."""
-    ids, us, vs, pairs = _contacts(labels, gap)
+def touching(labels, sen):  # type: ignore[no-untyped-def]  # numba types it
+    """Pairs (P, 2) of labels a < b that touch, how many contacts each has, and ray coordinates x, y (P, PAIR_POINTS) of some.
+
+    `labels` (H, W), `sen` as `packed` of a sensor. A pair with fewer contacts fills the first of its places only.
+    """
+    ids, us, vs, pairs = _contacts(labels, WIDEST_GAP_PX)
     starts, order = bucket(ids, pairs.shape[0])
     lengths = starts[2:] - starts[1:-1]
     x, y = np.empty((pairs.shape[0], PAIR_POINTS)), np.empty((pairs.shape[0], PAIR_POINTS))

@@ -13,11 +13,15 @@ from perception.range.fitting.surfaces import QUADRIC, SIZE
 from perception.range.segmentation.finish import SLOW_NOISE_AREA_PX
 from perception.range.segmentation.grid import Grid
 from perception.range.segmentation.grow_surface import GROW_SIGMAS, grow_surface
+from perception.range.segmentation.links import smooth_components
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 Flags = NDArray[np.bool_]
 
+ROUNDS = 6
+MOST_COMPONENTS = 48  # a round
+MOST_ATTEMPTS = 120  # on one grid: bounds the time that rubble can cost
 FIT_SAMPLES = 90
 GOOD_MEAN_SQUARE = 2.0
 GOOD_SHARE = 0.75
@@ -48,30 +52,26 @@ class Candidates:
 
     def arrays(self) -> tuple[NDArray[np.int64], Array]:
         """Kinds (n + 1,) and parameters (n + 1, 16), entry 0 unused, for compiled loops."""
-        kinds = np.zeros(len(self.kinds) + 1, np.int64)
-        table = np.zeros((len(self.kinds) + 1, SIZE))
-        for k, (kind, th) in enumerate(zip(self.kinds, self.parameters, strict=True), 1):
-            kinds[k], table[k] = kind, th
+        kinds = np.array([0, *self.kinds], np.int64)
+        table = np.array([np.zeros(SIZE), *self.parameters])
         return kinds, table
 
 
-def explain(
-    grid: Grid, members: NDArray[np.int64], free: Flags, blocks: Labels, *, found: Candidates, least: int
-) -> bool:
-    """Find the surface that explains most of the component `members` (flat block indices) and take its blocks.
+def explain(grid: Grid, blocks: Labels, *, found: Candidates, least: int, slope: float, focal_px: float) -> None:
+    """Offer each smooth component of unlabelled blocks to all primitives until no round adds a surface.
 
-    Extends `blocks` and `found`, clears `free`. Returns whether a surface of at least `least` blocks was found.
+    The surface that explains most of a component takes its blocks, if they are at least `least`. Extends `blocks` (h, w)
+    and `found`. `slope`: metres of depth per metre across that are no jump yet.
     """
+    free: Flags = np.isfinite(grid.z) & (blocks == 0)
+    turn_limit = float(np.cos(max(0.7, 5.0 * grid.normal_sigma_rad)))
     cos_limit = float(np.cos(max(0.5, 4.0 * grid.normal_sigma_rad)))
-    kind, parameters, mine = _explanation(
+    kinds, ths = _explanations(
         grid.x, grid.y, grid.z, grid.sigma, grid.normal, grid.rms, grid.perspective, grid.size_px**2, grid.slow_share,
-        cos_limit, free, members, least,
+        slope * grid.size_px, 1.0 / focal_px, turn_limit, cos_limit, free, blocks, len(found.kinds) + 1, least,
     )  # fmt: skip
-    if kind < 0:
-        return False
-    blocks.ravel()[mine] = found.add(kind, parameters)
-    free.ravel()[mine] = False
-    return True
+    for kind, th in zip(kinds.tolist(), ths, strict=True):
+        found.add(kind, th)
 
 
 def fit_best(grid: Grid, members: NDArray[np.int64], slack: float) -> tuple[int, Array, float]:
@@ -82,6 +82,41 @@ def fit_best(grid: Grid, members: NDArray[np.int64], slack: float) -> tuple[int,
         x, y, z, sigma, normal, grid.perspective, grid.size_px**2, grid.slow_share, members
     )  # fmt: skip
     return int(kind), th, float(share)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _explanations(  # type: ignore[no-untyped-def]  # numba types it
+    x, y, z, sigma, normal, rms, perspective, pixels, slow_share, slope, inverse_f, turn_limit, cos_limit, free, blocks,
+    first_label, least,
+):  # fmt: skip
+    """Kinds (M,) and parameters (M, 16) of the surfaces found, labelled from `first_label` in `blocks`; see `explain`."""
+    kinds, ths = np.zeros(ROUNDS * MOST_COMPONENTS, np.int64), np.zeros((ROUNDS * MOST_COMPONENTS, SIZE))
+    flat_free, flat_blocks = free.ravel(), blocks.ravel()
+    found, attempts = 0, 0
+    for _ in range(ROUNDS):
+        starts, indices = smooth_components(
+            z, sigma, free, slope, inverse_f, perspective, normal, rms, turn_limit, least, MOST_COMPONENTS
+        )  # fmt: skip
+        count = starts.shape[0] - 1
+        if count == 0 or attempts >= MOST_ATTEMPTS:
+            break
+        attempts += count
+        for k in range(count):
+            members = indices[starts[k] : starts[k + 1]]
+            members, kind = members[flat_free[members]], -1
+            if members.shape[0] >= least:
+                kind, th, mine = _explanation(
+                    x, y, z, sigma, normal, rms, perspective, pixels, slow_share, cos_limit, free, members, least
+                )  # fmt: skip
+                if kind >= 0:
+                    kinds[found], ths[found] = kind, th
+                    flat_blocks[mine] = first_label + found
+                    flat_free[mine] = False
+                    found += 1
+            if kind < 0:
+                # What nothing explains now, nothing will: it must not be offered again.
+                flat_free[members] = False
+    return kinds[:found].copy(), ths[:found].copy()
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

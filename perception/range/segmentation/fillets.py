@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from perception.range.fitting.surfaces import LEAN, PLANE, depth_on, normal_on
 from perception.range.segmentation.beside import WORD, flagged
-from perception.range.segmentation.borders import borders_of, step_and_turn
+from perception.range.segmentation.borders import step_and_turn, touching
 from perception.range.segmentation.grid import sigma_at
 from perception.range.segmentation.regions import regions_of
 from perception.range.segmentation.runs import pixels_of
@@ -73,30 +73,48 @@ def _strips(
     """The faces beside each strip that continues them: two or more, or one that it leaves gently towards an outline."""
     if not np.any((length >= LONG) & (half_width <= NARROWER * half_width.max())):
         return {}
-    perspective, narrow_px = bool(packed[0] > 0), NARROW * min(labels.shape)
+    pairs, lengths, x, y = touching(labels, packed)
+    goes_on, is_gentle = _continuations(
+        depth_m, packed, law, labels, kinds, table, half_width, length, pairs, lengths, x, y
+    )
     beside: dict[int, list[int]] = {}
-    gentle: set[int] = set()
-    for (a, b), border in borders_of(labels, packed).items():
+    for p in np.lexsort((pairs[:, 1], pairs[:, 0])).tolist():
+        if goes_on[p]:
+            a, b = pairs[p].tolist()
+            strip, face = (a, b) if half_width[a] < half_width[b] else (b, a)
+            beside.setdefault(strip, []).append(face)
+    return {strip: faces for strip, faces in beside.items() if len(faces) > 1 or is_gentle[strip]}
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _continuations(depth, sen, noise, labels, kinds, table, half_width, length, pairs, lengths, x, y):  # type: ignore[no-untyped-def]  # numba types it
+    """Of which pairs of labels that touch the narrower continues the wider as a strip; and which strips do so gently."""
+    narrow_px = NARROW * min(labels.shape[0], labels.shape[1])
+    out, is_gentle = np.zeros(pairs.shape[0], np.bool_), np.zeros(kinds.shape[0], np.bool_)
+    for p in range(pairs.shape[0]):
+        a, b = pairs[p]
         strip, face = (a, b) if half_width[a] < half_width[b] else (b, a)
         is_strip = length[strip] >= LONG and half_width[strip] <= NARROWER * half_width[face]
-        least_px = max(LEAST_BORDER_PX, ALONG_SHARE * length[strip] * half_width[strip])
-        if border.length_px < least_px or not is_strip:
+        if not is_strip or lengths[p] < max(LEAST_BORDER_PX, ALONG_SHARE * length[strip] * half_width[strip]):
             continue
-        surfaces = (int(kinds[a]), table[a], int(kinds[b]), table[b])
-        step, turn = step_and_turn(*surfaces, border.x, border.y, law, perspective)
-        if not _goes_on(step, turn, is_flat=kinds[strip] == PLANE, is_narrow=half_width[strip] < narrow_px):
+        count = min(lengths[p], x.shape[1])
+        step, turn = step_and_turn(
+            kinds[a], table[a], kinds[b], table[b], x[p, :count], y[p, :count], noise, sen[0] > 0
+        )
+        if not _goes_on(step, turn, kinds[strip] == PLANE, half_width[strip] < narrow_px):
             continue
         if kinds[face] == PLANE:
-            both = np.zeros(kinds.size, np.bool_)
-            both[[strip, face]] = True
-            if is_seam_grooved(depth_m, packed, law, labels, both, table[face], border.x, border.y):
+            both = np.zeros(kinds.shape[0], np.bool_)
+            both[strip] = both[face] = True
+            if is_seam_grooved(depth, sen, noise, labels, both, table[face], x[p, :count], y[p, :count]):
                 continue
-        beside.setdefault(strip, []).append(face)
-        gentle |= {strip} if turn <= GENTLE_RAD else set()
-    return {strip: faces for strip, faces in beside.items() if len(faces) > 1 or strip in gentle}
+        out[p] = True
+        is_gentle[strip] |= turn <= GENTLE_RAD
+    return out, is_gentle
 
 
-def _goes_on(step: float, turn: float, *, is_flat: bool, is_narrow: bool) -> bool:
+@njit(cache=True, error_model="numpy", **LEAN)
+def _goes_on(step, turn, is_flat, is_narrow):  # type: ignore[no-untyped-def]  # numba types it
     """Whether a strip continues a face; `step` in sigmas, `turn` in rad. A flat one that is wide enough is a bevel."""
     if is_narrow:
         return step <= NARROW_SIGMAS and turn <= TURN_RAD

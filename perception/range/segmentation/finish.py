@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import sqrt
+from math import isnan, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from perception.range.fitting.fit import fit_robust
 from perception.range.fitting.last_step import last_step
 from perception.range.fitting.starts import solve_positive
-from perception.range.fitting.surfaces import FREEDOM, QUADRIC, depth_on
+from perception.range.fitting.surfaces import FREEDOM, PLANE, SIZE, depth_on, frame_of
 from perception.range.noise import NoiseModel
 from perception.range.primitives import (
     COVARIANCE_OVER,
@@ -22,6 +23,7 @@ from perception.range.primitives import (
     named_covariance,
     primitive_of,
 )
+from perception.range.segmentation.bend import straightened
 from perception.range.segmentation.regions import Regions, spread
 from perception.range.segmentation.runs import pixels_of
 
@@ -29,12 +31,29 @@ Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 
 COARSE_SAMPLES = 300  # a refined start on these leaves the full fit one step
+NAMING_SAMPLES = 150
 MIDDLE_STRIDE = 4  # of these, every fourth tells where a surface lies
 SLOW_NOISE_AREA_PX = 150.0  # pixels that share one value of the slow noise; sets how little averaging gains on it
 STEP_AREA_PX = 16.0
 NO_SHIFT = 1e-9  # pixels: rounds up what is whole but for the last bit
 FARTHEST_SIGMAS = 50.0  # that the last step may move a surface where it was fitted already
 FREE = np.zeros(9, np.bool_)
+
+
+class Refinement(NamedTuple):
+    """What the last fit of one region says.
+
+    Frame (2, 3) of tilts, parameters, information matrix (9, 9), its inverse (p, p) over the free parameters, NaN where
+    they are not all determined, medians (4,) of x, y, z and sigma, squared residuals of the kept pixels, pixels kept.
+    """
+
+    frame: Array
+    parameters: Array
+    information: Array
+    inverse: Array
+    middles: Array
+    squares: float
+    kept: int
 
 
 def refine_surface(
@@ -55,28 +74,105 @@ def refine_surface(
         slack: how many times the noise is tolerated.
         fixed: (9,) tangent parameters that a prior holds.
     """
-    perspective = bool(regions.packed[0] > 0)
     image = (regions.depth_m, regions.packed, regions.law)
     n = int(regions.sizes[own])
-    th, H, inverse, middles, kept, used = refined(kind, th, *image, slack, regions.runs_of(own), n, fixed)
-    misfit = sqrt(kept / max(used - int(FREEDOM[kind]), 1))
+    th, *figures = refined(kind, th, *image, slack, regions.runs_of(own), n, fixed)
+    refinement = Refinement(frame_vectors(kind, th), th, *figures)
+    perspective = bool(regions.packed[0] > 0)
+    return _surface(label, kind, refinement, n, noise=noise, perspective=perspective, fixed=fixed), th
+
+
+def refine_surfaces(
+    owns: list[int], kinds: list[int], parameters: list[Array], slack: list[float], regions: Regions, noise: NoiseModel
+) -> tuple[list[Surface], list[int], Array]:
+    """`refine_surface` of the regions with labels `owns`, which become labels 1 to M.
+
+    A surface that the sensor has bent is named straight. It keeps the bent surface's pixels: kinds (M,) and parameters
+    (M, 16) by which pixels are judged come second and third.
+    """
+    if not owns:
+        return [], [], np.zeros((0, SIZE))
+    mine = np.array(owns)
+    at = mine - 1
+    surface_of_each = (np.array(kinds)[at], np.array(parameters)[at], np.array(slack)[at])
+    image = (regions.depth_m, regions.packed, regions.law, regions.starts, regions.runs, regions.sizes)
+    claiming, ths, names, *figures = _refined_regions(mine, *surface_of_each, *image)
+    perspective = bool(regions.packed[0] > 0)
+    surfaces = []
+    rows = zip(owns, names.tolist(), *figures[:-2], *(f.tolist() for f in figures[-2:]), strict=True)
+    for label, (own, kind, *rest) in enumerate(rows, 1):
+        p = int(FREEDOM[kind])
+        frame, th, H, inverse, *more = rest
+        refinement = Refinement(frame, th, H, inverse[:p, :p], *more)
+        pixels = int(regions.sizes[own])
+        surfaces.append(_surface(label, kind, refinement, pixels, noise=noise, perspective=perspective, fixed=FREE))
+    return surfaces, claiming.tolist(), ths
+
+
+def _surface(
+    label: int,
+    kind: int,
+    refinement: Refinement,
+    pixels: int,
+    *,
+    noise: NoiseModel,
+    perspective: bool,
+    fixed: NDArray[np.bool_],
+) -> Surface:
+    frame, th, H, inverse, middles, squares, kept = refinement
+    misfit = sqrt(squares / max(kept - int(FREEDOM[kind]), 1))
     x, y, depth, sigma = middles.tolist()
     loss = averaging_loss(noise, depth)
-    covariance = (_pseudo_inverse(H, kind, fixed) if inverse is None else inverse) * (max(misfit**2, 0.05) * loss)
+    known = _pseudo_inverse(H, kind, fixed) if isnan(inverse[0, 0]) else inverse
+    covariance = known * (max(misfit**2, 0.05) * loss)
     middle = np.array([x * depth, y * depth, depth] if perspective else [x, y, depth])
-    surface = Surface(
+    return Surface(
         label=label,
         type=TYPE_OF_KIND[kind],
         primitive=primitive_of(kind, th, middle),
         covariance=named_covariance(kind, th, covariance),
         covariance_over=COVARIANCE_OVER[kind],
-        frame=frame_vectors(kind, th) if kind != QUADRIC else np.eye(3)[:2],
-        pixels=n,
-        rms_m=misfit * sigma if n else 0.0,
+        frame=frame,
+        pixels=pixels,
+        rms_m=misfit * sigma if pixels else 0.0,
         misfit=misfit,
         middle_m=middle,
     )
-    return surface, th
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _refined_regions(mine, kinds, ths, slack, depth, sen, noise, starts, runs, sizes):  # type: ignore[no-untyped-def]  # numba types it
+    """`refined` of the regions `mine` (M,), and again under a simpler name where slow errors have bent a surface.
+
+    Returns kinds (M,) and parameters (M, 16) before that; after it kinds (M,), and what `Refinement` holds, M of each.
+    """
+    count, perspective, free = mine.shape[0], sen[0] > 0, np.zeros(9, np.bool_)
+    names, first, last, frames = kinds.copy(), np.empty((count, SIZE)), np.empty((count, SIZE)), np.empty((count, 6))
+    H, inverse, middles = np.empty((count, 9, 9)), np.empty((count, 9, 9)), np.empty((count, 4))
+    squares, kept = np.empty(count), np.empty(count, np.int64)
+    for i in range(count):
+        pixels, own = sizes[mine[i]], runs[starts[mine[i]] : starts[mine[i] + 1]]
+        kind, start = kinds[i], ths[i]
+        for is_again in (False, True):
+            th, H[i], inv, middles[i], squares[i], kept[i] = refined(
+                kind, start, depth, sen, noise, slack[i], own, pixels, free
+            )
+            p = FREEDOM[kind]
+            inverse[i, :p, :p] = inv
+            names[i], last[i] = kind, th
+            frame_of(kind, th, frames[i])
+            if is_again:
+                break
+            first[i] = th
+            if kind == PLANE:
+                break
+            few = np.empty((4, min(pixels, NAMING_SAMPLES)))
+            spread(depth, sen, noise, own, pixels, 0.5, few)
+            few[3] *= slack[i]
+            kind, start = straightened(kind, th, few, noise, perspective)
+            if kind == names[i]:
+                break
+    return kinds, first, names, frames.reshape((count, 2, 3)), last, H, inverse, middles, squares, kept
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -84,11 +180,10 @@ def refined(kind, th, depth, sen, noise, slack, runs, pixels, fixed):  # type: i
     """The fit to the `pixels` of runs (R, 3): robust on a few that are evenly spread, then one step on all.
 
     Returns:
-        parameters, information matrix (9, 9), its inverse (p, p) or None, medians (4,) of x, y, z and sigma,
-        squared residuals of the kept pixels, pixels kept.
+        what `Refinement` holds but for the frame.
     """
     if pixels == 0:
-        return th, np.zeros((9, 9)), None, np.full(4, np.nan), 0.0, 0
+        return th, np.zeros((9, 9)), np.full((FREEDOM[kind], FREEDOM[kind]), np.nan), np.full(4, np.nan), 0.0, 0
     few = np.empty((4, min(pixels, COARSE_SAMPLES)))
     spread(depth, sen, noise, runs, pixels, NO_SHIFT, few)
     few[3] *= slack
@@ -108,7 +203,7 @@ def refined(kind, th, depth, sen, noise, slack, runs, pixels, fixed):  # type: i
 
 @njit(cache=True, error_model="numpy")
 def _inverse(H, p, fixed):  # type: ignore[no-untyped-def]  # numba types it
-    """(p, p) inverse over the free parameters, zero elsewhere; None when they are not all determined."""
+    """(p, p) inverse over the free parameters, zero elsewhere; NaN when they are not all determined."""
     A, b, out, scale = np.empty((p, p)), np.empty(p), np.zeros((p, p)), np.empty(p)
     for i in range(p):
         scale[i] = 1.0 / np.sqrt(max(H[i, i], 1e-300))
@@ -119,7 +214,8 @@ def _inverse(H, p, fixed):  # type: ignore[no-untyped-def]  # numba types it
                 A[i, j] = (1.0 if i == j else 0.0) if held else H[i, j] * scale[i] * scale[j]
             b[i] = 1.0 if i == k and not fixed[k] else 0.0
         if not solve_positive(A, b, p):
-            return None
+            out[:] = np.nan
+            return out
         for i in range(p):
             out[i, k] = b[i] * scale[i] * scale[k]
     return out

@@ -73,7 +73,7 @@ def slope_sigma_rad(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float,
     pitch = sensor.pitch_m(depth_m)
     slow = noise.correlated[0] + noise.correlated[1] * depth_m**2
     step = noise.step[0] + noise.step[1] * depth_m**2
-    white = max(float(noise.sigma_m(depth_m)) ** 2 - slow**2, 0.0) ** 0.5 * np.sqrt(12.0) / (pitch * side_px**2)
+    white = max(noise.sigma_of(depth_m) ** 2 - slow**2, 0.0) ** 0.5 * np.sqrt(12.0) / (pitch * side_px**2)
     # White noise averages out; slow noise and steps do not, they tilt a short window as a whole.
     return float(np.hypot(white, np.hypot(0.7 * slow, 0.3 * step) / (pitch * side_px)))
 
@@ -103,8 +103,7 @@ def build_grid(
         lambda a, b: mean_blocks(depth_m, packed, law, size_px, x, y, z, sigma, count, a, b), h, tiles, pool=pool
     )
     perspective = bool(packed[0] > 0)
-    known = valid_sample(z, MIDDLE_SAMPLES)
-    middle = float(np.median(known)) if known.size else 1.0
+    middle = _middle_depth(z)
     radius, slope_sigma = _radius(noise, sensor, middle, size_px)
     slope = jump_slope / packed[1] * size_px
     normal, rms = np.full((h, w, 3), np.nan), np.full((h, w), np.nan)
@@ -146,6 +145,13 @@ def _radius(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float, size_px
         if sigma <= NORMAL_SIGMA_GOAL_RAD:
             return radius, sigma
     return WIDEST_RADIUS, sigma
+
+
+@njit(cache=True)
+def _middle_depth(z):  # type: ignore[no-untyped-def]  # numba types it
+    """Median of a sample of the known depths, 1 without any."""
+    known = valid_sample(z, MIDDLE_SAMPLES)
+    return np.median(known) if known.shape[0] > 0 else 1.0
 
 
 @njit(cache=True, **LEAN)

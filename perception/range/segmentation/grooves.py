@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from perception.range.components import label_components
 from perception.range.fitting.surfaces import LEAN, PLANE, depth_on
 from perception.range.segmentation.beside import WORD, column_range, flagged, new_columns
 from perception.range.segmentation.compete import Candidates
@@ -117,10 +118,11 @@ def _flag_others(labels, own, flags):  # type: ignore[no-untyped-def]  # numba t
 
 def _suspects(planes: Labels, rough: NDArray[np.uint8], sizes: Labels) -> list[int]:
     """Planes of whose inside two or more large parts remain when rough blocks are taken away."""
-    count, marks = cv2.connectedComponents(inside(planes, rough), connectivity=4)
-    if count < 3:
+    core = inside(planes, rough)
+    marks, areas = label_components(core, core, core)
+    if areas.size < 3:
         return []
-    areas, owners = _parts_of_planes(marks, planes, count)
+    owners = _planes_of_parts(marks, planes, areas.size)
     least = np.maximum(LEAST_BLOCKS, LEAST_SHARE * sizes)
     large = np.bincount(owners[(areas >= least[owners]) & (owners > 0)], minlength=sizes.size)
     suspects: list[int] = np.flatnonzero(large > 1).tolist()
@@ -129,9 +131,9 @@ def _suspects(planes: Labels, rough: NDArray[np.uint8], sizes: Labels) -> list[i
 
 @njit(cache=True, nogil=True)
 def inside(planes, rough):  # type: ignore[no-untyped-def]  # numba types it
-    """(h, w) 1 where a block and all of its neighbours belong to one plane and are not rough."""
+    """(h, w) where a block and all of its neighbours belong to one plane and are not rough."""
     h, w = planes.shape
-    out, own = np.zeros((h, w), np.uint8), np.zeros((h, w), np.int32)
+    out, own = np.zeros((h, w), np.bool_), np.zeros((h, w), np.int32)
     for r in range(h):
         _fill_smooth(planes[r], rough[r], own[r])
     least, most = new_columns(w)
@@ -157,16 +159,14 @@ def _fill_inside(own, least, most, out):  # type: ignore[no-untyped-def]  # numb
 
 
 @njit(cache=True, nogil=True)
-def _parts_of_planes(marks, planes, count):  # type: ignore[no-untyped-def]  # numba types it
-    """(count,) blocks of each mark, and the plane that it lies in; 0 for mark 0."""
-    areas, owners = np.zeros(count, np.int32), np.zeros(count, np.int32)
+def _planes_of_parts(marks, planes, count):  # type: ignore[no-untyped-def]  # numba types it
+    """(count,) the plane that each mark lies in; 0 for mark 0."""
+    owners = np.zeros(count, np.int32)
     for r in range(marks.shape[0]):
         for c in range(marks.shape[1]):
-            k = marks[r, c]
-            if k > 0:
-                areas[k] += 1
-                owners[k] = planes[r, c]
-    return areas, owners
+            if marks[r, c] > 0:
+                owners[marks[r, c]] = planes[r, c]
+    return owners
 
 
 def _parts(grid: Grid, mine: Flags, rough: NDArray[np.uint8], th: Array) -> Labels | None:

@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from perception.range.fitting import fit
-from perception.range.fitting.surfaces import PLANE, depth_on
+from perception.range.fitting.surfaces import LEAN, PLANE, depth_on
 from perception.range.segmentation import bend
 from perception.range.segmentation.grid import slow_share_at
 from perception.range.segmentation.regions import Regions
@@ -172,21 +172,35 @@ def gap_between(depth, sen, noise, labels, own, kind, th, a, b):  # type: ignore
 
     `own` says which `labels` (H, W) belong to the pieces: what lies between them shows a groove, however narrow.
     """
-    nearest, distance = np.empty(a.shape[1], np.int64), np.empty(a.shape[1])
-    for m in range(a.shape[1]):
-        least = np.inf
-        for n in range(b.shape[1]):
-            d2 = (a[0, m] - b[0, n]) ** 2 + (a[1, m] - b[1, n]) ** 2
-            if d2 < least:
-                nearest[m], least = n, d2
-        distance[m] = least
+    distance = np.full(a.shape[1], np.inf)
+    for n in range(b.shape[1]):
+        _lessen(a[0], a[1], b[0, n], b[1, n], distance)
     slack = GAP_SIGMAS * np.median(a[3])
     lines = np.argsort(distance)[:SIGHT_LINES]
     gaps = 0
     for m in lines:
-        n = nearest[m]
+        n = _first_at(distance[m], b[0], b[1], a[0, m], a[1, m])
         gaps += _is_gap(depth, sen, noise, labels, own, kind, th, a[0, m], a[1, m], b[0, n], b[1, n], slack)
     return 2 * gaps > lines.shape[0]
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _lessen(x, y, x0, y0, distance):  # type: ignore[no-untyped-def]  # numba types it
+    """Lessen the squared distances of rays (x, y) to the nearest of others by that to one more, (x0, y0)."""
+    for m in range(x.shape[0]):
+        dx, dy = x[m] - x0, y[m] - y0
+        d2 = dx * dx + dy * dy
+        distance[m] = d2 if d2 < distance[m] else distance[m]
+
+
+@njit(cache=True, error_model="numpy", **LEAN)
+def _first_at(distance, x, y, x0, y0):  # type: ignore[no-untyped-def]  # numba types it
+    """The first of the rays (x, y) that is at most at that squared distance from (x0, y0)."""
+    for n in range(x.shape[0]):
+        dx, dy = x0 - x[n], y0 - y[n]
+        if dx * dx + dy * dy <= distance:
+            return n
+    return 0
 
 
 @njit(cache=True, error_model="numpy")

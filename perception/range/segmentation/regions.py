@@ -43,8 +43,13 @@ class Regions:
     def few(self, most: int) -> list[Array]:
         """At most `most` samples of each label, evenly spread over its pixels; the same choice every time."""
         sizes = np.minimum(self.sizes[1:], most).tolist()
-        out = _spread_samples(self.depth_m, self.packed, self.law, self.starts, self.runs, self.sizes, most)
-        return [np.ascontiguousarray(s[:, :n]) for s, n in zip(out, sizes, strict=True)]
+        return [np.ascontiguousarray(s[:, :n]) for s, n in zip(self.samples(most), sizes, strict=True)]
+
+    def samples(self, most: int) -> Array:
+        """The same as one array (count, 4, most), of which a label with fewer pixels fills the first only."""
+        return np.asarray(
+            _spread_samples(self.depth_m, self.packed, self.law, self.starts, self.runs, self.sizes, most)
+        )
 
     def runs_of(self, label: int) -> Labels:
         """The runs (R, 3) of a label, in raster order: row, first column, and the one after the last."""

@@ -12,29 +12,27 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.range.components import for_each_tile, label_components
+from perception.range.components import for_each_tile
 from perception.range.fitting.surfaces import PLANE
 from perception.range.noise import WORST_SHARE, NoiseModel
 from perception.range.segmentation.beside import contested_pixels, pixels_around, renamed_pixels
-from perception.range.segmentation.claim import bucket, claim_again, claim_pixels
+from perception.range.segmentation.claim import claim_again, claim_pixels
 from perception.range.segmentation.compete import Candidates, explain
 from perception.range.segmentation.grid import Grid, block_size, build_grid, seen_from
 from perception.range.segmentation.grow_planes import grow_planes
 from perception.range.segmentation.left_over import unexplained
-from perception.range.segmentation.links import smooth_links
 from perception.range.segmentation.seeds import seed_order
 from perception.range.segmentation.settle import REACH_PX, settle
 from perception.range.sensor import RangeSensorModel
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
-Flags = NDArray[np.bool_]
 
 LEAST_PIXELS_AT_256 = 32  # per 256 x 256 pixels of image
 LEAST_FLAT_BLOCKS = 24  # a smaller flat patch may be a facet of something bent; whole components decide about it
@@ -44,9 +42,6 @@ LARGE_PLANE_BLOCKS = 80
 SETTLED_MEAN_SQUARE = 1.25  # residuals cut at three sigmas; wider noise than modelled drives them to 1.5 and more
 WIDER = 1.5
 WIDENINGS = 5
-ROUNDS = 6
-MOST_COMPONENTS = 48  # a round
-MOST_ATTEMPTS = 120  # on one grid: bounds the time that rubble can cost
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -54,7 +49,7 @@ class Task:
     """What every step needs: the (H, W) depth in metres, the sensor, and how many tiles share the pixel work.
 
     The depth may be a part of the sensor's image, which begins at row and column `corner_px`. `depths_m` (5,): the
-    whole image's `typical_depths_m`.
+    whole image's `typical_depths_m`. `packed` (5,): the sensor of this part of the image, as compiled loops read it.
     """
 
     depth_m: Array
@@ -63,16 +58,15 @@ class Task:
     tiles: int = 1
     pool: ThreadPoolExecutor | None = None
     corner_px: tuple[int, int] = (0, 0)
+    packed: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "packed", seen_from(self.sensor, self.corner_px))
 
     @property
     def least_pixels(self) -> float:
         """Pixels of the smallest surface that is looked for."""
         return LEAST_PIXELS_AT_256 * self.sensor.width_px * self.sensor.height_px / 65536
-
-    @property
-    def packed(self) -> Array:
-        """(5,) the sensor of this part of the image, as compiled loops read it."""
-        return seen_from(self.sensor, self.corner_px)
 
     def grid(self, depth_m: Array, noise: NoiseModel, size: int, **slope: float) -> Grid:
         """Blocks of `size` pixels of a depth image of this task's sensor."""
@@ -91,7 +85,7 @@ def segment(task: Task, noise: NoiseModel) -> tuple[Labels, Candidates, NoiseMod
     found, grid, blocks, noise = _settled_planes(task, noise)
     size = grid.size_px
     least = max(LEAST_CURVED_BLOCKS if size > 1 else 6, round(task.least_pixels / size**2))
-    _recover_curved(task, grid, blocks, found, least)
+    explain(grid, blocks, found=found, least=least, slope=STEEP_SLOPE, focal_px=float(task.packed[1]))
     labels = _claimed(task, noise, blocks, found, size=size)
     if size > 1:
         labels = _finer(task, noise, labels, found, size=(size + 1) // 2)
@@ -108,7 +102,7 @@ def _settled_planes(task: Task, noise: NoiseModel) -> tuple[Candidates, Grid, La
         blocks = np.zeros(grid.z.shape, np.int32)
         found = Candidates()
         scatter = _recover_planes(task, grid, blocks, found)
-        worst = float(noise.sigma_m(depths[2])) * WIDER > WORST_SHARE * abs(float(depths[2]))
+        worst = noise.sigma_of(float(depths[2])) * WIDER > WORST_SHARE * abs(float(depths[2]))
         if scatter <= SETTLED_MEAN_SQUARE or attempt == WIDENINGS or worst:
             break
         noise = noise.widened(WIDER, depths)
@@ -130,7 +124,7 @@ def _finer(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, 
     blocks = np.zeros(grid.z.shape, np.int32)
     before = len(found.kinds)
     _recover_planes(part, grid, blocks, found)
-    _recover_curved(part, grid, blocks, found, least)
+    explain(grid, blocks, found=found, least=least, slope=STEEP_SLOPE, focal_px=float(task.packed[1]))
     if len(found.kinds) == before:
         return labels
     inside = labels[top : top + left_over.shape[0], left : left + left_over.shape[1]]
@@ -220,38 +214,3 @@ def _recover_planes(task: Task, grid: Grid, blocks: Labels, found: Candidates) -
         found.add(PLANE, th)
     large = counts >= LARGE_PLANE_BLOCKS
     return float(np.average(mean2[large], weights=counts[large])) if large.any() else 0.0
-
-
-def _recover_curved(task: Task, grid: Grid, blocks: Labels, found: Candidates, least: int) -> None:
-    """Offer each smooth component of unlabelled blocks to all primitives until no round adds a surface."""
-    free: Flags = np.isfinite(grid.z) & (blocks == 0)
-    packed = task.packed
-    turn_limit = float(np.cos(max(0.7, 5.0 * grid.normal_sigma_rad)))
-    attempts = 0
-    for _ in range(ROUNDS):
-        right, down = smooth_links(
-            grid.z,
-            grid.sigma,
-            free,
-            STEEP_SLOPE * grid.size_px,
-            1.0 / packed[1],
-            grid.perspective,
-            grid.normal,
-            grid.rms,
-            turn_limit,
-        )
-        label, sizes = label_components(free, right, down, tiles=task.tiles, pool=task.pool)
-        big = np.flatnonzero(sizes >= least)
-        if big.size == 0:
-            return
-        big = big[np.argsort(-sizes[big], kind="stable")][:MOST_COMPONENTS]
-        starts, indices = bucket(label, sizes.size - 1)
-        if attempts >= MOST_ATTEMPTS:
-            return
-        attempts += big.size
-        for component in big:
-            members = indices[starts[component] : starts[component + 1]].astype(np.int64)
-            members = members[free.ravel()[members]]
-            if members.size < least or not explain(grid, members, free, blocks, found=found, least=least):
-                # What nothing explains now, nothing will: it must not be offered again.
-                free.ravel()[members] = False

@@ -37,14 +37,14 @@ def settle(depth, sen, noise, slow_share, labels, kinds, ths, rows, columns, out
         v, u = rows[n], columns[n]
         own, z = labels[v, u], depth[v, u]
         out[n] = own
-        _copy_patch(labels, v, u, patch)
-        same, other = _beside(patch, own)
+        same, other = _beside(labels, v, u, own)
         if other == 0 or not np.isfinite(z):
             continue
         x, y, sigma = (u - sen[3]) * per_x, (v - sen[4]) * per_y, sigma_at(noise, z)
         e = misfit_of(own, kinds, ths, x, y, z, sigma, perspective) if own > 0 else np.inf
         if e < PLAIN_SIGMAS and same >= SAFE_NEIGHBOURS:
             continue
+        _copy_patch(labels, v, u, patch)
         patch[OWN] = 0
         voters, mine = PATCH - _count(patch, np.int32(0)), _count(patch, own) if own > 0 else 0
         per_vote = NEIGHBOUR_WEIGHT / voters
@@ -78,12 +78,14 @@ def _copy_patch(labels, v, u, patch):  # type: ignore[no-untyped-def]  # numba t
 
 
 @njit(cache=True, error_model="numpy", **LEAN)
-def _beside(patch, own):  # type: ignore[no-untyped-def]  # numba types it
+def _beside(labels, v, u, own):  # type: ignore[no-untyped-def]  # numba types it
     """How many of the eight nearest neighbours bear the pixel's own label, and how many another one."""
+    H, W = labels.shape
+    inside = 0 < v < H - 1 and 0 < u < W - 1
     same, other = -1, 0
-    for i in range(REACH_PX - 1, REACH_PX + 2):
-        for j in range(REACH_PX - 1, REACH_PX + 2):
-            k = patch[SIDE_PX * i + j]
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            k = labels[v + i, u + j] if inside or (0 <= v + i < H and 0 <= u + j < W) else np.int32(0)
             same += k == own
             other += (k != own) & (k > 0)
     return same, other

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perception.range.segmentation.borders import PAIR_POINTS, WIDEST_GAP_PX, borders_of
+from perception.range.segmentation.borders import PAIR_POINTS, WIDEST_GAP_PX, touching
 from perception.range.segmentation.claim import bucket
 from perception.range.segmentation.left_over import unexplained
 
@@ -41,19 +41,21 @@ def plain_contacts(labels: np.ndarray) -> dict[tuple[int, int], list[tuple[float
 @pytest.mark.parametrize("seed", range(3))
 def test_borders_are_the_contacts_of_every_pair_evenly_spread(seed):
     labels = patchwork(seed)
-    borders, plain = borders_of(labels, PACKED), plain_contacts(labels)
-    assert list(borders) == sorted(plain)
-    for pair, places in plain.items():
+    pairs, lengths, x, y = touching(labels, PACKED)
+    plain = plain_contacts(labels)
+    assert sorted(map(tuple, pairs.tolist())) == sorted(plain)
+    for pair, length, px, py in zip(map(tuple, pairs.tolist()), lengths, x, y, strict=True):
+        places = plain[pair]
         count = min(len(places), PAIR_POINTS)
         u, v = np.array(places)[(np.arange(count) * len(places)) // count].T
-        assert borders[pair].length_px == len(places)
-        np.testing.assert_allclose(borders[pair].x, (u - 7.5) / 100.0)
-        np.testing.assert_allclose(borders[pair].y, (v - 4.0) / 120.0)
+        assert length == len(places)
+        np.testing.assert_allclose(px[:count], (u - 7.5) / 100.0)
+        np.testing.assert_allclose(py[:count], (v - 4.0) / 120.0)
 
 
 def test_one_region_has_no_border():
-    assert borders_of(np.ones((5, 6), np.int32), PACKED) == {}
-    assert borders_of(np.zeros((5, 6), np.int32), PACKED) == {}
+    assert touching(np.ones((5, 6), np.int32), PACKED)[0].shape == (0, 2)
+    assert touching(np.zeros((5, 6), np.int32), PACKED)[0].shape == (0, 2)
 
 
 def test_a_bucket_holds_the_pixels_of_its_label_in_raster_order():

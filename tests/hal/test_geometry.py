@@ -18,6 +18,7 @@ from hal.geometry import (
     point_covariance,
     skew,
     to_json,
+    transform_rpy,
 )
 
 numbers = st.floats(-2.0, 2.0)
@@ -93,3 +94,12 @@ def test_a_certain_pose_adds_nothing() -> None:
     c = random_covariance(5)
     uncertain = UncertainPose(parent_from_child=RigidTransform.identity(), covariance=c)
     np.testing.assert_allclose((certain(RigidTransform.identity()) * uncertain).covariance, c)
+
+
+def test_roll_pitch_and_yaw_turn_about_the_parents_axes_in_that_order() -> None:
+    roll, pitch, yaw = 0.3, -0.5, 1.1
+    x, y, z = np.eye(3)
+    expected = Rotation.from_rotvec(yaw * z) * Rotation.from_rotvec(pitch * y) * Rotation.from_rotvec(roll * x)
+    pose = transform_rpy((1.0, 2.0, 3.0), (roll, pitch, yaw))
+    np.testing.assert_allclose(pose.rotation.as_matrix(), expected.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(pose.translation, (1.0, 2.0, 3.0))

@@ -18,7 +18,7 @@ from service.commands.teach import teach
 from service.memory.teachings import Teachings
 from tests.perception.vision.bench_panel import TOML, panel, scene
 from tests.service.conftest import WriteCell
-from tests.service.memory.test_stored_images import (
+from tests.service.shown_panel import (
     PLATE,
     SHOWING_NO_PANEL,
     Shown,

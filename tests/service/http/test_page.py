@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,25 +11,13 @@ import pytest
 from service.client import Client
 from service.operations.context import Operation
 from service.serve import Options, Panelwright
+from tests.service.browser import NEEDS_CHROMIUM, browser, new_tab, until
 from tests.service.conftest import WriteCell
 from tests.service.verbs import OPERATIONS, HoldRequest, hold
 from tests.service.waiting import eventually
 
-CHROMIUM = Path("/usr/bin/chromium")
-FLAGS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
-PATIENCE_MS = 150_000  # a first click may compile, and a busy machine takes its time
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not CHROMIUM.exists(), reason="no Chromium: apt-get install chromium"),
-]
+__all__ = ["browser"]  # a fixture
+pytestmark = NEEDS_CHROMIUM
 
 
 @pytest.fixture(scope="module")
@@ -54,34 +41,20 @@ def served_page(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathF
 
 
 @pytest.fixture(scope="module")
-def page(served_page: Panelwright) -> Iterator[Any]:
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=str(CHROMIUM), args=FLAGS)
-        tab = browser.new_page(viewport={"width": 1400, "height": 1000})
-        tab.set_default_timeout(PATIENCE_MS)
-        faults: list[str] = []
-        tab.on("pageerror", lambda error: faults.append(str(error)))
-        tab.on("console", lambda line: faults.append(line.text) if "Content Security" in line.text else None)
-        tab.goto(served_page.url)
-        yield tab
-        assert not faults
-        browser.close()
-
-
-def _until(page: Any, claim: str) -> None:
-    """Wait until a JavaScript claim holds; asked from outside, because the page's own policy forbids `eval`."""
-    eventually(lambda: page.evaluate(f"() => Boolean({claim})"))
+def page(browser: Any, served_page: Panelwright) -> Iterator[Any]:
+    tab, faults = new_tab(browser, height_px=1000)
+    tab.goto(served_page.url)
+    yield tab
+    assert not faults
 
 
 def test_cell_devices_and_picture_show(page: Any) -> None:
-    _until(page, "document.querySelector('#cell-line').textContent.includes('cell fake')")
-    _until(page, "document.querySelectorAll('#devices li').length === 8")
+    until(page, "document.querySelector('#cell-line').textContent.includes('cell fake')")
+    until(page, "document.querySelectorAll('#devices li').length === 8")
     assert page.text_content("#devices-line") == "8 of 8 good"
-    _until(page, "document.querySelector('#picture').naturalWidth === 64")
+    until(page, "document.querySelector('#picture').naturalWidth === 64")
     page.click("text=range scanner")
-    _until(page, "document.querySelector('#picture').naturalWidth === 16")
+    until(page, "document.querySelector('#picture').naturalWidth === 16")
 
 
 def test_the_tasks_can_be_read_on_a_telephone(page: Any, served_page: Panelwright) -> None:
@@ -91,14 +64,14 @@ def test_the_tasks_can_be_read_on_a_telephone(page: Any, served_page: Panelwrigh
     client = Client(url=served_page.url)
     task = client.post("/v1/echo", {"text": "hello"})
     client.get(f"/v1/tasks/{task['id']}?wait_s=30")
-    _until(telephone, "document.querySelectorAll('#tasks td.step').length")
+    until(telephone, "document.querySelectorAll('#tasks td.step').length")
     assert telephone.evaluate("() => document.querySelector('#tasks td.step').clientWidth") > 100
     assert telephone.evaluate("() => document.documentElement.scrollWidth") <= 400
     telephone.close()
 
 
 def test_the_arm_shows_live(page: Any) -> None:
-    _until(page, "document.querySelectorAll('#joints .joint').length === 6")
+    until(page, "document.querySelectorAll('#joints .joint').length === 6")
     assert "mm" in page.text_content("#live")
 
 
@@ -109,24 +82,24 @@ def test_the_last_report_is_linked(page: Any) -> None:
 
 def test_a_mission_runs_with_progress_and_can_be_cancelled(page: Any) -> None:
     page.click("#start:not([disabled])")
-    _until(page, "document.querySelector('#mission-state').textContent === 'running'")
-    _until(page, "document.querySelector('#steps').textContent.includes('holding')")
+    until(page, "document.querySelector('#mission-state').textContent === 'running'")
+    until(page, "document.querySelector('#steps').textContent.includes('holding')")
     assert page.is_disabled("#start")
     page.click("#cancel:not([hidden])")
-    _until(page, "document.querySelector('#mission-state').textContent === 'cancelled'")
-    _until(page, "document.querySelector('#tasks').textContent.includes('missions')")
+    until(page, "document.querySelector('#mission-state').textContent === 'cancelled'")
+    until(page, "document.querySelector('#tasks').textContent.includes('missions')")
 
 
 def test_stop_latches_visibly_and_only_a_reset_clears_it(page: Any, served_page: Panelwright) -> None:
     page.click("#start:not([disabled])")
-    _until(page, "document.querySelector('#steps').textContent.includes('holding')")
+    until(page, "document.querySelector('#steps').textContent.includes('holding')")
     page.click("#stop")
-    _until(page, "document.querySelector('#stop-box').dataset.latched === 'yes'")
+    until(page, "document.querySelector('#stop-box').dataset.latched === 'yes'")
     assert served_page.service.supervisor.latch.is_set()
-    _until(page, "document.querySelector('#mission-state').textContent === 'failed'")
+    until(page, "document.querySelector('#mission-state').textContent === 'failed'")
     assert page.is_disabled("#start")
     page.click("#reset:not([hidden])")
-    _until(page, "document.querySelector('#stop-box').dataset.latched === 'no'")
+    until(page, "document.querySelector('#stop-box').dataset.latched === 'no'")
     assert not served_page.service.supervisor.latch.is_set()
     page.wait_for_selector("#start:not([disabled])")
 
@@ -136,12 +109,12 @@ def test_no_reset_is_offered_while_a_stop_is_under_way(page: Any, served_page: P
     held: list[Any] = []
     page.route(lambda url: url == served_page.stop_url, lambda route: held.append(route))  # noqa: PLW0108 - it needs a function of Python
     page.click("#stop")
-    _until(
+    until(
         page, "document.querySelector('#stop-box').dataset.latched === 'yes' && document.querySelector('#reset').hidden"
     )
     eventually(lambda: page.evaluate("() => true") and held)[0].continue_()
     page.click("#reset:not([hidden])")
-    _until(page, "document.querySelector('#stop-box').dataset.latched === 'no'")
+    until(page, "document.querySelector('#stop-box').dataset.latched === 'no'")
     assert not served_page.service.supervisor.latch.is_set()
     page.unroute_all()
 
@@ -151,12 +124,12 @@ def test_the_stop_works_before_the_page_knows_anything(page: Any, served_page: P
     tab.route("**/v1/info", lambda route: route.abort())
     tab.goto(served_page.url)
     tab.click("#stop")
-    _until(tab, "document.querySelector('#stop-box').dataset.latched === 'yes'")
+    until(tab, "document.querySelector('#stop-box').dataset.latched === 'yes'")
     assert served_page.service.supervisor.latch.is_set()
     tab.unroute_all()
-    _until(tab, "document.querySelector('#cell-line').textContent.includes('cell fake')")  # asked again and again
+    until(tab, "document.querySelector('#cell-line').textContent.includes('cell fake')")  # asked again and again
     tab.click("#reset:not([hidden])")  # not before both ways of the stop have ended
-    _until(tab, "document.querySelector('#stop-box').dataset.latched === 'no'")
+    until(tab, "document.querySelector('#stop-box').dataset.latched === 'no'")
     assert not served_page.service.supervisor.latch.is_set()
     tab.close()
 
@@ -166,7 +139,7 @@ def test_the_escape_key_stops_and_a_narrow_screen_still_shows_the_button(page: A
     assert page.is_visible("#stop")
     assert page.evaluate("document.documentElement.scrollWidth <= 420")
     page.keyboard.press("Escape")
-    _until(page, "document.querySelector('#stop-box').dataset.latched === 'yes'")
+    until(page, "document.querySelector('#stop-box').dataset.latched === 'yes'")
     assert served_page.service.supervisor.latch.is_set()
 
 
@@ -174,11 +147,11 @@ def test_an_unreachable_service_is_said_and_nothing_old_passes_for_new(page: Any
     page.route("**/*", lambda route: route.abort())
     page.wait_for_selector("#banner:not([hidden])")
     assert "does not answer" in page.text_content("#banner")
-    _until(page, "document.querySelector('#stop-box').dataset.latched === 'unknown'")
+    until(page, "document.querySelector('#stop-box').dataset.latched === 'unknown'")
     assert "hardware stop" in page.text_content("#stop-line")
     assert page.is_disabled("#start")
-    _until(page, "document.querySelector('#devices-line').textContent === 'not known now'")
-    _until(page, "document.querySelector('#picture').style.opacity === '0.35'")
+    until(page, "document.querySelector('#devices-line').textContent === 'not known now'")
+    until(page, "document.querySelector('#picture').style.opacity === '0.35'")
     page.unroute_all()
     page.wait_for_selector("#banner", state="hidden")
 
@@ -187,8 +160,8 @@ def test_a_stop_of_a_service_that_was_started_anew_is_no_old_news(page: Any, ser
     """It counts its stops from the beginning, and the machine's clock may have been set back meanwhile."""
     fresh = {"is_latched": False, "count": 0, "changed_time_s": time.time() - 3600.0, "source": "anew", "stop_url": ""}
     served_page.service.supervisor.stop("a test")
-    _until(page, "document.querySelector('#stop-box').dataset.latched === 'yes'")
+    until(page, "document.querySelector('#stop-box').dataset.latched === 'yes'")
     page.route("**/v1/stop", lambda route: route.fulfill(json=fresh))
-    _until(page, "document.querySelector('#stop-box').dataset.latched === 'no'")
+    until(page, "document.querySelector('#stop-box').dataset.latched === 'no'")
     page.wait_for_selector("#start:not([disabled])")
     page.unroute_all()

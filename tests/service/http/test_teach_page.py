@@ -13,25 +13,12 @@ import pytest
 from service.client import Client
 from service.serve import Panelwright
 from tests.perception.vision.bench_panel import panel
-from tests.service.http.test_page import CHROMIUM, FLAGS, PATIENCE_MS, _until
-from tests.service.memory.test_stored_images import Shown, house, shown
+from tests.service.browser import NEEDS_CHROMIUM, browser, new_tab, until
+from tests.service.shown_panel import Shown, house, shown
 from tests.service.waiting import eventually
 
-__all__ = ["house", "shown"]  # fixtures
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not CHROMIUM.exists(), reason="no Chromium: apt-get install chromium"),
-]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=str(CHROMIUM), args=FLAGS)
-        yield browser
-        browser.close()
+__all__ = ["browser", "house", "shown"]  # fixtures
+pytestmark = NEEDS_CHROMIUM
 
 
 @pytest.fixture
@@ -39,14 +26,10 @@ def page(browser: Any, house: Panelwright, shown: Shown, tmp_path: Path) -> Iter
     """The page with an image uploaded; every test has a page of its own, so that none begins with another's clicks."""
     file = tmp_path / "panel.png"
     cv2.imwrite(str(file), shown[0])
-    tab = browser.new_page(viewport={"width": 1400, "height": 1100})
-    tab.set_default_timeout(PATIENCE_MS)
-    faults: list[str] = []
-    tab.on("pageerror", lambda error: faults.append(str(error)))
-    tab.on("console", lambda line: faults.append(line.text) if "Content Security" in line.text else None)
+    tab, faults = new_tab(browser, height_px=1100)
     tab.goto(f"{house.url}/teach.html")
     tab.set_input_files("#file", str(file))
-    _until(tab, "document.querySelector('#picture').naturalWidth === 1280")
+    until(tab, "document.querySelector('#picture').naturalWidth === 1280")
     yield tab
     assert not faults
     tab.close()
@@ -62,7 +45,7 @@ def _click(page: Any, shown: Shown, *places_m: tuple[float, float]) -> None:
 
 def _outlined(page: Any, button: str) -> None:
     """Wait for the answer to the clicks: it must be an outline, and then the button works."""
-    _until(page, "!document.querySelector('#found').textContent.startsWith('Looking')")
+    until(page, "!document.querySelector('#found').textContent.startsWith('Looking')")
     assert page.is_enabled(button), page.text_content("#found")
 
 
@@ -73,13 +56,13 @@ def _corners(name: str, half_m: float) -> tuple[tuple[float, float], tuple[float
 
 def test_a_click_shows_the_outline_that_was_found(page: Any, shown: Shown) -> None:
     _click(page, shown, panel().object("mode").position_m)
-    _until(page, "document.querySelector('#found').textContent.includes('rotary')")
+    until(page, "document.querySelector('#found').textContent.includes('rotary')")
     assert "Found a circle" in page.text_content("#found")
     points = page.get_attribute("#outline", "points").split()
     middle = np.mean([[float(x) for x in point.split(",")] for point in points], axis=0)
     assert np.allclose(middle, shown[1].project([panel().object("mode").point_m])[0], atol=10.0)
     page.click("#clear")
-    _until(page, "!document.querySelector('#outline')")
+    until(page, "!document.querySelector('#outline')")
     assert page.is_disabled("#teach-kind")
 
 
@@ -88,18 +71,18 @@ def test_a_new_kind_is_named_saved_and_found(page: Any, shown: Shown) -> None:
     _outlined(page, "#teach-kind")
     page.fill("#kind", "mushroom")
     page.click("#teach-kind")
-    _until(page, "document.querySelector('#saved').textContent.includes('the new kind mushroom')")
-    _until(page, "document.querySelector('#results').textContent.includes('mushroom')")
-    _until(page, "document.querySelector('#known').textContent.includes('mushroom')")
+    until(page, "document.querySelector('#saved').textContent.includes('the new kind mushroom')")
+    until(page, "document.querySelector('#results').textContent.includes('mushroom')")
+    until(page, "document.querySelector('#known').textContent.includes('mushroom')")
     assert "/artefacts/blind.png" in page.get_attribute("#picture", "src")
     page.click("#show-plain")
     page.click("#known button")
-    _until(page, "!document.querySelector('#known').textContent.includes('mushroom')")
+    until(page, "!document.querySelector('#known').textContent.includes('mushroom')")
 
 
 def test_a_click_beside_the_panel_or_on_nothing_is_explained(page: Any, shown: Shown) -> None:
     _click(page, shown, (0.12, -0.15))
-    _until(page, "document.querySelector('#found').classList.contains('bad')")
+    until(page, "document.querySelector('#found').classList.contains('bad')")
     assert "nothing but plate" in page.text_content("#found")
     assert page.is_disabled("#teach-kind")
 
@@ -111,38 +94,38 @@ def test_a_whole_panel_is_put_together_saved_and_read(page: Any, shown: Shown) -
     _click(page, shown, gauge.position_m)
     _outlined(page, "#add-object")
     page.select_option("#object-kind", "gauge")
-    _until(page, "document.querySelector('[data-key=at_min]')")
+    until(page, "document.querySelector('[data-key=at_min]')")
     page.fill("[data-key=name]", "pressure")
     page.click(".pointed button >> nth=0")
     _click(page, shown, (gauge.position_m[0] - 0.021, gauge.position_m[1] - 0.021))
     assert "," in page.input_value("[data-key=at_min]")
     page.click("#add-object")
-    _until(page, "document.querySelector('#objects').textContent.includes('pressure · gauge')")
+    until(page, "document.querySelector('#objects').textContent.includes('pressure · gauge')")
     _click(page, shown, *_corners("emergency", 0.02))
     _outlined(page, "#add-object")
     page.select_option("#object-kind", "mushroom")
-    _until(page, "document.querySelectorAll('#questions [data-key]').length === 1")
+    until(page, "document.querySelectorAll('#questions [data-key]').length === 1")
     page.fill("[data-key=name]", "halt")
     page.click("#add-object")
     page.click("#save-panel")
-    _until(page, "document.querySelector('#saved').textContent.includes('Saved panel pump_room')")
-    _until(page, "document.querySelector('#results').textContent.includes('pressure · gauge6.')")
+    until(page, "document.querySelector('#saved').textContent.includes('Saved panel pump_room')")
+    until(page, "document.querySelector('#results').textContent.includes('pressure · gauge6.')")
     assert "/artefacts/annotated.png" in page.get_attribute("#picture", "src")
 
 
 def test_a_known_panel_teaches_its_looks_from_the_image(page: Any, house: Panelwright) -> None:
     assert page.is_hidden("#learn-image")
     page.click("#mode-looks")
-    _until(page, "document.querySelector('#known-panel').value === 'test'")
+    until(page, "document.querySelector('#known-panel').value === 'test'")
     page.click("#learn-image")
-    _until(page, "document.querySelector('#saved').textContent.startsWith('Panel test: new looks: ')")
+    until(page, "document.querySelector('#saved').textContent.startsWith('Panel test: new looks: ')")
     told, count = page.text_content("#saved"), len(panel().objects)
     assert "mushroom 1" in told and f"Of {count} objects" in told and f"{count} now." in told
     assert page.text_content("#results").count("recognised now") == count
     assert "/artefacts/learned.png" in page.get_attribute("#picture", "src")
-    _until(page, "document.querySelector('#known').textContent.includes('mushroom')")
+    until(page, "document.querySelector('#known').textContent.includes('mushroom')")
     page.click("#learn-image")
-    _until(page, "document.querySelector('#saved').textContent.includes('all of it was known already')")
+    until(page, "document.querySelector('#saved').textContent.includes('all of it was known already')")
     client = Client(url=house.url)
     for kind in client.get("/v1/knowledge?toml=false")["kinds"]:
         if kind["is_taught"]:
@@ -155,7 +138,7 @@ def test_a_drive_there_that_finds_no_panel_is_explained_and_a_latched_stop_forbi
     page.click("#learn-here:not([disabled])")
     page.wait_for_selector("#complaint:not([hidden])")
     assert len(page.text_content("#complaint")) > 30
-    _until(page, "document.querySelector('#saved').textContent === 'Nothing was learned.'")
+    until(page, "document.querySelector('#saved').textContent === 'Nothing was learned.'")
     page.click("#stop")
     page.wait_for_selector("#learn-here[disabled]")
     page.click("#reset:not([hidden])")
@@ -164,7 +147,7 @@ def test_a_drive_there_that_finds_no_panel_is_explained_and_a_latched_stop_forbi
 
 def test_what_is_typed_stays_when_the_questions_of_another_kind_come_late(page: Any) -> None:
     page.click("#mode-panel")
-    _until(page, "document.querySelector('[data-key=at_min]')")
+    until(page, "document.querySelector('[data-key=at_min]')")
     held: list[Any] = []
 
     def hold(route: Any) -> None:
@@ -172,11 +155,11 @@ def test_what_is_typed_stays_when_the_questions_of_another_kind_come_late(page: 
 
     page.route("**/v1/knowledge/questions*", hold)
     page.select_option("#object-kind", "display")
-    _until(page, "document.querySelector('#object-kind').value === 'display'")
+    until(page, "document.querySelector('#object-kind').value === 'display'")
     page.fill("[data-key=name]", "level")
     eventually(lambda: page.title() and held)  # asking lets the events of the browser in
     held[0].continue_()
-    _until(page, "!document.querySelector('[data-key=at_min]')")
+    until(page, "!document.querySelector('[data-key=at_min]')")
     assert page.input_value("[data-key=name]") == "level"
 
 
@@ -192,7 +175,7 @@ def test_the_stop_works_here_too_and_a_narrow_screen_shows_everything(page: Any,
     page.set_viewport_size({"width": 420, "height": 900})
     assert page.evaluate("document.documentElement.scrollWidth <= 420")
     page.click("#stop")
-    _until(page, "document.querySelector('#stop-box').dataset.latched === 'yes'")
+    until(page, "document.querySelector('#stop-box').dataset.latched === 'yes'")
     assert house.service.supervisor.latch.is_set()
     page.click("#reset:not([hidden])")
-    _until(page, "document.querySelector('#stop-box').dataset.latched === 'no'")
+    until(page, "document.querySelector('#stop-box').dataset.latched === 'no'")

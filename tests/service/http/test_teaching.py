@@ -14,7 +14,7 @@ from hal.strict import parse_toml
 from perception.vision.knowledge import KindRecord
 from service.serve import Panelwright
 from tests.perception.vision.bench_panel import panel
-from tests.service.memory.test_stored_images import (
+from tests.service.shown_panel import (
     PLATE,
     SHOWING_NO_PANEL,
     Shown,

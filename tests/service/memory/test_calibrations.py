@@ -16,7 +16,7 @@ from service.operations import OPERATIONS
 from service.operations.requests import CalibrationRequest
 from service.serve import Options, Panelwright
 from tests.service.conftest import WriteCell
-from tests.service.memory.test_stored_images import house, is_problem, web
+from tests.service.shown_panel import house, is_problem, web
 
 __all__ = ["house", "web"]  # fixtures
 MOVED = MountRecord(position_m=(0.001, -0.09, 0.06), rpy_rad=(0.0, 0.01, 0.0), sigma_m=(2e-4, 2e-4, 2e-4))

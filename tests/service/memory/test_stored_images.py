@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -12,64 +12,12 @@ import numpy as np
 import pytest
 from PIL import Image as Pillow
 
-from hal.config import load_cell
 from perception.vision.view import CameraView
-from service.operations import OPERATIONS
-from service.serve import Options, Panelwright
-from tests.perception.vision.bench_panel import TOML, panel, scene
-from tests.service.conftest import WriteCell
+from service.serve import Panelwright
+from tests.perception.vision.bench_panel import panel, scene
+from tests.service.shown_panel import PLATE, SHOWING_NO_PANEL, Shown, house, is_problem, png, shown, store, web
 
-PLATE = [0.60, 0.40]
-Shown = tuple[np.ndarray, CameraView]
-
-
-@pytest.fixture(scope="module")
-def house(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Panelwright]:
-    """A cell of fakes before the panel that the images show, with the real verbs."""
-    cell_path = write_module_cell(robot=True)
-    text = TOML.replace('style = "lcd" }', 'style = "lcd", minimum = -99.0 }')
-    (cell_path.parent / "panel.toml").write_text(text)
-    options = Options(port=0, runs_dir=tmp_path_factory.mktemp("runs"), inline=True)
-    panelwright = Panelwright(load_cell(cell_path), options, operations=OPERATIONS)
-    panelwright.start()
-    yield panelwright
-    panelwright.close()
-
-
-@pytest.fixture
-def web(house: Panelwright) -> Iterator[httpx2.Client]:
-    with httpx2.Client(base_url=house.url, timeout=60.0, trust_env=False) as http:
-        yield http
-
-
-@pytest.fixture(scope="module")
-def shown() -> Shown:
-    image, intrinsics, pose = scene(tilt_deg=3.0, distance_m=0.66, pose_error=0.0)
-    return image, CameraView(intrinsics=intrinsics, camera_from_panel=pose)
-
-
-def png(image: np.ndarray) -> bytes:
-    return cv2.imencode(".png", image)[1].tobytes()
-
-
-def store(web: httpx2.Client, image: np.ndarray) -> str:
-    answer = web.post("/v1/images", content=png(image), headers={"Content-Type": "image/png"})
-    assert answer.status_code == 201, answer.text
-    return str(answer.json()["id"])
-
-
-def corners(view: CameraView, name: str, half_m: float) -> list[list[float]]:
-    x, y = panel().object(name).position_m
-    return view.project([[x - half_m, y + half_m, 0.0], [x + half_m, y - half_m, 0.0]]).tolist()
-
-
-def is_problem(answer: httpx2.Response, status: int, kind: str, words: str) -> None:
-    assert answer.status_code == status, answer.text
-    assert answer.headers["content-type"] == "application/problem+json"
-    problem = answer.json()
-    assert problem["type"] == f"urn:panelwright:{kind}", problem
-    assert words in problem["detail"], problem
-    assert len(problem["hint"]) > 8
+__all__ = ["house", "shown", "web"]  # fixtures
 
 
 def test_an_image_is_kept_listed_fetched_and_deleted(web: httpx2.Client, shown: Shown) -> None:
@@ -171,18 +119,6 @@ def _bare(image: np.ndarray, view: CameraView) -> np.ndarray:
     out = image.copy()
     out[v - 60 : v + 60, u - 60 : u + 60] = np.median(image[v - 70 : v - 60, u - 70 : u + 70])
     return out
-
-
-SHOWING_NO_PANEL = pytest.mark.parametrize(
-    ("change", "kind", "words"),
-    [
-        (np.zeros_like, "not-observable", "black"),
-        (lambda image: np.full_like(image, 255), "not-observable", "saturated"),
-        (lambda image: np.full_like(image, 90), "not-found", "no plate"),
-        (lambda image: np.hstack([image, image]), "ambiguous", "two panels"),
-    ],
-    ids=["black", "saturated", "nothing", "two"],
-)
 
 
 @pytest.mark.parametrize("mode", [{"mode": "blind", "plate_m": PLATE}, {"mode": "blind"}])

@@ -1,0 +1,52 @@
+"""A real browser for the tests of the web pages. Skipped where there is no Chromium."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.service.waiting import eventually
+
+CHROMIUM = Path("/usr/bin/chromium")
+FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+PATIENCE_MS = 150_000  # a first click may compile, and a busy machine takes its time
+NEEDS_CHROMIUM = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not CHROMIUM.exists(), reason="no Chromium: apt-get install chromium"),
+]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=str(CHROMIUM), args=FLAGS)
+        yield browser
+        browser.close()
+
+
+def new_tab(browser: Any, *, height_px: int) -> tuple[Any, list[str]]:
+    """A tab, and the list of what goes wrong in its scripts or breaks the page's own policy."""
+    tab = browser.new_page(viewport={"width": 1400, "height": height_px})
+    tab.set_default_timeout(PATIENCE_MS)
+    faults: list[str] = []
+    tab.on("pageerror", lambda error: faults.append(str(error)))
+    tab.on("console", lambda line: faults.append(line.text) if "Content Security" in line.text else None)
+    return tab, faults
+
+
+def until(page: Any, claim: str) -> None:
+    """Wait until a JavaScript claim holds; asked from outside, because the page's own policy forbids `eval`."""
+    eventually(lambda: page.evaluate(f"() => Boolean({claim})"))

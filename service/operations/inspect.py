@@ -31,14 +31,28 @@ MOST_UNREAD = 4  # more than these at once: the light or the lens, and no cable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AnnotatedView:
+    """One look as people see it: an RGB image, uint8 (H, W, 3), with what was read drawn in."""
+
+    title: str
+    pixels: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Inspection:
-    """What one or several looks said. `pictures` are annotated RGB images, one a look."""
+    """What one or several looks said, with a picture a look."""
 
     readings: dict[str, ObjectReading]
-    pictures: tuple[NDArray[np.uint8], ...]
+    pictures: tuple[AnnotatedView, ...]
 
 
-def inspect_here(session: Session, names: Collection[str], seen: Look | None = None) -> Inspection:
+def inspect_here(
+    session: Session,
+    names: Collection[str],
+    seen: Look | None = None,
+    *,
+    title: str = "objects of the panel file in the image",
+) -> Inspection:
     """Read objects from where the camera is now."""
     view = seen or look(session)
     camera_from_panel = compose(view.base_from_camera.inverse(), session.known_panel())
@@ -46,7 +60,8 @@ def inspect_here(session: Session, names: Collection[str], seen: Look | None = N
         view.pixels, view.intrinsics, camera_from_panel, session.panel, names=names, previous=known_readings(session)
     )
     _remember(session, readings)
-    return Inspection(readings={r.name: r for r in readings}, pictures=(draw_annotated(view.pixels, readings),))
+    picture = AnnotatedView(title=title, pixels=draw_annotated(view.pixels, readings))
+    return Inspection(readings={r.name: r for r in readings}, pictures=(picture,))
 
 
 def inspect_close(session: Session, names: Collection[str]) -> Inspection:
@@ -59,7 +74,7 @@ def close_ups(session: Session, names: Collection[str]) -> Inspection:
     objects = [session.panel.object(name) for name in names]
     groups = close_up_groups(objects, session.lens())
     readings: dict[str, ObjectReading] = {}
-    pictures: list[NDArray[np.uint8]] = []
+    pictures: list[AnnotatedView] = []
     for k, (centre_m, group) in enumerate(groups):
         session.progress(k / len(groups), "close-up", ", ".join(group))
         closer = look_close(session, centre_m, group)
@@ -71,9 +86,10 @@ def close_ups(session: Session, names: Collection[str]) -> Inspection:
 def look_close(session: Session, centre_m: Iterable[float], names: Collection[str]) -> Inspection:
     """Drive the camera close before a panel point and read what is there."""
     pose = session.known_panel().parent_from_child
-    go_to_camera_view(session, close_up_poses(pose, tuple(centre_m)), name=f"close-up of {', '.join(names)}"[:60])
+    title = f"close-up of {', '.join(names)}"
+    go_to_camera_view(session, close_up_poses(pose, tuple(centre_m)), name=title[:60])
     settle(session)
-    return inspect_here(session, names)
+    return inspect_here(session, names, title=title)
 
 
 def look_past(session: Session, found: Inspection) -> Inspection:
@@ -101,13 +117,13 @@ def look_past(session: Session, found: Inspection) -> Inspection:
 def _from_the_sides(session: Session, name: str) -> Iterator[Inspection]:
     """Close-ups of one object from each side that the arm reaches and the panel shows at."""
     point_m = session.panel.object(name).point_m
-    for side in SIDES:
-        session.progress(1.0, "look past what hides it", name)
-        poses = side_poses(session.known_panel().parent_from_child, point_m, side)
+    for side, turns in SIDES.items():
+        session.progress(1.0, "look past what hides it", f"{name} from {side}")
+        poses = side_poses(session.known_panel().parent_from_child, point_m, turns)
         try:
-            go_to_camera_view(session, poses, name=f"{name} from the side")
+            go_to_camera_view(session, poses, name=f"{name} from {side}")
             settle(session)
-            yield inspect_here(session, (name,))
+            yield inspect_here(session, (name,), title=f"{name} from {side}")
         except (PerceptionError, Unreachable):
             continue
 
@@ -194,7 +210,7 @@ def need_all_present(found: Inspection, session: Session) -> None:
 
 def _answer(session: Session, found: Inspection) -> dict[str, Any]:
     pictures = [
-        session.context.task.artefact(f"annotated-{k}.png", png_of(picture), "image/png")
+        session.context.task.artefact(f"annotated-{k}.png", png_of(picture.pixels), "image/png")
         for k, picture in enumerate(found.pictures)
     ]
     return {

@@ -120,7 +120,7 @@ class _Eye:
         self.picture = Picture(
             name=f"after-{self._thing.name}",
             title=f"second look at {self._witness.name}",
-            png=png_of(found.pictures[-1]),
+            png=png_of(found.pictures[-1].pixels),
         )
         reading = found.readings[self._witness.name]
         return reading if reading.present and reading.answered else None

@@ -118,12 +118,12 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
         part.progress(0.0, "recognise the objects")
         settle(part)  # the border lights go out
         found = inspect_here(part, [thing.name for thing in session.panel.objects])
-        _note_pictures(record, found, "recognised", "objects of the panel file in the image")
+        _note_pictures(record, found, "recognised")
         need_all_present(found, session)
         record.facts["objects"] = _places(session, found)
     with _step(session, "read", 0.22, 0.38) as part:
         found = inspect_close(part, [thing.name for thing in session.panel.objects])
-        _note_pictures(record, found, "read", "close-up")
+        _note_pictures(record, found, "read")
         record.readings += [reading_row(reading, BEFORE) for reading in found.readings.values()]
     with _step(session, "touch", 0.38, 0.55) as part:
         felt = feel(part, request.touches)
@@ -244,9 +244,9 @@ def _note_plane(record: MissionRecord, plane: ScannedPlane) -> None:
     }
 
 
-def _note_pictures(record: MissionRecord, found: Inspection, name: str, title: str) -> None:
+def _note_pictures(record: MissionRecord, found: Inspection, name: str) -> None:
     for k, picture in enumerate(found.pictures):
-        record.pictures.append(Picture(name=f"{name}-{k}", title=title, png=png_of(picture)))
+        record.pictures.append(Picture(name=f"{name}-{k}", title=picture.title, png=png_of(picture.pixels)))
 
 
 def _places(session: Session, found: Inspection) -> list[dict[str, Any]]:

@@ -15,7 +15,12 @@ from hal.panel import Panel, PanelObject
 
 FILL = 0.85  # share of the image that the target may fill: pose and mount are not exact
 CLOSE_UP_M = 0.30  # at 460 px focal length a 36 mm gauge face is 110 px wide
-SIDES = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))  # turns about the panel's x and y: right, left, above, below
+SIDES = {  # turns about the panel's x and y
+    "the right": (0.0, 1.0),
+    "the left": (0.0, -1.0),
+    "below": (1.0, 0.0),
+    "above": (-1.0, 0.0),
+}
 SIDE_RAD = (0.42, 0.32)  # readers stand a tilt of 0.5; a cable 30 mm before a display moves by 13 mm
 REACH_M = 0.045  # half size that a close-up leaves round an object's middle
 
@@ -70,7 +75,7 @@ def close_up_poses(base_from_panel: RigidTransform, point_m: Sequence[float]) ->
 
 
 def side_poses(
-    base_from_panel: RigidTransform, point_m: Sequence[float], side: tuple[float, float]
+    base_from_panel: RigidTransform, point_m: Sequence[float], turns: tuple[float, float]
 ) -> Iterator[RigidTransform]:
     """Camera poses that look at a panel point from one of the `SIDES`, past what hides it from straight ahead.
 
@@ -79,7 +84,7 @@ def side_poses(
     for distance_m in (0.34, 0.38, CLOSE_UP_M):
         for lean_rad in SIDE_RAD:
             for roll in (0.0, math.pi / 2, -math.pi / 2, math.pi):
-                tilt = (lean_rad * side[0], lean_rad * side[1])
+                tilt = (lean_rad * turns[0], lean_rad * turns[1])
                 yield facing(base_from_panel, point_m, distance_m, roll_rad=roll, tilt_rad=tilt)
 
 

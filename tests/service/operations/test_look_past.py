@@ -46,13 +46,14 @@ def straight_look(session: Session) -> Inspection:
 def test_a_display_behind_a_cable_is_read_from_the_side(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     forget_reading(session, "temperature")
     with monkeypatch.context() as patch:
-        patch.setattr(inspect, "SIDES", ())
+        patch.setattr(inspect, "SIDES", {})
         straight = inspect_close(session, ("temperature", "flow"))
     assert not straight.readings["temperature"].answered and straight.readings["flow"].answered
     found = inspect_close(session, ("temperature", "flow"))
     reading = found.readings["temperature"]
     assert reading.text == truth_of(session, "temperature").text
     assert len(found.pictures) > len(straight.pictures), "every look leaves its picture"
+    assert [picture.title for picture in found.pictures][-1].startswith("temperature from ")
     assert known_readings(session)["temperature"] is reading
 
 

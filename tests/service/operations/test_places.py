@@ -16,7 +16,7 @@ from hal.geometry import transform_rpy
 from hal.panel import Panel, load_panel
 from perception.camera_model import project
 from service.operations.spots import EDGE_M, bare_spots, half_footprint_m
-from service.operations.views import close_up_groups, facing, overview_distance_m, overview_poses
+from service.operations.views import SIDES, close_up_groups, facing, overview_distance_m, overview_poses, side_poses
 
 ROOT = Path(__file__).parents[3]
 PANEL = load_panel(ROOT / "panels/bench.toml")
@@ -46,6 +46,16 @@ def test_an_upright_view_shows_the_panel_upright() -> None:
     right, up = project(camera_from_panel.apply(np.array([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])), LENS)
     assert right[0] > LENS.cx_px
     assert up[1] < LENS.cy_px
+
+
+@pytest.mark.parametrize(
+    ("side", "axis", "sign"), [("the right", 0, 1), ("the left", 0, -1), ("above", 1, 1), ("below", 1, -1)]
+)
+def test_a_look_from_a_side_stands_on_that_side(side: str, axis: int, sign: int) -> None:
+    for camera in side_poses(BASE_FROM_PANEL, (0.1, 0.05, 0.0), SIDES[side]):
+        stands = (BASE_FROM_PANEL.inv() * camera).translation - (0.1, 0.05, 0.0)
+        assert sign * stands[axis] > 0.08
+        assert abs(stands[1 - axis]) < 1e-9
 
 
 @pytest.mark.parametrize("slack_m", [0.0, 0.06])

@@ -17,6 +17,8 @@ from perception.vision.view import Array
 RADIUS = 0.075  # of the digit height
 LEVEL = 0.47  # of a lit segment: dots blurred by motion have .4 to .6, gaps without one up to .37 (of 1400 drawn ones)
 LEVEL_SPREAD = 0.07
+MOST_TYPICAL = 0.37  # where the gaps without a point seem to have more, the strokes are not known
+MOST_ODDS = 6.0  # logarithm: a dot that is brighter is no surer, and two gaps with one each stay in doubt
 HIDDEN_ODDS = -0.7  # logarithm, of a point in a gap that is hidden against no point at all
 STRIP = (0.55, 1.25)  # rows that are looked at, over the digit height from its top
 HALF_STROKES = np.array([0.045, 0.065])  # of the digit height: tried, with every blur
@@ -51,10 +53,10 @@ def find_point(ink: Float32, seen: Float32, comb: Comb, lit_levels: Array) -> Po
     if not clear.any():
         return Point(place=None, probability=0.5)
     order = np.sort(levels[clear])
-    typical = max(float(np.median(order[:-1])), 0.0) if len(order) > 1 else 0.0
+    typical = float(np.clip(np.median(order[:-1]), 0.0, MOST_TYPICAL)) if len(order) > 1 else 0.0
     odds = (levels - typical - LEVEL) / LEVEL_SPREAD
     # A gap that is hidden in part may show a dot; that it shows none says nothing. The last: no point.
-    odds = np.append(np.clip(odds, np.where(clear, -30.0, HIDDEN_ODDS), 30.0), 0.0)
+    odds = np.append(np.clip(odds, np.where(clear, -30.0, HIDDEN_ODDS), MOST_ODDS), 0.0)
     share = np.exp(odds - odds.max())
     k = int(share.argmax())
     return Point(place=None if k == len(levels) else k + 1, probability=float(share[k] / share.sum()))

@@ -150,6 +150,12 @@ def test_a_label_that_leads_into_the_slot_does_not_hide_the_track(seed: int) -> 
     assert rows and all(row.is_right for row in rows)
 
 
+@pytest.mark.parametrize("seed", [10142, 10177])
+def test_cables_that_may_be_spokes_make_a_wheel_unsure(seed: int) -> None:
+    rows = [row for row in read_scene(draw_scene(seed, "hard")) if row.kind == "handwheel"]
+    assert rows and all(row.is_right or row.confidence < 0.8 for row in rows)
+
+
 def test_a_cable_of_the_faces_own_gray_does_not_hide_the_face() -> None:
     """Its gray would lead a search by gray all over the face and its rim."""
     status = read_gauge(patch_of(hung(dark_face(6.0), (80, 84, 150), 34), noise=4.0), GAUGE)

@@ -150,6 +150,19 @@ def test_a_dot_that_a_cable_hides_in_part_is_found_and_a_bare_part_of_a_gap_says
         assert found.place == place and (found.probability > 0.95 if place else found.probability < 0.8)
 
 
+def test_a_dot_in_both_gaps_is_no_number_without_a_point() -> None:
+    """What every gap seems to have is not what a bare gap has: strokes that are not where they are thought to be."""
+    lit = np.array([LIT[NAMES.index(c)] * 150.0 for c in "264"])
+    ink, seen = segment_ink(window("264", slant=0.0), is_dark=False)
+    _, comb = find_combs(ink, seen)[0]
+    for gap in range(2):
+        u = comb.left_px + gap * comb.pitch_px + 0.5 * (comb.width_px + comb.pitch_px)
+        radius = round(0.075 * comb.height_px)
+        cv2.circle(ink, (round(u), round(comb.bottom_px)), radius, float(ink.max()), -1, cv2.LINE_AA)
+    assert (dot_levels(ink, seen, comb, lit)[0] > 0.6).all()
+    assert find_point(ink, seen, comb, lit).probability < 0.8
+
+
 def plate_patch(*, cable: tuple[int, int] | None, cable_gray: int = 60) -> Patch:
     gray = np.full((110, 200), 170, np.uint8)
     gray[25:85, 30:170] = 25

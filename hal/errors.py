@@ -68,7 +68,9 @@ class InvalidRequest(CellError):
 
 
 class Unsupported(CellError):
-    """This backend does not have that capability."""
+    """This backend does not have that capability; another one, in the cell file, may."""
+
+    retry = Retry.AFTER_FIX
 
 
 class DeviceError(CellError):

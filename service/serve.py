@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from pydantic.warnings import UnsupportedFieldAttributeWarning
 
 from hal.config import Cell
-from hal.errors import CellError
+from hal.errors import CellError, ConfigError
 from hal.garbage import set_aside
 from service.core import Service
 from service.operations.context import Operation
@@ -45,10 +45,15 @@ class Panelwright:
     """Everything that `serve` starts, with one way up and one way down.
 
     Raises:
-        ConfigError: a port is in use.
+        ConfigError: a port is in use, or given twice.
     """
 
     def __init__(self, cell: Cell, options: Options, *, operations: Mapping[str, Operation] | None = None) -> None:
+        if options.port and options.port == options.stop_port:
+            raise ConfigError(
+                f"port {options.port} cannot serve the API and the stop process",
+                hint="leave --stop-port out, or give it another number",
+            )
         listener = bound_socket(options.host, options.port)
         self.port: int = listener.getsockname()[1]
         stop_port = options.stop_port if options.stop_port is not None else (options.port and self.port + 1)

@@ -55,7 +55,8 @@ def client_of(url: str) -> Client:
 def find_cell(path: Path) -> Path:
     """`path` as given, or the shipped file of that name when there is none here."""
     shipped = ROOT / path
-    return shipped if not path.exists() and not path.is_absolute() and shipped.exists() else path
+    is_elsewhere = not path.exists() and not path.is_absolute() and shipped.parent.is_dir()
+    return shipped if is_elsewhere and (shipped.exists() or not path.parent.is_dir()) else path
 
 
 def read_cell(path: Path, seed: int | None) -> Cell:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field
 
 from hal.config import Mount
 from hal.devices import DeviceKind
@@ -14,7 +14,15 @@ from service.jsonable import jsonable
 from service.tasks.model import Task, TaskEvent, TaskState
 
 Finite = Annotated[float, Field(ge=-1e9, le=1e9)]
-Holder = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[ -~]+$", examples=["alice@console-2"])]
+
+
+def _printable(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("only printable characters: it is shown and written down")
+    return text
+
+
+Holder = Annotated[str, Field(min_length=1, max_length=80, examples=["alice@console-2"]), AfterValidator(_printable)]
 
 
 class ArtefactView(BaseModel):

@@ -30,12 +30,18 @@ class Page(StaticFiles):
         """A file, or an `HTTPException` that becomes a problem."""
         allowed = self._methods_of_routes(scope)
         if not allowed and scope["method"] not in FILE_METHODS:
-            allowed = FILE_METHODS if self.lookup_path(self.get_path(scope))[1] is not None else ()
+            allowed = FILE_METHODS if self._is_file(scope) else ()
             if not allowed:
                 raise HTTPException(404)
         if allowed:
             raise HTTPException(405, headers={"Allow": ", ".join(allowed)})
         await super().__call__(scope, receive, send)
+
+    def _is_file(self, scope: Scope) -> bool:
+        try:
+            return self.lookup_path(self.get_path(scope))[1] is not None
+        except (OSError, ValueError):  # too long for a name, or with a zero byte
+            return False
 
     def _methods_of_routes(self, scope: Scope) -> tuple[str, ...]:
         routes = [route for route in self._routes if getattr(route, "app", None) is not self]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from difflib import get_close_matches
 from http import HTTPStatus
 from typing import Annotated, Any
 
@@ -132,10 +133,15 @@ def install(app: FastAPI) -> None:
         return problem_response(422, "invalid-request", what, hint="see /openapi.json", faults=faults)
 
     @app.exception_handler(HTTPException)
-    async def _http(_request: Request, error: HTTPException) -> Response:
+    async def _http(request: Request, error: HTTPException) -> Response:
         name = HTTPStatus(error.status_code).phrase.lower().replace(" ", "-")
-        headers = dict(error.headers) if error.headers else None
-        return problem_response(error.status_code, name, str(error.detail), hint="see /openapi.json", headers=headers)
+        headers = dict(error.headers) if error.headers else {}
+        what, hint = str(error.detail), "see /openapi.json"
+        if error.status_code == HTTPStatus.NOT_FOUND:
+            what, hint = "nothing lives at this path", _near(request) + "/openapi.json lists all paths"
+        elif error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+            what = f"this path takes {headers.get('Allow', 'other methods')} only"
+        return problem_response(error.status_code, name, what, hint=hint, headers=headers or None)
 
     @app.exception_handler(OSError)
     async def _file(request: Request, error: OSError) -> Response:
@@ -150,6 +156,12 @@ def install(app: FastAPI) -> None:
         log.error("%s %s failed by a defect", request.method, request.url.path, exc_info=error)
         what = f"the service failed by a defect: {type(error).__name__}"
         return problem_response(500, "defect", what, hint="the log has more; please report it", retry=Retry.NEVER)
+
+
+def _near(request: Request) -> str:
+    """A question for somebody who mistyped a path; never the path itself, which may be hostile."""
+    near = get_close_matches(request.url.path[:100], request.app.openapi()["paths"], n=1, cutoff=0.75)
+    return f"did you mean {near[0]}? " if near else ""
 
 
 def path_of(location: tuple[int | str, ...]) -> str:

@@ -203,7 +203,7 @@ class TaskStore:
 
     def moving_for_others(self, holder: str) -> str | None:
         """The task that moves, or waits to, and was not started by this holder of the lease, in words; None without."""
-        for task in self.all():
+        for task in reversed(self.all()):  # the one that moves before those that wait
             if task.moves and not task.state.is_final and task.holder != holder:
                 who = task.holder or "somebody without a lease"
                 return f"{task.verb} (task {task.id}) of {who} is {task.state}"

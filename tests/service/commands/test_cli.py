@@ -23,7 +23,7 @@ PANELWRIGHT = [sys.executable, "-m", "service.cli"]
 
 
 def _run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*PANELWRIGHT, *arguments], capture_output=True, text=True, timeout=240, check=False)
+    return subprocess.run([*PANELWRIGHT, *arguments], capture_output=True, text=True, timeout=240, check=False, cwd=cwd)
 
 
 def _assert_refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
@@ -52,6 +52,11 @@ def test_a_missing_cell_file_is_one_clear_message() -> None:
     _assert_refused(_run("serve", "--cell", "nowhere.toml"), "nowhere.toml", "does not exist")
 
 
+def test_a_mistyped_name_of_a_shipped_cell_is_told_the_right_one_from_any_folder(tmp_path: Path) -> None:
+    done = _run("serve", "--cell", "cells/bnch.toml", cwd=tmp_path)
+    _assert_refused(done, "does not exist", "did you mean", "cells/bench.toml")
+
+
 def test_a_missing_device_is_one_clear_message(write_cell: WriteCell, tmp_path: Path) -> None:
     path = write_cell(options={"panel_lights": {"fail": "no answer from 10.0.0.9"}})
     done = _run("serve", "--cell", str(path), "--port", "0", "--runs", str(tmp_path / "runs"))
@@ -67,6 +72,7 @@ def test_a_port_in_use_is_one_clear_message(write_cell: WriteCell, tmp_path: Pat
         clash = _run("serve", "--cell", str(write_cell()), "--port", "0", "--stop-port", port)
     _assert_refused(done, f"port {port}", "--port")
     _assert_refused(clash, f"port {port}", "--stop-port")
+    _assert_refused(_run("serve", "--cell", str(write_cell()), "--port", port, "--stop-port", port), "the stop process")
 
 
 def test_a_public_address_is_refused_while_there_are_no_keys(write_cell: WriteCell) -> None:

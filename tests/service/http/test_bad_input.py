@@ -256,6 +256,7 @@ def test_wrong_methods_are_405_and_the_right_ones_are_named(
     answer = client.request(method, path)
     _assert_problem(answer, 405)
     assert answer.headers["allow"] == allowed
+    assert answer.json()["detail"] == f"this path takes {allowed} only"
 
 
 @pytest.mark.parametrize("method", ["GET", "PUT", "POST", "OPTIONS"])
@@ -263,6 +264,21 @@ def test_a_path_that_nobody_knows_is_404_whatever_the_method(client: httpx2.Clie
     answer = client.request(method, "/v1/nothing")
     _assert_problem(answer, 404)
     assert "allow" not in answer.headers
+
+
+@pytest.mark.parametrize(
+    ("path", "hint"),
+    [
+        ("/v1/echoo", "did you mean /v1/echo? /openapi.json lists all paths"),
+        ("/v1/leese", "did you mean /v1/lease? /openapi.json lists all paths"),
+        ("/" + "z" * 5000, "/openapi.json lists all paths"),
+        ("/zzz%00", "/openapi.json lists all paths"),
+    ],
+)
+def test_a_mistyped_path_is_told_the_right_one(client: httpx2.Client, path: str, hint: str) -> None:
+    answer = client.post(path)
+    assert (answer.status_code, answer.json()["hint"]) == (404, hint)
+    assert "zzz" not in answer.text
 
 
 @given(body=st.binary(max_size=300))

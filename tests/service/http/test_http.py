@@ -193,6 +193,18 @@ def test_a_lease_keeps_others_from_moving_until_it_is_released(client: httpx2.Cl
     assert client.post("/v1/lease/heartbeat", headers=token).json()["type"] == "urn:panelwright:stale-epoch"
 
 
+def test_a_holder_may_have_any_name_that_can_be_shown(client: httpx2.Client) -> None:
+    grant = client.post("/v1/lease", json={"holder": "Zoë@кухня-2"}).json()
+    assert client.get("/v1/lease").json()["holder"] == "Zoë@кухня-2"
+    assert client.post("/v1/lease", json={"holder": "bob"}).json()["detail"] == "Zoë@кухня-2 holds the cell"
+    assert client.post("/v1/stop/reset", headers={"Lease-Token": grant["token"]}).status_code == 200
+    client.post("/v1/lease/release", headers={"Lease-Token": grant["token"]})
+    for bad in ("two\nlines", "a\u202eb", ""):
+        refused = client.post("/v1/lease", json={"holder": bad})
+        assert refused.status_code == 422
+    assert "printable" in client.post("/v1/lease", json={"holder": "\t"}).json()["detail"]
+
+
 def test_a_take_over_ends_what_the_old_holder_started(client: httpx2.Client) -> None:
     alice = client.post("/v1/lease", json={"holder": "alice"}).json()
     where = client.post("/v1/hold", json={}, headers={"Lease-Token": alice["token"]}).headers["location"]

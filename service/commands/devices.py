@@ -34,6 +34,8 @@ STYLES = {"valid": "green", "degraded": "yellow", "invalid": "red"}
 @app.callback()
 def devices(context: typer.Context, url: Url = UrlDefault) -> None:
     """List the devices when no command is given."""
+    # Given before the command it is meant for it: `devices --url B swap …` went to the service at the usual address.
+    context.default_map = {name: {"url": url} for name in ("list", "read", "watch", "swap", "fault")}
     if context.invoked_subcommand is None:
         console.print(_table(client_of(url)))
 
@@ -260,7 +262,9 @@ def swap_device(
     except ValueError as error:
         raise ConfigError(f"--options is not JSON: {error}", hint='for example \'{"port": "/dev/ttyUSB0"}\'') from error
     view = client_of(url).put(f"/v1/devices/{name}", block)
-    console.print(f"{name}: {view['driver']}, {view['health']['quality']}; {escape(view['health']['detail'])}")
+    health = view["health"]
+    detail = f"; {escape(health['detail'])}" if health["detail"] else ""
+    console.print(f"{name}: {view['driver']}, {health['quality']}{detail}")
 
 
 @app.command("fault")

@@ -77,8 +77,7 @@ def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
     )
     app.state.panelwright = state
     app.state.sampler = stream.Sampler(state)
-    install(app)
-    for router in (
+    routers = (
         verbs.router(dict(service.operations)),
         tasks.router,
         devices.router,
@@ -90,8 +89,10 @@ def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
         missions.router,
         health.router,
         stream.router,
-    ):
+    )
+    for router in routers:
         app.include_router(router)
+    install(app, paths=[getattr(route, "path", "") for router in routers for route in router.routes])
     app.mount("/", Page(WEB, app.routes), name="page")
     bodies = [operation.request_model for operation in service.operations.values()]
     app.openapi = lambda: _document(app, bodies)  # type: ignore[method-assign]  # the documented way to extend it

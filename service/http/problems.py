@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Sequence
 from difflib import get_close_matches
 from http import HTTPStatus
 from typing import Annotated, Any
@@ -107,8 +108,8 @@ class BadBody(Exception):
         self.faults = faults
 
 
-def install(app: FastAPI) -> None:
-    """Register the handlers."""
+def install(app: FastAPI, *, paths: Sequence[str]) -> None:
+    """Register the handlers; `paths` are what a mistyped one may have meant."""
     from service.http.guard import BodyTooLarge
 
     @app.exception_handler(CellError)
@@ -138,7 +139,7 @@ def install(app: FastAPI) -> None:
         headers = dict(error.headers) if error.headers else {}
         what, hint = str(error.detail), "see /openapi.json"
         if error.status_code == HTTPStatus.NOT_FOUND:
-            what, hint = "nothing lives at this path", _near(request) + "/openapi.json lists all paths"
+            what, hint = "nothing lives at this path", _near(request.url.path, paths) + "/openapi.json lists all paths"
         elif error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
             what = f"this path takes {headers.get('Allow', 'other methods')} only"
         return problem_response(error.status_code, name, what, hint=hint, headers=headers or None)
@@ -158,9 +159,9 @@ def install(app: FastAPI) -> None:
         return problem_response(500, "defect", what, hint="the log has more; please report it", retry=Retry.NEVER)
 
 
-def _near(request: Request) -> str:
+def _near(asked: str, paths: Sequence[str]) -> str:
     """A question for somebody who mistyped a path; never the path itself, which may be hostile."""
-    near = get_close_matches(request.url.path[:100], request.app.openapi()["paths"], n=1, cutoff=0.75)
+    near = get_close_matches(asked[:100], paths, n=1, cutoff=0.75)
     return f"did you mean {near[0]}? " if near else ""
 
 

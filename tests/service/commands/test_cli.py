@@ -163,6 +163,8 @@ def test_devices_and_tasks_are_shown_on_the_terminal(served_alone: Served) -> No
     listed = _run("devices", "list", *url)
     assert "wrist_camera" in listed.stdout
     assert "valid" in listed.stdout
+    before = _run("devices", *url, "read", "finger_proximity")
+    assert before.returncode == 0, "an address before the command is for it: it went to the usual one"
     lines = _run("devices", "read", "finger_proximity", "--samples", "3", "--jsonl", *url).stdout.splitlines()
     assert len(lines) == 3
     assert '"value": 0.123' in lines[0]

@@ -16,6 +16,9 @@ SHADE_HALF, SHADE_SCALE = (
 )  # .95 of 179 flush caps on drawn hard panels stay below 0.062, half of the others exceed 0.068
 SPOT_HALF, SPOT_SCALES = 0.065, (0.02, 0.012)  # .95 of flush caps stay below 0.050, .95 of the others exceed 0.057
 LEAST_SHADE, LEAST_SPOT, MOST = -3.0, -2.5, 6.0  # log odds: a cap may be matt, its shadow may fall on black
+ALONE = (
+    1.3  # of a shade without a face, or of no shine without a ring: a cable that is not known to be one has a shade too
+)
 MODEL_SHARE = 0.25
 UNSEEN = "the button cannot be seen (glare, shadow or cover): change the angle or the light"
 
@@ -59,10 +62,8 @@ def _by_height(patch: Patch, spec: Button | Mushroom) -> float | None:
 def _by_shade(patch: Patch, radius_m: float) -> float | None:
     """Log odds of `released` from a shadow on one side and a spot of shine; None when neither can be seen."""
     seen = cap_shades(patch, radius_m)
-    odds = []
-    if np.isfinite(seen.shade):
-        odds.append(float(np.clip((seen.shade - SHADE_HALF) / SHADE_SCALE, LEAST_SHADE, MOST)))
-    if np.isfinite(seen.spot):
-        scale = SPOT_SCALES[seen.spot > SPOT_HALF]
-        odds.append(float(np.clip((seen.spot - SPOT_HALF) / scale, LEAST_SPOT, MOST)))
-    return sum(odds) if odds else None
+    shade = float(np.clip((seen.shade - SHADE_HALF) / SHADE_SCALE, LEAST_SHADE, MOST))
+    spot = float(np.clip((seen.spot - SPOT_HALF) / SPOT_SCALES[seen.spot > SPOT_HALF], LEAST_SPOT, MOST))
+    if np.isnan(spot):
+        return None if np.isnan(shade) else float(np.clip(shade, -ALONE, ALONE))
+    return max(spot, -ALONE) if np.isnan(shade) else shade + spot

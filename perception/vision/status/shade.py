@@ -26,7 +26,7 @@ CLEAR_OF_RING = 1.4  # of the radius: what crosses a circle of that size is no p
 BLUR_PX = 2.0  # of what lies across, beyond its mask
 LEAST_RING, LEAST_FACE = 0.4, 0.5  # share that must be known
 ODD_SIGMAS, ODD_SHARE = 4.0, 0.12  # the plate beside a cap is even but for what lies across it: noise, and of its gray
-HEADROOM = 25.0  # gray levels above a face, without which no shine shows
+HEADROOM = 0.2  # of the plate's gray, above a face: with less no shine shows
 ROUNDS = 4
 BLOB = (9, 3)  # angles and radii that a spot fills
 
@@ -59,7 +59,7 @@ def cap_shades(patch: Patch, radius_m: float) -> Shades:
     plate, no_plate = _mean_round(patch, unknown, radius_m * np.linspace(*PLATE, 5))
     rim, no_rim = _mean_round(patch, unknown, radius_m * np.linspace(*RIM, 4))
     level = max(float(np.median(plate[~no_plate] if not no_plate.all() else plate)), 8.0)
-    spot = _spot(patch, unknown, radius_m) / level
+    spot = _spot(patch, unknown, radius_m, level) / level
     if no_plate.mean() > 1.0 - LEAST_RING:
         return Shades(shade=np.nan, spot=spot)
     around = _wave(plate, ~no_plate)
@@ -74,7 +74,7 @@ def cap_shades(patch: Patch, radius_m: float) -> Shades:
     return Shades(shade=float(np.linalg.norm(harmonic)) / level, spot=spot)
 
 
-def _spot(patch: Patch, unknown: NDArray[np.uint8], radius_m: float) -> float:
+def _spot(patch: Patch, unknown: NDArray[np.uint8], radius_m: float, level: float) -> float:
     """How far the face's brightest spot stands out from a light that changes smoothly over the face, gray levels."""
     x, y = np.outer(FACE_RADII, np.sin(ANGLES)), np.outer(FACE_RADII, np.cos(ANGLES))
     u, v = patch.pixel_of(radius_m * x, radius_m * y)
@@ -99,7 +99,7 @@ def _spot(patch: Patch, unknown: NDArray[np.uint8], radius_m: float) -> float:
     beyond = mean[-2:, (int(turn) + np.arange(-3, 4)) % len(ANGLES)]
     beyond = beyond[np.isfinite(beyond)]
     found = float(mean[row, turn]) - max(float(beyond.mean()) if len(beyond) else 0.0, 0.0)
-    is_blind = WHITE_LEVEL - float(np.median(gray[known])) < HEADROOM
+    is_blind = WHITE_LEVEL - float(np.median(gray[known])) < HEADROOM * level
     return np.nan if is_blind or not np.isfinite(found) else found
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -108,3 +110,11 @@ def test_a_cable_beside_a_cap_is_not_its_shadow(is_released: bool, cable_at_m: f
 @pytest.mark.parametrize("glare_at_m", [-0.025, 0.02, 0.025])
 def test_a_glare_beside_a_flush_cap_is_not_its_shine(glare_at_m: float) -> None:
     assert read_button(seen_straight(is_released=False, glare_at_m=glare_at_m), BUTTON).state in ("pressed", None)
+
+
+def test_a_cap_too_bright_to_shine_is_not_surely_pressed() -> None:
+    """Its face and its plate are near white: a shine could not show, and its shadow is washed out."""
+    clear = seen_straight(is_released=True)
+    bright = np.clip(np.round(225 + 0.08 * (clear.gray.astype(float) - 60)), 0, 255).astype(np.uint8)
+    status = read_button(replace(clear, gray=bright), BUTTON)
+    assert status.state in ("released", None) or status.confidence < 0.8

@@ -220,6 +220,18 @@ def fastest_to_rest(way: float, most: float) -> Any:
 
 
 @njit(cache=True)
+def rest_place(place: float, speed: float, most: float) -> Any:
+    """Where something that has just come to `place` at `speed` a tick comes to rest."""
+    return place + np.sign(speed) * rest_way(abs(speed), most)
+
+
+@njit(cache=True)
+def step_to_rest(way: float, most: float) -> Any:
+    """`fastest_to_rest`, either way."""
+    return np.sign(way) * fastest_to_rest(abs(way), most)
+
+
+@njit(cache=True)
 def limited_step(
     wanted: Array,
     wanted_before: Array,
@@ -233,18 +245,24 @@ def limited_step(
 ) -> Any:
     """The set-point (n,) nearest to `wanted` that respects range, speed and acceleration limits per joint.
 
-    It aims where the wanted one would come to rest if it braked from now on, and goes no faster than it can brake
-    ahead of that: what it can follow it follows exactly, behind a leap it arrives without running past.
+    It goes no faster than it can brake ahead of where the wanted one would come to rest if that braked from now on:
+    what it can follow it follows exactly, behind a leap it arrives without running past. `wanted_before` (k, n), newest
+    first: of the speeds between them the fastest one each way counts, since ticks that come late and early make a
+    steady course jerk.
     """
     out = np.empty_like(wanted)
     for i in range(wanted.shape[0]):
         most, fastest = acceleration[i] * dt_s * dt_s, velocity[i] * dt_s
         goal = min(max(wanted[i], lower[i]), upper[i])
-        before = min(max(wanted_before[i], lower[i]), upper[i])
-        speed = min(max(goal - before, -fastest), fastest)
-        aim = min(max(goal + np.sign(speed) * rest_way(abs(speed), most), lower[i]), upper[i])
-        way = aim - last[i]
-        step = np.sign(way) * fastest_to_rest(abs(way), most)
+        slow, fast, after = fastest, -fastest, goal
+        for k in range(wanted_before.shape[0]):
+            before = min(max(wanted_before[k, i], lower[i]), upper[i])
+            slow, fast = min(slow, after - before), max(fast, after - before)
+            after = before
+        slow, fast = max(slow, -fastest), min(fast, fastest)  # faster than that nobody follows
+        below = min(max(rest_place(goal, slow, most), lower[i]), upper[i])
+        above = min(max(rest_place(goal, fast, most), lower[i]), upper[i])
+        step = min(max(goal - last[i], step_to_rest(below - last[i], most)), step_to_rest(above - last[i], most))
         low = max(-fastest, last_velocity[i] * dt_s - most)
         high = min(fastest, last_velocity[i] * dt_s + most)
         out[i] = last[i] + min(max(step, low), high)
@@ -384,6 +402,6 @@ def warm(dh: Array) -> None:
     )
     hermite(times, np.zeros((2, n)), np.zeros((2, n)), 0.5)
     admittance_step(np.zeros((2, 6)), np.zeros(6), np.ones(6), np.ones(6), np.ones(6), np.ones(6), 0.01)
-    safe_step(dh, eye, q, q, q, np.zeros(n), ones, ones, -ones, ones, 1e-9, 0.01)
+    safe_step(dh, eye, q, np.zeros((2, n)), q, np.zeros(n), ones, ones, -ones, ones, 1e-9, 0.01)
     wrench_at(np.zeros(6), eye)
     tick_view(dh, q, q, eye, eye, eye, np.zeros(6), np.zeros(6), 1.0, np.zeros(3), 9.8)

@@ -166,7 +166,7 @@ def test_a_set_point_never_breaks_range_speed_or_acceleration_limits() -> None:
     q, v, before, end = np.zeros(3), np.zeros(3), np.zeros(3), np.full(3, 0.05)
     for _ in range(2000):
         wanted = q + rng.normal(0, 0.1, 3)
-        new = kernels.limited_step(wanted, before, q, v, velocity, acceleration, -end, end, dt)
+        new = kernels.limited_step(wanted, before[None], q, v, velocity, acceleration, -end, end, dt)
         now, before = (new - q) / dt, wanted
         assert np.all(np.abs(new) <= end + 1e-12)
         assert np.all(np.abs(now) <= velocity + 1e-9)

@@ -10,15 +10,10 @@ from perception.vision.reading import Status, gated, refused
 from perception.vision.status.press import cap_height
 from perception.vision.status.shade import cap_shades
 
-SHADE_HALF, SHADE_SCALE = (
-    0.06,
-    0.02,
-)  # .95 of 179 flush caps on drawn hard panels stay below 0.062, half of the others exceed 0.068
-SPOT_HALF, SPOT_SCALES = 0.065, (0.02, 0.012)  # .95 of flush caps stay below 0.050, .95 of the others exceed 0.057
-LEAST_SHADE, LEAST_SPOT, MOST = -3.0, -2.5, 6.0  # log odds: a cap may be matt, its shadow may fall on black
-ALONE = (
-    1.3  # of a shade without a face, or of no shine without a ring: a cable that is not known to be one has a shade too
-)
+SHADE_HALF, SHADE_SCALE = 0.06, 0.03  # .95 of 179 drawn flush caps stay below 0.062, half of the others exceed 0.068
+SPOT_HALF, SPOT_SCALE = 1.12, 0.1  # .95 of flush caps stay below 0.96, .95 of the others exceed 1.28
+SHADE_ODDS, SPOT_ODDS = (-1.5, 3.0), (-2.5, 6.0)  # a cap a pixel beside its place has a shade too
+ALONE = 1.3  # log odds at most, of a shade without a face, and of no shine without a ring
 MODEL_SHARE = 0.25
 UNSEEN = "the button cannot be seen (glare, shadow or cover): change the angle or the light"
 
@@ -62,8 +57,8 @@ def _by_height(patch: Patch, spec: Button | Mushroom) -> float | None:
 def _by_shade(patch: Patch, radius_m: float) -> float | None:
     """Log odds of `released` from a shadow on one side and a spot of shine; None when neither can be seen."""
     seen = cap_shades(patch, radius_m)
-    shade = float(np.clip((seen.shade - SHADE_HALF) / SHADE_SCALE, LEAST_SHADE, MOST))
-    spot = float(np.clip((seen.spot - SPOT_HALF) / SPOT_SCALES[seen.spot > SPOT_HALF], LEAST_SPOT, MOST))
+    shade = float(np.clip((seen.shade - SHADE_HALF) / SHADE_SCALE, *SHADE_ODDS))
+    spot = float(np.clip((seen.spot - SPOT_HALF) / SPOT_SCALE, *SPOT_ODDS))
     if np.isnan(spot):
         return None if np.isnan(shade) else float(np.clip(shade, -ALONE, ALONE))
     return max(spot, -ALONE) if np.isnan(shade) else shade + spot

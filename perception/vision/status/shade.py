@@ -27,17 +27,19 @@ BLUR_PX = 2.0  # of what lies across, beyond its mask
 LEAST_RING, LEAST_FACE = 0.4, 0.5  # share that must be known
 ODD_SIGMAS, ODD_SHARE = 4.0, 0.12  # the plate beside a cap is even but for what lies across it: noise, and of its gray
 HEADROOM = 0.2  # of the plate's gray, above a face: with less no shine shows
+SMOOTH = 0.01  # of the plate's gray: so far a face's light may be off the smooth one
 ROUNDS = 4
 BLOB = (9, 3)  # angles and radii that a spot fills
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shades:
-    """Of a cap, over the gray of the plate round it; NaN where too little can be seen.
+    """Of a cap; NaN where too little can be seen.
 
     Attributes:
-        shade: first harmonic of the ring round the cap, beyond what face and plate have of it.
-        spot: how far the brightest spot of the face stands out from the face's smooth light.
+        shade: first harmonic of the ring round the cap, beyond what face and plate have of it, over the plate's gray.
+        spot: how far the brightest spot of the face stands out from the face's smooth light, over what the rest of the face
+            does (its noise, and a hundredth of the plate's gray).
     """
 
     shade: float
@@ -59,7 +61,7 @@ def cap_shades(patch: Patch, radius_m: float) -> Shades:
     plate, no_plate = _mean_round(patch, unknown, radius_m * np.linspace(*PLATE, 5))
     rim, no_rim = _mean_round(patch, unknown, radius_m * np.linspace(*RIM, 4))
     level = max(float(np.median(plate[~no_plate] if not no_plate.all() else plate)), 8.0)
-    spot = _spot(patch, unknown, radius_m, level) / level
+    spot = _spot(patch, unknown, radius_m, level)
     if no_plate.mean() > 1.0 - LEAST_RING:
         return Shades(shade=np.nan, spot=spot)
     around = _wave(plate, ~no_plate)
@@ -75,7 +77,7 @@ def cap_shades(patch: Patch, radius_m: float) -> Shades:
 
 
 def _spot(patch: Patch, unknown: NDArray[np.uint8], radius_m: float, level: float) -> float:
-    """How far the face's brightest spot stands out from a light that changes smoothly over the face, gray levels."""
+    """`Shades.spot`: the light of a face without one changes smoothly over it."""
     x, y = np.outer(FACE_RADII, np.sin(ANGLES)), np.outer(FACE_RADII, np.cos(ANGLES))
     u, v = patch.pixel_of(radius_m * x, radius_m * y)
     gray = np.asarray(sample_at(patch.gray, u, v), float)
@@ -84,7 +86,7 @@ def _spot(patch: Patch, unknown: NDArray[np.uint8], radius_m: float, level: floa
         return np.nan
     form = np.stack([np.ones_like(x), x, y, x**2 + y**2], axis=-1).reshape(-1, 4)
     area = (known * FACE_RADII[:, None]).ravel()
-    weight, off = area, np.zeros_like(gray)
+    weight, off, scale = area, np.zeros_like(gray), 1.0
     for _ in range(ROUNDS):
         weighted = form * weight[:, None]
         smooth = form @ np.linalg.solve(weighted.T @ form + 1e-9 * np.eye(4), weighted.T @ gray.ravel())
@@ -100,7 +102,7 @@ def _spot(patch: Patch, unknown: NDArray[np.uint8], radius_m: float, level: floa
     beyond = beyond[np.isfinite(beyond)]
     found = float(mean[row, turn]) - max(float(beyond.mean()) if len(beyond) else 0.0, 0.0)
     is_blind = WHITE_LEVEL - float(np.median(gray[known])) < HEADROOM * level
-    return np.nan if is_blind or not np.isfinite(found) else found
+    return np.nan if is_blind or not np.isfinite(found) else found / (scale + SMOOTH * level)
 
 
 def _mean_round(patch: Patch, unknown: NDArray[np.uint8], radii_m: Array) -> tuple[Array, NDArray[np.bool_]]:

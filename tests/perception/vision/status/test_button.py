@@ -118,3 +118,14 @@ def test_a_cap_too_bright_to_shine_is_not_surely_pressed() -> None:
     bright = np.clip(np.round(225 + 0.08 * (clear.gray.astype(float) - 60)), 0, 255).astype(np.uint8)
     status = read_button(replace(clear, gray=bright), BUTTON)
     assert status.state in ("released", None) or status.confidence < 0.8
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_noise_of_a_black_cap_is_not_its_shine(seed: int) -> None:
+    """In a dark picture a camera's noise is largest where it is darkest."""
+    clear = seen_straight(is_released=False)
+    linear = (0.45 * clear.gray.astype(float) / 255) ** 2.2
+    rough = cv2.resize(np.random.default_rng(seed).normal(0.0, 1.0, (SIZE * 2 // 3,) * 2), (SIZE, SIZE))
+    gray = np.round(255 * np.clip(linear + 0.006 * rough, 0.0, 1.0) ** (1 / 2.2)).astype(np.uint8)
+    status = read_button(replace(clear, gray=gray), BUTTON)
+    assert status.state == "pressed" or status.confidence < 0.8

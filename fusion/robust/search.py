@@ -27,6 +27,9 @@ ANNEALED, AS_IT_IS = plain(True), plain(False)
 FIT_LIMIT = 60.0  # a subset that its own pose explains no better than this is not clean
 LEAST_GAIN = 1e-6  # of truncated error, below which two are equal
 ANNEAL = (8.0, 4.0, 2.0, 1.0)
+OTHERS = 2  # hypotheses of another attitude that are settled too: the cheapest are often all one pose, and its mirror image none
+OTHER_ATTITUDE = 2.86  # trace of the turn between two of one attitude: 0.38 rad
+OTHER_COST = 23.0  # of truncated error above the cheapest, up to which a hypothesis may become another answer
 
 
 @inlined
@@ -107,7 +110,7 @@ def truncated(b: Batch, f: Array) -> float:
 
 @compiled
 def candidates(b: Batch, draws: Array, most: int, Rs: Array, ts: Array, costs: Array, inside: NDArray[np.int64]) -> int:
-    """One round: hypotheses from `draws` (H, DRAWS), of which the best `most` are settled.
+    """One round: hypotheses from `draws` (H, DRAWS), of which the best `most` are settled, and OTHERS of other attitudes.
 
     The first so many rows of Rs (H, 3, 3), ts (H, 3), costs (H,) are the settled ones, cheapest first, with the degrees
     of freedom inside their gates in `inside` (H,). Returns how many.
@@ -117,21 +120,38 @@ def candidates(b: Batch, draws: Array, most: int, Rs: Array, ts: Array, costs: A
     order = np.argsort(costs)
     kept = 0
     f = np.empty(n)
-    R, t, cost = np.empty((most, 3, 3)), np.empty((most, 3)), np.empty(most)
-    number = np.empty(most, np.int64)
-    for h in order[:most]:
-        if costs[h] < np.inf:
-            R[kept], t[kept] = Rs[h], ts[h]
-            cost[kept] = settle(b, R[kept], t[kept], f, ANNEALED)
-            number[kept] = 0
-            for i in range(n):
-                if f[i] < b.gate[i]:
-                    number[kept] += b.dof[i]
-            kept += 1
+    R, t, cost = np.empty((most + OTHERS, 3, 3)), np.empty((most + OTHERS, 3)), np.empty(most + OTHERS)
+    number = np.empty(most + OTHERS, np.int64)
+    for rank in range(order.size):
+        h = order[rank]
+        if not costs[h] < np.inf or kept == most + OTHERS:
+            break
+        if rank >= most and (costs[h] > costs[order[0]] + OTHER_COST or not _is_other(Rs[h], R, kept)):
+            continue
+        R[kept], t[kept] = Rs[h], ts[h]
+        cost[kept] = settle(b, R[kept], t[kept], f, ANNEALED)
+        number[kept] = 0
+        for i in range(n):
+            if f[i] < b.gate[i]:
+                number[kept] += b.dof[i]
+        kept += 1
     order = np.argsort(cost[:kept])
     for k in range(kept):
         Rs[k], ts[k], costs[k], inside[k] = R[order[k]], t[order[k]], cost[order[k]], number[order[k]]
     return kept
+
+
+@inlined
+def _is_other(R: Array, known: Array, count: int) -> bool:
+    """Is R (3, 3) of another attitude than the first `count` of `known`?"""
+    for k in range(count):
+        turn = 0.0
+        for i in range(3):
+            for j in range(3):
+                turn += R[i, j] * known[k, i, j]
+        if turn > OTHER_ATTITUDE:
+            return False
+    return True
 
 
 @compiled

@@ -59,7 +59,7 @@ def fuse_shape(given: Sequence[Measurement], shape: Shape, prior: UncertainPose)
             found.append(_descended(measurements, shape, prior, _forgiving, half))
     pose, values, used, _ = min(found, key=lambda made: made[3])
     b, f, H, _ = _system(measurements, shape, prior, pose, values, np.asarray(used, float))
-    local, joint = _local(b, f, H, pose, used)
+    local, joint = _local(b, f, H, pose, used, np.asarray(shape.sigma, float))
     found_values, rejected, evidence = weighed(b, used, local, np.array([*distinct, -1]), given, repeats)
     return FusedPose(
         pose=pose,
@@ -172,14 +172,19 @@ def _rows(b: Batch, R: Array, t: Array) -> tuple[Array, Array]:
     return r, J
 
 
-def _local(b: Batch, f: Array, H: Array, pose: RigidTransform, used: NDArray[np.bool_]) -> tuple[LocalSolution, Array]:
+def _local(
+    b: Batch, f: Array, H: Array, pose: RigidTransform, used: NDArray[np.bool_], sigma: Array
+) -> tuple[LocalSolution, Array]:
     """The solution as one of the pose alone, and the covariance (6 + P, 6 + P) of pose and parameters."""
     joint = np.asarray(np.linalg.inv(H), float)
     information = np.linalg.inv(joint[:6, :6])
+    fitted = len(sigma) - float(
+        np.diag(joint)[6:] @ sigma**-2.0
+    )  # parameters that the measurements tell, not the belief
     R = matrix_of(pose)
     covariance, free = covariance_and_freedom(information, *middle_and_size(b, used, R))
     local = LocalSolution(
         rotation=R, translation_m=np.array(pose.translation), covariance=covariance, information=information, values=f,
-        chi_square=float(f[used].sum()), dof=int(b.dof[used].sum()) - 6, unobservable=free,
+        chi_square=float(f[used].sum()), dof=int(b.dof[used].sum()) - 6 - round(fitted), unobservable=free,
     )  # fmt: skip
     return local, joint

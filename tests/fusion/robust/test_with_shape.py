@@ -101,3 +101,10 @@ def test_a_shape_knows_its_parts() -> None:
     edge = Box(size_m=(0.2, 0.1, 0.04)).feature("+x-z", np.array([0.2, 0.1, 0.04]), np.zeros(3))
     assert edge.point_m == pytest.approx([0.1, 0.0, -0.02])
     assert abs(edge.direction) == pytest.approx([0.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize(("sigma_m", "dof"), [(0.02, 9), (1e-6, 12)])
+def test_measures_that_the_touches_tell_cost_degrees_of_freedom(sigma_m: float, dof: int) -> None:
+    touches, prior, guess = touched_box()  # twelve constraints, and the prior's six for the pose
+    answer = fuse(touches, prior=prior, shape=replace(guess, sigma_m=sigma_m))
+    assert answer.dof == dof

@@ -8,6 +8,7 @@ import pytest
 from fusion.plan import Candidate, Tolerance, next_best, plan
 from fusion.solve import solve
 from hal.errors import InvalidRequest
+from hal.geometry import UncertainPose, point_covariance
 from tests.fusion.mixtures import mixture
 
 
@@ -37,6 +38,16 @@ def test_a_plan_stops_when_the_tolerance_is_met_and_is_no_longer_than_the_given_
     assert len({c.index for c in chosen}) == len(chosen)
     in_order = plan(wide, p.base_from_object, offered[: len(chosen) - 1], tolerance=tolerance)
     assert in_order[-1].error_after > 1.0
+
+
+def test_the_error_is_that_of_the_place_that_matters() -> None:
+    p, A = mixture(4, 14), np.random.default_rng(14).normal(size=(6, 6)) * 1e-3
+    now, place = UncertainPose(parent_from_child=p.base_from_object, covariance=A @ A.T), (0.4, 0.25, 0.1)
+    tolerance = Tolerance(position_m=0.002, angle_rad=0.01, at_m=place)
+    offered = [Candidate(expected=p.measurements[0], cost_s=1.0)]
+    choice = next_best(now.covariance, p.base_from_object, offered, tolerance=tolerance)
+    shift, turn = np.trace(point_covariance(now, place)) / 0.002**2, np.trace(now.covariance[3:, 3:]) / 0.01**2
+    assert choice.error_before == pytest.approx(0.5 * (shift + turn))
 
 
 def test_planning_needs_a_candidate_with_a_cost() -> None:

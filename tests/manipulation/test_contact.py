@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hal.errors import Cancelled, DeviceFault, InvalidRequest, Stopped
@@ -215,6 +215,12 @@ def test_inertia_at_the_start_is_not_taken_for_a_surface() -> None:
     assert onset(depth, force, 0.01)[0] == pytest.approx(0.009, abs=1e-4)
 
 
+def test_an_onset_lies_between_the_start_of_the_move_and_the_first_force() -> None:
+    depth = np.linspace(0.005, 0.01, 51)
+    force = 2.0 + 100.0 * (depth - 0.005)  # so soft that its line meets zero before the move began
+    assert onset(depth, force, 0.01)[0] == 0.005
+
+
 def test_no_force_at_all_answers_with_the_deepest_place() -> None:
     assert onset(np.linspace(0, 0.01, 50), np.zeros(50), 0.01) == (0.01, 0.0)
 
@@ -241,6 +247,8 @@ def test_a_touch_point_is_known_along_the_fingers_and_spread_across_them() -> No
 
 
 @given(angle=st.floats(-20.0, 20.0))
+@example(angle=-np.pi)
+@example(angle=np.pi)
 def test_a_wrapped_angle_is_the_same_direction(angle: float) -> None:
     assert -np.pi < wrapped(angle) <= np.pi + 1e-12
     assert np.cos(wrapped(angle)) == pytest.approx(np.cos(angle), abs=1e-9)

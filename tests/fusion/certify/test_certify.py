@@ -15,7 +15,7 @@ from fusion.distance.reference import residual
 from fusion.robust import used_entries
 from fusion.simulate import CODES, Problem, problem
 from fusion.solve import solve
-from hal.geometry import difference, matrix_of
+from hal.geometry import UncertainPose, difference, matrix_of, perturbed
 from tests.fusion.mixtures import mixture
 
 
@@ -45,6 +45,18 @@ def test_the_quadratic_form_is_the_squared_rows_of_every_class() -> None:
     z = monomials(R, t)
     expected = [residual(m, R, t) @ residual(m, R, t) for m in p.measurements]
     assert np.einsum("i,kij,j->k", z, forms, z) == pytest.approx(expected, rel=1e-4, abs=1e-6)
+
+
+def test_the_quadratic_form_of_a_prior_is_its_whitened_difference() -> None:
+    rng = np.random.default_rng(5)
+    A = rng.normal(size=(6, 6)) * 1e-3
+    prior = UncertainPose(parent_from_child=mixture(1, 6).base_from_object, covariance=A @ A.T + 1e-8 * np.eye(6))
+    delta = 1e-3 * rng.normal(size=6)
+    pose = perturbed(prior.parent_from_child, delta)
+    R, t = matrix_of(pose), np.array(pose.translation)
+    form = quadratic_forms(pack([], prior), R, t, np.zeros(3), np.zeros(3), 1.0)[0]
+    z = monomials(R, t)
+    assert z @ form @ z == pytest.approx(delta @ np.linalg.solve(prior.covariance, delta), rel=1e-3)
 
 
 def test_composed_poses_are_one_linear_map() -> None:

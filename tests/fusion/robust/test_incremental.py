@@ -8,7 +8,7 @@ import pytest
 from fusion import fuse
 from fusion.robust import incremental
 from hal.errors import InvalidRequest
-from hal.geometry import difference
+from hal.geometry import UncertainPose, difference
 from tests.fusion.mixtures import mixture
 
 
@@ -39,3 +39,15 @@ def test_a_repeated_measurement_is_refused() -> None:
 def test_removing_what_is_not_there_is_refused() -> None:
     with pytest.raises(InvalidRequest):
         incremental.remove(incremental.start(mixture(8, 9).measurements), 8)
+
+
+def test_a_prior_stays_what_it_is_when_measurements_come_and_go() -> None:
+    p = mixture(14, 21)
+    prior = UncertainPose(parent_from_child=p.base_from_object, covariance=np.diag([4e-6] * 3 + [1e-5] * 3))
+    grown = incremental.add(incremental.start(p.measurements[:13], prior=prior), p.measurements[13])
+    whole = fuse(p.measurements, prior=prior)
+    assert np.abs(difference(whole.pose, grown.answer.pose)).max() < 1e-6
+    assert grown.answer.covariance == pytest.approx(whole.covariance, rel=1e-3, abs=1e-12)
+    assert [r.index for r in grown.answer.rejected] == [r.index for r in whole.rejected]
+    shrunk = incremental.remove(grown, 13).answer
+    assert np.abs(difference(fuse(p.measurements[:13], prior=prior).pose, shrunk.pose)).max() < 1e-6

@@ -1,0 +1,172 @@
+"""What a skill says of its motions: whole skills over a mover that answers each motion as it is told to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hal.geometry import certain, transform_rpy
+from hal.motion import CartesianPath, DeclaredMotion, MotionLog, MotionOutcome, MotionReport, RobotState
+from hal.panel import load_panel
+from manipulation.kinematics import Kinematics
+from manipulation.skills.button import button
+from manipulation.skills.handwheel import GRIP_FLOOR_N, LARGEST_GRIP_N, grip_force_n
+from manipulation.skills.lever import lever
+from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport
+from manipulation.skills.press import stop_force_n, travelled_m
+from manipulation.skills.probe import proximity_probe
+from manipulation.skills.rotary import rotary
+from manipulation.skills.steps import PULLS, Attempt, retreat
+from manipulation.timing import SpeedLimits
+from manipulation.tool import Hand
+from manipulation.workcell import Workcell
+from tests.manipulation.arms import T3
+from tests.manipulation.rig import HOME
+from tests.manipulation.test_contact import AT_HOME, COMPLETED, GRIP, ScriptedMover
+
+PANEL = load_panel(Path(__file__).parents[2] / "panels" / "bench.toml")
+PAD_N_PER_M = Hand().pad_stiffness_n_per_m
+DOWN = AT_HOME.rotation.apply([0.0, 0.0, 1.0])
+
+
+class NamedMover(ScriptedMover):
+    """Answers a motion by its name; what has no answer of its own is completed."""
+
+    def __init__(self, answers: dict[str, MotionReport]) -> None:
+        super().__init__(COMPLETED)
+        self.answers = answers
+        self.motions: list[DeclaredMotion] = []
+        self.distances_m: list[float] = []
+
+    def execute(self, motion: DeclaredMotion) -> MotionReport:
+        self.asked.append(motion.name)
+        self.motions.append(motion)
+        return self.answers.get(motion.name, COMPLETED)
+
+    def state(self) -> RobotState:
+        samples = self.asked.count("proximity sample")
+        return replace(super().state(), proximity_m=tuple(self.distances_m[samples - 1 : samples]))
+
+
+def before_the_bench(answers: dict[str, MotionReport]) -> tuple[Workcell, NamedMover]:
+    mover = NamedMover(answers)
+    cell = Workcell(
+        mover=mover,
+        kinematics=Kinematics.of(T3),
+        panel=PANEL,
+        base_from_panel=certain(transform_rpy((0.75, 0.0, 0.6), (np.pi / 2, 0.0, -np.pi / 2))),
+        flange_from_grip=GRIP,
+        limits=SpeedLimits(tip_m_per_s=0.25),
+        park_rad=HOME,
+    )
+    return cell, mover
+
+
+def pressed(free_m: float, travel_m: float, force_n: float, *, tripped: bool = True) -> MotionReport:
+    """A push down: free, then onto a cap that gives way by `travel_m` and pads that give way by the force."""
+    deepest = free_m + travel_m + force_n / PAD_N_PER_M
+    depth = np.linspace(0.0, deepest, 400)
+    wrench = np.zeros((400, 6))
+    wrench[:, 2] = -force_n * np.clip((depth - free_m) / (deepest - free_m), 0.0, 1.0)
+    log = MotionLog(
+        times_s=np.arange(400) * 0.002, positions_rad=np.zeros((400, 6)), wrench=wrench,
+        tip_m=AT_HOME.translation + depth[:, None] * DOWN,
+    )  # fmt: skip
+    outcome = MotionOutcome.GUARD if tripped else MotionOutcome.COMPLETED
+    return replace(COMPLETED, outcome=outcome, tripped="bottom" if tripped else None, log=log)
+
+
+def test_the_travel_of_a_cap_is_that_of_the_tip_under_force_less_what_the_pads_gave() -> None:
+    found = travelled_m(pressed(0.004, 0.003, 20.0), PAD_N_PER_M)
+    assert found == pytest.approx(0.003, abs=4e-4)  # it begins to count at one newton
+    assert travelled_m(pressed(0.004, 0.0, 0.5), PAD_N_PER_M) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("push", "outcome"),
+    [
+        (pressed(0.004, 0.004, 20.0), Outcome.UNVERIFIED),
+        (pressed(0.004, 0.0003, 20.0), Outcome.STALLED),
+        (pressed(0.02, 0.004, 5.0, tripped=False), Outcome.MISSED),
+    ],
+    ids=["down", "stuck", "not there"],
+)
+def test_a_button_says_how_its_press_ended(push: MotionReport, outcome: Outcome) -> None:
+    cell, _ = before_the_bench({"press": push})
+    told = button(cell, "start", expected="on")
+    assert told.outcome is outcome
+    assert told.reached == pytest.approx(travelled_m(push, PAD_N_PER_M))
+
+
+def test_a_button_whose_lamp_stays_dark_is_not_pressed_again() -> None:
+    cell, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
+    told = button(cell, "start", expected="on", verify=lambda: ObjectState(name="start", state="off"))
+    assert (told.outcome, mover.asked.count("press")) == (Outcome.SLIPPED, 1)
+
+
+def test_a_press_is_guarded_by_more_than_the_springs_of_the_cap() -> None:
+    cell, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
+    button(cell, "start")
+    cap = PANEL.object("start")
+    (push,) = (m for m in mover.motions if m.name == "press")
+    assert push.guards[0].limit == stop_force_n(cap) > cap.preload_n + cap.spring_n_per_m * cap.travel_m
+
+
+@pytest.mark.parametrize(("distance_m", "against"), [(0.01, -1.0), (-0.01, 1.0)])
+def test_a_contact_is_looked_for_against_the_way(distance_m: float, against: float) -> None:
+    cell, mover = before_the_bench({})
+    Attempt(cell).advance(distance_m, name="advance")
+    (motion,) = mover.motions
+    assert isinstance(motion, CartesianPath) and motion.guards[0].axis == (0.0, 0.0, against)
+
+
+def test_a_hand_that_is_held_is_pulled_again() -> None:
+    held = replace(COMPLETED, outcome=MotionOutcome.GUARD, tripped="contact")
+    for answer, pulls in ((held, PULLS), (COMPLETED, 1)):
+        cell, mover = before_the_bench({"retreat": answer})
+        retreat(cell)
+        assert mover.asked.count("retreat") == pulls
+
+
+def test_a_wheel_that_slipped_is_held_more_firmly_up_to_what_a_hand_may() -> None:
+    wheel = next(thing for thing in PANEL.objects if thing.kind == "handwheel")
+    forces = [grip_force_n(wheel, tries=k) for k in range(20)]
+    assert forces == sorted(forces) and forces[0] < forces[3]
+    assert forces[0] >= GRIP_FLOOR_N and forces[-1] == LARGEST_GRIP_N
+
+
+def _turned(skill: Callable[..., SkillReport], name: str, target: str, now: ObjectState, seen: ObjectState) -> Outcome:
+    """The hand finds nothing between its fingers, so that the look alone decides."""
+    cell, _ = before_the_bench({})
+    return skill(cell, name, target, current=now, verify=lambda: seen).outcome
+
+
+@pytest.mark.parametrize(("off_deg", "outcome"), [(5.0, Outcome.DONE), (40.0, Outcome.MISSED)])
+@pytest.mark.parametrize(("skill", "name"), [(rotary, "mode"), (lever, "main_valve")])
+def test_an_angle_that_was_seen_is_a_state_only_near_it(
+    skill: Callable[..., SkillReport], name: str, off_deg: float, outcome: Outcome
+) -> None:
+    first, last = PANEL.object(name).states[0], PANEL.object(name).states[-1]
+    now = ObjectState(name=name, angle_rad=first.angle_rad)
+    seen = ObjectState(name=name, angle_rad=last.angle_rad - np.radians(off_deg))
+    assert _turned(skill, name, last.name, now, seen) is outcome
+
+
+@pytest.mark.parametrize("seen", [5, 10])
+def test_a_distance_is_the_middle_of_what_was_seen(seen: int) -> None:
+    cell, mover = before_the_bench({})
+    mover.distances_m = [0.05 + 0.001 * (k % 3) for k in range(seen)] + [np.nan] * (10 - seen)
+    (point,) = proximity_probe(cell, (0.0, 0.06, 0.0), flange_from_sensors=[GRIP], sigma_m=0.002)
+    assert (point.distance_m, point.samples) == (pytest.approx(0.051), seen)
+    assert point.sigma_m == pytest.approx(0.002 * max(1 / 3, seen**-0.5))
+
+
+def test_a_distance_that_few_samples_saw_is_none() -> None:
+    cell, mover = before_the_bench({})
+    mover.distances_m = [0.05] * 4 + [np.nan] * 6
+    with pytest.raises(SkillFailure, match="no proximity sensor"):
+        proximity_probe(cell, (0.0, 0.06, 0.0), flange_from_sensors=[GRIP])

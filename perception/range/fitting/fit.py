@@ -64,19 +64,11 @@ STEP_GOAL = 1e-3  # of a standard deviation of each parameter: a step that small
 @njit(cache=True, error_model="numpy")
 def new_scratch(samples):  # type: ignore[no-untyped-def]  # numba types it
     """What a fit works in: rows of `rays`, two systems (9, 9) and (9,), that of a step, two frames, a trial, residuals."""
-    return (
-        np.empty(SCRATCH),
-        np.empty((9, 9)),
-        np.empty(9),
-        np.empty((9, 9)),
-        np.empty(9),
-        np.empty((9, 9)),
-        np.empty(9),
-        np.empty(6),
-        np.empty(6),
-        np.empty(SIZE),
-        np.empty(samples),
-    )
+    small = np.empty(3 * 81 + 3 * 9 + 2 * 6 + SIZE)  # one allocation in place of nine
+    H, H2, A = small[:81].reshape((9, 9)), small[81:162].reshape((9, 9)), small[162:243].reshape((9, 9))
+    g, g2, step = small[243:252], small[252:261], small[261:270]
+    frame, new_frame, trial = small[270:276], small[276:282], small[282:]
+    return np.empty(SCRATCH), H, g, H2, g2, A, step, frame, new_frame, trial, np.empty(samples)
 
 
 @njit(cache=True, error_model="numpy", **LEAN)

@@ -44,7 +44,7 @@ def principal_axes(S):  # type: ignore[no-untyped-def]  # numba types it
 
     Cyclic Jacobi rotations (Golub and Van Loan, 8.5): a tenth of what a call of LAPACK costs at this size.
     """
-    A, V = S.copy(), np.eye(3)
+    A, V, values = S.copy(), np.eye(3), np.empty(3)
     size = abs(A[0, 0]) + abs(A[1, 1]) + abs(A[2, 2])
     for _ in range(MOST_SWEEPS):
         off = abs(A[0, 1]) + abs(A[0, 2]) + abs(A[1, 2])
@@ -65,12 +65,14 @@ def principal_axes(S):  # type: ignore[no-untyped-def]  # numba types it
                     A[i, k], A[j, k] = c * A[i, k] - s * A[j, k], s * A[i, k] + c * A[j, k]
                 for k in range(3):
                     V[k, i], V[k, j] = c * V[k, i] - s * V[k, j], s * V[k, i] + c * V[k, j]
-    order = np.argsort(np.diag(A))
-    values, vectors = np.empty(3), np.empty((3, 3))
     for k in range(3):
-        values[k] = A[order[k], order[k]]
-        vectors[:, k] = V[:, order[k]]
-    return values, vectors
+        values[k] = A[k, k]
+    for j in (1, 2, 1):  # neighbours that stand the wrong way round change places
+        if values[j] < values[j - 1]:
+            values[j - 1], values[j] = values[j], values[j - 1]
+            for k in range(3):
+                V[k, j - 1], V[k, j] = V[k, j], V[k, j - 1]
+    return values, V
 
 
 @njit(cache=True, error_model="numpy")

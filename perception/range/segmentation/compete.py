@@ -92,10 +92,10 @@ def _explanations(  # type: ignore[no-untyped-def]  # numba types it
     """Kinds (M,) and parameters (M, 16) of the surfaces found, labelled from `first_label` in `blocks`; see `explain`."""
     kinds, ths = np.zeros(ROUNDS * MOST_COMPONENTS, np.int64), np.zeros((ROUNDS * MOST_COMPONENTS, SIZE))
     flat_free, flat_blocks = free.ravel(), blocks.ravel()
-    found, attempts = 0, 0
+    found, attempts, left = 0, 0, np.flatnonzero(flat_free)
     for _ in range(ROUNDS):
         starts, indices = smooth_components(
-            z, sigma, free, slope, inverse_f, perspective, normal, rms, turn_limit, least, MOST_COMPONENTS
+            left, z, sigma, free, slope, inverse_f, perspective, normal, rms, turn_limit, least, MOST_COMPONENTS
         )  # fmt: skip
         count = starts.shape[0] - 1
         if count == 0 or attempts >= MOST_ATTEMPTS:
@@ -116,6 +116,7 @@ def _explanations(  # type: ignore[no-untyped-def]  # numba types it
             if kind < 0:
                 # What nothing explains now, nothing will: it must not be offered again.
                 flat_free[members] = False
+        left = left[flat_free[left]]
     return kinds[:found].copy(), ths[:found].copy()
 
 

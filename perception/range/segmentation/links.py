@@ -33,40 +33,37 @@ def smooth_links(z, sigma, free, slope, inverse_f, perspective, normal, rms, cos
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def smooth_components(z, sigma, free, slope, inverse_f, perspective, normal, rms, cos_limit, least, most):  # type: ignore[no-untyped-def]  # numba types it
+def smooth_components(blocks, z, sigma, free, slope, inverse_f, perspective, normal, rms, cos_limit, least, most):  # type: ignore[no-untyped-def]  # numba types it
     """Components of at least `least` free blocks over `smooth_links`, the `most` largest, those first.
 
-    Returns starts (n + 1,) and flat block indices (N,) in raster order: component k owns indices[starts[k] : starts[k + 1]].
+    `blocks` (B,): the free ones, flat, ascending. Returns starts (n + 1,) and flat indices (N,) in raster order: component
+    k owns indices[starts[k] : starts[k + 1]].
     """
     h, w = z.shape
-    parent, sizes = np.arange(h * w), np.zeros(h * w, np.int64)
-    for r in range(h):
-        for c in range(w):
-            if not free[r, c]:
-                continue
-            limit = slope * (z[r, c] if perspective else 1.0) * inverse_f + 4.0 * sigma[r, c]
-            for s in range(2):
-                i, j = r + s, c + 1 - s
-                if i < h and j < w and free[i, j] and _is_smooth(z, normal, rms, r, c, i, j, limit, cos_limit):
-                    unite(parent, r * w + c, i * w + j)
-    blocks = np.flatnonzero(free)
-    roots = np.empty_like(blocks)
-    for n in range(blocks.shape[0]):
-        roots[n] = find(parent, blocks[n])
-        sizes[roots[n]] += 1
-    large = np.flatnonzero(sizes >= least)
+    parent, sizes = np.empty(h * w, np.int64), np.empty(h * w, np.int64)
+    for i in blocks:
+        parent[i], sizes[i] = i, 0
+    for at in blocks:
+        r, c = at // w, at % w
+        limit = slope * (z[r, c] if perspective else 1.0) * inverse_f + 4.0 * sigma[r, c]
+        for s in range(2):
+            i, j = r + s, c + 1 - s
+            if i < h and j < w and free[i, j] and _is_smooth(z, normal, rms, r, c, i, j, limit, cos_limit):
+                unite(parent, at, i * w + j)
+    for i in blocks:
+        sizes[find(parent, i)] += 1
+    large = blocks[sizes[blocks] >= least]  # their first blocks: no other has a size
     large = large[np.argsort(-sizes[large], kind="mergesort")][:most]
     starts = np.zeros(large.shape[0] + 1, np.int64)
-    place = np.full(h * w, -1)
-    for k in range(large.shape[0]):
-        starts[k + 1] = starts[k] + sizes[large[k]]
-        place[large[k]] = starts[k]
-    indices = np.empty(starts[-1], np.int64)
-    for n in range(blocks.shape[0]):
-        at = place[roots[n]]
-        if at >= 0:
-            indices[at] = blocks[n]
-            place[roots[n]] += 1
+    starts[1:] = np.cumsum(sizes[large])
+    place, indices = sizes, np.empty(starts[-1], np.int64)
+    place[blocks] = -1
+    place[large] = starts[:-1]
+    for i in blocks:
+        root = find(parent, i)
+        if place[root] >= 0:
+            indices[place[root]] = i
+            place[root] += 1
     return starts, indices
 
 

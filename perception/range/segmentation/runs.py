@@ -63,12 +63,14 @@ def runs_of(labels, count):  # type: ignore[no-untyped-def]  # numba types it
     return starts, runs, pixels
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, **LEAN)
 def painted(starts, runs, names, labels):  # type: ignore[no-untyped-def]  # numba types it
     """Write label `names[k]` over the runs of each k into `labels` (H, W), which is zero."""
     for k in range(1, names.shape[0]):
         for i in range(starts[k], starts[k + 1]):
-            labels[runs[i, 0], runs[i, 1] : runs[i, 2]] = names[k]
+            row = labels[runs[i, 0]]
+            for u in range(runs[i, 1], runs[i, 2]):
+                row[u] = names[k]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -72,6 +72,16 @@ def test_status_bits(status: int, quality: Quality, cause: Cause) -> None:
     assert (sample.quality, sample.cause) == (quality, cause)
 
 
+def test_a_frame_that_comes_twice_is_one_sample_taken_before_its_bytes_came() -> None:
+    device = Bota(Context(name="wrist"), BotaOptions(port="none"))
+    device.byte_s = 1e-3
+    for _ in range(2):
+        device.receive(emulator.frame(scripted_wrench(3), 0, 1000), 5.0)
+    sample = device.mailbox.peek()
+    assert sample is not None and device.mailbox.published == 1
+    assert sample.host_time_s == pytest.approx(5.0 - 0.037)
+
+
 def test_not_a_number_is_invalid() -> None:
     device = Bota(Context(name="wrist"), BotaOptions(port="none"))
     broken = Wrench(force_n=np.array([math.nan, 0.0, 0.0]), torque_nm=np.zeros(3))

@@ -125,13 +125,13 @@ def test_a_capsule_by_hand() -> None:
     body = bytearray(82)
     body[0:2] = (10 * 64).to_bytes(2, "little")
     body[2:4] = (1500 << 2 | 0b01).to_bytes(2, "little")  # 1.5 m, bit 4 of the offset
-    body[4:6] = (2500 << 2).to_bytes(2, "little")
-    body[6] = 0x52  # offsets: 1|2 -> 18/8 degrees, and 5/8
+    body[4:6] = (2500 << 2 | 0b10).to_bytes(2, "little")  # 2.5 m, bit 5 of the offset
+    body[6] = 0x52  # offsets: 16 + 2 eighths of a degree, and 32 + 5
     check = xor_byte(bytes(body))
     capsule = bytes([0xA0 | check & 15, 0x50 | check >> 4]) + bytes(body)
     assert is_capsule(capsule) and not is_first(capsule)
     angle_rad, distance_m = decode_capsule(capsule, np.radians(42.0))
-    assert np.degrees(angle_rad[:2]) == pytest.approx([10.0 - 18 / 8, 11.0 - 5 / 8])
+    assert np.degrees(angle_rad[:2]) == pytest.approx([10.0 - 18 / 8, 11.0 - 37 / 8])
     assert distance_m[:2] == pytest.approx([1.5, 2.5])
     assert np.all(np.isnan(distance_m[2:]))
     assert not is_capsule(capsule[:50] + b"\x01" + capsule[51:])

@@ -150,6 +150,46 @@ def test_cancelling_a_queued_task_ends_it_without_touching_the_arm(bench: Bench)
     assert not ran
 
 
+def test_cancelling_a_task_that_only_reads_leaves_the_arm_alone(bench: Bench) -> None:
+    task = bench.store.start("test", {}, _until_cancelled, moves=False)
+    eventually(lambda: task.state is S.RUNNING)
+    bench.store.cancel(task.id)
+    assert task.wait(10.0)
+    assert bench.stops == 0
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_closing_stops_the_arm_of_a_task_that_moves_it(bench: Bench, moves: bool) -> None:
+    task = bench.store.start("test", {}, _until_cancelled, moves=moves)
+    eventually(lambda: task.state is S.RUNNING)
+    bench.store.close()
+    assert (bench.stops > 0) is moves
+
+
+def test_progress_stays_between_nothing_and_all(bench: Bench) -> None:
+    def work(context: TaskContext) -> None:
+        for fraction in (-0.5, 0.3, 1.7):
+            context.progress(fraction, "step")
+
+    told = [event.fraction for event in bench.run(work).events if event.kind == "progress"]
+    assert told == [0.0, 0.3, 1.0]
+
+
+def test_an_artefact_that_is_written_again_is_listed_once_with_its_new_size(bench: Bench) -> None:
+    def work(context: TaskContext) -> None:
+        context.artefact("a.txt", b"hello", "text/plain")
+        context.artefact("a.txt", b"hello again", "text/plain")
+
+    assert [(kept.name, kept.size_bytes) for kept in bench.run(work).artefacts] == [("a.txt", 11)]
+
+
+def test_who_comes_back_gets_the_events_after_the_last_one_seen(bench: Bench) -> None:
+    task = bench.run(lambda context: context.progress(0.5, "half"))
+    seen = [event.sequence for event in task.events]
+    assert seen == list(range(1, len(seen) + 1))
+    assert [event.sequence for event in task.events_after(seen[1])] == seen[2:]
+
+
 def test_an_ended_task_cannot_be_cancelled(bench: Bench) -> None:
     with pytest.raises(NotPossibleNow):
         bench.store.cancel(bench.run(lambda _: None).id)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -18,7 +19,7 @@ CLIPS = (CLIP * WEIGHTS).astype(np.float32)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Prepared:
-    """Taught looks over their spread, times the numbers' weights, made once an image.
+    """Taught looks over their spread, times the numbers' weights.
 
     Attributes:
         columns: (LENGTH, M), one column a look, the kinds side by side: one number of all looks lies together.
@@ -31,8 +32,9 @@ class Prepared:
     unit: Array
 
 
+@lru_cache(maxsize=4)
 def prepared(knowledge: Knowledge) -> Prepared:
-    """The looks of all kinds as `nearest` wants them."""
+    """The looks of all kinds as `nearest` wants them, made once for a knowledge."""
     counts = [len(kind.looks) for kind in knowledge.kinds]
     unit = knowledge.spread / WEIGHTS
     scaled = np.vstack([kind.looks for kind in knowledge.kinds]) / unit

@@ -1,0 +1,204 @@
+"""Cables that hang before a plate: where they run, and the picture as it would be without them.
+
+A cable is a dark band of one width that goes on from the top of the plate to the bottom, or to a side; nothing on a panel
+is so long. Its course is the path with the most darkness against both of its sides (dynamic programming, R. Bellman,
+1957; for lines in pictures U. Montanari, Comm. ACM 14(5), 1971). What it covers is bridged from side to side, row by row:
+not what is there, but nothing that an edge or a look would stumble over.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from perception.vision.image import Image
+from perception.vision.view import Array
+
+Float32 = NDArray[np.float32]
+
+ACROSS, ALONG = 2, 4  # px of the picture a cell of the search
+HALVES = np.array([1, 2, 3])  # cells of half a cable's width
+FULL = 0.25  # of the plate's gray: a band that is darker by this is wholly dark
+EVEN = 0.5  # darkness that speaks neither for a cable nor against it
+LEAST = 0.03  # mean darkness above `EVEN`, over the plate's height; 0.01 is the most without cables
+BEND = 0.7  # price of a change of slope by one
+MARGIN = 12  # cells beside the plate, where a cable may run unseen
+MOST = 3
+TAKEN = 4  # cells to either side of a cable where no further one is looked for
+SURE = 0.3
+REACH_PX = 18  # of the strip along a course in which its width is measured
+SHIFTS_PX = 6  # most that a course is moved when it is refined
+SIDES_SEEN = 0.85  # a cable ends where its sides' gray is reached to this share
+STEADY = 13  # rows agree on where the cable is
+
+
+def without_cables(picture: Image, plate_gray: Float32) -> Image:
+    """The (H, W) picture of a plate with its cables bridged; the picture itself where none hangs."""
+    height, width = picture.shape
+    cells = (width // ACROSS, height // ALONG)
+    small, level = (cv2.resize(p, cells, interpolation=cv2.INTER_AREA) for p in (picture, plate_gray))
+    dark = _darkness(np.asarray(small, np.float32), np.asarray(level, np.float32) + np.float32(10.0), HALVES)
+    gain = np.pad(dark - np.float32(EVEN), ((0, 0), (MARGIN, MARGIN)))
+    out = picture
+    for _ in range(MOST):
+        course, total = _course(gain, BEND)
+        if total < LEAST * len(gain):
+            break
+        middle = _middle(out, plate_gray, course - MARGIN, dark)
+        if middle is not None:
+            out = _bridged(out, *middle)
+        for row, at in enumerate(course):
+            gain[row, max(at - TAKEN, MARGIN) : min(at + TAKEN + 1, MARGIN + cells[0])] = -EVEN
+    return out
+
+
+def _middle(
+    picture: Image, plate_gray: Float32, course: NDArray[np.int64], dark: Float32
+) -> tuple[NDArray[np.int64], Array, float] | None:
+    """(N,) rows that a cable crosses, (N,) its middle in them, and half of its width, px; None for less than a stub."""
+    height, width = picture.shape
+    inside = (course >= 0) & (course < dark.shape[1])
+    sure = np.flatnonzero(inside & (dark[np.arange(len(course)), np.clip(course, 0, dark.shape[1] - 1)] > SURE))
+    if len(sure) < 2:
+        return None
+    first = 0 if sure[0] == 0 else ALONG * int(sure[0])
+    last = height if sure[-1] >= len(course) - 2 else ALONG * (int(sure[-1]) + 1)
+    rows = np.arange(first, last)
+    at = np.interp(rows, ALONG * sure + 0.5 * (ALONG - 1), ACROSS * course[sure] + 0.5 * (ACROSS - 1))
+    at = _steady(at)
+    for _ in range(2):
+        strip = _strip(picture, rows, at) / (plate_gray[rows, np.clip(at, 0, width - 1).astype(int)] + 10.0)[:, None]
+        profile = np.median(strip, axis=0)
+        low, high = _extent(profile)
+        at = at + 0.5 * (low + high) - REACH_PX
+        half = 0.5 * (high - low)
+        at = _steady(at + _shift(strip, 0.5 * (low + high), half))
+    return rows, at, half
+
+
+def _strip(picture: Image, rows: NDArray[np.int64], at: Array) -> Array:
+    """(N, 2 * REACH_PX + 1) grays beside a course."""
+    u = np.clip(np.round(at[:, None] + np.arange(-REACH_PX, REACH_PX + 1)), 0, picture.shape[1] - 1).astype(int)
+    return np.asarray(picture[rows[:, None], u], float)
+
+
+def _extent(profile: Array) -> tuple[int, int]:
+    """First and last pixel of the dark band in the middle of a profile."""
+    side = float(np.median(np.r_[profile[:4], profile[-4:]]))
+    core = REACH_PX + int(profile[REACH_PX - 3 : REACH_PX + 4].argmin()) - 3
+    end = profile[core] + SIDES_SEEN * (side - profile[core])
+    low = high = core
+    while low > 2 and profile[low] < end:
+        low -= 1
+    while high < 2 * REACH_PX - 2 and profile[high] < end:
+        high += 1
+    return low, high
+
+
+def _shift(strip: Array, middle: float, half: float) -> Array:
+    """(N,) by how much each row's darkest band lies beside the middle, as its neighbours along the cable agree."""
+    reach = max(1, round(half) - 1)
+    sums = np.pad(np.cumsum(strip, axis=1), ((0, 0), (1, 0)))
+    tried = np.clip(round(middle) + np.arange(-SHIFTS_PX, SHIFTS_PX + 1), reach + 4, strip.shape[1] - reach - 5)
+    core = (sums[:, tried + reach + 1] - sums[:, tried - reach]) / (2 * reach + 1)
+    sides = np.minimum(
+        (sums[:, tried - reach - 1] - sums[:, tried - reach - 4]) / 3,
+        (sums[:, tried + reach + 5] - sums[:, tried + reach + 2]) / 3,
+    )
+    alone = np.clip((sides - core) / FULL, -0.5, 1.0)
+    seen = np.asarray(cv2.blur(alone, (1, STEADY), borderType=cv2.BORDER_REFLECT), float)
+    rows = np.arange(len(seen))
+    sure = np.flatnonzero(seen.max(axis=1) > SURE)
+    if len(sure) < 2:
+        return np.zeros(len(seen))
+    return np.asarray(np.interp(rows, sure, tried[seen[sure].argmax(axis=1)] - middle))
+
+
+def _steady(at: Array) -> Array:
+    """(N,) smoothed along the cable, its ends kept."""
+    reach = STEADY // 2
+    if len(at) <= reach:
+        return at
+    framed = np.r_[2 * at[0] - at[reach:0:-1], at, 2 * at[-1] - at[-2 : -reach - 2 : -1]]
+    return np.asarray(np.convolve(framed, np.full(STEADY, 1 / STEADY), mode="valid"))
+
+
+def _bridged(picture: Image, rows: NDArray[np.int64], at: Array, half: float) -> Image:
+    """The picture with a straight slope of gray from one side of the band to the other, in every row."""
+    out = picture.copy()
+    _bridge(out, rows, np.floor(at - half).astype(np.int64) - 1, np.ceil(at + half).astype(np.int64) + 1)
+    return out
+
+
+@njit(cache=True)
+def _bridge(
+    picture: Image, rows: NDArray[np.int64], left: NDArray[np.int64], right: NDArray[np.int64]
+) -> None:  # pragma: no cover
+    """In place. Beyond the picture's border a side has the gray of the other."""
+    width = picture.shape[1]
+    for k in range(len(rows)):
+        row = picture[rows[k]]
+        a, b = left[k], right[k]
+        if b < 1 or a > width - 2:
+            continue
+        from_left = 0.5 * (row[a] + row[a - 1]) if a >= 1 else -1.0
+        from_right = 0.5 * (row[b] + row[b + 1]) if b <= width - 2 else from_left
+        if from_left < 0:
+            from_left = from_right
+        for x in range(max(a, 0), min(b, width - 1) + 1):
+            picture[rows[k], x] = np.uint8(from_left + (from_right - from_left) * (x - a) / (b - a) + 0.5)
+
+
+@njit(cache=True)
+def _darkness(small: Float32, level: Float32, halves: NDArray[np.int64]) -> Float32:  # pragma: no cover
+    """(H, W) by how much a band about each cell is darker than both of its sides, the best of several widths."""
+    height, width = small.shape
+    out = np.full((height, width), np.float32(-0.5))
+    sums = np.zeros(width + 1, np.float32)
+    for y in range(height):
+        for x in range(width):
+            sums[x + 1] = sums[x] + small[y, x]
+        for k in halves:
+            gap = k + 2
+            for x in range(gap + 1, width - gap - 1):
+                band = (sums[x + k + 1] - sums[x - k]) / (2 * k + 1)
+                before = 0.5 * (sums[x - gap + 1] - sums[x - gap - 1])
+                after = 0.5 * (sums[x + gap + 2] - sums[x + gap])
+                found = (min(before, after) - band) / (FULL * level[y, x])
+                out[y, x] = max(out[y, x], min(found, np.float32(1.0)))
+    return out
+
+
+@njit(cache=True)
+def _course(gain: Float32, bend: float) -> tuple[NDArray[np.int64], float]:  # pragma: no cover
+    """(H,) cell in every row of the path from top to bottom with the most gain, and that; slopes of up to two cells."""
+    height, width = gain.shape
+    slopes = 5
+    price = np.float32(bend)
+    total = np.empty((2, slopes, width), np.float32)
+    came = np.zeros((height, slopes, width), np.int8)
+    for s in range(slopes):
+        total[0, s] = gain[0]
+    for y in range(1, height):
+        before, here = total[(y - 1) % 2], total[y % 2]
+        for s in range(slopes):
+            lower, upper = max(s - 1, 0), min(s + 1, slopes - 1)
+            for x in range(width):
+                at = min(max(x - s + 2, 0), width - 1)
+                best, slope = before[s, at], s
+                if before[lower, at] - price > best:
+                    best, slope = before[lower, at] - price, lower
+                if before[upper, at] - price > best:
+                    best, slope = before[upper, at] - price, upper
+                here[s, x] = best + gain[y, x]
+                came[y, s, x] = slope
+    last = total[(height - 1) % 2]
+    s, x = divmod(int(last.argmax()), width)
+    most = float(last[s, x])
+    course = np.empty(height, np.int64)
+    for y in range(height - 1, -1, -1):
+        course[y] = x
+        s, x = int(came[y, s, x]), min(max(x - s + 2, 0), width - 1)
+    return course, most

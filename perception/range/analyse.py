@@ -22,6 +22,7 @@ from perception.range.segmentation.grid import Grid
 from perception.range.segmentation.grooves import cut_at_grooves
 from perception.range.segmentation.regions import Regions, regions_of
 from perception.range.segmentation.segment import Task, segment, settled
+from perception.range.segmentation.steps import cut_at_steps
 from perception.range.sensor import RangeSensorModel
 from perception.range.straight import doubt_about
 
@@ -171,6 +172,7 @@ def _grouped(task: Task, noise: NoiseModel, grid: Grid, labels: Labels, found: C
     regions = regions.given_to(join.join_pieces(regions, found.kinds, found.parameters))
     labels = whole_faces(task, grid, regions.labels, found)
     labels = cut_at_grooves(task, law, grid, labels, found)
+    labels = cut_at_steps(task, law, grid, labels, found)
     if labels is regions.labels:
         return regions
     return regions_of(task.depth_m, packed, law, labels, len(found.kinds))

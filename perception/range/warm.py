@@ -30,4 +30,5 @@ def warm_up() -> None:
         scene = analyse(depth, sensor)
         local_geometry(depth, sensor)
         match_models(scene, depth, shipped_models()[:1])
+    analyse(depth + 10.0 * noise, pinhole)  # coarse: what only averages tell
     fit_plane_near(depth, pinhole, point_m=[0.0, 0.0, 0.61], normal=[0.0, 0.0, -1.0])

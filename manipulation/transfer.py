@@ -18,6 +18,8 @@ from manipulation.timing import SpeedLimits, timed
 Array = NDArray[np.float64]
 
 SEARCH_STEP_RAD = 0.02  # edges of the search; the answer is checked again at RECHECK_RAD
+DETOUR_RAD = 0.8  # how far a joint may leave the range between its two ends, as long as that finds a way
+END_SHARE = 0.9  # of the room that an end has: with all of it the end itself would touch the margin
 CORNER_RAD = 0.25  # how far before a corner its rounding begins
 
 
@@ -96,13 +98,13 @@ class TransferPlanner:
                     f"the {which} of the transfer leaves only {1e3 * gap:.1f} mm between {self.model.nearest(q)}",
                     hint="choose a standoff further out, or another turn of the tool",
                 )
-        return min(self.margin_m, *(0.9 * gap for gap in gaps))
+        return min(self.margin_m, *(END_SHARE * gap for gap in gaps))
 
     def _search_range(self, start: Array, goal: Array) -> tuple[Array, Array]:
-        """Half a turn about the two ends: whole turns of the wrist are never the short way."""
+        """A little beyond the two ends: whole turns of the wrist are never the short way."""
         kin = self.model.kinematics
-        lower = np.maximum(kin.lower_rad, np.minimum(start, goal) - 0.8)
-        upper = np.minimum(kin.upper_rad, np.maximum(start, goal) + 0.8)
+        lower = np.maximum(kin.lower_rad, np.minimum(start, goal) - DETOUR_RAD)
+        upper = np.minimum(kin.upper_rad, np.maximum(start, goal) + DETOUR_RAD)
         return lower, upper
 
     def _rounded(self, path: Array, margin: float) -> Array | None:

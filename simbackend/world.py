@@ -36,6 +36,8 @@ Array = NDArray[np.float64]
 GRAVITY_M_PER_S2 = 9.81
 TIP_TICKS = 4  # how often to look which mechanisms are near; the tip goes 8 mm meanwhile
 UNUSED_7 = (0.0,) * 7  # numbers that the snapshot keeps free
+FINGER_FORCE_N = 250.0  # of the motors, far above the gripper's: its own model limits what it squeezes with
+ARM_GAIN, FINGER_GAIN = 0.45, 0.6  # share of a joint's error that its motor makes good in one tick
 CONE_RAYS = 4
 CONE_RAD = 0.0175
 CONE_DEPTH_M = 0.02
@@ -111,8 +113,8 @@ class World:
         places = [*park, self.gripper.width_m / 2, self.gripper.width_m / 2]
         for joint, place in zip(self.moving, places, strict=True):
             engine.resetJointState(self.arm, joint, place)
-        self._forces = [*self.model.torque_nm, 250.0, 250.0]
-        self._gains = [0.45] * DOF + [0.6, 0.6]
+        self._forces = [*self.model.torque_nm, FINGER_FORCE_N, FINGER_FORCE_N]
+        self._gains = [ARM_GAIN] * DOF + [FINGER_GAIN] * 2
         self._damps = [1.0] * (DOF + 2)
         self._zeros = [0.0] * (DOF + 2)
 

@@ -81,7 +81,7 @@ def _medians_of_four(side, n, work):  # type: ignore[no-untyped-def]  # numba ty
     for c in range(n):
         p, q, s, t = work[SAMPLES + c], work[at_q + c], work[at_s + c], work[at_t + c]
         p, q = p if p == p else np.inf, q if q == q else np.inf  # noqa: PLR0124 - NaN is not itself
-        s, t = s if s == s else np.inf, t if t == t else np.inf  # noqa: PLR0124
+        s, t = s if s == s else np.inf, t if t == t else np.inf  # noqa: PLR0124 - as above
         low_1, high_1, low_2, high_2 = min(p, q), max(p, q), min(s, t), max(s, t)
         second, third = min(max(low_1, low_2), high_1, high_2), max(low_1, low_2, min(high_1, high_2))
         # Of three or four readings the second, of two the first; one alone is too few.

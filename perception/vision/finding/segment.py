@@ -126,7 +126,7 @@ def _flush(sums: Array, k: int, moments: Moments, row: int, first: int, end: int
 
 
 @njit(cache=True)
-def _grow(gray: Image, tolerance: float) -> tuple[NDArray[np.int32], Array]:  # noqa: PLR0912  # pragma: no cover
+def _grow(gray: Image, tolerance: float) -> tuple[NDArray[np.int32], Array]:  # noqa: PLR0912 - a case a neighbour  # pragma: no cover - compiled
     """One raster pass. The region of the current run has its gray moments in registers (n, total, squares): most
     pixels have the same region above and to the left, and cost one comparison."""
     height, width = gray.shape

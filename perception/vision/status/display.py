@@ -7,7 +7,7 @@ equally likely there is no answer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -43,8 +43,6 @@ SURE = 0.732  # the most that one piece of evidence gives
 
 MOST_NAMED, NAMED = 4, 0.1  # numbers that a refusal names: at most; the share of the likelihood that each has
 MOST_POSSIBLE = 10  # numbers that a refusal lists for programs
-
-Prior = Callable[[float], float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

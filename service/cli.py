@@ -45,6 +45,7 @@ def _app() -> Callable[[], None]:
     from service.commands.demo import demo
     from service.commands.develop import conform, emulate, new_driver
     from service.commands.doctor import doctor
+    from service.commands.journal import journal
     from service.commands.learn import learn
     from service.commands.range import batch, range_image
     from service.commands.serve import serve
@@ -65,6 +66,7 @@ def _app() -> Callable[[], None]:
     app.add_typer(devices.app, name="devices")
     app.add_typer(tasks.app, name="task")
     app.command()(tasks.stop)
+    app.command()(journal)
     app.command()(conform)
     app.command()(warm)
     app.command()(teach)

@@ -50,7 +50,7 @@ class Aborted(CellError):
 
 
 class JournalError(CellError):
-    """The journal cannot be written, so nothing may start: no audit, no motion."""
+    """The journal cannot be written, so nothing may start (no audit, no motion); or it cannot be read or trusted."""
 
     retry = Retry.AFTER_FIX
 

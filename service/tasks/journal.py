@@ -6,13 +6,12 @@ of events costs one flush of the disk. Two services on one folder (a demo beside
 The disk that it takes is bounded: a file that has grown too big hands its rows over to an older part
 (`journal-<first>-<last>.sqlite`), and the oldest part goes when there are too many. Rows are copied first and deleted
 afterwards, so that each is in one place at least; readers read all parts as one journal. A row of the chain says what
-went, so that `verify` can tell it from a theft.
+went, so that `verify_chain` can tell it from a theft.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import logging
 import queue
@@ -20,36 +19,20 @@ import sqlite3
 import threading
 import time
 from concurrent.futures import Future
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from service.errors import JournalError
-from service.tasks.journal_parts import INSERT_ROW, SCHEMA, newest_first, parts_of, snapshot, write_part
+from service.tasks.journal_parts import INSERT_ROW, SCHEMA, parts_of, snapshot, write_part
+from service.tasks.journal_reader import DROPPED, FIRST_HASH, Record, chain_hash, read_records, verify_chain
 
-FIRST_HASH = "0" * 64
 MAX_GROUP = 200
 MAX_KEPT = 1000  # notes that wait for room on the disk
 PART_BYTES = 16_000_000  # some ten thousand rows
 KEEP_PARTS = 8  # with the live file some 150 MB
-MAX_ID = 2**62
-DROPPED = "journal-dropped"  # the kind of row that says up to where the oldest rows have gone
 log = logging.getLogger(__name__)
 APPEND_TIMEOUT_S = 10.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Record:
-    """One row. `wall_time_s` is for people; `monotonic_s` orders what happened within one run."""
-
-    id: int
-    wall_time_s: float
-    monotonic_s: float
-    kind: str
-    data: dict[str, Any]
-    previous_hash: str
-    hash: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,41 +90,11 @@ class Journal:
 
     def records(self, *, kinds: tuple[str, ...] = (), limit: int = 1000) -> list[Record]:
         """The newest records of the given kinds (all when empty), oldest first."""
-        where = f"AND kind IN ({','.join('?' * len(kinds))})" if kinds else ""
-        sql = f"SELECT * FROM journal WHERE id < ? {where} ORDER BY id DESC LIMIT ?"  # noqa: S608 - only ?s
-        found: list[Record] = []
-        before = MAX_ID
-        for path in newest_first(self.path):
-            with snapshot(path) as db:
-                found += [_record(row) for row in db.execute(sql, (before, *kinds, limit - len(found)))]
-                before = min(before, _first_id(db) or MAX_ID)
-            if len(found) == limit:
-                break
-        return found[::-1]
+        return read_records(self.path, kinds=kinds, limit=limit)
 
     def verify(self) -> int:
-        """Walk the whole chain, as far back as it is kept; returns the number of rows.
-
-        Raises:
-            JournalError: a row was changed, removed or inserted; names it.
-        """
-        dropped = self.records(kinds=(DROPPED,), limit=1)
-        previous, last_id = (dropped[0].data["hash"], dropped[0].data["id"]) if dropped else (FIRST_HASH, 0)
-        count = 0
-        with snapshot(self.path) as live, ExitStack() as files:  # before the parts are looked up
-            parts = [(path, files.enter_context(snapshot(path))) for path in parts_of(self.path)]
-            for path, db in (*parts, (self.path, live)):
-                for row in db.execute("SELECT * FROM journal WHERE id > ? ORDER BY id", (last_id,)):
-                    number, wall_s, mono_s, kind, text, said_previous, said = row
-                    real = _hash(previous, wall_s, mono_s, kind, text)
-                    if (number, said_previous, said) != (last_id + 1, previous, real):
-                        raise JournalError(
-                            f"{path}: the chain breaks at row {number}",
-                            hint="somebody changed the file; keep it and begin a new one",
-                            row=number,
-                        )
-                    previous, last_id, count = real, number, count + 1
-        return count
+        """Walk the whole chain, see `verify_chain`."""
+        return verify_chain(self.path)
 
     def close(self) -> None:
         """Write what waits and close; a second call does nothing."""
@@ -248,7 +201,7 @@ def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry]) -> list[_En
 
 def _insert(db: sqlite3.Connection, entry: _Entry) -> None:
     newest = _last_hash(db)  # under the lock, for another service may have written since
-    digest = _hash(newest, entry.wall_time_s, entry.monotonic_s, entry.kind, entry.text)
+    digest = chain_hash(newest, entry.wall_time_s, entry.monotonic_s, entry.kind, entry.text)
     row = (None, entry.wall_time_s, entry.monotonic_s, entry.kind, entry.text, newest, digest)
     db.execute(INSERT_ROW, row)
 
@@ -290,35 +243,12 @@ def _dropped(parts: list[Path]) -> _Entry:
     )
 
 
-def _first_id(db: sqlite3.Connection) -> int | None:
-    number: int | None = db.execute("SELECT MIN(id) FROM journal").fetchone()[0]
-    return number
-
-
 def _size_bytes(db: sqlite3.Connection) -> int:
     """What the rows take; pages that are free do not count."""
     pages, free, size = (
         int(db.execute(f"PRAGMA {what}").fetchone()[0]) for what in ("page_count", "freelist_count", "page_size")
     )
     return (pages - free) * size
-
-
-def _hash(previous: str, wall_time_s: float, monotonic_s: float, kind: str, text: str) -> str:
-    parts = json.dumps([previous, wall_time_s, monotonic_s, kind, text], separators=(",", ":"))
-    return hashlib.sha256(parts.encode()).hexdigest()
-
-
-def _record(row: tuple[Any, ...]) -> Record:
-    number, wall_s, mono_s, kind, text, previous, digest = row
-    return Record(
-        id=number,
-        wall_time_s=wall_s,
-        monotonic_s=mono_s,
-        kind=kind,
-        data=json.loads(text),
-        previous_hash=previous,
-        hash=digest,
-    )
 
 
 def _error(path: Path, error: Exception) -> JournalError:

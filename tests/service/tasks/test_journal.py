@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from service.errors import JournalError
-from service.tasks.journal import FIRST_HASH, Journal
+from service.tasks.journal import Journal
+from service.tasks.journal_reader import FIRST_HASH
 
 
 def test_what_was_appended_is_read_back_in_order(tmp_path: Path) -> None:

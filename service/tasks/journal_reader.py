@@ -1,0 +1,110 @@
+"""Reads a journal, all its parts as one, and walks its chain; needs no service and disturbs none."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sqlite3
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from service.errors import JournalError
+from service.tasks.journal_parts import newest_first, parts_of, snapshot
+
+FIRST_HASH = "0" * 64
+DROPPED = "journal-dropped"  # the kind of row that says up to where the oldest rows have gone
+MAX_ID = 2**62
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Record:
+    """One row. `wall_time_s` is for people; `monotonic_s` orders what happened within one run."""
+
+    id: int
+    wall_time_s: float
+    monotonic_s: float
+    kind: str
+    data: dict[str, Any]
+    previous_hash: str
+    hash: str
+
+
+def read_records(path: Path, *, kinds: tuple[str, ...] = (), limit: int = 1000) -> list[Record]:
+    """The newest records of the given kinds (all when empty), oldest first.
+
+    Raises:
+        JournalError: it cannot be read.
+    """
+    where = f"AND kind IN ({','.join('?' * len(kinds))})" if kinds else ""
+    sql = f"SELECT * FROM journal WHERE id < ? {where} ORDER BY id DESC LIMIT ?"  # noqa: S608 - only ?s
+    found: list[Record] = []
+    before = MAX_ID
+    for part in newest_first(path):
+        with _readable(part), snapshot(part) as db:
+            found += [_record(row) for row in db.execute(sql, (before, *kinds, limit - len(found)))]
+            before = min(before, _first_id(db) or MAX_ID)
+        if len(found) == limit:
+            break
+    return found[::-1]
+
+
+def verify_chain(path: Path) -> int:
+    """Walk the whole chain, as far back as it is kept; returns the number of rows.
+
+    Raises:
+        JournalError: a row was changed, removed or inserted (names it), or the journal cannot be read.
+    """
+    dropped = read_records(path, kinds=(DROPPED,), limit=1)
+    previous, last_id = (dropped[0].data["hash"], dropped[0].data["id"]) if dropped else (FIRST_HASH, 0)
+    count = 0
+    with _readable(path), snapshot(path) as live, ExitStack() as files:  # before the parts are looked up
+        parts = [(part, files.enter_context(snapshot(part))) for part in parts_of(path)]
+        for part, db in (*parts, (path, live)):
+            for row in db.execute("SELECT * FROM journal WHERE id > ? ORDER BY id", (last_id,)):
+                number, wall_s, mono_s, kind, text, said_previous, said = row
+                real = chain_hash(previous, wall_s, mono_s, kind, text)
+                if (number, said_previous, said) != (last_id + 1, previous, real):
+                    raise JournalError(
+                        f"{part}: the chain breaks at row {number}",
+                        hint="somebody changed the file; keep it and begin a new one",
+                        row=number,
+                    )
+                previous, last_id, count = real, number, count + 1
+    return count
+
+
+def chain_hash(previous: str, wall_time_s: float, monotonic_s: float, kind: str, text: str) -> str:
+    """The hash of a row, over its content and the hash of the row before."""
+    parts = json.dumps([previous, wall_time_s, monotonic_s, kind, text], separators=(",", ":"))
+    return hashlib.sha256(parts.encode()).hexdigest()
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise JournalError(
+            f"{path} cannot be read: {error}", hint="is it a journal of panelwright, and may this user read it?"
+        ) from error
+
+
+def _first_id(db: sqlite3.Connection) -> int | None:
+    number: int | None = db.execute("SELECT MIN(id) FROM journal").fetchone()[0]
+    return number
+
+
+def _record(row: tuple[Any, ...]) -> Record:
+    number, wall_s, mono_s, kind, text, previous, digest = row
+    return Record(
+        id=number,
+        wall_time_s=wall_s,
+        monotonic_s=mono_s,
+        kind=kind,
+        data=json.loads(text),
+        previous_hash=previous,
+        hash=digest,
+    )

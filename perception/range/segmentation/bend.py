@@ -17,7 +17,7 @@ from perception.range.fitting.starts import start_plane
 from perception.range.fitting.surfaces import CONE, CYLINDER, FREEDOM, PLANE, SIZE, normals_on
 from perception.range.segmentation.grid import slow_share_at
 
-BEND_TURN_RAD = 0.2  # walls and table tops of the real development frames turn by 0.07 to 0.15
+BEND_TURN_RAD = 0.3  # walls, floors, screens and table tops of the real development frames turn by 0.07 to 0.27
 ENDS = 0.02  # share of the samples whose normals may turn farther
 NEAR_SIGMAS = 5.0  # the bend that a plane leaves over
 NEAR_SHARE = 0.8

@@ -17,7 +17,7 @@ from pydantic import Field
 from drivers.kinds.line_scanners import Beams, LineScanner, within
 from drivers.transport.checks import sum_scip
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
-from drivers.transport.options import EitherOptions, PortNumber, either_opener, read_options
+from drivers.transport.options import EitherOptions, PortNumber, SerialPath, either_opener, read_options
 from drivers.transport.timebase import HostTime, Unwrapper
 from hal.registry import Context, takes
 
@@ -31,7 +31,7 @@ OK, LASER_ALREADY_ON, DATA, RESUMED = "00", "02", "99", "98"
 class ScipOptions(EitherOptions):
     """Options of `scip:scanner`: a serial path, or `host` with `port` (10940)."""
 
-    port: str | PortNumber = 10940
+    port: SerialPath | PortNumber = 10940
     cluster: Annotated[int, Field(ge=1, le=99)] = 1
     skip_scans: Annotated[int, Field(ge=0, le=9)] = 0
     sigma_m: Annotated[float, Field(gt=0)] = 0.01

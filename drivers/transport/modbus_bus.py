@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from drivers.transport.bus import Bus
 from drivers.transport.link import Link
 from drivers.transport.modbus import RTU_GAP_S, ModbusMaster, ModbusRtu, ModbusTcp
-from drivers.transport.options import EitherOptions, PortNumber, Seconds, either_opener
+from drivers.transport.options import EitherOptions, PortNumber, Seconds, SerialPath, either_opener
 from hal.registry import Context
 from hal.wires import Claim
 
@@ -17,7 +17,7 @@ from hal.wires import Claim
 class ModbusOptions(EitherOptions):
     """Keys of every Modbus device: `host` for TCP, or a path as `port` for RTU."""
 
-    port: str | PortNumber = 502
+    port: SerialPath | PortNumber = 502
     shared_as: ClassVar[str | None] = None
 
     unit: Annotated[int, Field(ge=1, le=247)] = 1

@@ -18,6 +18,7 @@ from hal.strict import Strict, validate
 from hal.wires import Claim, WireOptions
 
 M = TypeVar("M", bound=Strict)
+SerialPath = Annotated[str, Field(min_length=1)]
 PortNumber = Annotated[int, Field(ge=1, le=65535)]
 Rate = Annotated[float, Field(gt=0, le=1000)]
 Seconds = Annotated[float, Field(gt=0, le=60)]
@@ -43,7 +44,7 @@ class Captured(WireOptions):
 class SerialOptions(Captured):
     """A serial port. Give `port` a stable name, from `/dev/serial/by-id`."""
 
-    port: str
+    port: SerialPath
     baud: Annotated[int, Field(ge=300, le=4_500_000)] = 115_200
 
     def claim(self) -> Claim:
@@ -77,7 +78,7 @@ class EitherOptions(Captured):
     """Serial or TCP, by the type of `port`: a path, or a number with `host`."""
 
     host: str | None = None
-    port: str | PortNumber
+    port: SerialPath | PortNumber
     baud: Annotated[int, Field(ge=300, le=4_500_000)] = 115_200
 
     @property

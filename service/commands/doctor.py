@@ -19,4 +19,4 @@ def doctor(
 
     if not examine(cell, port, connect=connect):
         raise typer.Exit(1)
-    console.print("everything is in order: `panelwright demo` shows it at work")
+    console.print("everything is in order: `panelwright serve` runs it")

@@ -75,11 +75,11 @@ def teach(
     ways = (check, kind is not None, dialogue, from_panel is not None)
     if sum(ways) > 1:
         raise InvalidRequest("give one of --kind, --from-panel, --check and --dialogue", hint="teach first, then check")
+    pixels = read_image(image)
     if not (any(ways) or sys.stdin.isatty()):
         raise InvalidRequest(
             "nobody is there to ask", hint="give --kind, --from-panel, --check, or --dialogue with answers on stdin"
         )
-    pixels = read_image(image)
     teachings = Teachings(folder)
     if kind is not None:
         _by_clicks(teachings, pixels, plate_m, kind=kind, clicks=click or [])

@@ -223,6 +223,8 @@ def test_a_port_that_vanishes_in_a_call_is_an_error_of_the_device_or_none(call: 
     ("driver", "options", "key"),
     [
         ("serial:tfmini", {"port": "x", "rate_hz": float("nan")}, "rate_hz"),
+        ("serial:tfmini", {"port": ""}, "port"),
+        ("scip:scanner", {"port": ""}, "port"),
         ("udp:netft", {"host": "127.0.0.1", "counts_per_n": 0.0}, "counts_per_n"),
         ("serial:rplidar", {"port": "x", "mode": "dense"}, "mode"),
         ("modbus:tfmini", {"port": "x", "unit": 0}, "unit"),

@@ -108,4 +108,6 @@ def test_a_script_that_ends_too_early_or_never_makes_sense_writes_nothing(
     _talk(monkeypatch)
     with pytest.raises(InvalidRequest, match="nobody is there"):
         teach(tmp_path / "panel.png", folder=tmp_path / "kinds")
+    with pytest.raises(InvalidRequest, match=r"pane\.png"):  # before it asks
+        teach(tmp_path / "pane.png", folder=tmp_path / "kinds")
     assert not (tmp_path / "kinds").exists()

@@ -31,7 +31,7 @@ from hal.motion import (
     MotionReport,
     RobotState,
 )
-from manipulation import kernels
+from manipulation import braking, kernels
 from manipulation.control_thread import ControlThread
 from manipulation.drives import Drives
 from manipulation.endings import Ending, Watch
@@ -118,6 +118,7 @@ class Controller:
     def start(self) -> None:
         """Warm the compiled kernels, then start the control thread; a second call does nothing."""
         kernels.warm(self.kinematics.dh)
+        braking.warm(self.kinematics.dh)
         self._thread.start()
 
     def close(self) -> None:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 from hal.errors import MotionRefused
 from hal.geometry import difference
 from hal.motion import CartesianPath, DeclaredMotion, GripperMotion, Hold, JointTrajectory
-from manipulation import kernels
+from manipulation import braking
 from manipulation.kinematics import Kinematics
 from manipulation.sensing import DeviceFailure
 
@@ -21,9 +21,7 @@ START_RAD = 0.05
 START_M = 0.005
 SPEED_SLACK = 1.05
 RESTING_RAD_PER_S = 1e-4
-LOOK_BACK_TICKS = (
-    3  # 10 % of jitter in the ticks tripled the error behind a steady course when only the last one counted
-)
+LOOK_BACK_TICKS = 3  # with one, 10 % of jitter in the ticks tripled the error behind a steady course
 
 
 class SetPointFilter:
@@ -53,7 +51,7 @@ class SetPointFilter:
         if not math.isfinite(wanted_rad @ wanted_rad):
             raise DeviceFailure("controller", "a set-point was not finite")
         kin = self._kinematics
-        out: Array = kernels.safe_step(
+        out: Array = braking.safe_step(
             kin.dh, self._tool, wanted_rad, self._wanted_rad, self.last_rad, self.velocity_rad_per_s,
             kin.velocity_rad_per_s, kin.acceleration_rad_per_s2, kin.lower_rad, kin.upper_rad, self._tip_limit,
             self._dt_s,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from manipulation import clearance, kernels
+from manipulation import braking, clearance, kernels
 
 
 def warm_up() -> None:
@@ -12,6 +12,7 @@ def warm_up() -> None:
     dh, q = np.zeros((6, 4)), np.full(6, 0.1)
     dh[:, 1] = 0.2
     kernels.warm(dh)
+    braking.warm(dh)
     kernels.follow_pose(dh, np.eye(4), q, kernels.frames(dh, q)[-1], 0.01, 1)
     tool_ends, radii = np.zeros((1, 2, 3)), np.full(7, 0.01)
     box = (np.eye(3)[None], np.full((1, 3), 2.0), np.full((1, 3), 0.1))

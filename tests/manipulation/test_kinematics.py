@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from hal.devices import ArmCapabilities
 from hal.errors import Unreachable
 from hal.geometry import difference, interpolate, perturbed, transform_rpy
-from manipulation import kernels
+from manipulation import braking, kernels
 from manipulation.kinematics import Kinematics
 from tests.manipulation.arms import T3, UR, forward
 
@@ -156,8 +156,8 @@ def test_the_way_to_rest_is_that_of_a_brake_tick_by_tick(speed: float) -> None:
     left, way = speed - 1.0, 0.0
     while left > 0.0:
         way, left = way + left, left - 1.0
-    assert kernels.rest_way(speed, 1.0) == pytest.approx(way, abs=1e-9)
-    assert kernels.fastest_to_rest(speed + way, 1.0) == pytest.approx(speed, abs=1e-9)
+    assert braking.rest_way(speed, 1.0) == pytest.approx(way, abs=1e-9)
+    assert braking.fastest_to_rest(speed + way, 1.0) == pytest.approx(speed, abs=1e-9)
 
 
 def test_a_set_point_never_breaks_range_speed_or_acceleration_limits() -> None:
@@ -166,7 +166,7 @@ def test_a_set_point_never_breaks_range_speed_or_acceleration_limits() -> None:
     q, v, before, end = np.zeros(3), np.zeros(3), np.zeros(3), np.full(3, 0.05)
     for _ in range(2000):
         wanted = q + rng.normal(0, 0.1, 3)
-        new = kernels.limited_step(wanted, before[None], q, v, velocity, acceleration, -end, end, dt)
+        new = braking.limited_step(wanted, before[None], q, v, velocity, acceleration, -end, end, dt)
         now, before = (new - q) / dt, wanted
         assert np.all(np.abs(new) <= end + 1e-12)
         assert np.all(np.abs(now) <= velocity + 1e-9)

@@ -108,8 +108,15 @@ def face_ink(face: Face) -> tuple[Float32, Float32]:
         cv2.circle(ink, centre, round(face.dot * h * 16), 1.0, -1, cv2.LINE_AA, 4)
     for word, x, foot, letter in face.words:
         scale, thickness = letter * h / 22.0, max(1, round(0.16 * letter * h))  # letters of scale 1 are 22 px high
-        cv2.putText(ink, word, (round(x * h), round(foot * h)), 0, scale, 1.0, thickness, cv2.LINE_AA)
+        write(ink, word, (round(x * h), round(foot * h)), scale, 1.0, thickness)
     return ink, ghosts
+
+
+def write(canvas: Float32, words: str, foot_px: tuple[int, int], scale: float, gray: float, thickness_px: int) -> None:
+    """Writes on a picture of floats, (H, W): OpenCV 5 puts text on bytes only, so it makes a stencil."""
+    stencil = np.zeros(canvas.shape, np.uint8)
+    cv2.putText(stencil, words, foot_px, cv2.FONT_HERSHEY_SIMPLEX, scale, 255, thickness_px, cv2.LINE_8)
+    canvas[stencil > 0] = gray
 
 
 def _segment(face: Face, name: str) -> Array:

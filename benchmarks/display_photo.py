@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.display_face import Float32
+from benchmarks.display_face import Float32, write
 from perception.vision.view import Array
 
 Gray = NDArray[np.uint8]
@@ -27,9 +27,7 @@ def surroundings(random: np.random.Generator, shape: tuple[int, int], photo: str
     for _ in range(int(random.integers(3, 12))):
         x, y = random.uniform(0, shape[1]), random.uniform(0, shape[0])
         word = "".join(random.choice(list("AMPVOLTSETMODE0123")) for _ in range(random.integers(2, 7)))
-        cv2.putText(
-            picture, word, (int(x), int(y)), 0, float(random.uniform(0.5, 1.6)), gray * 0.4 + 20.0, 2, cv2.LINE_AA
-        )
+        write(picture, word, (int(x), int(y)), float(random.uniform(0.5, 1.6)), gray * 0.4 + 20.0, 2)
         x, y = random.uniform(0, shape[1]), random.uniform(0, shape[0])
         w, h = random.uniform(20, 120, 2)
         cv2.rectangle(picture, (int(x), int(y)), (int(x + w), int(y + h)), float(random.uniform(20, 230)), -1)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.display_face import Face, face_ink
+from benchmarks.display_face import Face, face_ink, write
 
 PX_PER_MM = 4.0
 DARK, WHITE = 32.0, 232.0
@@ -61,7 +61,7 @@ class Canvas:
         scale, thick = height_mm * PX_PER_MM / 22.0, max(1, round(0.15 * height_mm * PX_PER_MM))
         (w, h), _ = cv2.getTextSize(words, 0, scale, thick)
         at = (round(x * PX_PER_MM - w / 2), round(y * PX_PER_MM + h / 2))
-        cv2.putText(self.gray, words, at, 0, scale, gray, thick, cv2.LINE_AA)
+        write(self.gray, words, at, scale, gray, thick)
 
 
 def paint(canvas: Canvas, random: np.random.Generator, kind: str, x: float, y: float) -> Truth:

@@ -7,6 +7,7 @@ lights-off from lights-on would be trivially perfect.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -145,7 +146,8 @@ def _ideal_grid(lens: CameraIntrinsics) -> NDArray[np.float64]:
     matrix = np.array([[lens.fx_px, 0, lens.cx_px], [0, lens.fy_px, lens.cy_px], [0, 0, 1.0]])
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-10)
     pixels = np.stack([u.ravel(), v.ravel()], axis=1)[:, None]
-    ideal = cv2.undistortPointsIter(pixels, matrix, np.asarray(lens.distortion), np.eye(3), np.eye(3), criteria)
+    undistort: Any = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # OpenCV 5 has one function for both
+    ideal = undistort(pixels, matrix, np.asarray(lens.distortion), R=np.eye(3), P=np.eye(3), criteria=criteria)
     return np.asarray(ideal, float).reshape(lens.height_px, lens.width_px, 2)
 
 

@@ -1,11 +1,13 @@
-"""Panel vision against the issue's table: `python -m benchmarks.vision INPUTS.json OUT.json [--time]`.
+"""Panel vision against the issue's table: `python -m benchmarks.vision INPUTS.json OUT.json [--time] [--least-confidence X]`.
 
 Without arguments it runs the development images beside the repository and prints measured values beside the pass lines,
-then the robustness axes one by one. Formats: the data folder's README.
+then the robustness axes one by one. Formats: the data folder's README. Readings less sure than X (default 0.5) are refused; 0 gives
+best guesses with their confidences.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 import time
@@ -26,7 +28,7 @@ from perception.vision.knowledge import Knowledge, shipped_knowledge
 from perception.vision.lights import assign_lights, find_lights
 from perception.vision.photographs.dial import read_dial
 from perception.vision.photographs.photo_display import read_photograph
-from perception.vision.reading import ObjectReading, Status
+from perception.vision.reading import ANSWER_AT, ObjectReading, Status
 from perception.vision.taught import inspect_view
 from perception.vision.view import PlaneView
 
@@ -164,10 +166,11 @@ def _slider(entry: Job, w: float, h: float, part: dict[str, float]) -> dict[str,
     }
 
 
-def taught_answer(job: Job, image: Image) -> dict[str, Any]:
+def taught_answer(job: Job, image: Image, *, least_confidence: float = ANSWER_AT) -> dict[str, Any]:
     """Answer of a `taught` job."""
     panel = panel_of_job(job)
-    readings = inspect_view(image, as_gray(image), view_of_job(job), panel, digits_taught=False)
+    view = view_of_job(job)
+    readings = inspect_view(image, as_gray(image), view, panel, digits_taught=False, least_confidence=least_confidence)
     return {"objects": [_answer(entry, reading) for entry, reading in zip(job["layout"], readings, strict=True)]}
 
 
@@ -223,7 +226,7 @@ def status_answer(status: Status, key: str) -> dict[str, Any]:
     return {**out, key: value} if status.answered else out
 
 
-def answer(job: Job, folder: Path) -> dict[str, Any]:
+def answer(job: Job, folder: Path, *, least_confidence: float = ANSWER_AT) -> dict[str, Any]:
     """Answer of any job; what is refused as a whole has its reason in `refused`."""
     try:
         if job["mode"] == "lights":
@@ -231,16 +234,18 @@ def answer(job: Job, folder: Path) -> dict[str, Any]:
         image = decode((folder / job["image"]).read_bytes())
         match job["mode"]:
             case "taught":
-                return taught_answer(job, image)
+                return taught_answer(job, image, least_confidence=least_confidence)
             case "blind":
                 return blind_answer(job, image)
             case "dial":
                 status = read_dial(
-                    image, minimum=float(job["min"]), maximum=float(job["max"]), circular=bool(job["circular"])
-                )
+                    image, minimum=float(job["min"]), maximum=float(job["max"]), circular=bool(job["circular"]),
+                    least_confidence=least_confidence,
+                )  # fmt: skip
                 return status_answer(status, "reading")
             case _:
-                return status_answer(read_photograph(image, scene=bool(job["scene"])), "text")
+                status = read_photograph(image, scene=bool(job["scene"]), least_confidence=least_confidence)
+                return status_answer(status, "text")
     except CellError as error:
         return {"refused": error.what, "hint": error.hint}
 
@@ -250,7 +255,7 @@ def _knowledge() -> Knowledge:
     return shipped_knowledge()
 
 
-def run(jobs: list[Job], folder: Path, *, timed: bool) -> dict[str, Any]:
+def run(jobs: list[Job], folder: Path, *, timed: bool, least_confidence: float = ANSWER_AT) -> dict[str, Any]:
     """Answers by job id; the first job of every mode is done twice, so that compiling is not timed.
 
     Times are of the processor, one thread: what other work on the machine adds is left out.
@@ -260,9 +265,9 @@ def run(jobs: list[Job], folder: Path, *, timed: bool) -> dict[str, Any]:
     for job in jobs:
         if timed and job["mode"] not in warm:
             warm.add(job["mode"])
-            answer(job, folder)
+            answer(job, folder, least_confidence=least_confidence)
         started = time.process_time()
-        answers[job["id"]] = answer(job, folder)
+        answers[job["id"]] = answer(job, folder, least_confidence=least_confidence)
         if timed:
             answers[job["id"]]["ms"] = 1e3 * (time.process_time() - started)
     return answers
@@ -271,23 +276,26 @@ def run(jobs: list[Job], folder: Path, *, timed: bool) -> dict[str, Any]:
 def main(arguments: list[str]) -> int:
     """Entry point; returns the exit status."""
     cv2.setNumThreads(1)
-    paths = [Path(a) for a in arguments if not a.startswith("--")]
-    if not paths:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("files", nargs="*", type=Path, metavar="INPUTS.json OUT.json")
+    parser.add_argument("--time", action="store_true", help="add milliseconds")
+    parser.add_argument("--least-confidence", type=float, default=ANSWER_AT, metavar="X", help="0 to 1")
+    asked = parser.parse_args(arguments)
+    if not asked.files:
         from benchmarks.vision_report import report
 
         return report(DATA)
-    if len(paths) != 2:
-        print(__doc__)
+    if len(asked.files) != 2 or not 0.0 <= asked.least_confidence <= 1.0:
+        parser.print_help()
         return 2
-    source, target = paths
+    source, target = asked.files
     try:
         jobs = json.loads(source.read_text(encoding="utf-8"))["jobs"]
     except (OSError, ValueError, KeyError) as error:
         print(f"{source} is no inputs file: {error}")
         return 2
-    target.write_text(
-        json.dumps(run(jobs, _folder_of(source, jobs), timed="--time" in arguments), indent=1), encoding="utf-8"
-    )
+    answers = run(jobs, _folder_of(source, jobs), timed=asked.time, least_confidence=asked.least_confidence)
+    target.write_text(json.dumps(answers, indent=1), encoding="utf-8")
     return 0
 
 

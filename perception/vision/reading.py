@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 
 from perception.vision.view import Array
 
-ANSWER_AT = 0.5  # below this confidence a reading is refused
+ANSWER_AT = 0.5  # below this confidence a reading is refused, unless the caller asks for less or for more
+MOST_DOUBTED = 0.49  # confidence of a guess that a reader has a reason to refuse
+TOO_WEAK = "the evidence is too weak: come closer, change the angle or the light"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,6 +29,16 @@ class Possible:
         return 0.5 * 10.0 ** -len(self.text.partition(".")[2])
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Guess:
+    """What a refusal would have said: as the fields of `Answer` of the same names."""
+
+    value: float | None = None
+    uncertainty: float | None = None
+    state: str | None = None
+    text: str | None = None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Answer:
     """At most one of `value`, `state` and `text` leads; a refusal has none of them, and a `reason`.
@@ -33,9 +46,10 @@ class Answer:
     Attributes:
         value: in `unit`; a display has its text's number here too.
         uncertainty: one sigma of `value`, same unit.
-        confidence: 0 to 1, the expected share of right answers among such readings.
+        confidence: 0 to 1, the expected share of right answers among such readings; of a refusal, that its guess is right.
         reason: why no answer is given and what would help; None for an answer.
         possible: what a refused display may show, likeliest first; empty where nothing is known.
+        guess: what a refusal would have said, for callers who want less than `ANSWER_AT` (see `answer_at`).
     """
 
     value: float | None = None
@@ -46,11 +60,15 @@ class Answer:
     confidence: float = 0.0
     reason: str | None = None
     possible: tuple[Possible, ...] = ()
+    guess: Guess | None = None
 
     @property
     def answered(self) -> bool:
         """Whether there is an answer."""
         return self.reason is None
+
+
+A = TypeVar("A", bound=Answer)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,24 +106,58 @@ class ObjectReading(Answer):
         return replace(self, present=True, **{field.name: getattr(status, field.name) for field in fields(Answer)})
 
 
-def refused(reason: str, *, confidence: float = 0.0, unit: str = "", possible: tuple[Possible, ...] = ()) -> Status:
-    """No answer, with its reason (cause, then what would help)."""
-    return Status(reason=reason, confidence=confidence, unit=unit, possible=possible)
+def refused(reason: str, *, unit: str = "") -> Status:
+    """No answer and no guess either, with the reason (cause, then what would help)."""
+    return Status(reason=reason, unit=unit)
 
 
-def gated(status: Status) -> Status:
-    """The same answer, or a refusal when its confidence is too low."""
-    if not status.answered or status.confidence >= ANSWER_AT:
+def doubted(status: Status, reason: str) -> Status:
+    """A refusal with that reason, which keeps what the status says as its guess."""
+    return answer_at(limited(status, MOST_DOUBTED), ANSWER_AT, reason)
+
+
+def gated(status: Status, reason: str = TOO_WEAK, possible: tuple[Possible, ...] = ()) -> Status:
+    """The same answer, or a refusal with that reason when its confidence is too low, which keeps it as its guess.
+
+    Args:
+        possible: what a display may show if it is refused.
+    """
+    refusal = answer_at(status, ANSWER_AT, reason)
+    return replace(refusal, possible=possible) if possible and refusal.guess else refusal
+
+
+def as_often_right(status: Status, least: float) -> Status:
+    """The same status; a guess's confidence is stretched to the range from `least`, what it is worth without any evidence.
+
+    Readers are made to tell when to refuse; what they say below that is too low for kinds with few states.
+    """
+    if status.guess is None:
         return status
-    possible: tuple[Possible, ...] = ()
-    if status.text is not None and status.value is not None:
-        possible = (Possible(text=status.text, value=status.value, probability=status.confidence),)
-    return refused(
-        "the evidence is too weak: come closer, change the angle or the light",
-        confidence=status.confidence,
-        unit=status.unit,
-        possible=possible,
-    )
+    return replace(status, confidence=least + (MOST_DOUBTED - least) * status.confidence / ANSWER_AT)
+
+
+def answer_at(answer: A, least_confidence: float, reason: str = TOO_WEAK) -> A:
+    """The same answer for a caller to whom so much confidence is enough: guesses become answers, doubtful answers guesses."""
+    if answer.reason is None and answer.confidence < least_confidence:
+        return replace(
+            answer, value=None, uncertainty=None, state=None, text=None, reason=reason, guess=_guess_of(answer),
+            possible=answer.possible or _alone(answer),
+        )  # fmt: skip
+    if answer.guess is not None and answer.confidence >= least_confidence:
+        said = {field.name: getattr(answer.guess, field.name) for field in fields(Guess)}
+        return replace(answer, **said, reason=None, guess=None)
+    return answer
+
+
+def _guess_of(answer: Answer) -> Guess:
+    return Guess(**{field.name: getattr(answer, field.name) for field in fields(Guess)})
+
+
+def _alone(answer: Answer) -> tuple[Possible, ...]:
+    """What a display may show of which one number is known."""
+    if answer.text is None or answer.value is None:
+        return ()
+    return (Possible(text=answer.text, value=answer.value, probability=answer.confidence),)
 
 
 def probability(evidence: Sequence[tuple[float, float, float]]) -> float:

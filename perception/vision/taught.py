@@ -18,7 +18,7 @@ from perception.camera_model import check_size, rays
 from perception.vision.image import Image, as_gray
 from perception.vision.noise import noise_sigma
 from perception.vision.patch import Patch, rectify
-from perception.vision.reading import ObjectReading, Status, refused
+from perception.vision.reading import ANSWER_AT, ObjectReading, Status, answer_at, as_often_right, doubted, refused
 from perception.vision.registration.outline import contour_m, footprint_m
 from perception.vision.registration.register import Registration, register
 from perception.vision.status.button import read_button
@@ -42,6 +42,12 @@ MIN_EDGE_SHARE = 0.2  # the same for one object
 TELLING, TELLS = frozenset({"gauge", "panel_meter", "display", "rotary"}), 0.9
 NO_OUTLINE = "the object's outline is not where it should be: check the panel file, or something covers it"
 MIN_RESOLUTION_PX = 10.0  # smaller objects cannot be read
+# Share of a kind's guesses that are right however weak the evidence (of 4122 objects on 400 drawn hard panels, at most what a
+# guess may claim): of two states one is right soon, of many numbers none.
+GUESSES_RIGHT = {
+    "toggle": 0.45, "lever": 0.45, "button": 0.42, "lamp": 0.4, "rotary": 0.4, "handwheel": 0.38, "slider": 0.38,
+    "display": 0.12,
+}  # fmt: skip
 JUMP = 0.25  # of the scale: a larger change since the last reading needs a confident reading
 JUMP_CONFIDENCE = 0.9
 
@@ -54,6 +60,7 @@ def inspect(
     *,
     names: Iterable[str] | None = None,
     previous: Mapping[str, ObjectReading] | None = None,
+    least_confidence: float = ANSWER_AT,
 ) -> tuple[ObjectReading, ...]:
     """Every object of a taught panel as one image shows it.
 
@@ -64,6 +71,7 @@ def inspect(
         panel: the panel file.
         names: objects wanted; all by default.
         previous: last readings by name: an implausible jump is answered only when the evidence is strong.
+        least_confidence: 0 to 1; less sure readings are refused. Below `ANSWER_AT`, the default, best guesses are answers.
 
     Raises:
         InvalidRequest: bad image, calibration of another size, unknown name.
@@ -73,7 +81,7 @@ def inspect(
     gray = as_gray(image)
     check_size(gray, intrinsics)
     view = CameraView(intrinsics=intrinsics, camera_from_panel=camera_from_panel)
-    return inspect_view(image, gray, view, panel, names=names, previous=previous)
+    return inspect_view(image, gray, view, panel, names=names, previous=previous, least_confidence=least_confidence)
 
 
 def inspect_view(
@@ -85,6 +93,7 @@ def inspect_view(
     names: Iterable[str] | None = None,
     previous: Mapping[str, ObjectReading] | None = None,
     digits_taught: bool = True,
+    least_confidence: float = ANSWER_AT,
 ) -> tuple[ObjectReading, ...]:
     """`inspect` for any view of the panel (see perception.vision.view).
 
@@ -100,7 +109,7 @@ def inspect_view(
         )
     noise = noise_sigma(gray)
     colour = image if image.ndim == 3 and image.shape[2] >= 3 else None
-    return tuple(
+    readings = [
         _inspect_one(
             gray,
             colour,
@@ -111,11 +120,17 @@ def inspect_view(
             digits_taught=digits_taught,
         )
         for thing in wanted
-    )
+    ]
+    return tuple(answer_at(reading, least_confidence) for reading in readings)
 
 
 def read_patch(patch: Patch, spec: PanelObject, *, digits_taught: bool = True, before: float | None = None) -> Status:
     """The status of one object by the reader of its kind; the value `before` tells between a display's likely numbers."""
+    status = _by_kind(patch, spec, digits_taught=digits_taught, before=before)
+    return as_often_right(status, GUESSES_RIGHT.get(spec.kind, 0.0))
+
+
+def _by_kind(patch: Patch, spec: PanelObject, *, digits_taught: bool, before: float | None) -> Status:
     match spec.kind:
         case "gauge":
             return read_gauge(patch, spec)
@@ -231,10 +246,9 @@ def plausible(status: Status, spec: PanelObject, before: ObjectReading | None) -
         return status
     if abs(status.value - before.value) <= JUMP * span:
         return status
-    return refused(
+    return doubted(
+        status,
         f"{status.value:.4g} is far from the last reading {before.value:.4g} and the evidence is weak: look again",
-        confidence=status.confidence,
-        unit=status.unit,
     )
 
 

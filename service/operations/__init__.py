@@ -81,7 +81,7 @@ OPERATIONS: dict[str, Operation] = {
             request_model=requests.InspectRequest,
             run=_in_session("inspect", "run_inspect"),
             summary="Read instruments, lamps, switches and valves from close up",
-            example={"objects": ["pressure", "main_valve"]},
+            example={"objects": ["pressure", "main_valve"], "least_confidence": 0.5},
             check=targets.check_inspect,
             is_still=_is_stored,
         ),

@@ -13,7 +13,7 @@ from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import compose
 from hal.panel import PanelObject
 from perception.vision.annotate import draw_annotated, said
-from perception.vision.reading import ObjectReading
+from perception.vision.reading import ObjectReading, answer_at
 from perception.vision.several_looks import joined
 from perception.vision.taught import inspect as inspect_image
 from service.operations.beliefs import READINGS, forget_reading, known_readings
@@ -164,7 +164,7 @@ def run_inspect(session: Session, request: InspectRequest) -> dict[str, Any]:
     names = panel_object_or_all(session.panel, request.objects)
     ensure_located(session.part(0.0, 0.3))
     found = inspect_close(session.part(0.3, 1.0), names) if request.close_up else inspect_here(session, names)
-    return _answer(session, found)
+    return _answer(session, found, request.least_confidence)
 
 
 def run_recognise_taught(session: Session, request: RecogniseRequest) -> dict[str, Any]:
@@ -176,7 +176,7 @@ def run_recognise_taught(session: Session, request: RecogniseRequest) -> dict[st
         go_to_overview(session)
         settle(session)
     session.progress(0.8, "recognise")
-    return _answer(session, inspect_here(session, names, look(session, request.camera)))
+    return _answer(session, inspect_here(session, names, look(session, request.camera)), request.least_confidence)
 
 
 def ensure_located(session: Session) -> None:
@@ -208,13 +208,15 @@ def need_all_present(found: Inspection, session: Session) -> None:
         )
 
 
-def _answer(session: Session, found: Inspection) -> dict[str, Any]:
+def _answer(session: Session, found: Inspection, least_confidence: float) -> dict[str, Any]:
+    """The answer to a caller to whom so much confidence is enough; what the cell remembers and draws is the default's."""
+    readings = [answer_at(reading, least_confidence) for reading in found.readings.values()]
     pictures = [
         session.context.task.artefact(f"annotated-{k}.png", png_of(picture.pixels), "image/png")
         for k, picture in enumerate(found.pictures)
     ]
     return {
-        "objects": [reading_json(session, reading) for reading in found.readings.values()],
+        "objects": [reading_json(session, reading) for reading in readings],
         "missing": list(
             missing(found.readings.values(), [t for t in session.panel.objects if t.name in found.readings])
         ),

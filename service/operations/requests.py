@@ -19,6 +19,16 @@ ObjectName = Annotated[str, Field(min_length=1, max_length=41)]
 ImageId = Annotated[str, Field(pattern=r"^[0-9a-f]{24}$")]
 Side = Annotated[float, Field(gt=0.0, le=10.0)]
 PlateSize = tuple[Side, Side]
+LeastConfidence = Annotated[
+    float,
+    Field(
+        ge=0.0,
+        le=1.0,
+        description="readings that are less sure are refused with a reason; 0 gives the best guess of each, with its confidence",
+        examples=[0.0, 0.9],
+    ),
+]
+ANSWER_AT = 0.5  # as the readers have it
 Distortion = Annotated[float, Field(ge=-100.0, le=100.0)]
 
 
@@ -87,9 +97,12 @@ class RecogniseRequest(StoredLook):
     mode: Literal["taught", "blind"] = "taught"
     objects: Annotated[tuple[ObjectName, ...], Field(max_length=200)] | None = None
     move: bool = True
+    least_confidence: LeastConfidence = ANSWER_AT
 
     @model_validator(mode="after")
     def _sees_what_it_uses(self) -> RecogniseRequest:
+        if self.mode == "blind" and "least_confidence" in self.model_fields_set:
+            raise ValueError("a blind answer lists every candidate with its confidence: leave out least_confidence")
         if self.image is not None and "range" in self.use:
             raise ValueError("a stored image has no range: use vision")
         return self
@@ -102,6 +115,7 @@ class InspectRequest(StoredLook):
     close_up: Annotated[
         bool, Field(description="drive to close-ups, and aside of what they cannot read; false reads the overview only")
     ] = True
+    least_confidence: LeastConfidence = ANSWER_AT
 
 
 class LearnRequest(StoredLook):

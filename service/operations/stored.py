@@ -42,7 +42,9 @@ def read_stored(session: Session, request: RecogniseRequest | InspectRequest) ->
     panel = panel_of(session, request.panel)
     names = panel_object_or_all(panel, request.objects)
     pixels, view = stored_view(session, request, panel)
-    readings = inspect_view(pixels, as_gray(pixels), view, panel, names=names)
+    readings = inspect_view(
+        pixels, as_gray(pixels), view, panel, names=names, least_confidence=request.least_confidence
+    )
     picture = shown(draw_annotated(pixels, readings))
     return {
         "panel": panel.name,

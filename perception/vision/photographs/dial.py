@@ -17,7 +17,7 @@ from perception.vision.finding.circles import find_circles
 from perception.vision.finding.shapes import find_edges
 from perception.vision.image import WHITE_LEVEL, Image, as_gray
 from perception.vision.patch import Patch
-from perception.vision.reading import Status, gated, limited, refused
+from perception.vision.reading import ANSWER_AT, Status, answer_at, gated, limited, refused
 from perception.vision.status.gauge import RIVAL, SIGMA_RAD, pointer_confidence, status_of_pointer
 from perception.vision.status.pointer import PointerFit, find_pointer, unroll, wrapped
 
@@ -38,14 +38,16 @@ SCALE_END_RAD = np.deg2rad(135.0)  # three quarters of a turn is what almost all
 
 
 def read_dial(
-    image: NDArray[Any], *, minimum: float, maximum: float, circular: bool, ends_rad: tuple[float, float] | None = None
-) -> Status:
+    image: NDArray[Any], *, minimum: float, maximum: float, circular: bool, ends_rad: tuple[float, float] | None = None,
+    least_confidence: float = ANSWER_AT,
+) -> Status:  # fmt: skip
     """Value of the dial that fills the picture.
 
     Args:
         image: gray or RGB uint8, cropped to the dial.
         circular: the scale is a full turn that begins straight up.
         ends_rad: pointer angles at minimum and maximum of a scale that is not; three quarters of a turn by default.
+        least_confidence: as of `taught.inspect`.
 
     Raises:
         InvalidRequest, NotObservable: bad image.
@@ -66,7 +68,7 @@ def read_dial(
         low, high = ends_rad or (-SCALE_END_RAD, SCALE_END_RAD)
         scale = Scale(minimum=minimum, maximum=maximum, unit="", at_min=low, at_max=high)
         status = status_of_pointer(fit, scale, 1.0)
-    return gated(limited(status, _agreement(fit, fits)))
+    return answer_at(gated(limited(status, _agreement(fit, fits))), least_confidence)
 
 
 def _pointers(image: NDArray[Any]) -> list[PointerFit]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from perception.vision.image import Image, as_gray
 from perception.vision.photographs.digit_search import DigitRow, find_digit_rows
-from perception.vision.reading import Status, gated, limited, refused
+from perception.vision.reading import ANSWER_AT, Status, answer_at, gated, limited, refused
 from perception.vision.status.comb_jit import slant_energies
 from perception.vision.status.display import read_window
 from perception.vision.status.glyphs import lit_segments
@@ -24,12 +24,13 @@ RIVAL = 0.3  # how much another text read nearby takes from the confidence
 FRAME = 0.08  # of a crop's height that a frame may take
 
 
-def read_photograph(image: NDArray[Any], *, scene: bool) -> Status:
+def read_photograph(image: NDArray[Any], *, scene: bool, least_confidence: float = ANSWER_AT) -> Status:
     """Text of the display in a photograph.
 
     Args:
         image: gray or RGB uint8.
         scene: False when the image is cropped to the display.
+        least_confidence: as of `taught.inspect`.
 
     Raises:
         InvalidRequest, NotObservable: bad image.
@@ -42,7 +43,7 @@ def read_photograph(image: NDArray[Any], *, scene: bool) -> Status:
     ]
     if not answers:
         return refused("no display is found in the picture: crop it, or come closer")
-    return _agreed(answers)
+    return answer_at(_agreed(answers), least_confidence)
 
 
 def _agreed(answers: list[tuple[float, Status]]) -> Status:

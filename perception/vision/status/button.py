@@ -6,7 +6,7 @@ import numpy as np
 
 from hal.panel import Button, Mushroom
 from perception.vision.patch import Patch
-from perception.vision.reading import Status, gated, refused
+from perception.vision.reading import Status, doubted, gated, refused
 from perception.vision.status.press import cap_height
 from perception.vision.status.shade import cap_shades
 
@@ -35,11 +35,13 @@ def read_cap(patch: Patch, spec: Button | Mushroom) -> Status:
     if evidence is None:
         return refused(UNSEEN if seen < 0.4 else "the cap's edge cannot be found: come closer or add light")
     confidence = float(1.0 / (1.0 + np.exp(-abs(evidence)))) * (1.0 if by_height else min(1.0, seen + 0.2))
+    state = "pressed" if evidence < 0 else "released"
     if confidence < 0.75:
-        return refused(
-            "pressed and released look alike from here: look from the side or closer", confidence=2 * confidence - 1
+        return doubted(
+            Status(state=state, confidence=max(0.0, 2 * confidence - 1)),
+            "pressed and released look alike from here: look from the side or closer",
         )
-    return gated(Status(state="pressed" if evidence < 0 else "released", confidence=confidence))
+    return gated(Status(state=state, confidence=confidence))
 
 
 def _by_height(patch: Patch, spec: Button | Mushroom) -> float | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from perception.vision.bilinear import step_counts
 from perception.vision.patch import Patch
-from perception.vision.reading import Status, gated, probability, refused
+from perception.vision.reading import Status, doubted, gated, probability, refused
 from perception.vision.view import Array
 
 
@@ -28,7 +28,7 @@ def choose(names: Sequence[str], evidence: Array, *, noise: float, seen: float, 
     others = [float(e) for name, e in zip(names, evidence, strict=True) if name != names[best]]
     rival = max(others, default=0.0)
     peak = float(evidence[best])
-    if peak < 1.5 * noise:
+    if peak <= 0.0:
         return refused(f"no {what} stands out: come closer or add light")
     confidence = probability(
         [
@@ -37,7 +37,8 @@ def choose(names: Sequence[str], evidence: Array, *, noise: float, seen: float, 
             (seen, 0.55, 0.1),
         ]
     )
-    return gated(Status(state=names[best], confidence=confidence))
+    status = Status(state=names[best], confidence=confidence)
+    return gated(status) if peak >= 1.5 * noise else doubted(status, f"no {what} stands out: come closer or add light")
 
 
 def contrast_noise(patch: Patch) -> float:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hal.panel import Display
 from perception.vision.image import Image
 from perception.vision.patch import Patch
-from perception.vision.reading import ANSWER_AT, Possible, Status, probability, refused
+from perception.vision.reading import Possible, Status, gated, probability, refused
 from perception.vision.status.band import hidden_by_bands
 from perception.vision.status.comb import Comb, find_combs
 from perception.vision.status.comb_jit import Float32, apartness
@@ -221,19 +221,18 @@ def _answer(
         stray = stray_ink(found.ink, found.comb, found.lit_levels)
         trust *= probability([(-stray, -STRAY, STRAY_SCALE)]) / SURE
     rivals = _ranked([(text, value) for text, value, _ in possible], share, trust)
-    best = rivals[0]
-    if best.probability < ANSWER_AT:
-        named = [rival.text for rival in rivals[:MOST_NAMED] if rival.probability > NAMED * trust]
-        maybe = f" ({' or '.join(named)}?)" if len(named) > 1 else ""
-        why = (
-            f"something lies across the digits{maybe}: move it or look past it"
-            if covered and share.max() < 0.8
-            else f"the evidence is too weak{maybe}: come closer, change the angle or the light"
-        )
-        return refused(why, confidence=best.probability, unit=unit, possible=rivals[:MOST_POSSIBLE])
-    return Status(
-        value=best.value, unit=unit, uncertainty=best.half_digit, text=best.text, confidence=min(best.probability, 0.97)
+    named = [rival.text for rival in rivals[:MOST_NAMED] if rival.probability > NAMED * trust]
+    maybe = f" ({' or '.join(named)}?)" if len(named) > 1 else ""
+    why = (
+        f"something lies across the digits{maybe}: move it or look past it"
+        if covered and share.max() < 0.8
+        else f"the evidence is too weak{maybe}: come closer, change the angle or the light"
     )
+    best = rivals[0]
+    said = Status(
+        value=best.value, unit=unit, uncertainty=best.half_digit, text=best.text, confidence=min(best.probability, 0.97),
+    )  # fmt: skip
+    return gated(said, why, rivals[:MOST_POSSIBLE])
 
 
 def _ranked(numbers: Sequence[tuple[str, float]], share: Array, trust: float) -> tuple[Possible, ...]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from hal.panel import Gauge, Scale
 from perception.vision.patch import Patch
-from perception.vision.reading import Status, gated, probability, refused
+from perception.vision.reading import Status, doubted, gated, probability, refused
 from perception.vision.status.band import lying_across
 from perception.vision.status.pointer import PointerFit, find_pointer, wrapped
 
@@ -64,20 +64,19 @@ def status_of_pointer(
             "the pointer is off its scale, so what was found may not be the pointer: look again, closer",
             unit=scale.unit,
         )
-    if fit.sigma_rad > MOST_SIGMA_RAD:
-        return refused(
-            f"the pointer's direction is uncertain by {fit.sigma_rad:.2f} rad: come closer, or change the angle or the light",
-            unit=scale.unit,
-        )
     value = scale.value_at(place)
     slope = abs(scale.value_at(place + 1e-3) - scale.value_at(place - 1e-3)) / 2e-3
-    return gated(
-        Status(
-            value=float(value),
-            unit=scale.unit,
-            uncertainty=float(slope * fit.sigma_rad),
-            confidence=pointer_confidence(fit, seen, rival=rival, sigma_rad=sigma_rad),
-        )
+    status = Status(
+        value=float(value),
+        unit=scale.unit,
+        uncertainty=float(slope * fit.sigma_rad),
+        confidence=pointer_confidence(fit, seen, rival=rival, sigma_rad=sigma_rad),
+    )
+    if fit.sigma_rad <= MOST_SIGMA_RAD:
+        return gated(status)
+    return doubted(
+        status,
+        f"the pointer's direction is uncertain by {fit.sigma_rad:.2f} rad: come closer, or change the angle or the light",
     )
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hal.panel import Lever
 from perception.vision.patch import Patch
-from perception.vision.reading import Status, refused
+from perception.vision.reading import Status, doubted
 from perception.vision.status.band import cables_across
 from perception.vision.status.bar import bar_contrast
 from perception.vision.status.choice import choose, contrast_noise
@@ -53,7 +53,8 @@ def read_lever(patch: Patch, spec: Lever) -> Status:
         return replace(status, value=angle, unit="rad", uncertainty=ANGLE_SIGMA_RAD)
     if _is_parallel(patch, spec, nominal):
         return replace(status, value=nominal, unit="rad", uncertainty=BETWEEN_RAD)
-    return refused(f"the lever stands between its states, at {angle:.2f} rad: turn it to its stop", unit="rad")
+    between = replace(status, value=angle, unit="rad", uncertainty=ANGLE_SIGMA_RAD)
+    return doubted(between, f"the lever stands between its states, at {angle:.2f} rad: turn it to its stop")
 
 
 def _that_ends(

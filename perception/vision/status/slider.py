@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hal.panel import Slider
 from perception.vision.image import WHITE_LEVEL
 from perception.vision.patch import Patch, sample_at
-from perception.vision.reading import Status, gated, probability, refused
+from perception.vision.reading import Status, doubted, gated, probability, refused
 from perception.vision.registration.outline import footprint_m
 from perception.vision.status.band import lying_across
 from perception.vision.status.choice import contrast_noise
@@ -40,12 +40,13 @@ def read_slider(patch: Patch, spec: Slider) -> Status:
     open_ = _uncovered(patch, spec, s, np.minimum(left, right), lean_m)
     found = _best_pair(left, right, s, open_, along_m=along, lean_m=lean_m, limits_m=(lo, hi))
     noise = contrast_noise(patch)
-    if found.peak < 2.0 * noise:
-        if seen < 0.4:
-            reason = "the slider cannot be seen (glare, shadow or cover): change the angle or the light"
-        else:
-            reason = "no cap stands out on the track: come closer or add light"
-        return refused(reason, unit=spec.scale.unit)
+    unseen = (
+        "the slider cannot be seen (glare, shadow or cover): change the angle or the light"
+        if seen < 0.4
+        else "no cap stands out on the track: come closer or add light"
+    )
+    if found.peak <= 0.0:
+        return refused(unseen, unit=spec.scale.unit)
     place = float(np.clip(found.place_m, lo, hi))
     slope = abs(spec.scale.value_at(place + 1e-4) - spec.scale.value_at(place - 1e-4)) / 2e-4
     confidence = probability(
@@ -54,14 +55,13 @@ def read_slider(patch: Patch, spec: Slider) -> Status:
             (np.log((found.rival + noise) / (found.peak + noise)), np.log(0.7), -0.12),
         ]
     )
-    return gated(
-        Status(
-            value=spec.scale.value_at(place),
-            unit=spec.scale.unit,
-            uncertainty=slope * 0.5 / patch.image_px_per_m,
-            confidence=confidence,
-        )
+    status = Status(
+        value=spec.scale.value_at(place),
+        unit=spec.scale.unit,
+        uncertainty=slope * 0.5 / patch.image_px_per_m,
+        confidence=confidence,
     )
+    return gated(status) if found.peak >= 2.0 * noise else doubted(status, unseen)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 
 from benchmarks.vision_drawing import Disturbance, Shown
+from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest, NotFound, NotObservable
+from hal.geometry import UncertainPose
 from perception.vision.annotate import draw_annotated
 from perception.vision.reading import ObjectReading
 from perception.vision.taught import inspect
+from perception.vision.view import CameraView
 from tests.perception.vision.bench_panel import SHOWN, panel, scene
 
 VIEWS = [(0.0, 0.0, (1280, 960)), (8.0, 30.0, (1280, 960)), (15.0, 200.0, (640, 480)), (20.0, 100.0, (1280, 960))]
@@ -138,3 +144,42 @@ def test_the_annotated_picture_is_rgb_and_leaves_the_image_alone() -> None:
     assert picture.shape == (*image.shape, 3) and picture.dtype == np.uint8
     assert (picture != np.repeat(image[:, :, None], 3, axis=2)).any()
     assert (image == before).all()
+
+
+def behind_a_cable(offset_m: float) -> tuple[np.ndarray, CameraIntrinsics, UncertainPose]:
+    """The panel with a dark cable before the display `flow`, so far right of its middle."""
+    image, intrinsics, pose = scene(tilt_deg=3.0, distance_m=0.66, pose_error=0.0)
+    x, y = panel().object("flow").position_m
+    view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+    ends = view.project([[x + offset_m, y + 0.08, 0.0], [x + offset_m, y - 0.08, 0.0]])
+    first, last = (tuple(int(value) for value in end) for end in ends)
+    return np.asarray(cv2.line(image.copy(), first, last, 35, 9)), intrinsics, pose
+
+
+def test_who_asks_for_less_gets_the_likeliest_number_of_a_hidden_display() -> None:
+    look = behind_a_cable(0.012)
+    (refusal,) = inspect(*look, panel(), names=["flow"])
+    assert not refusal.answered and refusal.text is None and refusal.value is None
+    (guess,) = inspect(*look, panel(), names=["flow"], least_confidence=0.0)
+    assert guess.answered and guess.text == refusal.possible[0].text == SHOWN["flow"]
+    assert guess.possible == refusal.possible and 0.0 < guess.confidence < 0.5
+    (barely,) = inspect(*look, panel(), names=["flow"], least_confidence=guess.confidence + 0.005)
+    assert not barely.answered
+
+
+def test_who_asks_for_more_gets_only_the_surest() -> None:
+    image, intrinsics, pose = scene()
+    plain = inspect(image, intrinsics, pose, panel())
+    strict = inspect(image, intrinsics, pose, panel(), least_confidence=0.96)
+    assert {r.name for r in strict if r.answered} == {r.name for r in plain if r.answered and r.confidence >= 0.96}
+    assert all(r.reason for r in strict if not r.answered) and any(not r.answered for r in strict)
+
+
+def test_a_jump_is_a_guess_and_no_answer() -> None:
+    look = behind_a_cable(-0.012)  # read at less than .9
+    (seen,) = inspect(*look, panel(), names=["flow"])
+    far = replace(seen, value=getattr(panel().object("flow"), "maximum", None))
+    (refusal,) = inspect(*look, panel(), names=["flow"], previous={"flow": far})
+    assert seen.answered and not refusal.answered and "far from the last reading" in (refusal.reason or "")
+    (guess,) = inspect(*look, panel(), names=["flow"], previous={"flow": far}, least_confidence=0.0)
+    assert guess.text == seen.text and guess.confidence < 0.5

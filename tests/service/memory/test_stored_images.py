@@ -179,6 +179,25 @@ def test_an_object_that_is_not_there_and_one_in_glare_are_said(web: httpx2.Clien
     assert rows["pressure"]["value"] is None and rows["pressure"]["reason"]
 
 
+def test_the_caller_chooses_how_sure_is_sure_enough(web: httpx2.Client, shown: Shown) -> None:
+    image, view = shown
+    x, y = panel().object("flow").position_m
+    ends = np.rint(view.project([[x + 0.012, y + 0.08, 0.0], [x + 0.012, y - 0.08, 0.0]])).astype(int).tolist()
+    stored = store(web, np.asarray(cv2.line(image.copy(), tuple(ends[0]), tuple(ends[1]), 35, 9)))
+    for verb in ("inspect", "recognise"):
+
+        def flow(_verb: str = verb, **least: float) -> dict[str, Any]:
+            task = _ask(web, _verb, {"image": stored, "objects": ["flow"], **least})
+            row: dict[str, Any] = task.json()["result"]["objects"][0]
+            return row
+
+        default, less, more = flow(), flow(least_confidence=0.0), flow(least_confidence=1.0)
+        assert default["text"] is None and default["reason"] and len(default["possible"]) > 1
+        assert less["text"] == default["possible"][0]["text"] and less["reason"] is None
+        assert less["possible"] == default["possible"] and less["confidence"] == default["confidence"] < 0.5
+        assert more["text"] is None and more["reason"]
+
+
 def test_requests_that_make_no_sense_are_refused(web: httpx2.Client, shown: Shown) -> None:
     stored = store(web, shown[0])
     for verb, body in (
@@ -186,6 +205,9 @@ def test_requests_that_make_no_sense_are_refused(web: httpx2.Client, shown: Show
         ("recognise", {"image": stored, "use": ["range"]}),
         ("recognise", {"image": "../../etc/passwd"}),
         ("recognise", {"image": stored, "plate_m": [0.6, -1.0], "mode": "blind"}),
+        ("recognise", {"image": stored, "mode": "blind", "least_confidence": 0.2}),
+        ("recognise", {"image": stored, "least_confidence": 1.01}),
+        ("inspect", {"image": stored, "least_confidence": -0.1}),
         ("inspect", {"image": stored, "camera_from_panel": {"translation_m": [0, 0, 1]}}),
     ):
         answer = _ask(web, verb, body)

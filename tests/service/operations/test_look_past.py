@@ -12,10 +12,11 @@ import pytest
 from benchmarks.behind_cables import drawn_cable, open_session, with_cables
 from hal.config import CableSection, load_cell
 from hal.errors import Unreachable
-from perception.vision.reading import ObjectReading
+from perception.vision.reading import ANSWER_AT, ObjectReading
 from service.operations import inspect
 from service.operations.beliefs import forget_reading, known_readings
 from service.operations.inspect import Inspection, inspect_close
+from service.operations.requests import InspectRequest
 from service.operations.session import Session
 
 ROOT = Path(__file__).parents[3]
@@ -76,6 +77,15 @@ def test_a_cap_that_no_side_shows_says_how_often_it_was_looked_at(session: Sessi
     sides = len(found.pictures) - 1
     assert truth_of(session, "hold").state == "pressed" and not reading.answered
     assert sides > 0 and f"({sides} looks from the sides did not tell either)" in (reading.reason or "")
+
+
+def test_a_guess_is_answered_to_who_asks_for_it_and_not_remembered(session: Session) -> None:
+    forget_reading(session, "hold")
+    (refusal,) = inspect.run_inspect(session, InspectRequest(objects=("hold",)))["objects"]
+    (guess,) = inspect.run_inspect(session, InspectRequest(objects=("hold",), least_confidence=0.0))["objects"]
+    assert refusal["state"] is None and refusal["reason"]
+    assert guess["state"] in ("pressed", "released") and guess["reason"] is None and guess["confidence"] < ANSWER_AT
+    assert "hold" not in known_readings(session), "missions go by what is sure"
 
 
 def test_many_unread_objects_are_no_cables_work(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:

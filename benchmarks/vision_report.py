@@ -52,8 +52,11 @@ def report(data: Path) -> int:
     else:
         inputs, score = (_module(data / f"{name}.py") for name in ("make_inputs", "score"))
         truth = json.loads((data / "synth_dev" / "truth.json").read_text(encoding="utf-8"))
-        jobs = run(inputs.jobs(truth), data / "synth_dev", timed=True)
-        rows = _table(truth, jobs, score)
+        jobs = inputs.jobs(truth)
+        rows = _table(truth, run(jobs, data / "synth_dev", timed=True), score)
+        taught = [job for job in jobs if job["mode"] == "taught"]
+        guessed = run(taught, data / "synth_dev", timed=False, least_confidence=0.0)
+        print("\n".join(guess_lines(_taught_rows(truth, guessed, score))))
         answers += [Answer(confidence=r["confidence"], right=r["error"] <= 2.0) for r in rows if r["answered"]]
         real = json.loads((data / "real" / "truth.json").read_text(encoding="utf-8"))
         _real(real, run(inputs.jobs(real), data / "real", timed=True), score)
@@ -168,6 +171,36 @@ def _taught_rows(truth: dict[str, Any], answers: dict[str, Any], score: ModuleTy
                 }
             )
     return rows
+
+
+def guess_lines(rows: list[dict[str, Any]]) -> list[str]:
+    """The taught lines for a caller who wants the best guess of everything: right, beside what the confidences expect.
+
+    Readings that turn out right far more or less often than expected were lucky or unlucky, or say too little or too much.
+
+    Args:
+        rows: as `_taught_rows` gives them; what is refused nevertheless counts as wrong, and is the first to be left out.
+    """
+    lines = ["the same for least_confidence=0 (best guesses), right beside what their own confidences expect"]
+    for what, kinds in (
+        ("displays exact", ("display",)), ("gauge and panel meter within 2 % FS", POINTERS), ("states right", STATES),
+        ("slider within 2 % FS, handwheel within 7.2 deg", ("slider", "handwheel")),
+    ):  # fmt: skip
+        chosen = [[r for r in rows if r["cls"] in kinds and r["level"] == level] for level in LEVELS]
+        right = " / ".join(f"{np.mean([r['error'] <= 2.0 for r in c]):.3f}" for c in chosen)
+        expected = " / ".join(f"{np.mean([_claimed(r) for r in c]):.3f}" for c in chosen)
+        lines.append(f"  {what:50s} {right:24s} expected {expected}")
+    kept = sorted(rows, key=_claimed)[round(0.05 * len(rows)) :]
+    wrong, expected_wrong = np.mean([r["error"] > 2.0 for r in kept]), np.mean([1.0 - _claimed(r) for r in kept])
+    lines.append(
+        f"  {'wrong when the 5 % least sure of all are refused':50s} {wrong:<24.3f} expected {expected_wrong:.3f}"
+    )
+    return lines
+
+
+def _claimed(row: dict[str, Any]) -> float:
+    """How probably a row is right by its own confidence."""
+    return float(row["confidence"]) if row["answered"] else 0.0
 
 
 def _real(truth: dict[str, Any], answers: dict[str, Any], score: ModuleType) -> None:

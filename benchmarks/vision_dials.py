@@ -5,6 +5,7 @@ They are for judging the reader where no photographs with known values are at ha
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -41,7 +42,7 @@ def draw_dial(seed: int) -> DrawnDial:
     circular, share = bool(rng.random() < 0.5), float(rng.uniform(0.02, 0.98))
     face = FACES[int(rng.integers(len(FACES)))]
     ink = (230, 230, 230) if sum(face) < 200 else (35, 35, 40)
-    pen = _Pen.on(rng, face)
+    pen = Pen.on(rng, face)
     _scale(pen, rng, ink, circular)
     angle = share * 2 * np.pi if circular else (share - 0.5) * SPAN_RAD
     colour = ink if rng.random() < 0.35 else COLOURS[int(rng.integers(len(COLOURS)))]
@@ -51,7 +52,7 @@ def draw_dial(seed: int) -> DrawnDial:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Pen:
+class Pen:
     """Draws about a dial's middle, in shares of its radius: `up` along a direction, `right` across it."""
 
     canvas: NDArray[np.uint8]
@@ -59,11 +60,11 @@ class _Pen:
     radius: float
 
     @staticmethod
-    def on(rng: Rng, face: Colour) -> _Pen:
+    def on(rng: Rng, face: Colour) -> Pen:
         ground = tuple(int(c) for c in rng.integers(20, 220, 3)) if rng.random() < 0.5 else face
         canvas = np.full((CANVAS_PX, CANVAS_PX, 3), ground, np.uint8)
         middle = CANVAS_PX / 2 + rng.normal(0.0, 0.01 * CANVAS_PX, 2)
-        pen = _Pen(canvas=canvas, middle=middle, radius=float(rng.uniform(0.40, 0.49)) * CANVAS_PX)
+        pen = Pen(canvas=canvas, middle=middle, radius=float(rng.uniform(0.40, 0.49)) * CANVAS_PX)
         pen.disc(0.0, (0.0, 0.0), 1.0, face)
         rim = tuple(int(c) for c in rng.integers(0, 255, 3)) if rng.random() < 0.5 else (35, 35, 40)
         cv2.circle(
@@ -85,7 +86,7 @@ class _Pen:
         cv2.fillPoly(self.canvas, [np.array([self.place(angle_rad, c) for c in corners])], colour, cv2.LINE_AA, 4)
 
 
-def _scale(pen: _Pen, rng: Rng, ink: Colour, circular: bool) -> None:
+def _scale(pen: Pen, rng: Rng, ink: Colour, circular: bool) -> None:
     numerals, size = float(rng.uniform(0.62, 0.70)), 0.0022 * pen.radius
     for k in range(10 if circular else 11):
         angle = k / 10 * 2 * np.pi if circular else (k / 10 - 0.5) * SPAN_RAD
@@ -96,7 +97,7 @@ def _scale(pen: _Pen, rng: Rng, ink: Colour, circular: bool) -> None:
         cv2.putText(pen.canvas, str(k), at, cv2.FONT_HERSHEY_SIMPLEX, size, ink, 6, cv2.LINE_AA)
 
 
-def _pointer(pen: _Pen, rng: Rng, angle: float, shape: str, colour: Colour, ink: Colour) -> None:
+def _pointer(pen: Pen, rng: Rng, angle: float, shape: str, colour: Colour, ink: Colour) -> None:
     reach, tail = float(rng.uniform(0.72, 0.92)), float(rng.uniform(0.15, 0.4))
     w = float(rng.uniform(0.02, 0.045))
     match shape:
@@ -122,12 +123,8 @@ def _pointer(pen: _Pen, rng: Rng, angle: float, shape: str, colour: Colour, ink:
 
 def _photographed(canvas: NDArray[np.uint8], rng: Rng) -> Image:
     """The canvas seen a little aslant, at its final size, through light, lens, noise and JPEG."""
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32) * CANVAS_PX
-    from_middle, azimuth = corners - CANVAS_PX / 2, float(rng.uniform(0, 2 * np.pi))
-    depth = from_middle @ np.array([np.cos(azimuth), np.sin(azimuth)]) * 2 / CANVAS_PX
-    seen = CANVAS_PX / 2 + from_middle * (1 - float(rng.uniform(0, 0.06)) * depth[:, None])
-    warp = cv2.getPerspectiveTransform(corners, seen.astype(np.float32))
-    aslant = cv2.warpPerspective(canvas, warp, (CANVAS_PX, CANVAS_PX), borderMode=cv2.BORDER_REPLICATE)
+    azimuth = float(rng.uniform(0, 2 * np.pi))
+    aslant = seen_aslant(canvas, azimuth, float(rng.uniform(0, 0.06)))
     side = round(np.exp(rng.uniform(np.log(SMALLEST_PX), np.log(LARGEST_PX))))
     picture = np.asarray(cv2.resize(aslant, (side, side), interpolation=cv2.INTER_AREA), np.float32)
     picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), float(rng.uniform(0.3, 0.4 + 0.008 * side))), np.float32)
@@ -144,6 +141,16 @@ def _photographed(canvas: NDArray[np.uint8], rng: Rng) -> Image:
         coded = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(50, 95))])[1]
         out = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.uint8)
     return out
+
+
+def seen_aslant(canvas: Image, azimuth_rad: float, depth: float) -> Image:
+    """The canvas with one side as much smaller as the other is larger."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32) * CANVAS_PX
+    from_middle = corners - CANVAS_PX / 2
+    away = from_middle @ np.array([np.cos(azimuth_rad), np.sin(azimuth_rad)]) * 2 / CANVAS_PX
+    seen = CANVAS_PX / 2 + from_middle * (1 - depth * away[:, None])
+    warp = cv2.getPerspectiveTransform(corners, seen.astype(np.float32))
+    return np.asarray(cv2.warpPerspective(canvas, warp, canvas.shape[:2], borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 def error_of(dial: DrawnDial) -> tuple[float | None, float]:
@@ -164,11 +171,11 @@ class DialResult:
     confidence: float
 
 
-def read_drawn(seeds: range) -> list[DialResult]:
+def read_drawn(seeds: range, draw: Callable[[int], DrawnDial] = draw_dial) -> list[DialResult]:
     """The reader on every seed's dial."""
     results = []
     for seed in seeds:
-        dial = draw_dial(seed)
+        dial = draw(seed)
         error, confidence = error_of(dial)
         results.append(DialResult(shape=dial.shape, error=error, confidence=confidence))
     return results
@@ -177,7 +184,7 @@ def read_drawn(seeds: range) -> list[DialResult]:
 def summary(results: list[DialResult]) -> list[str]:
     """Shares read within 2 %, refused, and wrong above 5 %, of all and of every shape of pointer."""
     lines = []
-    for group in ("all", *SHAPES):
+    for group in ("all", *dict.fromkeys(sorted(r.shape for r in results))):
         errors = [r.error for r in results if group in ("all", r.shape)]
         given = np.array([e for e in errors if e is not None])
         shares = (np.sum(given <= 2.0), len(errors) - len(given), np.sum(given > 5.0))

@@ -18,10 +18,11 @@ from scipy.spatial.transform import RigidTransform
 from benchmarks.display_report import display_lines
 from benchmarks.vision import run
 from benchmarks.vision_axes import axes, random_state, shipped_panel
-from benchmarks.vision_dials import read_drawn
+from benchmarks.vision_dials import draw_dial, read_drawn
 from benchmarks.vision_dials import summary as dial_lines
 from benchmarks.vision_drawing import camera, draw_panel, looking_at
 from benchmarks.vision_held_out import held_out_lines
+from benchmarks.vision_manometers import draw_manometer
 from benchmarks.vision_reliability import Answer, draw_reliability, reliability_lines
 from hal.errors import CellError
 from hal.geometry import certain
@@ -61,10 +62,11 @@ def report(data: Path) -> int:
         real = json.loads((data / "real" / "truth.json").read_text(encoding="utf-8"))
         _real(real, run(inputs.jobs(real), data / "real", timed=True), score)
         _speed(data / "synth_dev")
-    drawn = read_drawn(DRAWN_DIALS)
-    print("drawn dials of many looks (not fitted to): within 2 % / refused / wrong above 5 %")
-    print("\n".join(dial_lines(drawn)))
-    answers += [Answer(confidence=r.confidence, right=r.error <= 2.0) for r in drawn if r.error is not None]
+    for what, draw in (("dials of many looks", draw_dial), ("pressure gauges", draw_manometer)):
+        drawn = read_drawn(DRAWN_DIALS, draw)
+        print(f"drawn {what} (not fitted to): within 2 % / refused / wrong above 5 %")
+        print("\n".join(dial_lines(drawn)))
+        answers += [Answer(confidence=r.confidence, right=r.error <= 2.0) for r in drawn if r.error is not None]
     display_lines()
     print("\n" + "\n".join(held_out_lines()))
     answers += axes()

@@ -13,23 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.panel import Scale
-from perception.vision.finding.circles import find_circles
-from perception.vision.finding.shapes import find_edges
 from perception.vision.image import WHITE_LEVEL, Image, as_gray
 from perception.vision.patch import Patch
+from perception.vision.photographs.dial_outline import SIDE_PX, dial_circle
 from perception.vision.reading import ANSWER_AT, Status, answer_at, gated, limited, refused
 from perception.vision.status.gauge import RIVAL, SIGMA_RAD, pointer_confidence, status_of_pointer
 from perception.vision.status.pointer import PointerFit, find_pointer, unroll, wrapped
 
-SIDE_PX = 220
 NUMERALS_FROM, TIP_AT = 0.45, 0.72  # share of the radius: beyond any round hub, within every pointer
 LEAST_CONNECTED = 0.7  # of the way to the hub: a pointer comes from it, a glare or a numeral does not
 SAME_RAD = np.deg2rad(6.0)
+COLOUR_OFF_RAD = np.deg2rad(
+    14.0
+)  # JPEG keeps colours by blocks of 16 px: a pointer of its own gray is that far off there
+SHOWN_WELL = 0.5  # confidence
 CLEARER_BY = 0.5  # than the best pointer elsewhere, as `_clearness` counts
-LEAST_SIDE_PX = 90
 BRIGHT_FACE = 205  # gray level
 HALO = 0.24  # of the radius: what a saturated spot is widened by
-UNSEEN_RIM = 0.48  # of the picture: the radius where no outline is found
 PIVOT_OFF = 0.08  # of the radius: seen aslant, the outline found is not about the pivot
 LEAST_SEPARATION = 3.2  # spreads of the face: two halves of one blurred gray lie 2.7 apart
 LEAST_COLOUR = 5.0  # of Lab: less is the noise of a camera or of JPEG
@@ -52,41 +52,38 @@ def read_dial(
     Raises:
         InvalidRequest, NotObservable: bad image.
     """
-    fits = _pointers(image)
-    if not fits:
+    in_gray, in_colour = _pointers(image)
+    if not in_gray and not in_colour:
         return refused("no pointer stands out on the dial: come closer or add light")
-    fit = max(fits, key=_clearness)
+    fit, rival = _believed(in_gray, in_colour)
     if circular:
         value = minimum + (fit.angle_rad % (2 * np.pi)) / (2 * np.pi) * (maximum - minimum)
         sigma = fit.sigma_rad / (2 * np.pi) * (maximum - minimum)
-        status = Status(
-            value=float(value),
-            uncertainty=float(sigma),
-            confidence=pointer_confidence(fit, 1.0, rival=RIVAL, sigma_rad=SIGMA_RAD),
-        )
+        status = Status(value=float(value), uncertainty=float(sigma), confidence=_confidence(fit))
     else:
         low, high = ends_rad or (-SCALE_END_RAD, SCALE_END_RAD)
         scale = Scale(minimum=minimum, maximum=maximum, unit="", at_min=low, at_max=high)
         status = status_of_pointer(fit, scale, 1.0)
-    return answer_at(gated(limited(status, _agreement(fit, fits))), least_confidence)
+    return answer_at(gated(limited(status, _agreement(fit, rival))), least_confidence)
 
 
-def _pointers(image: NDArray[Any]) -> list[PointerFit]:
-    """What looks like a pointer, in every channel of the picture and of either polarity; a drop leaves no question."""
+def _pointers(image: NDArray[Any]) -> tuple[list[PointerFit], list[PointerFit]]:
+    """What looks like a pointer in lightness, and in the other channels, of either polarity; a drop leaves no question."""
     gray = as_gray(image)
     scale = SIDE_PX / max(image.shape[:2])
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
     picture = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=interpolation), np.uint8)
-    u, v, radius = _dial_circle(gray, scale)
+    u, v, radius = dial_circle(gray, scale)
     drop = _drop(picture, u, v, radius)
     if drop is not None:
-        return [drop]
+        return [], [drop]
     gray = as_gray(picture)
     glare = _glare(gray, u, v, radius)
-    fits = []
+    fits: list[list[PointerFit]] = []
     y, x = np.mgrid[: gray.shape[0], : gray.shape[1]]
     for channel, least in _channels(picture, gray, np.hypot(x - u, y - v) < radius):
         patch = _patch(channel, u, v)
+        fits.append([])
         for dark in (True, False):
             fit = find_pointer(
                 patch, pivot_m=(0.0, 0.0), inner_m=NUMERALS_FROM * radius, outer_m=TIP_AT * radius,
@@ -96,15 +93,37 @@ def _pointers(image: NDArray[Any]) -> list[PointerFit]:
             if fit is None or fit.contrast < least:
                 continue
             if _reaches_hub(patch, fit.angle_rad, radius) >= LEAST_CONNECTED:
-                fits.append(fit)
-    return fits
+                fits[-1].append(fit)
+    return fits[0], [fit for of_channel in fits[1:] for fit in of_channel]
 
 
-def _agreement(best: PointerFit, fits: list[PointerFit]) -> float:
+def _believed(in_gray: list[PointerFit], in_colour: list[PointerFit]) -> tuple[PointerFit, PointerFit | None]:
+    """The pointer that is read, and the clearest other one.
+
+    Lightness is sharper than colour: where it shows the clearest pointer well, it says where that points.
+    """
+    fits = in_gray + in_colour
+    best, same_rad = max(fits, key=_clearness), SAME_RAD
+    well = [fit for fit in in_gray if _apart(fit, best) < COLOUR_OFF_RAD and _confidence(fit) > SHOWN_WELL]
+    if well:
+        best, same_rad = max(well, key=_clearness), COLOUR_OFF_RAD
+    others = [fit for fit in fits if _apart(fit, best) > same_rad]
+    return best, max(others, key=_clearness, default=None)
+
+
+def _agreement(best: PointerFit, rival: PointerFit | None) -> float:
     """Most confidence that the channels leave: less than an answer needs where a clear one points elsewhere."""
-    others = [f for f in fits if abs(wrapped(np.array(f.angle_rad - best.angle_rad))) > SAME_RAD]
-    rival = max((_clearness(f) for f in others), default=-np.inf)
-    return float(1.0 / (1.0 + np.exp(-(_clearness(best) - rival - CLEARER_BY) / 0.3)))
+    if rival is None:
+        return 1.0
+    return float(1.0 / (1.0 + np.exp(-(_clearness(best) - _clearness(rival) - CLEARER_BY) / 0.3)))
+
+
+def _apart(one: PointerFit, other: PointerFit) -> float:
+    return float(abs(wrapped(np.array(one.angle_rad - other.angle_rad))))
+
+
+def _confidence(fit: PointerFit) -> float:
+    return pointer_confidence(fit, 1.0, rival=RIVAL, sigma_rad=SIGMA_RAD)
 
 
 def _drop(image: Image, u: float, v: float, radius: float) -> PointerFit | None:
@@ -204,29 +223,6 @@ def _glare_within(gray: NDArray[Any], region: NDArray[np.bool_], radius: float) 
 
 def _clearness(fit: PointerFit) -> float:
     return float(np.log(fit.strength) + 3.0 * (1.0 - fit.rival_ratio) + 2.0 * fit.supported)
-
-
-def _dial_circle(gray: Image, scale: float) -> tuple[float, float, float]:
-    """Middle and radius, both times `scale`, of the largest round outline about the picture's middle, or of the picture.
-
-    A small picture is looked at in about its own size: blown up, its edges would be too faint.
-    """
-    own = np.clip(max(gray.shape), LEAST_SIDE_PX, SIDE_PX) / max(gray.shape)
-    interpolation = cv2.INTER_AREA if own < 1 else cv2.INTER_CUBIC
-    picture = np.asarray(cv2.resize(gray, None, fx=own, fy=own, interpolation=interpolation), np.uint8)
-    height, width = picture.shape
-    middle = np.array([(width - 1) / 2, (height - 1) / 2])
-    most = 0.52 * max(width, height)
-    circles = [
-        c
-        for c in find_circles(find_edges(picture, sigma_px=1.5), least_px=0.55 * most, most_px=most)
-        if np.hypot(c.u - middle[0], c.v - middle[1]) < 0.12 * most
-    ]
-    ratio = scale / own
-    if not circles:
-        return float(middle[0]) * ratio, float(middle[1]) * ratio, UNSEEN_RIM * min(width, height) * ratio
-    best = max(circles, key=lambda c: c.coverage * c.radius)
-    return best.u * ratio, best.v * ratio, best.radius * ratio
 
 
 def _glare(gray: Image, u: float, v: float, radius: float) -> NDArray[np.bool_] | None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.vision_dials import draw_dial, error_of
+from benchmarks.vision_manometers import draw_manometer
 from perception.vision.photographs.dial import read_dial
 
 TAIL_UNDER_GLARE = 46  # the tip lies under glare, the tail shows
@@ -53,4 +54,17 @@ def test_a_dial_without_a_pointer_is_refused() -> None:
 @pytest.mark.parametrize("seed", [2088, 2203])  # a glare on a drop's hub; a face that is white itself
 def test_a_glare_on_the_pointer_or_a_white_face_does_not_mislead(seed: int) -> None:
     error, _ = error_of(draw_dial(seed))
+    assert error is not None and error <= 2.0
+
+
+@pytest.mark.parametrize("seed", [5120, 5266, 5289])  # a dark or red pointer that JPEG displaces in colour only
+def test_a_pointer_that_lightness_shows_well_is_not_doubted_for_its_displaced_colours(seed: int) -> None:
+    error, confidence = error_of(draw_dial(seed))
+    assert error is not None and error <= 1.0
+    assert confidence > 0.8
+
+
+@pytest.mark.parametrize("seed", [5, 14, 15, 54, 91])  # wide bezels, whose outer edge is displaced
+def test_a_pressure_gauge_is_read_about_the_middle_of_its_face_not_of_its_bezel(seed: int) -> None:
+    error, _ = error_of(draw_manometer(seed))
     assert error is not None and error <= 2.0

@@ -1,0 +1,70 @@
+"""The round outline of a dial that fills the picture: middle and radius."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from perception.vision.bilinear import polar_values
+from perception.vision.finding.circles import Circle, find_circles
+from perception.vision.finding.shapes import find_edges
+from perception.vision.image import Image
+
+SIDE_PX = 220
+LEAST_SIDE_PX = 90
+UNSEEN_RIM = 0.48  # of the picture: the radius where no outline is found
+WHOLE = 0.9  # of the best coverage: the arc of a scale covers three quarters of a turn
+TURNS = np.linspace(0, 2 * np.pi, 120, endpoint=False)
+NORMALS = np.column_stack([np.sin(TURNS), -np.cos(TURNS)])
+REACHES = (0.12, 0.07, 0.04, 0.04)  # of the radius, to either side of the outline so far
+LEAST_SLOPE = 0.3  # of the median along the outline
+
+
+def dial_circle(gray: Image, scale: float) -> tuple[float, float, float]:
+    """Middle and radius, both times `scale`, of the round outline of the face about the picture's middle, or of the picture.
+
+    A bezel has an outline to either side, and what stands before the plate is displaced: the inner one is the face's.
+    A small picture is looked at in about its own size: blown up, its edges would be too faint.
+    """
+    own = np.clip(max(gray.shape), LEAST_SIDE_PX, SIDE_PX) / max(gray.shape)
+    interpolation = cv2.INTER_AREA if own < 1 else cv2.INTER_CUBIC
+    picture = np.asarray(cv2.resize(gray, None, fx=own, fy=own, interpolation=interpolation), np.uint8)
+    height, width = picture.shape
+    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+    most = 0.52 * max(width, height)
+    circles = [
+        c
+        for c in find_circles(find_edges(picture, sigma_px=1.5), least_px=0.55 * most, most_px=most)
+        if np.hypot(c.u - middle[0], c.v - middle[1]) < 0.12 * most
+    ]
+    ratio = scale / own
+    if not circles:
+        return float(middle[0]) * ratio, float(middle[1]) * ratio, UNSEEN_RIM * min(width, height) * ratio
+    whole = WHOLE * max(c.coverage for c in circles)
+    best = _settled(picture, min((c for c in circles if c.coverage >= whole), key=lambda c: c.radius))
+    return best[0] * ratio, best[1] * ratio, best[2] * ratio
+
+
+def _settled(picture: Image, circle: Circle) -> tuple[float, float, float]:
+    """Middle and radius fitted to the steepest change across the outline, of the sign that prevails along it.
+
+    Votes leave a circle anywhere on a wide edge.
+    """
+    smooth: Image = np.ascontiguousarray(cv2.GaussianBlur(picture, (0, 0), 1.0), np.uint8)
+    u, v, radius = circle.u, circle.v, circle.radius
+    J = np.column_stack([NORMALS, np.ones(len(TURNS))])
+    for reach in REACHES:
+        radii = np.arange((1 - reach) * radius, (1 + reach) * radius, 0.5)
+        slope = np.diff(polar_values(smooth, (u, v), radii, np.ascontiguousarray(NORMALS.T)), axis=0)
+        slope *= np.sign((slope * np.abs(slope)).sum())
+        off = radii[slope.argmax(axis=0)] + 0.25 - radius
+        steep = slope.max(axis=0)
+        found = steep > LEAST_SLOPE * np.median(steep)
+        solution = np.array([0.0, 0.0, float(np.median(off[found]))])
+        for _ in range(8):
+            residual = off - J @ solution
+            spread = max(0.5, 1.4826 * float(np.median(np.abs(residual[found]))))
+            weight = found / (1 + (residual / spread) ** 2) ** 2
+            solution = np.linalg.solve(J.T @ (weight[:, None] * J) + 1e-6 * np.eye(3), J.T @ (weight * off))
+        u, v, radius = u + solution[0], v + solution[1], radius + solution[2]
+    return float(u), float(v), float(radius)

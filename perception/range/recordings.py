@@ -2,7 +2,8 @@
 
 npz: `depth` (float or integer) and JSON text `meta` with `unit` ("m" or "mm"), `sensor` ({"kind": "pinhole", "shape",
 "f", "fy", "cx", "cy"} or {"kind": "ortho", "shape", "pitch"}; pitch in the unit), or `K` = fx, fy, cx, cy or
-the 3x3 matrix, with depth in millimetres. Where `depth` is absent, 8-bit codes `u8` are decoded with `meta.u8` (`near`,
+the 3x3 matrix, with depth in millimetres. A reading of a cell's scanner (`panelwright devices read --save`) has `depth_m`
+for `depth`. Where both are absent, 8-bit codes `u8` are decoded with `meta.u8` (`near`,
 `far`, 0 near .. 255 far).
 npy, PNG, TIFF, and npz with `depth` alone: the bare image; what it does not say comes from a `Reading`.
 """
@@ -200,8 +201,10 @@ def _load_npz(path: Path, reading: Reading, codes: bool) -> Loaded:
     if path.stat().st_size and not zipfile.is_zipfile(path):
         raise ValueError("it is no zip archive, or not all of it is there")
     with np.load(path, allow_pickle=False) as data:
-        if not {"depth", "u8"} & set(data.files):
+        if not {"depth", "depth_m", "u8"} & set(data.files):
             raise ValueError(f"it holds {', '.join(data.files) or 'nothing'}, and neither depth nor u8")
+        if "depth_m" in data.files:
+            return _decoded(data["depth_m"], reading), _sensor_of_reading(data)
         if not {"meta", "K"} & set(data.files) and "depth" in data.files:
             return _decoded(data["depth"], reading), None
         meta = json.loads(str(data["meta"])) if "meta" in data.files else _meta_of_intrinsics(data)
@@ -209,6 +212,11 @@ def _load_npz(path: Path, reading: Reading, codes: bool) -> Loaded:
         depth = _depth(data, meta, unit, reading, codes)
     filed = sensor_from_meta(meta["sensor"], unit) if "sensor" in meta else None
     return depth, filed
+
+
+def _sensor_of_reading(data: Any) -> RangeSensorModel | None:
+    """What the reading of a scanner says of it: a sweep of beams says nothing."""
+    return sensor_from_meta(json.loads(str(data["meta"]))["sensor"], 1.0) if "meta" in data.files else None
 
 
 def _depth(data: Any, meta: dict[str, Any], unit: float, reading: Reading, codes: bool) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import threading
 import time
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hal.clock import Deadline
-from hal.devices import DeviceKind, Image, RangeImage
+from hal.devices import DeviceKind, Image, RangeImage, RangeScannerCapabilities
 from hal.errors import InvalidRequest
 from hal.readings import Stamped
 from service.jsonable import jsonable
@@ -92,9 +93,14 @@ class ReadingDesk:
         return data
 
     def npz(self, name: str, *, max_age_s: float) -> bytes:
-        """The reading's array in numpy's npz format: `pixels` or `depth_m`, with its stamps."""
+        """The reading's array in numpy's npz format: `pixels` or `depth_m`, with its stamps.
+
+        A range image says which sensor took it (`meta`, as in `perception.range.recordings`), so that it can be analysed.
+        """
         stamped = self.read(name, max_age_s=max_age_s).stamped
         arrays = _arrays(name, stamped.value)
+        if isinstance(stamped.value, RangeImage):
+            arrays |= _sensor_of(self._connection().device(name).capabilities())
         stream = io.BytesIO()
         np.savez_compressed(stream, **arrays, host_time_s=stamped.host_time_s, sequence=stamped.sequence)
         return stream.getvalue()
@@ -136,6 +142,18 @@ def _arrays(name: str, value: Any) -> dict[str, Any]:
     if isinstance(value, RangeImage):
         return {"depth_m": value.depth_m}
     raise InvalidRequest(f"{name} gives no picture", hint="ask for format=json")
+
+
+def _sensor_of(scanner: RangeScannerCapabilities) -> dict[str, str]:
+    """`meta` of a recording: unit and sensor. A sweep of beams is no image, and has none."""
+    sensor: dict[str, Any]
+    if scanner.projection == "pinhole":
+        sensor = {"kind": "pinhole", "f": scanner.fx, "fy": scanner.fy, "cx": scanner.cx, "cy": scanner.cy}
+    elif scanner.projection == "orthographic":
+        sensor = {"kind": "ortho", "pitch": 1.0 / scanner.fx}
+    else:
+        return {}
+    return {"meta": json.dumps({"unit": "m", "sensor": sensor | {"shape": [scanner.height, scanner.width]}})}
 
 
 def _encode_png(name: str, value: Any) -> bytes:

@@ -7,12 +7,15 @@ import json
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import httpx2
 import numpy as np
 import pytest
 from PIL import Image as Picture
 
+from perception.range.recordings import AS_FILED, assumptions, load_recording
+from perception.range.sensor import PinholeSensor
 from service.serve import Panelwright
 from tests.service.waiting import eventually
 
@@ -144,6 +147,20 @@ def test_readings_come_as_json_png_and_npz(client: httpx2.Client) -> None:
     assert np.isnan(depth[0, 0])
     assert client.get("/v1/devices/range_scanner/reading?format=png").headers["content-type"] == "image/png"
     assert client.get("/v1/devices/finger_proximity/reading?format=png").status_code == 422
+
+
+def test_what_a_scanner_gives_is_a_recording_that_says_which_sensor_took_it(
+    client: httpx2.Client, tmp_path: Path
+) -> None:
+    file = tmp_path / "scan.npz"
+    file.write_bytes(client.get("/v1/devices/range_scanner/reading?format=npz").content)
+    depth_m, sensor = load_recording(file)
+    told = client.get("/v1/devices/range_scanner").json()["capabilities"]
+    assert isinstance(sensor, PinholeSensor)
+    assert (sensor.fx_px, sensor.fy_px, sensor.cx_px, sensor.cy_px) == tuple(told[k] for k in ("fx", "fy", "cx", "cy"))
+    assert depth_m.shape == (sensor.height_px, sensor.width_px) == (12, 16)
+    assert np.nanmax(depth_m) == pytest.approx(0.5)
+    assert assumptions(file, AS_FILED) == ()
 
 
 def test_a_young_reading_is_shared_and_an_old_one_is_not(client: httpx2.Client) -> None:

@@ -1,0 +1,73 @@
+"""The Python of the pages runs as it stands, with what a page leaves to the reader handed in."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from fusion.sensing import Pinhole
+from hal.geometry import UncertainPose
+from perception.range import SurfaceType
+
+ROOT = Path(__file__).parents[1]
+FACING = Rotation.from_matrix(
+    [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
+)  # a camera that looks down on z = 0
+
+
+def run(page: str, **given: Any) -> dict[str, Any]:
+    """All names after the first Python block of `docs/page`."""
+    block = re.search(r"```python\n(.*?)```", (ROOT / "docs" / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+    assert block is not None
+    names = dict(given)
+    exec(compile(block[1], page, "exec"), names)  # noqa: S102 - our own pages
+    return names
+
+
+def placed(x_m: float, y_m: float, z_m: float, *, facing: Rotation | None = None, sigma: float = 1e-6) -> UncertainPose:
+    pose = RigidTransform.from_components([x_m, y_m, z_m], facing or Rotation.identity())
+    return UncertainPose(parent_from_child=pose, covariance=sigma**2 * np.eye(6))
+
+
+def test_the_range_page_finds_its_wall() -> None:
+    found = run("range.md")
+    assert found["wall"].type is SurfaceType.PLANE
+    tilt_rad = np.arccos(abs(found["fit"].feature.direction @ found["wall"].primitive.normal))
+    assert tilt_rad < 1e-4
+    assert abs(abs(found["wall"].primitive.normal[0]) - 0.2 / np.hypot(1.0, 0.2)) < 1e-4
+
+
+def test_the_fusion_page_fuses_an_edge_and_a_touch() -> None:
+    focal_px, height_m, row_px = 460.0, 0.8, 374.0  # the middle row of the page's edge
+    camera = Pinhole(fx_px=focal_px, fy_px=focal_px, cx_px=319.5, cy_px=239.5)
+    above_m = height_m * (row_px - camera.cy_px) / focal_px
+    base_from_camera = placed(0.4, above_m, height_m, facing=FACING)
+    found = run(
+        "fusion.md",
+        camera=camera,
+        base_from_camera=base_from_camera,
+        base_from_finger=placed(0.4, 0.25, 0.001),  # a millimetre before where the face is thought
+        pose_from_the_lights=placed(0.0, 0.0, 0.0, sigma=0.05),
+    )
+    answer = found["answer"]
+    assert not answer.rejected
+    x, y, z = base_from_camera.parent_from_child.inv().apply(answer.pose.apply([[0.0, 0.0, 0.0], [0.8, 0.0, 0.0]])).T
+    u_px, v_px = camera.cx_px + focal_px * x / z, camera.cy_px + focal_px * y / z
+    np.testing.assert_allclose(np.polyval(np.polyfit(u_px, v_px, 1), [102.0, 511.0]), [377.0, 371.0], atol=0.1)
+    assert answer.pose.apply([0.4, 0.25, 0.0])[2] == pytest.approx(0.001, abs=1e-4)
+
+
+def test_the_vision_page_teaches_a_mushroom(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "docs").symlink_to(ROOT / "docs")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "kinds").mkdir()
+    run("vision.md")
+    assert (tmp_path / "kinds" / "mushroom.toml").is_file()
+    assert re.search(r"^mushroom (1\.0|0\.99)", capsys.readouterr().out, flags=re.MULTILINE)

@@ -205,7 +205,9 @@ def watch_devices(
         while True:
             try:
                 shown: Table | str = _watched(watch.look())
-            except CellError as error:  # the service may come back
+            except CellError as error:  # a service that was there may come back
+                if looks == 0:
+                    raise
                 shown = f"[red]{escape(error.what)}[/]; try: {escape(error.hint)}"
             if live is None:  # a log, where nothing can move: every look, as it comes
                 console.print(shown)

@@ -35,7 +35,11 @@ def journal(
     path = runs / ".service" / "journal.sqlite"
     if not path.is_file():
         raise FileFault(f"there is no journal {path}", hint="give the service's folder: --runs FOLDER")
-    for record in read_records(path, kinds=tuple(kind or ()), limit=last):
+    records = read_records(path, kinds=tuple(kind or ()), limit=last)
+    if kind and not records and not as_json:
+        seen = sorted({record.kind for record in read_records(path)})
+        console.print(f"no row is of kind {', '.join(kind)}; there are {', '.join(seen) or 'none'}", style="yellow")
+    for record in records:
         if as_json:
             console.print(json.dumps(asdict(record)), markup=False)
         else:

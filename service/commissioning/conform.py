@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -53,7 +54,7 @@ class Bench:
 
 
 def run(cell: Cell, *, devices: Sequence[str], level: str, report: Path | None = None) -> int:
-    """Try the named devices (all when empty) up to a level; returns pytest's exit code.
+    """Try the named devices (all when empty) up to a level; returns pytest's exit code, 130 after Ctrl-C.
 
     Args:
         report: where to write what was found, as `report.md` and `report.json`: the path without the ending.
@@ -78,7 +79,7 @@ def run(cell: Cell, *, devices: Sequence[str], level: str, report: Path | None =
         code = int(pytest.main([str(path), *options], plugins=[notebook]))
     if report is not None:
         write_report(report, cell, names, notebook)
-    return code
+    return 128 + signal.SIGINT if notebook.is_stopped else code  # pytest's 2 may also be a file that it cannot load
 
 
 def classes_for(cell_path: str, seed: int, names: Sequence[str], level: str) -> dict[str, Any]:

@@ -24,7 +24,7 @@ class Finding:
     """One promise of one device.
 
     Attributes:
-        outcome: passed, failed, skipped (it could not be tried here) or not tried (its level was not asked for).
+        outcome: passed, failed, skipped (it could not be tried here) or not tried (not asked for, or stopped before).
         why: of everything but a pass.
         link: what the device said about its wire.
     """
@@ -44,7 +44,9 @@ class Notebook:
     def __init__(self, level: str) -> None:
         self.level = level
         self.findings: list[Finding] = []
+        self.is_stopped = False
         self._levels: dict[str, str] = {}
+        self._open: list[str] = []
 
     def pytest_configure(self, config: Any) -> None:
         """Make the marker known."""
@@ -65,6 +67,7 @@ class Notebook:
                 self._note(item.nodeid, "not tried", 0.0, why, "")
         config.hook.pytest_deselected(items=above)
         items[:] = [item for item in items if item not in above]
+        self._open = [item.nodeid for item in items]
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         """One phase of one test: its call, or a set-up or an end that did not work."""
@@ -73,7 +76,14 @@ class Notebook:
         link = str(dict(report.user_properties).get("link", ""))
         self._note(report.nodeid, report.outcome, report.duration, _why(report), link)
 
+    def pytest_keyboard_interrupt(self) -> None:
+        """Ctrl-C: what was not reached is not tried, and the report must say so."""
+        self.is_stopped = True
+        for node in self._open:
+            self._note(node, "not tried", 0.0, "Ctrl-C came before", "")
+
     def _note(self, node: str, outcome: str, took_s: float, why: str, link: str) -> None:
+        self._open = [other for other in self._open if other != node]
         _, class_name, test = node.split("::")
         self.findings.append(
             Finding(

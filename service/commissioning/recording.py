@@ -95,8 +95,10 @@ def read_about(path: Path) -> About:
     try:
         with path.open(encoding="ascii") as file:
             line = json.loads(file.readline())
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path} cannot be read: {error}", hint=hint) from error
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}", hint=hint) from error
+    except ValueError as error:
+        raise ConfigError(f"{path} is no recording: its first line is no JSON", hint=hint) from error
     try:
         return About(
             device=str(line["device"]),

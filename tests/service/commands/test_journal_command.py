@@ -43,6 +43,16 @@ def test_kinds_and_the_newest_rows_can_be_asked_for(runs: Path, capsys: pytest.C
     assert (row["id"], row["kind"], row["data"]) == (2, "stop", {"source": "the page", "key": None})
 
 
+def test_a_kind_that_no_row_has_is_answered_with_those_there_are(
+    runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    journal(runs=runs, kind=["stops"])
+    told = " ".join(capsys.readouterr().out.split())
+    assert told == "no row is of kind stops; there are service-start, stop, task-ended"
+    journal(runs=runs, kind=["stops"], as_json=True)
+    assert capsys.readouterr().out == ""
+
+
 def test_the_chain_is_whole_until_somebody_changes_a_row(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     journal(runs=runs, verify=True)
     assert capsys.readouterr().out.endswith("3 rows, the chain is whole\n")

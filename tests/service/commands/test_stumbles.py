@@ -22,6 +22,7 @@ from service.commands import serve as serving
 from service.commands.common import patience, read_cell
 from service.errors import of_file
 from service.operations import mission
+from service.processes.stop_host import bound_socket
 from service.report.record import MissionRecord
 from service.serve import Panelwright
 from tests.service.conftest import WriteCell
@@ -157,6 +158,13 @@ def test_a_folder_that_is_not_there_is_said_in_words(served: Panelwright, tmp_pa
 def test_a_log_of_watching_has_every_look(served: Panelwright) -> None:
     done = CliRunner().invoke(devices.app, ["watch", "--url", served.url, "--count", "3", "--period-s", "0.1"])
     assert done.output.count("finger_proximity") == 3, done.output
+
+
+def test_watching_nobody_ends_at_once() -> None:
+    with bound_socket("127.0.0.1", 0) as silent:
+        nobody = f"http://127.0.0.1:{silent.getsockname()[1]}"
+    done = CliRunner().invoke(devices.app, ["watch", "--url", nobody, "--count", "2", "--period-s", "0.1"])
+    assert isinstance(done.exception, DeviceUnavailable)
 
 
 def test_a_task_watched_late_has_no_negative_times(served: Panelwright, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,8 +8,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from drivers.emulators import tfmini
 from drivers.emulators.scripted import ScriptedProximity
+from service.commissioning.conform_report import Notebook
 from tests.service.conftest import WriteCell
 
 ROOT = Path(__file__).parents[3]
@@ -51,6 +54,18 @@ def test_the_kit_finds_a_broken_promise(write_cell: WriteCell, tmp_path: Path) -
     assert all("no answer" in p["why"] for p in absent if p["outcome"] == "failed")
     assert "did not connect" in text
     assert found["counts"]["failed"] > 1
+
+
+def test_what_ctrl_c_came_before_is_not_tried_and_said_so(tmp_path: Path) -> None:
+    stopped = "raise KeyboardInterrupt"
+    tests = "".join(
+        f"    def test_{name}(self): {body}\n" for name, body in (("a", "pass"), ("b", stopped), ("c", "pass"))
+    )
+    (tmp_path / "test_kit.py").write_text(f"class Test_lights:\n{tests}")
+    notebook = Notebook("read")
+    pytest.main([str(tmp_path), "-p", "no:cacheprovider", "-c", "/dev/null"], plugins=[notebook])
+    assert notebook.is_stopped
+    assert {f.promise: f.outcome for f in notebook.findings} == {"a": "passed", "b": "not tried", "c": "not tried"}
 
 
 def test_the_wire_of_an_emulated_device_is_broken_too(tmp_path: Path) -> None:

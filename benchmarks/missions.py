@@ -127,6 +127,7 @@ def summary(runs: Sequence[Run]) -> int:
     error_deg = float(np.rad2deg(np.median([v["pose_error_rad"] for v in posed])))
     errors_m = [error for r in runs for error in r.by_surfaces_m.values()]
     found_mm = [1e3 * error for error in errors_m if error is not None]
+    longest_s = max(r.report["cell_s"] for r in runs)
     lines = [
         (f"every action confirmed: {done} of {n}", done >= 0.95 * n),
         (f"the judge agrees: {agreed} of {n}", agreed == n),
@@ -138,7 +139,7 @@ def summary(runs: Sequence[Run]) -> int:
             f" {np.median(found_mm) if found_mm else np.nan:.2f} mm",
             len(found_mm) >= 0.9 * len(errors_m),
         ),
-        (f"longest mission: {max(r.report['cell_s'] for r in runs):.1f} s on the cell's clock", True),
+        (f"longest mission: {longest_s:.1f} s on the cell's clock", longest_s <= 60.0),
         (f"median mission: {np.median([r.report['wall_s'] for r in runs]):.1f} s on the wall", True),
     ]
     for text, is_met in lines:

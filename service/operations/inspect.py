@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.devices import DeviceKind
 from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import compose
 from hal.panel import PanelObject
@@ -17,11 +18,12 @@ from perception.vision.reading import ObjectReading, answer_at
 from perception.vision.several_looks import joined
 from perception.vision.taught import inspect as inspect_image
 from service.operations.beliefs import READINGS, forget_reading, known_readings
-from service.operations.eyes import Look, look, settle
+from service.operations.eyes import Look, base_from, look, settle
 from service.operations.locate import go_to_overview, locate
 from service.operations.requests import InspectRequest, RecogniseRequest
 from service.operations.session import Session, panel_object_or_all
 from service.operations.stored import read_stored, reading_row_json
+from service.operations.tours import short_tour
 from service.operations.travel import go_to_camera_view
 from service.operations.views import SIDES, close_up_groups, close_up_poses, side_poses
 from service.report.plots import png_of
@@ -73,6 +75,7 @@ def close_ups(session: Session, names: Collection[str]) -> Inspection:
     """Read objects from as few close-ups as show them all."""
     objects = [session.panel.object(name) for name in names]
     groups = close_up_groups(objects, session.lens())
+    groups = [groups[k] for k in short_tour(_camera_over_panel(session), [centre_m for centre_m, _ in groups])]
     readings: dict[str, ObjectReading] = {}
     pictures: list[AnnotatedView] = []
     for k, (centre_m, group) in enumerate(groups):
@@ -81,6 +84,13 @@ def close_ups(session: Session, names: Collection[str]) -> Inspection:
         readings |= closer.readings
         pictures += closer.pictures
     return Inspection(readings=readings, pictures=tuple(pictures))
+
+
+def _camera_over_panel(session: Session) -> NDArray[np.float64]:
+    """(3,) panel point that the camera is before."""
+    camera = base_from(session, session.first(DeviceKind.CAMERA)).parent_from_child
+    x, y, _ = session.known_panel().parent_from_child.inv().apply(camera.translation)
+    return np.array([x, y, 0.0])
 
 
 def look_close(session: Session, centre_m: Iterable[float], names: Collection[str]) -> Inspection:

@@ -32,6 +32,7 @@ from service.operations.locate import Located, go_to_overview, locate, pose_json
 from service.operations.requests import BoxBody, CylinderBody, FeatureSetBody, FuseRequest, MeasurementBody
 from service.operations.session import Session
 from service.operations.spots import bare_spots
+from service.operations.tours import short_tour
 from service.operations.travel import workcell
 
 Array = NDArray[np.float64]
@@ -59,7 +60,9 @@ def feel(session: Session, touches: int) -> Felt:
     evidence: list[Evidence] = []
     spots: list[Array] = []
     skipped: list[str] = []
-    for spot in bare_spots(session.panel, touches + SPARE_SPOTS):
+    wanted = bare_spots(session.panel, touches + SPARE_SPOTS)
+    first = short_tour(_fingers_over_panel(session), wanted[:touches])
+    for spot in wanted[[*first, *range(touches, len(wanted))]]:
         if len(spots) == touches:
             break
         session.progress(len(spots) / touches, "touch the plate", f"at ({spot[0]:.3f}, {spot[1]:.3f}) m")
@@ -132,6 +135,13 @@ def collect(session: Session, touches: int) -> tuple[Evidence, ...]:
 def light_evidence(located: Sequence[Located]) -> tuple[LightEvidence, ...]:
     """The rays of several looks together."""
     return tuple(ray for found in located for ray in found.evidence)
+
+
+def _fingers_over_panel(session: Session) -> Array:
+    """(2,) panel point that the finger tips are over."""
+    cell = workcell(session)
+    tip = cell.mover.state().base_from_flange * cell.flange_from_grip
+    return np.asarray(cell.panel_pose.inv().apply(tip.translation)[:2])
 
 
 def _feel_at(session: Session, spot: Array) -> list[Evidence]:

@@ -91,7 +91,7 @@ def side_poses(
 def close_up_groups(
     objects: Sequence[PanelObject], intrinsics: CameraIntrinsics, distance_m: float = CLOSE_UP_M
 ) -> list[tuple[NDArray[np.float64], tuple[str, ...]]]:
-    """Few close-ups that together show every object: (view centre in the panel frame, names), left to right.
+    """Few close-ups that together show every object: (view centre in the panel frame, names), the fullest first.
 
     Greedy cover: each view is centred where it takes in most of the objects that are still unseen.
     """
@@ -110,4 +110,4 @@ def close_up_groups(
         places = np.array([unseen.pop(name) for name in best])
         centre = 0.5 * (places.min(axis=0) + places.max(axis=0))
         groups.append((np.array([*centre, 0.0]), best))
-    return sorted(groups, key=lambda group: (round(-group[0][1], 2), group[0][0]))
+    return groups

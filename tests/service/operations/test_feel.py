@@ -12,6 +12,7 @@ import pytest
 from hal.errors import NotFound, Stopped, Unreachable
 from hal.panel import load_panel
 from service.operations import sense
+from service.operations.spots import bare_spots
 
 PANEL = Path(__file__).parents[3] / "panels" / "bench.toml"
 
@@ -30,8 +31,9 @@ class Toucher:
         return [np.asarray(spot)]
 
 
-def feel(monkeypatch: pytest.MonkeyPatch, toucher: Toucher) -> sense.Felt:
+def feel(monkeypatch: pytest.MonkeyPatch, toucher: Toucher, over_m: tuple[float, float] = (0.0, 0.0)) -> sense.Felt:
     monkeypatch.setattr(sense, "_feel_at", toucher)
+    monkeypatch.setattr(sense, "_fingers_over_panel", lambda _: np.array(over_m))
     session: Any = SimpleNamespace(panel=load_panel(PANEL), progress=lambda *_: None)
     return sense.feel(session, 4)
 
@@ -52,3 +54,17 @@ def test_a_stop_ends_it_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(Stopped, match="latch"):
         feel(monkeypatch, toucher)
     assert toucher.tried == 1
+
+
+@pytest.mark.parametrize("over_m", [(0.2, -0.1), (-0.2, -0.1), (-0.1, 0.2)])
+def test_places_are_touched_on_a_short_way_from_where_the_fingers_are(
+    monkeypatch: pytest.MonkeyPatch, over_m: tuple[float, float]
+) -> None:
+    way = np.array([over_m, *feel(monkeypatch, Toucher(), over_m).spots])
+    wanted = bare_spots(load_panel(PANEL), 4)
+    assert {tuple(spot) for spot in way[1:]} == {tuple(spot) for spot in wanted}
+    assert length_m(way) < 0.8 * length_m(np.array([over_m, *wanted])), "from corner to opposite corner before"
+
+
+def length_m(way: Any) -> float:
+    return float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())

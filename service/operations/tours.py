@@ -1,0 +1,32 @@
+"""In which order to visit places, so that the way is short: the arm's tip may not be faster than the cell file says."""
+
+from __future__ import annotations
+
+from itertools import pairwise, permutations, starmap
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+MOST_TRIED = 6  # 720 orders; more places are visited nearest first
+
+
+def short_tour(start_m: ArrayLike, places_m: ArrayLike) -> list[int]:
+    """Indices of the places (N, k) in the order of a short way from `start_m` (k,) through them all, m.
+
+    The shortest of all orders for at most `MOST_TRIED` places, each time the nearest for more.
+    """
+    start, places = np.asarray(start_m, float), np.asarray(places_m, float)
+    points = np.vstack([start, places.reshape(-1, len(start))])
+    gaps = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    count = len(places)
+    if count <= MOST_TRIED:
+        best = min(permutations(range(1, count + 1)), key=lambda order: _length(gaps, (0, *order)))
+        return [k - 1 for k in best]
+    order = [0]
+    while len(order) <= count:
+        order.append(min(set(range(1, count + 1)) - set(order), key=lambda k: (gaps[order[-1], k], k)))
+    return [k - 1 for k in order[1:]]
+
+
+def _length(gaps: NDArray[np.float64], order: tuple[int, ...]) -> float:
+    return sum(starmap(gaps.item, pairwise(order)))

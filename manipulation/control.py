@@ -241,6 +241,7 @@ class Controller:
             motion.guards,
             self._safety.force_limit_n,
             look,
+            arm=self._devices.arm.name,
             is_latched=self._is_latched,
             is_cancelled=lambda: self._is_closing or self._cancel.is_set(),
         )

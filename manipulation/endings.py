@@ -17,6 +17,16 @@ Array = NDArray[np.float64]
 TRACKING_LIMIT_M = 0.02
 TRACKING_TICKS = 5
 LOADED_START_RATIO = 1.2  # otherwise a jammed hand could never be taken away
+UNITS = {
+    Quantity.FORCE: "N",
+    Quantity.TORQUE: "N m",
+    Quantity.FORCE_RISE: "N",
+    Quantity.TOUCH: "contacts",
+    Quantity.PROXIMITY: "m",
+    Quantity.TRAVEL: "m",
+    Quantity.ROTATION: "rad",
+    Quantity.TRACKING: "m",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,6 +46,7 @@ class Watch:
         declared: the guards that the motion brings.
         force_limit_n: holds in every motion.
         look: what is measured at its start.
+        arm: name of the device that is at fault when the arm does not follow.
         is_latched, is_cancelled: asked every tick.
     """
 
@@ -45,10 +56,12 @@ class Watch:
         force_limit_n: float,
         look: Look,
         *,
+        arm: str,
         is_latched: Callable[[], bool],
         is_cancelled: Callable[[], bool],
     ) -> None:
         self._guards = GuardSet((*declared, *_standing_guards(force_limit_n, look.wrench)), look.base_from_tool)
+        self._arm = arm
         self._is_latched = is_latched
         self._is_cancelled = is_cancelled
 
@@ -68,12 +81,22 @@ class Watch:
                 proximity_m=sample.proximity_m,
             )
         )
-        if guard is None:
-            return None
+        return None if guard is None else self._ending_of(guard, look)
+
+    def _ending_of(self, guard: Guard, look: Look) -> Ending:
         outcome = MotionOutcome.FAULT if guard.reaction is Reaction.FAULT else MotionOutcome.GUARD
-        side = "at most" if guard.below else "at least"
-        cause = f"guard {guard.name}: {guard.quantity} {side} {guard.limit:g}"
-        return Ending(outcome=outcome, cause=cause, tripped=guard.name)
+        device = None
+        match guard.name:
+            case "force_limit":
+                cause = f"contact force {np.linalg.norm(look.wrench[:3]):.0f} N; at most {guard.limit:.0f} N is allowed"
+            case "tracking":
+                behind_m = np.linalg.norm(look.base_from_tool[:3, 3] - look.commanded_tip_m)
+                cause = f"{self._arm} does not follow: {1e3 * behind_m:.0f} mm from where it was sent"
+                device = self._arm
+            case _:
+                side = "at most" if guard.below else "at least"
+                cause = f"guard {guard.name}: {guard.quantity} {side} {guard.limit:g} {UNITS[guard.quantity]}"
+        return Ending(outcome=outcome, cause=cause, tripped=guard.name, device=device)
 
 
 def _standing_guards(force_limit_n: float, wrench: Array) -> tuple[Guard, ...]:

@@ -63,7 +63,7 @@ class Attempt:
                 raise Stopped(f"{motion.name}: {report.cause}", hint="reset the stop, then command again")
             case MotionOutcome.CANCELLED:
                 raise Cancelled(f"{motion.name}: {report.cause}", hint="send the request again")
-            case MotionOutcome.FAULT if report.tripped is not None:
+            case MotionOutcome.FAULT if report.device is None:
                 raise SkillFailure(Outcome.FORCE_LIMIT, f"{motion.name}: {report.cause}")
             case MotionOutcome.FAULT:
                 raise DeviceFault(

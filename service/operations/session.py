@@ -185,6 +185,9 @@ class Session:
         match report.outcome:
             case MotionOutcome.STOPPED:
                 return Stopped(what, hint="reset the stop (POST /v1/stop/reset), then command again")
+            case MotionOutcome.FAULT if report.device is None:
+                hint = "something is in the way, or the panel is not where it was: see the wrench plot of the report"
+                return MotionError(what, hint=hint, motion=report.name)
             case MotionOutcome.FAULT:
                 hint = "see the named device in GET /v1/devices"
                 return DeviceFault(what, hint=hint, motion=report.name, device=report.device)

@@ -187,6 +187,7 @@ def test_an_arm_that_does_not_follow_is_a_fault(rig: Rig) -> None:
     rig.world.before_step = jam
     report = rig.controller.execute(forwards(0.1))
     assert report.outcome is MotionOutcome.FAULT and report.tripped == "tracking"
+    assert report.device == "arm" and "does not follow" in report.cause
 
 
 def test_compliance_yields_to_the_wall(rig: Rig) -> None:

@@ -129,7 +129,9 @@ SAMPLE = Sample(
 
 
 def watch(*guards: Guard, at_start: Look | None = None, latched: bool = False, cancelled: bool = False) -> Watch:
-    return Watch(guards, 100.0, at_start or look(), is_latched=lambda: latched, is_cancelled=lambda: cancelled)
+    return Watch(
+        guards, 100.0, at_start or look(), arm="left_arm", is_latched=lambda: latched, is_cancelled=lambda: cancelled
+    )
 
 
 def endings(watched: Watch, seen: Look, ticks: int) -> list[MotionOutcome | None]:
@@ -150,15 +152,26 @@ def test_a_guard_that_means_a_fault_ends_in_one_and_says_at_most_or_at_least() -
     low = Guard(name="low", quantity=Quantity.FORCE, limit=1.5, below=True, ticks=1, reaction=Reaction.FAULT)
     end = watch(low).ending(0.0, SAMPLE, look())
     assert end is not None
-    assert (end.outcome, end.tripped, end.cause) == (MotionOutcome.FAULT, "low", "guard low: force at most 1.5")
+    assert (end.outcome, end.tripped, end.cause) == (MotionOutcome.FAULT, "low", "guard low: force at most 1.5 N")
     end = watch(replace(low, below=False)).ending(0.0, SAMPLE, look(2.0))
-    assert end is not None and end.cause == "guard low: force at least 1.5"
+    assert end is not None and end.cause == "guard low: force at least 1.5 N"
 
 
 @pytest.mark.parametrize(("loaded_n", "limit_n"), [(0.0, 100.0), (80.0, 100.0), (90.0, 108.0), (200.0, 240.0)])
 def test_the_force_limit_always_holds_and_a_loaded_start_may_grow_by_a_fifth(loaded_n: float, limit_n: float) -> None:
     for force_n, outcome in ((limit_n - 1e-6, None), (limit_n + 1e-6, MotionOutcome.FAULT)):
         assert endings(watch(at_start=look(loaded_n)), look(force_n), 2) == [None, outcome]
+
+
+def test_what_always_holds_says_how_much_it_was_and_names_an_arm_that_does_not_follow() -> None:
+    pushed = watch()
+    end = [pushed.ending(0.002 * tick, SAMPLE, look(104.2)) for tick in range(2)][-1]
+    assert end is not None and end.device is None
+    assert end.cause == "contact force 104 N; at most 100 N is allowed"
+    behind = watch()
+    end = [behind.ending(0.002 * tick, SAMPLE, look(behind_m=0.0312)) for tick in range(5)][-1]
+    assert end is not None and end.device == "left_arm"
+    assert end.cause == "left_arm does not follow: 31 mm from where it was sent"
 
 
 def test_an_arm_20_mm_behind_for_five_ticks_is_a_fault() -> None:

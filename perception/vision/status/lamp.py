@@ -15,7 +15,8 @@ from perception.vision.view import Array
 CORE, RIM, PLATE = (0.0, 0.15, 0.3), (0.5, 0.6, 0.7), (1.45, 1.6, 1.75)  # of the radius
 RING_PLACES, LEAST_SEEN = 108, 0.3  # places looked at in each; share that must not be hidden
 CLEAR_OF_BEZEL = 1.4  # of the radius
-LIT_RATIO = 0.85  # between an unlit lens (0.3 to 0.6 of a gray plate) and a lit one (above 1)
+LIT_RATIO = 0.95  # between an unlit lens (0.2 to 0.9 of the plate) and a lit one (above 1.1)
+FLAT_RATIO = 1.1  # middle over rim: of unlit lenses .95 have less than 1.1, of lit ones that do not saturate .97 more
 
 
 def read_lamp(patch: Patch, spec: Lamp) -> Status:
@@ -30,9 +31,11 @@ def read_lamp(patch: Patch, spec: Lamp) -> Status:
     if around >= WHITE_LEVEL - 2 and core.mean() >= LIT_RATIO * WHITE_LEVEL:
         return refused("glare covers the lamp: change the angle or the light")  # a darker lens is unlit all the more
     level = max(around, 8.0)
-    brightness = np.log(max(float(core.mean()), 2.0) / level / LIT_RATIO)
-    peaked = np.log((float(core.mean()) + 8.0) / (float(np.median(rim)) + 8.0))
-    evidence = brightness / 0.12 + 1.5 * np.clip(peaked / 0.2, -1.0, 1.0)
+    middle = float(np.median(core))  # an unlit lens may have a shine
+    brightness = np.log(max(middle, 2.0) / level / LIT_RATIO)
+    peaked = np.log((middle + 8.0) / (float(np.median(rim)) + 8.0) / FLAT_RATIO)
+    is_saturated = middle >= WHITE_LEVEL - 2  # and the plate is not: brighter than shows, and its peak is cut off
+    evidence = brightness / 0.12 + (1.5 if is_saturated else 1.5 * np.clip(peaked / 0.1, -1.0, 1.0))
     inside = patch.inside.mean()
     if inside < 0.7:
         return refused("the lamp is outside the image: move the camera")

@@ -38,7 +38,7 @@ from manipulation.endings import Ending, Watch
 from manipulation.kinematics import Kinematics
 from manipulation.recorder import Recorder
 from manipulation.runs import GripperRun, Run, Tick, begin
-from manipulation.sensing import ContactWrench, DeviceFailure, Devices, RangeReader, Sample, ToolView
+from manipulation.sensing import ContactWrench, DeviceFailure, Devices, FrozenWrench, RangeReader, Sample, ToolView
 from manipulation.setpoint import SetPointFilter, check, flange_matrix
 
 Array = NDArray[np.float64]
@@ -94,6 +94,7 @@ class Controller:
             clock=clock,
             max_age_s=safety.max_reading_age_s,
         )
+        self._frozen_wrench = FrozenWrench(force_torque)
         capabilities = arm.capabilities()
         self.kinematics = Kinematics.of(capabilities)
         self._clock = clock
@@ -333,6 +334,7 @@ class Controller:
 
     def _read(self, before: Sample | None = None) -> Sample:
         sample = self._devices.read(before)
+        self._frozen_wrench.check(sample)
         self._faults = ()
         return sample
 

@@ -53,6 +53,7 @@ class World:
     commands: list[np.ndarray] = field(default_factory=list)
     silent: set[str] = field(default_factory=set)
     frozen: set[str] = field(default_factory=set)
+    repeating: set[str] = field(default_factory=set)  # the same reading under new stamps
     defective: set[str] = field(default_factory=set)
     before_step: Callable[[], None] = lambda: None
     ticks: int = 0
@@ -164,8 +165,14 @@ class FakeForceTorque(_Device):
             force_range_n=300, torque_range_nm=30, force_sigma_n=0.3, torque_sigma_nm=0.01, rate_hz=500
         )
 
+    _kept = np.zeros(6)
+
     def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:
-        w = self.world.wrench()
+        if self.name not in self.world.repeating:
+            self._kept = self.world.wrench() + 1e-9 * (
+                self.world.ticks % 2
+            )  # the least that a live sensor's noise does
+        w = self._kept
         return self.stamped(Wrench(force_n=w[:3], torque_nm=w[3:]))
 
 

@@ -178,6 +178,17 @@ def test_too_much_force_is_a_fault_in_any_motion(rig: Rig) -> None:
     assert report.peak_force_n < 130.0
 
 
+def test_a_frozen_force_sensor_ends_a_motion_before_the_wall_is_pressed_hard(rig: Rig) -> None:
+    """Nothing noticed, and the arm went on to 1029 N in a mission."""
+    rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) + 0.01
+    rig.world.repeating.add("wrist_ft")
+    report = rig.controller.execute(forwards(0.1))
+    assert (report.outcome, report.device) == (MotionOutcome.FAULT, "wrist_ft")
+    assert np.linalg.norm(rig.world.contact_force()) < 60.0
+    rig.world.repeating.clear()
+    assert rig.controller.execute(Hold(name="wait", duration_s=0.01)).outcome is MotionOutcome.COMPLETED
+
+
 def test_an_arm_that_does_not_follow_is_a_fault(rig: Rig) -> None:
     stuck = HOME.copy()
 

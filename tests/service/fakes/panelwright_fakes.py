@@ -214,7 +214,7 @@ class FakeForceTorque(FakeDevice):
 
     def capabilities(self) -> ForceTorqueCapabilities:
         return ForceTorqueCapabilities(
-            force_range_n=200.0, torque_range_nm=20.0, force_sigma_n=0.1, torque_sigma_nm=0.01, rate_hz=250.0
+            force_range_n=200.0, torque_range_nm=20.0, force_sigma_n=0.0, torque_sigma_nm=0.0, rate_hz=250.0
         )
 
     def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:

@@ -6,52 +6,78 @@ import numpy as np
 
 from hal.panel import Toggle
 from perception.vision.patch import Patch
-from perception.vision.reading import Status
+from perception.vision.reading import Status, doubted
 from perception.vision.status.bar import bar_contrast
 from perception.vision.status.choice import choose, contrast_noise
+from perception.vision.view import Array
 
+STATES, LEANS = ("on", "off"), (0.0, np.pi)  # clockwise from up
 BAT_FROM, BAT_TO = 0.62, 0.95  # of the length: the nut around the foot looks like a bar too
 BRIGHT_ODDS = 2.0  # bats are metal or white far more often than darker than their base
 BEYOND = (1.5, 3.0)  # of the bat's radius past its tip: clear of its round end
 BEHIND = (0.8, 1.7)  # of it behind the foot: still before the nut
 GOES_ON = 3.0  # how much what goes on counts: it may stand out less there
 PIVOT_M = 0.004  # a bat turns about a point that far above the plate
+FLANK, WIDE_FLANK = (
+    (1.6, 1.9),
+    (2.3, 2.6),
+)  # of 0.8 of the bat's radius: what is compared with it lies that far beside its axis
+AT_FOOT = (0.15, 0.5)  # of the length: there a bat of the plate's gray stands out from the nut about its foot
+AT_FOOT_NOISE = 3.0  # of the noise of a contrast: less tells nothing there
 
 
 def read_toggle(patch: Patch, spec: Toggle) -> Status:
     """State of a toggle switch. `patch` shows the plate (or any plane: heights are followed)."""
     reach = spec.bat_length_m * np.sin(spec.tilt_rad)
-    contrast = np.array([_bat(patch, spec, angle) for angle in (0.0, np.pi)])
     y = np.linspace(-1, 1, 12)[:, None] * reach
     seen = patch.seen(np.array([-1.0, 0.0, 1.0]) * spec.bat_radius_m + 0 * y, y + np.zeros(3))
-    # A bat has one colour: what is dark on one side and bright on the other is the rest of the switch.
-    evidence = max(
-        (np.maximum(contrast, 0.0), BRIGHT_ODDS), (np.maximum(-contrast, 0.0), 1.0), key=lambda e: e[0].max() * e[1]
-    )
-    return choose(["on", "off"], evidence[0], noise=contrast_noise(patch), seen=seen, what="bat")
+    noise = contrast_noise(patch)
+    at_foot = _at_foot(patch, spec, noise)
+    for flank in (FLANK, WIDE_FLANK):
+        contrast = np.array([_bat(patch, spec, angle, flank) for angle in LEANS])
+        status = choose(STATES, _of_one_colour(contrast), noise=noise, seen=seen, what="bat")
+        if status.answered and at_foot.max() > 0.0 and STATES[int(at_foot.argmax())] != status.state:
+            return doubted(status, "something lies across the bat: move it or look past it")
+        if status.answered:
+            return status
+    return choose(STATES, at_foot, noise=noise, seen=seen, what="bat")
 
 
-def _bat(patch: Patch, spec: Toggle, angle_rad: float) -> float:
+def _of_one_colour(contrast: Array) -> Array:
+    """(2,) evidence: what is dark on one side and bright on the other is the rest of the switch."""
+    rivals = (np.maximum(contrast, 0.0), BRIGHT_ODDS), (np.maximum(-contrast, 0.0), 1.0)
+    return np.asarray(max(rivals, key=lambda e: e[0].max() * e[1])[0])
+
+
+def _at_foot(patch: Patch, spec: Toggle, noise: float) -> Array:
+    """(2,) contrast of the bat before its nut, towards `LEANS`; zeros where it does not stand out on one side."""
+    contrast = np.array([_stretch(patch, spec, angle, AT_FOOT, FLANK) for angle in LEANS])
+    size = np.abs(contrast)
+    stands_out = size.max() > AT_FOOT_NOISE * noise and size.min() < 0.5 * size.max()
+    return size if stands_out else np.zeros(2)
+
+
+def _stretch(
+    patch: Patch, spec: Toggle, angle_rad: float, along: tuple[float, float], flank: tuple[float, float]
+) -> float:
+    """Signed contrast of a stretch of a bat that leans towards an angle; `along` and `flank` in shares, see `FLANK`."""
+    reach, height = spec.bat_length_m * np.sin(spec.tilt_rad), spec.bat_length_m * np.cos(spec.tilt_rad)
+    first, last = along
+    contrast = bar_contrast(
+        patch, angle_rad, along_m=(first * reach, last * reach), half_width_m=0.8 * spec.bat_radius_m, quantile=0.5,
+        height_m=(PIVOT_M + first * height, PIVOT_M + last * height), flank=flank,
+    )  # fmt: skip
+    return float(contrast[0])
+
+
+def _bat(patch: Patch, spec: Toggle, angle_rad: float, flank: tuple[float, float]) -> float:
     """Signed contrast of a bat that leans towards an angle, less what goes on beyond its tip or behind its foot.
 
     A bat ends there. A cable does not, nor does the bat in its other position where the view runs along both.
     """
     reach, height = spec.bat_length_m * np.sin(spec.tilt_rad), spec.bat_length_m * np.cos(spec.tilt_rad)
 
-    def stretch(first: float, last: float) -> float:
-        return float(
-            bar_contrast(
-                patch,
-                angle_rad,
-                along_m=(first * reach, last * reach),
-                half_width_m=0.8 * spec.bat_radius_m,
-                quantile=0.5,
-                height_m=(PIVOT_M + first * height, PIVOT_M + last * height),
-                flank=(1.6, 1.9),
-            )[0]
-        )
-
-    bat = stretch(BAT_FROM, BAT_TO)
+    bat = _stretch(patch, spec, angle_rad, (BAT_FROM, BAT_TO), flank)
     foot, tip = (
         np.array(patch.pixel_of(k * reach * np.sin(angle_rad), k * reach * np.cos(angle_rad), PIVOT_M + k * height))
         for k in (0.0, 1.0)
@@ -62,7 +88,8 @@ def _bat(patch: Patch, spec: Toggle, angle_rad: float) -> float:
     if radii > 1.0:
         return bat  # seen from its tip: it has no length
     beyond, behind = (
-        stretch(1.0 + BEYOND[0] * radii, 1.0 + BEYOND[1] * radii), stretch(-BEHIND[1] * radii, -BEHIND[0] * radii),
-    )  # fmt: skip
+        _stretch(patch, spec, angle_rad, along, flank)
+        for along in ((1.0 + BEYOND[0] * radii, 1.0 + BEYOND[1] * radii), (-BEHIND[1] * radii, -BEHIND[0] * radii))
+    )
     goes_on = max(beyond, 0.0) if bat > 0 else max(-beyond, -behind, 0.0)  # behind a bright bat its nut may shine
     return float(np.sign(bat) * max(abs(bat) - GOES_ON * goes_on, 0.0))

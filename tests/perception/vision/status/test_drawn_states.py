@@ -1,0 +1,30 @@
+"""States that drawn panels show plainly: refusing them is no caution."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks.panel_scene import draw_scene
+from benchmarks.vision_held_out import read_scene
+
+FAINT_LENSES = (70066, 70028)  # unlit ones at .75 and .80 of the plate's gray
+BATS_LIKE_THE_PLATE = (70023, 70040)  # that stand out from the nut about their foot alone
+WIDE_BAT = 70001  # what is beside a bat of the usual width is still the bat
+CABLE_OVER_ONE_SIDE = 70072  # a dark bar where the bat would be if it leaned the other way
+
+
+@pytest.mark.parametrize("seed", FAINT_LENSES)
+def test_a_flat_lens_darker_than_the_plate_is_unlit(seed: int) -> None:
+    lamps = [row for row in read_scene(draw_scene(seed, "hard")) if row.kind == "lamp"]
+    assert lamps and all(row.is_right for row in lamps)
+
+
+@pytest.mark.parametrize("seed", [*BATS_LIKE_THE_PLATE, WIDE_BAT])
+def test_a_bat_is_read_by_what_it_stands_out_from(seed: int) -> None:
+    toggles = [row for row in read_scene(draw_scene(seed, "hard")) if row.kind == "toggle"]
+    assert toggles and all(row.is_right for row in toggles)
+
+
+def test_a_cable_where_the_bat_is_not_makes_no_state() -> None:
+    toggles = [row for row in read_scene(draw_scene(CABLE_OVER_ONE_SIDE, "hard")) if row.kind == "toggle"]
+    assert toggles and not any(row.answered and not row.is_right for row in toggles)

@@ -84,7 +84,7 @@ def draw_scene(seed: int, level: str) -> Scene:
     px_from_mm = _placed(random, amount.tilt_rad)
     image, cover, bright = _taken(random, canvas.gray, px_from_mm, amount)
     for thing in objects:
-        thing.update(_seen(thing, px_from_mm, cover, bright))
+        thing.update(seen(thing, px_from_mm, cover, bright))
     truth = {"level": level, "kind": "overview", "panel_mm": list(PANEL_MM), "objects": objects}
     truth["H_mm_to_px"] = px_from_mm.tolist()
     return Scene(image=image, truth=truth, taught=_taught_job(random, truth))
@@ -113,11 +113,22 @@ def _taken(
     scene = np.full(size[::-1], (float(random.uniform(DARK, 65)) / 255) ** GAMMA, np.float32)
     border = cv2.BORDER_TRANSPARENT  # the wall stays
     cv2.warpPerspective((panel / 255) ** GAMMA, grow, size, dst=scene, flags=cv2.INTER_LINEAR, borderMode=border)
-    light = _lit(random, scene.astype(float), amount)
-    cover = _cables(random, size, amount.cables)
+    return pictured(random, scene.astype(float), amount, SIZE_PX)
+
+
+def pictured(
+    random: np.random.Generator, light: Array, amount: Level, size_px: tuple[int, int]
+) -> tuple[Image, Array, NDArray[np.bool_]]:
+    """A picture of linear light under a level's light, cables, lens and noise.
+
+    Returns:
+        The picture, the share of every pixel that cables cover, and where it is saturated.
+    """
+    light = _lit(random, light, amount)
+    cover = _cables(random, (light.shape[1], light.shape[0]), amount.cables)
     light = light * (1 - cover) + float(random.uniform(0.01, 0.1)) * cover
     light = np.maximum(light, 0.0) * random.uniform(*amount.exposure)
-    small, covered = (np.asarray(cv2.resize(x, SIZE_PX, interpolation=cv2.INTER_AREA), float) for x in (light, cover))
+    small, covered = (np.asarray(cv2.resize(x, size_px, interpolation=cv2.INTER_AREA), float) for x in (light, cover))
     blurred = np.asarray(cv2.GaussianBlur(small, (0, 0), random.uniform(*amount.blur_px)), float)
     small = _moved(random, blurred, random.uniform(*amount.motion_px))
     noise = np.sqrt(amount.shot**2 * np.maximum(small, 0) + amount.read**2)
@@ -168,7 +179,7 @@ def _moved(random: np.random.Generator, image: Array, length_px: float) -> Array
     return out
 
 
-def _seen(thing: Truth, px_from_mm: Array, cover: Array, bright: NDArray[np.bool_]) -> Truth:
+def seen(thing: Truth, px_from_mm: Array, cover: Array, bright: NDArray[np.bool_]) -> Truth:
     """Where an object lies in the picture and how much of it can be seen."""
     (x, y), (w, h) = thing["center_mm"], (s / 2 for s in thing["size"])
     quad = _applied(px_from_mm, np.array([[x - w, y - h], [x + w, y - h], [x + w, y + h], [x - w, y + h]]))

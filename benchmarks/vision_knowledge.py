@@ -3,7 +3,10 @@
 `python -m benchmarks.vision_knowledge FOLDER` prints recall, precision and calibration of three folds of the overviews
 beside the repository, then writes one TOML a kind, taught on all of them, into FOLDER. The shipped files were made this
 way: one look an object at its true middle, the looks of places that are no object, and of both only those that the ones
-kept so far do not tell with a margin (`perception.vision.teaching.condense`).
+kept so far do not tell with a margin (`perception.vision.teaching.condense`). Overviews in good light also teach what they
+would look like in bad light: drawn again with slopes of light, glare, shadow, cables, blur and noise (`panel_scene`), they
+give further looks, which count in noisy images only. With `--only-noisy` these alone are taught, beside what is shipped for
+every image: so the shipped ones were made, as those for every image are older than the bridging of cables, and no worse.
 """
 
 from __future__ import annotations
@@ -19,10 +22,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.panel_scene import AMOUNTS, GAMMA, pictured, seen
 from perception.vision.finding.blind import PLATE_M, Candidate, candidate_places, chosen, lay_out
 from perception.vision.finding.features import PLATE_PX_PER_M, Ground, look_at
 from perception.vision.finding.plate import find_plate
-from perception.vision.knowledge import NOTHING, Kind, Knowledge, spread_of, write_kind
+from perception.vision.image import Image
+from perception.vision.knowledge import NOTHING, Kind, Knowledge, shipped_knowledge, spread_of, write_kind
 from perception.vision.teaching.condense import worth_keeping
 from perception.vision.view import Array, PlaneView
 
@@ -34,46 +39,75 @@ STEP = 0.01  # looks are written with two decimals
 NO_SIZE_M = (0.01, 0.01)
 SLIDER_M = (0.05, 0.05)  # flat and upright ones share a kind
 BINS = 8
+BAD_LIGHT = "hard"
+COPIES = 3  # in bad light, of every overview in good light
+COPIES_OF_NOTHING = 2  # that also teach what is no object: the third adds size and no recall
+NOTHING_MARGIN = 0.015  # of their looks; twice as many are of nothing as of objects
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Lesson:
-    """One overview with its truth: the rectified plate, places with their looks, and the objects' looks and kinds."""
+class Examples:
+    """What one picture of an overview teaches: its objects with their middles and looks, and candidate places with theirs."""
 
-    level: str
     truth: list[dict[str, Any]]
-    view: PlaneView
-    ground: Ground
     places: Array
     looks: Array
     middles: Array
     object_looks: Array
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Lesson(Examples):
+    """One overview: its rectified plate too, and `worse`: what it would teach in bad light."""
+
+    level: str
+    view: PlaneView
+    ground: Ground
+    worse: tuple[Examples, ...]
+
+
 def lessons(folder: Path) -> Iterator[Lesson]:
     """The overviews of a folder in which the plate is found."""
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     for name, entry in truth.items():
-        gray = cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE) if entry["kind"] == "overview" else None
-        if gray is None or "lights_on" in entry or name.endswith("_off.png"):
+        read = cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE) if entry["kind"] == "overview" else None
+        if read is None or "lights_on" in entry or name.endswith("_off.png"):
             continue
-        plate = find_plate(np.asarray(gray, np.uint8), *PLATE_M)
+        gray = np.asarray(read, np.uint8)
+        plate = find_plate(gray, *PLATE_M)
         if plate is None:
             continue
-        ground = lay_out(np.asarray(gray, np.uint8), plate.view, PLATE_M)
-        pixels = np.array([[*o["center_px"], 1.0] for o in entry["objects"]])
-        on_plate = pixels @ np.linalg.inv(plate.view.px_from_plate).T
-        xy = on_plate[:, :2] / on_plate[:, 2:]
-        middles = np.column_stack([xy[:, 0] + PLATE_M[0] / 2, PLATE_M[1] / 2 - xy[:, 1]]) * PLATE_PX_PER_M
-        places = candidate_places(ground.edges)
-        yield Lesson(
-            level=entry["level"], truth=entry["objects"], view=plate.view, ground=ground, places=places,
-            looks=look_at(ground, places), middles=middles, object_looks=look_at(ground, middles),
-        )  # fmt: skip
+        worse = (_worse(gray, plate.view, entry, copy) for copy in range(COPIES) if entry["level"] != BAD_LIGHT)
+        ground = lay_out(gray, plate.view, PLATE_M)
+        seen_there = _seen_there(ground, plate.view, entry["objects"])
+        yield Lesson(level=entry["level"], view=plate.view, ground=ground, worse=tuple(worse), **seen_there)
+
+
+def _seen_there(ground: Ground, view: PlaneView, truth: list[dict[str, Any]]) -> dict[str, Any]:
+    """The fields of `Examples`."""
+    pixels = np.array([[*thing["center_px"], 1.0] for thing in truth])
+    on_plate = pixels @ np.linalg.inv(view.px_from_plate).T
+    xy = on_plate[:, :2] / on_plate[:, 2:]
+    middles = np.column_stack([xy[:, 0] + PLATE_M[0] / 2, PLATE_M[1] / 2 - xy[:, 1]]) * PLATE_PX_PER_M
+    places = candidate_places(ground.edges)
+    looks, object_looks = look_at(ground, places), look_at(ground, middles)
+    return {"truth": truth, "places": places, "looks": looks, "middles": middles, "object_looks": object_looks}
+
+
+def _worse(gray: Image, view: PlaneView, entry: dict[str, Any], copy: int) -> Examples:
+    """The overview as it would be in bad light, and what of its objects would be seen then."""
+    random = np.random.default_rng((copy, *gray.tobytes()[:: gray.size // 8]))  # other light for every overview
+    light = (gray.astype(float) / 255) ** GAMMA
+    image, cover, bright = pictured(random, light, AMOUNTS[BAD_LIGHT], (gray.shape[1], gray.shape[0]))
+    px_from_mm = np.array(entry["H_mm_to_px"])
+    truth = [{**thing, **seen(thing, px_from_mm, cover, bright)} for thing in entry["objects"]]
+    for worse, thing in zip(truth, entry["objects"], strict=True):
+        worse["visible"] *= thing["visible"]
+    return Examples(**_seen_there(lay_out(image, view, PLATE_M), view, truth))
 
 
 def knowledge_of(taught: Sequence[Lesson]) -> Knowledge:
-    """Condensed looks of every kind, and of nothing."""
+    """Condensed looks of every kind, and of nothing; then those of bad light that these do not tell."""
     looks, names = _examples(taught)
     kinds = [
         Kind(
@@ -84,10 +118,27 @@ def knowledge_of(taught: Sequence[Lesson]) -> Knowledge:
     kept = worth_keeping(looks, names, spread_of(kinds))
     rounded = np.round(looks[kept] / STEP) * STEP
     short = tuple(replace(kind, looks=rounded[names[kept] == kind.name]) for kind in kinds)
-    return Knowledge(kinds=short, spread=spread_of(short))
+    return with_noisy(Knowledge(kinds=short, spread=spread_of(short)), taught)
 
 
-def _examples(taught: Sequence[Lesson]) -> tuple[Array, NDArray[np.str_]]:
+def with_noisy(known: Knowledge, taught: Sequence[Lesson]) -> Knowledge:
+    """The knowledge with looks in bad light that it does not tell yet."""
+    worse = [
+        each if k < COPIES_OF_NOTHING else replace(each, places=each.places[:0], looks=each.looks[:0])
+        for lesson in taught
+        for k, each in enumerate(lesson.worse)
+    ]
+    looks, names = _examples(worse)
+    kept = worth_keeping(looks, names, known.spread, known=known, nothing_margin=NOTHING_MARGIN)
+    rounded = np.round(looks[kept] / STEP) * STEP
+    for name in sorted(set(names[kept].tolist())):
+        of_kind = rounded[names[kept] == name]
+        noisy = np.ones(len(of_kind), bool)
+        known = known.grown(Kind(name=name, size_m=NO_SIZE_M, looks=of_kind, noisy=noisy))
+    return known
+
+
+def _examples(taught: Sequence[Examples]) -> tuple[Array, NDArray[np.str_]]:
     """(N, LENGTH) looks and (N,) kinds of everything that is at least half visible, and of what is no object."""
     looks, names = [], []
     for lesson in taught:
@@ -147,7 +198,8 @@ def _print_folds(all_lessons: Sequence[Lesson]) -> None:
 
 def main() -> int:
     """Print what held-out overviews say, and write what all of them teach."""
-    if len(sys.argv) != 2 or not DATA.exists():
+    only_noisy = sys.argv[2:] == ["--only-noisy"]
+    if len(sys.argv) != 2 + only_noisy or not DATA.exists():
         print(__doc__ if DATA.exists() else "no labelled overviews beside the repository")
         return 2
     cv2.setNumThreads(1)
@@ -155,7 +207,8 @@ def main() -> int:
     _print_folds(everything)
     folder = Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)
-    for kind in knowledge_of(everything).kinds:
+    shipped = shipped_knowledge().for_image(noisy=False)
+    for kind in (with_noisy(shipped, everything) if only_noisy else knowledge_of(everything)).kinds:
         write_kind(kind, folder)
         print(f"{kind.name}: {len(kind.looks)} looks")
     return 0

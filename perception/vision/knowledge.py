@@ -3,12 +3,16 @@
 A kind has a size and looks. A look is what one taught example looked like (see `features`): four rows of numbers over the
 distance from the middle, in hundredths, and two tables with such a row a direction. The file `nothing.toml` holds looks
 of what is *not* an object: screws, labels, parts of objects. Adding a look to one kind changes no other kind's looks.
+
+Some looks are of noisy images, as a camera takes them in bad light, and only noisy images are compared with these: there a
+blurred, half shaded thing is worth knowing, and in a good image it would be taken for others.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,7 +42,7 @@ class LookRecord(Strict):
     label shows better than its middle.
 
     `gray_around` and `edge_around` have a row a direction, clockwise from straight up; left out, every direction is as
-    `gray` and `edge` are all around.
+    `gray` and `edge` are all around. `noisy`: counts in noisy images only.
     """
 
     gray: Row
@@ -48,6 +52,7 @@ class LookRecord(Strict):
     gray_around: Around | None = None
     edge_around: Around | None = None
     middle_m: tuple[float, float] = (0.0, 0.0)
+    noisy: bool = False
 
     @property
     def look(self) -> Array:
@@ -85,6 +90,7 @@ class Kind:
         size_m: (width, height) of a typical one, m.
         looks: (N, LENGTH), one row an example.
         middles_m: (N, 2) from the place that looks so to the object's middle, x right, y up; None: that is the middle.
+        noisy: (N,) which looks count in noisy images only; None: none of them.
     """
 
     name: str
@@ -92,11 +98,18 @@ class Kind:
     looks: Array
     taught_by: str = ""
     middles_m: Array | None = None
+    noisy: NDArray[np.bool_] | None = None
+
+    @property
+    def lasting(self) -> Kind:
+        """The kind with the looks only that count in every image."""
+        return self if self.noisy is None else replace(self.of(~self.noisy), noisy=None)
 
     def of(self, rows: NDArray[Any]) -> Kind:
         """The kind with some of its looks only."""
         middles_m = None if self.middles_m is None else self.middles_m[rows]
-        return replace(self, looks=self.looks[rows], middles_m=middles_m)
+        noisy = None if self.noisy is None else self.noisy[rows]
+        return replace(self, looks=self.looks[rows], middles_m=middles_m, noisy=noisy)
 
     def joined(self, other: Kind) -> Kind:
         """The kind with another one's looks after its own."""
@@ -105,7 +118,12 @@ class Kind:
             middles_m = np.vstack(
                 [np.zeros((len(k.looks), 2)) if k.middles_m is None else k.middles_m for k in (self, other)]
             )
-        return replace(self, looks=np.vstack([self.looks, other.looks]), middles_m=middles_m)
+        noisy = None
+        if self.noisy is not None or other.noisy is not None:
+            noisy = np.concatenate(
+                [np.zeros(len(k.looks), bool) if k.noisy is None else k.noisy for k in (self, other)]
+            )
+        return replace(self, looks=np.vstack([self.looks, other.looks]), middles_m=middles_m, noisy=noisy)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -114,6 +132,10 @@ class Knowledge:
 
     kinds: tuple[Kind, ...]
     spread: Array
+
+    def for_image(self, *, noisy: bool) -> Knowledge:
+        """What an image is compared with: everything if it is noisy, else only what counts in every image."""
+        return self if noisy else _lasting(self)
 
     def kind(self, name: str) -> Kind | None:
         """The kind of that name, or None."""
@@ -160,9 +182,21 @@ def load_knowledge(folder: Path) -> Knowledge:
     return Knowledge(kinds=kinds, spread=spread_of(kinds))
 
 
+@lru_cache(maxsize=8)
+def _lasting(knowledge: Knowledge) -> Knowledge:
+    """The knowledge without looks that count in noisy images only: the same object every time, as `prepared` wants it."""
+    if all(kind.noisy is None for kind in knowledge.kinds):
+        return knowledge
+    kinds = (kind.lasting for kind in knowledge.kinds)
+    return replace(knowledge, kinds=tuple(kind for kind in kinds if len(kind.looks)))
+
+
 def spread_of(kinds: Iterable[Kind]) -> Array:
-    """(LENGTH,) standard deviation of every number over the kinds' looks, each kind counting the same."""
-    kinds = [kind for kind in kinds if kind.name != NOTHING]
+    """(LENGTH,) standard deviation of every number over the kinds' looks that count in every image, each kind counting
+    the same.
+    """
+    lasting = (kind.lasting for kind in kinds if kind.name != NOTHING)
+    kinds = [kind for kind in lasting if len(kind.looks)]
     means = np.array([kind.looks.mean(axis=0) for kind in kinds])
     within = np.array([kind.looks.var(axis=0) for kind in kinds]).mean(axis=0)
     return np.asarray(np.maximum(np.sqrt(within + means.var(axis=0)), 0.05))
@@ -183,6 +217,8 @@ def write_kind(kind: Kind, folder: Path) -> Path:
         lines.append("\n[[looks]]")
         if kind.middles_m is not None and kind.middles_m[k].any():
             lines.append("middle_m = [{:.4f}, {:.4f}]".format(*kind.middles_m[k]))
+        if kind.noisy is not None and kind.noisy[k]:
+            lines.append("noisy = true")
         rows = look[: len(GROUPS) * len(RADII_M)].reshape(len(GROUPS), -1)
         lines += [f"{name} = {_written(row)}" for name, row in zip(GROUPS, rows, strict=True)]
         tables = look[len(GROUPS) * len(RADII_M) :].reshape(len(AROUND_GROUPS), DIRECTIONS, RINGS)
@@ -197,12 +233,14 @@ def _is_other(path: Path) -> bool:
 
 def _kind(record: KindRecord) -> Kind:
     middles_m = np.array([look.middle_m for look in record.looks])
+    noisy = np.array([look.noisy for look in record.looks])
     return Kind(
         name=record.name,
         size_m=(record.width_m, record.height_m),
         looks=np.array([look.look for look in record.looks]).reshape(-1, LENGTH),
         taught_by=record.taught_by,
         middles_m=middles_m if middles_m.any() else None,
+        noisy=noisy if noisy.any() else None,
     )
 
 

@@ -181,7 +181,7 @@ def _stamps(folder: Path) -> tuple[tuple[str, int, int], ...]:
 
 @lru_cache(maxsize=8)
 def _kinds_in(folder: Path, stamps: tuple[tuple[str, int, int], ...]) -> Knowledge:
-    """The kinds of a folder, read once: they are a third of a megabyte of numbers."""
+    """The kinds of a folder, read once: they are two megabytes of numbers."""
     del stamps
     from perception.vision.knowledge import load_knowledge
 

@@ -25,10 +25,13 @@ from perception.vision.finding.plate import find_plate
 from perception.vision.finding.shapes import Edges, direction_maps, find_edges, find_rectangles, find_slots
 from perception.vision.image import Image, as_gray
 from perception.vision.knowledge import NOTHING, Knowledge
+from perception.vision.noise import noise_sigma
 from perception.vision.reading import ANSWER_AT
 from perception.vision.view import Array, View
 
 PLATE_M = (0.40, 0.30)
+ROWS_APART = 3  # of those that tell the noise: enough, and a millisecond saved
+NOISY = 2.4  # gray levels; overviews drawn at medium have 2.2 at most, hard ones 2.5 at least
 UPSIDE_DOWN = 0.15  # see `uprightness`
 FURTHEST = 0.8  # a place further from every look is unlike anything taught
 SECOND_LOOK = 0.05  # a candidate this much liker to nothing still gets a look from its best middle
@@ -122,6 +125,7 @@ def uprightness(
         return 0.0
     middles = np.array([c.place_m for c in objects]) * [1.0, -1.0] + np.array(plate_m) / 2
     looks = look_at(ground, middles * PLATE_PX_PER_M)
+    knowledge = knowledge.for_image(noisy=ground.noisy)
     known = prepared(knowledge)
     names = [kind.name for kind in knowledge.kinds]
     turned = half_turned(looks)
@@ -142,7 +146,12 @@ def lay_out(gray: Image, view: View, plate_m: tuple[float, float]) -> Ground:
     picture = np.asarray(cv2.warpPerspective(gray, turn, size, flags=cv2.INTER_LINEAR), np.uint8)
     level = plate_gray(picture)
     picture = without_cables(picture, level)
-    return Ground(picture=picture.astype(np.float32), edges=find_edges(picture), plate_gray=level)
+    return Ground(
+        picture=picture.astype(np.float32),
+        edges=find_edges(picture),
+        plate_gray=level,
+        noisy=noise_sigma(gray, rows_apart=ROWS_APART) > NOISY,
+    )
 
 
 def candidate_places(edges: Edges) -> Array:
@@ -179,6 +188,7 @@ def chosen(
     ground: Ground, places: Array, looks: Array, knowledge: Knowledge, view: View, plate_m: tuple[float, float]
 ) -> tuple[Candidate, ...]:
     """The candidates that stand, likest first, then the refused ones; see the module's text."""
+    knowledge = knowledge.for_image(noisy=ground.noisy)
     known = prepared(knowledge)
     distance = nearest(looks, known)
     names = [kind.name for kind in knowledge.kinds]

@@ -45,11 +45,12 @@ DESCRIPTORS = 12
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Ground:
-    """The rectified plate, its edges and the gray that it would have without objects."""
+    """The rectified plate, its edges and the gray that it would have without objects; `noisy`: the image that it is of."""
 
     picture: NDArray[np.float32]
     edges: Edges
     plate_gray: NDArray[np.float32]
+    noisy: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -24,6 +24,7 @@ def worth_keeping(
     *,
     known: Knowledge | None = None,
     weights: Array = WEIGHTS,
+    nothing_margin: float = NOTHING_MARGIN,
 ) -> NDArray[np.int64]:
     """Indices of the looks to keep: those that the others kept, and what is known, do not name with the margin.
 
@@ -32,9 +33,10 @@ def worth_keeping(
         spread: (LENGTH,) the unit of likeness.
         known: what was taught before; None for nothing. Of a kind that it does not have, the first look is kept.
         weights: (LENGTH,) of the numbers of a look.
+        nothing_margin: by which a look of no object must be nearer to such looks than to objects'.
     """
     scaled, share = looks / spread, weights / weights.sum()
-    margin = np.where(names == NOTHING, NOTHING_MARGIN, OBJECT_MARGIN)
+    margin = np.where(names == NOTHING, nothing_margin, OBJECT_MARGIN)
     own, other = _beforehand(looks, names, known)
     kept: list[int] = []
 

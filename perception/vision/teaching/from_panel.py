@@ -197,7 +197,8 @@ def _grown(
     names = np.array([each.thing.kind for each in shown] + [NOTHING] * len(nothing))
     added: dict[str, int] = {}
     grown = knowledge
-    for k in np.sort(worth_keeping(looks, names, knowledge.spread, known=knowledge)):
+    known = knowledge.for_image(noisy=overview.ground.noisy)
+    for k in np.sort(worth_keeping(looks, names, knowledge.spread, known=known)):
         name = str(names[k])
         size_m, middles_m = NOTHING_SIZE_M, None
         if name != NOTHING:

@@ -66,6 +66,7 @@ class Example:
         outline_px: (N, 2) the same in the image; (0, 2) where there is none.
         size_m: width and height of the outline on the plate.
         look: (LENGTH,) see `features`.
+        noisy: whether the image is.
     """
 
     clicks_m: Array
@@ -74,6 +75,7 @@ class Example:
     outline_px: Array
     size_m: tuple[float, float]
     look: Array
+    noisy: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -163,6 +165,7 @@ def example_at(overview: Overview, clicks_px: Sequence[tuple[float, float]], *, 
         outline_px=outline_px,
         size_m=_size_m(clicks_m, outline),
         look=look_at(overview.ground, place[None])[0],
+        noisy=overview.ground.noisy,
     )
 
 
@@ -175,9 +178,11 @@ def teach_example(
         Ambiguous: the look would take examples away from another kind; says which.
     """
     known, look = knowledge.kind(kind), example.look
-    if known is not None and float(distances(look[None], _only(knowledge, known))[0, 0]) < SAME_LOOK:
+    in_use = knowledge.for_image(noisy=example.noisy)
+    alike = in_use.kind(kind)
+    if known is not None and alike is not None and _distance(look, knowledge, alike) < SAME_LOOK:
         return Lesson(knowledge=knowledge, kind=known, example=example, is_new_kind=False, added=False)
-    robbed = robbed_kinds(knowledge, kind, look)
+    robbed = robbed_kinds(in_use, kind, look)
     if robbed:
         raise Ambiguous(
             f"this {kind} looks so much like {', '.join(robbed)} that it would be taken for it",
@@ -224,7 +229,7 @@ def _to_own_kind(knowledge: Knowledge, kind: Kind, index: int) -> float:
     if len(kind.looks) < 2:
         return float("inf")
     rest = Kind(name=kind.name, size_m=kind.size_m, looks=np.delete(kind.looks, index, axis=0))
-    return float(distances(kind.looks[index][None], _only(knowledge, rest))[0, 0])
+    return _distance(kind.looks[index], knowledge, rest)
 
 
 def check(
@@ -273,6 +278,11 @@ def _snapped(place: Array, candidates: Array) -> Array:
     away = np.linalg.norm(candidates - place, axis=1)
     nearest = int(away.argmin())
     return np.asarray(candidates[nearest] if away[nearest] < SNAP_M * PLATE_PX_PER_M else place)
+
+
+def _distance(look: Array, knowledge: Knowledge, kind: Kind) -> float:
+    """Of a (LENGTH,) look to the nearest of a kind's."""
+    return float(distances(look[None], _only(knowledge, kind))[0, 0])
 
 
 def _only(knowledge: Knowledge, kind: Kind) -> Knowledge:

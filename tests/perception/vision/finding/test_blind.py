@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.vision_drawing import Disturbance
 from hal.errors import Ambiguous, InvalidRequest, NotFound
-from perception.vision.finding.blind import chosen, recognise
+from perception.vision.finding.blind import chosen, lay_out, recognise
 from perception.vision.finding.features import (
     AROUND_GROUPS,
     DIRECTIONS,
@@ -37,7 +37,7 @@ from perception.vision.knowledge import (
     spread_of,
     write_kind,
 )
-from perception.vision.teaching.teach import check, plate_points, teach
+from perception.vision.teaching.teach import check, example_at, overview_of, plate_points, teach, teach_example
 from perception.vision.view import CameraView, PlaneView
 from tests.perception.vision.bench_panel import panel, scene
 
@@ -201,6 +201,52 @@ def test_a_look_written_without_directions_is_the_same_all_around(tmp_path: Path
     look = load_knowledge(tmp_path).kinds[0].looks[0]
     around = look[len(GROUPS) * len(RADII_M) :].reshape(len(AROUND_GROUPS), DIRECTIONS, RINGS)
     assert np.allclose(around, (2 * np.arange(RINGS) + 0.5) / 100)
+
+
+def _with_noisy_look(knowledge: Knowledge, name: str, look: np.ndarray) -> Knowledge:
+    return knowledge.grown(Kind(name=name, size_m=(0.05, 0.05), looks=look[None], noisy=np.array([True])))
+
+
+def test_looks_of_noisy_images_survive_their_files_and_say_nothing_of_the_spread(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    kinds = (Kind(name="a", size_m=(0.05, 0.04), looks=np.round(rng.normal(0, 1, (3, LENGTH)), 2)),)
+    knowledge = _with_noisy_look(Knowledge(kinds=kinds, spread=spread_of(kinds)), "a", np.full(LENGTH, 9.0))
+    write_kind(knowledge.kinds[0], tmp_path)
+    loaded = load_knowledge(tmp_path)
+    (good,), (noisy,) = loaded.for_image(noisy=False).kinds, loaded.for_image(noisy=True).kinds
+    assert good.noisy is None and np.allclose(good.looks, kinds[0].looks)
+    assert noisy.noisy is not None and noisy.noisy.tolist() == [False, False, False, True]
+    assert np.allclose(loaded.spread, knowledge.spread)
+    assert loaded.for_image(noisy=False) is loaded.for_image(noisy=False), "prepared once"
+
+
+def test_a_kind_of_noisy_images_only_is_no_kind_elsewhere() -> None:
+    known = Knowledge(kinds=(Kind(name="a", size_m=(0.05, 0.04), looks=np.zeros((1, LENGTH))),), spread=np.ones(LENGTH))
+    grown = _with_noisy_look(known, "ghost", np.ones(LENGTH))
+    assert [kind.name for kind in grown.for_image(noisy=False).kinds] == ["a"]
+    assert [kind.name for kind in grown.for_image(noisy=True).kinds] == ["a", "ghost"]
+
+
+@pytest.mark.parametrize(("sigma", "noisy"), [(0.5, False), (4.0, True)])
+def test_only_a_noisy_image_is_compared_with_looks_of_noisy_images(sigma: float, noisy: bool) -> None:
+    image, view = overview(disturbance=Disturbance(noise_sigma=sigma))
+    ground = lay_out(image, view, PLATE)
+    at = (np.array(panel().object("mode").point_m[:2]) * [1.0, -1.0] + np.array(PLATE) / 2) * PLATE_PX_PER_M
+    look = look_at(ground, at)
+    knowledge = _with_noisy_look(shipped_knowledge(), "ghost", look[0])
+    found = chosen(ground, at[None], look, knowledge, view, PLATE)
+    assert ground.noisy is noisy
+    assert any(candidate.kind == "ghost" for candidate in found) is noisy
+
+
+def test_looks_of_noisy_images_refuse_no_lesson_of_a_good_one() -> None:
+    image, view = overview()
+    example = example_at(overview_of(image, plate_m=PLATE), [pixel_of(view, "emergency")])
+    others = shipped_knowledge()
+    twice = _with_noisy_look(_with_noisy_look(others, "ghost", example.look), "ghost", example.look + 1.0)
+    assert not example.noisy
+    assert teach_example(example, twice, kind="mushroom").added
+    assert teach_example(example, _with_noisy_look(others, "mushroom", example.look), kind="mushroom").added
 
 
 def test_a_disc_looks_the_same_from_all_directions_and_a_bar_does_not() -> None:

@@ -16,6 +16,7 @@ from fusion.distance.rows import values
 from fusion.errors import Contradiction
 from fusion.robust import search
 from fusion.solve.local import LocalSolution, local_solution
+from fusion.solve.placement import place
 from hal.geometry import Array
 
 Flags = NDArray[np.bool_]
@@ -26,9 +27,18 @@ MISS_PROBABILITY = 1e-4  # of never drawing a clean subset that also converges
 CONVERGES = 0.25  # share of clean subsets that reach their pose from a random rotation (measured 0.27)
 SETTLED_PER_ROUND = 8
 LARGEST_ROUND = 512
+SCARCE_DOF = 8  # with no more constraints than this, several poses may fit that no symmetry joins
+EVERYWHERE = 256  # hypotheses to find all of them from
+MOST_POSES = 32  # of those that are settled; two closer than ALIKE_RAD and ALIKE_M (unsettled as they are) are one
+ALIKE_RAD, ALIKE_M = 0.02, 0.002
+AIMED = (2, 3, 5, 6, 8, 9)  # classes whose object feature has a direction
+MOST_MIRRORED = 16  # minima whose mirror images are looked for
 READMITTED = 3  # cheapest candidates whose rejected measurements are tried again
 ALTERNATIVE_COST = 18.0  # a minimum this much worse has odds below 1e-4
 SAME_SIGMAS = 6.0  # minima closer than this are one
+FREE_COSINE = math.cos(
+    0.5
+)  # of the turn; where one of them leaves a motion free, its information speaks of its surroundings only
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -58,24 +68,28 @@ def minima(b: Batch, rng: np.random.Generator) -> tuple[Minimum, list[Minimum]]:
     """The best minimum and the other distinct ones within ALTERNATIVE_COST, best first."""
     n = len(b.cls)
     small = b if n <= MOST_SEARCHED else b.part(np.sort(rng.choice(n, MOST_SEARCHED, replace=False)))
-    poses = _search(small, rng)
     found: list[Minimum] = []
-    f, least = np.empty(n), np.inf
-    for k in range(len(poses.cost)):
-        R, t = poses.R[k], poses.t[k]
-        if k < READMITTED:
-            search.readmit(small, R, t, poses.cost[k])
-        # A pose from part of the measurements is only as exact as those are.
-        if any(_same(R, t, m.local, share=len(small.cls) / n) for m in found):
-            continue
-        if small is not b:
-            search.settle(b, R, t, f, False)
-        minimum = finished(b, R, t)
-        if minimum.cost < least + ALTERNATIVE_COST and not any(
-            _same(minimum.local.rotation, minimum.local.translation_m, m.local) for m in found
-        ):
-            found.append(minimum)
-            least = min(least, minimum.cost)
+    poses = _search(small, rng)
+    for k in range(min(READMITTED, len(poses.cost))):
+        search.readmit(small, poses.R[k], poses.t[k], poses.cost[k])
+    f, least, waiting = np.empty(n), np.inf, [poses]
+    while waiting:
+        poses = waiting.pop(0)
+        for R, t in zip(poses.R, poses.t, strict=True):
+            # A pose from part of the measurements is only as exact as those are.
+            if any(_same(R, t, m.local, share=len(small.cls) / n) for m in found):
+                continue
+            if small is not b:
+                search.settle(b, R, t, f, False)
+            minimum = finished(b, R, t)
+            local = minimum.local
+            if minimum.cost < least + ALTERNATIVE_COST and not any(
+                _same(local.rotation, local.translation_m, m.local) for m in found
+            ):
+                found.append(minimum)
+                least = min(least, minimum.cost)
+                if not local.unobservable and len(found) <= MOST_MIRRORED:
+                    waiting.append(_nearby(_mirrored(small, local.rotation, local.translation_m), least))
     found.sort(key=lambda m: m.cost)
     return found[0], [m for m in found[1:] if m.cost < found[0].cost + ALTERNATIVE_COST]
 
@@ -86,8 +100,7 @@ def _search(b: Batch, rng: np.random.Generator) -> Candidates:
     rounds: list[tuple[Array, Array, Array]] = []
     least, agreeing = np.inf, 0
     while True:
-        draws = rng.random((size, search.DRAWS))
-        draws[:, search.SUBSET_MOST :] = rng.normal(size=(size, search.DRAWS - search.SUBSET_MOST))
+        draws = _draws(rng, size)
         R, t, cost, inside = np.empty((size, 3, 3)), np.empty((size, 3)), np.empty(size), np.empty(size, np.int64)
         kept = search.candidates(b, draws, SETTLED_PER_ROUND, R, t, cost, inside)
         rounds.append((R[:kept], t[:kept], cost[:kept]))
@@ -101,17 +114,17 @@ def _search(b: Batch, rng: np.random.Generator) -> Candidates:
     R, t, cost = (np.concatenate(part) for part in zip(*rounds, strict=True))
     if not len(cost):
         raise Contradiction.among(0, n, [])
-    return _nearby(b, Candidates(R=R, t=t, cost=cost))
+    if 6 <= agreeing <= SCARCE_DOF:
+        more = _everywhere(b, rng)
+        R, t, cost = np.concatenate([R, more.R]), np.concatenate([t, more.t]), np.concatenate([cost, more.cost])
+    return _nearby(Candidates(R=R, t=t, cost=cost), float(cost.min()))
 
 
-def _nearby(b: Batch, found: Candidates) -> Candidates:
-    """Candidates near the least cost, with the mirror images of the best one."""
-    best = int(np.argmin(found.cost))
-    R, t, cost = _mirrored(b, found.R[best], found.t[best])
-    R, t, cost = np.concatenate([found.R, R]), np.concatenate([found.t, t]), np.concatenate([found.cost, cost])
-    order = np.argsort(cost, kind="stable")
-    order = order[cost[order] < cost[order[0]] + ALTERNATIVE_COST + 5.0]
-    return Candidates(R=R[order], t=t[order], cost=cost[order])
+def _nearby(found: Candidates, least: float) -> Candidates:
+    """The candidates that may become minima worth a mention, cheapest first."""
+    order = np.argsort(found.cost, kind="stable")
+    order = order[found.cost[order] < least + ALTERNATIVE_COST + 5.0]
+    return Candidates(R=found.R[order], t=found.t[order], cost=found.cost[order])
 
 
 def _enough(b: Batch, agreeing: int) -> float:
@@ -123,18 +136,52 @@ def _enough(b: Batch, agreeing: int) -> float:
     return math.log(MISS_PROBABILITY) / math.log1p(-CONVERGES * min(clean, 1.0)) if clean > 0 else np.inf
 
 
-def _mirrored(b: Batch, R: Array, t: Array) -> tuple[Array, Array, Array]:
-    """Settled poses from half a turn about each principal axis of the features, through their middle; and their costs."""
-    points = b.m[b.cls > 0]
-    if not len(points):
-        return np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0)
-    middle = points.mean(axis=0)
-    axes = np.linalg.svd(points - middle, full_matrices=True)[2]
-    turns = 2.0 * axes[:, :, None] * axes[:, None, :] - np.eye(3)
-    Rs, ts = R @ turns, t + (middle - turns @ middle) @ R.T
-    f = np.empty(len(b.cls))
-    costs = np.array([search.settle(b, Rs[k], ts[k], f, True) for k in range(3)])
-    return Rs, ts, costs
+def _draws(rng: np.random.Generator, count: int) -> Array:
+    """The random numbers of `count` hypotheses, (count, DRAWS): picks, evenly in 0 to 1, then quaternions, normal."""
+    made = rng.random((count, search.DRAWS))
+    made[:, search.SUBSET_MOST :] = rng.normal(size=(count, search.DRAWS - search.SUBSET_MOST))
+    return made
+
+
+def _everywhere(b: Batch, rng: np.random.Generator) -> Candidates:
+    """Settled poses from many hypotheses, one each of those that are alike: three rays, for one, fit up to four poses.
+
+    `_search` stops once it has a pose that cannot be bettered; where others fit as well, that says nothing of them.
+    """
+    draws = _draws(rng, EVERYWHERE)
+    R, t, cost = np.empty((EVERYWHERE, 3, 3)), np.empty((EVERYWHERE, 3)), np.empty(EVERYWHERE)
+    search.hypotheses(b, draws, R, t, cost)
+    kept: list[int] = []
+    for h in np.argsort(cost)[: int(np.sum(cost < cost.min() + search.OTHER_COST))]:
+        cosines = 0.5 * (np.einsum("kij,ij->k", R[kept], R[h]) - 1.0)
+        alike = (cosines > math.cos(ALIKE_RAD)) & (np.linalg.norm(t[kept] - t[h], axis=1) < ALIKE_M)
+        if not alike.any():
+            kept.append(int(h))
+        if len(kept) == MOST_POSES:
+            break
+    R, t, f = R[kept], t[kept], np.empty(len(b.cls))
+    return Candidates(R=R, t=t, cost=np.array([search.settle(b, R[k], t[k], f, False) for k in range(len(kept))]))
+
+
+def _mirrored(b: Batch, R: Array, t: Array) -> Candidates:
+    """Settled poses from half a turn about each principal axis of the features' places, then of their directions.
+
+    Each stands where its turn fits best those that agree at R, t.
+    """
+    own, aimed = b.cls > 0, np.isin(b.cls, AIMED)
+    if not own.any():
+        return Candidates(R=np.empty((0, 3, 3)), t=np.empty((0, 3)), cost=np.empty(0))
+    axes = np.linalg.svd(b.m[own] - b.m[own].mean(axis=0), full_matrices=True)[2]
+    if aimed.any():
+        axes = np.concatenate([axes, np.linalg.svd(b.w[aimed], full_matrices=True)[2]])
+    Rs = R @ (2.0 * axes[:, :, None] * axes[:, None, :] - np.eye(3))
+    ts, costs, f = np.tile(t, (len(Rs), 1)), np.empty(len(Rs)), np.empty(len(b.cls))
+    values(b, R, t, False, f)
+    use = (f < b.gate).astype(float)
+    for k in range(len(Rs)):
+        place(b, use, Rs[k], ts[k])
+        costs[k] = search.settle(b, Rs[k], ts[k], f, True)
+    return Candidates(R=Rs, t=ts, cost=costs)
 
 
 def finished(b: Batch, R: Array, t: Array) -> Minimum:
@@ -156,7 +203,7 @@ def _same(R: Array, t: Array, local: LocalSolution, *, share: float = 1.0) -> bo
     W = R @ local.rotation.T
     half = 0.5 * np.array([W[2, 1] - W[1, 2], W[0, 2] - W[2, 0], W[1, 0] - W[0, 1]])
     cosine, sine = 0.5 * (np.trace(W) - 1.0), math.sqrt(half @ half)
-    if cosine < 0.0 and not local.unobservable:
+    if cosine < (FREE_COSINE if local.unobservable else 0.0):
         return False
     delta = np.concatenate([t - local.translation_m, half * (math.atan2(sine, cosine) / sine if sine > 1e-12 else 1.0)])
     return bool(share * (delta @ local.information @ delta) < SAME_SIGMAS**2)

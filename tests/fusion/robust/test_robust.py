@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from fusion import fuse
@@ -98,6 +99,22 @@ def test_points_on_a_line_of_symmetry_leave_a_mirror() -> None:
     poses = [answer.pose, *(a.pose for a in answer.alternatives)]
     assert min(np.abs(difference(pose, found)).max() for found in poses) < 0.01
     assert answer.alternatives[0].odds > 0.3
+
+
+@pytest.mark.parametrize("seed", [1, 24, 29, 45])
+def test_three_rays_of_one_camera_fit_up_to_four_poses_and_the_true_one_is_listed(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pose = transform(Rotation.random(rng=rng).as_matrix(), (0.5, 0.1, 0.3))
+    marks = [point((-0.3, -0.2, 0.0)), point((0.3, -0.2, 0.0)), point((0.1, 0.25, 0.0))]
+    eye = pose.apply(rng.normal(0, (0.4, 0.4, 0.1)) + np.array([0.0, 0.0, 1.0]))
+    given = []
+    for mark in marks:
+        ray = pose.apply(mark.point_m) - eye
+        M = 3e6 * (np.eye(3) - np.outer(ray, ray) / (ray @ ray))
+        given.append(measurement(mark, Kind.LINE, mu_m=eye, C_m2=9e-8 * np.eye(3), M=M))
+    answer = fuse(given)
+    found = [answer.pose, *(other.pose for other in answer.alternatives)]
+    assert min(np.abs(difference(pose, one)).max() for one in found) < 1e-3
 
 
 def test_a_prior_sharpens_and_a_wrong_prior_is_outvoted() -> None:

@@ -22,6 +22,7 @@ RIVAL_STEPS = 30  # 15 degrees, beyond a spoke
 RIVAL_SHARE = (
     0.55  # of 330 drawn wheels read right .97 have less; of those read wrong at more than .85 all have more than 0.61
 )
+SPOKE_SHARE = 0.3  # of the clearest spoke; what stands out less is hidden or glared over
 BESIDE = 28  # steps: 14 degrees, beyond a spoke and its mark
 
 
@@ -47,7 +48,7 @@ def read_handwheel(patch: Patch, spec: Handwheel) -> Status:
     folded = np.sort(ink.reshape(n, -1), axis=0)[: max(1, n - 1)].mean(axis=0) if STEPS % n == 0 else _fold(ink, n)
     phase_step = int(folded.argmax())
     contrast = float(folded.max() - np.median(folded))
-    phase = _peak(folded, phase_step) * 2 * np.pi / STEPS
+    phase = _centred(ink, _peak(folded, phase_step), n) * 2 * np.pi / STEPS
     places = phase + 2 * np.pi * np.arange(n) / n
     profile = np.array([_at(mark, p) for p in places])
     drowned = unroll(glare, (0.0, 0.0), np.linspace(0.45, 0.97, 12) * R, angles, None)
@@ -106,6 +107,24 @@ def _peak(folded: Array, top: int) -> float:
     values = folded[(top + offsets) % len(folded)]
     weight = np.maximum(values - (values.max() + values.min()) / 2, 0.0)
     return float(top + (weight * offsets).sum() / max(weight.sum(), 1e-9))
+
+
+def _centred(ink: Array, phase: float, n: int) -> float:
+    """The phase again (steps) as the mean over all spokes, if each shows one.
+
+    A wheel that is seen beside its place turns one spoke one way and others the other way, by zero on average; the fold
+    has only what most of them share. 1 mm is 3 degrees at the spokes' middle.
+    """
+    period = STEPS / n
+    half = round(period / 4)
+    offsets = np.arange(-half, half + 1)
+    places = np.round(phase + period * np.arange(n)).astype(int)
+    windows = ink[(places[:, None] + offsets) % STEPS]
+    heights = windows.max(axis=1) - np.median(ink)
+    if heights.min() < SPOKE_SHARE * heights.max():
+        return phase
+    weights = np.maximum(windows - 0.5 * (windows.max(axis=1) + windows.min(axis=1))[:, None], 0.0)
+    return float(np.mean(places - period * np.arange(n) + (weights * offsets).sum(axis=1) / weights.sum(axis=1)))
 
 
 def _at(mark: NDArray[np.float32], angle: float) -> Array:

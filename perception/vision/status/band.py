@@ -44,6 +44,8 @@ BENDS = (
     4.5,
 )  # of the band's width, sideways
 INK_EDGE_PX = 4.0
+MOST_COVERED = 0.3  # of a face: what was followed over more of it is the face itself, or a glare on it
+WITHIN = np.linspace(-0.9, 0.9, 48)  # of the half width and height
 OWN_ASIDE, OWN_RAD = 0.6, np.deg2rad(12.0)  # of a band's width from the object's middle; from one of its directions
 BENT_AT = (0.5, 0.3, 0.7)  # of its length
 CORE = 0.2  # of the width, to either side of the axis: where a band's gray is looked at
@@ -115,9 +117,19 @@ def lying_across(
         through=through,
     )  # fmt: skip
     found = _drawn(bands, patch.gray.shape)
-    if leaked is not None:
+    if leaked is not None and _share(patch, leaked, half_width_m, half_height_m, is_round=is_round) < MOST_COVERED:
         found |= leaked
     return found if found.any() else None
+
+
+def _share(
+    patch: Patch, mask: NDArray[np.bool_], half_width_m: float, half_height_m: float, *, is_round: bool
+) -> float:
+    """Share of an object's face, its frame left out, that a mask covers."""
+    x, y = np.meshgrid(WITHIN, WITHIN)
+    face = np.hypot(x, y) < WITHIN[-1] + 1e-9 if is_round else np.ones(x.shape, bool)
+    u, v = patch.pixel_of(x[face] * half_width_m, y[face] * half_height_m)
+    return float((sample_at(mask.astype(np.uint8), u, v) > 0.5).mean())
 
 
 def cables_across(patch: Patch, *, radius_m: float, own_rad: Array) -> NDArray[np.bool_] | None:

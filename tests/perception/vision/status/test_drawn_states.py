@@ -13,6 +13,9 @@ WIDE_BAT = 70001  # what is beside a bat of the usual width is still the bat
 CABLE_OVER_ONE_SIDE = 70072  # a dark bar where the bat would be if it leaned the other way
 
 
+CABLES_BESIDE_A_FACE = (70009, 70084)  # whose gray a dark face or a shaded one has
+
+
 @pytest.mark.parametrize("seed", FAINT_LENSES)
 def test_a_flat_lens_darker_than_the_plate_is_unlit(seed: int) -> None:
     lamps = [row for row in read_scene(draw_scene(seed, "hard")) if row.kind == "lamp"]
@@ -28,3 +31,9 @@ def test_a_bat_is_read_by_what_it_stands_out_from(seed: int) -> None:
 def test_a_cable_where_the_bat_is_not_makes_no_state() -> None:
     toggles = [row for row in read_scene(draw_scene(CABLE_OVER_ONE_SIDE, "hard")) if row.kind == "toggle"]
     assert toggles and not any(row.answered and not row.is_right for row in toggles)
+
+
+@pytest.mark.parametrize("seed", CABLES_BESIDE_A_FACE)
+def test_a_face_of_a_cables_gray_is_not_taken_for_what_hides_it(seed: int) -> None:
+    gauges = [row for row in read_scene(draw_scene(seed, "hard")) if row.kind == "gauge"]
+    assert gauges and all(row.is_right for row in gauges)

@@ -94,7 +94,7 @@ def hidden_by_bands(
 
 
 def lying_across(
-    patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool, through: bool = False
+    patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool, through: bool = False, most: float = 1.0
 ) -> NDArray[np.bool_] | None:
     """(H, W) mask of what lies across an object in the patch; None when nothing does.
 
@@ -103,6 +103,7 @@ def lying_across(
 
     Args:
         half_width_m, half_height_m, is_round, through: as `followed_in`.
+        most: share of the object that what is followed covers at most; else it is a part of the object (see `MOST_COVERED`).
     """
     smooth = smoothed(patch)
     ends = border_crossings(
@@ -117,7 +118,7 @@ def lying_across(
         through=through,
     )  # fmt: skip
     found = _drawn(bands, patch.gray.shape)
-    if leaked is not None and _share(patch, leaked, half_width_m, half_height_m, is_round=is_round) < MOST_COVERED:
+    if leaked is not None and _share(patch, leaked, half_width_m, half_height_m, is_round=is_round) <= most:
         found |= leaked
     return found if found.any() else None
 

@@ -7,7 +7,7 @@ import numpy as np
 from hal.panel import Gauge, Scale
 from perception.vision.patch import Patch
 from perception.vision.reading import Status, doubted, gated, probability, refused
-from perception.vision.status.band import lying_across
+from perception.vision.status.band import MOST_COVERED, lying_across
 from perception.vision.status.pointer import PointerFit, find_pointer, wrapped
 
 POINTER_FROM, POINTER_TO = 0.25, 0.60  # share of the radius over which every gauge pointer has ink and no numeral is
@@ -30,7 +30,7 @@ def read_gauge(patch: Patch, spec: Gauge) -> Status:
     seen = _seen(patch, R)
     fit = find_pointer(
         patch,
-        cover=lying_across(patch, half_width_m=R, half_height_m=R, is_round=True),
+        cover=lying_across(patch, half_width_m=R, half_height_m=R, is_round=True, most=MOST_COVERED),
         pivot_m=(0.0, 0.0),
         inner_m=POINTER_FROM * R,
         outer_m=POINTER_TO * R,

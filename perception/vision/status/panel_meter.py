@@ -7,7 +7,7 @@ import numpy as np
 from hal.panel import PanelMeter
 from perception.vision.patch import Patch
 from perception.vision.reading import Status
-from perception.vision.status.band import lying_across
+from perception.vision.status.band import MOST_COVERED, lying_across
 from perception.vision.status.gauge import STOP_RAD, no_pointer, status_of_pointer
 from perception.vision.status.pointer import find_pointer
 
@@ -24,7 +24,9 @@ def read_panel_meter(patch: Patch, spec: PanelMeter) -> Status:
     margin = 1.5 * STOP_RAD
     fit = find_pointer(
         patch,
-        cover=lying_across(patch, half_width_m=spec.width_m / 2, half_height_m=spec.height_m / 2, is_round=False),
+        cover=lying_across(
+            patch, half_width_m=spec.width_m / 2, half_height_m=spec.height_m / 2, is_round=False, most=MOST_COVERED
+        ),
         pivot_m=pivot,
         inner_m=POINTER_FROM * spec.needle_m,
         outer_m=POINTER_TO * spec.needle_m,

@@ -28,7 +28,7 @@ from hal.devices import DeviceKind, LightsCapabilities, TouchCapabilities
 from hal.readings import Stamped
 from hal.registry import Context, takes
 
-OUTPUTS = ("timestamp", "actual_digital_input_bits", "actual_digital_output_bits")
+OUTPUTS = ("actual_digital_input_bits", "actual_digital_output_bits", "timestamp")
 INPUTS = ("standard_digital_output_mask", "standard_digital_output")
 CLOSE_S = 0.08
 Bits = tuple[bool, ...]

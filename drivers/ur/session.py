@@ -10,6 +10,7 @@ from drivers.transport.link import Link, NoAnswer, Refused, now_s
 from drivers.ur import rtde
 
 ANSWER_S = 0.5
+PLAUSIBLE = {"timestamp": (0.0, 1e9), "robot_mode": (-1, 255), "safety_mode": (0, 255), "runtime_state": (0, 255)}
 
 
 class RtdeSession:
@@ -33,7 +34,8 @@ class RtdeSession:
         """Agree on version 2, set up the recipes, start the stream.
 
         Args:
-            outputs: variables of the data packages; `timestamp` is one of them.
+            outputs: variables of the data packages; `timestamp` is one of them. RTDE has no check sum: where bytes are lost, all
+                that follows them in the package is shifted, so one of `PLAUSIBLE` had best be the last.
 
         Raises:
             Refused: another version, or a variable that the controller does not give. NoAnswer, LinkLost.
@@ -49,14 +51,17 @@ class RtdeSession:
         self._parser.data_size = rtde.HEADER.size + 1 + self._outputs.packing.size
 
     def take(self, chunk: bytes) -> list[dict[str, Any]]:
-        """Values by name of each data package that is complete now; one with the time of the last is the same again."""
+        """Values by name of each data package that is complete now and makes sense; one with the time of the last is the
+        same again.
+        """
         found = []
         for kind, payload in self._parser.feed(chunk):
             if kind != "U" or self._outputs is None or payload[0] != self._outputs.id:
                 continue
             values: dict[str, Any] = self._outputs.unpack(payload)
             device_s = float(values["timestamp"])
-            if math.isfinite(device_s) and device_s != self._last_s:
+            is_plausible = all(low <= values.get(name, low) <= high for name, (low, high) in PLAUSIBLE.items())
+            if is_plausible and device_s != self._last_s:
                 self._last_s = device_s
                 found.append(values)
         return found

@@ -14,9 +14,10 @@ from drivers.emulators import ur as emulator
 from drivers.emulators.scripted import ScriptedArm
 from drivers.ur import rtde
 from drivers.ur.arm import OUTPUTS
+from drivers.ur.session import RtdeSession
 from hal.conformance import ArmContract, Rig
 from hal.errors import CellError, DeviceFault, MotionRefused
-from tests.drivers.rigs import count_good, soon, until, wired, wired_rig
+from tests.drivers.rigs import ScriptLink, count_good, soon, until, wired, wired_rig
 
 DRIVER = "ur:rtde"
 NO_LIMITS = {"away_s": 0.05, "delay_s": 0.05, "silent_s": 0.05}
@@ -64,6 +65,29 @@ def test_lost_and_foreign_bytes_cost_the_packages_beside_them_and_no_more() -> N
     found = parser.feed(packages[0] + packages[1][:-2] + packages[2] + b"\x00\x1c" + packages[3] + packages[4])
     # 2 was cut; 3 is followed by bytes that begin nothing, so it cannot be told from a cut one either
     assert [body[0] for _, body in found] == [1, 4, 5]
+
+
+@pytest.mark.parametrize("lost", [slice(20, 21), slice(40, 42), slice(104, 107), slice(-3, -1)])
+def test_a_package_that_lost_bytes_is_no_sample_even_where_nothing_tells_what_follows(lost: slice) -> None:
+    types = ["DOUBLE", "VECTOR6D", "VECTOR6D", "INT32", "INT32", "UINT32"]
+    recipe = rtde.recipe(9, OUTPUTS, types)
+    wires = [recipe.pack([i, *[1e-5 * i] * 6, *[0.0] * 6, 7, 1, 1]) for i in (1, 2, 3)]
+    session = RtdeSession()
+    answers = (
+        rtde.package("V", b"\1"),
+        rtde.package("O", b"\x09" + ",".join(types).encode()),
+        rtde.package("S", b"\1"),
+    )
+    session.begin(ScriptLink(*answers), outputs=OUTPUTS, rate_hz=125.0)
+    cut = bytearray(wires[1])
+    del cut[lost]
+    heard = wires[0] + bytes(cut) + wires[2]
+    gone = len(wires[1]) - len(cut)
+    first = 2 * len(
+        wires[0]
+    )  # as long as a package was promised, with the head of the next in the place of what was lost
+    found = [v["timestamp"] for chunk in (heard[:first], heard[first:]) for v in session.take(chunk)]
+    assert gone and found in ([1.0], [1.0, 3.0])
 
 
 @pytest.mark.parametrize("fault", ["crc", "drop", "dup", "split", "delay", "silent", "garbage", "disconnect"])

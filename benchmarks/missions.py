@@ -60,6 +60,7 @@ class Run:
         pose = ("-", "-") if v["pose_error_m"] is None else _pose(v)
         done = f"{sum(a['confirmed'] for a in r['actions'])}/{len(r['actions'])}"
         note = "" if r["problem"] is None else r["problem"]["detail"][:80]
+        note += "".join(f" {moved['name']} moved unasked" for moved in v["moved_unasked"])
         found = ", ".join(
             f"{k} {'NOT FOUND' if e is None else f'{1e3 * e:.2f}'}" for k, e in self.by_surfaces_m.items()
         )
@@ -120,6 +121,7 @@ def summary(runs: Sequence[Run]) -> int:
     n = len(runs)
     posed = [r.judge for r in runs if r.judge["pose_error_m"] is not None]
     done = sum(bool(r.report["succeeded"]) for r in runs)
+    knocked = sum(bool(r.judge["moved_unasked"]) for r in runs)
     agreed = sum(bool(r.judge["agrees"]) for r in runs)
     inside = sum(bool(v["inside_95"]) for v in posed)
     right, given = (sum(r.judge[key] for r in runs) for key in ("readings_right", "readings_given"))
@@ -131,6 +133,7 @@ def summary(runs: Sequence[Run]) -> int:
     lines = [
         (f"every action confirmed: {done} of {n}", done >= 0.95 * n),
         (f"the judge agrees: {agreed} of {n}", agreed == n),
+        (f"missions that moved what nobody asked for: {knocked} of {n}", knocked == 0),
         (f"fused pose, median error: {error_mm:.2f} mm, {error_deg:.3f} deg", error_mm <= 2.0 and error_deg <= 0.3),
         (f"inside the stated 95 % ellipsoid: {inside} of {n}", inside >= 0.85 * n),
         (f"readings and states right: {right} of {given} ({100 * right / max(given, 1):.1f} %)", right >= 0.95 * given),

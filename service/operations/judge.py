@@ -13,7 +13,7 @@ from scipy.special import chdtri
 from hal.devices import DeviceKind
 from hal.errors import InvalidRequest, Unsupported
 from hal.geometry import difference
-from hal.panel import Panel, PanelObject
+from hal.panel import Button, Panel, PanelObject
 from hal.simulated import ObjectTruth, Truth
 from service.processes.connection import CellConnection
 from service.report.write import render, write_json
@@ -27,12 +27,19 @@ def judge(connection: CellConnection, folder: Path) -> dict[str, Any]:
     """Add `judge` to the report in `folder` and draw it again; returns that part.
 
     Raises:
-        InvalidRequest: there is no such report.
+        InvalidRequest: there is no such report, or another cell's simulator knows the truth of it.
         Unsupported: the cell is not simulated, so nobody knows the truth.
     """
     if not (folder / "report.json").is_file():
         raise InvalidRequest(f"there is no report of a mission {folder.name!r}", hint="GET /v1/missions lists them")
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    here = {"cell": connection.cell.name, "panel": connection.cell.panel.name, "seed": connection.cell.file.cell.seed}
+    for key, value in here.items():
+        if report[key] != value:
+            raise InvalidRequest(
+                f"mission {folder.name!r} was of {key} {report[key]!r}, this service runs {key} {value!r}",
+                hint="judge a mission in the service that ran it: the simulator of another one knows nothing of it",
+            )
     verdict = compare(report, truth_of(connection), connection.cell.panel)
     write_json(folder, {**report, "judge": verdict})
     render(folder)
@@ -69,6 +76,7 @@ def compare(report: dict[str, Any], truth: Truth, panel: Panel) -> dict[str, Any
         "readings_given": len(claims),
         "actions_confirmed": sum(action["confirmed"] for action in report["actions"]),
         "agrees": all(action["right"] for action in actions),
+        "moved_unasked": _moved_unasked(report["actions"], before, after, panel),
         "peak_force_n": truth.peak_force_n,
         "sim_time_s": truth.sim_time_s,
     }
@@ -132,6 +140,20 @@ def _action_claim(
         "right": reached or not action["confirmed"],
         "reached": reached,
     }
+
+
+def _moved_unasked(
+    actions: list[dict[str, Any]], before: dict[str, ObjectTruth], after: dict[str, ObjectTruth], panel: Panel
+) -> list[dict[str, str]]:
+    """What shows something else than before and was not worked, nor is lit by what was."""
+    worked = {action["object"] for action in actions}
+    worked |= {thing.lights_lamp for thing in panel.objects if isinstance(thing, Button) and thing.name in worked}
+    return [
+        {"name": name, "truth": f"{_shown(was)} to {_shown(after[name])}"}
+        for name, was in before.items()
+        if name not in worked
+        and not agrees(panel.object(name), after[name], value=was.value, state=was.state, text=was.text)
+    ]
 
 
 def _reached(spec: PanelObject, action: dict[str, Any], after: dict[str, ObjectTruth]) -> bool:

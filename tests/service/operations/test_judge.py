@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -72,6 +74,16 @@ def test_one_false_done_is_disagreed_with(lie: dict[str, Any]) -> None:
     assert not compare(report(actions=ALL_DONE), truth(**lie), PANEL)["agrees"]
 
 
+def test_what_moved_though_nobody_asked_is_told() -> None:
+    asked = report(actions=[action("main_valve", "open"), action("start", "on")])
+    knocked = compare(asked, truth(slider=60.0), PANEL)
+    assert knocked["moved_unasked"] == [{"name": "setpoint", "truth": "20 to 60"}]
+    assert compare(asked, truth(slider=20.5), PANEL)["moved_unasked"] == [], "within what a reading may be off"
+    assert compare(report(actions=ALL_DONE), truth(), PANEL)["moved_unasked"] == [], "the lamp is the button's"
+    lit = compare(report(actions=[action("main_valve", "open")]), truth(slider=20.0), PANEL)
+    assert [moved["name"] for moved in lit["moved_unasked"]] == ["run_lamp"]
+
+
 def test_a_failure_that_is_told_is_no_lie() -> None:
     verdict = compare(report(actions=[action("main_valve", "open", confirmed=False)]), truth(valve="closed"), PANEL)
     assert verdict["agrees"]
@@ -117,3 +129,13 @@ def test_right_means_two_per_cent_of_the_scale_or_the_very_state(
 def test_a_mission_without_a_report_is_refused_before_anything_is_asked(tmp_path: Path) -> None:
     with pytest.raises(InvalidRequest, match="no report of a mission '20261120T231502'"):
         judge(cast(CellConnection, None), tmp_path / "20261120T231502")
+
+
+@pytest.mark.parametrize(("key", "other"), [("cell", "press"), ("panel", "press"), ("seed", 8)])
+def test_a_mission_of_another_cell_is_not_judged_by_this_simulator(tmp_path: Path, key: str, other: str | int) -> None:
+    """Of another panel it was a KeyError, of another seed a verdict about the wrong world."""
+    ran = {"cell": "bench", "panel": "bench", "seed": 7, key: other}
+    (tmp_path / "report.json").write_text(json.dumps(report(**ran)))
+    cell = SimpleNamespace(name="bench", panel=PANEL, file=SimpleNamespace(cell=SimpleNamespace(seed=7)))
+    with pytest.raises(InvalidRequest, match=f"was of {key} {other!r}, this service runs {key}"):
+        judge(cast(CellConnection, SimpleNamespace(cell=cell)), tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -11,7 +12,7 @@ from hal.panel import Button, Mushroom
 from manipulation.skills.contact import SOFT_PUSH
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.probe import TURNS_RAD
-from manipulation.skills.steps import STANDOFF_M, Attempt, perform
+from manipulation.skills.steps import MAX_ATTEMPTS, STANDOFF_M, Attempt, perform
 from manipulation.stroke import shifted
 from manipulation.workcell import Workcell, panel_from_grip
 
@@ -33,13 +34,21 @@ def press(
     target: str,
     is_reached: Callable[[ObjectState], bool],
     verify: Verify | None,
+    is_there: bool = False,
 ) -> SkillReport:
     """Press a cap down to its stop and let go.
+
+    Args:
+        is_there: the target was shown before: it is only pressed if the look does not show it any more.
 
     The mechanical estimate is the travel of the cap in metres.
     """
 
+    tries = itertools.count()
+
     def stroke(attempt: Attempt) -> float:
+        if is_there and next(tries) == 0:
+            return 0.0
         x, y = cap.position_m
         top = cap.height_m
         heights = (top + STANDOFF_M, top + SEEK_ABOVE_M, top - cap.travel_m)
@@ -63,7 +72,8 @@ def press(
         target=target,
         is_reached=is_reached,
         verify=verify,
-        repeats=False,
+        attempts=2 if is_there else MAX_ATTEMPTS,
+        repeats=is_there,
     )
 
 

@@ -203,6 +203,7 @@ def perform(
             outcome, cause = Outcome.DONE, "the read-back confirms it"
             break
         if outcome is Outcome.UNVERIFIED and seen is None:
+            cause += "; nobody looked" if verify is None else "; the look afterwards could not tell"
             break
         if outcome is Outcome.UNVERIFIED:
             outcome, cause = Outcome.SLIPPED, "the hand went all the way; the read-back does not show the target"
@@ -228,7 +229,7 @@ def perform(
 
 def _try(attempt: Attempt, stroke: Stroke) -> tuple[Outcome, str, float | None]:
     try:
-        return Outcome.UNVERIFIED, "the stroke ended as declared; nobody looked", stroke(attempt)
+        return Outcome.UNVERIFIED, "the stroke ended as declared", stroke(attempt)
     except SkillFailure as failure:
         retreat(attempt.cell, attempt)
         return failure.outcome, failure.cause, failure.reached

@@ -90,13 +90,13 @@ class _Eye:
         self._session = session
         self._thing = thing
         self._is_open = is_open
-        self._witness = _witness(session, thing)
+        self.witness = _witness(session, thing)
         self.last: ObjectReading | None = None
         self.picture: Picture | None = None
 
     def before(self) -> ObjectReading | None:
         """What the witness showed before: the newest reading, or a look."""
-        known = known_readings(self._session).get(self._witness.name)
+        known = known_readings(self._session).get(self.witness.name)
         if known is not None or not self._is_open:
             return known
         return self._look()
@@ -106,23 +106,23 @@ class _Eye:
         return self._verify if self._is_open else None
 
     def _verify(self) -> ObjectState | None:
-        forget_reading(self._session, self._witness.name)
+        forget_reading(self._session, self.witness.name)
         forget_reading(self._session, self._thing.name)
         self.last = self._look()
-        return None if self.last is None else state_of(self.last, self._witness)
+        return None if self.last is None else state_of(self.last, self.witness)
 
     def _look(self) -> ObjectReading | None:
         try:
-            straight = look_close(self._session, self._witness.point_m, (self._witness.name,))
+            straight = look_close(self._session, self.witness.point_m, (self.witness.name,))
             found = look_past(self._session, straight)
         except (PerceptionError, Unreachable):
             return None  # "cannot tell" is an answer; the outcome will be `unverified`
         self.picture = Picture(
             name=f"after-{self._thing.name}",
-            title=f"second look at {self._witness.name}",
+            title=f"second look at {self.witness.name}",
             png=png_of(found.pictures[-1].pixels),
         )
-        reading = found.readings[self._witness.name]
+        reading = found.readings[self.witness.name]
         return reading if reading.present and reading.answered else None
 
 
@@ -137,7 +137,7 @@ def state_of(reading: ObjectReading, thing: PanelObject) -> ObjectState:
 
 def _perform(session: Session, thing: PanelObject, target: str, eye: _Eye, before: ObjectReading | None) -> SkillReport:
     cell, verify = workcell(session), eye.verify()
-    current = None if before is None else state_of(before, thing)
+    current = None if before is None else state_of(before, eye.witness)
     match thing:
         case Lever():
             return lever(cell, thing.name, target, current=current, verify=verify)
@@ -152,7 +152,7 @@ def _perform(session: Session, thing: PanelObject, target: str, eye: _Eye, befor
         case Mushroom():
             return mushroom(cell, thing.name, verify=verify)
         case Button():
-            return button(cell, thing.name, expected=target, verify=verify)
+            return button(cell, thing.name, expected=target, current=current, verify=verify)
     raise unworkable(thing)
 
 

@@ -160,13 +160,15 @@ def _work_all(session: Session, record: MissionRecord, request: MissionRequest, 
 
 
 def usual_actions(session: Session) -> tuple[ActionBody, ...]:
-    """The first lever by 90 degrees, the first slider to another value, a button with a lamp, the first toggle."""
+    """The first lever by 90 degrees, the first slider to another value, a button that shows it, the first toggle."""
     readings = known_readings(session)
     actions: list[ActionBody] = []
     for kind in (Lever, Slider, Button, Toggle):
         things = [thing for thing in session.panel.objects if isinstance(thing, kind)]
-        if kind is Button:
-            things = [t for t in things if isinstance(t, Button) and t.lights_lamp is not None] or things
+        if kind is Button:  # one that springs back and works no lamp shows nothing that could be confirmed
+            buttons = [thing for thing in things if isinstance(thing, Button)]
+            lit = [button for button in buttons if button.lights_lamp is not None]
+            things = [*lit, *(button for button in buttons if button.latching)]
         if things:
             actions.append(_other(things[0], readings))
     return tuple(actions)
@@ -187,6 +189,8 @@ def _other(thing: PanelObject, readings: dict[str, ObjectReading]) -> ActionBody
         case Button(lights_lamp=str(lamp)):
             lit = lamp in readings and readings[lamp].state == "on"
             return ActionBody(object=thing.name, state="off" if lit else "on")
+        case Button():
+            return ActionBody(object=thing.name, state="released" if state == "pressed" else "pressed")
     return ActionBody(object=thing.name, state="off" if state == "on" else "on")
 
 

@@ -32,7 +32,8 @@ def target_of(thing: PanelObject, body: ActionBody) -> str:
             return _one_of(thing, body.state or "pressed", ("pressed",))
         case Button():
             _only(thing, body, "state")
-            return _one_of(thing, body.state or "on", ("on", "off", "pressed", "released"))
+            states = button_states(thing)
+            return _one_of(thing, body.state or states[0], states)
     raise unworkable(thing)
 
 
@@ -52,6 +53,13 @@ def check_inspect(cell: Cell, request: InspectRequest) -> None:
     if request.image is None:
         for name in request.objects or ():
             cell.panel.object(name)
+
+
+def button_states(thing: Button) -> tuple[str, ...]:
+    """What a press can bring about: states of its lamp, or of the cap itself, which only stays in when it latches."""
+    if thing.lights_lamp is not None:
+        return ("on", "off")
+    return ("pressed", "released") if thing.latching else ("pressed",)
 
 
 def _only(thing: PanelObject, body: ActionBody, key: str) -> None:

@@ -108,6 +108,41 @@ def test_a_button_whose_lamp_stays_dark_is_not_pressed_again() -> None:
     assert (told.outcome, mover.asked.count("press")) == (Outcome.SLIPPED, 1)
 
 
+@pytest.mark.parametrize(
+    ("looks", "presses", "tries"), [(("on",), 0, 1), (("off", "on"), 1, 2), (("off", "off"), 1, 2)]
+)
+def test_a_button_whose_lamp_is_as_wanted_is_left_alone_unless_the_look_says_otherwise(
+    looks: tuple[str, ...], presses: int, tries: int
+) -> None:
+    """A press would undo it: asked for `on`, a lamp that was lit went out."""
+    cell, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
+    shown = iter(looks)
+    lit = ObjectState(name="run_lamp", state="on")
+    told = button(
+        cell, "start", expected="on", current=lit, verify=lambda: ObjectState(name="run_lamp", state=next(shown))
+    )
+    assert (told.is_done, mover.asked.count("press"), told.attempts) == (looks[-1] == "on", presses, tries)
+
+
+def test_a_button_that_nothing_shows_is_pressed_and_not_confirmed() -> None:
+    thing = PANEL.object("start").model_copy(update={"lights_lamp": None})
+    cell, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
+    cell = replace(cell, panel=PANEL.model_copy(update={"objects": (thing,)}))
+    told = button(cell, "start", expected="pressed", verify=lambda: ObjectState(name="start", state="released"))
+    assert (told.outcome, mover.asked.count("press")) == (Outcome.UNVERIFIED, 1)
+    assert "springs back" in told.cause
+
+
+def test_a_look_that_cannot_tell_is_not_called_no_look() -> None:
+    cell, _ = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
+    told = button(cell, "start", expected="on", verify=lambda: None)
+    assert (told.outcome, told.cause) == (
+        Outcome.UNVERIFIED,
+        "the stroke ended as declared; the look afterwards could not tell",
+    )
+    assert button(cell, "start", expected="on").cause.endswith("nobody looked")
+
+
 def test_a_press_is_guarded_by_more_than_the_springs_of_the_cap() -> None:
     cell, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
     button(cell, "start")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from hal.config import load_cell
 from hal.errors import InvalidRequest
 from service.operations import OPERATIONS
+from service.operations.mission import usual_actions
 from service.operations.requests import ActionBody
 from service.operations.targets import target_of
 
@@ -25,6 +27,8 @@ CELL = load_cell(Path(__file__).parents[3] / "cells/bench.toml")
         ({"object": "pump", "state": "on"}, "on"),
         ({"object": "emergency"}, "pressed"),
         ({"object": "start"}, "on"),
+        ({"object": "hold"}, "pressed"),
+        ({"object": "hold", "state": "released"}, "released"),
     ],
 )
 def test_a_deed_says_what_it_shall_reach(body: dict[str, Any], target: str) -> None:
@@ -39,6 +43,8 @@ NONSENSE = [
     ({"object": "main_valve", "state": "ajar"}, "no state 'ajar'", "open"),
     ({"object": "main_valve"}, "needs a state", "open"),
     ({"object": "emergency", "value": 3.0}, "takes state, not value", "'state'"),
+    ({"object": "start", "state": "pressed"}, "no state 'pressed'", "on, off"),
+    ({"object": "hold", "state": "on"}, "no state 'on'", "pressed, released"),
     ({"object": "pressure", "value": 3.0}, "cannot be worked", "levers"),
 ]
 
@@ -50,6 +56,27 @@ def test_nonsense_is_refused_by_both_verbs_that_work_controls(body: dict[str, An
         with pytest.raises(InvalidRequest, match=why) as refused:
             operation.check(CELL, operation.request_model(**request))
         assert hint in refused.value.hint
+
+
+def test_a_button_that_nothing_shows_can_be_asked_for_a_press_only() -> None:
+    bell = CELL.panel.object("hold").model_copy(update={"latching": False})
+    assert target_of(bell, ActionBody(object="hold")) == "pressed"
+    with pytest.raises(InvalidRequest, match="no state 'released'"):
+        target_of(bell, ActionBody(object="hold", state="released"))
+
+
+def test_a_mission_presses_by_itself_only_what_shows_that_it_was_pressed() -> None:
+    lit, latching = CELL.panel.object("start"), CELL.panel.object("hold")
+    bell = latching.model_copy(update={"latching": False, "name": "bell"})
+    for things, wanted in (
+        ((latching, lit), [("start", "on")]),
+        ((bell, latching), [("hold", "pressed")]),
+        ((bell,), []),
+    ):
+        session: Any = SimpleNamespace(
+            panel=CELL.panel.model_copy(update={"objects": things}), memory=SimpleNamespace(recall=lambda _: None)
+        )
+        assert [(body.object, body.state) for body in usual_actions(session)] == wanted
 
 
 def test_an_object_to_read_must_be_on_the_panel_unless_an_image_of_another_one_is_sent() -> None:

@@ -2,11 +2,14 @@
 import { ProblemError, ask, get, upload } from "./api.js";
 
 const MOST_CLICKS = 3;
+const WAYS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+const STEPS = 80; // of the keyboard's cross from side to side
 const SVG = "http://www.w3.org/2000/svg";
 const $ = (selector) => document.querySelector(selector);
 const picture = $("#picture");
 let image = null; // the stored image that is shown
 let points = [];
+let cross = null; // where the keyboard would click, px
 let pointed = null; // takes the next click instead of the outline
 let isElsewhere = false; // a picture is shown that is not of this image: a click on it has no meaning
 let listeners = [];
@@ -35,6 +38,7 @@ export async function startImage({ attempt, changed }) {
     changed();
   }));
   $("#canvas").addEventListener("click", click);
+  $("#canvas").addEventListener("keydown", steer);
   $("#clear").addEventListener("click", clear);
   await attempt(async () => {
     await list();
@@ -66,6 +70,8 @@ async function list() {
 
 function show(stored) {
   image = stored;
+  cross = null;
+  $("#cross").hidden = true;
   $("#canvas").dataset.empty = "no";
   $("#image-line").textContent = `${stored.width_px} × ${stored.height_px} px`;
   clear();
@@ -81,10 +87,28 @@ function clear() {
 
 function click(event) {
   if (!image) return;
-  if (isElsewhere) return showPicture(null);
   const box = picture.getBoundingClientRect();
   const x = ((event.clientX - box.left) / box.width) * image.width_px - 0.5;
   const y = ((event.clientY - box.top) / box.height) * image.height_px - 0.5;
+  pick(x, y);
+}
+
+// Without a mouse: arrow keys move a cross, with Shift by a pixel; Enter clicks where it stands.
+function steer(event) {
+  const way = WAYS[event.key];
+  if (!image || (!way && event.key !== "Enter")) return;
+  event.preventDefault(); // arrows would scroll
+  const size = [image.width_px, image.height_px];
+  cross ??= size.map((length) => Math.round(length / 2));
+  const step = event.shiftKey ? 1 : Math.round(image.width_px / STEPS);
+  if (way) cross = cross.map((at, axis) => Math.min(Math.max(at + step * way[axis], 0), size[axis] - 1));
+  else pick(...cross);
+  $("#cross").hidden = false;
+  [$("#cross").style.left, $("#cross").style.top] = cross.map((at, axis) => `${(100 * (at + 0.5)) / size[axis]}%`);
+}
+
+function pick(x, y) {
+  if (isElsewhere) return showPicture(null);
   if (pointed) {
     pointed(x, y);
     return pointAt(null);

@@ -66,6 +66,25 @@ def test_a_click_shows_the_outline_that_was_found(page: Any, shown: Shown) -> No
     assert page.is_disabled("#teach-kind")
 
 
+def test_the_keyboard_alone_uploads_and_clicks(page: Any, shown: Shown) -> None:
+    page.focus("#file")
+    assert page.evaluate("document.activeElement.id") == "file", "what is hidden takes no focus"
+    height, width = shown[0].shape[:2]
+    u, v = np.rint(shown[1].project([panel().object("mode").point_m])[0]).astype(int)
+    page.focus("#canvas")
+    for way, keys in (
+        (int(u) - width // 2, ("ArrowLeft", "ArrowRight")),
+        (int(v) - height // 2, ("ArrowUp", "ArrowDown")),
+    ):
+        wide, narrow = divmod(abs(way), width // 80)
+        for _ in range(wide):
+            page.keyboard.press(keys[way > 0])
+        for _ in range(narrow):
+            page.keyboard.press(f"Shift+{keys[way > 0]}")
+    page.keyboard.press("Enter")
+    until(page, "document.querySelector('#found').textContent.includes('rotary')")
+
+
 def test_a_new_kind_is_named_saved_and_found(page: Any, shown: Shown) -> None:
     _click(page, shown, *_corners("emergency", 0.02))
     _outlined(page, "#teach-kind")

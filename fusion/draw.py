@@ -19,8 +19,6 @@ from hal.geometry import Array, transform
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from hal.panel import Panel
-
 NEAREST_M = 0.02  # what comes closer to the lens is cut off
 CIRCLE_POINTS = 24
 
@@ -92,24 +90,6 @@ def circle_outline(centre_m: ArrayLike, radius_m: float) -> Array:
     angle = np.linspace(0.0, 2.0 * math.pi, CIRCLE_POINTS + 1)
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
     return np.asarray(np.asarray(centre_m, float) + radius_m * ring)
-
-
-def panel_outlines(panel: Panel) -> list[Array]:
-    """A panel file's plate, lights and objects: rectangles where it gives width and height, circles where a radius."""
-    half = np.array([panel.width_m, panel.height_m]) / 2
-    found = box_outlines([*-half, -panel.thickness_m], [*half, 0.0])
-    found += [circle_outline(light.position_m, light.radius_m) for light in panel.lights]
-    for thing in panel.objects:
-        x, y = thing.position_m
-        flat = hasattr(thing, "width_m") and hasattr(thing, "height_m")
-        if flat and not hasattr(thing, "radius_m") and not hasattr(thing, "length_m"):
-            w, h = getattr(thing, "width_m", 0.0) / 2, getattr(thing, "height_m", 0.0) / 2
-            corners = [[x - w, y - h], [x + w, y - h], [x + w, y + h], [x - w, y + h], [x - w, y - h]]
-            found.append(np.column_stack([corners, np.zeros(5)]))
-            continue
-        length = getattr(thing, "length_m", getattr(thing, "travel_m", 0.02))
-        found.append(circle_outline((x, y, 0.0), getattr(thing, "radius_m", length / 2)))
-    return found
 
 
 def seen(drawing: Drawing, sight: Sight) -> list[Array]:

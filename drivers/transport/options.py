@@ -20,7 +20,6 @@ from hal.wires import Claim, WireOptions
 M = TypeVar("M", bound=Strict)
 SerialPath = Annotated[str, Field(min_length=1)]
 PortNumber = Annotated[int, Field(ge=1, le=65535)]
-Rate = Annotated[float, Field(gt=0, le=1000)]
 Seconds = Annotated[float, Field(gt=0, le=60)]
 CONNECT_TIMEOUT_S = 0.5
 LOOPBACK = "127.0.0.1"

@@ -45,7 +45,6 @@ class Row:
     name: str
     driver: str
     health: str
-    is_connected: bool
     value: str
     rate_hz: float | None
     age_s: float | None
@@ -91,7 +90,6 @@ class Watch:
             name=name,
             driver=view["driver"],
             health=_health_word(health),
-            is_connected=health["connected"],
             value=value,
             rate_hz=(samples - samples_before) / (now - before_s) if is_later else None,
             age_s=age_s,

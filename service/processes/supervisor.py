@@ -256,16 +256,7 @@ class Supervisor:
                 errors.append(DeviceUnavailable(text, hint="its last words are in the log above", device="cell"))
             answered.set()
 
-        order = CellOrder(
-            cell_path=str(self.cell.path),
-            seed=self.cell.file.cell.seed,
-            latch_path=str(self._folder / "latch"),
-            beat_path=str(self._folder / "beat"),
-            address=str(self._folder / f"cell-{secrets.token_hex(4)}.sock"),
-            authkey=secrets.token_hex(32),
-            runs_dir=None if self._runs_dir is None else str(self._runs_dir.absolute()),
-            swapped={name: section.model_dump(mode="json") for name, section in self._swapped.items()},
-        )
+        order = self._order()
         child = self._begin_child(on_line, on_exit)
         child.write_line(order.to_line())
         if not answered.wait(START_TIMEOUT_S):
@@ -284,6 +275,19 @@ class Supervisor:
         self._problem = None
         self._is_ready.set()
         self._report("cell-ready", {"pid": child.pid, "seconds": round(time.monotonic() - child.started_s, 3)})
+
+    def _order(self) -> CellOrder:
+        """What the next cell process has to do; address and key are its own, so that nobody talks to one that died."""
+        return CellOrder(
+            cell_path=str(self.cell.path),
+            seed=self.cell.file.cell.seed,
+            latch_path=str(self._folder / "latch"),
+            beat_path=str(self._folder / "beat"),
+            address=str(self._folder / f"cell-{secrets.token_hex(4)}.sock"),
+            authkey=secrets.token_hex(32),
+            runs_dir=None if self._runs_dir is None else str(self._runs_dir.absolute()),
+            swapped={name: section.model_dump(mode="json") for name, section in self._swapped.items()},
+        )
 
     def _begin_child(self, on_line: Callable[[str], None], on_exit: Callable[[int], None]) -> Child:
         with self._lock:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform
 
-from fusion.plan import Candidate, Tolerance, next_best, plan
+from fusion import features, sensing
+from fusion.features import Kind
+from fusion.plan import Candidate, Tolerance, expected_measurement, next_best, plan
 from fusion.solve import solve
 from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose, point_covariance
@@ -19,6 +22,20 @@ def test_the_predicted_covariance_is_the_one_that_comes() -> None:
     after = solve(p.measurements, p.base_from_object)
     assert np.diag(choice.covariance) == pytest.approx(np.diag(after.covariance), rel=0.05)
     assert choice.gain_per_s == pytest.approx(np.log(choice.error_before / choice.error_after) / 2.0)
+
+
+def test_what_is_expected_of_a_touch_tells_as_much_as_the_touch() -> None:
+    p, sigma_m = mixture(10, 15), 2e-4
+    face = features.plane((0.4, 0.25, 0.0), (0.0, 0.0, 1.0))
+    finger = RigidTransform.from_translation(p.base_from_object.apply(face.point_m))
+    touched = sensing.touch(face, UncertainPose(parent_from_child=finger, covariance=np.zeros((6, 6))), sigma_m=sigma_m)
+    expected = expected_measurement(face, Kind.POINT, p.base_from_object, C_m2=sigma_m**2 * np.eye(3))
+    now = solve(p.measurements[:9], p.base_from_object).covariance
+    first, second = (
+        next_best(now, p.base_from_object, [Candidate(expected=m, cost_s=1.0)]) for m in (touched, expected)
+    )
+    assert np.diag(second.covariance) == pytest.approx(np.diag(first.covariance), rel=1e-4)
+    assert first.error_after < 0.95 * first.error_before
 
 
 def test_cheap_beats_dear_when_both_tell_the_same() -> None:

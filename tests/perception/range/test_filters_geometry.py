@@ -113,6 +113,13 @@ def test_single_precision_tells_the_same_and_holes_spread_by_a_pixel(sensor):
         assert np.nanmax(np.abs(mine - getattr(exact, name))) < tolerance
 
 
+def test_the_orientation_is_the_papers_angle_of_the_two_slopes():
+    v, u = np.mgrid[:20, :30]
+    for slope_u, slope_v in ((0.3, 0.4), (-0.3, 0.4), (0.3, -0.4)):
+        found = geometry_of(3.0 + slope_u * u + slope_v * v, PARALLEL, scale_px=0.0)
+        np.testing.assert_allclose(found.orientation_rad[1:-1, 1:-1], np.arctan2(slope_u, slope_v), atol=1e-12)
+
+
 def test_curvature_classes_tell_plane_from_ball():
     depth = np.minimum(sphere_depth(PARALLEL, np.array([0.0, 0.0, 0.55]), 0.07), 0.6)
     found = local_geometry(noisy(depth, 0.0002, seed=0), PARALLEL)

@@ -179,7 +179,7 @@ def test_a_running_service_is_watched(served: Panelwright) -> None:
     assert done.exit_code == 0, done.output
     rows = {row.name: row for row in Watch(_client(served), with_pictures=True).look()}
     assert rows.keys() == served.service.cell.file.devices.keys()
-    assert all(row.value and row.is_connected and row.age_s is not None for row in rows.values()), rows
+    assert all(row.value and row.health == "valid" and row.age_s is not None for row in rows.values()), rows
 
 
 def _client(served: Panelwright) -> Any:

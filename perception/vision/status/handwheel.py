@@ -23,6 +23,7 @@ RIVAL_SHARE = (
     0.55  # of 330 drawn wheels read right .97 have less; of those read wrong at more than .85 all have more than 0.61
 )
 SPOKE_SHARE = 0.3  # of the clearest spoke; what stands out less is hidden or glared over
+MOST_MOVED, MOST_UNLIKE = 10.0, 3.0  # steps that a wheel beside its place moves a spoke, and unlike a whole wheel's
 BESIDE = 28  # steps: 14 degrees, beyond a spoke and its mark
 
 
@@ -110,10 +111,11 @@ def _peak(folded: Array, top: int) -> float:
 
 
 def _centred(ink: Array, phase: float, n: int) -> float:
-    """The phase again (steps) as the mean over all spokes, if each shows one.
+    """The phase again (steps) as the mean over all spokes, if each shows one and they lie as those of a whole wheel can.
 
     A wheel that is seen beside its place turns one spoke one way and others the other way, by zero on average; the fold
-    has only what most of them share. 1 mm is 3 degrees at the spokes' middle.
+    has only what most of them share. 1 mm is 3 degrees at the spokes' middle. A cable or a shadow over one spoke moves it
+    alone, or further.
     """
     period = STEPS / n
     half = round(period / 4)
@@ -124,7 +126,13 @@ def _centred(ink: Array, phase: float, n: int) -> float:
     if heights.min() < SPOKE_SHARE * heights.max():
         return phase
     weights = np.maximum(windows - 0.5 * (windows.max(axis=1) + windows.min(axis=1))[:, None], 0.0)
-    return float(np.mean(places - period * np.arange(n) + (weights * offsets).sum(axis=1) / weights.sum(axis=1)))
+    moved = places + (weights * offsets).sum(axis=1) / weights.sum(axis=1) - phase - period * np.arange(n)
+    angles = 2 * np.pi * places / STEPS
+    J = np.column_stack([np.ones(n), np.sin(angles), np.cos(angles)])
+    unlike = moved - J @ np.linalg.lstsq(J, moved, rcond=None)[0]
+    if np.abs(moved).max() > MOST_MOVED or np.abs(unlike).max() > MOST_UNLIKE:
+        return phase
+    return phase + float(moved.mean())
 
 
 def _at(mark: NDArray[np.float32], angle: float) -> Array:

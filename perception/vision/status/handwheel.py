@@ -24,6 +24,7 @@ RIVAL_SHARE = (
 )
 SPOKE_SHARE = 0.3  # of the clearest spoke; what stands out less is hidden or glared over
 MOST_MOVED, MOST_UNLIKE = 10.0, 3.0  # steps that a wheel beside its place moves a spoke, and unlike a whole wheel's
+EVERY = 8  # steps between the directions whose gaps are looked at
 BESIDE = 28  # steps: 14 degrees, beyond a spoke and its mark
 
 
@@ -42,8 +43,7 @@ def read_handwheel(patch: Patch, spec: Handwheel) -> Status:
     glare = _glare(patch, R)
     dazzled = unroll(glare, (0.0, 0.0), np.linspace(0.42, 0.72, 8) * R, angles, None) > 0.2
     shown = np.where(dazzled & ~dazzled.all(axis=1, keepdims=True), np.nan, spoke) if dazzled.any() else spoke
-    typical = _median(shown, axis=1)[:, None]
-    ink = np.median(np.where(dazzled, 0.0, np.abs(spoke - typical)), axis=0)
+    ink = np.median(np.where(dazzled, 0.0, np.abs(spoke - _gaps(shown, n))), axis=0)
     window = STEPS // 60
     ink = _smooth(ink, window)
     folded = np.sort(ink.reshape(n, -1), axis=0)[: max(1, n - 1)].mean(axis=0) if STEPS % n == 0 else _fold(ink, n)
@@ -73,6 +73,20 @@ def read_handwheel(patch: Patch, spec: Handwheel) -> Status:
             value=float(wrapped(np.array(places[best]))), unit="rad", uncertainty=float(sigma), confidence=confidence
         )
     )
+
+
+def _gaps(spoke: Array | NDArray[np.float32], n: int) -> Array:
+    """(radii, STEPS) what lies between the spokes at every radius: the median of one spacing about every direction.
+
+    Under a light that falls off, the far side's gap is as unlike the whole turn's median as a spoke is. That median stands
+    in for what is NaN.
+    """
+    coarse = spoke[:, ::EVERY]
+    coarse = np.where(np.isnan(coarse), _median(spoke, axis=1)[:, None], coarse)
+    span = round(coarse.shape[1] / n)
+    turns = np.concatenate([coarse[:, -(span // 2) :], coarse, coarse[:, : span - span // 2 - 1]], axis=1)
+    around = np.median(np.lib.stride_tricks.sliding_window_view(turns, span, axis=1), axis=2)
+    return np.repeat(around, EVERY, axis=1)
 
 
 def _median(values: Array | NDArray[np.float32], *, axis: int) -> Array:

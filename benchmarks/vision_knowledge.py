@@ -129,7 +129,8 @@ def with_noisy(known: Knowledge, taught: Sequence[Lesson]) -> Knowledge:
         for k, each in enumerate(lesson.worse)
     ]
     looks, names = _examples(worse)
-    kept = worth_keeping(looks, names, known.spread, known=known, nothing_margin=NOTHING_MARGIN)
+    in_use = known.for_image(noisy=True)
+    kept = worth_keeping(looks, names, known.spread, known=in_use, nothing_margin=NOTHING_MARGIN)
     rounded = np.round(looks[kept] / STEP) * STEP
     for name in sorted(set(names[kept].tolist())):
         of_kind = rounded[names[kept] == name]

@@ -11,7 +11,7 @@ blurred, half shaded thing is worth knowing, and in a good image it would be tak
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,7 +23,16 @@ from pydantic import Field, model_validator
 from hal.errors import ConfigError
 from hal.strict import Strict, load_toml
 from hal.whole_file import write_whole
-from perception.vision.finding.features import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
+from perception.vision.finding.features import (
+    AROUND_GROUPS,
+    DIRECTIONS,
+    GROUPS,
+    LENGTH,
+    NOISY_WEIGHTS,
+    RADII_M,
+    RINGS,
+    WEIGHTS,
+)
 from perception.vision.view import Array
 
 NOTHING = "nothing"
@@ -128,14 +137,22 @@ class Kind:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Knowledge:
-    """All kinds, and `spread` (LENGTH,): how much every number varies between things at all, the unit of likeness."""
+    """All kinds, and what likeness to them means.
+
+    Attributes:
+        spread: (LENGTH,) how much every number varies between things at all, the unit of likeness.
+        weights: (LENGTH,) of the numbers.
+    """
 
     kinds: tuple[Kind, ...]
     spread: Array
+    weights: Array = field(default_factory=lambda: WEIGHTS)
 
     def for_image(self, *, noisy: bool) -> Knowledge:
-        """What an image is compared with: everything if it is noisy, else only what counts in every image."""
-        return self if noisy else _lasting(self)
+        """What an image is compared with: if it is noisy, all looks without what lies far from their middles; else only
+        the looks that count in every image.
+        """
+        return _for_image(self, noisy=noisy)
 
     def kind(self, name: str) -> Kind | None:
         """The kind of that name, or None."""
@@ -183,12 +200,12 @@ def load_knowledge(folder: Path) -> Knowledge:
 
 
 @lru_cache(maxsize=8)
-def _lasting(knowledge: Knowledge) -> Knowledge:
-    """The knowledge without looks that count in noisy images only: the same object every time, as `prepared` wants it."""
-    if all(kind.noisy is None for kind in knowledge.kinds):
-        return knowledge
+def _for_image(knowledge: Knowledge, *, noisy: bool) -> Knowledge:
+    """See `Knowledge.for_image`: the same object every time, as `prepared` wants it."""
+    if noisy:
+        return replace(knowledge, weights=NOISY_WEIGHTS)
     kinds = (kind.lasting for kind in knowledge.kinds)
-    return replace(knowledge, kinds=tuple(kind for kind in kinds if len(kind.looks)))
+    return replace(knowledge, kinds=tuple(kind for kind in kinds if len(kind.looks)), weights=WEIGHTS)
 
 
 def spread_of(kinds: Iterable[Kind]) -> Array:

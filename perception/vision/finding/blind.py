@@ -219,7 +219,7 @@ def chosen(
         kind = knowledge.kinds[int(seen.argmin())]
         middle = place
         if kind.middles_m is not None:
-            across, up = kind.middles_m[nearest_look(look[0], kind, knowledge.spread)]
+            across, up = kind.middles_m[nearest_look(look[0], kind, knowledge)]
             middle = place + np.array([across, -up]) * PLATE_PX_PER_M
             if _is_taken(middle, max(kind.size_m) * PLATE_PX_PER_M, taken):
                 continue

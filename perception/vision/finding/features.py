@@ -39,6 +39,14 @@ AROUND_GROUPS = ("gray_around", "edge_around")
 LENGTH = len(GROUPS) * len(RADII_M) + len(AROUND_GROUPS) * DIRECTIONS * RINGS
 # What is the same whichever way a thing is turned counts as much as what lies in which direction: twice a number.
 WEIGHTS = np.repeat([2.0, 1.0], [len(GROUPS) * len(RADII_M), len(AROUND_GROUPS) * DIRECTIONS * RINGS])
+# Of a noisy image what lies further out counts nothing: glare, shadow and cables make as much of it as the neighbours do.
+NOISY_REACH_M = 0.036
+NOISY_WEIGHTS = WEIGHTS * np.concatenate(
+    [
+        np.tile(RADII_M < NOISY_REACH_M, len(GROUPS)),
+        np.tile(RADII_M[: 2 * RINGS : 2] < NOISY_REACH_M, len(AROUND_GROUPS) * DIRECTIONS),
+    ]
+)
 EDGE_GAIN = 40.0
 DESCRIPTORS = 12
 

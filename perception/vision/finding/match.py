@@ -9,12 +9,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from perception.vision.finding.features import WEIGHTS
 from perception.vision.knowledge import NOTHING, Kind, Knowledge
 from perception.vision.view import Array
 
 CLIP = 3.0  # one number counts for three spreads at most: glare or a cable spoils some numbers, whatever is there
-CLIPS = (CLIP * WEIGHTS).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -24,24 +22,27 @@ class Prepared:
     Attributes:
         columns: (LENGTH, M), one column a look, the kinds side by side: one number of all looks lies together.
         first: (kinds + 1,) where every kind's columns begin, and where the last one's end.
-        unit: (LENGTH,) that looks are divided by before they are compared.
+        gain: (LENGTH,) that looks are multiplied by before they are compared.
+        weights: (LENGTH,) of the numbers.
     """
 
     columns: NDArray[np.float32]
     first: NDArray[np.int64]
-    unit: Array
+    gain: Array
+    weights: Array
 
 
 @lru_cache(maxsize=4)
 def prepared(knowledge: Knowledge) -> Prepared:
     """The looks of all kinds as `nearest` wants them, made once for a knowledge."""
     counts = [len(kind.looks) for kind in knowledge.kinds]
-    unit = knowledge.spread / WEIGHTS
-    scaled = np.vstack([kind.looks for kind in knowledge.kinds]) / unit
+    gain = knowledge.weights / knowledge.spread
+    scaled = np.vstack([kind.looks for kind in knowledge.kinds]) * gain
     return Prepared(
         columns=np.ascontiguousarray(scaled.T, np.float32),
         first=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        unit=unit,
+        gain=gain,
+        weights=knowledge.weights,
     )
 
 
@@ -56,14 +57,15 @@ def distances(looks: Array, knowledge: Knowledge) -> Array:
 def nearest(looks: Array, known: Prepared, *, kind: int | None = None) -> Array:
     """`distances` to looks that are prepared; with `kind`, (N, 1) to the looks of that column only."""
     first = known.first if kind is None else known.first[kind : kind + 2]
-    scaled = (looks / known.unit).astype(np.float32)
-    return np.asarray(_nearest(scaled, known.columns, first, CLIPS), float) / float(WEIGHTS.sum())
+    scaled = (looks * known.gain).astype(np.float32)
+    clips = (CLIP * known.weights).astype(np.float32)
+    return np.asarray(_nearest(scaled, known.columns, first, clips), float) / float(known.weights.sum())
 
 
-def nearest_look(look: Array, kind: Kind, spread: Array) -> int:
+def nearest_look(look: Array, kind: Kind, knowledge: Knowledge) -> int:
     """Which look of a kind is nearest to a (LENGTH,) look."""
-    difference = np.minimum(np.abs(kind.looks - look) / spread, CLIP)
-    return int((difference @ WEIGHTS).argmin())
+    difference = np.minimum(np.abs(kind.looks - look) / knowledge.spread, CLIP)
+    return int((difference @ knowledge.weights).argmin())
 
 
 def distances_reference(looks: Array, knowledge: Knowledge) -> Array:
@@ -71,7 +73,7 @@ def distances_reference(looks: Array, knowledge: Knowledge) -> Array:
     columns = []
     for kind in knowledge.kinds:
         difference = np.abs(looks[:, None] - kind.looks[None]) / knowledge.spread
-        columns.append(np.average(np.minimum(difference, CLIP), axis=2, weights=WEIGHTS).min(axis=1))
+        columns.append(np.average(np.minimum(difference, CLIP), axis=2, weights=knowledge.weights).min(axis=1))
     return np.column_stack(columns)
 
 

@@ -23,7 +23,7 @@ def worth_keeping(
     spread: Array,
     *,
     known: Knowledge | None = None,
-    weights: Array = WEIGHTS,
+    weights: Array | None = None,
     nothing_margin: float = NOTHING_MARGIN,
 ) -> NDArray[np.int64]:
     """Indices of the looks to keep: those that the others kept, and what is known, do not name with the margin.
@@ -32,9 +32,11 @@ def worth_keeping(
         looks: (N, LENGTH), and `names` (N,) of their kinds.
         spread: (LENGTH,) the unit of likeness.
         known: what was taught before; None for nothing. Of a kind that it does not have, the first look is kept.
-        weights: (LENGTH,) of the numbers of a look.
+        weights: (LENGTH,) of the numbers of a look; those of what is known if left out.
         nothing_margin: by which a look of no object must be nearer to such looks than to objects'.
     """
+    if weights is None:
+        weights = WEIGHTS if known is None else known.weights
     scaled, share = looks / spread, weights / weights.sum()
     margin = np.where(names == NOTHING, nothing_margin, OBJECT_MARGIN)
     own, other = _beforehand(looks, names, known)

@@ -7,7 +7,7 @@ its own kind as the likest. `check` shows what the system now finds. Whole panel
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -180,7 +180,7 @@ def teach_example(
     known, look = knowledge.kind(kind), example.look
     in_use = knowledge.for_image(noisy=example.noisy)
     alike = in_use.kind(kind)
-    if known is not None and alike is not None and _distance(look, knowledge, alike) < SAME_LOOK:
+    if known is not None and alike is not None and _distance(look, in_use, alike) < SAME_LOOK:
         return Lesson(knowledge=knowledge, kind=known, example=example, is_new_kind=False, added=False)
     robbed = robbed_kinds(in_use, kind, look)
     if robbed:
@@ -286,4 +286,4 @@ def _distance(look: Array, knowledge: Knowledge, kind: Kind) -> float:
 
 
 def _only(knowledge: Knowledge, kind: Kind) -> Knowledge:
-    return Knowledge(kinds=(kind,), spread=knowledge.spread)
+    return replace(knowledge, kinds=(kind,))

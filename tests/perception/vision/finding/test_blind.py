@@ -239,6 +239,17 @@ def test_only_a_noisy_image_is_compared_with_looks_of_noisy_images(sigma: float,
     assert any(candidate.kind == "ghost" for candidate in found) is noisy
 
 
+def test_what_lies_far_from_a_middle_counts_in_good_images_only() -> None:
+    known = Knowledge(kinds=(Kind(name="a", size_m=(0.05, 0.04), looks=np.zeros((1, LENGTH))),), spread=np.ones(LENGTH))
+    rows = np.zeros((2, len(GROUPS), len(RADII_M)))
+    rows[0, :, RADII_M > 0.036] = rows[1, :, RADII_M < 0.03] = 1.0
+    looks = np.zeros((2, LENGTH))
+    looks[:, : rows[0].size] = rows.reshape(2, -1)
+    far, near = distances(looks, known.for_image(noisy=True))[:, 0]
+    assert far == 0.0 < near
+    assert (distances(looks, known.for_image(noisy=False)) > 0.0).all()
+
+
 def test_looks_of_noisy_images_refuse_no_lesson_of_a_good_one() -> None:
     image, view = overview()
     example = example_at(overview_of(image, plate_m=PLATE), [pixel_of(view, "emergency")])
@@ -289,7 +300,8 @@ def test_the_fast_match_agrees_with_the_plain_one() -> None:
     )
     knowledge = Knowledge(kinds=kinds, spread=spread_of(kinds))
     looks = rng.normal(0, 1, (9, LENGTH))
-    assert np.allclose(distances(looks, knowledge), distances_reference(looks, knowledge))
+    for known in (knowledge, knowledge.for_image(noisy=True)):
+        assert np.allclose(distances(looks, known), distances_reference(looks, known))
 
 
 def test_shape_features_do_not_change_with_turn_and_size() -> None:

@@ -137,7 +137,7 @@ def _centred(ink: Array, phase: float, n: int) -> float:
     places = np.round(phase + period * np.arange(n)).astype(int)
     windows = ink[(places[:, None] + offsets) % STEPS]
     heights = windows.max(axis=1) - np.median(ink)
-    if heights.min() < SPOKE_SHARE * heights.max():
+    if heights.min() <= SPOKE_SHARE * heights.max():
         return phase
     weights = np.maximum(windows - 0.5 * (windows.max(axis=1) + windows.min(axis=1))[:, None], 0.0)
     moved = places + (weights * offsets).sum(axis=1) / weights.sum(axis=1) - phase - period * np.arange(n)

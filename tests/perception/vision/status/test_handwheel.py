@@ -43,3 +43,13 @@ def test_a_wheel_one_millimetre_beside_its_place_keeps_its_angle(spokes: int, to
     off_rad = abs(float(wrapped(np.array(status.value - ANGLE_RAD))))
     assert off_rad < 0.012
     assert off_rad < 2.0 * status.uncertainty
+
+
+def test_where_nothing_shows_nothing_is_read() -> None:
+    """Heights of nothing over nothing were NaN, and the reader ended with an error."""
+    wheel = Handwheel(name="trim", position_m=(0.0, 0.0), radius_m=0.026, rim_m=0.004, height_m=HEIGHT_M, spokes=4)
+    pose = certain(RigidTransform.from_matrix(looking_at(distance_m=DISTANCE_M, tilt_rad=0.0)))
+    view = CameraView(intrinsics=camera(focal_px=460.0), camera_from_panel=pose)
+    image = np.full((480, 640), 120, np.uint8)
+    status = read_handwheel(patch_of(image, image, view, wheel, np.zeros(2)), wheel)
+    assert not status.answered

@@ -14,6 +14,9 @@ HEADROOM = 0.5  # of a lit segment: where less is left below white, nothing can 
 SHOWS = 0.3  # of a lit segment: so much stands out that it is no noise
 KERNEL = 0.30  # of the picture's height: wider than any stroke, narrower than what light does
 SATURATED = 252
+GLARE = 80.0  # gray levels that the background varies by: more is glare, which adds light, and no slope of light
+#: Light of every gray level as cameras code it: under glare strokes stand out by less gray but by as much light.
+LIGHT = np.round(255.0 * (np.arange(256) / 255.0) ** 2.2).astype(np.uint8)
 BORDER_ROUNDS = 4
 STROKE_SHOWS = 18.0  # gray levels
 NEAR_STROKE = 0.12  # of the picture's height
@@ -24,31 +27,42 @@ WIDEST_STROKE = 0.17  # of the picture's height
 def segment_ink(gray: Image, is_dark: bool, hidden: NDArray[np.bool_] | None = None) -> tuple[Float32, Float32]:
     """(ink, seen), both (H, W): hat transform with a kernel wider than a segment's stroke, 0 at the typical background.
 
-    White-hat for glowing segments, black-hat for dark ones, so gradients and glare vanish. Hidden and drowned pixels
-    are taken as background and as not seen.
+    White-hat for glowing segments, black-hat for dark ones, so gradients and glare vanish: of light instead of gray levels
+    where glare makes the background uneven. Hidden and drowned pixels are taken as background and as not seen.
     """
-    smooth = cv2.GaussianBlur(gray, (0, 0), max(0.6, 0.012 * gray.shape[0]))
-    if is_dark:
-        smooth = cv2.bitwise_not(smooth)
-    size = max(5, round(KERNEL * gray.shape[0])) | 1
-    kernel = np.ones((size, size), np.uint8)
+    smooth = np.asarray(cv2.GaussianBlur(gray, (0, 0), max(0.6, 0.012 * gray.shape[0])), np.uint8)
     lost = _drowned(gray, is_dark) if hidden is None else hidden | _drowned(gray, is_dark)
-    if not lost.any():
-        seen = np.ones(gray.shape, np.float32)
-        background = cv2.morphologyEx(smooth, cv2.MORPH_OPEN, kernel)
-        ink = cv2.subtract(smooth, background).astype(np.float32)
-    else:
-        seen = (~lost).astype(np.float32)
-        background = cv2.erode(np.where(lost, 255, smooth).astype(np.uint8), kernel)
-        filled = np.where(lost, background, smooth).astype(np.uint8)
-        background = cv2.morphologyEx(filled, cv2.MORPH_OPEN, kernel)
-        ink = cv2.subtract(filled, background).astype(np.float32)
+    white = SATURATED
+    covered = lost if is_dark else hidden  # glare is its own background: filled, its flanks would stand out from that
+    ink, background = _hat(smooth, is_dark, covered)
+    if _is_uneven(background, lost):
+        ink, background = _hat(LIGHT[smooth], is_dark, covered)
+        white = int(LIGHT[SATURATED])
+    seen = (~lost).astype(np.float32)
     if not is_dark:
         lit = level_at(ink, 0.98)
         # Where glare leaves little room below white, a stroke that shows is one; that none shows says nothing.
-        seen = seen * ((SATURATED - background > HEADROOM * lit) | (ink > SHOWS * lit)).astype(np.float32)
+        seen = seen * ((background < white - HEADROOM * lit) | (ink > SHOWS * lit)).astype(np.float32)
     ink = np.maximum(ink - level_at(ink[seen > 0] if lost.any() else ink, 0.35), 0.0) * seen
     return np.asarray(ink, np.float32), seen
+
+
+def _is_uneven(background: Image, lost: NDArray[np.bool_]) -> bool:
+    """Whether the background varies by as much as only glare makes it."""
+    shown = background[::3, ::3][~lost[::3, ::3]].astype(np.float32)
+    return shown.size > 0 and level_at(shown, 0.95) - level_at(shown, 0.05) > GLARE
+
+
+def _hat(smooth: Image, is_dark: bool, covered: NDArray[np.bool_] | None) -> tuple[Float32, Image]:
+    """(H, W) how far strokes stand out, and the background that they stand out from; what is covered is background."""
+    size = max(5, round(KERNEL * smooth.shape[0])) | 1
+    kernel = np.ones((size, size), np.uint8)
+    filled = cv2.bitwise_not(smooth) if is_dark else smooth
+    if covered is not None and covered.any():
+        around = cv2.erode(np.where(covered, 255, filled).astype(np.uint8), kernel)
+        filled = np.where(covered, around, filled).astype(np.uint8)
+    background = cv2.morphologyEx(filled, cv2.MORPH_OPEN, kernel)
+    return cv2.subtract(filled, background).astype(np.float32), np.asarray(background, np.uint8)
 
 
 def _drowned(gray: Image, is_dark: bool) -> NDArray[np.bool_]:

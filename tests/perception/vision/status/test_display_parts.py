@@ -20,7 +20,7 @@ from perception.vision.status.cover import ring_medians
 from perception.vision.status.display import read_window
 from perception.vision.status.glyphs import LIT, NAMES, Levels, likelihoods, numbers, separate
 from perception.vision.status.ink import segment_ink
-from perception.vision.status.levels import with_hidden_ends
+from perception.vision.status.levels import segment_levels, with_hidden_ends
 from perception.vision.status.point import dot_levels, find_point
 from tests.perception.vision.status.test_display import window
 
@@ -124,6 +124,38 @@ def test_sliding_medians_of_a_ring_are_its_medians(size: int) -> None:
     around = np.pad(values, size // 2, mode="wrap")
     wanted = [np.median(around[k : k + size]) for k in range(len(values))]
     assert ring_medians(values, size).tolist() == wanted
+
+
+def in_glare(gray: np.ndarray, added: float) -> np.ndarray:
+    """The window under a glare at its right end: light adds up, then the camera codes it."""
+    columns = np.arange(gray.shape[1]) / gray.shape[1]
+    light = 0.5 * (gray / 255.0) ** 2.2 + added * np.exp(-((columns - 0.95) ** 2) / (2 * 0.3**2))
+    return np.asarray(np.round(255 * np.clip(light, 0, 1) ** (1 / 2.2)), np.uint8)
+
+
+def test_strokes_stand_out_alike_in_glare() -> None:
+    plain = window("8888", slant=0.0)
+    for added, spread in ((0.0, 0.1), (0.3, 0.15), (0.6, 0.2)):
+        ink, seen = segment_ink(in_glare(plain, added), is_dark=False)
+        _, comb = find_combs(ink, seen)[0]
+        cells = segment_levels(ink, seen, comb)[0].mean(axis=1)
+        assert comb.count == 4 and np.ptp(cells) < spread * cells.mean()
+
+
+@pytest.mark.parametrize("text", ["7669", "5.37", "3847"])
+@pytest.mark.parametrize("added", [0.3, 0.6])
+def test_a_window_in_glare_is_read(text: str, added: float) -> None:
+    status = read_window(in_glare(window(text), added), digits=None, decimals=None, dark=False, bare=True)
+    assert status.text == text
+
+
+def test_a_blank_within_a_number_is_a_digit_that_nobody_saw() -> None:
+    gray = window("4972", slant=0.0)
+    wiped = gray.copy()
+    wiped[:, 78:102] = 20  # the 7, by a cable of the window's gray
+    assert read_window(gray, digits=None, decimals=0, dark=False, bare=True).text == "4972"
+    status = read_window(wiped, digits=None, decimals=0, dark=False, bare=True)
+    assert not status.answered and status.confidence < 0.1
 
 
 @pytest.mark.parametrize(("text", "place"), [("26.48", 2), ("2.648", 1), ("2648", None)])

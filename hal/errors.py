@@ -44,9 +44,18 @@ class CellError(Exception):
     def for_people(self) -> str:
         """Several lines for a terminal: what, the facts, what to try, whether to retry."""
         lines = [f"{type(self).__name__}: {self.what}"]
-        lines += [f"  {key:<6} {value}" for key, value in self.details.items()]
-        lines += [f"  {'try':<6} {self.hint}", f"  {'retry':<6} {self.retry}"]
-        return "\n".join(lines)
+        return "\n".join([*lines, *detail_lines(self.details), f"  try    {self.hint}", f"  retry  {self.retry}"])
+
+
+def detail_lines(details: dict[str, Any]) -> list[str]:
+    """The facts of an error for a terminal, one a line; of the `faults` of a file those that the first line has not."""
+    lines: list[str] = []
+    for key, value in details.items():
+        if key == "faults":
+            lines += [f"  also   {fault}" for fault in value[1:]]
+        else:
+            lines.append(f"  {key:<6} {value}")
+    return lines
 
 
 def _rebuild(kind: type[CellError], what: str, hint: str, details: dict[str, Any]) -> CellError:

@@ -132,7 +132,8 @@ def _in_file(details: dict[str, Any], cell: Cell | None) -> dict[str, Any]:
     """`file` and `key` of a fault in a driver's options, which know the table they stand in and not its file."""
     if cell is None or "key" not in details or "file" not in details:
         return details
-    return {**details, "file": str(cell.path), "key": f"{details['file']}.{details['key']}"}
+    key = f"{details['file']}.{details['key']}".rstrip(".")  # of the options as a whole when they contradict each other
+    return {**details, "file": str(cell.path), "key": key}
 
 
 def connect(context: Context, driver: str, options: dict[str, Any], *, key: str = "") -> Device:

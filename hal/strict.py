@@ -69,19 +69,19 @@ def validate(data: dict[str, Any], model: type[M], *, source: str) -> M:
         items = sorted(error.errors(), key=lambda item: item["type"] != "extra_forbidden")
         faults = [_fault(item, model) for item in items]
         first_key, first_text, first_hint = faults[0]
-        more = f" (and {len(faults) - 1} more faults)" if len(faults) > 1 else ""
+        more = f" (and {len(faults) - 1} more {'fault' if len(faults) == 2 else 'faults'})" if len(faults) > 1 else ""
         raise ConfigError(
-            f"{source}: {first_key}: {first_text}{more}",
+            f"{_said(source, first_key, first_text)}{more}",
             hint=first_hint,
             file=source,
             key=first_key,
-            faults=[f"{key}: {text}" for key, text, _ in faults],
+            faults=[_said(key, text) for key, text, _ in faults],
         ) from error
 
 
 def _fault(item: Any, model: type[BaseModel]) -> tuple[str, str, str]:
     path = _path_in_file(item["loc"], model)
-    key = ".".join(str(part) for part in path) or "(top level)"
+    key = ".".join(str(part) for part in path)
     if item["type"] == "extra_forbidden":
         known = _fields_at(model, list(item["loc"][:-1]))
         return key, f"unknown key {path[-1]!r}", _did_you_mean(str(path[-1]), known)
@@ -91,6 +91,11 @@ def _fault(item: Any, model: type[BaseModel]) -> tuple[str, str, str]:
     if item["type"] == "value_error":
         return key, item["msg"].removeprefix("Value error, "), "see the file reference in docs/"
     return key, f"{item['msg']} (given: {given[:60]})", "see the file reference in docs/ for type, unit and range"
+
+
+def _said(*parts: str) -> str:
+    """Where and what, colons between; a fault of the whole has no key."""
+    return ": ".join(part for part in parts if part)
 
 
 def unknown_key_hint(model: type[BaseModel], location: tuple[int | str, ...]) -> str:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
 
-from hal.errors import CellError, ConfigError, DeviceUnavailable, Retry
+from hal.errors import CellError, ConfigError, DeviceUnavailable, Retry, detail_lines
 
 DEFAULT_URL = "http://127.0.0.1:8460"
 FINAL = ("succeeded", "failed", "cancelled")
@@ -30,8 +30,14 @@ class ApiError(CellError):
     def for_people(self) -> str:
         """Several lines for a terminal."""
         lines = [f"{self.problem.get('title', 'Problem')}: {self.what}"]
-        lines += [f"  {key:<6} {value}" for key, value in self.details.items()]
-        return "\n".join([*lines, f"  try    {self.hint}", f"  retry  {self.problem.get('retry', Retry.NEVER)}"])
+        return "\n".join(
+            [
+                *lines,
+                *detail_lines(self.details),
+                f"  try    {self.hint}",
+                f"  retry  {self.problem.get('retry', Retry.NEVER)}",
+            ]
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

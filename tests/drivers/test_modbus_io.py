@@ -157,7 +157,7 @@ def test_wrong_wiring_is_refused(driver: str, options: dict[str, Any], message: 
 
 def test_a_host_alone_is_modbus_tcp_at_its_usual_port_and_no_address_is_refused() -> None:
     assert LightsOptions(host="10.0.0.30").wire == "tcp 10.0.0.30:502"
-    with pytest.raises(ConfigError, match=r"options: .*say where the device is"):
+    with pytest.raises(ConfigError, match=r"options: say where the device is"):
         connect(Context(name="io"), "modbus:lights", {})
 
 

@@ -134,6 +134,9 @@ def test_an_error_reads_well_at_3_a_m() -> None:
         "  try    check power and cable\n"
         "  retry  safe"
     )
+    faults = ["panel: is missing", "seed: is missing"]
+    told = ConfigError("a.toml: panel: is missing (and 1 more fault)", hint="add panel", faults=faults).for_people()
+    assert told.splitlines()[1:] == ["  also   seed: is missing", "  try    add panel", "  retry  after-fix"]
     assert DeviceTimeout("x", hint="y").type_name == "device-timeout"
     assert DeviceTimeout.retry is Retry.SAFE
 

@@ -67,15 +67,15 @@ def test_what_devices_share_is_said_once_and_faults_of_their_own_by_name(write_c
     assert (all_of_them.hint.startswith("mend each"), all_of_them.retry) == (True, "after-fix")
 
 
-def test_a_fault_in_options_names_file_and_key(write_cell: WriteCell) -> None:
+@pytest.mark.parametrize(("options", "key"), [("unit = 900", ".unit"), ("unit = 3", "")], ids=["one", "all together"])
+def test_a_fault_in_options_names_file_and_key(write_cell: WriteCell, options: str, key: str) -> None:
     path = write_cell(mode="real")
-    path.write_text(
-        path.read_text().replace('"fake:lights"\noptions = {  }', '"modbus:lights"\noptions = { unit = 900 }')
-    )
+    wrong = f'"modbus:lights"\noptions = {{ {options} }}'
+    path.write_text(path.read_text().replace('"fake:lights"\noptions = {  }', wrong))
     with pytest.raises(ConfigError) as refused:
         CellRuntime.start(load_cell(path), is_latched=lambda: False)
     assert str(path) in refused.value.what
-    assert refused.value.details["key"] == "devices.panel_lights.options.unit"
+    assert refused.value.details["key"] == f"devices.panel_lights.options{key}"
 
 
 def test_a_calibration_that_is_not_there_names_the_device_that_wants_it(write_cell: WriteCell) -> None:

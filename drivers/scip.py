@@ -128,7 +128,7 @@ class Scip(LineScanner):
 
     def __init__(self, context: Context, options: ScipOptions) -> None:
         opener, name = either_opener(options, context.name)
-        super().__init__(context, open_link=opener, link_name=name, max_age_s=0.05, silence_s=1.0)
+        super().__init__(context, open_link=opener, link_name=name, max_age_s=0.05)
         self.sigma_m = options.sigma_m
         self._options = options
         self._parser = ScipParser()

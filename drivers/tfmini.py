@@ -32,6 +32,7 @@ UNIT_CODES = {"cm": 1, "mm": 6}
 METRES = {"cm": 0.01, "mm": 0.001}
 ANSWER_S = 0.15
 ATTEMPTS = 3
+SILENCE_S = 0.15  # no sensor starts anew in less, and one that has been without power speaks in its factory unit again
 
 
 def _exchange(link: Link, request: bytes, is_answered: Callable[[bytes], bool]) -> bytes:
@@ -96,7 +97,13 @@ class Tfmini(StreamDevice[float]):
     def __init__(self, context: Context, options: TfminiOptions) -> None:
         opener, name = serial_opener(options, context.name)
         period_s = 1.0 / options.rate_hz
-        super().__init__(context, open_link=opener, link_name=name, max_age_s=max(3.0 * period_s, 0.05))
+        super().__init__(
+            context,
+            open_link=opener,
+            link_name=name,
+            max_age_s=max(3.0 * period_s, 0.05),
+            silence_s=SILENCE_S,
+        )
         self._options = options
         self._framer = data_framer()
         self._bad_before = 0

@@ -21,7 +21,8 @@ class StreamDevice(PortDevice[T]):
 
     Args:
         open_link: opens the port.
-        silence_s: after this long without a sample the link is checked, then opened and set up anew.
+        silence_s: after this long without a sample (and not before the last one is too old to be given out) the link is
+            opened and set up anew.
         realtime_priority: of the owner thread (see `Port`).
     """
 
@@ -80,7 +81,7 @@ class StreamDevice(PortDevice[T]):
         silent_s = now_s() - self._heard_s
         if silent_s > 3 * SLICE_S and not link.is_present():
             raise LinkLost(f"{link.name}: its name has vanished or leads to another port")
-        if silent_s > self._silence_s:
+        if silent_s > max(self._silence_s, self.max_age_s):
             raise NoAnswer(f"no valid data for {silent_s:.2f} s; {self.wire_counts()}")
 
     def take_in(self, link: Link, until_s: float) -> None:

@@ -14,6 +14,7 @@ LATELY = 8  # frames: one of so many was not late; a talker that has shifted is 
 ALMOST = 0.1  # of a period: the jitter of a gap that a lost frame has left
 LATE_S, SELDOM = 5e-4, 0.2
 PERIOD_OVER_S = 1.0
+PAUSE_S, PAUSE_RATIO = 0.1, 3.0  # a pause lasts longer, and as many times longer than the shortest gap lately
 RESTART_S = 1.0  # a device clock this far behind itself, or off what is expected, has been restarted
 LONGEST_AWAY_S = 60.0  # quartz clocks part by 30 ms in that time
 
@@ -124,6 +125,7 @@ class FrameTimes:
         stamp(n) = min_i a_i + (n - n_i) p,  at most one period before its own arrival.
 
     This host is late seldom. Where many frames come late, the talker itself is irregular and its arrivals are the truth.
+    The frame that ends a pause may be as old as that, and nothing tells: it is left out, and the next one counts.
 
     Args:
         period_s: nominal time between two frames.
@@ -137,12 +139,14 @@ class FrameTimes:
         self._late: deque[bool] = deque(maxlen=8 * LATELY)
         self._stamped_s = -math.inf
         self._last = (b"", -math.inf)
+        self._gaps_s: deque[float] = deque(maxlen=LATELY)
 
     def reset(self) -> None:
         """The wire was opened anew."""
         self._arrivals.clear()
         self._late.clear()
         self._last = (b"", -math.inf)
+        self._gaps_s.clear()
 
     def stamped(self, frames: list[bytes], *, arrived_s: float, byte_s: float) -> list[tuple[bytes, float]]:
         """Each new frame with its time; the same bytes at the same moment are one frame that was repeated."""
@@ -150,9 +154,17 @@ class FrameTimes:
         for frame in frames:
             if frame == self._last[0] and arrived_s - self._last[1] < REPEATED * self._nominal_s:
                 continue
+            ends_pause = self._ends_pause(arrived_s)
             self._last = (frame, arrived_s)
+            if ends_pause:
+                continue
             fresh.append((frame, self._stamp_s(arrived_s - self._frame_bytes * byte_s)))
         return fresh
+
+    def _ends_pause(self, arrived_s: float) -> bool:
+        gap_s, shortest_s = arrived_s - self._last[1], min(self._gaps_s, default=math.inf)
+        self._gaps_s.append(gap_s)
+        return gap_s > max(PAUSE_S, PAUSE_RATIO * shortest_s)
 
     def _stamp_s(self, arrived_s: float) -> float:
         period_s, count = self._period_s(), 0

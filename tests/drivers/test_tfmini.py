@@ -13,7 +13,8 @@ from hal.conformance import ProximityContract, Rig
 from hal.errors import ConfigError, DeviceUnavailable, Unsupported
 from hal.readings import Cause, Quality
 from hal.registry import Context, connect
-from tests.drivers.rigs import soon, until, wired, wired_rig
+from hal.simulated import Fault
+from tests.drivers.rigs import CLOCK, soon, until, wired, wired_rig
 
 
 class TestTfmini(ProximityContract):
@@ -68,6 +69,27 @@ def test_the_unit_is_set_and_centimetres_are_understood() -> None:
         assert device.read_distance_m(deadline=soon()).value == pytest.approx(0.12)
     with wired(emulator.start(ScriptedProximity(fixed_m=0.123), {}), "serial:tfmini", {"unit": "mm"}) as device:
         assert device.read_distance_m(deadline=soon()).value == pytest.approx(0.123)
+
+
+def test_a_sensor_that_lost_its_power_for_a_moment_is_not_read_in_the_unit_of_before() -> None:
+    far_side = emulator.start(ScriptedProximity(fixed_m=0.5), {})
+    with wired(far_side, "serial:tfmini") as device:
+        far_side.inject(Fault.SILENT)
+        far_side.is_mm = False
+        until(lambda: device.mailbox.peek().age_s(CLOCK.now_s()) > 0.25)
+        before = device.mailbox.published
+        far_side.inject(None)
+        until(lambda: device.mailbox.published > before + 5)
+        samples, lost = device.mailbox.since(before)
+        assert not lost and [s.value for s in samples] == pytest.approx([0.5] * len(samples))
+        assert device.health().reconnects >= 1
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 3.0])
+def test_a_slow_sensor_is_not_taken_for_a_silent_one(rate_hz: float) -> None:
+    with wired(emulator.start(ScriptedProximity(), {}), "serial:tfmini", {"rate_hz": rate_hz}) as device:
+        until(lambda: device.mailbox.published >= 3)
+        assert device.health().reconnects == 0
 
 
 def test_a_second_opener_is_refused_and_told_the_owner() -> None:

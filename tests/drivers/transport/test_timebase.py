@@ -89,6 +89,21 @@ def test_repeated_bytes_at_the_same_moment_are_one_frame_and_line_time_counts() 
     assert [frame for frame, _ in times.stamped([b"a"], arrived_s=5.01, byte_s=1e-4)] == [b"a"]
 
 
+def test_a_frame_that_ends_a_pause_may_be_as_old_as_that_and_is_left_out() -> None:
+    times, heard = FrameTimes(period_s=0.01, frame_bytes=9), []
+    for n, late_s in enumerate([0.0] * 20 + [0.35] + [0.0] * 5):
+        arrived_s = 0.01 * n + (0.34 if n > 20 else late_s)
+        heard += [frame for frame, _ in times.stamped([bytes([n])], arrived_s=arrived_s, byte_s=0.0)]
+    assert heard == [bytes([n]) for n in range(26) if n != 20]
+
+
+@pytest.mark.parametrize("period_s", [0.15, 1.0])
+def test_a_talker_that_is_slower_than_was_told_does_not_pause(period_s: float) -> None:
+    times = FrameTimes(period_s=0.01, frame_bytes=9)
+    heard = [times.stamped([bytes([n])], arrived_s=period_s * n, byte_s=0.0) for n in range(9)]
+    assert sum(map(len, heard)) == 9
+
+
 def test_what_was_learned_of_a_talker_is_forgotten_when_its_wire_is_opened_anew() -> None:
     times, jitter_s = FrameTimes(period_s=0.01, frame_bytes=9), np.random.default_rng(5).uniform(0.0, 0.008, 300)
     for number, late_s in enumerate(jitter_s):

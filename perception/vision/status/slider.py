@@ -36,8 +36,8 @@ def read_slider(patch: Patch, spec: Slider) -> Status:
     u, v = patch.pixel_of(*_place(spec.angle_rad, s, np.zeros(1)))
     if float(np.mean(sample_at(patch.inside.astype(np.uint8), u, v))) < 0.97:
         return refused("part of the track is outside the image: move the camera", unit=spec.scale.unit)
-    lean_m = _base_shift_m(patch, spec)  # the foot of the cap shows on that side of its top
-    open_ = _uncovered(patch, spec, s, np.minimum(left, right), lean_m)
+    lean_m = _base_shift_m(patch, spec, s)  # the foot of a cap there shows on that side of its top
+    open_ = _uncovered(patch, spec, s, np.minimum(left, right), float(np.median(lean_m)))
     found = _best_pair(left, right, s, open_, along_m=along, lean_m=lean_m, limits_m=(lo, hi))
     noise = contrast_noise(patch)
     unseen = (
@@ -74,7 +74,7 @@ class _Cap:
 
 
 def _best_pair(
-    left: Array, right: Array, s: Array, open_: Array, *, along_m: float, lean_m: float, limits_m: tuple[float, float]
+    left: Array, right: Array, s: Array, open_: Array, *, along_m: float, lean_m: Array, limits_m: tuple[float, float]
 ) -> _Cap:
     """The pair of opposite edges as far apart as the cap is long; what lies between them (a line, a shine) is free.
 
@@ -82,7 +82,7 @@ def _best_pair(
     is on one side, glare and shadow have one edge.
     """
     step = float(s[1] - s[0])
-    low_shift, high_shift = along_m / 2 - min(lean_m, 0.0), along_m / 2 + max(lean_m, 0.0)
+    low_shift, high_shift = along_m / 2 - np.minimum(lean_m, 0.0), along_m / 2 + np.maximum(lean_m, 0.0)
     box, slack = EDGE_BOX * along_m / step, SLACK * along_m / step
     falls = np.stack([_fall(side, open_, box) for side in (left, right)])
     hidden = np.isnan(falls[0])
@@ -104,11 +104,12 @@ def _best_pair(
     if score[top] <= 0:
         return _Cap(place_m=0.0, peak=0.0, rival=0.0)
     apart = np.abs(s - s[top]) > 0.4 * along_m
-    low = _crest(s, into, float(s[top]) - low_shift, SLACK * along_m)
-    high = _crest(s, out, float(s[top]) + high_shift, SLACK * along_m)
-    place = (low + high - lean_m) / 2
-    if abs(lean_m) >= 0.1 * along_m:  # only one edge is the top's, the other is the foot's
-        place = low + along_m / 2 if lean_m > 0 else high - along_m / 2
+    low = _crest(s, into, float(s[top] - low_shift[top]), SLACK * along_m)
+    high = _crest(s, out, float(s[top] + high_shift[top]), SLACK * along_m)
+    lean = float(lean_m[top])
+    place = (low + high - lean) / 2
+    if abs(lean) >= 0.1 * along_m:  # only one edge is the top's, the other is the foot's
+        place = low + along_m / 2 if lean > 0 else high - along_m / 2
     rival = max(float(perhaps[apart].max(initial=0.0)), float(other[1].max()))
     return _Cap(place_m=place, peak=float(score[top]), rival=rival)
 
@@ -205,10 +206,15 @@ def _open(patch: Patch, cover: NDArray[np.bool_], angle_rad: float, s: Array, ac
     return np.asarray(sample_at(cover.astype(np.uint8), u, v).max(axis=1) < 0.3, float)
 
 
-def _base_shift_m(patch: Patch, spec: Slider) -> float:
-    """How far along the track the foot of the cap appears beside its top in the patch, m."""
+def _base_shift_m(patch: Patch, spec: Slider, s: Array) -> Array:
+    """How far along the track the foot of a cap at the places `s` (N,) appears beside its top in the patch, (N,) m.
+
+    The foot is further off than the top, so it appears nearer to where the camera looks: from before the track's middle
+    a cap at its end leans over by a millimetre.
+    """
     u, v = -patch.parallax_px_per_m * spec.cap_size_m[2] / patch.px_per_m
-    return float(u * np.cos(spec.angle_rad) - v * np.sin(spec.angle_rad))
+    at_middle_m = float(u * np.cos(spec.angle_rad) - v * np.sin(spec.angle_rad))
+    return np.asarray(at_middle_m - patch.growth_per_m * spec.cap_size_m[2] * s)
 
 
 def _beside_slot(patch: Patch, spec: Slider) -> tuple[Array, Array]:

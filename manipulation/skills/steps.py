@@ -209,6 +209,9 @@ def perform(
             outcome, cause = Outcome.SLIPPED, "the hand went all the way; the read-back does not show the target"
             if not repeats:
                 break
+        if outcome is Outcome.STALLED and seen is None and not repeats:
+            cause += "; whether it counted nobody can tell, and another try might undo it"
+            break
         if outcome is Outcome.STIFF:
             break
     return SkillReport(

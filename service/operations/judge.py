@@ -60,15 +60,19 @@ def truth_of(connection: CellConnection) -> Truth:
 
 
 def compare(report: dict[str, Any], truth: Truth, panel: Panel) -> dict[str, Any]:
-    """Pose error, reading errors and what really moved, against a report's claims."""
+    """Pose error, reading errors and what really moved, against a report's claims.
+
+    The simulator tells how the mission ended: of several deeds with one control only the last can be judged.
+    """
     before = {thing.name: thing for thing in truth.initial}
     after = {thing.name: thing for thing in truth.objects}
     claims = [
         _reading_claim(reading, (after if reading["when"] == AFTER else before)[reading["name"]], panel)
-        for reading in report["readings"]
-        if reading["reason"] is None and reading["present"]
+        for k, reading in enumerate(report["readings"])
+        if reading["reason"] is None and reading["present"] and not _is_outdated(k, report["readings"])
     ]
-    actions = [_action_claim(action, before, after, panel) for action in report["actions"]]
+    newest = {_shown_by(action["object"], panel): action for action in report["actions"]}
+    actions = [_action_claim(action, before, after, panel) for action in newest.values()]
     return {
         **_pose_verdict(report.get("fused"), truth),
         "claims": claims + actions,
@@ -140,6 +144,18 @@ def _action_claim(
         "right": reached or not action["confirmed"],
         "reached": reached,
     }
+
+
+def _is_outdated(k: int, readings: list[dict[str, Any]]) -> bool:
+    """Was the same object read again after a later deed?"""
+    asked = (readings[k]["name"], AFTER)
+    return readings[k]["when"] == AFTER and asked in [(later["name"], later["when"]) for later in readings[k + 1 :]]
+
+
+def _shown_by(name: str, panel: Panel) -> str:
+    """What shows that a control was worked: itself, or the lamp of a button."""
+    spec = panel.object(name)
+    return spec.lights_lamp if isinstance(spec, Button) and spec.lights_lamp is not None else name
 
 
 def _moved_unasked(

@@ -143,6 +143,14 @@ def test_a_look_that_cannot_tell_is_not_called_no_look() -> None:
     assert button(cell, "start", expected="on").cause.endswith("nobody looked")
 
 
+def test_a_press_that_may_have_counted_is_not_repeated_when_nobody_can_tell() -> None:
+    """A latching cap that gave way by little was pressed twice, which may have undone it."""
+    cell, mover = before_the_bench({"press": pressed(0.004, 0.0003, 20.0)})
+    told = button(cell, "hold", expected="pressed", verify=lambda: None)
+    assert (told.outcome, mover.asked.count("press")) == (Outcome.STALLED, 1)
+    assert "gave way by only" in told.cause and "undo" in told.cause
+
+
 def test_a_press_is_guarded_by_more_than_the_springs_of_the_cap() -> None:
     cell, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
     button(cell, "start")

@@ -84,6 +84,16 @@ def test_what_moved_though_nobody_asked_is_told() -> None:
     assert [moved["name"] for moved in lit["moved_unasked"]] == ["run_lamp"]
 
 
+def test_of_several_deeds_with_one_control_the_last_is_judged() -> None:
+    """On, and off again: the lamp is dark, and both claims were true when they were made."""
+    deeds = [action("start", "on"), action("start", "off")]
+    looks = [reading("run_lamp", AFTER, state="on"), reading("run_lamp", AFTER, state="off")]
+    verdict = compare(report(actions=deeds, readings=looks), truth(lamp="off"), PANEL)
+    assert verdict["agrees"] and (verdict["readings_right"], verdict["readings_given"]) == (1, 1)
+    verdict = compare(report(actions=deeds[::-1], readings=looks), truth(lamp="off"), PANEL)
+    assert not verdict["agrees"] and verdict["readings_right"] == 1
+
+
 def test_a_failure_that_is_told_is_no_lie() -> None:
     verdict = compare(report(actions=[action("main_valve", "open", confirmed=False)]), truth(valve="closed"), PANEL)
     assert verdict["agrees"]

@@ -12,32 +12,40 @@ from rich.markup import escape
 
 from hal.clock import Deadline
 from hal.config import Cell, load_cell
-from hal.errors import CellError, ConfigError
+from hal.errors import CellError, ConfigError, detail_lines
 from hal.registry import installed_drivers
+from service.client import Client
 from service.commands.common import console, find_cell
 from service.commissioning.preflight import check_machine, check_python, check_simulator
 from service.processes.stop_host import bound_socket
 
 PINNED = {"pybullet": "3.2.7", "numpy": "2.", "opencv-python-headless": "4."}
 READS = 20
+ANSWER_S = 1.0  # in which a service that runs has answered
 
 
 def examine(cell: Path, port: int, *, connect: bool) -> bool:
-    """Run all checks and print what they find; tells whether everything is in order."""
+    """Run all checks and print what they find; tells whether everything is in order.
+
+    Args:
+        connect: try the devices too, unless a service on `port` has them.
+    """
+    served = _served_cell(port)
     checks: list[tuple[str, Callable[[], str]]] = [
         ("python", _python),
         *((name, lambda name=name, wanted=wanted: _package(name, wanted)) for name, wanted in PINNED.items()),
         ("simulator", _simulator),
         ("drivers", lambda: ", ".join(installed_drivers())),
-        (f"port {port}", lambda: _ports(port)),
+        (f"port {port}", lambda: _ports(port, served)),
         ("cell file", lambda: _cell_file(cell)),
         ("runs folder", _writable),
         ("timer", _timer),
     ]
     results = [_check(name, check) for name, check in checks]
-    if connect and all(results):
+    may_connect = connect and served is None  # two programs on one arm are worse than an examination less
+    if may_connect and all(results):
         results.append(_wires(load_cell(find_cell(cell))))
-    if connect and all(results):
+    if may_connect and all(results):
         results.append(_check("devices", lambda: _devices(load_cell(find_cell(cell)))))
     return all(results)
 
@@ -47,8 +55,8 @@ def _check(name: str, check: Callable[[], str]) -> bool:
         words = check()
     except CellError as error:
         console.print(f"[red]wrong[/]  {name:<24} {escape(error.what)}\n{'':<31} try: {escape(error.hint)}")
-        for key, value in error.details.items():
-            console.print(f"{'':<31} {escape(key)}: {escape(str(value))}")
+        for line in detail_lines(error.details):
+            console.print(f"{'':<29} {escape(line)}")
         return False
     console.print(f"[green]good[/]   {name:<24} {escape(words)}")
     return True
@@ -87,7 +95,18 @@ def _simulator() -> str:
     return "PyBullet is there"
 
 
-def _ports(port: int) -> str:
+def _served_cell(port: int) -> str | None:
+    """Name of the cell that a panelwright on this machine serves at `port`, if one does."""
+    try:
+        info = Client(url=f"http://127.0.0.1:{port}", timeout_s=ANSWER_S).get("/v1/info")
+    except CellError:  # nobody, or something else
+        return None
+    return str(info["cell"]) if isinstance(info, dict) and "cell" in info else None
+
+
+def _ports(port: int, served: str | None) -> str:
+    if served is not None:
+        return f"panelwright serves cell {served} there; it has the devices, so they are not tried"
     for number in (port, port + 1):
         bound_socket("127.0.0.1", number).close()
     return f"{port} and {port + 1} are free"

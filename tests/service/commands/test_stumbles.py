@@ -160,6 +160,14 @@ def test_a_log_of_watching_has_every_look(served: Panelwright) -> None:
     assert done.output.count("finger_proximity") == 3, done.output
 
 
+def test_the_doctor_leaves_the_devices_to_a_service_that_runs(served: Panelwright) -> None:
+    words = ["doctor", "--cell", str(served.service.cell.path), "--port", str(served.port)]
+    done = CliRunner().invoke(_app(), words)
+    told = " ".join(done.output.split())
+    assert f"panelwright serves cell {served.service.cell.name} there" in told
+    assert "wrong port" not in told and " answer" not in told
+
+
 def test_watching_nobody_ends_at_once() -> None:
     with bound_socket("127.0.0.1", 0) as silent:
         nobody = f"http://127.0.0.1:{silent.getsockname()[1]}"

@@ -170,7 +170,7 @@ class Tally:
         if "error" in item:
             self._errors += 1
             return
-        self._last_s = item["host_time_s"]
+        self._last_s = time.monotonic()  # the samples' own stamps may be of a slower clock
         self._first_s = self._first_s if self._samples else self._last_s
         self._samples += 1
 

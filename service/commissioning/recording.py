@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hal.clock import Clock, WallClock
+from hal.clock import WallClock
 from hal.config import Cell
 from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError
@@ -62,7 +62,7 @@ def record(
             hint = f"`panelwright devices read {name} --jsonl` writes down its readings"
             raise ConfigError(what, hint=hint, device=name) from error
         try:
-            yield from _until(samples_of(device, name, section.kind, clock, timeout_s), clock, duration_s)
+            yield from _until(samples_of(device, name, section.kind, clock, timeout_s), duration_s)
         finally:
             device.close()
 
@@ -110,7 +110,9 @@ def read_about(path: Path) -> About:
         raise ConfigError(f"{path} does not say whose traffic it holds ({error!r})", hint=hint) from error
 
 
-def _until(items: Iterator[dict[str, Any]], clock: Clock, duration_s: float) -> Iterator[dict[str, Any]]:
+def _until(items: Iterator[dict[str, Any]], duration_s: float) -> Iterator[dict[str, Any]]:
+    """So many seconds on the wall, by which the wire runs: the clock of a mixed cell may go slower."""
+    clock = WallClock()
     end_s = clock.now_s() + duration_s
     for item in items:
         yield item

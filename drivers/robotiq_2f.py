@@ -157,6 +157,7 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
                     self._act(actions[0])
                     actions = actions[1:]
                 elif self.call(self._status, self._soon()).state == READY:
+                    self.mailbox.clear()  # of what was read before
                     return
                 elif actions is None:
                     actions = [0, ACTIVATE]
@@ -186,7 +187,10 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
         if status.fault > ACTIVATION_PENDING and status.fault not in PASSING_FAULTS:
             text = FAULTS.get(status.fault, "fault not in the manual")
             raise Refused(f"gripper fault {status.fault:X}h: {text}", code=status.fault)
-        quality, cause = (Quality.INVALID, Cause.DEVICE) if status.fault in PASSING_FAULTS else VALID
+        is_known = (
+            status.state == READY and status.fault not in PASSING_FAULTS
+        )  # before activation it counts from anywhere
+        quality, cause = VALID if is_known else (Quality.INVALID, Cause.DEVICE)
         is_current = self._goal is None or status.echo == self._goal
         is_holding = is_current and status.object in (OPENED_ON, CLOSED_ON)
         self.publish(

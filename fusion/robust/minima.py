@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from fusion.batch import Batch
 from fusion.distance.rows import values
-from fusion.errors import Contradiction
 from fusion.robust import search
 from fusion.solve.local import LocalSolution, local_solution
 from fusion.solve.placement import place
@@ -112,8 +111,10 @@ def _search(b: Batch, rng: np.random.Generator) -> Candidates:
             break
         size = int(min(max(wanted - done, FIRST_ROUND), LARGEST_ROUND, 3 * size))
     R, t, cost = (np.concatenate(part) for part in zip(*rounds, strict=True))
-    if not len(cost):
-        raise Contradiction.among(0, n, [])
+    if not len(cost):  # no subset fits any pose; one that is judged says what each measurement misses it by
+        R, t = np.eye(3)[np.newaxis], np.zeros((1, 3))
+        place(b, np.ones(n), R[0], t[0])
+        cost = np.array([search.settle(b, R[0], t[0], np.empty(n), True)])
     if 6 <= agreeing <= SCARCE_DOF:
         more = _everywhere(b, rng)
         R, t, cost = np.concatenate([R, more.R]), np.concatenate([t, more.t]), np.concatenate([cost, more.cost])

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from hal.geometry import UncertainPose, from_json
 from hal.strict import Strict
 from service.operations.examples import FUSE_EXAMPLES
 
 Vector3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+
+
+def _of_a_length(quaternion: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    if sum(q * q for q in quaternion) < 1e-12:
+        raise ValueError("a quaternion of zero length is no rotation")
+    return quaternion
+
+
+Quaternion = Annotated[tuple[float, float, float, float], AfterValidator(_of_a_length)]
 Row3 = tuple[Vector3, Vector3, Vector3]
 Length = Annotated[float, Field(ge=-100.0, le=100.0)]
 Point = tuple[Length, Length, Length]

@@ -10,7 +10,7 @@ from drivers.emulators.scripted import ScriptedGripper
 from drivers.robotiq_2f import decode_status, encode_command
 from hal.conformance import GripperContract, Rig
 from hal.errors import CellError, DeviceFault, InvalidRequest
-from hal.readings import Quality
+from hal.readings import Cause, Quality
 from hal.registry import Context, connect
 from tests.drivers.rigs import soon, until, wired, wired_rig
 
@@ -82,6 +82,15 @@ def test_a_gripper_that_complains_of_no_activation_or_no_host_is_connected_and_i
         assert device.read_state(deadline=soon()).quality is Quality.INVALID
         far_side.table.fault = 0
         assert device.newest(soon(), not_before_s=soon(0.0).at_s + 0.05).quality is Quality.VALID
+
+
+def test_a_gripper_that_has_started_anew_knows_no_width() -> None:
+    far_side = emulator.start(ScriptedGripper(), {})
+    with wired(far_side, DRIVER) as device:
+        assert device.read_state(deadline=soon()).quality is Quality.VALID
+        far_side.table.write_registers(1000, [0])  # what it comes up with after it was without power
+        sample = device.newest(soon(), not_before_s=soon(0.0).at_s + 0.05)
+        assert (sample.quality, sample.cause) == (Quality.INVALID, Cause.DEVICE)
 
 
 def test_a_lost_activation_is_said_and_nothing_moves_by_itself() -> None:

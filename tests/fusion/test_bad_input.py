@@ -14,6 +14,7 @@ from fusion.features import line, plane
 from fusion.simulate import CODES, Problem, problem
 from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose, difference
+from tests.fusion.mixtures import mixture
 
 NAN = float("nan")
 
@@ -93,6 +94,16 @@ def test_all_bad_is_a_contradiction_and_no_pose() -> None:
     with pytest.raises(Contradiction) as caught:
         fuse(p.measurements)
     assert caught.value.details["total"] == 12
+
+
+@pytest.mark.parametrize("count", [3, 5, 7])
+def test_where_nothing_agrees_each_measurement_is_named(count: int) -> None:
+    given = [mixture(count, 31 + k).measurements[k] for k in range(count)]  # of as many poses
+    with pytest.raises(Contradiction) as caught:
+        fuse(given)
+    named = [one["index"] for one in caught.value.details["outside"]]
+    assert len(named) == count - caught.value.details["agreeing"]
+    assert set(named) <= set(range(count)) and named
 
 
 def test_duplicates_count_once_and_are_named() -> None:

@@ -105,6 +105,7 @@ REFUSED: dict[str, dict[str, Any]] = {
     "unknown parameter": {**ROUND_POST, "shape": {
         "kind": "features", "parameters": [{"name": "gap", "start_m": 0.1}],
         "parts": [{"name": "wall", "feature": "plane", "point_m": [0, 0, 0], "slopes": {"gab": [0, 0, 1]}}]}},
+    "prior without a rotation": {**NINE_KINDS, "prior": {**PRIOR, "quaternion_xyzw": [0.0, 0.0, 0.0, 0.0]}},
     "negative radius": {**ROUND_POST, "shape": {"kind": "cylinder", "radius_m": -0.1, "length_m": 0.1}},
 }  # fmt: skip
 

@@ -33,6 +33,7 @@ STANDOFF_M = 0.030  # of the tips above the object's highest place
 RETREAT_M = 0.050
 RETREAT_M_PER_S = 0.15
 PADS_M_PER_S = 0.1
+CLOSED_M = 0.0005
 GRASP_M_PER_S = 0.03
 PULLS = 3
 PULL_N = 90.0  # after a failure the hand may be jammed; just below the cell's protective limit
@@ -78,10 +79,12 @@ class Attempt:
         """Measured base_from_grip."""
         return self.cell.kinematics.tool(self.joints(), self.cell.flange_from_grip)
 
-    def open_to(self, width_m: float, *, force_n: float = 15.0, name: str = "set opening") -> MotionReport:
-        """Move the pads to an opening while the arm holds; skipped when they are there."""
+    def open_to(self, width_m: float, *, force_n: float = 15.0, name: str = "set opening") -> None:
+        """Move the pads to an opening while the arm holds; closed pads that shall be closed are left alone."""
         width = min(width_m, self.cell.hand.max_width_m)
-        return self.run(GripperMotion(name=name, width_m=width, force_n=force_n, speed_m_per_s=PADS_M_PER_S))
+        if max(width, self.cell.mover.state().gripper_width_m) <= CLOSED_M:
+            return
+        self.run(GripperMotion(name=name, width_m=width, force_n=force_n, speed_m_per_s=PADS_M_PER_S))
 
     def grasp(self, force_n: float, *, name: str) -> float:
         """Close slowly until the pads press with `force_n`; returns the opening left, m.

@@ -15,10 +15,10 @@ from hal.panel import Panel, PanelObject
 
 FILL = 0.85  # share of the image that the target may fill: pose and mount are not exact
 CLOSE_UP_M = 0.30  # at 460 px focal length a 36 mm gauge face is 110 px wide
-SIDES = {  # turns about the panel's x and y
+SIDES = {  # turns about the panel's x and y; round the object, for the way across it is half as long again
     "the right": (0.0, 1.0),
-    "the left": (0.0, -1.0),
     "below": (1.0, 0.0),
+    "the left": (0.0, -1.0),
     "above": (-1.0, 0.0),
 }
 SIDE_RAD = (0.42, 0.32)  # readers stand a tilt of 0.5; a cable 30 mm before a display moves by 13 mm

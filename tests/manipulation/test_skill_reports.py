@@ -151,6 +151,18 @@ def test_a_press_that_may_have_counted_is_not_repeated_when_nobody_can_tell() ->
     assert "gave way by only" in told.cause and "undo" in told.cause
 
 
+@pytest.mark.parametrize(
+    ("width_m", "wanted_m", "moves"), [(0.0, 0.0, 0), (0.002, 0.0, 1), (0.0, 0.002, 1), (0.03, 0.03, 1)]
+)
+def test_closed_pads_that_shall_be_closed_are_left_alone(width_m: float, wanted_m: float, moves: int) -> None:
+    """Open ones are sent even where they are: they may press on something there."""
+    cell, mover = before_the_bench({})
+    state = replace(mover.state(), gripper_width_m=width_m)
+    mover.state = lambda: state  # type: ignore[method-assign]  # one state for this test
+    Attempt(cell).open_to(wanted_m)
+    assert mover.asked.count("set opening") == moves
+
+
 def test_a_press_is_guarded_by_more_than_the_springs_of_the_cap() -> None:
     cell, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
     button(cell, "start")

@@ -15,7 +15,7 @@ from hal.errors import Unreachable
 from manipulation.transfer import QUICK, THOROUGH, Effort
 from manipulation.workcell import Workcell
 from service.operations.session import Session
-from service.operations.travel import MOST_THOROUGH, MOST_TRIES, go_to_camera_view
+from service.operations.travel import MOST_THOROUGH, MOST_TRIES, NEAR_RAD, go_to_camera_view, near_first
 from service.operations.views import close_up_poses
 
 ROOT = Path(__file__).parents[3]
@@ -44,6 +44,21 @@ def efforts_of(session: Session, monkeypatch: pytest.MonkeyPatch, *, found_at: i
     poses = close_up_poses(session.known_panel().parent_from_child, (0.0, 0.0, 0.0))
     go_to_camera_view(session, poses, name="a close-up")
     return asked
+
+
+def test_views_near_by_go_before_those_of_another_branch_of_the_arm() -> None:
+    """One look took 3.9 s of turning over where the same from a camera on its side takes 1.4 s."""
+    here = np.zeros(6)
+    asked = []
+
+    def goals() -> Iterator[Any]:
+        for turn_rad in (2.0, NEAR_RAD, -NEAR_RAD - 0.01, 0.3):
+            asked.append(turn_rad)
+            yield np.array([0.1, turn_rad, 0.0, 0.0, 0.0, 0.0])
+
+    order = near_first(goals(), here)
+    assert next(order)[1] == NEAR_RAD and asked == [2.0, NEAR_RAD], "no more poses are worked out than are tried"
+    assert [goal[1] for goal in order] == [0.3, 2.0, -NEAR_RAD - 0.01]
 
 
 def test_the_next_pose_is_tried_before_a_long_search_for_the_first(

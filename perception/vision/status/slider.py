@@ -21,6 +21,8 @@ SLOT = 0.2  # of the cap's width: half of the slot and what blurs it
 EDGE_BOX = 0.22  # of the cap's length: a line across its middle is further from its edges
 LEAST_OPEN = 0.4  # of a box that must not be covered
 SLACK = 0.12  # of the cap's length: by how much a cap may differ from its drawing
+NEXT_TO = 0.4  # of the cap's length: how exactly two caps share an edge
+SAME_EDGE = 1.25  # times the weaker edge of the cap
 BEYOND, MOST_BEYOND = 0.8, 0.4  # of the cap's width from the track; share that may be as dark there
 SIDES = np.linspace(-0.40, 0.40, 17)  # of the cap's width: inside the cap
 
@@ -110,7 +112,12 @@ def _best_pair(
     place = (low + high - lean) / 2
     if abs(lean) >= 0.1 * along_m:  # only one edge is the top's, the other is the foot's
         place = low + along_m / 2 if lean > 0 else high - along_m / 2
-    rival = max(float(perhaps[apart].max(initial=0.0)), float(other[1].max()))
+    beside = np.abs(s - s[top]) > along_m  # the line across a whole cap's middle is no edge of another one
+    whole = max(float(score[apart].max(initial=0.0)), float(other[0].max()))
+    # An edge of the cap that is found whole would do for one of another gray beside it whose far edge is hidden.
+    next_to_it = np.abs(np.abs(s - s[top]) - along_m) < NEXT_TO * along_m
+    elsewhere = np.where(next_to_it & (other[1] <= SAME_EDGE * score[top]), 0.0, other[1])
+    rival = max(whole, *(float(partly[beside].max(initial=0.0)) for partly in (perhaps, elsewhere)))
     return _Cap(place_m=place, peak=float(score[top]), rival=rival)
 
 

@@ -8,6 +8,7 @@ from benchmarks.panel_scene import draw_scene
 from benchmarks.vision_held_out import read_scene
 
 GRAY_POINTERS = (70029, 70042)  # on dark faces, beside brighter numerals
+CABLES_BESIDE_A_CAP = (70062, 70080)  # whose own edge would do for a cap under the cable
 FAINT_LENSES = (70066, 70028)  # unlit ones at .75 and .80 of the plate's gray
 BATS_LIKE_THE_PLATE = (70023, 70040)  # that stand out from the nut about their foot alone
 WIDE_BAT = 70001  # what is beside a bat of the usual width is still the bat
@@ -44,3 +45,9 @@ def test_a_face_of_a_cables_gray_is_not_taken_for_what_hides_it(seed: int) -> No
 def test_the_gap_between_a_pointer_and_a_numeral_is_no_pointer(seed: int) -> None:
     gauges = [row for row in read_scene(draw_scene(seed, "medium")) if row.kind == "gauge"]
     assert gauges and not any(row.answered and not row.is_right for row in gauges)
+
+
+@pytest.mark.parametrize("seed", CABLES_BESIDE_A_CAP)
+def test_a_cable_a_cap_away_does_not_hide_the_cap_that_shows(seed: int) -> None:
+    sliders = [row for row in read_scene(draw_scene(seed, "hard")) if row.kind == "slider"]
+    assert sliders and all(row.is_right for row in sliders)

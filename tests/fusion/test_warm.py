@@ -2,9 +2,30 @@
 
 from __future__ import annotations
 
-from fusion import warm_up
+import sys
+
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+
+from fusion import fuse, warm_up
+from hal.geometry import UncertainPose
+from tests.fusion.mixtures import mixture
 
 
-def test_warming_up_twice_is_harmless() -> None:
+def variants() -> dict[str, int]:
+    """How often each compiled loop of the package was compiled or loaded, by its name."""
+    modules = [module for name, module in sys.modules.items() if name.startswith("fusion.")]
+    loops = {value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)}
+    return {f"{loop.py_func.__module__}.{loop.py_func.__name__}": len(loop.signatures) for loop in loops}
+
+
+def test_after_warming_up_no_fusion_waits_for_a_compiler() -> None:
+    p = mixture(16, 3, bad=4)  # making a problem is nothing that a user waits for
     warm_up()
-    warm_up()
+    warm = variants()
+    assert any(warm.values())
+    prior = UncertainPose(parent_from_child=p.base_from_object, covariance=1e-4 * np.eye(6))
+    fuse(p.measurements)
+    fuse(p.measurements, prior=prior, certify=True)
+    fuse([min(p.measurements, key=lambda one: one.dof)], prior=prior)
+    assert variants() == warm

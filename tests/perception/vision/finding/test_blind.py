@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,7 @@ import pytest
 
 from benchmarks.vision_drawing import Disturbance
 from hal.errors import Ambiguous, InvalidRequest, NotFound
-from perception.vision.finding.blind import chosen, lay_out, recognise
+from perception.vision.finding.blind import chosen, lay_out, recognise, uprightness
 from perception.vision.finding.features import (
     AROUND_GROUPS,
     DIRECTIONS,
@@ -237,6 +238,22 @@ def test_only_a_noisy_image_is_compared_with_looks_of_noisy_images(sigma: float,
     found = chosen(ground, at[None], look, knowledge, view, PLATE)
     assert ground.noisy is noisy
     assert any(candidate.kind == "ghost" for candidate in found) is noisy
+
+
+def test_noise_says_nothing_of_which_way_is_up() -> None:
+    image, view = overview()
+    ground, knowledge = lay_out(image, view, PLATE), shipped_knowledge()
+    at = (
+        np.array([thing.point_m[:2] for thing in panel().objects]) * [1.0, -1.0] + np.array(PLATE) / 2
+    ) * PLATE_PX_PER_M
+    found = chosen(ground, at, look_at(ground, at), knowledge, view, PLATE)
+    up = uprightness(ground, found, knowledge, PLATE)
+    noisy = replace(ground, noisy=True)
+    ghosts = [replace(candidate, kind="ghost") for candidate in found]
+    with_ghost = _with_noisy_look(knowledge, "ghost", np.zeros(LENGTH))
+    assert up > 0.0
+    assert uprightness(noisy, found, knowledge, PLATE) == up
+    assert uprightness(noisy, ghosts, with_ghost, PLATE) == 0.0
 
 
 def test_what_lies_far_from_a_middle_counts_in_good_images_only() -> None:

@@ -184,7 +184,7 @@ class ModbusRtu(ModbusMaster):
                 break
         if (unit, function) not in self._unanswered:
             return
-        for other in (READ_HOLDING, READ_INPUTS, READ_COILS, READ_INPUT_REGISTERS):
+        for other in (READ_HOLDING, READ_INPUT_REGISTERS, READ_INPUTS, READ_COILS):  # some slaves know registers only
             if (unit, other) not in self._unanswered:
                 self._probe(unit, other, until_s)
                 return

@@ -37,6 +37,16 @@ def test_rtu_never_takes_a_late_answer_for_the_next() -> None:
     assert [frame[1] for frame in link.written] == [2, 3, 2]
 
 
+def test_a_slave_that_knows_registers_only_is_heard_again_at_once_after_a_lost_answer() -> None:
+    """Grippers and force sensors leave requests for bits without any answer."""
+    link = ScriptLink(b"", rtu("0984 02"), rtu("0903 02 00aa"))
+    master = ModbusRtu(link, timeout_s=0.01, gap_s=0.0, quarantine_s=0.0)
+    with pytest.raises(NoAnswer):
+        master.read_registers(unit=9, address=180, count=1, until_s=later(0.0))
+    assert master.read_registers(unit=9, address=180, count=1, until_s=later()) == (0xAA,)
+    assert [frame[1] for frame in link.written] == [3, 4, 3]
+
+
 def test_rtu_drops_what_lies_ready_before_it_asks() -> None:
     link = ScriptLink(rtu("0902 01 aa"))
     link.ready = rtu("0902 01 55")

@@ -16,6 +16,7 @@ CORE, RIM, PLATE = (0.0, 0.15, 0.3), (0.5, 0.6, 0.7), (1.45, 1.6, 1.75)  # of th
 RING_PLACES, LEAST_SEEN = 108, 0.3  # places looked at in each; share that must not be hidden
 CLEAR_OF_BEZEL = 1.4  # of the radius
 LIT_RATIO = 0.95  # between an unlit lens (0.2 to 0.9 of the plate) and a lit one (above 1.1)
+MOST_WHITE = 0.2  # of the plate around
 FLAT_RATIO = 1.1  # middle over rim: of unlit lenses .95 have less than 1.1, of lit ones that do not saturate .97 more
 
 
@@ -34,8 +35,12 @@ def read_lamp(patch: Patch, spec: Lamp) -> Status:
     middle = float(np.median(core))  # an unlit lens may have a shine
     brightness = np.log(max(middle, 2.0) / level / LIT_RATIO)
     peaked = np.log((middle + 8.0) / (float(np.median(rim)) + 8.0) / FLAT_RATIO)
-    is_saturated = middle >= WHITE_LEVEL - 2  # and the plate is not: brighter than shows, and its peak is cut off
-    evidence = brightness / 0.12 + (1.5 if is_saturated else 1.5 * np.clip(peaked / 0.1, -1.0, 1.0))
+    peak = 1.5 * np.clip(peaked / 0.1, -1.0, 1.0)
+    if (
+        middle >= WHITE_LEVEL - 2
+    ):  # brighter than shows, and its peak is cut off; what is white beyond it too may be glare
+        peak = 0.5 if (plate >= WHITE_LEVEL - 2).mean() > MOST_WHITE else 1.5
+    evidence = brightness / 0.12 + peak
     inside = patch.inside.mean()
     if inside < 0.7:
         return refused("the lamp is outside the image: move the camera")

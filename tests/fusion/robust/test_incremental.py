@@ -10,6 +10,7 @@ from fusion.robust import incremental
 from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose, difference
 from tests.fusion.mixtures import mixture
+from tests.fusion.robust.test_answer import leaning
 
 
 def test_adding_and_removing_agree_with_fusing_at_once() -> None:
@@ -51,3 +52,15 @@ def test_a_prior_stays_what_it_is_when_measurements_come_and_go() -> None:
     assert [r.index for r in grown.answer.rejected] == [r.index for r in whole.rejected]
     shrunk = incremental.remove(grown, 13).answer
     assert np.abs(difference(fuse(p.measurements[:13], prior=prior).pose, shrunk.pose)).max() < 1e-6
+
+
+def test_another_pose_that_fits_stays_listed_as_measurements_come_and_go() -> None:
+    given = leaning(0.3, 0.2)
+    grown = incremental.add(incremental.start(given[:-1]), given[-1])
+    shrunk = incremental.remove(grown, len(given) - 1)
+    for step, whole in ((grown, fuse(given)), (shrunk, fuse(given[:-1]))):
+        assert len(step.answer.alternatives) == len(whole.alternatives) > 0
+        assert step.answer.alternatives[0].odds == pytest.approx(whole.alternatives[0].odds, rel=1e-3)
+        found = [step.answer.pose, *(other.pose for other in step.answer.alternatives)]
+        for pose in (whole.pose, *(other.pose for other in whole.alternatives)):
+            assert min(np.abs(difference(pose, one)).max() for one in found) < 1e-4

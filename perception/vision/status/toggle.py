@@ -36,11 +36,12 @@ def read_toggle(patch: Patch, spec: Toggle) -> Status:
     for flank in (FLANK, WIDE_FLANK):
         contrast = np.array([_bat(patch, spec, angle, flank) for angle in LEANS])
         status = choose(STATES, _of_one_colour(contrast), noise=noise, seen=seen, what="bat")
-        if status.answered and at_foot.max() > 0.0 and STATES[int(at_foot.argmax())] != status.state:
-            return doubted(status, "something lies across the bat: move it or look past it")
-        if status.answered:
+        if status.answered and status.state is not None:
+            k = STATES.index(status.state)
+            if contrast[k] < 0.0 < at_foot[1 - k]:  # a dark bar here, and a bright bat before its nut there
+                return doubted(status, "something lies across the bat: move it or look past it")
             return status
-    return choose(STATES, at_foot, noise=noise, seen=seen, what="bat")
+    return choose(STATES, np.abs(at_foot), noise=noise, seen=seen, what="bat")
 
 
 def _of_one_colour(contrast: Array) -> Array:
@@ -50,11 +51,11 @@ def _of_one_colour(contrast: Array) -> Array:
 
 
 def _at_foot(patch: Patch, spec: Toggle, noise: float) -> Array:
-    """(2,) contrast of the bat before its nut, towards `LEANS`; zeros where it does not stand out on one side."""
+    """(2,) signed contrast of the bat before its nut, towards `LEANS`; zeros where it does not stand out on one side."""
     contrast = np.array([_stretch(patch, spec, angle, AT_FOOT, FLANK) for angle in LEANS])
     size = np.abs(contrast)
     stands_out = size.max() > AT_FOOT_NOISE * noise and size.min() < 0.5 * size.max()
-    return size if stands_out else np.zeros(2)
+    return np.where(size == size.max(), contrast, 0.0) if stands_out else np.zeros(2)
 
 
 def _stretch(

@@ -35,9 +35,8 @@ MOST_MIRRORED = 16  # minima whose mirror images are looked for
 READMITTED = 3  # cheapest candidates whose rejected measurements are tried again
 ALTERNATIVE_COST = 18.0  # a minimum this much worse has odds below 1e-4
 SAME_SIGMAS = 6.0  # minima closer than this are one
-FREE_COSINE = math.cos(
-    0.5
-)  # of the turn; where one of them leaves a motion free, its information speaks of its surroundings only
+# Minima that leave a motion free are one within this turn: their information speaks of their surroundings only.
+FREE_COSINE = math.cos(0.5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +110,7 @@ class Served:
         arguments = ["--cell", str(cell), "--port", str(self.port), "--stop-port", "0", "--no-warm"]
         arguments += ["--runs", str(folder / "runs")]
         self.log = folder / "serve.log"
-        with self.log.open("w") as log:
+        with self.log.open("w") as log, _hearing_hangups():
             self.process = psutil.Popen([*PANELWRIGHT, "serve", *arguments], stdout=log, stderr=log)
         self.client = httpx2.Client(base_url=f"http://127.0.0.1:{self.port}", timeout=30.0, trust_env=False)
         eventually(self._is_ready)
@@ -125,6 +126,16 @@ class Served:
 
     def survivors(self) -> list[psutil.Process]:
         return [process for process in [*self.family, self.world] if _runs(process)]
+
+
+@contextmanager
+def _hearing_hangups() -> Iterator[None]:
+    """Children inherit that SIGHUP is ignored, and it is where the tests themselves run under `nohup`."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -107,35 +107,48 @@ def look_past(session: Session, found: Inspection) -> Inspection:
     unread = [reading for reading in found.readings.values() if reading.present and not reading.answered]
     if len(unread) > MOST_UNREAD:
         return found
-    readings, pictures = dict(found.readings), list(found.pictures)
-    for reading in unread:
-        looks = [reading]
-        for closer in _from_the_sides(session, reading.name):
-            looks.append(closer.readings[reading.name])
-            pictures += closer.pictures
-            if joined(looks).answered:
-                break
-        told = joined(looks)
-        if not told.answered and len(looks) > 1:
-            told = replace(told, reason=f"{told.reason} ({len(looks) - 1} looks from the sides did not tell either)")
-        readings[reading.name] = told
-        forget_reading(session, reading.name)  # one look alone may have said what the others contradict
+    looks = {reading.name: [reading] for reading in unread}
+    pictures = list(found.pictures)
+    for _, group in close_up_groups([session.panel.object(name) for name in looks], session.lens()):
+        pictures += _from_the_sides(session, group, looks)
+    told = {name: _told(each) for name, each in looks.items()}
+    for name in told:
+        forget_reading(session, name)  # one look alone may have said what the others contradict
+    readings = found.readings | told
     _remember(session, readings.values())
     return Inspection(readings=readings, pictures=tuple(pictures))
 
 
-def _from_the_sides(session: Session, name: str) -> Iterator[Inspection]:
-    """Close-ups of one object from each side that the arm reaches and the panel shows at."""
-    point_m = session.panel.object(name).point_m
+def _from_the_sides(
+    session: Session, group: Collection[str], looks: dict[str, list[ObjectReading]]
+) -> Iterator[AnnotatedView]:
+    """Pictures from each side that the arm reaches and the panel shows at, until all is told; readings go to `looks`."""
+    middle_m = np.mean([session.panel.object(name).point_m for name in group], axis=0)
+    unread = list(group)
     for side, turns in SIDES.items():
-        session.progress(1.0, "look past what hides it", f"{name} from {side}")
-        poses = side_poses(session.known_panel().parent_from_child, point_m, turns)
+        title = f"{', '.join(unread)} from {side}"
+        session.progress(1.0, "look past what hides it", title)
+        poses = side_poses(session.known_panel().parent_from_child, tuple(middle_m), turns)
         try:
-            go_to_camera_view(session, poses, name=f"{name} from {side}")
+            go_to_camera_view(session, poses, name=title[:60])
             settle(session)
-            yield inspect_here(session, (name,), title=f"{name} from {side}")
+            closer = inspect_here(session, unread, title=title)
         except (PerceptionError, Unreachable):
             continue
+        yield from closer.pictures
+        for name in unread:
+            looks[name].append(closer.readings[name])
+        unread = [name for name in unread if not joined(looks[name]).answered]
+        if not unread:
+            return
+
+
+def _told(looks: Sequence[ObjectReading]) -> ObjectReading:
+    """What a straight look and those from the sides say together."""
+    told = joined(looks)
+    if told.answered or len(looks) == 1:
+        return told
+    return replace(told, reason=f"{told.reason} ({len(looks) - 1} looks from the sides did not tell either)")
 
 
 def reading_row(reading: ObjectReading, when: str) -> Reading:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from hal.errors import Unreachable
 from perception.vision.reading import ANSWER_AT, ObjectReading
 from service.operations import inspect
 from service.operations.beliefs import forget_reading, known_readings
-from service.operations.inspect import Inspection, inspect_close
+from service.operations.inspect import Inspection, close_ups, inspect_close
 from service.operations.requests import InspectRequest
 from service.operations.session import Session
 
@@ -77,6 +78,17 @@ def test_a_cap_that_no_side_shows_says_how_often_it_was_looked_at(session: Sessi
     sides = len(found.pictures) - 1
     assert truth_of(session, "hold").state == "pressed" and not reading.answered
     assert sides > 0 and f"({sides} looks from the sides did not tell either)" in (reading.reason or "")
+
+
+def test_neighbours_that_cannot_be_read_are_looked_at_together(session: Session) -> None:
+    first = close_ups(session, ("hold", "start"))
+    unread = {name: replace(told, state=None, reason="doubted") for name, told in first.readings.items()}
+    found = inspect.look_past(session, replace(first, readings=unread))
+    titles = [picture.title for picture in found.pictures[len(first.pictures) :]]
+    assert found.readings["start"].state == truth_of(session, "start").state
+    assert titles[0] in ("hold, start from the right", "start, hold from the right")
+    assert len(titles) <= len(inspect.SIDES), "each side once"
+    assert titles[-1].startswith("hold from "), "what has been told is not asked for again"
 
 
 def test_a_guess_is_answered_to_who_asks_for_it_and_not_remembered(session: Session) -> None:

@@ -116,7 +116,10 @@ class Service:
             return operation.run(
                 OperationContext(
                     connection=GatedConnection(
-                        self.supervisor.connection, check_may_move, cell=self.calibrations.applied()
+                        self.supervisor.connection,
+                        check_may_move,
+                        cell=self.calibrations.applied(),
+                        stop=self.supervisor.stop,
                     ),
                     task=task,
                     runs_dir=self.runs_dir,

@@ -67,9 +67,8 @@ class Attempt:
             case MotionOutcome.FAULT if report.device is None:
                 raise SkillFailure(Outcome.FORCE_LIMIT, f"{motion.name}: {report.cause}")
             case MotionOutcome.FAULT:
-                raise DeviceFault(
-                    f"{motion.name}: {report.cause}", hint="run `panelwright devices`", device=report.device
-                )
+                hint = "run `panelwright devices`; an arm that failed stays there until the stop is reset"
+                raise DeviceFault(f"{motion.name}: {report.cause}", hint=hint, device=report.device)
 
     def joints(self) -> Array:
         """Measured joints (n,)."""

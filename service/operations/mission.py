@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from hal.errors import CellError
+from hal.devices import DeviceKind
+from hal.errors import CellError, DeviceError
 from hal.geometry import compose
 from hal.panel import Button, Lever, PanelObject, Slider, Toggle
 from perception.vision.reading import ObjectReading
@@ -40,7 +41,7 @@ BEFORE = "before the actions"
 def run_mission(context: OperationContext, request: MissionRequest) -> dict[str, Any]:
     """The verb `missions`.
 
-    Whatever happens, the arm is parked if it still obeys, and the report tells what is known.
+    Whatever happens, the arm is parked if it still obeys and has not failed itself, and the report tells what is known.
 
     Raises:
         CellError: what ended the mission early; the report is written first.
@@ -204,7 +205,13 @@ def _step(session: Session, name: str, low: float, high: float) -> Iterator[Sess
 
 
 def _park_after(session: Session, record: MissionRecord, error: Exception) -> None:
-    """Bring the arm home after an error, if the cell still obeys; a second error is told, not hidden."""
+    """Bring the arm home after an error, if the cell still obeys; a second error is told, not hidden.
+
+    An arm that failed itself is left where it stands: whoever goes near it must not see it move.
+    """
+    if isinstance(error, DeviceError) and error.details.get("device") in session.cell.names_of(DeviceKind.ARM):
+        record.facts["not_parked"] = f"{error.what}: the arm was not parked; look at it, then reset the stop"
+        return
     try:
         with record.step("park after the error"):
             settle(session)

@@ -189,7 +189,7 @@ class Session:
                 hint = "something is in the way, or the panel is not where it was: see the wrench plot of the report"
                 return MotionError(what, hint=hint, motion=report.name)
             case MotionOutcome.FAULT:
-                hint = "see the named device in GET /v1/devices"
+                hint = "see the named device in GET /v1/devices; an arm that failed stays there until the stop is reset"
                 return DeviceFault(what, hint=hint, motion=report.name, device=report.device)
             case MotionOutcome.CANCELLED:
                 return MotionError(what, hint="start the task again when ready", motion=report.name)

@@ -49,6 +49,8 @@ class World:
     width_target_m: float = 0.05
     wall_x_m: float = np.inf
     wall_n_per_m: float = 5000.0
+    stride_rad: float | None = None  # farther from the set-point before than this the arm takes none
+    bias_rad: float = 0.0  # of what the arm says of its joints
     enabled: bool = False
     commands: list[np.ndarray] = field(default_factory=list)
     silent: set[str] = field(default_factory=set)
@@ -124,20 +126,27 @@ class FakeArm(_Device):
         return T3
 
     def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
-        return self.stamped(JointState(position_rad=self.world.q.copy(), velocity_rad_per_s=self.world.velocity.copy()))
+        if self.name not in self.world.repeating:
+            said = self.world.q + self.world.bias_rad
+            self._kept = JointState(position_rad=said, velocity_rad_per_s=self.world.velocity.copy())
+        return self.stamped(self._kept)
 
     def command_position(self, position_rad: np.ndarray, *, deadline: Deadline) -> np.ndarray:
         if not self.world.enabled:
             raise DeviceUnavailable("arm is not enabled", hint="enable", device=self.name)
-        self.world.commands.append(position_rad.copy())
-        self.world.target = position_rad.copy()
-        return position_rad
+        sent = position_rad.copy()
+        if self.world.stride_rad is not None:  # as drives do that know where they are
+            sent = np.clip(sent, self.world.target - self.world.stride_rad, self.world.target + self.world.stride_rad)
+        self.world.commands.append(sent)
+        self.world.target = sent
+        return sent
 
     def enable(self, *, deadline: Deadline) -> None:
         self.world.enabled = True
 
     def stop(self, *, deadline: Deadline) -> None:
         self.world.enabled = False
+        self.world.target = self.world.q.copy()
         self.world.stops += 1
 
 

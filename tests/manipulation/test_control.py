@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from hal.errors import MotionRefused, Stopped
+from hal.errors import DeviceFault, MotionRefused, Stopped
 from hal.geometry import difference, perturbed
 from hal.motion import (
     CartesianPath,
@@ -199,6 +199,59 @@ def test_an_arm_that_does_not_follow_is_a_fault(rig: Rig) -> None:
     report = rig.controller.execute(forwards(0.1))
     assert report.outcome is MotionOutcome.FAULT and report.tripped == "tracking"
     assert report.device == "arm" and "does not follow" in report.cause
+
+
+def frozen_in_motion(rig: Rig) -> None:
+    """The arm goes on while it repeats one reading under new stamps, until that is noticed."""
+    rig.world.before_step = lambda: rig.world.repeating.add("arm") if rig.world.ticks == 300 else None
+    report = rig.controller.execute(forwards(0.1))
+    assert (report.tripped, report.device) == ("tracking", "arm")
+    rig.world.before_step = lambda: None
+    rig.world.commands.clear()
+
+
+def test_an_arm_that_failed_is_left_to_its_own_brake(rig: Rig) -> None:
+    frozen_in_motion(rig)
+    assert not rig.world.enabled
+
+
+def test_an_arm_whose_reading_is_still_wrong_is_not_sent_there_after_a_reset(rig: Rig) -> None:
+    """It leapt the 22 mm back at once: the first set-point of the next motion was the wrong reading."""
+    frozen_in_motion(rig)
+    stood = rig.world.q.copy()
+    rig.world.stride_rad = 0.006
+    for _ in range(2):
+        report = rig.controller.execute(Hold(name="settle", duration_s=0.1))
+        assert (report.outcome, report.device) == (MotionOutcome.FAULT, "arm")
+        assert "does not follow" in report.cause and report.cause.endswith("nothing moved")
+    assert np.array_equal(rig.world.q, stood) and not rig.world.enabled
+
+
+def test_an_arm_that_is_well_again_goes_on_from_where_it_is(rig: Rig) -> None:
+    frozen_in_motion(rig)
+    stood = rig.world.q.copy()
+    rig.world.repeating.clear()
+    rig.world.stride_rad = 0.006
+    assert rig.controller.execute(Hold(name="settle", duration_s=0.1)).outcome is MotionOutcome.COMPLETED
+    assert np.abs(np.array(rig.world.commands) - stood).max() < 1e-9
+    assert rig.controller.execute(forwards(0.02, start=rig.world.q)).outcome is MotionOutcome.COMPLETED
+
+
+@pytest.mark.parametrize("act", ["motion", "tare"])
+def test_an_arm_that_says_it_is_not_where_it_was_held_is_not_sent_there(rig: Rig, act: str) -> None:
+    """A bias of 20 mrad on all joints, come between two motions, made each motion begin with a leap."""
+    assert rig.controller.execute(Hold(name="still", duration_s=0.02)).outcome is MotionOutcome.COMPLETED
+    rig.world.commands.clear()
+    rig.world.bias_rad = 0.02
+    if act == "motion":
+        report = rig.controller.execute(Hold(name="settle", duration_s=0.1))
+        assert (report.outcome, report.device) == (MotionOutcome.FAULT, "arm")
+        assert "from where it was sent; nothing moved" in report.cause
+    else:
+        with pytest.raises(DeviceFault, match="does not follow"):
+            rig.controller.tare()
+    assert rig.world.commands == [] and np.array_equal(rig.world.q, HOME)
+    assert not rig.world.enabled
 
 
 def test_compliance_yields_to_the_wall(rig: Rig) -> None:

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from hal.config import load_cell
-from hal.errors import CellError, NotFound
+from hal.errors import CellError, DeviceFault, NotFound
+from hal.motion import DeclaredMotion, MotionReport
 from hal.simulated import Fault, ObjectTruth, Truth
 from service.operations.context import CellMemory, OperationContext
 from service.operations.inspect import look_close
@@ -139,6 +140,28 @@ def test_a_device_that_dies_ends_the_mission_by_name_and_nothing_is_lost(tmp_pat
     assert report["steps"] and not report["succeeded"]
     park = load_cell(ROOT / "cells/bench.toml").file.workspace.park_rad
     np.testing.assert_allclose(state.position_rad, park, atol=0.01)
+
+
+def test_an_arm_that_does_not_follow_is_left_where_it_stands(tmp_path: Path) -> None:
+    """Parking it began with a leap of 20 mm, and 102 N at the wrist."""
+    with mission_context(tmp_path, seed=4) as context:
+        mover = context.connection.mover
+        execute, reports = mover.execute, []
+
+        def noted(motion: DeclaredMotion) -> MotionReport:
+            reports.append(execute(motion))
+            return reports[-1]
+
+        mover.execute = noted  # type: ignore[method-assign]  # every motion, of the mission and after it
+        context.connection.device("arm").inject_fault(Fault.FROZEN)
+        with pytest.raises(DeviceFault, match="does not follow"):
+            run_mission(context, MissionRequest())
+    assert [report.tripped == "tracking" for report in reports] == [False] * (len(reports) - 1) + [True]
+    report = report_of(tmp_path)
+    assert "arm does not follow" in report["not_parked"]
+    assert report["not_parked"].endswith("the arm was not parked; look at it, then reset the stop")
+    (page,) = tmp_path.glob("runs/*/report.html")
+    assert "Not parked" in page.read_text()
 
 
 def test_an_arm_that_stands_at_the_panel_and_knows_of_none_gets_away(tmp_path: Path) -> None:

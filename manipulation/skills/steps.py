@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from hal.errors import Cancelled, DeviceFault, MotionRefused, Stopped, Unreachable
+from hal.errors import Cancelled, DeviceFault, MotionError, MotionRefused, Stopped, Unreachable
 from hal.motion import (
     Compliance,
     DeclaredMotion,
@@ -268,8 +268,17 @@ def park(cell: Workcell) -> None:
 
     Raises:
         Unreachable: no free way, even after backing off.
+        MotionError: something held the arm up on the way.
         DeviceFault, Stopped, Cancelled: the cell does not obey.
     """
+    try:
+        _park(cell)
+    except SkillFailure as failure:
+        hint = "something is in the way, or the panel is not where it was: look at the arm, then send this again"
+        raise MotionError(failure.cause, hint=hint) from failure
+
+
+def _park(cell: Workcell) -> None:
     attempt = Attempt(cell)
     state = cell.mover.state()
     width = max(state.gripper_width_m, 0.0)

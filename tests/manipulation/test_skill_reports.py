@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hal.errors import MotionError
 from hal.geometry import certain, transform_rpy
 from hal.motion import CartesianPath, DeclaredMotion, MotionLog, MotionOutcome, MotionReport, RobotState
 from hal.panel import load_panel
@@ -20,7 +21,7 @@ from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, Skil
 from manipulation.skills.press import stop_force_n, travelled_m
 from manipulation.skills.probe import proximity_probe
 from manipulation.skills.rotary import rotary
-from manipulation.skills.steps import PULLS, Attempt, retreat
+from manipulation.skills.steps import PULLS, Attempt, park, retreat
 from manipulation.timing import SpeedLimits
 from manipulation.tool import Hand
 from manipulation.workcell import Workcell
@@ -185,6 +186,14 @@ def test_a_hand_that_is_held_is_pulled_again() -> None:
         cell, mover = before_the_bench({"retreat": answer})
         retreat(cell)
         assert mover.asked.count("retreat") == pulls
+
+
+def test_what_holds_the_arm_up_on_its_way_to_park_is_an_error_of_the_motion_and_no_defect() -> None:
+    against = replace(COMPLETED, outcome=MotionOutcome.FAULT, cause="114 N against the arm")
+    cell, mover = before_the_bench({"to park": against})
+    with pytest.raises(MotionError, match="to park: 114 N") as caught:
+        park(replace(cell, park_rad=HOME + 0.05))
+    assert mover.asked[-1] == "to park" and "in the way" in caught.value.hint
 
 
 def test_a_wheel_that_slipped_is_held_more_firmly_up_to_what_a_hand_may() -> None:

@@ -34,12 +34,13 @@ from hal.motion import (
 from manipulation import braking, kernels
 from manipulation.control_thread import ControlThread
 from manipulation.drives import Drives
-from manipulation.endings import TRACKING_LIMIT_M, Ending, Watch
+from manipulation.endings import Ending, Watch
 from manipulation.kinematics import Kinematics
 from manipulation.recorder import Recorder
 from manipulation.runs import GripperRun, Run, Tick, begin
 from manipulation.sensing import ContactWrench, DeviceFailure, Devices, FrozenWrench, RangeReader, Sample, ToolView
 from manipulation.setpoint import SetPointFilter, check, flange_matrix
+from manipulation.standing import Standing
 
 Array = NDArray[np.float64]
 
@@ -105,7 +106,7 @@ class Controller:
         self._dt_s = 1.0 / (rate_hz or capabilities.command_rate_hz)
         self._filter = SetPointFilter(self.kinematics, self._grip, safety.speed_limit_m_per_s, self._dt_s)
         self._drives = Drives(arm, clock, self._dt_s)
-        self._is_arm_doubted = False  # since it failed, until it takes a set-point where it says that it stands
+        self._standing = Standing(arm.name, self.kinematics, self._grip, self._drives)
         self._is_lockstep = isinstance(clock, SimClock)
         self._thread = ControlThread(beat=None if self._is_lockstep else self._hold, at_end=self._drives.stop)
         self._busy = threading.Lock()
@@ -213,13 +214,13 @@ class Controller:
         view = ToolView(self.kinematics.dh, self._contact, tool)
         try:
             sample = self._read()
-            self._check_held(sample.position_rad)
+            self._standing.check_held(sample.position_rad, self._filter)
             check(motion, self.kinematics, sample.position_rad)
             self._filter = SetPointFilter(self.kinematics, tool, self._safety.speed_limit_m_per_s, self._dt_s)
-            self._resume(sample.position_rad)
+            self._standing.resume(sample.position_rad, self._filter)
             run = self._begin(motion, sample)
         except DeviceFailure as failure:
-            self._give_up_arm(failure.device)
+            self._standing.give_up(failure.device)
             end = Ending(outcome=MotionOutcome.FAULT, cause=f"{failure}; nothing moved", device=failure.device)
             return self._report(motion, end, started_s, view, recorder)
         self._is_moving = True
@@ -309,7 +310,7 @@ class Controller:
             self._drives.switch_off()
         if end.outcome is MotionOutcome.STOPPED:
             self._drives.switch_off()
-        self._give_up_arm(end.device)
+        self._standing.give_up(end.device)
         with suppress(DeviceFailure):
             self._newest = self._read()
 
@@ -319,8 +320,8 @@ class Controller:
         free: list[Array] = []
         try:
             sample = self._read()
-            self._check_held(sample.position_rad)
-            self._resume(sample.position_rad)
+            self._standing.check_held(sample.position_rad, self._filter)
+            self._standing.resume(sample.position_rad, self._filter)
             self._drives.begin_rhythm()
             for _ in range(max(2, round(TARE_S / self._dt_s))):
                 self._send(self._filter.last_rad)
@@ -329,47 +330,10 @@ class Controller:
                 flange = kernels.frames(self.kinematics.dh, sample.position_rad)[-1]
                 free.append(sample.raw_wrench - self._contact.weight(flange))
         except DeviceFailure as failure:
-            self._give_up_arm(failure.device)
+            self._standing.give_up(failure.device)
             raise DeviceFault(f"tare: {failure}", hint="run `panelwright devices`", device=failure.device) from failure
         self._contact.bias = np.mean(free, axis=0)
         return self._contact.bias.copy()
-
-    # -- is the arm where it says? ---------------------------------------------------------------------------------
-
-    def _check_held(self, measured_rad: Array) -> None:
-        """Refuse to begin where readings put an arm that was held elsewhere: it would leap there.
-
-        Raises:
-            DeviceFailure: the drives are on, and the arm says that it is far from where they hold it.
-        """
-        if self._drives.are_on:
-            self._check_near(measured_rad, self._filter.last_rad, "{:.0f} mm from where it was sent")
-
-    def _resume(self, measured_rad: Array) -> None:
-        """Drives on, the set-point where the arm says that it is.
-
-        Raises:
-            DeviceFailure: the drives refuse, or an arm that has failed takes a set-point far from there.
-        """
-        self._filter.begin_at(measured_rad)
-        self._drives.switch_on()
-        if self._is_arm_doubted:
-            taken_rad = self._drives.send(self._filter.last_rad)
-            self._check_near(measured_rad, taken_rad, "it says that it stands {:.0f} mm from where its drives have it")
-            self._is_arm_doubted = False
-
-    def _check_near(self, measured_rad: Array, other_rad: Array, how: str) -> None:
-        tips = [(kernels.frames(self.kinematics.dh, q)[-1] @ self._grip)[:3, 3] for q in (measured_rad, other_rad)]
-        apart_m = float(np.linalg.norm(tips[0] - tips[1]))
-        if apart_m >= TRACKING_LIMIT_M:
-            name = self._devices.arm.name
-            raise DeviceFailure(name, f"{name} does not follow: {how.format(1e3 * apart_m)}")
-
-    def _give_up_arm(self, failed: str | None) -> None:
-        """An arm that failed is held by its own brake: no set-point can be trusted to be where it is."""
-        if failed == self._devices.arm.name:
-            self._is_arm_doubted = True
-            self._drives.switch_off()
 
     # -- small steps -----------------------------------------------------------------------------------------------
 

@@ -338,8 +338,12 @@ class Controller:
     # -- small steps -----------------------------------------------------------------------------------------------
 
     def _read(self, before: Sample | None = None) -> Sample:
-        sample = self._devices.read(before)
-        self._frozen_wrench.check(sample)
+        try:
+            sample = self._devices.read(before)
+            self._frozen_wrench.check(sample)
+        except DeviceFailure as failure:
+            self._faults = self._faults or (str(failure),)  # who looks at the state sees that it is old
+            raise
         self._faults = ()
         return sample
 

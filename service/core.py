@@ -39,7 +39,7 @@ class Service:
         cell: the cell to run.
         operations: the verbs.
         runs_dir: missions leave their reports here; tasks and journal live in `runs_dir/.service`.
-        stop_listener, origins, inline: see `Supervisor`.
+        stop_listener, origins, inline, partial: see `Supervisor`.
     """
 
     def __init__(
@@ -51,6 +51,7 @@ class Service:
         stop_listener: socket.socket | None = None,
         origins: tuple[str, ...] = (),
         inline: bool = False,
+        partial: bool = False,
     ) -> None:
         self.cell = cell
         self.operations = operations
@@ -61,7 +62,13 @@ class Service:
         state_dir = runs_dir / ".service"
         self.journal = Journal(state_dir / "journal.sqlite")
         self.supervisor = Supervisor(
-            cell, stop_listener=stop_listener, origins=origins, inline=inline, runs_dir=runs_dir, report=self.note
+            cell,
+            stop_listener=stop_listener,
+            origins=origins,
+            inline=inline,
+            runs_dir=runs_dir,
+            partial=partial,
+            report=self.note,
         )
         self.tasks = TaskStore(state_dir / "tasks", recorder=self.journal, stop_motion=self._stop_motion)
         self.lease = LeaseDesk(

@@ -33,6 +33,12 @@ class DevicesUnavailable(DeviceUnavailable):
     retry = Retry.AFTER_FIX
 
 
+class NotConnected(DeviceUnavailable):
+    """The device did not connect when the cell started, nor when somebody tried again; the rest of the cell works."""
+
+    retry = Retry.AFTER_FIX
+
+
 class NotPossibleNow(CellError):
     """The thing exists, but its state does not allow this."""
 

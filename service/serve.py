@@ -31,13 +31,20 @@ SWITCH_S = 0.001  # a computing thread yields to the event loop five times soone
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """How to serve. `stop_port` None: the port after `port`, or any free one. `warm`: load hot loops early."""
+    """How to serve.
+
+    Attributes:
+        stop_port: None for the port after `port`, or any free one.
+        partial: go on without devices that do not connect.
+        warm: load hot loops early.
+    """
 
     host: str = "127.0.0.1"
     port: int = 8460
     stop_port: int | None = None
     runs_dir: Path = Path("runs")
     inline: bool = False
+    partial: bool = False
     warm: bool = True
 
 
@@ -81,6 +88,7 @@ class Panelwright:
             stop_listener=stop_listener,
             origins=tuple(sorted(origins)),
             inline=options.inline,
+            partial=options.partial,
         )
 
     @property
@@ -120,7 +128,7 @@ class Panelwright:
     def run(self) -> None:
         """Serve in the main thread until Ctrl-C or SIGTERM, then close.
 
-        The front is up before the hardware; a cell that cannot start ends it.
+        The front is up before the hardware; a cell that cannot start, as its file is wrong, ends it.
 
         Raises:
             CellError: the cell could not start.

@@ -35,7 +35,7 @@ STYLES = {"valid": "green", "degraded": "yellow", "invalid": "red"}
 def devices(context: typer.Context, url: Url = UrlDefault) -> None:
     """List the devices when no command is given."""
     # Given before the command it is meant for it: `devices --url B swap …` went to the service at the usual address.
-    context.default_map = {name: {"url": url} for name in ("list", "read", "watch", "swap", "fault")}
+    context.default_map = {name: {"url": url} for name in ("list", "read", "watch", "swap", "connect", "fault")}
     if context.invoked_subcommand is None:
         console.print(_table(client_of(url)))
 
@@ -263,10 +263,19 @@ def swap_device(
         block = {"driver": driver, "options": json.loads(options)}
     except ValueError as error:
         raise ConfigError(f"--options is not JSON: {error}", hint='for example \'{"port": "/dev/ttyUSB0"}\'') from error
-    view = client_of(url).put(f"/v1/devices/{name}", block)
+    _show_connected(client_of(url).put(f"/v1/devices/{name}", block))
+
+
+@app.command("connect")
+def connect_device(name: Name, url: Url = UrlDefault) -> None:
+    """Connect a device anew: one that was missing when the cell started, or whose driver stays down."""
+    _show_connected(client_of(url).post(f"/v1/devices/{name}/connect"))
+
+
+def _show_connected(view: dict[str, Any]) -> None:
     health = view["health"]
     detail = f"; {escape(health['detail'])}" if health["detail"] else ""
-    console.print(f"{name}: {view['driver']}, {health['quality']}{detail}")
+    console.print(f"{view['name']}: {view['driver']}, {health['quality']}{detail}")
 
 
 @app.command("fault")

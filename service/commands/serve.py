@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
+from rich.markup import escape
 
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console, read_cell
 from service.commands.leaving import leave
@@ -33,12 +34,12 @@ def serve(
     warm: Annotated[bool, typer.Option(help="Load the hot loops right after the start.")] = True,
     inline: Annotated[bool, typer.Option("--inline", help="Cell and stop port in this process (debugging).")] = False,
 ) -> None:
-    """Start the cell and serve it until Ctrl-C."""
+    """Start the cell and serve it until Ctrl-C, also while devices are missing."""
     from service.serve import Options, Panelwright
 
     check_host(host)
     loaded = read_cell(cell, seed)
-    options = Options(host=host, port=port, stop_port=stop_port, runs_dir=runs, inline=inline, warm=warm)
+    options = Options(host=host, port=port, stop_port=stop_port, runs_dir=runs, inline=inline, partial=True, warm=warm)
     panelwright = Panelwright(loaded, options)
     threading.Thread(target=_announce, args=(panelwright,), daemon=True).start()
     console.print(f"panelwright: cell [bold]{loaded.name}[/] ({loaded.file.cell.mode}) is starting")
@@ -77,5 +78,8 @@ def _announce(panelwright: Panelwright) -> None:
     panelwright.wait_until_settled(START_PATIENCE_S)
     if panelwright.error is None and not panelwright.is_ending:  # Ctrl-C while it starts: nothing is ready
         console.print(f"panelwright: ready at [bold]{panelwright.url}[/]   stop: POST {panelwright.stop_url}")
+        for missing in panelwright.service.supervisor.missing:
+            console.print(f"panelwright: without [bold]{missing.device}[/]: {escape(missing.why)}")
+            console.print(f"  try    {escape(missing.hint)}; then `panelwright devices connect {missing.device}`")
         if panelwright.service.supervisor.latch.is_set():
             console.print("panelwright: the stop is latched; `panelwright stop --reset` when the cell is clear")

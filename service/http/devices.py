@@ -102,6 +102,17 @@ async def swap_device(
 
 
 @router.post(
+    "/{name}/connect", summary="Connect a device anew, as it was asked for last", operation_id="connect_device"
+)
+async def connect_device(state: State, name: Name, lease_token: LeaseToken = None) -> DeviceDetail:
+    """For a device that did not connect when the cell started, or whose driver stays down. Refused as a swap is."""
+    _check(state, name)
+    state.service.lease.check(lease_token)
+    await state.in_thread(functools.partial(_connect, state, name))
+    return await state.in_thread(functools.partial(_detail, state.service, name))
+
+
+@router.post(
     "/{name}/fault",
     summary="Simulated cells: begin or end a fault in a device",
     operation_id="inject_fault",
@@ -134,6 +145,11 @@ def _swap(state: AppState, name: str, request: SwapRequest) -> None:
         )
     fresh = section.model_copy(update={"driver": request.driver, "options": request.options})
     state.service.swap_device(name, with_recordings(fresh, section, runs_dir=state.service.runs_dir))
+    state.readings.forget(name)
+
+
+def _connect(state: AppState, name: str) -> None:
+    state.service.swap_device(name, state.service.cell.file.devices[name])
     state.readings.forget(name)
 
 

@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from fastapi import APIRouter
 from starlette.responses import JSONResponse, Response
 
-from service.http.models import HealthzView, InfoView, ProcessView, ReadyView
+from service.http.models import HealthzView, InfoView, MissingView, ProcessView, ReadyView
 from service.http.problems import RESPONSES
 from service.http.state import State
 
@@ -32,7 +32,8 @@ async def healthz() -> HealthzView:
 async def readyz(state: State) -> JSONResponse:
     supervisor = state.service.supervisor
     processes = [ProcessView(**asdict(process)) for process in supervisor.processes()]
-    view = ReadyView(is_ready=supervisor.is_ready, processes=processes)
+    missing = [MissingView(**asdict(device)) for device in supervisor.missing]
+    view = ReadyView(is_ready=supervisor.is_ready, missing=missing, processes=processes)
     return JSONResponse(view.model_dump(mode="json"), 200 if supervisor.is_ready else 503)
 
 

@@ -244,10 +244,19 @@ class ProcessView(BaseModel):
     detail: str
 
 
+class MissingView(BaseModel):
+    """A device that did not connect; the cell works without it."""
+
+    device: str
+    why: str
+    hint: str
+
+
 class ReadyView(BaseModel):
-    """May work begin?"""
+    """May work begin, and without which devices?"""
 
     is_ready: bool
+    missing: list[MissingView]
     processes: list[ProcessView]
 
 

@@ -20,7 +20,7 @@ from typing import Any
 from hal.clock import Clock, PacedClock, SimClock, WallClock
 from hal.config import Cell, DeviceSection, load_cell
 from hal.devices import DeviceKind
-from hal.errors import CellError, ConfigError, DeviceUnavailable
+from hal.errors import CellError, ConfigError, DeviceError
 from hal.garbage import set_aside
 from hal.isolated import Report, isolated_device
 from hal.registry import Context, Shared, device_factory, emulator_factory
@@ -29,15 +29,17 @@ from hal.simulated import Fault
 from hal.strict import validate
 from service.errors import DevicesUnavailable
 from service.memory.calibrations import Calibrations
+from service.processes.absent import Absent
 from service.processes.child import Lifeline, kill_own_group
 from service.processes.connection import BEHIND, CLOCK, MOVER, PREFIX, SWAPPER
 from service.processes.latch import Beat, Latch
 from service.processes.motion import MotionPort, start_controller
-from service.processes.seats import Connect, Seat, Swapper, checked, names_another_wire
+from service.processes.seats import Connect, Seat, Swapper, checked, failure_of, names_another_wire
 
 BEAT_S = 0.05
 CLOSE_TIMEOUT_S = 4.0
 NOTE = "note "  # begins a line for the journal
+MISSING = "device-missing"  # a note: the cell goes on without this device
 SWITCH_S = 0.0005  # the control thread waits no longer than this for a thread that answers the service
 log = logging.getLogger(__name__)
 
@@ -59,6 +61,7 @@ class CellRuntime:
         is_latched: Callable[[], bool],
         swapped: Mapping[str, DeviceSection] | None = None,
         runs_dir: Path | None = None,
+        partial: bool = False,
         report: Report = lambda _kind, _data: None,
     ) -> CellRuntime:
         """Start emulators, connect all devices at once, then start the control thread.
@@ -67,7 +70,8 @@ class CellRuntime:
             is_latched: read by the control thread each tick.
             swapped: what takes the place of sections of the cell file, as an earlier run had it.
             runs_dir: where `panelwright calibrate` keeps records; motion uses those, devices the cell file's own.
-            report: told what becomes of drivers in processes of their own.
+            partial: go on without devices that do not connect; a wrong file is refused all the same.
+            report: told what becomes of drivers in processes of their own, and of devices that are `MISSING`.
 
         Raises:
             CellError: what could not be connected, all of it in one error; everything else is closed again.
@@ -93,7 +97,7 @@ class CellRuntime:
                 return checked(name, make(context, section.driver, section.options), section)
 
             sections = {name: complete(name, section) for name, section in cell.file.devices.items()}
-            seats = _connect_all(cell, sections, connect, closers)
+            seats = _connect_all(cell, sections, connect, closers, report=report if partial else None)
             objects: dict[str, Any] = {**seats, PREFIX + CLOCK: clock}
             objects |= {PREFIX + BEHIND + name: far_side.backing for name, far_side in far_sides.items()}
             motion: MotionPort | None = None
@@ -159,8 +163,14 @@ def start_emulators(cell: Cell, clock: Clock, shared: Shared, closers: list[Call
 
 
 def _connect_all(
-    cell: Cell, sections: Mapping[str, DeviceSection], connect: Connect, closers: list[Callable[[], None]]
+    cell: Cell,
+    sections: Mapping[str, DeviceSection],
+    connect: Connect,
+    closers: list[Callable[[], None]],
+    *,
+    report: Report | None,
 ) -> dict[str, Seat]:
+    """Every device in its seat; where `report` takes them, those that did not connect leave an `Absent` there."""
     with ThreadPoolExecutor(len(sections), thread_name_prefix="connect") as pool:
         waiting = {name: pool.submit(connect, name, section) for name, section in sections.items()}
     failed: dict[str, CellError] = {}
@@ -169,15 +179,15 @@ def _connect_all(
         error = future.exception()
         if error is None:
             seats[name] = Seat(future.result())
-            closers.append(seats[name].close)
-        elif isinstance(error, CellError):
-            failed[name] = error
         else:
-            text = f"its driver failed: {type(error).__name__}: {error}"
-            failed[name] = DeviceUnavailable(text, hint="report it to the driver's author", device=name)
-            log.error("devices.%s", name, exc_info=error)
-    if failed:
+            failed[name] = failure_of(name, error)
+            seats[name] = Seat(Absent(name, sections[name].kind, failed[name]))
+        closers.append(seats[name].close)
+    if failed and (report is None or not all(isinstance(error, DeviceError) for error in failed.values())):
         raise gathered(failed, total=len(sections), cell=cell)
+    for name, error in failed.items():
+        assert report is not None  # noqa: S101 - narrowing: else it was raised
+        report(MISSING, {"device": name, "why": error.what, "hint": error.hint})
     return seats
 
 
@@ -217,6 +227,7 @@ class CellOrder:
     address: str
     authkey: str
     runs_dir: str | None
+    partial: bool
     swapped: dict[str, dict[str, Any]]
 
     def to_line(self) -> str:
@@ -283,6 +294,7 @@ def _run(order: CellOrder, lifeline: Lifeline, is_latched: Callable[[], bool], e
         is_latched=is_latched,
         swapped=swapped,
         runs_dir=runs_dir,
+        partial=order.partial,
         report=lambda kind, data: lifeline.write_line(note_to_line(kind, data)),
     )
     server = serve(runtime.objects, order.address, bytes.fromhex(order.authkey), clock=runtime.clock)

@@ -16,6 +16,9 @@ from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, MotionRefused
 from hal.geometry import Array, identity
 from hal.motion import DeclaredMotion, MotionReport, RobotState
+from hal.readings import Quality
+from service.processes.absent import Absent
+from service.processes.seats import IN_MOTION, Seat
 
 if TYPE_CHECKING:
     from manipulation.control import Controller
@@ -24,17 +27,54 @@ STATE_WAIT_S = 2.0
 T = TypeVar("T")
 
 
+class Standstill:
+    """Stands for the control thread while a device that it needs is not connected: no motion, and no state, but why."""
+
+    def __init__(self, why: CellError) -> None:
+        self._why = why
+
+    def execute(self, motion: DeclaredMotion) -> MotionReport:  # noqa: ARG002 - an interface
+        """Raise."""
+        raise self._why
+
+    def tare(self) -> Array:
+        """Raise."""
+        raise self._why
+
+    def state(self) -> RobotState:
+        """Raise."""
+        raise self._why
+
+    def cancel(self) -> None:
+        """Nothing moves."""
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+
 class MotionPort:
     """The mover as many clients see it: watching the state never gets in the way of a motion.
+
+    Args:
+        start: starts the control thread, or says why there can be none yet.
+        failing: which of its devices do not answer, and why.
 
     A state that reads the devices and a motion exclude each other in the controller; here the motion waits the moment
     that a read takes, and the readers get the newest snapshot while a motion runs.
     """
 
-    def __init__(self, start: Callable[[], Controller], *, clock: Clock, is_latched: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        start: Callable[[], Controller | Standstill],
+        *,
+        clock: Clock,
+        is_latched: Callable[[], bool],
+        failing: Callable[[], tuple[str, ...]],
+    ) -> None:
         self._start = start
         self._controller = start()
         self._clock = clock
+        self._failing = failing
         self._is_latched = is_latched
         self._newest: RobotState | None = None
         self._is_restarting = False
@@ -62,7 +102,7 @@ class MotionPort:
         newest = self._newest
         is_still = isinstance(self._clock, SimClock) and newest is not None and newest.stamp_s == self._clock.now_s()
         if newest is not None and (is_still or self._is_restarting):
-            return replace(newest, is_stopped=self._is_latched())
+            return replace(newest, is_stopped=self._is_latched(), faults=self._failing())
         self._newest = self._read()
         return self._newest
 
@@ -75,12 +115,15 @@ class MotionPort:
                 self._devices_in_use.release()
 
     def at_rest(self, work: Callable[[], None]) -> None:
-        """Run `work` while no motion runs or begins.
+        """Run `work` while no motion runs or begins; without a control thread, try to start one afterwards.
 
         Raises:
             MotionRefused: a motion runs.
         """
-        self._alone("exchange of a device", work)
+        if isinstance(self._controller, Standstill):
+            self.restart(work)
+        else:
+            self._alone("exchange of a device", work)
 
     def restart(self, between: Callable[[], None]) -> None:
         """End the control thread, which stops the arm; run `between`; start the thread anew, with the drives off.
@@ -123,12 +166,26 @@ class MotionPort:
 
 
 def start_controller(
-    cell: Cell, devices: Mapping[str, Any], *, clock: Clock, is_latched: Callable[[], bool]
+    cell: Cell, devices: Mapping[str, Seat], *, clock: Clock, is_latched: Callable[[], bool]
 ) -> MotionPort:
     """The control thread over the cell's devices, as many clients see it; errors are those of `controller_of`."""
-    return MotionPort(
-        lambda: controller_of(cell, devices, clock=clock, is_latched=is_latched), clock=clock, is_latched=is_latched
-    )
+    used = {name: devices[name] for name, section in cell.file.devices.items() if section.kind in IN_MOTION}
+
+    def start() -> Controller | Standstill:
+        for seat in used.values():
+            if isinstance(absent := seat.occupant(), Absent):
+                return Standstill(absent.why)
+        return controller_of(cell, devices, clock=clock, is_latched=is_latched)
+
+    def failing() -> tuple[str, ...]:
+        healths = {name: device.health() for name, device in used.items()}
+        return tuple(
+            f"{name}: {health.detail or health.cause}"
+            for name, health in healths.items()
+            if not health.connected or health.quality is Quality.INVALID
+        )
+
+    return MotionPort(start, clock=clock, is_latched=is_latched, failing=failing)
 
 
 def controller_of(

@@ -13,6 +13,7 @@ from hal.config import Cell, DeviceSection
 from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, DeviceUnavailable, MotionRefused
 from service.errors import Busy
+from service.processes.absent import Absent
 
 WIRE_KEYS = ("host", "port", "channel", "device")  # options that name a port which takes one driver at a time
 HAS_MEMORY = {DeviceKind.ARM, DeviceKind.FORCE_TORQUE}  # the control thread keeps kinematics and bias of these
@@ -115,13 +116,31 @@ class Swapper:
         try:
             section = self._sections[name].model_copy(update={"driver": driver, "options": options})
             old, new = self._complete(name, self._sections[name]), self._complete(name, section)
-            if _share_a_port(old, new):
+            if isinstance(self._seats[name].occupant(), Absent):
+                self._fill(name, new)
+            elif _share_a_port(old, new):
                 self._swap_on_one_port(name, old, new)
             else:
                 self._swap_side_by_side(name, new)
             self._sections[name] = section  # everybody who looks into the cell file sees what is connected
         finally:
             self._busy.release()
+
+    def _fill(self, name: str, new: DeviceSection) -> None:
+        """A device where there was none."""
+        seat = self._seats[name]
+        try:
+            fresh = self._connect(name, new)
+        except Exception as error:
+            failure = failure_of(name, error)
+            seat.put(Absent(name, new.kind, failure))
+            raise failure from error
+        try:
+            self._seated(new.kind, lambda: seat.put(fresh))
+        except CellError as error:  # the control thread does not take it
+            seat.put(Absent(name, new.kind, error))
+            fresh.close()
+            raise
 
     def _swap_side_by_side(self, name: str, new: DeviceSection) -> None:
         seat, old = self._seats[name], self._seats[name].occupant()
@@ -191,6 +210,15 @@ class Swapper:
                 device=name,
                 kept=driver,
             ) from error
+
+
+def failure_of(name: str, error: BaseException) -> CellError:
+    """What connecting a device met; a defect of its driver is logged, and told as a device that cannot be had."""
+    if isinstance(error, CellError):
+        return error
+    log.error("devices.%s", name, exc_info=error)
+    text = f"its driver failed: {type(error).__name__}: {error}"
+    return DeviceUnavailable(text, hint="report it to the driver's author", device=name)
 
 
 def checked(name: str, device: Any, section: DeviceSection) -> Any:

@@ -13,12 +13,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceTimeout, DeviceUnavailable, MotionRefused
 from hal.isolated import Report
-from service.processes.cell import CellOrder, CellRuntime, error_from_line, note_from_line
+from service.processes.cell import MISSING, CellOrder, CellRuntime, error_from_line, note_from_line
 from service.processes.child import Child
 from service.processes.connection import CellConnection, LocalConnection, RemoteConnection
 from service.processes.latch import Beat, Latch, LatchState
@@ -71,6 +71,15 @@ class ProcessHealth:
     detail: str = ""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MissingDevice:
+    """A device that the cell goes on without, why, and what may help."""
+
+    device: str
+    why: str
+    hint: str
+
+
 class Supervisor:
     """Owner of a cell's processes.
 
@@ -80,6 +89,7 @@ class Supervisor:
         origins: web origins that may read answers of the stop port.
         inline: cell and stop port in this process.
         runs_dir: where calibrations are kept; None: only the cell file's own count.
+        partial: a cell whose devices do not all connect goes on without them; see `missing`.
         report: told about starts, deaths, stops and resets.
     """
 
@@ -91,12 +101,15 @@ class Supervisor:
         origins: tuple[str, ...] = (),
         inline: bool = False,
         runs_dir: Path | None = None,
+        partial: bool = False,
         report: Report = lambda _kind, _data: None,
     ) -> None:
         self.cell = cell
         self.inline = inline
         self._runs_dir = runs_dir
+        self._partial = partial
         self._report = report
+        self._missing: dict[str, MissingDevice] = {}
         self._folder = Path(tempfile.mkdtemp(prefix="panelwright-"))
         self.latch = Latch.create(self._folder / "latch")
         self._beat = Beat(self._folder / "beat")
@@ -136,6 +149,11 @@ class Supervisor:
     def problem(self) -> CellError | None:
         """Why the cell is not up, if it is known."""
         return self._problem
+
+    @property
+    def missing(self) -> tuple[MissingDevice, ...]:
+        """What did not connect when the cell started, nor later."""
+        return tuple(self._missing.values())
 
     def start(self) -> None:
         """Start the cell and wait until it is ready. In a simulated cell the latch is then reset, explicitly.
@@ -193,6 +211,7 @@ class Supervisor:
         """Another device for `name`, also after a restart of the cell process; see `service.processes.seats.Swapper`."""
         (self._local or self._remote).swap(name, section)
         self._swapped[name] = section
+        self._missing.pop(name, None)
 
     def processes(self) -> tuple[ProcessHealth, ...]:
         """State of the supervised processes."""
@@ -230,7 +249,7 @@ class Supervisor:
 
     def _start_inline(self) -> None:
         runtime = CellRuntime.start(
-            self.cell, is_latched=self.latch.is_set, runs_dir=self._runs_dir, report=self._report
+            self.cell, is_latched=self.latch.is_set, runs_dir=self._runs_dir, partial=self._partial, report=self._note
         )
         self._local = LocalConnection(self.cell, runtime.objects, close=runtime.close)
         self._is_ready.set()
@@ -244,7 +263,7 @@ class Supervisor:
         def on_line(line: str) -> None:
             note = note_from_line(line)
             if note is not None:
-                self._report(*note)
+                self._note(*note)
                 return
             if line.startswith("error "):
                 errors.append(error_from_line(line))
@@ -256,6 +275,7 @@ class Supervisor:
                 errors.append(DeviceUnavailable(text, hint="its last words are in the log above", device="cell"))
             answered.set()
 
+        self._missing.clear()
         order = self._order()
         child = self._begin_child(on_line, on_exit)
         child.write_line(order.to_line())
@@ -276,6 +296,12 @@ class Supervisor:
         self._is_ready.set()
         self._report("cell-ready", {"pid": child.pid, "seconds": round(time.monotonic() - child.started_s, 3)})
 
+    def _note(self, kind: str, data: dict[str, Any]) -> None:
+        """What the cell tells."""
+        if kind == MISSING:
+            self._missing[data["device"]] = MissingDevice(**data)
+        self._report(kind, data)
+
     def _order(self) -> CellOrder:
         """What the next cell process has to do; address and key are its own, so that nobody talks to one that died."""
         return CellOrder(
@@ -286,6 +312,7 @@ class Supervisor:
             address=str(self._folder / f"cell-{secrets.token_hex(4)}.sock"),
             authkey=secrets.token_hex(32),
             runs_dir=None if self._runs_dir is None else str(self._runs_dir.absolute()),
+            partial=self._partial,
             swapped={name: section.model_dump(mode="json") for name, section in self._swapped.items()},
         )
 

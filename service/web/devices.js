@@ -1,5 +1,8 @@
 // Health of all devices.
-import { get, repeat } from "./api.js";
+import { get, post, repeat } from "./api.js";
+
+const connecting = new Set(); // names of those that are being tried
+const trouble = new Map(); // what the newest try of each met
 
 export function startDevices() {
   repeat(list, () => 2000);
@@ -31,5 +34,33 @@ function item(device) {
   words.textContent = health.connected ? `${quality}${cause} · ${health.samples} ${health.samples === 1 ? "sample" : "samples"}` : "disconnected";
   words.title = health.detail;
   line.append(dot, name, words);
+  if (!health.connected) line.append(...remedy(device));
   return line;
+}
+
+// Why there is no device, and another try.
+function remedy(device) {
+  const why = document.createElement("span");
+  why.className = "quiet why";
+  why.textContent = trouble.get(device.name) || device.health.detail;
+  const again = document.createElement("button");
+  again.textContent = "connect";
+  again.setAttribute("aria-label", `connect ${device.name}`);
+  again.disabled = connecting.has(device.name);
+  again.addEventListener("click", () => connect(device.name));
+  return [why, again];
+}
+
+async function connect(name) {
+  connecting.add(name);
+  trouble.set(name, "connecting…");
+  await list();
+  try {
+    await post(`/v1/devices/${name}/connect`);
+    trouble.delete(name);
+  } catch (problem) {
+    trouble.set(name, `${problem.message}. ${problem.hint}`);
+  }
+  connecting.delete(name);
+  await list();
 }

@@ -23,7 +23,12 @@ function connect() {
 
 function draw(state) {
   if (!state.position_rad) return showState(state.problem || "no arm", "failed");
-  if (state.is_latched) showState("stopped", "stopped");
+  const isStale = state.faults.length > 0; // what is shown was so when the device was last heard
+  live.classList.toggle("stale", isStale);
+  joints.classList.toggle("stale", isStale);
+  chip.title = state.faults.join("; ");
+  if (isStale) showState(`stale: ${state.faults.map((fault) => fault.split(":")[0]).join(", ")}`, "failed");
+  else if (state.is_latched) showState("stopped", "stopped");
   else showState(state.is_moving ? "moving" : "at rest", state.is_moving ? "moving" : "ready");
   const [x, y, z] = state.base_from_flange.translation_m;
   const force = Math.hypot(...state.wrench.slice(0, 3));

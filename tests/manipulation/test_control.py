@@ -453,6 +453,14 @@ def test_the_state_tells_joints_contacts_and_the_latch(rig: Rig) -> None:
     assert np.linalg.norm(state.wrench[:3]) == pytest.approx(5.0, rel=1e-6)
 
 
+def test_the_state_tells_that_a_device_fell_silent_between_motions(rig: Rig) -> None:
+    assert rig.controller.state().faults == ()
+    rig.world.silent.add("wrist_ft")
+    assert rig.controller.state().faults == ("wrist_ft silent",)
+    rig.world.silent.clear()
+    assert rig.controller.state().faults == ()
+
+
 def test_a_closed_controller_refuses_and_closes_twice() -> None:
     rig = make_rig()
     rig.controller.close()

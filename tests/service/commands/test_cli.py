@@ -58,10 +58,25 @@ def test_a_mistyped_name_of_a_shipped_cell_is_told_the_right_one_from_any_folder
     _assert_refused(done, "does not exist", "did you mean", "cells/bench.toml")
 
 
-def test_a_missing_device_is_one_clear_message(write_cell: WriteCell, tmp_path: Path) -> None:
+def test_a_missing_device_is_one_clear_message_of_a_command_that_wants_them_all(
+    write_cell: WriteCell, tmp_path: Path
+) -> None:
     path = write_cell(options={"panel_lights": {"fail": "no answer from 10.0.0.9"}})
-    done = _run("serve", "--cell", str(path), "--port", "0", "--runs", str(tmp_path / "runs"))
+    done = _run("demo", "--cell", str(path), "--runs", str(tmp_path / "runs"))
     _assert_refused(done, "panel_lights", "no answer from 10.0.0.9", "plug it in")
+
+
+def test_a_missing_device_does_not_end_the_service(write_cell: WriteCell, tmp_path: Path) -> None:
+    away = {"fail": "no answer from [10.0.0.9]"}
+    world = {"child_pid_file": str(tmp_path / "world.pid")}
+    served = Served(write_cell(options={"finger_proximity": away, "panel_lights": world}), tmp_path)
+    try:
+        eventually(lambda: "devices connect finger_proximity" in served.log.read_text())
+        assert "no answer from [10.0.0.9]\n  try    plug it in; then" in served.log.read_text()
+    finally:
+        served.process.terminate()
+        served.process.wait(90)
+        served.client.close()
 
 
 def test_a_port_in_use_is_one_clear_message(write_cell: WriteCell, tmp_path: Path) -> None:

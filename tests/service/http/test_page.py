@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from hal.config import load_cell
+from hal.simulated import Fault
 from service.client import Client
 from service.operations.context import Operation
 from service.serve import Options, Panelwright
@@ -23,8 +26,6 @@ pytestmark = NEEDS_CHROMIUM
 @pytest.fixture(scope="module")
 def served_page(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Panelwright]:
     """A cell of fakes whose mission stands still for a long time."""
-    from hal.config import load_cell
-
     missions = Operation(name="missions", request_model=HoldRequest, run=hold, summary="Hold", moves=True)
     runs = tmp_path_factory.mktemp("runs")
     (runs / "2026-01-02T03-04-05").mkdir()
@@ -73,6 +74,41 @@ def test_the_tasks_can_be_read_on_a_telephone(page: Any, served_page: Panelwrigh
 def test_the_arm_shows_live(page: Any) -> None:
     until(page, "document.querySelectorAll('#joints .joint').length === 6")
     assert "mm" in page.text_content("#live")
+
+
+def test_what_a_silent_arm_said_last_is_called_stale(page: Any, served_page: Panelwright) -> None:
+    until(page, "document.querySelector('#live-state').textContent === 'at rest'")
+    arm = served_page.service.supervisor.connection.device("arm")
+    arm.inject_fault(Fault.SILENT)
+    until(page, "document.querySelector('#live-state').textContent === 'stale: arm'")
+    arm.inject_fault(None)
+    until(page, "document.querySelector('#live-state').textContent === 'at rest'")
+
+
+def test_a_device_that_is_missing_is_connected_from_the_page(
+    browser: Any, write_cell: WriteCell, tmp_path: Path
+) -> None:
+    trouble = tmp_path / "trouble"
+    trouble.write_text("away")
+    cell = load_cell(write_cell(robot=True, options={"arm": {"trouble": str(trouble)}}))
+    options = Options(port=0, runs_dir=tmp_path / "runs", inline=True, partial=True)
+    panelwright = Panelwright(cell, options, operations=OPERATIONS)
+    panelwright.start()
+    tab, faults = new_tab(browser, height_px=1000)
+    try:
+        tab.goto(panelwright.url)
+        until(tab, "document.querySelector('#devices').textContent.includes('arm is not on its port')")
+        until(tab, "document.querySelector('#live-state').textContent.includes('arm did not connect')")
+        tab.click("button:text-is('connect')")
+        until(tab, "document.querySelector('#devices').textContent.includes('plug it in')")
+        trouble.unlink()
+        tab.click("button:text-is('connect'):not([disabled])")
+        until(tab, "document.querySelector('#devices-line').textContent === '8 of 8 good'")
+        until(tab, "document.querySelector('#live-state').textContent === 'at rest'")
+        assert not faults
+    finally:
+        tab.close()
+        panelwright.close()
 
 
 def test_the_last_report_is_linked(page: Any) -> None:

@@ -45,6 +45,15 @@ def test_a_stop_shows_in_the_stream(socket: ClientConnection, client: httpx2.Cli
     eventually(lambda: _next(socket)["is_latched"])
 
 
+def test_an_arm_that_falls_silent_shows_in_the_stream(socket: ClientConnection, client: httpx2.Client) -> None:
+    """Its last joints were shown as if they were new."""
+    assert _next(socket)["faults"] == []
+    client.post("/v1/devices/arm/fault", json={"fault": "silent"})
+    eventually(lambda: _next(socket)["faults"] == ["arm: timeout"])
+    client.post("/v1/devices/arm/fault", json={"fault": None})
+    eventually(lambda: _next(socket)["faults"] == [])
+
+
 def test_listeners_share_samples_and_a_sleeping_one_holds_nobody_up(served: Panelwright, client: httpx2.Client) -> None:
     with _join(served), _join(served) as awake, _join(served) as another:
         stamps = [_next(awake)["stamp_s"] for _ in range(10)]

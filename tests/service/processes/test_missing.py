@@ -1,0 +1,130 @@
+"""A cell is served without the devices that do not connect: what works is offered, and the rest is connected later."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+
+from hal.config import load_cell
+from hal.errors import CellError
+from service.serve import Options, Panelwright
+from tests.service.conftest import WriteCell
+from tests.service.verbs import OPERATIONS
+from tests.service.waiting import eventually
+
+Serve = Callable[..., httpx2.Client]
+AWAY = "away"
+
+
+@pytest.fixture
+def trouble(tmp_path: Path) -> Path:
+    """A file that says what is wrong with the devices that look at it."""
+    file = tmp_path / "trouble"
+    file.write_text(AWAY)
+    return file
+
+
+@pytest.fixture
+def serve(write_cell: WriteCell, trouble: Path, tmp_path: Path) -> Iterator[Serve]:
+    """Serves a cell of fakes in which the given devices are away."""
+    opened: list[Any] = []
+
+    def serve(*away: str, inline: bool = True) -> httpx2.Client:
+        path = write_cell(robot=True, options={name: {"trouble": str(trouble)} for name in away})
+        options = Options(port=0, runs_dir=tmp_path / "runs", inline=inline, partial=True, warm=False)
+        panelwright = Panelwright(load_cell(path), options, operations=OPERATIONS)
+        opened.append(panelwright)
+        panelwright.start()
+        http = httpx2.Client(base_url=panelwright.url, timeout=60.0, trust_env=False)
+        opened.append(http)
+        return http
+
+    yield serve
+    for thing in reversed(opened):
+        thing.close()
+
+
+def test_what_is_missing_is_named_and_the_rest_works(serve: Serve, trouble: Path) -> None:
+    http = serve("panel_lights", "finger_proximity", inline=False)
+    ready = http.get("/readyz")
+    assert ready.status_code == 200
+    assert {each["device"]: each["why"] for each in ready.json()["missing"]} == {
+        name: f"{name} is not on its port" for name in ("panel_lights", "finger_proximity")
+    }
+    health = http.get("/v1/devices/panel_lights").json()["health"]
+    assert (health["connected"], "is not on its port" in health["detail"]) == (False, True)
+    assert http.get("/v1/devices/wrist_camera/reading").status_code == 200
+    problem = http.post("/v1/measure?wait_s=10").json()
+    assert (problem["type"], problem["details"]["device"]) == ("urn:panelwright:not-connected", "finger_proximity")
+    assert problem["hint"] == "plug it in; then POST /v1/devices/finger_proximity/connect"
+
+    trouble.unlink()
+    assert http.post("/v1/devices/finger_proximity/connect").json()["health"]["connected"]
+    assert http.post("/v1/measure?wait_s=10").json()["result"] == {"distance_m": 0.123}
+    assert [each["device"] for each in http.get("/readyz").json()["missing"]] == ["panel_lights"]
+
+
+@pytest.mark.parametrize("name", ["arm", "gripper", "wrist_ft", "finger_touch", "finger_proximity"])
+def test_nothing_moves_without_a_device_of_the_motion_until_it_is_there(serve: Serve, trouble: Path, name: str) -> None:
+    http = serve(name)
+    held = http.post("/v1/hold?wait_s=10", json={"seconds": 0.2})
+    assert (held.status_code, held.json()["details"]["device"]) == (503, name)
+    trouble.unlink()
+    assert http.post(f"/v1/devices/{name}/connect").status_code == 200
+    assert http.post("/v1/hold?wait_s=10", json={"seconds": 0.2}).json()["state"] == "succeeded"
+
+
+def test_of_two_that_are_missing_the_first_one_that_comes_starts_no_motion(serve: Serve, trouble: Path) -> None:
+    http = serve("arm", "gripper")
+    trouble.unlink()
+    assert http.post("/v1/devices/gripper/connect").status_code == 200
+    assert http.post("/v1/hold?wait_s=10").json()["details"]["device"] == "arm"
+    assert http.post("/v1/devices/arm/connect").status_code == 200
+    assert http.post("/v1/hold?wait_s=10", json={"seconds": 0.2}).json()["state"] == "succeeded"
+
+
+def test_another_try_that_fails_says_why_and_leaves_the_way_open(serve: Serve, trouble: Path) -> None:
+    http = serve("panel_lights")
+    refused = http.post("/v1/devices/panel_lights/connect")
+    assert (refused.status_code, refused.json()["detail"]) == (503, "panel_lights is not on its port")
+    wrong = http.put("/v1/devices/panel_lights", json={"driver": "fake:camera"})
+    assert (wrong.status_code, "is a camera, not a lights" in wrong.json()["detail"]) == (422, True)
+    assert "is a camera" in http.get("/v1/devices/panel_lights").json()["health"]["detail"]
+    assert http.put("/v1/devices/panel_lights", json={"driver": "fake:lights"}).status_code == 200
+    assert http.get("/readyz").json()["missing"] == []
+
+
+def test_a_device_that_is_there_is_connected_anew(serve: Serve) -> None:
+    http = serve()
+    assert http.get("/readyz").json()["missing"] == []
+    before = [http.get("/v1/devices/panel_lights/reading").json()["sequence"] for _ in range(3)]
+    assert http.post("/v1/devices/panel_lights/connect").status_code == 200
+    assert http.get("/v1/devices/panel_lights/reading").json()["sequence"] < before[-1]
+
+
+def test_a_wrong_file_ends_the_service_all_the_same(write_cell: WriteCell, tmp_path: Path) -> None:
+    path = write_cell(options={"panel_lights": {"fail": "no answer"}, "wrist_camera": {"wrong_key": 1}})
+    options = Options(port=0, runs_dir=tmp_path / "runs", inline=True, partial=True, warm=False)
+    panelwright = Panelwright(load_cell(path), options, operations=OPERATIONS)
+    with pytest.raises(CellError, match="2 of the 4 devices") as refused:
+        panelwright.start()
+    assert set(refused.value.details) == {"panel_lights", "wrist_camera"}
+
+
+def test_a_cell_that_starts_anew_goes_on_without_what_has_gone(serve: Serve, trouble: Path) -> None:
+    trouble.unlink()
+    http = serve("panel_lights", inline=False)
+    assert http.get("/readyz").json()["missing"] == []
+    trouble.write_text(AWAY)
+    cell = next(each for each in http.get("/readyz").json()["processes"] if each["name"] == "cell")
+
+    os.kill(cell["pid"], signal.SIGKILL)
+    eventually(lambda: http.get("/readyz").status_code == 503)
+    eventually(lambda: http.get("/readyz").status_code == 200)
+    assert [each["device"] for each in http.get("/readyz").json()["missing"]] == ["panel_lights"]

@@ -1,4 +1,4 @@
-"""Likeness of places to taught looks: the nearest look of every kind, and what follows for the place."""
+"""Likeness of places to taught looks: the nearest looks of every kind, and what follows for the place."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from perception.vision.knowledge import NOTHING, Kind, Knowledge
 from perception.vision.view import Array
 
+NEXT_FURTHER = 0.02  # by which the next nearest look of a kind is further, at the median of hard drawn overviews
 CLIP = 3.0  # one number counts for three spreads at most: glare or a cable spoils some numbers, whatever is there
 
 
@@ -54,12 +55,17 @@ def distances(looks: Array, knowledge: Knowledge) -> Array:
     return nearest(looks, prepared(knowledge))
 
 
-def nearest(looks: Array, known: Prepared, *, kind: int | None = None) -> Array:
-    """`distances` to looks that are prepared; with `kind`, (N, 1) to the looks of that column only."""
+def nearest(looks: Array, known: Prepared, *, kind: int | None = None, mean_of: int = 1) -> Array:
+    """`distances` to looks that are prepared; with `kind`, (N, 1) to the looks of that column only.
+
+    `mean_of`: to that many nearest looks of every kind, in the mean. One that a kind does not have counts as further
+    than the last by `NEXT_FURTHER`: a kind of one look is neither preferred nor out of the question.
+    """
     first = known.first if kind is None else known.first[kind : kind + 2]
     scaled = (looks * known.gain).astype(np.float32)
     clips = (CLIP * known.weights).astype(np.float32)
-    return np.asarray(_nearest(scaled, known.columns, first, clips), float) / float(known.weights.sum())
+    total = float(known.weights.sum())
+    return np.asarray(_nearest(scaled, known.columns, first, clips, mean_of, NEXT_FURTHER * total), float) / total
 
 
 def nearest_look(look: Array, kind: Kind, knowledge: Knowledge) -> int:
@@ -68,12 +74,14 @@ def nearest_look(look: Array, kind: Kind, knowledge: Knowledge) -> int:
     return int((difference @ knowledge.weights).argmin())
 
 
-def distances_reference(looks: Array, knowledge: Knowledge) -> Array:
-    """The same as `distances`, in plain numpy."""
+def distances_reference(looks: Array, knowledge: Knowledge, *, mean_of: int = 1) -> Array:
+    """The same as `distances`, or `nearest` with `mean_of`, in plain numpy."""
     columns = []
     for kind in knowledge.kinds:
         difference = np.abs(looks[:, None] - kind.looks[None]) / knowledge.spread
-        columns.append(np.average(np.minimum(difference, CLIP), axis=2, weights=knowledge.weights).min(axis=1))
+        near = np.sort(np.average(np.minimum(difference, CLIP), axis=2, weights=knowledge.weights), axis=1)[:, :mean_of]
+        lacking = np.arange(1, mean_of - near.shape[1] + 1)
+        columns.append(np.hstack([near, near[:, -1:] + NEXT_FURTHER * lacking]).mean(axis=1))
     return np.column_stack(columns)
 
 
@@ -85,7 +93,12 @@ def nothing_column(knowledge: Knowledge) -> int | None:
 
 @njit(cache=True)
 def _nearest(
-    looks: NDArray[np.float32], columns: NDArray[np.float32], first: NDArray[np.int64], clips: NDArray[np.float32]
+    looks: NDArray[np.float32],
+    columns: NDArray[np.float32],
+    first: NDArray[np.int64],
+    clips: NDArray[np.float32],
+    mean_of: int,
+    step: float,
 ) -> NDArray[np.float32]:  # pragma: no cover
     """One look against all taught ones at once, number by number: the inner loop runs in vector registers, in an order
     of sums that no processor changes."""
@@ -101,5 +114,22 @@ def _nearest(
                 d = abs(number - row[k])
                 total[k] += d if d < clip else clip
         for c in range(len(first) - 1):
-            out[i, c] = total[first[c] - begin : first[c + 1] - begin].min()
+            part = total[first[c] - begin : first[c + 1] - begin]
+            out[i, c] = part.min() if mean_of == 1 else _mean_of_least(part, mean_of, step)
     return out
+
+
+@njit(cache=True)
+def _mean_of_least(values: NDArray[np.float32], count: int, step: float) -> float:  # pragma: no cover
+    """Mean of the `count` least values; those that lack follow the last in steps."""
+    least = np.full(count, np.inf)
+    for value in values:
+        if value < least[-1]:
+            k = count - 1
+            while k > 0 and least[k - 1] > value:
+                least[k] = least[k - 1]
+                k -= 1
+            least[k] = value
+    for k in range(len(values), count):
+        least[k] = least[k - 1] + step
+    return float(least.mean())

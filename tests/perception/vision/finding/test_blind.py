@@ -26,7 +26,7 @@ from perception.vision.finding.features import (
     plate_gray,
     region_shape,
 )
-from perception.vision.finding.match import distances, distances_reference
+from perception.vision.finding.match import distances, distances_reference, nearest, prepared
 from perception.vision.finding.plate import TYPICAL_FOCAL, find_plate
 from perception.vision.finding.shapes import find_edges
 from perception.vision.knowledge import (
@@ -240,6 +240,22 @@ def test_only_a_noisy_image_is_compared_with_looks_of_noisy_images(sigma: float,
     assert any(candidate.kind == "ghost" for candidate in found) is noisy
 
 
+@pytest.mark.parametrize(("noisy", "named"), [(False, "chance"), (True, "often")])
+def test_one_look_that_is_near_by_chance_names_nothing_in_a_noisy_image(noisy: bool, named: str) -> None:
+    picture = np.full((300, 400), 150, np.uint8)
+    cv2.circle(picture, (200, 150), 30, 60, -1)
+    edges, level = find_edges(picture), plate_gray(picture)
+    ground = Ground(picture=picture.astype(np.float32), edges=edges, plate_gray=level, noisy=noisy)
+    place = np.array([[200.0, 150.0]])
+    look = look_at(ground, place)
+    off = {"chance": (0.0, 0.6, 0.6), "often": (0.1, 0.1, 0.1)}
+    kinds = tuple(Kind(name=n, size_m=(0.04, 0.04), looks=look + np.array(by)[:, None]) for n, by in off.items())
+    view = PlaneView(px_from_plate=np.diag([PLATE_PX_PER_M, -PLATE_PX_PER_M, 1.0]), corners_m=np.zeros((4, 2)))
+    plate_m = (400 / PLATE_PX_PER_M, 300 / PLATE_PX_PER_M)
+    (found,) = chosen(ground, place, look, Knowledge(kinds=kinds, spread=np.ones(LENGTH)), view, plate_m)
+    assert (found.kind, found.reason) == (named, None)
+
+
 def test_noise_says_nothing_of_which_way_is_up() -> None:
     image, view = overview()
     ground, knowledge = lay_out(image, view, PLATE), shipped_knowledge()
@@ -319,6 +335,9 @@ def test_the_fast_match_agrees_with_the_plain_one() -> None:
     looks = rng.normal(0, 1, (9, LENGTH))
     for known in (knowledge, knowledge.for_image(noisy=True)):
         assert np.allclose(distances(looks, known), distances_reference(looks, known))
+        for mean_of in (3, 6):  # one kind has four looks only
+            plain = distances_reference(looks, known, mean_of=mean_of)
+            assert np.allclose(nearest(looks, prepared(known), mean_of=mean_of), plain)
 
 
 def test_shape_features_do_not_change_with_turn_and_size() -> None:

@@ -6,18 +6,28 @@ import re
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from benchmarks.simcell import open_bench
 from fusion.sensing import Pinhole
+from hal.calibration import CameraIntrinsics
 from hal.geometry import UncertainPose
+from manipulation.skills.outcome import Outcome
 from perception.range import SurfaceType
 
 ROOT = Path(__file__).parents[1]
 FACING = Rotation.from_matrix(
     [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
 )  # a camera that looks down on z = 0
+LENS = CameraIntrinsics(width_px=640, height_px=480, fx_px=460.0, fy_px=460.0, cx_px=319.5, cy_px=239.5)
+LIGHTS_M = np.array([[-0.28, 0.18, 0.0], [0.28, 0.18, 0.0], [0.28, -0.18, 0.0], [-0.28, -0.18, 0.0]])
+CAMERA_FROM_PANEL = RigidTransform.from_components(
+    [0.01, -0.005, 0.62], Rotation.from_euler("xyz", [8.0, -12.0, 4.0], degrees=True) * FACING
+)
 
 
 def run(page: str, **given: Any) -> dict[str, Any]:
@@ -60,6 +70,49 @@ def test_the_fusion_page_fuses_an_edge_and_a_touch() -> None:
     u_px, v_px = camera.cx_px + focal_px * x / z, camera.cy_px + focal_px * y / z
     np.testing.assert_allclose(np.polyval(np.polyfit(u_px, v_px, 1), [102.0, 511.0]), [377.0, 371.0], atol=0.1)
     assert answer.pose.apply([0.4, 0.25, 0.0])[2] == pytest.approx(0.001, abs=1e-4)
+
+
+def test_the_pose_page_finds_the_drawn_panel() -> None:
+    found = run("pose.md", image_off=drawn(lit=False), image_on=drawn(lit=True), lights_m=LIGHTS_M, intrinsics=LENS)
+    pose = found["seen"].pose
+    miss = pose.camera_from_object * CAMERA_FROM_PANEL.inv()
+    assert np.linalg.norm(miss.translation) < 0.002
+    assert miss.rotation.magnitude() < np.radians(0.5)
+    assert pose.covariance.shape == (6, 6)
+    assert not pose.ambiguous
+
+
+def drawn(*, lit: bool) -> NDArray[np.uint8]:
+    """A panel of squares behind `LENS`, with its four lights off or on."""
+    rng = np.random.default_rng(5)
+    image = np.full((LENS.height_px, LENS.width_px), 90, np.uint8)
+    for _ in range(25):
+        corner = rng.integers([100, 100], [500, 340])
+        size = rng.integers(10, 40, 2)
+        cv2.rectangle(image, corner.tolist(), (corner + size).tolist(), int(rng.integers(30, 150)), -1)
+    x, y, z = CAMERA_FROM_PANEL.apply(LIGHTS_M).T
+    for u_px, v_px in zip(LENS.cx_px + LENS.fx_px * x / z, LENS.cy_px + LENS.fy_px * y / z, strict=True):
+        centre = (round(16 * u_px), round(16 * v_px))
+        cv2.circle(image, centre, 16 * 5, 230 if lit else 60, -1, cv2.LINE_AA, 4)
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.8), np.uint8)
+
+
+@pytest.mark.slow
+def test_the_manipulation_page_opens_the_valve() -> None:
+    bench = open_bench(106)
+    try:
+        assert bench.truth("main_valve").state == "closed"
+        found = run(
+            "manipulation.md",
+            cell=bench.cell,
+            known=bench.look("main_valve"),
+            look_again=lambda: bench.look("main_valve"),
+        )
+        assert found["report"].outcome is Outcome.DONE
+        assert found["report"].seen.state == "open"
+        assert bench.truth("main_valve").state == "open"
+    finally:
+        bench.close()
 
 
 def test_the_vision_page_teaches_a_mushroom(

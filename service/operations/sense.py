@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from fusion.features import Feature, Kind, unit
 from fusion.measurement import Measurement, SensingClass
@@ -38,6 +39,8 @@ from service.operations.travel import workcell
 Array = NDArray[np.float64]
 HOVER_M = 0.05  # of the finger tips above the plate while the proximity sensors look
 LEAST_TOUCHES = 3
+ONE_IN = 1e5
+NO_NOISE = 1e-9  # a chi-square a degree of freedom that no sensor's noise gives, in whatever unit
 SPARE_SPOTS = 2  # a spot that the arm cannot reach is replaced
 
 
@@ -243,6 +246,7 @@ def _account(fused: FusedPose, measurements: Sequence[Measurement]) -> dict[str,
     return {
         "chi_square": fused.chi_square,
         "dof": fused.dof,
+        "warnings": warnings_of(fused.chi_square, fused.dof),
         "ambiguous": fused.is_ambiguous,
         "unobservable": [direction.words for direction in fused.unobservable],
         "measurements": [
@@ -272,6 +276,20 @@ def _account(fused: FusedPose, measurements: Sequence[Measurement]) -> dict[str,
         "proven_set": fused.proven_set,
         "shape": _shape_json(fused.shape),
     }
+
+
+def warnings_of(chi_square: float, dof: int) -> list[str]:
+    """What a caller should look at although there is an answer.
+
+    Noise of the stated size agrees so well less than once in `ONE_IN` times; variances in mm^2 that are taken for m^2 make
+    the chi-square a million times too small. Examples drawn by hand agree exactly and are not meant.
+    """
+    if dof < 1 or chi_square < NO_NOISE * dof or chi2.cdf(chi_square, dof) * ONE_IN > 1.0:
+        return []
+    return [
+        f"the measurements agree far better than their covariances say (chi-square {chi_square:.2g} with {dof} degrees of "
+        "freedom): are these in m^2, not in mm^2, and of one reading?"
+    ]
 
 
 def _shape_json(shape: ShapeEstimate | None) -> dict[str, Any] | None:

@@ -48,6 +48,7 @@ def test_nine_kinds_are_fused_and_proven() -> None:
     answer = fused(NINE_KINDS)
     assert len({m["sensing"] for m in answer["measurements"]}) == 9
     assert not answer["rejected"]
+    assert answer["warnings"] == []
     assert answer["translation_m"] == pytest.approx([0.5, 0.1, 0.3], abs=0.005)
     assert answer["certificate"]["tight"]
     assert answer["proven_set"]["proven"]
@@ -120,3 +121,33 @@ def test_an_unknown_part_is_refused_by_name() -> None:
     lid = {**ROUND_POST["measurements"][0], "part": "lid"}
     with pytest.raises(InvalidRequest, match="no part 'lid'"):
         fused({**ROUND_POST, "measurements": [lid]})
+
+
+def edge_and_touches(rng: np.random.Generator, *, per_m2: float) -> dict[str, Any]:
+    """Nine touches of 0.2 mm on three faces of a corner; variances in 1 / `per_m2` of m^2."""
+    faces = [(axis, place) for axis in range(3) for place in (0.1, 0.3, 0.5)]
+    touches = []
+    for axis, place in faces:
+        point = np.full(3, place)
+        point[axis] = 0.0
+        point[(axis + 1) % 3] = 0.25
+        sensed = point + 2e-4 * rng.standard_normal(3)
+        touches.append(
+            {
+                "sensing": "point-plane",
+                "x_m": [0.0, 0.0, 0.0],
+                "u": np.eye(3)[axis].tolist(),
+                "mu_m": sensed.tolist(),
+                "c_m2": (4e-8 * per_m2 * np.eye(3)).tolist(),
+            }
+        )
+    prior = {**PRIOR, "translation_m": [0.0, 0.0, 0.0], "covariance": (1e-4 * per_m2 * np.eye(6)).tolist()}
+    return {"measurements": touches, "prior": prior}
+
+
+def test_variances_in_square_millimetres_are_warned_of_and_those_in_square_metres_are_not() -> None:
+    rng = np.random.default_rng(20261122)
+    right = [fused(edge_and_touches(rng, per_m2=1.0))["warnings"] for _ in range(20)]
+    wrong = [fused(edge_and_touches(rng, per_m2=1e6))["warnings"] for _ in range(20)]
+    assert not any(right)
+    assert all("mm^2" in warnings[0] for warnings in wrong)

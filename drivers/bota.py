@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import struct
+from contextlib import suppress
 from typing import Annotated, Any
 
 import numpy as np
@@ -11,7 +13,7 @@ from pydantic import Field
 from drivers.kinds.force_torque import RangeOptions, capabilities
 from drivers.transport.checks import crc_x25
 from drivers.transport.framing import Framer
-from drivers.transport.link import Link, NoAnswer, drain_until_quiet, now_s
+from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.options import SerialOptions, read_options, serial_opener
 from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import HostTime, Unwrapper
@@ -25,8 +27,9 @@ BODY = struct.Struct("<H6fIf")
 SLOW, OVERRANGE, INVALID, RAW = 1, 2, 4, 8
 SINC_S = 19.53125e-6  # sampling period for one unit of filter length
 POWER_UP_TEXT = b"App Init"
+BAUD_CODES = {9600: 0, 57_600: 1, 115_200: 2, 230_400: 3, 460_800: 4}
 ANSWER_S = 0.25
-ATTEMPTS = 4
+ATTEMPTS = 6
 
 
 class BotaOptions(SerialOptions, RangeOptions):
@@ -56,6 +59,8 @@ class Bota(StreamDevice[Wrench]):
         self._host = HostTime()
         self._last_us: int | None = None
         self._bad_before = 0
+        self._tail = b""  # of the last chunk: the power-up text may come in two
+        self._wants_lines = False
 
     @property
     def period_s(self) -> float:
@@ -71,31 +76,48 @@ class Bota(StreamDevice[Wrench]):
         return self.newest(deadline)
 
     def start(self, link: Link) -> None:
-        """Into set-up mode, set the filter, run."""
+        """Into set-up mode, calibrated values in binary frames, set the filter, run."""
         self._command(link, "C")
-        self._command(link, f"f,{self._options.sinc_length},0,0,0", answer="f")
+        if (baud_code := BAUD_CODES.get(self._options.baud)) is not None:
+            with suppress(NoAnswer, Refused):  # then it stays as it was left: its frames show what that is
+                self._command(link, f"c,0,1,0,{baud_code}", attempts=2)
+        self._command(link, f"f,{self._options.sinc_length},0,0,0")
         drain_until_quiet(link, quiet_s=0.01, until_s=now_s() + ANSWER_S)
         self._command(link, "R")
         self._framer.reset()
+        self._tail = b""
         self._clock, self._last_us = Unwrapper(bits=32, tick_s=1e-6), None
         self._host.reset()
 
-    def _command(self, link: Link, text: str, *, answer: str | None = None) -> None:
-        """Send until `r,0,X,0` stands among the data; `r` with another number is a refusal, which repeats too."""
-        wanted = f"r,0,{answer or text},0".encode()
-        for _ in range(ATTEMPTS):
-            link.write(text.encode() + b"\r\n", now_s() + ANSWER_S)
+    def _command(self, link: Link, text: str, *, attempts: int = ATTEMPTS) -> None:
+        """Send until `r,0,X,0` stands among the data, X being the command's letter.
+
+        The maker's own client ends no command; others read lines. What was understood last is tried first.
+        """
+        refusal = b""
+        for attempt in range(attempts):
+            is_line = self._wants_lines != bool(attempt % 2)
+            link.write((f"\r\n{text}\r\n" if is_line else text).encode(), now_s() + ANSWER_S)
             seen, until_s = b"", now_s() + ANSWER_S
             while chunk := link.read(until_s):
                 seen = (seen + chunk)[-4096:]
-                if wanted in seen:
-                    return
+                if answer := re.search(rb"r,(\d+),%c,\d" % text[0].encode(), seen):
+                    break
+            else:
+                continue
+            if answer[1] == b"0":
+                self._wants_lines = is_line
+                return
+            refusal = answer[0]
+        if refusal:
+            raise Refused(f"the sensor refuses {text!r}: {refusal.decode()}", code=int(refusal.split(b",")[1]))
         raise NoAnswer(f"the sensor does not confirm {text!r}; wrong baud rate or another device?")
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Publish each complete frame; the power-up text means that the sensor has forgotten its set-up."""
-        if POWER_UP_TEXT in chunk:
+        if POWER_UP_TEXT in self._tail + chunk:
             raise NoAnswer("the sensor has started anew")
+        self._tail = (self._tail + chunk)[1 - len(POWER_UP_TEXT) :]
         for frame in self._framer.feed(chunk):
             self._take(frame, arrived_s - FRAME_BYTES * self.byte_s)
 

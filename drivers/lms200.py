@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -19,6 +20,7 @@ from drivers.transport.framing import Framer
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.options import SerialOptions, read_options, serial_opener
 from drivers.transport.serial_link import SerialLink
+from hal.readings import Quality
 from hal.registry import Context, takes
 
 BAUD_CODES = {9600: 0x42, 19_200: 0x41, 38_400: 0x40, 500_000: 0x48}
@@ -29,11 +31,12 @@ PASSWORD = b"SICK_LMS"
 UNIT_BYTE, MILLIMETRES = 6, 1
 FIRST_CODE = 0x1FF7
 LONGEST_PAYLOAD = 812
-FATAL = 4
-ANSWER_S = 0.15
+WARNING, ERROR, FATAL = 2, 3, 4
+ANSWER_S, SLOW_S = 0.15, 0.6
 SET_UP_S = 3.0
-CONNECT_S = 6.0  # four baud rates, three requests at each
+CONNECT_S = 9.0  # four baud rates, three requests at each and then a patient one
 HEADER_BYTES = 4
+KEPT_BYTES = 4096
 
 
 class Lms200Options(SerialOptions):
@@ -52,9 +55,28 @@ def telegram(payload: bytes, *, address: int = 0) -> bytes:
     return body + struct.pack("<H", crc_sick(body))
 
 
-def framer(address: int = 0x80) -> Framer:
-    """Telegrams from one side."""
-    return Framer(bytes([2, address]), _length, lambda f: crc_sick(f[:-2]) == f[-2] | f[-1] << 8)
+def framer(address: int = 0x80, *, payload_bytes: int | None = None) -> Framer:
+    """Telegrams from one side, of that length alone where it is given: no false header makes a true one wait then."""
+
+    def length(data: bytes) -> int | None:
+        size = _length(data)
+        return 0 if payload_bytes is not None and size not in (None, HEADER_BYTES + payload_bytes + 2) else size
+
+    return Framer(bytes([2, address]), length, _is_whole)
+
+
+def _is_whole(frame: bytes) -> bool:
+    return crc_sick(frame[:-2]) == frame[-2] | frame[-1] << 8
+
+
+def payloads_in(seen: bytes) -> Iterator[bytes]:
+    """Of all whole telegrams, also behind a false header that promises more bytes than will ever come."""
+    at = seen.find(b"\x02\x80")
+    while at >= 0:
+        frame = seen[at : at + (_length(seen[at:]) or 0)]
+        if len(frame) > HEADER_BYTES and len(frame) == _length(frame) and _is_whole(frame):
+            yield frame[HEADER_BYTES:-2]
+        at = seen.find(b"\x02\x80", at + 1)
 
 
 def _length(data: bytes) -> int | None:
@@ -83,22 +105,23 @@ class Lms200(LineScanner):
         self.beams = beams
         self.sigma_m = options.sigma_m
         self._options = options
-        self._framer = framer()
+        self._framer = framer(payload_bytes=2 * beams.count + 4)
         self._bad_before = 0
         self._last = (b"", 0.0)
 
     def start(self, link: Link) -> None:
         """Find it, stop it, change the baud rate, set angles and unit, stream."""
         o = self._options
-        self._find(link)
-        self._set_mode(link, bytes([BAUD_CODES[o.baud]]))
-        self._set_baud(link, o.baud)
-        answer = self._ask(link, struct.pack("<BHH", VARIANT, o.field_deg, o.step_hundredths_deg), VARIANT | 0x80)
+        if self._find(link) != o.baud:
+            self._set_mode(link, bytes([BAUD_CODES[o.baud]]))
+            self._set_baud(link, o.baud)
+        variant = struct.pack("<BHH", VARIANT, o.field_deg, o.step_hundredths_deg)
+        answer = self._ask(link, variant, VARIANT | 0x80, SLOW_S)
         if answer[1:2] != b"\x01":
             what = f"{o.field_deg} deg in steps of {o.step_hundredths_deg / 100} deg are refused"
             raise Refused(what, code=int.from_bytes(answer[1:2]))
-        self._set_mode(link, bytes([SET_UP]) + PASSWORD)
-        config = bytearray(self._ask(link, bytes([READ_CONFIG]), READ_CONFIG | 0x80)[1:-1])
+        self._set_mode(link, bytes([SET_UP]) + PASSWORD, SET_UP_S)
+        config = bytearray(self._ask(link, bytes([READ_CONFIG]), READ_CONFIG | 0x80, SLOW_S)[1:-1])
         if len(config) <= UNIT_BYTE:
             raise NoAnswer(f"its configuration has {len(config)} bytes; is it an LMS 200?")
         if config[UNIT_BYTE] != MILLIMETRES:
@@ -107,22 +130,23 @@ class Lms200(LineScanner):
         self._set_mode(link, bytes([STREAM]))
         self._framer.reset()
 
-    def _set_mode(self, link: Link, mode: bytes) -> None:
-        answer = self._ask(link, bytes([MODE]) + mode, MODE | 0x80)
+    def _set_mode(self, link: Link, mode: bytes, wait_s: float = SLOW_S) -> None:
+        answer = self._ask(link, bytes([MODE]) + mode, MODE | 0x80, wait_s)
         if len(answer) > 1 and answer[1] != 0:
             raise Refused(f"operating mode {mode[0]:02X}h is refused", code=answer[1])
 
-    def _find(self, link: Link) -> None:
-        """Try all baud rates, the wanted one first, until it agrees to stop streaming."""
+    def _find(self, link: Link) -> int:
+        """Try all baud rates, the wanted one first, until it agrees to stop streaming; at which rate it did."""
         rates = sorted(BAUD_CODES, key=lambda rate: rate != self._options.baud)
-        for rate in rates:
-            self._set_baud(link, rate)
-            try:
-                self._ask(link, bytes([MODE, ON_REQUEST]), MODE | 0x80)
-            except NoAnswer:
-                continue
-            drain_until_quiet(link, quiet_s=0.03, until_s=now_s() + ANSWER_S)
-            return
+        for answer_s, attempts in ((ANSWER_S, 3), (SLOW_S, 1)):
+            for rate in rates:
+                self._set_baud(link, rate)
+                try:
+                    self._ask(link, bytes([MODE, ON_REQUEST]), MODE | 0x80, answer_s=answer_s, attempts=attempts)
+                except NoAnswer:
+                    continue
+                drain_until_quiet(link, quiet_s=0.03, until_s=now_s() + ANSWER_S)
+                return rate
         raise NoAnswer(f"no answer at {', '.join(map(str, sorted(rates)))} baud")
 
     @staticmethod
@@ -130,19 +154,31 @@ class Lms200(LineScanner):
         if (line := inside(link, SerialLink)) is not None:
             line.set_baud(baud)
 
-    def _ask(self, link: Link, payload: bytes, code: int, timeout_s: float = ANSWER_S) -> bytes:
-        """Payload of the answer with `code`; asked three times."""
-        for _ in range(3):
-            answers = framer()
+    @staticmethod
+    def _ask(
+        link: Link, payload: bytes, code: int, wait_s: float = 0.0, *, answer_s: float = ANSWER_S, attempts: int = 3
+    ) -> bytes:
+        """Payload of the answer with `code`.
+
+        Args:
+            wait_s: how long the answer to a request may take that the scanner has acknowledged. A request is repeated
+                sooner only without that; then the answers to all of them are let pass.
+        """
+        asked_s = now_s()
+        for attempt in range(attempts):
             link.write(telegram(payload), now_s() + ANSWER_S)
-            until_s = now_s() + timeout_s
-            while chunk := link.read(until_s):
-                for frame in answers.feed(chunk):
-                    answer = frame[HEADER_BYTES:-2]
-                    if answer[0] == NOT_ACCEPTED:
-                        raise Refused(f"command {payload[0]:02X}h is not accepted", code=NOT_ACCEPTED)
-                    if answer[0] == code:
-                        return answer
+            seen, sent_s = b"", now_s()
+            while chunk := link.read(sent_s + (max(wait_s, answer_s) if ACK in seen else answer_s)):
+                seen = (seen + chunk)[-KEPT_BYTES:]
+                answer = next((a for a in payloads_in(seen) if a[0] in (code, NOT_ACCEPTED)), None)
+                if answer is None:
+                    continue
+                if attempt:
+                    over_s = now_s() + 0.05 + 1.2 * attempt * (now_s() - asked_s)
+                    drain_until_quiet(link, quiet_s=over_s, until_s=over_s)
+                if answer[0] == NOT_ACCEPTED:
+                    raise Refused(f"command {payload[0]:02X}h is not accepted", code=NOT_ACCEPTED)
+                return answer
         raise NoAnswer(f"no answer to command {payload[0]:02X}h")
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
@@ -156,7 +192,7 @@ class Lms200(LineScanner):
             return  # the same telegram twice
         self._last = (frame, arrived_s)
         status = frame[-3]
-        if status & 7 == FATAL:
+        if status & 7 >= FATAL:
             raise Refused("the scanner reports a fatal error", code=status)
         range_m = decode_scan(frame[HEADER_BYTES:-2])
         if self.beams is None or len(range_m) != self.beams.count:
@@ -164,7 +200,8 @@ class Lms200(LineScanner):
             return
         bad, self._bad_before = self._framer.counts.bad - self._bad_before, self._framer.counts.bad
         valid = np.where(range_m <= self.beams.max_range_m, range_m, math.nan)
-        self.publish_scan(valid, valid_s=arrived_s - len(frame) * self.byte_s, missed=bad)
+        quality = {ERROR: Quality.INVALID, WARNING: Quality.DEGRADED}.get(status & 7, Quality.VALID)
+        self.publish_scan(valid, valid_s=arrived_s - len(frame) * self.byte_s, missed=bad, quality=quality)
 
 
 def decode_scan(payload: bytes) -> np.ndarray[Any, np.dtype[np.float64]]:

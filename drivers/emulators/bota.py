@@ -36,7 +36,6 @@ class BotaEmulator(WireEmulator):
         self._start_s = time.monotonic()
         self.period_s = 0.01
         self.is_running = True
-        self._text = b""
 
     def stamp_us(self) -> int:
         """The sensor's 32-bit clock."""
@@ -48,9 +47,8 @@ class BotaEmulator(WireEmulator):
         self.reply(None, b"App Init\r\n")
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
-        """Commands, line by line."""
-        *lines, self._text = (self._text + data).replace(b"\r", b"\n").split(b"\n")
-        for line in filter(None, lines):
+        """Commands, each written at once, with or without the end of a line."""
+        for line in data.split():
             self._command(peer, line)
 
     def _command(self, peer: Peer, line: bytes) -> None:

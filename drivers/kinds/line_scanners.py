@@ -65,16 +65,28 @@ class LineScanner(StreamDevice[RangeImage]):
         return self.newest(deadline, not_before_s=self.context.clock.now_s() + scan_s)
 
     def publish_scan(
-        self, range_m: NDArray[np.float64], *, valid_s: float, device_time_s: float | None = None, missed: int = 0
+        self,
+        range_m: NDArray[np.float64],
+        *,
+        valid_s: float,
+        device_time_s: float | None = None,
+        missed: int = 0,
+        quality: Quality = Quality.VALID,
     ) -> None:
-        """Put one scan, beam by beam, NaN where nothing was seen; `valid_s` is its end."""
-        is_seen = bool(np.any(np.isfinite(range_m)))
+        """Put one scan, beam by beam, NaN where nothing was seen; `valid_s` is its end.
+
+        Args:
+            quality: what the device itself says of it; a scan that saw nothing is invalid in any case.
+        """
+        cause = Cause.NONE if quality is Quality.VALID else Cause.DEVICE
+        if not np.any(np.isfinite(range_m)) and quality is not Quality.INVALID:
+            quality, cause = Quality.INVALID, Cause.OUT_OF_RANGE
         self.publish(
             RangeImage(depth_m=range_m.astype(np.float32)[np.newaxis, :]),
             valid_s=valid_s,
             device_time_s=device_time_s,
-            quality=Quality.VALID if is_seen else Quality.INVALID,
-            cause=Cause.NONE if is_seen else Cause.OUT_OF_RANGE,
+            quality=quality,
+            cause=cause,
             missed=missed,
         )
 

@@ -78,6 +78,11 @@ class CapsuleParser:
         self._buffer = data[at:]
         return found
 
+    @property
+    def pending(self) -> int:
+        """Measurements that wait for the next capsule."""
+        return 0 if self._before is None else POINTS
+
     def _follow(self, capsule: bytes) -> list[Points | None]:
         """What the arrival of a capsule tells of the one before; capsules of unequal span are no neighbours."""
         before, self._before = self._before, capsule

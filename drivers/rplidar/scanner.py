@@ -21,6 +21,7 @@ from drivers.transport.capture import inside
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.options import SerialOptions, read_options, serial_opener
 from drivers.transport.serial_link import SerialLink
+from hal.readings import Quality
 from hal.registry import Context, takes
 
 STOP, RESET, START_SCAN, GET_INFO, GET_HEALTH = 0x25, 0x40, 0x20, 0x50, 0x52
@@ -30,9 +31,14 @@ IN_STEP = 8  # a shifted stream passes the test of one measurement with probabil
 FULL_TURN_Q6 = 360 * 64
 WHOLE_TURN_RAD = math.radians(330)  # a turn that lost its beginning is not published as one
 JITTER_RAD = math.radians(2.0)
-ERROR = 2
-ANSWER_S = 0.3
+WARNING, ERROR = 1, 2
+ANSWER_S = (0.3, 0.6, 0.9)  # of each attempt: a slow scanner catches up with what it was asked again
 RESET_S = 0.5
+SPIN_UP_S = 2.5  # before the first measurement
+TURN_S = 3.0  # measurements, but no whole turn for so long
+CONNECT_S = 6.0
+SEND_S, QUIET_S = 0.3, 0.3
+OLD_FIRMWARE = '; the first A1 models know no express scans: set mode = "standard"'
 
 
 class RplidarOptions(SerialOptions):
@@ -105,6 +111,11 @@ class NodeParser:
         self._buffer = self._buffer[at:]
         return runs
 
+    @property
+    def pending(self) -> int:
+        """Measurements that have come and are not trusted yet."""
+        return len(self._buffer) // NODE_BYTES
+
 
 def _next_in_step(good: NDArray[np.bool_], at: int) -> int:
     """The first place from `at` on from where everything known is in step for as long as it takes to trust it."""
@@ -138,73 +149,114 @@ class Rplidar(LineScanner):
         self._is_express = options.mode == "express"
         self._nodes, self._capsules = NodeParser(), CapsuleParser()
         self._turn: list[Points] | None = None
+        self._turn_s = now_s()
+        self._begun: tuple[float, int] | None = (
+            None  # the turn: when its first chunk came, and what came in that with it
+        )
+        self._measurement_s = 0.0
         self._last_rad = 0.0
         self._missed = 0
+        self._quality = Quality.VALID
+
+    def set_up(self, link: Link) -> None:
+        """As any stream's, and then the motor may have to spin up."""
+        super().set_up(link)
+        self._heard_s += SPIN_UP_S
 
     def start(self, link: Link) -> None:
         """Start the motor, stop, identify, ask for its health (one reset if it is ill), scan."""
         if (line := inside(link, SerialLink)) is not None:
             line.set_dtr(False)  # an A1's motor turns while DTR is low
-        link.write(bytes([0xA5, STOP]), now_s() + ANSWER_S)
-        drain_until_quiet(link, quiet_s=0.02, until_s=now_s() + ANSWER_S)
+        link.write(bytes([0xA5, STOP]), now_s() + SEND_S)
+        drain_until_quiet(link, quiet_s=0.02, until_s=now_s() + QUIET_S)
         self._ask(link, bytes([0xA5, GET_INFO]), descriptor(20, 0, INFO_TYPE), 20)
-        if self._health(link) == ERROR:
-            link.write(bytes([0xA5, RESET]), now_s() + ANSWER_S)
+        status, _ = self._health(link)
+        if status == ERROR:
+            link.write(bytes([0xA5, RESET]), now_s() + SEND_S)
             drain_until_quiet(link, quiet_s=0.1, until_s=now_s() + RESET_S)
-            if self._health(link) == ERROR:
-                raise Refused("the scanner reports an error that a reset does not cure", code=ERROR)
-        self._nodes, self._capsules, self._turn = NodeParser(), CapsuleParser(), None
+            status, code = self._health(link)
+            if status == ERROR:
+                raise Refused(f"the scanner reports error {code:04X}h, which a reset does not cure", code=code)
+        self._quality = Quality.DEGRADED if status == WARNING else Quality.VALID
+        self._nodes, self._capsules, self._turn, self._begun = NodeParser(), CapsuleParser(), None, None
+        self._turn_s = now_s() + SPIN_UP_S
         if self._is_express:
-            rest = self._ask(link, REQUEST, descriptor(CAPSULE_BYTES, 1, EXPRESS_TYPE), 0)
+            rest = self._ask(link, REQUEST, descriptor(CAPSULE_BYTES, 1, EXPRESS_TYPE), 0, OLD_FIRMWARE)
         else:
             rest = self._ask(link, bytes([0xA5, START_SCAN]), descriptor(5, 1, SCAN_TYPE), 0)
         self.receive(rest, now_s())
 
-    def _health(self, link: Link) -> int:
-        return self._ask(link, bytes([0xA5, GET_HEALTH]), descriptor(3, 0, HEALTH_TYPE), 3)[0]
+    def _health(self, link: Link) -> tuple[int, int]:
+        """Status and error code."""
+        answer = self._ask(link, bytes([0xA5, GET_HEALTH]), descriptor(3, 0, HEALTH_TYPE), 3)
+        return answer[0], answer[1] | answer[2] << 8
 
-    def _ask(self, link: Link, request: bytes, head: bytes, length: int) -> bytes:
+    def _ask(self, link: Link, request: bytes, head: bytes, length: int, remedy: str = "") -> bytes:
         """What follows the descriptor `head`: at least `length` bytes."""
-        for _ in range(3):
-            link.write(request, now_s() + ANSWER_S)
-            seen, until_s = b"", now_s() + ANSWER_S
+        for answer_s in ANSWER_S:
+            link.write(request, now_s() + SEND_S)
+            seen, until_s = b"", now_s() + answer_s
             while chunk := link.read(until_s):
                 seen += chunk
                 at = seen.find(head)
                 if at >= 0 and len(seen) >= at + len(head) + length:
                     return seen[at + len(head) :]
-        raise NoAnswer(f"no answer to command {request[1]:02X}h")
+        raise NoAnswer(f"no answer to command {request[1]:02X}h{remedy}")
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Collect measurements; a start flag, or an angle that falls back to nought, ends a turn."""
-        for points in self._capsules.feed(chunk) if self._is_express else map(_points, self._nodes.feed(chunk)):
+        batches: list[Any] = (
+            list(self._capsules.feed(chunk)) if self._is_express else [_points(run) for run in self._nodes.feed(chunk)]
+        )
+        behind = self._capsules.pending if self._is_express else self._nodes.pending
+        behind += sum(len(points[-1]) for points in batches if points is not None)
+        for points in batches:
             if points is None:
                 self._missed += self._turn is not None
-                self._turn = None
+                self._turn = self._begun = None
                 continue
+            self._heard_s = max(self._heard_s, arrived_s)
             starts, angle_rad, distance_m = points if len(points) == 3 else (self._starts(points[0]), *points)
             for place, part in enumerate(np.split(np.arange(len(angle_rad)), starts)):
                 if place:
-                    self._finish(arrived_s)
+                    self._finish(arrived_s, behind)
                     self._turn = []
                 if self._turn is not None and len(part):
                     self._turn.append((angle_rad[part], distance_m[part]))
+                behind -= len(part)
+        if arrived_s > self._turn_s + TURN_S:
+            raise NoAnswer(f"measurements come, but no whole turn in {TURN_S:.0f} s; does its motor turn steadily?")
 
     def _starts(self, angle_rad: NDArray[np.float64]) -> list[int]:
         starts = split_turns(angle_rad, self._last_rad)
         self._last_rad = float(angle_rad[-1])
         return starts
 
-    def _finish(self, arrived_s: float) -> None:
-        if not self._turn or self.beams is None:
+    def _finish(self, arrived_s: float, behind: int) -> None:
+        """Publish the turn.
+
+        Args:
+            arrived_s: when the chunk came.
+            behind: measurements since the end of the turn, each of which took as long as those of the turn.
+        """
+        begun, self._begun = self._begun, (arrived_s, behind)
+        if not self._turn or begun is None or self.beams is None:
             return
         angle_rad, distance_m = (np.concatenate(arrays) for arrays in zip(*self._turn, strict=True))
         if np.ptp(angle_rad) < WHOLE_TURN_RAD or turns_back(angle_rad):
             self._missed += 1
             return
         missed, self._missed = self._missed, 0
+        between = len(angle_rad) + behind - begun[1]  # measurements between the two arrivals
+        if between > len(angle_rad) / 2:  # of fewer, the jitter of the arrivals would be all
+            self._measurement_s = (arrived_s - begun[0]) / between
+        each_s = self._measurement_s or self.beams.scan_s / len(angle_rad)
+        self._turn_s = max(self._turn_s, arrived_s)
         self.publish_scan(
-            sectors(angle_rad, within(distance_m, self.beams), self.beams.count), valid_s=arrived_s, missed=missed
+            sectors(angle_rad, within(distance_m, self.beams), self.beams.count),
+            valid_s=arrived_s - behind * each_s,
+            missed=missed,
+            quality=self._quality,
         )
 
 
@@ -237,5 +289,5 @@ def sectors(angle_rad: NDArray[np.float64], range_m: NDArray[np.float64], count:
 def connect(context: Context, options: dict[str, Any]) -> Rplidar:
     """Entry point `serial:rplidar`."""
     device = Rplidar(context, read_options(context, options, RplidarOptions))
-    device.join()
+    device.join(CONNECT_S)
     return device

@@ -11,12 +11,13 @@ import pytest
 from drivers.bota import Bota, BotaOptions, framer
 from drivers.emulators import bota as emulator
 from drivers.emulators.scripted import ScriptedForceTorque, scripted_wrench
+from drivers.transport.link import NoAnswer, Refused
 from hal.conformance import ForceTorqueContract, Rig
 from hal.devices import Wrench
 from hal.errors import DeviceUnavailable
 from hal.readings import Cause, Quality
 from hal.registry import Context, connect
-from tests.drivers.rigs import count_good, soon, until, wired, wired_rig
+from tests.drivers.rigs import ScriptLink, count_good, soon, until, wired, wired_rig
 
 DRIVER = "serial:bota"
 
@@ -112,6 +113,48 @@ def test_a_sensor_that_restarts_is_set_up_again() -> None:
         far_side.restart()
         until(lambda: device.health().reconnects >= 1 and device.health().quality is Quality.VALID)
         assert far_side.is_running
+
+
+class Sensor(ScriptLink):
+    """A sensor that reads commands as they are, or line by line."""
+
+    def __init__(self, *, reads_lines: bool, refuses: str = "-") -> None:
+        super().__init__()
+        self.reads_lines, self.refuses = reads_lines, refuses
+        self.understood: list[str] = []
+
+    def write(self, data: bytes, until_s: float) -> None:
+        text = data.decode()
+        if text.endswith("\n") != self.reads_lines:
+            return
+        self.understood.append(text.strip())
+        self.ready += f"r,{int(text.strip()[0] == self.refuses)},{text.strip()[0]},0\r\n".encode()
+
+
+@pytest.mark.parametrize("reads_lines", [False, True])
+def test_commands_are_understood_with_and_without_the_end_of_a_line(reads_lines: bool) -> None:
+    device, link = Bota(Context(name="wrist"), BotaOptions(port="none")), Sensor(reads_lines=reads_lines)
+    device.start(link)
+    assert link.understood == ["C", "c,0,1,0,4", "f,512,0,0,0", "R"]
+
+
+def test_a_sensor_that_does_not_know_its_output_command_is_set_up_all_the_same() -> None:
+    device, link = Bota(Context(name="wrist"), BotaOptions(port="none")), Sensor(reads_lines=False, refuses="c")
+    device.start(link)
+    assert link.understood[-1] == "R"
+
+
+def test_a_refused_filter_is_told_as_that() -> None:
+    device, link = Bota(Context(name="wrist"), BotaOptions(port="none")), Sensor(reads_lines=False, refuses="f")
+    with pytest.raises(Refused, match=r"refuses 'f,512,0,0,0': r,1,f,0"):
+        device.start(link)
+
+
+def test_a_power_up_text_that_comes_in_two_pieces_is_seen() -> None:
+    device = Bota(Context(name="wrist"), BotaOptions(port="none"))
+    device.receive(b"\xaa\x00App I", 0.0)
+    with pytest.raises(NoAnswer, match="started anew"):
+        device.receive(b"nit\r\n", 0.0)
 
 
 def test_another_device_on_the_port_is_told() -> None:

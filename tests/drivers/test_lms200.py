@@ -10,11 +10,14 @@ import pytest
 from drivers.emulators import lms200 as emulator
 from drivers.emulators.beams import line_m
 from drivers.emulators.scripted import ScriptedScanner, scripted_scan
-from drivers.lms200 import decode_scan, framer, telegram
+from drivers.lms200 import SET_UP_S, Lms200, Lms200Options, decode_scan, framer, telegram
+from drivers.transport.link import now_s
 from hal.conformance import RangeScannerContract, Rig
 from hal.devices import RangeImage, RangeScannerCapabilities
 from hal.errors import DeviceFault
-from tests.drivers.rigs import count_good, soon, wired, wired_rig
+from hal.readings import Quality
+from hal.registry import Context
+from tests.drivers.rigs import ScriptLink, count_good, soon, wired, wired_rig
 
 DRIVER = "serial:lms200"
 
@@ -96,3 +99,85 @@ def test_a_fatal_status_is_a_fault() -> None:
 
 def test_own_bytes_are_not_taken_for_the_scanners() -> None:
     assert framer().feed(telegram(b"\x31")) == []
+
+
+STOPPED = telegram(b"\xa0\x00\x10", address=0x80)
+
+
+def scan(millimetres: int, *, status: int = 0, count: int = 181) -> bytes:
+    """A scan telegram, all beams alike."""
+    head = b"\xb0" + (count | 1 << 14).to_bytes(2, "little")
+    return telegram(head + count * millimetres.to_bytes(2, "little") + bytes([status]), address=0x80)
+
+
+def lone_device() -> Lms200:
+    return Lms200(Context(name="scanner"), Lms200Options(port="none"))
+
+
+@pytest.mark.parametrize(
+    ("status", "quality"),
+    [(0, Quality.VALID), (1, Quality.VALID), (0x80, Quality.VALID), (2, Quality.DEGRADED), (3, Quality.INVALID)],
+)
+def test_what_the_scanner_says_of_itself_is_the_quality_of_its_scans(status: int, quality: Quality) -> None:
+    device = lone_device()
+    device.receive(scan(1000, status=status), 0.0)
+    sample = device.mailbox.peek()
+    assert sample is not None and sample.quality is quality
+
+
+def test_a_false_header_does_not_make_a_true_scan_wait_for_the_bytes_it_promises() -> None:
+    device = lone_device()
+    device.receive(b"\x02\x80\x00\x03" + scan(1000), 0.0)
+    assert device.mailbox.published == 1
+
+
+class Scanner(ScriptLink):
+    """Acknowledges each request, and answers those who wait long enough for it."""
+
+    def __init__(self, answer: bytes, *, takes_s: float) -> None:
+        super().__init__()
+        self.answer, self.takes_s = answer, takes_s
+
+    def read(self, until_s: float) -> bytes:
+        if self.ready:
+            return super().read(until_s)
+        answer, self.answer = (self.answer, b"") if until_s - now_s() > self.takes_s else (b"", self.answer)
+        return answer
+
+    def write(self, data: bytes, until_s: float) -> None:
+        super().write(data, until_s)
+        self.ready = b"\x06"
+
+
+def test_a_request_that_was_acknowledged_is_waited_for_and_not_repeated() -> None:
+    link = Scanner(STOPPED, takes_s=1.5)
+    lone_device()._set_mode(link, b"\x00SICK_LMS", SET_UP_S)
+    assert len(link.written) == 1
+
+
+def test_an_answer_behind_a_false_header_is_found() -> None:
+    link = ScriptLink(b"\x06\x02\x80\x00\x02noise" + STOPPED)
+    lone_device()._set_mode(link, b"\x25")
+
+
+class Repeater(ScriptLink):
+    """Loses the first request's time: both answers come after the second."""
+
+    def read(self, until_s: float) -> bytes:
+        first, self.ready = self.ready[: len(STOPPED)], self.ready[len(STOPPED) :]
+        return first
+
+
+def test_answers_to_repeated_requests_are_not_left_for_the_next_one() -> None:
+    link = Repeater(b"", 2 * STOPPED)
+    lone_device()._set_mode(link, b"\x25")
+    assert not link.ready
+
+
+def test_a_scanner_that_has_the_wanted_baud_rate_is_not_told_to_change_it() -> None:
+    well, millimetres = b"\x10", bytes([0, 0, 0, 0, 0, 0, 1]) + bytes(27)
+    variant = telegram(b"\xbb\x01\xb4\x00\x64\x00" + well, address=0x80)
+    config = telegram(b"\xf4" + millimetres + well, address=0x80)
+    link = ScriptLink(STOPPED, variant, STOPPED, config, STOPPED)
+    lone_device().start(link)
+    assert [frame[4:6] for frame in link.written[:3]] == [b"\x20\x25", b"\x3b\xb4", b"\x20\x00"]

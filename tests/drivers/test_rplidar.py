@@ -14,13 +14,15 @@ from drivers.emulators import rplidar as emulator
 from drivers.emulators.beams import line_m
 from drivers.emulators.scripted import ScriptedScanner, scripted_scan
 from drivers.rplidar.express import CAPSULE_BYTES, REQUEST, CapsuleParser, decode_capsule, is_capsule, is_first
-from drivers.rplidar.scanner import NodeParser, decode, descriptor, sectors, turns_back
+from drivers.rplidar.scanner import NodeParser, Rplidar, RplidarOptions, decode, descriptor, sectors, turns_back
 from drivers.transport.checks import xor_byte
+from drivers.transport.link import NoAnswer, now_s
 from hal.conformance import RangeScannerContract, Rig
 from hal.devices import RangeImage
 from hal.errors import DeviceUnavailable
+from hal.readings import Quality
 from hal.registry import Context, connect
-from tests.drivers.rigs import count_good, soon, wired, wired_rig
+from tests.drivers.rigs import ScriptLink, count_good, soon, wired, wired_rig
 
 DRIVER = "serial:rplidar"
 FAST = {"scan_rate_hz": 40.0}
@@ -90,10 +92,56 @@ def test_an_ill_scanner_is_reset_once() -> None:
         assert np.isfinite(device.read_range(deadline=soon()).value.depth_m).all()
 
 
+def test_a_scanner_that_warns_gives_degraded_scans() -> None:
+    with wired(emulator.start(ScriptedScanner(), {**FAST, "health": 1}), DRIVER) as device:
+        assert device.read_range(deadline=soon()).quality is Quality.DEGRADED
+
+
+@pytest.mark.parametrize(("mode", "at_once"), [("standard", 1), ("standard", 90), ("express", 64)])
+def test_a_turn_is_stamped_with_its_end_and_not_with_what_came_after_it(mode: str, at_once: int) -> None:
+    """Measurements of 0.5 ms each, so many at once: without counting back the stamps would be 4 to 45 ms late."""
+    device = Rplidar(Context(name="scanner"), RplidarOptions(port="none", mode=mode))
+    nodes = emulator.encode_turn(TURN_RAD, np.full(360, 1.0)) * 6
+    capsules = emulator.encode_capsules(np.full(384, 1.0), is_first=False) * 6
+    data, unit, size = (nodes, 1, 5) if mode == "standard" else (capsules, 32, CAPSULE_BYTES)
+    turn_s = (360 if mode == "standard" else 384) * 0.0005
+    begin_s = now_s()
+    ends_s: list[float] = []
+    for at in range(0, len(data), size * at_once // unit):
+        upto = min(at + size * at_once // unit, len(data))
+        device.receive(data[at:upto], begin_s + upto / size * unit * 0.0005)
+        if (sample := device.mailbox.peek()) is not None and len(ends_s) < device.mailbox.published:
+            ends_s.append(sample.host_time_s - begin_s)
+    assert len(ends_s) >= 3
+    late_s = [(end_s + turn_s / 2) % turn_s - turn_s / 2 for end_s in ends_s]
+    assert max(map(abs, late_s)) < 0.0015
+
+
+def test_measurements_without_a_whole_turn_are_told() -> None:
+    device = Rplidar(Context(name="scanner"), RplidarOptions(port="none"))
+    piece = emulator.encode_turn(TURN_RAD, np.full(360, 1.0))[10:500]
+    device.receive(piece, now_s())
+    with pytest.raises(NoAnswer, match="no whole turn in 3 s; does its motor turn"):
+        device.receive(piece, now_s() + 60.0)
+
+
+def test_a_motor_may_spin_up_before_the_first_measurement_comes() -> None:
+    answers = descriptor(20, 0, 4) + bytes(20), descriptor(3, 0, 6) + bytes(3), descriptor(5, 1, 0x81)
+    device = Rplidar(Context(name="scanner"), RplidarOptions(port="none"))
+    device.set_up(ScriptLink(b"", *answers))
+    assert device._heard_s > now_s() + 2.0
+
+
+def test_firmware_without_express_scans_is_told() -> None:
+    device = Rplidar(Context(name="scanner"), RplidarOptions(port="none", mode="express"))
+    with pytest.raises(NoAnswer, match='set mode = "standard"'):
+        device.start(ScriptLink(b"", descriptor(20, 0, 4) + bytes(20), descriptor(3, 0, 6) + bytes(3)))
+
+
 def test_an_incurable_scanner_is_told() -> None:
     far_side = emulator.start(ScriptedScanner(), {"health": 2, "is_cured_by_reset": False})
     try:
-        with pytest.raises(DeviceUnavailable, match="reset does not cure"):
+        with pytest.raises(DeviceUnavailable, match="error 0000h, which a reset does not cure"):
             connect(Context(name="scanner"), DRIVER, far_side.address)
     finally:
         far_side.close()

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import RigidTransform
 
 from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest
@@ -70,6 +71,27 @@ def project_with_jacobian(points_camera_m: ArrayLike, intrinsics: CameraIntrinsi
     focal = np.array([intrinsics.fx_px, intrinsics.fy_px])
     jacobian = focal[:, None] * (distortion_jacobian(normalised, intrinsics) @ d_normalised)
     return _to_pixels(distort(normalised, intrinsics), intrinsics), jacobian
+
+
+def disc_offset_px(
+    points_m: ArrayLike, radius_m: ArrayLike, camera_from_plate: RigidTransform, intrinsics: CameraIntrinsics
+) -> Array:
+    """How far the middle of a disc's image lies from the image of its middle, (N, 2) px: the near half looks larger.
+
+    The middle of the ellipse is the image of c - r^2 / c_z (a - (n a) n), a the optical axis and n the disc's normal:
+    the pole of the line at infinity by the dual conic r^2 (I - n n^T) - c c^T of the disc (Hartley, Zisserman,
+    Multiple View Geometry, Section 8.3).
+
+    Args:
+        points_m: (N, 3) middles of discs that lie in the plate (its normal is z), plate frame.
+        radius_m: of each.
+        camera_from_plate: where the plate stands; roughly is enough.
+    """
+    middles = _points(points_m, 3)
+    seen_m = camera_from_plate.apply(middles)
+    axis = camera_from_plate.as_matrix()[2, :3]  # the optical axis in the plate's frame
+    aside = np.outer(np.square(radius_m) / seen_m[:, 2], [axis[0], axis[1], 0.0])
+    return project(camera_from_plate.apply(middles - aside), intrinsics) - project(seen_m, intrinsics)
 
 
 def distort(normalised: ArrayLike, intrinsics: CameraIntrinsics) -> Array:

@@ -1,15 +1,16 @@
 """Camera on the hand, from known points seen from many poses of the arm: mount, target and lens in one fit.
 
-Pixel: u = lens((A X)^-1 Z (p + e)) with A = base_from_flange, X = flange_from_camera, Z = base_from_target. X, Z, the
-lens and the errors e of the points are estimated together; what is known beforehand of lens and points (one sigma
-each) enters as measurements, and the arm's own repeatability is marginalised into the noise of every view. So the
-covariance of X tells all of it. Covariances are over translation then rotation in the parent's axes.
+Pixel: u = lens((A X)^-1 Z (p + e)) + s with A = base_from_flange, X = flange_from_camera, Z = base_from_target. X, Z,
+the lens, the errors e of the points and two numbers of s (`InHandState.offset`) are estimated together; what is known
+beforehand of lens, e and s (one sigma each) enters as measurements, and the arm's own repeatability is marginalised
+into the noise of every view. So the covariance of X tells all of it. Covariances are over translation then rotation in
+the parent's axes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from hal.geometry import UncertainPose, certain, matrix_of, perturbed, skew
 from perception.calibration.hand_eye import HandEyeView, check_accuracy, check_turns
 from perception.calibration.intrinsics import NAMES, lens_jacobian, parameters, with_parameters
 from perception.calibration.newton import Minimum, descend
-from perception.camera_model import project_with_jacobian
+from perception.camera_model import disc_offset_px, project_with_jacobian
 
 Array = NDArray[np.float64]
 
@@ -47,12 +48,21 @@ class InHandView:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class InHandState:
-    """What is estimated: X, Z, the lens, and the errors (N, 3) of the target's points, m, target frame."""
+    """What is estimated.
+
+    Attributes:
+        flange_from_camera, base_from_target, intrinsics: X, Z and the lens.
+        point_errors_m: (N, 3) errors of the target's points, target frame.
+        offset: (2,) what all views share of the difference between a lamp's middle and that of its bright spot: how many
+            times the offset of a flat disc seen aslant (`disc_offset_px`), which is towards its near side, and px
+            outwards in the image, per squared tangent. A lamp has a body and a glow, and a lens shades.
+    """
 
     flange_from_camera: RigidTransform
     base_from_target: RigidTransform
     intrinsics: CameraIntrinsics
     point_errors_m: Array
+    offset: Array = field(default_factory=lambda: np.array([1.0, 0.0]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,6 +72,8 @@ class Beforehand:
     Attributes:
         focal_ratio, centre_px, k1: of the lens.
         point_m: of each coordinate of the target's points.
+        disc_m: radius of a flat disc that a point is the middle of; 0 for a corner or a cross. Not a sigma.
+        offset: of both numbers of `InHandState.offset`.
         arm_m, arm_rad: repeatability of the arm, drawn anew at every station.
     """
 
@@ -71,6 +83,8 @@ class Beforehand:
     point_m: float = 1e-4
     arm_m: float = 1e-4
     arm_rad: float = 1e-4
+    disc_m: float = 0.0
+    offset: tuple[float, float] = (2.0, 0.1)
 
 
 UNKNOWN_LENS = Beforehand(focal_ratio=0.02, centre_px=15.0, k1=0.1)  # what a maker's data sheet is worth
@@ -131,7 +145,7 @@ def calibrate_in_hand(
         if chdtrc(2 * len(points_m), errors[worst]) > OUTLIER_P or len(used) <= FEWEST_VIEWS:
             break
         del used[worst]
-    rest = np.concatenate([_residual(views[k], points_m, state)[0] for k in used])
+    rest = np.concatenate([_residual(views[k], points_m, state, known.disc_m)[0] for k in used])
     # More scatter than was stated: then everything is as much less certain.
     covariance = minimum.covariance * max(1.0, minimum.chi_square / (len(rest) - 12))
     check_accuracy(covariance, len(used), limit_m=limit_m, limit_rad=limit_rad)
@@ -190,7 +204,7 @@ def _information(
     nothing = np.zeros((len(points_m), 2))
     covariance = np.tile(sigma_px**2 * np.eye(2), (len(points_m), 1, 1))
     view = InHandView(base_from_flange=flange, pixels_px=nothing, covariance_px=covariance)
-    _, J = _residual(view, points_m, state)
+    _, J = _residual(view, points_m, state, known.disc_m)
     return np.asarray(J.T @ np.linalg.solve(_noise(view, points_m, state, known), J))
 
 
@@ -214,11 +228,12 @@ def _fit(
         whiten = [np.linalg.inv(np.linalg.cholesky(_noise(view, points_m, state, known))) for view in views]
 
         def linearise(at: InHandState, whiten: list[Array] = whiten) -> tuple[Array, Array]:
-            surprise = np.concatenate([parameters(at.intrinsics)[INDEX] - believed, at.point_errors_m.ravel()])
+            lens = parameters(at.intrinsics)[INDEX] - believed
+            surprise = np.concatenate([lens, at.point_errors_m.ravel(), at.offset - start.offset])
             residuals = [surprise / priors]
             rows = [np.hstack([np.zeros((len(priors), 12)), np.diag(1.0 / priors)])]
             for view, W in zip(views, whiten, strict=True):
-                r, J = _residual(view, points_m, at)
+                r, J = _residual(view, points_m, at, known.disc_m)
                 residuals.append(W @ r)
                 rows.append(W @ J)
             return np.concatenate(residuals), np.vstack(rows)
@@ -228,7 +243,7 @@ def _fit(
 
 
 def _priors(lens: CameraIntrinsics, known: Beforehand, count: int) -> Array:
-    """One sigma of the lens and of the points' coordinates, as they stand in the state's step."""
+    """One sigma of the lens, of the points' coordinates and of their offset, as they stand in the state's step."""
     of_lens = [
         known.focal_ratio * lens.fx_px,
         known.focal_ratio * lens.fy_px,
@@ -236,7 +251,7 @@ def _priors(lens: CameraIntrinsics, known: Beforehand, count: int) -> Array:
         known.centre_px,
         known.k1,
     ]
-    return np.array(of_lens + [known.point_m] * (3 * count))
+    return np.array(of_lens + [known.point_m] * (3 * count) + list(known.offset))
 
 
 def _moved(state: InHandState, step: Array) -> InHandState:
@@ -246,11 +261,12 @@ def _moved(state: InHandState, step: Array) -> InHandState:
         flange_from_camera=perturbed(state.flange_from_camera, step[:6]),
         base_from_target=perturbed(state.base_from_target, step[6:12]),
         intrinsics=with_parameters(state.intrinsics, values),
-        point_errors_m=state.point_errors_m + step[12 + len(FREE) :].reshape(-1, 3),
+        point_errors_m=state.point_errors_m + step[12 + len(FREE) : -2].reshape(-1, 3),
+        offset=state.offset + step[-2:],
     )
 
 
-def _residual(view: InHandView, points_m: Array, state: InHandState) -> tuple[Array, Array]:
+def _residual(view: InHandView, points_m: Array, state: InHandState, disc_m: float) -> tuple[Array, Array]:
     """(2N,) pixels that the state predicts less the measured ones, and their derivatives by the state's step."""
     Rx, Rz = matrix_of(state.flange_from_camera), matrix_of(state.base_from_target)
     Ra = matrix_of(view.base_from_flange)
@@ -260,16 +276,21 @@ def _residual(view: InHandView, points_m: Array, state: InHandState) -> tuple[Ar
     pixels, by_q = project_with_jacobian(q, state.intrinsics)
     n = len(points_m)
     camera_from_base = (Ra @ Rx).T
-    J = np.zeros((n, 2, 12 + len(FREE) + 3 * n))
+    tangent = q[:, :2] / q[:, 2:]
+    J = np.zeros((n, 2, 12 + len(FREE) + 3 * n + 2))
     lever = [skew(p) for p in in_flange - state.flange_from_camera.translation]
     J[:, :, :3], J[:, :, 3:6] = -by_q @ Rx.T, by_q @ (Rx.T @ np.array(lever))  # - r x f = [f]x r
     J[:, :, 6:9] = by_q @ camera_from_base
     J[:, :, 9:12] = by_q @ (camera_from_base @ np.array([-skew(p) for p in turned]))
-    J[:, :, 12 : 12 + len(FREE)] = lens_jacobian(q[:, :2] / q[:, 2:], state.intrinsics)[:, :, INDEX]
+    J[:, :, 12 : 12 + len(FREE)] = lens_jacobian(tangent, state.intrinsics)[:, :, INDEX]
     by_point = by_q @ camera_from_base @ Rz
     for k in range(n):
         J[k, :, 12 + len(FREE) + 3 * k :][:, :3] = by_point[k]
-    return (pixels - view.pixels_px).ravel(), J.reshape(2 * n, -1)
+    # Of some hundredths of a pixel: where exactly the camera stands changes nothing of them.
+    camera_from_target = (view.base_from_flange * state.flange_from_camera).inv() * state.base_from_target
+    J[:, :, -2] = disc_offset_px(points_m, disc_m, camera_from_target, state.intrinsics)
+    J[:, :, -1] = tangent * np.linalg.norm(tangent, axis=1, keepdims=True)
+    return (pixels + J[:, :, -2:] @ state.offset - view.pixels_px).ravel(), J.reshape(2 * n, -1)
 
 
 def _noise(view: InHandView, points_m: Array, state: InHandState, known: Beforehand) -> Array:
@@ -293,5 +314,5 @@ def _noise(view: InHandView, points_m: Array, state: InHandState, known: Beforeh
 
 
 def _chi_square(view: InHandView, points_m: Array, state: InHandState, known: Beforehand) -> float:
-    r, _ = _residual(view, points_m, state)
+    r, _ = _residual(view, points_m, state, known.disc_m)
     return float(r @ np.linalg.solve(_noise(view, points_m, state, known), r))

@@ -113,7 +113,8 @@ def beforehand(session: Session, camera: str, *, is_lens_known: bool) -> Beforeh
         ratio, centre, k1 = (max(a, b) for a, b in zip(stated, LEAST_LENS, strict=True))
         known = Beforehand(focal_ratio=ratio, centre_px=centre, k1=k1)
     point_m = max(session.panel.tolerances.light_m, 1e-5)
-    return replace(known, point_m=point_m, arm_rad=max(known.arm_rad, arm.resolution_rad))
+    disc_m = float(np.mean([light.radius_m for light in session.panel.lights]))
+    return replace(known, point_m=point_m, disc_m=disc_m, arm_rad=max(known.arm_rad, arm.resolution_rad))
 
 
 # -- range scanner: the plate from several sides ----------------------------------------------------------------------

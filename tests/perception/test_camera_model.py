@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform
 
 from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest
+from hal.geometry import transform_rpy
 from perception.camera_model import (
     CubicLens,
     check_size,
     cubic_monomials,
+    disc_offset_px,
     normalised_with_jacobian,
     project,
     project_with_jacobian,
@@ -116,3 +119,16 @@ def test_the_cubic_correction_is_used_in_place_of_the_lens() -> None:
 def test_points_of_a_wrong_shape_are_refused(wrong: object) -> None:
     with pytest.raises(InvalidRequest, match=r"\(N, 3\)"):
         project(wrong, LENS)
+
+
+def test_a_discs_image_has_its_middle_where_adding_up_its_points_says() -> None:
+    camera_from_plate: RigidTransform = transform_rpy([0.02, -0.03, 0.4], [np.pi - 0.7, 0.4, 0.1])
+    middles, radius_m = np.array([[-0.15, 0.1, 0.01], [0.12, 0.08, 0.0], [0.0, 0.0, 0.0]]), 0.02
+    x, y = np.meshgrid(*[np.linspace(-1, 1, 401)] * 2)
+    disc = radius_m * np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])[x.ravel() ** 2 + y.ravel() ** 2 <= 1.0]
+    for middle, offset_px in zip(middles, disc_offset_px(middles, radius_m, camera_from_plate, IDEAL), strict=True):
+        seen = camera_from_plate.apply(middle + disc)
+        area = seen[:, 2] ** -3.0  # of a piece of a plane, up to what is the same for all of it
+        mean = (area @ project(seen, IDEAL)) / area.sum()
+        assert np.allclose(offset_px, mean - project(camera_from_plate.apply(middle)[None], IDEAL)[0], atol=0.02 * 0.5)
+        assert np.linalg.norm(offset_px) > 0.2

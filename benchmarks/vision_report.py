@@ -52,7 +52,7 @@ def report(data: Path) -> int:
     if not data.exists():
         print(f"no development images at {data.name}: only the axes can be measured")
     else:
-        inputs, score = (_module(data / f"{name}.py") for name in ("make_inputs", "score"))
+        inputs, score = (module_of(data / f"{name}.py") for name in ("make_inputs", "score"))
         truth = json.loads((data / "synth_dev" / "truth.json").read_text(encoding="utf-8"))
         jobs = inputs.jobs(truth)
         rows = _table(truth, run(jobs, data / "synth_dev", timed=True), score)
@@ -77,7 +77,8 @@ def report(data: Path) -> int:
     return 0 if data.exists() else 1
 
 
-def _module(path: Path) -> ModuleType:
+def module_of(path: Path) -> ModuleType:
+    """A script of the data folder, loaded by its path."""
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None:
         raise FileNotFoundError(path)

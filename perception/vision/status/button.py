@@ -13,6 +13,8 @@ from perception.vision.status.shade import cap_shades
 SHADE_HALF, SHADE_SCALE = 0.06, 0.03  # .95 of 179 drawn flush caps stay below 0.062, half of the others exceed 0.068
 SPOT_HALF, SPOT_SCALE = 1.12, 0.1  # .95 of flush caps stay below 0.96, .95 of the others exceed 1.28
 SHADE_ODDS, SPOT_ODDS = (-1.5, 3.0), (-2.5, 6.0)  # a cap a pixel beside its place has a shade too
+#: Of 230 flush caps none has more than 0.002 below, but for glare beside some drawn ones (0.004 to 0.014).
+BELOW_FROM, BELOW_SCALE, BELOW_ODDS = 0.0075, 0.0015, 4.5
 ALONE = 1.3  # log odds at most, of a shade without a face, and of no shine without a ring
 MODEL_SHARE = 0.25
 UNSEEN = "the button cannot be seen (glare, shadow or cover): change the angle or the light"
@@ -61,6 +63,7 @@ def _by_shade(patch: Patch, radius_m: float) -> float | None:
     seen = cap_shades(patch, radius_m)
     shade = float(np.clip((seen.shade - SHADE_HALF) / SHADE_SCALE, *SHADE_ODDS))
     spot = float(np.clip((seen.spot - SPOT_HALF) / SPOT_SCALE, *SPOT_ODDS))
+    below = float(np.clip((seen.below - BELOW_FROM) / BELOW_SCALE, 0.0, BELOW_ODDS))
     if np.isnan(spot):
-        return None if np.isnan(shade) else float(np.clip(shade, -ALONE, ALONE))
-    return max(spot, -ALONE) if np.isnan(shade) else shade + spot
+        return None if np.isnan(shade) else float(np.clip(shade, -ALONE, ALONE)) + below
+    return (max(spot, -ALONE) if np.isnan(shade) else shade + spot) + below

@@ -11,7 +11,7 @@ from perception.vision.status.band import MOST_COVERED, lying_across
 from perception.vision.status.pointer import PointerFit, find_pointer, wrapped
 
 POINTER_FROM, POINTER_TO = 0.25, 0.60  # share of the radius over which every gauge pointer has ink and no numeral is
-FINE_TO = 0.72
+FINE_TO = 0.48  # numerals begin at half of the radius: blurred, they pulled pointers beside them by up to 6 degrees
 STOP_RAD = np.deg2rad(6.0)  # a pointer rests that far beyond its scale at most
 LEAST_SEEN = 0.25  # share of a face
 MOST_SIGMA_RAD = 0.03
@@ -35,6 +35,7 @@ def read_gauge(patch: Patch, spec: Gauge) -> Status:
         inner_m=POINTER_FROM * R,
         outer_m=POINTER_TO * R,
         fine_m=(POINTER_FROM * R, FINE_TO * R),
+        from_hub=True,
     )
     if fit is None:
         return no_pointer(seen, spec.scale.unit)

@@ -33,6 +33,7 @@ def read_panel_meter(patch: Patch, spec: PanelMeter) -> Status:
         fine_m=(POINTER_FROM * spec.needle_m, 0.92 * spec.needle_m),
         limits_rad=(lo - margin, hi + margin),
         width_rad=np.deg2rad(14.0),
+        from_hub=True,
     )
     if fit is None:
         return no_pointer(seen, spec.scale.unit)

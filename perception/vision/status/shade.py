@@ -21,6 +21,9 @@ ANGLES = np.linspace(0, 2 * np.pi, 72, endpoint=False)
 WAVES = np.column_stack([np.ones(len(ANGLES)), np.cos(ANGLES), np.sin(ANGLES)])
 FACE, RIM, RING, PLATE = (0.10, 0.62), (0.46, 0.62), (0.86, 1.06), (1.12, 1.32)  # of the cap's radius
 FACE_RADII = np.linspace(*FACE, 11)
+GAP, INNER = np.linspace(0.5, 1.12, 32), (0.35, 0.50)  # radii over which a gap round the cap is; of the face within
+GAP_DARK = 0.85  # of face and plate: a gap is darker than both
+LEAST_GAP = 0.6  # share of it that must be known
 SPOT_TO = 0.46  # of the radius: a glare from beside the cap is brightest further out
 CLEAR_OF_RING = 1.4  # of the radius: what crosses a circle of that size is no part of the button
 BLUR_PX = 2.0  # of what lies across, beyond its mask
@@ -40,10 +43,14 @@ class Shades:
         shade: first harmonic of the ring round the cap, beyond what face and plate have of it, over the plate's gray.
         spot: how far the brightest spot of the face stands out from the face's smooth light, over what the rest of the face
             does (its noise, and a hundredth of the plate's gray).
+        below: how much more darkness a gap round the cap has below than above, over the gray beside it and the radius; 0 where
+            there is no gap, or too little of it shows. A cap's side and shadow are below as light comes from above; in a cap that
+            is pushed in, the collar's shadow is above.
     """
 
     shade: float
     spot: float
+    below: float = 0.0
 
 
 def cap_shades(patch: Patch, radius_m: float) -> Shades:
@@ -61,19 +68,19 @@ def cap_shades(patch: Patch, radius_m: float) -> Shades:
     plate, no_plate = _mean_round(patch, unknown, radius_m * np.linspace(*PLATE, 5))
     rim, no_rim = _mean_round(patch, unknown, radius_m * np.linspace(*RIM, 4))
     level = max(float(np.median(plate[~no_plate] if not no_plate.all() else plate)), 8.0)
-    spot = _spot(patch, unknown, radius_m, level)
+    spot, below = _spot(patch, unknown, radius_m, level), _below(patch, unknown, radius_m)
     if no_plate.mean() > 1.0 - LEAST_RING:
-        return Shades(shade=np.nan, spot=spot)
+        return Shades(shade=np.nan, spot=spot, below=below)
     around = _wave(plate, ~no_plate)
     off = WAVES @ around - plate
     noise = max(1.4826 * float(np.median(np.abs(off[~no_plate]))), 1.0)
     odd = no_plate | no_ring | (off > max(ODD_SIGMAS * noise, ODD_SHARE * level))
     odd = odd | np.roll(odd, 1) | np.roll(odd, -1)
     if odd.mean() > 1.0 - LEAST_RING:
-        return Shades(shade=np.nan, spot=spot)
+        return Shades(shade=np.nan, spot=spot, below=below)
     within = around if no_rim.mean() > LEAST_FACE else _wave(rim, ~no_rim)
     harmonic = (_wave(ring, ~odd) - (around + within) / 2)[1:]
-    return Shades(shade=float(np.linalg.norm(harmonic)) / level, spot=spot)
+    return Shades(shade=float(np.linalg.norm(harmonic)) / level, spot=spot, below=below)
 
 
 def _spot(patch: Patch, unknown: NDArray[np.uint8], radius_m: float, level: float) -> float:
@@ -103,6 +110,22 @@ def _spot(patch: Patch, unknown: NDArray[np.uint8], radius_m: float, level: floa
     found = float(mean[row, turn]) - max(float(beyond.mean()) if len(beyond) else 0.0, 0.0)
     is_blind = WHITE_LEVEL - float(np.median(gray[known])) < HEADROOM * level
     return np.nan if is_blind or not np.isfinite(found) else found / (scale + SMOOTH * level)
+
+
+def _below(patch: Patch, unknown: NDArray[np.uint8], radius_m: float) -> float:
+    """`Shades.below`: a registration a pixel off moves both edges of a gap alike, so how thick it is on either side stays."""
+    u, v = patch.pixel_of(radius_m * np.outer(GAP, np.sin(ANGLES)), radius_m * np.outer(GAP, np.cos(ANGLES)))
+    gray = np.asarray(sample_at(patch.gray, u, v), float)
+    known = (sample_at(unknown, u, v) > 0.5).mean(axis=0) < 0.2
+    if known.mean() < LEAST_GAP:
+        return 0.0
+    face, _ = _mean_round(patch, unknown, radius_m * np.linspace(*INNER, 4))
+    beside = np.minimum(*(WAVES @ _wave(part, known) for part in (face, gray[-6:].mean(axis=0))))
+    beside = np.maximum(beside, 1.0)
+    if float(np.median((gray.min(axis=0) / beside)[known])) > GAP_DARK:
+        return 0.0
+    dark = np.maximum(beside - gray, 0.0).sum(axis=0) * (GAP[1] - GAP[0])
+    return -float(_wave(dark, known)[1] / np.median(beside))
 
 
 def _mean_round(patch: Patch, unknown: NDArray[np.uint8], radii_m: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -1,4 +1,4 @@
-"""A cap's height from the side, with a ring of its own gray round it."""
+"""A cap's height from the side, with a ring of its own gray round it; from ahead, the gap round it."""
 
 from __future__ import annotations
 
@@ -129,3 +129,26 @@ def test_the_noise_of_a_black_cap_is_not_its_shine(seed: int) -> None:
     gray = np.round(255 * np.clip(linear + 0.006 * rough, 0.0, 1.0) ** (1 / 2.2)).astype(np.uint8)
     status = read_button(replace(clear, gray=gray), BUTTON)
     assert status.state == "pressed" or status.confidence < 0.8
+
+
+def seen_from_ahead(below_px: float) -> Patch:
+    """A bright cap without shine in a dark gap that is thicker below by so much, of a homography's view."""
+    middle = (SIZE - 1) / 2
+    picture = np.full((SIZE, SIZE), 130, np.uint8)
+    R = BUTTON.radius_m * PX_PER_M
+    for share, down_px, gray in ((0.92, 0.0, 165), (0.78, below_px / 2, 35), (0.68, 0.0, 215)):
+        centre = (round(16 * middle), round(16 * (middle + down_px)))
+        cv2.circle(picture, centre, round(16 * share * R), gray, -1, cv2.LINE_AA, 4)
+    rough = np.random.default_rng(0).normal(0.0, 2.0, picture.shape)
+    gray = np.clip(np.round(cv2.GaussianBlur(picture, (0, 0), 1.2) + rough), 0, 255).astype(np.uint8)
+    return Patch(
+        gray=gray, colour=None, inside=np.ones(gray.shape, bool), px_per_m=PX_PER_M, image_px_per_m=PX_PER_M / 1.5,
+        origin_px=np.array([middle, middle]), parallax_px_per_m=np.zeros(2), growth_per_m=0.0, plane_z_m=0.0,
+    )  # fmt: skip
+
+
+def test_a_cap_whose_gap_is_dark_below_is_not_called_pressed() -> None:
+    """Its side shows below. Without a spot of shine it was pressed at .97."""
+    assert read_button(seen_from_ahead(4.0), BUTTON).state in ("released", None)
+    for below_px in (0.0, -4.0):
+        assert read_button(seen_from_ahead(below_px), BUTTON).state == "pressed"

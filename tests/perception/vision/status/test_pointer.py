@@ -1,6 +1,8 @@
-"""A dim pointer on a dark face: the bright numeral that it touches must not turn it."""
+"""A dim pointer on a dark face: the bright numeral that it touches must not turn it, and none stands in for it."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -44,3 +46,20 @@ def test_a_bright_numeral_beside_a_dim_pointer_does_not_turn_it(angle_deg: float
         )  # fmt: skip
         assert fit is not None and not fit.is_dark
         assert np.rad2deg(fit.angle_rad) == pytest.approx(angle_deg, abs=1.2)
+
+
+@pytest.mark.parametrize("angle_deg", [-100.0, 20.0, 100.0])
+def test_bright_numerals_that_do_not_reach_the_hub_are_no_pointer(angle_deg: float) -> None:
+    """At the end of the scale stood a 10: 4.5 bar was read as 9.9, and surely."""
+    R, angle_rad = RADIUS_M, float(np.deg2rad(angle_deg))
+    patch = face(angle_rad, 0)
+    middle, numerals = np.full(2, SIZE / 2), angle_rad + np.pi / 2
+    towards = np.array([np.sin(numerals), -np.cos(numerals)]) * R * PX_PER_M
+    ends = [np.round(16 * (middle + share * towards)).astype(int).tolist() for share in (0.36, 0.62)]
+    picture = cv2.line(patch.gray.copy(), *ends, 220, 7, cv2.LINE_AA, 4)
+    fit = find_pointer(
+        replace(patch, gray=cv2.GaussianBlur(picture, (0, 0), 1.0)), pivot_m=(0.0, 0.0), inner_m=0.25 * R, outer_m=0.6 * R,
+        fine_m=(0.25 * R, 0.48 * R), from_hub=True,
+    )  # fmt: skip
+    assert fit is not None
+    assert np.rad2deg(fit.angle_rad) == pytest.approx(angle_deg, abs=3.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
@@ -9,9 +10,10 @@ from scipy.spatial.transform import RigidTransform
 from benchmarks.vision_drawing import Disturbance, camera, draw_panel, looking_at
 from hal.geometry import certain
 from hal.panel import Light, Panel, Scale, Slider
+from perception.vision.patch import Patch
 from perception.vision.status.slider import read_slider
 from perception.vision.taught import patch_of
-from perception.vision.view import CameraView
+from perception.vision.view import Array, CameraView
 
 TRAVEL_M = 0.100
 CORNERS = ((-0.15, 0.12), (0.15, 0.12), (0.15, -0.12), (-0.15, -0.12))
@@ -32,3 +34,30 @@ def test_a_close_up_reads_a_cap_beside_the_middle_of_its_track(shown: float, ang
     )
     status = read_slider(patch_of(image, image, view, slider, np.zeros(2)), slider)
     assert status.value == pytest.approx(shown, abs=0.55)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("shown", [20.0, 71.0])
+def test_the_shadow_of_a_cap_does_not_move_it(shown: float, side: int) -> None:
+    """A shadow of nearly the cap's gray pulled its edge: 80.2 was read as 82.9, and surely."""
+    px_per_m, middle = 2500.0, np.array([169.5, 69.5])
+    slider = Slider(name="flow", position_m=(0.0, 0.0), angle_rad=0.0, travel_m=TRAVEL_M, scale=SCALE)
+    along, across = (k * px_per_m for k in slider.cap_size_m[:2])
+    cap = middle + np.array([SCALE.place_of(shown) * px_per_m, 0.0])
+    picture = np.full((140, 340), 200, np.uint8)
+
+    def box(centre: Array, width: float, height: float, gray: int) -> None:
+        corners = centre + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array([width, height]) / 2
+        cv2.fillConvexPoly(picture, np.round(16 * corners).astype(np.int32), gray, cv2.LINE_AA, 4)
+
+    box(middle, 1.15 * TRAVEL_M * px_per_m, 8, 30)
+    box(cap + np.array([side * 0.2 * along, 4.0]), along, across, 75)
+    box(cap, along, across, 50)
+    box(cap, 0.09 * along, across, 230)
+    noise = np.random.default_rng(0).normal(0.0, 2.0, picture.shape)
+    gray = np.clip(np.round(cv2.GaussianBlur(picture, (0, 0), 2.0) + noise), 0, 255).astype(np.uint8)
+    patch = Patch(
+        gray=gray, colour=None, inside=np.ones(gray.shape, bool), px_per_m=px_per_m, image_px_per_m=px_per_m / 1.5,
+        origin_px=middle, parallax_px_per_m=np.zeros(2), growth_per_m=0.0, plane_z_m=0.0,
+    )  # fmt: skip
+    assert read_slider(patch, slider).value == pytest.approx(shown, abs=0.4)

@@ -104,13 +104,17 @@ class Hold:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GripperMotion:
-    """Move the pads while the arm holds; ends when they rest or `timeout_s` is over."""
+    """Move the pads while the arm holds; ends when they rest or `timeout_s` is over.
+
+    With `must_arrive`, pads that hold nothing and say that they rest elsewhere are a fault of the gripper.
+    """
 
     name: str
     width_m: float
     force_n: float
     speed_m_per_s: float = 0.08
     timeout_s: float = 3.0
+    must_arrive: bool = True
     guards: tuple[Guard, ...] = ()
 
 

@@ -33,12 +33,13 @@ from hal.motion import (
 )
 from manipulation import braking, kernels
 from manipulation.control_thread import ControlThread
+from manipulation.doubts import DoubtedTouch, FrozenWrench
 from manipulation.drives import Drives
 from manipulation.endings import Ending, Watch
 from manipulation.kinematics import Kinematics
 from manipulation.recorder import Recorder
 from manipulation.runs import GripperRun, Run, Tick, begin
-from manipulation.sensing import ContactWrench, DeviceFailure, Devices, FrozenWrench, RangeReader, Sample, ToolView
+from manipulation.sensing import ContactWrench, DeviceFailure, Devices, RangeReader, Sample, ToolView
 from manipulation.setpoint import SetPointFilter, check, flange_matrix
 from manipulation.standing import Standing
 
@@ -96,6 +97,7 @@ class Controller:
             max_age_s=safety.max_reading_age_s,
         )
         self._frozen_wrench = FrozenWrench(force_torque)
+        self._doubted_touch = DoubtedTouch(touch, force_torque)
         capabilities = arm.capabilities()
         self.kinematics = Kinematics.of(capabilities)
         self._clock = clock
@@ -224,6 +226,7 @@ class Controller:
             end = Ending(outcome=MotionOutcome.FAULT, cause=f"{failure}; nothing moved", device=failure.device)
             return self._report(motion, end, started_s, view, recorder)
         self._is_moving = True
+        self._doubted_touch.begin(motion)
         self._drives.begin_rhythm()
         try:
             end = self._run(motion, run, sample, view, recorder)
@@ -258,11 +261,15 @@ class Controller:
             end = watch.ending(elapsed_s, sample, look)
             try:
                 if end is None:
+                    self._doubted_touch.check(sample, look.wrench, look.base_from_tool[:3, 3])
                     tick = Tick(elapsed_s - late_s, sample, look.wrench, self._filter.last_rad, self._dt_s)
                     wanted = run.wanted(tick)
                     if run.is_over(tick):
                         over_since_s = elapsed_s if over_since_s is None else over_since_s
                         if self._has_settled(motion, wanted, sample, elapsed_s - over_since_s):
+                            if isinstance(run, GripperRun):
+                                run.check_end(sample)
+                                self._doubted_touch.pads_moved(run.begun_m, sample)
                             return Ending(outcome=MotionOutcome.COMPLETED, cause=self._end_of(motion, wanted))
                     self._send(self._filter.apply(wanted))
                     self._drives.pass_tick()

@@ -15,6 +15,7 @@ from hal.devices import Gripper
 from hal.errors import CellError
 from hal.motion import CartesianPath, Compliance, GripperMotion, Hold, JointTrajectory
 from manipulation import kernels
+from manipulation.doubts import check_width
 from manipulation.kinematics import Kinematics
 from manipulation.sensing import Sample, command_wait_s
 
@@ -165,15 +166,16 @@ class HoldRun:
 class GripperRun:
     """The arm holds while the pads move; over when they rest."""
 
-    def __init__(self, motion: GripperMotion, gripper: Gripper, clock: Clock) -> None:
+    def __init__(self, motion: GripperMotion, gripper: Gripper, sample: Sample, clock: Clock) -> None:
         self._motion, self._gripper, self._clock = motion, gripper, clock
         self._resting_since_s: float | None = None
-        self._move_to(motion.width_m)
+        self.begun_m = sample.gripper_width_m
+        self._sent_m = self._move_to(motion.width_m)
 
-    def _move_to(self, width_m: float) -> None:
+    def _move_to(self, width_m: float) -> float:
         wanted = self._motion
         deadline = Deadline.after(self._clock, command_wait_s(self._clock))
-        self._gripper.command(
+        return self._gripper.command(
             width_m=width_m, force_n=wanted.force_n, speed_m_per_s=wanted.speed_m_per_s, deadline=deadline
         )
 
@@ -187,6 +189,15 @@ class GripperRun:
             pass  # it may be what has failed
         except Exception:  # a defect of its driver: the arm must come to rest all the same
             log.exception("halting %s", self._gripper.name)
+
+    def check_end(self, sample: Sample) -> None:
+        """Is the width what the pads were sent to, where they hold nothing?
+
+        Raises:
+            DeviceFailure: it cannot be.
+        """
+        if self._motion.must_arrive:
+            check_width(self._gripper.name, self._sent_m, self.begun_m, sample)
 
     def wanted(self, tick: Tick) -> Array:
         """Where it is."""
@@ -218,7 +229,7 @@ def begin(
         case Hold():
             return HoldRun(motion)
         case GripperMotion():
-            return GripperRun(motion, gripper, clock)
+            return GripperRun(motion, gripper, sample, clock)
 
 
 def _fade(elapsed_s: float) -> float:

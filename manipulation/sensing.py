@@ -27,7 +27,6 @@ GRAVITY_M_PER_S2 = 9.80665
 RANGE_WAIT_S = 0.004
 READ_WAIT_S = 0.02  # longest that one tick waits for a device; a tick itself lasts 2 to 8 ms
 PACED_WAIT_S = 1.0  # the same where the world stands still so long: a busy machine is no broken device
-FROZEN_S, FROZEN_TICKS, FROZEN_PERIODS = 0.1, 10, 4  # 6 N more in a touch; noise has never repeated so long
 COMMAND_WAIT_S = 0.25  # for what crosses a slow bus once a motion, not every tick
 
 
@@ -43,6 +42,7 @@ class Sample:
     proximity_m: tuple[float, ...]
     gripper_width_m: float
     gripper_is_moving: bool
+    gripper_is_holding: bool = False
 
 
 class DeviceFailure(Exception):
@@ -139,9 +139,11 @@ class Devices:
             contacts = self._ask(self.touch.name, self.touch.read_contacts, now_s, deadline)
         if before is None:
             grip = self._ask(self.gripper.name, self.gripper.read_state, now_s, deadline)
-            width_m, is_moving, seen = grip.width_m, grip.is_moving, self._ranges_m(now_s)
+            width_m, is_moving, is_holding = grip.width_m, grip.is_moving, grip.is_holding
+            seen = self._ranges_m(now_s)
         else:
-            width_m, is_moving, seen = before.gripper_width_m, before.gripper_is_moving, before.proximity_m
+            width_m, is_moving = before.gripper_width_m, before.gripper_is_moving
+            is_holding, seen = before.gripper_is_holding, before.proximity_m
         _check_finite(self.arm.name, joints.position_rad)
         return Sample(
             stamp_s=now_s,
@@ -152,6 +154,7 @@ class Devices:
             proximity_m=seen,
             gripper_width_m=width_m,
             gripper_is_moving=is_moving,
+            gripper_is_holding=is_holding,
         )
 
     def _ask(self, device: str, read: Callable[..., Stamped[T]], now_s: float, deadline: Deadline) -> T:
@@ -185,42 +188,6 @@ def failure_of(device: str, error: Exception) -> DeviceFailure:
 def _check_finite(device: str, values: Array) -> None:
     if not math.isfinite(values @ values):  # a sum hides neither NaN nor infinity
         raise DeviceFailure(device, "a reading is not finite")
-
-
-class FrozenWrench:
-    """Tells a force/torque sensor that repeats one reading under new stamps: no guard would ever see a contact.
-
-    A sensor that states no noise is believed: it may well repeat itself.
-    """
-
-    def __init__(self, sensor: ForceTorque | None) -> None:
-        self._name = "" if sensor is None else sensor.name
-        capabilities = None if sensor is None else sensor.capabilities()
-        self._is_noisy = capabilities is not None and capabilities.force_sigma_n > 0.0
-        period_s = 0.0 if capabilities is None else 1.0 / capabilities.rate_hz
-        self._longest_s = max(FROZEN_S, FROZEN_PERIODS * period_s)
-        self._kept = b""
-        self._since_s = 0.0
-        self._ticks = 0
-
-    def check(self, sample: Sample) -> None:
-        """Note the newest sample.
-
-        Raises:
-            DeviceFailure: all six numbers have been the same for too long.
-        """
-        if not self._is_noisy:
-            return
-        newest = sample.raw_wrench.tobytes()
-        if newest != self._kept:
-            self._kept, self._since_s, self._ticks = newest, sample.stamp_s, 0
-            return
-        self._ticks += 1
-        lasted_s = sample.stamp_s - self._since_s
-        if lasted_s >= self._longest_s and self._ticks >= FROZEN_TICKS:
-            raise DeviceFailure(
-                self._name, f"{self._name} repeats the same reading under new stamps for {lasted_s:.2f} s"
-            )
 
 
 class ContactWrench:

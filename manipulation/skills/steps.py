@@ -33,6 +33,7 @@ STANDOFF_M = 0.030  # of the tips above the object's highest place
 RETREAT_M = 0.050
 RETREAT_M_PER_S = 0.15
 PADS_M_PER_S = 0.1
+LET_GO_N = 15.0
 CLOSED_M = 0.0005
 GRASP_M_PER_S = 0.03
 PULLS = 3
@@ -78,7 +79,7 @@ class Attempt:
         """Measured base_from_grip."""
         return self.cell.kinematics.tool(self.joints(), self.cell.flange_from_grip)
 
-    def open_to(self, width_m: float, *, force_n: float = 15.0, name: str = "set opening") -> None:
+    def open_to(self, width_m: float, *, force_n: float = LET_GO_N, name: str = "set opening") -> None:
         """Move the pads to an opening while the arm holds; closed pads that shall be closed are left alone."""
         width = min(width_m, self.cell.hand.max_width_m)
         if max(width, self.cell.mover.state().gripper_width_m) <= CLOSED_M:
@@ -254,7 +255,10 @@ def retreat(cell: Workcell, attempt: Attempt | None = None, *, distance_m: float
     attempt = attempt or Attempt(cell)
     width = min(cell.hand.max_width_m, cell.mover.state().gripper_width_m + 0.02)
     with suppress(SkillFailure, MotionRefused):
-        attempt.open_to(width, name="let go")
+        # The way out does not wait for a gripper that says nonsense: it has let go, or the pull will tell.
+        attempt.run(
+            GripperMotion(name="let go", width_m=width, force_n=LET_GO_N, speed_m_per_s=PADS_M_PER_S, must_arrive=False)
+        )
     # Something may hold the hand: it is pulled several times, and `park` sees whether it came free.
     for _ in range(PULLS):
         with suppress(SkillFailure, MotionRefused):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from hal.errors import InvalidRequest
 from hal.motion import Guard, Quantity
 from hal.panel import Toggle
 from manipulation.skills.contact import SOFT_PUSH
-from manipulation.skills.outcome import Outcome, SkillFailure, SkillReport, Verify
+from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.steps import STANDOFF_M, Attempt, perform
 from manipulation.skills.subject import subject_of
 from manipulation.stroke import shifted
@@ -23,8 +25,14 @@ EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
 END_N = 4.0  # above what the detent needs: the bat stands on its stop
 
 
-def toggle(cell: Workcell, name: str, target: str, *, verify: Verify | None = None) -> SkillReport:
-    """Throw the toggle to `on` (up) or `off` (down).
+def toggle(
+    cell: Workcell, name: str, target: str, *, current: ObjectState | None = None, verify: Verify | None = None
+) -> SkillReport:
+    """Throw the toggle to `on` (up) or `off` (down); one that stands there already is only looked at.
+
+    Args:
+        current: what the last look said.
+        verify: the caller's second look.
 
     The mechanical estimate is how far past the pivot the fingertip's face came, in metres; more than 0 has thrown it.
 
@@ -36,10 +44,17 @@ def toggle(cell: Workcell, name: str, target: str, *, verify: Verify | None = No
     if target not in ("on", "off"):
         raise InvalidRequest(f"a toggle has no state {target!r}", hint="on (up) or off (down)")
     up = 1.0 if target == "on" else -1.0
+    tries = itertools.count()
+
+    def stroke(attempt: Attempt) -> float | None:
+        is_said_there = current is not None and current.state == target and next(tries) == 0
+        if is_said_there and verify is not None and (seen := verify()) is not None and seen.state == target:
+            return None
+        return _throw(attempt, thing, up)
 
     return perform(
         cell,
-        lambda attempt: _throw(attempt, thing, up),
+        stroke,
         skill="toggle",
         object_name=name,
         target=target,

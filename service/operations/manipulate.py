@@ -144,7 +144,7 @@ def _perform(session: Session, thing: PanelObject, target: str, eye: _Eye, befor
         case Slider():
             return slider(cell, thing.name, float(target), current=current, verify=verify)
         case Toggle():
-            return toggle(cell, thing.name, target, verify=verify)
+            return toggle(cell, thing.name, target, current=current, verify=verify)
         case Rotary():
             return rotary(cell, thing.name, target, current=current, verify=verify)
         case Handwheel():

@@ -20,6 +20,7 @@ from hal.geometry import UncertainPose
 from manipulation.skills.outcome import SkillFailure
 from manipulation.skills.probe import proximity_probe, touch_probe
 from service.operations.beliefs import believed_panel
+from service.operations.doubted_proximity import DoubtedProximity
 from service.operations.evidence import (
     Evidence,
     FusedEvidence,
@@ -28,6 +29,7 @@ from service.operations.evidence import (
     TouchEvidence,
     fuse_evidence,
 )
+from service.operations.eyes import settle
 from service.operations.inspect import ensure_located
 from service.operations.locate import Located, go_to_overview, locate, pose_json, scan_plate
 from service.operations.requests import BoxBody, CylinderBody, FeatureSetBody, FuseRequest, MeasurementBody
@@ -41,6 +43,7 @@ HOVER_M = 0.05  # of the finger tips above the plate while the proximity sensors
 LEAST_TOUCHES = 3
 ONE_IN = 1e5
 NO_NOISE = 1e-9  # a chi-square a degree of freedom that no sensor's noise gives, in whatever unit
+REST_S = 0.02  # two readings of a proximity sensor
 SPARE_SPOTS = 2  # a spot that the arm cannot reach is replaced
 
 
@@ -63,6 +66,7 @@ def feel(session: Session, touches: int) -> Felt:
     evidence: list[Evidence] = []
     spots: list[Array] = []
     skipped: list[str] = []
+    doubted = DoubtedProximity(session.panel)
     wanted = bare_spots(session.panel, touches + SPARE_SPOTS)
     first = short_tour(_fingers_over_panel(session), wanted[:touches])
     for spot in wanted[[*first, *range(touches, len(wanted))]]:
@@ -70,7 +74,7 @@ def feel(session: Session, touches: int) -> Felt:
             break
         session.progress(len(spots) / touches, "touch the plate", f"at ({spot[0]:.3f}, {spot[1]:.3f}) m")
         try:
-            evidence += _feel_at(session, spot)
+            evidence += _feel_at(session, spot, doubted)
             spots.append(spot)
         except Stopped:
             raise  # no spot is at fault
@@ -147,18 +151,22 @@ def _fingers_over_panel(session: Session) -> Array:
     return np.asarray(cell.panel_pose.inv().apply(tip.translation)[:2])
 
 
-def _feel_at(session: Session, spot: Array) -> list[Evidence]:
+def _feel_at(session: Session, spot: Array, doubted: DoubtedProximity) -> list[Evidence]:
     cell = workcell(session)
     place = (float(spot[0]), float(spot[1]), 0.0)
     evidence: list[Evidence] = []
-    names = [name for name in session.cell.names_of(DeviceKind.PROXIMITY) if session.has_mount(name)]
-    sigmas = {name: session.connection.device(name).capabilities().sigma_m for name in names}
+    proximities = session.cell.names_of(DeviceKind.PROXIMITY)
+    names = [name for name in proximities if session.has_mount(name)]
+    of = {name: session.connection.device(name).capabilities() for name in names}
     mounts = [session.mount(name).parent_from_child for name in names]
+    hovered = cell.mover.state()
     if names:
+        sigma_m = max(each.sigma_m for each in of.values())
         points = proximity_probe(
-            cell, place, flange_from_sensors=mounts, distance_m=HOVER_M, samples=5, sigma_m=max(sigmas.values())
+            cell, place, flange_from_sensors=mounts, distance_m=HOVER_M, samples=5, sigma_m=sigma_m
         )
-        flange = cell.mover.state().base_from_flange
+        hovered = cell.mover.state()
+        flange = hovered.base_from_flange
         for point in points:
             name = _whose(names, mounts, flange, point.base_from_sensor)
             evidence.append(
@@ -171,6 +179,16 @@ def _feel_at(session: Session, spot: Array) -> list[Evidence]:
                 )
             )
     touched = touch_probe(cell, place)
+    settle(session, REST_S)
+    for name, mount in zip(names, mounts, strict=True):
+        k = proximities.index(name)
+        doubted.check(
+            name,
+            of[name],
+            [(state.base_from_flange * mount, state.proximity_m[k]) for state in (hovered, cell.mover.state())],
+            base_from_panel=cell.panel_pose,
+            touched_m=touched.point_m,
+        )
     base_from_grip = touched.report.base_from_tool
     tip = base_from_grip.inv().apply(touched.point_m)
     normal_sigma = float(np.sqrt(touched.normal @ touched.covariance @ touched.normal))

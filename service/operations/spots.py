@@ -44,9 +44,13 @@ def _candidates(panel: Panel, clearance_m: float) -> Array:
     x = np.arange(-panel.width_m / 2 + EDGE_M, panel.width_m / 2 - EDGE_M + 1e-9, GRID_M)
     y = np.arange(-panel.height_m / 2 + EDGE_M, panel.height_m / 2 - EDGE_M + 1e-9, GRID_M)
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    return np.asarray(points[room_m(panel, points) >= clearance_m])
+
+
+def room_m(panel: Panel, points: Array) -> Array:
+    """(N,) how far points (N, 2) of the panel are from the nearest object or light, m; negative where one is."""
     gaps = [np.linalg.norm(points - light.position_m[:2], axis=1) - light.radius_m for light in panel.lights]
-    gaps += [_distance_to(points, thing) for thing in panel.objects]
-    return np.asarray(points[np.min(gaps, axis=0) >= clearance_m])
+    return np.asarray(np.min([*gaps, *(_distance_to(points, thing) for thing in panel.objects)], axis=0))
 
 
 def _distance_to(points: Array, thing: PanelObject) -> Array:

@@ -155,8 +155,9 @@ class Pads:
     def __init__(self) -> None:
         self.told: list[dict[str, Any]] = []
 
-    def command(self, **told: Any) -> None:
+    def command(self, **told: Any) -> float:
         self.told.append(told)
+        return float(told["width_m"])
 
 
 def test_a_hold_stays_where_it_is_for_its_time() -> None:
@@ -169,7 +170,7 @@ def test_a_hold_stays_where_it_is_for_its_time() -> None:
 def test_a_gripper_motion_is_over_when_the_pads_have_rested_since_they_could_have_begun() -> None:
     pads, clock = Pads(), SimClock()
     motion = GripperMotion(name="grasp", width_m=0.02, force_n=30.0, speed_m_per_s=0.05, timeout_s=1.0)
-    run = GripperRun(motion, pads, clock)
+    run = GripperRun(motion, pads, tick(0.0).sample, clock)
     (told,) = pads.told
     assert told.pop("deadline").remaining_s() == pytest.approx(command_wait_s(clock))
     assert told == {"width_m": 0.02, "force_n": 30.0, "speed_m_per_s": 0.05}
@@ -190,7 +191,7 @@ def test_a_gripper_motion_is_over_when_the_pads_have_rested_since_they_could_hav
 
 def test_pads_that_never_rest_are_waited_for_until_the_timeout() -> None:
     motion = GripperMotion(name="grasp", width_m=0.02, force_n=30.0, timeout_s=1.0)
-    run = GripperRun(motion, Pads(), SimClock())
+    run = GripperRun(motion, Pads(), tick(0.0).sample, SimClock())
     assert not run.is_over(tick(0.999, pads_move=True))
     assert run.is_over(tick(1.0, pads_move=True))
 

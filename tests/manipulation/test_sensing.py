@@ -13,11 +13,11 @@ from hal.clock import Deadline, PacedClock, SimClock, WallClock
 from hal.devices import ForceTorqueCapabilities, JointState, Wrench
 from hal.errors import DeviceTimeout, StaleReading
 from hal.readings import Stamped
+from manipulation.doubts import FrozenWrench
 from manipulation.sensing import (
     ContactWrench,
     DeviceFailure,
     Devices,
-    FrozenWrench,
     RangeReader,
     Sample,
     read_wait_s,

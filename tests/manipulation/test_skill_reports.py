@@ -22,6 +22,7 @@ from manipulation.skills.press import stop_force_n, travelled_m
 from manipulation.skills.probe import proximity_probe
 from manipulation.skills.rotary import rotary
 from manipulation.skills.steps import PULLS, Attempt, park, retreat
+from manipulation.skills.toggle import toggle
 from manipulation.timing import SpeedLimits
 from manipulation.tool import Hand
 from manipulation.workcell import Workcell
@@ -123,6 +124,33 @@ def test_a_button_whose_lamp_is_as_wanted_is_left_alone_unless_the_look_says_oth
         cell, "start", expected="on", current=lit, verify=lambda: ObjectState(name="run_lamp", state=next(shown))
     )
     assert (told.is_done, mover.asked.count("press"), told.attempts) == (looks[-1] == "on", presses, tries)
+
+
+@pytest.mark.parametrize(
+    ("before", "looks", "sweeps"),
+    [
+        ("on", ["on", "on"], 0),  # it is there: only looked at
+        ("on", ["off", "on"], 1),  # it was said to be, and is not
+        ("on", [None, "on"], 1),  # nobody can tell: a throw does no harm
+        ("on", ["on", "off", "on"], 1),  # the looks disagree
+        ("off", ["on"], 1),
+        (None, ["on"], 1),
+    ],
+)
+def test_a_toggle_that_stands_there_already_is_looked_at_and_thrown_only_when_in_doubt(
+    before: str | None, looks: list[str | None], sweeps: int
+) -> None:
+    cell, mover = before_the_bench({})
+    shown = iter(looks)
+
+    def look() -> ObjectState | None:
+        state = next(shown)
+        return None if state is None else ObjectState(name="pump", state=state)
+
+    current = None if before is None else ObjectState(name="pump", state=before)
+    told = toggle(cell, "pump", "on", current=current, verify=look)
+    assert next(shown, "no more") == "no more"
+    assert (told.is_done, mover.asked.count("to pump")) == (True, sweeps)
 
 
 def test_a_button_that_nothing_shows_is_pressed_and_not_confirmed() -> None:

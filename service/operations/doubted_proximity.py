@@ -1,0 +1,93 @@
+"""A proximity sensor that answers wrongly: what it says over the plate against the plate that the fingers touch there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from hal.devices import ProximityCapabilities
+from hal.errors import DeviceFault
+from hal.panel import Panel
+from service.operations.spots import room_m
+
+Array = NDArray[np.float64]
+BARE_M = 0.010  # of plate round the beam's foot: no part of it sees an edge
+LEAST_OFF_M = 0.005  # mounts and plates are known better
+OFF_SIGMA = 6.0  # of one reading
+
+
+class DoubtedProximity:
+    """Doubts a sensor whose readings over the touched plate are off by the same at two places in a row.
+
+    One place alone proves nothing: a cable may hang before the plate there.
+    """
+
+    def __init__(self, panel: Panel) -> None:
+        self._panel = panel
+        self._off_before_m: dict[str, Array] = {}
+
+    def check(
+        self,
+        sensor: str,
+        of: ProximityCapabilities,
+        readings: Sequence[tuple[RigidTransform, float]],
+        *,
+        base_from_panel: RigidTransform,
+        touched_m: Array,
+    ) -> None:
+        """Note one place of the plate.
+
+        Args:
+            of: its range and noise.
+            readings: `base_from_sensor` and what it said from there, m; NaN where it saw nothing.
+            touched_m: (3,) where the fingers met the plate, base frame.
+
+        Raises:
+            DeviceFault: the sensor is off, here as at the place before.
+        """
+        expected_m: list[float] = []
+        for place, _ in readings:
+            distance_m = self._expected_m(of, place, base_from_panel, touched_m)
+            if distance_m is None:
+                return
+            expected_m.append(distance_m)
+        said_m = np.array([distance_m for _, distance_m in readings])
+        off_m = said_m - np.array(expected_m)
+        limit_m = max(LEAST_OFF_M, OFF_SIGMA * of.sigma_m)
+        if np.all(np.abs(off_m) <= limit_m):  # NaN is not
+            self._off_before_m.pop(sensor, None)
+            return
+        before_m, self._off_before_m[sensor] = self._off_before_m.get(sensor), off_m
+        if before_m is None or not np.allclose(before_m, off_m, rtol=0.0, atol=limit_m, equal_nan=True):
+            return
+        worst = int(np.argmax(np.nan_to_num(np.abs(off_m), nan=np.inf)))
+        says = "sees nothing" if np.isnan(said_m[worst]) else f"says {1e3 * said_m[worst]:.0f} mm"
+        raise DeviceFault(
+            f"{sensor} {says} where the plate, as the fingers touched it, is {1e3 * expected_m[worst]:.0f} mm away,"
+            " and was as wrong at the place before: it is frozen, off its zero or out of line",
+            hint="clean its window, check its mount and cable, switch it off and on, then send this again",
+            device=sensor,
+        )
+
+    def _expected_m(
+        self,
+        of: ProximityCapabilities,
+        base_from_sensor: RigidTransform,
+        base_from_panel: RigidTransform,
+        touched_m: Array,
+    ) -> float | None:
+        """How far the bare plate is along the beam, m; None where the beam meets something else, or maybe."""
+        panel_from_sensor = base_from_panel.inv() * base_from_sensor
+        start, beam = panel_from_sensor.translation, panel_from_sensor.rotation.apply([0.0, 0.0, 1.0])
+        if beam[2] > -0.9:
+            return None
+        level_m = float(base_from_panel.inv().apply(touched_m)[2])
+        distance_m = float((level_m - start[2]) / beam[2])
+        foot = (start + distance_m * beam)[:2]
+        is_seen = of.min_range_m + LEAST_OFF_M < distance_m < of.max_range_m - LEAST_OFF_M
+        edge_m = float(np.min(0.5 * np.array([self._panel.width_m, self._panel.height_m]) - np.abs(foot)))
+        is_bare = min(edge_m, float(room_m(self._panel, foot[None])[0])) >= BARE_M
+        return distance_m if is_seen and is_bare else None

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +23,15 @@ SECOND_SHARE = 0.3  # of the largest region's area: a second panel that could as
 RECTANGLE_FILL = 0.85  # of its smallest enclosing rectangle that a plate's region fills
 ASPECT_RATIO = 1.3  # by which a plate seen aslant may differ from its proportions
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
-TURNED_LEAD = 0.15  # share of the objects' edges that must speak for upside down before it is said
+TURNED_LEAD = 0.15  # share of the objects' edges that must speak for another way up before it is said
+SURELY_UPRIGHT = 0.75  # a mirrored picture of a panel that is nearly symmetric shows 0.58
+UNMIRROR = "switch off the camera's mirroring, or mirror the picture back"
+ASKEW: tuple[tuple[str, str, Callable[[Image], Image]], ...] = (
+    ("mirrored", UNMIRROR, np.fliplr),
+    ("mirrored and upside down", UNMIRROR, np.flipud),
+    ("on its right side", "turn the image or the camera by 90 degrees", np.rot90),
+    ("on its left side", "turn the image or the camera by 90 degrees", partial(np.rot90, k=3)),
+)
 
 
 def one_plate(gray: Image, plate_m: tuple[float, float], *, focal_px: float | None = None) -> Plate:
@@ -44,18 +55,32 @@ def one_plate(gray: Image, plate_m: tuple[float, float], *, focal_px: float | No
 
 
 def check_upright(gray: Image, view: View, panel: Panel) -> None:
-    """Refuse a panel that fits better upside down.
+    """Refuse a panel that fits better upside down, mirrored, or on its side.
 
     Raises:
-        NotFound: it does; nothing could be read where the panel file has it.
+        NotFound: it does; what is read where the panel file has it would be wrong.
     """
     upright, turned = (_objects_share(gray, v, panel) for v in (view, upside_down(view)))
     if turned > upright + TURNED_LEAD:
-        raise NotFound(
-            f"panel {panel.name!r} is upside down in this image: {turned:.0%} of its objects' edges are found that way,"
-            f" {upright:.0%} upright",
-            hint="turn the image or the camera by 180 degrees",
-        )
+        raise _askew(panel, "upside down", turned, upright, hint="turn the image or the camera by 180 degrees")
+    if upright > SURELY_UPRIGHT:
+        return
+    shares = [_righted_share(np.ascontiguousarray(righted(gray)), panel) for _, _, righted in ASKEW]
+    best = int(np.argmax(shares))
+    if shares[best] > upright + TURNED_LEAD:
+        how, hint, _ = ASKEW[best]
+        raise _askew(panel, how, shares[best], upright, hint=hint)
+
+
+def _righted_share(gray: Image, panel: Panel) -> float:
+    """As `_objects_share` of an image whose plate is looked for anew; 0 where there is none."""
+    plate = find_plate(gray, panel.width_m, panel.height_m)
+    return 0.0 if plate is None else float(np.nan_to_num(_objects_share(gray, plate.view, panel)))
+
+
+def _askew(panel: Panel, how: str, share: float, upright: float, *, hint: str) -> NotFound:
+    edges = f"{share:.0%} of its objects' edges are found that way, {upright:.0%} upright"
+    return NotFound(f"panel {panel.name!r} is {how} in this image: {edges}", hint=hint)
 
 
 def upside_down(view: View) -> View:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import pytest
@@ -47,6 +49,10 @@ def corners_of(view: CameraView, name: str) -> list[tuple[float, float]]:
     w, h, _ = footprint_m(thing)
     x, y = thing.position_m
     return [(float(u), float(v)) for u, v in view.project([[x - w, y + h, 0.0], [x + w, y - h, 0.0]])]
+
+
+def turned_right(image: np.ndarray) -> np.ndarray:
+    return np.rot90(image, 3)
 
 
 def middle_of(view: CameraView, name: str) -> list[tuple[float, float]]:
@@ -193,6 +199,24 @@ def test_a_panel_upside_down_is_refused(seen: tuple[np.ndarray, CameraView, Over
     turned = np.ascontiguousarray(image[::-1, ::-1])
     with pytest.raises(NotFound, match="upside down"):
         check_upright(turned, overview_of(turned, plate_m=PLATE).view, panel())
+
+
+@pytest.mark.parametrize(
+    ("askew", "words"),
+    [
+        (np.fliplr, "is mirrored in"),
+        (np.flipud, "mirrored and upside down"),
+        (np.rot90, "left side"),
+        (turned_right, "right side"),
+    ],
+)
+def test_a_panel_that_is_mirrored_or_on_its_side_is_refused(
+    seen: tuple[np.ndarray, CameraView, Overview], askew: Callable[[np.ndarray], np.ndarray], words: str
+) -> None:
+    """A mirrored gauge was read, surely and wrong, and what was there taught the kinds."""
+    image = np.ascontiguousarray(askew(seen[0]))
+    with pytest.raises(NotFound, match=words):
+        check_upright(image, one_plate(image, PLATE).view, panel())
 
 
 def test_a_second_example_takes_no_object_from_another_kind() -> None:

@@ -16,6 +16,7 @@ from hal.panel import Scale
 from perception.vision.image import WHITE_LEVEL, Image, as_gray
 from perception.vision.patch import Patch
 from perception.vision.photographs.dial_outline import SIDE_PX, dial_circle
+from perception.vision.photographs.drop import find_drop, with_halo
 from perception.vision.reading import ANSWER_AT, Status, answer_at, gated, limited, refused
 from perception.vision.status.gauge import RIVAL, SIGMA_RAD, pointer_confidence, status_of_pointer
 from perception.vision.status.pointer import PointerFit, find_pointer, unroll, wrapped
@@ -27,13 +28,13 @@ COLOUR_OFF_RAD = np.deg2rad(
     14.0
 )  # JPEG keeps colours by blocks of 16 px: a pointer of its own gray is that far off there
 SHOWN_WELL = 0.5  # confidence
+SURE, CONTRADICTED = 0.8, 0.6  # confidence of a needle; of a drop where a sure needle points elsewhere
+RIVALLED = 0.8  # of the confidence of a needle that is not sure where a drop may point elsewhere
+OTHER_RAD = np.deg2rad(35.0)  # one side of a drop may be a needle
 CLEARER_BY = 0.5  # than the best pointer elsewhere, as `_clearness` counts
 BRIGHT_FACE = 205  # gray level
-HALO = 0.24  # of the radius: what a saturated spot is widened by
 PIVOT_OFF = 0.08  # of the radius: seen aslant, the outline found is not about the pivot
-LEAST_SEPARATION = 3.2  # spreads of the face: two halves of one blurred gray lie 2.7 apart
 LEAST_COLOUR = 5.0  # of Lab: less is the noise of a camera or of JPEG
-LEAST_HUB = 0.18  # of the radius: a drop's hub is wider than any needle's
 SCALE_END_RAD = np.deg2rad(135.0)  # three quarters of a turn is what almost all round gauges use
 
 
@@ -52,10 +53,10 @@ def read_dial(
     Raises:
         InvalidRequest, NotObservable: bad image.
     """
-    in_gray, in_colour = _pointers(image)
-    if not in_gray and not in_colour:
+    found = _pointer(image)
+    if found is None:
         return refused("no pointer stands out on the dial: come closer or add light")
-    fit, rival = _believed(in_gray, in_colour)
+    fit, most = found
     if circular:
         value = minimum + (fit.angle_rad % (2 * np.pi)) / (2 * np.pi) * (maximum - minimum)
         sigma = fit.sigma_rad / (2 * np.pi) * (maximum - minimum)
@@ -64,19 +65,33 @@ def read_dial(
         low, high = ends_rad or (-SCALE_END_RAD, SCALE_END_RAD)
         scale = Scale(minimum=minimum, maximum=maximum, unit="", at_min=low, at_max=high)
         status = status_of_pointer(fit, scale, 1.0)
-    return answer_at(gated(limited(status, _agreement(fit, rival))), least_confidence)
+    return answer_at(gated(limited(status, most)), least_confidence)
 
 
-def _pointers(image: NDArray[Any]) -> tuple[list[PointerFit], list[PointerFit]]:
-    """What looks like a pointer in lightness, and in the other channels, of either polarity; a drop leaves no question."""
-    gray = as_gray(image)
+def _pointer(image: NDArray[Any]) -> tuple[PointerFit, float] | None:
+    """The pointer and the most confidence that it deserves; None where nothing stands out."""
     scale = SIDE_PX / max(image.shape[:2])
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
     picture = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=interpolation), np.uint8)
-    u, v, radius = dial_circle(gray, scale)
-    drop = _drop(picture, u, v, radius)
+    circle = dial_circle(as_gray(image), scale)
+    drop, by_sides = find_drop(picture, *circle)
     if drop is not None:
-        return [], [drop]
+        return drop.fit, drop.most
+    in_gray, in_colour = _lines(picture, *circle)
+    fit, most = None, 0.0
+    if in_gray or in_colour:
+        fit, rival = _believed(in_gray, in_colour)
+        most = min(_confidence(fit), _agreement(fit, rival))
+    elsewhere = by_sides is not None and (fit is None or _apart(fit, by_sides.fit) > OTHER_RAD)
+    if by_sides is not None and elsewhere and by_sides.most > min(most, SURE):
+        return by_sides.fit, by_sides.most if most < SURE else CONTRADICTED
+    if elsewhere and most < SURE:
+        most *= RIVALLED
+    return None if fit is None else (fit, most)
+
+
+def _lines(picture: Image, u: float, v: float, radius: float) -> tuple[list[PointerFit], list[PointerFit]]:
+    """What looks like a needle in lightness, and in the other channels, of either polarity."""
     gray = as_gray(picture)
     glare = _glare(gray, u, v, radius)
     fits: list[list[PointerFit]] = []
@@ -126,101 +141,6 @@ def _confidence(fit: PointerFit) -> float:
     return pointer_confidence(fit, 1.0, rival=RIVAL, sigma_rad=SIGMA_RAD)
 
 
-def _drop(image: Image, u: float, v: float, radius: float) -> PointerFit | None:
-    """A wide hub with one tip, in a colour or gray of its own: its axis runs from the one to the other.
-
-    The axis does not need the dial's middle, so a pointer seen from the side is read right.
-    """
-    planes: list[NDArray[Any]] = [as_gray(image)]
-    if image.ndim == 3:
-        lab = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_RGB2LAB)
-        planes += [lab[:, :, 1], lab[:, :, 2]]
-    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
-    disc = np.hypot(x - u, y - v) < 0.86 * radius
-    best: tuple[float, NDArray[np.bool_]] | None = None
-    for plane in planes:
-        part = cv2.GaussianBlur(plane.astype(np.float32), (0, 0), 1.5)
-        for sign in (1.0, -1.0):
-            region, separation = _region(sign * part, disc, (round(u), round(v)))
-            if region is not None and (best is None or separation > best[0]):
-                best = separation, region
-    if best is None:
-        return None
-    region = best[1] | _glare_within(planes[0], best[1], radius)
-    return _axis(region, (u, v), radius, best[0])
-
-
-def _region(
-    channel: NDArray[np.float32], disc: NDArray[np.bool_], middle: tuple[int, int]
-) -> tuple[NDArray[np.bool_] | None, float]:
-    """The coloured region about the middle and how many spreads of the face it stands out by; None if it is no pointer."""
-    values = channel[disc]
-    low, high = float(np.percentile(values, 1)), float(np.percentile(values, 99))
-    if high - low < 12.0:
-        return None, 0.0
-    coded = np.clip((channel - low) / (high - low) * 255, 0, 255).astype(np.uint8)
-    threshold, _ = cv2.threshold(coded[disc][None], 0, 1, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    mask = ((coded > threshold) & disc).astype(np.uint8)
-    mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
-    if count < 2:
-        return None, 0.0
-    biggest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
-    region = labels == biggest
-    share = float(region.sum() / disc.sum())
-    near = region[max(0, middle[1] - 12) : middle[1] + 13, max(0, middle[0] - 12) : middle[0] + 13].any()
-    face = channel[disc & ~region]
-    spread = 1.4826 * float(np.median(np.abs(face - np.median(face)))) + 1.0
-    separation = (float(np.median(channel[region])) - float(np.median(face))) / spread
-    return (region, separation) if 0.03 < share < 0.4 and near and separation > LEAST_SEPARATION else (None, 0.0)
-
-
-def _axis(
-    region: NDArray[np.bool_], middle: tuple[float, float], radius: float, separation: float
-) -> PointerFit | None:
-    """The axis of a drop: a wide hub about the dial's middle with one tip; None for any other pointer."""
-    inner = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
-    core = np.argwhere(inner > 0.93 * inner.max())
-    hub = core.mean(axis=0)[::-1]
-    points = np.argwhere(region)[:, ::-1] - hub
-    away = np.hypot(points[:, 0], points[:, 1])
-    hub_radius, reach = float(inner.max()), float(np.percentile(away, 99.7))
-    if reach < 1.4 * hub_radius or reach < 0.4 * radius:
-        return None  # a disc points nowhere
-    if hub_radius < LEAST_HUB * radius or np.hypot(*(hub - middle)) > 0.25 * radius:
-        return None  # a thick place off the middle is a counterweight or a letter
-    far = points[away > max(1.15 * hub_radius, 0.55 * reach)]
-    direction = far.mean(axis=0)
-    angle = float(np.arctan2(direction[0], -direction[1]))
-    spread = np.abs((np.arctan2(far[:, 0], -far[:, 1]) - angle + np.pi) % (2 * np.pi) - np.pi)
-    stray = float((spread > np.deg2rad(35.0)).mean())
-    return PointerFit(
-        angle_rad=angle,
-        sigma_rad=float(np.arctan(1.0 / reach)),
-        strength=3.0 * separation,
-        contrast=separation,
-        rival_ratio=min(1.0, stray * 2),
-        rival_rad=angle + np.pi,
-        supported=1.0 - stray,
-        shown=1.0 - stray,
-        is_dark=False,
-        unknown=0.0,
-    )
-
-
-def _glare_within(gray: NDArray[Any], region: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
-    """(H, W) spots of glare on a pointer that all but its outline surrounds: they are the pointer, whatever they look like."""
-    corners = cv2.convexHull(np.argwhere(region)[:, ::-1].astype(np.int32))
-    hull = cv2.fillConvexPoly(np.zeros(region.shape, np.uint8), corners, 1) > 0
-    count, labels = cv2.connectedComponents((gray >= WHITE_LEVEL).astype(np.uint8))
-    beyond = np.unique(labels[~hull])
-    inside = [k for k in range(1, count) if k not in beyond]
-    thick = float(cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5).max())
-    if not inside or thick < 0.6 * LEAST_HUB * radius:  # a glare beside a needle makes no drop of it
-        return np.zeros(region.shape, bool)
-    return hull & _with_halo(np.isin(labels, inside), radius)
-
-
 def _clearness(fit: PointerFit) -> float:
     return float(np.log(fit.strength) + 3.0 * (1.0 - fit.rival_ratio) + 2.0 * fit.supported)
 
@@ -239,14 +159,7 @@ def _glare(gray: Image, u: float, v: float, radius: float) -> NDArray[np.bool_] 
     spots = [k for k in range(1, count) if k not in middle and least < stats[k, cv2.CC_STAT_AREA] < most]
     if not spots:
         return None
-    return _with_halo(np.isin(labels, spots), radius)
-
-
-def _with_halo(spots: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
-    """(H, W) spots of glare as wide as they change the picture."""
-    size = round(HALO * radius) | 1
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    return np.asarray(cv2.dilate(spots.astype(np.uint8), kernel) > 0)
+    return with_halo(np.isin(labels, spots), radius)
 
 
 def _reaches_hub(patch: Patch, angle_rad: float, radius: float) -> float:

@@ -68,3 +68,22 @@ def test_a_pointer_that_lightness_shows_well_is_not_doubted_for_its_displaced_co
 def test_a_pressure_gauge_is_read_about_the_middle_of_its_face_not_of_its_bezel(seed: int) -> None:
     error, _ = error_of(draw_manometer(seed))
     assert error is not None and error <= 2.0
+
+
+@pytest.mark.parametrize("value", [0.6, 2.4, 4.9])
+def test_a_drop_is_told_from_the_numerals_of_its_gray_that_touch_it(value: float) -> None:
+    image = np.full((220, 220), 150, np.uint8)
+    cv2.circle(image, (110, 110), 102, 70, 4, cv2.LINE_AA)
+    for k in range(10):
+        at = 110 + 62 * np.array([np.sin(k * np.pi / 5), -np.cos(k * np.pi / 5)]) + (-11, 12)
+        foot = (round(float(at[0])), round(float(at[1])))
+        cv2.putText(image, str(k), foot, cv2.FONT_HERSHEY_SIMPLEX, 1.15, 80, 6, cv2.LINE_AA)
+    angle = value / 10 * 2 * np.pi
+    along, across = np.array([np.sin(angle), -np.cos(angle)]), np.array([np.cos(angle), np.sin(angle)])
+    corners = [110 + 92 * along, 110 + 10 * along + 37 * across, 110 + 10 * along - 37 * across]
+    cv2.fillPoly(image, [np.round(corners).astype(np.int32)], 115, cv2.LINE_AA)
+    cv2.circle(image, (110, 110), 38, 115, -1, cv2.LINE_AA)
+    grain = cv2.GaussianBlur(np.random.default_rng(3).normal(0.0, 18.0, image.shape), (0, 0), 1.5)
+    image = np.clip(cv2.GaussianBlur(image, (0, 0), 1.5) + grain, 0, 255).astype(np.uint8)
+    status = read_dial(image, minimum=0.0, maximum=10.0, circular=True)
+    assert status.value == pytest.approx(value, abs=0.2)

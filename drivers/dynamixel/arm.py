@@ -9,13 +9,22 @@ from __future__ import annotations
 import math
 import struct
 from collections import deque
-from contextlib import suppress
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from drivers.dynamixel.client import BusOptions, DynamixelClient, dynamixel_bus
+from drivers.dynamixel.client import (
+    ALWAYS,
+    PACKET_BYTES,
+    REBOOT,
+    STATUS_RETURN,
+    BusOptions,
+    DynamixelClient,
+    dynamixel_bus,
+    fault_text,
+    naming_alerts,
+)
 from drivers.kinds.arms import Array, KinematicsOptions, SetPointFilter, capabilities, require_stations
 from drivers.kinds.digital_points import require_same_number
 from drivers.transport.bus import PolledDevice
@@ -24,21 +33,20 @@ from drivers.transport.link import BadAnswer, NoAnswer, Refused, WireError, now_
 from drivers.transport.options import read_options
 from hal.clock import Deadline
 from hal.devices import ArmCapabilities, DeviceKind, JointState
-from hal.errors import DeviceFault
 from hal.readings import Stamped
 from hal.registry import Context, takes
 
-MODE, TORQUE, HARDWARE_ERROR, BUS_WATCHDOG, GOAL, STATE = 11, 64, 70, 98, 116, 126
+MODE, TORQUE, BUS_WATCHDOG, GOAL, STATE = 11, 64, 98, 116, 126
 STATE_BYTES = 10  # current16 velocity32 position32
 POSITION_MODE = 3
 COUNTS_PER_TURN, CENTRE = 4096, 2048
 RAD_PER_COUNT = math.tau / COUNTS_PER_TURN
 RAD_PER_S_PER_COUNT = 0.229 * math.tau / 60.0
 WATCHDOG_TICK_S, WATCHDOG_TRIPPED = 0.02, 0xFF
-WATCHDOG_EVERY = 10  # polls
+WATCH_EVERY = 5  # polls
 CONNECT_S = 4.0
 MOVING_RAD_PER_S = 0.03
-HARDWARE_BITS = {0: "supply voltage", 2: "overheating", 3: "encoder", 4: "electrical shock", 5: "overload"}
+INSTRUCTION_UNKNOWN = 2
 
 
 class DynamixelOptions(BusOptions):
@@ -78,6 +86,7 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
         self._zero = np.array(options.zero_counts or (CENTRE,) * n, dtype=float)
         self._filter = SetPointFilter(context.name, options.kinematics, command_rate_hz=options.rate_hz)
         self._polls = 0
+        self._is_fast = options.is_fast
         self._modes: tuple[DynamixelClient | None, dict[int, int]] = (None, {})  # what a broken set-up has learned
         self._pending: deque[dict[int, bytes]] = deque(maxlen=1)  # the newest goals, not yet sent
 
@@ -136,39 +145,55 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
     def set_up(self, client: DynamixelClient) -> None:
         """Each servo must answer; motion stays off until `enable`."""
         self._filter.close()
-        for id_, mode in self._read_modes(client).items():
+        ids = self._options.ids
+        client.sync_write(STATUS_RETURN, 1, dict.fromkeys(ids, ALWAYS), now_s() + self._options.timeout_s)
+        with naming_alerts(client, ids, client.until_s(2 * len(ids), 2 * PACKET_BYTES)):
+            modes = self._read_modes(client)
+        for id_, mode in modes.items():
             if mode != POSITION_MODE:
-                raise Refused(f"servo {id_} is in mode {mode}, not {POSITION_MODE} (position)", code=mode)
+                hint = f"write {POSITION_MODE} to its address {MODE} while its torque is off"
+                raise Refused(f"servo {id_} is in mode {mode}, not {POSITION_MODE} (position)", code=mode, hint=hint)
 
     def _read_modes(self, client: DynamixelClient) -> dict[int, int]:
         """Of all servos at once or, on a bad wire, one by one, going on where the attempt before ended."""
         o = self._options
         modes = self._modes[1] if self._modes[0] is client else {}
-        if not modes:
-            with suppress(NoAnswer):
-                blocks = self._read_all(client, MODE, 1, now_s() + 2 * o.timeout_s)
+        for is_fast in (True, False) if o.is_fast and not modes else (False,) * (not modes):
+            self._is_fast = is_fast  # old firmware knows no fast reads: it is silent, or says so
+            try:
+                blocks = self._read_all(client, MODE, 1, attempts=2 if is_fast else 6)
                 return {id_: block[0] for id_, block in blocks.items()}
+            except NoAnswer:
+                self._is_fast = o.is_fast
+            except Refused as error:
+                if not is_fast or error.code != INSTRUCTION_UNKNOWN:
+                    raise
         self._modes = (client, modes)
         for id_ in set(o.ids) - set(modes):
-            modes[id_] = client.read(id_, MODE, 1, now_s() + 4 * o.timeout_s)[0]
+            modes[id_] = client.read(id_, MODE, 1, client.until_s(4, 2 * PACKET_BYTES))[0]
         self._modes = (None, {})
         return modes
 
-    def _read_all(self, client: DynamixelClient, address: int, length: int, until_s: float) -> dict[int, bytes]:
-        ask = client.fast_sync_read if self._options.is_fast else client.sync_read
-        return ask(self._options.ids, address, length, until_s)
+    def _read_all(
+        self, client: DynamixelClient, address: int, length: int, *, attempts: int = 2, until_s: float | None = None
+    ) -> dict[int, bytes]:
+        ids = self._options.ids
+        ask = client.fast_sync_read if self._is_fast else client.sync_read
+        if until_s is None:
+            until_s = client.until_s(attempts, len(ids) * (length + PACKET_BYTES) + 2 * PACKET_BYTES)
+        return ask(ids, address, length, until_s)
 
     def poll(self, client: DynamixelClient) -> None:
         """Current, velocity and position of all servos."""
         o = self._options
         self._send_pending(client, now_s() + o.timeout_s)
-        until_s = now_s() + 2 * o.timeout_s
-        blocks = self._read_all(client, STATE, STATE_BYTES, until_s)
+        with naming_alerts(client, o.ids, client.until_s(2 * len(o.ids), 2 * PACKET_BYTES)):
+            blocks = self._read_all(client, STATE, STATE_BYTES)
         valid_s = self.exchanges.taken_s(client.asked_s, now_s())
         rows = np.array([struct.unpack("<hii", blocks[id_]) for id_ in o.ids], dtype=float)
         self._polls += 1
-        if self._filter.is_open and self._polls % WATCHDOG_EVERY == 0:
-            self._watch(client, until_s)
+        if self._filter.is_open and self._polls % WATCH_EVERY == 0:
+            self._watch(client)
         velocity = rows[:, 1] * RAD_PER_S_PER_COUNT * self._direction
         self.publish(
             JointState(
@@ -180,12 +205,19 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
             valid_s=valid_s,
         )
 
-    def _watch(self, client: DynamixelClient, until_s: float) -> None:
-        """A tripped watchdog refuses goals without a word, as nobody answers a sync write."""
-        limits = client.sync_read(self._options.ids, BUS_WATCHDOG, 1, until_s)
+    def _watch(self, client: DynamixelClient) -> None:
+        """A tripped watchdog refuses goals, and a servo without torque follows none, without a word: nobody answers a
+        sync write. A servo that has started again has neither torque nor a watchdog."""
+        if self._polls % (2 * WATCH_EVERY):
+            torque = self._read_all(client, TORQUE, 1)
+            if limp := [id_ for id_, data in torque.items() if not data[0]]:
+                raise Refused(f"servo {limp[0]} has lost its torque", code=0, hint="has it started again? enable again")
+            return
+        limits = self._read_all(client, BUS_WATCHDOG, 1)
         tripped = [id_ for id_, data in limits.items() if data[0] == WATCHDOG_TRIPPED]
         if tripped:
-            raise Refused(f"the bus watchdog of servo {tripped[0]} has tripped; enable again", code=WATCHDOG_TRIPPED)
+            what = f"the bus watchdog of servo {tripped[0]} has tripped"
+            raise Refused(what, code=WATCHDOG_TRIPPED, hint="the bus was silent for too long; enable again")
 
     def fail(self, error: Exception) -> None:
         """A servo's error report or a lost bus takes the motion with it."""
@@ -196,21 +228,20 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
     def _torque_on(self, client: DynamixelClient, measured: Array, until_s: float) -> None:
         ids = self._options.ids
         for id_ in ids:
-            fault = client.read(id_, HARDWARE_ERROR, 1, until_s)[0]
-            if fault:
-                parts = [text for bit, text in HARDWARE_BITS.items() if fault >> bit & 1]
-                raise DeviceFault(
-                    f"{self.name}: servo {id_} reports {', '.join(parts) or fault}",
-                    hint="cure the cause, then reboot the servo",
-                    device=self.name,
-                )
+            if fault := client.hardware_error(id_, until_s):
+                raise Refused(f"servo {id_} reports {fault_text(fault)}", code=fault, hint=REBOOT)
             client.write(id_, BUS_WATCHDOG, b"\x00", until_s)  # clears a tripped one
         client.sync_write(GOAL, 4, self._goals(measured), until_s)
         for id_ in ids:
             client.write(id_, TORQUE, b"\x01", until_s)
         ticks = max(1, min(127, round(self._options.watchdog_s / WATCHDOG_TICK_S)))
-        for id_ in ids:
-            client.write(id_, BUS_WATCHDOG, bytes([ticks]), until_s)
+        idle = list(ids)
+        while idle:  # one by one, those that are armed already would wait for the last
+            client.sync_write(BUS_WATCHDOG, 1, dict.fromkeys(ids, bytes([ticks])), until_s)
+            armed = self._read_all(client, BUS_WATCHDOG, 1, until_s=until_s)
+            idle = [id_ for id_, data in armed.items() if data[0] != ticks]
+            if idle and now_s() >= until_s:
+                raise NoAnswer(f"the bus watchdog of servo {idle[0]} cannot be armed")
 
     def _goals(self, position_rad: Array) -> dict[int, bytes]:
         counts = np.round(position_rad / RAD_PER_COUNT * self._direction + self._zero).astype(int)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -21,6 +21,11 @@ from hal.wires import Claim
 
 QUARANTINE_S, LONGEST_QUARANTINE_S = 0.1, 0.8  # how long late answers are waited for; it doubles with each more lost
 DOUBT_S = 1.0  # an answer that is overtaken by others may come so late
+HARDWARE_ERROR, STATUS_RETURN = 70, 68
+ALWAYS = b"\x02"  # status return: every instruction is answered
+PACKET_BYTES = 10  # header, id, length, instruction, CRC
+HARDWARE_BITS = {0: "supply voltage", 2: "overheating", 3: "encoder", 4: "electrical shock", 5: "overload"}
+REBOOT = "cure the cause, then switch the servo off and on: only a reboot helps"
 PROBES = range(1, 13)  # lengths of a read from address 0, where no servo has gaps
 
 
@@ -72,7 +77,8 @@ class DynamixelClient:
     def __init__(self, link: Link, *, timeout_s: float) -> None:
         self._link = link
         self._timeout_s = timeout_s
-        self._framer = protocol.framer()
+        self._fast_sizes: set[int] = set()
+        self._framer = protocol.framer(self._fast_sizes)
         self._unanswered: list[Shape] = []  # oldest first
         self._overtaken: deque[tuple[float, Shape]] = deque(maxlen=64)  # lost, and later ones were answered
         self._lost_in_a_row = 0
@@ -95,6 +101,7 @@ class DynamixelClient:
     def fast_sync_read(self, ids: tuple[int, ...], address: int, length: int, until_s: float) -> dict[int, bytes]:
         """The same block of all servos in one packet."""
         step = length + 4  # error, id, data, and a CRC over everything so far
+        self._fast_sizes.add(len(ids) * step)
 
         def request() -> tuple[bytes, Shape]:
             self._turn += 1
@@ -108,6 +115,15 @@ class DynamixelClient:
         for id_, block in blocks.items():
             _check(id_, block[0])
         return {id_: blocks[id_][2 : 2 + length] for id_ in ids}
+
+    def hardware_error(self, id_: int, until_s: float) -> int:
+        """What a servo gives as the cause of its alert."""
+        request = protocol.read(id_, HARDWARE_ERROR, 1)
+        return self._exchange(lambda: (request, (Part(id_, 2),)), (id_,), until_s)[0].parameters[1]
+
+    def until_s(self, attempts: int, answer_bytes: int) -> float:
+        """When so many attempts have had their time, with what the bytes take on the line."""
+        return now_s() + attempts * (self._timeout_s + answer_bytes * self._link.byte_s)
 
     def sync_write(self, address: int, length: int, values: dict[int, bytes], until_s: float) -> None:
         """A block of each servo; nobody answers."""
@@ -137,13 +153,16 @@ class DynamixelClient:
 
     def _attempt(self, request: bytes, shape: Shape, ids: tuple[int, ...], until_s: float) -> list[protocol.Packet]:
         self._note_late(self._packets(drain(self._link)))
+        self._framer.reset()  # what has begun and not ended by now is noise
         self.asked_s = now_s()
         self._link.write(request, until_s)
         self._unanswered.append(shape)
         found: list[protocol.Packet] = []
         odd: list[protocol.Packet] = []
-        end_s = min(until_s, self.asked_s + self._timeout_s)
+        line_s = (len(request) + sum(part.size + PACKET_BYTES for part in shape)) * self._link.byte_s
+        end_s = min(until_s, self.asked_s + self._timeout_s + line_s)
         while chunk := self._link.read(end_s):
+            end_s = min(until_s, max(end_s, now_s() + self._timeout_s))  # an answer in pieces is on its way
             for packet in self._packets(chunk):
                 if shape[len(found)].fits(packet):
                     found.append(packet)
@@ -158,6 +177,8 @@ class DynamixelClient:
         self._lost_in_a_row += 1
         self._note_late(odd)
         what = f"{len(shape) - len(found)} of {len(shape)} answers of servos {', '.join(map(str, ids))} do not come"
+        if len(ids) == 1:
+            what = f"servo {ids[0]} does not answer"
         self._why = what + "".join(f"; servo {x.id} sent {len(x.parameters)} bytes" for x in odd[:1])
         raise NoAnswer(self._why)
 
@@ -222,6 +243,24 @@ class DynamixelClient:
         return [packet for packet in packets if packet.instruction == protocol.STATUS]
 
 
+@contextmanager
+def naming_alerts(client: DynamixelClient, ids: tuple[int, ...], until_s: float) -> Iterator[None]:
+    """A hardware alert that comes up inside is raised again with its servo and cause."""
+    try:
+        yield
+    except Refused as error:
+        if not error.code & protocol.ALERT:
+            raise
+        causes = {id_: fault for id_ in ids if (fault := client.hardware_error(id_, until_s))}
+        told = "; ".join(f"servo {id_} reports {fault_text(fault)}" for id_, fault in causes.items())
+        raise Refused(told or str(error), code=error.code, hint=REBOOT) from error
+
+
+def fault_text(fault: int) -> str:
+    """The bits of a hardware error in words."""
+    return ", ".join(text for bit, text in HARDWARE_BITS.items() if fault >> bit & 1) or f"hardware error {fault:02X}h"
+
+
 def dynamixel_bus(context: Context, options: BusOptions) -> Bus[DynamixelClient]:
     """The bus of this port; devices that name the same port get the same one."""
     opener, name = serial_opener(options, context.name)
@@ -237,7 +276,7 @@ def _check(id_: int, error: int) -> None:
         text = protocol.ERRORS.get(error & ~protocol.ALERT, "not in the manual")
         raise Refused(f"servo {id_}: error {error & ~protocol.ALERT} ({text})", code=error)
     if error & protocol.ALERT:
-        raise Refused(f"servo {id_}: hardware alert; only a reboot helps", code=error)
+        raise Refused(f"servo {id_}: hardware alert", code=error, hint=REBOOT)
 
 
 def _unpacked(frame: bytes) -> protocol.Packet:

@@ -11,7 +11,15 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
-from drivers.dynamixel.client import BusOptions, DynamixelClient, dynamixel_bus
+from drivers.dynamixel.client import (
+    ALWAYS,
+    PACKET_BYTES,
+    STATUS_RETURN,
+    BusOptions,
+    DynamixelClient,
+    dynamixel_bus,
+    naming_alerts,
+)
 from drivers.kinds.grippers import require_finite, require_stroke
 from drivers.transport.bus import PolledDevice
 from drivers.transport.link import Refused, now_s
@@ -138,18 +146,23 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
     def set_up(self, client: DynamixelClient) -> None:
         """The servo must answer, and be in the mode that limits its current; torque stays as it is."""
         self._clock, o = (Unwrapper(bits=TICK_BITS, tick_s=TICK_S), HostTime()), self._options
-        until_s = now_s() + 6 * o.timeout_s
-        mode = client.read(o.id, MODE, 1, until_s)[0]
+        client.sync_write(STATUS_RETURN, 1, {o.id: ALWAYS}, now_s() + o.timeout_s)
+        until_s = client.until_s(6, 2 * PACKET_BYTES)
+        with naming_alerts(client, (o.id,), until_s):
+            mode = client.read(o.id, MODE, 1, until_s)[0]
         if mode == GRIP_MODE:
             return
         if client.read(o.id, TORQUE, 1, until_s)[0]:
-            raise Refused(f"servo {o.id} is in mode {mode} under torque, not {GRIP_MODE} (grip)", code=mode)
+            what = f"servo {o.id} is in mode {mode} under torque, not {GRIP_MODE} (grip)"
+            raise Refused(what, code=mode, hint="switch its torque off: then the driver sets the mode")
         client.write(o.id, MODE, bytes([GRIP_MODE]), until_s)
 
     def poll(self, client: DynamixelClient) -> None:
         """Clock, current, velocity and position in one block; the clock tells a late answer from a young one."""
         o = self._options
-        block = client.read(o.id, STATE, BLOCK.size, now_s() + 2 * o.timeout_s)
+        until_s = client.until_s(2, BLOCK.size + 2 * PACKET_BYTES)
+        with naming_alerts(client, (o.id,), client.until_s(3, 2 * PACKET_BYTES)):
+            block = client.read(o.id, STATE, BLOCK.size, until_s)
         tick, current, velocity, position = BLOCK.unpack(block)
         ticks, host = self._clock
         device_s = ticks.seconds(tick)

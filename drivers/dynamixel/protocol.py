@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 
 from drivers.transport.checks import crc_dynamixel
@@ -49,16 +49,28 @@ def decode(frame: bytes) -> Packet:
     return Packet(frame[4], body[0], body[1:])
 
 
-def framer() -> Framer:
-    """Packets out of bytes: header, length in bounds, CRC."""
-    return Framer(HEADER, _length, lambda f: crc_dynamixel(f[:-2]) == f[-2] | f[-1] << 8)
+def framer(fast_sizes: Container[int] | None = None) -> Framer:
+    """Packets out of bytes: header, length in bounds, CRC.
 
+    A header inside a packet is stuffed, so one that stands there begins another: the first was a false one, and does not
+    make true ones wait for the bytes that it promises. Answers to fast sync reads are not stuffed; of them the length is
+    known.
 
-def _length(data: bytes) -> int | None:
-    if len(data) < 7:
-        return None
-    length = data[5] | data[6] << 8
-    return 7 + length if SHORTEST <= length <= LONGEST else 0
+    Args:
+        fast_sizes: how many bytes of parameters such an answer may have; any number unless given.
+    """
+
+    def length(data: bytes) -> int | None:
+        if len(data) < 8:
+            return None
+        size = 7 + (data[5] | data[6] << 8)
+        if not 7 + SHORTEST <= size <= 7 + LONGEST:
+            return 0
+        if data[4] == BROADCAST and data[7] == STATUS:
+            return size if fast_sizes is None or size - 8 in fast_sizes else 0
+        return 0 if 0 <= data.find(HEADER, 4) < size else size
+
+    return Framer(HEADER, length, lambda f: crc_dynamixel(f[:-2]) == f[-2] | f[-1] << 8)
 
 
 def sync_read(address: int, length: int, ids: Sequence[int], *, fast: bool = False) -> bytes:

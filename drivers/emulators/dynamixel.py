@@ -21,7 +21,8 @@ from hal.strict import validate
 
 TABLE_BYTES = 147
 EEPROM_BYTES = 64
-TORQUE, HARDWARE_ERROR, WATCHDOG, GOAL, STATE, TICK = 64, 70, 98, 116, 126, 120
+TORQUE, STATUS_RETURN, HARDWARE_ERROR, WATCHDOG, GOAL, STATE, TICK = 64, 68, 70, 98, 116, 126, 120
+ALWAYS = 2
 RAD_PER_COUNT = math.tau / 4096
 VELOCITY_UNIT = 0.229 * math.tau / 60.0
 ACCESS, RANGE, INSTRUCTION = 7, 4, 2
@@ -67,6 +68,7 @@ class DynamixelEmulator(WireEmulator):
         self._backing = backing
         self.servos = {i + 1: Servo(i + 1) for i in range(len(backing.capabilities().links))}
         self._framer = protocol.framer()
+        self.knows_fast_reads = True
         self._is_enabled = False
         self._is_new_goal = False
         self._device_s = 0.0
@@ -127,7 +129,7 @@ class DynamixelEmulator(WireEmulator):
                 for id_ in p[4:]:
                     if id_ in self.servos:
                         self._answer(id_, 0, self._block(id_, address, length))
-            case protocol.FAST_SYNC_READ:
+            case protocol.FAST_SYNC_READ if self.knows_fast_reads:
                 self._fast_answer(p)
             case protocol.SYNC_WRITE:
                 self._sync_write(p)
@@ -141,6 +143,8 @@ class DynamixelEmulator(WireEmulator):
         return list(self.servos) if id_ == protocol.BROADCAST else [id_] if id_ in self.servos else []
 
     def _answer(self, id_: int, error: int, data: bytes = b"") -> None:
+        if not data and self.servos[id_].table[STATUS_RETURN] != ALWAYS:
+            return
         error |= self.servos[id_].alert
         self.send(None, protocol.encode(id_, protocol.STATUS, bytes([error]) + data), protected=slice(4, None))
 

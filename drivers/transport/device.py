@@ -158,9 +158,7 @@ class WireDevice(Generic[T]):
             return error
         where = {"device": self.name, "link": self.link_name()}
         if isinstance(error, Refused):
-            return DeviceFault(
-                f"{self.name}: {error}", hint="look the code up in the device's manual", code=error.code, **where
-            )
+            return DeviceFault(f"{self.name}: {error}", hint=error.hint, code=error.code, **where)
         if isinstance(error, LinkLost):
             hint = "plug it in; it reconnects by itself"
             if isinstance(error, RecordingEnded):

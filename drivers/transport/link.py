@@ -37,11 +37,13 @@ class Refused(WireError):
 
     Attributes:
         code: as the device's manual numbers it.
+        hint: what to do about it.
     """
 
-    def __init__(self, what: str, *, code: int) -> None:
+    def __init__(self, what: str, *, code: int, hint: str = "look the code up in the device's manual") -> None:
         super().__init__(what)
         self.code = code
+        self.hint = hint
 
 
 class Link(Protocol):

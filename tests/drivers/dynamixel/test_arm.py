@@ -133,13 +133,56 @@ def test_a_tripped_watchdog_is_told_and_motion_is_off() -> None:
             device.command_position(arm.position_rad, deadline=soon())
 
 
+def test_a_servo_that_started_again_in_motion_is_told_and_motion_is_off() -> None:
+    """It has no torque then, answers as ever, and would be left behind without a word."""
+    arm = ScriptedArm()
+    with wired(far_side := emulator.start(arm, {}), DRIVER, {"watchdog_s": 0.5}) as device:
+        device.enable(deadline=soon())
+        far_side.servos[4] = emulator.Servo(4)
+        with pytest.raises(DeviceFault, match="servo 4 has lost its torque"):
+            until(lambda: device.read_state(deadline=soon()) is None)
+        with pytest.raises(MotionRefused):
+            device.command_position(arm.position_rad, deadline=soon())
+
+
+def test_servos_of_old_firmware_without_fast_reads_are_read_without() -> None:
+    arm = ScriptedArm()
+    far_side = emulator.start(arm, {})
+    far_side.knows_fast_reads = False
+    with wired(far_side, DRIVER) as device:
+        device.enable(deadline=soon())
+        np.testing.assert_allclose(
+            device.read_state(deadline=soon()).value.position_rad, arm.position_rad, atol=RAD_PER_COUNT
+        )
+
+
+def test_servos_that_acknowledge_no_write_are_told_to() -> None:
+    far_side = emulator.start(ScriptedArm(), {})
+    for servo in far_side.servos.values():
+        servo.table[emulator.STATUS_RETURN] = 1
+    with wired(far_side, DRIVER) as device:
+        device.enable(deadline=soon())
+        assert device.newest(soon(), not_before_s=soon(0.0).at_s).value.is_enabled
+
+
+def test_a_servo_in_another_mode_is_told_with_the_remedy() -> None:
+    far_side = emulator.start(ScriptedArm(), {})
+    far_side.servos[2].table[11] = 4
+    try:
+        with pytest.raises(DeviceUnavailable, match="servo 2 is in mode 4") as refused:
+            connect(Context(name="arm"), DRIVER, far_side.address)
+        assert "write 3 to its address 11" in refused.value.hint
+    finally:
+        far_side.close()
+
+
 def test_an_overload_is_a_fault_that_enable_does_not_paper_over() -> None:
     arm = ScriptedArm()
     with wired(far_side := emulator.start(arm, {}), DRIVER) as device:
         device.enable(deadline=soon())
         far_side.overload(3)
         until(lambda: not arm.is_enabled)
-        with pytest.raises(DeviceFault, match="servo 3"):
+        with pytest.raises(DeviceFault, match="servo 3 reports overload"):
             until(lambda: device.read_state(deadline=soon()) is None)
         with pytest.raises(CellError, match="servo 3"):
             device.enable(deadline=soon())
@@ -158,7 +201,7 @@ def test_torque_stays_off_after_unplugging() -> None:
 def test_a_missing_servo_is_told() -> None:
     far_side = emulator.start(ScriptedArm(), {})
     try:
-        with pytest.raises(DeviceUnavailable, match="answers of servos 9 do not come"):
+        with pytest.raises(DeviceUnavailable, match="servo 9 does not answer"):
             connect(Context(name="arm"), DRIVER, {**far_side.address, "ids": [1, 2, 3, 4, 5, 9]})
     finally:
         far_side.close()

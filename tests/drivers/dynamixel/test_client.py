@@ -123,10 +123,32 @@ def test_halves_that_come_apart_are_one_answer_however_late_the_second_is() -> N
     assert [x.parameters for x in bus.asked] == [b"\x0b\0\x01\0", b"\0\0\x02\0", b"\x0b\0\x01\0"]
 
 
+@pytest.mark.parametrize("false", [b"\xff\xff\xfd\x00\x01\x00\x03\x55", b"\xff\xff\xfd\x00\xfe\x00\x03\x55"])
+def test_a_false_header_makes_no_answer_wait_for_the_bytes_it_promises(false: bytes) -> None:
+    bus, client = client_of(lambda _, whole: [(0, false + b"noise" + whole)])
+    client.read(1, 132, 4, now_s() + 0.0005)
+    client.fast_sync_read(IDS, 126, 10, now_s() + 0.0005)
+    assert len(bus.asked) == 2
+
+
+class SlowLine(Bus):
+    """A millisecond a byte: who listens for less than that hears nothing."""
+
+    byte_s = 0.001
+
+    def read(self, until_s: float) -> bytes:
+        return super().read(until_s) if until_s - now_s() > 0.03 else b""
+
+
+def test_an_answer_has_the_time_that_its_bytes_take_on_the_line() -> None:
+    client = DynamixelClient(cast(Link, SlowLine(lambda _, whole: [(0, whole)])), timeout_s=0.002)
+    assert client.fast_sync_read(IDS, 126, 10, client.until_s(1, 150))[6][0] == 1
+
+
 def test_packets_that_fit_nothing_are_told() -> None:
     other = protocol.encode(9, protocol.STATUS, b"\0\x01\x02")
     _, client = client_of(lambda _n, _whole: [(0, other)])
-    with pytest.raises(NoAnswer, match=r"1 of 1 answers of servos 1 do not come; servo 9 sent 3 bytes"):
+    with pytest.raises(NoAnswer, match=r"servo 1 does not answer; servo 9 sent 3 bytes"):
         client.read(1, 132, 4, now_s() + 0.0005)
 
 

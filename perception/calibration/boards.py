@@ -24,11 +24,14 @@ class BoardView:
         points_m: (N, 3) in the board's (or panel's) frame.
         pixels_px: (N, 2) as measured.
         sigma_px: noise of each coordinate.
+        disc_m: radius of the flat disc that a point is the middle of; 0 for a corner. A disc's image has its middle
+            elsewhere, see `disc_offset_px`.
     """
 
     points_m: Array
     pixels_px: Array
     sigma_px: float
+    disc_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,4 +109,21 @@ class Dots:
                 hint="show every dot, with a bright margin round the grid, and light it evenly",
             )
         pixels = np.asarray(centres, float).reshape(-1, 2)
-        return BoardView(points_m=self.points_m(), pixels_px=pixels, sigma_px=DOT_SIGMA_PX)
+        return BoardView(
+            points_m=self.points_m(), pixels_px=pixels, sigma_px=DOT_SIGMA_PX, disc_m=self._radius_m(image, pixels)
+        )
+
+    def _radius_m(self, image: NDArray[np.uint8], centres_px: Array) -> float:
+        """Of a dot: the area of the dark part round its centre over that of the board's cell there."""
+        import cv2
+
+        grid = centres_px.reshape(self.rows, self.columns, 2)
+        across, down = np.asarray(np.gradient(grid, axis=1)), np.asarray(np.gradient(grid, axis=0))
+        cell_px = np.abs(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0]).ravel()
+        dots = np.round(centres_px).astype(int)
+        between = np.round(0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])).astype(int)
+        level = 0.5 * (np.median(image[dots[:, 1], dots[:, 0]]) + np.median(image[between[..., 1], between[..., 0]]))
+        _, labels, stats, _ = cv2.connectedComponentsWithStats((image < level).astype(np.uint8))
+        area_px = stats[labels[dots[:, 1], dots[:, 0]], cv2.CC_STAT_AREA]
+        radius_m = self.spacing_m * float(np.sqrt(np.median(area_px / cell_px) / np.pi))
+        return min(radius_m, 0.5 * self.spacing_m)

@@ -7,7 +7,7 @@ and, on top of it, the paper's bivariate cubic from measured to ideal pixel, whi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,17 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import matrix_of, perturbed, transform
-from perception.calibration.boards import BoardView
+from perception.calibration.boards import FEWEST_POINTS, BoardView
 from perception.calibration.newton import Minimum, descend
-from perception.camera_model import CubicLens, cubic_monomials, distort, distortion_jacobian, project, undistort_pixels
+from perception.camera_model import (
+    CubicLens,
+    cubic_monomials,
+    disc_offset_px,
+    distort,
+    distortion_jacobian,
+    project,
+    undistort_pixels,
+)
 
 Array = NDArray[np.float64]
 
@@ -28,6 +36,7 @@ LIGHTS_FREE = ("fx", "fy", "cx", "cy", "k1")  # four points a view
 FOCAL_LIMIT = 0.01  # of the focal length
 CENTRE_LIMIT = 0.02  # of the image width
 GRID = 24
+STRAY = 6.0  # sigmas, or times the view's median error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -86,11 +95,15 @@ def calibrate_camera(
     index = [NAMES.index(name) for name in NAMES if name in free]
     # The lens starts straight; focal lengths and poses settle first, then everything moves.
     state = _State(intrinsics=guess, poses=poses)
-    stages = [[i for i in index if i < 2], index] if start is None else [index]
-    for stage in stages:
-        state, minimum = _fit(views, state, stage)
+    if start is None:
+        state, _ = _fit(views, state, [i for i in index if i < 2])
+    state, _ = _fit(views, state, index)
+    views = [_cleaned(view, pose, state.intrinsics) for view, pose in zip(views, state.poses, strict=True)]
+    state, minimum = _fit(views, state, index)
     n = len(index)
-    covariance = minimum.covariance[:n, :n]
+    degrees = 2 * sum(len(view.points_m) for view in views) - n - 6 * len(views)
+    # More scatter than was stated: then everything is as much less certain.
+    covariance = minimum.covariance[:n, :n] * max(1.0, minimum.chi_square / degrees)
     _check_accuracy(covariance, [NAMES[i] for i in index], state.intrinsics)
     residuals = tuple(
         view.pixels_px - project(pose.apply(view.points_m), state.intrinsics)
@@ -101,9 +114,21 @@ def calibrate_camera(
     return CameraCalibration(
         intrinsics=state.intrinsics, names=tuple(NAMES[i] for i in index), covariance=covariance,
         rms_px=float(np.sqrt(np.mean(stacked**2))), residuals_px=residuals, chi_square=minimum.chi_square,
-        degrees=2 * len(stacked) - n - 6 * len(views), board_poses=state.poses, cubic=cubic,
+        degrees=degrees, board_poses=state.poses, cubic=cubic,
         cubic_covariance=cubic_covariance,
     )  # fmt: skip
+
+
+def _cleaned(view: BoardView, pose: RigidTransform, intrinsics: CameraIntrinsics) -> BoardView:
+    """The view without points that lie far from where the others want them, and with the middles of its discs."""
+    errors_px = np.linalg.norm(view.pixels_px - project(pose.apply(view.points_m), intrinsics), axis=1)
+    near = errors_px <= STRAY * max(view.sigma_px, float(np.median(errors_px)))
+    if near.sum() < FEWEST_POINTS:
+        near[:] = True  # four lights: nothing tells which of them is the stray
+    points_m, pixels_px = view.points_m[near], view.pixels_px[near]
+    if view.disc_m > 0.0:
+        pixels_px = pixels_px - disc_offset_px(points_m, view.disc_m, pose, intrinsics)
+    return replace(view, points_m=points_m, pixels_px=pixels_px)
 
 
 def fit_cubic(

@@ -66,6 +66,7 @@ OPERATIONS: dict[str, Operation] = {
             run=_in_session("recognise", "run_recognise"),
             summary="Find the panel's objects in the camera's image or surfaces in the range image",
             example={"use": ["vision"], "mode": "taught"},
+            check=targets.check_looked_for,
             is_still=_is_stored,
         ),
         Operation(
@@ -82,7 +83,7 @@ OPERATIONS: dict[str, Operation] = {
             run=_in_session("inspect", "run_inspect"),
             summary="Read instruments, lamps, switches and valves from close up",
             example={"objects": ["pressure", "main_valve"], "least_confidence": 0.5},
-            check=targets.check_inspect,
+            check=targets.check_looked_for,
             is_still=_is_stored,
         ),
         Operation(

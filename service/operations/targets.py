@@ -5,7 +5,7 @@ from __future__ import annotations
 from hal.config import Cell
 from hal.errors import InvalidRequest
 from hal.panel import Button, Handwheel, Lever, Mushroom, PanelObject, Rotary, Slider, Toggle
-from service.operations.requests import ActionBody, InspectRequest, ManipulateRequest, MissionRequest
+from service.operations.requests import ActionBody, InspectRequest, ManipulateRequest, MissionRequest, RecogniseRequest
 
 
 def target_of(thing: PanelObject, body: ActionBody) -> str:
@@ -48,7 +48,7 @@ def check_mission(cell: Cell, request: MissionRequest) -> None:
         target_of(cell.panel.object(body.object), body)
 
 
-def check_inspect(cell: Cell, request: InspectRequest) -> None:
+def check_looked_for(cell: Cell, request: InspectRequest | RecogniseRequest) -> None:
     """Raise `InvalidRequest` for an object that the cell's panel does not have, unless a stored image is asked about."""
     if request.image is None:
         for name in request.objects or ():

@@ -32,6 +32,7 @@ PART_M = (
     0.0067  # a sub-object this near to an object's middle is that object's, whichever of them blind recognition takes
 )
 FOOT_TO_TOP = np.array([0.0, 0.5, 1.0])  # what stands out of the plate appears between its foot and its top
+LEAST_THERE = 0.5  # of the objects; a panel of which the image has the left half showed 5 of 14
 NOT_DISTINCT = "nothing there stands out as a whole: come closer, or change the angle or the light"
 
 
@@ -97,6 +98,7 @@ def teach_from_panel(
     overview = overview_of(gray, plate_m=(panel.width_m, panel.height_m), focal_px=focal_px)
     registered = register(gray, view, panel).view
     readings = inspect_view(image, gray, registered, panel)
+    _check_most_are_there(readings, panel)
     places = candidate_places(overview.ground.edges)
     shown, left_out = _objects(overview, registered, panel, readings, places)
     if not shown:
@@ -107,6 +109,16 @@ def teach_from_panel(
     grown, added = _grown(overview, shown, _of_nothing(overview, registered, panel, shown, places), knowledge, source)
     before, now = (_recognised(overview, places, shown, known) for known in (knowledge, grown))
     return PanelLooks(knowledge=grown, added=added, shown=shown, left_out=left_out, known_before=before, known_now=now)
+
+
+def _check_most_are_there(readings: Sequence[ObjectReading], panel: Panel) -> None:
+    """Refuse an image of something else, or one whose border was taken wrongly: chance alone confirms some objects."""
+    there = sum(reading.present for reading in readings)
+    if 0 < there < LEAST_THERE * len(readings):
+        raise NotFound(
+            f"only {there} of the {len(readings)} objects of panel {panel.name!r} are where its file has them",
+            hint="take an overview that shows the whole panel with its border; is it this panel?",
+        )
 
 
 def _objects(

@@ -79,8 +79,9 @@ def test_a_mission_presses_by_itself_only_what_shows_that_it_was_pressed() -> No
         assert [(body.object, body.state) for body in usual_actions(session)] == wanted
 
 
-def test_an_object_to_read_must_be_on_the_panel_unless_an_image_of_another_one_is_sent() -> None:
-    operation = OPERATIONS["inspect"]
+@pytest.mark.parametrize("verb", ["inspect", "recognise"])
+def test_an_object_to_look_for_must_be_on_the_panel_unless_an_image_of_another_one_is_sent(verb: str) -> None:
+    operation = OPERATIONS[verb]
     with pytest.raises(InvalidRequest, match="presure"):
         operation.check(CELL, operation.request_model(objects=("presure",)))
     operation.check(CELL, operation.request_model(objects=("presure",), image="0" * 24))

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from hal.calibration import ToolLoad
-from hal.clock import Clock, Deadline, PacedClock
-from hal.devices import Arm, ForceTorque, Gripper, Proximity, Touch
+from hal.clock import Clock, Deadline, PacedClock, SimClock
+from hal.devices import Arm, ForceTorque, Gripper, JointState, Proximity, Touch
 from hal.errors import CellError, DeviceError, DeviceTimeout, StaleReading
 from hal.readings import Cause, Quality, Stamped
 from manipulation import kernels
@@ -27,6 +27,7 @@ GRAVITY_M_PER_S2 = 9.80665
 RANGE_WAIT_S = 0.004
 READ_WAIT_S = 0.02  # longest that one tick waits for a device; a tick itself lasts 2 to 8 ms
 PACED_WAIT_S = 1.0  # the same where the world stands still so long: a busy machine is no broken device
+STALE_WAIT_S, STALE_STEP_S = 0.1, 0.002
 COMMAND_WAIT_S = 0.25  # for what crosses a slow bus once a motion, not every tick
 
 
@@ -126,9 +127,9 @@ class Devices:
             DeviceFailure: the first device that is silent, broken, stale or invalid. "Nothing in range" is a
             proximity reading.
         """
+        joints = self._joints()
         now_s = self.clock.now_s()
         deadline = Deadline(now_s + read_wait_s(self.clock), self.clock)
-        joints = self._ask(self.arm.name, self.arm.read_state, now_s, deadline)
         raw = np.zeros(6)
         if self.force_torque is not None:
             wrench = self._ask(self.force_torque.name, self.force_torque.read_wrench, now_s, deadline)
@@ -156,6 +157,29 @@ class Devices:
             gripper_is_moving=is_moving,
             gripper_is_holding=is_holding,
         )
+
+    def _joints(self) -> JointState:
+        """The arm's newest state; an old one is waited out for a moment on a wall clock.
+
+        No set-point goes out meanwhile, so nothing moves on unseen. An arm that fails latches the stop: a machine that stood still
+        for a tenth of a second is no reason for that.
+        """
+        began_s = self.clock.now_s()
+        while True:
+            now_s = self.clock.now_s()
+            deadline = Deadline(now_s + read_wait_s(self.clock), self.clock)
+            try:
+                reading = self.arm.read_state(deadline=deadline)
+                is_old = reading.quality is not Quality.INVALID and reading.age_s(now_s) > self.max_age_s
+                if not (is_old and self._may_wait(now_s - began_s)):
+                    return reading.usable(now_s=now_s, max_age_s=self.max_age_s, device=self.arm.name)
+            except Exception as error:
+                raise failure_of(self.arm.name, error) from error
+            self.clock.sleep(STALE_STEP_S)
+
+    def _may_wait(self, waited_s: float) -> bool:
+        """In lockstep a reading is never old by chance, and waiting would move the world."""
+        return not isinstance(self.clock, SimClock) and waited_s < STALE_WAIT_S
 
     def _ask(self, device: str, read: Callable[..., Stamped[T]], now_s: float, deadline: Deadline) -> T:
         try:

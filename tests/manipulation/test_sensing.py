@@ -9,12 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from hal.clock import Deadline, PacedClock, SimClock, WallClock
+from hal.clock import Clock, Deadline, PacedClock, SimClock, WallClock
 from hal.devices import ForceTorqueCapabilities, JointState, Wrench
 from hal.errors import DeviceTimeout, StaleReading
-from hal.readings import Stamped
+from hal.readings import Quality, Stamped
 from manipulation.doubts import FrozenWrench
 from manipulation.sensing import (
+    STALE_STEP_S,
+    STALE_WAIT_S,
     ContactWrench,
     DeviceFailure,
     Devices,
@@ -77,6 +79,65 @@ def test_a_tick_waits_long_for_a_device_only_where_the_world_waits_too() -> None
     picture_s, watchdog_s = 0.15, 0.1
     assert read_wait_s(PacedClock()) > picture_s
     assert read_wait_s(WallClock()) < watchdog_s
+
+
+class Wall(WallClock):
+    """A wall whose time is a number."""
+
+    time_s = 100.0
+
+    def now_s(self) -> float:
+        return self.time_s
+
+    def sleep(self, duration_s: float) -> None:
+        self.time_s += duration_s
+
+
+class LateArm(FakeArm):
+    """What it says is old until a moment."""
+
+    def __init__(self, clock: Clock, *, fresh_at_s: float, quality: Quality = Quality.VALID) -> None:
+        super().__init__("arm", World())
+        self.clock, self.fresh_at_s, self.quality, self.asked = clock, fresh_at_s, quality, 0
+
+    def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
+        self.asked += 1
+        now_s = self.clock.now_s()
+        said = JointState(position_rad=np.zeros(6), velocity_rad_per_s=np.zeros(6))
+        taken_s = now_s if now_s >= self.fresh_at_s else now_s - 0.15
+        return Stamped(value=said, host_time_s=taken_s, sequence=1, quality=self.quality)
+
+
+def devices_with(arm: FakeArm, clock: Clock) -> Devices:
+    return Devices(
+        arm=arm, gripper=FakeGripper("gripper", World()), force_torque=None, touch=None, proximities=(), clock=clock,
+        max_age_s=0.1,
+    )  # fmt: skip
+
+
+def test_an_old_reading_of_the_arm_is_waited_out_on_a_wall() -> None:
+    """One reading of 0.1 s on a busy machine latched the stop."""
+    clock = Wall()
+    arm = LateArm(clock, fresh_at_s=100.0 + 0.5 * STALE_WAIT_S)
+    with pytest.raises(DeviceFailure, match=r"^gripper"):  # the arm has answered; the gripper's world has another clock
+        devices_with(arm, clock).read()
+    assert clock.time_s == pytest.approx(arm.fresh_at_s, abs=2 * STALE_STEP_S)
+
+
+def test_an_arm_that_stays_old_fails_after_a_bounded_wait() -> None:
+    clock = Wall()
+    with pytest.raises(DeviceFailure, match=r"arm reading is 0\.150 s old"):
+        devices_with(LateArm(clock, fresh_at_s=math.inf), clock).read()
+    assert clock.time_s == pytest.approx(100.0 + STALE_WAIT_S, abs=2 * STALE_STEP_S)
+
+
+def test_an_arm_in_lockstep_or_one_that_says_it_is_invalid_is_not_waited_for() -> None:
+    lockstep, wall = SimClock(), Wall()
+    for clock, quality in ((lockstep, Quality.VALID), (wall, Quality.INVALID)):
+        arm = LateArm(clock, fresh_at_s=math.inf, quality=quality)
+        with pytest.raises(DeviceFailure):
+            devices_with(arm, clock).read()
+        assert arm.asked == 1
 
 
 class LostArm(FakeArm):

@@ -16,6 +16,7 @@ from hal.panel import PanelObject
 from perception.vision.annotate import draw_annotated, said
 from perception.vision.reading import ObjectReading, answer_at
 from perception.vision.several_looks import joined
+from perception.vision.status.button import ALIKE, NO_EDGE
 from perception.vision.taught import inspect as inspect_image
 from service.operations.beliefs import READINGS, forget_reading, known_readings
 from service.operations.eyes import Look, base_from, look, settle
@@ -24,11 +25,12 @@ from service.operations.requests import InspectRequest, RecogniseRequest
 from service.operations.session import Session, panel_object_or_all
 from service.operations.stored import read_stored, reading_row_json
 from service.operations.tours import short_tour
-from service.operations.travel import go_to_camera_view
-from service.operations.views import SIDES, close_up_groups, close_up_poses, side_poses
+from service.operations.travel import go_to_camera_view, workcell
+from service.operations.views import CLOSE_UP_M, FOR_ALIKE, NEAR_M, SIDES, close_up_groups, close_up_poses, poses_from
 from service.report.plots import png_of
 from service.report.record import Reading
 
+TIPS_M = 0.085  # of the finger tips before the plate in a look from the side: what hides an object hangs there
 MOST_UNREAD = 4  # more than these at once: the light or the lens, and no cable
 
 
@@ -103,14 +105,20 @@ def look_close(session: Session, centre_m: Iterable[float], names: Collection[st
 
 
 def look_past(session: Session, found: Inspection) -> Inspection:
-    """What is there and could not be read is looked at again from the sides, until it can be."""
+    """What is there and could not be read is looked at again from the sides, until it can be.
+
+    From close by first where the trouble is that two states look alike.
+    """
     unread = [reading for reading in found.readings.values() if reading.present and not reading.answered]
     if len(unread) > MOST_UNREAD:
         return found
     looks = {reading.name: [reading] for reading in unread}
+    alike = [reading.name for reading in unread if reading.reason in (NO_EDGE, ALIKE)]
+    hidden = [name for name in looks if name not in alike]
     pictures = list(found.pictures)
-    for _, group in close_up_groups([session.panel.object(name) for name in looks], session.lens()):
-        pictures += _from_the_sides(session, group, looks)
+    for names, sides, distance_m in ((hidden, tuple(SIDES), CLOSE_UP_M), (alike, FOR_ALIKE, NEAR_M)):
+        for _, group in close_up_groups([session.panel.object(name) for name in names], session.lens(), distance_m):
+            pictures += _from_the_sides(session, group, looks, sides)
     told = {name: _told(each) for name, each in looks.items()}
     for name in told:
         forget_reading(session, name)  # one look alone may have said what the others contradict
@@ -120,17 +128,24 @@ def look_past(session: Session, found: Inspection) -> Inspection:
 
 
 def _from_the_sides(
-    session: Session, group: Collection[str], looks: dict[str, list[ObjectReading]]
+    session: Session,
+    group: Collection[str],
+    looks: dict[str, list[ObjectReading]],
+    sides: Sequence[str],
 ) -> Iterator[AnnotatedView]:
     """Pictures from each side that the arm reaches and the panel shows at, until all is told; readings go to `looks`."""
+    flange_from_camera = session.mount(session.first(DeviceKind.CAMERA)).parent_from_child
+    camera_from_tips = flange_from_camera.inv() * workcell(session).flange_from_grip
+    pose = session.known_panel().parent_from_child
     middle_m = np.mean([session.panel.object(name).point_m for name in group], axis=0)
     unread = list(group)
-    for side, turns in SIDES.items():
+    for side in sides:
         title = f"{', '.join(unread)} from {side}"
         session.progress(1.0, "look past what hides it", title)
-        poses = side_poses(session.known_panel().parent_from_child, tuple(middle_m), turns)
+        poses = poses_from(pose, tuple(middle_m), side)
+        clear = (view for view in poses if (pose.inv() * view * camera_from_tips).translation[2] >= TIPS_M)
         try:
-            go_to_camera_view(session, poses, name=title[:60])
+            go_to_camera_view(session, clear, name=title[:60])
             settle(session)
             closer = inspect_here(session, unread, title=title)
         except (PerceptionError, Unreachable):

@@ -22,6 +22,9 @@ SIDES = {  # turns about the panel's x and y; round the object, for the way acro
     "above": (-1.0, 0.0),
 }
 SIDE_RAD = (0.42, 0.32)  # readers stand a tilt of 0.5; a cable 30 mm before a display moves by 13 mm
+NEAR_M = 0.25  # aslant the fingers reach 10 cm ahead of the camera
+NEAR_SIDES = {"close by below": (0.45, 0.0), "close by the right": (0.0, 0.2)}  # tilts, rad
+FOR_ALIKE = (*NEAR_SIDES, "the right")  # where two states look alike from further off
 REACH_M = 0.045  # half size that a close-up leaves round an object's middle
 
 
@@ -86,6 +89,15 @@ def side_poses(
             for roll in (0.0, math.pi / 2, -math.pi / 2, math.pi):
                 tilt = (lean_rad * turns[0], lean_rad * turns[1])
                 yield facing(base_from_panel, point_m, distance_m, roll_rad=roll, tilt_rad=tilt)
+
+
+def poses_from(base_from_panel: RigidTransform, point_m: Sequence[float], side: str) -> Iterator[RigidTransform]:
+    """Camera poses from one of the `SIDES` or `NEAR_SIDES`, best first."""
+    if side in SIDES:
+        yield from side_poses(base_from_panel, point_m, SIDES[side])
+        return
+    for roll in (0.0, math.pi / 2, -math.pi / 2, math.pi):
+        yield facing(base_from_panel, point_m, NEAR_M, roll_rad=roll, tilt_rad=NEAR_SIDES[side])
 
 
 def close_up_groups(

@@ -17,6 +17,8 @@ SHADE_ODDS, SPOT_ODDS = (-1.5, 3.0), (-2.5, 6.0)  # a cap a pixel beside its pla
 BELOW_FROM, BELOW_SCALE, BELOW_ODDS = 0.0075, 0.0015, 4.5
 ALONE = 1.3  # log odds at most, of a shade without a face, and of no shine without a ring
 MODEL_SHARE = 0.25
+NO_EDGE = "the cap's edge cannot be found: come closer or add light"
+ALIKE = "pressed and released look alike from here: look from the side or closer"
 UNSEEN = "the button cannot be seen (glare, shadow or cover): change the angle or the light"
 
 
@@ -35,14 +37,11 @@ def read_cap(patch: Patch, spec: Button | Mushroom) -> Status:
         return refused(UNSEEN)
     evidence = _by_height(patch, spec) if by_height else _by_shade(patch, R)
     if evidence is None:
-        return refused(UNSEEN if seen < 0.4 else "the cap's edge cannot be found: come closer or add light")
+        return refused(UNSEEN if seen < 0.4 else NO_EDGE)
     confidence = float(1.0 / (1.0 + np.exp(-abs(evidence)))) * (1.0 if by_height else min(1.0, seen + 0.2))
     state = "pressed" if evidence < 0 else "released"
     if confidence < 0.75:
-        return doubted(
-            Status(state=state, confidence=max(0.0, 2 * confidence - 1)),
-            "pressed and released look alike from here: look from the side or closer",
-        )
+        return doubted(Status(state=state, confidence=max(0.0, 2 * confidence - 1)), ALIKE)
     return gated(Status(state=state, confidence=confidence))
 
 

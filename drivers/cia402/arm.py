@@ -33,7 +33,9 @@ from hal.registry import Context, takes
 
 NMT, SYNC, RPDO1, HEARTBEAT = 0x000, 0x080, 0x200, 0x700
 START, PRE_OPERATIONAL = 0x01, 0x80
-OPERATIONAL = 5
+OPERATIONAL, BOOT_UP = 5, 0
+IDLE_STATES = {4: "stopped", 0x7F: "pre-operational"}
+STARTS_S = 0.2  # after the order to start: older heartbeats may still be on their way
 CONNECT_S = 6.0  # seven objects of each of six drives
 MOVING_RAD_PER_S = 1e-3
 MOST_OWED = 4  # SYNCs that a drive may leave unanswered before it is waited for
@@ -74,12 +76,16 @@ class Axis:
     status: int | None = None
     increments: int = 0
     velocity: int = 0
+    emergency: int = 0
     count: SyncCount = field(default_factory=SyncCount)
 
     @property
     def state(self) -> DriveState:
         """By its status word."""
         return DriveState.NOT_READY if self.status is None else state_of(self.status)
+
+    def __str__(self) -> str:
+        return f"{self.state}" + (f", emergency {self.emergency:04X}h" if self.emergency else "")
 
 
 class Cia402(StreamDevice[JointState]):
@@ -112,7 +118,8 @@ class Cia402(StreamDevice[JointState]):
         self._is_wanted = False  # operation enabled is wanted
         self._is_reset = False  # a fault reset was asked for
         self._commands = threading.RLock()
-        self._next_sync_s = 0.0
+        self._started_s = self._next_sync_s = 0.0
+        self._odd = ""
         self._syncs = self._published = 0
         self._sync_s = [0.0] * MOST_KNOWN
         self._next_beat_s = 0.0
@@ -177,11 +184,12 @@ class Cia402(StreamDevice[JointState]):
         link.write(self._codec.opening(o.bitrate), now_s() + self._answer_s)
         drain(link)
         self._send(link, NMT, bytes([PRE_OPERATIONAL, 0]))
-        self._set_up.run(SdoClient(link, self._codec, answer_s=self._answer_s))
+        self._set_up.run(SdoClient(link, self._codec, answer_s=self._answer_s, restarted=self._set_up.forget))
         self._axes = {node: Axis() for node in o.nodes}
         self._syncs = self._published = 0
+        self._odd = ""
         self._send(link, NMT, bytes([START, 0]))
-        self._next_sync_s = self._next_beat_s = now_s()
+        self._started_s = self._next_sync_s = self._next_beat_s = now_s()
 
     def _send(self, link: Link, id_: int, data: bytes = b"") -> None:
         link.write(self._codec.encode(CanFrame(id_, data)), now_s() + self._answer_s)
@@ -235,7 +243,7 @@ class Cia402(StreamDevice[JointState]):
             return FAULT_RESET if self._is_reset else DISABLE
         return towards_enabled(axis.state)
 
-    def receive(self, chunk: bytes, arrived_s: float) -> None:  # noqa: ARG002  # the SYNC stamps the states
+    def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Collect the states of one SYNC; mind emergencies and restarts."""
         for frame in self._codec.feed(chunk):
             node = frame.id & 0x7F
@@ -255,14 +263,29 @@ class Cia402(StreamDevice[JointState]):
                 case 0x580 if frame.data[1:4] == upload_request(*PROBES[axis.count.probes % len(PROBES)])[1:4]:
                     axis.count.probe_answered()
                     self._publish_when_complete()
+                case 0x180 | 0x280:
+                    self.errors += 1
+                    self._odd = f"; node {node} sends PDOs of {len(frame.data)} bytes, not 6"
                 case 0x080 if len(frame.data) == 8:
                     self._emergency(node, frame.data)
-                case 0x700 if frame.data == b"\x00":
-                    self._set_up.forget(node)
-                    raise NoAnswer(f"node {node} has restarted")
+                case 0x700 if len(frame.data) == 1:
+                    self._heard_beat(node, frame.data[0] & 0x7F, arrived_s)
+
+    def _heard_beat(self, node: int, state: int, arrived_s: float) -> None:
+        """A drive that is not operational sends no PDOs: to wait for them would only take longer."""
+        if state == BOOT_UP:
+            self._set_up.forget(node)
+            raise NoAnswer(f"node {node} has restarted")
+        if state in IDLE_STATES and arrived_s > self._started_s + STARTS_S:
+            raise NoAnswer(f"node {node} says that it is {IDLE_STATES[state]}")
+
+    def wire_counts(self) -> str:
+        """As any stream's, and which drives leave SYNCs unanswered."""
+        silent = ", ".join(str(node) for node, axis in self._axes.items() if axis.count.owed >= MOST_OWED)
+        return super().wire_counts() + self._odd + (f"; nodes that answer no SYNC: {silent}" if silent else "")
 
     def _emergency(self, node: int, data: bytes) -> None:
-        code = data[0] | data[1] << 8
+        code = self._axes[node].emergency = data[0] | data[1] << 8
         if code:  # 0000 says: error gone
             self._switch_off()
             self.fail(Refused(f"node {node} reports emergency {code:04X}h", code=code))
@@ -294,7 +317,7 @@ class Cia402(StreamDevice[JointState]):
             self._filter.close()
 
     def _not_enabled(self) -> DeviceFault | DeviceTimeout:
-        states = ", ".join(f"{node}: {axis.state}" for node, axis in self._axes.items())
+        states = ", ".join(f"{node}: {axis}" for node, axis in self._axes.items())
         if any(axis.state is DriveState.FAULT for axis in self._axes.values()):
             hint = "read object 603Fh; enable again resets the fault"
             return DeviceFault(f"{self.name}: a drive is in fault ({states})", hint=hint, device=self.name)

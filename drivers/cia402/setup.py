@@ -9,7 +9,10 @@ from typing import Protocol
 from drivers.transport.canbus import CanCodec, CanFrame
 from drivers.transport.link import Link, NoAnswer, Refused, now_s
 
-SDO_ANSWER, SDO_REQUEST = 0x580, 0x600
+SDO_ANSWER, SDO_REQUEST, HEARTBEAT = 0x580, 0x600, 0x700
+BOOT_UP = b"\x00"
+UPLOAD_SEGMENT, UPLOADED, DOWNLOADED, ABORTED = 0, 2, 3, 4  # first three bits of an answer
+EXPEDITED, LAST, TOGGLE = 0x02, 0x01, 0x10
 MAPPINGS = {0x1600: (0x60400010, 0x607A0020), 0x1A00: (0x60410010, 0x60640020)}
 CONSUMER, PRODUCER, MODE = 0x1016, 0x1017, 0x6060  # heartbeats and mode of operation
 # Objects that every configured drive has, asked in turn: so many that the answer to an old probe names another one.
@@ -47,45 +50,73 @@ class Objects(Protocol):
 
 
 class SdoClient:
-    """Expedited transfers; each is repeated by itself, as it names what it is about and changes nothing twice.
+    """Transfers of up to four bytes; each is repeated by itself, as it names what it is about and changes nothing twice.
 
     Args:
         answer_s: how long an answer is waited for.
+        restarted: is told which node has started again meanwhile.
 
     Raises:
         NoAnswer: nobody answers as that node. Refused: SDO abort.
     """
 
-    def __init__(self, link: Link, codec: CanCodec, *, answer_s: float = SDO_S) -> None:
+    def __init__(
+        self, link: Link, codec: CanCodec, *, answer_s: float = SDO_S, restarted: Callable[[int], None] = lambda _: None
+    ) -> None:
         self._link = link
         self._codec = codec
         self._answer_s = answer_s
+        self._restarted = restarted
 
     def upload(self, node: int, index: int, sub: int) -> int:
         """Value of an object, unsigned."""
-        answer = self._transfer(node, upload_request(index, sub))
+        answer = self._transfer(node, upload_request(index, sub), UPLOADED)
+        if not answer[0] & EXPEDITED:
+            return int.from_bytes(self._segments(node), "little")
         size = 4 - (answer[0] >> 2 & 3)
         return int.from_bytes(answer[4 : 4 + size], "little")
 
     def download(self, node: int, index: int, sub: int, data: bytes) -> None:
         """Write an object of up to four bytes."""
         command = 0x23 | (4 - len(data)) << 2
-        self._transfer(node, struct.pack("<BHB", command, index, sub) + data.ljust(4, b"\0"))
+        self._transfer(node, struct.pack("<BHB", command, index, sub) + data.ljust(4, b"\0"), DOWNLOADED)
 
-    def _transfer(self, node: int, request: bytes) -> bytes:
+    def _segments(self, node: int) -> bytes:
+        """What a drive sends in pieces though it would fit into its first answer, as it may."""
+        data, toggle = b"", 0
+        while True:
+            answer = self._exchange(node, bytes([0x60 | toggle, *7 * [0]]), lambda a: a[0] >> 5 in (0, ABORTED))
+            if answer is None or answer[0] & TOGGLE != toggle:
+                raise NoAnswer(f"node {node} ends a segmented transfer before its time")
+            self._checked(node, answer)
+            data += answer[1 : 8 - (answer[0] >> 1 & 7)]
+            if answer[0] & LAST:
+                return data
+            toggle ^= TOGGLE
+
+    def _transfer(self, node: int, request: bytes, kind: int) -> bytes:
+        def is_answer(answer: bytes) -> bool:
+            return answer[0] >> 5 in (kind, ABORTED) and answer[1:4] == request[1:4]
+
         for _ in range(ATTEMPTS):
-            self._link.write(self._codec.encode(CanFrame(SDO_REQUEST + node, request)), now_s() + self._answer_s)
-            until_s = now_s() + self._answer_s
-            while chunk := self._link.read(until_s):
-                for frame in self._codec.feed(chunk):
-                    is_answer = frame.id == SDO_ANSWER + node and len(frame.data) == 8
-                    if is_answer and frame.data[1:4] == request[1:4]:
-                        return self._checked(node, frame.data)
+            if (answer := self._exchange(node, request, is_answer)) is not None:
+                return self._checked(node, answer)
         raise NoAnswer(f"node {node} does not answer; is it powered, and is the bit rate right?")
+
+    def _exchange(self, node: int, request: bytes, is_answer: Callable[[bytes], bool]) -> bytes | None:
+        self._link.write(self._codec.encode(CanFrame(SDO_REQUEST + node, request)), now_s() + self._answer_s)
+        until_s, found = now_s() + self._answer_s, None
+        while found is None and (chunk := self._link.read(until_s)):
+            for frame in self._codec.feed(chunk):
+                if frame.id & 0x780 == HEARTBEAT and frame.data == BOOT_UP:
+                    self._restarted(frame.id & 0x7F)
+                if frame.id == SDO_ANSWER + node and len(frame.data) == 8 and is_answer(frame.data):
+                    found = frame.data
+        return found
 
     @staticmethod
     def _checked(node: int, answer: bytes) -> bytes:
-        if answer[0] != 0x80:
+        if answer[0] >> 5 != ABORTED:
             return answer
         code = int.from_bytes(answer[4:], "little")
         index = int.from_bytes(answer[1:3], "little")
@@ -107,6 +138,7 @@ class SetUp:
     def __init__(self, nodes: Iterable[int], *, consumer: int, producer_ms: int) -> None:
         self._consumer = consumer
         self._done = dict.fromkeys(nodes, 0)
+        self._restarts = 0
         self._steps: tuple[Callable[[Objects, int], None], ...] = (
             lambda sdo, node: sdo.download(node, CONSUMER, 1, struct.pack("<I", consumer)),
             lambda sdo, node: sdo.download(node, PRODUCER, 0, struct.pack("<H", producer_ms)),
@@ -119,14 +151,16 @@ class SetUp:
         for node, done in self._done.items():
             if done and sdo.upload(node, CONSUMER, 1) != self._consumer:
                 self.forget(node)
-        for node in self._done:
-            for step in self._steps[self._done[node] :]:
-                step(sdo, node)
-                self._done[node] += 1
+        while unfinished := [node for node, done in self._done.items() if done < len(self._steps)]:
+            node, restarts = unfinished[0], self._restarts
+            self._steps[self._done[node]](sdo, node)
+            self._done[node] += restarts == self._restarts
 
     def forget(self, node: int) -> None:
-        """The drive has started again."""
-        self._done[node] = 0
+        """The drive has started again, maybe while it was set up."""
+        if node in self._done:
+            self._done[node] = 0
+            self._restarts += 1
 
     @staticmethod
     def _mapping_check(index: int, sub: int) -> Callable[[Objects, int], None]:
@@ -135,6 +169,9 @@ class SetUp:
         def check(sdo: Objects, node: int) -> None:
             mapped = sdo.upload(node, index, sub)
             if mapped != wanted:
-                raise Refused(f"node {node}: object {index:04X}h:{sub} maps {mapped:08X}, not {wanted:08X}", code=index)
+                what = f"node {node}: object {index:04X}h:{sub} maps {mapped:08X}, not {wanted:08X}"
+                raise Refused(
+                    what, code=index, hint="give its PDOs the mapping of docs/drivers.md with the maker's tool"
+                )
 
         return check

@@ -23,6 +23,7 @@ SLCAN_RATES = {rate: code for code, rate in enumerate((10, 20, 50, 100, 125, 250
 RAW = struct.Struct("<IB3x8s")
 NO_DATA = 0xE0000000  # flags of extended identifiers, remote requests and error frames (linux/can.h)
 LONGEST_LINE = 32
+STAMP_CHARS = 4  # milliseconds, where the adapter was told once to add them
 TCP = "tcp://"
 
 
@@ -84,7 +85,10 @@ class CanCodec(Protocol):
 
 
 class Slcan:
-    """`tIIILDD..` and a carriage return a frame (Lawicel CAN232 manual); `z`, a bare return and BEL acknowledge."""
+    """`tIIILDD..` and a carriage return a frame, maybe with a time stamp (Lawicel CAN232 manual).
+
+    `z`, a bare return and BEL acknowledge.
+    """
 
     def __init__(self) -> None:
         self._buffer = b""
@@ -109,11 +113,16 @@ class Slcan:
     def _line(self, line: bytes) -> CanFrame | None:
         try:
             identifier, length = int(line[1:4], 16), int(line[4:5])
-            data = bytes.fromhex(line[5:].decode("ascii"))
+            data = bytes.fromhex(line[5 : 5 + 2 * length].decode("ascii"))
         except ValueError:
             self.bad += 1
             return None
-        if length != len(data) or length > 8 or identifier > 0x7FF or len(line) != 5 + 2 * length:
+        if (
+            length != len(data)
+            or length > 8
+            or identifier > 0x7FF
+            or len(line) - 2 * length not in (5, 5 + STAMP_CHARS)
+        ):
             self.bad += 1
             return None
         return CanFrame(identifier, data)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from drivers.transport.link import Link, RecordingEnded, now_s
+from drivers.transport.link import Cancellable, Link, RecordingEnded, now_s
 from hal.errors import ConfigError, DeviceUnavailable
 
 EARLY_S = 0.01  # a replay is never quite in step; what is due so soon was there when the recorded driver looked
@@ -57,6 +57,11 @@ class CaptureLink:
     def is_present(self) -> bool:
         """As the link inside."""
         return self.inner.is_present()
+
+    def cancel(self) -> None:
+        """As the link inside, where it can."""
+        if isinstance(self.inner, Cancellable):
+            self.inner.cancel()
 
     def close(self) -> None:
         """Close link and file."""

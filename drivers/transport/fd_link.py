@@ -10,6 +10,7 @@ import threading
 from drivers.transport.link import LinkLost, NoAnswer, now_s
 
 CHUNK_BYTES = 65_536
+LOOK_UP_S = 0.02  # how long a read that is cancelled may go on
 SELECT_MOST = 1024  # descriptors that `select` knows
 
 
@@ -20,6 +21,7 @@ class FdLink:
         self._fd = fd
         self._name = name
         self.received = 0  # bytes so far: tells a dead line from one whose bytes nobody understands
+        self._is_cancelled = False
         self._write_lock = threading.Lock()
         self._close_lock = threading.Lock()
         self._poll_in, self._poll_out = select.poll(), select.poll()
@@ -39,7 +41,7 @@ class FdLink:
     def read(self, until_s: float) -> bytes:
         """At least one byte, or `b""` at `until_s`."""
         try:
-            if not self._is_readable(max(0.0, until_s - now_s())):
+            if not self._has_bytes(until_s):
                 return b""
             data = os.read(self._fd, CHUNK_BYTES)
         except BlockingIOError:
@@ -50,6 +52,19 @@ class FdLink:
             raise LinkLost(f"{self._name}: the far side hung up")
         self.received += len(data)
         return data
+
+    def _has_bytes(self, until_s: float) -> bool:
+        while not self._is_cancelled:
+            wait_s = max(0.0, until_s - now_s())
+            if self._is_readable(min(wait_s, LOOK_UP_S)):
+                return True
+            if wait_s <= LOOK_UP_S:
+                return False
+        raise LinkLost(f"{self._name} is being closed")
+
+    def cancel(self) -> None:
+        """End a read that waits, and all later ones, with `LinkLost`; from any thread. The owner closes the link."""
+        self._is_cancelled = True
 
     def _is_readable(self, wait_s: float) -> bool:
         # `poll` waits whole milliseconds, rounded up: a SYNC that is due meanwhile would leave up to 1 ms late.

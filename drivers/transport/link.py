@@ -7,7 +7,7 @@ Times here are `time.monotonic` seconds: a wire does not know the cell's clock. 
 from __future__ import annotations
 
 import time
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 FLOOD_BYTES = 1 << 20  # more than any buffer between a device and us holds
 
@@ -82,6 +82,15 @@ class Link(Protocol):
 
     def close(self) -> None:
         """Release the port; a second call does nothing."""
+        ...
+
+
+@runtime_checkable
+class Cancellable(Protocol):
+    """A link whose reads another thread can end: a set-up may wait for answers for seconds, `close` must not."""
+
+    def cancel(self) -> None:
+        """End a read that waits, and all later ones, with `LinkLost`."""
         ...
 
 

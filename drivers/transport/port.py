@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
 
-from drivers.transport.link import LinkLost, WireError
+from drivers.transport.link import Cancellable, LinkLost, WireError
 from hal.errors import CellError
 
 log = logging.getLogger(__name__)
@@ -68,6 +68,7 @@ class Port(Generic[L]):
         self._tenant = tenant
         self._closing = threading.Event()
         self._link: L | None = None
+        self._held: L | None = None  # also while it is being set up
         self._sessions = 0
         self._realtime_priority = realtime_priority
         self.is_realtime = False
@@ -90,6 +91,9 @@ class Port(Generic[L]):
     def close(self) -> None:
         """End the thread and release the port; bounded, idempotent."""
         self._closing.set()
+        held = self._held
+        if isinstance(held, Cancellable):
+            held.cancel()
         if self._thread.is_alive() and self._thread is not threading.current_thread():
             self._thread.join(JOIN_S)
 
@@ -110,19 +114,24 @@ class Port(Generic[L]):
         """Tell the tenant, wait, and say how long the next wait is."""
         retry_s = FIRST_RETRY_S if self._link is not None else min(2.0 * retry_s, LAST_RETRY_S)
         self._link = None
+        if self._closing.is_set():
+            return retry_s  # it was let go
         self._tenant.lost(error)
         self._closing.wait(retry_s)
         return retry_s
 
     def _session(self) -> None:
-        link = self._open_link()
+        link = self._held = self._open_link()
         try:
+            if self._closing.is_set():
+                return  # it was closed while the link was opened, and not cancelled
             self._tenant.set_up(link)
             self._link = link
             self._sessions += 1
             while not self._closing.is_set():
                 self._tenant.serve(link)
         finally:
+            self._held = None
             link.close()
 
 

@@ -7,7 +7,7 @@ import os
 import socket
 
 from drivers.transport.fd_link import CHUNK_BYTES, FdLink
-from drivers.transport.link import LinkLost, now_s
+from drivers.transport.link import LinkLost
 from hal.errors import DeviceUnavailable
 
 
@@ -28,7 +28,7 @@ class DatagramLink(SocketLink):
     def read(self, until_s: float) -> bytes:
         """One datagram; a far side that is not there yet counts as silence, not as loss."""
         try:
-            if self._poll_in.poll(max(0.0, (until_s - now_s()) * 1e3)):
+            if self._has_bytes(until_s):
                 data = self._sock.recv(CHUNK_BYTES)
                 self.received += len(data)
                 return data

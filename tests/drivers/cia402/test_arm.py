@@ -19,6 +19,7 @@ from drivers.emulators.scripted import ScriptedArm
 from drivers.kinds.arms import kinematics_of
 from drivers.tfmini_i import CanTfminiOptions
 from drivers.transport.canbus import RAW, CanFrame, RawCan, Slcan
+from drivers.transport.link import NoAnswer
 from drivers.transport.options import read_options
 from hal.conformance import ArmContract, Rig
 from hal.errors import CellError, ConfigError, DeviceFault, DeviceUnavailable, MotionRefused
@@ -139,6 +140,40 @@ def test_a_repeated_pdo_is_not_taken_for_the_answer_to_the_next_sync() -> None:
     assert link.written.count(b"t0800\r") == 4
     assert np.ptp(seen, axis=1).max() < 0.5, "joints of different moments"
     np.testing.assert_allclose(seen[-1], 4)
+
+
+def lone_arm() -> Cia402:
+    options = {"channel": "/dev/unread", "kinematics": kinematics_of(ScriptedArm().capabilities())}
+    context = Context(name="arm")
+    return Cia402(context, read_options(context, options, Cia402Options))
+
+
+@pytest.mark.parametrize(("state", "told"), [(4, "stopped"), (0x7F, "pre-operational")])
+def test_a_drive_whose_heartbeat_says_that_it_is_not_operational_is_named_at_once(state: int, told: str) -> None:
+    with pytest.raises(NoAnswer, match=f"node 3 says that it is {told}"):
+        lone_arm().receive(Slcan().encode(CanFrame(0x703, bytes([state]))), 10.0)
+
+
+def test_pdos_of_a_wrong_length_are_named() -> None:
+    device = lone_arm()
+    device.receive(Slcan().encode(CanFrame(0x182, bytes(4))), 10.0)
+    assert "node 2 sends PDOs of 4 bytes, not 6" in device.wire_counts()
+    assert device.errors == 1
+
+
+def test_drives_that_answer_no_sync_and_their_emergencies_are_named() -> None:
+    device, link = lone_arm(), cast(Any, Unread())
+    for _ in range(5):
+        device._cycle(link)
+        for node in (1, 2, 3, 5, 6):
+            device.receive(pdos(node, 7), 0.0)
+    assert device.wire_counts().endswith("nodes that answer no SYNC: 4")
+    device.receive(Slcan().encode(CanFrame(0x085, bytes.fromhex("1186200000000000"))), 0.0)
+    assert "5: operation_enabled, emergency 8611h" in str(device._not_enabled())
+
+
+def test_lines_with_time_stamps_are_frames_too() -> None:
+    assert Slcan().feed(b"t1812AABB1F40\rt1812AABB\r") == 2 * [CanFrame(0x181, b"\xaa\xbb")]
 
 
 def test_enabling_takes_the_measured_position_as_target() -> None:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import itertools
 import struct
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.cia402.setup import CONSUMER, MAPPINGS, SetUp
+from drivers.cia402.setup import CONSUMER, MAPPINGS, SdoClient, SetUp
 from drivers.cia402.sync import PDOS, PROBE_S, SyncCount
+from drivers.transport.canbus import CanFrame, Slcan
 from drivers.transport.link import NoAnswer, Refused
+from tests.drivers.rigs import ScriptLink
 
 PERIOD_S = 0.01
 Fate = int | None
@@ -216,10 +219,12 @@ class Drives:
             for node in (1, 2)
         }
         self.transfers = 0
+        self.at_transfer: Callable[[], None] = lambda: None
         self._breaks = breaks
 
     def _count(self) -> None:
         self.transfers += 1
+        self.at_transfer()
         if self.transfers in self._breaks:
             raise NoAnswer("unplugged")
 
@@ -260,6 +265,44 @@ def test_a_drive_that_was_switched_off_meanwhile_begins_anew() -> None:
     drives.transfers = 0
     set_up.run(drives)
     assert drives.transfers == 1 + 7
+
+
+def test_a_drive_that_restarts_while_another_is_set_up_is_set_up_again() -> None:
+    drives = Drives(breaks=set())
+    set_up = set_up_of(drives)
+
+    def restart() -> None:
+        if drives.transfers == 10:
+            drives.objects[1].pop((CONSUMER, 1))
+            set_up.forget(1)
+
+    drives.at_transfer = restart
+    set_up.run(drives)
+    assert drives.objects[1][CONSUMER, 1] == 0x7F0064
+
+
+class SdoLine(ScriptLink):
+    """An slcan line whose far side answers each request with some frames."""
+
+    def __init__(self, *frames: list[CanFrame]) -> None:
+        super().__init__(*(b"".join(map(Slcan().encode, answer)) for answer in frames))
+
+
+def test_an_upload_in_segments_is_put_together() -> None:
+    link = SdoLine(
+        [CanFrame(0x581, bytes.fromhex("4100160104000000"))],
+        [CanFrame(0x581, bytes.fromhex("0810007a00000000"))],  # three bytes, more to come
+        [CanFrame(0x581, bytes.fromhex("1d60000000000000"))],  # one byte, the last
+    )
+    assert SdoClient(link, Slcan()).upload(1, 0x1600, 1) == 0x607A0010
+    assert [Slcan().feed(line)[0].data[0] for line in link.written] == [0x40, 0x60, 0x70]
+
+
+def test_a_boot_up_between_sdo_answers_is_told() -> None:
+    restarted: list[int] = []
+    link = SdoLine([CanFrame(0x702, b"\0"), CanFrame(0x581, bytes.fromhex("4b17100032000000"))])
+    assert SdoClient(link, Slcan(), restarted=restarted.append).upload(1, 0x1017, 0) == 50
+    assert restarted == [2]
 
 
 def test_a_drive_that_maps_other_objects_is_refused() -> None:

@@ -36,6 +36,31 @@ class Tenant:
         self.losses.append(str(error))
 
 
+class Waiter(Tenant):
+    """Waits a minute for an answer in its set-up."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_waiting = threading.Event()
+
+    def set_up(self, link: Link) -> None:
+        self.is_waiting.set()
+        link.read(later(60.0))
+
+
+def test_a_port_is_closed_in_the_middle_of_a_set_up_that_waits() -> None:
+    far, tenant = PtyPort("line"), Waiter()
+    port = Port("p", open_link=lambda: open_serial(str(far.path), baud=9600, device="p"), tenant=tenant)
+    try:
+        port.start()
+        assert tenant.is_waiting.wait(5.0)
+        port.close()
+        assert not port._thread.is_alive()
+        assert tenant.losses == [], "it was let go, not lost"
+    finally:
+        far.close()
+
+
 def test_a_port_repeats_the_set_up_after_each_loss_without_a_leak() -> None:
     far = PtyPort("line")
     tenant = Tenant()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
@@ -9,6 +10,7 @@ from scipy.spatial.transform import RigidTransform
 from benchmarks.vision_drawing import Disturbance, camera, draw_panel, looking_at
 from hal.geometry import certain
 from hal.panel import Handwheel, Light, Panel
+from perception.vision.patch import Patch
 from perception.vision.reading import Status
 from perception.vision.status.handwheel import read_handwheel
 from perception.vision.status.pointer import wrapped
@@ -53,3 +55,33 @@ def test_where_nothing_shows_nothing_is_read() -> None:
     image = np.full((480, 640), 120, np.uint8)
     status = read_handwheel(patch_of(image, image, view, wheel, np.zeros(2)), wheel)
     assert not status.answered
+
+
+@pytest.mark.parametrize(("mark", "is_sure"), [(230, True), (None, False)])
+def test_a_spoke_that_differs_within_the_wheels_own_grays_is_not_surely_the_marked_one(
+    mark: int | None, is_sure: bool
+) -> None:
+    """A thing in front made one spoke unlike the others, and the mark of another was hidden: sure, and a quarter turn off."""
+    px_per_m, middle, R = 2000.0, np.full(2, 99.5), 60.0
+    wheel = Handwheel(name="trim", position_m=(0.0, 0.0), radius_m=0.030, rim_m=0.004, height_m=HEIGHT_M, spokes=4)
+    picture = np.full((200, 200), 170, np.uint8)
+
+    def point(angle_rad: float, radius: float) -> list[int]:
+        place = middle + radius * R * np.array([np.sin(angle_rad), -np.cos(angle_rad)])
+        return [round(16 * float(k)) for k in place]
+
+    for k in range(4):
+        gray = 70 if mark is not None or k else 125
+        cv2.line(picture, point(0.0, 0.0), point(ANGLE_RAD + k * np.pi / 2, 1.0), gray, 11, cv2.LINE_AA, 4)
+    cv2.circle(picture, point(0.0, 0.0), round(16 * R), 70, 12, cv2.LINE_AA, 4)
+    if mark is not None:
+        cv2.circle(picture, point(ANGLE_RAD, 1.0), 16 * 6, mark, -1, cv2.LINE_AA, 4)
+    noise = np.random.default_rng(0).normal(0.0, 2.0, picture.shape)
+    gray = np.clip(np.round(cv2.GaussianBlur(picture, (0, 0), 1.3) + noise), 0, 255).astype(np.uint8)
+    patch = Patch(
+        gray=gray, colour=None, inside=np.ones(gray.shape, bool), px_per_m=px_per_m, image_px_per_m=px_per_m / 1.5,
+        origin_px=middle, parallax_px_per_m=np.zeros(2), growth_per_m=0.0, plane_z_m=0.0,
+    )  # fmt: skip
+    status = read_handwheel(patch, wheel)
+    assert (status.confidence >= 0.8) is is_sure
+    assert not is_sure or status.value == pytest.approx(ANGLE_RAD, abs=0.03)

@@ -60,3 +60,15 @@ def test_a_handle_between_its_states_is_refused(off_rad: float) -> None:
     for seed, shadow in enumerate((None, 60.0)):
         status = read_lever(patch_of(drawn(off_rad, 90.0, shadow), seed), LEVER)
         assert not status.answered
+
+
+@pytest.mark.parametrize(("handle", "state"), [(84.0, "open"), (100.0, None)])
+def test_a_handle_beside_a_glare_is_read_and_the_glare_alone_is_none(handle: float, state: str | None) -> None:
+    """The plate on the glare's side is far brighter than the handle, that on the other side hardly."""
+    picture = drawn(float(np.pi / 2), 2 * handle, None) / 2
+    v, u = np.mgrid[:SIZE, :SIZE]
+    picture += 120.0 * np.exp(-((u - 220.0) ** 2 + (v - 90.0) ** 2) / (2 * 45.0**2))
+    for seed in range(3):
+        status = read_lever(patch_of(np.asarray(picture, np.float32), seed), LEVER)
+        assert status.state == state
+        assert state is None or status.confidence < 0.8

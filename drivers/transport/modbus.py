@@ -27,7 +27,21 @@ EXCEPTIONS = {
     10: "gateway has no path",
     11: "gateway target does not answer",
 }
+BUSY = (5, 6)
+BUSY_REST_S = 0.01
+HINTS = {
+    1: "it lacks a function that the driver needs: is it the right device?",
+    2: "it has fewer points or other registers than the options say",
+    3: "it has fewer points or other registers than the options say",
+    4: "look at the device itself",
+    10: "check unit and wiring behind the gateway",
+    11: "check unit and wiring behind the gateway",
+}
 RTU_GAP_S = 0.00175  # 3.5 characters above 19200 baud (Modbus over serial line V1.02, 2.5.1.1)
+
+
+class Busy(NoAnswer):
+    """The device asks for more time."""
 
 
 class ModbusMaster(ABC):
@@ -78,14 +92,19 @@ class ModbusMaster(ABC):
         Each exchange is repeated by itself, so that a work of several does not begin anew with every lost frame.
 
         Raises:
-            NoAnswer: nothing that fits came in time. Refused: the device answered with an exception. LinkLost.
+            NoAnswer: nothing that fits came in time, or the device stayed busy.
+            Refused: the device answered with an exception.
+            LinkLost.
         """
         while True:
             try:
                 return self._exchange(unit, request, answer_head, rest, until_s)
-            except NoAnswer:
-                if until_s - now_s() < 0.5 * self._timeout_s:
-                    raise
+            except NoAnswer as error:
+                left_s = until_s - now_s()
+                if left_s < (self.attempt_s if isinstance(error, Busy) else 0.5 * self._timeout_s):
+                    raise  # a busy device is not polled again and again while others wait for the bus
+                if isinstance(error, Busy):
+                    self._link.read(now_s() + BUSY_REST_S)
 
     @property
     def attempt_s(self) -> float:
@@ -112,12 +131,17 @@ class ModbusMaster(ABC):
 
     def _silence(self, buffer: bytes, unit: int) -> NoAnswer:
         got = f"{len(buffer)} bytes that do not fit: {buffer[:16].hex(' ')}" if buffer else "not one byte"
-        return NoAnswer(f"{self._link.name}, unit {unit}: no answer, {got}")
+        late = f"; bytes that came later than `timeout_s` = {self._timeout_s:g} s: {self.late_bytes}"
+        return NoAnswer(f"{self._link.name}, unit {unit}: no answer, {got}{late if self.late_bytes else ''}")
 
 
-def refused(unit: int, code: int) -> Refused:
+def exception(unit: int, function: int, code: int) -> Refused | Busy:
     """The error for a Modbus exception."""
-    return Refused(f"unit {unit} reports exception {code} ({EXCEPTIONS.get(code, 'not in the standard')})", code=code)
+    text = EXCEPTIONS.get(code, "not in the standard")
+    what = f"unit {unit} reports exception {code} ({text}) to function {function & 0x7F}"
+    if code in BUSY:
+        return Busy(what)
+    return Refused(what, code=code, hint=HINTS.get(code, "look the code up in the device's manual"))
 
 
 class ModbusTcp(ModbusMaster):
@@ -143,7 +167,7 @@ class ModbusTcp(ModbusMaster):
         bad = struct.pack(">HHHBB", self._tid, 0, 3, unit, head[0] | 0x80)
         at = buffer.find(bad)
         if 0 <= at < len(buffer) - len(bad):
-            raise refused(unit, buffer[at + len(bad)])
+            raise exception(unit, head[0], buffer[at + len(bad)])
         return None
 
 
@@ -215,7 +239,7 @@ class ModbusRtu(ModbusMaster):
 
     def _probe(self, unit: int, function: int, until_s: float) -> None:
         size = 2 if function >= READ_HOLDING else 1
-        with contextlib.suppress(Refused):  # an exception is an answer too
+        with contextlib.suppress(Refused, Busy):  # an exception is an answer too
             request = struct.pack(">BHH", function, 0, 1)
             self._transact(unit, request, bytes([function, size]), size, until_s)
 
@@ -244,7 +268,7 @@ class ModbusRtu(ModbusMaster):
                     self._quiet_since_s = now_s()
                     self._unanswered = {lost for lost in self._unanswered if lost[0] != unit}
                     if start is bad:
-                        raise refused(unit, frame[2])
+                        raise exception(unit, head[0], frame[2])
                     return frame[len(good) : -2]
                 at = buffer.find(start, at + 1)
         return None

@@ -81,6 +81,34 @@ def test_exceptions_say_what_they_mean() -> None:
     assert caught.value.code == 2
 
 
+def test_a_busy_device_is_asked_again_while_there_is_time() -> None:
+    link = ScriptLink(rtu("098f 06"), rtu("098f 05"), rtu("090f 0000 0002"))
+    ModbusRtu(link, timeout_s=0.01, gap_s=0.0).write_coils(unit=9, address=0, values=[True, False], until_s=later())
+    assert len(link.written) == 3
+
+
+def test_a_device_that_is_busy_in_a_poll_leaves_the_bus_to_others() -> None:
+    link = ScriptLink(*4 * [rtu("0982 06")])
+    master = ModbusRtu(link, timeout_s=0.01, gap_s=0.0)
+    with pytest.raises(NoAnswer, match=r"exception 6 \(device busy\) to function 2"):
+        master.read_bits(unit=9, address=0, count=2, until_s=later(master.attempt_s))
+    assert len(link.written) == 1
+
+
+def test_exceptions_name_the_function_and_a_remedy() -> None:
+    master = ModbusRtu(ScriptLink(rtu("0982 02")), timeout_s=0.01, gap_s=0.0)
+    with pytest.raises(Refused, match=r"exception 2 \(no such address\) to function 2") as refused:
+        master.read_bits(unit=9, address=0, count=2, until_s=later())
+    assert "fewer points" in refused.value.hint
+
+
+def test_answers_that_come_too_late_are_told_with_the_option_that_waits_longer() -> None:
+    link = ScriptLink(b"")
+    link.ready = rtu("0902 01 55")  # of an earlier request
+    with pytest.raises(NoAnswer, match=r"later than `timeout_s` = 0.01 s: 6"):
+        ModbusRtu(link, timeout_s=0.01, gap_s=0.0).read_bits(unit=9, address=0, count=2, until_s=later(0.0))
+
+
 def test_a_device_that_was_slow_to_every_question_is_not_believed_until_it_has_finished() -> None:
     stale, fresh = rtu("09 04 02 00 01"), rtu("09 04 02 00 02")
     link = ScriptLink()

@@ -1,8 +1,8 @@
-"""A line scanner on the moving wrist as a range camera: each beam is placed where the wrist was when it was measured.
+"""A line scanner on the moving wrist: each beam is placed where the wrist was when it was measured.
 
     base_point = base_from_wrist(t) wrist_from_scanner r (sin a, 0, cos a),   t = end of scan - (1 - a's part of a turn) T
 
-The points of a sweep are then seen from one place as an image of depths, the nearest of each pixel.
+`perception/range/from_points.py` makes an image of depths of the points.
 """
 
 from __future__ import annotations
@@ -105,23 +105,3 @@ def sweep_points(
     """All points of a sweep in the base frame."""
     parts = [scan_points(scan, c, track, wrist_from_scanner) for scan in scans]
     return np.concatenate(parts) if parts else np.empty((0, 3))
-
-
-def seen_from(base_points_m: Points, base_from_view: RigidTransform, c: RangeScannerCapabilities) -> RangeImage:
-    """The depth image of these points from one place: the nearest along z in each pixel, NaN where none falls.
-
-    Args:
-        c: geometry of the wanted image, pinhole or orthographic.
-
-    Raises:
-        InvalidRequest: the wanted image is a line.
-    """
-    if c.projection == "polar":
-        raise InvalidRequest("a sweep is shown as an image", hint="ask for pinhole or orthographic")
-    x, y, z = base_from_view.inv().apply(base_points_m).T if len(base_points_m) else np.empty((3, 0))
-    scale = 1.0 / np.where(z > 0.0, z, np.nan) if c.projection == "pinhole" else np.ones_like(z)
-    u, v = np.round(c.cx + c.fx * x * scale), np.round(c.cy + c.fy * y * scale)
-    inside = (u >= 0) & (u < c.width) & (v >= 0) & (v < c.height) & (z >= c.min_range_m) & (z <= c.max_range_m)
-    depth_m = np.full((c.height, c.width), np.inf)
-    np.minimum.at(depth_m, (v[inside].astype(np.int64), u[inside].astype(np.int64)), z[inside])
-    return RangeImage(depth_m=np.where(np.isfinite(depth_m), depth_m, np.nan).astype(np.float32))

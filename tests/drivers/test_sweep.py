@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from drivers.sweep import PoseTrack, beam_times_s, scan_points, seen_from, sweep_points
+from drivers.sweep import PoseTrack, beam_times_s, scan_points, sweep_points
 from hal.devices import RangeImage, RangeScannerCapabilities
 from hal.errors import InvalidRequest, StaleReading
 from hal.geometry import identity, transform_rpy
@@ -84,16 +84,6 @@ def test_the_last_beam_ends_the_scan_and_the_scanner_turns_steadily() -> None:
     assert times_s[0] == pytest.approx(2.0 - 0.1 * 90 / 360)
 
 
-def test_the_image_shows_the_nearest_point_of_each_pixel() -> None:
-    points = np.array([[0.0, 0.0, 1.0], [0.001, 0.0, 0.7], [0.1, -0.05, 1.2], [9.0, 0.0, 1.0], [0.0, 0.0, 0.05]])
-    depth_m = seen_from(points, identity(), IMAGE).depth_m
-    assert depth_m.shape == (48, 64) and depth_m.dtype == np.float32
-    assert depth_m[24, 32] == pytest.approx(0.7)
-    assert depth_m[19, 42] == pytest.approx(1.2)
-    assert np.count_nonzero(np.isfinite(depth_m)) == 2
-    assert not np.any(np.isfinite(seen_from(np.empty((0, 3)), identity(), IMAGE).depth_m))
-
-
 def test_unseen_beams_and_invalid_scans_give_no_points() -> None:
     depth_m = np.full((1, LINE.width), np.nan, np.float32)
     depth_m[0, 90] = 1.0
@@ -110,8 +100,6 @@ def test_times_without_poses_are_refused() -> None:
         PoseTrack([0.0, 0.5], [identity(), identity()]).at(0.25)
 
 
-def test_only_lines_are_swept_and_only_images_shown() -> None:
+def test_only_lines_are_swept() -> None:
     with pytest.raises(InvalidRequest, match="lines"):
         scan_points(scan_of_the_plane(0.5), IMAGE, track(), WRIST_FROM_SCANNER)
-    with pytest.raises(InvalidRequest, match="image"):
-        seen_from(np.empty((0, 3)), identity(), LINE)

@@ -1,4 +1,4 @@
-"""Recordings, batches, pictures, polar sweeps and features."""
+"""Recordings, batches, pictures, images of points and features."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from perception.range import FeatureKind, SurfaceType, analyse
 from perception.range.batch import analyse_files, batch_range, recordings_in, tasks_of
 from perception.range.batch_results import write_results
 from perception.range.features import corner_point, crease_line
-from perception.range.polar import PolarScan, depth_image, fitting_view, sweep_points
+from perception.range.from_points import depth_image, fitting_view
 from perception.range.recordings import Reading, assumptions, load_recording
 from perception.range.render import MARK, picture, scene_json, write_ply, write_png
 from tests.perception.range.scenes import PINHOLE, ball_on_table, nearest, noisy, plane_depth
@@ -189,19 +189,19 @@ def test_json_picture_and_point_cloud(tmp_path):
     assert f"element vertex {116 * 160}".encode() in head and len(body) == 116 * 160 * 15
 
 
-def test_a_polar_sweep_becomes_a_plane_in_the_base_frame():
+def test_the_points_of_a_sweep_become_a_plane_in_the_base_frame():
     """A scanner on the wrist slides along y and looks down on a slab; every scan has its own arm pose."""
     rng = np.random.default_rng(0)
     angles = np.linspace(-0.4, 0.4, 181)
     down = Rotation.from_matrix(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]))
     scans = []
+    beams = np.stack([np.sin(angles), np.zeros(181), np.cos(angles)], axis=1)
     for k, y in enumerate(np.linspace(-0.2, 0.2, 161)):
         height = 0.6 + 0.02 * np.sin(k / 10)
         ranges = (height - 0.1) / np.cos(angles) + rng.normal(0, 0.0004, angles.shape)
         pose = RigidTransform.from_components([0.3, y, height], down)
-        scans.append(PolarScan(ranges_m=ranges, angles_rad=angles, base_from_scanner=pose))
-    points = sweep_points(scans)
-    assert points.shape == (181 * 161, 3)
+        scans.append(pose.apply(ranges[:, None] * beams))
+    points = np.concatenate(scans)
     view = RigidTransform.from_components([0.3, 0.0, 0.6], down)
     sensor = fitting_view(points, view, width_px=120, height_px=110)
     plane = analyse(depth_image(points, view, sensor), sensor).largest_plane()
@@ -210,15 +210,15 @@ def test_a_polar_sweep_becomes_a_plane_in_the_base_frame():
     assert view.apply(plane.primitive.point_m)[2] == pytest.approx(0.1, abs=0.0005)
 
 
-def test_sweeps_without_sense_are_refused():
-    pose = RigidTransform.identity()
-    with pytest.raises(InvalidRequest):
-        sweep_points([])
-    with pytest.raises(InvalidRequest):
-        sweep_points([PolarScan(ranges_m=np.ones(3), angles_rad=np.ones(4), base_from_scanner=pose)])
-    none = sweep_points([PolarScan(ranges_m=np.full(3, np.nan), angles_rad=np.zeros(3), base_from_scanner=pose)])
-    with pytest.raises(NotFound):
-        depth_image(none, pose, PINHOLE)
+def test_an_image_of_points_shows_the_nearest_in_each_pixel_and_needs_one():
+    here = RigidTransform.identity()
+    depth_m = depth_image(
+        np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.7], [0.1, 0.0, 1.0], [0.0, 0.0, -1.0]]), here, PINHOLE
+    )
+    assert sorted(depth_m[np.isfinite(depth_m)]) == [0.7, 1.0]
+    for unseen in (np.empty((0, 3)), np.array([[0.0, 0.0, -1.0], [90.0, 0.0, 1.0]])):
+        with pytest.raises(NotFound):
+            depth_image(unseen, here, PINHOLE)
 
 
 def three_walls(seed):

@@ -1,55 +1,18 @@
-"""Polar sweeps: scans of a 2-D scanner on the moving wrist, each with its own arm pose, made into one depth image."""
+"""Points, as a scanner that the wrist sweeps gives them (`drivers/sweep.py`), made into one depth image."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from hal.errors import InvalidRequest, NotFound
+from hal.errors import NotFound
 from perception.range.sensor import PinholeSensor, RangeSensorModel
 
 Array = NDArray[np.float64]
 
 FILL_NEIGHBOURS = 3  # an empty pixel between this many measured ones of one surface is filled by their mean
 FILL_SWEEPS = 2
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PolarScan:
-    """One scan: ranges (N,) in metres (NaN = none) at angles (N,) in the scanner's x-z plane, z forward.
-
-    A beam at angle a points along (sin a, 0, cos a). `base_from_scanner` is the arm's pose when the scan was taken.
-    """
-
-    ranges_m: Array
-    angles_rad: Array
-    base_from_scanner: RigidTransform
-
-
-def sweep_points(scans: Sequence[PolarScan]) -> Array:
-    """(N, 3) points of all scans in the base frame, metres; beams without a reading are left out.
-
-    Raises:
-        InvalidRequest: no scans, or ranges and angles of different length.
-    """
-    if not scans:
-        raise InvalidRequest("a sweep needs at least one scan", hint="record scans while the wrist moves")
-    parts = []
-    for k, scan in enumerate(scans):
-        r, a = np.asarray(scan.ranges_m, float), np.asarray(scan.angles_rad, float)
-        if r.shape != a.shape or r.ndim != 1:
-            raise InvalidRequest(
-                f"scan {k} has {r.size} ranges at {a.size} angles", hint="one angle a range, both flat arrays"
-            )
-        ok = np.isfinite(r) & (r > 0)
-        local = np.stack([r[ok] * np.sin(a[ok]), np.zeros(int(ok.sum())), r[ok] * np.cos(a[ok])], axis=1)
-        if len(local):
-            parts.append(scan.base_from_scanner.apply(local))
-    return np.concatenate(parts) if parts else np.empty((0, 3))
 
 
 def depth_image(points_base_m: Array, base_from_view: RigidTransform, sensor: RangeSensorModel) -> Array:
@@ -65,7 +28,7 @@ def depth_image(points_base_m: Array, base_from_view: RigidTransform, sensor: Ra
     u, v = np.rint(P[:, 0] / scale * fx + cx).astype(int), np.rint(P[:, 1] / scale * fy + cy).astype(int)
     inside = (u >= 0) & (v >= 0) & (u < sensor.width_px) & (v < sensor.height_px)
     if not inside.any():
-        raise NotFound("no point of the sweep falls into the view", hint="check the arm poses and the virtual sensor")
+        raise NotFound("none of the points falls into the view", hint="check the arm poses and the virtual sensor")
     depth = np.full((sensor.height_px, sensor.width_px), np.inf)
     np.minimum.at(depth, (v[inside], u[inside]), P[inside, 2])
     depth[~np.isfinite(depth)] = np.nan

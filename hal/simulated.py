@@ -52,4 +52,4 @@ class Truth:
     objects: tuple[ObjectTruth, ...]
     peak_force_n: float
     sim_time_s: float
-    initial: tuple[ObjectTruth, ...] = field(default=())
+    initial: tuple[ObjectTruth, ...] = field(default=())  # at the time asked for, 0 is the beginning of the world

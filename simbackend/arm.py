@@ -86,9 +86,9 @@ class SimArm(SimDevice[JointState]):
         self._check(deadline)
         self._world.stop()
 
-    def truth(self) -> Truth:
+    def truth(self, initial_s: float = 0.0) -> Truth:
         """For the judge of a finished mission and for tests; nothing else may call it."""
-        return self._world.truth()
+        return self._world.truth(initial_s)
 
     def _measure(self, frame: Frame, bias: float) -> tuple[JointState, Quality, Cause]:
         snapshot = frame.snapshot

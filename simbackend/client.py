@@ -236,10 +236,10 @@ class WorldClient:
         with self._lock:
             return self._link.picture([*lens, float(kind), *matrix.ravel().tolist()], shape)
 
-    def truth(self) -> Truth:
-        """What the judge may ask for when a mission has ended."""
+    def truth(self, initial_s: float = 0.0) -> Truth:
+        """What the judge may ask for when a mission has ended; `initial` is of a simulated time."""
         with self._lock:
-            truth = self._link.ask(Op.TRUTH)
+            truth = self._link.ask(Op.TRUTH, initial_s)
         if not isinstance(truth, Truth):
             raise DeviceFault("the simulated world gave no truth", hint="report this", device="world")
         return truth

@@ -6,6 +6,7 @@ import math
 import os
 import sys
 import tempfile
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from hal.simulated import Truth
+from hal.simulated import ObjectTruth, Truth
 from simbackend.arm_model import MODELS, arm_urdf, base_from_flange
 from simbackend.draws import Draws
 from simbackend.drive import ArmDrive, GripperDrive
@@ -41,6 +42,7 @@ ARM_GAIN, FINGER_GAIN = 0.45, 0.6  # share of a joint's error that its motor mak
 CONE_RAYS = 4
 CONE_RAD = 0.0175
 CONE_DEPTH_M = 0.02
+PAST_TICKS, PAST_KEPT = 100, 4500  # what objects showed, for the judge: at 500 Hz every 0.2 s for 15 minutes
 
 
 class World:
@@ -71,6 +73,7 @@ class World:
         self._ray_directions = np.concatenate(
             [np.empty((0, 3)), *(mount.rotation.apply(RAYS) for mount in config.proximity)]
         )
+        self._past: deque[tuple[int, tuple[ObjectTruth, ...]]] = deque(maxlen=PAST_KEPT)
         self.initial = self.panel.truth()
         self._proximity = np.full(MAX_PROXIMITY + 1, np.nan)  # distances, then the tick they belong to
         self._settle()
@@ -197,6 +200,8 @@ class World:
         self.tick += 1
         self._read_joints()
         self._read_contacts()
+        if self.tick % PAST_TICKS == 0:
+            self._past.append((self.tick, self.panel.truth()))
 
     def _read_joints(self) -> None:
         engine = self.engine
@@ -260,15 +265,24 @@ class World:
         for i in range(len(self.config.proximity)):
             self._proximity[i] = _nearest(depths[i * len(RAYS) : (i + 1) * len(RAYS)])
 
-    def truth(self) -> Truth:
-        """What the judge compares with."""
+    def truth(self, initial_s: float = 0.0) -> Truth:
+        """What the judge compares with.
+
+        Args:
+            initial_s: simulated time at which `initial` is wanted, as far back as is kept; 0 is the beginning.
+        """
         return Truth(
             base_from_panel_matrix=np.asarray(self.panel.base_from_panel.as_matrix()),
             objects=self.panel.truth(),
             peak_force_n=self.peak_force_n,
             sim_time_s=self.tick * self.dt_s,
-            initial=self.initial,
+            initial=self._showed(initial_s),
         )
+
+    def _showed(self, time_s: float) -> tuple[ObjectTruth, ...]:
+        """What the objects showed then, or a moment before."""
+        before = (things for tick, things in reversed(self._past) if tick * self.dt_s <= time_s)
+        return next(before, self.initial)
 
     def close(self) -> None:
         """Let the engine go."""

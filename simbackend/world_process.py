@@ -45,7 +45,7 @@ def serve(pipe: Connection, images: mmap.mmap) -> None:
             case Op.RENDER:
                 pipe.send(picture(world, request, images))
             case Op.TRUTH:
-                pipe.send(world.truth())
+                pipe.send(world.truth(float(request[1])))
             case Op.CLOSE:
                 break
     world.close()

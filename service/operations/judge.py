@@ -40,18 +40,19 @@ def judge(connection: CellConnection, folder: Path) -> dict[str, Any]:
                 f"mission {folder.name!r} was of {key} {report[key]!r}, this service runs {key} {value!r}",
                 hint="judge a mission in the service that ran it: the simulator of another one knows nothing of it",
             )
-    verdict = compare(report, truth_of(connection), connection.cell.panel)
+    began_s = report.get("started_cell_s", -np.inf)  # reports of older versions do not say
+    verdict = compare(report, truth_of(connection, connection.clock.now_s() - began_s), connection.cell.panel)
     write_json(folder, {**report, "judge": verdict})
     render(folder)
     return verdict
 
 
-def truth_of(connection: CellConnection) -> Truth:
-    """The truth of a simulated cell; ask only when the mission is over."""
+def truth_of(connection: CellConnection, ago_s: float) -> Truth:
+    """The truth of a simulated cell, its `initial` from `ago_s` before; ask only when the mission is over."""
     arms = connection.devices_of(DeviceKind.ARM) | connection.behind_wires_of(DeviceKind.ARM)
     for arm in arms.values():
         if hasattr(arm, "truth"):
-            truth: Truth = arm.truth()
+            truth: Truth = arm.truth(max(0.0, arm.truth().sim_time_s - ago_s))
             return truth
     raise Unsupported(
         "this cell has no simulated arm, so there is no truth to judge by",

@@ -90,6 +90,10 @@ class MissionRecord:
     motions: list[MotionReport] = field(default_factory=list)
     facts: dict[str, Any] = field(default_factory=dict)
     problem: dict[str, Any] | None = None
+    started_cell_s: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.started_cell_s = self.now_s()
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
@@ -128,6 +132,7 @@ class MissionRecord:
             "mode": self.mode,
             "seed": self.seed,
             "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self.started_wall)),
+            "started_cell_s": self.started_cell_s,
             "succeeded": self.succeeded,
             "wall_s": sum(step.wall_s for step in self.steps),
             "cell_s": sum(step.cell_s for step in self.steps),

@@ -117,9 +117,13 @@ def test_a_pressed_button_is_felt_counted_and_lights_its_lamp(finger: Finger) ->
     finger.go(place(finger, "start", button.height_m + 0.03), 1.0)
     after = finger.shown("start")
     assert (after.state, after.value) == ("released", (pressed.value or 0.0) + 1.0)
-    assert finger.shown("run_lamp").state != lamp
+    after_lamp = finger.shown("run_lamp").state
+    assert after_lamp != lamp
     assert touch.read_contacts(deadline=cell.deadline()).value == (False, False)
     assert finger.arm.truth().peak_force_n >= push_n - 1.0
+    for seconds_ago, lit in ((0.0, after_lamp), (5.0, lamp)):
+        then = finger.arm.truth(finger.arm.truth().sim_time_s - seconds_ago).initial
+        assert next(thing for thing in then if thing.name == "run_lamp").state == lit
 
 
 def test_the_lamp_of_the_button_shows_in_the_picture(finger: Finger) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -149,3 +150,26 @@ def test_a_mission_of_another_cell_is_not_judged_by_this_simulator(tmp_path: Pat
     cell = SimpleNamespace(name="bench", panel=PANEL, file=SimpleNamespace(cell=SimpleNamespace(seed=7)))
     with pytest.raises(InvalidRequest, match=f"was of {key} {other!r}, this service runs {key}"):
         judge(cast(CellConnection, SimpleNamespace(cell=cell)), tmp_path)
+
+
+def test_a_mission_is_compared_with_what_its_own_beginning_showed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second mission of a service was compared with the beginning of the world: what the first had moved was blamed on it."""
+    asked: list[float] = []
+
+    def told(initial_s: float = 0.0) -> Truth:
+        asked.append(initial_s)
+        return replace(truth(), sim_time_s=130.0, initial=truth().objects if initial_s > 0.0 else truth().initial)
+
+    ran = report(cell="bench", panel="bench", seed=7, started_cell_s=1000.0)
+    (tmp_path / "report.json").write_text(json.dumps(ran))
+    connection = SimpleNamespace(
+        cell=SimpleNamespace(name="bench", panel=PANEL, file=SimpleNamespace(cell=SimpleNamespace(seed=7))),
+        clock=SimpleNamespace(now_s=lambda: 1050.0),
+        devices_of=lambda kind: {"arm": SimpleNamespace(truth=told)},
+        behind_wires_of=lambda kind: {},
+    )
+    monkeypatch.setattr("service.operations.judge.render", lambda folder: None)
+    verdict = judge(cast(CellConnection, connection), tmp_path)
+    assert asked[-1] == 80.0 and verdict["moved_unasked"] == []

@@ -90,7 +90,7 @@ def test_a_planted_wrong_truth_changes_nothing_but_the_judgement(tmp_path: Path)
             arm = context.connection.device("arm")
             if name == "planted":
                 true_truth = arm.truth
-                arm.truth = lambda ask=true_truth: lie(ask())
+                arm.truth = lambda *at, ask=true_truth: lie(ask(*at))
             answer = run_mission(context, request)
             judge(context.connection, tmp_path / name / "runs" / answer["mission"])
     honest, planted = report_of(tmp_path / "honest"), report_of(tmp_path / "planted")

@@ -60,7 +60,6 @@ def blind_in_stored(session: Session, request: RecogniseRequest) -> dict[str, An
     Raises:
         as `read_stored`.
     """
-    from perception.vision.finding.framing import one_plate
     from perception.vision.image import as_gray
 
     pixels = _stores(session)[0].pixels(request.image or "")
@@ -71,7 +70,6 @@ def blind_in_stored(session: Session, request: RecogniseRequest) -> dict[str, An
     gray = as_gray(pixels)
     lens = _lens(session, request, gray)
     focal_px = lens.fx_px if lens is not None else None
-    one_plate(gray, plate_m, focal_px=focal_px)
     return blind_answer(session, pixels, plate_m, focal_px=focal_px)
 
 

@@ -20,8 +20,8 @@ from perception.vision.finding.cables import without_cables
 from perception.vision.finding.circles import find_circles
 from perception.vision.finding.components import components
 from perception.vision.finding.features import PLATE_PX_PER_M, Ground, half_turned, look_at, plate_gray
+from perception.vision.finding.framing import one_plate
 from perception.vision.finding.match import Prepared, nearest, nearest_look, nothing_column, prepared
-from perception.vision.finding.plate import find_plate
 from perception.vision.finding.shapes import Edges, direction_maps, find_edges, find_rectangles, find_slots
 from perception.vision.image import Image, as_gray
 from perception.vision.knowledge import NOTHING, Knowledge
@@ -33,6 +33,7 @@ PLATE_M = (0.40, 0.30)
 ROWS_APART = 3  # of those that tell the noise: enough, and a millisecond saved
 NOISY = 2.4  # gray levels; overviews drawn at medium have 2.2 at most, hard ones 2.5 at least
 UPSIDE_DOWN = 0.15  # see `uprightness`
+SURE, LEAST_SURE = 0.95, 3  # so many objects confirm a plate; of close-ups and turned panels taken for one 2 at most
 FURTHEST = 0.8  # a place further from every look is unlike anything taught
 SECOND_LOOK = 0.05  # a candidate this much liker to nothing still gets a look from its best middle
 # Confidence = logistic((lead - EVEN) / SCALE), lead = how much nearer the kind is than what is next. Logistic regression
@@ -94,20 +95,21 @@ def recognise(
     Raises:
         InvalidRequest, NotObservable: bad image.
         NotFound: no plate in the image, or a panel upside down.
+        Ambiguous: two panels are in view.
     """
     gray = as_gray(image)
+    is_sure = True
     if view is None:
-        plate = find_plate(gray, *plate_m, focal_px=focal_px)
-        if plate is None:
-            raise NotFound(
-                "no plate fills the image", hint="take an overview of one panel, upright, with its border in view"
-            )
-        view = plate.view
+        plate = one_plate(gray, plate_m, focal_px=focal_px)
+        view, is_sure = plate.view, plate.is_sure
     ground = lay_out(gray, view, plate_m)
     places = candidate_places(ground.edges)
-    if not len(places):
-        return ()
-    found = chosen(ground, places, look_at(ground, places), knowledge, view, plate_m)
+    found = chosen(ground, places, look_at(ground, places), knowledge, view, plate_m) if len(places) else ()
+    if not is_sure and sum(c.confidence >= SURE for c in found) < LEAST_SURE:
+        raise NotFound(
+            "what may be the plate's border is not confirmed, neither by edges nor by objects on it",
+            hint="take an overview of one panel, upright, with its border in view",
+        )
     if uprightness(ground, found, knowledge, plate_m) < -UPSIDE_DOWN:
         raise NotFound(
             "the panel is upside down: its objects look more like the taught ones turned by half a turn",

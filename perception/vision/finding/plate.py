@@ -34,6 +34,11 @@ LEAST_SIDES = 2  # that show as lines: one alone is anything's edge
 FILLED = 0.85  # of the image: then one line is enough, the other sides lie close to the image's border
 CONFIRMED = 0.7  # share of a side's visible edge
 LEAST_CONFIRMED = SIDE_POINTS // 4  # samples in all; in noise and in soft shades none is
+LEAST_SHARE_CONFIRMED = (
+    0.6  # of the visible border; close-ups and bare walls have less, with the plate misplaced by half
+)
+SURE_SHARE, SURE_SIDES, SURE_SIDE_VISIBLE = 0.9, 3, 16  # for `is_sure`; all development overviews have the share
+MOST_STRETCHED = 1.45  # see `_stretch`; a plate turned by a quarter has the square of its proportions, 1.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,10 +48,12 @@ class Plate:
     Attributes:
         view: plate metres (origin in the middle, y up) to pixels.
         sides_seen: top, right, bottom, left: whether the image shows that side.
+        is_sure: whether the border alone says where the plate is; else it may be the edge of something else.
     """
 
     view: PlaneView
     sides_seen: tuple[bool, bool, bool, bool]
+    is_sure: bool
 
 
 def find_plate(gray: Image, width_m: float, height_m: float, *, focal_px: float | None = None) -> Plate | None:
@@ -70,7 +77,7 @@ def find_plate(gray: Image, width_m: float, height_m: float, *, focal_px: float 
     if found is None:
         return None
     top, right, bottom, left = (line is not None for line in lines)
-    return Plate(view=found, sides_seen=(top, right, bottom, left))
+    return Plate(view=found, sides_seen=(top, right, bottom, left), is_sure=search.is_sure(found))
 
 
 _Attempt = tuple[list[Array | None], tuple[float, ...], float]  # lines, windows in pixels, sigma in pixels
@@ -99,7 +106,30 @@ class _Search:
             laid = [self._free(lines), *(self._laid(*attempt) for attempt in attempts)]
             found += [(self._score(view), view) for view in laid if view is not None]
         best = max(found, key=lambda f: f[0])[1] if found else None
-        return best if best is not None and self._confirmed(best) >= LEAST_CONFIRMED else None
+        return best if best is not None and self._is_plate(best) else None
+
+    def _is_plate(self, view: PlaneView) -> bool:
+        """Whether edges confirm enough of the border, and a camera could see a plate of these proportions so."""
+        visible, near = (int(mask.sum()) for mask in confirmed(self.image, view, self.outline))
+        is_confirmed = near >= max(LEAST_CONFIRMED, LEAST_SHARE_CONFIRMED * visible)
+        return is_confirmed and self._stretch(view) < MOST_STRETCHED
+
+    def is_sure(self, view: PlaneView) -> bool:
+        """Whether edges confirm nearly all of the visible border, on three sides at least: two leave the size open."""
+        visible, near = (mask.reshape(4, -1).sum(axis=1) for mask in confirmed(self.image, view, self.outline))
+        sides = (visible >= SURE_SIDE_VISIBLE) & (2 * near > visible)
+        return bool(sides.sum() >= SURE_SIDES and near.sum() >= SURE_SHARE * visible.sum())
+
+    def _stretch(self, view: PlaneView) -> float:
+        """How much longer one direction of the plate would be than the other, before the camera of known focal length.
+
+        The columns of K^-1 H of a rigid plate are as long as each other; a focal length that is off by half makes them
+        differ by 1.2 at a tilt of 40 degrees.
+        """
+        rows, columns = self.image.smooth.shape
+        K = np.array([[self.focal_px, 0, (columns - 1.0) / 2], [0, self.focal_px, (rows - 1.0) / 2], [0, 0, 1.0]])
+        across, up = np.linalg.norm(np.linalg.solve(K, view.px_from_plate)[:, :2], axis=0)
+        return float(max(across, up) / max(min(across, up), 1e-9))
 
     def _laid(self, lines: list[Array | None], windows_px: tuple[float, ...], sigma_px: float) -> PlaneView | None:
         """The plate through the lines, moved onto the image's edges: first as a rigid one, then freely."""
@@ -134,10 +164,6 @@ class _Search:
         """Samples of the border that an edge confirms, less visible ones that none does."""
         visible, near = confirmed(self.image, view, self.outline)
         return 2 * int(near.sum()) - int(visible.sum())
-
-    def _confirmed(self, view: PlaneView) -> int:
-        """Samples of the border that an edge confirms."""
-        return int(confirmed(self.image, view, self.outline)[1].sum())
 
     def _least_confirmed(self, view: PlaneView) -> float:
         """Share of the visible samples with an edge, on the worst side of which enough is visible."""

@@ -379,3 +379,38 @@ def test_a_panel_upside_down_is_refused(name: str) -> None:
     assert recognise(upright, knowledge)
     with pytest.raises(NotFound, match="upside down"):
         recognise(np.ascontiguousarray(upright[::-1, ::-1]), knowledge)
+
+
+@pytest.mark.parametrize("quarters", [1, 3])
+def test_a_panel_turned_by_a_quarter_is_no_plate_of_its_size(quarters: int) -> None:
+    image, _ = overview()
+    assert recognise(image, shipped_knowledge(), plate_m=PLATE)
+    with pytest.raises(NotFound, match="no plate"):
+        recognise(np.ascontiguousarray(np.rot90(image, quarters)), shipped_knowledge(), plate_m=PLATE)
+
+
+def test_two_panels_are_ambiguous_blind_too() -> None:
+    image, _ = overview()
+    with pytest.raises(Ambiguous, match="two panels"):
+        recognise(np.ascontiguousarray(np.hstack([image, image])), shipped_knowledge(), plate_m=PLATE)
+
+
+def test_a_border_that_neither_edges_nor_objects_confirm_is_no_plate() -> None:
+    bare = np.full((480, 640), 60, np.uint8)
+    bare[100:, 120:] = 170  # one corner of something large
+    plate = find_plate(bare, *PLATE)
+    assert plate is not None and not plate.is_sure
+    with pytest.raises(NotFound, match="not confirmed"):
+        recognise(bare, shipped_knowledge(), plate_m=PLATE)
+    bare[400:], bare[:, 570:] = 60, 60
+    whole = find_plate(bare, *PLATE)
+    assert whole is not None and whole.is_sure
+    assert not any(c.reason is None for c in recognise(bare, shipped_knowledge(), plate_m=PLATE))
+
+
+@pytest.mark.skipif(not OVERVIEWS.exists(), reason="no overviews beside the repository")
+def test_a_close_up_of_one_object_is_not_taken_for_a_panel() -> None:
+    for file in sorted(OVERVIEWS.glob("p22_*.png")):
+        gray = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        with pytest.raises(NotFound):
+            recognise(np.asarray(gray, np.uint8), shipped_knowledge())

@@ -110,7 +110,9 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
         ticks = bytes([max(1, min(127, round(o.watchdog_s / WATCHDOG_TICK_S)))])
 
         def work(client: DynamixelClient, until_s: float) -> None:
-            if not client.read(o.id, TORQUE, 1, until_s)[0]:
+            with naming_alerts(client, (o.id,), until_s):
+                has_torque = client.read(o.id, TORQUE, 1, until_s)[0]
+            if not has_torque:
                 raise DeviceFault(
                     f"{self.name} has no torque", hint="connect it again: that switches it on", device=self.name
                 )

@@ -156,7 +156,7 @@ def _refuse_frozen(session: Session, name: str, sample: Stamped[Any], array: NDA
     if previous is not None and previous[1] == digest and previous[0] != sample.host_time_s:
         raise StaleReading(
             f"{name} repeats the same frame under a new stamp",
-            hint="the camera is frozen: power-cycle it; nothing was measured with the old frame",
+            hint=f"{name} is frozen: power-cycle it; nothing was measured with the old frame",
             device=name,
             cause=str(Cause.FROZEN),
         )

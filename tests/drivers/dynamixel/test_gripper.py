@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from drivers.emulators import dynamixel_gripper as emulator
-from drivers.emulators.dynamixel import TORQUE, WATCHDOG
+from drivers.emulators.dynamixel import HARDWARE_ERROR, OVERLOAD, TORQUE, WATCHDOG
 from drivers.emulators.scripted import ScriptedGripper, ScriptedLights
 from hal.conformance import GripperContract, Rig
 from hal.errors import DeviceFault, InvalidRequest, Unsupported
@@ -69,6 +69,14 @@ def test_a_servo_in_another_mode_under_torque_is_refused() -> None:
             connect(Context(name="gripper"), DRIVER, far_side.address)
     finally:
         far_side.close()
+
+
+def test_a_command_to_an_overloaded_servo_names_the_cause() -> None:
+    with wired(far_side := emulator.start(ScriptedGripper(), {}), DRIVER) as device:
+        far_side.servo.table[HARDWARE_ERROR] = OVERLOAD
+        with pytest.raises(DeviceFault, match="servo 7 reports overload") as fault:
+            device.command(width_m=0.02, force_n=10.0, speed_m_per_s=0.1, deadline=soon())
+        assert "only a reboot helps" in fault.value.hint
 
 
 def test_numbers_that_are_none_and_other_devices_are_refused() -> None:

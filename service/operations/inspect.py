@@ -60,9 +60,19 @@ def inspect_here(
     """Read objects from where the camera is now."""
     view = seen or look(session)
     camera_from_panel = compose(view.base_from_camera.inverse(), session.known_panel())
-    readings = inspect_image(
-        view.pixels, view.intrinsics, camera_from_panel, session.panel, names=names, previous=known_readings(session)
-    )
+    try:
+        readings = inspect_image(
+            view.pixels,
+            view.intrinsics,
+            camera_from_panel,
+            session.panel,
+            names=names,
+            previous=known_readings(session),
+        )
+    except PerceptionError:
+        settle(session)
+        look(session, view.camera)  # a frozen camera shows the panel where it was: the second equal frame names it
+        raise
     _remember(session, readings)
     picture = AnnotatedView(title=title, pixels=draw_annotated(view.pixels, readings))
     return Inspection(readings={r.name: r for r in readings}, pictures=(picture,))

@@ -12,7 +12,8 @@ import pytest
 
 from benchmarks.behind_cables import drawn_cable, open_session, with_cables
 from hal.config import CableSection, load_cell
-from hal.errors import Unreachable
+from hal.errors import StaleReading, Unreachable
+from hal.simulated import Fault
 from perception.vision.reading import ANSWER_AT, ObjectReading
 from service.operations import inspect
 from service.operations.beliefs import forget_reading, known_readings
@@ -111,6 +112,18 @@ def test_a_guess_is_answered_to_who_asks_for_it_and_not_remembered(
     assert refusal["state"] is None and refusal["reason"]
     assert guess["state"] in ("pressed", "released") and guess["reason"] is None and guess["confidence"] < ANSWER_AT
     assert "hold" not in known_readings(session), "missions go by what is sure"
+
+
+def test_a_camera_that_froze_on_the_way_is_named_by_the_first_close_up(session: Session) -> None:
+    """Its first frame is no repetition yet: it shows the panel as from before, and the panel's pose was blamed."""
+    camera = session.connection.device("wrist_camera")
+    inspect.go_to_overview(session)
+    camera.inject_fault(Fault.FROZEN)
+    try:
+        with pytest.raises(StaleReading, match="wrist_camera repeats the same frame"):
+            inspect.look_close(session, session.panel.object("flow").point_m, ("flow",))
+    finally:
+        camera.inject_fault(None)
 
 
 def test_many_unread_objects_are_no_cables_work(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:

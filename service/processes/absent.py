@@ -20,7 +20,7 @@ class Absent:
     def __init__(self, name: str, kind: DeviceKind, error: CellError) -> None:
         self.name, self.kind = name, kind
         self._why = NotConnected(
-            f"{name} did not connect: {error.what.removeprefix(f'{name}: ')}",
+            f"{name} did not connect: {error.what.removeprefix(name).lstrip(': ')}",
             hint=f"{error.hint}; then POST /v1/devices/{name}/connect",
             **{**error.details, "device": name},
         )

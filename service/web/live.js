@@ -22,7 +22,7 @@ function connect() {
 }
 
 function draw(state) {
-  if (!state.position_rad) return showState(state.problem || "no arm", "failed");
+  if (!state.position_rad) return showWhyNot(state.problem || "no arm");
   const isStale = state.faults.length > 0; // what is shown was so when the device was last heard
   live.classList.toggle("stale", isStale);
   joints.classList.toggle("stale", isStale);
@@ -43,6 +43,17 @@ function draw(state) {
   };
   live.replaceChildren(...Object.entries(facts).map(fact));
   joints.replaceChildren(...state.position_rad.map(joint));
+}
+
+// In words of any length: there is no state while a device that belongs to it is missing.
+function showWhyNot(problem) {
+  showState("no state", "failed");
+  const why = document.createElement("p");
+  why.className = "quiet";
+  why.textContent = problem;
+  live.replaceChildren(why);
+  live.classList.remove("stale");
+  joints.replaceChildren();
 }
 
 function showState(words, state) {

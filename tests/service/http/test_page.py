@@ -97,8 +97,9 @@ def test_a_device_that_is_missing_is_connected_from_the_page(
     tab, faults = new_tab(browser, height_px=1000)
     try:
         tab.goto(panelwright.url)
-        until(tab, "document.querySelector('#devices').textContent.includes('arm is not on its port')")
-        until(tab, "document.querySelector('#live-state').textContent.includes('arm did not connect')")
+        until(tab, "document.querySelector('#devices').textContent.includes('arm did not connect: is not on its port')")
+        until(tab, "document.querySelector('#live').textContent.includes('arm did not connect')")
+        assert tab.evaluate("() => document.documentElement.scrollWidth") <= 1400
         tab.click("button:text-is('connect')")
         until(tab, "document.querySelector('#devices').textContent.includes('plug it in')")
         trouble.unlink()

@@ -28,7 +28,7 @@ SWEEP_RAD = np.deg2rad(np.arange(-30.0, 30.5, 1.0))
 BETWEEN_RAD = 0.16  # a quarter-turn valve that is 9 degrees off its stop is neither open nor closed
 ANGLE_SIGMA_RAD = 0.02
 LIGHT_SIGMA, MIDDLE_GRAY = 1.4, 128.0  # of the bar's width; gray levels
-MOST_IN_GLARE = 0.79  # all of 28 that the second look answered were right; it stays a doubt
+MOST_IN_GLARE = 0.79  # of some thirty that the second look answered one was wrong: it stays a doubt
 WOBBLE_RAD = np.deg2rad(np.linspace(-10, 10, 9))
 
 

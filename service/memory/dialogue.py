@@ -157,6 +157,8 @@ class Dialogue:
 
     def _name(self, question: Question) -> str:
         name = self._answer(question)
+        if name in IS_IT.choices:  # one question too late: it would become a kind
+            raise InvalidRequest(f"{name!r} is no answer to what it is called", hint="give a name")
         check_name(name)
         return name
 

@@ -69,10 +69,11 @@ def test_the_dialogue_teaches_a_kind_and_shows_it(
 ) -> None:
     _example(tmp_path / "panel.png")
     clicks = _pixels("emergency", 0.02)
-    _talk(monkeypatch, "kind", "somewhere", "3,3", clicks, "no", clicks, "", "Not A Name", "mushroom", "no")
+    _talk(monkeypatch, "kind", "somewhere", "3,3", clicks, "no", clicks, "", "Not A Name", "no", "mushroom", "no")
     teach(tmp_path / "panel.png", folder=tmp_path / "kinds", dialogue=True)
     said = capsys.readouterr().out
     assert "is not pixels" in said and "beside the plate" in said and "is no name" in said
+    assert "'no' is no answer to what it is called" in said
     assert "found a circle of 40 x 40 mm" in said
     assert sum(line.startswith("mushroom at") for line in said.splitlines()) == 1
     assert [kind.name for kind in load_knowledge(tmp_path / "kinds").kinds] == ["mushroom"]

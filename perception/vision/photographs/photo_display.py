@@ -21,6 +21,8 @@ ROWS_TRIED = 4
 ROOM_ABOVE, ROOM_BESIDE = 0.5, 1.6  # round a row's cells, over the digit height
 TURNS = np.tan(np.deg2rad(np.arange(-8.0, 8.1, 1.0)))  # looked for
 RIVAL = 0.3  # how much another text read nearby takes from the confidence
+ROW = 0.35  # of the weight of what a crop says: of rows of digits found in it that say something else
+FEW, FEW_OF_SCENE = 4.0, 5.6  # segments, see `_agreed`: of a scene, four are answered and nine are not sure
 FRAME = 0.08  # of a crop's height that a frame may take
 
 
@@ -36,35 +38,55 @@ def read_photograph(image: NDArray[Any], *, scene: bool, least_confidence: float
         InvalidRequest, NotObservable: bad image.
     """
     gray = as_gray(image)
-    answers = [
-        (share, read_window(_straight(_scaled(window)), digits=None, decimals=None, dark=dark, framed=framed))
-        for window, dark, share in (_rows(gray) if scene else _crops(gray))
-        for framed in (True, False)
-    ]
+    rows = [(share, answer) for window in _rows(gray) for share, answer in _read(window)]
+    answers = rows if scene else _with_rows([pair for window in _crops(gray) for pair in _read(window)], rows)
     if not answers:
         return refused("no display is found in the picture: crop it, or come closer")
-    return answer_at(_agreed(answers), least_confidence)
+    return answer_at(_agreed(answers, FEW_OF_SCENE if scene else FEW), least_confidence)
 
 
-def _agreed(answers: list[tuple[float, Status]]) -> Status:
-    """The answer that says most, less sure for every rival; the likeliest refusal where nothing was read.
+def _read(place: tuple[Image, bool | None, float]) -> list[tuple[float, Status]]:
+    """What a window says, with the weight of its place: with and without what touches its border."""
+    window, dark, share = place
+    straight = _straight(_scaled(window))
+    return [
+        (share, read_window(straight, digits=None, decimals=None, dark=dark, framed=framed)) for framed in (True, False)
+    ]
+
+
+def _with_rows(whole: list[tuple[float, Status]], rows: list[tuple[float, Status]]) -> list[tuple[float, Status]]:
+    """The readings of a crop, and those of rows of digits found in it.
+
+    A row may lack digits, but has no frame and no words beside it: what it says counts in full where the crop at least guesses the
+    same.
+    """
+    supposed = {said.text for _, answer in whole if (said := answer.guess or answer).text is not None}
+    return whole + [(1.0 if answer.text in supposed else ROW * share, answer) for share, answer in rows]
+
+
+def _agreed(answers: list[tuple[float, Status]], few: float = FEW) -> Status:
+    """The answer that says most, less sure for every rival, in a doubtful place, and of few segments, as any bar makes a 1;
+    the likeliest refusal where nothing was read.
 
     Args:
         answers: with the weight of the place where each was read.
+        few: segments that are worth 1 - 1/e.
     """
     weighed = [
-        (share * answer.confidence * float(np.sqrt(lit_segments(answer.text))), answer)
+        (share * answer.confidence * float(np.sqrt(lit_segments(answer.text))), share, answer)
         for share, answer in answers
         if answer.text is not None
     ]
     if not weighed:
         return max((answer for _, answer in answers), key=lambda answer: answer.confidence)
-    most, best = max(weighed, key=lambda pair: pair[0])
+    most, _, best = max(weighed, key=lambda found: found[0])
     rivals: dict[str, float] = {}
-    for weight, answer in weighed:
+    for weight, _, answer in weighed:
         if answer.text is not None and answer.text != best.text:
             rivals[answer.text] = max(weight, rivals.get(answer.text, 0.0))
-    return gated(limited(best, best.confidence * most / (most + RIVAL * sum(rivals.values()))))
+    placed = max(0.5 * (1 + share) * answer.confidence for _, share, answer in weighed if answer.text == best.text)
+    enough = 1.0 - float(np.exp(-lit_segments(best.text or "") / few))
+    return gated(limited(best, min(best.confidence * most / (most + RIVAL * sum(rivals.values())), placed, enough)))
 
 
 def _crops(gray: Image) -> list[tuple[Image, bool | None, float]]:

@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from hal.panel import Display
 from perception.vision.image import Image
 from perception.vision.patch import Patch
-from perception.vision.reading import Possible, Status, gated, probability, refused
+from perception.vision.reading import Possible, Status, doubted, gated, probability, refused
 from perception.vision.status.band import hidden_by_bands
 from perception.vision.status.comb import Comb, find_combs
 from perception.vision.status.comb_jit import Float32, apartness
 from perception.vision.status.glyphs import CLOSE, LEAST_SEEN, LIT, NAMES, Number, likelihoods, numbers, separate
 from perception.vision.status.ink import segment_ink, without_border
 from perception.vision.status.levels import loop_levels, segment_levels, with_hidden_ends, without_frames
-from perception.vision.status.point import Point, find_point
-from perception.vision.status.stray import stray_ink
+from perception.vision.status.point import Point, find_colon, find_point
+from perception.vision.status.stray import leaves_out, stray_ink
 from perception.vision.view import Array
 
 MARGIN = 0.09  # share of the smaller side that a frame may take
@@ -42,6 +42,7 @@ STRAY, STRAY_SCALE = 0.045, 0.003  # ink off the strokes, see `stray_ink`
 # Level of the weakest digit over the typical one: of 355 drawn hard displays read right all have more than .52, of 9 read wrong
 # two less than .36: a digit behind a cable that nobody saw, and one in glare.
 WEAK, WEAK_SCALE = 0.44, 0.025
+LEFT_OUT = 0.7  # of the trust, where a digit or a sign may stand beside those that were read
 SURE = 0.732  # the most that one piece of evidence gives
 
 MOST_NAMED, NAMED = 4, 0.1  # numbers that a refusal names: at most; the share of the likelihood that each has
@@ -119,9 +120,28 @@ def read_window(
     if not found:
         return refused("no digits stand out: come closer, or change the angle or the light", unit=unit)
     best = max(found, key=lambda d: d.explained * apartness(d.comb.gap) - CELL_COST * d.comb.count)
-    point = find_point(best.ink, best.seen, best.comb, best.lit_levels) if decimals is None else None
+    where = best.ink, best.seen, best.comb, best.lit_levels
+    colon = find_colon(*where) if decimals is None and not bare else None
+    if colon is not None:
+        no_point = Point(place=None, probability=1.0)
+        return _as_time(_answer(best, no_point, unit, None, limits, before, covered=False, bare=bare), best, colon)
+    point = find_point(*where) if decimals is None else None
     is_covered = hidden is not None and bool(hidden.any())
     return _answer(best, point, unit, decimals, limits, before, covered=is_covered, bare=bare)
+
+
+def _as_time(number: Status, found: Decoded, place: int) -> Status:
+    """What a clock shows, which is text and no value: a colon, and as digits stand beside one; else doubted."""
+    characters = found.listed[0].characters
+    before, after = characters[:place].strip(), characters[place:]
+    text = f"{before}:{after}"
+    guess = number.guess and replace(number.guess, value=None, uncertainty=None, text=text)
+    shown = text if number.answered else None
+    time = replace(number, value=None, uncertainty=None, text=shown, possible=(), guess=guess)
+    fits = before.isdigit() and after.isdigit() and len(before) <= 2 and len(after) == 2
+    return (
+        time if fits else doubted(time, "a colon, but no time beside it: come closer, or change the angle or the light")
+    )
 
 
 def _decoded(
@@ -138,7 +158,7 @@ def _decoded(
     best: Decoded | None = None
     most_worth = score = 0.0
     for worth, comb in combs:
-        if best is not None and (best.fit > FITS or _same(best.comb, comb)):
+        if worth <= 0 or (best is not None and (best.fit > FITS or _same(best.comb, comb))):
             break
         decoded = decode(ink, seen, comb, all_cells=digits is not None)
         if decoded is None:
@@ -238,6 +258,8 @@ def _answer(
         stray = stray_ink(found.ink, found.comb, found.lit_levels)
         trust *= probability([(-stray, -STRAY, STRAY_SCALE)]) / SURE
         trust *= probability([(found.weakest, WEAK, WEAK_SCALE)]) / SURE
+    elif leaves_out(found.ink, found.comb, found.lit_levels):
+        trust *= LEFT_OUT
     rivals = _ranked([(text, value) for text, value, _ in possible], share, trust)
     named = [rival.text for rival in rivals[:MOST_NAMED] if rival.probability > NAMED * trust]
     maybe = f" ({' or '.join(named)}?)" if len(named) > 1 else ""

@@ -27,6 +27,11 @@ INSETS = (0.2, 0.08, 0.32)  # of a segment's axis, at either end, by which its s
 PLACES_X = np.linspace(0.25, 0.75, 6)  # of the gap
 MORE_PLACES_X = np.linspace(0.25, 1.05, 9)  # of one hidden in part: no stroke beside it says where the comb lies
 PLACES_Y = np.linspace(-0.12, 0.06, 7)  # of the digit height, from the bottom segments' axis
+COLON_STRIP, COLON_LEVEL = (
+    (0.0, 1.0),
+    0.8,
+)  # colons of 36 drawn clocks have 1.1 or more, gaps of 75 sure numbers up to .6
+COLON_Y = (np.linspace(-0.80, -0.58, 7), np.linspace(-0.42, -0.20, 7))
 LEAST_OF_DOT = 0.4  # of a dot's picture that must be seen to tell its height
 STEPS = 8  # places a px at which a stroke's profile is tabled
 
@@ -62,19 +67,36 @@ def find_point(ink: Float32, seen: Float32, comb: Comb, lit_levels: Array) -> Po
     return Point(place=None if k == len(levels) else k + 1, probability=float(share[k] / share.sum()))
 
 
-def dot_levels(ink: Float32, seen: Float32, comb: Comb, lit_levels: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """(cells - 1,) level of the best dot in every gap over that of lit segments beside it, and whether the gap is seen."""
-    first, last = (round(comb.top_px + share * comb.height_px) for share in STRIP)
+def find_colon(ink: Float32, seen: Float32, comb: Comb, lit_levels: Array) -> int | None:
+    """Number of cells before a clock's colon: a gap with one dot in its upper half and one in its lower; None without one."""
+    if comb.count < 2:
+        return None
+    dots = [dot_levels(ink, seen, comb, lit_levels, strip=COLON_STRIP, places_y=ys)[0] for ys in COLON_Y]
+    both = np.minimum(*dots)
+    k = int(both.argmax())
+    return k + 1 if both[k] > COLON_LEVEL else None
+
+
+def dot_levels(
+    ink: Float32, seen: Float32, comb: Comb, lit_levels: Array, *, strip: tuple[float, float] = STRIP, places_y: Array = PLACES_Y
+) -> tuple[Array, NDArray[np.bool_]]:  # fmt: skip
+    """(cells - 1,) level of the best dot in every gap over that of lit segments beside it, and whether the gap is seen.
+
+    Args:
+        strip: rows that are looked at, over the digit height from its top.
+        places_y: of the dot, over the digit height, from the bottom segments' axis.
+    """
+    first, last = (round(comb.top_px + share * comb.height_px) for share in strip)
     first, last = max(0, first), min(len(ink), last)
     if last - first < 3:
         return np.zeros(comb.count - 1), np.zeros(comb.count - 1, bool)
-    strip, clear = ink[first:last], seen[first:last]
-    drawn, sigma_px = _drawn(strip, clear, comb, lit_levels, first)
-    rest = (strip - drawn) * clear
+    shown, clear = ink[first:last], seen[first:last]
+    drawn, sigma_px = _drawn(shown, clear, comb, lit_levels, first)
+    rest = (shown - drawn) * clear
     dot = _dot(RADIUS * comb.height_px, sigma_px)
-    levels, visible = _best_dots(rest, clear, dot, comb.numbers, comb.count, first, PLACES_X, PLACES_Y)
+    levels, visible = _best_dots(rest, clear, dot, comb.numbers, comb.count, first, PLACES_X, places_y)
     if not visible.all():
-        wide, _ = _best_dots(rest, clear, dot, comb.numbers, comb.count, first, MORE_PLACES_X, PLACES_Y)
+        wide, _ = _best_dots(rest, clear, dot, comb.numbers, comb.count, first, MORE_PLACES_X, places_y)
         levels = np.where(visible > 0, levels, wide)
     gain = float(np.percentile(drawn, 99.0)) / max(float(lit_levels.max()), 1e-6)
     return levels / np.maximum(gain * _beside(lit_levels), 1e-6), visible > 0

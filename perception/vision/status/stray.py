@@ -12,6 +12,9 @@ from perception.vision.view import Array
 THICK = 0.30  # of the digit height: a stroke with its blur
 NOISE = 0.05  # of the digit height
 ROWS = (-0.12, 0.90)  # of the digit height from its top: further down stand points
+BEYOND = 0.35  # of the digit height, above and below: where a frame goes on
+CLEAR = 0.4  # of the gap beside the last cell, where its own blur and a point are
+AS_CLEAR, AS_HIGH, SIGN = 0.45, 0.75, 0.2  # of the lit level; of the rows; of the digit height, a sign's least width
 BESIDE = 0.3  # of the digit height, and half of the gap at most: how far a cell's ink reaches
 
 
@@ -47,3 +50,35 @@ def stray_ink(ink: Float32, comb: Comb, lit_levels: Array) -> float:
         if rest.size:  # in a dark picture noise lifts the ink everywhere: strokes stand out from that
             worst = max(worst, float((np.maximum(rest - np.median(rest), 0.0) ** 2).sum()))
     return worst / max(typical, 1e-6)
+
+
+def leaves_out(ink: Float32, comb: Comb, lit_levels: Array) -> bool:
+    """Whether something as high as a digit, or a bar at half height like a sign, stands right beside the comb.
+
+    A frame is higher than the digits, and words beside them are lower.
+    """
+    written = np.flatnonzero((lit_levels > 0).any(axis=1))
+    if len(written) == 0:
+        return False
+    left, pitch, width, top, _, slant = comb.numbers
+    height, gap = comb.height_px, pitch - width
+    rows = np.arange(max(0, round(top - BEYOND * height)), min(len(ink), round(top + (1 + BEYOND) * height) + 1))
+    at = (rows - top) / height
+    start, end = left + written[0] * pitch, left + written[-1] * pitch + width
+    for first, last, cell in (
+        (start - pitch, start - CLEAR * gap, written[0]),
+        (end + CLEAR * gap, end + pitch, written[-1]),
+    ):
+        columns = np.round(slant * (0.5 - at) * height).astype(int)[:, None] + np.arange(round(first), round(last) + 1)
+        inside = (columns >= 0) & (columns < ink.shape[1])
+        shown = np.where(inside, ink[rows[:, None], columns.clip(0, ink.shape[1] - 1)], 0.0)
+        level = lit_levels[cell][lit_levels[cell] > 0].mean()
+        wide = (shown > AS_CLEAR * level).sum(axis=1)
+        within, beyond, middle = (at > 0.0) & (at < 1.0), (at < -0.15) | (at > 1.15), np.abs(at - 0.5) < 0.15
+        if beyond.any() and (wide[beyond] > 0).mean() > 0.5:
+            continue
+        if (wide[within] > 0).mean() > AS_HIGH:
+            return True
+        if wide[middle].max(initial=0) > SIGN * height and (wide[within & ~middle] > 0).mean() < 0.1:
+            return True
+    return False

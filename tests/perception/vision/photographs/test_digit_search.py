@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from benchmarks.display_drawing import draw_photograph
 from perception.vision.photographs.digit_search import CELL_PX, MARGIN, STRIDE, cell_scores, find_digit_rows
-from perception.vision.photographs.photo_display import ROWS_TRIED, _agreed, read_photograph
+from perception.vision.photographs.photo_display import FEW_OF_SCENE, ROWS_TRIED, _agreed, read_photograph
 from perception.vision.reading import Status, refused
 from perception.vision.status.comb import LIT_SHARES
 from perception.vision.status.comb_jit import cell_boxes
@@ -86,13 +86,51 @@ def test_a_frame_that_stands_out_more_than_the_digits_is_left_aside() -> None:
     assert left.max() < 20.0
 
 
-@given(st.lists(st.tuples(st.sampled_from(["12", "8.8", None]), st.floats(0.5, 0.97)), min_size=1, max_size=6))
+@given(st.lists(st.tuples(st.sampled_from(["260", "8.8", None]), st.floats(0.5, 0.97)), min_size=1, max_size=6))
 def test_rivals_make_an_answer_less_sure(read: list[tuple[str | None, float]]) -> None:
     answers = [(1.0, Status(text=t, value=1.0, confidence=c) if t else refused("no")) for t, c in read]
     agreed = _agreed(answers)
     assert agreed.confidence <= max((c for t, c in read if t), default=0.0)
     if len({t for t, _ in read if t}) == 1:
         assert agreed.answered and agreed.confidence == pytest.approx(max(c for t, c in read if t))
+
+
+@pytest.mark.parametrize("text", ["1", "-1", "7"])
+def test_a_few_strokes_alone_are_not_sure_since_any_bar_makes_some(text: str) -> None:
+    sure = Status(text=text, value=float(text), confidence=0.97)
+    assert _agreed([(1.0, sure)], FEW_OF_SCENE).confidence < 0.5
+    assert _agreed([(1.0, sure)]).confidence < 0.6
+
+
+def test_what_stands_in_a_doubtful_place_is_not_sure() -> None:
+    sure = Status(text="260", value=260.0, confidence=0.97)
+    assert _agreed([(0.4, sure)]).confidence < 0.7
+    assert _agreed([(0.4, sure), (1.0, sure)]).confidence == 0.97
+
+
+@pytest.mark.parametrize(("high", "low", "text"), [(0.3, 0.7, "12:58"), (0.3, None, None)])
+def test_two_dots_between_digits_are_a_clocks_colon(high: float, low: float | None, text: str | None) -> None:
+    gray = window("1258", dark=True, high=60, slant=0.0, pitch=1.6)
+    for y in (high, low):
+        if y is not None:
+            cv2.circle(gray, (gray.shape[1] // 2, round(60 * (0.35 + y))), 5, 40, -1, cv2.LINE_AA)
+    status = read_photograph(gray, scene=False)
+    assert status.text == text if text else ":" not in (status.text or "")
+    assert status.value is None if text else True
+
+
+@pytest.mark.parametrize("shown", ["digit", "sign"])
+def test_a_digit_or_a_sign_beside_those_that_were_read_is_a_doubt(shown: str) -> None:
+    gray = window("2608", dark=True, high=60, slant=0.0, pitch=1.6)
+    alone = read_window(gray, digits=None, decimals=None, dark=True)
+    width, left = 30, 0.5 * (gray.shape[1] - 4 * 48 + 18)
+    wide = cv2.copyMakeBorder(gray, 0, 0, 60, 0, cv2.BORDER_REPLICATE)
+    x, y = round(60 + left - width), 21 + 30
+    first, last = ((x, y - 30), (x, y + 30)) if shown == "digit" else ((x - 12, y), (x + 10, y))
+    cv2.line(wide, first, last, 60, 6)
+    status = read_window(wide, digits=None, decimals=None, dark=True)
+    assert alone.confidence > 0.8
+    assert status.text != "2608" or status.confidence < 0.8
 
 
 def test_own_scenes_are_read_by_and_large() -> None:

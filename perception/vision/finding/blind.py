@@ -33,7 +33,7 @@ PLATE_M = (0.40, 0.30)
 ROWS_APART = 3  # of those that tell the noise: enough, and a millisecond saved
 NOISY = 2.4  # gray levels; overviews drawn at medium have 2.2 at most, hard ones 2.5 at least
 UPSIDE_DOWN = 0.15  # see `uprightness`
-SURE, LEAST_SURE = 0.95, 3  # so many objects confirm a plate; of close-ups and turned panels taken for one 2 at most
+SURE, LEAST_SURE = 0.95, 4  # so many objects confirm a plate; of close-ups and turned panels taken for one 3 at most
 FURTHEST = 0.8  # a place further from every look is unlike anything taught
 SECOND_LOOK = 0.05  # a candidate this much liker to nothing still gets a look from its best middle
 # Confidence = logistic((lead - EVEN) / SCALE), lead = how much nearer the kind is than what is next. Logistic regression

@@ -34,9 +34,7 @@ LEAST_SIDES = 2  # that show as lines: one alone is anything's edge
 FILLED = 0.85  # of the image: then one line is enough, the other sides lie close to the image's border
 CONFIRMED = 0.7  # share of a side's visible edge
 LEAST_CONFIRMED = SIDE_POINTS // 4  # samples in all; in noise and in soft shades none is
-LEAST_SHARE_CONFIRMED = (
-    0.6  # of the visible border; close-ups and bare walls have less, with the plate misplaced by half
-)
+LEAST_SHARE_CONFIRMED = 0.55  # of the visible border; close-ups and bare walls mostly have less
 SURE_SHARE, SURE_SIDES, SURE_SIDE_VISIBLE = 0.9, 3, 16  # for `is_sure`; all development overviews have the share
 MOST_STRETCHED = 1.45  # see `_stretch`; a plate turned by a quarter has the square of its proportions, 1.8
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import cv2
 import numpy as np
@@ -29,8 +28,6 @@ UNMIRROR = "switch off the camera's mirroring, or mirror the picture back"
 ASKEW: tuple[tuple[str, str, Callable[[Image], Image]], ...] = (
     ("mirrored", UNMIRROR, np.fliplr),
     ("mirrored and upside down", UNMIRROR, np.flipud),
-    ("on its right side", "turn the image or the camera by 90 degrees", np.rot90),
-    ("on its left side", "turn the image or the camera by 90 degrees", partial(np.rot90, k=3)),
 )
 
 
@@ -55,7 +52,7 @@ def one_plate(gray: Image, plate_m: tuple[float, float], *, focal_px: float | No
 
 
 def check_upright(gray: Image, view: View, panel: Panel) -> None:
-    """Refuse a panel that fits better upside down, mirrored, or on its side.
+    """Refuse a panel that fits better upside down or mirrored.
 
     Raises:
         NotFound: it does; what is read where the panel file has it would be wrong.

@@ -11,8 +11,6 @@ from hal.errors import NotFound
 from hal.geometry import UncertainPose, perturbed
 from hal.panel import Lamp, Panel
 from perception.vision.finding.blind import Candidate, recognise
-from perception.vision.finding.framing import one_plate
-from perception.vision.image import as_gray
 from perception.vision.knowledge import NOTHING, Knowledge, load_knowledge, shipped_knowledge, write_kind
 from perception.vision.registration.outline import footprint_m
 from perception.vision.teaching.from_panel import PanelLooks, teach_from_panel
@@ -97,13 +95,13 @@ def test_a_panel_that_is_not_where_the_pose_has_it_teaches_nothing() -> None:
         teach_from_panel(image, view, panel(), shipped_knowledge())
 
 
-def test_a_strip_of_a_panel_taken_for_the_whole_teaches_nothing() -> None:
+def test_a_panel_of_which_most_is_elsewhere_teaches_nothing() -> None:
     """What lay where chance had it taught."""
-    image, _, _ = scene(tilt_deg=4.0, distance_m=0.66)
-    strip = np.ascontiguousarray(image[: image.shape[0] // 4])
-    view = one_plate(as_gray(strip), PLATE_M).view
-    with pytest.raises(NotFound, match="of the 12 objects"):
-        teach_from_panel(strip, view, panel(), shipped_knowledge())
+    bare = [(-0.26 + 0.04 * k, 0.06) for k in range(14)]
+    more = [Lamp(kind="lamp", name=f"lamp_{k}", position_m=place, radius_m=0.01) for k, place in enumerate(bare)]
+    other = panel().model_copy(update={"objects": (*panel().objects, *more)})
+    with pytest.raises(NotFound, match="of the 26 objects"):
+        learned(other)
 
 
 def test_what_is_written_is_what_was_learned(lesson: PanelLooks, tmp_path: Path) -> None:

@@ -25,9 +25,7 @@ class Quantity(StrEnum):
     FORCE_RISE = "force-rise"  # N above the running median of the last 0.4 s, along `axis` or the norm
     TOUCH = "touch"  # number of channels in contact
     PROXIMITY = "proximity"  # m, nearest of all valid proximity readings
-    TRAVEL = (
-        "travel"  # m, tip displacement from the start of the motion (along `axis` of the start tool frame, or the norm)
-    )
+    TRAVEL = "travel"  # m, of the tip since the motion's start (along `axis` of the start tool frame, or the norm)
     ROTATION = "rotation"  # rad, turn of the tool since the start
     TRACKING = "tracking"  # m, distance between commanded and measured tip
 

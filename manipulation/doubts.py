@@ -17,9 +17,7 @@ Array = NDArray[np.float64]
 FROZEN_S, FROZEN_TICKS, FROZEN_PERIODS = 0.1, 10, 4  # 6 N more in a touch; noise has never repeated so long
 WIDTH_OFF_M = 0.003  # pads that rest and hold nothing are nearer than this to where they were sent
 FELT_N = 8.0  # twice what the hand's own inertia makes of a transfer, and far above what closes a switch
-NEAR_TIPS_M = (
-    0.03  # lever arm of a force about the tips: what pushes the hand further up is not for the fingers to feel
-)
+NEAR_TIPS_M = 0.03  # lever arm of a force about the tips: what pushes further up is not for the fingers to feel
 UNFELT_S = 0.05
 QUIET_S = 20.0  # after it was told: the hand must be able to leave what it pushes on
 FREE_N = 5.0

@@ -150,9 +150,8 @@ class Rplidar(LineScanner):
         self._nodes, self._capsules = NodeParser(), CapsuleParser()
         self._turn: list[Points] | None = None
         self._turn_s = now_s()
-        self._begun: tuple[float, int] | None = (
-            None  # the turn: when its first chunk came, and what came in that with it
-        )
+        # The turn: when its first chunk came, and what came in that with it.
+        self._begun: tuple[float, int] | None = None
         self._measurement_s = 0.0
         self._last_rad = 0.0
         self._missed = 0

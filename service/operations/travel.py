@@ -32,9 +32,8 @@ Array = NDArray[np.float64]
 ENOUGH_CONDITIONING = 0.06  # smallest singular value over the largest: below it, small moves need fast wrists
 CLEAR_M = 0.004
 MOST_TRIES, MOST_THOROUGH = 24, 3  # goals that are searched for quickly, and then thoroughly
-NEAR_RAD = (
-    1.5  # the largest turn of a joint between neighbouring views; 3.9 s to another branch of the arm, 1.1 s without
-)
+# The largest turn of a joint between neighbouring views; 3.9 s to another branch of the arm, 1.1 s without.
+NEAR_RAD = 1.5
 MOST_STEPS_BACK = 6  # of 50 mm: further than the room of an unlocated panel reaches
 
 

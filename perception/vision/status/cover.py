@@ -19,9 +19,7 @@ from perception.vision.image import Image
 from perception.vision.patch import Patch, sample_at
 from perception.vision.view import Array
 
-STANDS_OUT = (
-    14.0  # gray levels, and four sigmas of the noise; less in a dark picture, as everything stands out less there
-)
+STANDS_OUT = 14.0  # gray levels, and four sigmas of the noise; less in a dark picture, where everything does less
 STANDS_OUT_SHARE, LEAST_STANDS_OUT = 0.12, 5.0
 LARGEST_SHARE = 0.4  # of the object: what follows the gray of a cable and fills more has leaked into the object
 RIM_PX = 4.0

@@ -19,9 +19,8 @@ from perception.vision.view import Array
 STEPS = 720
 GLARE = 0.25  # of the radius: marks are smaller
 RIVAL_STEPS = 30  # 15 degrees, beyond a spoke
-RIVAL_SHARE = (
-    0.55  # of 330 drawn wheels read right .97 have less; of those read wrong at more than .85 all have more than 0.61
-)
+# Of 330 drawn wheels read right .97 have less; of those read wrong at more than .85 all have more than 0.61.
+RIVAL_SHARE = 0.55
 #: Of the spokes' contrast, that a marked one is brighter or darker by than gaps and other spokes: of 405 wheels read right four
 #: have less; of seven read wrong four, whose mark a cable or glare hides. Then it may be a spoke without one.
 LEAST_BEYOND, FAINT = 0.65, 0.7

@@ -16,9 +16,7 @@ from perception.vision.status.choice import contrast_noise
 from perception.vision.view import Array
 
 EDGE_SIGMA_PX = 0.25  # of one edge point, image px, model error of a rendered or real cap included
-RESOLVED = (
-    1.5  # widths of an edge: a wall that shows narrower than that runs into the face, and its foot cannot be told
-)
+RESOLVED = 1.5  # widths of an edge: a wall that shows narrower runs into the face, and its foot cannot be told
 SHARP_PX, PULL = 1.8, 1.0  # edges wider than sharp ones are pulled by their neighbours: the excess times that, px
 RING, RING_SHARE, RING_NEAR_PX = (1.08, 1.5), 0.5, 2.0  # radii over the cap's; share of it that must show; image px
 CLEAR_OF_RING = 1.6  # of the cap's radius: what crosses a circle of that size is no part of the button

@@ -28,9 +28,8 @@ from perception.vision.teaching.condense import worth_keeping
 from perception.vision.teaching.teach import NOTHING_SIZE_M, SNAP_M, Overview, overview_of, under_pixels
 from perception.vision.view import Array, CameraView, View
 
-PART_M = (
-    0.0067  # a sub-object this near to an object's middle is that object's, whichever of them blind recognition takes
-)
+# A sub-object this near to an object's middle is that object's, whichever of them blind recognition takes.
+PART_M = 0.0067
 FOOT_TO_TOP = np.array([0.0, 0.5, 1.0])  # what stands out of the plate appears between its foot and its top
 LEAST_THERE = 0.5  # of the objects; a panel of which the image has the left half showed 5 of 14
 NOT_DISTINCT = "nothing there stands out as a whole: come closer, or change the angle or the light"

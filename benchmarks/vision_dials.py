@@ -190,3 +190,10 @@ def summary(results: list[DialResult]) -> list[str]:
         shares = (np.sum(given <= 2.0), len(errors) - len(given), np.sum(given > 5.0))
         lines.append(f"  {group:8s} {' / '.join(f'{n / max(1, len(errors)):.3f}' for n in shares)}")
     return lines
+
+
+def right_wrong_sure(results: list[DialResult]) -> tuple[int, int, int]:
+    """How many are within 2 %, how many are not, and how many of those claim 0.8 or more."""
+    wrong = [r for r in results if r.error is not None and r.error > 2.0]
+    right = sum(r.error is not None and r.error <= 2.0 for r in results)
+    return right, len(wrong), sum(r.confidence >= 0.8 for r in wrong)

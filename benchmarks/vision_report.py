@@ -18,11 +18,11 @@ from scipy.spatial.transform import RigidTransform
 from benchmarks.display_report import display_lines
 from benchmarks.vision import run
 from benchmarks.vision_axes import axes, random_state, shipped_panel
-from benchmarks.vision_dials import draw_dial, read_drawn
+from benchmarks.vision_dials import draw_dial, read_drawn, right_wrong_sure
 from benchmarks.vision_dials import summary as dial_lines
 from benchmarks.vision_drawing import camera, draw_panel, looking_at
 from benchmarks.vision_held_out import held_out_lines
-from benchmarks.vision_manometers import draw_manometer
+from benchmarks.vision_manometers import UNUSUAL, draw_manometer
 from benchmarks.vision_reliability import Answer, draw_reliability, reliability_lines
 from hal.errors import CellError
 from hal.geometry import certain
@@ -43,6 +43,7 @@ STATES = ("toggle", "rotary", "button", "lamp", "lever")
 POINTERS = ("gauge", "panel_meter")
 ROOT = Path(__file__).resolve().parent.parent
 DRAWN_DIALS = range(200)
+FEW_GAUGES = range(71000, 71050)  # nobody looked at them
 READINGS_TIMED = 40
 
 
@@ -68,6 +69,10 @@ def report(data: Path) -> int:
         print(f"drawn {what} (not fitted to): within 2 % / refused / wrong above 5 %")
         print("\n".join(dial_lines(drawn)))
         answers += [Answer(confidence=r.confidence, right=r.error <= 2.0) for r in drawn if r.error is not None]
+    print("drawn pressure gauges with other scales: within 2 % / wrong above 2 % / the same at .8 or more")
+    for name, way in UNUSUAL.items():
+        drawn = read_drawn(FEW_GAUGES, partial(draw_manometer, way=way))
+        print(f"  {name:17s} {' / '.join(f'{n / len(drawn):.2f}' for n in right_wrong_sure(drawn))}")
     display_lines()
     print("\n" + "\n".join(held_out_lines()))
     answers += axes()

@@ -17,6 +17,7 @@ from perception.vision.image import WHITE_LEVEL, Image, as_gray
 from perception.vision.patch import Patch
 from perception.vision.photographs.dial_outline import SIDE_PX, dial_circle
 from perception.vision.photographs.drop import find_drop, with_halo
+from perception.vision.photographs.scale_ends import scale_ends
 from perception.vision.reading import ANSWER_AT, Status, answer_at, gated, limited, refused
 from perception.vision.status.gauge import RIVAL, SIGMA_RAD, pointer_confidence, status_of_pointer
 from perception.vision.status.pointer import PointerFit, find_pointer, unroll, wrapped
@@ -36,6 +37,9 @@ BRIGHT_FACE = 205  # gray level
 PIVOT_OFF = 0.08  # of the radius: seen aslant, the outline found is not about the pivot
 LEAST_COLOUR = 5.0  # of Lab: less is the noise of a camera or of JPEG
 SCALE_END_RAD = np.deg2rad(135.0)  # three quarters of a turn is what almost all round gauges use
+USUAL_RAD = np.deg2rad(10.0)  # ticks that end so near to it mean it: one tick more or less
+SAME_SPAN_RAD, TURNED_RAD = np.deg2rad([5.0, 3.0])  # unless all is turned: the photograph or the gauge is not upright
+BY_TICKS = 0.75  # confidence: an end may be a tick off
 
 
 def read_dial(
@@ -47,13 +51,15 @@ def read_dial(
     Args:
         image: gray or RGB uint8, cropped to the dial.
         circular: the scale is a full turn that begins straight up.
-        ends_rad: pointer angles at minimum and maximum of a scale that is not; three quarters of a turn by default.
+        ends_rad: pointer angles at minimum and maximum of a scale that is not; when None, where its ticks end, and three
+            quarters of a turn where they do not tell.
         least_confidence: as of `taught.inspect`.
 
     Raises:
         InvalidRequest, NotObservable: bad image.
     """
-    found = _pointer(image)
+    picture, circle = _at_reading_size(image)
+    found = _pointer(picture, *circle)
     if found is None:
         return refused("no pointer stands out on the dial: come closer or add light")
     fit, most = found
@@ -62,22 +68,40 @@ def read_dial(
         sigma = fit.sigma_rad / (2 * np.pi) * (maximum - minimum)
         status = Status(value=float(value), uncertainty=float(sigma), confidence=_confidence(fit))
     else:
-        low, high = ends_rad or (-SCALE_END_RAD, SCALE_END_RAD)
+        (low, high), most_of_ends = (ends_rad, 1.0) if ends_rad else _ends(as_gray(picture), *circle)
+        most = min(most, most_of_ends)
         scale = Scale(minimum=minimum, maximum=maximum, unit="", at_min=low, at_max=high)
         status = status_of_pointer(fit, scale, 1.0)
     return answer_at(gated(limited(status, most)), least_confidence)
 
 
-def _pointer(image: NDArray[Any]) -> tuple[PointerFit, float] | None:
-    """The pointer and the most confidence that it deserves; None where nothing stands out."""
+def _at_reading_size(image: NDArray[Any]) -> tuple[Image, tuple[float, float, float]]:
+    """The picture with a side of `SIDE_PX`, and the dial in it: u, v and radius."""
     scale = SIDE_PX / max(image.shape[:2])
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
     picture = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=interpolation), np.uint8)
-    circle = dial_circle(as_gray(image), scale)
-    drop, by_sides = find_drop(picture, *circle)
+    return picture, dial_circle(as_gray(image), scale)
+
+
+def _ends(gray: Image, u: float, v: float, radius: float) -> tuple[tuple[float, float], float]:
+    """Pointer angles at minimum and maximum, and the most confidence that they deserve."""
+    usual = (-SCALE_END_RAD, SCALE_END_RAD)
+    by_ticks = scale_ends(gray, u, v, radius, usual)
+    if by_ticks is None:
+        return usual, 1.0
+    off = wrapped(np.array(by_ticks) - usual)
+    turned = float(off.mean())
+    if abs(off[0] - off[1]) < SAME_SPAN_RAD and abs(turned) > TURNED_RAD:
+        return (usual[0] + turned, usual[1] + turned), BY_TICKS
+    return (usual, 1.0) if np.all(np.abs(off) < USUAL_RAD) else (by_ticks, BY_TICKS)
+
+
+def _pointer(picture: Image, u: float, v: float, radius: float) -> tuple[PointerFit, float] | None:
+    """The pointer and the most confidence that it deserves; None where nothing stands out."""
+    drop, by_sides = find_drop(picture, u, v, radius)
     if drop is not None:
         return drop.fit, drop.most
-    in_gray, in_colour = _lines(picture, *circle)
+    in_gray, in_colour = _lines(picture, u, v, radius)
     fit, most = None, 0.0
     if in_gray or in_colour:
         fit, rival = _believed(in_gray, in_colour)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.vision_dials import draw_dial, error_of
-from benchmarks.vision_manometers import draw_manometer
-from perception.vision.photographs.dial import read_dial
+from benchmarks.vision_manometers import UNUSUAL, draw_manometer
+from perception.vision.photographs.dial import BY_TICKS, read_dial
 
 TAIL_UNDER_GLARE = 46  # the tip lies under glare, the tail shows
 GLARE_BESIDE = (59, 62, 80, 98)
@@ -68,6 +68,18 @@ def test_a_pointer_that_lightness_shows_well_is_not_doubted_for_its_displaced_co
 def test_a_pressure_gauge_is_read_about_the_middle_of_its_face_not_of_its_bezel(seed: int) -> None:
     error, _ = error_of(draw_manometer(seed))
     assert error is not None and error <= 2.0
+
+
+@pytest.mark.parametrize("name", UNUSUAL)
+def test_a_scale_of_another_span_is_read_by_where_its_ticks_end(name: str) -> None:
+    errors = [error_of(draw_manometer(seed, UNUSUAL[name]))[0] for seed in range(70000, 70012)]
+    assert sum(error is not None and error <= 2.0 for error in errors) >= 7
+
+
+def test_an_end_that_the_pointer_hides_does_not_move_the_scale() -> None:
+    error, confidence = error_of(draw_manometer(70221))  # its ticks are 24 degrees under the pointer
+    assert error is not None and error <= 2.0
+    assert confidence > BY_TICKS  # as the usual scale deserves
 
 
 @pytest.mark.parametrize("value", [0.6, 2.4, 4.9])

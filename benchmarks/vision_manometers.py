@@ -1,7 +1,8 @@
 """Drawn photographs of pressure gauges with known readings: double scales, bands, screws, words, shadows, reflections.
 
 Three quarters of a turn unless told otherwise, a dark or red pointer with a counterweight, a bezel, and something around
-it. Nothing of the pointer is fitted to them; where ticks end was tried on seeds 70000 to 70320.
+it. Nothing of the pointer is fitted to them; where ticks end was tried on
+seeds 70000 to 70320, 71000 to 71099 and 84000 to 84199.
 """
 
 from __future__ import annotations

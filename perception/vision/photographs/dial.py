@@ -39,6 +39,7 @@ LEAST_COLOUR = 5.0  # of Lab: less is the noise of a camera or of JPEG
 SCALE_END_RAD = np.deg2rad(135.0)  # three quarters of a turn is what almost all round gauges use
 USUAL_RAD = np.deg2rad(10.0)  # ticks that end so near to it mean it: one tick more or less
 SAME_SPAN_RAD, TURNED_RAD = np.deg2rad([5.0, 3.0])  # unless all is turned: the photograph or the gauge is not upright
+LOPSIDED_RAD = np.deg2rad(10.0)  # middle of another span from straight up: then ticks at one end do not show
 BY_TICKS = 0.75  # confidence: an end may be a tick off
 
 
@@ -86,14 +87,15 @@ def _at_reading_size(image: NDArray[Any]) -> tuple[Image, tuple[float, float, fl
 def _ends(gray: Image, u: float, v: float, radius: float) -> tuple[tuple[float, float], float]:
     """Pointer angles at minimum and maximum, and the most confidence that they deserve."""
     usual = (-SCALE_END_RAD, SCALE_END_RAD)
-    by_ticks = scale_ends(gray, u, v, radius, usual)
+    by_ticks = scale_ends(gray, u, v, radius)
     if by_ticks is None:
         return usual, 1.0
-    off = wrapped(np.array(by_ticks) - usual)
-    turned = float(off.mean())
-    if abs(off[0] - off[1]) < SAME_SPAN_RAD and abs(turned) > TURNED_RAD:
-        return (usual[0] + turned, usual[1] + turned), BY_TICKS
-    return (usual, 1.0) if np.all(np.abs(off) < USUAL_RAD) else (by_ticks, BY_TICKS)
+    wider_rad, turned_rad = by_ticks[1] - by_ticks[0] - 2 * SCALE_END_RAD, 0.5 * (by_ticks[0] + by_ticks[1])
+    if abs(wider_rad) < SAME_SPAN_RAD and abs(turned_rad) > TURNED_RAD:
+        return (usual[0] + turned_rad, usual[1] + turned_rad), BY_TICKS
+    if 0.5 * abs(wider_rad) + abs(turned_rad) < USUAL_RAD:
+        return usual, 1.0
+    return (usual if abs(turned_rad) > LOPSIDED_RAD else by_ticks), BY_TICKS
 
 
 def _pointer(picture: Image, u: float, v: float, radius: float) -> tuple[PointerFit, float] | None:

@@ -45,16 +45,12 @@ class TickRun:
         return self.ticks * float(np.log1p(self.contrast))
 
 
-def scale_ends(
-    gray: Image, u: float, v: float, radius: float, usual_rad: tuple[float, float]
-) -> tuple[float, float] | None:
+def scale_ends(gray: Image, u: float, v: float, radius: float) -> tuple[float, float] | None:
     """Angles of the first and the last tick, rad clockwise from up, their middle within half a turn; None where rings disagree.
 
     Args:
         gray: (H, W) uint8.
         u, v, radius: the dial in it, px.
-        usual_rad: the ends that almost all gauges have: these, where one ring has as many ticks between them as any of
-            those that agree on others, on which the pointer hides some.
     """
     runs = [run for profile in _rings(gray, u, v, radius) if (run := _longest(profile)) is not None]
     if not runs:
@@ -63,9 +59,6 @@ def scale_ends(
     group = max(groups, key=_weight)
     if len(group) < LEAST_RINGS or _weight(group) < LEAST_SHARE * _weight(runs):
         return None
-    most = max(run.ticks for run in group)
-    if any(run.ticks >= most and _apart(run, usual_rad) < SAME_RAD for run in runs):
-        return usual_rad
     weights = [run.weight for run in group]
     first_rad, last_rad = group[0].ends_rad
     off = [[_off(run.ends_rad[k], group[0].ends_rad[k]) for run in group] for k in (0, 1)]

@@ -11,7 +11,6 @@ from perception.vision.photographs.scale_ends import scale_ends
 
 SIDE_PX, RADIUS_PX = 300, 130.0
 MIDDLE_PX = 0.5 * (SIDE_PX - 1)
-USUAL_RAD = (-np.deg2rad(135.0), np.deg2rad(135.0))
 
 
 def face(first_deg: float, last_deg: float, steps: int, *, light: bool = False, seed: int = 1) -> Image:
@@ -39,7 +38,7 @@ def face(first_deg: float, last_deg: float, steps: int, *, light: bool = False, 
     ],
 )
 def test_the_first_and_the_last_tick_are_found(first_deg: float, last_deg: float, steps: int, light: bool) -> None:
-    found = scale_ends(face(first_deg, last_deg, steps, light=light), MIDDLE_PX, MIDDLE_PX, RADIUS_PX, USUAL_RAD)
+    found = scale_ends(face(first_deg, last_deg, steps, light=light), MIDDLE_PX, MIDDLE_PX, RADIUS_PX)
     assert found is not None
     assert np.rad2deg(found) == pytest.approx([first_deg, last_deg], abs=1.0)
 
@@ -51,13 +50,13 @@ def test_ticks_that_a_pointer_covers_are_stepped_over() -> None:
         round(MIDDLE_PX - RADIUS_PX * np.cos(np.deg2rad(30.0))),
     )
     cv2.line(image, (round(MIDDLE_PX), round(MIDDLE_PX)), end, 30, 14, cv2.LINE_AA)
-    found = scale_ends(image, MIDDLE_PX, MIDDLE_PX, RADIUS_PX, USUAL_RAD)
+    found = scale_ends(image, MIDDLE_PX, MIDDLE_PX, RADIUS_PX)
     assert found is not None
     assert np.rad2deg(found) == pytest.approx([-90.0, 90.0], abs=1.5)
 
 
 def test_a_face_without_ticks_or_with_ticks_all_round_tells_nothing() -> None:
-    assert scale_ends(face(0.0, 0.0, 0), MIDDLE_PX, MIDDLE_PX, RADIUS_PX, USUAL_RAD) is None
-    assert scale_ends(face(-180.0, 174.0, 59), MIDDLE_PX, MIDDLE_PX, RADIUS_PX, USUAL_RAD) is None
+    assert scale_ends(face(0.0, 0.0, 0), MIDDLE_PX, MIDDLE_PX, RADIUS_PX) is None
+    assert scale_ends(face(-180.0, 174.0, 59), MIDDLE_PX, MIDDLE_PX, RADIUS_PX) is None
     flat = np.full((SIDE_PX, SIDE_PX), 128, np.uint8)
-    assert scale_ends(flat, MIDDLE_PX, MIDDLE_PX, RADIUS_PX, USUAL_RAD) is None
+    assert scale_ends(flat, MIDDLE_PX, MIDDLE_PX, RADIUS_PX) is None

@@ -13,7 +13,8 @@ import numpy as np
 
 from benchmarks.display_face import HIGH_PX, Face, face_gray, face_ink, random_face
 from benchmarks.display_photo import Gray, disturbed, surroundings, taken
-from perception.vision.view import Array, homography
+from hal.arrays import Array
+from perception.vision.view import homography
 
 LEVELS = ("easy", "medium", "hard")
 PHOTOGRAPHS = ("cropped", "scene", "low contrast")

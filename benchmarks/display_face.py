@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.vision.view import Array
+from hal.arrays import Array
 
 Float32 = NDArray[np.float32]
 

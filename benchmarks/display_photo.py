@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.display_face import Float32, write
-from perception.vision.view import Array
+from hal.arrays import Array
 
 Gray = NDArray[np.uint8]
 

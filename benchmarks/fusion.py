@@ -31,7 +31,8 @@ from fusion.errors import Contradiction
 from fusion.robust import used_entries
 from fusion.simulate import TABLE_II, problem
 from fusion.solve import solve
-from hal.geometry import Array, difference, matrix_of, perturbed, transform
+from hal.arrays import Array
+from hal.geometry import difference, matrix_of, perturbed, transform
 
 ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])  # the case files put rotation first, the cell translation
 

@@ -15,7 +15,8 @@ from fusion import Measurement
 from fusion.distance.reference import residual
 from fusion.simulate import problem
 from fusion.solve import solve, solve_from_many
-from hal.geometry import Array, difference, matrix_of, perturbed, transform
+from hal.arrays import Array
+from hal.geometry import difference, matrix_of, perturbed, transform
 
 Row = tuple[str, str, str]
 

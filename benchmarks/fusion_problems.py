@@ -12,7 +12,8 @@ from fusion import FusedPose, Measurement, SensingClass, fuse
 from fusion.errors import Contradiction
 from fusion.simulate import CODES, Problem, problem
 from fusion.solve import solve
-from hal.geometry import Array, difference
+from hal.arrays import Array
+from hal.geometry import difference
 
 NEAR_M, NEAR_RAD = 0.005, np.radians(1.0)
 

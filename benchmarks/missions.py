@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.cell import clear_stop, run_to_end
+from hal.arrays import Array
 from hal.config import Cell, load_cell
 from service.client import Client
 from service.serve import Options, Panelwright
@@ -36,7 +36,7 @@ class Run:
 
     seed: int
     report: dict[str, Any]
-    places_m: dict[str, NDArray[np.float64]]
+    places_m: dict[str, Array]
 
     @property
     def judge(self) -> dict[str, Any]:
@@ -106,7 +106,7 @@ def run(seed: int, cell: Path) -> Run:
         return Run(seed=seed, report=report, places_m=built_places(loaded, seed))
 
 
-def built_places(cell: Cell, seed: int) -> dict[str, NDArray[np.float64]]:
+def built_places(cell: Cell, seed: int) -> dict[str, Array]:
     """Where the simulator builds each object of the panel with this seed: (3,) on the plate, base frame."""
     draws = Draws(seed)
     base_from_panel = draws.panel_pose(cell.file.workspace)

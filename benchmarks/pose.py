@@ -15,16 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.pose_cases import Problem, error, is_flipped, problems
 from benchmarks.pose_hand_eye import rows as hand_eye_rows
 from benchmarks.pose_lights import drawn_pairs, score_pairs, stored_pairs
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.errors import CellError
 from perception.vision.quadrangle import QuadranglePose, estimate, warm_up
 
-Array = NDArray[np.float64]
 ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
 DEVELOPMENT = Path(__file__).resolve().parents[2] / "shared" / "data" / "pose" / "dev_quads.json"
 SHAPES = [

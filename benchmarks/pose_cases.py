@@ -8,10 +8,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
+
 Problem = dict[str, Any]
 
 SHAPES: dict[str, list[list[float]]] = {

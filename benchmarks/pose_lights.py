@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.errors import PerceptionError
 from perception.vision.lights import assign_lights, find_lights
 
-Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 STORED = Path(__file__).resolve().parents[2] / "shared" / "data" / "vision" / "synth_dev"
 WIDTH, HEIGHT = 640, 480

@@ -20,18 +20,17 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks import range_matching, range_peers, range_rooms
 from benchmarks.range_sensors import SENSORS, table_top
 from benchmarks.range_soft import SCENES, VIEWS, soft_scene
+from hal.arrays import Array
 from perception.range import Surface, analyse
 from perception.range.primitives import Cone, Cylinder, Ellipsoid, Plane, Sphere
 from perception.range.recordings import load_recording, sensor_from_meta
 from perception.range.warm import warm_up
 from perception.range.window import Window
 
-Array = NDArray[np.float64]
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "range"
 MM = 1000.0
 MATCHED_SEEDS = 5  # fourteen components a scene

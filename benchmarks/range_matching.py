@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range import RangeScene, analyse
 from perception.range.matching.match import Match, match_models
 from perception.range.matching.models import shipped_models
 from perception.range.recordings import sensor_from_meta
 
-Array = NDArray[np.float64]
 MM = 1000.0
 HIDDEN_SHARE = 0.4
 MOST_HIDDEN_SHARE = 0.5

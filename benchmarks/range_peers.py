@@ -18,7 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
+
 Labels = NDArray[np.int32]
 Found = tuple[NDArray[np.bool_], dict[str, Any]]  # which points, and the primitive as the scorer reads it
 Segmenter = Callable[[ModuleType, Array], Iterator[Found]]

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.range_sensors import FINE, LEAST_PIXELS, Array, Case, case_seen, sensor_model
+from benchmarks.range_sensors import FINE, LEAST_PIXELS, Case, case_seen, sensor_model
 from benchmarks.range_soft import STRAIGHT, UP, SoftBox, drawn, plane, sofa, soft_box
+from hal.arrays import Array
 
 VIEWS = ("structured", "tof", FINE)
 NARROWEST_MM = 50.0  # a face that anybody outlines

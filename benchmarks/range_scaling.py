@@ -27,7 +27,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.range.analyse import analyse
+from hal.arrays import Array
+from perception.range.analysis import analyse
 from perception.range.batch import IMAGES_A_TASK, _client, analyse_files, recordings_in, tasks_of
 from perception.range.components import _merge_seam, _scan, merge_rounds, tile_rows
 from perception.range.fitting.surfaces import SIZE
@@ -39,8 +40,6 @@ from perception.range.segmentation.claim import claim_again, claim_pixels
 from perception.range.segmentation.tangents import tangent_planes
 from perception.range.sensor import PinholeSensor
 from perception.range.warm import warm_up
-
-Array = NDArray[np.float64]
 
 SHARED_BARRIER_S = 10e-6
 MESSAGE_S = 50e-6

@@ -15,17 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.range_sensors import (
-    FINE,
-    LEAST_PIXELS,
-    SENSORS,
-    TABLE_HEIGHT_MM,
-    Array,
-    Case,
-    case_seen,
-    sensor_model,
-    stands,
-)
+from benchmarks.range_sensors import FINE, LEAST_PIXELS, SENSORS, TABLE_HEIGHT_MM, Case, case_seen, sensor_model, stands
+from hal.arrays import Array
 
 SCENES = ("table", "room")
 WALK_STEPS = 90

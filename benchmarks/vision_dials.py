@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hal.arrays import Array
 from perception.vision.image import Image
 from perception.vision.photographs.dial import read_dial
 
@@ -56,7 +57,7 @@ class Pen:
     """Draws about a dial's middle, in shares of its radius: `up` along a direction, `right` across it."""
 
     canvas: NDArray[np.uint8]
-    middle: NDArray[np.float64]
+    middle: Array
     radius: float
 
     @staticmethod

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.panel import (
     Button,
@@ -30,7 +31,7 @@ from hal.panel import (
     Slider,
     Toggle,
 )
-from perception.vision.view import Array, View
+from perception.vision.view import View
 
 SUPERSAMPLING = 3
 WALL, PLATE, INK, FACE, KNOB, WHITE, STEEL = 40, 150, 35, 240, 45, 240, 205

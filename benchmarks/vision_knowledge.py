@@ -23,13 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.panel_scene import AMOUNTS, GAMMA, pictured, seen
+from hal.arrays import Array
 from perception.vision.finding.blind import PLATE_M, Candidate, candidate_places, chosen, lay_out
 from perception.vision.finding.features import PLATE_PX_PER_M, Ground, look_at
 from perception.vision.finding.plate import find_plate
 from perception.vision.image import Image
 from perception.vision.knowledge import NOTHING, Kind, Knowledge, shipped_knowledge, spread_of, write_kind
 from perception.vision.teaching.condense import worth_keeping
-from perception.vision.view import Array, PlaneView
+from perception.vision.view import PlaneView
 
 DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "vision" / "synth_dev"
 FOLDS = 3

@@ -22,8 +22,8 @@ from benchmarks.panel_scene import AMOUNTS, FOCAL_PX, GAMMA, LEVELS, Level, Scen
 from benchmarks.vision import DATA
 from benchmarks.vision_held_out import SURE, Judged, read_scene
 from benchmarks.vision_report import module_of
+from hal.arrays import Array
 from perception.vision.image import as_gray, decode
-from perception.vision.view import Array
 
 FIRST, COUNT, LEVEL = 1000, 3, "hard"
 OWN_BLUR_PX = 0.36  # of an easy image, which the new blur adds to (squares add)

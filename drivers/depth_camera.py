@@ -16,6 +16,7 @@ from pydantic import Field
 
 from drivers.kinds.file_player import FilePlayer
 from drivers.transport.options import read_options
+from hal.arrays import Array
 from hal.clock import Deadline
 from hal.devices import DeviceKind, RangeImage, RangeScannerCapabilities
 from hal.errors import DeviceFault, DeviceUnavailable
@@ -108,7 +109,7 @@ class DepthCamera(FilePlayer[RangeImage]):
         return DeviceFault(f"{self.name}: {what}", hint="remove or replace it", device=self.name)
 
 
-def _read(path: Path, unit_m: float) -> NDArray[np.float64]:
+def _read(path: Path, unit_m: float) -> Array:
     if path.suffix == ".png":
         raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if raw is None or raw.dtype != np.uint16:

@@ -13,15 +13,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from hal.arrays import Array
 from hal.devices import RangeImage, RangeScannerCapabilities
 from hal.errors import InvalidRequest, StaleReading
 from hal.geometry import interpolate
 from hal.readings import Quality, Stamped
 
-Points = NDArray[np.float64]
+Points = Array
 LONGEST_GAP_S = 0.1  # between two poses: at 1 m/s^2 the path bends 1.3 mm away from the straight line meanwhile
 KNOTS = 9  # poses a scan; beams between two of them are placed by interpolation
 

@@ -12,16 +12,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from fusion import FusedPose, Measurement, fuse
 from fusion.features import Kind, plane
 from fusion.measurement import measurement
 from fusion.shapes import Box, Cylinder, Shape
+from hal.arrays import Array
 from hal.geometry import UncertainPose, perturbed, transform_rpy
 
-Array = NDArray[np.float64]
 TOUCH_SIGMA_M, RANGE_SIGMA_M, ARC_SIGMA_M = 0.0002, 0.002, 0.0008
 PRIOR_SIGMA = np.array([0.005] * 3 + [0.02] * 3)  # what the camera knew: 5 mm, 1.1 degrees
 

@@ -19,7 +19,8 @@ from fusion.draw import Drawing, Sight, axes, box_outlines, circle_outline, sigh
 from fusion.errors import Contradiction
 from fusion.simulate import TABLE_II, Problem, problem
 from fusion.solve import solve_from_many
-from hal.geometry import Array, difference
+from hal.arrays import Array
+from hal.geometry import difference
 
 # Table II: local pose function of the added measurement at the true pose, error in inches, error in degrees.
 PAPER = (

@@ -9,9 +9,37 @@
 
 from __future__ import annotations
 
-from fusion.features import Feature, Kind
-from fusion.measurement import Measurement, SensingClass
-from fusion.robust import FusedPose, fuse
-from fusion.warm import warm_up
+from typing import TYPE_CHECKING
 
-__all__ = ["Feature", "FusedPose", "Kind", "Measurement", "SensingClass", "fuse", "warm_up"]
+from hal.face import load_on_first_use
+
+if TYPE_CHECKING:
+    from fusion.batch import pack
+    from fusion.features import Feature, Kind, plane, point, unit
+    from fusion.measurement import Measurement, SensingClass
+    from fusion.robust import FusedPose, ShapeEstimate, fuse
+    from fusion.shapes import Box, Cylinder, FeatureSet, MovingPart, Shape
+    from fusion.solve import local_solution
+    from fusion.warm import warm_up
+
+__all__ = [
+    "Box",
+    "Cylinder",
+    "Feature",
+    "FeatureSet",
+    "FusedPose",
+    "Kind",
+    "Measurement",
+    "MovingPart",
+    "SensingClass",
+    "Shape",
+    "ShapeEstimate",
+    "fuse",
+    "local_solution",
+    "pack",
+    "plane",
+    "point",
+    "unit",
+    "warm_up",
+]
+__getattr__ = load_on_first_use(__name__, __file__)

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from fusion.measurement import NULL_RATIO, Measurement, constraints_of
+from hal.arrays import Array
 from hal.errors import InvalidRequest
-from hal.geometry import Array, UncertainPose
+from hal.geometry import UncertainPose
 
 GATE_PROBABILITY = 0.999  # a good measurement passes its gate with this probability (notes/fusion.md, "Robust")
 GATES = np.array([np.inf, *(2.0 * gammaincinv(0.5 * np.arange(1, 7), GATE_PROBABILITY))])  # quantiles of chi-square

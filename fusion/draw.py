@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
 from fusion.sensing import Pinhole
-from hal.geometry import Array, transform
+from hal.arrays import Array
+from hal.geometry import transform
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,8 +8,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hal.arrays import Array
 from hal.errors import InvalidRequest
-from hal.geometry import Array
 
 
 class Kind(StrEnum):

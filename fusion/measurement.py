@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion.features import Feature, Kind
+from hal.arrays import Array
 from hal.errors import InvalidRequest
-from hal.geometry import Array
 
 NULL_RATIO = 1e-9  # an eigenvalue of M below this share of the largest one is rounding
 

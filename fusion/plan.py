@@ -18,8 +18,9 @@ from fusion.batch import pack
 from fusion.distance.rows import informations
 from fusion.features import Feature, Kind
 from fusion.measurement import Measurement, measurement
+from hal.arrays import Array
 from hal.errors import InvalidRequest
-from hal.geometry import Array, matrix_of, skew
+from hal.geometry import matrix_of, skew
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

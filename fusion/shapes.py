@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 
 from fusion.features import Feature, line, plane
+from hal.arrays import Array
 from hal.errors import InvalidRequest
-from hal.geometry import Array
 
 
 class Shape(Protocol):

@@ -15,7 +15,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from fusion.distance import local_values
 from fusion.features import Feature, Kind, box_features, plane, point
 from fusion.measurement import Measurement, measurement
-from hal.geometry import Array, matrix_of, transform
+from hal.arrays import Array
+from hal.geometry import matrix_of, transform
 
 # Class and sense of each kind of sensing in Table I: v vision, t touch, p proximity, r range.
 CODES = ("1v", "1t", "1p", "2t", "2p", "3t", "3p", "4v", "5v", "6t", "6p", "7r", "8v", "9t", "9p", "9r")

@@ -7,34 +7,12 @@ Symmetric 3x3 matrices are (xx, xy, xz, yy, yz, zz).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
 
-import numba as nb
-import numpy as np
-from numba.extending import register_jitable
+from hal.arrays import Array
+from hal.jit import inlined
 
-from hal.geometry import Array
-
-F = TypeVar("F", bound=Callable[..., Any])
-T = TypeVar("T", bool, int)
 Vec = tuple[float, float, float]
 Sym = tuple[float, float, float, float, float, float]
-
-
-def compiled(function: F) -> F:
-    """`function` compiled by numba on first use and kept on disk."""
-    return cast(F, nb.njit(cache=True, error_model="numpy", nogil=True)(function))
-
-
-def inlined(function: F) -> F:
-    """A small helper that is compiled into its callers only: called from Python it is Python."""
-    return register_jitable(error_model="numpy", nogil=True)(function)
-
-
-def plain(value: T) -> T:
-    """`value` as numpy's scalar. Numba compiles a `compiled` function once more for every Python constant in a call to it."""
-    return cast(T, np.asarray(value)[()])
 
 
 @inlined

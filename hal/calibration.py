@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from hal.arrays import Array
 from hal.geometry import UncertainPose, transform_rpy
 from hal.strict import Strict, load_toml
 
@@ -77,7 +77,7 @@ class MountRecord(Strict):
             covariance=self._correlation_matrix() * np.outer(sigma, sigma),
         )
 
-    def _correlation_matrix(self) -> NDArray[np.float64]:
+    def _correlation_matrix(self) -> Array:
         lower = np.zeros((6, 6))
         if self.correlations:
             lower[np.tril_indices(6, -1)] = self.correlations

@@ -18,11 +18,10 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.clock import Deadline
 from hal.readings import Cause, Quality, Stamped
-
-Array = NDArray[np.float64]
 
 
 class DeviceKind(StrEnum):

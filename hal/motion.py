@@ -10,11 +10,9 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
 
 
 class Quantity(StrEnum):

@@ -1,1 +1,57 @@
-"""A pose to a deed: kinematics, planning, trajectories, guarded and compliant motion, one file a skill."""
+"""A pose to a deed: collision-free motion, a guarded skill for each kind of control, and the control loop (paper V)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hal.face import load_on_first_use
+
+if TYPE_CHECKING:
+    from manipulation.collision import CollisionModel
+    from manipulation.control import Controller
+    from manipulation.kinematics import Kinematics
+    from manipulation.shapes import Box
+    from manipulation.skills.button import button
+    from manipulation.skills.handwheel import handwheel
+    from manipulation.skills.lever import lever
+    from manipulation.skills.mushroom import mushroom
+    from manipulation.skills.outcome import ObjectState, SkillFailure, SkillReport, Verify
+    from manipulation.skills.probe import proximity_probe, touch_probe
+    from manipulation.skills.rotary import rotary
+    from manipulation.skills.slider import slider
+    from manipulation.skills.steps import Attempt, park, retreat
+    from manipulation.skills.toggle import toggle
+    from manipulation.timing import SpeedLimits
+    from manipulation.transfer import QUICK, THOROUGH, Effort
+    from manipulation.warm import warm_up
+    from manipulation.workcell import Workcell
+
+__all__ = [
+    "QUICK",
+    "THOROUGH",
+    "Attempt",
+    "Box",
+    "CollisionModel",
+    "Controller",
+    "Effort",
+    "Kinematics",
+    "ObjectState",
+    "SkillFailure",
+    "SkillReport",
+    "SpeedLimits",
+    "Verify",
+    "Workcell",
+    "button",
+    "handwheel",
+    "lever",
+    "mushroom",
+    "park",
+    "proximity_probe",
+    "retreat",
+    "rotary",
+    "slider",
+    "toggle",
+    "touch_probe",
+    "warm_up",
+]
+__getattr__ = load_on_first_use(__name__, __file__)

@@ -9,11 +9,9 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from manipulation.kernels import tool_and_jacobian
-
-Array = NDArray[np.float64]
 
 
 @njit(cache=True)

@@ -8,9 +8,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from manipulation.kernels import frames
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 GOLDEN = 0.6180339887498949

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from manipulation import clearance
 from manipulation.kinematics import Kinematics
 from manipulation.shapes import Box, Capsule
-
-Array = NDArray[np.float64]
 
 RECHECK_RAD = 0.005  # the notes' goal: no collision when re-checked every 5 mrad
 SELF_SAMPLES = 400  # random joint vectors that tell which pairs of links always touch

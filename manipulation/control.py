@@ -12,9 +12,9 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.calibration import ToolLoad
 from hal.clock import Clock, SimClock
 from hal.config import SafetySection
@@ -42,8 +42,6 @@ from manipulation.runs import GripperRun, Run, Tick, begin
 from manipulation.sensing import ContactWrench, DeviceFailure, Devices, RangeReader, Sample, ToolView
 from manipulation.setpoint import SetPointFilter, check, flange_matrix
 from manipulation.standing import Standing
-
-Array = NDArray[np.float64]
 
 RAN = "ran to its declared end"
 SETTLE_S = 0.3

@@ -6,13 +6,11 @@ Each doubt needs two witnesses, and tells only what no healthy device could say;
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.devices import ForceTorque, Touch
 from hal.motion import DeclaredMotion, GripperMotion
 from manipulation.sensing import DeviceFailure, Sample
-
-Array = NDArray[np.float64]
 
 FROZEN_S, FROZEN_TICKS, FROZEN_PERIODS = 0.1, 10, 4  # 6 N more in a touch; noise has never repeated so long
 WIDTH_OFF_M = 0.003  # pads that rest and hold nothing are nearer than this to where they were sent

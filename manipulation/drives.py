@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import logging
 
-import numpy as np
-from numpy.typing import NDArray
-
+from hal.arrays import Array
 from hal.clock import Clock, Deadline, WallClock
 from hal.devices import Arm
 from hal.errors import CellError
 from manipulation.sensing import command_wait_s, failure_of, read_wait_s
 
-Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 

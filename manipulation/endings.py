@@ -6,13 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.motion import Guard, MotionOutcome, Quantity, Reaction
 from manipulation.guards import GuardSet, Measured
 from manipulation.sensing import Look, Sample
-
-Array = NDArray[np.float64]
 
 TRACKING_LIMIT_M = 0.02
 TRACKING_TICKS = 5

@@ -8,12 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.motion import Guard, Quantity
 from manipulation import kernels
-
-Array = NDArray[np.float64]
 
 RISE_WINDOW_S = 0.4
 RISE_AFTER_S = 0.15  # a motion that begins under load takes it up again first; an arm behind a wire is 50 ms later

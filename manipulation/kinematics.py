@@ -11,11 +11,10 @@ from eaik.IK_DH import DhRobot
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.devices import ArmCapabilities
 from hal.errors import Unreachable
 from manipulation import kernels
-
-Array = NDArray[np.float64]
 
 RESIDUAL = 1e-6  # EAIK answers an unreachable pose in the least-squares sense; a round trip through FK tells
 LARGEST_STEP_RAD = 0.35  # between neighbouring samples of a stroke; a larger step is another branch

@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.motion import MotionLog
-
-Array = NDArray[np.float64]
 
 LOG_RATE_HZ = 125.0
 

@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
+
 Free = Callable[[Array, Array], float]
 """`free(start, end)`: fraction of the straight segment that is free."""
 

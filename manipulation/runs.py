@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.clock import Clock, Deadline
 from hal.devices import Gripper
 from hal.errors import CellError
@@ -18,8 +18,6 @@ from manipulation import kernels
 from manipulation.doubts import check_width
 from manipulation.kinematics import Kinematics
 from manipulation.sensing import Sample, command_wait_s
-
-Array = NDArray[np.float64]
 
 BLEND_S = 0.25  # the gap between the declared and the measured start is closed over this time
 TURN_ARM_M = 0.1  # a turn of 1 rad counts as this much way

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.calibration import ToolLoad
 from hal.clock import Clock, Deadline, PacedClock, SimClock
 from hal.devices import Arm, ForceTorque, Gripper, JointState, Proximity, Touch
@@ -19,7 +19,6 @@ from hal.errors import CellError, DeviceError, DeviceTimeout, StaleReading
 from hal.readings import Cause, Quality, Stamped
 from manipulation import kernels
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 log = logging.getLogger(__name__)
 

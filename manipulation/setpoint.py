@@ -5,17 +5,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.errors import MotionRefused
 from hal.geometry import difference
 from hal.motion import CartesianPath, DeclaredMotion, GripperMotion, Hold, JointTrajectory
 from manipulation import braking
 from manipulation.kinematics import Kinematics
 from manipulation.sensing import DeviceFailure
-
-Array = NDArray[np.float64]
 
 START_RAD = 0.05
 START_M = 0.005

@@ -10,8 +10,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from hal.geometry import identity, transform_rpy
@@ -27,7 +25,6 @@ from hal.panel import (
     Toggle,
 )
 
-Array = NDArray[np.float64]
 Vector3 = tuple[float, float, float]
 
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from manipulation import kernels
 from manipulation.drives import Drives
 from manipulation.endings import TRACKING_LIMIT_M
 from manipulation.kinematics import Kinematics
 from manipulation.sensing import DeviceFailure
 from manipulation.setpoint import SetPointFilter
-
-Array = NDArray[np.float64]
 
 
 class Standing:

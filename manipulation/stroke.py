@@ -10,13 +10,12 @@ import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from hal.arrays import Array
 from hal.geometry import difference, interpolate
 from hal.motion import CartesianPath, Compliance, Guard
-
-Array = NDArray[np.float64]
 
 RAMP_M_PER_S2 = 0.5  # a 0.9 kg tool pushes 0.5 N at this acceleration, far below any contact threshold
 TURN_ARM_M = 0.10  # a turn of 1 rad counts as this much way when a path is timed

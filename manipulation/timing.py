@@ -12,15 +12,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.motion import Guard, JointTrajectory
 from manipulation import kernels
 from manipulation.kinematics import Kinematics
-
-Array = NDArray[np.float64]
 
 SAMPLE_RAD = 0.02  # spacing of the timing grid along the path
 

@@ -6,16 +6,14 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.errors import Unreachable
 from hal.motion import Guard, JointTrajectory
 from manipulation.collision import CollisionModel
 from manipulation.rrt import connect, shortcut
 from manipulation.timing import SpeedLimits, timed
-
-Array = NDArray[np.float64]
 
 SEARCH_STEP_RAD = 0.02  # edges of the search; the answer is checked again at RECHECK_RAD
 DETOUR_RAD = 0.8  # how far a joint may leave the range between its two ends, as long as that finds a way

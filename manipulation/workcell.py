@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.errors import Unreachable
 from hal.geometry import UncertainPose, transform
 from hal.motion import JointTrajectory, Mover
@@ -19,8 +19,6 @@ from manipulation.shapes import Box, floor_box, panel_boxes
 from manipulation.timing import SpeedLimits
 from manipulation.tool import Hand
 from manipulation.transfer import THOROUGH, Effort, TransferPlanner
-
-Array = NDArray[np.float64]
 
 STROKE_MARGIN_M = 0.001
 FINGERS = ("finger_left", "finger_right")

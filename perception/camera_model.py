@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest
-
-Array = NDArray[np.float64]
 
 NEWTON_STEPS = 20  # quadratic convergence reaches 1e-15 in 4 to 6 for |k1| <= 0.3; the rest serves the image corners
 

@@ -14,25 +14,25 @@ def _imports() -> None:
 
 
 def _vision() -> None:
-    from perception.vision.warm import warm_up
+    from perception.vision import warm_up
 
     warm_up()
 
 
 def _range() -> None:
-    from perception.range.warm import warm_up
+    from perception.range import warm_up
 
     warm_up()
 
 
 def _fusion() -> None:
-    from fusion.warm import warm_up
+    from fusion import warm_up
 
     warm_up()
 
 
 def _planning() -> None:
-    from manipulation.warm import warm_up
+    from manipulation import warm_up
 
     warm_up()
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from hal.arrays import Array
 from hal.clock import Deadline
 from hal.devices import ArmCapabilities, DeviceKind, JointState
 from hal.errors import InvalidRequest, MotionRefused
@@ -20,8 +20,6 @@ from simbackend import kernels
 from simbackend.arm_model import MODELS
 from simbackend.client import Frame
 from simbackend.device import VALID, SimDevice, SimOptions, parse
-
-Array = NDArray[np.float64]
 
 DIGITS = 6  # encoders resolve a microradian
 MOVING_RAD_PER_S = 0.002

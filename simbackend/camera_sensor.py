@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from simbackend.wire import Emitter, PictureInfo
 
@@ -140,7 +141,7 @@ def _enlarge(image: Grey, width: int, height: int) -> Grey:
     return np.asarray(large, np.float32)
 
 
-def _ideal_grid(lens: CameraIntrinsics) -> NDArray[np.float64]:
+def _ideal_grid(lens: CameraIntrinsics) -> Array:
     """(H, W, 2) undistorted normalised coordinates of every pixel."""
     u, v = np.meshgrid(np.arange(lens.width_px, dtype=float), np.arange(lens.height_px, dtype=float))
     matrix = np.array([[lens.fx_px, 0, lens.cx_px], [0, lens.fy_px, lens.cy_px], [0, 0, 1.0]])

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.clock import Clock, SimClock
 from hal.config import Cell
 from hal.errors import ConfigError, DeviceFault
@@ -34,8 +35,6 @@ from simbackend.wire import (
     Snapshot,
     WorldConfig,
 )
-
-Array = NDArray[np.float64]
 
 PROXIMITY_RANGE_M = 0.6
 MOST_TICKS_BEHIND = 100

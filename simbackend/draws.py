@@ -6,14 +6,12 @@ import zlib
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics, MountRecord, ToolLoad
 from hal.config import WorkspaceSection
 from hal.geometry import perturbed, transform_rpy
-
-Array = NDArray[np.float64]
 
 PANEL_SPREAD_M = 0.06
 PANEL_SPREAD_RAD = 0.14

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.devices import ArmCapabilities
 from simbackend.tool_model import MAX_WIDTH_M
-
-Array = NDArray[np.float64]
 
 MOVING_RAD_PER_S = 0.05
 START_WIDTH_M = 0.040

@@ -6,7 +6,6 @@ import math
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from hal.calibration import ToolLoad
@@ -17,8 +16,6 @@ from hal.registry import Context
 from simbackend import kernels
 from simbackend.client import Frame
 from simbackend.device import VALID, SimDevice, SimOptions, parse
-
-Array = NDArray[np.float64]
 
 FORCE_RANGE_N, TORQUE_RANGE_NM = 300.0, 30.0
 FORCE_DIGIT_N, TORQUE_DIGIT_NM = 0.02, 0.0005

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
 
 FINE_M = 0.012  # circles of at most this radius have FEW corners
 FEW, MANY = 20, 40

@@ -15,7 +15,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
+
 Float32 = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 

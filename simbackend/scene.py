@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from hal.arrays import Array
 from simbackend import meshes
 from simbackend.meshes import Mesh
 from simbackend.raster import rasterise
 from simbackend.textures import Pixels
 
-Array = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 Pose = tuple[tuple[float, ...], tuple[float, ...]]  # position and quaternion, as the engine gives them
 

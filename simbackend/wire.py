@@ -6,13 +6,10 @@ import os
 from dataclasses import dataclass
 from enum import IntEnum
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.config import Cell
-
-Array = NDArray[np.float64]
 
 DOF = 6
 LIGHTS = 4

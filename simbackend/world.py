@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.simulated import ObjectTruth, Truth
 from simbackend.arm_model import MODELS, arm_urdf, base_from_flange
 from simbackend.draws import Draws
@@ -31,8 +31,6 @@ from simbackend.wire import (
     Drive,
     WorldConfig,
 )
-
-Array = NDArray[np.float64]
 
 GRAVITY_M_PER_S2 = 9.81
 TIP_TICKS = 4  # how often to look which mechanisms are near; the tip goes 8 mm meanwhile

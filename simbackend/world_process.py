@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.lockstep import share_core
 from simbackend.wire import CAMERA_AT, DOUBLE, IMAGE_BYTES, REQUEST, Op, Picture, PictureInfo, read_exactly
 from simbackend.world import World
-
-Array = NDArray[np.float64]
 
 
 def serve(pipe: Connection, images: mmap.mmap) -> None:

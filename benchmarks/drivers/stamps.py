@@ -7,11 +7,11 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.drivers.benches import bench
 from benchmarks.drivers.far_process import far_process
 from benchmarks.drivers.report import line
+from hal.arrays import Array
 from hal.registry import Context, connect
 
 TALKERS = ("tfmini", "ft300 stream", "netft", "bota", "scip serial", "lms200")
@@ -27,7 +27,7 @@ def part_stamps(seconds: float) -> None:
         line(f"{name}: stamp error, p99 of {len(within)}", "2 ms", f"{p99_ms:.2f} ms", p99_ms <= 2.0)
 
 
-def _record(name: str, seconds: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _record(name: str, seconds: float) -> tuple[Array, Array]:
     item, stamps_s = bench(name), list[float]()
     with far_process(name) as far:
         device: Any = connect(Context(name="dut"), item.driver, {**far.addresses[name], **item.options})

@@ -19,12 +19,13 @@ from pydantic import Field, model_validator
 from drivers.cia402.setup import PROBES, SDO_REQUEST, SDO_S, SdoClient, SetUp, upload_request
 from drivers.cia402.states import DISABLE, FAULT_RESET, QUICK_STOP, DriveState, state_of, towards_enabled
 from drivers.cia402.sync import SyncCount
-from drivers.kinds.arms import Array, KinematicsOptions, SetPointFilter, capabilities, require_stations
+from drivers.kinds.arms import KinematicsOptions, SetPointFilter, capabilities, require_stations
 from drivers.transport.canbus import CanCodec, CanFrame, CanOptions, can_opener
 from drivers.transport.device import wall_until
 from drivers.transport.link import Link, NoAnswer, Refused, drain, now_s
 from drivers.transport.options import read_options
 from drivers.transport.stream import StreamDevice
+from hal.arrays import Array
 from hal.clock import Deadline
 from hal.devices import ArmCapabilities, DeviceKind, JointState
 from hal.errors import DeviceFault, DeviceTimeout

@@ -25,12 +25,13 @@ from drivers.dynamixel.client import (
     fault_text,
     naming_alerts,
 )
-from drivers.kinds.arms import Array, KinematicsOptions, SetPointFilter, capabilities, require_stations
+from drivers.kinds.arms import KinematicsOptions, SetPointFilter, capabilities, require_stations
 from drivers.kinds.digital_points import require_same_number
 from drivers.transport.bus import PolledDevice
 from drivers.transport.device import wall_until
 from drivers.transport.link import BadAnswer, NoAnswer, Refused, WireError, now_s
 from drivers.transport.options import read_options
+from hal.arrays import Array
 from hal.clock import Deadline
 from hal.devices import ArmCapabilities, DeviceKind, JointState
 from hal.readings import Stamped

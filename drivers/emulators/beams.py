@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.devices import RangeImage, RangeScannerCapabilities
 
 
-def line_m(image: RangeImage, c: RangeScannerCapabilities, angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+def line_m(image: RangeImage, c: RangeScannerCapabilities, angle_rad: Array) -> Array:
     """Distance along each beam at `angle_rad` about the sensor's y axis, from the image's middle row; NaN outside it.
 
     Pinhole: u = cx + fx tan(a), distance = z / cos(a). Orthographic images have no beams from one point: their columns
@@ -28,7 +28,7 @@ def line_m(image: RangeImage, c: RangeScannerCapabilities, angle_rad: NDArray[np
     return np.where(is_ahead, range_m, np.nan)
 
 
-def _at(row: NDArray[np.float64], column: NDArray[np.float64]) -> NDArray[np.float64]:
+def _at(row: Array, column: Array) -> Array:
     """The nearest pixel; NaN beyond the ends."""
     nearest = np.round(column)
     is_inside = np.isfinite(nearest) & (nearest >= 0) & (nearest < len(row))

@@ -12,6 +12,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.clock import Clock, Deadline, WallClock
 from hal.devices import (
     ArmCapabilities,
@@ -275,7 +276,7 @@ class ScriptedArm(Scripted):
         )
         return Stamped(value=state, host_time_s=now_s, sequence=index, device_time_s=self.device_s)
 
-    def command_position(self, position_rad: NDArray[np.float64], *, deadline: Deadline) -> NDArray[np.float64]:
+    def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:
         """Jump there."""
         self.count(deadline)
         if not self.is_enabled:

@@ -8,15 +8,14 @@ from collections.abc import Sequence
 from typing import Annotated, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from drivers.kinds.digital_points import require_same_number
+from hal.arrays import Array
 from hal.devices import ArmCapabilities, DhLink
 from hal.errors import InvalidRequest, MotionRefused
 from hal.strict import Strict
 
-Array = NDArray[np.float64]
 Positive = Annotated[float, Field(gt=0)]
 STEP_MARGIN = 3.0  # set-points arrive in bunches on a busy host; a jump beyond this many periods is clipped
 

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.transport.stream import StreamDevice
+from hal.arrays import Array
 from hal.clock import Deadline
 from hal.devices import DeviceKind, RangeImage, RangeScannerCapabilities
 from hal.errors import DeviceUnavailable
@@ -66,7 +66,7 @@ class LineScanner(StreamDevice[RangeImage]):
 
     def publish_scan(
         self,
-        range_m: NDArray[np.float64],
+        range_m: Array,
         *,
         valid_s: float,
         device_time_s: float | None = None,
@@ -91,6 +91,6 @@ class LineScanner(StreamDevice[RangeImage]):
         )
 
 
-def within(range_m: NDArray[np.float64], beams: Beams) -> NDArray[np.float64]:
+def within(range_m: Array, beams: Beams) -> Array:
     """Ranges with everything outside the sensor's limits as NaN."""
     return np.where((range_m >= beams.min_range_m) & (range_m <= beams.max_range_m), range_m, math.nan)

@@ -10,9 +10,9 @@ import math
 import struct
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.transport.checks import xor_byte
+from hal.arrays import Array
 
 EXPRESS_SCAN, EXPRESS_TYPE = 0x82, 0x82
 REQUEST_BODY = bytes([0xA5, EXPRESS_SCAN, 5, 0, 0, 0, 0, 0])
@@ -21,7 +21,7 @@ CAPSULE_BYTES, POINTS = 84, 32
 CABIN = np.dtype([("d1", "<u2"), ("d2", "<u2"), ("offsets", "u1")])
 UNEVEN = 0.3  # part by which the angles of two neighbours may differ: a motor's speed changes slowly
 NO_RANGE = math.nan
-Points = tuple[NDArray[np.float64], NDArray[np.float64]]
+Points = tuple[Array, Array]
 
 
 def is_capsule(data: bytes) -> bool:
@@ -103,7 +103,7 @@ class CapsuleParser:
         return [None]
 
 
-def split_turns(angle_rad: NDArray[np.float64], last_rad: float) -> list[int]:
+def split_turns(angle_rad: Array, last_rad: float) -> list[int]:
     """Places where a new turn begins: the angle falls by more than half a turn.
 
     Args:

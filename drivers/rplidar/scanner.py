@@ -21,6 +21,7 @@ from drivers.transport.capture import inside
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.options import SerialOptions, read_options, serial_opener
 from drivers.transport.serial_link import SerialLink
+from hal.arrays import Array
 from hal.readings import Quality
 from hal.registry import Context, takes
 
@@ -68,7 +69,7 @@ def begins_node(data: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return is_good
 
 
-def decode(nodes: NDArray[np.uint8]) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+def decode(nodes: NDArray[np.uint8]) -> tuple[NDArray[np.bool_], Array, Array]:
     """Start flags, angles in radians, distances in metres (NaN for none) of (n, 5) measurements."""
     n = nodes.astype(np.int32)
     angle_rad = np.radians((n[:, 1] >> 1 | n[:, 2] << 7) / 64.0)
@@ -226,7 +227,7 @@ class Rplidar(LineScanner):
         if arrived_s > self._turn_s + TURN_S:
             raise NoAnswer(f"measurements come, but no whole turn in {TURN_S:.0f} s; does its motor turn steadily?")
 
-    def _starts(self, angle_rad: NDArray[np.float64]) -> list[int]:
+    def _starts(self, angle_rad: Array) -> list[int]:
         starts = split_turns(angle_rad, self._last_rad)
         self._last_rad = float(angle_rad[-1])
         return starts
@@ -261,7 +262,7 @@ class Rplidar(LineScanner):
 
 def _points(
     run: NDArray[np.uint8] | None,
-) -> tuple[list[int], NDArray[np.float64], NDArray[np.float64]] | None:
+) -> tuple[list[int], Array, Array] | None:
     """Places of start flags, angles and distances of a run of measurements."""
     if run is None:
         return None
@@ -269,13 +270,13 @@ def _points(
     return [int(place) for place in np.flatnonzero(is_start)], angle_rad, distance_m
 
 
-def turns_back(angle_rad: NDArray[np.float64]) -> bool:
+def turns_back(angle_rad: Array) -> bool:
     """Does an angle go back by more than the motor's jitter? Noise that looks like a measurement makes it."""
     step_rad = (np.diff(angle_rad) + np.pi) % math.tau - np.pi
     return bool(np.any(step_rad < -JITTER_RAD))
 
 
-def sectors(angle_rad: NDArray[np.float64], range_m: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+def sectors(angle_rad: Array, range_m: Array, count: int) -> Array:
     """The nearest range in each of `count` sectors centred on multiples of the step; NaN in empty ones."""
     seen = np.isfinite(range_m)
     sector = np.round(angle_rad[seen] * (count / math.tau)).astype(np.int64) % count

@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from drivers.kinds.arms import Array, KinematicsOptions, SetPointFilter, capabilities, ur10e
+from drivers.kinds.arms import KinematicsOptions, SetPointFilter, capabilities, ur10e
 from drivers.transport.device import wall_until
 from drivers.transport.link import Link, LinkLost, WireError, drain, now_s
 from drivers.transport.options import CONNECT_TIMEOUT_S, PortNumber, read_options, tcp_opener
@@ -23,6 +23,7 @@ from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import HostTime
 from drivers.ur import rtde
 from drivers.ur.session import ANSWER_S, RtdeSession
+from hal.arrays import Array
 from hal.clock import Deadline, WallClock
 from hal.devices import ArmCapabilities, DeviceKind, JointState
 from hal.errors import DeviceFault, MotionRefused

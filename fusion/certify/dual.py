@@ -17,7 +17,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fusion.certify.relaxation import BACK, ROTATION, SIZE, TRANSLATION, constraints
-from hal.geometry import Array, skew
+from hal.arrays import Array
+from hal.geometry import skew
 
 GAUSS_NEWTON_STEPS = 20
 STILL = 1e-22  # of the predicted fall, as a share of the error's scale

@@ -11,8 +11,9 @@ import numpy as np
 
 from fusion.batch import Batch
 from fusion.distance.rows import NEAR, rows
-from fusion.vectors import Vec, across, cholesky, compiled, cross, inlined, turned, vec
-from hal.geometry import Array
+from fusion.vectors import Vec, across, cholesky, cross, turned, vec
+from hal.arrays import Array
+from hal.jit import compiled, inlined
 
 SIZE = 16  # numbers in z: 1, R row by row at 1, t at 10, s at 13
 

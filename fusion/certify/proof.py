@@ -20,7 +20,8 @@ from fusion.certify.dual import minimiser
 from fusion.certify.lifted import lift
 from fusion.certify.relaxation import SIZE, nearest_pose, relaxed
 from fusion.solve.local import LocalSolution, middle_and_size
-from hal.geometry import Array, difference, transform
+from hal.arrays import Array
+from hal.geometry import difference, transform
 
 TIGHT_GAP = 1e-3
 AGREES_SIGMAS = 1.0  # freezing the covariances moves the minimum by a small part of a standard deviation

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from hal.arrays import Array
 from hal.errors import Unsupported
-from hal.geometry import Array
 
 SIZE = 16
 ROTATION, TRANSLATION, BACK = slice(1, 10), slice(10, 13), slice(13, 16)

@@ -16,19 +16,9 @@ import math
 import numpy as np
 
 from fusion.batch import Batch
-from fusion.vectors import (
-    Vec,
-    across,
-    blend,
-    compiled,
-    cross,
-    dot,
-    inlined,
-    normalised,
-    turned,
-    vec,
-)
-from hal.geometry import Array
+from fusion.vectors import Vec, across, blend, cross, dot, normalised, turned, vec
+from hal.arrays import Array
+from hal.jit import compiled, inlined
 
 # A symmetric matrix by its eigenvalues and unit eigenvectors: v.S v then is a sum of squares, not a difference of large numbers.
 Spectral = tuple[float, float, float, Vec, Vec, Vec]

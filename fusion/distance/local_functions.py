@@ -14,7 +14,8 @@ from scipy.spatial.transform import RigidTransform
 from fusion.batch import Batch, pack
 from fusion.distance.exact import evaluate
 from fusion.measurement import Measurement
-from hal.geometry import Array, matrix_of
+from hal.arrays import Array
+from hal.geometry import matrix_of
 
 
 def local_values(measurements: Sequence[Measurement], base_from_object: RigidTransform) -> Array:

@@ -12,7 +12,8 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import RigidTransform
 
 from fusion.measurement import Measurement, SensingClass
-from hal.geometry import Array, matrix_of
+from hal.arrays import Array
+from hal.geometry import matrix_of
 
 SPHERE = 1500  # directions of the first look
 REFINED = 3

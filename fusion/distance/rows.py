@@ -16,26 +16,15 @@ import math
 import numpy as np
 
 from fusion.batch import Batch
-from fusion.vectors import (
-    Vec,
-    across,
-    cholesky,
-    compiled,
-    cross,
-    dot,
-    form,
-    inlined,
-    plain,
-    rotation_vector,
-    solve_lower,
-    sym,
-    turned,
-    vec,
-)
-from hal.geometry import Array
+from fusion.vectors import Vec, across, cholesky, cross, dot, form, rotation_vector, solve_lower, sym, turned, vec
+from hal.arrays import Array
+from hal.jit import as_numpy_scalar, compiled, inlined
 
 HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
-NEAR, FAR = plain(False), plain(True)  # what `far` says: first steps from anywhere, or the last ones at the solution
+NEAR, FAR = (
+    as_numpy_scalar(False),
+    as_numpy_scalar(True),
+)  # what `far` says: first steps from anywhere, or the last ones at the solution
 FLOOR = 1e-6  # share of the direction variance that is kept where u^T S u vanishes far from the solution
 
 

@@ -19,7 +19,8 @@ from fusion.robust.inliers import ProvenSet, best_set
 from fusion.robust.minima import Minimum
 from fusion.solve.local import LocalSolution
 from fusion.solve.observability import FreeDirection
-from hal.geometry import Array, UncertainPose
+from hal.arrays import Array
+from hal.geometry import UncertainPose
 
 EVIDENCE_NEEDED = math.log(1000.0)  # for agreement against chance, once something was rejected
 EVIDENCE_PER_MISMATCH = 0.5  # each rejected measurement is a surprise: fewer are bad than good

@@ -28,8 +28,9 @@ from fusion.certify.dual import minimiser
 from fusion.certify.proof import monomials, quadratic_forms
 from fusion.certify.relaxation import nearest_pose, relaxed
 from fusion.solve.local import LocalSolution, middle_and_size
+from hal.arrays import Array
 from hal.errors import InvalidRequest
-from hal.geometry import Array, transform
+from hal.geometry import transform
 
 MOST = 16  # measurements; the tree has up to 2^N leaves
 RELATIVE_GAP = 1e-4  # two errors closer than this share are the same

@@ -16,7 +16,7 @@ from fusion.distance.rows import values
 from fusion.robust import search
 from fusion.solve.local import LocalSolution, local_solution
 from fusion.solve.placement import place
-from hal.geometry import Array
+from hal.arrays import Array
 
 Flags = NDArray[np.bool_]
 MOST_SEARCHED = 96  # measurements that the search looks at; the finish uses all

@@ -15,15 +15,15 @@ from fusion.batch import Batch
 from fusion.distance.rows import FAR, NEAR, values
 from fusion.solve.descent import cost_of, descend
 from fusion.solve.placement import place
-from fusion.vectors import compiled, inlined, plain
-from hal.geometry import Array
+from hal.arrays import Array
+from hal.jit import as_numpy_scalar, compiled, inlined
 
 SUBSET_DOF = 7  # six unknowns and one to check them by; 8 finds clean subsets a third less often
 SUBSET_MOST = 8  # measurements in a subset
 ROTATIONS = 3
 DRAWS = SUBSET_MOST + 4 * ROTATIONS  # random numbers a hypothesis uses: picks and quaternions
-STEPS, ANNEAL_STEPS = plain(12), plain(4)
-ANNEALED, AS_IT_IS = plain(True), plain(False)
+STEPS, ANNEAL_STEPS = as_numpy_scalar(12), as_numpy_scalar(4)
+ANNEALED, AS_IT_IS = as_numpy_scalar(True), as_numpy_scalar(False)
 FIT_LIMIT = 60.0  # a subset that its own pose explains no better than this is not clean
 LEAST_GAIN = 1e-6  # of truncated error, below which two are equal
 ANNEAL = (8.0, 4.0, 2.0, 1.0)

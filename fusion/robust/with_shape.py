@@ -23,8 +23,9 @@ from fusion.robust.answer import FusedPose, ShapeEstimate, weighed
 from fusion.shapes import Shape
 from fusion.solve.local import LocalSolution, middle_and_size
 from fusion.solve.observability import covariance_and_freedom
+from hal.arrays import Array
 from hal.errors import InvalidRequest
-from hal.geometry import Array, UncertainPose, matrix_of, perturbed
+from hal.geometry import UncertainPose, matrix_of, perturbed
 
 CONVERGENCE = 2.0  # factor by which the forgiving weights narrow in each step
 FINAL_STEPS = 8

@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike
 from fusion.features import Feature, Kind, unit
 from fusion.measurement import Measurement
 from fusion.sensing.propagation import sensed_by
+from hal.arrays import Array
 from hal.errors import InvalidRequest
-from hal.geometry import Array, UncertainPose, matrix_of
+from hal.geometry import UncertainPose, matrix_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

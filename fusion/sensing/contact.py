@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from fusion.features import Feature, Kind, unit
 from fusion.measurement import Measurement, measurement
 from fusion.sensing.propagation import floored, sensed_by
-from hal.geometry import Array, UncertainPose, matrix_of, point_covariance
+from hal.arrays import Array
+from hal.geometry import UncertainPose, matrix_of, point_covariance
 
 
 def touch(

@@ -8,7 +8,8 @@ import numpy as np
 
 from fusion.features import Feature, Kind
 from fusion.measurement import Measurement, measurement
-from hal.geometry import Array, UncertainPose, matrix_of, skew
+from hal.arrays import Array
+from hal.geometry import UncertainPose, matrix_of, skew
 
 SMALLEST_SIGMA_M = 1e-6  # nothing is placed better than a micrometre
 SMALLEST_SIGMA_RAD = 1e-6

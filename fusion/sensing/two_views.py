@@ -11,8 +11,9 @@ from fusion.features import Feature, Kind, unit
 from fusion.measurement import Measurement, measurement
 from fusion.sensing.camera import View, checked_ends, image_plane, middle_ray
 from fusion.sensing.propagation import block_diagonal, floored, from_joint, jacobian, moved
+from hal.arrays import Array
 from hal.errors import NotObservable
-from hal.geometry import Array, UncertainPose
+from hal.geometry import UncertainPose
 
 
 def stereo_point(

@@ -6,8 +6,9 @@ import numpy as np
 
 from fusion.batch import Batch
 from fusion.distance.rows import rows, whitened
-from fusion.vectors import cholesky, compiled, move, solve_lower, solve_upper
-from hal.geometry import Array
+from fusion.vectors import cholesky, move, solve_lower, solve_upper
+from hal.arrays import Array
+from hal.jit import compiled
 
 
 @compiled

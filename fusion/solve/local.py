@@ -15,8 +15,9 @@ from fusion.measurement import Measurement
 from fusion.solve.observability import FreeDirection, covariance_and_freedom
 from fusion.solve.placement import place
 from fusion.solve.polish import solve_from
+from hal.arrays import Array
 from hal.errors import InvalidRequest
-from hal.geometry import Array, UncertainPose
+from hal.geometry import UncertainPose
 
 MIN_SIZE_M = 0.05  # features closer together than this still make an object of this size
 

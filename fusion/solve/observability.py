@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hal.geometry import Array, skew
+from hal.arrays import Array
+from hal.geometry import skew
 
 FREE_SIGMA = 1.0  # a share of the object's size, or a radian: past it the measurements say nothing
 PRIOR_SIGMA = 10.0  # what a free direction's standard deviation is given as, in the same unit

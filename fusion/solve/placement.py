@@ -6,8 +6,9 @@ import numpy as np
 
 from fusion.batch import Batch
 from fusion.distance.rows import FAR, rows
-from fusion.vectors import cholesky, compiled, solve_lower, solve_upper, turned, vec
-from hal.geometry import Array
+from fusion.vectors import cholesky, solve_lower, solve_upper, turned, vec
+from hal.arrays import Array
+from hal.jit import compiled
 
 
 @compiled

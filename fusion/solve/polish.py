@@ -12,11 +12,12 @@ from fusion.batch import Batch
 from fusion.distance.exact import evaluate
 from fusion.distance.rows import FAR, NEAR, rows
 from fusion.solve.descent import accumulate, descend
-from fusion.vectors import cholesky, compiled, move, plain, solve_lower, solve_upper
-from hal.geometry import Array
+from fusion.vectors import cholesky, move, solve_lower, solve_upper
+from hal.arrays import Array
+from hal.jit import as_numpy_scalar, compiled
 
-COARSE_STEPS, FINE_STEPS = plain(30), plain(20)
-ANYWHERE = plain(True)
+COARSE_STEPS, FINE_STEPS = as_numpy_scalar(30), as_numpy_scalar(20)
+ANYWHERE = as_numpy_scalar(True)
 
 
 @compiled

@@ -7,15 +7,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.motion import Compliance, Guard, Hold, MotionReport, Quantity
 from manipulation.skills.outcome import Outcome, SkillFailure
 from manipulation.skills.steps import Attempt
 from manipulation.stroke import shifted
-
-Array = NDArray[np.float64]
 
 INF = float("inf")
 FEEL_N = 3.0  # moves no lever, and no knob by its own side

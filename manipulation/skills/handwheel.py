@@ -5,9 +5,9 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.errors import InvalidRequest
 from hal.motion import Compliance, Guard, Quantity
 from hal.panel import Handwheel
@@ -17,8 +17,6 @@ from manipulation.skills.steps import STANDOFF_M, Attempt, perform
 from manipulation.skills.subject import Whereabouts, subject_of
 from manipulation.stroke import arc
 from manipulation.workcell import Workcell, panel_from_grip
-
-Array = NDArray[np.float64]
 
 HUB_M = 0.009  # the panel file does not say how thick the hub is; this is generous
 SIDE_M = 0.009  # most room between each finger and the rim when coming down

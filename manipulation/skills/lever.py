@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.errors import InvalidRequest
 from hal.motion import Compliance, Guard, Quantity
 from hal.panel import Lever
@@ -17,8 +17,6 @@ from manipulation.skills.steps import STANDOFF_M, Attempt, perform
 from manipulation.skills.subject import Whereabouts, subject_of
 from manipulation.stroke import arc
 from manipulation.workcell import Workcell, panel_from_grip
-
-Array = NDArray[np.float64]
 
 OVERLAP_M = 0.013  # how far the tips reach below the top of the bar
 FROM_END_M = 0.008  # the fingers hold the bar this far before its end: a long lever arm spares the soft pads

@@ -6,17 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.motion import Guard, Hold, MotionReport, Quantity
 from manipulation.skills.contact import onset
 from manipulation.skills.outcome import Outcome, SkillFailure
 from manipulation.skills.steps import RETREAT_M_PER_S, Attempt
 from manipulation.stroke import shifted
 from manipulation.workcell import Workcell, panel_from_grip
-
-Array = NDArray[np.float64]
 
 SLOW_FROM_M = 0.010  # slow from here before the expected surface; covers a pose error of 3 mm and 1 degree with room
 BEYOND_M = 0.012

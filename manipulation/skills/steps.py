@@ -7,10 +7,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.errors import Cancelled, DeviceFault, MotionError, MotionRefused, Stopped, Unreachable
 from hal.motion import (
     Compliance,
@@ -24,8 +23,6 @@ from hal.motion import (
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
 from manipulation.stroke import line, shifted, through
 from manipulation.workcell import Workcell
-
-Array = NDArray[np.float64]
 
 APPROACH_M_PER_S = 0.06
 CONTACT_N = 8.0

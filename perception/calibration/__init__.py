@@ -1,1 +1,53 @@
-"""Calibration of camera, hand, range scanner and wrist sensor, each with covariance."""
+"""Where camera and scanner sit, what the lens does and what the tool weighs, found from the cell's own views."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hal.face import load_on_first_use
+
+if TYPE_CHECKING:
+    from perception.calibration.boards import BoardView, Charuco, Dots
+    from perception.calibration.hand_eye import HandEyeView, propose_next, stations
+    from perception.calibration.in_hand import (
+        UNKNOWN_LENS,
+        Beforehand,
+        InHandCalibration,
+        InHandState,
+        InHandView,
+        calibrate_in_hand,
+        propose_view,
+    )
+    from perception.calibration.intrinsics import calibrate_camera
+    from perception.calibration.records import record_of, renewed, to_toml
+    from perception.calibration.scanner import ScannerCalibration, ScannerView, calibrate_scanner
+    from perception.calibration.wrench import WrenchCalibration, calibrate_wrench
+    from perception.camera_model import project, undistort_pixels
+
+__all__ = [
+    "UNKNOWN_LENS",
+    "Beforehand",
+    "BoardView",
+    "Charuco",
+    "Dots",
+    "HandEyeView",
+    "InHandCalibration",
+    "InHandState",
+    "InHandView",
+    "ScannerCalibration",
+    "ScannerView",
+    "WrenchCalibration",
+    "calibrate_camera",
+    "calibrate_in_hand",
+    "calibrate_scanner",
+    "calibrate_wrench",
+    "project",
+    "propose_next",
+    "propose_view",
+    "record_of",
+    "renewed",
+    "stations",
+    "to_toml",
+    "undistort_pixels",
+]
+__getattr__ = load_on_first_use(__name__, __file__)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.errors import NotFound
 
-Array = NDArray[np.float64]
 CORNER_SIGMA_PX = 0.1  # of a refined ChArUco corner; calibrations on sharp images leave 0.05 to 0.2 px rms
 DOT_SIGMA_PX = 0.05
 FEWEST_POINTS = 6

@@ -12,14 +12,12 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from hal.arrays import Array
 from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import UncertainPose, matrix_of, perturbed, skew, transform
 from perception.calibration.newton import Minimum, descend
-
-Array = NDArray[np.float64]
 
 LEAST_AXIS_SPREAD = 0.02  # of sin^2 between the turns' axes: 8 degrees; with less, one coordinate of X is mostly noise
 LEAST_TURN_RAD = 0.05

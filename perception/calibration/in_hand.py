@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 from scipy.special import chdtrc
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose, certain, matrix_of, perturbed, skew
@@ -24,8 +24,6 @@ from perception.calibration.hand_eye import HandEyeView, check_accuracy, check_t
 from perception.calibration.intrinsics import NAMES, lens_jacobian, parameters, with_parameters
 from perception.calibration.newton import Minimum, descend
 from perception.camera_model import disc_offset_px, project_with_jacobian
-
-Array = NDArray[np.float64]
 
 FREE = ("fx", "fy", "cx", "cy", "k1")
 INDEX = [NAMES.index(name) for name in FREE]

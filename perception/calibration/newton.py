@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.errors import NotObservable
 
-Array = NDArray[np.float64]
 S = TypeVar("S")
 
 STEPS = 60

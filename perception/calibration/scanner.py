@@ -9,14 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import UncertainPose, matrix_of, perturbed
 from perception.calibration.newton import Minimum, descend
-
-Array = NDArray[np.float64]
 
 LIMIT_M = 0.003
 LIMIT_RAD = 0.02

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from hal.arrays import Array
 from hal.calibration import ToolLoad
 from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import skew
-
-Array = NDArray[np.float64]
 
 GRAVITY_M_PER_S2 = 9.80665
 LEAST_SPREAD = 0.02  # mean square of gravity's direction along its second axis, after its mean: 8 degrees of tilt

@@ -1,17 +1,36 @@
 """Range images to named surfaces with covariance, and surfaces to models (paper, Section III)."""
 
-from perception.range.analyse import RangeScene, analyse
-from perception.range.features import FeatureKind, RangeFeature
-from perception.range.noise import NoiseModel, estimate_noise
-from perception.range.plane import PlaneFit, fit_plane_near
-from perception.range.primitives import Cone, Cylinder, Ellipsoid, Plane, Sphere, Surface, SurfaceType
-from perception.range.sensor import OrthographicSensor, PinholeSensor, RangeSensorModel
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hal.face import load_on_first_use
+
+if TYPE_CHECKING:
+    from perception.range.analysis import RangeScene, analyse
+    from perception.range.batch import batch_range, recordings_in
+    from perception.range.batch_results import BatchResult, KeptResults
+    from perception.range.features import FeatureKind, RangeFeature
+    from perception.range.matching.match import Match, match_models
+    from perception.range.matching.models import ComponentModel, load_models, models_from, shipped_models
+    from perception.range.noise import NoiseModel, estimate_noise
+    from perception.range.plane import PlaneFit, fit_plane_near
+    from perception.range.primitives import Cone, Cylinder, Ellipsoid, Plane, Sphere, Surface, SurfaceType
+    from perception.range.recordings import Reading, assumptions, load_recording
+    from perception.range.render import MARK, match_json, picture, scene_json, write_ply, write_png
+    from perception.range.sensor import OrthographicSensor, PinholeSensor, RangeSensorModel
+    from perception.range.warm import warm_up
 
 __all__ = [
+    "MARK",
+    "BatchResult",
+    "ComponentModel",
     "Cone",
     "Cylinder",
     "Ellipsoid",
     "FeatureKind",
+    "KeptResults",
+    "Match",
     "NoiseModel",
     "OrthographicSensor",
     "PinholeSensor",
@@ -20,10 +39,26 @@ __all__ = [
     "RangeFeature",
     "RangeScene",
     "RangeSensorModel",
+    "Reading",
     "Sphere",
     "Surface",
     "SurfaceType",
     "analyse",
+    "assumptions",
+    "batch_range",
     "estimate_noise",
     "fit_plane_near",
+    "load_models",
+    "load_recording",
+    "match_json",
+    "match_models",
+    "models_from",
+    "picture",
+    "recordings_in",
+    "scene_json",
+    "shipped_models",
+    "warm_up",
+    "write_ply",
+    "write_png",
 ]
+__getattr__ = load_on_first_use(__name__, __file__)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from hal.errors import CellError, ConfigError, InvalidRequest
-from perception.range.analyse import analyse
+from perception.range.analysis import analyse
 from perception.range.batch_results import BatchResult, KeptResults
 from perception.range.recordings import AS_FILED, SUFFIXES, Reading, load_recording
 from perception.range.render import MARK, scene_json

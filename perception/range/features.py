@@ -11,11 +11,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.primitives import Cone, Cylinder, Ellipsoid, Plane, Sphere, Surface
-
-Array = NDArray[np.float64]
 
 LEAST_CREASE_RAD = 0.15  # planes closer to parallel meet in a line that noise decides
 

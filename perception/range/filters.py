@@ -7,10 +7,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.noise import NoiseModel
 from perception.range.sensor import RangeSensorModel
-
-Array = NDArray[np.float64]
 
 GROSS_SIGMAS = 6.0
 EDGE_SIGMAS = 4.0

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.errors import NotFound
 from perception.range.sensor import PinholeSensor, RangeSensorModel
-
-Array = NDArray[np.float64]
 
 FILL_NEIGHBOURS = 3  # an empty pixel between this many measured ones of one surface is filled by their mean
 FILL_SWEEPS = 2

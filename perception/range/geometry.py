@@ -16,12 +16,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.filters import gaussian, remove_gross_errors
 from perception.range.fitting.rays import LOOSE
 from perception.range.noise import NoiseModel, estimate_noise
 from perception.range.sensor import RangeSensorModel
-
-Array = NDArray[np.float64]
 
 CURVATURE_GOAL_PER_M = 4.0  # noise of H that still tells a ball of 0.1 m radius from a plane
 CHUNK, ROW = 128, 144  # pixels worked on at a time; a row of the scratch array holds them and a neighbour on each side

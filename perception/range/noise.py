@@ -13,12 +13,10 @@ from math import sqrt
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.fitting.surfaces import LEAN
 from perception.range.sensor import RangeSensorModel
-
-Array = NDArray[np.float64]
 
 WINDOW = 5  # samples across; a window of 25 samples rarely holds a gross error
 LARGE_SHARE = 1 / 60  # of the shorter side: spacing of the large window's samples, at least 2 pixels

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hal.arrays import Array
 from hal.errors import InvalidRequest, NotFound
-from perception.range.analyse import checked_depth
+from perception.range.analysis import checked_depth
 from perception.range.features import RangeFeature, plane_feature
 from perception.range.fitting.surfaces import PLANE, SIZE
 from perception.range.noise import NoiseModel, estimate_noise
@@ -17,8 +18,6 @@ from perception.range.segmentation.finish import refine_surface
 from perception.range.segmentation.grid import Grid, block_size, build_grid
 from perception.range.segmentation.regions import regions_of
 from perception.range.sensor import RangeSensorModel
-
-Array = NDArray[np.float64]
 
 HYPOTHESES = 24
 INLIER_SIGMAS = 3.0

@@ -7,12 +7,10 @@ from enum import StrEnum
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.fitting.starts import principal_axes
 from perception.range.fitting.surfaces import CONE, CYLINDER, PLANE, QUADRIC, SIZE, SPHERE, frame_of, step_into
-
-Array = NDArray[np.float64]
 
 
 class SurfaceType(StrEnum):

@@ -11,12 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.errors import NotObservable
 from perception.range.primitives import SurfaceType
-
-Array = NDArray[np.float64]
 
 TERMS = 10
 FLAT_RATIO = 1e-6  # residual ratio below which a second quadric fits as well: the points do not determine one

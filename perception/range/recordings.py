@@ -22,11 +22,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.errors import InvalidRequest
 from perception.range.sensor import OrthographicSensor, PinholeSensor, RangeSensorModel
 from perception.range.window import Window, decode_scaled
-
-Array = NDArray[np.float64]
 
 SUFFIXES = (".npz", ".npy", ".png", ".tif", ".tiff")
 UNITS_M = {"m": 1.0, "mm": 0.001}

@@ -10,12 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.geometry import to_json
-from perception.range.analyse import RangeScene
+from perception.range.analysis import RangeScene
 from perception.range.matching.match import Match
 from perception.range.primitives import Surface
-
-Array = NDArray[np.float64]
 
 MARK = ".surfaces"  # in the name of what is drawn of a recording, so that no batch takes it for one
 PICTURE_PX = 768  # small images are shown larger, or nobody could read what is written on them

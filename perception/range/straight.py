@@ -8,12 +8,10 @@ windows that some model makes straight vote, each with the log-likelihood that a
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.noise import quadratics, window_rms
 from perception.range.sensor import RangeSensorModel
-
-Array = NDArray[np.float64]
 
 SIDE = 9  # samples across a window
 WINDOWS_ACROSS = 3  # of the shorter side; windows overlap by half

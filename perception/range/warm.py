@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.range.analyse import analyse
+from perception.range.analysis import analyse
 from perception.range.geometry import local_geometry
 from perception.range.matching.match import match_models
 from perception.range.matching.models import shipped_models

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hal.arrays import Array
 from hal.errors import InvalidRequest, NotFound
-
-Array = NDArray[np.float64]
 
 TAIL = 0.005  # share of the pixels at each end that may be gross errors
 MARGIN = 0.05  # of the span, kept free at both ends

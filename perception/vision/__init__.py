@@ -1,1 +1,90 @@
-"""Pixels to facts: lights, pose, segmentation, features, matching and reading."""
+"""Images to facts: the panel's lights and pose, its objects and what they show, and teaching (paper II)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hal.face import load_on_first_use
+
+if TYPE_CHECKING:
+    from perception.vision.annotate import AMBER, GREEN, draw_annotated, draw_outlines, said
+    from perception.vision.finding.blind import recognise
+    from perception.vision.finding.framing import check_upright, one_plate
+    from perception.vision.image import as_gray, check_image, decode
+    from perception.vision.knowledge import NOTHING, Kind, Knowledge, load_knowledge, write_kind
+    from perception.vision.lights import find_lights
+    from perception.vision.lights.assign import AssignedLights, assign_lights
+    from perception.vision.quadrangle import QuadranglePose, estimate
+    from perception.vision.reading import ObjectReading, answer_at
+    from perception.vision.registration.outline import contour_m
+    from perception.vision.several_looks import joined
+    from perception.vision.status.button import ALIKE, NO_EDGE
+    from perception.vision.taught import inspect, inspect_view
+    from perception.vision.teaching.from_panel import PanelLooks, teach_from_panel
+    from perception.vision.teaching.panel_lights import LightsFound, find_border_lights
+    from perception.vision.teaching.panel_questions import Question, kind_question, questions
+    from perception.vision.teaching.panel_teach import PanelObjectDraft, object_row, panel_text
+    from perception.vision.teaching.teach import (
+        Example,
+        Overview,
+        check,
+        example_at,
+        likest,
+        overview_of,
+        teach_example,
+    )
+    from perception.vision.view import CameraView, View
+    from perception.vision.warm import warm_up
+
+__all__ = [
+    "ALIKE",
+    "AMBER",
+    "GREEN",
+    "NOTHING",
+    "NO_EDGE",
+    "AssignedLights",
+    "CameraView",
+    "Example",
+    "Kind",
+    "Knowledge",
+    "LightsFound",
+    "ObjectReading",
+    "Overview",
+    "PanelLooks",
+    "PanelObjectDraft",
+    "QuadranglePose",
+    "Question",
+    "View",
+    "answer_at",
+    "as_gray",
+    "assign_lights",
+    "check",
+    "check_image",
+    "check_upright",
+    "contour_m",
+    "decode",
+    "draw_annotated",
+    "draw_outlines",
+    "estimate",
+    "example_at",
+    "find_border_lights",
+    "find_lights",
+    "inspect",
+    "inspect_view",
+    "joined",
+    "kind_question",
+    "likest",
+    "load_knowledge",
+    "object_row",
+    "one_plate",
+    "overview_of",
+    "panel_text",
+    "questions",
+    "recognise",
+    "said",
+    "teach_example",
+    "teach_from_panel",
+    "warm_up",
+    "write_kind",
+]
+__getattr__ = load_on_first_use(__name__, __file__)

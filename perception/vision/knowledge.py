@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from hal.arrays import Array
 from hal.errors import ConfigError
 from hal.strict import Strict, load_toml
 from hal.whole_file import write_whole
@@ -33,7 +34,6 @@ from perception.vision.finding.features import (
     RINGS,
     WEIGHTS,
 )
-from perception.vision.view import Array
 
 NOTHING = "nothing"
 UNIT = 100.0  # looks are stored in hundredths

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hal.arrays import Array
 from perception.vision.image import WHITE_LEVEL, Image, as_gray
-from perception.vision.view import Array, View, homography
+from perception.vision.view import View, homography
 
 OVERSAMPLING = 1.5  # rectified pixels per image pixel: keeps detail through the second interpolation
 MAX_SIDE_PX = 320

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from perception.vision.view import Array
+from hal.arrays import Array
 
 ANSWER_AT = 0.5  # below this confidence a reading is refused, unless the caller asks for less or for more
 MOST_DOUBTED = 0.49  # confidence of a guess that a reader has a reason to refuse

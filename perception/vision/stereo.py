@@ -9,14 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest, NotFound, NotObservable
 from hal.geometry import UncertainPose, matrix_of, skew
 from perception.camera_model import normalised_with_jacobian
-
-Array = NDArray[np.float64]
 
 LEAST_PARALLAX_RAD = 0.005  # at 0.5 m: a base of 2.5 mm
 DISAGREEMENT_CHI_SQUARE = 30.0  # for one or two surplus measurements: chance below 1e-6

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.errors import NotFound
 from hal.geometry import UncertainPose, matrix_of
@@ -32,7 +33,7 @@ from perception.vision.status.panel_meter import read_panel_meter
 from perception.vision.status.rotary import read_rotary
 from perception.vision.status.slider import read_slider
 from perception.vision.status.toggle import read_toggle
-from perception.vision.view import Array, CameraView, View
+from perception.vision.view import CameraView, View
 
 MARGIN = 1.25  # of the footprint: readers look at the plate around the object too
 LAMP_MARGIN = 2.0

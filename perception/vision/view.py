@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from typing import Protocol, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.geometry import UncertainPose, perturbed
 from perception.camera_model import project
-
-Array = NDArray[np.float64]
 
 
 class View(Protocol):

@@ -14,7 +14,7 @@ from service.commands.common import console
 from service.commands.teach import read_image
 
 if TYPE_CHECKING:
-    from perception.calibration.boards import BoardView, Charuco, Dots
+    from perception.calibration import BoardView, Charuco, Dots
 
 
 class BoardKind(StrEnum):
@@ -39,9 +39,7 @@ def board(
 ) -> None:
     """Focal lengths, centre and distortion, each with one sigma, as a calibration record."""
     from hal.calibration import load_calibration
-    from perception.calibration.boards import Charuco, Dots
-    from perception.calibration.intrinsics import calibrate_camera
-    from perception.calibration.records import record_of, renewed, to_toml
+    from perception.calibration import Charuco, Dots, calibrate_camera, record_of, renewed, to_toml
 
     if kind is BoardKind.CHARUCO and marker >= pitch:
         raise InvalidRequest(f"markers of {marker} m do not fit squares of {pitch} m", hint="measure both, in metres")
@@ -75,7 +73,7 @@ def _views(images: list[Path], target: Charuco | Dots) -> tuple[list[BoardView],
     Raises:
         InvalidRequest: images of different sizes. NotFound: fewer than three show the board.
     """
-    from perception.vision.image import as_gray
+    from perception.vision import as_gray
 
     found: list[BoardView] = []
     sizes: dict[tuple[int, int], Path] = {}

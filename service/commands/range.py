@@ -18,10 +18,7 @@ from service.commands.leaving import INTERRUPTED, one_interrupt
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from perception.range import RangeScene, Surface
-    from perception.range.batch_results import BatchResult, KeptResults
-    from perception.range.matching.match import Match
-    from perception.range.recordings import Reading
+    from perception.range import BatchResult, KeptResults, Match, RangeScene, Reading, Surface
 
 batch = typer.Typer(help="Folders of recordings on many workers (dask).", no_args_is_help=True)
 SHOWN_ERRORS = 5
@@ -48,11 +45,19 @@ def range_image(
     pitch: Pitch = None,
 ) -> None:
     """Analyse one range image: NAME.surfaces.json, .png (coloured) and .ply (coloured points)."""
-    from perception.range import analyse
-    from perception.range.matching.match import match_models
-    from perception.range.matching.models import load_models, shipped_models
-    from perception.range.recordings import assumptions, load_recording
-    from perception.range.render import MARK, match_json, scene_json, write_ply, write_png
+    from perception.range import (
+        MARK,
+        analyse,
+        assumptions,
+        load_models,
+        load_recording,
+        match_json,
+        match_models,
+        scene_json,
+        shipped_models,
+        write_ply,
+        write_png,
+    )
 
     reading = _reading(scale, near, far, focal, centre, pitch)
     library = () if models is None else shipped_models() if models == "shipped" else load_models(Path(models))
@@ -93,8 +98,7 @@ def batch_range_images(
 
     Ctrl-C stops it; the same command goes on where it was stopped.
     """
-    from perception.range.batch import batch_range, recordings_in
-    from perception.range.batch_results import KeptResults
+    from perception.range import KeptResults, batch_range, recordings_in
 
     reading = _reading(scale, near, far, focal, centre, pitch)
     total = len(recordings_in(folder))
@@ -135,7 +139,7 @@ def _reading(
     centre: str | None,
     pitch: float | None,
 ) -> Reading:
-    from perception.range.recordings import Reading
+    from perception.range import Reading
 
     return Reading(
         scale_m=scale,

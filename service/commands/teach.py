@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from perception.vision.teaching.panel_questions import Question
+    from perception.vision import Question
     from service.memory.teachings import Teachings
 
 MOST_PLATE_M = 10.0
@@ -114,8 +114,7 @@ def _by_clicks(
 
 def _by_panel(teachings: Teachings, pixels: NDArray[np.uint8], panel_file: Path) -> None:
     from hal.panel import load_panel
-    from perception.vision.finding.framing import check_upright, one_plate
-    from perception.vision.image import as_gray
+    from perception.vision import as_gray, check_upright, one_plate
     from service.commands.learn import tell
     from service.memory.lessons import learn_panel
 
@@ -133,7 +132,7 @@ def read_image(image: Path) -> NDArray[np.uint8]:
     Raises:
         InvalidRequest: it cannot be read, or is no usable image.
     """
-    from perception.vision.image import decode
+    from perception.vision import decode
 
     try:
         data = image.read_bytes()

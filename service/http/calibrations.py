@@ -68,7 +68,7 @@ def _all(state: AppState, *, with_text: bool) -> list[CalibrationView]:
 
 
 def _view(entry: Calibrated, *, with_text: bool) -> CalibrationView:
-    from perception.calibration.records import to_toml
+    from perception.calibration import to_toml
 
     record = entry.record.model_dump(mode="json", by_alias=True)
     return CalibrationView(

@@ -110,7 +110,7 @@ class Calibrations:
         Raises:
             ConfigError: the device has no mount, so nothing would read the record.
         """
-        from perception.calibration.records import to_toml
+        from perception.calibration import to_toml
 
         section = self._cell.file.devices[record.device]
         if section.mount is None:

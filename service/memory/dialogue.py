@@ -13,18 +13,29 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from hal.errors import CellError, InvalidRequest
 from hal.panel import OBJECT_KINDS
-from perception.vision.teaching.panel_lights import find_border_lights
-from perception.vision.teaching.panel_questions import Question, kind_question, questions
-from perception.vision.teaching.panel_teach import PanelObjectDraft, object_row, panel_text
-from perception.vision.teaching.teach import Example, Overview, check, example_at, likest, overview_of, teach_example
+from perception.vision import (
+    Example,
+    Overview,
+    PanelObjectDraft,
+    Question,
+    check,
+    example_at,
+    find_border_lights,
+    kind_question,
+    likest,
+    object_row,
+    overview_of,
+    panel_text,
+    questions,
+    teach_example,
+)
 from service.memory.teachings import Teachings, check_name
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from perception.vision.knowledge import Knowledge
-    from perception.vision.teaching.panel_lights import LightsFound
+    from perception.vision import Knowledge, LightsFound
 
 T = TypeVar("T")
 MOST_TRIES = 5  # a script that goes on giving the same wrong answer must end
@@ -190,9 +201,7 @@ class Dialogue:
             self.talk.say(line)
 
     def _show_read(self, name: str) -> None:
-        from perception.vision.annotate import said
-        from perception.vision.image import as_gray
-        from perception.vision.taught import inspect_view
+        from perception.vision import as_gray, inspect_view, said
 
         panel = self.teachings.panel(name)
         for reading in inspect_view(self.pixels, as_gray(self.pixels), self.overview.view, panel):

@@ -61,7 +61,7 @@ class ImageStore:
             InvalidRequest: no image, damaged, deeper than 8 bits, too small, too large.
             NotPossibleNow: the store is full.
         """
-        from perception.vision.image import check_image, decode
+        from perception.vision import check_image, decode
 
         if len(data) > MAX_IMAGE_BYTES:
             raise InvalidRequest(f"the image has {len(data)} bytes", hint=f"send at most {MAX_IMAGE_BYTES}")
@@ -102,7 +102,7 @@ class ImageStore:
         Raises:
             NoSuchImage: there is none.
         """
-        from perception.vision.image import decode
+        from perception.vision import decode
 
         return decode(self.get(image_id).path.read_bytes())
 

@@ -19,10 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from perception.vision.teaching.from_panel import PanelLooks
-    from perception.vision.teaching.panel_questions import Question
-    from perception.vision.teaching.teach import Example, Overview
-    from perception.vision.view import View
+    from perception.vision import Example, Overview, PanelLooks, Question, View
 
 PixelNumber = Annotated[float, Field(ge=-1e5, le=1e5)]
 Click = tuple[PixelNumber, PixelNumber]
@@ -79,7 +76,7 @@ class TeachRequest(Strict):
 
 def questions_of(kind: str) -> tuple[Question, ...]:
     """What the dialogue asks about an object of this kind."""
-    from perception.vision.teaching.panel_questions import questions
+    from perception.vision import questions
 
     return questions(kind)
 
@@ -90,7 +87,7 @@ def find_outline(images: ImageStore, teachings: Teachings, request: OutlineReque
     Raises:
         NoSuchImage, InvalidRequest, NotObservable, NotFound, Ambiguous: says what is wrong and what helps.
     """
-    from perception.vision.teaching.teach import example_at, overview_of
+    from perception.vision import example_at, overview_of
 
     overview = overview_of(images.pixels(request.image), plate_m=request.plate_m)
     return described(overview, example_at(overview, request.clicks_px), teachings)
@@ -120,8 +117,7 @@ def teach_kind(
     size_m: tuple[float, float] | None = None,
 ) -> dict[str, Any]:
     """Teach one example of a kind and keep it; see `teach`."""
-    from perception.vision.knowledge import NOTHING
-    from perception.vision.teaching.teach import example_at, overview_of, teach_example
+    from perception.vision import NOTHING, example_at, overview_of, teach_example
 
     check_name(kind)
     overview = overview_of(pixels, plate_m=plate_m)
@@ -144,9 +140,7 @@ def teach_panel(
     teachings: Teachings, pixels: NDArray[np.uint8], plate_m: tuple[float, float], lesson: PanelLesson
 ) -> dict[str, Any]:
     """Write a whole panel's file from clicks and answers; see `teach`."""
-    from perception.vision.teaching.panel_lights import find_border_lights
-    from perception.vision.teaching.panel_teach import PanelObjectDraft, panel_text
-    from perception.vision.teaching.teach import example_at, overview_of
+    from perception.vision import PanelObjectDraft, example_at, find_border_lights, overview_of, panel_text
 
     check_name(lesson.name)
     overview = overview_of(pixels, plate_m=plate_m)
@@ -197,7 +191,7 @@ def learn_panel(teachings: Teachings, pixels: NDArray[np.uint8], view: View, pan
     Raises:
         InvalidRequest, NotObservable, NotFound, Ambiguous: the overview teaches nothing; says why and what helps.
     """
-    from perception.vision.teaching.from_panel import teach_from_panel
+    from perception.vision import teach_from_panel
 
     looks = teach_from_panel(pixels, view, panel, teachings.knowledge(), source="panelwright learn")
     return Learned(panel=panel.name, looks=looks, files=tuple(teachings.write_kind(kind) for kind in looks.kinds))
@@ -205,7 +199,7 @@ def learn_panel(teachings: Teachings, pixels: NDArray[np.uint8], view: View, pan
 
 def described(overview: Overview, example: Example, teachings: Teachings) -> dict[str, Any]:
     """An example for people and pages: its outline in the image, and what it is taken for now."""
-    from perception.vision.teaching.teach import likest
+    from perception.vision import likest
 
     if example.outline is None:
         raise InvalidRequest("nothing was pointed at", hint="click on an object")

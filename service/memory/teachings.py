@@ -18,7 +18,7 @@ from service.errors import NoSuchTask
 
 if TYPE_CHECKING:
     from hal.config import Cell
-    from perception.vision.knowledge import Kind, Knowledge
+    from perception.vision import Kind, Knowledge
 
 FOLDER = "knowledge"
 SHIPPED = Path(__file__).parents[2] / "perception" / "vision" / "knowledge"
@@ -91,7 +91,7 @@ class Teachings:
         Raises:
             ConfigError: a file of a folder is malformed; names it.
         """
-        from perception.vision.knowledge import Knowledge
+        from perception.vision import Knowledge
 
         shipped = _kinds_in(SHIPPED, _stamps(SHIPPED))
         if self.of_cell is not None:
@@ -136,7 +136,7 @@ class Teachings:
 
     def write_kind(self, kind: Kind) -> Path:
         """Keep a taught kind, in place of the one of that name."""
-        from perception.vision.knowledge import write_kind
+        from perception.vision import write_kind
 
         check_name(kind.name)
         with self._lock:
@@ -183,7 +183,7 @@ def _stamps(folder: Path) -> tuple[tuple[str, int, int], ...]:
 def _kinds_in(folder: Path, stamps: tuple[tuple[str, int, int], ...]) -> Knowledge:
     """The kinds of a folder, read once: they are two megabytes of numbers."""
     del stamps
-    from perception.vision.knowledge import load_knowledge
+    from perception.vision import load_knowledge
 
     return load_knowledge(folder)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hal.geometry import UncertainPose, transform_rpy
-from perception.vision.reading import ObjectReading
+from perception.vision import ObjectReading
 from service.operations.session import Session
 
 READINGS = "readings"  # key in the cell's memory: newest reading by object

@@ -11,10 +11,7 @@ from hal.calibration import CalibrationRecord
 from hal.devices import DeviceKind
 from hal.errors import InvalidRequest, Unsupported
 from hal.geometry import difference, to_json
-from perception.calibration.in_hand import InHandCalibration
-from perception.calibration.records import record_of, renewed
-from perception.calibration.scanner import ScannerCalibration
-from perception.calibration.wrench import WrenchCalibration
+from perception.calibration import InHandCalibration, ScannerCalibration, WrenchCalibration, record_of, renewed
 from service.memory.calibrations import Calibrations
 from service.operations.calibrate_sensors import (
     beforehand,

@@ -5,24 +5,27 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.devices import DeviceKind
 from hal.errors import NotObservable
 from hal.geometry import matrix_of
 from hal.motion import Hold
-from perception.calibration.in_hand import (
+from perception.calibration import (
     UNKNOWN_LENS,
     Beforehand,
     InHandCalibration,
     InHandState,
     InHandView,
+    ScannerCalibration,
+    ScannerView,
+    WrenchCalibration,
     calibrate_in_hand,
+    calibrate_scanner,
+    calibrate_wrench,
     propose_view,
 )
-from perception.calibration.scanner import ScannerCalibration, ScannerView, calibrate_scanner
-from perception.calibration.wrench import WrenchCalibration, calibrate_wrench
 from service.operations.beliefs import believed_panel
 from service.operations.eyes import OLDEST_S, deadline, look_with_lights, settle
 from service.operations.locate import lights_in, scan_plate
@@ -40,8 +43,6 @@ from service.operations.stations import (
 )
 from service.operations.travel import go_to_joints, kinematics
 from service.operations.views import overview_distance_m
-
-Array = NDArray[np.float64]
 
 MOST_SCATTER = 9.0  # chi-square a degree: three times the stated noise is no noise any more
 LEAST_LENS = (1e-5, 0.01, 1e-5)  # a record without sigmas does not mean a lens without error

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.devices import ProximityCapabilities
 from hal.errors import DeviceFault
 from hal.panel import Panel
 from service.operations.spots import room_m
 
-Array = NDArray[np.float64]
 BARE_M = 0.010  # of plate round the beam's foot: no part of it sees an edge
 LEAST_OFF_M = 0.005  # mounts and plates are known better
 OFF_SIGMA = 6.0  # of one reading

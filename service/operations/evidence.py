@@ -13,21 +13,15 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from fusion import sensing
-from fusion.batch import pack
-from fusion.features import plane, point
-from fusion.measurement import Measurement
-from fusion.robust import FusedPose, fuse
-from fusion.solve import local_solution
+from fusion import FusedPose, Measurement, fuse, local_solution, pack, plane, point, sensing
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.geometry import UncertainPose, certain, compose, difference, matrix_of, perturbed
-from perception.camera_model import undistort_pixels
+from perception.calibration import undistort_pixels
 from perception.range import PlaneFit
 
-Array = NDArray[np.float64]
 PLATE = plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), name="plate")
 
 

@@ -9,15 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.devices import DeviceKind
 from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import compose
 from hal.panel import PanelObject
-from perception.vision.annotate import draw_annotated, said
-from perception.vision.reading import ObjectReading, answer_at
-from perception.vision.several_looks import joined
-from perception.vision.status.button import ALIKE, NO_EDGE
-from perception.vision.taught import inspect as inspect_image
+from perception.vision import ALIKE, NO_EDGE, ObjectReading, answer_at, draw_annotated, joined, said
+from perception.vision import inspect as inspect_image
 from service.operations.beliefs import READINGS, forget_reading, known_readings
 from service.operations.eyes import Look, base_from, look, settle
 from service.operations.locate import go_to_overview, locate
@@ -98,7 +96,7 @@ def close_ups(session: Session, names: Collection[str]) -> Inspection:
     return Inspection(readings=readings, pictures=tuple(pictures))
 
 
-def _camera_over_panel(session: Session) -> NDArray[np.float64]:
+def _camera_over_panel(session: Session) -> Array:
     """(3,) panel point that the camera is before."""
     camera = base_from(session, session.first(DeviceKind.CAMERA)).parent_from_child
     x, y, _ = session.known_panel().parent_from_child.inv().apply(camera.translation)

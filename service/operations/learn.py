@@ -17,8 +17,7 @@ from service.report.plots import png_of
 
 if TYPE_CHECKING:
     from hal.panel import Panel
-    from perception.vision.teaching.from_panel import PanelLooks
-    from perception.vision.view import View
+    from perception.vision import PanelLooks, View
 
 
 def run_learn(session: Session, request: LearnRequest) -> dict[str, Any]:
@@ -28,7 +27,7 @@ def run_learn(session: Session, request: LearnRequest) -> dict[str, Any]:
         NoSuchImage, NoSuchKnowledge: unknown image or panel.
         InvalidRequest, NotObservable, NotFound, Ambiguous: the overview teaches nothing; says why and what helps.
     """
-    from perception.vision.view import CameraView
+    from perception.vision import CameraView
 
     if request.image is not None:
         session.progress(0.1, "look at the stored image")
@@ -56,7 +55,7 @@ def _learn(session: Session, pixels: Pixels, view: View, panel: Panel) -> dict[s
 
 def _drawn(pixels: Pixels, looks: PanelLooks) -> Pixels:
     """The overview with the objects that taught: green are recognised blind now, amber are not."""
-    from perception.vision.annotate import AMBER, GREEN, draw_outlines
+    from perception.vision import AMBER, GREEN, draw_outlines
 
     return draw_outlines(
         pixels,

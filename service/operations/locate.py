@@ -6,15 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.errors import Ambiguous, NotFound
 from hal.geometry import UncertainPose, compose, difference, matrix_of, to_json
 from perception.range import PinholeSensor, PlaneFit, fit_plane_near
-from perception.vision.lights import find_lights
-from perception.vision.lights.assign import AssignedLights, assign_lights
-from perception.vision.quadrangle import QuadranglePose, estimate
+from perception.vision import AssignedLights, QuadranglePose, assign_lights, estimate, find_lights
 from service.operations.beliefs import believed_panel, expected_panel
 from service.operations.evidence import LightEvidence, PlaneEvidence
 from service.operations.eyes import LightPair, Look, Scan, look_with_lights, scan
@@ -23,7 +21,6 @@ from service.operations.session import Session
 from service.operations.travel import go_to_camera_view, leave_the_panel
 from service.operations.views import overview_poses
 
-Array = NDArray[np.float64]
 WRONG_FIT_P = 1e-4  # a worse fit than one in ten thousand means a wrong lamp, panel file or lens
 
 

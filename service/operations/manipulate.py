@@ -7,16 +7,8 @@ from typing import Any
 
 from hal.errors import PerceptionError, Unreachable
 from hal.panel import Button, Handwheel, Lever, Mushroom, PanelObject, Rotary, Slider, Toggle
-from manipulation.skills.button import button
-from manipulation.skills.handwheel import handwheel
-from manipulation.skills.lever import lever
-from manipulation.skills.mushroom import mushroom
-from manipulation.skills.outcome import ObjectState, SkillReport, Verify
-from manipulation.skills.rotary import rotary
-from manipulation.skills.slider import slider
-from manipulation.skills.toggle import toggle
-from perception.vision.annotate import said
-from perception.vision.reading import ObjectReading
+from manipulation import ObjectState, SkillReport, Verify, button, handwheel, lever, mushroom, rotary, slider, toggle
+from perception.vision import ObjectReading, said
 from service.operations.beliefs import forget_reading, known_readings
 from service.operations.inspect import ensure_located, look_close, look_past
 from service.operations.requests import ActionBody, ManipulateRequest

@@ -15,7 +15,7 @@ from hal.devices import DeviceKind
 from hal.errors import CellError, DeviceError
 from hal.geometry import compose
 from hal.panel import Button, Lever, PanelObject, Slider, Toggle
-from perception.vision.reading import ObjectReading
+from perception.vision import ObjectReading
 from service.operations.beliefs import known_readings
 from service.operations.context import OperationContext
 from service.operations.eyes import settle

@@ -7,22 +7,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.errors import Unsupported
 from hal.geometry import UncertainPose, compose, point_covariance
 from hal.panel import Handwheel, Mushroom, Panel
-from perception.range import PinholeSensor, RangeScene, Surface, analyse
-from perception.range.matching.match import Match, match_models
-from perception.range.matching.models import ComponentModel
+from perception.range import ComponentModel, Match, PinholeSensor, RangeScene, Surface, analyse, match_models
 from service.operations.eyes import Scan
 from service.operations.locate import pose_json
 from service.operations.relief_models import models_of
 from service.operations.spots import half_footprint_m
 from service.report.surfaces import Mark
-
-Array = NDArray[np.float64]
 
 NEAR_M = 0.02  # a match further from where the file has its object is another thing; three sigmas of the belief beside
 LEAST_PIXELS = 20  # over an object's footprint; with fewer it is not in view

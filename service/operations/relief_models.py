@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from hal.panel import Handwheel, Mushroom, Panel, PanelObject
-from perception.range.matching.models import ComponentModel, models_from
+from perception.range import ComponentModel, models_from
 
 HUB_RADIUS_M = 0.009
 SPOKE_RADIUS_M = 0.003

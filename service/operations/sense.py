@@ -7,18 +7,28 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from fusion.features import Feature, Kind, unit
-from fusion.measurement import Measurement, SensingClass
-from fusion.robust import FusedPose, ShapeEstimate, fuse
-from fusion.shapes import Box, Cylinder, FeatureSet, MovingPart, Shape
+from fusion import (
+    Box,
+    Cylinder,
+    Feature,
+    FeatureSet,
+    FusedPose,
+    Kind,
+    Measurement,
+    MovingPart,
+    SensingClass,
+    Shape,
+    ShapeEstimate,
+    fuse,
+    unit,
+)
+from hal.arrays import Array
 from hal.devices import DeviceKind
 from hal.errors import MotionError, NotFound, Stopped
 from hal.geometry import UncertainPose
-from manipulation.skills.outcome import SkillFailure
-from manipulation.skills.probe import proximity_probe, touch_probe
+from manipulation import SkillFailure, proximity_probe, touch_probe
 from service.operations.beliefs import believed_panel
 from service.operations.doubted_proximity import DoubtedProximity
 from service.operations.evidence import (
@@ -38,7 +48,6 @@ from service.operations.spots import bare_spots
 from service.operations.tours import short_tour
 from service.operations.travel import workcell
 
-Array = NDArray[np.float64]
 HOVER_M = 0.05  # of the finger tips above the plate while the proximity sensors look
 LEAST_TOUCHES = 3
 ONE_IN = 1e5

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.config import Cell
 from hal.devices import DeviceKind
 from hal.errors import ConfigError, DeviceFault, InvalidRequest, MotionError, NotFound, Stopped
 from hal.frames import frame_tree
 from hal.geometry import UncertainPose, identity
-from hal.motion import Array, DeclaredMotion, MotionOutcome, MotionReport, Mover, RobotState
+from hal.motion import DeclaredMotion, MotionOutcome, MotionReport, Mover, RobotState
 from hal.panel import Panel
 from service.operations.context import CellMemory, OperationContext
 from service.processes.connection import CellConnection

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.errors import NotFound
 from hal.panel import Panel, PanelObject
 
-Array = NDArray[np.float64]
 GRID_M = 0.005
 EDGE_M = 0.025  # a finger that misses the plate finds nothing
 

@@ -6,20 +6,17 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.errors import Ambiguous, NotFound, Unreachable
 from hal.geometry import certain, matrix_of, transform
-from manipulation.kinematics import Kinematics
-from perception.calibration.hand_eye import HandEyeView, propose_next, stations
-from perception.camera_model import project
+from manipulation import Kinematics
+from perception.calibration import HandEyeView, project, propose_next, stations
 from service.operations.eyes import settle
 from service.operations.session import Session
 from service.operations.travel import go_to_first, reachable
-
-Array = NDArray[np.float64]
 
 EDGE_PX = 24.0  # a light this near the image's edge may be cut
 LIGHTS_CONE_RAD = 0.95  # 0.6 rad leave the camera's depth in the hand uncertain by half as much again

@@ -13,7 +13,7 @@ from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose
 from hal.panel import Panel
-from perception.vision.reading import ObjectReading
+from perception.vision import ObjectReading
 from service.memory.images import ImageStore
 from service.memory.teachings import Teachings
 from service.operations.requests import InspectRequest, RecogniseRequest, StoredLook
@@ -21,7 +21,7 @@ from service.operations.session import Session, panel_object_or_all
 from service.report.plots import png_of
 
 if TYPE_CHECKING:
-    from perception.vision.view import View
+    from perception.vision import View
 
 Pixels = NDArray[np.uint8]
 PICTURE_WIDTH_PX = 1600  # wider pictures are shown smaller: nobody looks at 40 megapixels
@@ -35,9 +35,7 @@ def read_stored(session: Session, request: RecogniseRequest | InspectRequest) ->
         NoSuchImage, NoSuchKnowledge: unknown image or panel.
         InvalidRequest, NotObservable, NotFound, Ambiguous: the image cannot be answered for; says why and what helps.
     """
-    from perception.vision.annotate import draw_annotated
-    from perception.vision.image import as_gray
-    from perception.vision.taught import inspect_view
+    from perception.vision import as_gray, draw_annotated, inspect_view
 
     panel = panel_of(session, request.panel)
     names = panel_object_or_all(panel, request.objects)
@@ -60,7 +58,7 @@ def blind_in_stored(session: Session, request: RecogniseRequest) -> dict[str, An
     Raises:
         as `read_stored`.
     """
-    from perception.vision.image import as_gray
+    from perception.vision import as_gray
 
     pixels = _stores(session)[0].pixels(request.image or "")
     plate_m = request.plate_m
@@ -77,8 +75,7 @@ def blind_answer(
     session: Session, pixels: Pixels, plate_m: tuple[float, float], *, focal_px: float | None
 ) -> dict[str, Any]:
     """All candidates, refused ones with their reasons, and a picture of the others."""
-    from perception.vision.annotate import GREEN, draw_outlines
-    from perception.vision.finding.blind import recognise
+    from perception.vision import GREEN, draw_outlines, recognise
 
     found = recognise(pixels, _stores(session)[1].knowledge(), plate_m=plate_m, focal_px=focal_px)
     taken = [candidate for candidate in found if candidate.reason is None]
@@ -140,8 +137,7 @@ def stored_view(session: Session, request: StoredLook, panel: Panel) -> tuple[Pi
     Raises:
         as `read_stored`.
     """
-    from perception.vision.finding.framing import check_upright
-    from perception.vision.image import as_gray
+    from perception.vision import as_gray, check_upright
 
     pixels = _stores(session)[0].pixels(request.image or "")
     gray = as_gray(pixels)
@@ -152,9 +148,7 @@ def stored_view(session: Session, request: StoredLook, panel: Panel) -> tuple[Pi
 
 def _view(session: Session, request: StoredLook, gray: Pixels, panel: Panel) -> View:
     """Where the panel is: as the caller says, or by its border, through the lens if that is known."""
-    from perception.vision.finding.framing import one_plate
-    from perception.vision.quadrangle import estimate
-    from perception.vision.view import CameraView
+    from perception.vision import CameraView, estimate, one_plate
 
     lens = _lens(session, request, gray)
     if lens is not None and request.camera_from_panel is not None:

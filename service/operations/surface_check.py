@@ -17,7 +17,7 @@ from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import UncertainPose, compose
 from hal.panel import Handwheel, Mushroom
 from perception.range import RangeScene
-from perception.vision.reading import ObjectReading
+from perception.vision import ObjectReading
 from service.operations.beliefs import believed_panel, known_readings
 from service.operations.eyes import Scan, settle
 from service.operations.locate import ScannedPlane, scan_plate

@@ -5,7 +5,9 @@ from __future__ import annotations
 from itertools import pairwise, permutations, starmap
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from hal.arrays import Array
 
 MOST_TRIED = 6  # 720 orders; more places are visited nearest first
 
@@ -28,5 +30,5 @@ def short_tour(start_m: ArrayLike, places_m: ArrayLike) -> list[int]:
     return [k - 1 for k in order[1:]]
 
 
-def _length(gaps: NDArray[np.float64], order: tuple[int, ...]) -> float:
+def _length(gaps: Array, order: tuple[int, ...]) -> float:
     return sum(starmap(gaps.item, pairwise(order)))

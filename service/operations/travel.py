@@ -8,27 +8,31 @@ from dataclasses import replace
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.devices import DeviceKind
 from hal.errors import Unreachable
 from hal.geometry import transform_rpy
 from hal.motion import MotionReport
 from hal.panel import Lever
-from manipulation.collision import CollisionModel
-from manipulation.kinematics import Kinematics
-from manipulation.shapes import Box
-from manipulation.skills.outcome import SkillFailure
-from manipulation.skills.steps import Attempt, retreat
-from manipulation.skills.steps import park as park_arm
-from manipulation.timing import SpeedLimits
-from manipulation.transfer import QUICK, THOROUGH, Effort
-from manipulation.workcell import Workcell
+from manipulation import (
+    QUICK,
+    THOROUGH,
+    Attempt,
+    Box,
+    CollisionModel,
+    Effort,
+    Kinematics,
+    SkillFailure,
+    SpeedLimits,
+    Workcell,
+    retreat,
+)
+from manipulation import park as park_arm
 from service.operations.beliefs import believed_panel, known_readings
 from service.operations.session import Session
 
-Array = NDArray[np.float64]
 ENOUGH_CONDITIONING = 0.06  # smallest singular value over the largest: below it, small moves need fast wrists
 CLEAR_M = 0.004
 MOST_TRIES, MOST_THOROUGH = 24, 3  # goals that are searched for quickly, and then thoroughly

@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.geometry import transform
 from hal.panel import Panel, PanelObject
@@ -102,7 +102,7 @@ def poses_from(base_from_panel: RigidTransform, point_m: Sequence[float], side: 
 
 def close_up_groups(
     objects: Sequence[PanelObject], intrinsics: CameraIntrinsics, distance_m: float = CLOSE_UP_M
-) -> list[tuple[NDArray[np.float64], tuple[str, ...]]]:
+) -> list[tuple[Array, tuple[str, ...]]]:
     """Few close-ups that together show every object: (view centre in the panel frame, names), the fullest first.
 
     Greedy cover: each view is centred where it takes in most of the objects that are still unseen.
@@ -111,7 +111,7 @@ def close_up_groups(
     half_y = FILL * 0.5 * intrinsics.height_px / intrinsics.fy_px * distance_m - REACH_M
     span = np.array([2 * half_x, 2 * half_y])
     unseen = {thing.name: np.array(thing.position_m) for thing in objects}
-    groups: list[tuple[NDArray[np.float64], tuple[str, ...]]] = []
+    groups: list[tuple[Array, tuple[str, ...]]] = []
     while unseen:
         best: tuple[str, ...] = ()
         for corner_x in unseen.values():

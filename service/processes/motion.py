@@ -9,19 +9,20 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.calibration import ToolLoad
 from hal.clock import Clock, SimClock
 from hal.config import Cell
 from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, MotionRefused
-from hal.geometry import Array, identity
+from hal.geometry import identity
 from hal.motion import DeclaredMotion, MotionReport, RobotState
 from hal.readings import Quality
 from service.processes.absent import Absent
 from service.processes.seats import IN_MOTION, Seat
 
 if TYPE_CHECKING:
-    from manipulation.control import Controller
+    from manipulation import Controller
 
 STATE_WAIT_S = 2.0
 T = TypeVar("T")
@@ -196,7 +197,7 @@ def controller_of(
     Raises:
         ConfigError: a part that motion needs is missing from the cell file.
     """
-    from manipulation.control import Controller
+    from manipulation import Controller
 
     arm, gripper = _first(cell, devices, DeviceKind.ARM), _first(cell, devices, DeviceKind.GRIPPER)
     if gripper is None:

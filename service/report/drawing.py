@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.panel import Panel
-from perception.camera_model import project
-from perception.vision.registration.outline import contour_m
+from perception.calibration import project
+from perception.vision import contour_m
 from service.report.plots import figure_png
 
 PLATE, OBJECT, LIGHT = "#2ec4b6", "#ff9f1c", "#ffe066"
@@ -27,7 +28,7 @@ def panel_drawing(
     pane = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     pane.imshow(pixels, cmap="gray", vmin=0, vmax=255, alpha=0.8)
 
-    def line(points_m: NDArray[np.float64], colour: str, width: float = 1.2) -> None:
+    def line(points_m: Array, colour: str, width: float = 1.2) -> None:
         u, v = project(camera_from_panel.apply(points_m), intrinsics).T
         pane.plot(u, v, color=colour, lw=width)
 
@@ -48,7 +49,7 @@ def panel_drawing(
     return figure_png(figure)
 
 
-def _edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def _edges(corners: Array) -> Array:
     """A polyline fine enough to follow the lens's distortion."""
     pieces = [a + (b - a) * f for a, b in pairwise(corners) for f in np.linspace(0, 1, 20)]
     return np.array(pieces)

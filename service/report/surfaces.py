@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.range import RangeScene
-from perception.range.render import picture
+from hal.arrays import Array
+from perception.range import RangeScene, picture
 
 Pixels = NDArray[np.uint8]
 FOUND, LOST = (40, 220, 60), (255, 60, 60)
@@ -21,7 +21,7 @@ TEXT_SCALE = 0.5
 class Mark:
     """An object drawn over the image: `outline_px` (N, 2) in pixels of the range image."""
 
-    outline_px: NDArray[np.float64]
+    outline_px: Array
     text: str
     is_found: bool
 

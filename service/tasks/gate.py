@@ -9,11 +9,11 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any
 
+from hal.arrays import Array
 from hal.clock import Clock
 from hal.config import Cell
 from hal.devices import DeviceKind
 from hal.errors import DeviceError
-from hal.geometry import Array
 from hal.motion import DeclaredMotion, MotionReport, Mover, RobotState
 from service.processes.connection import CellConnection
 

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from simbackend.arm_model import base_from_flange, t3
 from simbackend.camera import scaled
@@ -49,7 +50,7 @@ def info(*lit: Emitter) -> PictureInfo:
     )
 
 
-def project(points_m: NDArray[np.float64], lens: CameraIntrinsics) -> NDArray[np.float64]:
+def project(points_m: Array, lens: CameraIntrinsics) -> Array:
     """OpenCV as the independent lens."""
     matrix = np.array([[lens.fx_px, 0, lens.cx_px], [0, lens.fy_px, lens.cy_px], [0, 0, 1.0]])
     pixels, _ = cv2.projectPoints(
@@ -84,7 +85,7 @@ def test_border_lights_appear_where_truth_lens_and_mount_put_them(bench: SimCell
     """The whole chain against OpenCV: panel pose, kinematics, mount, lens, drawing, sensor."""
     lights, camera, arm = bench.connect("panel_lights"), bench.connect("wrist_camera"), bench.connect("arm")
 
-    def picture(on: bool) -> NDArray[np.float64]:
+    def picture(on: bool) -> Array:
         lights.set_on([on] * 4, deadline=bench.deadline())
         bench.clock.sleep(0.05)
         return np.asarray(camera.read_image(deadline=bench.deadline()).value.pixels, float)

@@ -8,16 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from eaik.IK_DH import DhRobot
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.simulated import ObjectTruth
 from simbackend.arm_model import base_from_flange
 from simbackend.client import true_mount
 from simbackend.draws import Draws
 from tests.simbackend.rig import SimCell, sim_cell
 
-Array = NDArray[np.float64]
 FACING = RigidTransform.from_matrix(np.diag([1.0, -1.0, -1.0, 1.0]))
 TICK_S = 0.002
 

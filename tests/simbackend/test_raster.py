@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from simbackend import meshes
 from simbackend.meshes import Mesh
 from simbackend.raster import rasterise
 
-Array = NDArray[np.float64]
 W, H = 64, 48
 CAMERA = np.array([60.0, 60.0, 31.5, 23.5, 0.05])
 NO_TEXTURE = (np.zeros(1, np.uint8), np.array([[0, 2, 2, 0]], np.int64))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.panel import Display, Gauge, Scale, load_panel
 from simbackend import textures
 from tests.simbackend.rig import ROOT
@@ -21,11 +22,11 @@ GAUGE = Gauge(
 )
 
 
-def grey(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
+def grey(pixels: NDArray[np.uint8]) -> Array:
     return np.asarray(pixels, float).mean(axis=2)
 
 
-def at_angle(face: NDArray[np.float64], angle_rad: float, radius_ratio: float) -> float:
+def at_angle(face: Array, angle_rad: float, radius_ratio: float) -> float:
     """Grey level at an angle clockwise from straight up."""
     half = len(face) / 2
     x, y = half * (1 + radius_ratio * np.sin(angle_rad)), half * (1 - radius_ratio * np.cos(angle_rad))

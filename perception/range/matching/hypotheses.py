@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.range.analyse import RangeScene
+from hal.arrays import Array
+from perception.range.analysis import RangeScene
 from perception.range.matching.models import ComponentModel, Form, ModelSurface, MotionKind
 from perception.range.matching.solids import boxes_of, solid_of
 from perception.range.matching.verify import Solid, View
 from perception.range.primitives import Cylinder, Plane, Sphere, Surface
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 LEAST_HEIGHT_M = 0.002

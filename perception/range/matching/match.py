@@ -13,16 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from hal.arrays import Array
 from hal.geometry import UncertainPose
-from perception.range.analyse import RangeScene
+from perception.range.analysis import RangeScene
 from perception.range.matching.hypotheses import candidate_of, pieces_of
 from perception.range.matching.models import ComponentModel, MotionKind
 from perception.range.matching.placing import placed_covariance
 from perception.range.matching.search import Try, climb, refined, tries_of
 from perception.range.matching.verify import BEHIND, COVERED, HITS, RING, View, explained
 from perception.range.primitives import Plane, Surface
-
-Array = NDArray[np.float64]
 
 LEAST_SCORE = 45.0  # of a match; a pixel that agrees counts 3
 LEAST_PIXELS = 20

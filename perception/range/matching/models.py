@@ -14,11 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.errors import ConfigError
-
-Array = NDArray[np.float64]
 
 
 class Form(StrEnum):

@@ -7,15 +7,13 @@ shift at which the best gain over all sizes has dropped by 2 is two standard dev
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.features import plane_feature
 from perception.range.matching.models import MotionKind
 from perception.range.matching.search import FINE_M, FINE_RAD, Try, climb, growths_of, ways_of
 from perception.range.matching.verify import View
 from perception.range.primitives import Surface
-
-Array = NDArray[np.float64]
 
 FREE_TURN_RAD = np.pi / np.sqrt(3.0)  # of a turn of which nothing is known
 DROP = 2.0

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.matching.hypotheses import Candidate, Piece, hypotheses
 from perception.range.matching.models import ComponentModel, MotionKind
 from perception.range.matching.verify import View, climbed
-
-Array = NDArray[np.float64]
 
 FEW_PIXELS, MANY_PIXELS = 400, 4000  # of a model: below the one every pixel is looked at, above the other a ninth
 STARTS = 24  # of a model, and a quarter of the pieces

@@ -19,11 +19,9 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.matching.models import ComponentModel, Form, ModelSurface, MotionKind
-
-Array = NDArray[np.float64]
 
 DISC, RECTANGLE, CYLINDER, CONE, SPHERE, ELLIPSOID, TORUS = range(7)
 WIDTH = 16

@@ -14,9 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.matching.solids import MOVES, render, window_of
-
-Array = NDArray[np.float64]
 
 HIT = 3.0  # log-likelihood of a pixel that agrees, over one of a gross error
 HIDDEN = -0.4

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.fitting import fit
 from perception.range.fitting.surfaces import QUADRIC, SIZE
 from perception.range.segmentation.finish import SLOW_NOISE_AREA_PX
@@ -15,7 +16,6 @@ from perception.range.segmentation.grid import Grid
 from perception.range.segmentation.grow_surface import GROW_SIGMAS, grow_surface
 from perception.range.segmentation.links import smooth_components
 
-Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 Flags = NDArray[np.bool_]
 

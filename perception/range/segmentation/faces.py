@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.components import label_components
 from perception.range.segmentation.compete import Candidates, fit_best
 from perception.range.segmentation.grid import Grid
@@ -19,7 +20,6 @@ from perception.range.segmentation.links import smooth_links
 from perception.range.segmentation.segment import STEEP_SLOPE, Task
 from perception.range.segmentation.tangents import STEADY_RMS, TURN_RAD, bent_planes
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Labels = NDArray[np.int32]
 

@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.fitting.surfaces import LEAN, PLANE, depth_on, normal_on
 from perception.range.segmentation.beside import WORD, flagged
 from perception.range.segmentation.borders import step_and_turn, touching
@@ -19,7 +20,6 @@ from perception.range.segmentation.regions import regions_of
 from perception.range.segmentation.runs import pixels_of
 from perception.range.segmentation.seams import is_seam_grooved
 
-Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 
 NARROWER = 0.6  # than the faces beside it

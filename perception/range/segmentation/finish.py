@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.fitting.fit import fit_robust
 from perception.range.fitting.last_step import last_step
 from perception.range.fitting.starts import solve_positive
@@ -27,7 +28,6 @@ from perception.range.segmentation.bend import straightened
 from perception.range.segmentation.regions import Regions, spread
 from perception.range.segmentation.runs import pixels_of
 
-Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 
 COARSE_SAMPLES = 300  # a refined start on these leaves the full fit one step

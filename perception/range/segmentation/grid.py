@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.components import for_each_tile
 from perception.range.fitting.surfaces import LEAN
 from perception.range.noise import NoiseModel, valid_sample
@@ -21,7 +22,6 @@ from perception.range.segmentation.blocks import JUMP_SLOPE, mean_blocks
 from perception.range.segmentation.tangents import tangent_planes
 from perception.range.sensor import RangeSensorModel
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 NORMAL_SIGMA_GOAL_RAD = 0.06  # tangent planes noisier than this are fitted over a wider window

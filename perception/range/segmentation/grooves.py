@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.components import label_components
 from perception.range.fitting.surfaces import LEAN, PLANE, depth_on
 from perception.range.segmentation.beside import WORD, column_range, flagged, new_columns
@@ -20,7 +21,6 @@ from perception.range.segmentation.faces import labels_of_blocks
 from perception.range.segmentation.grid import Grid, sigma_at
 from perception.range.segmentation.segment import Task
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Labels = NDArray[np.int32]
 

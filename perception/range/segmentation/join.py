@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.fitting import fit
 from perception.range.fitting.surfaces import LEAN, PLANE, depth_on
 from perception.range.segmentation import bend
 from perception.range.segmentation.grid import slow_share_at
 from perception.range.segmentation.regions import Regions
 from perception.range.segmentation.seams import crosses_groove, is_grooved_at
-
-Array = NDArray[np.float64]
 
 PAIR_SAMPLES = 150
 JOINED_SHARE = 0.85

@@ -6,11 +6,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.components import find, unite
 from perception.range.segmentation.beside import WORD
 from perception.range.segmentation.runs import row_ends
 
-Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 
 

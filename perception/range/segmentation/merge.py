@@ -11,15 +11,13 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.fitting.surfaces import PLANE, SIZE
 from perception.range.segmentation.borders import touching
 from perception.range.segmentation.pairs import FIGURES, PIXELS, described, judged, united
 from perception.range.segmentation.regions import Regions
 from perception.range.segmentation.seams import is_seam_grooved
-
-Array = NDArray[np.float64]
 
 PART_SAMPLES = 80
 LEAST_BORDER_PX = 6

@@ -12,10 +12,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.fitting.rays import LOOSE
 from perception.range.segmentation.runs import painted, places_of, runs_of
 
-Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 
 

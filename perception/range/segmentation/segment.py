@@ -18,6 +18,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.components import for_each_tile
 from perception.range.fitting.surfaces import PLANE
 from perception.range.noise import WORST_SHARE, NoiseModel
@@ -31,7 +32,6 @@ from perception.range.segmentation.seeds import seed_order
 from perception.range.segmentation.settle import REACH_PX, settle
 from perception.range.sensor import RangeSensorModel
 
-Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 
 LEAST_PIXELS_AT_256 = 32  # per 256 x 256 pixels of image

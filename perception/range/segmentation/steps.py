@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range.fitting.surfaces import PLANE, depth_on
 from perception.range.segmentation.basins import (
     LEAST_FIT,
@@ -28,7 +29,6 @@ from perception.range.segmentation.faces import labels_of_blocks
 from perception.range.segmentation.grid import Grid, sigma_at
 from perception.range.segmentation.segment import Task
 
-Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 
 COARSE_SHARE = 0.004  # of the depth: where three sigmas are less, single pixels tell faces apart

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.errors import NotFound
 from perception.vision.finding.cables import without_cables
 from perception.vision.finding.circles import find_circles
@@ -27,7 +28,7 @@ from perception.vision.image import Image, as_gray
 from perception.vision.knowledge import NOTHING, Knowledge
 from perception.vision.noise import noise_sigma
 from perception.vision.reading import ANSWER_AT
-from perception.vision.view import Array, View
+from perception.vision.view import View
 
 PLATE_M = (0.40, 0.30)
 ROWS_APART = 3  # of those that tell the noise: enough, and a millisecond saved

@@ -13,8 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.vision.image import Image
-from perception.vision.view import Array
 
 Float32 = NDArray[np.float32]
 

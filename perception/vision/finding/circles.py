@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.vision.finding.shapes import Edges, Float32
-from perception.vision.view import Array
 
 SMALL_PX = 24.0
 CIRCLE_SAMPLES = 40

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from perception.vision.view import Array
+from hal.arrays import Array
 
 
 def components(mask: NDArray[np.uint8], *, diagonal: bool) -> Array:

@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hal.arrays import Array
 from perception.vision.finding.shapes import Edges
 from perception.vision.image import Image
 from perception.vision.patch import sample_at
-from perception.vision.view import Array
 
 PLATE_PX_PER_M = 1500.0  # resolution of the rectified plate
 RADII_M = np.arange(0.0015, 0.045, 0.003)

@@ -9,8 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.vision.knowledge import NOTHING, Kind, Knowledge
-from perception.vision.view import Array
 
 NEXT_FURTHER = 0.02  # by which the next nearest look of a kind is further, at the median of hard drawn overviews
 CLIP = 3.0  # one number counts for three spreads at most: glare or a cable spoils some numbers, whatever is there

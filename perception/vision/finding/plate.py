@@ -14,11 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.vision.finding.plate_pose import rigid_plate
 from perception.vision.image import Image
 from perception.vision.registration.outline import Outline, rectangle
 from perception.vision.registration.register import EdgeImage, confirmed, edge_image, follow_edges
-from perception.vision.view import Array, PlaneView, homography
+from perception.vision.view import PlaneView, homography
 
 COARSE_WIDTH_PX = 160
 TYPICAL_FOCAL = 1.25  # of the longer image side: a lens of 44 degrees; completes a side that is cut off

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from perception.vision.view import Array, homography
+from hal.arrays import Array
+from perception.vision.view import homography
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

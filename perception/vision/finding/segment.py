@@ -13,9 +13,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.vision.image import Image
 from perception.vision.noise import noise_sigma
-from perception.vision.view import Array
 
 TOLERANCE = 9.0  # gray levels, at least
 NOISES = 6.0  # sigmas of the pixel noise: fewer leave thousands of single pixels, as bright parts are noisier than the median

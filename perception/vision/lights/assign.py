@@ -12,6 +12,7 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.errors import Ambiguous, InvalidRequest, NotFound
 from perception.camera_model import undistort_pixels
@@ -26,8 +27,6 @@ from perception.vision.lights.search import (
     insert,
     search,
 )
-
-Array = NDArray[np.float64]
 
 UPRIGHT = np.diag([1.0, -1.0, -1.0])  # camera x right, y down, z forward; panel x right, y up, z towards the viewer
 CANDIDATES = 16

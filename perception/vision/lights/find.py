@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.errors import InvalidRequest
 from perception.vision.lights.core import Core, lamp_core, level_at
 from perception.vision.lights.registration import Registration, register
 
-Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 SEED_SIGMAS = 6.0  # a 640x480 image has 3e5 pixels: 6 sigma leaves no noise seed

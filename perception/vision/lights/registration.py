@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.errors import PerceptionError
 
-Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 LEAST_AGREEMENT = 0.6  # gradient correlation after registration; 0.9 and more is usual, unrelated images give 0.1

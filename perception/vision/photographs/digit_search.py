@@ -15,11 +15,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.vision.image import Image
 from perception.vision.noise import noise_sigma
 from perception.vision.status.comb import LIT_SHARES
 from perception.vision.status.comb_jit import Float32, cell_boxes
-from perception.vision.view import Array
 
 CELL_PX = 24.0  # between the axes of the top and bottom segments
 STRIDE = 2

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.vision.image import WHITE_LEVEL, Image, as_gray
 from perception.vision.reading import probability
 from perception.vision.status.pointer import PointerFit, wrapped
-from perception.vision.view import Array
 
 FACE = 0.86  # of the radius: where a drop is looked for
 LEAST_SEPARATION = 3.2  # spreads of the face: two halves of one blurred gray lie 2.7 apart

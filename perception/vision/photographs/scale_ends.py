@@ -11,11 +11,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.vision.image import Image
-
-Array = NDArray[np.float64]
 
 SAMPLES = 1440  # of a turn
 RINGS = np.linspace(0.45, 1.0, 28)  # share of the radius

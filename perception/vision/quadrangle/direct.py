@@ -9,14 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest, NotFound, NotObservable
 from perception.camera_model import project, rays
 from perception.vision.quadrangle.three_point import three_point
-
-Array = NDArray[np.float64]
 
 DOUBLE_ROOT_PX = 0.5  # the solver also returns real parts of complex pairs; so near to its pixels it is a double root
 

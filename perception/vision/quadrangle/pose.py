@@ -9,15 +9,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest, NotFound, NotObservable
 from hal.geometry import UncertainPose
 from perception.vision.quadrangle.search import solve
-
-Array = NDArray[np.float64]
 
 # 300x200 mm, 1 px, 2 m, 5-60 deg: flags 13 % and leaves 0.4 % unflagged; 0.02 would flag 20.5 % and leave 0.09 %.
 AMBIGUOUS_SHARE = 0.11

@@ -6,8 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.vision.bilinear import value_at
-from perception.vision.view import Array
 
 STEP_PX = 0.5
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hal.arrays import Array
 from hal.panel import Panel, PanelObject
-from perception.vision.view import Array
 
 CIRCLE_POINTS = 32
 SIDE_POINTS = 10

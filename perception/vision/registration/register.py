@@ -14,12 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.panel import Panel
 from perception.vision.image import Image
 from perception.vision.noise import noise_sigma
 from perception.vision.registration.edge_search import strongest_edges
 from perception.vision.registration.outline import Outline, edges_of, plate_edges
-from perception.vision.view import Array, View
+from perception.vision.view import View
 
 WINDOWS_PX = (8.0, 5.0, 3.0, 2.0)  # search to either side; the pose is known to a few pixels
 LAST_LOOK_PX, NEAR_PX = 2.5, 2.0  # search at the end, and how near an edge confirms the model

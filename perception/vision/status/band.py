@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.vision.patch import Patch, sample_at
 from perception.vision.status.cover import OUTSIDE, Crossing, border_crossings, followed_in, smoothed
-from perception.vision.view import Array
 
 SAME_GRAY = 16.0  # levels along a band; real cables shine a little
 GROUND_SHARE = 0.5  # of what a band within the window stands out by

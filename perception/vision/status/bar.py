@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hal.arrays import Array
 from perception.vision.patch import Patch, sample_at
-from perception.vision.view import Array
 
 CORE = (-0.5, 0.0, 0.5)  # of the half width
 FLANK = (1.7, 2.1)

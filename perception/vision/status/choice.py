@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hal.arrays import Array
 from perception.vision.bilinear import step_counts
 from perception.vision.patch import Patch
 from perception.vision.reading import Status, doubted, gated, probability, refused
-from perception.vision.view import Array
 
 
 def choose(names: Sequence[str], evidence: Array, *, noise: float, seen: float, what: str) -> Status:

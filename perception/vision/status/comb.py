@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from hal.arrays import Array
 from perception.vision.status.comb_fit import refine_comb
 from perception.vision.status.comb_jit import (
     INNER,
@@ -24,7 +25,6 @@ from perception.vision.status.comb_jit import (
 )
 from perception.vision.status.glyphs import LIT
 from perception.vision.status.ink import column_levels, level_at
-from perception.vision.view import Array
 
 #: Ends of every segment's axis in a cell of unit width and height, y down.
 AXES = np.array([

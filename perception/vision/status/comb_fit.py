@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from hal.arrays import Array
 from perception.vision.status.comb_jit import (
     FLAT,
     INNER,
@@ -17,7 +18,6 @@ from perception.vision.status.comb_jit import (
     apartness,
     cell_worth,
 )
-from perception.vision.view import Array
 
 
 @njit(cache=True)

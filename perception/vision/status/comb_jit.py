@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from perception.vision.view import Array
+from hal.arrays import Array
 
 Float32 = NDArray[np.float32]
 

@@ -14,10 +14,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.vision.bilinear import step_counts
 from perception.vision.image import Image
 from perception.vision.patch import Patch, sample_at
-from perception.vision.view import Array
 
 STANDS_OUT = 14.0  # gray levels, and four sigmas of the noise; less in a dark picture, where everything does less
 STANDS_OUT_SHARE, LEAST_STANDS_OUT = 0.12, 5.0

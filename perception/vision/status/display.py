@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.panel import Display
 from perception.vision.image import Image
 from perception.vision.patch import Patch
@@ -26,7 +27,6 @@ from perception.vision.status.ink import segment_ink, without_border
 from perception.vision.status.levels import loop_levels, segment_levels, with_hidden_ends, without_frames
 from perception.vision.status.point import Point, find_colon, find_point
 from perception.vision.status.stray import leaves_out, stray_ink
-from perception.vision.view import Array
 
 MARGIN = 0.09  # share of the smaller side that a frame may take
 WORK_ROWS = 64  # a window is read with so many rows: a stroke is 4 px wide then

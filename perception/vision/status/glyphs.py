@@ -13,7 +13,7 @@ from math import prod
 
 import numpy as np
 
-from perception.vision.view import Array
+from hal.arrays import Array
 
 SEGMENTS = "abcdefg"  # top, upper right, lower right, bottom, lower left, upper left, middle
 GLYPHS = (

@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.panel import Handwheel
 from perception.vision.image import WHITE_LEVEL
 from perception.vision.patch import Patch
 from perception.vision.reading import Status, gated, probability, refused
 from perception.vision.status.choice import contrast_noise
 from perception.vision.status.pointer import unroll, wrapped
-from perception.vision.view import Array
 
 STEPS = 720
 GLARE = 0.25  # of the radius: marks are smaller

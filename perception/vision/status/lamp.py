@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.panel import Lamp
 from perception.vision.image import WHITE_LEVEL, Image
 from perception.vision.patch import Patch, sample_at
 from perception.vision.reading import Status, gated, refused
 from perception.vision.status.band import cables_across
-from perception.vision.view import Array
 
 CORE, RIM, PLATE = (0.0, 0.15, 0.3), (0.5, 0.6, 0.7), (1.45, 1.6, 1.75)  # of the radius
 RING_PLACES, LEAST_SEEN = 108, 0.3  # places looked at in each; share that must not be hidden

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numba import njit
 
+from hal.arrays import Array
 from perception.vision.status.comb import AXES, Comb
 from perception.vision.status.comb_jit import BEYOND, INNER, STROKE, Float32
-from perception.vision.view import Array
 
 PARTS = 5  # places along a segment's axis
 CLEAR = 0.6  # of a pixel seen

@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.panel import Lever
 from perception.vision.patch import Patch
 from perception.vision.reading import Status, doubted
 from perception.vision.status.band import cables_across
 from perception.vision.status.bar import bar_contrast
 from perception.vision.status.choice import choose, contrast_noise
-from perception.vision.view import Array
 
 BAR_FROM, BAR_TO = 0.40, 0.92  # share of the length: outside the hub, inside the tip
 FLANK = (1.35, 1.6)  # of the half width: pipes and flanges lie close by

@@ -10,9 +10,9 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from hal.arrays import Array
 from perception.vision.status.comb import AXES, Comb
 from perception.vision.status.comb_jit import Float32
-from perception.vision.view import Array
 
 RADIUS = 0.075  # of the digit height
 LEVEL = 0.47  # of a lit segment: dots blurred by motion have .4 to .6, gaps without one up to .37 (of 1400 drawn ones)

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.vision.bilinear import polar_values
 from perception.vision.patch import Patch
 from perception.vision.status.pointer_axis import pointer_axis
-from perception.vision.view import Array
 
 ANGLE_STEP_PX = 0.7  # at the outer radius
 RIVAL_APART_RAD = np.deg2rad(14.0)  # further than a pointer is wide

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from perception.vision.view import Array
+from hal.arrays import Array
 
 NUMERAL, PLAIN = 1.8, 35.0  # times the ink of a row at that percentile: numerals and ticks may be beside half of them
 HALF_LEVEL = 0.3  # of a row's strongest ink: less is the pointer's blur

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.panel import Slider
 from perception.vision.image import WHITE_LEVEL
 from perception.vision.patch import Patch, sample_at
@@ -15,7 +16,6 @@ from perception.vision.reading import Status, doubted, gated, probability, refus
 from perception.vision.registration.outline import footprint_m
 from perception.vision.status.band import lying_across
 from perception.vision.status.choice import contrast_noise
-from perception.vision.view import Array
 
 SLOT = 0.2  # of the cap's width: half of the slot and what blurs it
 EDGE_BOX = 0.22  # of the cap's length: a line across its middle is further from its edges

@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from hal.arrays import Array
 from perception.vision.status.comb import AXES, Comb
 from perception.vision.status.comb_jit import Float32
-from perception.vision.view import Array
 
 THICK = 0.30  # of the digit height: a stroke with its blur
 NOISE = 0.05  # of the digit height

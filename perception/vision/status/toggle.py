@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from hal.arrays import Array
 from hal.panel import Toggle
 from perception.vision.patch import Patch
 from perception.vision.reading import Status, doubted
 from perception.vision.status.bar import bar_contrast
 from perception.vision.status.choice import choose, contrast_noise
-from perception.vision.view import Array
 
 STATES, LEANS = ("on", "off"), (0.0, np.pi)  # clockwise from up
 BAT_FROM, BAT_TO = 0.62, 0.95  # of the length: the nut around the foot looks like a bar too

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.errors import NotFound
 from hal.panel import Panel, PanelObject
 from perception.vision.finding.blind import Candidate, candidate_places, chosen
@@ -26,7 +27,7 @@ from perception.vision.registration.register import register
 from perception.vision.taught import inspect_view
 from perception.vision.teaching.condense import worth_keeping
 from perception.vision.teaching.teach import NOTHING_SIZE_M, SNAP_M, Overview, overview_of, under_pixels
-from perception.vision.view import Array, CameraView, View
+from perception.vision.view import CameraView, View
 
 # A sub-object this near to an object's middle is that object's, whichever of them blind recognition takes.
 PART_M = 0.0067

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from hal.arrays import Array
 from hal.errors import InvalidRequest
 from hal.panel import Panel
 from hal.strict import validate
@@ -19,7 +20,6 @@ from perception.toml_text import toml_document
 from perception.vision.teaching.panel_lights import LightsFound
 from perception.vision.teaching.panel_questions import Question, questions
 from perception.vision.teaching.teach import Example, Overview, plate_points
-from perception.vision.view import Array
 
 CORNERS = ("upper_left", "upper_right", "lower_right", "lower_left")
 CAP_M = 0.012  # of a slider, along its track

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from hal.arrays import Array
 from hal.errors import NotFound
 from perception.vision.finding.blind import CIRCLE_RADII_M
 from perception.vision.finding.blind import SIDES_M as FOUND_SIDES_M
@@ -14,7 +15,6 @@ from perception.vision.finding.circles import find_circles
 from perception.vision.finding.components import components
 from perception.vision.finding.features import PLATE_PX_PER_M, Ground
 from perception.vision.finding.shapes import direction_maps, find_rectangles
-from perception.vision.view import Array
 
 RADII_M = (CIRCLE_RADII_M, (0.036, 0.075))  # as the blind search, and larger: a person may point at anything
 SIDES_M = (FOUND_SIDES_M, (0.06, 0.16))

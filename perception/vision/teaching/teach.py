@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hal.arrays import Array
 from hal.errors import Ambiguous, InvalidRequest, NotFound
 from perception.vision.finding.blind import PLATE_M, Candidate, candidate_places, chosen, lay_out, recognise
 from perception.vision.finding.features import PLATE_PX_PER_M, Ground, look_at
@@ -21,7 +22,7 @@ from perception.vision.finding.match import distances
 from perception.vision.image import as_gray
 from perception.vision.knowledge import NOTHING, Kind, Knowledge
 from perception.vision.teaching.sub_object import SubObject, outline_at
-from perception.vision.view import Array, View, homography
+from perception.vision.view import View, homography
 
 SNAP_M = 0.004  # a click is taken to the middle of the sub-object that lies that near
 ABOUT_M = 0.012  # further middles of the same object: hub and face of a gauge are not quite concentric

@@ -14,7 +14,8 @@ from fusion.distance import local_value, local_values, local_values_and_gradient
 from fusion.distance.reference import brute_force, residual
 from fusion.measurement import Measurement, SensingClass
 from fusion.simulate import CODES, problem
-from hal.geometry import Array, matrix_of, perturbed, transform
+from hal.arrays import Array
+from hal.geometry import matrix_of, perturbed, transform
 
 CLASSES = list(SensingClass)
 

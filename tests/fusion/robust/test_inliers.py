@@ -16,8 +16,8 @@ from fusion.robust.minima import minima
 from fusion.simulate import CODES, problem
 from fusion.solve import LocalSolution
 from fusion.solve.local import middle_and_size
+from hal.arrays import Array
 from hal.errors import InvalidRequest
-from hal.geometry import Array
 
 pytest.importorskip("clarabel", reason="branch and bound is an extra")
 

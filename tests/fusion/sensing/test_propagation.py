@@ -9,7 +9,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from fusion import sensing
 from fusion.features import Kind, line, plane
 from fusion.sensing.propagation import from_joint
-from hal.geometry import Array, certain, matrix_of, transform
+from hal.arrays import Array
+from hal.geometry import certain, matrix_of, transform
 
 PIVOT, D = np.array([0.3, -0.2, 0.5]), np.array([0.0, 0.6, 0.8])
 ACROSS = np.array([[1.0, 0.0, 0.0], [0.0, 0.8, -0.6]])

@@ -11,8 +11,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from fusion import Measurement, SensingClass, sensing
 from fusion.distance import local_value
 from fusion.features import line, plane, point
+from hal.arrays import Array
 from hal.errors import InvalidRequest, NotObservable
-from hal.geometry import Array, UncertainPose, certain, matrix_of, perturbed, transform
+from hal.geometry import UncertainPose, certain, matrix_of, perturbed, transform
 
 CAMERA = sensing.Pinhole(fx_px=800.0, fy_px=790.0, cx_px=320.0, cy_px=240.0)
 POSE_SIGMA = np.array([3e-4] * 3 + [1e-3] * 3)

@@ -10,7 +10,8 @@ from fusion.features import Kind, point
 from fusion.measurement import measurement
 from fusion.solve import solve
 from fusion.solve.observability import PRIOR_SIGMA, covariance_and_freedom
-from hal.geometry import Array, transform
+from hal.arrays import Array
+from hal.geometry import transform
 
 CENTRE = np.array([0.3, -0.1, 0.2])
 AXIS = np.array([0.0, 0.0, 1.0])

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from perception.range import OrthographicSensor, PinholeSensor
-
-Array = NDArray[np.float64]
 
 PINHOLE = PinholeSensor(width_px=160, height_px=120, fx_px=180.0, fy_px=180.0, cx_px=79.5, cy_px=59.5)
 PARALLEL = OrthographicSensor(width_px=160, height_px=120, pixel_pitch_m=0.0015)

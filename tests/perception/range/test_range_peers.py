@@ -8,7 +8,8 @@ from types import ModuleType
 
 import numpy as np
 
-from benchmarks.range_peers import Array, Found, _greedy, _labelled
+from benchmarks.range_peers import Found, _greedy, _labelled
+from hal.arrays import Array
 
 
 def test_a_surface_in_two_parts_of_the_image_is_two_regions_and_holes_belong_to_none() -> None:

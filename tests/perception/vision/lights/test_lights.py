@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.pose_lights import drawn_pairs, seen_lights, stored_pairs
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest, PerceptionError
 from perception.camera_model import project
@@ -33,7 +34,7 @@ def scene(seed: int) -> NDArray[np.float32]:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.8))
 
 
-def disc(image: NDArray[np.float32], centre_px: NDArray[np.float64], radius_px: float, rise: float) -> None:
+def disc(image: NDArray[np.float32], centre_px: Array, radius_px: float, rise: float) -> None:
     """Add an anti-aliased disc in place."""
     v, u = np.mgrid[:480, :640]
     away = np.hypot(u - centre_px[0], v - centre_px[1])
@@ -45,7 +46,7 @@ def shot(image: NDArray[np.float32], seed: int, noise: float = 1.5) -> NDArray[n
     return np.clip(np.round(image + noise * rng.standard_normal(image.shape)), 0, 255).astype(np.uint8)
 
 
-def light_pixels(R: NDArray[np.float64] = R_TRUE, t: NDArray[np.float64] = T_TRUE) -> NDArray[np.float64]:
+def light_pixels(R: Array = R_TRUE, t: Array = T_TRUE) -> Array:
     return project(LIGHTS @ R.T + t, CAMERA)
 
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 
-Array = NDArray[np.float64]
 CAMERA = CameraIntrinsics(width_px=1280, height_px=960, fx_px=800.0, fy_px=805.0, cx_px=640.0, cy_px=480.0)
 BENT = CameraIntrinsics(
     width_px=1280, height_px=960, fx_px=800.0, fy_px=805.0, cx_px=640.0, cy_px=480.0,

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import difference, transform
@@ -19,7 +20,6 @@ from tests.perception.vision.quadrangle.quadrangle_cases import (
     CAMERA,
     RECTANGLE,
     SHAPES,
-    Array,
     View,
     angle_deg,
     pixels_of,

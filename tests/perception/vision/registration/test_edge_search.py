@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
+from hal.arrays import Array
 from perception.vision.registration.edge_search import STEP_PX, strongest_edges
-from perception.vision.view import Array
 
 
 def in_numpy(smooth: np.ndarray, points: Array, normals: Array, window_px: float) -> tuple[Array, Array, np.ndarray]:

@@ -8,12 +8,13 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from benchmarks.vision_drawing import Disturbance, camera, draw_panel, looking_at
+from hal.arrays import Array
 from hal.geometry import certain
 from hal.panel import Light, Panel, Scale, Slider
 from perception.vision.patch import Patch
 from perception.vision.status.slider import read_slider
 from perception.vision.taught import patch_of
-from perception.vision.view import Array, CameraView
+from perception.vision.view import CameraView
 
 TRAVEL_M = 0.100
 CORNERS = ((-0.15, 0.12), (0.15, 0.12), (0.15, -0.12), (-0.15, -0.12))

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from hal.arrays import Array
 from hal.errors import InvalidRequest, NotFound
 from perception.range.features import RangeFeature, features_of
 from perception.range.noise import NoiseModel, estimate_noise, typical_depths_m
@@ -26,7 +27,6 @@ from perception.range.segmentation.steps import cut_at_steps
 from perception.range.sensor import RangeSensorModel
 from perception.range.straight import doubt_about
 
-Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 
 LEAST_VALID_PIXELS = 16

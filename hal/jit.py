@@ -1,0 +1,60 @@
+"""The one way to compile a hot loop.
+
+    @compiled
+    def sum_of_squares(x: Array) -> float:
+        total = 0.0
+        for i in range(x.shape[0]):
+            total += x[i] * x[i]
+        return total
+
+A compiled function has Python type annotations, which mypy checks, and is called with one set of argument types only,
+because numba compiles it once more for every other set. The machine code is kept on disk beside the source.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast, overload
+
+import numba
+import numpy as np
+from numba.extending import register_jitable
+
+F = TypeVar("F", bound=Callable[..., Any])
+T = TypeVar("T", bool, int)
+
+REORDERED = frozenset({"reassoc", "contract", "nsz", "arcp"})
+"""For `fastmath`: the terms of a sum may be added in another order; NaN and infinity keep their meaning."""
+
+
+@overload
+def compiled(function: F, /) -> F: ...
+@overload
+def compiled(*, fastmath: frozenset[str]) -> Callable[[F], F]: ...
+
+
+def compiled(function: F | None = None, /, *, fastmath: frozenset[str] = frozenset()) -> F | Callable[[F], F]:
+    """Compile a function on its first call and keep the result on disk.
+
+    Division by zero gives infinity or NaN as in numpy. The interpreter lock is released while the function runs.
+
+    Args:
+        function: the function, when the decorator is used without arguments.
+        fastmath: liberties that the compiler may take with floating-point arithmetic, see `REORDERED`.
+    """
+
+    def compile_one(plain_function: F) -> F:
+        compiler = numba.njit(cache=True, error_model="numpy", nogil=True, fastmath=set(fastmath) or False)
+        return cast(F, compiler(plain_function))
+
+    return compile_one if function is None else compile_one(function)
+
+
+def inlined(function: F) -> F:
+    """Let compiled functions call a small helper, which is compiled into each of them and is plain Python elsewhere."""
+    return register_jitable(error_model="numpy", nogil=True)(function)
+
+
+def as_numpy_scalar(value: T) -> T:
+    """Return `value` as numpy's scalar, because numba compiles a function once more for every Python constant in a call."""
+    return cast(T, np.asarray(value)[()])

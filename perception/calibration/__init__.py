@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from perception.calibration.records import record_of, renewed, to_toml
     from perception.calibration.scanner import ScannerCalibration, ScannerView, calibrate_scanner
     from perception.calibration.wrench import WrenchCalibration, calibrate_wrench
-    from perception.camera_model import project, undistort_pixels
 
 __all__ = [
     "UNKNOWN_LENS",
@@ -41,13 +40,11 @@ __all__ = [
     "calibrate_in_hand",
     "calibrate_scanner",
     "calibrate_wrench",
-    "project",
     "propose_next",
     "propose_view",
     "record_of",
     "renewed",
     "stations",
     "to_toml",
-    "undistort_pixels",
 ]
 __getattr__ = load_on_first_use(__name__, __file__)

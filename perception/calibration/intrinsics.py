@@ -14,26 +14,18 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
+from hal.camera_model import disc_offset_px, distort, distortion_jacobian, project, undistort_pixels
 from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import matrix_of, perturbed, transform
 from perception.calibration.boards import FEWEST_POINTS, BoardView
+from perception.calibration.cubic_lens import CubicLens, fit_cubic
 from perception.calibration.newton import Minimum, descend
-from perception.camera_model import (
-    CubicLens,
-    cubic_monomials,
-    disc_offset_px,
-    distort,
-    distortion_jacobian,
-    project,
-    undistort_pixels,
-)
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 BOARD_FREE = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")  # k3 needs points in the corners of a wide lens
 LIGHTS_FREE = ("fx", "fy", "cx", "cy", "k1")  # four points a view
 FOCAL_LIMIT = 0.01  # of the focal length
 CENTRE_LIMIT = 0.02  # of the image width
-GRID = 24
 STRAY = 6.0  # sigmas, or times the view's median error
 
 
@@ -127,36 +119,6 @@ def _cleaned(view: BoardView, pose: RigidTransform, intrinsics: CameraIntrinsics
     if view.disc_m > 0.0:
         pixels_px = pixels_px - disc_offset_px(points_m, view.disc_m, pose, intrinsics)
     return replace(view, points_m=points_m, pixels_px=pixels_px)
-
-
-def fit_cubic(
-    views: Sequence[BoardView], intrinsics: CameraIntrinsics, poses: Sequence[RigidTransform]
-) -> tuple[CubicLens, Array]:
-    """The paper's correction: least squares of the ideal pixels of the points over cubics of the measured ones.
-
-    Returns: the correction, and the (10, 10) covariance of the coefficients of one axis (px^2).
-    """
-    width, height = intrinsics.width_px, intrinsics.height_px
-    centre, scale = ((width - 1) / 2.0, (height - 1) / 2.0), width / 2.0
-    straight = CameraIntrinsics(
-        width_px=width, height_px=height, fx_px=intrinsics.fx_px, fy_px=intrinsics.fy_px, cx_px=intrinsics.cx_px,
-        cy_px=intrinsics.cy_px,
-    )  # fmt: skip
-    measured = np.concatenate([view.pixels_px for view in views])
-    ideal = np.concatenate(
-        [project(pose.apply(view.points_m), straight) for view, pose in zip(views, poses, strict=True)]
-    )
-    rows = cubic_monomials(measured, centre, scale)
-    coefficients = np.linalg.lstsq(rows, ideal, rcond=None)[0]
-    lens = CubicLens(coefficients=coefficients, centre_px=centre, scale_px=scale, bias_px=0.0)
-    grid = np.stack(np.meshgrid(np.linspace(0, width - 1, GRID), np.linspace(0, height - 1, GRID)), axis=-1)
-    grid = grid.reshape(-1, 2)
-    miss = lens.ideal(grid) - undistort_pixels(grid, intrinsics)
-    bias = float(np.sqrt(np.nanmean(np.sum(miss**2, axis=1))))
-    sigma = float(np.mean([view.sigma_px for view in views]))
-    covariance = sigma**2 * np.linalg.pinv(rows.T @ rows)
-    lens = CubicLens(coefficients=coefficients, centre_px=centre, scale_px=scale, bias_px=bias)
-    return lens, np.asarray(covariance)
 
 
 def _check(views: Sequence[BoardView], free: Sequence[str]) -> None:

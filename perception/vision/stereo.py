@@ -12,9 +12,9 @@ import numpy as np
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
+from hal.camera_model import normalised_with_jacobian
 from hal.errors import InvalidRequest, NotFound, NotObservable
 from hal.geometry import UncertainPose, matrix_of, skew
-from perception.camera_model import normalised_with_jacobian
 
 LEAST_PARALLAX_RAD = 0.005  # at 0.5 m: a base of 2.5 mm
 DISAGREEMENT_CHI_SQUARE = 30.0  # for one or two surplus measurements: chance below 1e-6

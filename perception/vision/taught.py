@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
+from hal.camera_model import check_size, rays
 from hal.errors import NotFound
 from hal.geometry import UncertainPose, matrix_of
 from hal.panel import Display, Panel, PanelObject, Scale
-from perception.camera_model import check_size, rays
 from perception.vision.image import Image, as_gray
 from perception.vision.noise import noise_sigma
 from perception.vision.patch import Patch, rectify

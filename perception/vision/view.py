@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
+from hal.camera_model import project
 from hal.geometry import UncertainPose, perturbed
-from perception.camera_model import project
 
 
 class View(Protocol):

@@ -18,8 +18,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from fusion import FusedPose, Measurement, fuse, local_solution, pack, plane, point, sensing
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
+from hal.camera_model import undistort_pixels
 from hal.geometry import UncertainPose, certain, compose, difference, matrix_of, perturbed
-from perception.calibration import undistort_pixels
 from perception.range import PlaneFit
 
 PLATE = plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), name="plate")

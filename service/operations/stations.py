@@ -10,10 +10,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
+from hal.camera_model import project
 from hal.errors import Ambiguous, NotFound, Unreachable
 from hal.geometry import certain, matrix_of, transform
 from manipulation import Kinematics
-from perception.calibration import HandEyeView, project, propose_next, stations
+from perception.calibration import HandEyeView, propose_next, stations
 from service.operations.eyes import settle
 from service.operations.session import Session
 from service.operations.travel import go_to_first, reachable

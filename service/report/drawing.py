@@ -10,8 +10,8 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
+from hal.camera_model import project
 from hal.panel import Panel
-from perception.calibration import project
 from perception.vision import contour_m
 from service.report.plots import figure_png
 

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
+from hal.camera_model import undistort_pixels
 from hal.errors import Ambiguous, InvalidRequest, NotFound
-from perception.camera_model import undistort_pixels
 from perception.vision.lights.find import LightBlobs
 from perception.vision.lights.search import (
     CONTRAST_SPREAD,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hal.calibration import CameraIntrinsics
-from perception.camera_model import check_size
+from hal.camera_model import check_size
 from perception.vision.lights.assign import UPRIGHT, AssignedLights, WrongLamp, assign_lights
 from perception.vision.lights.find import LightBlobs, find_lights
 from perception.vision.quadrangle import QuadranglePose, estimate

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
+from hal.camera_model import project, rays
 from hal.errors import InvalidRequest, NotFound, NotObservable
-from perception.camera_model import project, rays
 from perception.vision.quadrangle.three_point import three_point
 
 DOUBLE_ROOT_PX = 0.5  # the solver also returns real parts of complex pairs; so near to its pixels it is a double root

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.calibration import CameraIntrinsics
+from hal.camera_model import project
 from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import difference, perturbed, transform_rpy
 from perception.calibration.hand_eye import stations
@@ -24,7 +25,6 @@ from perception.calibration.in_hand import (
     calibrate_in_hand,
     propose_view,
 )
-from perception.camera_model import project
 
 LENS = CameraIntrinsics(width_px=640, height_px=480, fx_px=460.0, fy_px=460.0, cx_px=319.5, cy_px=239.5,
                         distortion=(-0.08, 0.02, 0.0, 0.0, 0.0))  # fmt: skip

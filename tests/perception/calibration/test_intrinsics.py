@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hal.calibration import CameraIntrinsics
+from hal.camera_model import disc_offset_px, project, undistort_pixels
 from hal.errors import InvalidRequest, NotFound, NotObservable
 from perception.calibration.boards import BoardView, Charuco, Dots
 from perception.calibration.intrinsics import LIGHTS_FREE, NAMES, CameraCalibration, calibrate_camera, parameters
-from perception.camera_model import disc_offset_px, project, undistort_pixels
 
 TRUE = CameraIntrinsics(
     width_px=640, height_px=480, fx_px=610.0, fy_px=606.0, cx_px=325.0, cy_px=236.0,

@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from hal.calibration import CameraIntrinsics
+from hal.camera_model import project
 from hal.errors import InvalidRequest, NotFound, NotObservable
 from hal.geometry import UncertainPose, certain, perturbed, transform_rpy
-from perception.camera_model import project
 from perception.vision.stereo import SeenLine, SeenPoint, Station, stereo_line, stereo_point
 
 LENS = CameraIntrinsics(

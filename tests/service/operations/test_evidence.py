@@ -8,8 +8,8 @@ from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2
 
 from hal.calibration import CameraIntrinsics
+from hal.camera_model import project
 from hal.geometry import UncertainPose, difference, perturbed, transform_rpy
-from perception.camera_model import project
 from service.operations.evidence import Evidence, LightEvidence, ProximityEvidence, TouchEvidence, fuse_evidence
 
 LENS = CameraIntrinsics(

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.calibration import load_calibration
+from hal.camera_model import project
 from hal.errors import NotFound
 from hal.geometry import transform_rpy
 from hal.panel import Panel, load_panel
-from perception.camera_model import project
 from service.operations.spots import EDGE_M, bare_spots, half_footprint_m
 from service.operations.views import SIDES, close_up_groups, facing, overview_distance_m, overview_poses, side_poses
 

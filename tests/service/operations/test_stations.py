@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from hal.camera_model import project
 from hal.config import load_cell
 from hal.errors import NotObservable
 from hal.geometry import certain, matrix_of, transform_rpy
 from manipulation.kinematics import Kinematics
 from perception.calibration.hand_eye import HandEyeView, check_turns
 from perception.calibration.wrench import GRAVITY_M_PER_S2, calibrate_wrench
-from perception.camera_model import project
 from service.operations.stations import (
     EDGE_PX,
     around,

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from benchmarks.pose_lights import drawn_pairs, seen_lights, stored_pairs
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
+from hal.camera_model import project
 from hal.errors import InvalidRequest, PerceptionError
-from perception.camera_model import project
 from perception.vision.lights import CameraMoved, LightMissing, WrongLamp, assign_lights, find_lights, panel_pose
 from perception.vision.lights.registration import register
 

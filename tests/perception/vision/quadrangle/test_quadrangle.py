@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
+from hal.camera_model import project
 from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import difference, transform
-from perception.camera_model import project
 from perception.vision.quadrangle import QuadranglePose, estimate, warm_up
 from tests.perception.vision.quadrangle.quadrangle_cases import (
     BENT,

@@ -1,4 +1,4 @@
-"""Points to pixels and back: pinhole with the radial-tangential lens, and the paper's cubic correction as an option.
+"""Project points to pixels and turn pixels into rays: a pinhole with the radial-tangential lens.
 
 Camera axes: x right, y down, z along the view. Pixel (0, 0) is the centre of the upper left pixel.
 Lens model: D. C. Brown, Photogrammetric Engineering 37(8), 1971, in OpenCV's order (k1, k2, p1, p2, k3).
@@ -6,7 +6,6 @@ Lens model: D. C. Brown, Photogrammetric Engineering 37(8), 1971, in OpenCV's or
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,33 +17,6 @@ from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest
 
 NEWTON_STEPS = 20  # quadratic convergence reaches 1e-15 in 4 to 6 for |k1| <= 0.3; the rest serves the image corners
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CubicLens:
-    """The paper's lens correction (Section II-B): ideal pixel = bivariate cubic of the distorted pixel.
-
-    Attributes:
-        coefficients: (10, 2), one column an axis, over the monomials of `cubic_monomials`.
-        centre_px, scale_px: the monomials are taken of `(pixel - centre_px) / scale_px`, for conditioning.
-        bias_px: root mean square of what the cubic cannot follow over the frame. It is bias: data do not shrink it.
-    """
-
-    coefficients: Array
-    centre_px: tuple[float, float]
-    scale_px: float
-    bias_px: float
-
-    def ideal(self, pixels_px: ArrayLike) -> Array:
-        """(N, 2) ideal pixels of (N, 2) distorted ones."""
-        return cubic_monomials(pixels_px, self.centre_px, self.scale_px) @ self.coefficients
-
-
-def cubic_monomials(pixels_px: ArrayLike, centre_px: tuple[float, float], scale_px: float) -> Array:
-    """(N, 10) monomials 1, x, y, x^2, xy, y^2, x^3, x^2 y, x y^2, y^3 of the scaled pixel."""
-    x, y = ((_points(pixels_px, 2) - centre_px) / scale_px).T
-    one = np.ones_like(x)
-    return np.stack([one, x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], axis=1)
 
 
 def project(points_camera_m: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
@@ -60,7 +32,7 @@ def project(points_camera_m: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
 
 
 def project_with_jacobian(points_camera_m: ArrayLike, intrinsics: CameraIntrinsics) -> tuple[Array, Array]:
-    """(N, 2) pixels and their (N, 2, 3) derivatives (px per metre) by the point in camera axes."""
+    """(N, 2) pixels and their (N, 2, 3) derivatives (px per metre) with respect to the point in camera axes."""
     points = _points(points_camera_m, 3)
     depth = np.where(points[:, 2] > 0, points[:, 2], np.nan)
     normalised = points[:, :2] / depth[:, None]
@@ -75,7 +47,7 @@ def project_with_jacobian(points_camera_m: ArrayLike, intrinsics: CameraIntrinsi
 def disc_offset_px(
     points_m: ArrayLike, radius_m: ArrayLike, camera_from_plate: RigidTransform, intrinsics: CameraIntrinsics
 ) -> Array:
-    """How far the middle of a disc's image lies from the image of its middle, (N, 2) px: the near half looks larger.
+    """Distance between the middle of a disc's image and the image of its middle, (N, 2) px: the near half looks larger.
 
     The middle of the ellipse is the image of c - r^2 / c_z (a - (n a) n), a the optical axis and n the disc's normal:
     the pole of the line at infinity by the dual conic r^2 (I - n n^T) - c c^T of the disc (Hartley, Zisserman,
@@ -109,7 +81,7 @@ def distort(normalised: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
 
 
 def distortion_jacobian(normalised: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
-    """(N, 2, 2) derivatives of `distort` by its argument."""
+    """(N, 2, 2) derivatives of `distort` with respect to its argument."""
     x, y = np.asarray(normalised, float).T
     k1, k2, p1, p2, k3 = intrinsics.distortion
     r2 = x * x + y * y
@@ -154,24 +126,17 @@ def undistort_normalised(distorted: ArrayLike, intrinsics: CameraIntrinsics) -> 
     return np.where((residual < 1e-9)[:, None], ideal, np.nan)
 
 
-def undistort_pixels(pixels_px: ArrayLike, intrinsics: CameraIntrinsics, *, cubic: CubicLens | None = None) -> Array:
-    """(N, 2) pixels that an ideal pinhole with the same focal lengths and centre would show.
+def undistort_pixels(pixels_px: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
+    """(N, 2) pixels that an ideal pinhole with the same focal lengths and centre would show, of (N, 2) measured ones.
 
-    Args:
-        pixels_px: (N, 2) as measured.
-        intrinsics: the camera; its `distortion` is used unless `cubic` is given.
-        cubic: the paper's cubic correction, used in place of the radial-tangential model.
-
-    Returns: NaN where the lens model has no inverse.
+    NaN where the lens model has no inverse.
     """
     pixels = _points(pixels_px, 2)
-    if cubic is not None:
-        return cubic.ideal(pixels)
     return _to_pixels(undistort_normalised(_to_normalised(pixels, intrinsics), intrinsics), intrinsics)
 
 
 def normalised_with_jacobian(pixels_px: ArrayLike, intrinsics: CameraIntrinsics) -> tuple[Array, Array]:
-    """(N, 2) ideal normalised coordinates and their (N, 2, 2) derivatives by the measured pixel."""
+    """(N, 2) ideal normalised coordinates and their (N, 2, 2) derivatives with respect to the measured pixel."""
     ideal = undistort_normalised(_to_normalised(_points(pixels_px, 2), intrinsics), intrinsics)
     scale = np.array([1.0 / intrinsics.fx_px, 1.0 / intrinsics.fy_px])
     if not any(intrinsics.distortion):
@@ -181,29 +146,11 @@ def normalised_with_jacobian(pixels_px: ArrayLike, intrinsics: CameraIntrinsics)
     return ideal, np.linalg.inv(jacobian) * scale
 
 
-def rays(pixels_px: ArrayLike, intrinsics: CameraIntrinsics, *, cubic: CubicLens | None = None) -> Array:
+def rays(pixels_px: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
     """(N, 3) unit directions in camera axes through (N, 2) pixels; NaN where the lens model has no inverse."""
-    ideal = _to_normalised(undistort_pixels(pixels_px, intrinsics, cubic=cubic), intrinsics)
+    ideal = _to_normalised(undistort_pixels(pixels_px, intrinsics), intrinsics)
     directions = np.column_stack([ideal, np.ones(len(ideal))])
     return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
-
-
-def undistort_image(image: NDArray[Any], intrinsics: CameraIntrinsics) -> NDArray[Any]:
-    """The image that the ideal pinhole would show, same size and type; bilinear, black outside.
-
-    Args:
-        image: (H, W) or (H, W, C) with the size that `intrinsics` names.
-
-    Raises:
-        InvalidRequest: the image has another size than the calibration.
-    """
-    import cv2
-
-    check_size(image, intrinsics)
-    v, u = np.mgrid[: intrinsics.height_px, : intrinsics.width_px]
-    ideal = _to_normalised(np.stack([u.ravel(), v.ravel()], axis=1).astype(float), intrinsics)
-    source = _to_pixels(distort(ideal, intrinsics), intrinsics).astype(np.float32).reshape(*u.shape, 2)
-    return np.asarray(cv2.remap(image, source[..., 0], source[..., 1], cv2.INTER_LINEAR))
 
 
 def check_size(image: NDArray[Any], intrinsics: CameraIntrinsics) -> None:
@@ -232,5 +179,5 @@ def _to_pixels(normalised: Array, intrinsics: CameraIntrinsics) -> Array:
 def _points(points: ArrayLike, width: int) -> Array:
     array = np.asarray(points, float)
     if array.ndim != 2 or array.shape[1] != width:
-        raise InvalidRequest(f"points must be (N, {width}), not {array.shape}", hint="one row a point")
+        raise InvalidRequest(f"points must be (N, {width}), not {array.shape}", hint="give one row per point")
     return array

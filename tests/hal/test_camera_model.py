@@ -10,20 +10,17 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
 from hal.calibration import CameraIntrinsics
-from hal.errors import InvalidRequest
-from hal.geometry import transform_rpy
-from perception.camera_model import (
-    CubicLens,
+from hal.camera_model import (
     check_size,
-    cubic_monomials,
     disc_offset_px,
     normalised_with_jacobian,
     project,
     project_with_jacobian,
     rays,
-    undistort_image,
     undistort_pixels,
 )
+from hal.errors import InvalidRequest
+from hal.geometry import transform_rpy
 
 LENS = CameraIntrinsics(
     width_px=640, height_px=480, fx_px=620.0, fy_px=615.0, cx_px=322.0, cy_px=236.0,
@@ -88,31 +85,9 @@ def test_a_pixel_beyond_the_fold_of_the_lens_is_not_a_number() -> None:
     assert np.isnan(ideal[1]).all()
 
 
-def test_an_undistorted_image_shows_straight_lines_where_the_pinhole_has_them() -> None:
-    image = np.zeros((480, 640), np.uint8)
-    line = np.column_stack([np.linspace(-0.4, 0.4, 4000), np.full(4000, 0.25), np.ones(4000)])
-    for u, v in project(line, LENS):
-        cv2.circle(image, (round(u), round(v)), 2, 255, -1)
-    straight = undistort_image(image, LENS)
-    expected_row = IDEAL.fy_px * 0.25 + IDEAL.cy_px
-    for column in range(100, 560, 20):
-        rows = np.flatnonzero(straight[:, column] > 128)
-        assert abs(rows.mean() - expected_row) < 0.8
-
-
 def test_an_image_of_another_size_is_refused_by_name() -> None:
     with pytest.raises(InvalidRequest, match="320x240"):
         check_size(np.zeros((240, 320), np.uint8), LENS)
-
-
-def test_the_cubic_correction_is_used_in_place_of_the_lens() -> None:
-    shift = np.zeros((10, 2))
-    shift[0] = [5.0, -3.0]
-    shift[1, 0] = shift[2, 1] = 320.0
-    cubic = CubicLens(coefficients=shift, centre_px=(320.0, 240.0), scale_px=320.0, bias_px=0.0)
-    moved = undistort_pixels([[330.0, 250.0]], LENS, cubic=cubic)
-    np.testing.assert_allclose(moved, [[15.0, 7.0]])
-    assert cubic_monomials([[1.0, 2.0]], (0.0, 0.0), 1.0).tolist() == [[1, 1, 2, 1, 2, 4, 1, 2, 4, 8]]
 
 
 @pytest.mark.parametrize("wrong", [[1.0, 2.0, 3.0], [[1.0, 2.0]], np.zeros((2, 2, 3))])

@@ -1,0 +1,74 @@
+"""The paper's lens correction (Section II-B): a bivariate cubic from the measured to the ideal pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform
+
+from hal.arrays import Array
+from hal.calibration import CameraIntrinsics
+from hal.camera_model import project, undistort_pixels
+from perception.calibration.boards import BoardView
+
+GRID = 24  # points along each side of the frame at which the bias is taken
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CubicLens:
+    """The paper's lens correction (Section II-B): ideal pixel = bivariate cubic of the distorted pixel.
+
+    Attributes:
+        coefficients: (10, 2), one column per axis, over the monomials of `cubic_monomials`.
+        centre_px, scale_px: the monomials are taken of `(pixel - centre_px) / scale_px`, for conditioning.
+        bias_px: root mean square of what the cubic cannot follow over the frame. It is bias: data do not shrink it.
+    """
+
+    coefficients: Array
+    centre_px: tuple[float, float]
+    scale_px: float
+    bias_px: float
+
+    def ideal(self, pixels_px: ArrayLike) -> Array:
+        """(N, 2) ideal pixels of (N, 2) distorted ones."""
+        return cubic_monomials(pixels_px, self.centre_px, self.scale_px) @ self.coefficients
+
+
+def cubic_monomials(pixels_px: ArrayLike, centre_px: tuple[float, float], scale_px: float) -> Array:
+    """(N, 10) monomials 1, x, y, x^2, xy, y^2, x^3, x^2 y, x y^2, y^3 of the scaled pixel."""
+    x, y = ((np.asarray(pixels_px, float) - centre_px) / scale_px).T
+    one = np.ones_like(x)
+    return np.stack([one, x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], axis=1)
+
+
+def fit_cubic(
+    views: Sequence[BoardView], intrinsics: CameraIntrinsics, poses: Sequence[RigidTransform]
+) -> tuple[CubicLens, Array]:
+    """The paper's correction: least squares of the ideal pixels of the points over cubics of the measured ones.
+
+    Returns: the correction, and the (10, 10) covariance of the coefficients of one axis (px^2).
+    """
+    width, height = intrinsics.width_px, intrinsics.height_px
+    centre, scale = ((width - 1) / 2.0, (height - 1) / 2.0), width / 2.0
+    straight = CameraIntrinsics(
+        width_px=width, height_px=height, fx_px=intrinsics.fx_px, fy_px=intrinsics.fy_px, cx_px=intrinsics.cx_px,
+        cy_px=intrinsics.cy_px,
+    )  # fmt: skip
+    measured = np.concatenate([view.pixels_px for view in views])
+    ideal = np.concatenate(
+        [project(pose.apply(view.points_m), straight) for view, pose in zip(views, poses, strict=True)]
+    )
+    rows = cubic_monomials(measured, centre, scale)
+    coefficients = np.linalg.lstsq(rows, ideal, rcond=None)[0]
+    lens = CubicLens(coefficients=coefficients, centre_px=centre, scale_px=scale, bias_px=0.0)
+    grid = np.stack(np.meshgrid(np.linspace(0, width - 1, GRID), np.linspace(0, height - 1, GRID)), axis=-1)
+    grid = grid.reshape(-1, 2)
+    miss = lens.ideal(grid) - undistort_pixels(grid, intrinsics)
+    bias = float(np.sqrt(np.nanmean(np.sum(miss**2, axis=1))))
+    sigma = float(np.mean([view.sigma_px for view in views]))
+    covariance = sigma**2 * np.linalg.pinv(rows.T @ rows)
+    lens = CubicLens(coefficients=coefficients, centre_px=centre, scale_px=scale, bias_px=bias)
+    return lens, np.asarray(covariance)

@@ -103,9 +103,9 @@ def judge_cell(seed: int, folder: Path) -> tuple[Counter[str], Counter[str], lis
     after: Counter[str] = Counter()
     wrong = []
     with open_session(cell, folder) as session:
-        first = close_ups(session, [thing.name for thing in cell.panel.objects])
+        first = close_ups(session, [panel_object.name for panel_object in cell.panel.objects])
         found = look_past(session, first)
-        truth = {thing.name: thing for thing in session.connection.device("arm").truth().objects}
+        truth = {panel_object.name: panel_object for panel_object in session.connection.device("arm").truth().objects}
         for spec in cell.panel.objects:
             last = found.readings[spec.name]
             straight[verdict(first.readings[spec.name], spec, truth[spec.name])] += 1

@@ -111,7 +111,7 @@ def built_places(cell: Cell, seed: int) -> dict[str, Array]:
     draws = Draws(seed)
     base_from_panel = draws.panel_pose(cell.file.workspace)
     return {
-        built.thing.name: base_from_panel.apply([*np.add(built.thing.position_m, built.offset_m), 0.0])
+        built.panel_object.name: base_from_panel.apply([*np.add(built.panel_object.position_m, built.offset_m), 0.0])
         for built in build(cell.panel, draws)
     }
 

@@ -84,8 +84,8 @@ def draw_scene(seed: int, level: str) -> Scene:
         objects.append({**paint(canvas, random, str(kind), float(x), float(y)), "id": k, "label": ""})
     px_from_mm = _placed(random, amount.tilt_rad)
     image, cover, bright = _taken(random, canvas.gray, px_from_mm, amount)
-    for thing in objects:
-        thing.update(seen(thing, px_from_mm, cover, bright))
+    for panel_object in objects:
+        panel_object.update(seen(panel_object, px_from_mm, cover, bright))
     truth = {"level": level, "kind": "overview", "panel_mm": list(PANEL_MM), "objects": objects}
     truth["H_mm_to_px"] = px_from_mm.tolist()
     return Scene(image=image, truth=truth, taught=_taught_job(random, truth))
@@ -180,9 +180,9 @@ def _moved(random: np.random.Generator, image: Array, length_px: float) -> Array
     return out
 
 
-def seen(thing: Truth, px_from_mm: Array, cover: Array, bright: NDArray[np.bool_]) -> Truth:
+def seen(panel_object: Truth, px_from_mm: Array, cover: Array, bright: NDArray[np.bool_]) -> Truth:
     """Where an object lies in the picture and how much of it can be seen."""
-    (x, y), (w, h) = thing["center_mm"], (s / 2 for s in thing["size"])
+    (x, y), (w, h) = panel_object["center_mm"], (s / 2 for s in panel_object["size"])
     quad = _applied(px_from_mm, np.array([[x - w, y - h], [x + w, y - h], [x + w, y + h], [x - w, y + h]]))
     margin = 400
     mask = np.zeros((cover.shape[0] + 2 * margin, cover.shape[1] + 2 * margin), np.uint8)
@@ -192,7 +192,7 @@ def seen(thing: Truth, px_from_mm: Array, cover: Array, bright: NDArray[np.bool_
     visible = float((1.0 - cover)[inside].sum()) / total
     saturated = float(bright[inside].sum()) / total
     low = quad.min(axis=0)
-    is_lit = thing["cls"] in ("lamp", "button")
+    is_lit = panel_object["cls"] in ("lamp", "button")
     return {
         "center_px": _applied(px_from_mm, np.array([[x, y]]))[0].tolist(), "quad_px": quad.tolist(),
         "bbox_px": [*low.tolist(), *(quad.max(axis=0) - low).tolist()], "visible": visible, "saturated": saturated,
@@ -208,16 +208,16 @@ def _taught_job(random: np.random.Generator, truth: dict[str, Any]) -> dict[str,
     guess = homography(corners, px)
     hidden = ("reading", "state", "text", "visible", "saturated", "readable", "quad_px", "bbox_px", "center_px")
     layout = []
-    for thing in truth["objects"]:
-        entry = {key: value for key, value in thing.items() if key not in hidden}
-        if thing["cls"] == "display":
+    for panel_object in truth["objects"]:
+        entry = {key: value for key, value in panel_object.items() if key not in hidden}
+        if panel_object["cls"] == "display":
             entry = {key: value for key, value in entry.items() if key not in ("min", "max")}
-        elif thing["cls"] == "rotary":
-            n = thing["positions"]
+        elif panel_object["cls"] == "rotary":
+            n = panel_object["positions"]
             span = {2: 90, 3: 120, 4: 150, 5: 180}[n]
             entry["state_angles_deg"] = {str(k): -span / 2 + span * k / (n - 1) for k in range(n)}
-        elif thing["cls"] == "slider":
-            entry["travel_mm"] = max(thing["size"]) - 16
+        elif panel_object["cls"] == "slider":
+            entry["travel_mm"] = max(panel_object["size"]) - 16
         layout.append(entry)
     return {"id": "drawn", "mode": "taught", "panel_mm": truth["panel_mm"], "H_guess": guess.tolist(), "layout": layout}
 

@@ -109,7 +109,9 @@ def _draw(rng: np.random.Generator, *, hard: float, stress: bool) -> LightPair:
     H = _homography(rng, size, np.radians(2 + 26 * hard))
     lights_px = _apply(H, lights)
     things = _things(rng, size)
-    toggled = [k for k, thing in enumerate(things) if stress and thing[0] == "lamp" and rng.random() < 0.7]
+    toggled = [
+        k for k, panel_object in enumerate(things) if stress and panel_object[0] == "lamp" and rng.random() < 0.7
+    ]
     motion = np.zeros(3) if not stress else np.array([*rng.uniform(-3, 3, 2), rng.uniform(-0.0035, 0.0035)])
     motion[:2] += rng.uniform(-0.5, 0.5, 2)
     gains = 1.0 + rng.uniform(-0.04, 0.04, 2) + (rng.uniform(-0.25, 0.25) * hard)

@@ -113,7 +113,7 @@ def open_bench(
         progress=progress,
     )
     bench = SimBench(file, clock, shared, made["arm"], controller, cell, latched, rng, made)
-    levers = [thing.name for thing in file.panel.objects if thing.kind == "lever"]
+    levers = [panel_object.name for panel_object in file.panel.objects if panel_object.kind == "lever"]
     angles = {name: float(bench.truth(name).value or 0.0) for name in levers}
     bench.cell = replace(cell, angles_rad=angles)
     return bench

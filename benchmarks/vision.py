@@ -55,15 +55,15 @@ def panel_of_job(job: Job) -> Panel:
         Panel,
         source=str(job["id"]),
     )
-    return panel.model_copy(update={"objects": tuple(_by_meaning(thing) for thing in panel.objects)})
+    return panel.model_copy(update={"objects": tuple(_by_meaning(panel_object) for panel_object in panel.objects)})
 
 
-def _by_meaning(thing: PanelObject) -> PanelObject:
+def _by_meaning(panel_object: PanelObject) -> PanelObject:
     """A lever whose opposite stops have one name: a panel file names every state once, a job only what it means."""
-    if not isinstance(thing, Lever):
-        return thing
-    states = tuple(state.model_copy(update={"name": state.name.split("_")[0]}) for state in thing.states)
-    return thing.model_copy(update={"states": states})
+    if not isinstance(panel_object, Lever):
+        return panel_object
+    states = tuple(state.model_copy(update={"name": state.name.split("_")[0]}) for state in panel_object.states)
+    return panel_object.model_copy(update={"states": states})
 
 
 def view_of_job(job: Job) -> PlaneView:

@@ -92,21 +92,25 @@ def random_state(panel: Panel, seed: int) -> dict[str, Shown]:
     """What every object shows: any value or state, the same for the same seed."""
     random = np.random.default_rng(seed)
     shown: dict[str, Shown] = {}
-    for thing in panel.objects:
+    for panel_object in panel.objects:
         share = float(random.uniform(0.05, 0.95))
-        match thing.kind:
+        match panel_object.kind:
             case "gauge" | "panel_meter" | "slider":
-                shown[thing.name] = thing.scale.minimum + share * (thing.scale.maximum - thing.scale.minimum)
+                shown[panel_object.name] = panel_object.scale.minimum + share * (
+                    panel_object.scale.maximum - panel_object.scale.minimum
+                )
             case "display":
-                shown[thing.name] = f"{thing.minimum + share * (thing.maximum - thing.minimum):.{thing.decimals}f}"
+                shown[panel_object.name] = (
+                    f"{panel_object.minimum + share * (panel_object.maximum - panel_object.minimum):.{panel_object.decimals}f}"
+                )
             case "lamp" | "toggle":
-                shown[thing.name] = "on" if share > 0.5 else "off"
+                shown[panel_object.name] = "on" if share > 0.5 else "off"
             case "button" | "mushroom":
-                shown[thing.name] = "pressed" if share > 0.5 else "released"
+                shown[panel_object.name] = "pressed" if share > 0.5 else "released"
             case "rotary" | "lever":
-                shown[thing.name] = thing.states[int(share * len(thing.states))].name
+                shown[panel_object.name] = panel_object.states[int(share * len(panel_object.states))].name
             case "handwheel":
-                shown[thing.name] = 4.0 * share - 2.0
+                shown[panel_object.name] = 4.0 * share - 2.0
     return shown
 
 

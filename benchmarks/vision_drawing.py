@@ -114,8 +114,8 @@ def draw_panel(
     brush.box(0, 0, 0, (panel.width_m, panel.height_m), PLATE)
     for light in panel.lights:
         brush.disc(*light.position_m, light.radius_m, 110)
-    for thing in panel.objects:
-        _draw(brush, thing, shown[thing.name])
+    for panel_object in panel.objects:
+        _draw(brush, panel_object, shown[panel_object.name])
     small = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.float32)
     return disturbed(small, disturbance or Disturbance())
 
@@ -139,83 +139,83 @@ def disturbed(image: NDArray[np.float32], d: Disturbance) -> NDArray[np.uint8]:
     return np.asarray(np.clip(np.round(picture + noise), 0, 255), np.uint8)
 
 
-def _draw(brush: Brush, thing: PanelObject, shown: Shown) -> None:
-    match thing:
+def _draw(brush: Brush, panel_object: PanelObject, shown: Shown) -> None:
+    match panel_object:
         case Gauge():
-            _gauge(brush, thing, float(shown))
+            _gauge(brush, panel_object, float(shown))
         case PanelMeter():
-            _meter(brush, thing, float(shown))
+            _meter(brush, panel_object, float(shown))
         case Display():
-            _display(brush, thing, str(shown))
+            _display(brush, panel_object, str(shown))
         case Lamp():
-            x, y = thing.position_m
-            brush.disc(x, y, 0.0, thing.radius_m + 0.0025, INK)
-            brush.disc(x, y, thing.height_m, thing.radius_m, 75)
+            x, y = panel_object.position_m
+            brush.disc(x, y, 0.0, panel_object.radius_m + 0.0025, INK)
+            brush.disc(x, y, panel_object.height_m, panel_object.radius_m, 75)
             if shown == "on":
                 for share, gray in ((1.0, 200), (0.7, 235), (0.4, 255)):
-                    brush.disc(x, y, thing.height_m, share * thing.radius_m, gray)
+                    brush.disc(x, y, panel_object.height_m, share * panel_object.radius_m, gray)
         case Button() | Mushroom():
-            x, y = thing.position_m
-            z = thing.height_m - (thing.pressed_depth_m if shown == "pressed" else 0.0)
-            brush.disc(x, y, 0.0, thing.radius_m + 0.003, INK if isinstance(thing, Button) else 215)
+            x, y = panel_object.position_m
+            z = panel_object.height_m - (panel_object.pressed_depth_m if shown == "pressed" else 0.0)
+            brush.disc(x, y, 0.0, panel_object.radius_m + 0.003, INK if isinstance(panel_object, Button) else 215)
             for k in range(8):
-                brush.disc(x, y, z * k / 8, thing.radius_m, 90)
-            brush.disc(x, y, z, thing.radius_m, 185 if isinstance(thing, Button) else 120)
+                brush.disc(x, y, z * k / 8, panel_object.radius_m, 90)
+            brush.disc(x, y, z, panel_object.radius_m, 185 if isinstance(panel_object, Button) else 120)
         case _:
-            _draw_moving(brush, thing, shown)
+            _draw_moving(brush, panel_object, shown)
 
 
-def _draw_moving(brush: Brush, thing: PanelObject, shown: Shown) -> None:
-    x, y = thing.position_m
-    match thing:
+def _draw_moving(brush: Brush, panel_object: PanelObject, shown: Shown) -> None:
+    x, y = panel_object.position_m
+    match panel_object:
         case Toggle():
-            tilt = thing.tilt_rad if shown == "on" else -thing.tilt_rad
-            tip = (x, y + thing.bat_length_m * np.sin(tilt), 0.004 + thing.bat_length_m * np.cos(tilt))
+            tilt = panel_object.tilt_rad if shown == "on" else -panel_object.tilt_rad
+            tip = (x, y + panel_object.bat_length_m * np.sin(tilt), 0.004 + panel_object.bat_length_m * np.cos(tilt))
             brush.box(x, y, 0.0, (0.026, 0.044), INK)
-            brush.disc(x, y, 0.004, 1.8 * thing.bat_radius_m, 120)
-            brush.bar((x, y, 0.004), tip, 1.4 * thing.bat_radius_m, STEEL)
-            brush.disc(*tip, thing.bat_radius_m, WHITE)
+            brush.disc(x, y, 0.004, 1.8 * panel_object.bat_radius_m, 120)
+            brush.bar((x, y, 0.004), tip, 1.4 * panel_object.bat_radius_m, STEEL)
+            brush.disc(*tip, panel_object.bat_radius_m, WHITE)
         case Rotary():
-            angle = next(s.angle_rad for s in thing.states if s.name == shown)
-            r, h = thing.radius_m, thing.height_m
+            angle = next(s.angle_rad for s in panel_object.states if s.name == shown)
+            r, h = panel_object.radius_m, panel_object.height_m
             brush.disc(x, y, 0.0, r, 30)
             brush.disc(x, y, h / 2, r, KNOB)
             brush.bar(_at(x, y, angle, -r, h), _at(x, y, angle, r, h), 0.45 * r, 60)
             brush.bar(_at(x, y, angle, 0.22 * r, h), _at(x, y, angle, 0.97 * r, h), 0.12 * r, WHITE)
         case Slider():
-            _slider(brush, thing, float(shown))
+            _slider(brush, panel_object, float(shown))
         case Lever():
-            angle = next(s.angle_rad for s in thing.states if s.name == shown)
-            h = thing.height_m
+            angle = next(s.angle_rad for s in panel_object.states if s.name == shown)
+            h = panel_object.height_m
             for z in np.linspace(h - 0.016, h, 4):
-                brush.bar((x, y, z), _at(x, y, angle, thing.length_m, z), thing.width_m, 70)
-            brush.bar((x, y, h), _at(x, y, angle, thing.length_m, h), thing.width_m, 85)
-            brush.disc(x, y, h, 0.75 * thing.width_m, 80)
+                brush.bar((x, y, z), _at(x, y, angle, panel_object.length_m, z), panel_object.width_m, 70)
+            brush.bar((x, y, h), _at(x, y, angle, panel_object.length_m, h), panel_object.width_m, 85)
+            brush.disc(x, y, h, 0.75 * panel_object.width_m, 80)
         case Handwheel():
-            _handwheel(brush, thing, float(shown))
+            _handwheel(brush, panel_object, float(shown))
 
 
 def _at(x: float, y: float, angle_rad: float, r: float, z: float) -> tuple[float, float, float]:
     return (x + r * float(np.sin(angle_rad)), y + r * float(np.cos(angle_rad)), z)
 
 
-def _gauge(brush: Brush, thing: Gauge, value: float) -> None:
-    (x, y), r = thing.position_m, thing.radius_m
+def _gauge(brush: Brush, panel_object: Gauge, value: float) -> None:
+    (x, y), r = panel_object.position_m, panel_object.radius_m
     brush.disc(x, y, 0.001, r, INK)
     brush.disc(x, y, 0.001, 0.91 * r, FACE)
-    _ticks(brush, thing.scale, (x, y), 0.86 * r, 0.0008)
-    angle, z = thing.scale.place_of(value), thing.depth_m
+    _ticks(brush, panel_object.scale, (x, y), 0.86 * r, 0.0008)
+    angle, z = panel_object.scale.place_of(value), panel_object.depth_m
     brush.bar(_at(x, y, angle, -0.22 * r, z), _at(x, y, angle, 0.76 * r, z), 0.055 * r, INK)
     brush.disc(x, y, z, 0.1 * r, INK)
 
 
-def _meter(brush: Brush, thing: PanelMeter, value: float) -> None:
-    (x, y), n = thing.position_m, thing.needle_m
-    brush.box(x, y, 0.001, (thing.width_m, thing.height_m), INK)
-    brush.box(x, y, 0.001, (thing.width_m - 0.006, thing.height_m - 0.006), FACE)
-    pivot = (x, y - thing.pivot_below_m)
-    _ticks(brush, thing.scale, pivot, 1.02 * n, 0.0006)
-    angle, z = thing.scale.place_of(value), thing.depth_m
+def _meter(brush: Brush, panel_object: PanelMeter, value: float) -> None:
+    (x, y), n = panel_object.position_m, panel_object.needle_m
+    brush.box(x, y, 0.001, (panel_object.width_m, panel_object.height_m), INK)
+    brush.box(x, y, 0.001, (panel_object.width_m - 0.006, panel_object.height_m - 0.006), FACE)
+    pivot = (x, y - panel_object.pivot_below_m)
+    _ticks(brush, panel_object.scale, pivot, 1.02 * n, 0.0006)
+    angle, z = panel_object.scale.place_of(value), panel_object.depth_m
     brush.bar(_at(*pivot, angle, -0.12 * n, z), _at(*pivot, angle, n, z), 0.0016, INK)
 
 
@@ -225,16 +225,16 @@ def _ticks(brush: Brush, scale: Scale, centre: tuple[float, float], outer_m: flo
         brush.bar(_at(*centre, angle, 0.84 * outer_m, 0.001), _at(*centre, angle, outer_m, 0.001), width_m, INK)
 
 
-def _display(brush: Brush, thing: Display, text: str) -> None:
-    x, y = thing.position_m
-    back, ink = (18, 200) if thing.style == "led" else (150, 30)
-    brush.box(x, y, 0.001, (thing.width_m, thing.height_m), INK)
-    brush.box(x, y, 0.001, (thing.width_m - 0.004, thing.height_m - 0.004), back)
-    pitch = (thing.width_m - 0.008) / thing.digits
-    high = min(0.68 * thing.height_m, 1.7 * pitch)
-    column = thing.digits - 1 - sum(c != "." for c in text)
+def _display(brush: Brush, panel_object: Display, text: str) -> None:
+    x, y = panel_object.position_m
+    back, ink = (18, 200) if panel_object.style == "led" else (150, 30)
+    brush.box(x, y, 0.001, (panel_object.width_m, panel_object.height_m), INK)
+    brush.box(x, y, 0.001, (panel_object.width_m - 0.004, panel_object.height_m - 0.004), back)
+    pitch = (panel_object.width_m - 0.008) / panel_object.digits
+    high = min(0.68 * panel_object.height_m, 1.7 * pitch)
+    column = panel_object.digits - 1 - sum(c != "." for c in text)
     for character in text:
-        middle = (column - (thing.digits - 1) / 2) * pitch
+        middle = (column - (panel_object.digits - 1) / 2) * pitch
         if character == ".":
             brush.disc(x + middle + pitch / 2, y - high / 2, 0.001, 0.07 * high, ink)
             continue
@@ -263,27 +263,27 @@ def _segment(brush: Brush, middle: tuple[float, float], segment: str, high: floa
     brush.bar(points[0], points[1], 0.12 * high, ink)
 
 
-def _slider(brush: Brush, thing: Slider, value: float) -> None:
-    x, y = thing.position_m
-    turn = thing.angle_rad
+def _slider(brush: Brush, panel_object: Slider, value: float) -> None:
+    x, y = panel_object.position_m
+    turn = panel_object.angle_rad
     along = np.array([np.cos(turn), np.sin(turn)])
-    sx, sy, sz = thing.cap_size_m
-    brush.box(x, y, 0.0, (thing.travel_m + sx, 0.004), INK, turn)
-    px, py = np.array([x, y]) + thing.scale.place_of(value) * along
+    sx, sy, sz = panel_object.cap_size_m
+    brush.box(x, y, 0.0, (panel_object.travel_m + sx, 0.004), INK, turn)
+    px, py = np.array([x, y]) + panel_object.scale.place_of(value) * along
     for z in np.linspace(0, sz, 5):
         brush.box(px, py, float(z), (sx, sy), 35, turn)
     brush.box(px, py, sz, (sx, sy), KNOB, turn)
     brush.box(px, py, sz, (0.0016, sy), WHITE, turn)
 
 
-def _handwheel(brush: Brush, thing: Handwheel, angle_rad: float) -> None:
-    (x, y), r, z = thing.position_m, thing.radius_m, thing.height_m - thing.rim_m
+def _handwheel(brush: Brush, panel_object: Handwheel, angle_rad: float) -> None:
+    (x, y), r, z = panel_object.position_m, panel_object.radius_m, panel_object.height_m - panel_object.rim_m
     a = np.linspace(0, 2 * np.pi, 61)
     for a0, a1 in pairwise(a):
-        brush.bar(_at(x, y, float(a0), r, z), _at(x, y, float(a1), r, z), 2 * thing.rim_m, 75)
-    for k in range(thing.spokes):
+        brush.bar(_at(x, y, float(a0), r, z), _at(x, y, float(a1), r, z), 2 * panel_object.rim_m, 75)
+    for k in range(panel_object.spokes):
         gray, half = (WHITE, 0.0036) if k == 0 else (75, 0.003)
-        spoke = angle_rad + 2 * np.pi * k / thing.spokes
+        spoke = angle_rad + 2 * np.pi * k / panel_object.spokes
         brush.bar((x, y, z), _at(x, y, spoke, r, z), 2 * half, gray)
     brush.disc(x, y, z, 0.009, 80)
 

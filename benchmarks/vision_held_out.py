@@ -49,41 +49,48 @@ def read_scene(scene: Scene) -> list[Judged]:
     try:
         answers = {entry["id"]: entry for entry in taught_answer(scene.taught, scene.image)["objects"]}
     except CellError as error:
-        answers = {thing["id"]: {"reason": error.what} for thing in scene.truth["objects"]}
-    return [_judged(thing, answers[thing["id"]]) for thing in scene.truth["objects"] if thing["readable"]]
+        answers = {panel_object["id"]: {"reason": error.what} for panel_object in scene.truth["objects"]}
+    return [
+        _judged(panel_object, answers[panel_object["id"]])
+        for panel_object in scene.truth["objects"]
+        if panel_object["readable"]
+    ]
 
 
-def _judged(thing: dict[str, Any], answer: dict[str, Any]) -> Judged:
-    key = "text" if "text" in thing else "state" if "state" in thing else "reading"
+def _judged(panel_object: dict[str, Any], answer: dict[str, Any]) -> Judged:
+    key = "text" if "text" in panel_object else "state" if "state" in panel_object else "reading"
     error = 100.0
     if key in answer and key == "reading":
-        span = thing["max"] - thing["min"]
-        off = abs(answer[key] - thing[key])
-        error = 100.0 * (min(off % span, span - off % span) if thing.get("circular") else off) / span
+        span = panel_object["max"] - panel_object["min"]
+        off = abs(answer[key] - panel_object[key])
+        error = 100.0 * (min(off % span, span - off % span) if panel_object.get("circular") else off) / span
     elif key in answer:
-        error = 0.0 if str(answer[key]) == str(thing[key]) else 100.0
+        error = 0.0 if str(answer[key]) == str(panel_object[key]) else 100.0
     return Judged(
-        kind=thing["cls"], truth=str(thing[key]), given=str(answer.get(key, "")), error=error, answered=key in answer,
+        kind=panel_object["cls"], truth=str(panel_object[key]), given=str(answer.get(key, "")), error=error, answered=key in answer,
         confidence=float(answer.get("confidence", 0.0)), reason=answer.get("reason") or "",
     )  # fmt: skip
 
 
 def found_blind(scene: Scene) -> tuple[int, int, int]:
     """Objects found, objects given, and objects at least half visible, of a scene that is recognised blind."""
-    there = [thing for thing in scene.truth["objects"] if thing["visible"] >= 0.5]
-    hidden = [thing for thing in scene.truth["objects"] if thing["visible"] < 0.5]
+    there = [panel_object for panel_object in scene.truth["objects"] if panel_object["visible"] >= 0.5]
+    hidden = [panel_object for panel_object in scene.truth["objects"] if panel_object["visible"] < 0.5]
     try:
         given = blind_answer({"panel_mm": list(PANEL_MM)}, scene.image)["objects"]
     except CellError:
         return 0, 0, len(there)
-    given = [entry for entry in given if not any(_is_near(entry, thing) for thing in hidden)]
-    right = [any(_is_near(entry, thing) and entry["cls"] == thing["cls"] for entry in given) for thing in there]
+    given = [entry for entry in given if not any(_is_near(entry, panel_object) for panel_object in hidden)]
+    right = [
+        any(_is_near(entry, panel_object) and entry["cls"] == panel_object["cls"] for entry in given)
+        for panel_object in there
+    ]
     return sum(right), len(given), len(there)
 
 
-def _is_near(entry: dict[str, Any], thing: dict[str, Any]) -> bool:
-    off = np.linalg.norm(np.subtract(entry["center_px"], thing["center_px"]))
-    return bool(off <= 0.5 * max(thing["bbox_px"][2:]))
+def _is_near(entry: dict[str, Any], panel_object: dict[str, Any]) -> bool:
+    off = np.linalg.norm(np.subtract(entry["center_px"], panel_object["center_px"]))
+    return bool(off <= 0.5 * max(panel_object["bbox_px"][2:]))
 
 
 def held_out_lines(first: int = FIRST, count: int = COUNT) -> list[str]:

@@ -86,7 +86,7 @@ def lessons(folder: Path) -> Iterator[Lesson]:
 
 def _seen_there(ground: Ground, view: PlaneView, truth: list[dict[str, Any]]) -> dict[str, Any]:
     """The fields of `Examples`."""
-    pixels = np.array([[*thing["center_px"], 1.0] for thing in truth])
+    pixels = np.array([[*panel_object["center_px"], 1.0] for panel_object in truth])
     on_plate = pixels @ np.linalg.inv(view.px_from_plate).T
     xy = on_plate[:, :2] / on_plate[:, 2:]
     middles = np.column_stack([xy[:, 0] + PLATE_M[0] / 2, PLATE_M[1] / 2 - xy[:, 1]]) * PLATE_PX_PER_M
@@ -101,9 +101,9 @@ def _worse(gray: Image, view: PlaneView, entry: dict[str, Any], copy: int) -> Ex
     light = (gray.astype(float) / 255) ** GAMMA
     image, cover, bright = pictured(random, light, AMOUNTS[BAD_LIGHT], (gray.shape[1], gray.shape[0]))
     px_from_mm = np.array(entry["H_mm_to_px"])
-    truth = [{**thing, **seen(thing, px_from_mm, cover, bright)} for thing in entry["objects"]]
-    for worse, thing in zip(truth, entry["objects"], strict=True):
-        worse["visible"] *= thing["visible"]
+    truth = [{**panel_object, **seen(panel_object, px_from_mm, cover, bright)} for panel_object in entry["objects"]]
+    for worse, panel_object in zip(truth, entry["objects"], strict=True):
+        worse["visible"] *= panel_object["visible"]
     return Examples(**_seen_there(lay_out(image, view, PLATE_M), view, truth))
 
 
@@ -144,10 +144,10 @@ def _examples(taught: Sequence[Examples]) -> tuple[Array, NDArray[np.str_]]:
     """(N, LENGTH) looks and (N,) kinds of everything that is at least half visible, and of what is no object."""
     looks, names = [], []
     for lesson in taught:
-        for thing, look in zip(lesson.truth, lesson.object_looks, strict=True):
-            if thing["visible"] >= 0.5:
+        for panel_object, look in zip(lesson.truth, lesson.object_looks, strict=True):
+            if panel_object["visible"] >= 0.5:
                 looks.append(look)
-                names.append(str(thing["cls"]))
+                names.append(str(panel_object["cls"]))
         away = np.linalg.norm(lesson.places[:, None] - lesson.middles[None], axis=2).min(axis=1) > ELSEWHERE_PX
         looks += list(lesson.looks[away])
         names += [NOTHING] * int(away.sum())
@@ -155,7 +155,7 @@ def _examples(taught: Sequence[Examples]) -> tuple[Array, NDArray[np.str_]]:
 
 
 def _size_m(taught: Sequence[Lesson], name: str) -> tuple[float, float]:
-    sizes = [thing["size"] for lesson in taught for thing in lesson.truth if thing["cls"] == name]
+    sizes = [panel_object["size"] for lesson in taught for panel_object in lesson.truth if panel_object["cls"] == name]
     if name == "slider":
         return SLIDER_M
     width, height = np.median(np.array(sizes), axis=0) / 1000 if sizes else NO_SIZE_M
@@ -166,15 +166,15 @@ def judged(lesson: Lesson, knowledge: Knowledge) -> tuple[list[tuple[float, bool
     """(confidence, right) of every accepted candidate, and how many objects are at least half visible."""
     found = chosen(lesson.ground, lesson.places, lesson.looks, knowledge, lesson.view, PLATE_M)
     rows = [(c.confidence, right) for c in found if c.reason is None and (right := _right(lesson, c)) is not None]
-    return rows, sum(thing["visible"] >= 0.5 for thing in lesson.truth)
+    return rows, sum(panel_object["visible"] >= 0.5 for panel_object in lesson.truth)
 
 
 def _right(lesson: Lesson, candidate: Candidate) -> bool | None:
     """Whether the nearest object is of that kind and near enough; None for one that is hidden for the most part."""
-    off = [float(np.linalg.norm(candidate.centre_px - thing["center_px"])) for thing in lesson.truth]
-    thing = lesson.truth[int(np.argmin(off))]
-    near = min(off) < 0.5 * max(thing["bbox_px"][2:])
-    return None if near and thing["visible"] < 0.5 else bool(near and thing["cls"] == candidate.kind)
+    off = [float(np.linalg.norm(candidate.centre_px - panel_object["center_px"])) for panel_object in lesson.truth]
+    panel_object = lesson.truth[int(np.argmin(off))]
+    near = min(off) < 0.5 * max(panel_object["bbox_px"][2:])
+    return None if near and panel_object["visible"] < 0.5 else bool(near and panel_object["cls"] == candidate.kind)
 
 
 def _print_folds(all_lessons: Sequence[Lesson]) -> None:

@@ -61,9 +61,9 @@ def redegraded(name: str, truth: dict[str, Any], seed: int, level: str) -> Scene
         cover, 1.0 - np.asarray(cv2.resize(known, (width, height), interpolation=cv2.INTER_AREA), float)
     )
     objects = []
-    for thing in truth["objects"]:
-        now = seen(thing, new_from_mm, hidden, bright)
-        objects.append({**thing, **now, "readable": now["readable"] and thing["readable"]})
+    for panel_object in truth["objects"]:
+        now = seen(panel_object, new_from_mm, hidden, bright)
+        objects.append({**panel_object, **now, "readable": now["readable"] and panel_object["readable"]})
     taken = {**truth, "level": level, "H_mm_to_px": new_from_mm.tolist(), "objects": objects}
     return Scene(image=picture, truth=taken, taught=_taught_job(f"{seed}_{name}", taken))
 

@@ -235,15 +235,17 @@ def _speed(folder: Path) -> None:
     view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
     image = draw_panel(panel, view, (960, 1280), random_state(panel, 0))
     # A reading takes a moment, so that a busy machine may disturb a few in a row, but not each of many.
-    readings = [_best([partial(_read_one, image, view, thing)], READINGS_TIMED) for thing in panel.objects]
+    readings = [
+        _best([partial(_read_one, image, view, panel_object)], READINGS_TIMED) for panel_object in panel.objects
+    ]
     slowest = panel.objects[int(np.argmax(readings))]
     _line("one taught reading (patch and reader), ms: median", [1e3 * float(np.median(readings))], (3.0,), at_most=True)
     _line(f"  the slowest, a {slowest.kind.replace('_', ' ')}", [1e3 * max(readings)], (3.0,), at_most=True)
     print(f"{'  the same two, blurs':52s} {np.median(readings) / blur:.3g} / {max(readings) / blur:.3g}")
 
 
-def _read_one(image: Image, view: CameraView, thing: PanelObject) -> object:
-    return read_patch(patch_of(image, image, view, thing, np.zeros(2)), thing)
+def _read_one(image: Image, view: CameraView, panel_object: PanelObject) -> object:
+    return read_patch(patch_of(image, image, view, panel_object, np.zeros(2)), panel_object)
 
 
 def _best(tasks: list[Callable[[], object]], repeats: int) -> float:

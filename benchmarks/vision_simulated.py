@@ -86,16 +86,16 @@ def look(cell: Cell, seed: int) -> list[Overview]:
 
 def judged(cell: Cell, seed: int, candidates: Sequence[dict[str, Any]]) -> Overview:
     """Candidates against where the simulator built the objects: right in kind, and within half of the larger side."""
-    built = {each.thing.name: each for each in build(cell.panel, Draws(seed))}
-    places = {name: np.add(each.thing.position_m, each.offset_m) for name, each in built.items()}
+    built = {each.panel_object.name: each for each in build(cell.panel, Draws(seed))}
+    places = {name: np.add(each.panel_object.position_m, each.offset_m) for name, each in built.items()}
     answers, found = [], set()
     for candidate in candidates:
         if candidate["reason"] is not None:
             continue
         away = {name: float(np.linalg.norm(place - candidate["centre_m"])) for name, place in places.items()}
         name = min(away, key=lambda key: away[key])
-        is_there = away[name] < max(footprint_m(built[name].thing)[:2])
-        is_right = is_there and built[name].thing.kind == candidate["kind"]
+        is_there = away[name] < max(footprint_m(built[name].panel_object)[:2])
+        is_right = is_there and built[name].panel_object.kind == candidate["kind"]
         if is_right:
             found.add(name)
         answers.append(

@@ -126,8 +126,8 @@ def _run_host(
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
         lifeline.recv()  # returns only when the parent closes it or dies
     server.close()
-    for thing in objects.values():
-        close = getattr(thing, "close", None)
+    for panel_object in objects.values():
+        close = getattr(panel_object, "close", None)
         if close is not None:
             with contextlib.suppress(Exception):  # the process ends anyway, and every object gets its turn
                 close()

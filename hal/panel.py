@@ -296,18 +296,20 @@ class Panel(Strict):
 
     @model_validator(mode="after")
     def _names_are_unique_and_places_on_the_plate(self) -> Panel:
-        names = [thing.name for thing in (*self.lights, *self.objects)]
+        names = [panel_object.name for panel_object in (*self.lights, *self.objects)]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"the name {twice[0]!r} is given twice")
-        for thing in (*self.lights, *self.objects):
-            x, y = thing.position_m[:2]
+        for panel_object in (*self.lights, *self.objects):
+            x, y = panel_object.position_m[:2]
             if abs(x) > self.width_m / 2 or abs(y) > self.height_m / 2:
-                raise ValueError(f"{thing.name} at ({x}, {y}) m lies off the plate")
-        lamps = {thing.name for thing in self.objects if isinstance(thing, Lamp)}
-        for thing in self.objects:
-            if isinstance(thing, Button) and thing.lights_lamp not in (None, *lamps):
-                raise ValueError(f"{thing.name} lights {thing.lights_lamp!r}, which is no lamp of the panel")
+                raise ValueError(f"{panel_object.name} at ({x}, {y}) m lies off the plate")
+        lamps = {panel_object.name for panel_object in self.objects if isinstance(panel_object, Lamp)}
+        for panel_object in self.objects:
+            if isinstance(panel_object, Button) and panel_object.lights_lamp not in (None, *lamps):
+                raise ValueError(
+                    f"{panel_object.name} lights {panel_object.lights_lamp!r}, which is no lamp of the panel"
+                )
         return self
 
     def object(self, name: str) -> PanelObject:
@@ -316,14 +318,14 @@ class Panel(Strict):
         Raises:
             InvalidRequest: no such object; says which name is near.
         """
-        for thing in self.objects:
-            if thing.name == name:
-                return thing
+        for panel_object in self.objects:
+            if panel_object.name == name:
+                return panel_object
         from difflib import get_close_matches
 
         from hal.errors import InvalidRequest
 
-        names = [thing.name for thing in self.objects]
+        names = [panel_object.name for panel_object in self.objects]
         near = get_close_matches(name, names, n=1)
         raise InvalidRequest(
             f"no object called {name!r} on panel {self.name!r}",

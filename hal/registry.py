@@ -28,29 +28,29 @@ F = TypeVar("F", bound=Callable[..., Any])
 class Shared:
     """What several devices of one cell share: the world, a bus. Made once, closed last."""
 
-    _things: dict[str, Any] = field(default_factory=dict)
+    _resources: dict[str, Any] = field(default_factory=dict)
     _lock: threading.RLock = field(default_factory=threading.RLock)
 
     def get(self, key: str, make: Callable[[], R]) -> R:
-        """The thing under `key`; the first caller makes it."""
+        """The resource under `key`; the first caller makes it."""
         with self._lock:
-            if key not in self._things:
-                self._things[key] = make()
-            thing: R = self._things[key]
-            return thing
+            if key not in self._resources:
+                self._resources[key] = make()
+            resource: R = self._resources[key]
+            return resource
 
     def peek(self, key: str) -> Any | None:
-        """The thing under `key`, or None."""
-        return self._things.get(key)
+        """The resource under `key`, or None."""
+        return self._resources.get(key)
 
     def close(self) -> None:
         """Close everything in reverse order; a second call does nothing."""
         with self._lock:
-            things = list(self._things.values())
-            self._things.clear()
+            resources = list(self._resources.values())
+            self._resources.clear()
         with ExitStack() as stack:  # calls in reverse order, each whatever the one before did
-            for thing in things:
-                stack.callback(thing.close)
+            for resource in resources:
+                stack.callback(resource.close)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -70,18 +70,18 @@ def panel_boxes(panel: Panel, angles_rad: Mapping[str, float] | None = None) -> 
         half_m=(panel.width_m / 2 + WALL_BEYOND_M, panel.height_m / 2 + WALL_BEYOND_M, half_depth_m),
     )
     known = angles_rad or {}
-    return (plate, *(envelope(thing, angle_rad=known.get(thing.name)) for thing in panel.objects))
+    return (plate, *(envelope(panel_object, angle_rad=known.get(panel_object.name)) for panel_object in panel.objects))
 
 
-def envelope(thing: PanelObject, *, angle_rad: float | None = None) -> Box:
+def envelope(panel_object: PanelObject, *, angle_rad: float | None = None) -> Box:
     """A box in the panel frame that holds the object in any state, or a lever at `angle_rad`."""
-    if isinstance(thing, Lever) and angle_rad is not None:
-        return _bar(thing, angle_rad)
-    half_x, half_y, height = _half_sizes(thing)
-    turn = thing.angle_rad if isinstance(thing, Slider) else 0.0
+    if isinstance(panel_object, Lever) and angle_rad is not None:
+        return _bar(panel_object, angle_rad)
+    half_x, half_y, height = _half_sizes(panel_object)
+    turn = panel_object.angle_rad if isinstance(panel_object, Slider) else 0.0
     return Box(
-        name=thing.name,
-        parent_from_box=transform_rpy((*thing.position_m, height / 2), (0.0, 0.0, turn)),
+        name=panel_object.name,
+        parent_from_box=transform_rpy((*panel_object.position_m, height / 2), (0.0, 0.0, turn)),
         half_m=(half_x, half_y, height / 2),
     )
 
@@ -97,29 +97,29 @@ def _bar(lever: Lever, angle_rad: float) -> Box:
     )
 
 
-def _half_sizes(thing: PanelObject) -> tuple[float, float, float]:
+def _half_sizes(panel_object: PanelObject) -> tuple[float, float, float]:
     """Half width, half height and full height out of the plate."""
-    match thing:
+    match panel_object:
         case Lever():
-            reach = thing.length_m + thing.width_m
-            return reach, reach, thing.height_m
+            reach = panel_object.length_m + panel_object.width_m
+            return reach, reach, panel_object.height_m
         case Slider():
-            along, across, out = thing.cap_size_m
-            return (thing.travel_m + along) / 2, across / 2, out
+            along, across, out = panel_object.cap_size_m
+            return (panel_object.travel_m + along) / 2, across / 2, out
         case Toggle():
             # The bat swings in the vertical plane.
-            half = thing.bat_length_m * math.sin(thing.tilt_rad) + 2 * thing.bat_radius_m
-            return 2 * thing.bat_radius_m, half, thing.bat_length_m + thing.bat_radius_m
+            half = panel_object.bat_length_m * math.sin(panel_object.tilt_rad) + 2 * panel_object.bat_radius_m
+            return 2 * panel_object.bat_radius_m, half, panel_object.bat_length_m + panel_object.bat_radius_m
         case Rotary() | Button() | Mushroom():
-            return thing.radius_m, thing.radius_m, thing.height_m
+            return panel_object.radius_m, panel_object.radius_m, panel_object.height_m
         case Handwheel():
-            reach = thing.radius_m + thing.rim_m
-            return reach, reach, thing.height_m + thing.rim_m
-    radius = getattr(thing, "radius_m", None)
-    half_x = radius if radius is not None else getattr(thing, "width_m", 0.02) / 2
-    half_y = radius if radius is not None else getattr(thing, "height_m", 0.02) / 2
-    depth = getattr(thing, "depth_m", 0.0)
-    lamp = getattr(thing, "height_m", 0.0) if thing.kind == "lamp" else 0.0
+            reach = panel_object.radius_m + panel_object.rim_m
+            return reach, reach, panel_object.height_m + panel_object.rim_m
+    radius = getattr(panel_object, "radius_m", None)
+    half_x = radius if radius is not None else getattr(panel_object, "width_m", 0.02) / 2
+    half_y = radius if radius is not None else getattr(panel_object, "height_m", 0.02) / 2
+    depth = getattr(panel_object, "depth_m", 0.0)
+    lamp = getattr(panel_object, "height_m", 0.0) if panel_object.kind == "lamp" else 0.0
     return half_x, half_y, max(depth, lamp, 0.004)
 
 

@@ -72,31 +72,35 @@ class ObjectModel:
 
 def object_model(built: Built) -> ObjectModel:  # one a kind
     """The model of one built object."""
-    match built.thing:
+    match built.panel_object:
         case Gauge():
-            return _gauge(built.thing, built)
+            return _gauge(built.panel_object, built)
         case PanelMeter():
-            return _meter(built.thing, built)
+            return _meter(built.panel_object, built)
         case Display():
-            return _display(built.thing, built)
+            return _display(built.panel_object, built)
         case Lamp():
             return ObjectModel(
-                urdf=_disc(built.thing.radius_m, max(built.thing.height_m, LENS_M), PAINT[built.thing.colour])
+                urdf=_disc(
+                    built.panel_object.radius_m,
+                    max(built.panel_object.height_m, LENS_M),
+                    PAINT[built.panel_object.colour],
+                )
             )
         case Button():
-            return _button(built.thing)
+            return _button(built.panel_object)
         case Mushroom():
-            return _mushroom(built.thing)
+            return _mushroom(built.panel_object)
         case Toggle():
-            return _toggle(built.thing, built)
+            return _toggle(built.panel_object, built)
         case Rotary():
-            return _rotary(built.thing, built)
+            return _rotary(built.panel_object, built)
         case Slider():
-            return _slider(built.thing, built)
+            return _slider(built.panel_object, built)
         case Lever():
-            return _lever(built.thing, built)
+            return _lever(built.panel_object, built)
         case Handwheel():
-            return _handwheel(built.thing, built)
+            return _handwheel(built.panel_object, built)
 
 
 def light_urdf(light: Light) -> str:
@@ -165,69 +169,87 @@ def _needle_height_m(depth_m: float) -> float:
     return max(depth_m, FACE_HEIGHT_M + 0.001)
 
 
-def _gauge(thing: Gauge, built: Built) -> ObjectModel:
-    r = thing.radius_m
+def _gauge(panel_object: Gauge, built: Built) -> ObjectModel:
+    r = panel_object.radius_m
     needle = _needle(
-        length_m=0.76 * r, tail_m=0.22 * r, width_m=0.055 * r, height_m=_needle_height_m(thing.depth_m), pivot_y_m=0.0
-    )
-    face = Quad(pixels=textures.gauge_face(thing), size_m=(2 * r, 2 * r), centre_m=(0, 0, FACE_HEIGHT_M), is_round=True)
-    return ObjectModel(urdf=needle, quads=(face,), place=built.place)
-
-
-def _meter(thing: PanelMeter, built: Built) -> ObjectModel:
-    needle = _needle(
-        length_m=thing.needle_m,
-        tail_m=0.12 * thing.needle_m,
-        width_m=0.0016,
-        height_m=_needle_height_m(thing.depth_m),
-        pivot_y_m=-thing.pivot_below_m,
+        length_m=0.76 * r,
+        tail_m=0.22 * r,
+        width_m=0.055 * r,
+        height_m=_needle_height_m(panel_object.depth_m),
+        pivot_y_m=0.0,
     )
     face = Quad(
-        pixels=textures.meter_face(thing), size_m=(thing.width_m, thing.height_m), centre_m=(0, 0, FACE_HEIGHT_M)
+        pixels=textures.gauge_face(panel_object), size_m=(2 * r, 2 * r), centre_m=(0, 0, FACE_HEIGHT_M), is_round=True
     )
     return ObjectModel(urdf=needle, quads=(face,), place=built.place)
 
 
-def _display(thing: Display, built: Built) -> ObjectModel:
-    pixels = textures.display_face(thing, built.text or "")
+def _meter(panel_object: PanelMeter, built: Built) -> ObjectModel:
+    needle = _needle(
+        length_m=panel_object.needle_m,
+        tail_m=0.12 * panel_object.needle_m,
+        width_m=0.0016,
+        height_m=_needle_height_m(panel_object.depth_m),
+        pivot_y_m=-panel_object.pivot_below_m,
+    )
+    face = Quad(
+        pixels=textures.meter_face(panel_object),
+        size_m=(panel_object.width_m, panel_object.height_m),
+        centre_m=(0, 0, FACE_HEIGHT_M),
+    )
+    return ObjectModel(urdf=needle, quads=(face,), place=built.place)
+
+
+def _display(panel_object: Display, built: Built) -> ObjectModel:
+    pixels = textures.display_face(panel_object, built.text or "")
     return ObjectModel(
-        quads=(Quad(pixels=pixels, size_m=(thing.width_m, thing.height_m), centre_m=(0, 0, FACE_HEIGHT_M)),)
+        quads=(
+            Quad(pixels=pixels, size_m=(panel_object.width_m, panel_object.height_m), centre_m=(0, 0, FACE_HEIGHT_M)),
+        )
     )
 
 
-def _button(thing: Button) -> ObjectModel:
-    cap = shape(at(0, 0, thing.height_m / 2), cylinder(thing.radius_m, thing.height_m), PAINT[thing.colour])
+def _button(panel_object: Button) -> ObjectModel:
+    cap = shape(
+        at(0, 0, panel_object.height_m / 2),
+        cylinder(panel_object.radius_m, panel_object.height_m),
+        PAINT[panel_object.colour],
+    )
     urdf = _moving(
-        [cap], kind="prismatic", axis=(0, 0, 1), limits=(-thing.travel_m, 0.0), mass_kg=0.05, inertia_kg_m2=1e-4
+        [cap], kind="prismatic", axis=(0, 0, 1), limits=(-panel_object.travel_m, 0.0), mass_kg=0.05, inertia_kg_m2=1e-4
     )
     return ObjectModel(urdf=urdf)
 
 
-def _mushroom(thing: Mushroom) -> ObjectModel:
-    head_m = 0.5 * thing.height_m
+def _mushroom(panel_object: Mushroom) -> ObjectModel:
+    head_m = 0.5 * panel_object.height_m
     parts = [
-        shape(at(0, 0, thing.height_m - head_m / 2), cylinder(thing.radius_m, head_m), RED),
-        shape(at(0, 0, thing.height_m / 2 - 0.002), cylinder(0.5 * thing.radius_m, thing.height_m - 0.004), RED),
+        shape(at(0, 0, panel_object.height_m - head_m / 2), cylinder(panel_object.radius_m, head_m), RED),
+        shape(
+            at(0, 0, panel_object.height_m / 2 - 0.002),
+            cylinder(0.5 * panel_object.radius_m, panel_object.height_m - 0.004),
+            RED,
+        ),
     ]
     urdf = _moving(
-        parts, kind="prismatic", axis=(0, 0, 1), limits=(-thing.travel_m, 0.0), mass_kg=0.08, inertia_kg_m2=1e-4
+        parts, kind="prismatic", axis=(0, 0, 1), limits=(-panel_object.travel_m, 0.0), mass_kg=0.08, inertia_kg_m2=1e-4
     )
     return ObjectModel(urdf=urdf)
 
 
-def _toggle(thing: Toggle, built: Built) -> ObjectModel:
+def _toggle(panel_object: Toggle, built: Built) -> ObjectModel:
     pivot_m = 0.004
-    reach_m = thing.bat_length_m
+    reach_m = panel_object.bat_length_m
     parts = [
-        shape(at(0, 0, reach_m / 2), cylinder(0.7 * thing.bat_radius_m, reach_m), STEEL),
-        shape(at(0, 0, reach_m - thing.bat_radius_m), sphere(thing.bat_radius_m), WHITE),
+        shape(at(0, 0, reach_m / 2), cylinder(0.7 * panel_object.bat_radius_m, reach_m), STEEL),
+        shape(at(0, 0, reach_m - panel_object.bat_radius_m), sphere(panel_object.bat_radius_m), WHITE),
     ]
-    nut = shape(at(0, 0, 0.002), cylinder(1.8 * thing.bat_radius_m, 0.004), (0.55, 0.56, 0.58))
+    nut = shape(at(0, 0, 0.002), cylinder(1.8 * panel_object.bat_radius_m, 0.004), (0.55, 0.56, 0.58))
     urdf = _moving(
         parts,
         kind="revolute",
         axis=(-1, 0, 0),
-        limits=(-thing.tilt_rad, thing.tilt_rad),
+        limits=(-panel_object.tilt_rad, panel_object.tilt_rad),
         mass_kg=0.02,
         inertia_kg_m2=1e-4,
         pivot_m=(0, 0, pivot_m),
@@ -236,60 +258,60 @@ def _toggle(thing: Toggle, built: Built) -> ObjectModel:
     return ObjectModel(urdf=urdf, place=built.place)
 
 
-def _rotary(thing: Rotary, built: Built) -> ObjectModel:
-    r, h = thing.radius_m, thing.height_m
+def _rotary(panel_object: Rotary, built: Built) -> ObjectModel:
+    r, h = panel_object.radius_m, panel_object.height_m
     parts = [
         shape(at(0, 0, h / 4), cylinder(r, h / 2), KNOB),
         shape(at(0, 0, 0.75 * h), box((0.45 * r, 2 * r, h / 2)), KNOB),
         shape(at(0, 0.6 * r, h), box((0.12 * r, 0.75 * r, 0.0006)), WHITE, collision=False),
     ]
-    angles = [state.angle_rad for state in thing.states]
+    angles = [state.angle_rad for state in panel_object.states]
     limits = (min(angles) - 0.1, max(angles) + 0.1)
     urdf = _moving(parts, kind="revolute", axis=(0, 0, -1), limits=limits, mass_kg=0.05, inertia_kg_m2=1e-4)
     return ObjectModel(urdf=urdf, place=built.place)
 
 
-def _slider(thing: Slider, built: Built) -> ObjectModel:
-    sx, sy, sz = thing.cap_size_m
+def _slider(panel_object: Slider, built: Built) -> ObjectModel:
+    sx, sy, sz = panel_object.cap_size_m
     lift_m = 0.0005
-    turn = RigidTransform.from_rotation(Rotation.from_euler("z", thing.angle_rad))
+    turn = RigidTransform.from_rotation(Rotation.from_euler("z", panel_object.angle_rad))
     parts = [
         shape(turn * at(0, 0, sz / 2 + lift_m), box((sx, sy, sz)), KNOB),
         shape(turn * at(0, 0, sz + lift_m), box((0.0016, sy, 0.0006)), WHITE, collision=False),
     ]
-    axis = (math.cos(thing.angle_rad), math.sin(thing.angle_rad), 0.0)
-    limits = (-thing.travel_m / 2, thing.travel_m / 2)
+    axis = (math.cos(panel_object.angle_rad), math.sin(panel_object.angle_rad), 0.0)
+    limits = (-panel_object.travel_m / 2, panel_object.travel_m / 2)
     urdf = _moving(parts, kind="prismatic", axis=axis, limits=limits, mass_kg=0.05, inertia_kg_m2=1e-4)
     return ObjectModel(urdf=urdf, place=built.place)
 
 
-def _lever(thing: Lever, built: Built) -> ObjectModel:
-    w, h = thing.width_m, thing.height_m
+def _lever(panel_object: Lever, built: Built) -> ObjectModel:
+    w, h = panel_object.width_m, panel_object.height_m
     hub_m = 0.75 * w
-    bar_m = thing.length_m
+    bar_m = panel_object.length_m
     parts = [
         shape(at(0, 0, h / 2), cylinder(hub_m, h), RED),
         shape(at(0, bar_m / 2, h - BAR_THICKNESS_M / 2), box((w, bar_m, BAR_THICKNESS_M)), RED),
     ]
-    angles = [state.angle_rad for state in thing.states]
+    angles = [state.angle_rad for state in panel_object.states]
     urdf = _moving(
         parts, kind="revolute", axis=(0, 0, -1), limits=(min(angles), max(angles)), mass_kg=0.2, inertia_kg_m2=5e-4
     )
     return ObjectModel(urdf=urdf, place=built.place)
 
 
-def _handwheel(thing: Handwheel, built: Built) -> ObjectModel:
-    ring_m = thing.height_m - thing.rim_m
+def _handwheel(panel_object: Handwheel, built: Built) -> ObjectModel:
+    ring_m = panel_object.height_m - panel_object.rim_m
     blue: Colour = (0.10, 0.25, 0.55)
     angles = np.linspace(0.0, 2 * np.pi, WHEEL_SEGMENTS + 1)
-    points = [(thing.radius_m * math.sin(a), thing.radius_m * math.cos(a), ring_m) for a in angles]
-    parts = [shape(at(0, 0, thing.height_m / 2 - 0.001), cylinder(0.009, thing.height_m - 0.002), blue)]
+    points = [(panel_object.radius_m * math.sin(a), panel_object.radius_m * math.cos(a), ring_m) for a in angles]
+    parts = [shape(at(0, 0, panel_object.height_m / 2 - 0.001), cylinder(0.009, panel_object.height_m - 0.002), blue)]
     for a_m, b_m in pairwise(points):
         middle, length_m = along(a_m, b_m)
-        parts.append(shape(middle, cylinder(thing.rim_m, length_m + 0.0015), blue))
-    for i in range(thing.spokes):
-        angle = 2 * math.pi * i / thing.spokes
-        end = (thing.radius_m * math.sin(angle), thing.radius_m * math.cos(angle), ring_m)
+        parts.append(shape(middle, cylinder(panel_object.rim_m, length_m + 0.0015), blue))
+    for i in range(panel_object.spokes):
+        angle = 2 * math.pi * i / panel_object.spokes
+        end = (panel_object.radius_m * math.sin(angle), panel_object.radius_m * math.cos(angle), ring_m)
         middle, length_m = along((0, 0, ring_m), end)
         # The marked spoke is white and wider than the others: it shows the angle.
         colour, radius_m = (WHITE, 0.0036) if i == 0 else (blue, 0.003)
@@ -298,7 +320,7 @@ def _handwheel(thing: Handwheel, built: Built) -> ObjectModel:
         parts,
         kind="revolute",
         axis=(0, 0, -1),
-        limits=(thing.minimum_rad, thing.maximum_rad),
+        limits=(panel_object.minimum_rad, panel_object.maximum_rad),
         mass_kg=0.3,
         inertia_kg_m2=4e-4,
     )

@@ -38,7 +38,7 @@ class Built:
         value: the value behind `place` or `text`.
     """
 
-    thing: PanelObject
+    panel_object: PanelObject
     offset_m: tuple[float, float]
     effort_ratio: float
     place: float = 0.0
@@ -49,54 +49,62 @@ class Built:
 
 def build(panel: Panel, draws: Draws) -> tuple[Built, ...]:
     """All objects of the panel, drawn from the seed; the streams are named by object, so the order does not matter."""
-    button_lamps = {thing.lights_lamp for thing in panel.objects if isinstance(thing, Button) and thing.lights_lamp}
-    return tuple(_built(thing, panel, draws, button_lamps) for thing in panel.objects)
+    button_lamps = {
+        panel_object.lights_lamp
+        for panel_object in panel.objects
+        if isinstance(panel_object, Button) and panel_object.lights_lamp
+    }
+    return tuple(_built(panel_object, panel, draws, button_lamps) for panel_object in panel.objects)
 
 
-def _built(thing: PanelObject, panel: Panel, draws: Draws, button_lamps: set[str]) -> Built:  # one a kind
-    random = draws.stream(f"object/{thing.name}")
+def _built(panel_object: PanelObject, panel: Panel, draws: Draws, button_lamps: set[str]) -> Built:  # one a kind
+    random = draws.stream(f"object/{panel_object.name}")
     dx, dy = panel.tolerances.position_m * random.standard_normal(2)
     # A tenth is the least: a part without any friction would never rest.
     ratio = max(0.1, 1.0 + panel.tolerances.effort_ratio * float(random.standard_normal()))
     u = float(random.uniform())
-    common: dict[str, Any] = {"thing": thing, "offset_m": (float(dx), float(dy)), "effort_ratio": ratio}
-    match thing:
+    common: dict[str, Any] = {"panel_object": panel_object, "offset_m": (float(dx), float(dy)), "effort_ratio": ratio}
+    match panel_object:
         case Gauge() | PanelMeter():
-            value = thing.scale.minimum + (0.05 + 0.9 * u) * (thing.scale.maximum - thing.scale.minimum)
-            return Built(**common, place=thing.scale.place_of(value), value=value)
+            value = panel_object.scale.minimum + (0.05 + 0.9 * u) * (
+                panel_object.scale.maximum - panel_object.scale.minimum
+            )
+            return Built(**common, place=panel_object.scale.place_of(value), value=value)
         case Display():
-            low, high = _displayable(thing)
-            value = round(low + (0.02 + 0.96 * u) * (high - low), thing.decimals)
-            return Built(**common, text=display_text(thing, value), value=value)
+            low, high = _displayable(panel_object)
+            value = round(low + (0.02 + 0.96 * u) * (high - low), panel_object.decimals)
+            return Built(**common, text=display_text(panel_object, value), value=value)
         case Lamp():
-            return Built(**common, is_on=thing.name not in button_lamps and u < 0.5)
+            return Built(**common, is_on=panel_object.name not in button_lamps and u < 0.5)
         case Button():
-            return Built(**common, is_on=thing.latching and u < 0.5)
+            return Built(**common, is_on=panel_object.latching and u < 0.5)
         case Mushroom():
             return Built(**common)
         case Toggle():
-            return Built(**common, place=thing.tilt_rad if u < 0.5 else -thing.tilt_rad)
+            return Built(**common, place=panel_object.tilt_rad if u < 0.5 else -panel_object.tilt_rad)
         case Rotary() | Lever():
-            return Built(**common, place=thing.states[int(u * len(thing.states))].angle_rad)
+            return Built(**common, place=panel_object.states[int(u * len(panel_object.states))].angle_rad)
         case Slider():
-            value = thing.scale.minimum + (0.1 + 0.8 * u) * (thing.scale.maximum - thing.scale.minimum)
-            return Built(**common, place=thing.scale.place_of(value), value=value)
+            value = panel_object.scale.minimum + (0.1 + 0.8 * u) * (
+                panel_object.scale.maximum - panel_object.scale.minimum
+            )
+            return Built(**common, place=panel_object.scale.place_of(value), value=value)
         case Handwheel():
-            low = max(thing.minimum_rad, -WHEEL_SPREAD_RAD)
-            high = min(thing.maximum_rad, WHEEL_SPREAD_RAD)
+            low = max(panel_object.minimum_rad, -WHEEL_SPREAD_RAD)
+            high = min(panel_object.maximum_rad, WHEEL_SPREAD_RAD)
             return Built(**common, place=low + u * (high - low))
 
 
-def _displayable(thing: Display) -> tuple[float, float]:
+def _displayable(panel_object: Display) -> tuple[float, float]:
     """The file's range, cut to what its digits can show; a minus sign takes one of them."""
-    unit = 10.0**-thing.decimals
-    highest = (10**thing.digits - 1) * unit
-    lowest = -(10 ** (thing.digits - 1) - 1) * unit
-    return min(max(thing.minimum, lowest), highest), max(min(thing.maximum, highest), lowest)
+    unit = 10.0**-panel_object.decimals
+    highest = (10**panel_object.digits - 1) * unit
+    lowest = -(10 ** (panel_object.digits - 1) - 1) * unit
+    return min(max(panel_object.minimum, lowest), highest), max(min(panel_object.maximum, highest), lowest)
 
 
-def display_text(thing: Display, value: float) -> str:
+def display_text(panel_object: Display, value: float) -> str:
     """The characters on the display, right-justified; a point does not take a digit's place."""
-    text = f"{value:.{thing.decimals}f}"
-    width = thing.digits + (1 if thing.decimals else 0)
+    text = f"{value:.{panel_object.decimals}f}"
+    width = panel_object.digits + (1 if panel_object.decimals else 0)
     return text.rjust(width)

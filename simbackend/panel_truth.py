@@ -15,12 +15,12 @@ def truth_of(built: Built, mechanism: Mechanism | None, *, lamp_is_on: bool) -> 
 
     A lever or rotary between its resting places has no state; a button's value is the number of its presses.
     """
-    thing = built.thing
-    name = thing.name
+    panel_object = built.panel_object
+    name = panel_object.name
     place = mechanism.place() if mechanism is not None else 0.0
-    match thing:
+    match panel_object:
         case Gauge() | PanelMeter() | Slider():
-            return ObjectTruth(name=name, value=thing.scale.value_at(place))
+            return ObjectTruth(name=name, value=panel_object.scale.value_at(place))
         case Lamp():
             return ObjectTruth(name=name, state="on" if lamp_is_on else "off")
         case Button() | Mushroom() if isinstance(mechanism, Spring):
@@ -29,7 +29,7 @@ def truth_of(built: Built, mechanism: Mechanism | None, *, lamp_is_on: bool) -> 
         case Toggle():
             return ObjectTruth(name=name, state="on" if place > 0.0 else "off", value=place)
         case Rotary() | Lever():
-            return ObjectTruth(name=name, state=nearest_state(thing.states, place), value=place)
+            return ObjectTruth(name=name, state=nearest_state(panel_object.states, place), value=place)
         case Handwheel():
             return ObjectTruth(name=name, value=place)
         case _:

@@ -66,7 +66,7 @@ class PanelWorld:
         self.panel: Panel = cell.panel
         self.folder = folder
         self.base_from_panel = draws.panel_pose(cell.file.workspace)
-        self.built = {built.thing.name: built for built in build(cell.panel, draws)}
+        self.built = {built.panel_object.name: built for built in build(cell.panel, draws)}
         self.bodies: dict[str, int] = {}
         self.mechanisms: dict[str, Mechanism] = {}
         self.lights_on = [0.0] * len(cell.panel.lights)
@@ -85,7 +85,9 @@ class PanelWorld:
             self._load_cable(k, cable)
         self._keep_apart()
         self.scene = self._draw_up()
-        self.lamps_on = {name: built.is_on for name, built in self.built.items() if isinstance(built.thing, Lamp)}
+        self.lamps_on = {
+            name: built.is_on for name, built in self.built.items() if isinstance(built.panel_object, Lamp)
+        }
         for name, on in self.lamps_on.items():
             self._paint_lamp(name, on=on)
         for light in cell.panel.lights:
@@ -174,7 +176,7 @@ class PanelWorld:
         return int(body)
 
     def _load_object(self, built: Built) -> None:
-        name = built.thing.name
+        name = built.panel_object.name
         pose = self.object_pose(built)
         model = object_model(built)
         self._pictures += [(quad, pose) for quad in model.quads]
@@ -189,43 +191,43 @@ class PanelWorld:
             self.mechanisms[name] = self._mechanism(built, body)
 
     def _mechanism(self, built: Built, body: int) -> Mechanism:
-        thing, ratio = built.thing, built.effort_ratio
-        match thing:
+        panel_object, ratio = built.panel_object, built.effort_ratio
+        match panel_object:
             case Button() | Mushroom():
                 spring = Spring(
                     engine=self.engine,
                     body=body,
-                    travel_m=thing.travel_m,
-                    spring_n_per_m=thing.spring_n_per_m * ratio,
-                    preload_n=thing.preload_n * ratio,
-                    latching=isinstance(thing, Mushroom) or thing.latching,
-                    releases=isinstance(thing, Button),
+                    travel_m=panel_object.travel_m,
+                    spring_n_per_m=panel_object.spring_n_per_m * ratio,
+                    preload_n=panel_object.preload_n * ratio,
+                    latching=isinstance(panel_object, Mushroom) or panel_object.latching,
+                    releases=isinstance(panel_object, Button),
                     is_latched=built.is_on,
                 )
                 if built.is_on:
                     self.engine.resetJointState(body, JOINT, -spring.latched_depth_m)
                 return spring
             case Toggle():
-                ends = (-thing.tilt_rad, thing.tilt_rad)
-                effort = thing.force_n * thing.bat_length_m * ratio
+                ends = (-panel_object.tilt_rad, panel_object.tilt_rad)
+                effort = panel_object.force_n * panel_object.bat_length_m * ratio
                 return Detent(engine=self.engine, body=body, places=ends, effort=effort, max_speed=8.0)
             case Rotary():
-                places = tuple(state.angle_rad for state in thing.states)
+                places = tuple(state.angle_rad for state in panel_object.states)
                 return Detent(
-                    engine=self.engine, body=body, places=places, effort=thing.torque_nm * ratio, max_speed=6.0
+                    engine=self.engine, body=body, places=places, effort=panel_object.torque_nm * ratio, max_speed=6.0
                 )
             case Slider():
-                friction_n = thing.friction_n * ratio
+                friction_n = panel_object.friction_n * ratio
                 return Friction(engine=self.engine, body=body, effort=friction_n, damping=SLIDE_DAMPING_N_S_PER_M)
             case Lever() | Handwheel():
-                torque_nm = thing.torque_nm * ratio
+                torque_nm = panel_object.torque_nm * ratio
                 return Friction(engine=self.engine, body=body, effort=torque_nm, damping=TURN_DAMPING_NM_S_PER_RAD)
             case _:  # a needle: its movement holds it
                 return Friction(engine=self.engine, body=body, effort=1.0)
 
     def object_pose(self, built: Built) -> RigidTransform:
         """base_from_object as built."""
-        x, y = built.thing.position_m
+        x, y = built.panel_object.position_m
         dx, dy = built.offset_m
         return self.base_from_panel * RigidTransform.from_translation([x + dx, y + dy, 0.0])
 
@@ -267,15 +269,15 @@ class PanelWorld:
         if button.presses == self._presses[name]:
             return
         self._presses[name] = button.presses
-        lamp = getattr(self.built[name].thing, "lights_lamp", None)
+        lamp = getattr(self.built[name].panel_object, "lights_lamp", None)
         if lamp is not None:
             self.lamps_on[lamp] = not self.lamps_on[lamp]
             self._paint_lamp(lamp, on=self.lamps_on[lamp])
 
     def _paint_lamp(self, name: str, *, on: bool) -> None:
-        thing = self.built[name].thing
-        assert isinstance(thing, Lamp)  # noqa: S101 - the panel file lets a button light lamps only
-        colour = thing.colour
+        panel_object = self.built[name].panel_object
+        assert isinstance(panel_object, Lamp)  # noqa: S101 - the panel file lets a button light lamps only
+        colour = panel_object.colour
         self._paint(name, GLOW[colour] if on else PAINT[colour], LAMP_RADIANCE if on else DIM, on=on)
 
     def _paint(self, name: str, colour: Colour, level: float, *, on: bool) -> None:
@@ -301,14 +303,14 @@ class PanelWorld:
         ]
         for name, on in self.lamps_on.items():
             if on:
-                thing = self.built[name].thing
-                assert isinstance(thing, Lamp)  # noqa: S101 - for mypy
-                place = self.object_pose(self.built[name]).apply([0, 0, thing.height_m])
+                panel_object = self.built[name].panel_object
+                assert isinstance(panel_object, Lamp)  # noqa: S101 - for mypy
+                place = self.object_pose(self.built[name]).apply([0, 0, panel_object.height_m])
                 lit.append(
                     Emitter(
-                        colour=GLOW[thing.colour],
+                        colour=GLOW[panel_object.colour],
                         position_m=(float(place[0]), float(place[1]), float(place[2])),
-                        radius_m=thing.radius_m,
+                        radius_m=panel_object.radius_m,
                         is_border_light=False,
                     )
                 )

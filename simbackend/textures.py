@@ -108,46 +108,46 @@ class Canvas:
 def plate(panel: Panel) -> Pixels:
     """The plate: ground, border line, labels, and what is printed round each control."""
     canvas = Canvas(panel.width_m, panel.height_m, PLATE_PX_PER_M, PLATE)
-    for thing in panel.objects:
-        _print_round(canvas, thing)
+    for panel_object in panel.objects:
+        _print_round(canvas, panel_object)
     for light in panel.lights:
         canvas.disc(light.position_m[:2], light.radius_m + 0.002, RIM)
     return canvas.pixels()
 
 
-def _print_round(canvas: Canvas, thing: PanelObject) -> None:  # one case a kind
-    match thing:
+def _print_round(canvas: Canvas, panel_object: PanelObject) -> None:  # one case a kind
+    match panel_object:
         case Gauge():
-            _label(canvas, thing.position_m, thing.radius_m, thing.label)
+            _label(canvas, panel_object.position_m, panel_object.radius_m, panel_object.label)
         case PanelMeter() | Display():
-            _label(canvas, thing.position_m, thing.height_m / 2, thing.label)
+            _label(canvas, panel_object.position_m, panel_object.height_m / 2, panel_object.label)
         case Lamp():
-            canvas.disc(thing.position_m, thing.radius_m + 0.0025, RIM)
-            _label(canvas, thing.position_m, thing.radius_m + 0.0025, thing.label)
+            canvas.disc(panel_object.position_m, panel_object.radius_m + 0.0025, RIM)
+            _label(canvas, panel_object.position_m, panel_object.radius_m + 0.0025, panel_object.label)
         case Button():
-            canvas.disc(thing.position_m, thing.radius_m + 0.003, RIM)
-            _label(canvas, thing.position_m, thing.radius_m + 0.003, thing.label)
+            canvas.disc(panel_object.position_m, panel_object.radius_m + 0.003, RIM)
+            _label(canvas, panel_object.position_m, panel_object.radius_m + 0.003, panel_object.label)
         case Mushroom():
-            canvas.disc(thing.position_m, thing.radius_m + 0.010, YELLOW)
-            _label(canvas, thing.position_m, thing.radius_m + 0.010, thing.label)
+            canvas.disc(panel_object.position_m, panel_object.radius_m + 0.010, YELLOW)
+            _label(canvas, panel_object.position_m, panel_object.radius_m + 0.010, panel_object.label)
         case Toggle():
-            canvas.box(thing.position_m, (0.026, 0.044), RIM, round_m=0.003)
-            x, y = thing.position_m
+            canvas.box(panel_object.position_m, (0.026, 0.044), RIM, round_m=0.003)
+            x, y = panel_object.position_m
             canvas.text((x + 0.021, y + 0.015), "ON", 0.0045)
             canvas.text((x + 0.021, y - 0.015), "OFF", 0.0045)
-            _label(canvas, thing.position_m, 0.022, thing.label)
+            _label(canvas, panel_object.position_m, 0.022, panel_object.label)
         case Rotary():
-            for state in thing.states:
-                _name(canvas, thing.position_m, state, thing.radius_m)
-            _label(canvas, thing.position_m, thing.radius_m + 0.0025, thing.label)
+            for state in panel_object.states:
+                _name(canvas, panel_object.position_m, state, panel_object.radius_m)
+            _label(canvas, panel_object.position_m, panel_object.radius_m + 0.0025, panel_object.label)
         case Lever():
-            for state in thing.states:
-                _name(canvas, thing.position_m, state, thing.length_m)
-            _label(canvas, thing.position_m, 0.020, thing.label)
+            for state in panel_object.states:
+                _name(canvas, panel_object.position_m, state, panel_object.length_m)
+            _label(canvas, panel_object.position_m, 0.020, panel_object.label)
         case Slider():
-            _track(canvas, thing)
+            _track(canvas, panel_object)
         case Handwheel():
-            _label(canvas, thing.position_m, thing.radius_m + thing.rim_m, thing.label)
+            _label(canvas, panel_object.position_m, panel_object.radius_m + panel_object.rim_m, panel_object.label)
 
 
 def _name(canvas: Canvas, at_m: tuple[float, float], state: State, radius_m: float) -> None:
@@ -171,43 +171,43 @@ def _mark(canvas: Canvas, at_m: tuple[float, float], angle_rad: float, radius_m:
     canvas.line(_polar(at_m, angle_rad, radius_m), _polar(at_m, angle_rad, radius_m + length_m), 0.0012)
 
 
-def _track(canvas: Canvas, thing: Slider) -> None:
+def _track(canvas: Canvas, panel_object: Slider) -> None:
     """Slot, ticks and numerals of a slider."""
-    c, s = math.cos(thing.angle_rad), math.sin(thing.angle_rad)
+    c, s = math.cos(panel_object.angle_rad), math.sin(panel_object.angle_rad)
 
     def point(along_m: float, across_m: float) -> tuple[float, float]:
-        x, y = thing.position_m
+        x, y = panel_object.position_m
         return (x + along_m * c - across_m * s, y + along_m * s + across_m * c)
 
-    half_m = thing.travel_m / 2 + thing.cap_size_m[0] / 2
+    half_m = panel_object.travel_m / 2 + panel_object.cap_size_m[0] / 2
     corners = [point(-half_m, -0.002), point(half_m, -0.002), point(half_m, 0.002), point(-half_m, 0.002)]
     canvas.polygon(corners, RIM)
-    edge_m = thing.cap_size_m[1] / 2 + 0.002
-    for value in np.linspace(thing.scale.minimum, thing.scale.maximum, thing.scale.major_ticks):
-        place_m = thing.scale.place_of(float(value))
+    edge_m = panel_object.cap_size_m[1] / 2 + 0.002
+    for value in np.linspace(panel_object.scale.minimum, panel_object.scale.maximum, panel_object.scale.major_ticks):
+        place_m = panel_object.scale.place_of(float(value))
         canvas.line(point(place_m, edge_m), point(place_m, edge_m + 0.005), 0.0009)
         canvas.text(point(place_m, edge_m + 0.010), f"{value:g}", 0.0042)
-    canvas.text(point(0.0, -edge_m - 0.009), f"{thing.label} {thing.scale.unit}".strip(), 0.0052)
+    canvas.text(point(0.0, -edge_m - 0.009), f"{panel_object.label} {panel_object.scale.unit}".strip(), 0.0052)
 
 
-def gauge_face(thing: Gauge) -> Pixels:
+def gauge_face(panel_object: Gauge) -> Pixels:
     """Dark rim, white face, major and minor ticks, numerals, unit."""
-    r = thing.radius_m
+    r = panel_object.radius_m
     canvas = Canvas(2 * r, 2 * r, FACE_PX_PER_M, RIM)
     canvas.disc((0, 0), 0.91 * r, FACE)
-    _scale(canvas, (0.0, 0.0), thing.scale, outer_m=0.86 * r, text_m=0.55 * r, tall_m=0.125 * r)
-    canvas.text((0.0, -0.38 * r), thing.scale.unit, 0.12 * r)
+    _scale(canvas, (0.0, 0.0), panel_object.scale, outer_m=0.86 * r, text_m=0.55 * r, tall_m=0.125 * r)
+    canvas.text((0.0, -0.38 * r), panel_object.scale.unit, 0.12 * r)
     return canvas.pixels()
 
 
-def meter_face(thing: PanelMeter) -> Pixels:
+def meter_face(panel_object: PanelMeter) -> Pixels:
     """Dark frame, white face, an arc of ticks about the pivot."""
-    canvas = Canvas(thing.width_m, thing.height_m, FACE_PX_PER_M, RIM)
-    canvas.box((0, 0), (thing.width_m - 0.006, thing.height_m - 0.006), FACE, round_m=0.002)
-    pivot = (0.0, -thing.pivot_below_m)
-    n = thing.needle_m
-    _scale(canvas, pivot, thing.scale, outer_m=1.02 * n, text_m=1.13 * n, tall_m=0.004)
-    canvas.text((0.0, pivot[1] + 0.35 * n), thing.scale.unit, 0.006)
+    canvas = Canvas(panel_object.width_m, panel_object.height_m, FACE_PX_PER_M, RIM)
+    canvas.box((0, 0), (panel_object.width_m - 0.006, panel_object.height_m - 0.006), FACE, round_m=0.002)
+    pivot = (0.0, -panel_object.pivot_below_m)
+    n = panel_object.needle_m
+    _scale(canvas, pivot, panel_object.scale, outer_m=1.02 * n, text_m=1.13 * n, tall_m=0.004)
+    canvas.text((0.0, pivot[1] + 0.35 * n), panel_object.scale.unit, 0.006)
     return canvas.pixels()
 
 
@@ -226,22 +226,22 @@ def _scale(
                 canvas.line(_polar(centre, a, outer_m * 0.92), _polar(centre, a, outer_m), 0.0005)
 
 
-def display_face(thing: Display, text: str) -> Pixels:
+def display_face(panel_object: Display, text: str) -> Pixels:
     """Seven-segment digits, slanted by 6 degrees, in a dark frame."""
-    back, ink = (LED_BACK, LED) if thing.style == "led" else (LCD_BACK, LCD)
-    canvas = Canvas(thing.width_m, thing.height_m, FACE_PX_PER_M, RIM)
-    canvas.box((0, 0), (thing.width_m - 0.004, thing.height_m - 0.004), back, round_m=0.001)
-    pitch = (thing.width_m - 0.008) / thing.digits
-    high = min(0.68 * thing.height_m, 1.7 * pitch)
+    back, ink = (LED_BACK, LED) if panel_object.style == "led" else (LCD_BACK, LCD)
+    canvas = Canvas(panel_object.width_m, panel_object.height_m, FACE_PX_PER_M, RIM)
+    canvas.box((0, 0), (panel_object.width_m - 0.004, panel_object.height_m - 0.004), back, round_m=0.001)
+    pitch = (panel_object.width_m - 0.008) / panel_object.digits
+    high = min(0.68 * panel_object.height_m, 1.7 * pitch)
     wide = 0.52 * high
     column = -1
     for char in text:
         if char == ".":
-            x = (column - (thing.digits - 1) / 2) * pitch + pitch / 2
+            x = (column - (panel_object.digits - 1) / 2) * pitch + pitch / 2
             canvas.disc((x - 0.006 * high, -high / 2), 0.07 * high, ink)
             continue
         column += 1
-        centre_m = (column - (thing.digits - 1) / 2) * pitch
+        centre_m = (column - (panel_object.digits - 1) / 2) * pitch
         for segment in SEGMENTS[char]:
             _segment(canvas, segment, x_m=centre_m, wide=wide, high=high, ink=ink)
     return canvas.pixels()

@@ -33,11 +33,11 @@ def button(
         InvalidRequest: it is not a button.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    thing = subject_of(cell, name, Button, "button")
-    shows = thing.latching or thing.lights_lamp is not None
+    panel_object = subject_of(cell, name, Button, "button")
+    shows = panel_object.latching or panel_object.lights_lamp is not None
     report = press(
         cell,
-        thing,
+        panel_object,
         skill="button",
         target=expected or "pressed once",
         is_reached=lambda seen: expected is None or seen.state == expected,

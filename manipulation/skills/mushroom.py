@@ -16,10 +16,10 @@ def mushroom(cell: Workcell, name: str, *, verify: Verify | None = None) -> Skil
         InvalidRequest: it is not a mushroom.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    thing = subject_of(cell, name, Mushroom, "mushroom")
+    panel_object = subject_of(cell, name, Mushroom, "mushroom")
     return press(
         cell,
-        thing,
+        panel_object,
         skill="mushroom",
         target="pressed",
         is_reached=lambda seen: seen.state == "pressed",

@@ -63,8 +63,8 @@ def slider(
         InvalidRequest: not a slider, a value off its scale, or nobody knows where the cap is.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    thing = subject_of(cell, name, Slider, "slider")
-    scale = thing.scale
+    panel_object = subject_of(cell, name, Slider, "slider")
+    scale = panel_object.scale
     if not scale.minimum <= target <= scale.maximum:
         raise InvalidRequest(
             f"{target} {scale.unit} is off the scale of {name}", hint=f"{scale.minimum} to {scale.maximum} {scale.unit}"
@@ -74,7 +74,7 @@ def slider(
 
     def stroke(attempt: Attempt) -> float:
         push = _Push(start_m=scale.place_of(where.known), goal_m=scale.place_of(target))
-        return where.moved_to(scale.value_at(push.start_m + _push(attempt, thing, push)))
+        return where.moved_to(scale.value_at(push.start_m + _push(attempt, panel_object, push)))
 
     return perform(
         cell,
@@ -87,21 +87,23 @@ def slider(
     )
 
 
-def _push(attempt: Attempt, thing: Slider, push: _Push) -> float:
+def _push(attempt: Attempt, panel_object: Slider, push: _Push) -> float:
     """One push; returns how far the cap moved along the track, m, signed."""
     cell = attempt.cell
     half_x, half_y = cell.hand.closed_half_m
     turns = ((0.0, half_x), (np.pi, half_x), (np.pi / 2, half_y), (-np.pi / 2, half_y))
-    ways = [_way(thing, push, turn, half) for turn, half in turns]
-    attempt.begin(ways, may_touch=(thing.name,), width_m=0.0, name=thing.name)
-    top = thing.cap_size_m[2]
+    ways = [_way(panel_object, push, turn, half) for turn, half in turns]
+    attempt.begin(ways, may_touch=(panel_object.name,), width_m=0.0, name=panel_object.name)
+    top = panel_object.cap_size_m[2]
     down = attempt.advance(STANDOFF_M + top - TIP_HEIGHT_M, name="approach")
     if down.tripped is not None:
         height = (cell.panel_pose.inv() * attempt.pose()).translation[2]
         if height > 0.6 * top:
             raise SkillFailure(Outcome.MISSED, "the fingertip landed on the cap")
         attempt.advance(-0.002, name="lift off the plate", speed_m_per_s=0.03)
-    ahead = push.sign * cell.panel_pose.rotation.apply([np.cos(thing.angle_rad), np.sin(thing.angle_rad), 0.0])
+    ahead = push.sign * cell.panel_pose.rotation.apply(
+        [np.cos(panel_object.angle_rad), np.sin(panel_object.angle_rad), 0.0]
+    )
     begun = attempt.pose().translation
     met = meet(
         attempt,
@@ -116,24 +118,24 @@ def _push(attempt: Attempt, thing: Slider, push: _Push) -> float:
     face = float(met.way_m - (attempt.pose().translation - begun) @ ahead)  # from here back to the face, not positive
     length = abs(push.goal_m - push.start_m)
     start = attempt.pose().translation
-    _go(attempt, thing, ahead, max(0.0, length + face - SHORT_M), "push")
+    _go(attempt, panel_object, ahead, max(0.0, length + face - SHORT_M), "push")
     give = _give_m(attempt, ahead)
     so_far = float((attempt.pose().translation - start) @ ahead)
-    _go(attempt, thing, ahead, max(0.0, length + face + give - so_far), "push to the end")
+    _go(attempt, panel_object, ahead, max(0.0, length + face + give - so_far), "push to the end")
     moved = float((attempt.pose().translation - start) @ ahead) - face - _give_m(attempt, ahead)
-    _go(attempt, thing, -ahead, 0.004, "let go")
+    _go(attempt, panel_object, -ahead, 0.004, "let go")
     attempt.leave()
     return push.sign * moved
 
 
-def _way(thing: Slider, push: _Push, turn: float, half: float) -> list[RigidTransform]:
-    along = np.array([np.cos(thing.angle_rad), np.sin(thing.angle_rad)])
-    beside = thing.cap_size_m[0] / 2 + half + SIDE_M
-    middle = np.array(thing.position_m)
+def _way(panel_object: Slider, push: _Push, turn: float, half: float) -> list[RigidTransform]:
+    along = np.array([np.cos(panel_object.angle_rad), np.sin(panel_object.angle_rad)])
+    beside = panel_object.cap_size_m[0] / 2 + half + SIDE_M
+    middle = np.array(panel_object.position_m)
     start = middle + (push.start_m - push.sign * beside) * along
     end = middle + (push.goal_m - push.sign * (beside - SIDE_M)) * along
-    top = thing.cap_size_m[2]
-    angle = thing.angle_rad + turn
+    top = panel_object.cap_size_m[2]
+    angle = panel_object.angle_rad + turn
     return [
         panel_from_grip((*start, top + STANDOFF_M), angle),
         panel_from_grip((*start, TIP_HEIGHT_M), angle),
@@ -147,10 +149,10 @@ def _moved(attempt: Attempt, way_m: np.ndarray) -> RigidTransform:
     return shifted(pose, pose.rotation.inv().apply(way_m))
 
 
-def _go(attempt: Attempt, thing: Slider, ahead: np.ndarray, distance_m: float, name: str) -> None:
+def _go(attempt: Attempt, panel_object: Slider, ahead: np.ndarray, distance_m: float, name: str) -> None:
     if distance_m < 1e-4:
         return
-    limit = 3.0 * thing.friction_n + 15.0
+    limit = 3.0 * panel_object.friction_n + 15.0
     guard = Guard(name="effort", quantity=Quantity.FORCE, limit=limit)
     report = attempt.straight(
         _moved(attempt, distance_m * ahead), name=name, speed_m_per_s=PUSH_M_PER_S, guards=(guard,)

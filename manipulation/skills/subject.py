@@ -19,10 +19,10 @@ def subject_of(cell: Workcell, name: str, kind: type[Subject], called: str) -> S
     Raises:
         InvalidRequest: there is none, or it is not of the kind, whose name for people is `called`.
     """
-    thing = cell.panel.object(name)
-    if not isinstance(thing, kind):
-        raise InvalidRequest(f"{name} is a {thing.kind}, not a {called}", hint="see the panel file")
-    return thing
+    panel_object = cell.panel.object(name)
+    if not isinstance(panel_object, kind):
+        raise InvalidRequest(f"{name} is a {panel_object.kind}, not a {called}", hint="see the panel file")
+    return panel_object
 
 
 class Whereabouts:

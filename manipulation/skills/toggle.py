@@ -40,7 +40,7 @@ def toggle(
         InvalidRequest: not a toggle, or no such state.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    thing = subject_of(cell, name, Toggle, "toggle")
+    panel_object = subject_of(cell, name, Toggle, "toggle")
     if target not in ("on", "off"):
         raise InvalidRequest(f"a toggle has no state {target!r}", hint="on (up) or off (down)")
     up = 1.0 if target == "on" else -1.0
@@ -50,7 +50,7 @@ def toggle(
         is_said_there = current is not None and current.state == target and next(tries) == 0
         if is_said_there and verify is not None and (seen := verify()) is not None and seen.state == target:
             return None
-        return _throw(attempt, thing, up)
+        return _throw(attempt, panel_object, up)
 
     return perform(
         cell,
@@ -63,15 +63,15 @@ def toggle(
     )
 
 
-def _throw(attempt: Attempt, thing: Toggle, up: float) -> float:
+def _throw(attempt: Attempt, panel_object: Toggle, up: float) -> float:
     """Come down beside the bat and sweep it over, `up` 1 or -1; returns how far past the pivot the face came, m."""
     half = max(attempt.cell.hand.closed_half_m)
     # The bat leans away from the target; come down beyond it.
-    lean = thing.bat_length_m * np.sin(thing.tilt_rad) + thing.bat_radius_m
-    y = thing.position_m[1]
+    lean = panel_object.bat_length_m * np.sin(panel_object.tilt_rad) + panel_object.bat_radius_m
+    y = panel_object.position_m[1]
     start, end = y - up * (lean + half + SIDE_M), y + up * (BEYOND_M - half)
-    _come_down(attempt, thing, start, end)
-    stop_n = stop_force_n(thing)
+    _come_down(attempt, panel_object, start, end)
+    stop_n = stop_force_n(panel_object)
     moved = _sweep(attempt, end - start, stop_n)
     past = float(moved - (abs(end - start) - BEYOND_M))
     if past < -0.004:
@@ -80,21 +80,21 @@ def _throw(attempt: Attempt, thing: Toggle, up: float) -> float:
     return past
 
 
-def stop_force_n(thing: Toggle) -> float:
+def stop_force_n(panel_object: Toggle) -> float:
     """Force that tells the bat stands on its stop, N: its own effort acts at its tip, the fingertip pushes lower down."""
-    return EFFORT_SPREAD * thing.force_n / GRIP_RATIO + END_N
+    return EFFORT_SPREAD * panel_object.force_n / GRIP_RATIO + END_N
 
 
-def _come_down(attempt: Attempt, thing: Toggle, start_m: float, end_m: float) -> None:
+def _come_down(attempt: Attempt, panel_object: Toggle, start_m: float, end_m: float) -> None:
     """The fingertip beside the bat, at panel height `start_m`, from where the sweep to `end_m` is free."""
-    reach = PIVOT_M + GRIP_RATIO * thing.bat_length_m
-    x, above = thing.position_m[0], reach + thing.bat_length_m + STANDOFF_M
+    reach = PIVOT_M + GRIP_RATIO * panel_object.bat_length_m
+    x, above = panel_object.position_m[0], reach + panel_object.bat_length_m + STANDOFF_M
     ways = [
         [panel_from_grip(point, turn) for point in ((x, start_m, above), (x, start_m, reach), (x, end_m, reach))]
         for turn in (0.0, np.pi, np.pi / 2, -np.pi / 2)
     ]
-    attempt.begin(ways, may_touch=(thing.name,), width_m=0.0, name=thing.name)
-    down = attempt.advance(thing.bat_length_m + STANDOFF_M, name="approach")
+    attempt.begin(ways, may_touch=(panel_object.name,), width_m=0.0, name=panel_object.name)
+    down = attempt.advance(panel_object.bat_length_m + STANDOFF_M, name="approach")
     if down.tripped is None:
         return
     left_m = float((attempt.cell.panel_pose.inv() * attempt.pose()).translation[2]) - reach

@@ -115,12 +115,12 @@ def inspect_view(
             gray,
             colour,
             registration,
-            thing,
+            panel_object,
             noise=noise,
-            before=(previous or {}).get(thing.name),
+            before=(previous or {}).get(panel_object.name),
             digits_taught=digits_taught,
         )
-        for thing in wanted
+        for panel_object in wanted
     ]
     return tuple(answer_at(reading, least_confidence) for reading in readings)
 

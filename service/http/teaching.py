@@ -191,9 +191,14 @@ def _knowledge(state: AppState, *, with_text: bool) -> KnowledgeView:
     return KnowledgeView(
         kinds=[_kind(file, with_text=with_text) for file in teachings.kinds()],
         objects=[
-            ObjectView(panel=panel.name, name=thing.name, kind=thing.kind, position_m=list(thing.position_m))
+            ObjectView(
+                panel=panel.name,
+                name=panel_object.name,
+                kind=panel_object.kind,
+                position_m=list(panel_object.position_m),
+            )
             for panel, _, _ in panels
-            for thing in panel.objects
+            for panel_object in panel.objects
         ],
         panels=[
             PanelView(
@@ -201,7 +206,7 @@ def _knowledge(state: AppState, *, with_text: bool) -> KnowledgeView:
                 is_taught=is_taught,
                 width_m=panel.width_m,
                 height_m=panel.height_m,
-                objects=[thing.name for thing in panel.objects],
+                objects=[panel_object.name for panel_object in panel.objects],
                 toml=text,
             )
             for panel, is_taught, text in panels

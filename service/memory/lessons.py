@@ -147,9 +147,12 @@ def teach_panel(
     lights = find_border_lights(overview, lesson.lights_px)
     drafts = [
         PanelObjectDraft(
-            kind=thing.kind, name=thing.name, example=example_at(overview, thing.clicks_px), answers=thing.answers
+            kind=panel_object.kind,
+            name=panel_object.name,
+            example=example_at(overview, panel_object.clicks_px),
+            answers=panel_object.answers,
         )
-        for thing in lesson.objects
+        for panel_object in lesson.objects
     ]
     text = panel_text(lesson.name, overview, lights, drafts)
     is_new = lesson.name not in {file.name for file in teachings.panels()}
@@ -177,7 +180,7 @@ class Learned:
         return {
             "panel": self.panel,
             "added": self.looks.added,
-            "taught_by": [each.thing.name for each in self.looks.shown],
+            "taught_by": [each.panel_object.name for each in self.looks.shown],
             "left_out": self.looks.left_out,
             "known_before": list(self.looks.known_before),
             "known_now": list(self.looks.known_now),

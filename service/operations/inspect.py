@@ -237,7 +237,7 @@ def ensure_located(session: Session) -> None:
 def missing(readings: Iterable[ObjectReading], wanted: Iterable[PanelObject]) -> tuple[str, ...]:
     """Names of objects that are not where the panel file says."""
     present = {r.name for r in readings if r.present}
-    return tuple(thing.name for thing in wanted if thing.name not in present)
+    return tuple(panel_object.name for panel_object in wanted if panel_object.name not in present)
 
 
 def need_all_present(found: Inspection, session: Session) -> None:

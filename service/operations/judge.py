@@ -65,8 +65,8 @@ def compare(report: dict[str, Any], truth: Truth, panel: Panel) -> dict[str, Any
 
     The simulator tells how the mission ended: of several deeds with one control only the last can be judged.
     """
-    before = {thing.name: thing for thing in truth.initial}
-    after = {thing.name: thing for thing in truth.objects}
+    before = {panel_object.name: panel_object for panel_object in truth.initial}
+    after = {panel_object.name: panel_object for panel_object in truth.objects}
     claims = [
         _reading_claim(reading, (after if reading["when"] == AFTER else before)[reading["name"]], panel)
         for k, reading in enumerate(report["readings"])
@@ -164,7 +164,11 @@ def _moved_unasked(
 ) -> list[dict[str, str]]:
     """What shows something else than before and was not worked, nor is lit by what was."""
     worked = {action["object"] for action in actions}
-    worked |= {thing.lights_lamp for thing in panel.objects if isinstance(thing, Button) and thing.name in worked}
+    worked |= {
+        panel_object.lights_lamp
+        for panel_object in panel.objects
+        if isinstance(panel_object, Button) and panel_object.name in worked
+    }
     return [
         {"name": name, "truth": f"{_shown(was)} to {_shown(after[name])}"}
         for name, was in before.items()

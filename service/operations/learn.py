@@ -60,6 +60,6 @@ def _drawn(pixels: Pixels, looks: PanelLooks) -> Pixels:
     return draw_outlines(
         pixels,
         [each.box_px for each in looks.shown],
-        [f"{each.thing.name}: {each.thing.kind}" for each in looks.shown],
-        [GREEN if each.thing.name in looks.known_now else AMBER for each in looks.shown],
+        [f"{each.panel_object.name}: {each.panel_object.kind}" for each in looks.shown],
+        [GREEN if each.panel_object.name in looks.known_now else AMBER for each in looks.shown],
     )

@@ -37,15 +37,15 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
         InvalidRequest: the object cannot be worked, or has no such state or value.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    thing = session.panel.object(body.object)
-    target = target_of(thing, body)
-    eye = _Eye(session, thing, verify)
+    panel_object = session.panel.object(body.object)
+    target = target_of(panel_object, body)
+    eye = _Eye(session, panel_object, verify)
     before = eye.before()
-    report = _perform(session, thing, target, eye, before)
+    report = _perform(session, panel_object, target, eye, before)
     reached = report.is_done
     return Deed(
         action=Action(
-            object=thing.name,
+            object=panel_object.name,
             skill=report.skill,
             target=target,
             outcome=str(report.outcome),
@@ -78,11 +78,11 @@ def run_manipulate(session: Session, request: ManipulateRequest) -> dict[str, An
 class _Eye:
     """The second look at one control; what it saw last is kept."""
 
-    def __init__(self, session: Session, thing: PanelObject, is_open: bool) -> None:
+    def __init__(self, session: Session, panel_object: PanelObject, is_open: bool) -> None:
         self._session = session
-        self._thing = thing
+        self._thing = panel_object
         self._is_open = is_open
-        self.witness = _witness(session, thing)
+        self.witness = _witness(session, panel_object)
         self.last: ObjectReading | None = None
         self.picture: Picture | None = None
 
@@ -118,38 +118,40 @@ class _Eye:
         return reading if reading.present and reading.answered else None
 
 
-def state_of(reading: ObjectReading, thing: PanelObject) -> ObjectState:
+def state_of(reading: ObjectReading, panel_object: PanelObject) -> ObjectState:
     """A reading in the words of the skills."""
-    angle_rad = reading.value if isinstance(thing, Handwheel | Lever) else None
-    if angle_rad is None and isinstance(thing, Lever | Rotary) and reading.state is not None:
-        angle_rad = next((s.angle_rad for s in thing.states if s.name == reading.state), None)
+    angle_rad = reading.value if isinstance(panel_object, Handwheel | Lever) else None
+    if angle_rad is None and isinstance(panel_object, Lever | Rotary) and reading.state is not None:
+        angle_rad = next((s.angle_rad for s in panel_object.states if s.name == reading.state), None)
     sigma = 0.0 if reading.uncertainty is None else reading.uncertainty
     return ObjectState(name=reading.name, state=reading.state, value=reading.value, angle_rad=angle_rad, sigma=sigma)
 
 
-def _perform(session: Session, thing: PanelObject, target: str, eye: _Eye, before: ObjectReading | None) -> SkillReport:
+def _perform(
+    session: Session, panel_object: PanelObject, target: str, eye: _Eye, before: ObjectReading | None
+) -> SkillReport:
     cell, verify = workcell(session), eye.verify()
     current = None if before is None else state_of(before, eye.witness)
-    match thing:
+    match panel_object:
         case Lever():
-            return lever(cell, thing.name, target, current=current, verify=verify)
+            return lever(cell, panel_object.name, target, current=current, verify=verify)
         case Slider():
-            return slider(cell, thing.name, float(target), current=current, verify=verify)
+            return slider(cell, panel_object.name, float(target), current=current, verify=verify)
         case Toggle():
-            return toggle(cell, thing.name, target, current=current, verify=verify)
+            return toggle(cell, panel_object.name, target, current=current, verify=verify)
         case Rotary():
-            return rotary(cell, thing.name, target, current=current, verify=verify)
+            return rotary(cell, panel_object.name, target, current=current, verify=verify)
         case Handwheel():
-            return handwheel(cell, thing.name, float(target), current=current, verify=verify)
+            return handwheel(cell, panel_object.name, float(target), current=current, verify=verify)
         case Mushroom():
-            return mushroom(cell, thing.name, verify=verify)
+            return mushroom(cell, panel_object.name, verify=verify)
         case Button():
-            return button(cell, thing.name, expected=target, current=current, verify=verify)
-    raise unworkable(thing)
+            return button(cell, panel_object.name, expected=target, current=current, verify=verify)
+    raise unworkable(panel_object)
 
 
-def _witness(session: Session, thing: PanelObject) -> PanelObject:
+def _witness(session: Session, panel_object: PanelObject) -> PanelObject:
     """What shows that the deed worked: a button that springs back shows it by its lamp."""
-    if isinstance(thing, Button) and thing.lights_lamp is not None:
-        return session.panel.object(thing.lights_lamp)
-    return thing
+    if isinstance(panel_object, Button) and panel_object.lights_lamp is not None:
+        return session.panel.object(panel_object.lights_lamp)
+    return panel_object

@@ -118,12 +118,12 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
     with _step(session, "recognise", 0.19, 0.22) as part:
         part.progress(0.0, "recognise the objects")
         settle(part)  # the border lights go out
-        found = inspect_here(part, [thing.name for thing in session.panel.objects])
+        found = inspect_here(part, [panel_object.name for panel_object in session.panel.objects])
         _note_pictures(record, found, "recognised")
         need_all_present(found, session)
         record.facts["objects"] = _places(session, found)
     with _step(session, "read", 0.22, 0.38) as part:
-        found = inspect_close(part, [thing.name for thing in session.panel.objects])
+        found = inspect_close(part, [panel_object.name for panel_object in session.panel.objects])
         _note_pictures(record, found, "read")
         record.readings += [reading_row(reading, BEFORE) for reading in found.readings.values()]
     with _step(session, "touch", 0.38, 0.55) as part:
@@ -165,9 +165,9 @@ def usual_actions(session: Session) -> tuple[ActionBody, ...]:
     readings = known_readings(session)
     actions: list[ActionBody] = []
     for kind in (Lever, Slider, Button, Toggle):
-        things = [thing for thing in session.panel.objects if isinstance(thing, kind)]
+        things = [panel_object for panel_object in session.panel.objects if isinstance(panel_object, kind)]
         if kind is Button:  # one that springs back and works no lamp shows nothing that could be confirmed
-            buttons = [thing for thing in things if isinstance(thing, Button)]
+            buttons = [panel_object for panel_object in things if isinstance(panel_object, Button)]
             lit = [button for button in buttons if button.lights_lamp is not None]
             things = [*lit, *(button for button in buttons if button.latching)]
         if things:
@@ -175,24 +175,26 @@ def usual_actions(session: Session) -> tuple[ActionBody, ...]:
     return tuple(actions)
 
 
-def _other(thing: PanelObject, readings: dict[str, ObjectReading]) -> ActionBody:
+def _other(panel_object: PanelObject, readings: dict[str, ObjectReading]) -> ActionBody:
     """The deed that changes what the object shows now."""
-    reading = readings.get(thing.name)
+    reading = readings.get(panel_object.name)
     state = reading.state if reading is not None else None
-    match thing:
+    match panel_object:
         case Lever():
-            return ActionBody(object=thing.name, state=next(s.name for s in thing.states if s.name != state))
+            return ActionBody(
+                object=panel_object.name, state=next(s.name for s in panel_object.states if s.name != state)
+            )
         case Slider():
-            low, high = thing.scale.minimum, thing.scale.maximum
+            low, high = panel_object.scale.minimum, panel_object.scale.maximum
             near, far = low + 0.3 * (high - low), low + 0.7 * (high - low)
             shown = reading.value if reading is not None and reading.value is not None else low
-            return ActionBody(object=thing.name, value=far if abs(far - shown) > abs(near - shown) else near)
+            return ActionBody(object=panel_object.name, value=far if abs(far - shown) > abs(near - shown) else near)
         case Button(lights_lamp=str(lamp)):
             lit = lamp in readings and readings[lamp].state == "on"
-            return ActionBody(object=thing.name, state="off" if lit else "on")
+            return ActionBody(object=panel_object.name, state="off" if lit else "on")
         case Button():
-            return ActionBody(object=thing.name, state="released" if state == "pressed" else "pressed")
-    return ActionBody(object=thing.name, state="off" if state == "on" else "on")
+            return ActionBody(object=panel_object.name, state="released" if state == "pressed" else "pressed")
+    return ActionBody(object=panel_object.name, state="off" if state == "on" else "on")
 
 
 @contextmanager

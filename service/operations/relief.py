@@ -35,7 +35,7 @@ class Sighting:
         state: how far a mushroom is pressed in (m, 0 to -travel), or a wheel's angle clockwise (rad, modulo one spoke).
     """
 
-    thing: Mushroom | Handwheel
+    panel_object: Mushroom | Handwheel
     match: Match | None = None
     base_from_object: UncertainPose | None = None
     off_m: float | None = None
@@ -67,52 +67,54 @@ def find_by_surfaces(
         base_from_panel: where the panel is believed to be; it tells two of a kind apart.
     """
     models = models_of(panel)
-    things = [thing for thing in panel.objects if isinstance(thing, Mushroom | Handwheel)]
+    things = [panel_object for panel_object in panel.objects if isinstance(panel_object, Mushroom | Handwheel)]
     if not things:
         return []
     depth = np.asarray(image.depth_m, float)
     panel_from_scanner = base_from_panel.parent_from_child.inv() * image.base_from_scanner.parent_from_child
     points = panel_from_scanner.apply(scene.sensor.points(depth).reshape(-1, 3)).reshape(*depth.shape, 3)
-    return [_sighting(thing, models, scene, image, points, base_from_panel, plate) for thing in things]
+    return [_sighting(panel_object, models, scene, image, points, base_from_panel, plate) for panel_object in things]
 
 
 def _sighting(
-    thing: Mushroom | Handwheel, models: Mapping[str, ComponentModel], scene: RangeScene, image: Scan, points: Array,
+    panel_object: Mushroom | Handwheel, models: Mapping[str, ComponentModel], scene: RangeScene, image: Scan, points: Array,
     base_from_panel: UncertainPose, plate: Surface,
 ) -> Sighting:  # fmt: skip
     """Of `points` (H, W, 3), in the panel's frame, only those about the object are looked at: that is what keeps it quick."""
-    away = np.abs(points[..., :2] - thing.position_m).max(axis=-1)
-    half = max(half_footprint_m(thing))
-    sigma_m = float(np.sqrt(np.linalg.eigvalsh(point_covariance(base_from_panel, thing.point_m))[-1]))
+    away = np.abs(points[..., :2] - panel_object.position_m).max(axis=-1)
+    half = max(half_footprint_m(panel_object))
+    sigma_m = float(np.sqrt(np.linalg.eigvalsh(point_covariance(base_from_panel, panel_object.point_m))[-1]))
     reach_m = NEAR_M + 3.0 * sigma_m
     if np.count_nonzero(away < half + 3.0 * sigma_m) < LEAST_PIXELS:
-        return Sighting(thing=thing, why="not in the scanner's view")
-    near = np.where(away < half + thing.height_m + reach_m, np.asarray(image.depth_m, float), np.nan)
-    expected = base_from_panel.parent_from_child.apply([*thing.position_m, 0.0])
+        return Sighting(panel_object=panel_object, why="not in the scanner's view")
+    near = np.where(away < half + panel_object.height_m + reach_m, np.asarray(image.depth_m, float), np.nan)
+    expected = base_from_panel.parent_from_child.apply([*panel_object.position_m, 0.0])
     found = []
-    for match in match_models(scene, near, (models[thing.name],), panel=plate):
+    for match in match_models(scene, near, (models[panel_object.name],), panel=plate):
         pose = compose(image.base_from_scanner, match.sensor_from_object)
         found.append((float(np.linalg.norm(pose.parent_from_child.translation - expected)), pose, match))
     if not found:
-        return Sighting(thing=thing, why="no surfaces like its own near its place")
+        return Sighting(panel_object=panel_object, why="no surfaces like its own near its place")
     off_m, pose, match = min(found, key=lambda f: f[0])
     if off_m > reach_m:
-        return Sighting(thing=thing, why=f"the nearest like it stands {1e3 * off_m:.0f} mm from its place")
-    state = _state(thing, match, base_from_panel.parent_from_child.inv() * pose.parent_from_child)
-    return Sighting(thing=thing, match=match, base_from_object=pose, off_m=off_m, state=state)
+        return Sighting(
+            panel_object=panel_object, why=f"the nearest like it stands {1e3 * off_m:.0f} mm from its place"
+        )
+    state = _state(panel_object, match, base_from_panel.parent_from_child.inv() * pose.parent_from_child)
+    return Sighting(panel_object=panel_object, match=match, base_from_object=pose, off_m=off_m, state=state)
 
 
-def _state(thing: Mushroom | Handwheel, match: Match, panel_from_object: RigidTransform) -> float | None:
-    if isinstance(thing, Mushroom):
+def _state(panel_object: Mushroom | Handwheel, match: Match, panel_from_object: RigidTransform) -> float | None:
+    if isinstance(panel_object, Mushroom):
         return match.state
     x, y, _ = panel_from_object.rotation.apply([1.0, 0.0, 0.0])
-    return float(-np.arctan2(y, x) % (2.0 * np.pi / thing.spokes))
+    return float(-np.arctan2(y, x) % (2.0 * np.pi / panel_object.spokes))
 
 
 def sighting_json(sighting: Sighting) -> dict[str, Any]:
     """A sighting as the API gives it."""
-    thing, match = sighting.thing, sighting.match
-    row: dict[str, Any] = {"name": thing.name, "kind": thing.kind, "found": match is not None}
+    panel_object, match = sighting.panel_object, sighting.match
+    row: dict[str, Any] = {"name": panel_object.name, "kind": panel_object.kind, "found": match is not None}
     if match is None or sighting.base_from_object is None:
         return row | {"why": sighting.why}
     return row | {
@@ -128,20 +130,22 @@ def sighting_json(sighting: Sighting) -> dict[str, Any]:
 
 def mark_of(sighting: Sighting, image: Scan, base_from_panel: UncertainPose) -> Mark:
     """The object's outline at its height: where it was found, or else where it was looked for."""
-    thing = sighting.thing
+    panel_object = sighting.panel_object
     found = sighting.base_from_object
     base_from_object = (
         found.parent_from_child
         if found is not None
-        else base_from_panel.parent_from_child * RigidTransform.from_translation([*thing.position_m, 0.0])
+        else base_from_panel.parent_from_child * RigidTransform.from_translation([*panel_object.position_m, 0.0])
     )
     turn = np.linspace(0.0, 2.0 * np.pi, OUTLINE_POINTS, endpoint=False)
-    radius = max(half_footprint_m(thing))
-    ring = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(OUTLINE_POINTS, thing.height_m)], axis=-1)
+    radius = max(half_footprint_m(panel_object))
+    ring = np.stack(
+        [radius * np.cos(turn), radius * np.sin(turn), np.full(OUTLINE_POINTS, panel_object.height_m)], axis=-1
+    )
     x, y, z = (image.base_from_scanner.parent_from_child.inv() * base_from_object).apply(ring).T
     c, depth = image.capabilities, np.maximum(z, 1e-3)
     return Mark(
         outline_px=np.stack([c.fx * x / depth + c.cx, c.fy * y / depth + c.cy], axis=-1),
-        text=thing.name if sighting.match is not None else f"{thing.name}: {sighting.why}",
+        text=panel_object.name if sighting.match is not None else f"{panel_object.name}: {sighting.why}",
         is_found=sighting.match is not None,
     )

@@ -204,9 +204,9 @@ def panel_object_or_all(panel: Panel, names: Collection[str] | None) -> tuple[st
         InvalidRequest: an unknown name, with the nearest known one.
     """
     if names is None:
-        return tuple(thing.name for thing in panel.objects)
+        return tuple(panel_object.name for panel_object in panel.objects)
     for name in names:
         panel.object(name)
     if not names:
         raise InvalidRequest("no objects were named", hint="leave `objects` out to mean all of them")
-    return tuple(thing.name for thing in panel.objects if thing.name in names)
+    return tuple(panel_object.name for panel_object in panel.objects if panel_object.name in names)

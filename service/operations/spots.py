@@ -49,31 +49,31 @@ def _candidates(panel: Panel, clearance_m: float) -> Array:
 def room_m(panel: Panel, points: Array) -> Array:
     """(N,) how far points (N, 2) of the panel are from the nearest object or light, m; negative where one is."""
     gaps = [np.linalg.norm(points - light.position_m[:2], axis=1) - light.radius_m for light in panel.lights]
-    return np.asarray(np.min([*gaps, *(_distance_to(points, thing) for thing in panel.objects)], axis=0))
+    return np.asarray(np.min([*gaps, *(_distance_to(points, panel_object) for panel_object in panel.objects)], axis=0))
 
 
-def _distance_to(points: Array, thing: PanelObject) -> Array:
+def _distance_to(points: Array, panel_object: PanelObject) -> Array:
     """From (N, 2) panel points to the footprint of an object, in any of its states; negative inside."""
-    half = np.array(half_footprint_m(thing))
-    outside = np.abs(points - np.array(thing.position_m)) - half
+    half = np.array(half_footprint_m(panel_object))
+    outside = np.abs(points - np.array(panel_object.position_m)) - half
     return np.asarray(np.linalg.norm(np.maximum(outside, 0.0), axis=1) + np.minimum(outside.max(axis=1), 0.0))
 
 
-def half_footprint_m(thing: PanelObject) -> tuple[float, float]:
+def half_footprint_m(panel_object: PanelObject) -> tuple[float, float]:
     """Half width and half height of the upright box on the plate that holds an object in any state."""
-    match thing.kind:
+    match panel_object.kind:
         case "lever":
-            reach = thing.length_m + thing.width_m
+            reach = panel_object.length_m + panel_object.width_m
             return reach, reach
         case "slider":
-            along = thing.travel_m / 2 + thing.cap_size_m[0] / 2
-            c, s = abs(np.cos(thing.angle_rad)), abs(np.sin(thing.angle_rad))
-            across = thing.cap_size_m[1] / 2
+            along = panel_object.travel_m / 2 + panel_object.cap_size_m[0] / 2
+            c, s = abs(np.cos(panel_object.angle_rad)), abs(np.sin(panel_object.angle_rad))
+            across = panel_object.cap_size_m[1] / 2
             return float(c * along + s * across), float(s * along + c * across)
         case "toggle":
-            return thing.bat_length_m, thing.bat_length_m
+            return panel_object.bat_length_m, panel_object.bat_length_m
         case "panel_meter" | "display":
-            return thing.width_m / 2, thing.height_m / 2
+            return panel_object.width_m / 2, panel_object.height_m / 2
         case "handwheel":
-            return thing.radius_m + thing.rim_m, thing.radius_m + thing.rim_m
-    return thing.radius_m, thing.radius_m
+            return panel_object.radius_m + panel_object.rim_m, panel_object.radius_m + panel_object.rim_m
+    return panel_object.radius_m, panel_object.radius_m

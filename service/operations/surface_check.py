@@ -92,13 +92,13 @@ def check_surfaces(session: Session, first: SurfaceView) -> tuple[list[SurfaceCh
     checks: list[SurfaceCheck] = []
     pictures = [_picture(session, first, "surfaces")]
     for sighting in first.sightings:
-        name = sighting.thing.name
+        name = sighting.panel_object.name
         check = judged(sighting, base_from_panel, session.panel.tolerances.position_m, shown.get(name), first.place)
         if not check.agrees:
-            again = _look_closer(session, sighting.thing)
+            again = _look_closer(session, sighting.panel_object)
             if isinstance(again, SurfaceView):
                 pictures.append(_picture(session, again, f"surfaces-{name}"))
-                (second,) = [s for s in again.sightings if s.thing.name == name]
+                (second,) = [s for s in again.sightings if s.panel_object.name == name]
                 closer = judged(second, base_from_panel, session.panel.tolerances.position_m, shown.get(name), CLOSER)
                 check = after_both(check, closer)
             else:
@@ -115,30 +115,30 @@ def judged(
     Args:
         position_m: how far an object of a built panel stands from its place in the file, one sigma.
     """
-    thing, match = sighting.thing, sighting.match
+    panel_object, match = sighting.panel_object, sighting.match
     if match is None or sighting.base_from_object is None:
         return SurfaceCheck(
-            name=thing.name, kind=thing.kind, seen_from=place, found=False, agrees=None, centre_in_base_m=None,
-            off_m=None, sigma_m=None, chi_square=None, off_vision_m=None, shows=None, vision_shows=_said(thing, reading),
+            name=panel_object.name, kind=panel_object.kind, seen_from=place, found=False, agrees=None, centre_in_base_m=None,
+            off_m=None, sigma_m=None, chi_square=None, off_vision_m=None, shows=None, vision_shows=_said(panel_object, reading),
             stands_elsewhere=False,
             finding=f"not found by its surfaces: {sighting.why}",
         )  # fmt: skip
     panel_from_object = compose(base_from_panel.inverse(), sighting.base_from_object)
     x, y, z = sighting.base_from_object.parent_from_child.translation
     at_m = panel_from_object.parent_from_child.translation[:2]
-    off = at_m - thing.position_m
+    off = at_m - panel_object.position_m
     C = panel_from_object.covariance[:2, :2] + position_m**2 * np.eye(2)
     chi_square = float(off @ np.linalg.solve(C, off))
     is_elsewhere = bool(chi_square > chdtri(2, ELSEWHERE_P))
     shows_alike = _shows_alike(sighting, reading)
     off_m, sigma_m = float(np.linalg.norm(off)), float(np.sqrt(0.5 * np.trace(C)))
     seen = None if reading is None or reading.centre_m is None else reading.centre_m[:2]
-    shows, vision_shows = _shown(sighting), _said(thing, reading)
+    shows, vision_shows = _shown(sighting), _said(panel_object, reading)
     finding = f"stands {1e3 * off_m:.1f} mm from its place in the panel file (1 sigma {1e3 * sigma_m:.1f} mm)"
     if not shows_alike:
         finding += f"; shows {shows} by its surfaces and {vision_shows} by vision"
     return SurfaceCheck(
-        name=thing.name, kind=thing.kind, seen_from=place, found=True, agrees=shows_alike and not is_elsewhere,
+        name=panel_object.name, kind=panel_object.kind, seen_from=place, found=True, agrees=shows_alike and not is_elsewhere,
         centre_in_base_m=(float(x), float(y), float(z)), off_m=off_m, sigma_m=sigma_m, chi_square=chi_square,
         off_vision_m=None if seen is None else float(np.linalg.norm(at_m - seen)),
         shows=shows, vision_shows=vision_shows, stands_elsewhere=is_elsewhere, finding=finding,
@@ -167,43 +167,45 @@ def need_its_place(checks: Iterable[SurfaceCheck], name: str) -> None:
 
 def _shown(sighting: Sighting) -> str | None:
     """The state by surfaces in the words of vision; a wheel's spokes look the same after each."""
-    thing, state = sighting.thing, sighting.state
+    panel_object, state = sighting.panel_object, sighting.state
     if state is None:
         return None
-    if isinstance(thing, Mushroom):
-        return "pressed" if state < -0.5 * thing.pressed_depth_m else "released"
-    return f"{np.degrees(state):.0f} deg (modulo {360 / thing.spokes:.0f})"
+    if isinstance(panel_object, Mushroom):
+        return "pressed" if state < -0.5 * panel_object.pressed_depth_m else "released"
+    return f"{np.degrees(state):.0f} deg (modulo {360 / panel_object.spokes:.0f})"
 
 
-def _said(thing: Mushroom | Handwheel, reading: ObjectReading | None) -> str | None:
+def _said(panel_object: Mushroom | Handwheel, reading: ObjectReading | None) -> str | None:
     if reading is None or not reading.answered:
         return None
-    if isinstance(thing, Mushroom) or reading.value is None:
+    if isinstance(panel_object, Mushroom) or reading.value is None:
         return reading.state
     return f"{np.degrees(reading.value):.0f} deg"
 
 
 def _shows_alike(sighting: Sighting, reading: ObjectReading | None) -> bool:
     """Do surfaces and vision give the same state? Where one of them gives none, nothing contradicts."""
-    thing, match, state = sighting.thing, sighting.match, sighting.state
+    panel_object, match, state = sighting.panel_object, sighting.match, sighting.state
     if match is None or state is None or reading is None or not reading.answered:
         return True
-    if isinstance(thing, Mushroom):
+    if isinstance(panel_object, Mushroom):
         return reading.state is None or _shown(sighting) == reading.state
     if reading.value is None:
         return True
-    spoke = 2.0 * np.pi / thing.spokes
+    spoke = 2.0 * np.pi / panel_object.spokes
     apart = abs((state - reading.value + 0.5 * spoke) % spoke - 0.5 * spoke)
     sigma = np.hypot(match.state_sigma or 0.0, reading.uncertainty or 0.0)
     return bool(apart <= TURN_SLACK_RAD + 3.0 * sigma)
 
 
-def _look_closer(session: Session, thing: Mushroom | Handwheel) -> SurfaceView | str:
+def _look_closer(session: Session, panel_object: Mushroom | Handwheel) -> SurfaceView | str:
     """The scanner square before the object; text says why not."""
     flange_from_scanner = session.mount(session.first(DeviceKind.RANGE_SCANNER)).parent_from_child
-    views = close_up_poses(session.known_panel().parent_from_child, thing.point_m)
+    views = close_up_poses(session.known_panel().parent_from_child, panel_object.point_m)
     try:
-        go_to_first(session, (v * flange_from_scanner.inv() for v in views), name=f"closer look at {thing.name}"[:60])
+        go_to_first(
+            session, (v * flange_from_scanner.inv() for v in views), name=f"closer look at {panel_object.name}"[:60]
+        )
         settle(session)
         return view_surfaces(session, scan_plate(session), CLOSER)
     except (PerceptionError, Unreachable) as error:

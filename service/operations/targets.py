@@ -8,33 +8,42 @@ from hal.panel import Button, Handwheel, Lever, Mushroom, PanelObject, Rotary, S
 from service.operations.requests import ActionBody, InspectRequest, ManipulateRequest, MissionRequest, RecogniseRequest
 
 
-def target_of(thing: PanelObject, body: ActionBody) -> str:
+def target_of(panel_object: PanelObject, body: ActionBody) -> str:
     """What shall be reached, as text; the usual deed of its kind when nothing is asked.
 
     Raises:
         InvalidRequest: the object cannot be worked, or has no such state or value.
     """
-    match thing:
+    match panel_object:
         case Slider():
-            _only(thing, body, "value")
-            return _number(thing, body.value, thing.scale.minimum, thing.scale.maximum, thing.scale.unit, "value")
+            _only(panel_object, body, "value")
+            return _number(
+                panel_object,
+                body.value,
+                panel_object.scale.minimum,
+                panel_object.scale.maximum,
+                panel_object.scale.unit,
+                "value",
+            )
         case Handwheel():
-            _only(thing, body, "angle_rad")
-            return _number(thing, body.angle_rad, thing.minimum_rad, thing.maximum_rad, "rad", "angle_rad")
+            _only(panel_object, body, "angle_rad")
+            return _number(
+                panel_object, body.angle_rad, panel_object.minimum_rad, panel_object.maximum_rad, "rad", "angle_rad"
+            )
         case Lever() | Rotary():
-            _only(thing, body, "state")
-            return _one_of(thing, body.state, tuple(state.name for state in thing.states))
+            _only(panel_object, body, "state")
+            return _one_of(panel_object, body.state, tuple(state.name for state in panel_object.states))
         case Toggle():
-            _only(thing, body, "state")
-            return _one_of(thing, body.state, ("on", "off"))
+            _only(panel_object, body, "state")
+            return _one_of(panel_object, body.state, ("on", "off"))
         case Mushroom():
-            _only(thing, body, "state")
-            return _one_of(thing, body.state or "pressed", ("pressed",))
+            _only(panel_object, body, "state")
+            return _one_of(panel_object, body.state or "pressed", ("pressed",))
         case Button():
-            _only(thing, body, "state")
-            states = button_states(thing)
-            return _one_of(thing, body.state or states[0], states)
-    raise unworkable(thing)
+            _only(panel_object, body, "state")
+            states = button_states(panel_object)
+            return _one_of(panel_object, body.state or states[0], states)
+    raise unworkable(panel_object)
 
 
 def check_manipulate(cell: Cell, request: ManipulateRequest) -> None:
@@ -55,41 +64,43 @@ def check_looked_for(cell: Cell, request: InspectRequest | RecogniseRequest) -> 
             cell.panel.object(name)
 
 
-def button_states(thing: Button) -> tuple[str, ...]:
+def button_states(panel_object: Button) -> tuple[str, ...]:
     """What a press can bring about: states of its lamp, or of the cap itself, which only stays in when it latches."""
-    if thing.lights_lamp is not None:
+    if panel_object.lights_lamp is not None:
         return ("on", "off")
-    return ("pressed", "released") if thing.latching else ("pressed",)
+    return ("pressed", "released") if panel_object.latching else ("pressed",)
 
 
-def _only(thing: PanelObject, body: ActionBody, key: str) -> None:
+def _only(panel_object: PanelObject, body: ActionBody, key: str) -> None:
     """Raise unless what is asked for is asked for under `key`: what is meant must not be guessed."""
     for other in {"state", "value", "angle_rad"} - {key}:
         if getattr(body, other) is not None:
-            hint = f"send {{'object': '{thing.name}', '{key}': ...}}"
-            raise InvalidRequest(f"{thing.name} is a {thing.kind}: it takes {key}, not {other}", hint=hint)
+            hint = f"send {{'object': '{panel_object.name}', '{key}': ...}}"
+            raise InvalidRequest(
+                f"{panel_object.name} is a {panel_object.kind}: it takes {key}, not {other}", hint=hint
+            )
 
 
-def _number(thing: PanelObject, asked: float | None, low: float, high: float, unit: str, key: str) -> str:
+def _number(panel_object: PanelObject, asked: float | None, low: float, high: float, unit: str, key: str) -> str:
     if asked is None or not low <= asked <= high:
         raise InvalidRequest(
-            f"{thing.name} needs {key} from {low:g} to {high:g} {unit}".rstrip(),
-            hint=f"send {{'object': '{thing.name}', '{key}': ...}}",
+            f"{panel_object.name} needs {key} from {low:g} to {high:g} {unit}".rstrip(),
+            hint=f"send {{'object': '{panel_object.name}', '{key}': ...}}",
         )
     return f"{asked:g}"
 
 
-def _one_of(thing: PanelObject, state: str | None, states: tuple[str, ...]) -> str:
+def _one_of(panel_object: PanelObject, state: str | None, states: tuple[str, ...]) -> str:
     if state is None:
-        raise InvalidRequest(f"{thing.name} needs a state", hint=f"states: {', '.join(states)}")
+        raise InvalidRequest(f"{panel_object.name} needs a state", hint=f"states: {', '.join(states)}")
     if state not in states:
-        raise InvalidRequest(f"{thing.name} has no state {state!r}", hint=f"states: {', '.join(states)}")
+        raise InvalidRequest(f"{panel_object.name} has no state {state!r}", hint=f"states: {', '.join(states)}")
     return state
 
 
-def unworkable(thing: PanelObject) -> InvalidRequest:
+def unworkable(panel_object: PanelObject) -> InvalidRequest:
     """The refusal to work an object that only shows something."""
     return InvalidRequest(
-        f"{thing.name} is a {thing.kind}, which cannot be worked",
+        f"{panel_object.name} is a {panel_object.kind}, which cannot be worked",
         hint="levers, sliders, toggles, rotaries, wheels, buttons and mushrooms can",
     )

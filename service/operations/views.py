@@ -110,7 +110,7 @@ def close_up_groups(
     half_x = FILL * 0.5 * intrinsics.width_px / intrinsics.fx_px * distance_m - REACH_M
     half_y = FILL * 0.5 * intrinsics.height_px / intrinsics.fy_px * distance_m - REACH_M
     span = np.array([2 * half_x, 2 * half_y])
-    unseen = {thing.name: np.array(thing.position_m) for thing in objects}
+    unseen = {panel_object.name: np.array(panel_object.position_m) for panel_object in objects}
     groups: list[tuple[Array, tuple[str, ...]]] = []
     while unseen:
         best: tuple[str, ...] = ()

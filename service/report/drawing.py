@@ -34,8 +34,8 @@ def panel_drawing(
 
     x, y = panel.width_m / 2, panel.height_m / 2
     line(_edges(np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0], [-x, -y, 0.0]])), PLATE, 1.8)
-    for thing in panel.objects:
-        contour = contour_m(thing)
+    for panel_object in panel.objects:
+        contour = contour_m(panel_object)
         line(np.vstack([contour, contour[:1]]), OBJECT)
     turn = np.linspace(0.0, 2 * np.pi, 25)
     for light in panel.lights:

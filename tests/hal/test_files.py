@@ -142,7 +142,7 @@ LEVER_STATES = 'kind = "lever"\nstates = [{ name = "open" }, { name = "open", an
 
 
 @pytest.mark.parametrize(
-    ("thing", "says"),
+    ("panel_object", "says"),
     [
         (GAUGE.format("at_min = -1.0, at_max = 1.0, table = [[-1.0, 3.0]]"), "must all rise, or all fall"),
         (GAUGE.format("at_min = -1.0, at_max = 1.0, table = [[0.0, 3.0], [0.5, 3.0]]"), "must all rise, or all fall"),
@@ -153,10 +153,10 @@ LEVER_STATES = 'kind = "lever"\nstates = [{ name = "open" }, { name = "open", an
     ],
 )
 def test_an_object_that_cannot_be_is_refused_and_not_found_out_when_it_is_read(
-    cell_path: Path, thing: str, says: str
+    cell_path: Path, panel_object: str, says: str
 ) -> None:
     panel = cell_path.parents[1] / "panels/tiny.toml"
-    panel.write_text(f'{PANEL}[[objects]]\nname = "thing"\nposition_m = [0.1, 0.0]\n{thing}\n')
+    panel.write_text(f'{PANEL}[[objects]]\nname = "thing"\nposition_m = [0.1, 0.0]\n{panel_object}\n')
     with pytest.raises(ConfigError, match=says):
         load_panel(panel)
 

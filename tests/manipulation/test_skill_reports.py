@@ -154,9 +154,9 @@ def test_a_toggle_that_stands_there_already_is_looked_at_and_thrown_only_when_in
 
 
 def test_a_button_that_nothing_shows_is_pressed_and_not_confirmed() -> None:
-    thing = PANEL.object("start").model_copy(update={"lights_lamp": None})
+    panel_object = PANEL.object("start").model_copy(update={"lights_lamp": None})
     cell, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
-    cell = replace(cell, panel=PANEL.model_copy(update={"objects": (thing,)}))
+    cell = replace(cell, panel=PANEL.model_copy(update={"objects": (panel_object,)}))
     told = button(cell, "start", expected="pressed", verify=lambda: ObjectState(name="start", state="released"))
     assert (told.outcome, mover.asked.count("press")) == (Outcome.UNVERIFIED, 1)
     assert "springs back" in told.cause
@@ -225,7 +225,7 @@ def test_what_holds_the_arm_up_on_its_way_to_park_is_an_error_of_the_motion_and_
 
 
 def test_a_wheel_that_slipped_is_held_more_firmly_up_to_what_a_hand_may() -> None:
-    wheel = next(thing for thing in PANEL.objects if thing.kind == "handwheel")
+    wheel = next(panel_object for panel_object in PANEL.objects if panel_object.kind == "handwheel")
     forces = [grip_force_n(wheel, tries=k) for k in range(20)]
     assert forces == sorted(forces) and forces[0] < forces[3]
     assert forces[0] >= GRIP_FLOOR_N and forces[-1] == LARGEST_GRIP_N

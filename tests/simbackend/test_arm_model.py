@@ -81,9 +81,9 @@ def test_every_object_is_reached_squarely_and_off_the_wrist_singularity(cell_nam
     facing = RigidTransform.from_matrix(np.diag([1.0, -1.0, -1.0, 1.0]))
     for seed in range(12):
         base_from_panel = Draws(seed).panel_pose(cell.file.workspace)
-        for thing in cell.panel.objects:
+        for panel_object in cell.panel.objects:
             for distance_m in (0.0, 0.4):
-                panel_from_grip = RigidTransform.from_translation([*thing.position_m, distance_m]) * facing
+                panel_from_grip = RigidTransform.from_translation([*panel_object.position_m, distance_m]) * facing
                 flange = np.asarray((base_from_panel * panel_from_grip * GRIP.inv()).as_matrix())
                 found = eaik.IK(flange)
                 wrists = [
@@ -91,4 +91,4 @@ def test_every_object_is_reached_squarely_and_off_the_wrist_singularity(cell_nam
                     for q, is_approximate in zip(found.Q, found.is_LS, strict=True)
                     if not is_approximate and np.all((q > low) & (q < high))
                 ]
-                assert max(wrists, default=0.0) > 0.3, (seed, thing.name, distance_m)
+                assert max(wrists, default=0.0) > 0.3, (seed, panel_object.name, distance_m)

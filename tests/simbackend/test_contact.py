@@ -57,7 +57,7 @@ class Finger:
             self.cell.clock.sleep(TICK_S)
 
     def shown(self, name: str) -> ObjectTruth:
-        return next(thing for thing in self.arm.truth().objects if thing.name == name)
+        return next(panel_object for panel_object in self.arm.truth().objects if panel_object.name == name)
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +122,7 @@ def test_a_pressed_button_is_felt_counted_and_lights_its_lamp(finger: Finger) ->
     assert finger.arm.truth().peak_force_n >= push_n - 1.0
     for seconds_ago, lit in ((0.0, after_lamp), (5.0, lamp)):
         then = finger.arm.truth(finger.arm.truth().sim_time_s - seconds_ago).initial
-        assert next(thing for thing in then if thing.name == "run_lamp").state == lit
+        assert next(panel_object for panel_object in then if panel_object.name == "run_lamp").state == lit
 
 
 def test_the_lamp_of_the_button_shows_in_the_picture(finger: Finger) -> None:

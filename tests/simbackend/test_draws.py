@@ -72,26 +72,30 @@ def test_the_lens_and_the_load_are_near_their_records_and_not_on_them() -> None:
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**31 - 1))
 def test_what_a_seeded_panel_shows_is_within_its_scales(seed: int) -> None:
-    built = {item.thing.name: item for item in build(CELL.panel, Draws(seed))}
-    assert list(built) == [thing.name for thing in CELL.panel.objects]
+    built = {item.panel_object.name: item for item in build(CELL.panel, Draws(seed))}
+    assert list(built) == [panel_object.name for panel_object in CELL.panel.objects]
     for item in built.values():
-        thing = item.thing
-        if isinstance(thing, (Gauge, PanelMeter, Slider)):
+        panel_object = item.panel_object
+        if isinstance(panel_object, (Gauge, PanelMeter, Slider)):
             assert item.value is not None
-            assert thing.scale.minimum <= item.value <= thing.scale.maximum
-            assert thing.scale.value_at(item.place) == pytest.approx(item.value)
-        if isinstance(thing, Display):
+            assert panel_object.scale.minimum <= item.value <= panel_object.scale.maximum
+            assert panel_object.scale.value_at(item.place) == pytest.approx(item.value)
+        if isinstance(panel_object, Display):
             assert float(item.text or "nan") == pytest.approx(item.value)
-        if isinstance(thing, Button) and not thing.latching:
+        if isinstance(panel_object, Button) and not panel_object.latching:
             assert not item.is_on
 
 
 def test_a_lamp_that_a_button_lights_begins_dark() -> None:
-    lit = [thing.lights_lamp for thing in CELL.panel.objects if isinstance(thing, Button) and thing.lights_lamp]
+    lit = [
+        panel_object.lights_lamp
+        for panel_object in CELL.panel.objects
+        if isinstance(panel_object, Button) and panel_object.lights_lamp
+    ]
     assert lit
     for seed in range(20):
         for item in build(CELL.panel, Draws(seed)):
-            if isinstance(item.thing, Lamp) and item.thing.name in lit:
+            if isinstance(item.panel_object, Lamp) and item.panel_object.name in lit:
                 assert not item.is_on
 
 
@@ -102,6 +106,6 @@ def test_states_differ_from_seed_to_seed() -> None:
 
 @pytest.mark.parametrize(("value", "text"), [(159.3, "159.3"), (7.0, "  7.0"), (0.04, "  0.0")])
 def test_a_display_is_right_justified_and_the_point_takes_no_digit(value: float, text: str) -> None:
-    thing = Display(name="d", position_m=(0.0, 0.0), width_m=0.08, height_m=0.03, digits=4, decimals=1)
+    panel_object = Display(name="d", position_m=(0.0, 0.0), width_m=0.08, height_m=0.03, digits=4, decimals=1)
     # Four digits and a point: five characters.
-    assert display_text(thing, value) == text.rjust(5)
+    assert display_text(panel_object, value) == text.rjust(5)

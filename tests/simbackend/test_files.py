@@ -18,20 +18,20 @@ WORKED = {"button", "toggle", "rotary", "slider", "lever", "handwheel", "mushroo
 
 
 def test_the_bench_panel_has_every_kind_and_a_gauge_that_is_not_linear() -> None:
-    assert {thing.kind for thing in PANEL.objects} == set(OBJECT_KINDS)
-    gauges = [thing for thing in PANEL.objects if isinstance(thing, Gauge)]
+    assert {panel_object.kind for panel_object in PANEL.objects} == set(OBJECT_KINDS)
+    gauges = [panel_object for panel_object in PANEL.objects if isinstance(panel_object, Gauge)]
     assert len(gauges) == 2
     assert sorted(bool(gauge.scale.table) for gauge in gauges) == [False, True]
 
 
 def test_what_is_worked_stands_far_enough_apart_for_the_fingers() -> None:
-    worked = [thing for thing in PANEL.objects if thing.kind in WORKED]
+    worked = [panel_object for panel_object in PANEL.objects if panel_object.kind in WORKED]
     for a, b in itertools.combinations(worked, 2):
         assert np.hypot(*np.subtract(a.position_m, b.position_m)) >= 0.07 + _reach(a) * 0.5, (a.name, b.name)
 
 
-def _reach(thing: object) -> float:
-    return thing.length_m if isinstance(thing, Lever) else 0.0
+def _reach(panel_object: object) -> float:
+    return panel_object.length_m if isinstance(panel_object, Lever) else 0.0
 
 
 @pytest.mark.parametrize("name", ["bench", "ur10e"])
@@ -103,12 +103,14 @@ def test_a_panel_at_the_edges_of_the_file_format_is_built_and_seen(text: str, tm
     cell = SimCell(cell=load_cell(ROOT / "cells" / "bench.toml", seed=9).model_copy(update={"panel": panel}))
     try:
         truth = cell.connect("arm").truth()
-        assert [thing.name for thing in truth.objects] == [thing.name for thing in panel.objects]
+        assert [panel_object.name for panel_object in truth.objects] == [
+            panel_object.name for panel_object in panel.objects
+        ]
         assert truth.objects == truth.initial
         cell.clock.sleep(0.2)
-        after = {thing.name: thing.value for thing in cell.connect("arm").truth().objects}
-        for thing in truth.initial:
-            assert after[thing.name] == pytest.approx(thing.value, abs=2e-3), thing.name
+        after = {panel_object.name: panel_object.value for panel_object in cell.connect("arm").truth().objects}
+        for panel_object in truth.initial:
+            assert after[panel_object.name] == pytest.approx(panel_object.value, abs=2e-3), panel_object.name
         assert cell.connect("wrist_camera").read_image(deadline=cell.deadline()).value.pixels.std() > 10.0
     finally:
         cell.shared.close()

@@ -38,8 +38,8 @@ def engine() -> Iterator[Engine]:
     pybullet.disconnect(engine.client)
 
 
-def load(engine: Engine, folder: Path, thing: Any, place: float = 0.0) -> int:
-    built = Built(thing=thing, offset_m=(0.0, 0.0), effort_ratio=1.0, place=place)
+def load(engine: Engine, folder: Path, panel_object: Any, place: float = 0.0) -> int:
+    built = Built(panel_object=panel_object, offset_m=(0.0, 0.0), effort_ratio=1.0, place=place)
     path = folder / "part.urdf"
     path.write_text(robot(object_model(built).urdf), encoding="ascii")
     body = int(engine.loadURDF(str(path), useFixedBase=True, flags=engine.URDF_USE_INERTIA_FROM_FILE))
@@ -80,15 +80,15 @@ def _external(engine: Engine, body: int, effort: float) -> None:
 
 
 def button(engine: Engine, folder: Path, **changes: Any) -> Spring:
-    thing = Button(name="b", position_m=(0.0, 0.0), radius_m=0.012, **changes)
-    body = load(engine, folder, thing)
+    panel_object = Button(name="b", position_m=(0.0, 0.0), radius_m=0.012, **changes)
+    body = load(engine, folder, panel_object)
     spring = Spring(
         engine=engine,
         body=body,
-        travel_m=thing.travel_m,
-        spring_n_per_m=thing.spring_n_per_m,
-        preload_n=thing.preload_n,
-        latching=thing.latching,
+        travel_m=panel_object.travel_m,
+        spring_n_per_m=panel_object.spring_n_per_m,
+        preload_n=panel_object.preload_n,
+        latching=panel_object.latching,
         releases=True,
     )
     spring.free()
@@ -124,8 +124,8 @@ def test_a_latching_button_stays_in_until_pressed_again(engine: Engine, tmp_path
 
 
 def test_a_mushroom_latches_for_good(engine: Engine, tmp_path: Path) -> None:
-    thing = Mushroom(name="m", position_m=(0.0, 0.0))
-    body = load(engine, tmp_path, thing)
+    panel_object = Mushroom(name="m", position_m=(0.0, 0.0))
+    body = load(engine, tmp_path, panel_object)
     spring = Spring(
         engine=engine, body=body, travel_m=0.006, spring_n_per_m=2000.0, preload_n=8.0, latching=True, releases=False
     )
@@ -140,8 +140,8 @@ def test_a_mushroom_latches_for_good(engine: Engine, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("effort", "moves"), [(3.6, False), (4.4, True)])
 def test_a_slider_breaks_away_at_its_friction(engine: Engine, tmp_path: Path, effort: float, moves: bool) -> None:
     scale = Scale(minimum=0.0, maximum=100.0, unit="%", at_min=-0.05, at_max=0.05)
-    thing = Slider(name="s", position_m=(0.0, 0.0), travel_m=0.1, scale=scale, friction_n=4.0)
-    friction = Friction(engine=engine, body=load(engine, tmp_path, thing), effort=4.0, damping=5.0)
+    panel_object = Slider(name="s", position_m=(0.0, 0.0), travel_m=0.1, scale=scale, friction_n=4.0)
+    friction = Friction(engine=engine, body=load(engine, tmp_path, panel_object), effort=4.0, damping=5.0)
     place = push(engine, friction.body, effort, friction.drive)
     assert (place > 0.01) is moves
     assert place <= 0.0505
@@ -159,9 +159,11 @@ def test_a_lever_turned_too_hard_stops_at_its_ends(engine: Engine, tmp_path: Pat
 def test_a_toggle_flips_beyond_its_effort_and_rests_at_an_end(
     engine: Engine, tmp_path: Path, effort_nm: float, flips: bool
 ) -> None:
-    thing = Toggle(name="t", position_m=(0.0, 0.0))
-    body = load(engine, tmp_path, thing, place=-thing.tilt_rad)
-    detent = Detent(engine=engine, body=body, places=(-thing.tilt_rad, thing.tilt_rad), effort=0.12, max_speed=8.0)
+    panel_object = Toggle(name="t", position_m=(0.0, 0.0))
+    body = load(engine, tmp_path, panel_object, place=-panel_object.tilt_rad)
+    detent = Detent(
+        engine=engine, body=body, places=(-panel_object.tilt_rad, panel_object.tilt_rad), effort=0.12, max_speed=8.0
+    )
     push(engine, body, effort_nm, detent.drive, 0.5)
     rest = push(engine, body, 0.0, detent.drive, 0.5)
-    assert rest == pytest.approx(thing.tilt_rad if flips else -thing.tilt_rad, abs=2e-3)
+    assert rest == pytest.approx(panel_object.tilt_rad if flips else -panel_object.tilt_rad, abs=2e-3)

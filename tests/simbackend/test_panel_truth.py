@@ -31,8 +31,8 @@ class At:
         return self.where
 
 
-def truth(thing: Any, place: float, *, lamp: bool = False) -> Any:
-    return truth_of(Built(thing=thing, offset_m=(0.0, 0.0), effort_ratio=1.0), At(place), lamp_is_on=lamp)
+def truth(panel_object: Any, place: float, *, lamp: bool = False) -> Any:
+    return truth_of(Built(panel_object=panel_object, offset_m=(0.0, 0.0), effort_ratio=1.0), At(place), lamp_is_on=lamp)
 
 
 @pytest.mark.parametrize(("angle", "state"), [(0.1, "open"), (1.5, "closed"), (0.8, None), (-0.5, None)])

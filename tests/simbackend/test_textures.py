@@ -48,17 +48,17 @@ def test_the_face_has_a_dark_rim_and_a_white_ground() -> None:
 
 @pytest.mark.parametrize("digit", "0123456789")
 def test_every_digit_lights_its_own_segments(digit: str) -> None:
-    thing = Display(name="d", position_m=(0.0, 0.0), width_m=0.03, height_m=0.04, digits=1)
-    face = grey(textures.display_face(thing, digit))
+    panel_object = Display(name="d", position_m=(0.0, 0.0), width_m=0.03, height_m=0.04, digits=1)
+    face = grey(textures.display_face(panel_object, digit))
     lit = np.count_nonzero(face > 80)
-    full = np.count_nonzero(grey(textures.display_face(thing, "8")) > 80)
+    full = np.count_nonzero(grey(textures.display_face(panel_object, "8")) > 80)
     expected = len(textures.SEGMENTS[digit]) / 7
     assert lit / full == pytest.approx(expected, abs=0.05)
 
 
 def test_ten_digits_make_ten_pictures() -> None:
-    thing = Display(name="d", position_m=(0.0, 0.0), width_m=0.03, height_m=0.04, digits=1)
-    assert len({textures.display_face(thing, str(digit)).tobytes() for digit in range(10)}) == 10
+    panel_object = Display(name="d", position_m=(0.0, 0.0), width_m=0.03, height_m=0.04, digits=1)
+    assert len({textures.display_face(panel_object, str(digit)).tobytes() for digit in range(10)}) == 10
 
 
 def test_the_plate_is_light_and_printed(tmp_path: Path) -> None:

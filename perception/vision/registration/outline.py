@@ -26,23 +26,23 @@ class Outline:
     reach_m: float = 0.0
 
 
-def edges_of(thing: PanelObject) -> Outline | None:
+def edges_of(panel_object: PanelObject) -> Outline | None:
     """The edges that every state shows; None for kinds whose fixed parts the panel file leaves open."""
-    x, y = thing.position_m
-    match thing.kind:
+    x, y = panel_object.position_m
+    match panel_object.kind:
         case "gauge":
             # The rim lies at the plate; only the needle stands `depth_m` above it. The face begins inside the rim.
-            return replace(_circle(x, y, 0.0, thing.radius_m), reach_m=0.12 * thing.radius_m)
+            return replace(_circle(x, y, 0.0, panel_object.radius_m), reach_m=0.12 * panel_object.radius_m)
         case "lamp":
-            return _circle(x, y, 0.0, thing.radius_m)
+            return _circle(x, y, 0.0, panel_object.radius_m)
         case "handwheel":
-            return _circle(x, y, thing.height_m - thing.rim_m, thing.radius_m + thing.rim_m)
+            return _circle(x, y, panel_object.height_m - panel_object.rim_m, panel_object.radius_m + panel_object.rim_m)
         case "rotary":
-            return _circle(x, y, thing.height_m / 2, thing.radius_m)
+            return _circle(x, y, panel_object.height_m / 2, panel_object.radius_m)
         case "panel_meter":
-            return rectangle(x, y, 0.0, width_m=thing.width_m, height_m=thing.height_m, count=SIDE_POINTS)
+            return rectangle(x, y, 0.0, width_m=panel_object.width_m, height_m=panel_object.height_m, count=SIDE_POINTS)
         case "display":
-            return rectangle(x, y, 0.0, width_m=thing.width_m, height_m=thing.height_m, count=SIDE_POINTS)
+            return rectangle(x, y, 0.0, width_m=panel_object.width_m, height_m=panel_object.height_m, count=SIDE_POINTS)
         case _:
             return None
 
@@ -52,48 +52,48 @@ def plate_edges(panel: Panel) -> Outline:
     return rectangle(0.0, 0.0, 0.0, width_m=panel.width_m, height_m=panel.height_m, count=PLATE_POINTS)
 
 
-def footprint_m(thing: PanelObject) -> tuple[float, float, float]:
+def footprint_m(panel_object: PanelObject) -> tuple[float, float, float]:
     """Half width, half height and the height above the plate of the box that holds the object, metres."""
-    match thing.kind:
+    match panel_object.kind:
         case "gauge":
-            return thing.radius_m, thing.radius_m, thing.depth_m
+            return panel_object.radius_m, panel_object.radius_m, panel_object.depth_m
         case "panel_meter":
-            return thing.width_m / 2, thing.height_m / 2, thing.depth_m
+            return panel_object.width_m / 2, panel_object.height_m / 2, panel_object.depth_m
         case "display":
-            return thing.width_m / 2, thing.height_m / 2, 0.0
+            return panel_object.width_m / 2, panel_object.height_m / 2, 0.0
         case "lamp" | "button" | "mushroom" | "rotary":
-            return thing.radius_m, thing.radius_m, thing.height_m
+            return panel_object.radius_m, panel_object.radius_m, panel_object.height_m
         case "handwheel":
-            outer = thing.radius_m + thing.rim_m
-            return outer, outer, thing.height_m - thing.rim_m
+            outer = panel_object.radius_m + panel_object.rim_m
+            return outer, outer, panel_object.height_m - panel_object.rim_m
         case "toggle":
-            reach = thing.bat_length_m * np.sin(thing.tilt_rad) + thing.bat_radius_m
-            half_width = max(3.0 * thing.bat_radius_m, 0.010)
-            return half_width, max(reach, half_width), thing.bat_length_m * np.cos(thing.tilt_rad)
+            reach = panel_object.bat_length_m * np.sin(panel_object.tilt_rad) + panel_object.bat_radius_m
+            half_width = max(3.0 * panel_object.bat_radius_m, 0.010)
+            return half_width, max(reach, half_width), panel_object.bat_length_m * np.cos(panel_object.tilt_rad)
         case "slider":
-            along = thing.travel_m / 2 + thing.cap_size_m[0] / 2
-            across = thing.cap_size_m[1] / 2
-            c, s = abs(np.cos(thing.angle_rad)), abs(np.sin(thing.angle_rad))
-            return along * c + across * s, along * s + across * c, thing.cap_size_m[2]
+            along = panel_object.travel_m / 2 + panel_object.cap_size_m[0] / 2
+            across = panel_object.cap_size_m[1] / 2
+            c, s = abs(np.cos(panel_object.angle_rad)), abs(np.sin(panel_object.angle_rad))
+            return along * c + across * s, along * s + across * c, panel_object.cap_size_m[2]
         case "lever":
-            return thing.length_m, thing.length_m, thing.height_m
+            return panel_object.length_m, panel_object.length_m, panel_object.height_m
 
 
-def box_m(thing: PanelObject) -> Array:
+def box_m(panel_object: PanelObject) -> Array:
     """(4, 3) corners of the object's footprint, upper left first and clockwise as the viewer sees it."""
-    w, h, z = footprint_m(thing)
-    x, y = thing.position_m
+    w, h, z = footprint_m(panel_object)
+    x, y = panel_object.position_m
     return np.array([[x - w, y + h, z], [x + w, y + h, z], [x + w, y - h, z], [x - w, y - h, z]])
 
 
-def contour_m(thing: PanelObject) -> Array:
+def contour_m(panel_object: PanelObject) -> Array:
     """(N, 3) closed contour for drawing: a circle for round kinds, else the footprint."""
-    edges = edges_of(thing)
+    edges = edges_of(panel_object)
     if edges is not None:
         return edges.points_m
-    if thing.kind in ("button", "mushroom"):
-        return _circle(*thing.position_m, footprint_m(thing)[2], footprint_m(thing)[0]).points_m
-    return box_m(thing)
+    if panel_object.kind in ("button", "mushroom"):
+        return _circle(*panel_object.position_m, footprint_m(panel_object)[2], footprint_m(panel_object)[0]).points_m
+    return box_m(panel_object)
 
 
 def rectangle(x: float, y: float, z: float, *, width_m: float, height_m: float, count: int) -> Outline:

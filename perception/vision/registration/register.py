@@ -70,7 +70,7 @@ def register(gray: Image, view: View, panel: Panel) -> Registration:
     """
     image = edge_image(gray)
     smooth, slope_noise = image.smooth, image.slope_noise
-    own = {thing.name: edges for thing in panel.objects if (edges := edges_of(thing)) is not None}
+    own = {panel_object.name: edges for panel_object in panel.objects if (edges := edges_of(panel_object)) is not None}
     everything = _joined([plate_edges(panel), *own.values()])
     covariance = np.diag(view.prior_sigma**2)
     reference = view

@@ -46,7 +46,7 @@ class Shown:
         centre_px, box_px: (2,) and (4, 2), the object in the image.
     """
 
-    thing: PanelObject
+    panel_object: PanelObject
     place_px: Array
     middle_m: Array
     centre_px: Array
@@ -127,21 +127,21 @@ def _objects(
     """The objects that can teach, and why the others cannot."""
     shown: list[Shown] = []
     left_out: dict[str, str] = {}
-    for thing, reading in zip(panel.objects, readings, strict=True):
+    for panel_object, reading in zip(panel.objects, readings, strict=True):
         if not reading.present:
-            left_out[thing.name] = reading.reason or "it is not seen"
+            left_out[panel_object.name] = reading.reason or "it is not seen"
             continue
-        shift_px = reading.centre_px - view.project([thing.point_m])[0]
-        found = _nearest_sub_object(overview, view, thing, shift_px, places)
+        shift_px = reading.centre_px - view.project([panel_object.point_m])[0]
+        found = _nearest_sub_object(overview, view, panel_object, shift_px, places)
         if found is None:
-            left_out[thing.name] = NOT_DISTINCT
+            left_out[panel_object.name] = NOT_DISTINCT
             continue
         place, middle_m = found
-        (left, top), (right, bottom) = _box(overview, view, thing, shift_px)
+        (left, top), (right, bottom) = _box(overview, view, panel_object, shift_px)
         corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
         shown.append(
             Shown(
-                thing=thing,
+                panel_object=panel_object,
                 place_px=place,
                 middle_m=middle_m,
                 centre_px=overview.in_image(overview.on_plate(place[None]) + middle_m)[0],
@@ -152,19 +152,19 @@ def _objects(
 
 
 def _nearest_sub_object(
-    overview: Overview, view: View, thing: PanelObject, shift_px: Array, places: Array
+    overview: Overview, view: View, panel_object: PanelObject, shift_px: Array, places: Array
 ) -> tuple[Array, Array] | None:
     """The sub-object at the object's middle; else, as for a slider or a lever, the nearest in its box, and how the middle
     lies from it.
     """
-    x, y = thing.position_m
-    stem = np.column_stack([np.tile([x, y], (3, 1)), footprint_m(thing)[2] * FOOT_TO_TOP])
+    x, y = panel_object.position_m
+    stem = np.column_stack([np.tile([x, y], (3, 1)), footprint_m(panel_object)[2] * FOOT_TO_TOP])
     line = _on_ground(overview, view.project(stem) + shift_px)
     away = np.linalg.norm(places[:, None] - line, axis=2)
     is_near = away.min(axis=1) < SNAP_M * PLATE_PX_PER_M
     if is_near.any():
         return np.asarray(places[int(np.where(is_near, away[:, 1], np.inf).argmin())]), np.zeros(2)
-    low, high = _box(overview, view, thing, shift_px)
+    low, high = _box(overview, view, panel_object, shift_px)
     is_near = ((places >= low) & (places <= high)).all(axis=1)
     if not is_near.any():
         return None
@@ -173,11 +173,11 @@ def _nearest_sub_object(
     return np.asarray(place), np.round(middle_m, 4)
 
 
-def _box(overview: Overview, view: View, thing: PanelObject, shift_px: Array) -> Array:
+def _box(overview: Overview, view: View, panel_object: PanelObject, shift_px: Array) -> Array:
     """(2, 2) lowest and highest u and v of the object's box, foot to top, on the rectified plate."""
-    half_width, half_height, height = footprint_m(thing)
+    half_width, half_height, height = footprint_m(panel_object)
     corners = np.array([[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (0.0, 1.0)])
-    box = corners * [half_width, half_height, height] + [*thing.position_m, 0.0]
+    box = corners * [half_width, half_height, height] + [*panel_object.position_m, 0.0]
     at = _on_ground(overview, view.project(box) + shift_px)
     return np.stack([at.min(axis=0), at.max(axis=0)])
 
@@ -192,10 +192,10 @@ def _of_nothing(overview: Overview, view: View, panel: Panel, shown: Sequence[Sh
     middles = np.array([each.place_px for each in shown])
     away = np.linalg.norm(places[:, None] - middles, axis=2).min(axis=1)
     is_nothing = away > PART_M * PLATE_PX_PER_M
-    names = {each.thing.name for each in shown}
-    for thing in panel.objects:
-        if thing.name not in names:
-            low, high = _box(overview, view, thing, np.zeros(2))
+    names = {each.panel_object.name for each in shown}
+    for panel_object in panel.objects:
+        if panel_object.name not in names:
+            low, high = _box(overview, view, panel_object, np.zeros(2))
             is_nothing &= ~((places >= low) & (places <= high)).all(axis=1)
     return look_at(overview.ground, places[is_nothing])
 
@@ -206,7 +206,7 @@ def _grown(
     """The knowledge with what it does not tell yet, and how many looks every kind got."""
     own = look_at(overview.ground, np.array([each.place_px for each in shown]))
     looks = np.round(np.vstack([own, nothing]) * UNIT) / UNIT  # as the files have them
-    names = np.array([each.thing.kind for each in shown] + [NOTHING] * len(nothing))
+    names = np.array([each.panel_object.kind for each in shown] + [NOTHING] * len(nothing))
     added: dict[str, int] = {}
     grown = knowledge
     known = knowledge.for_image(noisy=overview.ground.noisy)
@@ -214,7 +214,7 @@ def _grown(
         name = str(names[k])
         size_m, middles_m = NOTHING_SIZE_M, None
         if name != NOTHING:
-            half_width, half_height, _ = footprint_m(shown[k].thing)
+            half_width, half_height, _ = footprint_m(shown[k].panel_object)
             size_m = (2.0 * half_width, 2.0 * half_height)
             middles_m = shown[k].middle_m[None] if shown[k].middle_m.any() else None
         grown = grown.grown(
@@ -228,11 +228,11 @@ def _recognised(overview: Overview, places: Array, shown: Sequence[Shown], knowl
     """Names of the objects that are recognised blind in this overview."""
     looks = look_at(overview.ground, places)
     found = chosen(overview.ground, places, looks, knowledge, overview.view, overview.plate_m)
-    return tuple(each.thing.name for each in shown if any(_is(each, candidate) for candidate in found))
+    return tuple(each.panel_object.name for each in shown if any(_is(each, candidate) for candidate in found))
 
 
 def _is(shown: Shown, candidate: Candidate) -> bool:
-    if candidate.reason is not None or candidate.kind != shown.thing.kind:
+    if candidate.reason is not None or candidate.kind != shown.panel_object.kind:
         return False
     reach_px = 0.5 * float(np.ptp(shown.box_px, axis=0).max())
     return bool(np.linalg.norm(candidate.centre_px - shown.centre_px) < reach_px)

@@ -32,8 +32,8 @@ def check(reading: ObjectReading, shown: Shown) -> None:
 
 
 def span(name: str) -> float:
-    thing = panel().object(name)
-    scale = getattr(thing, "scale", None)
+    panel_object = panel().object(name)
+    scale = getattr(panel_object, "scale", None)
     return 2 * np.pi / 3.6 if scale is None else scale.maximum - scale.minimum
 
 
@@ -41,7 +41,7 @@ def span(name: str) -> float:
 def test_every_kind_is_read_from_every_side(tilt_deg: float, azimuth_deg: float, size: tuple[int, int]) -> None:
     image, intrinsics, pose = scene(tilt_deg=tilt_deg, azimuth_deg=azimuth_deg, size=size)
     readings = inspect(image, intrinsics, pose, panel())
-    assert [r.name for r in readings] == [thing.name for thing in panel().objects]
+    assert [r.name for r in readings] == [panel_object.name for panel_object in panel().objects]
     for reading in readings:
         assert reading.present, (reading.name, reading.reason)
         if reading.kind in ("button", "mushroom") and not reading.answered:

@@ -31,7 +31,7 @@ from tests.service.shown_panel import (
 )
 
 __all__ = ["house", "shown", "web"]  # fixtures
-NAMES = [thing.name for thing in panel().objects]
+NAMES = [panel_object.name for panel_object in panel().objects]
 
 
 def blind(web: httpx2.Client, image: str) -> list[str]:

@@ -91,7 +91,7 @@ def test_the_dialogue_teaches_a_whole_panel_and_reads_it(
     said = capsys.readouterr().out
     assert "must be a number" in said and "there is a 'pressure' already" in said
     made = load_panel(tmp_path / "kinds" / "panels" / "pump_room.toml")
-    assert [(thing.name, thing.kind) for thing in made.objects] == [
+    assert [(panel_object.name, panel_object.kind) for panel_object in made.objects] == [
         ("pressure", "gauge"), ("mode", "rotary"), ("halt", "mushroom"),
     ]  # fmt: skip
     assert "mode (rotary): high" in said

@@ -75,7 +75,7 @@ def test_a_whole_panel_is_taught_and_read(web: httpx2.Client, shown: Shown, hous
     taught = web.post("/v1/knowledge/teach", json=body)
     assert taught.status_code == 200, taught.text
     made = parse_toml(taught.json()["toml"], Panel, source="answer")
-    assert [thing.name for thing in made.objects] == ["pressure", "flow", "halt"]
+    assert [panel_object.name for panel_object in made.objects] == ["pressure", "flow", "halt"]
     known = web.get("/v1/knowledge").json()
     panels = {p["name"]: p for p in known["panels"]}
     assert panels["pump_room"]["is_taught"] and panels["pump_room"]["toml"] == taught.json()["toml"]
@@ -93,7 +93,7 @@ def test_lessons_that_cannot_be_are_refused_and_write_nothing(web: httpx2.Client
     before = web.get("/v1/knowledge?toml=false").json()
     bare = view.project([[0.12, -0.15, 0.0]]).tolist()
     base = {"image": image, "plate_m": PLATE}
-    thing = {"kind": "gauge", "name": "a", "clicks_px": middle(shown, "pressure")}
+    panel_object = {"kind": "gauge", "name": "a", "clicks_px": middle(shown, "pressure")}
     for status, body in (
         (409, {**base, "kind": "pump", "clicks_px": bare}),
         (409, {**base, "kind": "pump", "clicks_px": [[1.0, 1.0]]}),
@@ -102,9 +102,9 @@ def test_lessons_that_cannot_be_are_refused_and_write_nothing(web: httpx2.Client
         (422, {**base, "kind": "pump", "clicks_px": bare * 4}),
         (422, {**base}),
         (422, {**base, "panel": {"name": "p", "objects": []}}),
-        (422, {**base, "panel": {"name": "p", "objects": [thing, thing]}}),
-        (422, {**base, "panel": {"name": "p", "objects": [{**thing, "kind": "pyramid"}]}}),
-        (422, {**base, "panel": {"name": "p", "objects": [{**thing, "answers": {"minimum": "much"}}]}}),
+        (422, {**base, "panel": {"name": "p", "objects": [panel_object, panel_object]}}),
+        (422, {**base, "panel": {"name": "p", "objects": [{**panel_object, "kind": "pyramid"}]}}),
+        (422, {**base, "panel": {"name": "p", "objects": [{**panel_object, "answers": {"minimum": "much"}}]}}),
         (404, {**base, "image": "0" * 24, "kind": "pump", "clicks_px": bare}),
     ):
         answer = web.post("/v1/knowledge/teach", json=body)
@@ -136,11 +136,11 @@ def test_images_that_teach_nothing_are_refused_with_the_reason(
     image = store(web, np.ascontiguousarray(change(shown[0])))
     before = web.get("/v1/knowledge?toml=false").json()
     clicks = {"clicks_px": middle(shown, "pressure")}
-    thing = {"kind": "gauge", "name": "a", **clicks}
+    panel_object = {"kind": "gauge", "name": "a", **clicks}
     more = {
         "outline": clicks,
         "kind": {"kind": "pump", **clicks},
-        "panel": {"panel": {"name": "p", "objects": [thing]}},
+        "panel": {"panel": {"name": "p", "objects": [panel_object]}},
     }
     path = "/v1/knowledge/outline" if lesson == "outline" else "/v1/knowledge/teach"
     is_problem(web.post(path, json={"image": image, "plate_m": PLATE, **more[lesson]}), 409, kind, words)

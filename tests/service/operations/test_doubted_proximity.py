@@ -72,8 +72,8 @@ def test_noise_and_what_hangs_before_the_plate_at_one_place_is_no_fault() -> Non
 
 def test_beams_that_may_meet_something_else_say_nothing() -> None:
     edge = PANEL.width_m / 2
-    thing = PANEL.objects[0].position_m
-    for foot in ((edge - 0.5 * BARE_M, 0.0), (edge + 0.05, 0.0), thing):
+    panel_object = PANEL.objects[0].position_m
+    for foot in ((edge - 0.5 * BARE_M, 0.0), (edge + 0.05, 0.0), panel_object):
         watch = DoubtedProximity(PANEL)
         for _ in range(3):
             visit(watch, foot, 0.3, 0.3)

@@ -132,7 +132,7 @@ def test_readings_are_held_against_their_own_time() -> None:
 def test_right_means_two_per_cent_of_the_scale_or_the_very_state(
     name: str, said: dict[str, Any], is_right: bool
 ) -> None:
-    now = {thing.name: thing for thing in truth().objects}[name]
+    now = {panel_object.name: panel_object for panel_object in truth().objects}[name]
     answer = {"value": None, "state": None, "text": None, **said}
     assert agrees(PANEL.object(name), now, **answer) is is_right
 

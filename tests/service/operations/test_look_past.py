@@ -37,7 +37,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
 def truth_of(session: Session, name: str) -> Any:
     """What the object truly shows."""
     arm = session.connection.device("arm")
-    return next(thing for thing in arm.truth().objects if thing.name == name)
+    return next(panel_object for panel_object in arm.truth().objects if panel_object.name == name)
 
 
 def straight_look(session: Session) -> Inspection:

@@ -42,7 +42,7 @@ def mission_context(folder: Path, seed: int, *, misplaced_m: float = 0.0) -> Ite
     if misplaced_m:
         wheel = cell.panel.object("bypass")
         moved = wheel.model_copy(update={"position_m": (wheel.position_m[0] - misplaced_m, wheel.position_m[1])})
-        things = tuple(moved if thing is wheel else thing for thing in cell.panel.objects)
+        things = tuple(moved if panel_object is wheel else panel_object for panel_object in cell.panel.objects)
         cell = cell.model_copy(update={"panel": cell.panel.model_copy(update={"objects": things})})
     try:
         yield OperationContext(
@@ -72,7 +72,9 @@ def lie(truth: Truth) -> Truth:
     """A truth in which everything is elsewhere and shows something else."""
     matrix = truth.base_from_panel_matrix.copy()
     matrix[:3, 3] += (0.05, -0.04, 0.03)
-    wrong = tuple(ObjectTruth(name=thing.name, value=-1.0, state="broken", text="8888") for thing in truth.objects)
+    wrong = tuple(
+        ObjectTruth(name=panel_object.name, value=-1.0, state="broken", text="8888") for panel_object in truth.objects
+    )
     return replace(truth, base_from_panel_matrix=matrix, objects=wrong, initial=wrong)
 
 

@@ -71,7 +71,7 @@ def test_the_overview_holds_the_whole_plate_wherever_it_is(slack_m: float) -> No
 def test_close_ups_show_every_object_once_and_whole() -> None:
     groups = close_up_groups(PANEL.objects, LENS)
     names = [name for _, group in groups for name in group]
-    assert sorted(names) == sorted(thing.name for thing in PANEL.objects)
+    assert sorted(names) == sorted(panel_object.name for panel_object in PANEL.objects)
     assert len(groups) <= 5
     for centre_m, group in groups:
         camera_from_panel = facing(BASE_FROM_PANEL, tuple(centre_m), 0.30).inv() * BASE_FROM_PANEL
@@ -86,12 +86,13 @@ def test_spots_are_bare_and_far_apart(count: int) -> None:
     assert len(spots) == count
     for x, y in spots:
         assert abs(x) <= PANEL.width_m / 2 - EDGE_M + 1e-9 and abs(y) <= PANEL.height_m / 2 - EDGE_M + 1e-9
-        for thing in PANEL.objects:
-            half_x, half_y = half_footprint_m(thing)
+        for panel_object in PANEL.objects:
+            half_x, half_y = half_footprint_m(panel_object)
             gap = np.hypot(
-                max(abs(x - thing.position_m[0]) - half_x, 0.0), max(abs(y - thing.position_m[1]) - half_y, 0.0)
+                max(abs(x - panel_object.position_m[0]) - half_x, 0.0),
+                max(abs(y - panel_object.position_m[1]) - half_y, 0.0),
             )
-            assert gap >= 0.0299, f"{thing.name} is {gap:.3f} m from a spot"
+            assert gap >= 0.0299, f"{panel_object.name} is {gap:.3f} m from a spot"
     nearest = min(np.linalg.norm(a - b) for a, b in itertools.combinations(spots, 2))
     assert nearest > 0.08
 

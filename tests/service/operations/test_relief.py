@@ -50,9 +50,9 @@ def certain(pose: RigidTransform) -> UncertainPose:
     return UncertainPose(parent_from_child=pose, covariance=np.zeros((6, 6)))
 
 
-def drawn(panel_from_thing: RigidTransform, thing: Mushroom | Handwheel) -> np.ndarray:
+def drawn(panel_from_thing: RigidTransform, panel_object: Mushroom | Handwheel) -> np.ndarray:
     """Depth of one object by itself."""
-    model = models_of(panel())[thing.name]
+    model = models_of(panel())[panel_object.name]
     sen = np.array([1.0, FOCAL_PX, FOCAL_PX, (SIDE - 1) / 2, (SIDE - 1) / 2])
     pose = SCANNER_FROM_PANEL * panel_from_thing
     m, k = np.empty((SIDE, SIDE)), np.empty((SIDE, SIDE), np.int64)
@@ -70,9 +70,9 @@ def plate_depth(height_m: float = 0.0) -> np.ndarray:
     return np.asarray((R[:, 2] @ p) / (rays @ R[:, 2]))
 
 
-def standing(thing: Mushroom | Handwheel, turn_rad: float = 0.0) -> RigidTransform:
+def standing(panel_object: Mushroom | Handwheel, turn_rad: float = 0.0) -> RigidTransform:
     """Pose of an object at its place in the panel file, turned counter-clockwise."""
-    return RigidTransform.from_components([*thing.position_m, 0.0], Rotation.from_euler("z", turn_rad))
+    return RigidTransform.from_components([*panel_object.position_m, 0.0], Rotation.from_euler("z", turn_rad))
 
 
 def scan_of(depth: np.ndarray, *, seed: int = 3, projection: str = "pinhole") -> Scan:
@@ -110,7 +110,7 @@ def sightings(
     scene = surfaces_in(scan)
     pose = UncertainPose(parent_from_child=believed, covariance=np.diag([sigma_m**2] * 3 + [0.0] * 3))
     found = find_by_surfaces(scene, scan, panel(), pose, scene.largest_plane())
-    return {s.thing.name: s for s in found}
+    return {s.panel_object.name: s for s in found}
 
 
 @pytest.mark.parametrize("seed", [3, 4])
@@ -138,8 +138,8 @@ def test_what_stands_in_the_place_of_the_wheel_is_not_taken_for_it(what):
     middle = SCANNER_FROM_PANEL.apply([*WHEEL.position_m, 0.03])
     off_px = np.hypot(*(FOCAL_PX * middle[k] / middle[2] + (SIDE - 1) / 2 - uv for k, uv in enumerate((u, v))))
     lid = np.where(off_px < FOCAL_PX * 0.04 / middle[2], plate_depth(0.03), np.inf)
-    thing = lid if what == "lid" else drawn(standing(WHEEL), MUSHROOM)
-    assert sightings(scan_of(np.minimum(plate_depth(), thing)))["bypass"].match is None
+    panel_object = lid if what == "lid" else drawn(standing(WHEEL), MUSHROOM)
+    assert sightings(scan_of(np.minimum(plate_depth(), panel_object)))["bypass"].match is None
 
 
 def test_a_thing_far_from_its_place_in_the_file_is_another_one_unless_the_panel_may_stand_there():
@@ -161,8 +161,8 @@ def test_the_picture_rings_what_was_found_in_green_and_what_was_not_in_red():
     found = find_by_surfaces(scene, scan, panel(), certain(SCANNER_FROM_PANEL), scene.largest_plane())
     marks = [mark_of(s, scan, certain(SCANNER_FROM_PANEL)) for s in found]
     image = surfaces_picture(scene, marks)
-    for mark, colour, thing in zip(marks, (FOUND, LOST), (MUSHROOM, WHEEL), strict=True):
-        at = SCANNER_FROM_PANEL.apply([thing.position_m[0], thing.position_m[1], thing.height_m])
+    for mark, colour, panel_object in zip(marks, (FOUND, LOST), (MUSHROOM, WHEEL), strict=True):
+        at = SCANNER_FROM_PANEL.apply([panel_object.position_m[0], panel_object.position_m[1], panel_object.height_m])
         assert mark.outline_px.mean(axis=0) == pytest.approx(FOCAL_PX * at[:2] / at[2] + (SIDE - 1) / 2, abs=0.6)
         scale = image.shape[0] / SIDE
         u, v = np.round(scale * (mark.outline_px[5] + 0.5) - 0.5).astype(int)

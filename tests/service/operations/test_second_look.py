@@ -21,8 +21,8 @@ def reading(uncertainty: float | None) -> ObjectReading:
 
 
 def test_the_skill_learns_how_sure_the_look_is() -> None:
-    thing = load_panel(PANEL).object("setpoint")
-    assert isinstance(thing, Slider)
-    assert state_of(reading(0.3), thing).sigma == 0.3
-    assert state_of(reading(None), thing).sigma == 0.0
-    assert state_of(reading(0.3), thing).value == 71.1
+    panel_object = load_panel(PANEL).object("setpoint")
+    assert isinstance(panel_object, Slider)
+    assert state_of(reading(0.3), panel_object).sigma == 0.3
+    assert state_of(reading(None), panel_object).sigma == 0.0
+    assert state_of(reading(0.3), panel_object).value == 71.1

@@ -25,12 +25,16 @@ def pose(parent_from_child: RigidTransform, sigma_m: float) -> UncertainPose:
     return UncertainPose(parent_from_child=parent_from_child, covariance=np.diag([sigma_m**2] * 3 + [1e-10] * 3))
 
 
-def sighting(thing: Mushroom | Handwheel, *, off_m: tuple[float, float] = (0.0, 0.0), state: float = 0.0) -> Sighting:
+def sighting(
+    panel_object: Mushroom | Handwheel, *, off_m: tuple[float, float] = (0.0, 0.0), state: float = 0.0
+) -> Sighting:
     """An object seen `off_m` (x, y on the panel) beside its place in the file."""
-    at = RigidTransform.from_translation([thing.position_m[0] + off_m[0], thing.position_m[1] + off_m[1], 0.0])
+    at = RigidTransform.from_translation(
+        [panel_object.position_m[0] + off_m[0], panel_object.position_m[1] + off_m[1], 0.0]
+    )
     found = pose(BASE_FROM_PANEL * at, SIGMA_M)
     match = Match(
-        model=thing.name,
+        model=panel_object.name,
         sensor_from_object=found,
         labels={},
         state=state,
@@ -39,18 +43,22 @@ def sighting(thing: Mushroom | Handwheel, *, off_m: tuple[float, float] = (0.0, 
         score=100.0,
         seen=0.6,
     )
-    return Sighting(thing=thing, match=match, base_from_object=found, off_m=float(np.hypot(*off_m)), state=state)
+    return Sighting(
+        panel_object=panel_object, match=match, base_from_object=found, off_m=float(np.hypot(*off_m)), state=state
+    )
 
 
-def reading(thing: Mushroom | Handwheel, *, state: str | None = None, value: float | None = None) -> ObjectReading:
+def reading(
+    panel_object: Mushroom | Handwheel, *, state: str | None = None, value: float | None = None
+) -> ObjectReading:
     """What vision says, from where the file has the object."""
     return ObjectReading(
-        name=thing.name,
-        kind=thing.kind,
+        name=panel_object.name,
+        kind=panel_object.kind,
         present=True,
         centre_px=np.zeros(2),
         outline_px=np.zeros((4, 2)),
-        centre_m=np.array([*thing.position_m, 0.0]),
+        centre_m=np.array([*panel_object.position_m, 0.0]),
         state=state,
         value=value,
         uncertainty=0.01 if value is not None else None,
@@ -107,7 +115,7 @@ def test_the_state_is_compared_too_a_wheel_up_to_its_spokes(seen, shown, is_alik
 
 
 def test_what_was_not_found_says_why_and_forbids_nothing():
-    row = check(Sighting(thing=WHEEL, why="not in the scanner's view"))
+    row = check(Sighting(panel_object=WHEEL, why="not in the scanner's view"))
     assert (row.found, row.agrees, row.off_m) == (False, None, None)
     assert "not in the scanner's view" in row.finding
     need_its_place([row], "bypass")
@@ -118,5 +126,5 @@ def test_the_closer_look_counts_and_both_are_told():
     both = after_both(far, near)
     assert both.agrees and both.seen_from == CLOSER
     assert "6.0 mm" in both.finding and "0.5 mm" in both.finding
-    lost = check(Sighting(thing=WHEEL, why="no surfaces like its own near its place"), place=CLOSER)
+    lost = check(Sighting(panel_object=WHEEL, why="no surfaces like its own near its place"), place=CLOSER)
     assert after_both(far, lost).stands_elsewhere and "no surfaces" in after_both(far, lost).finding

@@ -46,8 +46,8 @@ def serve(write_cell: WriteCell, trouble: Path, tmp_path: Path) -> Iterator[Serv
         return http
 
     yield serve
-    for thing in reversed(opened):
-        thing.close()
+    for panel_object in reversed(opened):
+        panel_object.close()
 
 
 def test_what_is_missing_is_named_and_the_rest_works(serve: Serve, trouble: Path) -> None:

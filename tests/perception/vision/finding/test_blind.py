@@ -260,7 +260,7 @@ def test_noise_says_nothing_of_which_way_is_up() -> None:
     image, view = overview()
     ground, knowledge = lay_out(image, view, PLATE), shipped_knowledge()
     at = (
-        np.array([thing.point_m[:2] for thing in panel().objects]) * [1.0, -1.0] + np.array(PLATE) / 2
+        np.array([panel_object.point_m[:2] for panel_object in panel().objects]) * [1.0, -1.0] + np.array(PLATE) / 2
     ) * PLATE_PX_PER_M
     found = chosen(ground, at, look_at(ground, at), knowledge, view, PLATE)
     up = uprightness(ground, found, knowledge, PLATE)

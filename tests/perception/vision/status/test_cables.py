@@ -251,6 +251,10 @@ def test_stray_ink_is_what_no_lit_segment_accounts_for() -> None:
 
 def test_a_sure_reading_proves_an_object_whose_outline_does_not_show() -> None:
     scene = draw_scene(100, "hard")
-    (display,) = [thing for thing in scene.truth["objects"] if thing["cls"] == "display" and thing["text"] == "-348"]
+    (display,) = [
+        panel_object
+        for panel_object in scene.truth["objects"]
+        if panel_object["cls"] == "display" and panel_object["text"] == "-348"
+    ]
     (read,) = [row for row in read_scene(scene) if row.kind == "display" and row.truth == display["text"]]
     assert read.is_right

@@ -39,10 +39,11 @@ def right(knowledge: Knowledge) -> tuple[set[str], list[Candidate]]:
     )
     given = [c for c in recognise(image, knowledge, plate_m=PLATE_M) if c.reason is None]
     names = {
-        thing.name
-        for thing in panel().objects
+        panel_object.name
+        for panel_object in panel().objects
         for c in given
-        if c.kind == thing.kind and np.linalg.norm(c.centre_m - thing.position_m) < max(footprint_m(thing)[:2])
+        if c.kind == panel_object.kind
+        and np.linalg.norm(c.centre_m - panel_object.position_m) < max(footprint_m(panel_object)[:2])
     }
     return names, given
 
@@ -58,7 +59,7 @@ def test_what_one_overview_taught_is_found_in_another(lesson: PanelLooks) -> Non
 def test_the_lesson_says_what_it_did(lesson: PanelLooks) -> None:
     assert lesson.added["mushroom"] == 1 and lesson.added[NOTHING] > 0
     assert {kind.name for kind in lesson.kinds} == set(lesson.added)
-    assert [each.thing.name for each in lesson.shown] == [thing.name for thing in panel().objects]
+    assert [each.panel_object.name for each in lesson.shown] == [panel_object.name for panel_object in panel().objects]
     assert set(lesson.known_before) < set(lesson.known_now) and not lesson.left_out
     shipped = shipped_knowledge()
     for kind in lesson.knowledge.kinds:

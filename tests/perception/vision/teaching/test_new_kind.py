@@ -108,7 +108,7 @@ def taught() -> Knowledge:
 def found(image: Canvas, view: CameraView, knowledge: Knowledge) -> set[str]:
     """Names of the panel's objects, and new kinds, that are found where they are."""
     hits = [c for c in check(image, knowledge, plate_m=PLATE, view=view) if c.reason is None]
-    places = [(thing.name, str(thing.kind), thing.position_m) for thing in panel().objects]
+    places = [(panel_object.name, str(panel_object.kind), panel_object.position_m) for panel_object in panel().objects]
     places += [(kind.name, kind.name, kind.asked_m) for kind in KINDS]
     return {
         name

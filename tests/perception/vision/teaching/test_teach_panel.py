@@ -45,9 +45,9 @@ def seen() -> tuple[np.ndarray, CameraView, Overview]:
 
 def corners_of(view: CameraView, name: str) -> list[tuple[float, float]]:
     """Two opposite corners around an object, as a person clicks them."""
-    thing = panel().object(name)
-    w, h, _ = footprint_m(thing)
-    x, y = thing.position_m
+    panel_object = panel().object(name)
+    w, h, _ = footprint_m(panel_object)
+    x, y = panel_object.position_m
     return [(float(u), float(v)) for u, v in view.project([[x - w, y + h, 0.0], [x + w, y - h, 0.0]])]
 
 
@@ -104,9 +104,11 @@ def test_a_taught_panel_is_a_panel_file_that_reads_the_same_image(
     image, _, overview = seen
     text = panel_text("taught", overview, find_border_lights(overview), drafts(seen))
     made = parse_toml(text, Panel, source="taught")
-    assert {thing.name for thing in made.objects} == set(ANSWERS)
-    for thing in made.objects:
-        assert np.allclose(thing.position_m, panel().object(thing.name).position_m, atol=0.004), thing.name
+    assert {panel_object.name for panel_object in made.objects} == set(ANSWERS)
+    for panel_object in made.objects:
+        assert np.allclose(panel_object.position_m, panel().object(panel_object.name).position_m, atol=0.004), (
+            panel_object.name
+        )
     readings = {r.name: r for r in inspect_view(image, as_gray(image), overview.view, made)}
     assert readings["pressure"].value == pytest.approx(6.3, abs=0.2)
     assert readings["flow"].text == SHOWN["flow"]
@@ -223,10 +225,14 @@ def test_a_second_example_takes_no_object_from_another_kind() -> None:
     ]
     before = [_found(image, knowledge) for image in tests]
     taught = 0
-    for thing in panel().objects:
+    for panel_object in panel().objects:
         try:
             lesson = teach(
-                lesson_image, knowledge, kind=thing.kind, clicks_px=corners_of(view, thing.name), plate_m=PLATE
+                lesson_image,
+                knowledge,
+                kind=panel_object.kind,
+                clicks_px=corners_of(view, panel_object.name),
+                plate_m=PLATE,
             )
         except Ambiguous:
             continue  # it would have cost another kind: refused, which is the promise
@@ -244,8 +250,8 @@ def _found(image: np.ndarray, knowledge: object) -> set[str]:
 
     hits = [c for c in check(image, knowledge, plate_m=PLATE, view=overview.view) if c.reason is None]
     return {
-        thing.name
-        for thing in panel().objects
+        panel_object.name
+        for panel_object in panel().objects
         for c in hits
-        if c.kind == thing.kind and np.linalg.norm(c.centre_m - thing.position_m) < 0.015
+        if c.kind == panel_object.kind and np.linalg.norm(c.centre_m - panel_object.position_m) < 0.015
     }

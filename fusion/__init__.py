@@ -14,12 +14,18 @@ from typing import TYPE_CHECKING
 from hal.face import load_on_first_use
 
 if TYPE_CHECKING:
-    from fusion.batch import pack
     from fusion.features import Feature, Kind, plane, point, unit
     from fusion.measurement import Measurement, SensingClass
+    from fusion.observations import (
+        Observation,
+        PixelObservation,
+        PlaneObservation,
+        ProximityObservation,
+        TouchObservation,
+    )
     from fusion.robust import FusedPose, ShapeEstimate, fuse
     from fusion.shapes import Box, Cylinder, FeatureSet, MovingPart, Shape
-    from fusion.solve import local_solution
+    from fusion.shared_errors import FusedObservations, fuse_observations
     from fusion.warm import warm_up
 
 __all__ = [
@@ -27,16 +33,21 @@ __all__ = [
     "Cylinder",
     "Feature",
     "FeatureSet",
+    "FusedObservations",
     "FusedPose",
     "Kind",
     "Measurement",
     "MovingPart",
+    "Observation",
+    "PixelObservation",
+    "PlaneObservation",
+    "ProximityObservation",
     "SensingClass",
     "Shape",
     "ShapeEstimate",
+    "TouchObservation",
     "fuse",
-    "local_solution",
-    "pack",
+    "fuse_observations",
     "plane",
     "point",
     "unit",

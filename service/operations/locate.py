@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from fusion import PixelObservation, PlaneObservation
 from hal.arrays import Array
 from hal.errors import Ambiguous, NotFound
 from hal.geometry import UncertainPose, compose, difference, matrix_of, to_json
 from perception.range import PinholeSensor, PlaneFit, fit_plane_near
 from perception.vision import AssignedLights, QuadranglePose, assign_lights, estimate, find_lights
 from service.operations.beliefs import believed_panel, expected_panel
-from service.operations.evidence import LightEvidence, PlaneEvidence
 from service.operations.eyes import LightPair, Look, Scan, look_with_lights, scan
 from service.operations.requests import PanelPoseRequest
 from service.operations.session import Session
@@ -37,7 +37,7 @@ class Located:
     pose: QuadranglePose
     pair: LightPair
     lights_px: Array
-    evidence: tuple[LightEvidence, ...]
+    observations: tuple[PixelObservation, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -46,7 +46,7 @@ class ScannedPlane:
 
     fit: PlaneFit
     scan: Scan
-    evidence: PlaneEvidence
+    observation: PlaneObservation
 
 
 def go_to_overview(session: Session) -> None:
@@ -90,7 +90,7 @@ def locate_in(session: Session, pair: LightPair) -> Located:
         pose=pose,
         pair=pair,
         lights_px=chosen.points_px,
-        evidence=_light_evidence(session, look, chosen.points_px, covariance_px),
+        observations=_light_observations(session, look, chosen.points_px, covariance_px),
     )
 
 
@@ -148,9 +148,15 @@ def plate_in(session: Session, image: Scan) -> ScannedPlane:
         sigma_angle_rad=float(max(sigma[3:].max(), 0.01)),
     )
     flange = session.mover.state().base_from_flange
-    return ScannedPlane(
-        fit=fit, scan=image, evidence=PlaneEvidence(sensor=image.scanner, base_from_flange=flange, fit=fit)
+    observation = PlaneObservation(
+        sensor=image.scanner,
+        base_from_flange=flange,
+        point_m=fit.feature.point_m,
+        normal=fit.feature.direction,
+        point_covariance=fit.feature.point_covariance,
+        normal_covariance=fit.feature.direction_covariance,
     )
+    return ScannedPlane(fit=fit, scan=image, observation=observation)
 
 
 def run_panel_pose(session: Session, request: PanelPoseRequest) -> dict[str, Any]:
@@ -228,14 +234,16 @@ def _is_expected(session: Session, base_from_panel: RigidTransform) -> bool:
     )
 
 
-def _light_evidence(session: Session, look: Look, pixels: Array, covariances: Array) -> tuple[LightEvidence, ...]:
+def _light_observations(
+    session: Session, look: Look, pixels: Array, covariances: Array
+) -> tuple[PixelObservation, ...]:
     flange = session.mover.state().base_from_flange
     return tuple(
-        LightEvidence(
+        PixelObservation(
             sensor=look.camera,
             base_from_flange=flange,
-            light=light.name,
-            light_m=np.array(light.position_m),
+            name=light.name,
+            point_m=np.array(light.position_m),
             pixel_px=pixel,
             covariance_px=covariance,
             intrinsics=look.intrinsics,

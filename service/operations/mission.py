@@ -24,7 +24,7 @@ from service.operations.judge import AFTER
 from service.operations.locate import Located, ScannedPlane, go_to_overview, locate, pose_json, scan_plate
 from service.operations.manipulate import work
 from service.operations.requests import ActionBody, MissionRequest
-from service.operations.sense import feel, fuse_and_remember, fused_json, light_evidence
+from service.operations.sense import feel, fuse_and_remember, fused_json, light_observations
 from service.operations.session import Session
 from service.operations.surface_check import OVERVIEW, SurfaceCheck, check_surfaces, need_its_place, view_surfaces
 from service.operations.travel import leave_the_panel, park
@@ -130,7 +130,7 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
         felt = feel(part, request.touches)
     with _step(session, "fuse", 0.55, 0.57) as part:
         part.progress(0.0, "fuse light rays, range plane, distances and touches")
-        answer = fuse_and_remember(part, (*light_evidence([first, located]), plane.evidence, *felt.evidence))
+        answer = fuse_and_remember(part, (*light_observations([first, located]), plane.observation, *felt.observations))
         record.facts["fused"] = fused_json(answer)
         record.facts["by_lights"] = pose_json(located.base_from_panel)
         record.pictures.append(_drawing(session, located))

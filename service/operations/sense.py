@@ -14,14 +14,20 @@ from fusion import (
     Cylinder,
     Feature,
     FeatureSet,
+    FusedObservations,
     FusedPose,
     Kind,
     Measurement,
     MovingPart,
+    Observation,
+    PixelObservation,
+    ProximityObservation,
     SensingClass,
     Shape,
     ShapeEstimate,
+    TouchObservation,
     fuse,
+    fuse_observations,
     unit,
 )
 from hal.arrays import Array
@@ -31,14 +37,6 @@ from hal.geometry import UncertainPose
 from manipulation import SkillFailure, proximity_probe, touch_probe
 from service.operations.beliefs import believed_panel
 from service.operations.doubted_proximity import DoubtedProximity
-from service.operations.evidence import (
-    Evidence,
-    FusedEvidence,
-    LightEvidence,
-    ProximityEvidence,
-    TouchEvidence,
-    fuse_evidence,
-)
 from service.operations.eyes import settle
 from service.operations.inspect import ensure_located
 from service.operations.locate import Located, go_to_overview, locate, pose_json, scan_plate
@@ -58,9 +56,9 @@ SPARE_SPOTS = 2  # a spot that the arm cannot reach is replaced
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Felt:
-    """What the fingers found: evidence, and the spots (panel frame, m) that gave it."""
+    """What the fingers found: observations, and the spots (panel frame, m) that gave it."""
 
-    evidence: tuple[Evidence, ...]
+    observations: tuple[Observation, ...]
     spots: tuple[Array, ...]
     skipped: tuple[str, ...]
 
@@ -72,7 +70,7 @@ def feel(session: Session, touches: int) -> Felt:
         NotFound: fewer than three places could be touched; says why.
         Stopped: somebody stopped the cell.
     """
-    evidence: list[Evidence] = []
+    observations: list[Observation] = []
     spots: list[Array] = []
     skipped: list[str] = []
     doubted = DoubtedProximity(session.panel)
@@ -83,7 +81,7 @@ def feel(session: Session, touches: int) -> Felt:
             break
         session.progress(len(spots) / touches, "touch the plate", f"at ({spot[0]:.3f}, {spot[1]:.3f}) m")
         try:
-            evidence += _feel_at(session, spot, doubted)
+            observations += _feel_at(session, spot, doubted)
             spots.append(spot)
         except Stopped:
             raise  # no spot is at fault
@@ -94,27 +92,29 @@ def feel(session: Session, touches: int) -> Felt:
             f"only {len(spots)} of {touches} places of the plate could be touched: {'; '.join(skipped)}",
             hint="is the panel where the lights say? is something in the way?",
         )
-    return Felt(evidence=tuple(evidence), spots=tuple(spots), skipped=tuple(skipped))
+    return Felt(observations=tuple(observations), spots=tuple(spots), skipped=tuple(skipped))
 
 
-def mounts_of(session: Session, evidence: Sequence[Evidence]) -> dict[str, UncertainPose]:
-    """`flange_from_sensor` of every sensor that gave evidence."""
-    return {sensor: session.mount(sensor) for sensor in sorted({e.sensor for e in evidence})}
+def mounts_of(session: Session, observations: Sequence[Observation]) -> dict[str, UncertainPose]:
+    """`flange_from_sensor` of every sensor that gave observations."""
+    return {sensor: session.mount(sensor) for sensor in sorted({o.sensor for o in observations})}
 
 
-def fuse_and_remember(session: Session, evidence: Sequence[Evidence]) -> FusedEvidence:
-    """One pose from all evidence; the cell believes it from now on."""
+def fuse_and_remember(session: Session, observations: Sequence[Observation]) -> FusedObservations:
+    """One pose from all observations; the cell believes it from now on."""
     lenses = {
         camera: record.one_sigma_lenses()
         for camera in session.cell.names_of(DeviceKind.CAMERA)
         if (record := session.cell.calibration_of(camera).intrinsics) is not None
     }
-    fused = fuse_evidence(evidence, mounts_of(session, evidence), lenses=lenses, prior=believed_panel(session))
+    fused = fuse_observations(
+        observations, mounts_of(session, observations), lenses=lenses, prior=believed_panel(session)
+    )
     session.memory.remember("base_from_panel", fused.base_from_panel)
     return fused
 
 
-def fused_json(answer: FusedEvidence) -> dict[str, Any]:
+def fused_json(answer: FusedObservations) -> dict[str, Any]:
     """The fused pose as reports and the API give it."""
     fused = answer.fused
     return {**pose_json(answer.base_from_panel), **_account(fused, answer.measurements)}
@@ -123,8 +123,8 @@ def fused_json(answer: FusedEvidence) -> dict[str, Any]:
 def run_fuse(session: Session, request: FuseRequest) -> dict[str, Any]:
     """The verb `fuse`: measurements that are given, or collected."""
     if request.collect:
-        evidence = collect(session, request.touches)
-        return fused_json(fuse_and_remember(session, evidence))
+        observations = collect(session, request.touches)
+        return fused_json(fuse_and_remember(session, observations))
     measurements = [_measurement(body) for body in request.measurements]
     prior = request.prior.pose() if request.prior is not None else None
     fused = fuse(
@@ -137,7 +137,7 @@ def run_fuse(session: Session, request: FuseRequest) -> dict[str, Any]:
     return {**pose_json(fused.base_from_object), **_account(fused, measurements)}
 
 
-def collect(session: Session, touches: int) -> tuple[Evidence, ...]:
+def collect(session: Session, touches: int) -> tuple[Observation, ...]:
     """Look, scan, hover and touch."""
     ensure_located(session.part(0.0, 0.2))
     go_to_overview(session)
@@ -145,12 +145,12 @@ def collect(session: Session, touches: int) -> tuple[Evidence, ...]:
     session.progress(0.3, "scan the plate")
     plane = scan_plate(session)
     felt = feel(session.part(0.35, 1.0), touches)
-    return (*found.evidence, plane.evidence, *felt.evidence)
+    return (*found.observations, plane.observation, *felt.observations)
 
 
-def light_evidence(located: Sequence[Located]) -> tuple[LightEvidence, ...]:
+def light_observations(located: Sequence[Located]) -> tuple[PixelObservation, ...]:
     """The rays of several looks together."""
-    return tuple(ray for found in located for ray in found.evidence)
+    return tuple(ray for found in located for ray in found.observations)
 
 
 def _fingers_over_panel(session: Session) -> Array:
@@ -160,10 +160,10 @@ def _fingers_over_panel(session: Session) -> Array:
     return np.asarray(cell.panel_pose.inv().apply(tip.translation)[:2])
 
 
-def _feel_at(session: Session, spot: Array, doubted: DoubtedProximity) -> list[Evidence]:
+def _feel_at(session: Session, spot: Array, doubted: DoubtedProximity) -> list[Observation]:
     cell = workcell(session)
     place = (float(spot[0]), float(spot[1]), 0.0)
-    evidence: list[Evidence] = []
+    observations: list[Observation] = []
     proximities = session.cell.names_of(DeviceKind.PROXIMITY)
     names = [name for name in proximities if session.has_mount(name)]
     of = {name: session.connection.device(name).capabilities() for name in names}
@@ -178,8 +178,8 @@ def _feel_at(session: Session, spot: Array, doubted: DoubtedProximity) -> list[E
         flange = hovered.base_from_flange
         for point in points:
             name = _whose(names, mounts, flange, point.base_from_sensor)
-            evidence.append(
-                ProximityEvidence(
+            observations.append(
+                ProximityObservation(
                     sensor=name,
                     base_from_flange=flange,
                     distance_m=point.distance_m,
@@ -201,8 +201,8 @@ def _feel_at(session: Session, spot: Array, doubted: DoubtedProximity) -> list[E
     base_from_grip = touched.report.base_from_tool
     tip = base_from_grip.inv().apply(touched.point_m)
     normal_sigma = float(np.sqrt(touched.normal @ touched.covariance @ touched.normal))
-    evidence.append(
-        TouchEvidence(
+    observations.append(
+        TouchObservation(
             sensor=session.first(DeviceKind.GRIPPER),
             base_from_flange=base_from_grip * cell.flange_from_grip.inv(),
             tip_m=tip,
@@ -210,7 +210,7 @@ def _feel_at(session: Session, spot: Array, doubted: DoubtedProximity) -> list[E
             label=f"touch at ({spot[0]:.3f}, {spot[1]:.3f})",
         )
     )
-    return evidence
+    return observations
 
 
 def _whose(names: Sequence[str], mounts: Sequence[Any], flange: Any, base_from_sensor: Any) -> str:

@@ -40,7 +40,7 @@ def feel(monkeypatch: pytest.MonkeyPatch, toucher: Toucher, over_m: tuple[float,
 
 def test_a_place_out_of_reach_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     felt = feel(monkeypatch, Toucher(Unreachable("no way to it", hint="another place")))
-    assert len(felt.spots) == len(felt.evidence) == 4
+    assert len(felt.spots) == len(felt.observations) == 4
     assert "no way to it" in felt.skipped[0]
 
 

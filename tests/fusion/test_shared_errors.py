@@ -1,4 +1,4 @@
-"""Fused evidence: does the stated covariance hold when every error is drawn as stated?"""
+"""Fused observations: does the stated covariance hold when every error is drawn as stated?"""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2
 
+from fusion import Observation, PixelObservation, ProximityObservation, TouchObservation, fuse_observations
 from hal.calibration import CameraIntrinsics
 from hal.camera_model import project
 from hal.geometry import UncertainPose, difference, perturbed, transform_rpy
-from service.operations.evidence import Evidence, LightEvidence, ProximityEvidence, TouchEvidence, fuse_evidence
 
 LENS = CameraIntrinsics(
     width_px=640, height_px=480, fx_px=460.0, fy_px=460.0, cx_px=319.5, cy_px=239.5, distortion=(-0.08, 0.02, 0, 0, 0)
@@ -46,23 +46,23 @@ def facing(point_m: tuple[float, ...], distance_m: float, sensor: str) -> RigidT
     return BASE_FROM_PANEL * panel_from_sensor * MOUNTS[sensor].parent_from_child.inv()
 
 
-def draw(rng: np.random.Generator) -> list[Evidence]:
+def draw(rng: np.random.Generator) -> list[Observation]:
     """Readings whose every error is drawn with its stated sigma; each mount's error is drawn once."""
     mounts = {
         name: perturbed(m.parent_from_child, rng.normal(size=6) * np.sqrt(np.diag(m.covariance)))
         for name, m in MOUNTS.items()
     }
-    evidence: list[Evidence] = []
+    observations: list[Observation] = []
     flange = facing((0.0, 0.0), 0.66, "camera")
     camera_from_panel = (flange * mounts["camera"]).inv() * BASE_FROM_PANEL
     for name, light in LIGHTS.items():
         pixel = project(camera_from_panel.apply(np.array(light))[None], LENS)[0] + rng.normal(size=2) * PIXEL_SIGMA
-        evidence.append(
-            LightEvidence(
+        observations.append(
+            PixelObservation(
                 sensor="camera",
                 base_from_flange=flange,
-                light=name,
-                light_m=np.array(light),
+                name=name,
+                point_m=np.array(light),
                 pixel_px=pixel,
                 covariance_px=PIXEL_SIGMA**2 * np.eye(2),
                 intrinsics=LENS,
@@ -71,8 +71,8 @@ def draw(rng: np.random.Generator) -> list[Evidence]:
     for spot in SPOTS:
         flange = facing(spot, 0.0, "grip")
         depth = depth_to_plate(flange * mounts["grip"]) + rng.normal() * TOUCH_SIGMA_M
-        evidence.append(
-            TouchEvidence(
+        observations.append(
+            TouchObservation(
                 sensor="grip",
                 base_from_flange=flange,
                 tip_m=np.array([0.0, 0.0, depth]),
@@ -82,12 +82,12 @@ def draw(rng: np.random.Generator) -> list[Evidence]:
         )
         flange = facing(spot, 0.05, "beam")
         distance = depth_to_plate(flange * mounts["beam"]) + rng.normal() * BEAM_SIGMA_M
-        evidence.append(
-            ProximityEvidence(
+        observations.append(
+            ProximityObservation(
                 sensor="beam", base_from_flange=flange, distance_m=distance, sigma_m=BEAM_SIGMA_M, label="beam"
             )
         )
-    return evidence
+    return observations
 
 
 def depth_to_plate(base_from_sensor: RigidTransform) -> float:
@@ -101,7 +101,7 @@ def test_the_stated_covariance_is_honest_although_readings_share_their_mounts() 
     runs = 24
     distances = []
     for _ in range(runs):
-        pose = fuse_evidence(draw(rng), MOUNTS).base_from_panel
+        pose = fuse_observations(draw(rng), MOUNTS).base_from_panel
         delta = difference(BASE_FROM_PANEL, pose.parent_from_child)
         distances.append(delta @ np.linalg.solve(pose.covariance, delta))
     low, high = chi2.ppf([0.0005, 0.9995], 6 * runs) / runs
@@ -109,29 +109,29 @@ def test_the_stated_covariance_is_honest_although_readings_share_their_mounts() 
 
 
 def test_a_touch_on_something_else_is_named_and_not_used() -> None:
-    evidence = draw(np.random.default_rng(4))
-    wrong = next(i for i, e in enumerate(evidence) if isinstance(e, TouchEvidence))
-    touched = evidence[wrong]
-    assert isinstance(touched, TouchEvidence)
-    evidence[wrong] = TouchEvidence(
+    observations = draw(np.random.default_rng(4))
+    wrong = next(i for i, e in enumerate(observations) if isinstance(e, TouchObservation))
+    touched = observations[wrong]
+    assert isinstance(touched, TouchObservation)
+    observations[wrong] = TouchObservation(
         sensor="grip",
         base_from_flange=touched.base_from_flange,
         tip_m=touched.tip_m - (0, 0, 0.02),
         sigma_m=TOUCH_SIGMA_M,
         label="knob",
     )
-    answer = fuse_evidence(evidence, MOUNTS)
+    answer = fuse_observations(observations, MOUNTS)
     assert [r.index for r in answer.fused.rejected] == [wrong]
     assert np.linalg.norm(difference(BASE_FROM_PANEL, answer.base_from_panel.parent_from_child)[:3]) < 0.003
 
 
 @pytest.mark.parametrize("sensor", ["camera", "grip"])
 def test_a_worse_mount_makes_a_less_certain_pose(sensor: str) -> None:
-    evidence = draw(np.random.default_rng(5))
+    observations = draw(np.random.default_rng(5))
     worse = {
         **MOUNTS,
         sensor: UncertainPose(parent_from_child=MOUNTS[sensor].parent_from_child, covariance=25 * MOUNT_COVARIANCE),
     }
-    good = fuse_evidence(evidence, MOUNTS).base_from_panel.covariance
-    bad = fuse_evidence(evidence, worse).base_from_panel.covariance
+    good = fuse_observations(observations, MOUNTS).base_from_panel.covariance
+    bad = fuse_observations(observations, worse).base_from_panel.covariance
     assert np.trace(bad) > np.trace(good)

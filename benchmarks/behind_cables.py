@@ -20,11 +20,12 @@ from hal.errors import CellError
 from hal.panel import PanelObject
 from hal.simulated import ObjectTruth
 from perception.vision.reading import ObjectReading
-from service.operations.context import CellMemory, OperationContext
+from service.operations.context import OperationContext
 from service.operations.inspect import close_ups, look_past
 from service.operations.judge import agrees
 from service.operations.locate import go_to_overview, locate
 from service.operations.session import Session
+from service.operations.world_model import WorldModel
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection
 from service.tasks.model import Task
@@ -75,7 +76,7 @@ def open_session(cell: Cell, folder: Path) -> Iterator[Session]:
                 connection=LocalConnection(cell, runtime.objects, close=runtime.close),
                 task=TaskContext(Task(id="cables", verb="inspect", request={}, moves=True), folder / "artefacts"),
                 runs_dir=folder / "runs",
-                state=CellMemory(),
+                world=WorldModel(),
             )
         )
         go_to_overview(session)

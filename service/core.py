@@ -19,7 +19,8 @@ from hal.errors import CellError, DeviceUnavailable, InvalidRequest, LeaseError,
 from service.commissioning.preflight import check_wires
 from service.errors import NotPossibleNow
 from service.memory.calibrations import Calibrations
-from service.operations.context import CellMemory, Operation, OperationContext
+from service.operations.context import Operation, OperationContext
+from service.operations.world_model import WorldModel
 from service.processes.supervisor import Supervisor
 from service.tasks.gate import GatedConnection
 from service.tasks.journal import Journal
@@ -56,7 +57,7 @@ class Service:
         self.cell = cell
         self.operations = operations
         self.runs_dir = runs_dir
-        self.memory = CellMemory()
+        self.world = WorldModel()
         self.calibrations = Calibrations.of_runs(runs_dir, cell)
         self.started_s = time.monotonic()
         state_dir = runs_dir / ".service"
@@ -130,7 +131,7 @@ class Service:
                     ),
                     task=task,
                     runs_dir=self.runs_dir,
-                    state=self.memory,
+                    world=self.world,
                 ),
                 request,
             )

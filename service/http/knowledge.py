@@ -40,7 +40,7 @@ def _frames(service: Service) -> list[FrameView]:
         frames.append(_frame("base", "flange", certain(flange), "measured"))
     except CellError:
         pass  # no arm, or it cannot be read now: then nobody knows where the flange is
-    panel = service.memory.base_from_panel
+    panel = service.world.base_from_panel
     if panel is not None:
         frames.append(_frame("base", "panel", panel, "estimated"))
     return frames

@@ -71,7 +71,7 @@ class Sampler:
             sample |= _shown(service.supervisor.connection.mover.state())
         except CellError as error:
             sample["problem"] = error.what
-        panel = service.memory.base_from_panel
+        panel = service.world.base_from_panel
         sample["base_from_panel"] = to_json(panel.parent_from_child) if panel is not None else None
         return sample
 

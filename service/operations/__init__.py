@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import Any
 
 from service.operations import requests, targets
-from service.operations.context import CellMemory, Operation, OperationContext
+from service.operations.context import Operation, OperationContext
 
-__all__ = ["OPERATIONS", "CellMemory", "Operation", "OperationContext"]
+__all__ = ["OPERATIONS", "Operation", "OperationContext"]
 
 MEASUREMENT_EXAMPLE = {
     "sensing": "point-plane",

@@ -47,7 +47,7 @@ def run_calibrations(session: Session, request: CalibrationRequest) -> dict[str,
     record = renewed(current, record_of(device, found, date=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())))
     path = Calibrations.of_runs(session.context.runs_dir, session.cell).write(record)
     if request.what != "tool":
-        session.memory.remember("base_from_panel", None)  # it was seen through the mount of before
+        session.world.forget_panel()  # it was seen through the mount of before
     session.progress(0.97, "back to the parking place")
     park(session)
     return {

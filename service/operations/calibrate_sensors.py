@@ -26,7 +26,6 @@ from perception.calibration import (
     calibrate_wrench,
     propose_view,
 )
-from service.operations.beliefs import believed_panel
 from service.operations.eyes import OLDEST_S, deadline, look_with_lights, settle
 from service.operations.locate import lights_in, scan_plate
 from service.operations.session import Session
@@ -95,7 +94,7 @@ def measure_camera(session: Session, camera: str, count: int, known: Beforehand)
 def _nominal(session: Session, camera: str) -> InHandState:
     return InHandState(
         flange_from_camera=session.mount(camera).parent_from_child,
-        base_from_target=believed_panel(session).parent_from_child,
+        base_from_target=session.believed_panel().parent_from_child,
         intrinsics=session.lens(camera),
         point_errors_m=np.zeros((len(session.panel.lights), 3)),
     )
@@ -123,7 +122,7 @@ def beforehand(session: Session, camera: str, *, is_lens_known: bool) -> Beforeh
 
 def scanner_stations(session: Session, scanner: str, count: int) -> list[RigidTransform]:
     """Flange poses that look at the plate; the `count` that together tell most come first."""
-    x, z = session.mount(scanner).parent_from_child, believed_panel(session).parent_from_child
+    x, z = session.mount(scanner).parent_from_child, session.believed_panel().parent_from_child
     candidates = around(z, x, SCANNER_DISTANCE_M, steps=SCANNER_STEPS, cone_rad=PLATE_CONE_RAD)
     return order(session, candidates, by_plate(x, z), count=count)
 

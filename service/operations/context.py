@@ -1,8 +1,7 @@
-"""What an operation gets beside its request: the cell, its task, a folder and the memory of the cell."""
+"""What an operation gets beside its request: the cell, its task, a folder, and what the cell has found out."""
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,38 +10,9 @@ from typing import Any
 from pydantic import BaseModel
 
 from hal.config import Cell
-from hal.geometry import UncertainPose
+from service.operations.world_model import WorldModel
 from service.processes.connection import CellConnection
 from service.tasks.store import TaskContext
-
-
-class CellMemory:
-    """What the cell has found out so far. Every access holds one lock; values are replaced, never changed in place."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._facts: dict[str, Any] = {}
-
-    def remember(self, key: str, value: Any) -> None:
-        """Keep `value` under `key` until it is replaced."""
-        with self._lock:
-            self._facts[key] = value
-
-    def recall(self, key: str) -> Any | None:
-        """The newest value under `key`, or None."""
-        with self._lock:
-            return self._facts.get(key)
-
-    def forget(self) -> None:
-        """Drop everything: another panel stands before the cell."""
-        with self._lock:
-            self._facts.clear()
-
-    @property
-    def base_from_panel(self) -> UncertainPose | None:
-        """Where the panel is believed to stand, with covariance; None until it was located."""
-        pose: UncertainPose | None = self.recall("base_from_panel")
-        return pose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,7 +22,7 @@ class OperationContext:
     connection: CellConnection
     task: TaskContext
     runs_dir: Path
-    state: CellMemory = field(default_factory=CellMemory)
+    world: WorldModel = field(default_factory=WorldModel)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

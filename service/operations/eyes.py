@@ -19,6 +19,7 @@ from hal.geometry import UncertainPose
 from hal.motion import Hold, MotionOutcome
 from hal.readings import Cause, Stamped
 from service.operations.session import Session
+from service.operations.world_model import Frame
 
 READ_S = 5.0  # wall seconds for one device call; a software renderer on a busy machine takes up to 0.5 s
 OLDEST_S = 0.2  # before the call: a frame must be of the present, however long it takes to arrive
@@ -151,9 +152,8 @@ def _switch(session: Session, name: str, lights: Any, on: tuple[bool, ...], wait
 def _refuse_frozen(session: Session, name: str, sample: Stamped[Any], array: NDArray[Any]) -> None:
     """Two frames of a live sensor are never equal to the last bit: its noise sees to that."""
     digest = hashlib.blake2b(np.ascontiguousarray(array).tobytes(), digest_size=16).digest()
-    previous = session.memory.recall(f"frame.{name}")
-    session.memory.remember(f"frame.{name}", (sample.host_time_s, digest))
-    if previous is not None and previous[1] == digest and previous[0] != sample.host_time_s:
+    before = session.world.note_frame(name, Frame(stamp_s=sample.host_time_s, digest=digest))
+    if before is not None and before.digest == digest and before.stamp_s != sample.host_time_s:
         raise StaleReading(
             f"{name} repeats the same frame under a new stamp",
             hint=f"{name} is frozen: power-cycle it; nothing was measured with the old frame",

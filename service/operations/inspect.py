@@ -16,7 +16,6 @@ from hal.geometry import compose
 from hal.panel import PanelObject
 from perception.vision import ALIKE, NO_EDGE, ObjectReading, answer_at, draw_annotated, joined, said
 from perception.vision import inspect as inspect_image
-from service.operations.beliefs import READINGS, forget_reading, known_readings
 from service.operations.eyes import Look, base_from, look, settle
 from service.operations.locate import go_to_overview, locate
 from service.operations.requests import InspectRequest, RecogniseRequest
@@ -65,13 +64,13 @@ def inspect_here(
             camera_from_panel,
             session.panel,
             names=names,
-            previous=known_readings(session),
+            previous=session.world.readings,
         )
     except PerceptionError:
         settle(session)
         look(session, view.camera)  # a frozen camera shows the panel where it was: the second equal frame names it
         raise
-    _remember(session, readings)
+    session.world.note_readings(readings)
     picture = AnnotatedView(title=title, pixels=draw_annotated(view.pixels, readings))
     return Inspection(readings={r.name: r for r in readings}, pictures=(picture,))
 
@@ -129,9 +128,9 @@ def look_past(session: Session, found: Inspection) -> Inspection:
             pictures += _from_the_sides(session, group, looks, sides)
     told = {name: _told(each) for name, each in looks.items()}
     for name in told:
-        forget_reading(session, name)  # one look alone may have said what the others contradict
+        session.world.forget_reading(name)  # one look alone may have said what the others contradict
     readings = found.readings | told
-    _remember(session, readings.values())
+    session.world.note_readings(readings.values())
     return Inspection(readings=readings, pictures=tuple(pictures))
 
 
@@ -195,7 +194,7 @@ def reading_row(reading: ObjectReading, when: str) -> Reading:
 def reading_json(session: Session, reading: ObjectReading) -> dict[str, Any]:
     """A reading as the API gives it; the place in the base frame when the panel's pose is known."""
     row = reading_row_json(reading)
-    panel = session.memory.base_from_panel
+    panel = session.world.base_from_panel
     if reading.centre_m is not None and panel is not None:
         row["centre_in_panel_m"] = list(reading.centre_m)
         row["centre_in_base_m"] = list(panel.parent_from_child.apply(reading.centre_m))
@@ -227,7 +226,7 @@ def run_recognise_taught(session: Session, request: RecogniseRequest) -> dict[st
 
 def ensure_located(session: Session) -> None:
     """Locate the panel unless that was done before."""
-    if session.memory.base_from_panel is not None:
+    if session.world.base_from_panel is not None:
         return
     session.progress(0.1, "drive to the overview")
     go_to_overview(session)
@@ -268,8 +267,3 @@ def _answer(session: Session, found: Inspection, least_confidence: float) -> dic
         ),
         "pictures": pictures,
     }
-
-
-def _remember(session: Session, readings: Iterable[ObjectReading]) -> None:
-    answered = {r.name: r for r in readings if r.answered}
-    session.memory.remember(READINGS, known_readings(session) | answered)

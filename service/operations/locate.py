@@ -14,12 +14,12 @@ from hal.errors import Ambiguous, NotFound
 from hal.geometry import UncertainPose, compose, difference, matrix_of, to_json
 from perception.range import PinholeSensor, PlaneFit, fit_plane_near
 from perception.vision import AssignedLights, QuadranglePose, assign_lights, estimate, find_lights
-from service.operations.beliefs import believed_panel, expected_panel
 from service.operations.eyes import LightPair, Look, Scan, look_with_lights, scan
 from service.operations.requests import PanelPoseRequest
 from service.operations.session import Session
 from service.operations.travel import go_to_camera_view, leave_the_panel
 from service.operations.views import overview_poses
+from service.operations.world_model import expected_panel
 
 WRONG_FIT_P = 1e-4  # a worse fit than one in ten thousand means a wrong lamp, panel file or lens
 
@@ -51,11 +51,11 @@ class ScannedPlane:
 
 def go_to_overview(session: Session) -> None:
     """Drive the camera to where it sees the whole panel."""
-    known = session.memory.base_from_panel
+    known = session.world.base_from_panel
     if known is None:
         leave_the_panel(session)
     slack_m = 0.01 if known is not None else 0.6 * session.cell.file.workspace.position_tolerance_m
-    pose = believed_panel(session).parent_from_child
+    pose = session.believed_panel().parent_from_child
     lens = session.lens()
     go_to_camera_view(session, overview_poses(pose, session.panel, lens, slack_m), name="overview")
 
@@ -70,14 +70,14 @@ def locate(session: Session) -> Located:
     pair = look_with_lights(session)
     session.progress(0.8, "pose of the four lights")
     found = locate_in(session, pair)
-    session.memory.remember("base_from_panel", found.base_from_panel)
+    session.world.believe_panel(found.base_from_panel)
     return found
 
 
 def locate_in(session: Session, pair: LightPair) -> Located:
     """The panel's pose in a pair of images."""
     look = pair.on
-    expected = believed_panel(session).parent_from_child
+    expected = session.believed_panel().parent_from_child
     chosen = lights_in(session, pair)
     lights_m = np.array([light.position_m for light in session.panel.lights])
     covariance_px = chosen.covariance_px + model_sigma_px(session, look, expected) ** 2 * np.eye(2)
@@ -101,7 +101,7 @@ def lights_in(session: Session, pair: LightPair) -> AssignedLights:
         NotFound, Ambiguous: not all are seen, or something else stands where they should.
     """
     look = pair.on
-    upright = look.base_from_camera.parent_from_child.inv() * believed_panel(session).parent_from_child
+    upright = look.base_from_camera.parent_from_child.inv() * session.believed_panel().parent_from_child
     return assign_lights(
         find_lights(pair.off.pixels, pair.on.pixels),
         np.array([light.position_m for light in session.panel.lights]),
@@ -129,7 +129,7 @@ def plate_in(session: Session, image: Scan) -> ScannedPlane:
     Raises:
         NotFound: no plane near where the panel is believed to be, or a scanner that is no pinhole.
     """
-    believed = believed_panel(session)
+    believed = session.believed_panel()
     scanner_from_panel = compose(image.base_from_scanner.inverse(), believed)
     c = image.capabilities
     if c.projection != "pinhole":
@@ -209,7 +209,8 @@ def _plausible(session: Session, look: Look, pose: QuadranglePose) -> tuple[Rigi
     fitting = [c for c in candidates if _is_expected(session, look.base_from_camera.parent_from_child * c[0])]
     if not fitting:
         offset = difference(
-            look.base_from_camera.parent_from_child * pose.camera_from_object, expected_panel(session).parent_from_child
+            look.base_from_camera.parent_from_child * pose.camera_from_object,
+            expected_panel(session.cell).parent_from_child,
         )
         raise NotFound(
             f"the lights put the panel {np.linalg.norm(offset[:3]):.3f} m and {np.linalg.norm(offset[3:]):.3f} rad from"
@@ -226,7 +227,7 @@ def _plausible(session: Session, look: Look, pose: QuadranglePose) -> tuple[Rigi
 
 def _is_expected(session: Session, base_from_panel: RigidTransform) -> bool:
     w = session.cell.file.workspace
-    offset = difference(base_from_panel, expected_panel(session).parent_from_child)
+    offset = difference(base_from_panel, expected_panel(session.cell).parent_from_child)
     # The tolerances bound each axis; their corners lie a factor sqrt(3) further out.
     return bool(
         np.linalg.norm(offset[:3]) <= 1.75 * w.position_tolerance_m

@@ -9,7 +9,6 @@ from hal.errors import PerceptionError, Unreachable
 from hal.panel import Button, Handwheel, Lever, Mushroom, PanelObject, Rotary, Slider, Toggle
 from manipulation import ObjectState, SkillReport, Verify, button, handwheel, lever, mushroom, rotary, slider, toggle
 from perception.vision import ObjectReading, said
-from service.operations.beliefs import forget_reading, known_readings
 from service.operations.inspect import ensure_located, look_close, look_past
 from service.operations.requests import ActionBody, ManipulateRequest
 from service.operations.session import Session
@@ -88,7 +87,7 @@ class _Eye:
 
     def before(self) -> ObjectReading | None:
         """What the witness showed before: the newest reading, or a look."""
-        known = known_readings(self._session).get(self.witness.name)
+        known = self._session.world.readings.get(self.witness.name)
         if known is not None or not self._is_open:
             return known
         return self._look()
@@ -98,8 +97,8 @@ class _Eye:
         return self._verify if self._is_open else None
 
     def _verify(self) -> ObjectState | None:
-        forget_reading(self._session, self.witness.name)
-        forget_reading(self._session, self._thing.name)
+        self._session.world.forget_reading(self.witness.name)
+        self._session.world.forget_reading(self._thing.name)
         self.last = self._look()
         return None if self.last is None else state_of(self.last, self.witness)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ from hal.errors import CellError, DeviceError
 from hal.geometry import compose
 from hal.panel import Button, Lever, PanelObject, Slider, Toggle
 from perception.vision import ObjectReading
-from service.operations.beliefs import known_readings
 from service.operations.context import OperationContext
 from service.operations.eyes import settle
 from service.operations.inspect import Inspection, inspect_close, inspect_here, need_all_present, reading_row
@@ -101,7 +100,7 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
     with _step(session, "overview", 0.0, 0.06) as part:
         part.progress(0.0, "drive to the overview")
         leave_the_panel(part)
-        session.memory.forget()  # another panel may stand there: a mission believes nothing that it has not seen
+        session.world.forget()  # another panel may stand there: a mission believes nothing that it has not seen
         go_to_overview(part)
     with _step(session, "lights", 0.06, 0.10) as part:
         first = locate(part)
@@ -162,7 +161,7 @@ def _work_all(session: Session, record: MissionRecord, request: MissionRequest, 
 
 def usual_actions(session: Session) -> tuple[ActionBody, ...]:
     """The first lever by 90 degrees, the first slider to another value, a button that shows it, the first toggle."""
-    readings = known_readings(session)
+    readings = session.world.readings
     actions: list[ActionBody] = []
     for kind in (Lever, Slider, Button, Toggle):
         things = [panel_object for panel_object in session.panel.objects if isinstance(panel_object, kind)]
@@ -175,7 +174,7 @@ def usual_actions(session: Session) -> tuple[ActionBody, ...]:
     return tuple(actions)
 
 
-def _other(panel_object: PanelObject, readings: dict[str, ObjectReading]) -> ActionBody:
+def _other(panel_object: PanelObject, readings: Mapping[str, ObjectReading]) -> ActionBody:
     """The deed that changes what the object shows now."""
     reading = readings.get(panel_object.name)
     state = reading.state if reading is not None else None

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from hal.errors import NotFound
-from service.operations.beliefs import believed_panel
 from service.operations.eyes import look, scan, settle
 from service.operations.inspect import ensure_located, run_recognise_taught
 from service.operations.locate import go_to_overview, plate_in
@@ -54,7 +53,7 @@ def _by_range(session: Session, request: RecogniseRequest) -> dict[str, Any]:
         settle(session)
     session.progress(0.9, "scan")
     image = scan(session)
-    scene, believed = surfaces_in(image), believed_panel(session)
+    scene, believed = surfaces_in(image), session.believed_panel()
     answer: dict[str, Any] = {
         "surfaces": [
             {"label": s.label, "type": str(s.type), "primitive": s.primitive, "pixels": s.pixels, "rms_m": s.rms_m}

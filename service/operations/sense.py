@@ -35,7 +35,6 @@ from hal.devices import DeviceKind
 from hal.errors import MotionError, NotFound, Stopped
 from hal.geometry import UncertainPose
 from manipulation import SkillFailure, proximity_probe, touch_probe
-from service.operations.beliefs import believed_panel
 from service.operations.doubted_proximity import DoubtedProximity
 from service.operations.eyes import settle
 from service.operations.inspect import ensure_located
@@ -108,9 +107,9 @@ def fuse_and_remember(session: Session, observations: Sequence[Observation]) -> 
         if (record := session.cell.calibration_of(camera).intrinsics) is not None
     }
     fused = fuse_observations(
-        observations, mounts_of(session, observations), lenses=lenses, prior=believed_panel(session)
+        observations, mounts_of(session, observations), lenses=lenses, prior=session.believed_panel()
     )
-    session.memory.remember("base_from_panel", fused.base_from_panel)
+    session.world.believe_panel(fused.base_from_panel)
     return fused
 
 

@@ -14,7 +14,8 @@ from hal.frames import frame_tree
 from hal.geometry import UncertainPose, identity
 from hal.motion import DeclaredMotion, MotionOutcome, MotionReport, Mover, RobotState
 from hal.panel import Panel
-from service.operations.context import CellMemory, OperationContext
+from service.operations.context import OperationContext
+from service.operations.world_model import WorldModel, expected_panel
 from service.processes.connection import CellConnection
 from service.report.record import MissionRecord
 
@@ -81,9 +82,9 @@ class Session:
         return NotedMover(self.context.connection.mover, self)
 
     @property
-    def memory(self) -> CellMemory:
+    def world(self) -> WorldModel:
         """What the cell has found out so far."""
-        return self.context.state
+        return self.context.world
 
     def progress(self, fraction: float, step: str, detail: str = "") -> None:
         """Tell watchers how far this operation is (0 to 1).
@@ -175,10 +176,14 @@ class Session:
         Raises:
             NotFound: nobody has located it yet.
         """
-        pose = self.memory.base_from_panel
+        pose = self.world.base_from_panel
         if pose is None:
             raise NotFound("the panel has not been located yet", hint="POST /v1/panel-pose first, or send a pose along")
         return pose
+
+    def believed_panel(self) -> UncertainPose:
+        """The newest pose of the panel, or where the cell file expects it."""
+        return self.world.base_from_panel or expected_panel(self.cell)
 
     def _failure(self, report: MotionReport) -> Exception:
         self.context.task.check_cancelled()

@@ -18,7 +18,6 @@ from hal.geometry import UncertainPose, compose
 from hal.panel import Handwheel, Mushroom
 from perception.range import RangeScene
 from perception.vision import ObjectReading
-from service.operations.beliefs import believed_panel, known_readings
 from service.operations.eyes import Scan, settle
 from service.operations.locate import ScannedPlane, scan_plate
 from service.operations.relief import Sighting, find_by_surfaces, mark_of, surfaces_in
@@ -77,7 +76,7 @@ class SurfaceCheck:
 def view_surfaces(session: Session, plane: ScannedPlane, place: str) -> SurfaceView:
     """The mushrooms and handwheels in a scan whose plate is known."""
     scene = surfaces_in(plane.scan)
-    found = find_by_surfaces(scene, plane.scan, session.panel, believed_panel(session), plane.fit.surface)
+    found = find_by_surfaces(scene, plane.scan, session.panel, session.believed_panel(), plane.fit.surface)
     return SurfaceView(place=place, scan=plane.scan, scene=scene, sightings=tuple(found))
 
 
@@ -88,7 +87,7 @@ def check_surfaces(session: Session, first: SurfaceView) -> tuple[list[SurfaceCh
         NotFound: the panel has not been located.
         Stopped, DeviceFault, MotionError, Cancelled: the cell cannot go on.
     """
-    base_from_panel, shown = session.known_panel(), known_readings(session)
+    base_from_panel, shown = session.known_panel(), session.world.readings
     checks: list[SurfaceCheck] = []
     pictures = [_picture(session, first, "surfaces")]
     for sighting in first.sightings:
@@ -213,6 +212,6 @@ def _look_closer(session: Session, panel_object: Mushroom | Handwheel) -> Surfac
 
 
 def _picture(session: Session, view: SurfaceView, name: str) -> Picture:
-    marks = [mark_of(s, view.scan, believed_panel(session)) for s in view.sightings]
+    marks = [mark_of(s, view.scan, session.believed_panel()) for s in view.sightings]
     title = f"surfaces in the range image from {view.place}, and what the panel file has of them"
     return Picture(name=name, title=title, png=png_of(surfaces_picture(view.scene, marks)))

@@ -30,7 +30,6 @@ from manipulation import (
     retreat,
 )
 from manipulation import park as park_arm
-from service.operations.beliefs import believed_panel, known_readings
 from service.operations.session import Session
 
 ENOUGH_CONDITIONING = 0.06  # smallest singular value over the largest: below it, small moves need fast wrists
@@ -126,7 +125,7 @@ def leave_the_panel(session: Session) -> None:
     """
     if _stands_clear(session):
         return
-    if session.memory.base_from_panel is not None:
+    if session.world.base_from_panel is not None:
         park(session)
         return
     cell = workcell(session)
@@ -150,13 +149,13 @@ def workcell(session: Session) -> Workcell:
         mover=session.mover,
         kinematics=kinematics(session),
         panel=session.panel,
-        base_from_panel=believed_panel(session),
+        base_from_panel=session.believed_panel(),
         flange_from_grip=session.mount(session.first(DeviceKind.GRIPPER)).parent_from_child,
         limits=SpeedLimits(tip_m_per_s=file.safety.speed_limit_m_per_s),
         park_rad=np.array(file.workspace.park_rad),
         angles_rad=lever_angles(session),
         floor_z_m=file.workspace.floor_z_m,
-        obstacles=() if session.memory.base_from_panel is not None else (_where_the_panel_may_be(session),),
+        obstacles=() if session.world.base_from_panel is not None else (_where_the_panel_may_be(session),),
         seed=file.cell.seed,
         progress=session.progress,
     )
@@ -164,17 +163,15 @@ def workcell(session: Session) -> Workcell:
 
 def kinematics(session: Session) -> Kinematics:
     """The arm's kinematics, made once a cell."""
-    known: Kinematics | None = session.memory.recall("kinematics")
-    if known is None:
-        arm = session.connection.device(session.first(DeviceKind.ARM))
-        known = Kinematics.of(arm.capabilities())
-        session.memory.remember("kinematics", known)
-    return known
+    connection = session.connection
+    return session.world.kinematics(
+        lambda: Kinematics.of(connection.device(session.first(DeviceKind.ARM)).capabilities())
+    )
 
 
 def lever_angles(session: Session) -> Mapping[str, float]:
     """Angles of the levers whose state has been read."""
-    readings = known_readings(session)
+    readings = session.world.readings
     return {
         lever.name: state.angle_rad
         for lever in session.panel.objects

@@ -101,7 +101,7 @@ def test_a_stored_image_needs_neither_lease_nor_a_clear_stop_and_teaches_the_cel
     web.post("/v1/stop")
     task = _ask(web, "inspect", {"image": stored, "objects": ["pressure"]})
     assert task.status_code == 200 and task.json()["moves"] is False
-    assert house.service.memory.recall("readings") is None
+    assert not house.service.world.readings
     assert web.post("/v1/stop/reset").status_code == 200
 
 

@@ -16,11 +16,12 @@ from hal.errors import Cancelled
 from hal.geometry import difference
 from service.memory.calibrations import Calibrations
 from service.operations.calibrate import run_calibrations
-from service.operations.context import CellMemory, OperationContext
+from service.operations.context import OperationContext
 from service.operations.eyes import settle
 from service.operations.requests import CalibrationRequest
 from service.operations.session import Session
 from service.operations.travel import kinematics
+from service.operations.world_model import WorldModel
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection
 from service.tasks.gate import GatedConnection
@@ -40,7 +41,7 @@ class Rig:
     runtime: CellRuntime
     runs: Path
     cell: Cell
-    memory: CellMemory = field(default_factory=CellMemory)
+    world: WorldModel = field(default_factory=WorldModel)
     task: Task = field(default_factory=lambda: Task(id="test", verb="calibrations", request={}, moves=True))
 
     def session(self) -> Session:
@@ -49,9 +50,7 @@ class Rig:
         local = LocalConnection(self.cell, self.runtime.objects, close=self.runtime.close)
         applied = Calibrations.of_runs(self.runs, self.cell).applied()
         connection = GatedConnection(local, task.check_cancelled, cell=applied)
-        return Session(
-            context=OperationContext(connection=connection, task=task, runs_dir=self.runs, state=self.memory)
-        )
+        return Session(context=OperationContext(connection=connection, task=task, runs_dir=self.runs, world=self.world))
 
     def calibrate(self, what: str, **more: Any) -> dict[str, Any]:
         return run_calibrations(self.session(), CalibrationRequest(what=what, **more))

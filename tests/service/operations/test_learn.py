@@ -11,11 +11,12 @@ import pytest
 from benchmarks.vision_simulated import judged, without_looks
 from hal.config import Cell, load_cell
 from hal.errors import NotFound
-from service.operations.context import CellMemory, OperationContext
+from service.operations.context import OperationContext
 from service.operations.learn import run_learn
 from service.operations.recognise import run_recognise
 from service.operations.requests import LearnRequest, RecogniseRequest
 from service.operations.session import Session
+from service.operations.world_model import WorldModel
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection
 from service.tasks.model import Task
@@ -33,11 +34,11 @@ def runtime() -> Iterator[CellRuntime]:
     started.close()
 
 
-def session(runtime: CellRuntime, cell: Cell, folder: Path, memory: CellMemory) -> Session:
+def session(runtime: CellRuntime, cell: Cell, folder: Path, memory: WorldModel) -> Session:
     task = TaskContext(Task(id="test", verb="learn", request={}, moves=True), folder / "artefacts")
     local = LocalConnection(cell, runtime.objects, close=runtime.close)
     return Session(
-        context=OperationContext(connection=local, task=task, runs_dir=folder / "runs", state=memory),
+        context=OperationContext(connection=local, task=task, runs_dir=folder / "runs", world=memory),
     )
 
 
@@ -48,10 +49,10 @@ def blind(session: Session, cell: Cell) -> Any:
 
 
 def test_one_overview_teaches_the_cell_its_panel(runtime: CellRuntime, tmp_path: Path) -> None:
-    cell, memory = without_looks(runtime.cell), CellMemory()
+    cell, memory = without_looks(runtime.cell), WorldModel()
     before = blind(session(runtime, cell, tmp_path, memory), cell)
     with pytest.raises(NotFound, match="not been located"):
-        run_learn(session(runtime, cell, tmp_path, CellMemory()), LearnRequest(move=False))
+        run_learn(session(runtime, cell, tmp_path, WorldModel()), LearnRequest(move=False))
     taught = run_learn(session(runtime, cell, tmp_path, memory), LearnRequest())
     assert len(taught["taught_by"]) == len(cell.panel.objects) and not taught["left_out"]
     now = blind(session(runtime, cell, tmp_path, memory), cell)
@@ -60,5 +61,5 @@ def test_one_overview_teaches_the_cell_its_panel(runtime: CellRuntime, tmp_path:
 
 
 def test_the_shipped_cell_knows_its_panel_untaught(runtime: CellRuntime, tmp_path: Path) -> None:
-    seen = blind(session(runtime, runtime.cell, tmp_path, CellMemory()), runtime.cell)
+    seen = blind(session(runtime, runtime.cell, tmp_path, WorldModel()), runtime.cell)
     assert len(seen.missed) <= 1 and all(answer.is_right for answer in seen.answers)

@@ -16,7 +16,6 @@ from hal.errors import StaleReading, Unreachable
 from hal.simulated import Fault
 from perception.vision.reading import ANSWER_AT, ObjectReading
 from service.operations import inspect
-from service.operations.beliefs import forget_reading, known_readings
 from service.operations.inspect import Inspection, close_ups, inspect_close
 from service.operations.requests import InspectRequest
 from service.operations.session import Session
@@ -42,12 +41,12 @@ def truth_of(session: Session, name: str) -> Any:
 
 def straight_look(session: Session) -> Inspection:
     """From straight ahead, by one who has never read the display: the last number would decide between two."""
-    forget_reading(session, "temperature")
+    session.world.forget_reading("temperature")
     return inspect.look_close(session, session.panel.object("temperature").point_m, ("temperature",))
 
 
 def test_a_display_behind_a_cable_is_read_from_the_side(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    forget_reading(session, "temperature")
+    session.world.forget_reading("temperature")
     with monkeypatch.context() as patch:
         patch.setattr(inspect, "SIDES", {})
         straight = inspect_close(session, ("temperature", "flow"))
@@ -57,7 +56,7 @@ def test_a_display_behind_a_cable_is_read_from_the_side(session: Session, monkey
     assert reading.text == truth_of(session, "temperature").text
     assert len(found.pictures) > len(straight.pictures), "every look leaves its picture"
     assert [picture.title for picture in found.pictures][-1].startswith("temperature from ")
-    assert known_readings(session)["temperature"] is reading
+    assert session.world.readings["temperature"] is reading
 
 
 def test_a_side_that_the_arm_cannot_reach_is_left_out(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -69,7 +68,7 @@ def test_a_side_that_the_arm_cannot_reach_is_left_out(session: Session, monkeypa
     found = inspect.look_past(session, first)
     assert found.readings["temperature"].reason == first.readings["temperature"].reason
     assert found.pictures == first.pictures
-    assert "temperature" not in known_readings(session)
+    assert "temperature" not in session.world.readings
 
 
 def test_a_cap_that_looks_alike_from_afar_is_read_from_close_by(session: Session) -> None:
@@ -86,7 +85,7 @@ def test_a_cap_that_no_side_shows_says_how_often_it_was_looked_at(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(inspect, "FOR_ALIKE", ("the left", "above"))  # from further off this one looks alike
-    forget_reading(session, "hold")
+    session.world.forget_reading("hold")
     reading = inspect_close(session, ("hold",)).readings["hold"]
     assert not reading.answered and "(2 looks from the sides did not tell either)" in (reading.reason or "")
 
@@ -106,12 +105,12 @@ def test_a_guess_is_answered_to_who_asks_for_it_and_not_remembered(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(inspect, "FOR_ALIKE", ())
-    forget_reading(session, "hold")
+    session.world.forget_reading("hold")
     (refusal,) = inspect.run_inspect(session, InspectRequest(objects=("hold",)))["objects"]
     (guess,) = inspect.run_inspect(session, InspectRequest(objects=("hold",), least_confidence=0.0))["objects"]
     assert refusal["state"] is None and refusal["reason"]
     assert guess["state"] in ("pressed", "released") and guess["reason"] is None and guess["confidence"] < ANSWER_AT
-    assert "hold" not in known_readings(session), "missions go by what is sure"
+    assert "hold" not in session.world.readings, "missions go by what is sure"
 
 
 def test_a_camera_that_froze_on_the_way_is_named_by_the_first_close_up(session: Session) -> None:

@@ -16,7 +16,7 @@ from hal.config import load_cell
 from hal.errors import CellError, DeviceFault, NotFound
 from hal.motion import DeclaredMotion, MotionReport
 from hal.simulated import Fault, ObjectTruth, Truth
-from service.operations.context import CellMemory, OperationContext
+from service.operations.context import OperationContext
 from service.operations.inspect import look_close
 from service.operations.judge import judge
 from service.operations.locate import go_to_overview, locate, scan_plate
@@ -25,6 +25,7 @@ from service.operations.requests import ActionBody, MissionRequest
 from service.operations.session import Session
 from service.operations.surface_check import CLOSER, OVERVIEW, check_surfaces, need_its_place, view_surfaces
 from service.operations.travel import go_to_joints
+from service.operations.world_model import WorldModel
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection
 from service.tasks.model import Task
@@ -49,7 +50,7 @@ def mission_context(folder: Path, seed: int, *, misplaced_m: float = 0.0) -> Ite
             connection=LocalConnection(cell, runtime.objects, close=runtime.close),
             task=TaskContext(Task(id="test", verb="missions", request={}, moves=True), folder / "artefacts"),
             runs_dir=folder / "runs",
-            state=CellMemory(),
+            world=WorldModel(),
         )
     finally:
         runtime.close()
@@ -170,7 +171,7 @@ def test_an_arm_that_stands_at_the_panel_and_knows_of_none_gets_away(tmp_path: P
     with mission_context(tmp_path, seed=4) as context:
         session = Session(context=context)
         stand_close(session)
-        session.memory.forget()  # as after a restart of the service
+        session.world.forget()  # as after a restart of the service
         home = np.array(session.cell.file.workspace.park_rad)
         assert not go_to_joints(session, home, name="home")  # nothing can be planned from in there
         go_to_overview(session)

@@ -14,6 +14,7 @@ from service.operations import OPERATIONS
 from service.operations.mission import usual_actions
 from service.operations.requests import ActionBody
 from service.operations.targets import target_of
+from service.operations.world_model import WorldModel
 
 CELL = load_cell(Path(__file__).parents[3] / "cells/bench.toml")
 
@@ -73,9 +74,7 @@ def test_a_mission_presses_by_itself_only_what_shows_that_it_was_pressed() -> No
         ((bell, latching), [("hold", "pressed")]),
         ((bell,), []),
     ):
-        session: Any = SimpleNamespace(
-            panel=CELL.panel.model_copy(update={"objects": things}), memory=SimpleNamespace(recall=lambda _: None)
-        )
+        session: Any = SimpleNamespace(panel=CELL.panel.model_copy(update={"objects": things}), world=WorldModel())
         assert [(body.object, body.state) for body in usual_actions(session)] == wanted
 
 

@@ -1,0 +1,118 @@
+"""What the cell has found out so far: where the panel stands, what its objects last showed, and what each sensor last sent.
+
+The facts are one frozen value that is replaced as a whole under a lock, so that a reader in another thread never sees
+half of a change.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hal.config import Cell
+from hal.geometry import UncertainPose, transform_rpy
+
+if TYPE_CHECKING:
+    from manipulation import Kinematics
+    from perception.vision import ObjectReading
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Frame:
+    """The newest frame of a sensor: when it was taken (cell clock, s) and a digest of its array."""
+
+    stamp_s: float
+    digest: bytes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Facts:
+    """Everything that is known of one panel before one cell.
+
+    Attributes:
+        base_from_panel: pose of the panel with covariance; None until the panel was located.
+        readings: newest answered reading of each object, by the object's name.
+        frames: newest frame of each camera and range scanner, by the device's name.
+        kinematics: of the cell's arm; None until it was first needed.
+    """
+
+    base_from_panel: UncertainPose | None = None
+    readings: Mapping[str, ObjectReading] = field(default_factory=lambda: MappingProxyType({}))
+    frames: Mapping[str, Frame] = field(default_factory=lambda: MappingProxyType({}))
+    kinematics: Kinematics | None = None
+
+
+class WorldModel:
+    """The cell's facts and the only ways to change them; safe to use from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._facts = Facts()
+
+    @property
+    def base_from_panel(self) -> UncertainPose | None:
+        """Where the panel is believed to stand, with covariance; None until it was located."""
+        return self._facts.base_from_panel
+
+    @property
+    def readings(self) -> Mapping[str, ObjectReading]:
+        """The newest answered reading of each object, by name."""
+        return self._facts.readings
+
+    def believe_panel(self, base_from_panel: UncertainPose) -> None:
+        """Take `base_from_panel` for the panel's pose from now on."""
+        self._change(lambda facts: replace(facts, base_from_panel=base_from_panel))
+
+    def forget_panel(self) -> None:
+        """Drop the panel's pose, because what it was measured with has changed."""
+        self._change(lambda facts: replace(facts, base_from_panel=None))
+
+    def note_readings(self, readings: Iterable[ObjectReading]) -> None:
+        """Keep the readings that were answered in place of earlier ones of the same objects."""
+        answered = {reading.name: reading for reading in readings if reading.answered}
+        self._change(lambda facts: replace(facts, readings=MappingProxyType({**facts.readings, **answered})))
+
+    def forget_reading(self, name: str) -> None:
+        """Drop the reading of an object that is being worked: what it showed before does not predict what it shows now."""
+        self._change(
+            lambda facts: replace(
+                facts, readings=MappingProxyType({known: r for known, r in facts.readings.items() if known != name})
+            )
+        )
+
+    def note_frame(self, device: str, frame: Frame) -> Frame | None:
+        """Keep the newest frame of a sensor; returns the one before."""
+        before = self._change(lambda facts: replace(facts, frames=MappingProxyType({**facts.frames, device: frame})))
+        return before.frames.get(device)
+
+    def kinematics(self, make: Callable[[], Kinematics]) -> Kinematics:
+        """The arm's kinematics, made once."""
+        known = self._facts.kinematics
+        if known is None:
+            known = make()
+            self._change(lambda facts: replace(facts, kinematics=known))
+        return known
+
+    def forget(self) -> None:
+        """Drop everything: another panel may stand before the cell, and another arm may move."""
+        self._change(lambda _facts: Facts())
+
+    def _change(self, change: Callable[[Facts], Facts]) -> Facts:
+        """Replace the facts by what `change` makes of them; returns those before."""
+        with self._lock:
+            before = self._facts
+            self._facts = change(before)
+            return before
+
+
+def expected_panel(cell: Cell) -> UncertainPose:
+    """`base_from_panel` as the cell file has it; its tolerances count as three standard deviations."""
+    w = cell.file.workspace
+    sigma = np.repeat([w.position_tolerance_m / 3.0, w.angle_tolerance_rad / 3.0], 3)
+    pose = transform_rpy(w.panel_position_m, w.panel_rpy_rad)
+    return UncertainPose(parent_from_child=pose, covariance=np.diag(sigma**2))

@@ -20,7 +20,7 @@ from hal.devices import CameraCapabilities, DeviceKind, Image
 from hal.errors import DeviceUnavailable
 from hal.readings import Stamped
 from hal.registry import Context, takes
-from hal.wires import Claim, WireOptions
+from hal.wires import ResourceClaim, WireOptions
 
 GRAB_FAILURES = 3
 EXPOSURE_UNIT_S = 1e-4  # V4L2_CID_EXPOSURE_ABSOLUTE counts 100 us
@@ -36,9 +36,9 @@ class CameraV4l2Options(LensOptions, WireOptions):
     is_colour: bool = True
     exposure_s: Annotated[float, Field(gt=0, le=1)] | None = None
 
-    def claims(self) -> tuple[Claim, ...]:
+    def claims(self) -> tuple[ResourceClaim, ...]:
         """The camera."""
-        return (Claim(wire=f"camera {self.device}"),)
+        return (ResourceClaim(wire=f"camera {self.device}"),)
 
 
 class Grabber(Protocol):

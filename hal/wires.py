@@ -12,7 +12,7 @@ from hal.strict import Strict, validate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Claim:
+class ResourceClaim:
     """What a device takes of a wire.
 
     Attributes:
@@ -37,12 +37,12 @@ class Claim:
 class WireOptions(Strict):
     """Base of the options of devices on wires."""
 
-    def claims(self) -> tuple[Claim, ...]:
+    def claims(self) -> tuple[ResourceClaim, ...]:
         """What a device with these options takes; nothing, unless a model says more."""
         return ()
 
 
-def claims_of(driver: str, options: dict[str, Any]) -> tuple[Claim, ...]:
+def claims_of(driver: str, options: dict[str, Any]) -> tuple[ResourceClaim, ...]:
     """What a device of `driver` takes of wires.
 
     Nothing for a driver whose entry point does not name its options (`hal.registry.takes`). Nothing either for one that
@@ -57,7 +57,7 @@ def claims_of(driver: str, options: dict[str, Any]) -> tuple[Claim, ...]:
         return ()
 
 
-def clash(one: Claim, other: Claim, *, apart: bool = False) -> tuple[str, str] | None:
+def clash(one: ResourceClaim, other: ResourceClaim, *, apart: bool = False) -> tuple[str, str] | None:
     """Why two devices cannot both have what they claim, and the remedy; None when they can.
 
     Args:

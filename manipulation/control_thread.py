@@ -11,8 +11,8 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from hal.cpu_affinity import share_core
 from hal.errors import MotionRefused
-from hal.lockstep import share_core
 
 T = TypeVar("T")
 

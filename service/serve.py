@@ -17,7 +17,7 @@ from pydantic.warnings import UnsupportedFieldAttributeWarning
 
 from hal.config import Cell
 from hal.errors import CellError, ConfigError
-from hal.garbage import set_aside
+from hal.gc_freeze import freeze_loaded
 from service.core import Service
 from service.operations.context import Operation
 from service.processes.stop_host import bound_socket
@@ -176,7 +176,7 @@ class Panelwright:
             state_of_app(app).hub.close()
 
         self._server = HttpServer(app, self._listener, on_exit=on_exit)
-        set_aside()
+        freeze_loaded()
         if self._error is not None:
             self._server.stop()  # the cell failed before there was a server to end
         if self._wants_warmth:  # beside the cell's start, which waits for another process
@@ -205,7 +205,7 @@ def _warm() -> None:
         warm()
     except Exception:  # the first user gets it with its context
         log.warning("warming up failed", exc_info=True)
-    set_aside()
+    freeze_loaded()
 
 
 def exit_on_sigterm() -> None:

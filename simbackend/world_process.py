@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
-from hal.lockstep import share_core
+from hal.cpu_affinity import share_core
 from simbackend.wire import CAMERA_AT, DOUBLE, IMAGE_BYTES, REQUEST, Op, Picture, PictureInfo, read_exactly
 from simbackend.world import World
 

@@ -14,7 +14,7 @@ from benchmarks.drivers.motion import part_csp, part_kill, part_ur
 from benchmarks.drivers.stamps import part_stamps
 from benchmarks.drivers.swap import part_swap
 from benchmarks.drivers.wire import part_decode, part_latency, part_rtu
-from hal.garbage import set_aside
+from hal.gc_freeze import freeze_loaded
 from service.processes.cell import SWITCH_S
 
 PARTS: dict[str, Callable[[float], None]] = {
@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--only", default=",".join(PARTS), help="comma list of parts")
     arguments = parser.parse_args()
     sys.setswitchinterval(SWITCH_S)  # both as in the cell process
-    set_aside()
+    freeze_loaded()
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; {arguments.seconds:.0f} s a figure")
     for name in arguments.only.split(","):
         if name not in PARTS:

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from benchmarks.drivers.benches import bench
-from hal.garbage import set_aside
+from hal.gc_freeze import freeze_loaded
 from hal.simulated import Fault
 
 
@@ -68,7 +68,7 @@ def start(text: str) -> tuple[str, Any]:
 def main() -> None:
     """Run the far sides named on the command line."""
     sides = dict(map(start, sys.argv[1:]))
-    set_aside()  # as in a cell process: a full collection would silence all devices for 50 ms
+    freeze_loaded()  # as in a cell process: a full collection would silence all devices for 50 ms
     print(json.dumps({name: side.address for name, side in sides.items()}), flush=True)
     for text in sys.stdin:
         what, _, rest = text.strip().partition(" ")

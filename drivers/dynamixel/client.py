@@ -17,7 +17,7 @@ from drivers.transport.bus import Bus
 from drivers.transport.link import Link, NoAnswer, Refused, drain, drain_until_quiet, now_s
 from drivers.transport.options import SerialOptions, serial_opener
 from hal.registry import Context
-from hal.wires import Claim
+from hal.wires import ResourceClaim
 
 QUARANTINE_S, LONGEST_QUARANTINE_S = 0.1, 0.8  # how long late answers are waited for; it doubles with each more lost
 DOUBT_S = 1.0  # an answer that is overtaken by others may come so late
@@ -59,10 +59,10 @@ class BusOptions(SerialOptions):
     def servos(self) -> tuple[int, ...]:
         """Ids of the device's servos."""
 
-    def claim(self) -> Claim:
+    def claim(self) -> ResourceClaim:
         """Its servos, on a bus for many."""
         stations = tuple(f"servo {id_}" for id_ in self.servos)
-        return Claim(wire=f"serial {self.port}", bus=f"Dynamixel 2.0 at {self.baud} baud", stations=stations)
+        return ResourceClaim(wire=f"serial {self.port}", bus=f"Dynamixel 2.0 at {self.baud} baud", stations=stations)
 
 
 class DynamixelClient:

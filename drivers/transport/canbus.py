@@ -17,7 +17,7 @@ from drivers.transport.options import CONNECT_TIMEOUT_S, Captured, opener_with_f
 from drivers.transport.serial_link import open_serial
 from drivers.transport.socket_link import open_tcp
 from hal.errors import DeviceUnavailable
-from hal.wires import Claim
+from hal.wires import ResourceClaim
 
 SLCAN_RATES = {rate: code for code, rate in enumerate((10, 20, 50, 100, 125, 250, 500, 800, 1000))}  # kbit/s
 RAW = struct.Struct("<IB3x8s")
@@ -42,11 +42,11 @@ class CanOptions(Captured):
     def stations(self) -> tuple[str, ...]:
         """What of the bus is this device's alone."""
 
-    def claim(self) -> Claim:
+    def claim(self) -> ResourceClaim:
         """Its stations; an adapter on a serial port is opened for one device, whatever hangs on its bus."""
         if self.is_slcan and tcp_address(self.channel) is None:
-            return Claim(wire=f"serial {self.channel}")
-        return Claim(wire=f"CAN {self.channel}", bus=f"CAN at {self.bitrate} bit/s", stations=self.stations)
+            return ResourceClaim(wire=f"serial {self.channel}")
+        return ResourceClaim(wire=f"CAN {self.channel}", bus=f"CAN at {self.bitrate} bit/s", stations=self.stations)
 
     @property
     def is_slcan(self) -> bool:

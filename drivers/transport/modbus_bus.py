@@ -11,7 +11,7 @@ from drivers.transport.link import Link
 from drivers.transport.modbus import RTU_GAP_S, ModbusMaster, ModbusRtu, ModbusTcp
 from drivers.transport.options import EitherOptions, PortNumber, Seconds, SerialPath, either_opener
 from hal.registry import Context
-from hal.wires import Claim
+from hal.wires import ResourceClaim
 
 
 class ModbusOptions(EitherOptions):
@@ -32,10 +32,10 @@ class ModbusOptions(EitherOptions):
             raise ValueError("say where the device is: host for Modbus TCP, or the path of a serial port as port")
         return self
 
-    def claim(self) -> Claim:
+    def claim(self) -> ResourceClaim:
         """The unit, on a bus for many."""
         bus = "Modbus TCP" if self.transport == "tcp" else f"Modbus RTU at {self.baud} baud"
-        return Claim(wire=self.wire, bus=bus, stations=(f"unit {self.unit}",), shared_as=self.shared_as)
+        return ResourceClaim(wire=self.wire, bus=bus, stations=(f"unit {self.unit}",), shared_as=self.shared_as)
 
 
 def modbus_bus(context: Context, options: ModbusOptions) -> Bus[ModbusMaster]:

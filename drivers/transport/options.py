@@ -15,7 +15,7 @@ from drivers.transport.serial_link import open_serial
 from drivers.transport.socket_link import open_tcp, open_udp
 from hal.registry import Context
 from hal.strict import Strict, validate
-from hal.wires import Claim, WireOptions
+from hal.wires import ResourceClaim, WireOptions
 
 M = TypeVar("M", bound=Strict)
 SerialPath = Annotated[str, Field(min_length=1)]
@@ -31,12 +31,12 @@ class Captured(WireOptions):
     capture: Path | None = None
     replay: Path | None = None
 
-    def claims(self) -> tuple[Claim, ...]:
+    def claims(self) -> tuple[ResourceClaim, ...]:
         """The wire, unless its traffic comes from a file."""
         return () if self.replay is not None else (self.claim(),)
 
     @abstractmethod
-    def claim(self) -> Claim:
+    def claim(self) -> ResourceClaim:
         """What the device takes of its wire."""
 
 
@@ -46,9 +46,9 @@ class SerialOptions(Captured):
     port: SerialPath
     baud: Annotated[int, Field(ge=300, le=4_500_000)] = 115_200
 
-    def claim(self) -> Claim:
+    def claim(self) -> ResourceClaim:
         """The port."""
-        return Claim(wire=f"serial {self.port}")
+        return ResourceClaim(wire=f"serial {self.port}")
 
 
 class TcpOptions(Captured):
@@ -57,9 +57,9 @@ class TcpOptions(Captured):
     host: str
     port: PortNumber
 
-    def claim(self) -> Claim:
+    def claim(self) -> ResourceClaim:
         """The connection."""
-        return Claim(wire=f"tcp {self.host}:{self.port}")
+        return ResourceClaim(wire=f"tcp {self.host}:{self.port}")
 
 
 class UdpOptions(Captured):
@@ -68,9 +68,9 @@ class UdpOptions(Captured):
     host: str
     port: PortNumber
 
-    def claim(self) -> Claim:
+    def claim(self) -> ResourceClaim:
         """The far side: it answers one."""
-        return Claim(wire=f"udp {self.host}:{self.port}")
+        return ResourceClaim(wire=f"udp {self.host}:{self.port}")
 
 
 class EitherOptions(Captured):
@@ -90,9 +90,9 @@ class EitherOptions(Captured):
         """The wire in words."""
         return f"tcp {self.host or LOOPBACK}:{self.port}" if self.transport == "tcp" else f"serial {self.port}"
 
-    def claim(self) -> Claim:
+    def claim(self) -> ResourceClaim:
         """Port or connection."""
-        return Claim(wire=self.wire)
+        return ResourceClaim(wire=self.wire)
 
 
 def read_options(context: Context, options: dict[str, Any], model: type[M]) -> M:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from drivers.transport.options import PortNumber, TcpOptions
-from hal.wires import Claim
+from hal.wires import ResourceClaim
 
 HEADER = struct.Struct(">HB")
 TYPES = {
@@ -33,9 +33,9 @@ class RtdeOptions(TcpOptions):
     owns: ClassVar[tuple[str, ...]] = ()
     port: PortNumber = 30_004
 
-    def claim(self) -> Claim:
+    def claim(self) -> ResourceClaim:
         """What it owns of the controller."""
-        return Claim(wire=f"tcp {self.host}:{self.port}", bus="RTDE", stations=self.owns)
+        return ResourceClaim(wire=f"tcp {self.host}:{self.port}", bus="RTDE", stations=self.owns)
 
 
 class RecipeRefused(ValueError):

@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from hal.atomic_write import write_atomically
 from hal.errors import InvalidRequest
-from hal.whole_file import write_whole
 from perception.range.recordings import Reading
 
 PART = ".part"
@@ -56,7 +56,7 @@ class KeptResults:
         self.goes_on = bool(self._lines)
         self._stamps: dict[str, list[int]] = {}
         fresh = [json.dumps(self._asked), *(json.dumps(line) for line in self._lines.values())]
-        write_whole(self.part, _lines(fresh))  # without the line that an abrupt end may have cut
+        write_atomically(self.part, _lines(fresh))  # without the line that an abrupt end may have cut
 
     def of(self, recordings: Iterable[Path]) -> dict[str, BatchResult]:
         """The earlier results that still hold, by name: those of unchanged recordings that gave a scene."""
@@ -95,7 +95,7 @@ class KeptResults:
 
 def write_results(path: Path, results: Sequence[BatchResult]) -> None:
     """One JSON object a line: name, scene or error. Whole or not at all."""
-    write_whole(path, _lines(json.dumps(asdict(result)) for result in results))
+    write_atomically(path, _lines(json.dumps(asdict(result)) for result in results))
 
 
 def _lines(lines: Iterable[str]) -> str:

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from hal.arrays import Array
+from hal.atomic_write import write_atomically
 from hal.errors import ConfigError
 from hal.strict import Strict, load_toml
-from hal.whole_file import write_whole
 from perception.vision.finding.features import (
     AROUND_GROUPS,
     DIRECTIONS,
@@ -241,7 +241,7 @@ def write_kind(kind: Kind, folder: Path) -> Path:
         tables = look[len(GROUPS) * len(RADII_M) :].reshape(len(AROUND_GROUPS), DIRECTIONS, RINGS)
         for name, table in zip(AROUND_GROUPS, tables, strict=True):
             lines.append(f"{name} = [{', '.join(_written(row) for row in table)}]")
-    return write_whole(folder / f"{kind.name}.toml", "\n".join(lines) + "\n")
+    return write_atomically(folder / f"{kind.name}.toml", "\n".join(lines) + "\n")
 
 
 def _is_other(path: Path) -> bool:

@@ -11,9 +11,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hal.atomic_write import write_atomically
 from hal.errors import ConfigError, InvalidRequest
 from hal.panel import Panel, load_panel
-from hal.whole_file import write_whole
 from service.errors import NoSuchTask
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ class Teachings:
         folder = self.folder / "panels"
         with self._lock:
             folder.mkdir(parents=True, exist_ok=True)
-            return write_whole(folder / f"{name}.toml", text)
+            return write_atomically(folder / f"{name}.toml", text)
 
     def forget(self, group: str, name: str) -> None:
         """Delete a taught kind or panel; a shipped kind of that name is in use again.

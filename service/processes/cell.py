@@ -21,7 +21,7 @@ from hal.clock import Clock, PacedClock, SimClock, WallClock
 from hal.config import Cell, DeviceSection, load_cell
 from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, DeviceError
-from hal.garbage import set_aside
+from hal.gc_freeze import freeze_loaded
 from hal.isolated import Report, isolated_device
 from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
@@ -298,7 +298,7 @@ def _run(order: CellOrder, lifeline: Lifeline, is_latched: Callable[[], bool], e
         report=lambda kind, data: lifeline.write_line(note_to_line(kind, data)),
     )
     server = serve(runtime.objects, order.address, bytes.fromhex(order.authkey), clock=runtime.clock)
-    set_aside()
+    freeze_loaded()
     lifeline.write_line("ready")
     end.wait()
     runtime.close()

@@ -8,7 +8,7 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from hal.whole_file import write_whole
+from hal.atomic_write import write_atomically
 from service.jsonable import jsonable
 from service.report.record import MissionRecord
 
@@ -29,7 +29,7 @@ def write_report(record: MissionRecord, folder: Path) -> Path:
 
 def write_json(folder: Path, summary: dict[str, Any]) -> None:
     """Replace `report.json` in one step, so that a reader never sees half of it."""
-    write_whole(folder / "report.json", json.dumps(summary, indent=1, allow_nan=False))
+    write_atomically(folder / "report.json", json.dumps(summary, indent=1, allow_nan=False))
 
 
 def render(folder: Path) -> Path:
@@ -41,4 +41,4 @@ def render(folder: Path) -> Path:
     environment.filters["deg"] = lambda radians: f"{57.29577951308232 * radians:.3f}"
     environment.filters["seconds"] = lambda s: f"{s:.2f}"
     html = environment.get_template("report.html.jinja").render(r=summary, titles=titles)
-    return write_whole(folder / "report.html", html)
+    return write_atomically(folder / "report.html", html)

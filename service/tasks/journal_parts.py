@@ -13,7 +13,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from hal.whole_file import NEW
+from hal.atomic_write import NEW
 
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS journal (

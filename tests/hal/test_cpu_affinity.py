@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from hal.lockstep import share_core
+from hal.cpu_affinity import share_core
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system has no core affinity")
 

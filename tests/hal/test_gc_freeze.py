@@ -1,4 +1,4 @@
-"""Full collections skip what was set aside, and still find later cycles."""
+"""Full collections skip what was frozen, and still find later cycles."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import weakref
 
 import pytest
 
-from hal.garbage import set_aside
+from hal.gc_freeze import freeze_loaded
 
 
 class Link:
@@ -23,16 +23,16 @@ def thawed() -> object:
     gc.unfreeze()
 
 
-def test_a_full_collection_does_not_walk_what_was_set_aside() -> None:
+def test_a_full_collection_does_not_walk_what_was_frozen() -> None:
     kept = [Link() for _ in range(1000)]
     assert len(gc.get_objects()) > len(kept)
-    set_aside()
+    freeze_loaded()
     assert gc.get_freeze_count() > len(kept)
     assert len(gc.get_objects()) < len(kept)
 
 
 def test_cycles_made_afterwards_are_still_collected() -> None:
-    set_aside()
+    freeze_loaded()
     a, b = Link(), Link()
     a.other, b.other = b, a
     gone = weakref.ref(a)

@@ -21,8 +21,8 @@ from hal.panel import PanelObject
 from hal.simulated import ObjectTruth
 from perception.vision.reading import ObjectReading
 from service.operations.context import OperationContext
+from service.operations.evaluate import agrees
 from service.operations.inspect import close_ups, look_past
-from service.operations.judge import agrees
 from service.operations.locate import go_to_overview, locate
 from service.operations.session import Session
 from service.operations.world_model import WorldModel

@@ -17,7 +17,7 @@ def main() -> None:
         raise SystemExit(2)
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # what it warns of comes as an error of ours, with a remedy
     from hal.errors import CellError
-    from service.commands.leaving import leave
+    from service.commands.shutdown import leave
     from service.errors import of_file
 
     try:

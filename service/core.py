@@ -18,7 +18,7 @@ from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceUnavailable, InvalidRequest, LeaseError, Stopped
 from service.commissioning.preflight import check_wires
 from service.errors import NotPossibleNow
-from service.memory.calibrations import Calibrations
+from service.knowledge.calibrations import Calibrations
 from service.operations.context import Operation, OperationContext
 from service.operations.world_model import WorldModel
 from service.processes.supervisor import Supervisor
@@ -152,7 +152,7 @@ class Service:
             raise
 
     def swap_device(self, name: str, section: DeviceSection) -> None:
-        """Another driver or other options for a device, until the service ends; see `service.processes.seats.Swapper`.
+        """Another driver or other options for a device, until the service ends; see `service.processes.device_slots.Swapper`.
 
         Raises:
             DeviceUnavailable: the cell is not up.

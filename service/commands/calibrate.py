@@ -66,7 +66,7 @@ def list_records(
     if url is not None:
         entries = client_of(url).get("/v1/calibrations")["calibrations"]
     else:
-        from service.memory.calibrations import Calibrations
+        from service.knowledge.calibrations import Calibrations
 
         found = Calibrations.of_runs(runs, read_cell(cell, seed)).all()
         entries = [{**e.record.model_dump(), "is_measured": e.is_measured} for e in found]

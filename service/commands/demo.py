@@ -13,7 +13,7 @@ from rich.table import Table
 
 from service.client import ApiError, Client
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console, read_cell
-from service.commands.leaving import INTERRUPTED, leave, one_interrupt
+from service.commands.shutdown import INTERRUPTED, leave, one_interrupt
 from service.commands.tasks import follow
 
 JUDGE_S = 30  # most that is waited for a verdict

@@ -18,7 +18,7 @@ from rich.table import Column, Table
 from hal.errors import CellError, ConfigError, InvalidRequest
 from service.client import Client
 from service.commands.common import Url, UrlDefault, client_of, console, find_cell
-from service.commands.leaving import one_interrupt
+from service.commands.shutdown import one_interrupt
 
 if TYPE_CHECKING:
     from service.commissioning.watching import Row

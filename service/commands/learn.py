@@ -36,7 +36,7 @@ def _learn(client: Client) -> bool:
 
 
 def tell(learned: dict[str, Any]) -> None:
-    """What an overview of a known panel taught (`service.memory.lessons.Learned.told`), for people."""
+    """What an overview of a known panel taught (`service.knowledge.teach.Learned.told`), for people."""
     added, seen = learned["added"], len(learned["taught_by"])
     looks = ", ".join(f"{name} {count}" for name, count in sorted(added.items())) or "none, everything was known"
     console.print(f"panel [bold]{learned['panel']}[/]: {seen} objects looked at; new looks: {looks}")

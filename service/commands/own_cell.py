@@ -11,7 +11,7 @@ import typer
 
 from service.client import ApiError, Client
 from service.commands.common import client_of, console, read_cell
-from service.commands.leaving import INTERRUPTED, leave, one_interrupt
+from service.commands.shutdown import INTERRUPTED, leave, one_interrupt
 from service.commands.tasks import follow
 
 ServiceUrl = Annotated[str | None, typer.Option("--url", help="Use this running service instead of starting the cell.")]

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from hal.errors import CellError, InvalidRequest
 from service.commands.common import console, patience
-from service.commands.leaving import INTERRUPTED, one_interrupt
+from service.commands.shutdown import INTERRUPTED, one_interrupt
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console, read_cell
-from service.commands.leaving import leave
+from service.commands.shutdown import leave
 
 if TYPE_CHECKING:
     from service.serve import Panelwright

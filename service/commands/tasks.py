@@ -13,7 +13,7 @@ from rich.table import Table
 
 from service.client import Client
 from service.commands.common import Url, UrlDefault, client_of, console, state_style
-from service.commands.leaving import INTERRUPTED
+from service.commands.shutdown import INTERRUPTED
 
 app = typer.Typer(help="List, show, watch and cancel tasks of a running service.", no_args_is_help=True)
 TaskId = Annotated[str, typer.Argument(help="Id of the task, as `task list` shows it.")]

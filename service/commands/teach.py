@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from perception.vision import Question
-    from service.memory.teachings import Teachings
+    from service.knowledge.store import KnowledgeStore
 
 MOST_PLATE_M = 10.0
 
@@ -26,7 +26,7 @@ class Terminal:
 
     def ask(self, question: Question) -> str:
         """One line of standard input; the question goes to standard output."""
-        from service.memory.dialogue import NobodyAnswers
+        from service.knowledge.dialogue import NobodyAnswers
 
         choices = f" [{'/'.join(question.choices)}]" if question.choices else ""
         default = f" ({question.default})" if question.default else ""
@@ -67,7 +67,7 @@ def teach(
     """Teach by clicks (--kind), by a panel file (--from-panel), by questions and answers (alone), or show with --check what is
     found now.
     """
-    from service.memory.teachings import Teachings
+    from service.knowledge.store import KnowledgeStore
 
     plate_m = _pair(plate, "--plate")
     if min(plate_m) <= 0 or max(plate_m) > MOST_PLATE_M:
@@ -80,17 +80,17 @@ def teach(
         raise InvalidRequest(
             "nobody is there to ask", hint="give --kind, --from-panel, --check, or --dialogue with answers on stdin"
         )
-    teachings = Teachings(folder)
+    store = KnowledgeStore(folder)
     if kind is not None:
-        _by_clicks(teachings, pixels, plate_m, kind=kind, clicks=click or [])
+        _by_clicks(store, pixels, plate_m, kind=kind, clicks=click or [])
         return
     if from_panel is not None:
-        _by_panel(teachings, pixels, from_panel)
+        _by_panel(store, pixels, from_panel)
         return
-    from service.memory.dialogue import Dialogue
+    from service.knowledge.dialogue import Dialogue
 
     with patience():
-        talk = Dialogue.about(Terminal(), teachings, pixels, plate_m)
+        talk = Dialogue.about(Terminal(), store, pixels, plate_m)
     if check:
         with patience():
             talk.show_found()
@@ -99,30 +99,30 @@ def teach(
 
 
 def _by_clicks(
-    teachings: Teachings, pixels: NDArray[np.uint8], plate_m: tuple[float, float], *, kind: str, clicks: list[str]
+    store: KnowledgeStore, pixels: NDArray[np.uint8], plate_m: tuple[float, float], *, kind: str, clicks: list[str]
 ) -> None:
-    from service.memory.lessons import teach_kind
+    from service.knowledge.teach import teach_kind
 
     clicks_px = tuple(_pair(text, "--click") for text in clicks)
     with patience():
-        taught = teach_kind(teachings, pixels, plate_m, kind=kind, clicks_px=clicks_px)
+        taught = teach_kind(store, pixels, plate_m, kind=kind, clicks_px=clicks_px)
     if not taught["added"]:
         console.print(f"{kind} looks like that already: nothing was written", markup=False)
         return
     console.print(f"wrote {taught['path']}", markup=False)
 
 
-def _by_panel(teachings: Teachings, pixels: NDArray[np.uint8], panel_file: Path) -> None:
+def _by_panel(store: KnowledgeStore, pixels: NDArray[np.uint8], panel_file: Path) -> None:
     from hal.panel import load_panel
     from perception.vision import as_gray, check_upright, one_plate
     from service.commands.learn import tell
-    from service.memory.lessons import learn_panel
+    from service.knowledge.teach import learn_panel
 
     panel, gray = load_panel(panel_file), as_gray(pixels)
     with patience():
         view = one_plate(gray, (panel.width_m, panel.height_m)).view
         check_upright(gray, view, panel)
-        learned = learn_panel(teachings, pixels, view, panel)
+        learned = learn_panel(store, pixels, view, panel)
     tell(learned.told())
 
 

@@ -19,13 +19,13 @@ from service.http import (
     calibrations,
     control,
     devices,
+    frames,
     health,
     images,
     knowledge,
     missions,
     stream,
     tasks,
-    teaching,
     verbs,
 )
 from service.http.guard import Allowed, Guard
@@ -38,7 +38,7 @@ from service.http.problems import Problem, install
 from service.http.query import check_query
 from service.http.readings import ReadingDesk
 from service.http.state import AppState
-from service.memory.lessons import OutlineRequest, TeachRequest
+from service.knowledge.teach import OutlineRequest, TeachRequest
 
 WEB = Path(__file__).parents[1] / "web"
 DESCRIPTION = f"""
@@ -83,7 +83,7 @@ def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
         devices.router,
         knowledge.router,
         images.router,
-        teaching.router,
+        frames.router,
         calibrations.router,
         control.router,
         missions.router,

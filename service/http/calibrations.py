@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field
 
 from service.http.problems import RESPONSES
 from service.http.state import AppState, State
-from service.memory.calibrations import Calibrated
+from service.knowledge.calibrations import Calibrated
 
 router = APIRouter(prefix="/v1/calibrations", tags=["calibrations"], responses=RESPONSES)
 DeviceName = Annotated[str, Path(max_length=64, examples=["wrist_camera"])]

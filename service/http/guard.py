@@ -10,7 +10,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.http.problems import problem_response
-from service.memory.images import MAX_IMAGE_BYTES
+from service.knowledge.images import MAX_IMAGE_BYTES
 
 MAX_BODY_BYTES = 1_000_000
 LARGE_BODIES = {("POST", "/v1/images"): MAX_IMAGE_BYTES}

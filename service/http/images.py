@@ -11,7 +11,7 @@ from starlette.responses import FileResponse, Response
 
 from service.http.problems import RESPONSES, refuse_body
 from service.http.state import AppState, State
-from service.memory.images import MEDIA, ImageStore, StoredImage
+from service.knowledge.images import MEDIA, ImageStore, StoredImage
 
 router = APIRouter(prefix="/v1/images", tags=["images"], responses=RESPONSES)
 ImageName = Annotated[str, Path(max_length=64, examples=["3f9c2a7be01d4c553f9c2a7b"])]

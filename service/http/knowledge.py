@@ -1,55 +1,233 @@
-"""`/v1/frames` and `/v1/panel`: what the cell knows."""
+"""`/v1/knowledge`: what the system knows of kinds and panels, and how users add to it."""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import functools
+from collections.abc import Sequence
+from typing import Annotated, Literal, TypeVar
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Path, Query
+from fastapi import Depends as DependsOn
+from pydantic import BaseModel, Field
 
-from hal.errors import CellError
-from hal.geometry import UncertainPose, certain, to_json
-from service.core import Service
-from service.http.models import FrameList, FrameView
+from hal.panel import Panel, load_panel
+from perception.toml_text import toml_document
+from service.http.body import body_schema, strict_body
+from service.http.images import store_of
 from service.http.problems import RESPONSES
-from service.http.state import State
+from service.http.state import AppState, State
+from service.knowledge.store import KnowledgeFile, KnowledgeStore, NoSuchKnowledge
+from service.knowledge.teach import OutlineRequest, TeachRequest, find_outline, questions_of, teach
 
-router = APIRouter(prefix="/v1", tags=["knowledge"], responses=RESPONSES)
-
-
-@router.get("/frames", summary="Where things are", operation_id="list_frames")
-async def list_frames(state: State) -> FrameList:
-    return FrameList(frames=await state.in_thread(lambda: _frames(state.service)))
-
-
-@router.get("/panel", summary="The panel file", operation_id="show_panel")
-async def show_panel(state: State) -> dict[str, Any]:
-    return state.service.cell.panel.model_dump(mode="json", by_alias=True)
+router = APIRouter(prefix="/v1/knowledge", tags=["knowledge"], responses=RESPONSES)
+PlainName = Annotated[str, Path(max_length=64, examples=["mushroom"])]
+EXAMPLE_ID = "3f9c2a7be01d4c553f9c2a7b"
+OUTLINE_EXAMPLE = {"image": EXAMPLE_ID, "plate_m": [0.6, 0.4], "clicks_px": [[1047.0, 674.0]]}
+TEACH_EXAMPLE = {**OUTLINE_EXAMPLE, "kind": "mushroom"}
 
 
-def _frames(service: Service) -> list[FrameView]:
-    frames = []
-    cell = service.calibrations.applied()
-    for name, section in cell.file.devices.items():
-        if section.mount is None:
-            continue
-        mount = cell.calibrations[section.mount.calibration].mount
-        if mount is not None:
-            frames.append(_frame(section.mount.parent, name, mount.pose(), "calibration"))
-    try:
-        flange = service.supervisor.connection.mover.state().base_from_flange
-        frames.append(_frame("base", "flange", certain(flange), "measured"))
-    except CellError:
-        pass  # no arm, or it cannot be read now: then nobody knows where the flange is
-    panel = service.world.base_from_panel
-    if panel is not None:
-        frames.append(_frame("base", "panel", panel, "estimated"))
-    return frames
+class KindView(BaseModel):
+    """A kind of object; `is_taught` False: shipped with the system."""
+
+    name: str
+    is_taught: bool
+    width_m: float
+    height_m: float
+    looks: Annotated[int, Field(description="how many examples it was taught by")]
+    toml: str | None = None
 
 
-def _frame(
-    parent: str, child: str, pose: UncertainPose, source: Literal["calibration", "measured", "estimated"]
-) -> FrameView:
-    covariance = None if source == "measured" else [[float(v) for v in row] for row in pose.covariance]
-    return FrameView(
-        parent=parent, child=child, **to_json(pose.parent_from_child), covariance=covariance, source=source
+class ObjectView(BaseModel):
+    """An object of a panel that is known."""
+
+    panel: str
+    name: str
+    kind: str
+    position_m: Annotated[list[float], Field(description="x, y on the plate from its middle, y up")]
+
+
+class PanelView(BaseModel):
+    """A panel that is known; `is_taught` False: the one of the cell file."""
+
+    name: str
+    is_taught: bool
+    width_m: float
+    height_m: float
+    objects: list[str]
+    toml: str | None = None
+
+
+class KnowledgeView(BaseModel):
+    """Everything that is known."""
+
+    kinds: list[KindView]
+    objects: list[ObjectView]
+    panels: list[PanelView]
+
+
+class QuestionView(BaseModel):
+    """A question of the dialogue; `choices` is empty where any text or number will do."""
+
+    key: str
+    text: str
+    choices: list[str]
+    default: str
+
+
+class QuestionList(BaseModel):
+    """What must be known of one clicked object."""
+
+    kind: str
+    questions: list[QuestionView]
+
+
+class OutlineView(BaseModel):
+    """What was found at the clicks, and what it is taken for now."""
+
+    shape: str
+    outline_px: list[list[float]]
+    centre_px: list[float]
+    centre_m: list[float]
+    size_m: list[float]
+    taken_for: str | None
+    confidence: float | None
+    reason: str | None
+
+
+class TaughtView(BaseModel):
+    """What a lesson wrote. `added` False: the look was known already and nothing was written."""
+
+    what: Literal["kind", "panel"]
+    name: str
+    added: bool
+    is_new: bool
+    path: str | None
+    toml: str
+    outline: OutlineView | None = None
+    lights_are_seen: bool | None = None
+
+
+V = TypeVar("V", KindView, PanelView)
+
+
+@router.get("", summary="Kinds, objects and panels, with their TOML", operation_id="list_knowledge")
+async def list_knowledge(
+    state: State, toml: Annotated[bool, Query(description="with the text of the files")] = True
+) -> KnowledgeView:
+    return await state.in_thread(functools.partial(_knowledge, state, with_text=toml))
+
+
+@router.get("/questions", summary="What the dialogue asks about a kind", operation_id="list_questions")
+async def list_questions(
+    kind: Annotated[str, Query(max_length=41, description="kind of the object", examples=["gauge"])],
+) -> QuestionList:
+    asked = [
+        QuestionView(key=q.key, text=q.text, choices=list(q.choices), default=q.default) for q in questions_of(kind)
+    ]
+    return QuestionList(kind=kind, questions=asked)
+
+
+@router.post(
+    "/outline",
+    summary="What is at one to three clicks in a stored image; writes nothing",
+    operation_id="find_outline",
+    openapi_extra=body_schema(OutlineRequest, OUTLINE_EXAMPLE, required=True),
+)
+async def outline(
+    state: State, request: Annotated[OutlineRequest, DependsOn(strict_body(OutlineRequest))]
+) -> OutlineView:
+    found = await state.in_thread(functools.partial(find_outline, store_of(state), _store(state), request))
+    return OutlineView(**found)
+
+
+@router.post(
+    "/teach",
+    summary="Teach a kind by clicks, or a whole panel by clicks and answers",
+    operation_id="teach",
+    openapi_extra=body_schema(TeachRequest, TEACH_EXAMPLE, required=True),
+)
+async def teach_something(
+    state: State, request: Annotated[TeachRequest, DependsOn(strict_body(TeachRequest))]
+) -> TaughtView:
+    taught = await state.in_thread(functools.partial(teach, store_of(state), _store(state), request))
+    state.service.note("taught", {"what": taught["what"], "name": taught["name"], "added": taught["added"]})
+    return TaughtView(**taught)
+
+
+@router.get("/kinds/{name}", summary="One kind, with its TOML", operation_id="show_kind")
+async def show_kind(state: State, name: PlainName) -> KindView:
+    kinds = (await state.in_thread(functools.partial(_knowledge, state, with_text=True))).kinds
+    return _named(kinds, name)
+
+
+@router.get("/panels/{name}", summary="One panel, with its TOML", operation_id="show_panel_knowledge")
+async def show_panel_knowledge(state: State, name: PlainName) -> PanelView:
+    panels = (await state.in_thread(functools.partial(_knowledge, state, with_text=True))).panels
+    return _named(panels, name)
+
+
+@router.delete(
+    "/{group}/{name}", status_code=204, summary="Forget a taught kind or panel", operation_id="forget_knowledge"
+)
+async def forget(state: State, group: Literal["kinds", "panels"], name: PlainName) -> None:
+    await state.in_thread(functools.partial(_store(state).forget, group, name))
+
+
+def _named(known: Sequence[V], name: str) -> V:
+    for view in known:
+        if view.name == name:
+            return view
+    raise NoSuchKnowledge("nothing of that name is known", hint="GET /v1/knowledge lists what is known")
+
+
+def _store(state: AppState) -> KnowledgeStore:
+    return KnowledgeStore.of_runs(state.service.runs_dir, state.service.cell)
+
+
+def _knowledge(state: AppState, *, with_text: bool) -> KnowledgeView:
+    store, cell = _store(state), state.service.cell
+    panels = [(cell.panel, False, _text_of(cell.panel) if with_text else None)]
+    panels += [(load_panel(file.path), True, file.text() if with_text else None) for file in store.panels()]
+    return KnowledgeView(
+        kinds=[_kind(file, with_text=with_text) for file in store.kinds()],
+        objects=[
+            ObjectView(
+                panel=panel.name,
+                name=panel_object.name,
+                kind=panel_object.kind,
+                position_m=list(panel_object.position_m),
+            )
+            for panel, _, _ in panels
+            for panel_object in panel.objects
+        ],
+        panels=[
+            PanelView(
+                name=panel.name,
+                is_taught=is_taught,
+                width_m=panel.width_m,
+                height_m=panel.height_m,
+                objects=[panel_object.name for panel_object in panel.objects],
+                toml=text,
+            )
+            for panel, is_taught, text in panels
+        ],
+    )
+
+
+def _text_of(panel: Panel) -> str:
+    """The cell's panel as a panel file has it, defaults written out."""
+    data = panel.model_dump(mode="json", by_alias=True, exclude_none=True)
+    top = {key: value for key, value in data.items() if key not in ("lights", "objects")}
+    return toml_document(top, {"lights": data["lights"], "objects": data["objects"]})
+
+
+def _kind(file: KnowledgeFile, *, with_text: bool) -> KindView:
+    summary = file.summary()
+    return KindView(
+        name=file.name,
+        is_taught=file.is_taught,
+        width_m=summary.width_m,
+        height_m=summary.height_m,
+        looks=summary.looks,
+        toml=file.text() if with_text else None,
     )

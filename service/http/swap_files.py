@@ -8,7 +8,7 @@ from typing import get_args
 from hal.config import DeviceSection
 from hal.errors import ConfigError, InvalidRequest
 from hal.registry import device_factory, options_model
-from service.processes.seats import WIRE_KEYS
+from service.processes.device_slots import WIRE_KEYS
 
 RECORDINGS = "recordings"
 ALWAYS_FILES = {"capture", "replay"}  # in drivers that do not name their options, too

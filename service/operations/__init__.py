@@ -40,10 +40,10 @@ def _mission(context: OperationContext, request: requests.MissionRequest) -> Any
     return run_mission(context, request)
 
 
-def _judge(context: OperationContext, request: requests.JudgeRequest) -> Any:
-    from service.operations.judge import judge
+def _evaluate(context: OperationContext, request: requests.EvaluateRequest) -> Any:
+    from service.operations.evaluate import evaluate
 
-    return judge(context.connection, context.runs_dir / request.mission)
+    return evaluate(context.connection, context.runs_dir / request.mission)
 
 
 def _is_stored(request: requests.StoredLook) -> bool:
@@ -119,8 +119,8 @@ OPERATIONS: dict[str, Operation] = {
         ),
         Operation(
             name="judge",
-            request_model=requests.JudgeRequest,
-            run=_judge,
+            request_model=requests.EvaluateRequest,
+            run=_evaluate,
             summary="Compare a finished mission with the simulator's truth (simulated cells only)",
             example={"mission": "20261120T231502-a1b2c3"},
             moves=False,

@@ -12,7 +12,7 @@ from hal.devices import DeviceKind
 from hal.errors import InvalidRequest, Unsupported
 from hal.geometry import difference, to_json
 from perception.calibration import InHandCalibration, ScannerCalibration, WrenchCalibration, record_of, renewed
-from service.memory.calibrations import Calibrations
+from service.knowledge.calibrations import Calibrations
 from service.operations.calibrate_sensors import (
     beforehand,
     camera_stations,

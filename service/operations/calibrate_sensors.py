@@ -26,7 +26,7 @@ from perception.calibration import (
     calibrate_wrench,
     propose_view,
 )
-from service.operations.eyes import OLDEST_S, deadline, look_with_lights, settle
+from service.operations.acquisition import OLDEST_S, deadline, look_with_lights, settle
 from service.operations.locate import lights_in, scan_plate
 from service.operations.session import Session
 from service.operations.stations import (

@@ -16,7 +16,7 @@ from hal.geometry import compose
 from hal.panel import PanelObject
 from perception.vision import ALIKE, NO_EDGE, ObjectReading, answer_at, draw_annotated, joined, said
 from perception.vision import inspect as inspect_image
-from service.operations.eyes import Look, base_from, look, settle
+from service.operations.acquisition import Look, base_from, look, settle
 from service.operations.locate import go_to_overview, locate
 from service.operations.requests import InspectRequest, RecogniseRequest
 from service.operations.session import Session, panel_object_or_all

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from hal.geometry import compose
-from service.memory.lessons import learn_panel
-from service.memory.teachings import Teachings
-from service.operations.eyes import look, settle
+from service.knowledge.store import KnowledgeStore
+from service.knowledge.teach import learn_panel
+from service.operations.acquisition import look, settle
 from service.operations.inspect import ensure_located
 from service.operations.locate import go_to_overview
 from service.operations.requests import LearnRequest
@@ -47,8 +47,8 @@ def run_learn(session: Session, request: LearnRequest) -> dict[str, Any]:
 
 def _learn(session: Session, pixels: Pixels, view: View, panel: Panel) -> dict[str, Any]:
     session.progress(0.9, "learn")
-    teachings = Teachings.of_runs(session.context.runs_dir, session.cell)
-    learned = learn_panel(teachings, pixels, view, panel)
+    store = KnowledgeStore.of_runs(session.context.runs_dir, session.cell)
+    learned = learn_panel(store, pixels, view, panel)
     picture = png_of(shown(_drawn(pixels, learned.looks)))
     return {**learned.told(), "pictures": [session.context.task.artefact("learned.png", picture, "image/png")]}
 

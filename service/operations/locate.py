@@ -14,7 +14,7 @@ from hal.errors import Ambiguous, NotFound
 from hal.geometry import UncertainPose, compose, difference, matrix_of, to_json
 from perception.range import PinholeSensor, PlaneFit, fit_plane_near
 from perception.vision import AssignedLights, QuadranglePose, assign_lights, estimate, find_lights
-from service.operations.eyes import LightPair, Look, Scan, look_with_lights, scan
+from service.operations.acquisition import LightPair, Look, Scan, look_with_lights, scan
 from service.operations.requests import PanelPoseRequest
 from service.operations.session import Session
 from service.operations.travel import go_to_camera_view, leave_the_panel

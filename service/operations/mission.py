@@ -16,16 +16,16 @@ from hal.errors import CellError, DeviceError
 from hal.geometry import compose
 from hal.panel import Button, Lever, PanelObject, Slider, Toggle
 from perception.vision import ObjectReading
+from service.operations.acquisition import settle
 from service.operations.context import OperationContext
-from service.operations.eyes import settle
+from service.operations.cross_check import OVERVIEW, SurfaceCheck, check_surfaces, need_its_place, view_surfaces
+from service.operations.evaluate import AFTER
 from service.operations.inspect import Inspection, inspect_close, inspect_here, need_all_present, reading_row
-from service.operations.judge import AFTER
 from service.operations.locate import Located, ScannedPlane, go_to_overview, locate, pose_json, scan_plate
 from service.operations.manipulate import work
 from service.operations.requests import ActionBody, MissionRequest
 from service.operations.sense import feel, fuse_and_remember, fused_json, light_observations
 from service.operations.session import Session
-from service.operations.surface_check import OVERVIEW, SurfaceCheck, check_surfaces, need_its_place, view_surfaces
 from service.operations.travel import leave_the_panel, park
 from service.problem import problem_of
 from service.report.drawing import panel_drawing

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from hal.errors import NotFound
-from service.operations.eyes import look, scan, settle
+from service.operations.acquisition import look, scan, settle
 from service.operations.inspect import ensure_located, run_recognise_taught
 from service.operations.locate import go_to_overview, plate_in
 from service.operations.relief import Sighting, find_by_surfaces, mark_of, sighting_json, surfaces_in

@@ -14,7 +14,7 @@ from hal.errors import Unsupported
 from hal.geometry import UncertainPose, compose, point_covariance
 from hal.panel import Handwheel, Mushroom, Panel
 from perception.range import ComponentModel, Match, PinholeSensor, RangeScene, Surface, analyse, match_models
-from service.operations.eyes import Scan
+from service.operations.acquisition import Scan
 from service.operations.locate import pose_json
 from service.operations.relief_models import models_of
 from service.operations.spots import half_footprint_m

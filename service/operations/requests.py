@@ -292,7 +292,7 @@ class CalibrationRequest(Strict):
     dry_run: Annotated[bool, Field(description="only plan the stations; nothing moves, nothing is written")] = False
 
 
-class JudgeRequest(Strict):
+class EvaluateRequest(Strict):
     """Compare a finished mission's report with what the simulator says (simulated cells only)."""
 
     mission: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,80}$")]

@@ -35,8 +35,8 @@ from hal.devices import DeviceKind
 from hal.errors import MotionError, NotFound, Stopped
 from hal.geometry import UncertainPose
 from manipulation import SkillFailure, proximity_probe, touch_probe
+from service.operations.acquisition import settle
 from service.operations.doubted_proximity import DoubtedProximity
-from service.operations.eyes import settle
 from service.operations.inspect import ensure_located
 from service.operations.locate import Located, go_to_overview, locate, pose_json, scan_plate
 from service.operations.requests import BoxBody, CylinderBody, FeatureSetBody, FuseRequest, MeasurementBody

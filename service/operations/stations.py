@@ -15,7 +15,7 @@ from hal.errors import Ambiguous, NotFound, Unreachable
 from hal.geometry import certain, matrix_of, transform
 from manipulation import Kinematics
 from perception.calibration import HandEyeView, propose_next, stations
-from service.operations.eyes import settle
+from service.operations.acquisition import settle
 from service.operations.session import Session
 from service.operations.travel import go_to_first, reachable
 

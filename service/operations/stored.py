@@ -14,8 +14,8 @@ from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose
 from hal.panel import Panel
 from perception.vision import ObjectReading
-from service.memory.images import ImageStore
-from service.memory.teachings import Teachings
+from service.knowledge.images import ImageStore
+from service.knowledge.store import KnowledgeStore
 from service.operations.requests import InspectRequest, RecogniseRequest, StoredLook
 from service.operations.session import Session, panel_object_or_all
 from service.report.plots import png_of
@@ -126,9 +126,9 @@ def shown(picture: Pixels) -> Pixels:
     return np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _stores(session: Session) -> tuple[ImageStore, Teachings]:
+def _stores(session: Session) -> tuple[ImageStore, KnowledgeStore]:
     runs = session.context.runs_dir
-    return ImageStore(runs), Teachings.of_runs(runs, session.cell)
+    return ImageStore(runs), KnowledgeStore.of_runs(runs, session.cell)
 
 
 def stored_view(session: Session, request: StoredLook, panel: Panel) -> tuple[Pixels, View]:

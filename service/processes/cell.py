@@ -28,13 +28,20 @@ from hal.registry import connect as connect_device
 from hal.simulated import Fault
 from hal.strict import validate
 from service.errors import DevicesUnavailable
-from service.memory.calibrations import Calibrations
-from service.processes.absent import Absent
+from service.knowledge.calibrations import Calibrations
 from service.processes.child import Lifeline, kill_own_group
 from service.processes.connection import BEHIND, CLOCK, MOVER, PREFIX, SWAPPER
+from service.processes.device_slots import (
+    Connect,
+    DeviceSlot,
+    Swapper,
+    UnavailableDevice,
+    checked,
+    failure_of,
+    names_another_wire,
+)
 from service.processes.latch import Beat, Latch
 from service.processes.motion import MotionPort, start_controller
-from service.processes.seats import Connect, Seat, Swapper, checked, failure_of, names_another_wire
 
 BEAT_S = 0.05
 CLOSE_TIMEOUT_S = 4.0
@@ -97,16 +104,16 @@ class CellRuntime:
                 return checked(name, make(context, section.driver, section.options), section)
 
             sections = {name: complete(name, section) for name, section in cell.file.devices.items()}
-            seats = _connect_all(cell, sections, connect, closers, report=report if partial else None)
-            objects: dict[str, Any] = {**seats, PREFIX + CLOCK: clock}
+            slots = _connect_all(cell, sections, connect, closers, report=report if partial else None)
+            objects: dict[str, Any] = {**slots, PREFIX + CLOCK: clock}
             objects |= {PREFIX + BEHIND + name: far_side.backing for name, far_side in far_sides.items()}
             motion: MotionPort | None = None
             if cell.names_of(DeviceKind.ARM):
                 measured = cell if runs_dir is None else Calibrations.of_runs(runs_dir, cell).applied()
-                motion = start_controller(measured, seats, clock=clock, is_latched=is_latched)
+                motion = start_controller(measured, slots, clock=clock, is_latched=is_latched)
                 objects[PREFIX + MOVER] = motion
                 closers.append(motion.close)
-            objects[PREFIX + SWAPPER] = Swapper(cell, connect=connect, complete=complete, seats=seats, motion=motion)
+            objects[PREFIX + SWAPPER] = Swapper(cell, connect=connect, complete=complete, slots=slots, motion=motion)
         except BaseException:
             _close_all(closers)
             raise
@@ -169,26 +176,26 @@ def _connect_all(
     closers: list[Callable[[], None]],
     *,
     report: Report | None,
-) -> dict[str, Seat]:
-    """Every device in its seat; where `report` takes them, those that did not connect leave an `Absent` there."""
+) -> dict[str, DeviceSlot]:
+    """Every device in its slot; with a `report`, devices that did not connect leave an `UnavailableDevice` there."""
     with ThreadPoolExecutor(len(sections), thread_name_prefix="connect") as pool:
         waiting = {name: pool.submit(connect, name, section) for name, section in sections.items()}
     failed: dict[str, CellError] = {}
-    seats: dict[str, Seat] = {}
+    slots: dict[str, DeviceSlot] = {}
     for name, future in waiting.items():
         error = future.exception()
         if error is None:
-            seats[name] = Seat(future.result())
+            slots[name] = DeviceSlot(future.result())
         else:
             failed[name] = failure_of(name, error)
-            seats[name] = Seat(Absent(name, sections[name].kind, failed[name]))
-        closers.append(seats[name].close)
+            slots[name] = DeviceSlot(UnavailableDevice(name, sections[name].kind, failed[name]))
+        closers.append(slots[name].close)
     if failed and (report is None or not all(isinstance(error, DeviceError) for error in failed.values())):
         raise gathered(failed, total=len(sections), cell=cell)
     for name, error in failed.items():
         assert report is not None  # noqa: S101 - narrowing: else it was raised
         report(MISSING, {"device": name, "why": error.what, "hint": error.hint})
-    return seats
+    return slots
 
 
 def gathered(failed: Mapping[str, CellError], *, total: int, cell: Cell) -> CellError:

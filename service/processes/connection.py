@@ -116,7 +116,7 @@ class LocalConnection:
         return {name: self._objects[PREFIX + BEHIND + name] for name in emulated(self.cell, kind)}
 
     def swap(self, name: str, section: DeviceSection) -> None:
-        """Another device for `name`; see `service.processes.seats.Swapper`."""
+        """Another device for `name`; see `service.processes.device_slots.Swapper`."""
         deadline = Deadline.after(WallClock(), SWAP_TIMEOUT_S)
         self._objects[PREFIX + SWAPPER].swap(name, section.driver, section.options, deadline=deadline)
 
@@ -174,7 +174,7 @@ class RemoteConnection:
         return {name: self._proxy(PREFIX + BEHIND + name) for name in emulated(self.cell, kind)}
 
     def swap(self, name: str, section: DeviceSection) -> None:
-        """Another device for `name`; see `service.processes.seats.Swapper`. Proxies of the old one are dropped."""
+        """Another device for `name`; see `service.processes.device_slots.Swapper`. Proxies of the old one are dropped."""
         deadline = Deadline.after(WallClock(), SWAP_TIMEOUT_S)
         self._proxy(PREFIX + SWAPPER).swap(name, section.driver, section.options, deadline=deadline)
         self.cell.file.devices[name] = section

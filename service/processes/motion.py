@@ -18,8 +18,7 @@ from hal.errors import CellError, ConfigError, MotionRefused
 from hal.geometry import identity
 from hal.motion import DeclaredMotion, MotionReport, RobotState
 from hal.readings import Quality
-from service.processes.absent import Absent
-from service.processes.seats import IN_MOTION, Seat
+from service.processes.device_slots import IN_MOTION, DeviceSlot, UnavailableDevice
 
 if TYPE_CHECKING:
     from manipulation import Controller
@@ -167,14 +166,14 @@ class MotionPort:
 
 
 def start_controller(
-    cell: Cell, devices: Mapping[str, Seat], *, clock: Clock, is_latched: Callable[[], bool]
+    cell: Cell, devices: Mapping[str, DeviceSlot], *, clock: Clock, is_latched: Callable[[], bool]
 ) -> MotionPort:
     """The control thread over the cell's devices, as many clients see it; errors are those of `controller_of`."""
     used = {name: devices[name] for name, section in cell.file.devices.items() if section.kind in IN_MOTION}
 
     def start() -> Controller | Standstill:
-        for seat in used.values():
-            if isinstance(absent := seat.occupant(), Absent):
+        for slot in used.values():
+            if isinstance(absent := slot.installed(), UnavailableDevice):
                 return Standstill(absent.why)
         return controller_of(cell, devices, clock=clock, is_latched=is_latched)
 

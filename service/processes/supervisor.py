@@ -208,7 +208,7 @@ class Supervisor:
         return self.latch.state()
 
     def swap(self, name: str, section: DeviceSection) -> None:
-        """Another device for `name`, also after a restart of the cell process; see `service.processes.seats.Swapper`."""
+        """Another device for `name`, also after a restart of the cell process; see `service.processes.device_slots.Swapper`."""
         (self._local or self._remote).swap(name, section)
         self._swapped[name] = section
         self._missing.pop(name, None)

@@ -15,7 +15,7 @@ from hal.errors import ConfigError, InvalidRequest, NotFound
 from hal.geometry import to_json
 from perception.vision.knowledge import Kind, load_knowledge, shipped_knowledge, write_kind
 from service.commands.teach import teach
-from service.memory.teachings import Teachings
+from service.knowledge.store import KnowledgeStore
 from tests.perception.vision.bench_panel import TOML, panel, scene
 from tests.service.conftest import WriteCell
 from tests.service.shown_panel import (
@@ -116,19 +116,19 @@ def test_the_looks_of_a_cell_add_to_the_shipped_kinds_and_give_way_to_taught_one
     of_cell.mkdir()
     write_kind(Kind(name="lamp", size_m=lamp.size_m, looks=odd), of_cell)
     write_kind(Kind(name="bell", size_m=(0.02, 0.02), looks=odd), of_cell)
-    teachings = Teachings(folder, of_cell=of_cell)
-    known = teachings.knowledge()
+    store = KnowledgeStore(folder, of_cell=of_cell)
+    known = store.knowledge()
     both, bell = known.kind("lamp"), known.kind("bell")
     assert both is not None and len(both.looks) == len(lamp.looks) + 1 and bell is not None
-    files = {file.name: file for file in teachings.kinds()}
+    files = {file.name: file for file in store.kinds()}
     assert files["lamp"].summary().looks == len(both.looks) and not files["lamp"].is_taught
     assert files["bell"].summary().looks == 1 and not files["bell"].is_taught
     (tmp_path / "shown").mkdir()
     (tmp_path / "shown" / "lamp.toml").write_text(files["lamp"].text())
     (read,) = load_knowledge(tmp_path / "shown").kinds
     np.testing.assert_array_equal(read.looks, both.looks)
-    teachings.write_kind(Kind(name="lamp", size_m=lamp.size_m, looks=odd))
-    alone = teachings.knowledge().kind("lamp")
+    store.write_kind(Kind(name="lamp", size_m=lamp.size_m, looks=odd))
+    alone = store.knowledge().kind("lamp")
     assert alone is not None and len(alone.looks) == 1
 
 

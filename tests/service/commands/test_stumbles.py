@@ -37,7 +37,7 @@ def test_a_folder_that_is_not_there_is_one_clear_message(capsys: pytest.CaptureF
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(service.cli, "_app", lambda: command)
-        patched.setattr("service.commands.leaving.leave", _leave)
+        patched.setattr("service.commands.shutdown.leave", _leave)
         with pytest.raises(SystemExit, match="2"):
             service.cli.main()
     told = capsys.readouterr().err

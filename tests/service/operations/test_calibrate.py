@@ -14,10 +14,10 @@ from hal.calibration import load_calibration
 from hal.config import Cell, load_cell
 from hal.errors import Cancelled
 from hal.geometry import difference
-from service.memory.calibrations import Calibrations
+from service.knowledge.calibrations import Calibrations
+from service.operations.acquisition import settle
 from service.operations.calibrate import run_calibrations
 from service.operations.context import OperationContext
-from service.operations.eyes import settle
 from service.operations.requests import CalibrationRequest
 from service.operations.session import Session
 from service.operations.travel import kinematics

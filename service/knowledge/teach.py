@@ -11,8 +11,8 @@ from pydantic import Field, model_validator
 from hal.errors import InvalidRequest
 from hal.panel import Panel
 from hal.strict import Strict
-from service.memory.images import ImageStore
-from service.memory.teachings import Teachings, check_name
+from service.knowledge.images import ImageStore
+from service.knowledge.store import KnowledgeStore, check_name
 from service.operations.requests import ImageId, ObjectName, PlateSize
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def questions_of(kind: str) -> tuple[Question, ...]:
     return questions(kind)
 
 
-def find_outline(images: ImageStore, teachings: Teachings, request: OutlineRequest) -> dict[str, Any]:
+def find_outline(images: ImageStore, store: KnowledgeStore, request: OutlineRequest) -> dict[str, Any]:
     """The outline at the clicks and what it is taken for; writes nothing.
 
     Raises:
@@ -90,10 +90,10 @@ def find_outline(images: ImageStore, teachings: Teachings, request: OutlineReque
     from perception.vision import example_at, overview_of
 
     overview = overview_of(images.pixels(request.image), plate_m=request.plate_m)
-    return described(overview, example_at(overview, request.clicks_px), teachings)
+    return described(overview, example_at(overview, request.clicks_px), store)
 
 
-def teach(images: ImageStore, teachings: Teachings, request: TeachRequest) -> dict[str, Any]:
+def teach(images: ImageStore, store: KnowledgeStore, request: TeachRequest) -> dict[str, Any]:
     """Learn what the request says and write it down.
 
     Raises:
@@ -101,14 +101,14 @@ def teach(images: ImageStore, teachings: Teachings, request: TeachRequest) -> di
     """
     pixels = images.pixels(request.image)
     if request.panel is not None:
-        return teach_panel(teachings, pixels, request.plate_m, request.panel)
+        return teach_panel(store, pixels, request.plate_m, request.panel)
     return teach_kind(
-        teachings, pixels, request.plate_m, kind=request.kind or "", clicks_px=request.clicks_px, size_m=request.size_m
+        store, pixels, request.plate_m, kind=request.kind or "", clicks_px=request.clicks_px, size_m=request.size_m
     )
 
 
 def teach_kind(
-    teachings: Teachings,
+    store: KnowledgeStore,
     pixels: NDArray[np.uint8],
     plate_m: tuple[float, float],
     *,
@@ -122,9 +122,9 @@ def teach_kind(
     check_name(kind)
     overview = overview_of(pixels, plate_m=plate_m)
     example = example_at(overview, clicks_px, needs_outline=kind != NOTHING)
-    lesson = teach_example(example, teachings.knowledge(), kind=kind, size_m=size_m, source="panelwright teach")
-    path = teachings.write_kind(lesson.kind) if lesson.added else None
-    file = next(file for file in teachings.kinds() if file.name == kind)
+    lesson = teach_example(example, store.knowledge(), kind=kind, size_m=size_m, source="panelwright teach")
+    path = store.write_kind(lesson.kind) if lesson.added else None
+    file = next(file for file in store.kinds() if file.name == kind)
     return {
         "what": "kind",
         "name": kind,
@@ -132,12 +132,12 @@ def teach_kind(
         "is_new": lesson.is_new_kind,
         "path": None if path is None else str(path),
         "toml": file.text(),
-        "outline": None if example.outline is None else described(overview, example, teachings),
+        "outline": None if example.outline is None else described(overview, example, store),
     }
 
 
 def teach_panel(
-    teachings: Teachings, pixels: NDArray[np.uint8], plate_m: tuple[float, float], lesson: PanelLesson
+    store: KnowledgeStore, pixels: NDArray[np.uint8], plate_m: tuple[float, float], lesson: PanelLesson
 ) -> dict[str, Any]:
     """Write a whole panel's file from clicks and answers; see `teach`."""
     from perception.vision import PanelObjectDraft, example_at, find_border_lights, overview_of, panel_text
@@ -155,13 +155,13 @@ def teach_panel(
         for panel_object in lesson.objects
     ]
     text = panel_text(lesson.name, overview, lights, drafts)
-    is_new = lesson.name not in {file.name for file in teachings.panels()}
+    is_new = lesson.name not in {file.name for file in store.panels()}
     return {
         "what": "panel",
         "name": lesson.name,
         "added": True,
         "is_new": is_new,
-        "path": str(teachings.write_panel(lesson.name, text)),
+        "path": str(store.write_panel(lesson.name, text)),
         "toml": text,
         "lights_are_seen": lights.are_seen,
     }
@@ -188,7 +188,7 @@ class Learned:
         }
 
 
-def learn_panel(teachings: Teachings, pixels: NDArray[np.uint8], view: View, panel: Panel) -> Learned:
+def learn_panel(store: KnowledgeStore, pixels: NDArray[np.uint8], view: View, panel: Panel) -> Learned:
     """Let a known panel teach its own looks from one overview, and keep them.
 
     Raises:
@@ -196,17 +196,17 @@ def learn_panel(teachings: Teachings, pixels: NDArray[np.uint8], view: View, pan
     """
     from perception.vision import teach_from_panel
 
-    looks = teach_from_panel(pixels, view, panel, teachings.knowledge(), source="panelwright learn")
-    return Learned(panel=panel.name, looks=looks, files=tuple(teachings.write_kind(kind) for kind in looks.kinds))
+    looks = teach_from_panel(pixels, view, panel, store.knowledge(), source="panelwright learn")
+    return Learned(panel=panel.name, looks=looks, files=tuple(store.write_kind(kind) for kind in looks.kinds))
 
 
-def described(overview: Overview, example: Example, teachings: Teachings) -> dict[str, Any]:
+def described(overview: Overview, example: Example, store: KnowledgeStore) -> dict[str, Any]:
     """An example for people and pages: its outline in the image, and what it is taken for now."""
     from perception.vision import likest
 
     if example.outline is None:
         raise InvalidRequest("nothing was pointed at", hint="click on an object")
-    taken = likest(overview, example, teachings.knowledge())
+    taken = likest(overview, example, store.knowledge())
     return {
         "shape": example.outline.shape,
         "outline_px": example.outline_px.tolist(),

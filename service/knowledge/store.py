@@ -71,7 +71,7 @@ class KnowledgeFile:
         return replace(own, looks=own.looks + added.looks)
 
 
-class Teachings:
+class KnowledgeStore:
     """Kinds in `folder/*.toml`, panels in `folder/panels/*.toml`; `of_cell` holds looks that add to the shipped kinds."""
 
     _lock = threading.Lock()  # of all of this process: two lessons at once must not lose one
@@ -81,7 +81,7 @@ class Teachings:
         self.of_cell = of_cell
 
     @classmethod
-    def of_runs(cls, runs_dir: Path, cell: Cell) -> Teachings:
+    def of_runs(cls, runs_dir: Path, cell: Cell) -> KnowledgeStore:
         """Where a service keeps them, over what its cell file names."""
         return cls(runs_dir / FOLDER, of_cell=cell.knowledge_path)
 

@@ -15,7 +15,7 @@ from hal.errors import InvalidRequest
 from hal.geometry import perturbed, to_json, transform_rpy
 from hal.panel import load_panel
 from hal.simulated import ObjectTruth, Truth
-from service.operations.judge import AFTER, agrees, compare, judge
+from service.operations.evaluate import AFTER, agrees, compare, evaluate
 from service.processes.connection import CellConnection
 
 PANEL = load_panel(Path(__file__).parents[3] / "panels/bench.toml")
@@ -139,7 +139,7 @@ def test_right_means_two_per_cent_of_the_scale_or_the_very_state(
 
 def test_a_mission_without_a_report_is_refused_before_anything_is_asked(tmp_path: Path) -> None:
     with pytest.raises(InvalidRequest, match="no report of a mission '20261120T231502'"):
-        judge(cast(CellConnection, None), tmp_path / "20261120T231502")
+        evaluate(cast(CellConnection, None), tmp_path / "20261120T231502")
 
 
 @pytest.mark.parametrize(("key", "other"), [("cell", "press"), ("panel", "press"), ("seed", 8)])
@@ -149,7 +149,7 @@ def test_a_mission_of_another_cell_is_not_judged_by_this_simulator(tmp_path: Pat
     (tmp_path / "report.json").write_text(json.dumps(report(**ran)))
     cell = SimpleNamespace(name="bench", panel=PANEL, file=SimpleNamespace(cell=SimpleNamespace(seed=7)))
     with pytest.raises(InvalidRequest, match=f"was of {key} {other!r}, this service runs {key}"):
-        judge(cast(CellConnection, SimpleNamespace(cell=cell)), tmp_path)
+        evaluate(cast(CellConnection, SimpleNamespace(cell=cell)), tmp_path)
 
 
 def test_a_mission_is_compared_with_what_its_own_beginning_showed(
@@ -170,6 +170,6 @@ def test_a_mission_is_compared_with_what_its_own_beginning_showed(
         devices_of=lambda kind: {"arm": SimpleNamespace(truth=told)},
         behind_wires_of=lambda kind: {},
     )
-    monkeypatch.setattr("service.operations.judge.render", lambda folder: None)
-    verdict = judge(cast(CellConnection, connection), tmp_path)
+    monkeypatch.setattr("service.operations.evaluate.render", lambda folder: None)
+    verdict = evaluate(cast(CellConnection, connection), tmp_path)
     assert asked[-1] == 80.0 and verdict["moved_unasked"] == []

@@ -18,7 +18,7 @@ from hal.geometry import UncertainPose, compose
 from hal.panel import Handwheel, Mushroom
 from perception.range import RangeScene
 from perception.vision import ObjectReading
-from service.operations.eyes import Scan, settle
+from service.operations.acquisition import Scan, settle
 from service.operations.locate import ScannedPlane, scan_plate
 from service.operations.relief import Sighting, find_by_surfaces, mark_of, surfaces_in
 from service.operations.session import Session
@@ -92,13 +92,13 @@ def check_surfaces(session: Session, first: SurfaceView) -> tuple[list[SurfaceCh
     pictures = [_picture(session, first, "surfaces")]
     for sighting in first.sightings:
         name = sighting.panel_object.name
-        check = judged(sighting, base_from_panel, session.panel.tolerances.position_m, shown.get(name), first.place)
+        check = compared(sighting, base_from_panel, session.panel.tolerances.position_m, shown.get(name), first.place)
         if not check.agrees:
             again = _look_closer(session, sighting.panel_object)
             if isinstance(again, SurfaceView):
                 pictures.append(_picture(session, again, f"surfaces-{name}"))
                 (second,) = [s for s in again.sightings if s.panel_object.name == name]
-                closer = judged(second, base_from_panel, session.panel.tolerances.position_m, shown.get(name), CLOSER)
+                closer = compared(second, base_from_panel, session.panel.tolerances.position_m, shown.get(name), CLOSER)
                 check = after_both(check, closer)
             else:
                 check = replace(check, finding=f"{check.finding}; no closer look: {again}")
@@ -106,7 +106,7 @@ def check_surfaces(session: Session, first: SurfaceView) -> tuple[list[SurfaceCh
     return checks, pictures
 
 
-def judged(
+def compared(
     sighting: Sighting, base_from_panel: UncertainPose, position_m: float, reading: ObjectReading | None, place: str
 ) -> SurfaceCheck:
     """A sighting held against the panel file and against what vision says.

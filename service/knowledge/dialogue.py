@@ -29,7 +29,7 @@ from perception.vision import (
     questions,
     teach_example,
 )
-from service.memory.teachings import Teachings, check_name
+from service.knowledge.store import KnowledgeStore, check_name
 
 if TYPE_CHECKING:
     import numpy as np
@@ -68,13 +68,13 @@ class Dialogue:
     """One session over one image."""
 
     talk: Talk
-    teachings: Teachings
+    store: KnowledgeStore
     pixels: NDArray[np.uint8]
     overview: Overview
 
     @classmethod
     def about(
-        cls, talk: Talk, teachings: Teachings, pixels: NDArray[np.uint8], plate_m: tuple[float, float]
+        cls, talk: Talk, store: KnowledgeStore, pixels: NDArray[np.uint8], plate_m: tuple[float, float]
     ) -> Dialogue:
         """A dialogue about an image.
 
@@ -82,7 +82,7 @@ class Dialogue:
             InvalidRequest, NotObservable, NotFound, Ambiguous: the image shows no panel to teach from.
         """
         overview = overview_of(pixels, plate_m=plate_m)
-        return cls(talk=talk, teachings=teachings, pixels=pixels, overview=overview)
+        return cls(talk=talk, store=store, pixels=pixels, overview=overview)
 
     def run(self) -> None:
         """Ask, teach, and show what is found now."""
@@ -98,7 +98,7 @@ class Dialogue:
             kind = self._until_good(partial(self._kind_name, example, knowledge))
             lesson = teach_example(example, knowledge, kind=kind, source="panelwright teach, dialogue")
             if lesson.added:
-                self.talk.say(f"wrote {self.teachings.write_kind(lesson.kind)}")
+                self.talk.say(f"wrote {self.store.write_kind(lesson.kind)}")
             else:
                 self.talk.say(f"{kind} looks like that already: nothing was written")
             if self._until_good(lambda: self._answer(MORE)) == "no":
@@ -114,7 +114,7 @@ class Dialogue:
             if self._until_good(lambda: self._answer(MORE)) == "no":
                 break
         text = panel_text(name, self.overview, lights, drafts)
-        self.talk.say(f"wrote {self.teachings.write_panel(name, text)}")
+        self.talk.say(f"wrote {self.store.write_panel(name, text)}")
         self._show_read(name)
 
     def _object(self, taken: set[str]) -> PanelObjectDraft:
@@ -149,7 +149,7 @@ class Dialogue:
     def _example(self) -> tuple[Example, Knowledge]:
         while True:
             example = self._until_good(lambda: example_at(self.overview, points_of(self.talk.ask(WHERE))))
-            knowledge = self.teachings.knowledge()
+            knowledge = self.store.knowledge()
             self.talk.say(describe(self.overview, example, knowledge))
             if self._until_good(lambda: self._answer(IS_IT)) == "yes":
                 return example, knowledge
@@ -193,7 +193,7 @@ class Dialogue:
     def show_found(self) -> None:
         """What is found in the image with what is known now."""
         lines = []
-        for found in check(self.pixels, self.teachings.knowledge(), plate_m=self.overview.plate_m):
+        for found in check(self.pixels, self.store.knowledge(), plate_m=self.overview.plate_m):
             x, y = found.centre_px
             verdict = f"refused: {found.reason}" if found.reason else f"confidence {found.confidence:.2f}"
             lines.append(f"{found.kind} at {x:.0f},{y:.0f} px  {verdict}")
@@ -203,7 +203,7 @@ class Dialogue:
     def _show_read(self, name: str) -> None:
         from perception.vision import as_gray, inspect_view, said
 
-        panel = self.teachings.panel(name)
+        panel = self.store.panel(name)
         for reading in inspect_view(self.pixels, as_gray(self.pixels), self.overview.view, panel):
             self.talk.say(f"{reading.name} ({reading.kind}): {reading.reason or said(reading)}")
 

@@ -11,7 +11,7 @@ from hal.calibration import LoadRecord, MountRecord, load_calibration
 from hal.config import Cell, load_cell
 from hal.errors import ConfigError
 from perception.calibration.records import renewed
-from service.memory.calibrations import Calibrations, NoSuchCalibration
+from service.knowledge.calibrations import Calibrations, NoSuchCalibration
 from service.operations import OPERATIONS
 from service.operations.requests import CalibrationRequest
 from service.serve import Options, Panelwright

@@ -23,7 +23,7 @@ WHEEL_RAD = 0.105
 AFTER = "after the actions"
 
 
-def judge(connection: CellConnection, folder: Path) -> dict[str, Any]:
+def evaluate(connection: CellConnection, folder: Path) -> dict[str, Any]:
     """Add `judge` to the report in `folder` and draw it again; returns that part.
 
     Raises:

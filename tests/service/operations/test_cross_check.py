@@ -11,8 +11,8 @@ from hal.geometry import UncertainPose
 from hal.panel import Handwheel, Mushroom
 from perception.range.matching.match import Match
 from perception.vision.reading import ObjectReading
+from service.operations.cross_check import CLOSER, OVERVIEW, SurfaceCheck, after_both, compared, need_its_place
 from service.operations.relief import Sighting
-from service.operations.surface_check import CLOSER, OVERVIEW, SurfaceCheck, after_both, judged, need_its_place
 
 BASE_FROM_PANEL = RigidTransform.from_components([0.9, 0.1, 0.5], Rotation.from_euler("xyz", [1.5, 0.1, -1.6]))
 MUSHROOM = Mushroom(name="stop", position_m=(0.19, 0.0))
@@ -67,7 +67,7 @@ def reading(
 
 def check(seen: Sighting, shown: ObjectReading | None = None, place: str = OVERVIEW) -> SurfaceCheck:
     """The judgement with a panel pose that is known to a tenth of a millimetre."""
-    return judged(seen, pose(BASE_FROM_PANEL, 1e-4), 0.0002, shown, place)
+    return compared(seen, pose(BASE_FROM_PANEL, 1e-4), 0.0002, shown, place)
 
 
 def test_the_distance_is_told_with_its_deviation_and_that_from_vision():

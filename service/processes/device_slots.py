@@ -1,4 +1,4 @@
-"""Seats of a running cell: whoever holds a seat keeps talking to whatever device sits there now."""
+"""Slots of a running cell: whoever holds a slot keeps talking to the device that is installed there now."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from typing import Any, Protocol
+from typing import Any, NoReturn, Protocol
 
 from hal.clock import Deadline
 from hal.config import Cell, DeviceSection
-from hal.devices import DeviceKind
+from hal.devices import PROTOCOLS, DeviceKind, Health
 from hal.errors import CellError, ConfigError, DeviceUnavailable, MotionRefused
-from service.errors import Busy
-from service.processes.absent import Absent
+from hal.readings import Cause, Quality
+from service.errors import Busy, NotConnected
 
 WIRE_KEYS = ("host", "port", "channel", "device")  # options that name a port which takes one driver at a time
 HAS_MEMORY = {DeviceKind.ARM, DeviceKind.FORCE_TORQUE}  # the control thread keeps kinematics and bias of these
@@ -21,8 +21,8 @@ IN_MOTION = HAS_MEMORY | {DeviceKind.GRIPPER, DeviceKind.TOUCH, DeviceKind.PROXI
 log = logging.getLogger(__name__)
 
 
-class Seat:
-    """Passes everything on to the device that sits here."""
+class DeviceSlot:
+    """Passes every call on to the installed device."""
 
     def __init__(self, device: Any) -> None:
         self._device = device
@@ -36,20 +36,61 @@ class Seat:
         return dir(self._device)  # what a host offers to other processes
 
     def close(self) -> None:
-        """Close the device of the moment."""
+        """Close the installed device."""
         self._device.close()
 
-    def occupant(self) -> Any:
+    def installed(self) -> Any:
         """The device itself."""
         return self._device
 
-    def put(self, device: Any) -> None:
-        """Another device sits here from now on; the one before is the caller's to close."""
+    def install(self, device: Any) -> None:
+        """Install another device; the caller closes the one before."""
         self._device = device
 
 
+class UnavailableDevice:
+    """Stands in the slot of a device that did not connect, so that the rest of the cell can be used meanwhile.
+
+    It has the interface of its kind; every call raises why there is no device, with how to try again.
+
+    Args:
+        error: why connecting failed.
+    """
+
+    def __init__(self, name: str, kind: DeviceKind, error: CellError) -> None:
+        self.name, self.kind = name, kind
+        self._why = NotConnected(
+            f"{name} did not connect: {error.what.removeprefix(name).lstrip(': ')}",
+            hint=f"{error.hint}; then POST /v1/devices/{name}/connect",
+            **{**error.details, "device": name},
+        )
+
+    def __dir__(self) -> list[str]:
+        return ["name", *dir(PROTOCOLS[self.kind])]  # what a host offers to other processes
+
+    def __getattr__(self, attribute: str) -> Any:
+        if attribute.startswith("_") or attribute not in dir(PROTOCOLS[self.kind]):
+            raise AttributeError(attribute)
+        return self._refuse
+
+    def _refuse(self, *_args: Any, **_kwargs: Any) -> NoReturn:
+        raise self._why
+
+    @property
+    def why(self) -> NotConnected:
+        """The error that every call raises."""
+        return self._why
+
+    def health(self) -> Health:
+        """Not connected, and why."""
+        return Health(connected=False, quality=Quality.INVALID, cause=Cause.COMM, detail=self._why.what)
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
 class MotionDesk(Protocol):
-    """What a swap needs of the motion port."""
+    """The part of the motion port that a swap needs."""
 
     def at_rest(self, work: Callable[[], None]) -> None:
         """Run `work` while no motion runs or begins.
@@ -75,7 +116,7 @@ Complete = Callable[[str, DeviceSection], DeviceSection]
 
 
 class Swapper:
-    """Puts other devices into the seats while the cell runs, one at a time.
+    """Installs other devices in the slots while the cell runs, one at a time.
 
     The new device is connected before the old one is closed, unless both are on one port. Motion power is off after a
     swap of the arm until the next declared motion asks for it, and a device that moves is not swapped during a motion.
@@ -91,18 +132,18 @@ class Swapper:
         *,
         connect: Connect,
         complete: Complete,
-        seats: Mapping[str, Seat],
+        slots: Mapping[str, DeviceSlot],
         motion: MotionDesk | None,
     ) -> None:
         self._sections = cell.file.devices
         self._connect = connect
         self._complete = complete
-        self._seats = seats
+        self._slots = slots
         self._motion = motion
         self._busy = threading.Lock()
 
     def swap(self, name: str, driver: str, options: dict[str, Any], *, deadline: Deadline) -> None:  # noqa: ARG002 - an interface
-        """Another driver or other options for the device `name`.
+        """Install another driver, or the same one with other options, for the device `name`.
 
         Args:
             deadline: of the caller's wait for the answer; a connection that fails takes as long as its driver tries.
@@ -116,7 +157,7 @@ class Swapper:
         try:
             section = self._sections[name].model_copy(update={"driver": driver, "options": options})
             old, new = self._complete(name, self._sections[name]), self._complete(name, section)
-            if isinstance(self._seats[name].occupant(), Absent):
+            if isinstance(self._slots[name].installed(), UnavailableDevice):
                 self._fill(name, new)
             elif _share_a_port(old, new):
                 self._swap_on_one_port(name, old, new)
@@ -127,31 +168,31 @@ class Swapper:
             self._busy.release()
 
     def _fill(self, name: str, new: DeviceSection) -> None:
-        """A device where there was none."""
-        seat = self._seats[name]
+        """Install a device where there was none."""
+        slot = self._slots[name]
         try:
             fresh = self._connect(name, new)
         except Exception as error:
             failure = failure_of(name, error)
-            seat.put(Absent(name, new.kind, failure))
+            slot.install(UnavailableDevice(name, new.kind, failure))
             raise failure from error
         try:
-            self._seated(new.kind, lambda: seat.put(fresh))
+            self._at_rest(new.kind, lambda: slot.install(fresh))
         except CellError as error:  # the control thread does not take it
-            seat.put(Absent(name, new.kind, error))
+            slot.install(UnavailableDevice(name, new.kind, error))
             fresh.close()
             raise
 
     def _swap_side_by_side(self, name: str, new: DeviceSection) -> None:
-        seat, old = self._seats[name], self._seats[name].occupant()
+        slot, old = self._slots[name], self._slots[name].installed()
         with self._kept(name):
             fresh = self._connect(name, new)
         try:
             with self._kept(name):
-                self._seated(new.kind, lambda: seat.put(fresh))
+                self._at_rest(new.kind, lambda: slot.install(fresh))
         except CellError:
-            if seat.occupant() is fresh:  # the control thread does not take it
-                self._seated(new.kind, lambda: seat.put(old))
+            if slot.installed() is fresh:  # the control thread does not take it
+                self._at_rest(new.kind, lambda: slot.install(old))
             fresh.close()
             raise
         old.close()
@@ -159,22 +200,22 @@ class Swapper:
     def _swap_on_one_port(self, name: str, old: DeviceSection, new: DeviceSection) -> None:
         try:
             with self._kept(name):
-                self._seated(new.kind, lambda: self._reseat(name, new))
+                self._at_rest(new.kind, lambda: self._replace(name, new))
         except MotionRefused:
             raise  # nothing was touched
         except CellError:
-            self._seated(new.kind, lambda: self._return(name, old))
+            self._at_rest(new.kind, lambda: self._return(name, old))
             raise
 
-    def _reseat(self, name: str, section: DeviceSection) -> None:
-        seat = self._seats[name]
-        seat.close()
-        seat.put(self._connect(name, section))
+    def _replace(self, name: str, section: DeviceSection) -> None:
+        slot = self._slots[name]
+        slot.close()
+        slot.install(self._connect(name, section))
 
     def _return(self, name: str, old: DeviceSection) -> None:
         """The old device again, after its port was given to one that did not connect."""
         try:
-            self._reseat(name, old)
+            self._replace(name, old)
         except CellError as error:
             raise DeviceUnavailable(
                 f"{name}: the new driver did not connect, and the old one, {old.driver}, did not come back: {error.what}",
@@ -182,7 +223,7 @@ class Swapper:
                 device=name,
             ) from error
 
-    def _seated(self, kind: DeviceKind, work: Callable[[], None]) -> None:
+    def _at_rest(self, kind: DeviceKind, work: Callable[[], None]) -> None:
         if self._motion is None or kind not in IN_MOTION:
             work()
         elif kind in HAS_MEMORY:
@@ -192,7 +233,7 @@ class Swapper:
 
     @contextmanager
     def _kept(self, name: str) -> Iterator[None]:
-        """Errors inside say that the old device stays."""
+        """Let errors inside say that the old device stays."""
         driver = self._sections[name].driver
         kept = f"{name} keeps {driver}, as the new driver"
         try:
@@ -213,7 +254,7 @@ class Swapper:
 
 
 def failure_of(name: str, error: BaseException) -> CellError:
-    """What connecting a device met; a defect of its driver is logged, and told as a device that cannot be had."""
+    """The error that connecting a device raised; a defect of its driver is logged and reported as `DeviceUnavailable`."""
     if isinstance(error, CellError):
         return error
     log.error("devices.%s", name, exc_info=error)

@@ -17,7 +17,7 @@ from drivers.transport.checks import crc_modbus, xor_byte
 from drivers.transport.link import NoAnswer, Refused, now_s
 from drivers.transport.modbus import ModbusMaster, ModbusRtu, ModbusTcp
 from drivers.ur import rtde
-from drivers.vendor_frames import cola_a, cola_b, cola_b_framer, decode_cola_a, decode_xarm, xarm
+from tests.drivers.vendor_frames import cola_a, cola_b, cola_b_framer, decode_cola_a, decode_xarm, xarm
 
 FILE = Path(__file__).parents[3] / "shared" / "data" / "drivers" / "vectors.json"
 VECTORS: list[dict[str, Any]] = json.loads(FILE.read_text())["vectors"] if FILE.exists() else []

@@ -1,4 +1,4 @@
-"""Frames of SICK CoLa and UFACTORY xArm: what a driver for either would stand on."""
+"""Frames of SICK CoLa and UFACTORY xArm, for which there is no driver: they prove the framer on two more protocols."""
 
 from __future__ import annotations
 

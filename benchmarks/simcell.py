@@ -19,10 +19,10 @@ from hal.devices import DeviceKind
 from hal.geometry import UncertainPose, perturbed
 from hal.registry import Context, Shared, connect
 from hal.simulated import ObjectTruth
-from manipulation.control import Controller
+from manipulation.control.controller import Controller
+from manipulation.planning.time_parameterization import SpeedLimits
+from manipulation.skills.context import SkillContext
 from manipulation.skills.outcome import ObjectState
-from manipulation.timing import SpeedLimits
-from manipulation.workcell import Workcell
 from service.processes.motion import controller_of, flange_from
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -30,14 +30,14 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @dataclass
 class SimBench:
-    """A running simulated cell. `cell` is what skills get; `truth` is for the judge."""
+    """A running simulated cell. `context` is what skills get; `truth` is for the judge."""
 
     file: Cell
     clock: SimClock
     shared: Shared
     arm: Any
     controller: Controller
-    cell: Workcell
+    context: SkillContext
     latched: list[bool]
     rng: np.random.Generator
     devices: dict[str, Any]
@@ -100,7 +100,7 @@ def open_bench(
     controller = controller_of(file, made, clock=clock, is_latched=lambda: latched[0])
     rng = np.random.default_rng([seed, 1])
     true = RigidTransform.from_matrix(made["arm"].truth().base_from_panel_matrix)
-    cell = Workcell(
+    skill_context = SkillContext(
         mover=controller,
         kinematics=controller.kinematics,
         panel=file.panel,
@@ -112,10 +112,10 @@ def open_bench(
         seed=seed,
         progress=progress,
     )
-    bench = SimBench(file, clock, shared, made["arm"], controller, cell, latched, rng, made)
+    bench = SimBench(file, clock, shared, made["arm"], controller, skill_context, latched, rng, made)
     levers = [panel_object.name for panel_object in file.panel.objects if panel_object.kind == "lever"]
     angles = {name: float(bench.truth(name).value or 0.0) for name in levers}
-    bench.cell = replace(cell, angles_rad=angles)
+    bench.context = replace(skill_context, angles_rad=angles)
     return bench
 
 

@@ -7,40 +7,41 @@ from typing import TYPE_CHECKING
 from hal.face import load_on_first_use
 
 if TYPE_CHECKING:
-    from manipulation.collision import CollisionModel
-    from manipulation.control import Controller
-    from manipulation.kinematics import Kinematics
-    from manipulation.shapes import Box
+    from manipulation.arm.kinematics import Kinematics
+    from manipulation.control.controller import Controller
+    from manipulation.planning.collision import CollisionModel
+    from manipulation.planning.shapes import CollisionBox
+    from manipulation.planning.time_parameterization import SpeedLimits
+    from manipulation.planning.transfer import QUICK, THOROUGH, Effort
+    from manipulation.skills.attempt import Attempt
     from manipulation.skills.button import button
+    from manipulation.skills.context import SkillContext
     from manipulation.skills.handwheel import handwheel
     from manipulation.skills.lever import lever
     from manipulation.skills.mushroom import mushroom
     from manipulation.skills.outcome import ObjectState, SkillFailure, SkillReport, Verify
     from manipulation.skills.probe import proximity_probe, touch_probe
+    from manipulation.skills.retreat import park, retreat
     from manipulation.skills.rotary import rotary
     from manipulation.skills.slider import slider
-    from manipulation.skills.steps import Attempt, park, retreat
     from manipulation.skills.toggle import toggle
-    from manipulation.timing import SpeedLimits
-    from manipulation.transfer import QUICK, THOROUGH, Effort
     from manipulation.warm import warm_up
-    from manipulation.workcell import Workcell
 
 __all__ = [
     "QUICK",
     "THOROUGH",
     "Attempt",
-    "Box",
+    "CollisionBox",
     "CollisionModel",
     "Controller",
     "Effort",
     "Kinematics",
     "ObjectState",
+    "SkillContext",
     "SkillFailure",
     "SkillReport",
     "SpeedLimits",
     "Verify",
-    "Workcell",
     "button",
     "handwheel",
     "lever",

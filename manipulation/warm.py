@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from manipulation import braking, clearance, kernels
+from manipulation.arm import kernels
+from manipulation.control import braking
+from manipulation.planning import clearance
 
 
 def warm_up() -> None:
-    """Run every compiled function of kinematics, control and clearance once, on an arm of six joints and one box."""
+    """Executor every compiled function of kinematics, control and clearance once, on an arm of six joints and one box."""
     dh, q = np.zeros((6, 4)), np.full(6, 0.1)
     dh[:, 1] = 0.2
     kernels.warm(dh)

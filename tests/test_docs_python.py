@@ -104,7 +104,7 @@ def test_the_manipulation_page_opens_the_valve() -> None:
         assert bench.truth("main_valve").state == "closed"
         found = run(
             "manipulation.md",
-            cell=bench.cell,
+            context=bench.context,
             known=bench.look("main_valve"),
             look_again=lambda: bench.look("main_valve"),
         )

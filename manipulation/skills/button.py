@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 from hal.panel import Button
+from manipulation.skills.context import SkillContext
+from manipulation.skills.initial_state import object_of_kind
 from manipulation.skills.outcome import ObjectState, Outcome, SkillReport, Verify
 from manipulation.skills.press import press
-from manipulation.skills.subject import subject_of
-from manipulation.workcell import Workcell
 
 
 def button(
-    cell: Workcell,
+    context: SkillContext,
     name: str,
     *,
     expected: str | None = None,
@@ -33,10 +33,10 @@ def button(
         InvalidRequest: it is not a button.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    panel_object = subject_of(cell, name, Button, "button")
+    panel_object = object_of_kind(context, name, Button, "button")
     shows = panel_object.latching or panel_object.lights_lamp is not None
     report = press(
-        cell,
+        context,
         panel_object,
         skill="button",
         target=expected or "pressed once",

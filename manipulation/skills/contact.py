@@ -11,9 +11,9 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.motion import Compliance, Guard, Hold, MotionReport, Quantity
+from manipulation.planning.cartesian_path import shifted
+from manipulation.skills.attempt import Attempt
 from manipulation.skills.outcome import Outcome, SkillFailure
-from manipulation.skills.steps import Attempt
-from manipulation.stroke import shifted
 
 INF = float("inf")
 FEEL_N = 3.0  # moves no lever, and no knob by its own side
@@ -79,7 +79,7 @@ def meet(
 
 
 def _shakes(attempt: Attempt) -> bool:
-    return attempt.cell.kinematics.capabilities.resolution_rad >= COARSE_RAD
+    return attempt.context.kinematics.capabilities.resolution_rad >= COARSE_RAD
 
 
 def force_at_rest_n(attempt: Attempt, in_tool: Array) -> float:
@@ -121,7 +121,7 @@ def against_turn(start: RigidTransform, hub_m: Array, axis: Array) -> tuple[floa
 
 
 def centre_between(attempt: Attempt, *, room_m: float, what: str) -> None:
-    """Local refinement before a cage or a grasp: feel the thing between the open fingers on both sides, go to the
+    """Local refinement before a cage or a grasp: feel the object between the open fingers on both sides, go to the
     middle.
 
     Args:

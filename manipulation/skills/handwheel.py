@@ -11,12 +11,13 @@ from hal.arrays import Array
 from hal.errors import InvalidRequest
 from hal.motion import Compliance, Guard, Quantity
 from hal.panel import Handwheel
+from manipulation.planning.cartesian_path import arc
+from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import against_turn, centre_between
+from manipulation.skills.context import SkillContext, panel_from_grip
+from manipulation.skills.initial_state import InitialState, object_of_kind
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
-from manipulation.skills.steps import STANDOFF_M, Attempt, perform
-from manipulation.skills.subject import Whereabouts, subject_of
-from manipulation.stroke import arc
-from manipulation.workcell import Workcell, panel_from_grip
+from manipulation.skills.perform import perform
 
 HUB_M = 0.009  # the panel file does not say how thick the hub is; this is generous
 SIDE_M = 0.009  # most room between each finger and the rim when coming down
@@ -44,7 +45,12 @@ RADIAL = Compliance(
 
 
 def handwheel(
-    cell: Workcell, name: str, target_rad: float, *, current: ObjectState | None = None, verify: Verify | None = None
+    context: SkillContext,
+    name: str,
+    target_rad: float,
+    *,
+    current: ObjectState | None = None,
+    verify: Verify | None = None,
 ) -> SkillReport:
     """Turn the wheel until its marked spoke has come from the present angle to `target_rad` (clockwise from up).
 
@@ -59,13 +65,13 @@ def handwheel(
         InvalidRequest: not a wheel, a target beyond its stops, or nobody knows its angle.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    panel_object = subject_of(cell, name, Handwheel, "handwheel")
+    panel_object = object_of_kind(context, name, Handwheel, "handwheel")
     if not panel_object.minimum_rad <= target_rad <= panel_object.maximum_rad:
         raise InvalidRequest(
             f"{target_rad:.2f} rad is beyond the stops of {name}",
             hint=f"{panel_object.minimum_rad:.2f} to {panel_object.maximum_rad:.2f} rad",
         )
-    where = Whereabouts(lambda seen: seen.angle_rad, what=f"the angle of {name}", current=current, verify=verify)
+    where = InitialState(lambda seen: seen.angle_rad, what=f"the angle of {name}", current=current, verify=verify)
     tries = itertools.count()
 
     def stroke(attempt: Attempt) -> float:
@@ -77,7 +83,7 @@ def handwheel(
         return angle_rad
 
     return perform(
-        cell,
+        context,
         stroke,
         skill="handwheel",
         object_name=name,
@@ -104,8 +110,8 @@ def free_side_m(panel_object: Handwheel, finger_m: float) -> float:
 
 def _carry(attempt: Attempt, panel_object: Handwheel, angle_rad: float, span_rad: float, grip_n: float) -> float:
     """One hold and turn; returns the signed angle by which the wheel turned."""
-    cell, sign = attempt.cell, float(np.sign(span_rad))
-    side_m = free_side_m(panel_object, cell.hand.finger_thickness_m)
+    context, sign = attempt.context, float(np.sign(span_rad))
+    side_m = free_side_m(panel_object, context.hand.finger_thickness_m)
     open_m = 2.0 * (panel_object.rim_m + side_m)
     gap = np.pi / panel_object.spokes
     between = [angle_rad + (2 * k + 1) * gap for k in range(panel_object.spokes)]
@@ -120,12 +126,12 @@ def _carry(attempt: Attempt, panel_object: Handwheel, angle_rad: float, span_rad
     if width < panel_object.rim_m:
         raise SkillFailure(Outcome.MISSED, f"the fingers closed to {1e3 * width:.1f} mm; no rim between them")
     start = attempt.pose()
-    axis = cell.panel_pose.rotation.apply([0.0, 0.0, -1.0])  # clockwise seen from the front
+    axis = context.panel_pose.rotation.apply([0.0, 0.0, -1.0])  # clockwise seen from the front
     stop_n = min(LARGEST_STOP_N, EFFORT_SPREAD * panel_object.torque_nm / panel_object.radius_m + EFFORT_FLOOR_N)
     against = against_turn(start, hub, sign * axis)
     guard = Guard(name="effort", quantity=Quantity.FORCE, limit=stop_n, axis=against)
     lag = panel_object.torque_nm / (
-        2.0 * cell.hand.pad_stiffness_n_per_m * panel_object.radius_m**2
+        2.0 * context.hand.pad_stiffness_n_per_m * panel_object.radius_m**2
     )  # what both pads give
     poses = arc(start, centre_m=hub, axis=axis, angle_rad=span_rad + sign * lag)
     report = attempt.along(poses, name="turn", speed_m_per_s=TURN_M_PER_S, guards=(guard,), compliance=RADIAL)
@@ -140,7 +146,7 @@ def _carry(attempt: Attempt, panel_object: Handwheel, angle_rad: float, span_rad
 
 def _hub(attempt: Attempt, panel_object: Handwheel, place_rad: float) -> Array:
     """The hub in the base frame: the panel's pose, moved along the radius by what the fingers found of the rim."""
-    panel = attempt.cell.panel_pose
+    panel = attempt.context.panel_pose
     tool = (panel.inv() * attempt.pose()).translation
     radial = np.array([np.sin(place_rad), np.cos(place_rad), 0.0])
     offset = (tool - np.array(panel_object.point_m)) @ radial - panel_object.radius_m

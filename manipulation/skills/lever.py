@@ -11,12 +11,13 @@ from hal.arrays import Array
 from hal.errors import InvalidRequest
 from hal.motion import Compliance, Guard, Quantity
 from hal.panel import Lever
+from manipulation.planning.cartesian_path import arc
+from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import against_turn, centre_between
+from manipulation.skills.context import SkillContext, panel_from_grip
+from manipulation.skills.initial_state import InitialState, object_of_kind
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
-from manipulation.skills.steps import STANDOFF_M, Attempt, perform
-from manipulation.skills.subject import Whereabouts, subject_of
-from manipulation.stroke import arc
-from manipulation.workcell import Workcell, panel_from_grip
+from manipulation.skills.perform import perform
 
 OVERLAP_M = 0.013  # how far the tips reach below the top of the bar
 FROM_END_M = 0.008  # the fingers hold the bar this far before its end: a long lever arm spares the soft pads
@@ -58,7 +59,7 @@ class _Turn:
 
 
 def lever(
-    cell: Workcell, name: str, target: str, *, current: ObjectState | None = None, verify: Verify | None = None
+    context: SkillContext, name: str, target: str, *, current: ObjectState | None = None, verify: Verify | None = None
 ) -> SkillReport:
     """Turn the lever to a state of the panel file.
 
@@ -72,12 +73,12 @@ def lever(
         InvalidRequest: not a lever, no such state, or nobody knows where the bar is.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    panel_object = subject_of(cell, name, Lever, "lever")
+    panel_object = object_of_kind(context, name, Lever, "lever")
     angles = {state.name: state.angle_rad for state in panel_object.states}
     if target not in angles:
         raise InvalidRequest(f"{name} has no state {target!r}", hint=f"states: {', '.join(angles)}")
     goal = angles[target]
-    where = Whereabouts(
+    where = InitialState(
         lambda seen: _angle_of(seen, angles), what=f"the angle of {name}", current=current, verify=verify
     )
 
@@ -88,7 +89,7 @@ def lever(
         return _turn_lever(attempt, panel_object, turn)
 
     return perform(
-        cell,
+        context,
         stroke,
         skill="lever",
         object_name=name,
@@ -143,7 +144,7 @@ def _way(panel_object: Lever, turn: _Turn, radius: float, flip: float) -> list[R
 
 def _hub(attempt: Attempt, panel_object: Lever, angle_rad: float) -> Array:
     """The hub in the base frame: where the panel's pose says, moved across the bar by what the fingers found."""
-    panel = attempt.cell.panel_pose
+    panel = attempt.context.panel_pose
     tool = (panel.inv() * attempt.pose()).translation
     across = np.array([np.cos(angle_rad), -np.sin(angle_rad), 0.0])
     offset = (tool - np.array(panel_object.point_m)) @ across
@@ -156,9 +157,9 @@ def _carry(attempt: Attempt, panel_object: Lever, turn: _Turn, hub: Array) -> fl
     Returns the signed angle by which the bar turned: that of the tool less the play of the cage and the give of the
     pads.
     """
-    cell, span_rad = attempt.cell, turn.span_rad
+    context, span_rad = attempt.context, turn.span_rad
     sign = float(np.sign(span_rad))
-    axis = cell.panel_pose.rotation.apply([0.0, 0.0, -1.0])  # clockwise seen from the front
+    axis = context.panel_pose.rotation.apply([0.0, 0.0, -1.0])  # clockwise seen from the front
     radius = panel_object.length_m - FROM_END_M
     stop_n = min(LARGEST_STOP_N, EFFORT_SPREAD * panel_object.torque_nm / radius + EFFORT_FLOOR_N)
     start = attempt.pose()
@@ -206,7 +207,7 @@ def _to_the_stop(attempt: Attempt, way: _Arc, start: RigidTransform, strong: Gua
         )  # fmt: skip
         force = float(np.linalg.norm(report.wrench[:3]))
         tool_rad = _between(start, report.base_from_tool)
-        lag_rad = (CAGE_SIDE_M + force / attempt.cell.hand.pad_stiffness_n_per_m) / way.radius_m
+        lag_rad = (CAGE_SIDE_M + force / attempt.context.hand.pad_stiffness_n_per_m) / way.radius_m
         # The tool is ahead of the bar by a lag that is known badly, so at the stop it has always passed the state.
         if report.tripped != rise.name or tool_rad > way.span_rad - SHORT_RAD or tries == STOP_TRIES:
             return max(0.0, tool_rad - lag_rad)

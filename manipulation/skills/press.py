@@ -9,12 +9,13 @@ import numpy as np
 
 from hal.motion import Guard, MotionReport, Quantity
 from hal.panel import Button, Mushroom
+from manipulation.planning.cartesian_path import shifted
+from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import SOFT_PUSH
+from manipulation.skills.context import SkillContext, panel_from_grip
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
+from manipulation.skills.perform import MAX_ATTEMPTS, perform
 from manipulation.skills.probe import TURNS_RAD
-from manipulation.skills.steps import MAX_ATTEMPTS, STANDOFF_M, Attempt, perform
-from manipulation.stroke import shifted
-from manipulation.workcell import Workcell, panel_from_grip
 
 SEEK_N = 2.5  # a light contact ends the fast part, so that the slow part always begins above or on the cap
 SEEK_ABOVE_M = 0.004
@@ -27,7 +28,7 @@ LOST_M = 0.018  # how far behind its expected place the cap may be met, and what
 
 
 def press(
-    cell: Workcell,
+    context: SkillContext,
     cap: Button | Mushroom,
     *,
     skill: str,
@@ -56,7 +57,7 @@ def press(
         attempt.begin(ways, may_touch=(cap.name,), width_m=0.0, name=cap.name)
         attempt.advance(STANDOFF_M - SEEK_ABOVE_M, name="approach", stop_n=SEEK_N)
         report = _push(attempt, cap)
-        travel = travelled_m(report, cell.hand.pad_stiffness_n_per_m)
+        travel = travelled_m(report, context.hand.pad_stiffness_n_per_m)
         if report.tripped is None:
             raise SkillFailure(Outcome.MISSED, "no cap was met where it should be", reached=travel)
         if travel < DEEP_ENOUGH_RATIO * cap.travel_m:
@@ -65,7 +66,7 @@ def press(
         return travel
 
     return perform(
-        cell,
+        context,
         stroke,
         skill=skill,
         object_name=cap.name,

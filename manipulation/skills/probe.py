@@ -10,11 +10,11 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.motion import Guard, Hold, MotionReport, Quantity
+from manipulation.planning.cartesian_path import shifted
+from manipulation.skills.attempt import RETREAT_M_PER_S, Attempt
 from manipulation.skills.contact import onset
+from manipulation.skills.context import SkillContext, panel_from_grip
 from manipulation.skills.outcome import Outcome, SkillFailure
-from manipulation.skills.steps import RETREAT_M_PER_S, Attempt
-from manipulation.stroke import shifted
-from manipulation.workcell import Workcell, panel_from_grip
 
 SLOW_FROM_M = 0.010  # slow from here before the expected surface; covers a pose error of 3 mm and 1 degree with room
 BEYOND_M = 0.012
@@ -51,7 +51,7 @@ class ProximityPoint:
 
 
 def touch_probe(
-    cell: Workcell, point_m: Sequence[float], *, object_name: str | None = None, retreat_m: float = 0.03
+    context: SkillContext, point_m: Sequence[float], *, object_name: str | None = None, retreat_m: float = 0.03
 ) -> TouchPoint:
     """Touch the panel (or an object's top) at a point of the panel frame, straight along the panel's normal.
 
@@ -63,7 +63,7 @@ def touch_probe(
         SkillFailure: nothing was met within 12 mm behind the expected surface (`missed`), or the force limit.
         Unreachable: no free way.
     """
-    attempt = Attempt(cell)
+    attempt = Attempt(context)
     x, y, z = (float(v) for v in point_m)
     ways = [[panel_from_grip((x, y, z + up), turn) for up in (SLOW_FROM_M, 0.0, -BEYOND_M)] for turn in TURNS_RAD]
     attempt.begin(ways, may_touch=() if object_name is None else (object_name,), width_m=0.0, name="touch point")
@@ -74,7 +74,7 @@ def touch_probe(
     attempt.advance(-retreat_m, name="leave touch point", speed_m_per_s=RETREAT_M_PER_S, stop_n=40.0)
     if report.tripped is None:
         raise SkillFailure(Outcome.MISSED, f"no surface within {1e3 * BEYOND_M:.0f} mm behind the expected point")
-    return contact_of(report, finger_half_m=cell.hand.closed_half_m)
+    return contact_of(report, finger_half_m=context.hand.closed_half_m)
 
 
 def contact_of(report: MotionReport, *, finger_half_m: tuple[float, float]) -> TouchPoint:
@@ -104,7 +104,7 @@ def contact_of(report: MotionReport, *, finger_half_m: tuple[float, float]) -> T
 
 
 def proximity_probe(
-    cell: Workcell,
+    context: SkillContext,
     point_m: Sequence[float],
     *,
     flange_from_sensors: Sequence[RigidTransform],
@@ -122,14 +122,14 @@ def proximity_probe(
         SkillFailure: no sensor saw a surface (`missed`).
         Unreachable: no free way.
     """
-    attempt = Attempt(cell)
+    attempt = Attempt(context)
     x, y, z = (float(v) for v in point_m)
     ways = [[panel_from_grip((x, y, z + distance_m), turn)] * 2 for turn in TURNS_RAD]
     attempt.begin(ways, may_touch=(), width_m=0.0, name="proximity point")
     readings, poses = [], []
     for _ in range(samples):
         attempt.run(Hold(name="proximity sample", duration_s=0.01))
-        state = cell.mover.state()
+        state = context.mover.state()
         readings.append(state.proximity_m)
         poses.append(state.base_from_flange)
     table = np.array(readings, float)
@@ -143,7 +143,7 @@ def proximity_probe(
                     distance_m=float(np.median(seen)),
                     sigma_m=sigma_m * max(1.0 / 3.0, float(len(seen)) ** -0.5),
                     samples=len(seen),
-                    stamp_s=cell.mover.state().stamp_s,
+                    stamp_s=context.mover.state().stamp_s,
                 )
             )
     if not points:

@@ -8,12 +8,13 @@ from scipy.spatial.transform import RigidTransform
 from hal.errors import InvalidRequest
 from hal.motion import Compliance, Guard, Quantity
 from hal.panel import Rotary
+from manipulation.planning.cartesian_path import arc
+from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import centre_between
+from manipulation.skills.context import SkillContext, panel_from_grip
+from manipulation.skills.initial_state import InitialState, object_of_kind
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
-from manipulation.skills.steps import STANDOFF_M, Attempt, perform
-from manipulation.skills.subject import Whereabouts, subject_of
-from manipulation.stroke import arc
-from manipulation.workcell import Workcell, panel_from_grip
+from manipulation.skills.perform import perform
 
 SIDE_M = 0.009
 BAR_RATIO = 0.45  # width of the bar over the knob's radius
@@ -34,7 +35,7 @@ YIELDING = Compliance(
 
 
 def rotary(
-    cell: Workcell, name: str, target: str, *, current: ObjectState | None = None, verify: Verify | None = None
+    context: SkillContext, name: str, target: str, *, current: ObjectState | None = None, verify: Verify | None = None
 ) -> SkillReport:
     """Turn the selector to a state of the panel file.
 
@@ -47,15 +48,15 @@ def rotary(
         InvalidRequest: not a selector, no such state, or nobody knows where it points.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    panel_object = subject_of(cell, name, Rotary, "rotary selector")
+    panel_object = object_of_kind(context, name, Rotary, "rotary selector")
     angles = {state.name: state.angle_rad for state in panel_object.states}
     if target not in angles:
         raise InvalidRequest(f"{name} has no state {target!r}", hint=f"states: {', '.join(angles)}")
-    where = Whereabouts(
+    where = InitialState(
         lambda seen: _resting_angle(seen, angles), what=f"the position of {name}", current=current, verify=verify
     )
     return perform(
-        cell,
+        context,
         lambda attempt: _turn(attempt, panel_object, where.known, angles[target]),
         skill="rotary",
         object_name=name,
@@ -79,7 +80,7 @@ def _is_at(seen: ObjectState, target: str, angle_rad: float) -> bool:
 
 
 def _turn(attempt: Attempt, panel_object: Rotary, start_rad: float, goal_rad: float) -> float:
-    cell = attempt.cell
+    context = attempt.context
     bar_m = BAR_RATIO * panel_object.radius_m
     open_m = bar_m + 2.0 * SIDE_M
     seat = panel_object.height_m / 2  # the shoulder under the bar
@@ -88,7 +89,7 @@ def _turn(attempt: Attempt, panel_object: Rotary, start_rad: float, goal_rad: fl
     down = attempt.advance(
         STANDOFF_M + panel_object.height_m - seat + 0.004, name="approach", speed_m_per_s=0.04, stop_n=SEAT_N
     )
-    height = float((cell.panel_pose.inv() * attempt.pose()).translation[2])
+    height = float((context.panel_pose.inv() * attempt.pose()).translation[2])
     if down.tripped is not None and height > panel_object.height_m - 0.002:
         raise SkillFailure(Outcome.MISSED, "a finger landed on the bar")
     if down.tripped is not None:
@@ -98,7 +99,7 @@ def _turn(attempt: Attempt, panel_object: Rotary, start_rad: float, goal_rad: fl
     if width < 0.5 * bar_m:
         raise SkillFailure(Outcome.MISSED, f"the fingers closed to {1e3 * width:.1f} mm; no bar between them")
     start = attempt.pose()
-    axis = cell.panel_pose.rotation.apply([0.0, 0.0, -1.0])
+    axis = context.panel_pose.rotation.apply([0.0, 0.0, -1.0])
     over = PLAY_RAD * float(np.sign(goal_rad - start_rad))  # the detent pulls the knob back into place
     poses = arc(start, centre_m=start.translation, axis=axis, angle_rad=goal_rad - start_rad + over)
     guard = Guard(name="effort", quantity=Quantity.FORCE, limit=STOP_N)

@@ -10,12 +10,13 @@ from scipy.spatial.transform import RigidTransform
 from hal.errors import InvalidRequest
 from hal.motion import Guard, Quantity
 from hal.panel import Slider
+from manipulation.planning.cartesian_path import shifted
+from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import force_at_rest_n, meet
+from manipulation.skills.context import SkillContext, panel_from_grip
+from manipulation.skills.initial_state import InitialState, object_of_kind
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
-from manipulation.skills.steps import STANDOFF_M, Attempt, perform
-from manipulation.skills.subject import Whereabouts, subject_of
-from manipulation.stroke import shifted
-from manipulation.workcell import Workcell, panel_from_grip
+from manipulation.skills.perform import perform
 
 TIP_HEIGHT_M = 0.007  # of the fingertip over the plate: low on the cap, yet a pose error does not scrape
 SIDE_M = 0.009  # room between fingertip and cap when coming down
@@ -40,7 +41,7 @@ class _Push:
 
 
 def slider(
-    cell: Workcell,
+    context: SkillContext,
     name: str,
     target: float,
     *,
@@ -63,13 +64,13 @@ def slider(
         InvalidRequest: not a slider, a value off its scale, or nobody knows where the cap is.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    panel_object = subject_of(cell, name, Slider, "slider")
+    panel_object = object_of_kind(context, name, Slider, "slider")
     scale = panel_object.scale
     if not scale.minimum <= target <= scale.maximum:
         raise InvalidRequest(
             f"{target} {scale.unit} is off the scale of {name}", hint=f"{scale.minimum} to {scale.maximum} {scale.unit}"
         )
-    where = Whereabouts(lambda seen: seen.value, what=f"the value of {name}", current=current, verify=verify)
+    where = InitialState(lambda seen: seen.value, what=f"the value of {name}", current=current, verify=verify)
     allowed = tolerance if tolerance is not None else TOLERANCE_RATIO * (scale.maximum - scale.minimum)
 
     def stroke(attempt: Attempt) -> float:
@@ -77,7 +78,7 @@ def slider(
         return where.moved_to(scale.value_at(push.start_m + _push(attempt, panel_object, push)))
 
     return perform(
-        cell,
+        context,
         stroke,
         skill="slider",
         object_name=name,
@@ -89,19 +90,19 @@ def slider(
 
 def _push(attempt: Attempt, panel_object: Slider, push: _Push) -> float:
     """One push; returns how far the cap moved along the track, m, signed."""
-    cell = attempt.cell
-    half_x, half_y = cell.hand.closed_half_m
+    context = attempt.context
+    half_x, half_y = context.hand.closed_half_m
     turns = ((0.0, half_x), (np.pi, half_x), (np.pi / 2, half_y), (-np.pi / 2, half_y))
     ways = [_way(panel_object, push, turn, half) for turn, half in turns]
     attempt.begin(ways, may_touch=(panel_object.name,), width_m=0.0, name=panel_object.name)
     top = panel_object.cap_size_m[2]
     down = attempt.advance(STANDOFF_M + top - TIP_HEIGHT_M, name="approach")
     if down.tripped is not None:
-        height = (cell.panel_pose.inv() * attempt.pose()).translation[2]
+        height = (context.panel_pose.inv() * attempt.pose()).translation[2]
         if height > 0.6 * top:
             raise SkillFailure(Outcome.MISSED, "the fingertip landed on the cap")
         attempt.advance(-0.002, name="lift off the plate", speed_m_per_s=0.03)
-    ahead = push.sign * cell.panel_pose.rotation.apply(
+    ahead = push.sign * context.panel_pose.rotation.apply(
         [np.cos(panel_object.angle_rad), np.sin(panel_object.angle_rad), 0.0]
     )
     begun = attempt.pose().translation
@@ -164,4 +165,4 @@ def _go(attempt: Attempt, panel_object: Slider, ahead: np.ndarray, distance_m: f
 def _give_m(attempt: Attempt, ahead: np.ndarray) -> float:
     """How far the pads give under the push that friction holds now."""
     force = max(0.0, force_at_rest_n(attempt, attempt.pose().rotation.inv().apply(-ahead)))
-    return force / attempt.cell.hand.pad_stiffness_n_per_m
+    return force / attempt.context.hand.pad_stiffness_n_per_m

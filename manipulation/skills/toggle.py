@@ -9,12 +9,13 @@ import numpy as np
 from hal.errors import InvalidRequest
 from hal.motion import Guard, Quantity
 from hal.panel import Toggle
+from manipulation.planning.cartesian_path import shifted
+from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import SOFT_PUSH
+from manipulation.skills.context import SkillContext, panel_from_grip
+from manipulation.skills.initial_state import object_of_kind
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
-from manipulation.skills.steps import STANDOFF_M, Attempt, perform
-from manipulation.skills.subject import subject_of
-from manipulation.stroke import shifted
-from manipulation.workcell import Workcell, panel_from_grip
+from manipulation.skills.perform import perform
 
 PIVOT_M = 0.004  # the bat turns a little above the plate
 GRIP_RATIO = 0.55  # how far up the bat the fingertip pushes: high enough for a lever arm, low enough not to slip off
@@ -26,7 +27,7 @@ END_N = 4.0  # above what the detent needs: the bat stands on its stop
 
 
 def toggle(
-    cell: Workcell, name: str, target: str, *, current: ObjectState | None = None, verify: Verify | None = None
+    context: SkillContext, name: str, target: str, *, current: ObjectState | None = None, verify: Verify | None = None
 ) -> SkillReport:
     """Throw the toggle to `on` (up) or `off` (down); one that stands there already is only looked at.
 
@@ -40,7 +41,7 @@ def toggle(
         InvalidRequest: not a toggle, or no such state.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    panel_object = subject_of(cell, name, Toggle, "toggle")
+    panel_object = object_of_kind(context, name, Toggle, "toggle")
     if target not in ("on", "off"):
         raise InvalidRequest(f"a toggle has no state {target!r}", hint="on (up) or off (down)")
     up = 1.0 if target == "on" else -1.0
@@ -53,7 +54,7 @@ def toggle(
         return _throw(attempt, panel_object, up)
 
     return perform(
-        cell,
+        context,
         stroke,
         skill="toggle",
         object_name=name,
@@ -65,7 +66,7 @@ def toggle(
 
 def _throw(attempt: Attempt, panel_object: Toggle, up: float) -> float:
     """Come down beside the bat and sweep it over, `up` 1 or -1; returns how far past the pivot the face came, m."""
-    half = max(attempt.cell.hand.closed_half_m)
+    half = max(attempt.context.hand.closed_half_m)
     # The bat leans away from the target; come down beyond it.
     lean = panel_object.bat_length_m * np.sin(panel_object.tilt_rad) + panel_object.bat_radius_m
     y = panel_object.position_m[1]
@@ -97,7 +98,7 @@ def _come_down(attempt: Attempt, panel_object: Toggle, start_m: float, end_m: fl
     down = attempt.advance(panel_object.bat_length_m + STANDOFF_M, name="approach")
     if down.tripped is None:
         return
-    left_m = float((attempt.cell.panel_pose.inv() * attempt.pose()).translation[2]) - reach
+    left_m = float((attempt.context.panel_pose.inv() * attempt.pose()).translation[2]) - reach
     if left_m > 0.004:
         raise SkillFailure(Outcome.MISSED, "the fingertip landed on something before it was beside the bat")
     attempt.advance(-0.002, name="lift off", speed_m_per_s=0.03)
@@ -106,7 +107,7 @@ def _come_down(attempt: Attempt, panel_object: Toggle, start_m: float, end_m: fl
 def _sweep(attempt: Attempt, way_m: float, stop_n: float) -> float:
     """Push along the panel's y axis until the bat stands on its stop; returns how far the fingertip came, m."""
     here = attempt.pose()
-    sweep = attempt.cell.panel_pose.rotation.apply([0.0, way_m, 0.0])
+    sweep = attempt.context.panel_pose.rotation.apply([0.0, way_m, 0.0])
     unit = sweep / np.linalg.norm(sweep)
     # Only against the sweep: what wedges the finger up along the leaning bat is no effort of the bat.
     x, y, z = here.rotation.inv().apply(-unit)

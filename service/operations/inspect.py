@@ -22,7 +22,7 @@ from service.operations.requests import InspectRequest, RecogniseRequest
 from service.operations.session import Session, panel_object_or_all
 from service.operations.stored import read_stored, reading_row_json
 from service.operations.tours import short_tour
-from service.operations.travel import go_to_camera_view, workcell
+from service.operations.travel import go_to_camera_view, skill_context
 from service.operations.views import CLOSE_UP_M, FOR_ALIKE, NEAR_M, SIDES, close_up_groups, close_up_poses, poses_from
 from service.report.plots import png_of
 from service.report.record import Reading
@@ -142,7 +142,7 @@ def _from_the_sides(
 ) -> Iterator[AnnotatedView]:
     """Pictures from each side that the arm reaches and the panel shows at, until all is told; readings go to `looks`."""
     flange_from_camera = session.mount(session.first(DeviceKind.CAMERA)).parent_from_child
-    camera_from_tips = flange_from_camera.inv() * workcell(session).flange_from_grip
+    camera_from_tips = flange_from_camera.inv() * skill_context(session).flange_from_grip
     pose = session.known_panel().parent_from_child
     middle_m = np.mean([session.panel.object(name).point_m for name in group], axis=0)
     unread = list(group)

@@ -13,7 +13,7 @@ from service.operations.inspect import ensure_located, look_close, look_past
 from service.operations.requests import ActionBody, ManipulateRequest
 from service.operations.session import Session
 from service.operations.targets import target_of, unworkable
-from service.operations.travel import workcell
+from service.operations.travel import skill_context
 from service.report.plots import png_of
 from service.report.record import Action, Picture
 
@@ -129,23 +129,23 @@ def state_of(reading: ObjectReading, panel_object: PanelObject) -> ObjectState:
 def _perform(
     session: Session, panel_object: PanelObject, target: str, eye: _Eye, before: ObjectReading | None
 ) -> SkillReport:
-    cell, verify = workcell(session), eye.verify()
+    context, verify = skill_context(session), eye.verify()
     current = None if before is None else state_of(before, eye.witness)
     match panel_object:
         case Lever():
-            return lever(cell, panel_object.name, target, current=current, verify=verify)
+            return lever(context, panel_object.name, target, current=current, verify=verify)
         case Slider():
-            return slider(cell, panel_object.name, float(target), current=current, verify=verify)
+            return slider(context, panel_object.name, float(target), current=current, verify=verify)
         case Toggle():
-            return toggle(cell, panel_object.name, target, current=current, verify=verify)
+            return toggle(context, panel_object.name, target, current=current, verify=verify)
         case Rotary():
-            return rotary(cell, panel_object.name, target, current=current, verify=verify)
+            return rotary(context, panel_object.name, target, current=current, verify=verify)
         case Handwheel():
-            return handwheel(cell, panel_object.name, float(target), current=current, verify=verify)
+            return handwheel(context, panel_object.name, float(target), current=current, verify=verify)
         case Mushroom():
-            return mushroom(cell, panel_object.name, verify=verify)
+            return mushroom(context, panel_object.name, verify=verify)
         case Button():
-            return button(cell, panel_object.name, expected=target, current=current, verify=verify)
+            return button(context, panel_object.name, expected=target, current=current, verify=verify)
     raise unworkable(panel_object)
 
 

@@ -43,7 +43,7 @@ from service.operations.requests import BoxBody, CylinderBody, FeatureSetBody, F
 from service.operations.session import Session
 from service.operations.spots import bare_spots
 from service.operations.tours import short_tour
-from service.operations.travel import workcell
+from service.operations.travel import skill_context
 
 HOVER_M = 0.05  # of the finger tips above the plate while the proximity sensors look
 LEAST_TOUCHES = 3
@@ -154,26 +154,26 @@ def light_observations(located: Sequence[Located]) -> tuple[PixelObservation, ..
 
 def _fingers_over_panel(session: Session) -> Array:
     """(2,) panel point that the finger tips are over."""
-    cell = workcell(session)
-    tip = cell.mover.state().base_from_flange * cell.flange_from_grip
-    return np.asarray(cell.panel_pose.inv().apply(tip.translation)[:2])
+    context = skill_context(session)
+    tip = context.mover.state().base_from_flange * context.flange_from_grip
+    return np.asarray(context.panel_pose.inv().apply(tip.translation)[:2])
 
 
 def _feel_at(session: Session, spot: Array, doubted: DoubtedProximity) -> list[Observation]:
-    cell = workcell(session)
+    context = skill_context(session)
     place = (float(spot[0]), float(spot[1]), 0.0)
     observations: list[Observation] = []
     proximities = session.cell.names_of(DeviceKind.PROXIMITY)
     names = [name for name in proximities if session.has_mount(name)]
     of = {name: session.connection.device(name).capabilities() for name in names}
     mounts = [session.mount(name).parent_from_child for name in names]
-    hovered = cell.mover.state()
+    hovered = context.mover.state()
     if names:
         sigma_m = max(each.sigma_m for each in of.values())
         points = proximity_probe(
-            cell, place, flange_from_sensors=mounts, distance_m=HOVER_M, samples=5, sigma_m=sigma_m
+            context, place, flange_from_sensors=mounts, distance_m=HOVER_M, samples=5, sigma_m=sigma_m
         )
-        hovered = cell.mover.state()
+        hovered = context.mover.state()
         flange = hovered.base_from_flange
         for point in points:
             name = _whose(names, mounts, flange, point.base_from_sensor)
@@ -186,15 +186,15 @@ def _feel_at(session: Session, spot: Array, doubted: DoubtedProximity) -> list[O
                     label=f"{name} at ({spot[0]:.3f}, {spot[1]:.3f})",
                 )
             )
-    touched = touch_probe(cell, place)
+    touched = touch_probe(context, place)
     settle(session, REST_S)
     for name, mount in zip(names, mounts, strict=True):
         k = proximities.index(name)
         doubted.check(
             name,
             of[name],
-            [(state.base_from_flange * mount, state.proximity_m[k]) for state in (hovered, cell.mover.state())],
-            base_from_panel=cell.panel_pose,
+            [(state.base_from_flange * mount, state.proximity_m[k]) for state in (hovered, context.mover.state())],
+            base_from_panel=context.panel_pose,
             touched_m=touched.point_m,
         )
     base_from_grip = touched.report.base_from_tool
@@ -203,7 +203,7 @@ def _feel_at(session: Session, spot: Array, doubted: DoubtedProximity) -> list[O
     observations.append(
         TouchObservation(
             sensor=session.first(DeviceKind.GRIPPER),
-            base_from_flange=base_from_grip * cell.flange_from_grip.inv(),
+            base_from_flange=base_from_grip * context.flange_from_grip.inv(),
             tip_m=tip,
             sigma_m=normal_sigma,
             label=f"touch at ({spot[0]:.3f}, {spot[1]:.3f})",

@@ -20,13 +20,13 @@ from manipulation import (
     QUICK,
     THOROUGH,
     Attempt,
-    Box,
+    CollisionBox,
     CollisionModel,
     Effort,
     Kinematics,
+    SkillContext,
     SkillFailure,
     SpeedLimits,
-    Workcell,
     retreat,
 )
 from manipulation import park as park_arm
@@ -64,9 +64,9 @@ def go_to_first(
     Raises:
         Unreachable: none of them; says what is in the way of the last one.
     """
-    cell = workcell(session)
+    context = skill_context(session)
     state = session.mover.state()
-    model = cell.collision(width_m=state.gripper_width_m)
+    model = context.collision(width_m=state.gripper_width_m)
     tried: list[Array] = []
     reason = "no arm configuration reaches any of the poses"
 
@@ -81,7 +81,7 @@ def go_to_first(
     for goal, effort in goals():
         session.context.task.check_cancelled()
         try:
-            way = cell.transfer(state.position_rad, goal, width_m=state.gripper_width_m, name=name, effort=effort)
+            way = context.transfer(state.position_rad, goal, width_m=state.gripper_width_m, name=name, effort=effort)
         except Unreachable as error:
             reason = error.what
             continue
@@ -92,18 +92,18 @@ def go_to_first(
 def reachable(session: Session, base_from_flange: Sequence[RigidTransform]) -> list[int]:
     """Which of the poses the arm can stand in without touching anything; says nothing about the way there."""
     state = session.mover.state()
-    model = workcell(session).collision(width_m=state.gripper_width_m)
+    model = skill_context(session).collision(width_m=state.gripper_width_m)
     return [k for k, pose in enumerate(base_from_flange) if _goals(model, pose, state.position_rad)]
 
 
 def go_to_joints(session: Session, goal_rad: Array, *, name: str) -> bool:
     """Drive to a joint vector; False when something is in the way, and nothing moved."""
-    cell = workcell(session)
+    context = skill_context(session)
     state = session.mover.state()
-    if not cell.collision(width_m=state.gripper_width_m).is_clear(goal_rad, margin_m=CLEAR_M):
+    if not context.collision(width_m=state.gripper_width_m).is_clear(goal_rad, margin_m=CLEAR_M):
         return False
     try:
-        trajectory = cell.transfer(state.position_rad, goal_rad, width_m=state.gripper_width_m, name=name)
+        trajectory = context.transfer(state.position_rad, goal_rad, width_m=state.gripper_width_m, name=name)
     except Unreachable:
         return False
     session.run(trajectory)
@@ -112,7 +112,7 @@ def go_to_joints(session: Session, goal_rad: Array, *, name: str) -> bool:
 
 def park(session: Session) -> None:
     """Back off from the panel if need be, then drive to the parking place of the cell file."""
-    park_arm(workcell(session))
+    park_arm(skill_context(session))
 
 
 def leave_the_panel(session: Session) -> None:
@@ -128,9 +128,9 @@ def leave_the_panel(session: Session) -> None:
     if session.world.base_from_panel is not None:
         park(session)
         return
-    cell = workcell(session)
-    retreat(cell)
-    attempt = Attempt(cell)
+    context = skill_context(session)
+    retreat(context)
+    attempt = Attempt(context)
     for _ in range(MOST_STEPS_BACK):
         if _stands_clear(session):
             return
@@ -142,10 +142,10 @@ def leave_the_panel(session: Session) -> None:
     )
 
 
-def workcell(session: Session) -> Workcell:
+def skill_context(session: Session) -> SkillContext:
     """What skills work with, from what is known now; an unlocated panel takes all the room that it may stand in."""
     file = session.cell.file
-    return Workcell(
+    return SkillContext(
         mover=session.mover,
         kinematics=kinematics(session),
         panel=session.panel,
@@ -183,15 +183,15 @@ def lever_angles(session: Session) -> Mapping[str, float]:
 
 def _stands_clear(session: Session) -> bool:
     """Is the arm outside all the room that an unlocated panel may take?"""
-    cell = replace(workcell(session), obstacles=(_where_the_panel_may_be(session),))
+    context = replace(skill_context(session), obstacles=(_where_the_panel_may_be(session),))
     state = session.mover.state()
-    return cell.collision(width_m=state.gripper_width_m).is_clear(state.position_rad, margin_m=CLEAR_M)
+    return context.collision(width_m=state.gripper_width_m).is_clear(state.position_rad, margin_m=CLEAR_M)
 
 
-def _where_the_panel_may_be(session: Session) -> Box:
+def _where_the_panel_may_be(session: Session) -> CollisionBox:
     w, panel = session.cell.file.workspace, session.panel
     slack = w.position_tolerance_m + 0.5 * max(panel.width_m, panel.height_m) * np.sin(w.angle_tolerance_rad)
-    return Box(
+    return CollisionBox(
         name="where the panel may be",
         parent_from_box=transform_rpy(w.panel_position_m, w.panel_rpy_rad),
         half_m=(panel.width_m / 2 + w.position_tolerance_m, panel.height_m / 2 + w.position_tolerance_m, float(slack)),

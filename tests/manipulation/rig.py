@@ -26,8 +26,8 @@ from hal.devices import (
 from hal.errors import DeviceTimeout, DeviceUnavailable
 from hal.geometry import transform_rpy
 from hal.readings import Cause, Quality, Stamped
-from manipulation.control import Controller
-from manipulation.kinematics import Kinematics
+from manipulation.arm.kinematics import Kinematics
+from manipulation.control.controller import Controller
 from tests.manipulation.arms import T3
 
 GRIP = transform_rpy((0.0, 0.0, 0.2), (0.0, 0.0, 0.0))

@@ -11,7 +11,7 @@ from hal.camera_model import project
 from hal.config import load_cell
 from hal.errors import NotObservable
 from hal.geometry import certain, matrix_of, transform_rpy
-from manipulation.kinematics import Kinematics
+from manipulation.arm.kinematics import Kinematics
 from perception.calibration.hand_eye import HandEyeView, check_turns
 from perception.calibration.wrench import GRAVITY_M_PER_S2, calibrate_wrench
 from service.operations.stations import (

@@ -12,8 +12,8 @@ import pytest
 from benchmarks.behind_cables import open_session
 from hal.config import load_cell
 from hal.errors import Unreachable
-from manipulation.transfer import QUICK, THOROUGH, Effort
-from manipulation.workcell import Workcell
+from manipulation.planning.transfer import QUICK, THOROUGH, Effort
+from manipulation.skills.context import SkillContext
 from service.operations.session import Session
 from service.operations.travel import MOST_THOROUGH, MOST_TRIES, NEAR_RAD, go_to_camera_view, near_first
 from service.operations.views import close_up_poses
@@ -32,15 +32,15 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
 def efforts_of(session: Session, monkeypatch: pytest.MonkeyPatch, *, found_at: int) -> list[Effort]:
     """The efforts of all searches when the one of that number finds a way; the arm drives it."""
     asked: list[Effort] = []
-    transfer = Workcell.transfer
+    transfer = SkillContext.transfer
 
-    def search(cell: Workcell, *args: Any, effort: Effort, **kwargs: Any) -> Any:
+    def search(cell: SkillContext, *args: Any, effort: Effort, **kwargs: Any) -> Any:
         asked.append(effort)
         if len(asked) - 1 != found_at:
             raise Unreachable("no way", hint="none")
         return transfer(cell, *args, effort=effort, **kwargs)
 
-    monkeypatch.setattr(Workcell, "transfer", search)
+    monkeypatch.setattr(SkillContext, "transfer", search)
     poses = close_up_poses(session.known_panel().parent_from_child, (0.0, 0.0, 0.0))
     go_to_camera_view(session, poses, name="a close-up")
     return asked
@@ -76,7 +76,7 @@ def test_without_any_way_the_searches_end(session: Session, monkeypatch: pytest.
         asked.append(effort)
         raise Unreachable("no way", hint="none")
 
-    monkeypatch.setattr(Workcell, "transfer", search)
+    monkeypatch.setattr(SkillContext, "transfer", search)
     poses = close_up_poses(session.known_panel().parent_from_child, (0.0, 0.0, 0.0))
     with pytest.raises(Unreachable, match="a close-up: no way"):
         go_to_camera_view(session, poses, name="a close-up")

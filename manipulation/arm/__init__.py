@@ -1,0 +1,1 @@
+"""The arm as geometry: its chain of joints, forwards and backwards."""

@@ -1,0 +1,143 @@
+"""The last filter before the drive: joint range, speed and acceleration, braking ahead, and the speed of the tip.
+
+Compiled as `kernels` is. Ways and speeds are of one tick, `most` is the change of speed in a tick.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from hal.arrays import Array
+from manipulation.arm.kernels import tool_and_jacobian
+
+
+@njit(cache=True)
+def rest_way(speed: float, most: float) -> Any:
+    """The way still to go of something that just went `speed` a tick and slows down by `most` with each further one."""
+    ticks = np.floor(speed / most)
+    return ticks * speed - 0.5 * ticks * (ticks + 1.0) * most
+
+
+@njit(cache=True)
+def fastest_to_rest(way: float, most: float) -> Any:
+    """The speed a tick that comes to rest exactly after `way`: v + rest_way(v, most) = way."""
+    ticks = max(1.0, np.ceil(0.5 * (np.sqrt(1.0 + 8.0 * way / most) - 1.0)))
+    return way / ticks + 0.5 * (ticks - 1.0) * most
+
+
+@njit(cache=True)
+def rest_place(place: float, speed: float, most: float) -> Any:
+    """Where something that has just come to `place` at `speed` a tick comes to rest."""
+    return place + np.sign(speed) * rest_way(abs(speed), most)
+
+
+@njit(cache=True)
+def step_to_rest(way: float, most: float) -> Any:
+    """`fastest_to_rest`, either way."""
+    return np.sign(way) * fastest_to_rest(abs(way), most)
+
+
+@njit(cache=True)
+def limited_step(
+    wanted: Array,
+    wanted_before: Array,
+    last: Array,
+    last_velocity: Array,
+    velocity: Array,
+    acceleration: Array,
+    lower: Array,
+    upper: Array,
+    dt_s: float,
+) -> Any:
+    """The set-point (n,) nearest to `wanted` that respects range, speed and acceleration limits per joint.
+
+    It goes no faster than it can brake ahead of where the wanted one would come to rest if that braked from now on:
+    what it can follow it follows exactly, behind a leap it arrives without running past. `wanted_before` (k, n), newest
+    first: of the speeds between them the fastest one each way counts, since ticks that come late and early make a
+    steady course jerk.
+    """
+    out = np.empty_like(wanted)
+    for i in range(wanted.shape[0]):
+        most, fastest = acceleration[i] * dt_s * dt_s, velocity[i] * dt_s
+        goal = min(max(wanted[i], lower[i]), upper[i])
+        slow, fast, after = fastest, -fastest, goal
+        for k in range(wanted_before.shape[0]):
+            before = min(max(wanted_before[k, i], lower[i]), upper[i])
+            slow, fast = min(slow, after - before), max(fast, after - before)
+            after = before
+        slow, fast = max(slow, -fastest), min(fast, fastest)  # faster than that nobody follows
+        below = min(max(rest_place(goal, slow, most), lower[i]), upper[i])
+        above = min(max(rest_place(goal, fast, most), lower[i]), upper[i])
+        step = min(max(goal - last[i], step_to_rest(below - last[i], most)), step_to_rest(above - last[i], most))
+        low = max(-fastest, last_velocity[i] * dt_s - most)
+        high = min(fastest, last_velocity[i] * dt_s + most)
+        out[i] = last[i] + min(max(step, low), high)
+    return out
+
+
+@njit(cache=True)
+def slowed_step(
+    jacobian: Array, step: Array, last_step: Array, most: Array, below: Array, above: Array, tip_m: float
+) -> Any:
+    """The joint step (n,) nearest to `step` that moves the tip by `tip_m` at most.
+
+    On the way from `step` to the one that keeps its direction and brakes as hard as acceleration allows (`most` (n,) a
+    tick): both respect acceleration and range (`below`, `above` (n,): what is left of it), so all between do. Where
+    even that is too fast for the tip, it is scaled: of the limits that of the tip comes first.
+    """
+    share = 1.0
+    for i in range(step.shape[0]):
+        if abs(last_step[i]) > most[i]:
+            share = min(share, most[i] / abs(last_step[i]))
+    brake = last_step * (1.0 - share)
+    for i in range(step.shape[0]):
+        brake[i] = max(-fastest_to_rest(below[i], most[i]), min(brake[i], fastest_to_rest(above[i], most[i])))
+    harder = brake.copy()
+    for i in range(step.shape[0]):  # a joint near its goal brakes harder than that, and may if the tip allows it
+        if (last_step[i] - brake[i]) * (brake[i] - step[i]) > 0.0:
+            harder[i] = step[i]
+    slow = jacobian[:3] @ harder
+    if slow @ slow < tip_m * tip_m:
+        brake = harder
+    slow, change = jacobian[:3] @ brake, jacobian[:3] @ (step - brake)
+    a, b, c = change @ change, slow @ change, slow @ slow - tip_m * tip_m
+    if c >= 0.0:
+        return brake * (tip_m / np.sqrt(slow @ slow))
+    return brake + (step - brake) * ((np.sqrt(b * b - a * c) - b) / a)
+
+
+@njit(cache=True)
+def safe_step(
+    dh: Array,
+    flange_from_tool: Array,
+    wanted: Array,
+    wanted_before: Array,
+    last: Array,
+    last_velocity: Array,
+    velocity: Array,
+    acceleration: Array,
+    lower: Array,
+    upper: Array,
+    tip_limit_m_per_s: float,
+    dt_s: float,
+) -> Any:
+    """The last filter before the drive: joint range, speed and acceleration, and the speed of the tool's tip."""
+    out = limited_step(wanted, wanted_before, last, last_velocity, velocity, acceleration, lower, upper, dt_s)
+    out = np.minimum(np.maximum(out, lower), upper)
+    _, jacobian = tool_and_jacobian(dh, last, flange_from_tool)
+    tip = jacobian[:3] @ (out - last)
+    tip_m = tip_limit_m_per_s * dt_s
+    if tip @ tip > tip_m * tip_m:
+        most, below, above = acceleration * dt_s * dt_s, np.maximum(last - lower, 0.0), np.maximum(upper - last, 0.0)
+        out = last + slowed_step(jacobian, out - last, last_velocity * dt_s, most, below, above, tip_m)
+    return out
+
+
+def warm(dh: Array) -> None:
+    """Compile (or load from the cache) the filter, so that no tick waits for a compiler."""
+    n = dh.shape[0]
+    q, ones = np.full(n, 0.1), np.ones(n)
+    safe_step(dh, np.eye(4), q, np.zeros((2, n)), q, np.zeros(n), ones, ones, -ones, ones, 1e-9, 0.01)

@@ -1,0 +1,400 @@
+"""The control thread: executes declared motions, one at a time, and reports what really happened.
+
+Every tick: read all devices, look at stop latch, cancel and guards, compute the set-point, filter it, send it, let one
+period pass. On a simulated clock the period steps the world in lockstep, and nothing ticks between motions; on a
+wall clock the thread always ticks and holds the arm.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from hal.arrays import Array
+from hal.calibration import ToolLoad
+from hal.clock import Clock, SimClock
+from hal.config import SafetySection
+from hal.devices import Arm, ForceTorque, Gripper, Proximity, Touch
+from hal.errors import CellError, DeviceFault, MotionRefused, Stopped
+from hal.geometry import identity
+from hal.motion import (
+    CartesianPath,
+    DeclaredMotion,
+    GripperMotion,
+    Hold,
+    JointTrajectory,
+    MotionOutcome,
+    MotionReport,
+    RobotState,
+)
+from manipulation.arm import kernels
+from manipulation.arm.kinematics import Kinematics
+from manipulation.control import braking
+from manipulation.control.control_thread import ControlThread
+from manipulation.control.drives import Drives
+from manipulation.control.executors import Executor, GripperExecutor, Tick, begin
+from manipulation.control.following_error import FollowingErrorMonitor
+from manipulation.control.plausibility import DoubtedTouch, FrozenWrench
+from manipulation.control.recorder import Recorder
+from manipulation.control.sensing import ContactWrench, DeviceFailure, Devices, RangeReader, Sample, ToolView
+from manipulation.control.setpoint import SetPointLimiter, check, flange_matrix
+from manipulation.control.termination import Termination, TerminationMonitor
+
+RAN = "ran to its declared end"
+SETTLE_S = 0.3
+CATCH_UP_S = 2.0  # for a set-point that speed limits hold back
+SETTLED_RAD = 2e-4
+SETTLED_RAD_PER_S = 0.02
+TARE_S = 0.1
+LATE_TICKS = 2  # a tick that comes later makes the motion late: caught up, 50 ms made 0.25 m/s of an approach at 0.06
+SLOW_TICKS = 4  # gripper and proximity are read every so many ticks
+
+
+class Controller:
+    """Implements `hal.motion.Mover` over the devices of one cell.
+
+    Args:
+        safety: force and speed limits that hold in every motion.
+        load: what hangs below the sensor; `tare` corrects its bias.
+        is_latched: reads the stop latch; called every tick.
+        flange_from_grip: the tool of motions that name none.
+        rate_hz: control rate; None takes the arm's.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        gripper: Gripper,
+        force_torque: ForceTorque | None,
+        touch: Touch | None,
+        proximities: Sequence[Proximity] = (),
+        *,
+        clock: Clock,
+        safety: SafetySection,
+        load: ToolLoad,
+        flange_from_sensor: RigidTransform,
+        is_latched: Callable[[], bool],
+        flange_from_grip: RigidTransform | None = None,
+        rate_hz: float | None = None,
+    ) -> None:
+        # In lockstep no reading is late by chance.
+        patience_s = (1.0 if isinstance(clock, SimClock) else 3.0) * safety.max_reading_age_s
+        self._devices = Devices(
+            arm=arm,
+            gripper=gripper,
+            force_torque=force_torque,
+            touch=touch,
+            proximities=tuple(
+                RangeReader(sensor, clock, max_age_s=safety.max_reading_age_s, patience_s=patience_s)
+                for sensor in proximities
+            ),
+            clock=clock,
+            max_age_s=safety.max_reading_age_s,
+        )
+        self._frozen_wrench = FrozenWrench(force_torque)
+        self._doubted_touch = DoubtedTouch(touch, force_torque)
+        capabilities = arm.capabilities()
+        self.kinematics = Kinematics.of(capabilities)
+        self._clock = clock
+        self._safety = safety
+        self._contact = ContactWrench(load, flange_from_sensor)
+        self._is_latched = is_latched
+        self._grip = flange_matrix(identity() if flange_from_grip is None else flange_from_grip)
+        self._dt_s = 1.0 / (rate_hz or capabilities.command_rate_hz)
+        self._filter = SetPointLimiter(self.kinematics, self._grip, safety.speed_limit_m_per_s, self._dt_s)
+        self._drives = Drives(arm, clock, self._dt_s)
+        self._standing = FollowingErrorMonitor(arm.name, self.kinematics, self._grip, self._drives)
+        self._is_lockstep = isinstance(clock, SimClock)
+        self._thread = ControlThread(beat=None if self._is_lockstep else self._hold, at_end=self._drives.stop)
+        self._busy = threading.Lock()
+        self._cancel = threading.Event()
+        self._newest: Sample | None = None
+        self._faults: tuple[str, ...] = ()
+        self._is_moving = False
+        self._is_closing = False
+
+    # -- life ------------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Warm the compiled kernels, then start the control thread; a second call does nothing."""
+        kernels.warm(self.kinematics.dh)
+        braking.warm(self.kinematics.dh)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Cancel what runs, stop the arm, end the thread; a second call does nothing."""
+        self._is_closing = True  # a motion that begins at this moment clears `_cancel`
+        self._cancel.set()
+        self._thread.close()
+
+    # -- the Mover port --------------------------------------------------------------------------------------------
+
+    def execute(self, motion: DeclaredMotion) -> MotionReport:
+        """Executor the motion on the control thread and wait for its end.
+
+        Raises:
+            MotionRefused: not finite, outside limits, start too far away, or another motion runs.
+            Stopped: the stop latch is set.
+        """
+        if not self._busy.acquire(blocking=False):
+            raise MotionRefused(f"motion {motion.name!r} refused: another motion runs", hint="wait for it or cancel it")
+        try:
+            self._cancel.clear()
+            return self._thread.do(lambda: self._execute(motion))
+        finally:
+            self._busy.release()
+
+    def cancel(self) -> None:
+        """Let the running motion decelerate and end with outcome `cancelled`; returns at once."""
+        self._cancel.set()
+
+    def tare(self) -> Array:
+        """Take the present wrench, averaged over 0.1 s at rest, as zero contact; returns the bias (6,), sensor axes.
+
+        Raises:
+            MotionRefused: a motion runs.
+            Stopped: the stop latch is set.
+            DeviceFault: a device failed meanwhile; names it.
+        """
+        if not self._busy.acquire(blocking=False):
+            raise MotionRefused("tare refused: a motion runs", hint="tare when the arm rests")
+        try:
+            return self._thread.do(self._tare)
+        finally:
+            self._busy.release()
+
+    def state(self) -> RobotState:
+        """Newest snapshot; between motions on a simulated clock the devices are read for it.
+
+        Raises:
+            DeviceFault: there is no snapshot, and a device fails.
+        """
+        if self._is_lockstep and self._busy.acquire(blocking=False):
+            try:
+                self._thread.do(self._refresh)
+            finally:
+                self._busy.release()
+        sample = self._newest
+        if sample is None:
+            sample = self._thread.do(self._refresh)
+        return self._state_of(sample)
+
+    # -- between motions -------------------------------------------------------------------------------------------
+
+    def _hold(self) -> None:
+        """One tick between motions on a wall clock: the arm stays, its watchdog quiet, the state fresh."""
+        if self._is_latched():  # before the devices: one of them may be dead, and the drives must go off all the same
+            self._drives.switch_off()
+        with suppress(DeviceFailure):
+            sample = self._read()
+            if self._drives.are_on:
+                self._send(self._filter.last_rad)
+            self._newest = sample
+        self._drives.pass_tick()
+
+    def _refresh(self) -> Sample:
+        try:
+            self._newest = self._read()
+        except DeviceFailure as failure:
+            if self._newest is None:
+                raise DeviceFault(str(failure), hint="run `panelwright devices`", device=failure.device) from failure
+        return self._newest
+
+    # -- one motion ------------------------------------------------------------------------------------------------
+
+    def _execute(self, motion: DeclaredMotion) -> MotionReport:
+        if self._is_latched():
+            raise Stopped("the stop latch is set", hint="reset the stop, then command again")
+        tool = flange_matrix(motion.flange_from_tool) if isinstance(motion, CartesianPath) else self._grip
+        started_s = self._clock.now_s()
+        recorder = Recorder(self._dt_s)
+        view = ToolView(self.kinematics.dh, self._contact, tool)
+        try:
+            sample = self._read()
+            self._standing.check_held(sample.position_rad, self._filter)
+            check(motion, self.kinematics, sample.position_rad)
+            self._filter = SetPointLimiter(self.kinematics, tool, self._safety.speed_limit_m_per_s, self._dt_s)
+            self._standing.resume(sample.position_rad, self._filter)
+            run = self._begin(motion, sample)
+        except DeviceFailure as failure:
+            self._standing.give_up(failure.device)
+            end = Termination(outcome=MotionOutcome.FAULT, cause=f"{failure}; nothing moved", device=failure.device)
+            return self._report(motion, end, started_s, view, recorder)
+        self._is_moving = True
+        self._doubted_touch.begin(motion)
+        self._drives.begin_rhythm()
+        try:
+            end = self._run(motion, run, sample, view, recorder)
+        finally:
+            self._is_moving = False
+        return self._report(motion, end, started_s, view, recorder)
+
+    def _begin(self, motion: DeclaredMotion, sample: Sample) -> Executor:
+        try:
+            return begin(motion, self.kinematics, self._devices.gripper, sample, self._clock)
+        except CellError as error:
+            device = str(error.details.get("device", self._devices.gripper.name))
+            raise DeviceFailure(device, error.what) from error
+
+    def _run(
+        self, motion: DeclaredMotion, run: Executor, sample: Sample, view: ToolView, recorder: Recorder
+    ) -> Termination:
+        started_s = sample.stamp_s
+        look = view.look(sample, self._filter.last_rad)
+        watch = TerminationMonitor(
+            motion.guards,
+            self._safety.force_limit_n,
+            look,
+            arm=self._devices.arm.name,
+            is_latched=self._is_latched,
+            is_cancelled=lambda: self._is_closing or self._cancel.is_set(),
+        )
+        ticks = 0
+        late_s = 0.0
+        over_since_s: float | None = None
+        while True:
+            elapsed_s = sample.stamp_s - started_s
+            recorder.note(elapsed_s, sample.position_rad, look.wrench, look.base_from_tool[:3, 3])
+            end = watch.ending(elapsed_s, sample, look)
+            try:
+                if end is None:
+                    self._doubted_touch.check(sample, look.wrench, look.base_from_tool[:3, 3])
+                    tick = Tick(elapsed_s - late_s, sample, look.wrench, self._filter.last_rad, self._dt_s)
+                    wanted = run.wanted(tick)
+                    if run.is_over(tick):
+                        over_since_s = elapsed_s if over_since_s is None else over_since_s
+                        if self._has_settled(motion, wanted, sample, elapsed_s - over_since_s):
+                            if isinstance(run, GripperExecutor):
+                                run.check_end(sample)
+                                self._doubted_touch.pads_moved(run.begun_m, sample)
+                            return Termination(outcome=MotionOutcome.COMPLETED, cause=self._end_of(motion, wanted))
+                    self._send(self._filter.apply(wanted))
+                    self._drives.pass_tick()
+                    ticks += 1
+                    before_s = sample.stamp_s
+                    sample = self._newest = self._read(None if ticks % SLOW_TICKS == 0 else sample)
+                    late_s += max(0.0, sample.stamp_s - before_s - LATE_TICKS * self._dt_s)
+                    look = view.look(sample, self._filter.last_rad)
+                    continue
+            except DeviceFailure as failure:
+                end = Termination(outcome=MotionOutcome.FAULT, cause=str(failure), device=failure.device)
+            if isinstance(run, GripperExecutor):
+                run.halt(sample, elapsed_s)
+            self._come_to_rest(end)
+            return end
+
+    def _has_settled(self, motion: DeclaredMotion, wanted: Array, sample: Sample, over_s: float) -> bool:
+        if isinstance(motion, Hold | GripperMotion):
+            return True
+        is_behind = np.abs(wanted - self._filter.last_rad).max() >= SETTLED_RAD
+        if not is_behind and np.abs(sample.velocity_rad_per_s).max() < SETTLED_RAD_PER_S:
+            return True
+        # A path may be far from its joints for good, where it yields; a trajectory's set-point is only on its way.
+        return over_s >= (CATCH_UP_S if is_behind and isinstance(motion, JointTrajectory) else SETTLE_S)
+
+    def _end_of(self, motion: DeclaredMotion, wanted: Array) -> str:
+        """The cause of a completed motion; tells when the limits have kept a trajectory's set-point from its end."""
+        left_rad = np.abs(wanted - self._filter.last_rad)
+        k = int(np.argmax(left_rad))
+        if left_rad[k] < SETTLED_RAD or not isinstance(motion, JointTrajectory):
+            return RAN
+        return f"{RAN}, but joint {k + 1} is still {1e3 * left_rad[k]:.1f} mrad away from it"
+
+    def _come_to_rest(self, end: Termination) -> None:
+        """Decelerate at the limit, then hold; only the arm is listened to, since another device may be what failed."""
+        if end.device is not None:
+            self._faults = (end.cause,)
+        try:
+            while True:
+                self._send(self._filter.brake())
+                self._drives.pass_tick()
+                if self._filter.is_at_rest:
+                    break
+        except DeviceFailure:
+            self._drives.switch_off()
+        if end.outcome is MotionOutcome.STOPPED:
+            self._drives.switch_off()
+        self._standing.give_up(end.device)
+        with suppress(DeviceFailure):
+            self._newest = self._read()
+
+    def _tare(self) -> Array:
+        if self._is_latched():
+            raise Stopped("the stop latch is set", hint="reset the stop, then command again")
+        free: list[Array] = []
+        try:
+            sample = self._read()
+            self._standing.check_held(sample.position_rad, self._filter)
+            self._standing.resume(sample.position_rad, self._filter)
+            self._drives.begin_rhythm()
+            for _ in range(max(2, round(TARE_S / self._dt_s))):
+                self._send(self._filter.last_rad)
+                self._drives.pass_tick()
+                sample = self._newest = self._read()
+                flange = kernels.frames(self.kinematics.dh, sample.position_rad)[-1]
+                free.append(sample.raw_wrench - self._contact.weight(flange))
+        except DeviceFailure as failure:
+            self._standing.give_up(failure.device)
+            raise DeviceFault(f"tare: {failure}", hint="run `panelwright devices`", device=failure.device) from failure
+        self._contact.bias = np.mean(free, axis=0)
+        return self._contact.bias.copy()
+
+    # -- small steps -----------------------------------------------------------------------------------------------
+
+    def _read(self, before: Sample | None = None) -> Sample:
+        try:
+            sample = self._devices.read(before)
+            self._frozen_wrench.check(sample)
+        except DeviceFailure as failure:
+            self._faults = self._faults or (str(failure),)  # who looks at the state sees that it is old
+            raise
+        self._faults = ()
+        return sample
+
+    def _send(self, position_rad: Array) -> None:
+        self._filter.sent(self._drives.send(position_rad))
+
+    def _report(
+        self, motion: DeclaredMotion, end: Termination, started_s: float, view: ToolView, recorder: Recorder
+    ) -> MotionReport:
+        sample = self._newest
+        n = len(self.kinematics.dh)
+        q, wrench, pose = np.zeros(n), np.zeros(6), identity()
+        if sample is not None:
+            look = view.look(sample, self._filter.last_rad)
+            q, wrench, pose = sample.position_rad, look.wrench, RigidTransform.from_matrix(look.base_from_tool)
+        return MotionReport(
+            name=motion.name,
+            outcome=end.outcome,
+            tripped=end.tripped,
+            cause=end.cause,
+            started_s=started_s,
+            ended_s=self._clock.now_s(),
+            position_rad=q,
+            base_from_tool=pose,
+            wrench=wrench,
+            peak_force_n=recorder.peak_force_n,
+            gripper_width_m=None if sample is None else sample.gripper_width_m,
+            log=recorder.log(n),
+            device=end.device,
+        )
+
+    def _state_of(self, sample: Sample) -> RobotState:
+        flange = kernels.frames(self.kinematics.dh, sample.position_rad)[-1]
+        return RobotState(
+            stamp_s=sample.stamp_s,
+            position_rad=sample.position_rad,
+            velocity_rad_per_s=sample.velocity_rad_per_s,
+            base_from_flange=RigidTransform.from_matrix(flange),
+            wrench=self._contact.in_flange(sample.raw_wrench, flange),
+            contacts=sample.contacts,
+            proximity_m=sample.proximity_m,
+            gripper_width_m=sample.gripper_width_m,
+            is_moving=self._is_moving,
+            is_stopped=self._is_latched(),
+            faults=self._faults,
+        )

@@ -1,0 +1,77 @@
+"""The arm's drives as the control thread uses them: on, held by set-points in an even rhythm, off."""
+
+from __future__ import annotations
+
+import logging
+
+from hal.arrays import Array
+from hal.clock import Clock, Deadline, WallClock
+from hal.devices import Arm
+from hal.errors import CellError
+from manipulation.control.sensing import command_wait_s, failure_of, read_wait_s
+
+log = logging.getLogger(__name__)
+
+
+class Drives:
+    """Switches the drives and sends set-points, one a period of `dt_s`."""
+
+    def __init__(self, arm: Arm, clock: Clock, dt_s: float) -> None:
+        self.dt_s = dt_s
+        self.are_on = False
+        self._arm = arm
+        self._clock = clock
+        self._next_tick_s = clock.now_s()
+
+    def switch_on(self) -> None:
+        """Take the arm under power.
+
+        Raises:
+            DeviceFailure: the arm refuses or does not answer.
+        """
+        try:
+            self._arm.enable(deadline=Deadline.after(self._clock, command_wait_s(self._clock)))
+        except Exception as error:
+            raise failure_of(self._arm.name, error) from error
+        self.are_on = True
+
+    def switch_off(self) -> None:
+        """Drives off, when they are on: stop latched, or the arm does not answer."""
+        if self.are_on:
+            self.stop()
+        self.are_on = False
+
+    def stop(self) -> None:
+        """Ask the arm to stop, whatever is known of it; an arm that does not hear stops by its own watchdog."""
+        try:
+            self._arm.stop(deadline=Deadline.after(self._clock, command_wait_s(self._clock)))
+        except CellError:
+            pass
+        except Exception:  # a defect of its driver: whoever stops goes on with what else there is to end
+            log.exception("stopping %s", self._arm.name)
+
+    def send(self, position_rad: Array) -> Array:
+        """Send a set-point (n,), rad; returns what the arm took.
+
+        Raises:
+            DeviceFailure: the arm refuses or does not answer.
+        """
+        try:
+            deadline = Deadline(self._clock.now_s() + read_wait_s(self._clock), self._clock)
+            return self._arm.command_position(position_rad, deadline=deadline)
+        except Exception as error:
+            raise failure_of(self._arm.name, error) from error
+
+    def begin_rhythm(self) -> None:
+        """Count periods from now."""
+        self._next_tick_s = self._clock.now_s()
+
+    def pass_tick(self) -> None:
+        """Let one period pass; a simulated world makes its steps meanwhile."""
+        if not isinstance(self._clock, WallClock):
+            self._clock.sleep(self.dt_s)
+            return
+        now_s = self._clock.now_s()
+        # After a late tick the rhythm starts anew: catching up would bunch set-points.
+        self._next_tick_s = max(self._next_tick_s + self.dt_s, now_s)
+        self._clock.sleep(self._next_tick_s - now_s)

@@ -1,0 +1,236 @@
+"""One run per kind of declared motion: where the arm should be in this tick, and whether the motion is over."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from hal.arrays import Array
+from hal.clock import Clock, Deadline
+from hal.devices import Gripper
+from hal.errors import CellError
+from hal.motion import CartesianPath, Compliance, GripperMotion, Hold, JointTrajectory
+from manipulation.arm import kernels
+from manipulation.arm.kinematics import Kinematics
+from manipulation.control.plausibility import check_width
+from manipulation.control.sensing import Sample, command_wait_s
+
+BLEND_S = 0.25  # the gap between the declared and the measured start is closed over this time
+TURN_ARM_M = 0.1  # a turn of 1 rad counts as this much way
+DAMPING = 1e-3  # of the damped least squares; strokes are chosen clear of singularities beforehand
+GRIP_START_S = 0.08  # a gripper needs this long to report that it moves
+GRIP_REST_S = 0.05
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tick:
+    """What a run may look at: time since its start, the sample, the contact wrench (6,) in tool axes, the last
+    set-point.
+    """
+
+    elapsed_s: float
+    sample: Sample
+    wrench: Array
+    last_rad: Array
+    dt_s: float
+
+
+class Executor(Protocol):
+    """A motion in execution."""
+
+    def wanted(self, tick: Tick) -> Array:
+        """Joint set-point (n,) for this tick."""
+        ...
+
+    def is_over(self, tick: Tick) -> bool:
+        """Has the declared course been run?"""
+        ...
+
+
+class TrajectoryExecutor:
+    """Cubic Hermite between the declared joint states, blended from the measured start."""
+
+    def __init__(self, motion: JointTrajectory, start_rad: Array) -> None:
+        self._t = motion.times_s
+        self._q, self._v = motion.positions_rad, motion.velocities_rad_per_s
+        self._gap = start_rad - motion.positions_rad[0]
+
+    def wanted(self, tick: Tick) -> Array:
+        """The point of the trajectory at this time."""
+        q: Array = kernels.hermite(self._t, self._q, self._v, tick.elapsed_s)
+        return np.asarray(q + self._gap * _fade(tick.elapsed_s))
+
+    def is_over(self, tick: Tick) -> bool:
+        """The declared time is over."""
+        return bool(tick.elapsed_s >= self._t[-1])
+
+
+class PathExecutor:
+    """Tool poses in time; with compliance the tool yields about them by an admittance in tool axes."""
+
+    def __init__(self, motion: CartesianPath, kinematics: Kinematics, start_rad: Array) -> None:
+        poses = motion.base_from_tool
+        self._dh = kinematics.dh
+        self._tool = np.ascontiguousarray(motion.flange_from_tool.as_matrix())
+        self._t = np.ascontiguousarray(motion.times_s, float)
+        self._p = np.array([pose.translation for pose in poses])
+        self._r = np.array([pose.rotation.as_matrix() for pose in poses])
+        turns = [(b.rotation * a.rotation.inv()).as_rotvec() for a, b in itertools.pairwise(poses)]
+        self._w = np.array(turns).reshape(-1, 3)
+        self._ways, self._speeds = smooth_ways(self._t, self._p, self._w)
+        first = np.ascontiguousarray(poses[0].as_matrix())
+        measured, _ = kernels.tool_and_jacobian(self._dh, start_rad, self._tool)
+        self._gap = kernels.pose_error(measured, first)
+        self._admittance = None if motion.compliance is None else Admittance(motion.compliance)
+
+    def wanted(self, tick: Tick) -> Array:
+        """Joints whose tool pose is the path's, displaced by the admittance."""
+        offset = np.zeros(6) if self._admittance is None else self._admittance.step(tick.wrench, tick.dt_s)
+        shift = self._gap * _fade(tick.elapsed_s)
+        q: Array = kernels.path_joints(
+            self._dh,
+            self._tool,
+            self._t,
+            self._ways,
+            self._speeds,
+            self._p,
+            self._r,
+            self._w,
+            tick.elapsed_s,
+            shift,
+            offset,
+            tick.last_rad,
+            DAMPING,
+        )
+        return q
+
+    def is_over(self, tick: Tick) -> bool:
+        """The declared time is over."""
+        return bool(tick.elapsed_s >= self._t[-1])
+
+
+def smooth_ways(times_s: Array, points: Array, turns: Array) -> tuple[Array, Array]:
+    """Way (N,) along a path of points (N, 3) and turns (N - 1, 3), and its speed (N,) at each point: rest at both ends.
+
+    Between, the harmonic mean of the neighbouring speeds, which keeps the cubic from running backwards.
+
+    Source: Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5(2), 1984.
+    """
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1) + TURN_ARM_M * np.linalg.norm(turns, axis=1)
+    rates = lengths / np.diff(times_s)
+    speeds = np.zeros(len(times_s))
+    before, after = rates[:-1], rates[1:]
+    speeds[1:-1] = 2.0 * before * after / np.maximum(before + after, 1e-12)
+    return np.concatenate([[0.0], np.cumsum(lengths)]), speeds
+
+
+class Admittance:
+    """A virtual mass, damper and spring on each tool axis; its offset (6,) is added to the path in tool axes."""
+
+    def __init__(self, compliance: Compliance) -> None:
+        self._k = np.array(compliance.stiffness)
+        self._d = np.array(compliance.damping)
+        self._m = np.array(compliance.mass)
+        self._target = np.array(compliance.target_wrench)
+        self._bound = np.array([compliance.max_offset_m] * 3 + [compliance.max_offset_rad] * 3)
+        self._state = np.zeros((2, 6))
+
+    def step(self, wrench: Array, dt_s: float) -> Array:
+        """Advance by one tick under the contact wrench; returns the offset (6,)."""
+        kernels.admittance_step(self._state, wrench - self._target, self._k, self._d, self._m, self._bound, dt_s)
+        return np.array(self._state[0])
+
+
+class HoldExecutor:
+    """Stand still."""
+
+    def __init__(self, motion: Hold) -> None:
+        self._duration_s = motion.duration_s
+
+    def wanted(self, tick: Tick) -> Array:
+        """Where it is."""
+        return tick.last_rad
+
+    def is_over(self, tick: Tick) -> bool:
+        """The time is over."""
+        return tick.elapsed_s >= self._duration_s
+
+
+class GripperExecutor:
+    """The arm holds while the pads move; over when they rest."""
+
+    def __init__(self, motion: GripperMotion, gripper: Gripper, sample: Sample, clock: Clock) -> None:
+        self._motion, self._gripper, self._clock = motion, gripper, clock
+        self._resting_since_s: float | None = None
+        self.begun_m = sample.gripper_width_m
+        self._sent_m = self._move_to(motion.width_m)
+
+    def _move_to(self, width_m: float) -> float:
+        wanted = self._motion
+        deadline = Deadline.after(self._clock, command_wait_s(self._clock))
+        return self._gripper.command(
+            width_m=width_m, force_n=wanted.force_n, speed_m_per_s=wanted.speed_m_per_s, deadline=deadline
+        )
+
+    def halt(self, sample: Sample, elapsed_s: float) -> None:
+        """Let the pads stay where they are, unless they rest already: what ends a motion early is meant for them too."""
+        if not sample.gripper_is_moving and elapsed_s >= GRIP_START_S:
+            return
+        try:
+            self._move_to(sample.gripper_width_m)
+        except CellError:
+            pass  # it may be what has failed
+        except Exception:  # a defect of its driver: the arm must come to rest all the same
+            log.exception("halting %s", self._gripper.name)
+
+    def check_end(self, sample: Sample) -> None:
+        """Is the width what the pads were sent to, where they hold nothing?
+
+        Raises:
+            DeviceFailure: it cannot be.
+        """
+        if self._motion.must_arrive:
+            check_width(self._gripper.name, self._sent_m, self.begun_m, sample)
+
+    def wanted(self, tick: Tick) -> Array:
+        """Where it is."""
+        return tick.last_rad
+
+    def is_over(self, tick: Tick) -> bool:
+        """The pads have rested for a moment, or the time is over."""
+        if tick.sample.gripper_is_moving or tick.elapsed_s < GRIP_START_S:
+            self._resting_since_s = None
+        elif self._resting_since_s is None:
+            self._resting_since_s = tick.elapsed_s
+        rested = self._resting_since_s is not None and tick.elapsed_s - self._resting_since_s >= GRIP_REST_S
+        return rested or tick.elapsed_s >= self._motion.timeout_s
+
+
+def begin(
+    motion: JointTrajectory | CartesianPath | Hold | GripperMotion,
+    kinematics: Kinematics,
+    gripper: Gripper,
+    sample: Sample,
+    clock: Clock,
+) -> Executor:
+    """The run of a motion that starts at the measured joints of `sample`."""
+    match motion:
+        case JointTrajectory():
+            return TrajectoryExecutor(motion, sample.position_rad)
+        case CartesianPath():
+            return PathExecutor(motion, kinematics, sample.position_rad)
+        case Hold():
+            return HoldExecutor(motion)
+        case GripperMotion():
+            return GripperExecutor(motion, gripper, sample, clock)
+
+
+def _fade(elapsed_s: float) -> float:
+    """1 at the start, 0 after BLEND_S, level at both ends."""
+    u = min(1.0, elapsed_s / BLEND_S)
+    return 1.0 - u * u * (3.0 - 2.0 * u)

@@ -1,0 +1,67 @@
+"""Does the arm stand where it says? An arm that is believed wrongly leaps there with its next set-point."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hal.arrays import Array
+from manipulation.arm import kernels
+from manipulation.arm.kinematics import Kinematics
+from manipulation.control.drives import Drives
+from manipulation.control.sensing import DeviceFailure
+from manipulation.control.setpoint import SetPointLimiter
+from manipulation.control.termination import TRACKING_LIMIT_M
+
+
+class FollowingErrorMonitor:
+    """Compares where an arm says that it stands with where its drives have it, before anything moves.
+
+    Args:
+        arm: its name in the cell file.
+        flange_from_grip: (4, 4) the tips, where a difference of joints is measured in metres.
+    """
+
+    def __init__(self, arm: str, kinematics: Kinematics, flange_from_grip: Array, drives: Drives) -> None:
+        self._arm = arm
+        self._kinematics = kinematics
+        self._grip = flange_from_grip
+        self._drives = drives
+        self._is_doubted = False  # since it failed, until it takes a set-point where it says that it stands
+
+    def check_held(self, measured_rad: Array, held: SetPointLimiter) -> None:
+        """Refuse to begin where readings put an arm that is held elsewhere: it would leap there.
+
+        Args:
+            measured_rad: (n,) what the arm says.
+            held: what was sent last.
+
+        Raises:
+            DeviceFailure: the drives are on, and the arm says that it is far from where they hold it.
+        """
+        if self._drives.are_on:
+            self._check_near(measured_rad, held.last_rad, "{:.0f} mm from where it was sent")
+
+    def resume(self, measured_rad: Array, filter_: SetPointLimiter) -> None:
+        """Drives on, the set-point where the arm says that it is.
+
+        Raises:
+            DeviceFailure: the drives refuse, or an arm that has failed takes a set-point far from there.
+        """
+        filter_.begin_at(measured_rad)
+        self._drives.switch_on()
+        if self._is_doubted:
+            taken_rad = self._drives.send(filter_.last_rad)
+            self._check_near(measured_rad, taken_rad, "it says that it stands {:.0f} mm from where its drives have it")
+            self._is_doubted = False
+
+    def give_up(self, failed: str | None) -> None:
+        """If it is the arm that failed, its own brake holds it: no set-point can be trusted to be where it is."""
+        if failed == self._arm:
+            self._is_doubted = True
+            self._drives.switch_off()
+
+    def _check_near(self, measured_rad: Array, other_rad: Array, how: str) -> None:
+        tips = [(kernels.frames(self._kinematics.dh, q)[-1] @ self._grip)[:3, 3] for q in (measured_rad, other_rad)]
+        apart_m = float(np.linalg.norm(tips[0] - tips[1]))
+        if apart_m >= TRACKING_LIMIT_M:
+            raise DeviceFailure(self._arm, f"{self._arm} does not follow: {how.format(1e3 * apart_m)}")

@@ -1,0 +1,99 @@
+"""Guards: what ends a motion. Quantities are computed once a tick, and only when a guard asks for them."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hal.arrays import Array
+from hal.motion import Guard, Quantity
+from manipulation.arm import kernels
+
+RISE_WINDOW_S = 0.4
+RISE_AFTER_S = 0.15  # a motion that begins under load takes it up again first; an arm behind a wire is 50 ms later
+RISE_SAMPLE_S = 0.016  # the running median is refreshed at 62 Hz; a contact rises within a few of these
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class Measured:
+    """What guards may ask for in one tick: contact wrench (6,) and tool pose (4, 4) measured, tip commanded (3,)."""
+
+    elapsed_s: float
+    wrench: Array
+    base_from_tool: Array
+    commanded_tip_m: Array
+    contacts: tuple[bool, ...]
+    proximity_m: tuple[float, ...]
+
+
+class GuardSet:
+    """The guards of one motion, with their memories."""
+
+    def __init__(self, guards: Sequence[Guard], start_tool: Array) -> None:
+        self._watches = [_GuardMonitor(guard, start_tool) for guard in guards]
+
+    def tripped(self, now: Measured) -> Guard | None:
+        """The first guard that has held for its ticks, or None."""
+        for watch in self._watches:
+            if watch.holds(now):
+                return watch.guard
+        return None
+
+
+class _GuardMonitor:
+    """One guard: how many ticks it has held, and the running median when it watches a rise."""
+
+    def __init__(self, guard: Guard, start_tool: Array) -> None:
+        self.guard = guard
+        self._start = start_tool
+        self._held = 0
+        self._axis = None if guard.axis is None else np.asarray(guard.axis, float)
+        self._recent: deque[float] = deque(maxlen=round(RISE_WINDOW_S / RISE_SAMPLE_S))
+        self._next_s = RISE_AFTER_S
+        self._median: float | None = None
+
+    def holds(self, now: Measured) -> bool:
+        value = self._value(now)
+        beyond = value <= self.guard.limit if self.guard.below else value >= self.guard.limit
+        self._held = self._held + 1 if beyond else 0  # NaN compares false, so "nothing in range" never trips
+        return self._held >= self.guard.ticks
+
+    def _value(self, now: Measured) -> float:
+        match self.guard.quantity:
+            case Quantity.FORCE:
+                return self._along(now.wrench[:3])
+            case Quantity.TORQUE:
+                return self._along(now.wrench[3:])
+            case Quantity.FORCE_RISE:
+                return self._rise(now)
+            case Quantity.TOUCH:
+                return float(sum(now.contacts))
+            case Quantity.PROXIMITY:
+                seen = [m for m in now.proximity_m if not math.isnan(m)]
+                return min(seen) if seen else math.nan
+            case Quantity.TRAVEL:
+                moved = now.base_from_tool[:3, 3] - self._start[:3, 3]
+                return self._along(self._start[:3, :3].T @ moved)
+            case Quantity.ROTATION:
+                turn = kernels.rotation_log(np.ascontiguousarray(now.base_from_tool[:3, :3] @ self._start[:3, :3].T))
+                return math.sqrt(float(turn @ turn))
+            case Quantity.TRACKING:
+                gap = now.base_from_tool[:3, 3] - now.commanded_tip_m
+                return math.sqrt(float(gap @ gap))
+
+    def _along(self, vector: Array) -> float:
+        if self._axis is not None:
+            return float(self._axis @ vector)
+        return math.sqrt(float(vector @ vector))
+
+    def _rise(self, now: Measured) -> float:
+        force = self._along(now.wrench[:3])
+        if now.elapsed_s >= self._next_s:
+            self._next_s = now.elapsed_s + RISE_SAMPLE_S
+            self._recent.append(force)
+            self._median = float(np.median(self._recent)) if len(self._recent) >= 5 else None
+        return 0.0 if self._median is None else force - self._median

@@ -1,0 +1,280 @@
+"""One look at all motion devices per control tick, and the contact wrench behind the raw one."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from hal.arrays import Array
+from hal.calibration import ToolLoad
+from hal.clock import Clock, Deadline, PacedClock, SimClock
+from hal.devices import Arm, ForceTorque, Gripper, JointState, Proximity, Touch
+from hal.errors import CellError, DeviceError, DeviceTimeout, StaleReading
+from hal.readings import Cause, Quality, Stamped
+from manipulation.arm import kernels
+
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+
+GRAVITY_M_PER_S2 = 9.80665
+RANGE_WAIT_S = 0.004
+READ_WAIT_S = 0.02  # longest that one tick waits for a device; a tick itself lasts 2 to 8 ms
+PACED_WAIT_S = 1.0  # the same where the world stands still so long: a busy machine is no broken device
+STALE_WAIT_S, STALE_STEP_S = 0.1, 0.002
+COMMAND_WAIT_S = 0.25  # for what crosses a slow bus once a motion, not every tick
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sample:
+    """What the devices said in one tick; `raw_wrench` (6,) in sensor axes with bias and weight inside."""
+
+    stamp_s: float
+    position_rad: Array
+    velocity_rad_per_s: Array
+    raw_wrench: Array
+    contacts: tuple[bool, ...]
+    proximity_m: tuple[float, ...]
+    gripper_width_m: float
+    gripper_is_moving: bool
+    gripper_is_holding: bool = False
+
+
+class DeviceFailure(Exception):
+    """A device could not be used in this tick; `device` names it."""
+
+    def __init__(self, device: str, cause: str) -> None:
+        super().__init__(cause if cause.startswith(device) else f"{device}: {cause}")  # drivers name themselves
+        self.device = device
+        self.cause = cause
+
+
+class RangeReader:
+    """A proximity sensor in the control loop: its newest distance, NaN when nothing is within range.
+
+    A range sensor on a slow wire misses a beat now and then. It stops the arm only when nothing has come for `patience_s`.
+    """
+
+    def __init__(self, sensor: Proximity, clock: Clock, *, max_age_s: float, patience_s: float) -> None:
+        self._sensor = sensor
+        self._clock = clock
+        self._max_age_s = max_age_s
+        self._patience_s = patience_s
+        self._value_m = float("nan")
+        self._good_s: float | None = None
+
+    @property
+    def name(self) -> str:
+        """Name in the cell file."""
+        return self._sensor.name
+
+    def read(self, now_s: float) -> float:
+        """The distance, m.
+
+        Raises:
+            CellError: silent or stale for longer than the patience, or broken.
+        """
+        try:
+            self._value_m = self._fresh(now_s)
+            self._good_s = now_s
+        except (DeviceTimeout, StaleReading):
+            if self._good_s is None or now_s - self._good_s > self._patience_s:
+                raise
+        return self._value_m
+
+    def _fresh(self, now_s: float) -> float:
+        reading = self._sensor.read_distance_m(deadline=Deadline(now_s + RANGE_WAIT_S, self._clock))
+        is_empty = reading.quality is Quality.INVALID and reading.cause is Cause.OUT_OF_RANGE
+        if is_empty and reading.age_s(now_s) <= self._max_age_s:
+            return float("nan")
+        return reading.usable(now_s=now_s, max_age_s=self._max_age_s, device=self.name)
+
+
+def read_wait_s(clock: Clock) -> float:
+    """How long one tick may wait for a device."""
+    return PACED_WAIT_S if isinstance(clock, PacedClock) else READ_WAIT_S
+
+
+def command_wait_s(clock: Clock) -> float:
+    """How long a motion may wait at its begin or end for a command to be taken."""
+    return 2.0 * PACED_WAIT_S if isinstance(clock, PacedClock) else COMMAND_WAIT_S
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Devices:
+    """The devices of the control loop. All but the arm and its gripper may be absent."""
+
+    arm: Arm
+    gripper: Gripper
+    force_torque: ForceTorque | None
+    touch: Touch | None
+    proximities: Sequence[RangeReader]
+    clock: Clock
+    max_age_s: float
+
+    def read(self, before: Sample | None = None) -> Sample:
+        """Read the devices once; with the sample `before`, gripper and proximity are taken over from it.
+
+        Those two are slow by nature: reading them every fourth tick leaves time for the others.
+
+        Raises:
+            DeviceFailure: the first device that is silent, broken, stale or invalid. "Nothing in range" is a
+            proximity reading.
+        """
+        joints = self._joints()
+        now_s = self.clock.now_s()
+        deadline = Deadline(now_s + read_wait_s(self.clock), self.clock)
+        raw = np.zeros(6)
+        if self.force_torque is not None:
+            wrench = self._ask(self.force_torque.name, self.force_torque.read_wrench, now_s, deadline)
+            raw[:3], raw[3:] = wrench.force_n, wrench.torque_nm
+            _check_finite(self.force_torque.name, raw)
+        contacts: tuple[bool, ...] = ()
+        if self.touch is not None:
+            contacts = self._ask(self.touch.name, self.touch.read_contacts, now_s, deadline)
+        if before is None:
+            grip = self._ask(self.gripper.name, self.gripper.read_state, now_s, deadline)
+            width_m, is_moving, is_holding = grip.width_m, grip.is_moving, grip.is_holding
+            seen = self._ranges_m(now_s)
+        else:
+            width_m, is_moving = before.gripper_width_m, before.gripper_is_moving
+            is_holding, seen = before.gripper_is_holding, before.proximity_m
+        _check_finite(self.arm.name, joints.position_rad)
+        return Sample(
+            stamp_s=now_s,
+            position_rad=joints.position_rad,
+            velocity_rad_per_s=joints.velocity_rad_per_s,
+            raw_wrench=raw,
+            contacts=contacts,
+            proximity_m=seen,
+            gripper_width_m=width_m,
+            gripper_is_moving=is_moving,
+            gripper_is_holding=is_holding,
+        )
+
+    def _joints(self) -> JointState:
+        """The arm's newest state; an old one is waited out for a moment on a wall clock.
+
+        No set-point goes out meanwhile, so nothing moves on unseen. An arm that fails latches the stop: a machine that stood still
+        for a tenth of a second is no reason for that.
+        """
+        began_s = self.clock.now_s()
+        while True:
+            now_s = self.clock.now_s()
+            deadline = Deadline(now_s + read_wait_s(self.clock), self.clock)
+            try:
+                reading = self.arm.read_state(deadline=deadline)
+                is_old = reading.quality is not Quality.INVALID and reading.age_s(now_s) > self.max_age_s
+                if not (is_old and self._may_wait(now_s - began_s)):
+                    return reading.usable(now_s=now_s, max_age_s=self.max_age_s, device=self.arm.name)
+            except Exception as error:
+                raise failure_of(self.arm.name, error) from error
+            self.clock.sleep(STALE_STEP_S)
+
+    def _may_wait(self, waited_s: float) -> bool:
+        """In lockstep a reading is never old by chance, and waiting would move the world."""
+        return not isinstance(self.clock, SimClock) and waited_s < STALE_WAIT_S
+
+    def _ask(self, device: str, read: Callable[..., Stamped[T]], now_s: float, deadline: Deadline) -> T:
+        try:
+            return read(deadline=deadline).usable(now_s=now_s, max_age_s=self.max_age_s, device=device)
+        except Exception as error:
+            raise failure_of(device, error) from error
+
+    def _ranges_m(self, now_s: float) -> tuple[float, ...]:
+        ranges = []
+        for reader in self.proximities:
+            try:
+                ranges.append(reader.read(now_s))
+            except Exception as error:
+                raise failure_of(reader.name, error) from error
+        return tuple(ranges)
+
+
+def failure_of(device: str, error: Exception) -> DeviceFailure:
+    """By the name that the error itself gives, if it does: a device may stand for others.
+
+    A defect of a driver is a failure of its device: it must end a motion as gently as a loose cable does.
+    """
+    if not isinstance(error, CellError):
+        log.error("%s: its driver failed", device, exc_info=error)
+        return DeviceFailure(device, f"its driver failed: {type(error).__name__}: {error}")
+    named = error.details.get("device") if isinstance(error, DeviceError) else None
+    return DeviceFailure(str(named or device), error.what)
+
+
+def _check_finite(device: str, values: Array) -> None:
+    if not math.isfinite(values @ values):  # a sum hides neither NaN nor infinity
+        raise DeviceFailure(device, "a reading is not finite")
+
+
+class ContactWrench:
+    """Takes bias and tool weight off the raw wrench: contact = raw - bias - weight, sensor axes.
+
+    weight: f = m R^T g, t = c x f, with R the rotation base_from_sensor and c the centre of mass in sensor axes.
+    """
+
+    def __init__(self, load: ToolLoad, flange_from_sensor: RigidTransform) -> None:
+        self.mass_kg = load.mass_kg
+        self.centre_m = np.asarray(load.centre_of_mass_m, float)
+        self.flange_from_sensor = np.ascontiguousarray(flange_from_sensor.as_matrix())
+        self.bias = np.asarray(load.bias, float)
+
+    def weight(self, base_from_flange: Array) -> Array:
+        """(6,) what gravity alone makes the sensor read."""
+        # The third row of base_from_sensor is "up" seen by the sensor.
+        up = base_from_flange[2, :3] @ self.flange_from_sensor[:3, :3]
+        return np.asarray(kernels.weight_at(GRAVITY_M_PER_S2 * up, self.mass_kg, self.centre_m))
+
+    def in_flange(self, raw_wrench: Array, base_from_flange: Array) -> Array:
+        """(6,) the contact wrench in flange axes about the flange."""
+        contact = raw_wrench - self.bias - self.weight(base_from_flange)
+        return np.asarray(kernels.wrench_at(contact, self.flange_from_sensor))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToolReading:
+    """One tick seen from a tool: measured pose (4, 4), commanded tip (3,) m, contact wrench (6,) in tool axes."""
+
+    base_from_tool: Array
+    commanded_tip_m: Array
+    wrench: Array
+
+
+class ToolView:
+    """Carries samples over to one tool, with the wrench as the mean of two ticks.
+
+    Rubbing contacts change the sign of their friction from tick to tick, in the engine by 30 N and in a stiff wrist by
+    ringing; the mean of two ticks cancels that at the price of half a tick of delay.
+    """
+
+    def __init__(self, dh: Array, contact: ContactWrench, flange_from_tool: Array) -> None:
+        self._dh = dh
+        self._contact = contact
+        self._tool = flange_from_tool
+        self._tool_from_sensor = np.ascontiguousarray(np.linalg.inv(flange_from_tool) @ contact.flange_from_sensor)
+        self._before: Array | None = None
+
+    def look(self, sample: Sample, commanded_rad: Array) -> ToolReading:
+        """What the tool is and feels in this tick."""
+        contact = self._contact
+        pose, tip, now = kernels.tick_view(
+            self._dh,
+            sample.position_rad,
+            commanded_rad,
+            self._tool,
+            contact.flange_from_sensor,
+            self._tool_from_sensor,
+            sample.raw_wrench,
+            contact.bias,
+            contact.mass_kg,
+            contact.centre_m,
+            GRAVITY_M_PER_S2,
+        )
+        before, self._before = self._before, now
+        return ToolReading(pose, tip, now if before is None else 0.5 * (now + before))

@@ -1,0 +1,146 @@
+"""The last filter between a motion and the drive, and the checks before a motion starts."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from hal.arrays import Array
+from hal.errors import MotionRefused
+from hal.geometry import difference
+from hal.motion import CartesianPath, DeclaredMotion, GripperMotion, Hold, JointTrajectory
+from manipulation.arm.kinematics import Kinematics
+from manipulation.control import braking
+from manipulation.control.sensing import DeviceFailure
+
+START_RAD = 0.05
+START_M = 0.005
+SPEED_SLACK = 1.05
+RESTING_RAD_PER_S = 1e-4
+LOOK_BACK_TICKS = 3  # with one, 10 % of jitter in the ticks tripled the error behind a steady course
+
+
+class SetPointLimiter:
+    """Finite, within joint range, speed and acceleration, and tip speed; remembers what was really sent."""
+
+    def __init__(self, kinematics: Kinematics, flange_from_tool: Array, tip_limit_m_per_s: float, dt_s: float) -> None:
+        self._kinematics = kinematics
+        self._tool = flange_from_tool
+        self._tip_limit = tip_limit_m_per_s
+        self._dt_s = dt_s
+        self._wanted_rad = np.zeros((LOOK_BACK_TICKS, len(kinematics.dh)))  # newest first
+        self.last_rad = np.zeros(len(kinematics.dh))
+        self.velocity_rad_per_s = np.zeros(len(kinematics.dh))
+
+    def begin_at(self, measured_rad: Array) -> None:
+        """The first set-point after any resume is the measured position."""
+        self.last_rad = np.clip(measured_rad, self._kinematics.lower_rad, self._kinematics.upper_rad)
+        self.velocity_rad_per_s = np.zeros_like(measured_rad)
+        self._wanted_rad[:] = self.last_rad
+
+    def apply(self, wanted_rad: Array) -> Array:
+        """The set-point that may be sent.
+
+        Raises:
+            DeviceFailure: the wanted one is not finite.
+        """
+        if not math.isfinite(wanted_rad @ wanted_rad):
+            raise DeviceFailure("controller", "a set-point was not finite")
+        kin = self._kinematics
+        out: Array = braking.safe_step(
+            kin.dh, self._tool, wanted_rad, self._wanted_rad, self.last_rad, self.velocity_rad_per_s,
+            kin.velocity_rad_per_s, kin.acceleration_rad_per_s2, kin.lower_rad, kin.upper_rad, self._tip_limit,
+            self._dt_s,
+        )  # fmt: skip
+        self._wanted_rad[1:] = self._wanted_rad[:-1]
+        self._wanted_rad[0] = wanted_rad
+        return out
+
+    def brake(self) -> Array:
+        """The set-point of a tick that only slows down, each joint as fast as it may."""
+        self._wanted_rad[:] = self.last_rad
+        return self.apply(self.last_rad)
+
+    def sent(self, position_rad: Array) -> None:
+        """What the arm says that it sent to its drives."""
+        self.velocity_rad_per_s = (position_rad - self.last_rad) / self._dt_s
+        self.last_rad = position_rad
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Does the set-point stand still?"""
+        return bool(np.abs(self.velocity_rad_per_s).max() < RESTING_RAD_PER_S)
+
+
+def check(motion: DeclaredMotion, kinematics: Kinematics, measured_rad: Array) -> None:
+    """Refuse a motion that cannot be meant.
+
+    Raises:
+        MotionRefused: not finite, times that do not rise, outside joint range or speed, or a start that is far away.
+    """
+    match motion:
+        case JointTrajectory():
+            _check_trajectory(motion, kinematics, measured_rad)
+        case CartesianPath():
+            _check_path(motion, kinematics, measured_rad)
+        case Hold():
+            if not 0.0 <= motion.duration_s <= 60.0:
+                raise _refused(motion, f"a hold of {motion.duration_s} s", "hold between 0 and 60 s")
+        case GripperMotion():
+            numbers = (motion.width_m, motion.force_n, motion.speed_m_per_s, motion.timeout_s)
+            if not all(np.isfinite(n) and n >= 0.0 for n in numbers):
+                raise _refused(motion, "a number is negative or not finite", "give width, force, speed and time")
+
+
+def _check_trajectory(motion: JointTrajectory, kin: Kinematics, measured: Array) -> None:
+    q, v = motion.positions_rad, motion.velocities_rad_per_s
+    shape = (len(motion.times_s), len(kin.dh))
+    if q.shape != shape or v.shape != shape:
+        raise _refused(
+            motion, f"positions {q.shape} and velocities {v.shape} for times and joints {shape}", "same rows"
+        )
+    _check_times(motion, motion.times_s)
+    if not (np.isfinite(q).all() and np.isfinite(v).all()):
+        raise _refused(motion, "a position or velocity is not finite", "plan again")
+    if (q < kin.lower_rad - 1e-6).any() or (q > kin.upper_rad + 1e-6).any():
+        raise _refused(motion, "a position lies outside the joint range", "plan inside the arm's limits")
+    if (np.abs(v) > SPEED_SLACK * kin.velocity_rad_per_s).any():
+        raise _refused(motion, "a velocity is above the joint limit", "slow the trajectory down")
+    gap = float(np.abs(q[0] - measured).max())
+    if gap > START_RAD:
+        raise _refused(motion, f"starts {gap:.3f} rad away from the arm", "plan from the measured joints")
+
+
+def _check_path(motion: CartesianPath, kin: Kinematics, measured: Array) -> None:
+    _check_times(motion, motion.times_s)
+    if len(motion.base_from_tool) != len(motion.times_s):
+        raise _refused(motion, f"{len(motion.base_from_tool)} poses for {len(motion.times_s)} times", "one pose a time")
+    places = np.array([pose.translation for pose in motion.base_from_tool])
+    if not np.isfinite(places).all():
+        raise _refused(motion, "a pose is not finite", "plan again")
+    apart = difference(motion.base_from_tool[0], kin.tool(measured, motion.flange_from_tool))
+    if np.linalg.norm(apart[:3]) > START_M or np.linalg.norm(apart[3:]) > START_RAD:
+        raise _refused(
+            motion,
+            f"starts {1e3 * np.linalg.norm(apart[:3]):.1f} mm and {np.linalg.norm(apart[3:]):.3f} rad from the tool",
+            "begin the path at the measured tool pose",
+        )
+
+
+def _check_times(motion: JointTrajectory | CartesianPath, times_s: Array) -> None:
+    rising = (
+        np.isfinite(times_s).all() and len(times_s) >= 2 and abs(times_s[0]) < 1e-9 and (np.diff(times_s) > 0).all()
+    )
+    if not rising:
+        raise _refused(motion, "times must be finite, begin at 0 and rise", "plan again")
+
+
+def _refused(motion: DeclaredMotion, what: str, hint: str) -> MotionRefused:
+    return MotionRefused(f"motion {motion.name!r} refused: {what}", hint=hint, motion=motion.name)
+
+
+def flange_matrix(pose: RigidTransform) -> Array:
+    """A pose as the contiguous (4, 4) array that the kernels take."""
+    return np.ascontiguousarray(pose.as_matrix())

@@ -1,0 +1,113 @@
+"""What ends a motion early: the stop latch, its caller, its guards, and those that hold in every motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hal.arrays import Array
+from hal.motion import Guard, MotionOutcome, Quantity, Reaction
+from manipulation.control.guards import GuardSet, Measured
+from manipulation.control.sensing import Sample, ToolReading
+
+TRACKING_LIMIT_M = 0.02
+TRACKING_TICKS = 5
+LOADED_START_RATIO = 1.2  # otherwise a jammed hand could never be taken away
+UNITS = {
+    Quantity.FORCE: "N",
+    Quantity.TORQUE: "N m",
+    Quantity.FORCE_RISE: "N",
+    Quantity.TOUCH: "contacts",
+    Quantity.PROXIMITY: "m",
+    Quantity.TRAVEL: "m",
+    Quantity.ROTATION: "rad",
+    Quantity.TRACKING: "m",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Termination:
+    """Why a motion is over."""
+
+    outcome: MotionOutcome
+    cause: str
+    tripped: str | None = None
+    device: str | None = None
+
+
+class TerminationMonitor:
+    """Looks every tick whether the motion must end.
+
+    Args:
+        declared: the guards that the motion brings.
+        force_limit_n: holds in every motion.
+        look: what is measured at its start.
+        arm: name of the device that is at fault when the arm does not follow.
+        is_latched, is_cancelled: asked every tick.
+    """
+
+    def __init__(
+        self,
+        declared: Sequence[Guard],
+        force_limit_n: float,
+        look: ToolReading,
+        *,
+        arm: str,
+        is_latched: Callable[[], bool],
+        is_cancelled: Callable[[], bool],
+    ) -> None:
+        self._guards = GuardSet((*declared, *_standing_guards(force_limit_n, look.wrench)), look.base_from_tool)
+        self._arm = arm
+        self._is_latched = is_latched
+        self._is_cancelled = is_cancelled
+
+    def ending(self, elapsed_s: float, sample: Sample, look: ToolReading) -> Termination | None:
+        """Why the motion must end now, or None."""
+        if self._is_latched():
+            return Termination(outcome=MotionOutcome.STOPPED, cause="the stop latch was set")
+        if self._is_cancelled():
+            return Termination(outcome=MotionOutcome.CANCELLED, cause="cancelled by the caller")
+        guard = self._guards.tripped(
+            Measured(
+                elapsed_s=elapsed_s,
+                wrench=look.wrench,
+                base_from_tool=look.base_from_tool,
+                commanded_tip_m=look.commanded_tip_m,
+                contacts=sample.contacts,
+                proximity_m=sample.proximity_m,
+            )
+        )
+        return None if guard is None else self._ending_of(guard, look)
+
+    def _ending_of(self, guard: Guard, look: ToolReading) -> Termination:
+        outcome = MotionOutcome.FAULT if guard.reaction is Reaction.FAULT else MotionOutcome.GUARD
+        device = None
+        match guard.name:
+            case "force_limit":
+                cause = f"contact force {np.linalg.norm(look.wrench[:3]):.0f} N; at most {guard.limit:.0f} N is allowed"
+            case "tracking":
+                behind_m = np.linalg.norm(look.base_from_tool[:3, 3] - look.commanded_tip_m)
+                cause = f"{self._arm} does not follow: {1e3 * behind_m:.0f} mm from where it was sent"
+                device = self._arm
+            case _:
+                side = "at most" if guard.below else "at least"
+                cause = f"guard {guard.name}: {guard.quantity} {side} {guard.limit:g} {UNITS[guard.quantity]}"
+        return Termination(outcome=outcome, cause=cause, tripped=guard.name, device=device)
+
+
+def _standing_guards(force_limit_n: float, wrench: Array) -> tuple[Guard, ...]:
+    """Force and tracking hold in every motion; one that begins under load may go on while that does not grow."""
+    loaded_n = LOADED_START_RATIO * float(np.linalg.norm(wrench[:3]))
+    force_n = max(force_limit_n, loaded_n)
+    return (
+        Guard(name="force_limit", quantity=Quantity.FORCE, limit=force_n, reaction=Reaction.FAULT),
+        Guard(
+            name="tracking",
+            quantity=Quantity.TRACKING,
+            limit=TRACKING_LIMIT_M,
+            ticks=TRACKING_TICKS,
+            reaction=Reaction.FAULT,
+        ),
+    )

@@ -1,0 +1,134 @@
+"""What can touch what: arm and tool as capsules, panel and surroundings as boxes.
+
+A capsule is a segment with a radius. The distance from a point to a box is convex, so along a segment its minimum is
+found by a golden-section search; that makes a whole check of arm against panel a matter of microseconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from scipy.spatial.transform import RigidTransform
+
+from hal.geometry import identity, transform_rpy
+from hal.panel import (
+    Button,
+    Handwheel,
+    Lever,
+    Mushroom,
+    Panel,
+    PanelObject,
+    Rotary,
+    Slider,
+    Toggle,
+)
+
+Vector3 = tuple[float, float, float]
+
+
+# A panel is set in a wall or a cabinet that nobody has measured: no way leads round its edge, where a hand would hook on.
+WALL_BEYOND_M = 0.3
+WALL_DEPTH_M = 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Capsule:
+    """A capsule fixed to the flange: both ends in flange axes, m."""
+
+    name: str
+    start_m: Vector3
+    end_m: Vector3
+    radius_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CollisionBox:
+    """A box: pose of its middle in the parent, and half its edges, m."""
+
+    name: str
+    parent_from_box: RigidTransform
+    half_m: Vector3
+
+    def moved(self, grand_from_parent: RigidTransform) -> CollisionBox:
+        """The same box seen from the parent's parent."""
+        return CollisionBox(
+            name=self.name, parent_from_box=grand_from_parent * self.parent_from_box, half_m=self.half_m
+        )
+
+
+def panel_boxes(panel: Panel, angles_rad: Mapping[str, float] | None = None) -> tuple[CollisionBox, ...]:
+    """Plate and objects of a panel as boxes in the panel frame; the plate with the wall that it is set in.
+
+    Args:
+        angles_rad: present angle (clockwise from up) of levers by name; one whose angle is unknown gets the box of its
+            whole sweep.
+    """
+    half_depth_m = max(panel.thickness_m, WALL_DEPTH_M) / 2
+    plate = CollisionBox(
+        name="plate",
+        parent_from_box=transform_rpy((0.0, 0.0, -half_depth_m), (0.0, 0.0, 0.0)),
+        half_m=(panel.width_m / 2 + WALL_BEYOND_M, panel.height_m / 2 + WALL_BEYOND_M, half_depth_m),
+    )
+    known = angles_rad or {}
+    return (plate, *(envelope(panel_object, angle_rad=known.get(panel_object.name)) for panel_object in panel.objects))
+
+
+def envelope(panel_object: PanelObject, *, angle_rad: float | None = None) -> CollisionBox:
+    """A box in the panel frame that holds the object in any state, or a lever at `angle_rad`."""
+    if isinstance(panel_object, Lever) and angle_rad is not None:
+        return _bar(panel_object, angle_rad)
+    half_x, half_y, height = _half_sizes(panel_object)
+    turn = panel_object.angle_rad if isinstance(panel_object, Slider) else 0.0
+    return CollisionBox(
+        name=panel_object.name,
+        parent_from_box=transform_rpy((*panel_object.position_m, height / 2), (0.0, 0.0, turn)),
+        half_m=(half_x, half_y, height / 2),
+    )
+
+
+def _bar(lever: Lever, angle_rad: float) -> CollisionBox:
+    # Hub and bar: from half a width behind the hub to the far end.
+    along = lever.length_m / 2
+    turned = transform_rpy((*lever.position_m, 0.0), (0.0, 0.0, -angle_rad))
+    return CollisionBox(
+        name=lever.name,
+        parent_from_box=turned * transform_rpy((0.0, along, lever.height_m / 2), (0.0, 0.0, 0.0)),
+        half_m=(lever.width_m, along + lever.width_m, lever.height_m / 2),
+    )
+
+
+def _half_sizes(panel_object: PanelObject) -> tuple[float, float, float]:
+    """Half width, half height and full height out of the plate."""
+    match panel_object:
+        case Lever():
+            reach = panel_object.length_m + panel_object.width_m
+            return reach, reach, panel_object.height_m
+        case Slider():
+            along, across, out = panel_object.cap_size_m
+            return (panel_object.travel_m + along) / 2, across / 2, out
+        case Toggle():
+            # The bat swings in the vertical plane.
+            half = panel_object.bat_length_m * math.sin(panel_object.tilt_rad) + 2 * panel_object.bat_radius_m
+            return 2 * panel_object.bat_radius_m, half, panel_object.bat_length_m + panel_object.bat_radius_m
+        case Rotary() | Button() | Mushroom():
+            return panel_object.radius_m, panel_object.radius_m, panel_object.height_m
+        case Handwheel():
+            reach = panel_object.radius_m + panel_object.rim_m
+            return reach, reach, panel_object.height_m + panel_object.rim_m
+    radius = getattr(panel_object, "radius_m", None)
+    half_x = radius if radius is not None else getattr(panel_object, "width_m", 0.02) / 2
+    half_y = radius if radius is not None else getattr(panel_object, "height_m", 0.02) / 2
+    depth = getattr(panel_object, "depth_m", 0.0)
+    lamp = getattr(panel_object, "height_m", 0.0) if panel_object.kind == "lamp" else 0.0
+    return half_x, half_y, max(depth, lamp, 0.004)
+
+
+def floor_box(z_m: float) -> CollisionBox:
+    """The floor as a box whose top lies at `z_m` of the base; it leaves a hole for the arm's own foot to the caller."""
+    return CollisionBox(
+        name="floor",
+        parent_from_box=identity() * transform_rpy((0.0, 0.0, z_m - 0.5), (0.0, 0.0, 0.0)),
+        half_m=(3.0, 3.0, 0.5),
+    )

@@ -1,0 +1,152 @@
+"""Collision-free transfers: the straight segment when it is free, else a search, then shortcuts and timing."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from hal.arrays import Array
+from hal.errors import Unreachable
+from hal.motion import Guard, JointTrajectory
+from manipulation.planning.collision import CollisionModel
+from manipulation.planning.rrt import connect, shortcut
+from manipulation.planning.time_parameterization import SpeedLimits, timed
+
+SEARCH_STEP_RAD = 0.02  # edges of the search; the answer is checked again at RECHECK_RAD
+DETOUR_RAD = 0.8  # how far a joint may leave the range between its two ends, as long as that finds a way
+END_SHARE = 0.9  # of the room that an end has: with all of it the end itself would touch the margin
+CORNER_RAD = 0.25  # how far before a corner its rounding begins
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Effort:
+    """How long to look for a way: so many searches of so many nodes at most."""
+
+    searches: int
+    nodes: int
+
+
+THOROUGH = Effort(searches=4, nodes=4000)  # ten seconds where there is no way
+QUICK = Effort(searches=2, nodes=400)  # the searches of four missions took 24 nodes at most
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TransferPlanner:
+    """Plans in joint space among the boxes of a collision model.
+
+    Attributes:
+        margin_m: least gap on the way.
+        end_margin_m: least gap at both ends, where the tool may be near its object.
+        seed: same seed, same path.
+    """
+
+    model: CollisionModel
+    flange_from_tool: RigidTransform
+    limits: SpeedLimits
+    margin_m: float = 0.008
+    end_margin_m: float = 0.002
+    seed: int = 0
+
+    def plan(
+        self,
+        start_rad: Array,
+        goal_rad: Array,
+        *,
+        name: str = "transfer",
+        guards: tuple[Guard, ...] = (),
+        effort: Effort = THOROUGH,
+    ) -> JointTrajectory:
+        """A timed free trajectory from rest at `start_rad` to rest at `goal_rad`, (n,) each.
+
+        Raises:
+            Unreachable: start or goal touches something, or no free path was found; names what is in the way.
+        """
+        margin = self._margin(start_rad, goal_rad)
+
+        def free(a: Array, b: Array, step: float = SEARCH_STEP_RAD) -> float:
+            return self.model.free_fraction(a, b, margin_m=margin, step_rad=step)
+
+        if self.model.free_fraction(start_rad, goal_rad, margin_m=margin) == 1.0:
+            return self._timed(np.array([start_rad, goal_rad]), name, guards)
+        kin = self.model.kinematics
+        lower, upper = self._search_range(start_rad, goal_rad)
+        for attempt in range(effort.searches):
+            seed = self.seed + attempt
+            path = connect(start_rad, goal_rad, free=free, lower=lower, upper=upper, seed=seed, max_nodes=effort.nodes)
+            if path is None:
+                lower, upper = kin.lower_rad, kin.upper_rad
+                continue
+            rounded = self._rounded(shortcut(path, free=free, seed=seed), margin)
+            if rounded is not None:
+                return self._timed(rounded, name, guards)
+        raise Unreachable(
+            f"{name}: no collision-free path was found, by {effort.searches} x {effort.nodes} steps of search",
+            hint=f"the tightest place of the straight way is between {self._in_the_way(start_rad, goal_rad, margin)}",
+        )
+
+    def _margin(self, start: Array, goal: Array) -> float:
+        """The wished margin, or what both ends leave of it."""
+        gaps = [self.model.clearance_m(q, enough_m=self.margin_m) for q in (start, goal)]
+        for which, q, gap in zip(("start", "goal"), (start, goal), gaps, strict=True):
+            if gap < self.end_margin_m:
+                raise Unreachable(
+                    f"the {which} of the transfer leaves only {1e3 * gap:.1f} mm between {self.model.nearest(q)}",
+                    hint="choose a standoff further out, or another turn of the tool",
+                )
+        return min(self.margin_m, *(END_SHARE * gap for gap in gaps))
+
+    def _search_range(self, start: Array, goal: Array) -> tuple[Array, Array]:
+        """A little beyond the two ends: whole turns of the wrist are never the short way."""
+        kin = self.model.kinematics
+        lower = np.maximum(kin.lower_rad, np.minimum(start, goal) - DETOUR_RAD)
+        upper = np.minimum(kin.upper_rad, np.maximum(start, goal) + DETOUR_RAD)
+        return lower, upper
+
+    def _rounded(self, path: Array, margin: float) -> Array | None:
+        """The path densely sampled with parabolic corners; corners are made tighter until all of it is free."""
+        for corner in (CORNER_RAD, CORNER_RAD / 3, CORNER_RAD / 10, CORNER_RAD / 30):
+            dense = round_corners(path, corner)
+            steps = itertools.pairwise(dense)
+            if all(self.model.free_fraction(a, b, margin_m=0.5 * margin) == 1.0 for a, b in steps):
+                return dense
+        return None
+
+    def _timed(self, path: Array, name: str, guards: tuple[Guard, ...]) -> JointTrajectory:
+        return timed(
+            self.model.kinematics,
+            path,
+            flange_from_tool=self.flange_from_tool,
+            limits=self.limits,
+            name=name,
+            guards=guards,
+        )
+
+    def _in_the_way(self, start: Array, goal: Array, margin: float) -> str:
+        fraction = self.model.free_fraction(start, goal, margin_m=margin)
+        beyond = min(1.0, fraction + 0.02)
+        return self.model.nearest(start + beyond * (goal - start))
+
+
+def round_corners(path_rad: Array, corner_rad: float, *, spacing_rad: float = 0.05) -> Array:
+    """A dense path (M, n) along the polyline (N, n) whose corners are parabolas that begin `corner_rad` before them."""
+    out = [path_rad[0]]
+    for before, at, after in zip(path_rad, path_rad[1:], path_rad[2:], strict=False):
+        back, ahead = before - at, after - at
+        lengths = float(np.linalg.norm(back)), float(np.linalg.norm(ahead))
+        reach = min(corner_rad, 0.45 * lengths[0], 0.45 * lengths[1])
+        a, b = at + back * (reach / lengths[0]), at + ahead * (reach / lengths[1])
+        _append_line(out, a, spacing_rad)
+        # Quadratic Bezier with the corner as its control point: tangent to both legs.
+        for u in np.linspace(0.0, 1.0, 7)[1:]:
+            out.append((1 - u) ** 2 * a + 2 * u * (1 - u) * at + u**2 * b)
+    _append_line(out, path_rad[-1], spacing_rad)
+    return np.array(out)
+
+
+def _append_line(out: list[Array], end: Array, spacing: float) -> None:
+    start = out[-1]
+    count = int(np.ceil(np.linalg.norm(end - start) / spacing))
+    out.extend(start + (k / count) * (end - start) for k in range(1, count + 1))

@@ -1,0 +1,142 @@
+"""What a skill works with: the mover, the arm's kinematics, the panel where it is believed to be, and the limits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from hal.arrays import Array
+from hal.errors import Unreachable
+from hal.geometry import UncertainPose, transform
+from hal.motion import JointTrajectory, Mover
+from hal.panel import Panel
+from manipulation.arm.kinematics import Kinematics
+from manipulation.planning.collision import CollisionModel, placed
+from manipulation.planning.hand import Hand
+from manipulation.planning.shapes import CollisionBox, floor_box, panel_boxes
+from manipulation.planning.time_parameterization import SpeedLimits
+from manipulation.planning.transfer import THOROUGH, Effort, TransferPlanner
+
+STROKE_MARGIN_M = 0.001
+FINGERS = ("finger_left", "finger_right")
+
+
+def _no_progress(_fraction: float, _text: str) -> None:
+    return None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SkillContext:
+    """The frozen context of a skill.
+
+    Attributes:
+        mover: runs declared motions.
+        base_from_panel: the panel's estimated pose with its covariance.
+        flange_from_grip: finger tips on the flange, z along the fingers, x the closing direction.
+        limits: speed of transfers.
+        angles_rad: present angles of levers, by name, for collision checks; others get their whole sweep.
+        park_rad: where the arm rests.
+        floor_z_m: height of the floor in the base frame.
+        obstacles: further boxes in the base frame.
+        progress: called with a fraction and a sentence.
+        seed: of the transfer planner.
+    """
+
+    mover: Mover
+    kinematics: Kinematics
+    panel: Panel
+    base_from_panel: UncertainPose
+    flange_from_grip: RigidTransform
+    limits: SpeedLimits
+    park_rad: Array
+    hand: Hand = field(default_factory=Hand)
+    angles_rad: Mapping[str, float] = field(default_factory=dict)
+    floor_z_m: float = 0.0
+    obstacles: tuple[CollisionBox, ...] = ()
+    progress: Callable[[float, str], None] = _no_progress
+    seed: int = 0
+
+    @property
+    def panel_pose(self) -> RigidTransform:
+        """Best estimate of base_from_panel."""
+        return self.base_from_panel.parent_from_child
+
+    def collision(self, *, width_m: float, may_touch: Sequence[str] = (), near_plate: bool = False) -> CollisionModel:
+        """Arm, hand at an opening, panel, floor and obstacles.
+
+        Args:
+            may_touch: names of objects that the hand may touch.
+            near_plate: the fingers may come down to the plate.
+        """
+        hand = self.hand.capsules(self.flange_from_grip, width_m)
+        boxes = (
+            floor_box(self.floor_z_m),
+            *placed(panel_boxes(self.panel, self.angles_rad), self.panel_pose),
+            *self.obstacles,
+        )
+        ignored = [("", name) for name in may_touch]
+        if near_plate:
+            ignored += [(finger, "plate") for finger in FINGERS]
+        return CollisionModel.build(self.kinematics, hand).with_boxes(boxes, ignored=ignored)
+
+    def transfer(
+        self, start_rad: Array, goal_rad: Array, *, width_m: float, name: str, effort: Effort = THOROUGH
+    ) -> JointTrajectory:
+        """A collision-free trajectory between two joint vectors.
+
+        Raises:
+            Unreachable: none found.
+        """
+        planner = TransferPlanner(
+            model=self.collision(width_m=width_m),
+            flange_from_tool=self.flange_from_grip,
+            limits=self.limits,
+            seed=self.seed,
+        )
+        return planner.plan(start_rad, goal_rad, name=name, effort=effort)
+
+    def choose(
+        self, options: Sequence[Sequence[RigidTransform]], *, near_rad: Array, width_m: float, may_touch: Sequence[str]
+    ) -> tuple[int, Array]:
+        """Which of several ways to do a stroke the arm can do best, and its joints (N, n) along it.
+
+        Args:
+            options: each a sequence of panel_from_grip poses, the first at the standoff.
+
+        Raises:
+            Unreachable: none can be followed on one branch without touching something else.
+        """
+        model = self.collision(width_m=width_m, may_touch=may_touch, near_plate=True)
+        failures, best = [], None
+        for index, poses in enumerate(options):
+            flange = [self.panel_pose * pose * self.flange_from_grip.inv() for pose in poses]
+            try:
+                paths = self.kinematics.follow(flange, near_rad=near_rad)
+            except Unreachable as failure:
+                failures.append(failure)
+                continue
+            for path in paths:
+                touching = next((q for q in path if not model.is_clear(q, margin_m=STROKE_MARGIN_M)), None)
+                if touching is not None:
+                    what = f"the stroke would bring {model.nearest(touching)} together"
+                    failures.append(Unreachable(what, hint="another turn of the tool or a smaller opening may do"))
+                    continue
+                cost = float(np.max(np.abs(path[0] - near_rad) / self.kinematics.velocity_rad_per_s))
+                if best is None or cost < best[0]:
+                    best = (cost, index, path)
+                break
+        if best is None:
+            raise failures[-1]
+        return best[1], best[2]
+
+
+def panel_from_grip(point_m: Sequence[float], turn_rad: float) -> RigidTransform:
+    """Grip pose in the panel frame: fingers straight at the plate, closing direction at `turn_rad` from the panel's x.
+
+    Columns: x = (cos, sin, 0), z = (0, 0, -1), y = z cross x.
+    """
+    c, s = np.cos(turn_rad), np.sin(turn_rad)
+    return transform([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]], point_m)

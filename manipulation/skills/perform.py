@@ -1,0 +1,94 @@
+"""The frame of every skill: a stroke, a second look, and at most two more tries while the look disagrees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from hal.errors import MotionRefused, Unreachable
+from manipulation.skills.attempt import Attempt
+from manipulation.skills.context import SkillContext
+from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
+from manipulation.skills.retreat import retreat
+
+MAX_ATTEMPTS = 3
+
+Stroke = Callable[[Attempt], float | None]
+"""One try of the deed; returns the mechanical estimate; raises `SkillFailure`."""
+
+
+def perform(
+    context: SkillContext,
+    stroke: Stroke,
+    *,
+    skill: str,
+    object_name: str,
+    target: str,
+    is_reached: Callable[[ObjectState], bool],
+    verify: Verify | None,
+    attempts: int = MAX_ATTEMPTS,
+    repeats: bool = True,
+) -> SkillReport:
+    """Try a stroke, retreat, look again, and try at most twice more while the look disagrees.
+
+    Args:
+        repeats: may a stroke that ended as declared be tried again when the look disagrees? Not for a button, whose
+            second press undoes the first.
+
+    Raises:
+        DeviceFault, Stopped, Cancelled: the cell cannot go on; the caller parks when that is possible.
+    """
+    attempt = Attempt(context)
+    started_s = context.mover.state().stamp_s
+    seen: ObjectState | None = None
+    reached: float | None = None
+    outcome, cause, tries = Outcome.UNREACHABLE, "", 0
+    for tries in range(1, attempts + 1):
+        context.progress((tries - 1) / attempts, f"{skill} {object_name}: attempt {tries}")
+        outcome, cause, reached = _try(attempt, stroke)
+        looks = outcome is Outcome.UNVERIFIED and verify is not None
+        context.progress((tries - 0.5) / attempts, f"{skill} {object_name}: {'look again' if looks else cause}")
+        if outcome is Outcome.UNREACHABLE:
+            break
+        seen = None if verify is None else verify()
+        if seen is not None and is_reached(seen):
+            outcome, cause = Outcome.DONE, "the read-back confirms it"
+            break
+        if outcome is Outcome.UNVERIFIED and seen is None:
+            cause += "; nobody looked" if verify is None else "; the look afterwards could not tell"
+            break
+        if outcome is Outcome.UNVERIFIED:
+            outcome, cause = Outcome.SLIPPED, "the hand went all the way; the read-back does not show the target"
+            if not repeats:
+                break
+        if outcome is Outcome.STALLED and seen is None and not repeats:
+            cause += "; whether it counted nobody can tell, and another try might undo it"
+            break
+        if outcome is Outcome.STIFF:
+            break
+    return SkillReport(
+        skill=skill,
+        object=object_name,
+        target=target,
+        outcome=outcome,
+        cause=cause,
+        reached=reached,
+        seen=seen,
+        attempts=tries,
+        started_s=started_s,
+        ended_s=context.mover.state().stamp_s,
+        peak_force_n=max((report.peak_force_n for report in attempt.reports), default=0.0),
+        motions=tuple(attempt.reports),
+    )
+
+
+def _try(attempt: Attempt, stroke: Stroke) -> tuple[Outcome, str, float | None]:
+    try:
+        return Outcome.UNVERIFIED, "the stroke ended as declared", stroke(attempt)
+    except SkillFailure as failure:
+        retreat(attempt.context, attempt)
+        return failure.outcome, failure.cause, failure.reached
+    except Unreachable as failure:
+        return Outcome.UNREACHABLE, f"{failure.what}; {failure.hint}", None
+    except MotionRefused as failure:
+        retreat(attempt.context, attempt)
+        return Outcome.UNREACHABLE, failure.what, None

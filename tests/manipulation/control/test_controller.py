@@ -1,0 +1,469 @@
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from hal.errors import DeviceFault, MotionRefused, Stopped
+from hal.geometry import difference, perturbed
+from hal.motion import (
+    CartesianPath,
+    Compliance,
+    GripperMotion,
+    Guard,
+    Hold,
+    JointTrajectory,
+    MotionOutcome,
+    Quantity,
+)
+from manipulation.planning.cartesian_path import line
+from tests.manipulation.rig import GRIP, HOME, LOAD, Rig, make_rig, tool_pose
+
+INF = float("inf")
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    rig = make_rig()
+    yield rig
+    rig.controller.close()
+
+
+def forwards(
+    distance_m: float,
+    *,
+    speed: float = 0.06,
+    start: np.ndarray = HOME,
+    guards: tuple[Guard, ...] = (),
+    compliance: Compliance | None = None,
+) -> CartesianPath:
+    pose = tool_pose(start)
+    return line(
+        pose,
+        perturbed(pose, np.array([distance_m, 0, 0, 0, 0, 0])),
+        name="forwards",
+        speed_m_per_s=speed,
+        flange_from_tool=GRIP,
+        guards=guards,
+        compliance=compliance,
+    )
+
+
+def joints(goal: np.ndarray, duration_s: float = 2.0) -> JointTrajectory:
+    t = np.linspace(0, 1, 20)
+    u = t * t * (3 - 2 * t)
+    du = 6 * t * (1 - t) / duration_s
+    return JointTrajectory(
+        name="joints",
+        times_s=t * duration_s,
+        positions_rad=HOME + u[:, None] * (goal - HOME),
+        velocities_rad_per_s=du[:, None] * (goal - HOME),
+    )
+
+
+def test_a_path_ends_where_it_was_declared(rig: Rig) -> None:
+    motion = forwards(0.05)
+    report = rig.controller.execute(motion)
+    assert report.outcome is MotionOutcome.COMPLETED
+    assert np.linalg.norm(difference(motion.base_from_tool[-1], report.base_from_tool)) < 1e-4
+    assert report.duration_s == pytest.approx(motion.times_s[-1], abs=0.1)
+    assert report.log.positions_rad.shape[1] == 6 and len(report.log.times_s) > 20
+    assert report.peak_force_n < 0.05
+
+
+def test_a_trajectory_ends_where_it_was_declared_and_begins_at_the_measured_joints(rig: Rig) -> None:
+    goal = HOME + np.array([0.2, -0.1, 0.1, 0.3, -0.2, 0.4])
+    rig.world.q = rig.world.target = HOME + 0.02
+    report = rig.controller.execute(joints(goal))
+    assert report.outcome is MotionOutcome.COMPLETED
+    assert np.abs(report.position_rad - goal).max() < 1e-3
+    assert np.abs(rig.world.commands[0] - (HOME + 0.02)).max() < 1e-3
+
+
+@pytest.mark.parametrize(("leap_rad", "cause"), [(0.2, "declared end$"), (1.5, r"joint 1 is still \d+\.\d mrad away")])
+def test_a_set_point_that_the_limits_hold_back_is_waited_for_and_what_is_left_is_told(
+    rig: Rig, leap_rad: float, cause: str
+) -> None:
+    goal = HOME + np.array([leap_rad, 0, 0, 0, 0, 0])
+    times = np.array([0.0, 0.01, 0.02])
+    leap = JointTrajectory(
+        name="leap", times_s=times, positions_rad=np.array([HOME, HOME, goal]), velocities_rad_per_s=np.zeros((3, 6))
+    )
+    report = rig.controller.execute(leap)
+    assert report.outcome is MotionOutcome.COMPLETED
+    assert re.search(cause, report.cause)
+    assert report.ended_s - report.started_s > 0.3
+    assert (np.abs(report.position_rad - goal).max() < 2e-3) == (leap_rad < 1.0)
+
+
+@pytest.mark.parametrize("stall_s", [0.02, 0.05, 0.2])
+def test_a_machine_that_stands_still_makes_a_motion_late_and_not_fast(rig: Rig, stall_s: float) -> None:
+    def stall() -> None:
+        if rig.world.ticks == 200:
+            rig.world.clock.set_now_s(rig.world.clock.now_s() + stall_s)
+
+    rig.world.before_step = stall
+    motion = forwards(0.05)
+    report = rig.controller.execute(motion)
+    assert report.outcome is MotionOutcome.COMPLETED
+    tips = np.array([tool_pose(q).translation for q in rig.world.commands])
+    assert np.linalg.norm(np.diff(tips, axis=0), axis=1).max() / 0.002 <= 1.7 * 0.06
+    assert np.diff(tips[:, 0]).min() >= -1e-9, "and it never goes back"
+    assert np.linalg.norm(difference(report.base_from_tool, motion.base_from_tool[-1])[:3]) < 1e-4
+    assert report.ended_s - report.started_s >= motion.times_s[-1] + stall_s - 0.002
+
+
+def test_contact_stops_an_approach_close_to_the_wall(rig: Rig) -> None:
+    rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) + 0.03
+    guard = Guard(name="contact", quantity=Quantity.FORCE, limit=8.0)
+    report = rig.controller.execute(forwards(0.08, guards=(guard,)))
+    assert report.outcome is MotionOutcome.GUARD and report.tripped == "contact"
+    assert 8.0 <= report.peak_force_n < 14.0
+    assert report.base_from_tool.translation[0] - rig.world.wall_x_m < 0.003
+
+
+def test_the_contact_wrench_is_free_of_weight_and_bias_and_in_tool_axes(rig: Rig) -> None:
+    rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) - 0.002
+    report = rig.controller.execute(Hold(name="look", duration_s=0.02))
+    force = tool_pose(HOME).rotation.inv().apply([-0.002 * rig.world.wall_n_per_m, 0, 0])
+    assert np.allclose(report.wrench[:3], force, atol=1e-6)
+    assert np.allclose(report.wrench[3:], 0.0, atol=1e-6)  # the wall acts at the tip
+
+
+def test_tare_finds_the_bias(rig: Rig) -> None:
+    assert np.allclose(rig.controller.tare(), LOAD.bias, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "limit", "axis", "below"),
+    [
+        (Quantity.TRAVEL, 0.02, None, False),
+        (Quantity.PROXIMITY, 0.03, None, True),
+        (Quantity.TOUCH, 1, None, False),
+        (Quantity.FORCE_RISE, 5.0, None, False),
+        (Quantity.TORQUE, -1.0, None, False),
+    ],
+)
+def test_every_quantity_can_end_a_motion(
+    rig: Rig, quantity: Quantity, limit: float, axis: tuple[float, float, float] | None, below: bool
+) -> None:
+    rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) + 0.05
+    guard = Guard(name="it", quantity=quantity, limit=limit, axis=axis, below=below)
+    report = rig.controller.execute(forwards(0.1, guards=(guard,)))
+    assert (report.outcome, report.tripped) == (MotionOutcome.GUARD, "it")
+
+
+def test_rotation_ends_a_turn(rig: Rig) -> None:
+    pose = tool_pose(HOME)
+    motion = line(
+        pose,
+        perturbed(pose, np.array([0, 0, 0, 0.4, 0, 0])),
+        name="turn",
+        speed_m_per_s=0.02,
+        flange_from_tool=GRIP,
+        guards=(Guard(name="turned", quantity=Quantity.ROTATION, limit=0.2),),
+    )
+    report = rig.controller.execute(motion)
+    assert report.tripped == "turned"
+    assert np.linalg.norm(difference(report.base_from_tool, pose)[3:]) == pytest.approx(0.2, abs=0.01)
+
+
+def test_too_much_force_is_a_fault_in_any_motion(rig: Rig) -> None:
+    rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) + 0.01
+    report = rig.controller.execute(forwards(0.1))
+    assert report.outcome is MotionOutcome.FAULT and report.tripped == "force_limit"
+    assert report.peak_force_n < 130.0
+
+
+def test_a_frozen_force_sensor_ends_a_motion_before_the_wall_is_pressed_hard(rig: Rig) -> None:
+    """Nothing noticed, and the arm went on to 1029 N in a mission."""
+    rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) + 0.01
+    rig.world.repeating.add("wrist_ft")
+    report = rig.controller.execute(forwards(0.1))
+    assert (report.outcome, report.device) == (MotionOutcome.FAULT, "wrist_ft")
+    assert np.linalg.norm(rig.world.contact_force()) < 60.0
+    rig.world.repeating.clear()
+    assert rig.controller.execute(Hold(name="wait", duration_s=0.01)).outcome is MotionOutcome.COMPLETED
+
+
+def test_an_arm_that_does_not_follow_is_a_fault(rig: Rig) -> None:
+    stuck = HOME.copy()
+
+    def jam() -> None:
+        rig.world.target = stuck
+
+    rig.world.before_step = jam
+    report = rig.controller.execute(forwards(0.1))
+    assert report.outcome is MotionOutcome.FAULT and report.tripped == "tracking"
+    assert report.device == "arm" and "does not follow" in report.cause
+
+
+def frozen_in_motion(rig: Rig) -> None:
+    """The arm goes on while it repeats one reading under new stamps, until that is noticed."""
+    rig.world.before_step = lambda: rig.world.repeating.add("arm") if rig.world.ticks == 300 else None
+    report = rig.controller.execute(forwards(0.1))
+    assert (report.tripped, report.device) == ("tracking", "arm")
+    rig.world.before_step = lambda: None
+    rig.world.commands.clear()
+
+
+def test_an_arm_that_failed_is_left_to_its_own_brake(rig: Rig) -> None:
+    frozen_in_motion(rig)
+    assert not rig.world.enabled
+
+
+def test_an_arm_whose_reading_is_still_wrong_is_not_sent_there_after_a_reset(rig: Rig) -> None:
+    """It leapt the 22 mm back at once: the first set-point of the next motion was the wrong reading."""
+    frozen_in_motion(rig)
+    stood = rig.world.q.copy()
+    rig.world.stride_rad = 0.006
+    for _ in range(2):
+        report = rig.controller.execute(Hold(name="settle", duration_s=0.1))
+        assert (report.outcome, report.device) == (MotionOutcome.FAULT, "arm")
+        assert "does not follow" in report.cause and report.cause.endswith("nothing moved")
+    assert np.array_equal(rig.world.q, stood) and not rig.world.enabled
+
+
+def test_an_arm_that_is_well_again_goes_on_from_where_it_is(rig: Rig) -> None:
+    frozen_in_motion(rig)
+    stood = rig.world.q.copy()
+    rig.world.repeating.clear()
+    rig.world.stride_rad = 0.006
+    assert rig.controller.execute(Hold(name="settle", duration_s=0.1)).outcome is MotionOutcome.COMPLETED
+    assert np.abs(np.array(rig.world.commands) - stood).max() < 1e-9
+    assert rig.controller.execute(forwards(0.02, start=rig.world.q)).outcome is MotionOutcome.COMPLETED
+
+
+@pytest.mark.parametrize("act", ["motion", "tare"])
+def test_an_arm_that_says_it_is_not_where_it_was_held_is_not_sent_there(rig: Rig, act: str) -> None:
+    """A bias of 20 mrad on all joints, come between two motions, made each motion begin with a leap."""
+    assert rig.controller.execute(Hold(name="still", duration_s=0.02)).outcome is MotionOutcome.COMPLETED
+    rig.world.commands.clear()
+    rig.world.bias_rad = 0.02
+    if act == "motion":
+        report = rig.controller.execute(Hold(name="settle", duration_s=0.1))
+        assert (report.outcome, report.device) == (MotionOutcome.FAULT, "arm")
+        assert "from where it was sent; nothing moved" in report.cause
+    else:
+        with pytest.raises(DeviceFault, match="does not follow"):
+            rig.controller.tare()
+    assert rig.world.commands == [] and np.array_equal(rig.world.q, HOME)
+    assert not rig.world.enabled
+
+
+def test_compliance_yields_to_the_wall(rig: Rig) -> None:
+    rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) + 0.02
+    soft = Compliance(stiffness=(300.0,) * 3 + (INF,) * 3, damping=(100.0,) * 6, mass=(2.0,) * 6)
+    report = rig.controller.execute(forwards(0.04, speed=0.02, compliance=soft))
+    # 20 mm beyond the wall: the series of 300 and 5000 N/m carries 5.7 N, where a stiff arm would press 100 N.
+    assert report.outcome is MotionOutcome.COMPLETED
+    assert np.linalg.norm(report.wrench[:3]) == pytest.approx(0.02 / (1 / 300 + 1 / 5000), rel=0.15)
+
+
+@pytest.mark.parametrize("device", ["arm", "gripper", "wrist_ft", "finger_touch", "proximity_left"])
+@pytest.mark.parametrize("how", ["silent", "frozen"])
+def test_a_device_that_fails_in_motion_stops_the_arm_and_is_named(rig: Rig, device: str, how: str) -> None:
+    def fail() -> None:
+        if rig.world.ticks == 300:
+            getattr(rig.world, how).add(device)
+
+    rig.world.before_step = fail
+    report = rig.controller.execute(forwards(0.1))
+    assert report.outcome is MotionOutcome.FAULT
+    assert report.device == device
+    assert report.cause.count(device) == 1, "named, and once"
+    assert rig.controller.state().faults == (report.cause,)
+    after = rig.world.ticks
+    assert after < 300 + 120
+    assert np.abs(rig.world.velocity).max() < 1e-3
+
+
+@pytest.mark.parametrize("device", ["arm", "gripper", "wrist_ft", "finger_touch", "proximity_left"])
+def test_a_defect_of_a_driver_stops_the_arm_as_gently_as_a_failing_device(rig: Rig, device: str) -> None:
+    def fail() -> None:
+        if rig.world.ticks == 300:
+            rig.world.defective.add(device)
+
+    rig.world.before_step = fail
+    report = rig.controller.execute(forwards(0.1))
+    assert report.outcome is MotionOutcome.FAULT
+    assert report.device == device and "ZeroDivisionError" in report.cause
+    assert rig.world.ticks < 300 + 120
+    assert np.abs(rig.world.velocity).max() < 1e-3
+
+
+def test_a_device_that_is_dead_before_the_start_moves_nothing(rig: Rig) -> None:
+    rig.world.silent.add("wrist_ft")
+    report = rig.controller.execute(forwards(0.1))
+    assert report.outcome is MotionOutcome.FAULT and "wrist_ft" in report.cause
+    assert rig.world.commands == []
+
+
+def test_the_latch_stops_a_motion_and_refuses_the_next(rig: Rig) -> None:
+    def press() -> None:
+        rig.latched[0] = rig.world.ticks >= 200
+
+    rig.world.before_step = press
+    report = rig.controller.execute(forwards(0.1))
+    assert report.outcome is MotionOutcome.STOPPED
+    assert not rig.world.enabled
+    assert np.abs(rig.world.velocity).max() < 1e-3
+    with pytest.raises(Stopped):
+        rig.controller.execute(forwards(0.1))
+
+
+@pytest.mark.parametrize("dead", ["arm", "gripper", "wrist_ft", "finger_touch", "proximity_left"])
+def test_a_stop_between_motions_switches_the_drives_off_though_a_device_is_dead(rig: Rig, dead: str) -> None:
+    assert rig.controller.execute(Hold(name="still", duration_s=0.02)).outcome is MotionOutcome.COMPLETED
+    assert rig.world.enabled
+    rig.world.silent.add(dead)
+    rig.world.clock.sleep(1.0)  # longer than anybody's patience
+    rig.latched[0] = True
+    rig.controller._hold()  # what the control thread does each tick on a wall clock
+    assert not rig.world.enabled
+
+
+def test_after_a_stop_the_first_set_point_is_the_measured_position(rig: Rig) -> None:
+    rig.world.before_step = lambda: rig.latched.__setitem__(0, rig.world.ticks == 200)
+    rig.controller.execute(forwards(0.1))
+    rig.latched[0] = False
+    rig.world.before_step = lambda: None
+    moved = rig.world.q + 0.1  # somebody jogged the arm meanwhile
+    rig.world.q = rig.world.target = moved
+    rig.world.commands.clear()
+    rig.controller.execute(Hold(name="still", duration_s=0.02))
+    assert np.abs(rig.world.commands[0] - moved).max() < 1e-9
+
+
+def test_cancel_ends_the_motion(rig: Rig) -> None:
+    rig.world.before_step = lambda: rig.controller.cancel() if rig.world.ticks == 150 else None
+    report = rig.controller.execute(forwards(0.1))
+    assert report.outcome is MotionOutcome.CANCELLED
+    assert rig.controller.execute(Hold(name="still", duration_s=0.02)).outcome is MotionOutcome.COMPLETED
+
+
+def test_a_motion_that_begins_while_the_controller_closes_is_cancelled_too(rig: Rig) -> None:
+    closing = threading.Thread(target=rig.controller.close)
+
+    def close() -> None:
+        if rig.world.ticks == 150:
+            closing.start()
+            assert rig.controller._cancel.wait(10.0)
+            rig.controller._cancel.clear()  # as `execute` does, if it comes between the cancel and the thread's end
+
+    rig.world.before_step = close
+    report = rig.controller.execute(forwards(0.1))
+    closing.join(10.0)
+    assert report.outcome is MotionOutcome.CANCELLED
+
+
+def test_set_points_never_break_the_limits_even_when_a_path_asks_for_it(rig: Rig) -> None:
+    rig.controller.execute(forwards(0.12, speed=2.0))
+    commands = np.array(rig.world.commands)
+    velocity = np.diff(commands, axis=0) / 0.002
+    tips = np.array([tool_pose(q).translation for q in commands])
+    assert np.all(np.abs(velocity) <= 3.2 + 1e-6)
+    assert np.linalg.norm(np.diff(tips, axis=0), axis=1).max() / 0.002 <= 0.2505
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        forwards(0.1, start=HOME + 0.2),
+        joints(HOME + 5.0),
+        joints(HOME + np.nan),
+        joints(HOME + 1.0, duration_s=0.1),
+        Hold(name="long", duration_s=float("nan")),
+        GripperMotion(name="wide", width_m=-1.0, force_n=1.0),
+        CartesianPath(name="empty", flange_from_tool=GRIP, times_s=np.array([0.0]), base_from_tool=(tool_pose(HOME),)),
+    ],
+    ids=lambda motion: motion.name,
+)  # fmt: skip
+def test_nonsense_is_refused_and_nothing_moves(rig: Rig, motion: CartesianPath) -> None:
+    with pytest.raises(MotionRefused):
+        rig.controller.execute(motion)
+    assert rig.world.commands == []
+
+
+def test_a_second_motion_at_the_same_time_is_refused(rig: Rig) -> None:
+    running, release = threading.Event(), threading.Event()
+
+    def wait() -> None:
+        running.set()
+        release.wait(5.0)
+
+    rig.world.before_step = wait
+    first = threading.Thread(target=lambda: rig.controller.execute(Hold(name="long", duration_s=0.1)))
+    first.start()
+    assert running.wait(5.0)
+    with pytest.raises(MotionRefused, match="another motion"):
+        rig.controller.execute(Hold(name="second", duration_s=0.1))
+    release.set()
+    first.join()
+
+
+def test_the_gripper_moves_while_the_arm_holds(rig: Rig) -> None:
+    report = rig.controller.execute(GripperMotion(name="close", width_m=0.01, force_n=10.0))
+    assert report.outcome is MotionOutcome.COMPLETED
+    assert report.gripper_width_m == pytest.approx(0.01, abs=1e-4)
+    assert np.allclose(rig.world.q, HOME)
+
+
+@pytest.mark.parametrize("ticks", [0, 3, 100])
+@pytest.mark.parametrize("how", ["stop", "cancel"])
+def test_the_pads_stop_with_the_motion(rig: Rig, how: str, ticks: int) -> None:
+    begun = rig.world.ticks
+
+    def end() -> None:
+        if rig.world.ticks - begun == ticks:
+            rig.latched[0] = how == "stop"
+            rig.controller.cancel()
+
+    rig.world.before_step = end
+    report = rig.controller.execute(GripperMotion(name="close", width_m=0.0, force_n=20.0, speed_m_per_s=0.05))
+    assert report.outcome is (MotionOutcome.STOPPED if how == "stop" else MotionOutcome.CANCELLED)
+    where_m = rig.world.width_m
+    rig.world.clock.sleep(1.0)
+    assert abs(rig.world.width_m - where_m) < 0.002
+    assert rig.world.width_m > 0.02
+
+
+@pytest.mark.parametrize("fails", ["silent", "defective"])
+def test_a_gripper_that_does_not_hear_hinders_no_stop(rig: Rig, fails: str) -> None:
+    def break_and_stop() -> None:
+        if rig.world.ticks == 20:
+            getattr(rig.world, fails).add("gripper")
+            rig.latched[0] = True
+
+    rig.world.before_step = break_and_stop
+    motion = GripperMotion(name="close", width_m=0.0, force_n=20.0, speed_m_per_s=0.05)
+    assert rig.controller.execute(motion).outcome in (MotionOutcome.STOPPED, MotionOutcome.FAULT)
+    assert not rig.world.enabled
+
+
+def test_the_state_tells_joints_contacts_and_the_latch(rig: Rig) -> None:
+    rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) - 0.001
+    rig.latched[0] = True
+    state = rig.controller.state()
+    assert np.array_equal(state.position_rad, HOME)
+    assert state.contacts == (True, False) and state.is_stopped and not state.is_moving
+    assert np.linalg.norm(state.wrench[:3]) == pytest.approx(5.0, rel=1e-6)
+
+
+def test_the_state_tells_that_a_device_fell_silent_between_motions(rig: Rig) -> None:
+    assert rig.controller.state().faults == ()
+    rig.world.silent.add("wrist_ft")
+    assert rig.controller.state().faults == ("wrist_ft silent",)
+    rig.world.silent.clear()
+    assert rig.controller.state().faults == ()
+
+
+def test_a_closed_controller_refuses_and_closes_twice() -> None:
+    rig = make_rig()
+    rig.controller.close()
+    rig.controller.close()
+    with pytest.raises(MotionRefused):
+        rig.controller.execute(Hold(name="late", duration_s=0.1))

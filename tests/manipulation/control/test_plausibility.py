@@ -1,0 +1,194 @@
+"""Fingers and pads that answer, and answer what cannot be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hal.motion import GripperMotion, Hold, MotionOutcome, RobotState
+from manipulation.control.plausibility import (
+    FELT_N,
+    FREE_WAY_M,
+    NEAR_TIPS_M,
+    QUIET_S,
+    UNFELT_S,
+    DoubtedTouch,
+    check_width,
+)
+from manipulation.control.sensing import DeviceFailure, Sample
+from tests.manipulation.rig import FakeForceTorque, FakeTouch, Rig, World, make_rig
+
+DT_S = 0.002
+HOLD = Hold(name="hold", duration_s=1.0)
+
+
+def sample(
+    *,
+    stamp_s: float = 0.0,
+    width_m: float = 0.0,
+    moving: bool = False,
+    holding: bool = False,
+    contacts: tuple[bool, ...] = (False, False),
+) -> Sample:
+    return Sample(
+        stamp_s=stamp_s, position_rad=np.zeros(6), velocity_rad_per_s=np.zeros(6), raw_wrench=np.zeros(6),
+        contacts=contacts, proximity_m=(), gripper_width_m=width_m, gripper_is_moving=moving,
+        gripper_is_holding=holding,
+    )  # fmt: skip
+
+
+# -- the gripper ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("begun_m", "sent_m", "said_m", "holding", "moving"),
+    [
+        (0.0, 0.034, 0.034, False, False),
+        (0.0, 0.034, 0.0315, False, False),  # as coarse as grippers are
+        (0.034, 0.0, 0.014, True, False),  # an object between the pads
+        (0.014, 0.0, 0.014, True, False),  # held already, and held more firmly
+        (0.034, 0.0, 0.020, False, True),  # slow pads on their way when the time was over
+        (0.014, 0.034, 0.030, True, False),  # open until something stopped them
+    ],
+)
+def test_what_a_healthy_gripper_says_is_believed(
+    begun_m: float, sent_m: float, said_m: float, holding: bool, moving: bool
+) -> None:
+    check_width("pads", sent_m, begun_m, sample(width_m=said_m, holding=holding, moving=moving))
+
+
+@pytest.mark.parametrize(
+    ("begun_m", "sent_m", "said_m", "holding", "moving"),
+    [
+        (0.0, 0.034, 0.0, False, False),  # frozen closed
+        (0.034, 0.0, 0.034, False, False),  # frozen open, and nothing is held
+        (0.014, 0.034, 0.014, True, False),  # frozen while it held
+        (0.0, 0.034, 0.0, False, True),  # frozen while it moved
+        (0.044, 0.034, 0.044, False, False),  # 10 mm too much, always
+        (0.044, 0.0, 0.010, False, False),
+        (0.024, 0.0, -0.010, False, False),
+    ],
+)
+def test_a_width_that_contradicts_its_command_names_the_gripper(
+    begun_m: float, sent_m: float, said_m: float, holding: bool, moving: bool
+) -> None:
+    with pytest.raises(DeviceFailure, match=f"^pads was sent to {1e3 * sent_m:.1f} mm") as caught:
+        check_width("pads", sent_m, begun_m, sample(width_m=said_m, holding=holding, moving=moving))
+    assert caught.value.device == "pads" and "switch the gripper off and on" in caught.value.cause
+
+
+@pytest.fixture
+def rig() -> Rig:
+    made = make_rig()
+    yield made  # type: ignore[misc]  # a generator fixture
+    made.controller.close()
+
+
+def opening(*, must_arrive: bool = True) -> GripperMotion:
+    return GripperMotion(name="open", width_m=0.07, force_n=10.0, must_arrive=must_arrive)
+
+
+def test_pads_that_say_they_did_not_move_end_the_motion_and_the_way_out_goes_on(rig: Rig) -> None:
+    assert rig.controller.execute(opening()).outcome is MotionOutcome.COMPLETED
+
+    def jam() -> None:
+        rig.world.width_m = rig.world.width_target_m = 0.02
+
+    rig.world.before_step = jam
+    report = rig.controller.execute(opening())
+    assert (report.outcome, report.device) == (MotionOutcome.FAULT, "gripper")
+    assert "says 20.0 mm" in report.cause
+    assert rig.controller.execute(opening(must_arrive=False)).outcome is MotionOutcome.COMPLETED
+    state: RobotState = rig.controller.state()
+    assert not state.is_stopped
+
+
+# -- the fingers ---------------------------------------------------------------------------------------------------
+
+
+class Hand:
+    """A hand whose fingers and wrist say what they are told to, tick by tick."""
+
+    def __init__(self, *, threshold_n: float = 0.5) -> None:
+        world = World()
+        self.watch = DoubtedTouch(FakeTouch("finger_touch", world), FakeForceTorque("wrist_ft", world))
+        self.now_s = 0.0
+        self.tip_m = np.zeros(3)
+        self.watch.begin(HOLD)
+
+    def opens(self) -> Hand:
+        self.watch.begin(opening())
+        self.watch.pads_moved(0.0, sample(width_m=0.034))
+        self.watch.begin(HOLD)
+        return self
+
+    def closes(self) -> Hand:
+        self.watch.begin(GripperMotion(name="close", width_m=0.0, force_n=10.0))
+        self.watch.pads_moved(0.034, sample(width_m=0.014, holding=True))
+        self.watch.begin(HOLD)
+        return self
+
+    def feels(
+        self, force_n: float, *, lasting_s: float, fingers: bool, lever_m: float = 0.0, way_m: float = 0.0
+    ) -> None:
+        ticks = round(lasting_s / DT_S)
+        for _ in range(ticks + 1):
+            wrench = np.array([0.0, 0.0, -force_n, force_n * lever_m, 0.0, 0.0])
+            self.watch.check(sample(stamp_s=self.now_s, contacts=(fingers, False)), wrench, self.tip_m)
+            self.now_s += DT_S
+            self.tip_m = self.tip_m + np.array([way_m / ticks, 0.0, 0.0])
+
+
+def test_a_push_on_the_tips_that_the_fingers_do_not_feel_names_them() -> None:
+    with pytest.raises(DeviceFailure, match="finger_touch feels nothing while 9 N push on the tips") as caught:
+        Hand().feels(9.0, lasting_s=UNFELT_S + DT_S, fingers=False)
+    assert caught.value.device == "finger_touch" and "by hand" in caught.value.cause
+
+
+def test_what_was_told_is_told_again_only_when_the_hand_had_time_to_leave() -> None:
+    """It was told in every motion, so that the arm stayed where it pushed on a button with 14 N."""
+    hand = Hand()
+    with pytest.raises(DeviceFailure):
+        hand.feels(14.0, lasting_s=1.0, fingers=False)
+    hand.feels(14.0, lasting_s=0.95 * QUIET_S, fingers=False)
+    with pytest.raises(DeviceFailure):
+        hand.feels(14.0, lasting_s=0.1 * QUIET_S, fingers=False)
+
+
+def test_short_touches_add_up_until_one_is_felt() -> None:
+    hand = Hand()
+    for _ in range(4):
+        hand.feels(12.0, lasting_s=0.4 * UNFELT_S, fingers=False)
+        hand.feels(12.0, lasting_s=DT_S, fingers=True)
+    hand.feels(12.0, lasting_s=0.6 * UNFELT_S, fingers=False)
+    with pytest.raises(DeviceFailure):
+        hand.feels(12.0, lasting_s=0.6 * UNFELT_S, fingers=False)
+
+
+@pytest.mark.parametrize(
+    ("force_n", "lever_m"), [(0.9 * FELT_N, 0.0), (40.0, 1.1 * NEAR_TIPS_M)], ids=["weak", "on the hand's body"]
+)
+def test_what_need_not_reach_the_fingers_is_no_contradiction(force_n: float, lever_m: float) -> None:
+    Hand().feels(force_n, lasting_s=1.0, fingers=False, lever_m=lever_m)
+
+
+def test_a_finger_that_says_contact_all_along_a_free_way_names_itself() -> None:
+    with pytest.raises(DeviceFailure, match="says contact while the open hand goes 150 mm"):
+        Hand().opens().feels(1.0, lasting_s=1.0, fingers=True, way_m=1.1 * FREE_WAY_M)
+
+
+def test_a_hand_that_carries_or_rubs_or_has_just_let_go_may_say_contact() -> None:
+    Hand().closes().feels(1.0, lasting_s=1.0, fingers=True, way_m=1.0)
+    Hand().feels(1.0, lasting_s=1.0, fingers=True, way_m=1.0)  # nobody knows what it holds
+    Hand().opens().feels(6.0, lasting_s=1.0, fingers=True, way_m=1.0)
+    hand = Hand().opens()
+    for _ in range(5):
+        hand.feels(1.0, lasting_s=0.2, fingers=True, way_m=0.9 * FREE_WAY_M)
+        hand.feels(1.0, lasting_s=0.2, fingers=False, way_m=0.9 * FREE_WAY_M)
+
+
+def test_fingers_are_believed_where_no_wrist_feels() -> None:
+    world = World()
+    for watch in (DoubtedTouch(FakeTouch("finger_touch", world), None), DoubtedTouch(None, None)):
+        for tick in range(1000):
+            watch.check(sample(stamp_s=tick * DT_S), np.array([0.0, 0.0, -50.0, 0.0, 0.0, 0.0]), np.zeros(3))

@@ -1,0 +1,238 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from hal.clock import Clock, Deadline, PacedClock, SimClock, WallClock
+from hal.devices import ForceTorqueCapabilities, JointState, Wrench
+from hal.errors import DeviceTimeout, StaleReading
+from hal.readings import Quality, Stamped
+from manipulation.control.plausibility import FrozenWrench
+from manipulation.control.sensing import (
+    STALE_STEP_S,
+    STALE_WAIT_S,
+    ContactWrench,
+    DeviceFailure,
+    Devices,
+    RangeReader,
+    Sample,
+    read_wait_s,
+)
+from tests.manipulation.rig import (
+    LOAD,
+    SENSOR,
+    FakeArm,
+    FakeForceTorque,
+    FakeGripper,
+    FakeProximity,
+    FakeTouch,
+    World,
+)
+
+PATIENCE_S = 0.3
+
+
+def reader(world: World) -> RangeReader:
+    return RangeReader(FakeProximity("near", world), world.clock, max_age_s=0.1, patience_s=PATIENCE_S)
+
+
+def world_with_wall() -> World:
+    world = World(clock=SimClock())
+    world.wall_x_m = float(world.tip()[0, 3]) + 0.05
+    return world
+
+
+def test_a_missed_beat_is_bridged_and_silence_is_not() -> None:
+    world = world_with_wall()
+    sensor = reader(world)
+    assert sensor.read(0.0) == pytest.approx(0.05)
+    world.silent.add("near")
+    assert sensor.read(0.9 * PATIENCE_S) == pytest.approx(0.05)
+    with pytest.raises(DeviceTimeout, match="near"):
+        sensor.read(1.1 * PATIENCE_S)
+
+
+def test_a_sensor_that_never_spoke_is_not_waited_for() -> None:
+    world = world_with_wall()
+    world.silent.add("near")
+    with pytest.raises(DeviceTimeout):
+        reader(world).read(0.0)
+
+
+def test_an_old_stamp_counts_as_silence() -> None:
+    world = world_with_wall()
+    sensor = reader(world)
+    sensor.read(0.0)
+    world.frozen.add("near")
+    assert sensor.read(0.2) == pytest.approx(0.05)
+    with pytest.raises(StaleReading):
+        sensor.read(0.31)
+
+
+def test_a_tick_waits_long_for_a_device_only_where_the_world_waits_too() -> None:
+    picture_s, watchdog_s = 0.15, 0.1
+    assert read_wait_s(PacedClock()) > picture_s
+    assert read_wait_s(WallClock()) < watchdog_s
+
+
+class Wall(WallClock):
+    """A wall whose time is a number."""
+
+    time_s = 100.0
+
+    def now_s(self) -> float:
+        return self.time_s
+
+    def sleep(self, duration_s: float) -> None:
+        self.time_s += duration_s
+
+
+class LateArm(FakeArm):
+    """What it says is old until a moment."""
+
+    def __init__(self, clock: Clock, *, fresh_at_s: float, quality: Quality = Quality.VALID) -> None:
+        super().__init__("arm", World())
+        self.clock, self.fresh_at_s, self.quality, self.asked = clock, fresh_at_s, quality, 0
+
+    def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
+        self.asked += 1
+        now_s = self.clock.now_s()
+        said = JointState(position_rad=np.zeros(6), velocity_rad_per_s=np.zeros(6))
+        taken_s = now_s if now_s >= self.fresh_at_s else now_s - 0.15
+        return Stamped(value=said, host_time_s=taken_s, sequence=1, quality=self.quality)
+
+
+def devices_with(arm: FakeArm, clock: Clock) -> Devices:
+    return Devices(
+        arm=arm, gripper=FakeGripper("gripper", World()), force_torque=None, touch=None, proximities=(), clock=clock,
+        max_age_s=0.1,
+    )  # fmt: skip
+
+
+def test_an_old_reading_of_the_arm_is_waited_out_on_a_wall() -> None:
+    """One reading of 0.1 s on a busy machine latched the stop."""
+    clock = Wall()
+    arm = LateArm(clock, fresh_at_s=100.0 + 0.5 * STALE_WAIT_S)
+    with pytest.raises(DeviceFailure, match=r"^gripper"):  # the arm has answered; the gripper's world has another clock
+        devices_with(arm, clock).read()
+    assert clock.time_s == pytest.approx(arm.fresh_at_s, abs=2 * STALE_STEP_S)
+
+
+def test_an_arm_that_stays_old_fails_after_a_bounded_wait() -> None:
+    clock = Wall()
+    with pytest.raises(DeviceFailure, match=r"arm reading is 0\.150 s old"):
+        devices_with(LateArm(clock, fresh_at_s=math.inf), clock).read()
+    assert clock.time_s == pytest.approx(100.0 + STALE_WAIT_S, abs=2 * STALE_STEP_S)
+
+
+def test_an_arm_in_lockstep_or_one_that_says_it_is_invalid_is_not_waited_for() -> None:
+    lockstep, wall = SimClock(), Wall()
+    for clock, quality in ((lockstep, Quality.VALID), (wall, Quality.INVALID)):
+        arm = LateArm(clock, fresh_at_s=math.inf, quality=quality)
+        with pytest.raises(DeviceFailure):
+            devices_with(arm, clock).read()
+        assert arm.asked == 1
+
+
+class LostArm(FakeArm):
+    def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
+        return self.stamped(JointState(position_rad=np.full(6, np.nan), velocity_rad_per_s=np.zeros(6)))
+
+
+class BrokenForceTorque(FakeForceTorque):
+    def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:
+        return self.stamped(Wrench(force_n=np.zeros(3), torque_nm=np.array([0.0, np.inf, 0.0])))
+
+
+@pytest.mark.parametrize(
+    ("arm", "force_torque", "blamed"), [(LostArm, FakeForceTorque, "arm"), (FakeArm, BrokenForceTorque, "wrist_ft")]
+)
+def test_a_number_that_is_none_is_blamed_on_the_device_that_gave_it(
+    arm: type[FakeArm], force_torque: type[FakeForceTorque], blamed: str
+) -> None:
+    world = world_with_wall()
+    devices = Devices(
+        arm=arm("arm", world),
+        gripper=FakeGripper("gripper", world),
+        force_torque=force_torque("wrist_ft", world),
+        touch=FakeTouch("finger_touch", world),
+        proximities=(reader(world),),
+        clock=world.clock,
+        max_age_s=0.1,
+    )
+    with pytest.raises(DeviceFailure, match=f"{blamed}: a reading is not finite"):
+        devices.read()
+
+
+def test_nothing_in_range_is_an_answer() -> None:
+    world = world_with_wall()
+    world.wall_x_m = math.inf
+    assert math.isnan(reader(world).read(0.0))
+
+
+@given(turn=st.lists(st.floats(-3, 3), min_size=3, max_size=3))
+@settings(max_examples=40, deadline=None)
+def test_at_rest_in_any_posture_weight_and_bias_leave_no_contact(turn: list[float]) -> None:
+    flange = RigidTransform.from_components([0.1, 0.2, 0.3], Rotation.from_rotvec(turn))
+    sensor = flange * SENSOR
+    gravity = sensor.rotation.inv().apply([0.0, 0.0, -9.80665 * LOAD.mass_kg])
+    raw = np.concatenate([gravity, np.cross(LOAD.centre_of_mass_m, gravity)]) + np.asarray(LOAD.bias)
+    found = ContactWrench(LOAD, SENSOR).in_flange(raw, np.ascontiguousarray(flange.as_matrix()))
+    assert np.abs(found).max() < 1e-9
+
+
+def wrench_sample(stamp_s: float, force_n: float) -> Sample:
+    raw = np.array([force_n, 0.0, 0.0, 0.0, 0.0, 0.0])
+    return Sample(
+        stamp_s=stamp_s, position_rad=np.zeros(6), velocity_rad_per_s=np.zeros(6), raw_wrench=raw, contacts=(),
+        proximity_m=(), gripper_width_m=0.0, gripper_is_moving=False,
+    )  # fmt: skip
+
+
+class Wrist(FakeForceTorque):
+    """Of any noise and rate."""
+
+    def __init__(self, *, force_sigma_n: float = 0.3, rate_hz: float = 500.0) -> None:
+        super().__init__("wrist_ft", World())
+        self.stated = replace(super().capabilities(), force_sigma_n=force_sigma_n, rate_hz=rate_hz)
+
+    def capabilities(self) -> ForceTorqueCapabilities:
+        return self.stated
+
+
+def repeats_for_s(sensor: Wrist | None, *, every_s: float = 0.002, lasting_s: float = 2.0) -> float | None:
+    """How long one reading may repeat until it is a failure; None for ever."""
+    watch = FrozenWrench(sensor)
+    for tick in range(round(lasting_s / every_s)):
+        try:
+            watch.check(wrench_sample(tick * every_s, 1.0))
+        except DeviceFailure as failure:
+            assert failure.device == "wrist_ft" and "same reading under new stamps" in failure.cause
+            return tick * every_s
+    return None
+
+
+def test_a_wrench_that_repeats_under_new_stamps_is_a_failure_before_a_touch_grows_strong() -> None:
+    assert repeats_for_s(Wrist()) == pytest.approx(0.1, abs=0.003)
+
+
+def test_a_slow_sensor_repeats_itself_between_its_samples_and_few_ticks_prove_nothing() -> None:
+    assert repeats_for_s(Wrist(rate_hz=10.0)) == pytest.approx(0.4, abs=0.003)
+    assert repeats_for_s(Wrist(), every_s=0.05) == pytest.approx(0.5, abs=0.051)
+
+
+def test_a_sensor_without_noise_may_repeat_itself_and_so_may_none() -> None:
+    assert repeats_for_s(Wrist(force_sigma_n=0.0)) is None
+    assert repeats_for_s(None) is None
+
+
+def test_any_other_reading_begins_anew() -> None:
+    watch = FrozenWrench(Wrist())
+    for tick in range(500):
+        watch.check(wrench_sample(0.002 * tick, float(tick // 45)))

@@ -1,0 +1,203 @@
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from hal.errors import Unreachable
+from hal.geometry import identity, transform_rpy
+from hal.panel import Lever, Panel, Slider
+from hal.strict import validate
+from manipulation.arm.kinematics import Kinematics
+from manipulation.planning import clearance
+from manipulation.planning.collision import RECHECK_RAD, CollisionModel, placed
+from manipulation.planning.shapes import Capsule, CollisionBox, envelope, floor_box, panel_boxes
+from manipulation.planning.time_parameterization import SpeedLimits
+from manipulation.planning.transfer import TransferPlanner, round_corners
+from tests.manipulation.arms import T3
+
+points = st.lists(st.floats(-1, 1), min_size=3, max_size=3).map(np.array)
+TOOL = (Capsule(name="hand", start_m=(0.0, 0.0, 0.03), end_m=(0.0, 0.0, 0.12), radius_m=0.04),)
+KINEMATICS = Kinematics.of(T3)
+
+
+@given(a=points, b=points, turn=points, middle=points)
+@settings(max_examples=60, deadline=None)
+def test_segment_to_box_is_the_least_over_many_points(
+    a: np.ndarray, b: np.ndarray, turn: np.ndarray, middle: np.ndarray
+) -> None:
+    rotation, half = Rotation.from_rotvec(turn).as_matrix(), np.array([0.1, 0.3, 0.2])
+    found = clearance.segment_box(a, b, rotation, middle, half)
+    along = np.linspace(0, 1, 4001)[:, None]
+    local = (a + along * (b - a) - middle) @ rotation
+    outside = np.abs(local) - half
+    gaps = np.linalg.norm(np.maximum(outside, 0), axis=1) + np.minimum(outside.max(axis=1), 0)
+    assert found == pytest.approx(gaps.min(), abs=1.5e-3)
+
+
+@given(a=points, b=points, c=points, d=points)
+@settings(max_examples=60, deadline=None)
+def test_segment_to_segment_is_the_least_over_a_grid(
+    a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray
+) -> None:
+    u = np.linspace(0, 1, 301)
+    first, second = a + u[:, None] * (b - a), c + u[:, None] * (d - c)
+    least = np.linalg.norm(first[:, None] - second[None], axis=-1).min()
+    found = clearance.segment_segment(a, b, c, d)
+    assert found <= least + 1e-7
+    assert found == pytest.approx(least, abs=1.2e-2)
+
+
+def test_a_box_in_the_forearm_is_found_and_named() -> None:
+    q = np.array([0.0, 0.3, 0.3, 0.0, 0.5, 0.0])
+    tip = KINEMATICS.flange(q).translation
+    box = CollisionBox(name="post", parent_from_box=transform_rpy(tip, (0, 0, 0)), half_m=(0.02, 0.02, 0.02))
+    model = CollisionModel.build(KINEMATICS, TOOL, [box])
+    assert not model.is_clear(q, margin_m=0.0)
+    assert "post" in model.nearest(q)
+    assert model.with_boxes([box], ignored=[("", "post")]).is_clear(q, margin_m=0.0)
+
+
+def test_an_ordinary_pose_does_not_touch_itself_and_a_folded_one_does() -> None:
+    model = CollisionModel.build(KINEMATICS, TOOL)
+    assert model.is_clear(np.array([0.0, 0.2, 0.5, 0.0, 0.9, 0.0]), margin_m=0.01)
+    # Forearm folded back along the upper arm and the wrist bent towards it.
+    folded = [np.array([0.0, 0.0, 1.6, 0.0, wrist, 0.0]) for wrist in np.linspace(-2.8, 2.8, 15)]
+    assert min(model.clearance_m(q) for q in folded) < 0.0
+
+
+def _obstacle() -> tuple[np.ndarray, np.ndarray, CollisionBox]:
+    start = np.array([-0.7, 0.6, 0.2, 0.0, 0.6, 0.0])
+    goal = np.array([0.7, 0.6, 0.2, 0.0, 0.6, 0.0])
+    middle = KINEMATICS.flange(0.5 * (start + goal)).translation
+    wall = CollisionBox(name="divider", parent_from_box=transform_rpy(middle, (0, 0, 0)), half_m=(0.15, 0.02, 0.15))
+    return start, goal, wall
+
+
+def _planner(*boxes: CollisionBox, seed: int = 1) -> TransferPlanner:
+    return TransferPlanner(
+        model=CollisionModel.build(KINEMATICS, TOOL, boxes),
+        flange_from_tool=transform_rpy((0, 0, 0.15), (0, 0, 0)),
+        limits=SpeedLimits(tip_m_per_s=0.25),
+        seed=seed,
+    )
+
+
+def test_a_transfer_goes_round_a_divider_and_every_five_milliradians_are_free() -> None:
+    start, goal, wall = _obstacle()
+    planner = _planner(wall)
+    assert planner.model.free_fraction(start, goal, margin_m=0.0) < 1.0
+    motion = planner.plan(start, goal)
+    q = motion.positions_rad
+    assert np.allclose(q[0], start) and np.allclose(q[-1], goal)
+    for a, b in itertools.pairwise(q):
+        assert planner.model.free_fraction(a, b, margin_m=0.0, step_rad=RECHECK_RAD) == 1.0
+
+
+def test_the_same_seed_gives_the_same_path() -> None:
+    start, goal, wall = _obstacle()
+    first, second = (_planner(wall, seed=4).plan(start, goal) for _ in range(2))
+    assert np.array_equal(first.positions_rad, second.positions_rad)
+    assert np.array_equal(first.times_s, second.times_s)
+
+
+def test_a_goal_inside_an_obstacle_is_unreachable_and_named() -> None:
+    start, goal, _ = _obstacle()
+    box = CollisionBox(
+        name="cupboard",
+        parent_from_box=transform_rpy(KINEMATICS.flange(goal).translation, (0, 0, 0)),
+        half_m=(0.1, 0.1, 0.1),
+    )
+    with pytest.raises(Unreachable, match="cupboard"):
+        _planner(box).plan(start, goal)
+
+
+def test_a_transfer_keeps_to_joint_and_tip_limits() -> None:
+    start, goal, wall = _obstacle()
+    for boxes in ((), (wall,)):
+        motion = _planner(*boxes).plan(start, goal)
+        t = np.linspace(0, motion.times_s[-1], 4000)
+        from scipy.interpolate import CubicHermiteSpline
+
+        spline = CubicHermiteSpline(motion.times_s, motion.positions_rad, motion.velocities_rad_per_s)
+        v = spline(t, 1)
+        assert np.all(np.abs(v) <= 0.55 * KINEMATICS.velocity_rad_per_s)
+        tool = transform_rpy((0, 0, 0.15), (0, 0, 0))
+        tips = np.array([KINEMATICS.tool(q, tool).translation for q in spline(t)])
+        assert np.linalg.norm(np.diff(tips, axis=0), axis=1).max() / (t[1] - t[0]) < 0.27
+        assert np.all(v[0] == 0) and np.allclose(v[-1], 0, atol=1e-9)
+
+
+def test_rounded_corners_keep_the_ends_and_stay_near() -> None:
+    path = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    dense = round_corners(path, 0.2)
+    assert np.array_equal(dense[0], path[0]) and np.array_equal(dense[-1], path[-1])
+    assert np.linalg.norm(dense - path[1], axis=1).min() == pytest.approx(0.2 * np.sqrt(2) / 4, abs=0.02)
+
+
+def make_panel() -> Panel:
+    lights = [
+        {"name": f"l{k}", "position_m": [x, y, 0.0]}
+        for k, (x, y) in enumerate([(-0.2, 0.1), (0.2, 0.1), (0.2, -0.1), (-0.2, -0.1)])
+    ]
+    objects = [
+        {
+            "kind": "lever", "name": "valve", "position_m": [0.0, 0.0],
+            "states": [{"name": "open", "angle_rad": 0.0}, {"name": "closed", "angle_rad": 1.5708}],
+        },
+        {
+            "kind": "slider", "name": "fader", "position_m": [0.1, 0.0], "travel_m": 0.08, "angle_rad": 1.5708,
+            "scale": {"minimum": 0.0, "maximum": 1.0, "unit": "", "at_min": -0.04, "at_max": 0.04},
+        },
+    ]  # fmt: skip
+    data = {"schema": 1, "name": "p", "width_m": 0.5, "height_m": 0.3, "lights": lights, "objects": objects}
+    return validate(data, Panel, source="test")
+
+
+def test_the_envelope_of_a_lever_follows_its_angle() -> None:
+    panel = make_panel()
+    lever = panel.object("valve")
+    assert isinstance(lever, Lever)
+    sideways = envelope(lever, angle_rad=np.pi / 2)
+    # Clockwise from up by a quarter turn points to +x.
+    assert sideways.parent_from_box.translation[0] == pytest.approx(lever.length_m / 2)
+    assert sideways.parent_from_box.translation[1] == pytest.approx(0.0, abs=1e-9)
+    sweep = envelope(lever)
+    assert sweep.half_m[0] > lever.length_m
+
+
+def test_the_envelope_of_a_slider_covers_its_track() -> None:
+    slider = make_panel().object("fader")
+    assert isinstance(slider, Slider)
+    box = envelope(slider)
+    along = box.parent_from_box.rotation.apply([1, 0, 0])
+    assert abs(along @ [0, 1, 0]) == pytest.approx(1.0)
+    assert box.half_m[0] == pytest.approx((slider.travel_m + slider.cap_size_m[0]) / 2)
+
+
+def test_the_boxes_of_a_panel_move_with_it_and_the_plate_lies_behind_its_face() -> None:
+    boxes = {box.name: box for box in placed(panel_boxes(make_panel()), transform_rpy((1.0, 0.0, 0.5), (0, 0, 0)))}
+    assert set(boxes) == {"plate", "valve", "fader"}
+    plate = boxes["plate"]
+    assert plate.parent_from_box.translation[2] + plate.half_m[2] == pytest.approx(0.5)
+
+
+def test_no_hand_fits_round_the_edge_of_the_plate() -> None:
+    panel = make_panel()
+    plate = next(box for box in panel_boxes(panel) if box.name == "plate")
+    for side in (-1.0, 1.0):
+        for beside in ((side * (panel.width_m / 2 + 0.1), 0.0, -0.03), (0.0, side * (panel.height_m / 2 + 0.1), -0.03)):
+            local = plate.parent_from_box.inv().apply(np.array(beside))
+            assert (np.abs(local) < plate.half_m).all(), "a finger tip beside the plate and behind its face"
+
+
+def test_the_floor_stops_the_hand_but_not_the_foot() -> None:
+    model = CollisionModel.build(KINEMATICS, TOOL, [floor_box(0.0)])
+    assert model.is_clear(np.array([0.0, 0.2, 0.5, 0.0, 0.9, 0.0]), margin_m=0.01)
+    low = np.array([0.0, 1.4, 0.6, 0.0, 0.5, 0.0])
+    assert KINEMATICS.tool(low, identity()).translation[2] < 0.1
+    assert not model.is_clear(low, margin_m=0.0)

@@ -1,0 +1,256 @@
+"""What skills conclude from a motion: outcomes, contact points, and when they try again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from hal.errors import Cancelled, DeviceFault, InvalidRequest, Stopped
+from hal.geometry import certain, transform_rpy
+from hal.motion import DeclaredMotion, Hold, MotionLog, MotionOutcome, MotionReport, RobotState
+from manipulation.arm.kinematics import Kinematics
+from manipulation.planning.time_parameterization import SpeedLimits
+from manipulation.skills.attempt import Attempt
+from manipulation.skills.contact import onset
+from manipulation.skills.context import SkillContext
+from manipulation.skills.lever import lever
+from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, surely_within, wrapped
+from manipulation.skills.perform import perform
+from manipulation.skills.probe import contact_of
+from manipulation.skills.slider import slider
+from tests.manipulation.arms import T3
+from tests.manipulation.planning.test_collision import make_panel
+from tests.manipulation.rig import HOME
+
+GRIP = transform_rpy((0.0, 0.0, 0.21), (0.0, 0.0, 0.0))
+AT_HOME = Kinematics.of(T3).tool(HOME, GRIP)
+
+
+def report(
+    outcome: MotionOutcome, *, cause: str = "", tripped: str | None = None, device: str | None = None
+) -> MotionReport:
+    log = MotionLog(
+        times_s=np.empty(0), positions_rad=np.empty((0, 6)), wrench=np.empty((0, 6)), tip_m=np.empty((0, 3))
+    )
+    return MotionReport(
+        name="m", outcome=outcome, tripped=tripped, cause=cause, started_s=0.0, ended_s=0.1, position_rad=HOME,
+        base_from_tool=AT_HOME, wrench=np.zeros(6), peak_force_n=3.0, gripper_width_m=0.04, log=log, device=device,
+    )  # fmt: skip
+
+
+class ScriptedMover:
+    """Answers every motion with the same report and counts."""
+
+    def __init__(self, answer: MotionReport) -> None:
+        self.answer = answer
+        self.asked: list[str] = []
+
+    def execute(self, motion: DeclaredMotion) -> MotionReport:
+        self.asked.append(motion.name)
+        return self.answer
+
+    def cancel(self) -> None:
+        return None
+
+    def tare(self) -> np.ndarray:
+        return np.zeros(6)
+
+    def state(self) -> RobotState:
+        return RobotState(
+            stamp_s=0.0, position_rad=HOME, velocity_rad_per_s=np.zeros(6),
+            base_from_flange=Kinematics.of(T3).flange(HOME), wrench=np.zeros(6), contacts=(), proximity_m=(),
+            gripper_width_m=0.04, is_moving=False, is_stopped=False,
+        )  # fmt: skip
+
+
+def context(answer: MotionReport) -> SkillContext:
+    return SkillContext(
+        mover=ScriptedMover(answer),
+        kinematics=Kinematics.of(T3),
+        panel=make_panel(),
+        base_from_panel=certain(transform_rpy((0.75, 0.0, 0.6), (np.pi / 2, 0.0, -np.pi / 2))),
+        flange_from_grip=GRIP,
+        limits=SpeedLimits(tip_m_per_s=0.25),
+        park_rad=HOME,
+    )
+
+
+def deed(work: SkillContext, stroke, looks: list[ObjectState | None] | None):
+    answers = iter(looks or [])
+    return perform(
+        work,
+        stroke,
+        skill="s",
+        object_name="o",
+        target="on",
+        is_reached=lambda seen: seen.state == "on",
+        verify=None if looks is None else lambda: next(answers),
+    )
+
+
+ON, OFF = ObjectState(name="o", state="on"), ObjectState(name="o", state="off")
+COMPLETED = report(MotionOutcome.COMPLETED)
+
+
+def test_nothing_is_done_without_a_look() -> None:
+    result = deed(context(COMPLETED), lambda attempt: 1.0, None)
+    assert result.outcome is Outcome.UNVERIFIED and not result.is_done and result.attempts == 1
+
+
+def test_a_look_that_cannot_tell_leaves_it_unverified() -> None:
+    assert deed(context(COMPLETED), lambda attempt: 1.0, [None]).outcome is Outcome.UNVERIFIED
+
+
+def test_a_look_that_confirms_makes_it_done() -> None:
+    result = deed(context(COMPLETED), lambda attempt: 1.0, [ON])
+    assert result.is_done and result.reached == 1.0 and result.seen == ON
+
+
+def test_a_look_that_denies_leads_to_another_try_and_at_most_three() -> None:
+    assert deed(context(COMPLETED), lambda attempt: 1.0, [OFF, ON]).attempts == 2
+    failed = deed(context(COMPLETED), lambda attempt: 1.0, [OFF, OFF, OFF])
+    assert failed.outcome is Outcome.SLIPPED and failed.attempts == 3
+
+
+def test_a_look_that_may_err_confirms_only_what_it_would_confirm_two_sigmas_off() -> None:
+    assert surely_within(71.2, 70.0, 2.0, sigma=0.3)
+    assert not surely_within(71.9, 70.0, 2.0, sigma=0.3)
+    assert surely_within(71.9, 70.0, 2.0, sigma=0.0)
+    assert not surely_within(None, 70.0, 2.0, sigma=0.0)
+
+
+@given(truth=st.floats(60.0, 80.0), error=st.floats(-2.0, 2.0), sigma=st.floats(0.0, 0.9))
+def test_nothing_outside_the_tolerance_is_confirmed_by_an_error_of_two_sigmas(
+    truth: float, error: float, sigma: float
+) -> None:
+    if surely_within(truth + error * sigma, 70.0, 2.0, sigma=sigma):
+        assert abs(truth - 70.0) <= 2.0 + 1e-9
+
+
+def test_a_second_press_never_undoes_the_first() -> None:
+    looks = iter([OFF, OFF, OFF])
+    result = perform(
+        context(COMPLETED), lambda attempt: 1.0, skill="s", object_name="o", target="on", repeats=False,
+        is_reached=lambda seen: seen.state == "on", verify=lambda: next(looks),
+    )  # fmt: skip
+    assert result.outcome is Outcome.SLIPPED and result.attempts == 1
+
+
+def test_a_failure_retreats_and_keeps_its_name_when_the_look_agrees() -> None:
+    work = context(COMPLETED)
+
+    def miss(attempt: Attempt) -> float:
+        raise SkillFailure(Outcome.MISSED, "not there")
+
+    result = deed(work, miss, [OFF, OFF, OFF])
+    assert result.outcome is Outcome.MISSED and result.attempts == 3
+    assert work.mover.asked.count("retreat") == 3
+
+
+def test_a_failed_stroke_that_did_the_deed_is_done() -> None:
+    def stall(attempt: Attempt) -> float:
+        raise SkillFailure(Outcome.STALLED, "stopped early", reached=0.5)
+
+    assert deed(context(COMPLETED), stall, [ON]).is_done
+
+
+def test_a_stiff_object_is_not_forced_again() -> None:
+    def stiff(attempt: Attempt) -> float:
+        raise SkillFailure(Outcome.STIFF, "would not move")
+
+    result = deed(context(COMPLETED), stiff, [OFF, OFF])
+    assert result.outcome is Outcome.STIFF and result.attempts == 1
+
+
+@pytest.mark.parametrize(
+    ("answer", "error"),
+    [
+        (report(MotionOutcome.STOPPED), Stopped),
+        (report(MotionOutcome.CANCELLED), Cancelled),
+        (report(MotionOutcome.FAULT, cause="wrist_ft silent", device="wrist_ft"), DeviceFault),
+        (report(MotionOutcome.FAULT, tripped="force_limit"), SkillFailure),
+    ],
+    ids=["stopped", "cancelled", "device", "force"],
+)
+def test_what_ends_a_motion_decides_what_is_raised(answer: MotionReport, error: type[Exception]) -> None:
+    with pytest.raises(error) as caught:
+        Attempt(context(answer)).run(Hold(name="h", duration_s=0.1))
+    if error is DeviceFault:
+        assert caught.value.details["device"] == "wrist_ft"
+    if error is SkillFailure:
+        assert caught.value.outcome is Outcome.FORCE_LIMIT
+
+
+def test_a_deed_without_knowledge_of_the_object_is_refused_before_anything_moves() -> None:
+    work = context(COMPLETED)
+    with pytest.raises(InvalidRequest, match="not known"):
+        lever(work, "valve", "closed")
+    with pytest.raises(InvalidRequest, match="not known"):
+        slider(work, "fader", 0.5)
+    with pytest.raises(InvalidRequest, match="no state"):
+        lever(work, "valve", "ajar")
+    with pytest.raises(InvalidRequest, match="off the scale"):
+        slider(work, "fader", 7.0)
+    with pytest.raises(InvalidRequest, match="not a lever"):
+        lever(work, "fader", "closed")
+    assert work.mover.asked == []
+
+
+@given(surface=st.floats(0.002, 0.01), stiffness=st.floats(2000.0, 40000.0), seed=st.integers(0, 2**31))
+@settings(max_examples=50, deadline=None)
+def test_the_onset_of_a_contact_is_found_behind_noise_and_give(surface: float, stiffness: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    depth = np.arange(0.0, surface + 6.0 / stiffness, 0.0001)
+    force = np.maximum(0.0, stiffness * (depth - surface)) + rng.normal(0.0, 0.1, len(depth))
+    found, _ = onset(depth, force, float(depth[-1]))
+    assert found == pytest.approx(surface, abs=0.00025)
+
+
+def test_inertia_at_the_start_is_not_taken_for_a_surface() -> None:
+    depth = np.linspace(0.0, 0.01, 101)
+    force = np.where(depth < 0.0005, 2.0, 0.0) + 5000.0 * np.maximum(0.0, depth - 0.009)
+    assert onset(depth, force, 0.01)[0] == pytest.approx(0.009, abs=1e-4)
+
+
+def test_an_onset_lies_between_the_start_of_the_move_and_the_first_force() -> None:
+    depth = np.linspace(0.005, 0.01, 51)
+    force = 2.0 + 100.0 * (depth - 0.005)  # so soft that its line meets zero before the move began
+    assert onset(depth, force, 0.01)[0] == 0.005
+
+
+def test_no_force_at_all_answers_with_the_deepest_place() -> None:
+    assert onset(np.linspace(0, 0.01, 50), np.zeros(50), 0.01) == (0.01, 0.0)
+
+
+def test_a_touch_point_is_known_along_the_fingers_and_spread_across_them() -> None:
+    axis = AT_HOME.rotation.apply([0.0, 0.0, 1.0])
+    depth = np.linspace(-0.01, 0.001, 111)
+    force = 5000.0 * np.maximum(0.0, depth)
+    wrench = np.zeros((111, 6))
+    wrench[:, 2] = -force
+    log = MotionLog(
+        times_s=np.arange(111) * 0.008,
+        positions_rad=np.zeros((111, 6)),
+        wrench=wrench,
+        tip_m=AT_HOME.translation + (depth[:, None] - 0.001) * axis,
+    )
+    point = contact_of(replace(COMPLETED, log=log), finger_half_m=(0.007, 0.006))
+    surface = AT_HOME.translation - 0.001 * axis
+    assert np.linalg.norm(point.point_m - surface) < 1e-4
+    assert point.normal @ axis == pytest.approx(-1.0)
+    along = axis @ point.covariance @ axis
+    across = AT_HOME.rotation.apply([1.0, 0.0, 0.0])
+    assert np.sqrt(along) < 0.0005 < np.sqrt(across @ point.covariance @ across)
+
+
+@given(angle=st.floats(-20.0, 20.0))
+@example(angle=-np.pi)
+@example(angle=np.pi)
+def test_a_wrapped_angle_is_the_same_direction(angle: float) -> None:
+    assert -np.pi < wrapped(angle) <= np.pi + 1e-12
+    assert np.cos(wrapped(angle)) == pytest.approx(np.cos(angle), abs=1e-9)
+    assert np.sin(wrapped(angle)) == pytest.approx(np.sin(angle), abs=1e-9)

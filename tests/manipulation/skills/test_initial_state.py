@@ -1,0 +1,51 @@
+"""Where a skill's object stands, by what was seen of it."""
+
+from __future__ import annotations
+
+import pytest
+
+from hal.errors import InvalidRequest
+from manipulation.skills.initial_state import InitialState
+from manipulation.skills.outcome import ObjectState
+
+
+def at(value: float | None) -> ObjectState:
+    return ObjectState(name="fader", value=value)
+
+
+def value_of(seen: ObjectState) -> float | None:
+    return seen.value
+
+
+def test_without_any_look_the_place_is_not_known_and_the_message_says_of_what() -> None:
+    where = InitialState(value_of, what="the value of fader", current=None, verify=None)
+    assert where.verify is None
+    with pytest.raises(InvalidRequest, match="the value of fader is not known"):
+        _ = where.known
+
+
+def test_the_current_state_saves_a_look() -> None:
+    asked: list[ObjectState] = []
+
+    def verify() -> ObjectState:
+        asked.append(at(5.0))
+        return asked[-1]
+
+    assert InitialState(value_of, what="it", current=at(2.0), verify=verify).known == 2.0
+    assert asked == []
+    assert InitialState(value_of, what="it", current=None, verify=verify).known == 5.0
+    assert len(asked) == 1
+
+
+def test_a_look_corrects_what_the_tool_measured_and_one_that_tells_nothing_does_not() -> None:
+    looks = iter([at(3.0), None, at(None), at(4.0)])
+    where = InitialState(value_of, what="it", current=None, verify=lambda: next(looks))
+    verify = where.verify
+    assert verify is not None
+    assert where.moved_to(3.5) == where.known == 3.5
+    assert verify() is None
+    assert where.known == 3.5
+    assert verify() == at(None)
+    assert where.known == 3.5
+    assert verify() == at(4.0)
+    assert where.known == 4.0

@@ -1,0 +1,66 @@
+"""The last part of a lever's stroke: what is an end stop, and what was only a bar that stuck and slipped."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from hal.motion import Guard, MotionReport, Quantity
+from manipulation.skills.attempt import Attempt
+from manipulation.skills.lever import CAGE_SIDE_M, STOP_TRIES, _Arc, _to_the_stop
+
+SPAN_RAD = np.pi / 2
+AXIS = np.array([0.0, 0.0, -1.0])
+RADIUS_M = 0.1
+PUSH = np.array([25.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+LAG_DEG = float(np.degrees((CAGE_SIDE_M + 25.0 / 5000.0) / RADIUS_M))  # the tool is so far ahead of the bar
+START = RigidTransform.from_components([0.1, 0.0, 0.0], Rotation.identity())
+STRONG = Guard(name="effort", quantity=Quantity.FORCE, limit=60.0)
+
+
+class Turned:
+    """An attempt whose tool is carried to one angle after another; each carry ends by the guard named with it."""
+
+    def __init__(self, ends: list[tuple[float, str | None]]) -> None:
+        self.ends = ends
+        self.angles_rad = [np.radians(81.0)]
+        self.goals_rad: list[float] = []
+        self.context = SimpleNamespace(hand=SimpleNamespace(pad_stiffness_n_per_m=5000.0))
+
+    def pose(self) -> RigidTransform:
+        turn = Rotation.from_rotvec(self.angles_rad[-1] * AXIS)
+        return RigidTransform.from_components(turn.apply(START.translation), turn)
+
+    def along(self, poses: list[RigidTransform], **_: Any) -> MotionReport:
+        self.goals_rad.append(float((poses[-1].rotation * START.rotation.inv()).magnitude()))
+        degrees, tripped = self.ends[len(self.goals_rad) - 1]
+        self.angles_rad.append(np.radians(degrees))
+        return cast(MotionReport, SimpleNamespace(tripped=tripped, base_from_tool=self.pose(), wrench=PUSH))
+
+
+def carried(ends: list[tuple[float, str | None]]) -> tuple[Turned, float]:
+    attempt = Turned(ends)
+    way = _Arc(hub=np.zeros(3), axis=AXIS, radius_m=RADIUS_M, span_rad=SPAN_RAD, against=(1.0, 0.0, 0.0))
+    return attempt, _to_the_stop(cast(Attempt, attempt), way, START, STRONG)
+
+
+@pytest.mark.parametrize("end", [(91.0, "end stop"), (89.5, "end stop"), (102.0, None), (83.0, "effort")])
+def test_an_end_stop_a_free_way_and_too_much_effort_end_it_at_once(end: tuple[float, str | None]) -> None:
+    attempt, turned_rad = carried([end])
+    assert len(attempt.goals_rad) == 1
+    assert np.degrees(turned_rad) == pytest.approx(end[0] - LAG_DEG)
+
+
+def test_a_rise_long_before_the_state_is_passed_on_the_way_to_the_same_goal() -> None:
+    attempt, turned_rad = carried([(82.0, "end stop"), (88.5, "end stop"), (94.0, "end stop")])
+    assert np.degrees(turned_rad) == pytest.approx(94.0 - LAG_DEG)
+    assert attempt.goals_rad == pytest.approx([attempt.goals_rad[0]] * 3)
+
+
+def test_a_bar_that_is_stuck_is_not_pushed_for_ever() -> None:
+    attempt, _ = carried([(82.0, "end stop")] * 10)
+    assert len(attempt.goals_rad) == STOP_TRIES

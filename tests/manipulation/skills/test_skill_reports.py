@@ -1,0 +1,265 @@
+"""What a skill says of its motions: whole skills over a mover that answers each motion as it is told to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hal.errors import MotionError
+from hal.geometry import certain, transform_rpy
+from hal.motion import CartesianPath, DeclaredMotion, MotionLog, MotionOutcome, MotionReport, RobotState
+from hal.panel import load_panel
+from manipulation.arm.kinematics import Kinematics
+from manipulation.planning.hand import Hand
+from manipulation.planning.time_parameterization import SpeedLimits
+from manipulation.skills.attempt import Attempt
+from manipulation.skills.button import button
+from manipulation.skills.context import SkillContext
+from manipulation.skills.handwheel import GRIP_FLOOR_N, LARGEST_GRIP_N, grip_force_n
+from manipulation.skills.lever import lever
+from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport
+from manipulation.skills.press import stop_force_n, travelled_m
+from manipulation.skills.probe import proximity_probe
+from manipulation.skills.retreat import PULLS, park, retreat
+from manipulation.skills.rotary import rotary
+from manipulation.skills.toggle import toggle
+from tests.manipulation.arms import T3
+from tests.manipulation.rig import HOME
+from tests.manipulation.skills.test_contact import AT_HOME, COMPLETED, GRIP, ScriptedMover
+
+PANEL = load_panel(Path(__file__).parents[3] / "panels" / "bench.toml")
+PAD_N_PER_M = Hand().pad_stiffness_n_per_m
+DOWN = AT_HOME.rotation.apply([0.0, 0.0, 1.0])
+
+
+class NamedMover(ScriptedMover):
+    """Answers a motion by its name; what has no answer of its own is completed."""
+
+    def __init__(self, answers: dict[str, MotionReport]) -> None:
+        super().__init__(COMPLETED)
+        self.answers = answers
+        self.motions: list[DeclaredMotion] = []
+        self.distances_m: list[float] = []
+
+    def execute(self, motion: DeclaredMotion) -> MotionReport:
+        self.asked.append(motion.name)
+        self.motions.append(motion)
+        return self.answers.get(motion.name, COMPLETED)
+
+    def state(self) -> RobotState:
+        samples = self.asked.count("proximity sample")
+        return replace(super().state(), proximity_m=tuple(self.distances_m[samples - 1 : samples]))
+
+
+def before_the_bench(answers: dict[str, MotionReport]) -> tuple[SkillContext, NamedMover]:
+    mover = NamedMover(answers)
+    context = SkillContext(
+        mover=mover,
+        kinematics=Kinematics.of(T3),
+        panel=PANEL,
+        base_from_panel=certain(transform_rpy((0.75, 0.0, 0.6), (np.pi / 2, 0.0, -np.pi / 2))),
+        flange_from_grip=GRIP,
+        limits=SpeedLimits(tip_m_per_s=0.25),
+        park_rad=HOME,
+    )
+    return context, mover
+
+
+def pressed(free_m: float, travel_m: float, force_n: float, *, tripped: bool = True) -> MotionReport:
+    """A push down: free, then onto a cap that gives way by `travel_m` and pads that give way by the force."""
+    deepest = free_m + travel_m + force_n / PAD_N_PER_M
+    depth = np.linspace(0.0, deepest, 400)
+    wrench = np.zeros((400, 6))
+    wrench[:, 2] = -force_n * np.clip((depth - free_m) / (deepest - free_m), 0.0, 1.0)
+    log = MotionLog(
+        times_s=np.arange(400) * 0.002, positions_rad=np.zeros((400, 6)), wrench=wrench,
+        tip_m=AT_HOME.translation + depth[:, None] * DOWN,
+    )  # fmt: skip
+    outcome = MotionOutcome.GUARD if tripped else MotionOutcome.COMPLETED
+    return replace(COMPLETED, outcome=outcome, tripped="bottom" if tripped else None, log=log)
+
+
+def test_the_travel_of_a_cap_is_that_of_the_tip_under_force_less_what_the_pads_gave() -> None:
+    found = travelled_m(pressed(0.004, 0.003, 20.0), PAD_N_PER_M)
+    assert found == pytest.approx(0.003, abs=4e-4)  # it begins to count at one newton
+    assert travelled_m(pressed(0.004, 0.0, 0.5), PAD_N_PER_M) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("push", "outcome"),
+    [
+        (pressed(0.004, 0.004, 20.0), Outcome.UNVERIFIED),
+        (pressed(0.004, 0.0003, 20.0), Outcome.STALLED),
+        (pressed(0.02, 0.004, 5.0, tripped=False), Outcome.MISSED),
+    ],
+    ids=["down", "stuck", "not there"],
+)
+def test_a_button_says_how_its_press_ended(push: MotionReport, outcome: Outcome) -> None:
+    context, _ = before_the_bench({"press": push})
+    told = button(context, "start", expected="on")
+    assert told.outcome is outcome
+    assert told.reached == pytest.approx(travelled_m(push, PAD_N_PER_M))
+
+
+def test_a_button_whose_lamp_stays_dark_is_not_pressed_again() -> None:
+    context, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
+    told = button(context, "start", expected="on", verify=lambda: ObjectState(name="start", state="off"))
+    assert (told.outcome, mover.asked.count("press")) == (Outcome.SLIPPED, 1)
+
+
+@pytest.mark.parametrize(
+    ("looks", "presses", "tries"), [(("on",), 0, 1), (("off", "on"), 1, 2), (("off", "off"), 1, 2)]
+)
+def test_a_button_whose_lamp_is_as_wanted_is_left_alone_unless_the_look_says_otherwise(
+    looks: tuple[str, ...], presses: int, tries: int
+) -> None:
+    """A press would undo it: asked for `on`, a lamp that was lit went out."""
+    context, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
+    shown = iter(looks)
+    lit = ObjectState(name="run_lamp", state="on")
+    told = button(
+        context, "start", expected="on", current=lit, verify=lambda: ObjectState(name="run_lamp", state=next(shown))
+    )
+    assert (told.is_done, mover.asked.count("press"), told.attempts) == (looks[-1] == "on", presses, tries)
+
+
+@pytest.mark.parametrize(
+    ("before", "looks", "sweeps"),
+    [
+        ("on", ["on", "on"], 0),  # it is there: only looked at
+        ("on", ["off", "on"], 1),  # it was said to be, and is not
+        ("on", [None, "on"], 1),  # nobody can tell: a throw does no harm
+        ("on", ["on", "off", "on"], 1),  # the looks disagree
+        ("off", ["on"], 1),
+        (None, ["on"], 1),
+    ],
+)
+def test_a_toggle_that_stands_there_already_is_looked_at_and_thrown_only_when_in_doubt(
+    before: str | None, looks: list[str | None], sweeps: int
+) -> None:
+    context, mover = before_the_bench({})
+    shown = iter(looks)
+
+    def look() -> ObjectState | None:
+        state = next(shown)
+        return None if state is None else ObjectState(name="pump", state=state)
+
+    current = None if before is None else ObjectState(name="pump", state=before)
+    told = toggle(context, "pump", "on", current=current, verify=look)
+    assert next(shown, "no more") == "no more"
+    assert (told.is_done, mover.asked.count("to pump")) == (True, sweeps)
+
+
+def test_a_button_that_nothing_shows_is_pressed_and_not_confirmed() -> None:
+    panel_object = PANEL.object("start").model_copy(update={"lights_lamp": None})
+    context, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
+    context = replace(context, panel=PANEL.model_copy(update={"objects": (panel_object,)}))
+    told = button(context, "start", expected="pressed", verify=lambda: ObjectState(name="start", state="released"))
+    assert (told.outcome, mover.asked.count("press")) == (Outcome.UNVERIFIED, 1)
+    assert "springs back" in told.cause
+
+
+def test_a_look_that_cannot_tell_is_not_called_no_look() -> None:
+    context, _ = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
+    told = button(context, "start", expected="on", verify=lambda: None)
+    assert (told.outcome, told.cause) == (
+        Outcome.UNVERIFIED,
+        "the stroke ended as declared; the look afterwards could not tell",
+    )
+    assert button(context, "start", expected="on").cause.endswith("nobody looked")
+
+
+def test_a_press_that_may_have_counted_is_not_repeated_when_nobody_can_tell() -> None:
+    """A latching cap that gave way by little was pressed twice, which may have undone it."""
+    context, mover = before_the_bench({"press": pressed(0.004, 0.0003, 20.0)})
+    told = button(context, "hold", expected="pressed", verify=lambda: None)
+    assert (told.outcome, mover.asked.count("press")) == (Outcome.STALLED, 1)
+    assert "gave way by only" in told.cause and "undo" in told.cause
+
+
+@pytest.mark.parametrize(
+    ("width_m", "wanted_m", "moves"), [(0.0, 0.0, 0), (0.002, 0.0, 1), (0.0, 0.002, 1), (0.03, 0.03, 1)]
+)
+def test_closed_pads_that_shall_be_closed_are_left_alone(width_m: float, wanted_m: float, moves: int) -> None:
+    """Open ones are sent even where they are: they may press on something there."""
+    context, mover = before_the_bench({})
+    state = replace(mover.state(), gripper_width_m=width_m)
+    mover.state = lambda: state  # type: ignore[method-assign]  # one state for this test
+    Attempt(context).open_to(wanted_m)
+    assert mover.asked.count("set opening") == moves
+
+
+def test_a_press_is_guarded_by_more_than_the_springs_of_the_cap() -> None:
+    context, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
+    button(context, "start")
+    cap = PANEL.object("start")
+    (push,) = (m for m in mover.motions if m.name == "press")
+    assert push.guards[0].limit == stop_force_n(cap) > cap.preload_n + cap.spring_n_per_m * cap.travel_m
+
+
+@pytest.mark.parametrize(("distance_m", "against"), [(0.01, -1.0), (-0.01, 1.0)])
+def test_a_contact_is_looked_for_against_the_way(distance_m: float, against: float) -> None:
+    context, mover = before_the_bench({})
+    Attempt(context).advance(distance_m, name="advance")
+    (motion,) = mover.motions
+    assert isinstance(motion, CartesianPath) and motion.guards[0].axis == (0.0, 0.0, against)
+
+
+def test_a_hand_that_is_held_is_pulled_again() -> None:
+    held = replace(COMPLETED, outcome=MotionOutcome.GUARD, tripped="contact")
+    for answer, pulls in ((held, PULLS), (COMPLETED, 1)):
+        context, mover = before_the_bench({"retreat": answer})
+        retreat(context)
+        assert mover.asked.count("retreat") == pulls
+
+
+def test_what_holds_the_arm_up_on_its_way_to_park_is_an_error_of_the_motion_and_no_defect() -> None:
+    against = replace(COMPLETED, outcome=MotionOutcome.FAULT, cause="114 N against the arm")
+    context, mover = before_the_bench({"to park": against})
+    with pytest.raises(MotionError, match="to park: 114 N") as caught:
+        park(replace(context, park_rad=HOME + 0.05))
+    assert mover.asked[-1] == "to park" and "in the way" in caught.value.hint
+
+
+def test_a_wheel_that_slipped_is_held_more_firmly_up_to_what_a_hand_may() -> None:
+    wheel = next(panel_object for panel_object in PANEL.objects if panel_object.kind == "handwheel")
+    forces = [grip_force_n(wheel, tries=k) for k in range(20)]
+    assert forces == sorted(forces) and forces[0] < forces[3]
+    assert forces[0] >= GRIP_FLOOR_N and forces[-1] == LARGEST_GRIP_N
+
+
+def _turned(skill: Callable[..., SkillReport], name: str, target: str, now: ObjectState, seen: ObjectState) -> Outcome:
+    """The hand finds nothing between its fingers, so that the look alone decides."""
+    context, _ = before_the_bench({})
+    return skill(context, name, target, current=now, verify=lambda: seen).outcome
+
+
+@pytest.mark.parametrize(("off_deg", "outcome"), [(5.0, Outcome.DONE), (40.0, Outcome.MISSED)])
+@pytest.mark.parametrize(("skill", "name"), [(rotary, "mode"), (lever, "main_valve")])
+def test_an_angle_that_was_seen_is_a_state_only_near_it(
+    skill: Callable[..., SkillReport], name: str, off_deg: float, outcome: Outcome
+) -> None:
+    first, last = PANEL.object(name).states[0], PANEL.object(name).states[-1]
+    now = ObjectState(name=name, angle_rad=first.angle_rad)
+    seen = ObjectState(name=name, angle_rad=last.angle_rad - np.radians(off_deg))
+    assert _turned(skill, name, last.name, now, seen) is outcome
+
+
+@pytest.mark.parametrize("seen", [5, 10])
+def test_a_distance_is_the_middle_of_what_was_seen(seen: int) -> None:
+    context, mover = before_the_bench({})
+    mover.distances_m = [0.05 + 0.001 * (k % 3) for k in range(seen)] + [np.nan] * (10 - seen)
+    (point,) = proximity_probe(context, (0.0, 0.06, 0.0), flange_from_sensors=[GRIP], sigma_m=0.002)
+    assert (point.distance_m, point.samples) == (pytest.approx(0.051), seen)
+    assert point.sigma_m == pytest.approx(0.002 * max(1 / 3, seen**-0.5))
+
+
+def test_a_distance_that_few_samples_saw_is_none() -> None:
+    context, mover = before_the_bench({})
+    mover.distances_m = [0.05] * 4 + [np.nan] * 6
+    with pytest.raises(SkillFailure, match="no proximity sensor"):
+        proximity_probe(context, (0.0, 0.06, 0.0), flange_from_sensors=[GRIP])

@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.display_face import HIGH_PX, Face, face_gray, face_ink, random_face
 from benchmarks.display_photo import Gray, disturbed, surroundings, taken
 from hal.arrays import Array
-from perception.vision.view import homography
+from perception.vision.projection import homography
 
 LEVELS = ("easy", "medium", "hard")
 PHOTOGRAPHS = ("cropped", "scene", "low contrast")

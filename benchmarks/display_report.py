@@ -13,22 +13,22 @@ import numpy as np
 
 from benchmarks.display_drawing import LEVELS, PHOTOGRAPHS, DisplayCase, draw_photograph, draw_taught
 from hal.panel import Display
+from perception.vision.inspection import patch_of
 from perception.vision.photographs.photo_display import read_photograph
-from perception.vision.reading import Status
+from perception.vision.projection import PlateProjection, homography
+from perception.vision.reading import PatchReading
 from perception.vision.status.display import read_display
-from perception.vision.taught import patch_of
-from perception.vision.view import PlaneView, homography
 
 CASES = 40
 SURE = 0.8
 PASS = {"cropped": 0.70, "scene": 0.50, "low contrast": 0.30}
 
 
-def read_case(case: DisplayCase, *, known: bool) -> Status:
+def read_case(case: DisplayCase, *, known: bool) -> PatchReading:
     """The reading of a drawn display through a plane view that knows its place; `known`: digits and decimals are taught."""
     w, h = 0.02 * case.size[0], 0.02 * case.size[1]
     plate = np.array([[-w / 2, h / 2], [w / 2, h / 2], [w / 2, -h / 2], [-w / 2, -h / 2]])
-    view = PlaneView(px_from_plate=homography(plate, case.corners_px), corners_m=plate)
+    view = PlateProjection(px_from_plate=homography(plate, case.corners_px), corners_m=plate)
     spec = Display(
         name="d", position_m=(0.0, 0.0), width_m=w + 0.002, height_m=h + 0.002, digits=case.digits,
         decimals=case.decimals, style="lcd" if case.is_dark else "led", minimum=-1e9, maximum=1e9,
@@ -50,7 +50,7 @@ def display_lines(count: int = CASES) -> None:
         _line(f"photograph-like, {kind}", [(case.text, read(case.image)) for case in drawn], PASS[kind])
 
 
-def _line(what: str, answers: list[tuple[str, Status]], least: float | None = None) -> None:
+def _line(what: str, answers: list[tuple[str, PatchReading]], least: float | None = None) -> None:
     right = float(np.mean([status.text == text for text, status in answers]))
     bad = float(
         np.mean([status.answered and status.text != text and status.confidence > SURE for text, status in answers])

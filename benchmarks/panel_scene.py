@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.panel_paint import DARK, PX_PER_MM, Canvas, Truth, paint
-from hal.arrays import Array
-from perception.vision.image import Image
-from perception.vision.view import homography
+from hal.arrays import Array, Image
+from perception.vision.projection import homography
 
 LEVELS = ("easy", "medium", "hard")
 KINDS = ("gauge", "panel_meter", "display", "toggle", "rotary", "button", "lamp", "slider", "handwheel", "lever")

@@ -19,18 +19,19 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hal.arrays import Image
 from hal.errors import CellError
 from hal.panel import Lever, Panel, PanelObject
 from hal.strict import validate
 from perception.vision.finding.blind import recognise
-from perception.vision.image import Image, as_gray, decode
+from perception.vision.image import as_gray, decode
+from perception.vision.inspection import inspect_view
 from perception.vision.knowledge import Knowledge, shipped_knowledge
 from perception.vision.lights import assign_lights, find_lights
 from perception.vision.photographs.dial import read_dial
 from perception.vision.photographs.photo_display import read_photograph
-from perception.vision.reading import ANSWER_AT, ObjectReading, Status
-from perception.vision.taught import inspect_view
-from perception.vision.view import PlaneView
+from perception.vision.projection import PlateProjection
+from perception.vision.reading import ANSWER_AT, ObjectReading, PatchReading
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT.parent / "shared" / "data" / "vision"
@@ -66,12 +67,12 @@ def _by_meaning(panel_object: PanelObject) -> PanelObject:
     return panel_object.model_copy(update={"states": states})
 
 
-def view_of_job(job: Job) -> PlaneView:
+def view_of_job(job: Job) -> PlateProjection:
     """The job's homography guess over panel metres."""
     w, h = job["panel_mm"]
     mm_from_m = np.array([[1000.0, 0, w / 2], [0, -1000.0, h / 2], [0, 0, 1]])
     corners = np.array([[-w / 2, h / 2], [w / 2, h / 2], [w / 2, -h / 2], [-w / 2, -h / 2]]) / 1000
-    return PlaneView(px_from_plate=np.asarray(job["H_guess"], float) @ mm_from_m, corners_m=corners, sigma_px=2.0)
+    return PlateProjection(px_from_plate=np.asarray(job["H_guess"], float) @ mm_from_m, corners_m=corners, sigma_px=2.0)
 
 
 def _object(entry: Job, panel_mm: list[float]) -> dict[str, Any]:
@@ -219,7 +220,7 @@ def lights_answer(job: Job, folder: Path) -> dict[str, Any]:
     }
 
 
-def status_answer(status: Status, key: str) -> dict[str, Any]:
+def status_answer(status: PatchReading, key: str) -> dict[str, Any]:
     """Answer of a `dial` or `display` job."""
     value = status.value if key == "reading" else status.text
     out = {"confidence": status.confidence, "reason": status.reason}

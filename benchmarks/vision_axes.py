@@ -14,8 +14,8 @@ from hal.config import load_cell
 from hal.errors import CellError
 from hal.geometry import certain
 from hal.panel import Panel
-from perception.vision.taught import inspect
-from perception.vision.view import CameraView
+from perception.vision.inspection import inspect
+from perception.vision.projection import CameraProjection
 
 ROOT = Path(__file__).resolve().parent.parent
 SEEDS = range(3)
@@ -64,7 +64,7 @@ def _axis(
     tilt, azimuth = np.deg2rad(tilt_deg), np.deg2rad(azimuth_deg)
     placed = looking_at(distance_m=distance_m, tilt_rad=tilt, azimuth_rad=azimuth)
     pose = certain(RigidTransform.from_matrix(placed))
-    view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+    view = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
     right = refused = bad = total = 0
     answers: list[Answer] = []
     for seed in SEEDS:

@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hal.arrays import Array
-from perception.vision.image import Image
+from hal.arrays import Array, Image
 from perception.vision.photographs.dial import read_dial
 
 CANVAS_PX = 800

@@ -31,7 +31,7 @@ from hal.panel import (
     Slider,
     Toggle,
 )
-from perception.vision.view import View
+from perception.vision.projection import PanelProjection
 
 SUPERSAMPLING = 3
 WALL, PLATE, INK, FACE, KNOB, WHITE, STEEL = 40, 150, 35, 240, 45, 240, 205
@@ -58,7 +58,7 @@ class Brush:
     """Paints panel-frame shapes into an image through a view."""
 
     image: NDArray[np.float32]
-    view: View
+    view: PanelProjection
 
     def fill(self, points_m: ArrayLike, gray: float) -> None:
         """A filled polygon of (N, 3) panel points."""
@@ -102,7 +102,7 @@ class Disturbance:
 
 def draw_panel(
     panel: Panel,
-    view: View,
+    view: PanelProjection,
     shape: tuple[int, int],
     shown: Mapping[str, Shown],
     disturbance: Disturbance | None = None,

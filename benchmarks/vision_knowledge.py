@@ -23,14 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.panel_scene import AMOUNTS, GAMMA, pictured, seen
-from hal.arrays import Array
-from perception.vision.finding.blind import PLATE_M, Candidate, candidate_places, chosen, lay_out
+from hal.arrays import Array, Image
+from perception.vision.finding.blind import PLATE_M, Detection, candidate_places, chosen, lay_out
 from perception.vision.finding.features import PLATE_PX_PER_M, Ground, look_at
 from perception.vision.finding.plate import find_plate
-from perception.vision.image import Image
-from perception.vision.knowledge import NOTHING, Kind, Knowledge, shipped_knowledge, spread_of, write_kind
+from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind, shipped_knowledge, spread_of, write_kind
+from perception.vision.projection import PlateProjection
 from perception.vision.teaching.condense import worth_keeping
-from perception.vision.view import PlaneView
 
 DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "vision" / "synth_dev"
 FOLDS = 3
@@ -62,7 +61,7 @@ class Lesson(Examples):
     """One overview: its rectified plate too, and `worse`: what it would teach in bad light."""
 
     level: str
-    view: PlaneView
+    view: PlateProjection
     ground: Ground
     worse: tuple[Examples, ...]
 
@@ -84,7 +83,7 @@ def lessons(folder: Path) -> Iterator[Lesson]:
         yield Lesson(level=entry["level"], view=plate.view, ground=ground, worse=tuple(worse), **seen_there)
 
 
-def _seen_there(ground: Ground, view: PlaneView, truth: list[dict[str, Any]]) -> dict[str, Any]:
+def _seen_there(ground: Ground, view: PlateProjection, truth: list[dict[str, Any]]) -> dict[str, Any]:
     """The fields of `Examples`."""
     pixels = np.array([[*panel_object["center_px"], 1.0] for panel_object in truth])
     on_plate = pixels @ np.linalg.inv(view.px_from_plate).T
@@ -95,7 +94,7 @@ def _seen_there(ground: Ground, view: PlaneView, truth: list[dict[str, Any]]) ->
     return {"truth": truth, "places": places, "looks": looks, "middles": middles, "object_looks": object_looks}
 
 
-def _worse(gray: Image, view: PlaneView, entry: dict[str, Any], copy: int) -> Examples:
+def _worse(gray: Image, view: PlateProjection, entry: dict[str, Any], copy: int) -> Examples:
     """The overview as it would be in bad light, and what of its objects would be seen then."""
     random = np.random.default_rng((copy, *gray.tobytes()[:: gray.size // 8]))  # other light for every overview
     light = (gray.astype(float) / 255) ** GAMMA
@@ -111,7 +110,7 @@ def knowledge_of(taught: Sequence[Lesson]) -> Knowledge:
     """Condensed looks of every kind, and of nothing; then those of bad light that these do not tell."""
     looks, names = _examples(taught)
     kinds = [
-        Kind(
+        TaughtKind(
             name=name, size_m=_size_m(taught, name), looks=looks[names == name], taught_by="benchmarks/vision_knowledge"
         )
         for name in sorted(set(names.tolist()))
@@ -136,7 +135,7 @@ def with_noisy(known: Knowledge, taught: Sequence[Lesson]) -> Knowledge:
     for name in sorted(set(names[kept].tolist())):
         of_kind = rounded[names[kept] == name]
         noisy = np.ones(len(of_kind), bool)
-        known = known.grown(Kind(name=name, size_m=NO_SIZE_M, looks=of_kind, noisy=noisy))
+        known = known.grown(TaughtKind(name=name, size_m=NO_SIZE_M, looks=of_kind, noisy=noisy))
     return known
 
 
@@ -169,7 +168,7 @@ def judged(lesson: Lesson, knowledge: Knowledge) -> tuple[list[tuple[float, bool
     return rows, sum(panel_object["visible"] >= 0.5 for panel_object in lesson.truth)
 
 
-def _right(lesson: Lesson, candidate: Candidate) -> bool | None:
+def _right(lesson: Lesson, candidate: Detection) -> bool | None:
     """Whether the nearest object is of that kind and near enough; None for one that is hidden for the most part."""
     off = [float(np.linalg.norm(candidate.centre_px - panel_object["center_px"])) for panel_object in lesson.truth]
     panel_object = lesson.truth[int(np.argmin(off))]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.vision_dials import CANVAS_PX, SPAN_RAD, Colour, DrawnDial, Pen, Rng, seen_aslant
-from perception.vision.image import Image
+from hal.arrays import Image
 
 SMALLEST_PX, LARGEST_PX = 110.0, 600.0
 FULL_SCALES = (1, 2.5, 4, 6, 10, 16, 25, 60, 100, 160, 200, 300)

@@ -24,15 +24,15 @@ from benchmarks.vision_drawing import camera, draw_panel, looking_at
 from benchmarks.vision_held_out import held_out_lines
 from benchmarks.vision_manometers import UNUSUAL, draw_manometer
 from benchmarks.vision_reliability import Answer, draw_reliability, reliability_lines
+from hal.arrays import Image
 from hal.errors import CellError
 from hal.geometry import certain
 from hal.panel import PanelObject
 from perception.vision.finding.blind import recognise
 from perception.vision.finding.segment import grow_regions
-from perception.vision.image import Image
+from perception.vision.inspection import patch_of, read_patch
 from perception.vision.knowledge import shipped_knowledge
-from perception.vision.taught import patch_of, read_patch
-from perception.vision.view import CameraView
+from perception.vision.projection import CameraProjection
 
 LEVELS = ("easy", "medium", "hard")
 PASS = {
@@ -232,7 +232,7 @@ def _speed(folder: Path) -> None:
     panel = shipped_panel()
     intrinsics = camera(1280, 960, focal_px=1200.0)
     pose = certain(RigidTransform.from_matrix(looking_at(distance_m=0.62)))
-    view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+    view = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
     image = draw_panel(panel, view, (960, 1280), random_state(panel, 0))
     # A reading takes a moment, so that a busy machine may disturb a few in a row, but not each of many.
     readings = [
@@ -244,7 +244,7 @@ def _speed(folder: Path) -> None:
     print(f"{'  the same two, blurs':52s} {np.median(readings) / blur:.3g} / {max(readings) / blur:.3g}")
 
 
-def _read_one(image: Image, view: CameraView, panel_object: PanelObject) -> object:
+def _read_one(image: Image, view: CameraProjection, panel_object: PanelObject) -> object:
     return read_patch(patch_of(image, image, view, panel_object, np.zeros(2)), panel_object)
 
 

@@ -11,15 +11,16 @@ if TYPE_CHECKING:
     from perception.vision.finding.blind import recognise
     from perception.vision.finding.framing import check_upright, one_plate
     from perception.vision.image import as_gray, check_image, decode
-    from perception.vision.knowledge import NOTHING, Kind, Knowledge, load_knowledge, write_kind
+    from perception.vision.inspection import inspect, inspect_view
+    from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind, load_knowledge, write_kind
     from perception.vision.lights import find_lights
     from perception.vision.lights.assign import AssignedLights, assign_lights
+    from perception.vision.multi_view import merge_views
+    from perception.vision.projection import CameraProjection, PanelProjection
     from perception.vision.quadrangle import QuadranglePose, estimate
     from perception.vision.reading import ObjectReading, answer_at
     from perception.vision.registration.outline import contour_m
-    from perception.vision.several_looks import joined
     from perception.vision.status.button import ALIKE, NO_EDGE
-    from perception.vision.taught import inspect, inspect_view
     from perception.vision.teaching.from_panel import PanelLooks, teach_from_panel
     from perception.vision.teaching.panel_lights import LightsFound, find_border_lights
     from perception.vision.teaching.panel_questions import Question, kind_question, questions
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
         overview_of,
         teach_example,
     )
-    from perception.vision.view import CameraView, View
     from perception.vision.warm import warm_up
 
 __all__ = [
@@ -43,18 +43,18 @@ __all__ = [
     "NOTHING",
     "NO_EDGE",
     "AssignedLights",
-    "CameraView",
+    "CameraProjection",
     "Example",
-    "Kind",
     "Knowledge",
     "LightsFound",
     "ObjectReading",
     "Overview",
     "PanelLooks",
     "PanelObjectDraft",
+    "PanelProjection",
     "QuadranglePose",
     "Question",
-    "View",
+    "TaughtKind",
     "answer_at",
     "as_gray",
     "assign_lights",
@@ -71,10 +71,10 @@ __all__ = [
     "find_lights",
     "inspect",
     "inspect_view",
-    "joined",
     "kind_question",
     "likest",
     "load_knowledge",
+    "merge_views",
     "object_row",
     "one_plate",
     "overview_of",

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.vision.image import Image, check_image
-from perception.vision.labels import Box, place_labels
+from hal.arrays import Image
+from perception.vision.image import check_image
+from perception.vision.labels import PixelBox, place_labels
 from perception.vision.reading import ObjectReading
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -41,7 +42,7 @@ def draw_outlines(
     scale = max(0.4, picture.shape[1] / 1600)
     contours = [np.round(outline).astype(np.int32).reshape(-1, 1, 2) for outline in outlines_px]
     labels = place_labels(
-        [Box(*cv2.boundingRect(contour)) for contour in contours],
+        [PixelBox(*cv2.boundingRect(contour)) for contour in contours],
         [_size(text, scale) for text in texts],
         (picture.shape[1], picture.shape[0]),
     )
@@ -71,7 +72,7 @@ def _size(text: str, scale: float) -> tuple[int, int]:
     return width + RIM, height + below
 
 
-def _write(picture: Image, text: str, place: Box, colour: Colour, scale: float) -> None:
+def _write(picture: Image, text: str, place: PixelBox, colour: Colour, scale: float) -> None:
     _, below = cv2.getTextSize(text, FONT, scale, RIM)
     foot = (place.x + RIM // 2, place.y + place.height - below)
     cv2.putText(picture, text, foot, FONT, scale, (0, 0, 0), RIM, cv2.LINE_AA)

@@ -5,15 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from hal.arrays import Array
-from perception.vision.image import Image
+from hal.arrays import Array, Image
+from hal.jit import compiled, inlined
 
 
-@njit(cache=True)
-def value_at(image: NDArray[Any], u: float, v: float) -> float:  # pragma: no cover
+@inlined
+def value_at(image: NDArray[Any], u: float, v: float) -> float:
     """Bilinear value of an (H, W) picture; the border repeats."""
     height, width = image.shape
     u, v = min(max(u, 0.0), width - 1.0), min(max(v, 0.0), height - 1.0)
@@ -24,10 +23,10 @@ def value_at(image: NDArray[Any], u: float, v: float) -> float:  # pragma: no co
     return float(above * (1.0 - b) + (image[below, x] * (1.0 - a) + image[below, right] * a) * b)
 
 
-@njit(cache=True)
+@compiled
 def polar_values(
     image: Image, centre_px: tuple[float, float], radii_px: Array, directions: Array
-) -> NDArray[np.float32]:  # pragma: no cover
+) -> NDArray[np.float32]:
     """(radii, directions) values about a centre; `directions` is (2, N), what a pixel of radius adds to u and to v."""
     out = np.empty((len(radii_px), directions.shape[1]), np.float32)
     for i in range(len(radii_px)):
@@ -38,8 +37,8 @@ def polar_values(
     return out
 
 
-@njit(cache=True)
-def step_counts(gray: Image, every: int) -> NDArray[np.int64]:  # pragma: no cover
+@compiled
+def step_counts(gray: Image, every: int) -> NDArray[np.int64]:
     """(1021,) how often every magnitude of the second difference along `every`-th row occurs."""
     counts = np.zeros(4 * 255 + 1, np.int64)
     for v in range(0, gray.shape[0], every):

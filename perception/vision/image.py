@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Image
 from hal.errors import InvalidRequest, NotObservable
-
-Image = NDArray[np.uint8]
 
 MIN_SIDE_PX = 24  # no object has readable detail below this
 MAX_PIXELS = 40_000_000  # beyond it a decoder could be used to exhaust the memory
@@ -72,7 +71,7 @@ def as_gray(image: NDArray[Any]) -> Image:
         raise NotObservable("the image is black", hint="more light or a longer exposure; check the lens cap")
     if np.percentile(sample, 2.0) >= WHITE_LEVEL:
         raise NotObservable("the image is saturated", hint="less light or a shorter exposure")
-    return np.ascontiguousarray(gray)
+    return np.require(gray, requirements=("C", "W"))  # compiled loops take no other layout
 
 
 def check_image(image: NDArray[Any]) -> None:

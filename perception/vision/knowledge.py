@@ -91,7 +91,7 @@ class KindRecord(Strict):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Kind:
+class TaughtKind:
     """A kind of object.
 
     Attributes:
@@ -110,17 +110,17 @@ class Kind:
     noisy: NDArray[np.bool_] | None = None
 
     @property
-    def lasting(self) -> Kind:
+    def lasting(self) -> TaughtKind:
         """The kind with the looks only that count in every image."""
         return self if self.noisy is None else replace(self.of(~self.noisy), noisy=None)
 
-    def of(self, rows: NDArray[Any]) -> Kind:
+    def of(self, rows: NDArray[Any]) -> TaughtKind:
         """The kind with some of its looks only."""
         middles_m = None if self.middles_m is None else self.middles_m[rows]
         noisy = None if self.noisy is None else self.noisy[rows]
         return replace(self, looks=self.looks[rows], middles_m=middles_m, noisy=noisy)
 
-    def joined(self, other: Kind) -> Kind:
+    def joined(self, other: TaughtKind) -> TaughtKind:
         """The kind with another one's looks after its own."""
         middles_m = None
         if self.middles_m is not None or other.middles_m is not None:
@@ -144,7 +144,7 @@ class Knowledge:
         weights: (LENGTH,) of the numbers.
     """
 
-    kinds: tuple[Kind, ...]
+    kinds: tuple[TaughtKind, ...]
     spread: Array
     weights: Array = field(default_factory=lambda: WEIGHTS)
 
@@ -154,22 +154,22 @@ class Knowledge:
         """
         return _for_image(self, noisy=noisy)
 
-    def kind(self, name: str) -> Kind | None:
+    def kind(self, name: str) -> TaughtKind | None:
         """The kind of that name, or None."""
         return next((kind for kind in self.kinds if kind.name == name), None)
 
     def with_look(self, name: str, size_m: tuple[float, float], look: Array, *, taught_by: str = "") -> Knowledge:
         """The knowledge with one more look; a new name makes a new kind."""
-        return self.grown(Kind(name=name, size_m=size_m, looks=look[None], taught_by=taught_by))
+        return self.grown(TaughtKind(name=name, size_m=size_m, looks=look[None], taught_by=taught_by))
 
-    def grown(self, more: Kind) -> Knowledge:
+    def grown(self, more: TaughtKind) -> Knowledge:
         """The knowledge with further looks of a kind, which may be new."""
         known = self.kind(more.name)
         if known is None:
             return replace(self, kinds=(*self.kinds, more))
         return replace(self, kinds=tuple(kind.joined(more) if kind is known else kind for kind in self.kinds))
 
-    def with_looks_of(self, kinds: Iterable[Kind]) -> Knowledge:
+    def with_looks_of(self, kinds: Iterable[TaughtKind]) -> Knowledge:
         """The knowledge with these kinds' looks beside its own; a new name makes a new kind, a known look adds nothing."""
         grown = self
         for kind in kinds:
@@ -208,7 +208,7 @@ def _for_image(knowledge: Knowledge, *, noisy: bool) -> Knowledge:
     return replace(knowledge, kinds=tuple(kind for kind in kinds if len(kind.looks)), weights=WEIGHTS)
 
 
-def spread_of(kinds: Iterable[Kind]) -> Array:
+def spread_of(kinds: Iterable[TaughtKind]) -> Array:
     """(LENGTH,) standard deviation of every number over the kinds' looks that count in every image, each kind counting
     the same.
     """
@@ -219,7 +219,7 @@ def spread_of(kinds: Iterable[Kind]) -> Array:
     return np.asarray(np.maximum(np.sqrt(within + means.var(axis=0)), 0.05))
 
 
-def write_kind(kind: Kind, folder: Path) -> Path:
+def write_kind(kind: TaughtKind, folder: Path) -> Path:
     """Write one kind's file and return its path."""
     lines = [
         f"# What a {kind.name.replace('_', ' ')} looks like: rows over the distance from its middle, "
@@ -248,10 +248,10 @@ def _is_other(path: Path) -> bool:
     return path.stem == "proportions"
 
 
-def _kind(record: KindRecord) -> Kind:
+def _kind(record: KindRecord) -> TaughtKind:
     middles_m = np.array([look.middle_m for look in record.looks])
     noisy = np.array([look.noisy for look in record.looks])
-    return Kind(
+    return TaughtKind(
         name=record.name,
         size_m=(record.width_m, record.height_m),
         looks=np.array([look.look for look in record.looks]).reshape(-1, LENGTH),

@@ -11,7 +11,7 @@ OVER_A_NAME, OVER_AN_OBJECT, OVER_ITS_OWN = 1e6, 1.0, 0.5  # cost of each pixel 
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
+class PixelBox:
     """A rectangle in pixels, from (x, y) to (x + width, y + height)."""
 
     x: int
@@ -19,19 +19,21 @@ class Box:
     width: int
     height: int
 
-    def overlap_px(self, other: Box) -> int:
+    def overlap_px(self, other: PixelBox) -> int:
         """Area that both cover, pixels."""
         width = min(self.x + self.width, other.x + other.width) - max(self.x, other.x)
         height = min(self.y + self.height, other.y + other.height) - max(self.y, other.y)
         return max(0, width) * max(0, height)
 
-    def inside(self, width: int, height: int) -> Box:
+    def inside(self, width: int, height: int) -> PixelBox:
         """Moved into a picture of that size as far as it fits."""
         x, y = (max(0, min(at, most)) for at, most in ((self.x, width - self.width), (self.y, height - self.height)))
-        return Box(x, y, self.width, self.height)
+        return PixelBox(x, y, self.width, self.height)
 
 
-def place_labels(objects: Sequence[Box], sizes: Sequence[tuple[int, int]], picture: tuple[int, int]) -> list[Box]:
+def place_labels(
+    objects: Sequence[PixelBox], sizes: Sequence[tuple[int, int]], picture: tuple[int, int]
+) -> list[PixelBox]:
     """A box for each object's name, one after the other: each takes the cheapest of a few places.
 
     Args:
@@ -39,10 +41,10 @@ def place_labels(objects: Sequence[Box], sizes: Sequence[tuple[int, int]], pictu
         sizes: width and height of each name, pixels.
         picture: its width and height, pixels.
     """
-    placed: list[Box] = []
+    placed: list[PixelBox] = []
     for own, size in zip(objects, sizes, strict=True):
 
-        def cost(box: Box, own: Box = own) -> float:
+        def cost(box: PixelBox, own: PixelBox = own) -> float:
             over_names = sum(box.overlap_px(name) for name in placed)
             over_objects = sum(box.overlap_px(other) for other in objects if other is not own)
             over_own = box.overlap_px(own)
@@ -53,15 +55,15 @@ def place_labels(objects: Sequence[Box], sizes: Sequence[tuple[int, int]], pictu
     return placed
 
 
-def _places(own: Box, width: int, height: int) -> Iterator[Box]:
+def _places(own: PixelBox, width: int, height: int) -> Iterator[PixelBox]:
     """Above, below and beside the object, near before far."""
     flush = (own.x, own.x + (own.width - width) // 2, own.x + own.width - width)
     for row in range(ROWS):
         away = GAP_PX + row * (height + GAP_PX)
         for y in (own.y - away - height, own.y + own.height + away):
             for x in flush:
-                yield Box(x, y, width, height)
+                yield PixelBox(x, y, width, height)
         if row == 0:
             middle = own.y + (own.height - height) // 2
-            yield Box(own.x + own.width + GAP_PX, middle, width, height)
-            yield Box(own.x - GAP_PX - width, middle, width, height)
+            yield PixelBox(own.x + own.width + GAP_PX, middle, width, height)
+            yield PixelBox(own.x - GAP_PX - width, middle, width, height)

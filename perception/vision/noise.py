@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from perception.vision.image import Image
+from hal.arrays import Image
+from hal.jit import compiled
 
 LEAST_NOISE = 0.3  # gray levels: the rounding
 ENOUGH_PX = 500_000
@@ -26,8 +26,8 @@ def noise_sigma(gray: Image, *, rows_apart: int = 1) -> float:
     return float(max(median / 0.6745 / 6.0, LEAST_NOISE))
 
 
-@njit(cache=True)
-def _response_counts(gray: Image, step: int) -> NDArray[np.int64]:  # pragma: no cover
+@compiled
+def _response_counts(gray: Image, step: int) -> NDArray[np.int64]:
     """How often every magnitude of the response to [1 -2 1; -2 4 -2; 1 -2 1] occurs inside every `step`-th row."""
     height, width = gray.shape
     counts = np.zeros(8 * 255 + 1, np.int64)

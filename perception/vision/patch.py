@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hal.arrays import Array
-from perception.vision.image import WHITE_LEVEL, Image, as_gray
-from perception.vision.view import View, homography
+from hal.arrays import Array, Image
+from perception.vision.image import WHITE_LEVEL, as_gray
+from perception.vision.projection import PanelProjection, homography
 
 OVERSAMPLING = 1.5  # rectified pixels per image pixel: keeps detail through the second interpolation
 MAX_SIDE_PX = 320
@@ -84,7 +84,7 @@ def sample_at(image: NDArray[Any], u: Array, v: Array, *, outside: float | None 
 
 def rectify(
     image: Image,
-    view: View,
+    view: PanelProjection,
     centre_m: ArrayLike,
     *,
     half_width_m: float,

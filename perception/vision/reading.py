@@ -72,7 +72,7 @@ A = TypeVar("A", bound=Answer)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Status(Answer):
+class PatchReading(Answer):
     """What a reader says of the object in its patch."""
 
 
@@ -101,22 +101,22 @@ class ObjectReading(Answer):
         """Whether the object was read."""
         return self.present and self.reason is None
 
-    def saying(self, status: Status) -> ObjectReading:
+    def saying(self, status: PatchReading) -> ObjectReading:
         """The object, found where it should be, with what its reader says of it."""
         return replace(self, present=True, **{field.name: getattr(status, field.name) for field in fields(Answer)})
 
 
-def refused(reason: str, *, unit: str = "") -> Status:
+def refused(reason: str, *, unit: str = "") -> PatchReading:
     """No answer and no guess either, with the reason (cause, then what would help)."""
-    return Status(reason=reason, unit=unit)
+    return PatchReading(reason=reason, unit=unit)
 
 
-def doubted(status: Status, reason: str) -> Status:
+def doubted(status: PatchReading, reason: str) -> PatchReading:
     """A refusal with that reason, which keeps what the status says as its guess."""
     return answer_at(limited(status, MOST_DOUBTED), ANSWER_AT, reason)
 
 
-def gated(status: Status, reason: str = TOO_WEAK, possible: tuple[Possible, ...] = ()) -> Status:
+def gated(status: PatchReading, reason: str = TOO_WEAK, possible: tuple[Possible, ...] = ()) -> PatchReading:
     """The same answer, or a refusal with that reason when its confidence is too low, which keeps it as its guess.
 
     Args:
@@ -126,7 +126,7 @@ def gated(status: Status, reason: str = TOO_WEAK, possible: tuple[Possible, ...]
     return replace(refusal, possible=possible) if possible and refusal.guess else refusal
 
 
-def as_often_right(status: Status, least: float) -> Status:
+def as_often_right(status: PatchReading, least: float) -> PatchReading:
     """The same status; a guess's confidence is stretched to the range from `least`, what it is worth without any evidence.
 
     Readers are made to tell when to refuse; what they say below that is too low for kinds with few states.
@@ -171,6 +171,6 @@ def probability(evidence: Sequence[tuple[float, float, float]]) -> float:
     return float(1.0 / (1.0 + np.exp(-total)))
 
 
-def limited(status: Status, most: float) -> Status:
+def limited(status: PatchReading, most: float) -> PatchReading:
     """The same status with a confidence of at most `most`."""
     return status if status.confidence <= most else replace(status, confidence=most)

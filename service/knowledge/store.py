@@ -18,7 +18,7 @@ from service.errors import NoSuchTask
 
 if TYPE_CHECKING:
     from hal.config import Cell
-    from perception.vision import Kind, Knowledge
+    from perception.vision import Knowledge, TaughtKind
 
 FOLDER = "knowledge"
 SHIPPED = Path(__file__).parents[2] / "perception" / "vision" / "knowledge"
@@ -134,7 +134,7 @@ class KnowledgeStore:
                 return load_panel(file.path)
         raise NoSuchKnowledge("no panel of that name was taught", hint="GET /v1/knowledge lists what is known")
 
-    def write_kind(self, kind: Kind) -> Path:
+    def write_kind(self, kind: TaughtKind) -> Path:
         """Keep a taught kind, in place of the one of that name."""
         from perception.vision import write_kind
 

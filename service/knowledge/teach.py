@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from perception.vision import Example, Overview, PanelLooks, Question, View
+    from perception.vision import Example, Overview, PanelLooks, PanelProjection, Question
 
 PixelNumber = Annotated[float, Field(ge=-1e5, le=1e5)]
 Click = tuple[PixelNumber, PixelNumber]
@@ -188,7 +188,7 @@ class Learned:
         }
 
 
-def learn_panel(store: KnowledgeStore, pixels: NDArray[np.uint8], view: View, panel: Panel) -> Learned:
+def learn_panel(store: KnowledgeStore, pixels: NDArray[np.uint8], view: PanelProjection, panel: Panel) -> Learned:
     """Let a known panel teach its own looks from one overview, and keep them.
 
     Raises:

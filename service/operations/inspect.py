@@ -14,7 +14,7 @@ from hal.devices import DeviceKind
 from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import compose
 from hal.panel import PanelObject
-from perception.vision import ALIKE, NO_EDGE, ObjectReading, answer_at, draw_annotated, joined, said
+from perception.vision import ALIKE, NO_EDGE, ObjectReading, answer_at, draw_annotated, merge_views, said
 from perception.vision import inspect as inspect_image
 from service.operations.acquisition import Look, base_from, look, settle
 from service.operations.locate import go_to_overview, locate
@@ -160,14 +160,14 @@ def _from_the_sides(
         yield from closer.pictures
         for name in unread:
             looks[name].append(closer.readings[name])
-        unread = [name for name in unread if not joined(looks[name]).answered]
+        unread = [name for name in unread if not merge_views(looks[name]).answered]
         if not unread:
             return
 
 
 def _told(looks: Sequence[ObjectReading]) -> ObjectReading:
     """What a straight look and those from the sides say together."""
-    told = joined(looks)
+    told = merge_views(looks)
     if told.answered or len(looks) == 1:
         return told
     return replace(told, reason=f"{told.reason} ({len(looks) - 1} looks from the sides did not tell either)")

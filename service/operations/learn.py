@@ -17,7 +17,7 @@ from service.report.plots import png_of
 
 if TYPE_CHECKING:
     from hal.panel import Panel
-    from perception.vision import PanelLooks, View
+    from perception.vision import PanelLooks, PanelProjection
 
 
 def run_learn(session: Session, request: LearnRequest) -> dict[str, Any]:
@@ -27,7 +27,7 @@ def run_learn(session: Session, request: LearnRequest) -> dict[str, Any]:
         NoSuchImage, NoSuchKnowledge: unknown image or panel.
         InvalidRequest, NotObservable, NotFound, Ambiguous: the overview teaches nothing; says why and what helps.
     """
-    from perception.vision import CameraView
+    from perception.vision import CameraProjection
 
     if request.image is not None:
         session.progress(0.1, "look at the stored image")
@@ -41,11 +41,11 @@ def run_learn(session: Session, request: LearnRequest) -> dict[str, Any]:
     session.progress(0.8, "look")
     seen = look(session, request.camera)
     pose = compose(seen.base_from_camera.inverse(), session.known_panel())
-    live = CameraView(intrinsics=seen.intrinsics, camera_from_panel=pose)
+    live = CameraProjection(intrinsics=seen.intrinsics, camera_from_panel=pose)
     return _learn(session, seen.pixels, live, session.panel)
 
 
-def _learn(session: Session, pixels: Pixels, view: View, panel: Panel) -> dict[str, Any]:
+def _learn(session: Session, pixels: Pixels, view: PanelProjection, panel: Panel) -> dict[str, Any]:
     session.progress(0.9, "learn")
     store = KnowledgeStore.of_runs(session.context.runs_dir, session.cell)
     learned = learn_panel(store, pixels, view, panel)

@@ -21,7 +21,7 @@ from service.operations.session import Session, panel_object_or_all
 from service.report.plots import png_of
 
 if TYPE_CHECKING:
-    from perception.vision import View
+    from perception.vision import PanelProjection
 
 Pixels = NDArray[np.uint8]
 PICTURE_WIDTH_PX = 1600  # wider pictures are shown smaller: nobody looks at 40 megapixels
@@ -131,7 +131,7 @@ def _stores(session: Session) -> tuple[ImageStore, KnowledgeStore]:
     return ImageStore(runs), KnowledgeStore.of_runs(runs, session.cell)
 
 
-def stored_view(session: Session, request: StoredLook, panel: Panel) -> tuple[Pixels, View]:
+def stored_view(session: Session, request: StoredLook, panel: Panel) -> tuple[Pixels, PanelProjection]:
     """The stored image of an upright panel, and where the panel is in it.
 
     Raises:
@@ -146,20 +146,20 @@ def stored_view(session: Session, request: StoredLook, panel: Panel) -> tuple[Pi
     return pixels, view
 
 
-def _view(session: Session, request: StoredLook, gray: Pixels, panel: Panel) -> View:
+def _view(session: Session, request: StoredLook, gray: Pixels, panel: Panel) -> PanelProjection:
     """Where the panel is: as the caller says, or by its border, through the lens if that is known."""
-    from perception.vision import CameraView, estimate, one_plate
+    from perception.vision import CameraProjection, estimate, one_plate
 
     lens = _lens(session, request, gray)
     if lens is not None and request.camera_from_panel is not None:
-        return CameraView(intrinsics=lens, camera_from_panel=request.camera_from_panel.pose())
+        return CameraProjection(intrinsics=lens, camera_from_panel=request.camera_from_panel.pose())
     plate_m = request.plate_m or (panel.width_m, panel.height_m)
     plate = one_plate(gray, plate_m, focal_px=lens.fx_px if lens is not None else None)
     if lens is None:
         return plate.view
     corners_m = np.column_stack([plate.view.corners_m, np.zeros(4)])
     pose = estimate(corners_m, plate.view.project(corners_m), BORDER_SIGMA_PX**2, lens)
-    return CameraView(
+    return CameraProjection(
         intrinsics=lens,
         camera_from_panel=UncertainPose(parent_from_child=pose.camera_from_object, covariance=pose.covariance),
     )

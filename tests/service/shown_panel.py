@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hal.config import load_cell
-from perception.vision.view import CameraView
+from perception.vision.projection import CameraView
 from service.operations import OPERATIONS
 from service.serve import Options, Panelwright
 from tests.perception.vision.bench_panel import TOML, panel, scene

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.arrays import Array
+from hal.arrays import Array, Image
 from hal.errors import NotFound
 from perception.vision.finding.cables import without_cables
 from perception.vision.finding.circles import find_circles
@@ -24,11 +24,11 @@ from perception.vision.finding.features import PLATE_PX_PER_M, Ground, half_turn
 from perception.vision.finding.framing import one_plate
 from perception.vision.finding.match import Prepared, nearest, nearest_look, nothing_column, prepared
 from perception.vision.finding.shapes import Edges, direction_maps, find_edges, find_rectangles, find_slots
-from perception.vision.image import Image, as_gray
+from perception.vision.image import as_gray
 from perception.vision.knowledge import NOTHING, Knowledge
 from perception.vision.noise import noise_sigma
+from perception.vision.projection import PanelProjection
 from perception.vision.reading import ANSWER_AT
-from perception.vision.view import View
 
 PLATE_M = (0.40, 0.30)
 ROWS_APART = 3  # of those that tell the noise: enough, and a millisecond saved
@@ -53,7 +53,7 @@ SLOT_M = (0.034, 0.085)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Candidate:
+class Detection:
     """A place where an object may be.
 
     Attributes:
@@ -82,9 +82,9 @@ def recognise(
     knowledge: Knowledge,
     *,
     plate_m: tuple[float, float] = PLATE_M,
-    view: View | None = None,
+    view: PanelProjection | None = None,
     focal_px: float | None = None,
-) -> tuple[Candidate, ...]:
+) -> tuple[Detection, ...]:
     """Objects of known kinds, best first; then the refused candidates with their reasons.
 
     Args:
@@ -120,7 +120,7 @@ def recognise(
 
 
 def uprightness(
-    ground: Ground, found: Sequence[Candidate], knowledge: Knowledge, plate_m: tuple[float, float]
+    ground: Ground, found: Sequence[Detection], knowledge: Knowledge, plate_m: tuple[float, float]
 ) -> float:
     """By how much the accepted objects look more like the taught ones as they are than turned by half a turn, in sum.
 
@@ -144,7 +144,7 @@ def uprightness(
     return lead
 
 
-def lay_out(gray: Image, view: View, plate_m: tuple[float, float]) -> Ground:
+def lay_out(gray: Image, view: PanelProjection, plate_m: tuple[float, float]) -> Ground:
     """The plate seen straight on, without cables, with its edges."""
     w, h = plate_m
     size = (round(w * PLATE_PX_PER_M), round(h * PLATE_PX_PER_M))
@@ -193,8 +193,13 @@ def _groups(edges: Edges) -> list[tuple[float, float]]:
 
 
 def chosen(
-    ground: Ground, places: Array, looks: Array, knowledge: Knowledge, view: View, plate_m: tuple[float, float]
-) -> tuple[Candidate, ...]:
+    ground: Ground,
+    places: Array,
+    looks: Array,
+    knowledge: Knowledge,
+    view: PanelProjection,
+    plate_m: tuple[float, float],
+) -> tuple[Detection, ...]:
     """The candidates that stand, likest first, then the refused ones; see the module's text."""
     knowledge = knowledge.for_image(noisy=ground.noisy)
     known = prepared(knowledge)
@@ -272,8 +277,8 @@ def _centred(ground: Ground, place: Array, known: Prepared, kind: int) -> Array:
 
 def _candidate(
     place: Array, middle: Array, names: list[str], kinds: Array, to_nothing: float, size: tuple[float, float],
-    view: View, plate_m: tuple[float, float], *, even: float,
-) -> Candidate:  # fmt: skip
+    view: PanelProjection, plate_m: tuple[float, float], *, even: float,
+) -> Detection:  # fmt: skip
     order = np.argsort(kinds)
     first, second = int(order[0]), int(order[min(1, len(order) - 1)])
     to_second = float(kinds[second]) if second != first else np.inf
@@ -284,7 +289,7 @@ def _candidate(
     w, h = size[0] / 2, size[1] / 2
     box = np.array([[x - w, y + h, 0], [x + w, y + h, 0], [x + w, y - h, 0], [x - w, y - h, 0], [x, y, 0]])
     px = view.project(box)
-    return Candidate(
+    return Detection(
         kind=names[first],
         confidence=confidence,
         centre_px=px[4],

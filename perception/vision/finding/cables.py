@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from hal.arrays import Array
-from perception.vision.image import Image
+from hal.arrays import Array, Image
+from hal.jit import compiled
 
 Float32 = NDArray[np.float32]
 
@@ -132,10 +131,8 @@ def _bridged(picture: Image, rows: NDArray[np.int64], at: Array, half: float) ->
     return out
 
 
-@njit(cache=True)
-def _bridge(
-    picture: Image, rows: NDArray[np.int64], left: NDArray[np.int64], right: NDArray[np.int64]
-) -> None:  # pragma: no cover
+@compiled
+def _bridge(picture: Image, rows: NDArray[np.int64], left: NDArray[np.int64], right: NDArray[np.int64]) -> None:
     """In place. Beyond the picture's border a side has the gray of the other."""
     width = picture.shape[1]
     for k in range(len(rows)):
@@ -151,8 +148,8 @@ def _bridge(
             picture[rows[k], x] = np.uint8(from_left + (from_right - from_left) * (x - a) / (b - a) + 0.5)
 
 
-@njit(cache=True)
-def _darkness(small: Float32, level: Float32, halves: NDArray[np.int64]) -> Float32:  # pragma: no cover
+@compiled
+def _darkness(small: Float32, level: Float32, halves: NDArray[np.int64]) -> Float32:
     """(H, W) by how much a band about each cell is darker than both of its sides, the best of several widths."""
     height, width = small.shape
     out = np.full((height, width), np.float32(-0.5))
@@ -171,8 +168,8 @@ def _darkness(small: Float32, level: Float32, halves: NDArray[np.int64]) -> Floa
     return out
 
 
-@njit(cache=True)
-def _course(gain: Float32, bend: float) -> tuple[NDArray[np.int64], float]:  # pragma: no cover
+@compiled
+def _course(gain: Float32, bend: float) -> tuple[NDArray[np.int64], float]:
     """(H,) cell in every row of the path from top to bottom with the most gain, and that; slopes of up to two cells."""
     height, width = gain.shape
     slopes = 5

@@ -11,10 +11,10 @@ from math import hypot
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hal.arrays import Array
+from hal.jit import compiled, inlined
 from perception.vision.finding.shapes import Edges, Float32
 
 SMALL_PX = 24.0
@@ -116,8 +116,8 @@ def _distinct(circles: list[Circle]) -> list[Circle]:
     return kept
 
 
-@njit(cache=True)
-def _average(planes: Float32, radii: Float32) -> None:  # pragma: no cover
+@compiled
+def _average(planes: Float32, radii: Float32) -> None:
     """In place: mean of every plane and its two neighbours, the outermost as they are, over the radius."""
     count, height, width = planes.shape
     before, here = planes[0].copy(), planes[0].copy()
@@ -133,10 +133,8 @@ def _average(planes: Float32, radii: Float32) -> None:  # pragma: no cover
         before, here = here, before
 
 
-@njit(cache=True)
-def _vote(
-    votes: Float32, u: Array, v: Array, nx: Array, ny: Array, radii: Array, cell: int
-) -> None:  # pragma: no cover
+@compiled
+def _vote(votes: Float32, u: Array, v: Array, nx: Array, ny: Array, radii: Array, cell: int) -> None:
     """One vote a radius on either side of every edge pixel; radius by radius, so that one plane stays in the cache."""
     _, height, width = votes.shape
     share = 1.0 / cell  # cells are powers of two: exactly as dividing, and quicker
@@ -151,10 +149,10 @@ def _vote(
                     plane[y, x] += 1.0
 
 
-@njit(cache=True)
+@inlined
 def _covered(
     gx: Float32, gy: Float32, strength: Float32, strong: NDArray[np.bool_], normals: Array, u: float, v: float, r: float
-) -> float:  # pragma: no cover
+) -> float:
     """`circle_coverage` of one circle."""
     height, width = strong.shape
     hits = 0
@@ -167,11 +165,11 @@ def _covered(
     return hits / len(normals)
 
 
-@njit(cache=True)
+@compiled
 def _climbed(
     gx: Float32, gy: Float32, strength: Float32, strong: NDArray[np.bool_], normals: Array, steps: Array,
     u: float, v: float, r: float,
-) -> tuple[float, float, float, float]:  # pragma: no cover  # fmt: skip
+) -> tuple[float, float, float, float]:  # fmt: skip
     """(u, v, r, coverage) of the best of 27 neighbours a step, in ever smaller steps, until nothing is better."""
     score = -1.0
     for step in steps:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hal.arrays import Array
+from hal.jit import compiled, inlined
 
 
 def components(mask: NDArray[np.uint8], *, diagonal: bool) -> Array:
@@ -19,8 +19,8 @@ def components(mask: NDArray[np.uint8], *, diagonal: bool) -> Array:
     return np.asarray(_components(np.ascontiguousarray(mask), 1 if diagonal else 0))
 
 
-@njit(cache=True)
-def _components(mask: NDArray[np.uint8], reach: int) -> Array:  # pragma: no cover
+@compiled
+def _components(mask: NDArray[np.uint8], reach: int) -> Array:
     """Runs of a row join the runs of the row above that they overlap (union-find); sums are kept a run."""
     height, width = mask.shape
     most = height * (width + 1) // 2 + 1
@@ -47,10 +47,10 @@ def _components(mask: NDArray[np.uint8], reach: int) -> Array:  # pragma: no cov
     return _boxes(parent[:made], first, last, row)
 
 
-@njit(cache=True)
+@inlined
 def _boxes(
     parent: NDArray[np.int32], first: NDArray[np.int32], last: NDArray[np.int32], row: NDArray[np.int32]
-) -> Array:  # pragma: no cover
+) -> Array:
     """Box and middle of every set of runs."""
     number = np.full(len(parent), -1, np.int32)
     sums = np.zeros((len(parent), 7))  # left, top, right, bottom, u, v, area
@@ -76,16 +76,16 @@ def _boxes(
     return out
 
 
-@njit(cache=True)
-def _root(parent: NDArray[np.int32], k: int) -> int:  # pragma: no cover
+@inlined
+def _root(parent: NDArray[np.int32], k: int) -> int:
     while parent[k] != k:
         parent[k] = parent[parent[k]]
         k = parent[k]
     return k
 
 
-@njit(cache=True)
-def _join(parent: NDArray[np.int32], a: int, b: int) -> None:  # pragma: no cover
+@inlined
+def _join(parent: NDArray[np.int32], a: int, b: int) -> None:
     """The older root stays."""
     ra, rb = _root(parent, a), _root(parent, b)
     if ra < rb:

@@ -16,9 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hal.arrays import Array
+from hal.arrays import Array, Image
 from perception.vision.finding.shapes import Edges
-from perception.vision.image import Image
 from perception.vision.patch import sample_at
 
 PLATE_PX_PER_M = 1500.0  # resolution of the rectified plate

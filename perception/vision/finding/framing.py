@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Image
 from hal.errors import Ambiguous, NotFound
 from hal.geometry import UncertainPose, transform
 from hal.panel import Panel
 from perception.vision.finding.plate import Plate, find_plate
-from perception.vision.image import Image
+from perception.vision.projection import CameraProjection, PanelProjection, PlateProjection
 from perception.vision.registration.register import register
-from perception.vision.view import CameraView, PlaneView, View
 
 COARSE_WIDTH_PX = 240
 LEAST_SHARE = 0.06  # of the image: smaller plates show no objects
@@ -51,7 +51,7 @@ def one_plate(gray: Image, plate_m: tuple[float, float], *, focal_px: float | No
     return plate
 
 
-def check_upright(gray: Image, view: View, panel: Panel) -> None:
+def check_upright(gray: Image, view: PanelProjection, panel: Panel) -> None:
     """Refuse a panel that fits better upside down or mirrored.
 
     Raises:
@@ -80,21 +80,23 @@ def _askew(panel: Panel, how: str, share: float, upright: float, *, hint: str) -
     return NotFound(f"panel {panel.name!r} is {how} in this image: {edges}", hint=hint)
 
 
-def upside_down(view: View) -> View:
+def upside_down(view: PanelProjection) -> PanelProjection:
     """The same plate turned by half a turn about its middle."""
-    if isinstance(view, PlaneView):
-        return PlaneView(px_from_plate=view.px_from_plate @ HALF_TURN, corners_m=view.corners_m, sigma_px=view.sigma_px)
-    if isinstance(view, CameraView):
+    if isinstance(view, PlateProjection):
+        return PlateProjection(
+            px_from_plate=view.px_from_plate @ HALF_TURN, corners_m=view.corners_m, sigma_px=view.sigma_px
+        )
+    if isinstance(view, CameraProjection):
         pose = view.camera_from_panel
         turned = pose.parent_from_child * transform(HALF_TURN, np.zeros(3))
-        return CameraView(
+        return CameraProjection(
             intrinsics=view.intrinsics,
             camera_from_panel=UncertainPose(parent_from_child=turned, covariance=pose.covariance),
         )
     raise TypeError(f"no half turn of a {type(view).__name__}")
 
 
-def _objects_share(gray: Image, view: View, panel: Panel) -> float:
+def _objects_share(gray: Image, view: PanelProjection, panel: Panel) -> float:
     """Share of the edges of the panel's objects that the image shows; NaN, which compares as no, where none has any."""
     shares = np.array(list(register(gray, view, panel).edge_share.values()))
     shares = shares[np.isfinite(shares)]

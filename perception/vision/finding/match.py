@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hal.arrays import Array
-from perception.vision.knowledge import NOTHING, Kind, Knowledge
+from hal.jit import compiled, inlined
+from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind
 
 NEXT_FURTHER = 0.02  # by which the next nearest look of a kind is further, at the median of hard drawn overviews
 CLIP = 3.0  # one number counts for three spreads at most: glare or a cable spoils some numbers, whatever is there
@@ -68,7 +68,7 @@ def nearest(looks: Array, known: Prepared, *, kind: int | None = None, mean_of: 
     return np.asarray(_nearest(scaled, known.columns, first, clips, mean_of, NEXT_FURTHER * total), float) / total
 
 
-def nearest_look(look: Array, kind: Kind, knowledge: Knowledge) -> int:
+def nearest_look(look: Array, kind: TaughtKind, knowledge: Knowledge) -> int:
     """Which look of a kind is nearest to a (LENGTH,) look."""
     difference = np.minimum(np.abs(kind.looks - look) / knowledge.spread, CLIP)
     return int((difference @ knowledge.weights).argmin())
@@ -91,7 +91,7 @@ def nothing_column(knowledge: Knowledge) -> int | None:
     return names.index(NOTHING) if NOTHING in names else None
 
 
-@njit(cache=True)
+@compiled
 def _nearest(
     looks: NDArray[np.float32],
     columns: NDArray[np.float32],
@@ -99,7 +99,7 @@ def _nearest(
     clips: NDArray[np.float32],
     mean_of: int,
     step: float,
-) -> NDArray[np.float32]:  # pragma: no cover
+) -> NDArray[np.float32]:
     """One look against all taught ones at once, number by number: the inner loop runs in vector registers, in an order
     of sums that no processor changes."""
     n, length = looks.shape
@@ -119,8 +119,8 @@ def _nearest(
     return out
 
 
-@njit(cache=True)
-def _mean_of_least(values: NDArray[np.float32], count: int, step: float) -> float:  # pragma: no cover
+@inlined
+def _mean_of_least(values: NDArray[np.float32], count: int, step: float) -> float:
     """Mean of the `count` least values; those that lack follow the last in steps."""
     least = np.full(count, np.inf)
     for value in values:

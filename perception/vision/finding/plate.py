@@ -14,12 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.arrays import Array
+from hal.arrays import Array, Image
 from perception.vision.finding.plate_pose import rigid_plate
-from perception.vision.image import Image
+from perception.vision.projection import PlateProjection, homography
 from perception.vision.registration.outline import Outline, rectangle
 from perception.vision.registration.register import EdgeImage, confirmed, edge_image, follow_edges
-from perception.vision.view import PlaneView, homography
 
 COARSE_WIDTH_PX = 160
 TYPICAL_FOCAL = 1.25  # of the longer image side: a lens of 44 degrees; completes a side that is cut off
@@ -50,7 +49,7 @@ class Plate:
         is_sure: whether the border alone says where the plate is; else it may be the edge of something else.
     """
 
-    view: PlaneView
+    view: PlateProjection
     sides_seen: tuple[bool, bool, bool, bool]
     is_sure: bool
 
@@ -93,7 +92,7 @@ class _Search:
     shrink: float
     focal_px: float
 
-    def best(self, lines: list[Array | None]) -> PlaneView | None:
+    def best(self, lines: list[Array | None]) -> PlateProjection | None:
         """The plate that the image's edges confirm best; None when the lines make none, or hardly an edge confirms it."""
         view = self._laid(lines, WINDOWS_PX, START_SIGMA_PX)
         found = [] if view is None else [(self._score(view), view)]
@@ -107,19 +106,19 @@ class _Search:
         best = max(found, key=lambda f: f[0])[1] if found else None
         return best if best is not None and self._is_plate(best) else None
 
-    def _is_plate(self, view: PlaneView) -> bool:
+    def _is_plate(self, view: PlateProjection) -> bool:
         """Whether edges confirm enough of the border, and a camera could see a plate of these proportions so."""
         visible, near = (int(mask.sum()) for mask in confirmed(self.image, view, self.outline))
         is_confirmed = near >= max(LEAST_CONFIRMED, LEAST_SHARE_CONFIRMED * visible)
         return is_confirmed and self._stretch(view) < MOST_STRETCHED
 
-    def is_sure(self, view: PlaneView) -> bool:
+    def is_sure(self, view: PlateProjection) -> bool:
         """Whether edges confirm nearly all of the visible border, on three sides at least: two leave the size open."""
         visible, near = (mask.reshape(4, -1).sum(axis=1) for mask in confirmed(self.image, view, self.outline))
         sides = (visible >= SURE_SIDE_VISIBLE) & (2 * near > visible)
         return bool(sides.sum() >= SURE_SIDES and near.sum() >= SURE_SHARE * visible.sum())
 
-    def _stretch(self, view: PlaneView) -> float:
+    def _stretch(self, view: PlateProjection) -> float:
         """How much longer one direction of the plate would be than the other, before the camera of known focal length.
 
         The columns of K^-1 H of a rigid plate are as long as each other; a focal length that is off by half makes them
@@ -130,7 +129,9 @@ class _Search:
         across, up = np.linalg.norm(np.linalg.solve(K, view.px_from_plate)[:, :2], axis=0)
         return float(max(across, up) / max(min(across, up), 1e-9))
 
-    def _laid(self, lines: list[Array | None], windows_px: tuple[float, ...], sigma_px: float) -> PlaneView | None:
+    def _laid(
+        self, lines: list[Array | None], windows_px: tuple[float, ...], sigma_px: float
+    ) -> PlateProjection | None:
         """The plate through the lines, moved onto the image's edges: first as a rigid one, then freely."""
         corners_px = self._corners_px(lines)
         if corners_px is None:
@@ -141,16 +142,16 @@ class _Search:
             middle_px=np.array([columns - 1.0, rows - 1.0]) / 2,
         )  # fmt: skip
         rigid = follow_edges(self.image, rigid, self.outline, windows_px)
-        free = PlaneView(px_from_plate=rigid.px_from_plate, corners_m=self.corners_m, sigma_px=FREE_SIGMA_PX)
+        free = PlateProjection(px_from_plate=rigid.px_from_plate, corners_m=self.corners_m, sigma_px=FREE_SIGMA_PX)
         return follow_edges(self.image, free, self.outline, FREE_WINDOWS_PX)
 
-    def _free(self, lines: list[Array | None]) -> PlaneView | None:
+    def _free(self, lines: list[Array | None]) -> PlateProjection | None:
         """The plate through four lines, as no rigid one: a lens that is not typical shows at a steep tilt."""
         corners_px = self._corners_px(lines) if all(line is not None for line in lines) else None
         if corners_px is None:
             return None
         H = homography(self.corners_m, corners_px)
-        view = PlaneView(px_from_plate=H, corners_m=self.corners_m, sigma_px=START_SIGMA_PX)
+        view = PlateProjection(px_from_plate=H, corners_m=self.corners_m, sigma_px=START_SIGMA_PX)
         return follow_edges(self.image, view, self.outline, WINDOWS_PX)
 
     def _corners_px(self, lines: list[Array | None]) -> Array | None:
@@ -159,12 +160,12 @@ class _Search:
         corners = _corners(lines, self.coarse_shape, float(width / height), self.focal_px / self.shrink)
         return None if corners is None else (corners + 0.5) * self.shrink - 0.5
 
-    def _score(self, view: PlaneView) -> int:
+    def _score(self, view: PlateProjection) -> int:
         """Samples of the border that an edge confirms, less visible ones that none does."""
         visible, near = confirmed(self.image, view, self.outline)
         return 2 * int(near.sum()) - int(visible.sum())
 
-    def _least_confirmed(self, view: PlaneView) -> float:
+    def _least_confirmed(self, view: PlateProjection) -> float:
         """Share of the visible samples with an edge, on the worst side of which enough is visible."""
         visible, near = (mask.reshape(4, -1).sum(axis=1) for mask in confirmed(self.image, view, self.outline))
         return float(np.where(visible >= SIDE_POINTS // 5, near / np.maximum(visible, 1), 1.0).min())

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hal.arrays import Array
-from perception.vision.view import homography
+from perception.vision.projection import homography
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RigidPlate:
-    """A `View` of the plate's plane; moves by a turn (rad, camera axes), then a shift in units of its distance.
+    """A `PanelProjection` of the plate's plane; moves by a turn (rad, camera axes), then a shift in units of its distance.
 
     Attributes:
         R, t_m: camera_from_plate, (3, 3) and (3,).

@@ -10,11 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from hal.arrays import Array
-from perception.vision.image import Image
+from hal.arrays import Array, Image
+from hal.jit import compiled, inlined
 from perception.vision.noise import noise_sigma
 
 TOLERANCE = 9.0  # gray levels, at least
@@ -26,7 +25,7 @@ SPREADS = 2.0  # of the region's own standard deviation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Regions:
+class ImageRegions:
     """Segmentation of an image.
 
     Attributes:
@@ -44,7 +43,7 @@ class Regions:
     box_px: Array
 
 
-def grow_regions(gray: Image, *, tolerance: float | None = None) -> Regions:
+def grow_regions(gray: Image, *, tolerance: float | None = None) -> ImageRegions:
     """Segment a gray image (H, W) uint8.
 
     Args:
@@ -57,24 +56,22 @@ def grow_regions(gray: Image, *, tolerance: float | None = None) -> Regions:
     count = sums[:, 0]
     mean = sums[:, 1] / count
     box = np.column_stack([sums[:, 5], sums[:, 7], sums[:, 6] - sums[:, 5] + 1, sums[:, 8] - sums[:, 7] + 1])
-    return Regions(
+    return ImageRegions(
         labels=labels, area_px=count, mean=mean, variance=np.maximum(sums[:, 2] / count - mean**2, 0.0),
         middle_px=sums[:, 3:5] / count[:, None], box_px=box,
     )  # fmt: skip
 
 
-@njit(cache=True, inline="always")
-def _root(parent: NDArray[np.int32], k: int) -> int:  # pragma: no cover
+@inlined
+def _root(parent: NDArray[np.int32], k: int) -> int:
     while parent[k] != k:
         parent[k] = parent[parent[k]]
         k = parent[k]
     return k
 
 
-@njit(cache=True, inline="always")
-def _fits(
-    n: np.int64, total: np.int64, squares: np.int64, value: np.int64, tolerance: float
-) -> bool:  # pragma: no cover
+@inlined
+def _fits(n: np.int64, total: np.int64, squares: np.int64, value: np.int64, tolerance: float) -> bool:
     """Whether a gray value belongs to a region: |I - mean| <= max(tolerance, SPREADS * sigma), no roots."""
     d = abs(value * n - total)  # n |I - mean|: no division on the common path
     if d <= tolerance * n:
@@ -84,22 +81,22 @@ def _fits(
     return bool(d * d <= SPREADS * SPREADS * (squares * n - total * total))
 
 
-@njit(cache=True, inline="always")
-def _moments(region: Array) -> Moments:  # pragma: no cover
+@inlined
+def _moments(region: Array) -> Moments:
     """Count, sum and sum of squares of a region's gray levels: whole numbers, which add faster."""
     return np.int64(region[0]), np.int64(region[1]), np.int64(region[2])
 
 
-@njit(cache=True, inline="always")
-def _begin(sums: Array, parent: NDArray[np.int32], k: int, u: int, v: int) -> None:  # pragma: no cover
+@inlined
+def _begin(sums: Array, parent: NDArray[np.int32], k: int, u: int, v: int) -> None:
     """A region without pixels yet, from this place on."""
     parent[k] = k
     sums[k] = 0.0
     sums[k, 5], sums[k, 6], sums[k, 7] = u, u, v
 
 
-@njit(cache=True, inline="always")
-def _joined(sums: Array, parent: NDArray[np.int32], a: int, b: int) -> int:  # pragma: no cover
+@inlined
+def _joined(sums: Array, parent: NDArray[np.int32], a: int, b: int) -> int:
     """One region of two roots; the older one's number stays."""
     low, high = (a, b) if a < b else (b, a)
     parent[high] = low
@@ -112,8 +109,8 @@ def _joined(sums: Array, parent: NDArray[np.int32], a: int, b: int) -> int:  # p
     return low
 
 
-@njit(cache=True, inline="always")
-def _flush(sums: Array, k: int, moments: Moments, row: int, first: int, end: int) -> None:  # pragma: no cover
+@inlined
+def _flush(sums: Array, k: int, moments: Moments, row: int, first: int, end: int) -> None:
     """Write back the gray moments of region `k`, and add the places of its run [first, end) in a row."""
     count = end - first
     region = sums[k]
@@ -125,7 +122,7 @@ def _flush(sums: Array, k: int, moments: Moments, row: int, first: int, end: int
     region[8] = row
 
 
-@njit(cache=True)
+@compiled
 def _grow(gray: Image, tolerance: float) -> tuple[NDArray[np.int32], Array]:  # noqa: PLR0912 - a case a neighbour  # pragma: no cover - compiled
     """One raster pass. The region of the current run has its gray moments in registers (n, total, squares): most
     pixels have the same region above and to the left, and cost one comparison."""
@@ -183,10 +180,8 @@ def _grow(gray: Image, tolerance: float) -> tuple[NDArray[np.int32], Array]:  # 
     return _numbered(labels, parent[:made], sums)
 
 
-@njit(cache=True)
-def _numbered(
-    labels: NDArray[np.int32], parent: NDArray[np.int32], sums: Array
-) -> tuple[NDArray[np.int32], Array]:  # pragma: no cover
+@compiled
+def _numbered(labels: NDArray[np.int32], parent: NDArray[np.int32], sums: Array) -> tuple[NDArray[np.int32], Array]:
     """Labels 0 to N - 1 in the order of the roots, in place, and the roots' sums."""
     number = np.full(len(parent), -1, np.int32)
     out = np.empty((len(parent), 9))
@@ -204,8 +199,8 @@ def _numbered(
     return labels, out[:count].copy()
 
 
-@njit(cache=True)
-def _enlarged(parent: NDArray[np.int32], sums: Array) -> tuple[NDArray[np.int32], Array]:  # pragma: no cover
+@compiled
+def _enlarged(parent: NDArray[np.int32], sums: Array) -> tuple[NDArray[np.int32], Array]:
     more_parent = np.empty(2 * len(parent), np.int32)
     more_parent[: len(parent)] = parent
     more_sums = np.empty((2 * len(sums), sums.shape[1]))

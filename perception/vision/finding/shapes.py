@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Image
 from perception.vision.finding.components import components
-from perception.vision.image import Image
 from perception.vision.noise import noise_sigma
 
 Float32 = NDArray[np.float32]

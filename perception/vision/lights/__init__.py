@@ -4,10 +4,10 @@
 each, `assign` picks the four that the taught quadrangle allows (`search`), `panel_view` joins them.
 """
 
+from perception.vision.lights.alignment import CameraMoved
 from perception.vision.lights.assign import UPRIGHT, AssignedLights, LightMissing, WrongLamp, assign_lights
 from perception.vision.lights.find import LightBlobs, find_lights, gray_of
 from perception.vision.lights.panel_view import PanelView, panel_pose, warm_up
-from perception.vision.lights.registration import CameraMoved
 
 __all__ = [
     "UPRIGHT", "AssignedLights", "CameraMoved", "LightBlobs", "LightMissing", "PanelView", "WrongLamp", "assign_lights",

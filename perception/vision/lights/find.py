@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from hal.arrays import Array
 from hal.errors import InvalidRequest
+from perception.vision.lights.alignment import ImageAlignment, register
 from perception.vision.lights.core import Core, lamp_core, level_at
-from perception.vision.lights.registration import Registration, register
 
 Image = NDArray[np.float32]
 
@@ -117,7 +117,7 @@ def _raw_noise(off: Image, on: Image) -> float:
     return max(1.4826 * float(np.mean(rough)) / float(np.sqrt(6.0)), 0.5)
 
 
-def _rise(on: Image, registration: Registration, diameter: float) -> Image:
+def _rise(on: Image, registration: ImageAlignment, diameter: float) -> Image:
     """Difference on - off, smoothed, without what is wider than a lamp (white top-hat)."""
     import cv2
 
@@ -132,7 +132,7 @@ def _rise(on: Image, registration: Registration, diameter: float) -> Image:
     return rise
 
 
-def _noise(rise: Image, registration: Registration) -> Image:
+def _noise(rise: Image, registration: ImageAlignment) -> Image:
     """(H, W) standard deviation of `rise` where nothing changed.
 
     sigma^2 = a + b I + c |grad I|^2: read noise, shot noise, and misregistered edges; each from quantiles of this pair.
@@ -282,7 +282,7 @@ def _edge_quality(rise: Image, core: Core) -> tuple[float, float]:
     return (outer - inner) / max(middle, 1.0), uneven
 
 
-def _describe(regions: list[_Region], sigma: Image, registration: Registration) -> LightBlobs:
+def _describe(regions: list[_Region], sigma: Image, registration: ImageAlignment) -> LightBlobs:
     rows = [row for row in map(_measure, regions) if row[4] >= LEAST_ASPECT]
     rows.sort(key=lambda row: -row[6])
     rows = rows[:MOST_BLOBS]

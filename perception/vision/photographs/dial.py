@@ -12,13 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Image
 from hal.panel import Scale
-from perception.vision.image import WHITE_LEVEL, Image, as_gray
+from perception.vision.image import WHITE_LEVEL, as_gray
 from perception.vision.patch import Patch
 from perception.vision.photographs.dial_outline import SIDE_PX, dial_circle
 from perception.vision.photographs.drop import find_drop, with_halo
 from perception.vision.photographs.scale_ends import scale_ends
-from perception.vision.reading import ANSWER_AT, Status, answer_at, gated, limited, refused
+from perception.vision.reading import ANSWER_AT, PatchReading, answer_at, gated, limited, refused
 from perception.vision.status.gauge import RIVAL, SIGMA_RAD, pointer_confidence, status_of_pointer
 from perception.vision.status.pointer import PointerFit, find_pointer, unroll, wrapped
 
@@ -46,7 +47,7 @@ BY_TICKS = 0.75  # confidence: an end may be a tick off
 def read_dial(
     image: NDArray[Any], *, minimum: float, maximum: float, circular: bool, ends_rad: tuple[float, float] | None = None,
     least_confidence: float = ANSWER_AT,
-) -> Status:  # fmt: skip
+) -> PatchReading:  # fmt: skip
     """Value of the dial that fills the picture.
 
     Args:
@@ -67,7 +68,7 @@ def read_dial(
     if circular:
         value = minimum + (fit.angle_rad % (2 * np.pi)) / (2 * np.pi) * (maximum - minimum)
         sigma = fit.sigma_rad / (2 * np.pi) * (maximum - minimum)
-        status = Status(value=float(value), uncertainty=float(sigma), confidence=_confidence(fit))
+        status = PatchReading(value=float(value), uncertainty=float(sigma), confidence=_confidence(fit))
     else:
         (low, high), most_of_ends = (ends_rad, 1.0) if ends_rad else _ends(as_gray(picture), *circle)
         most = min(most, most_of_ends)

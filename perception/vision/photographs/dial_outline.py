@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from hal.arrays import Image
 from perception.vision.bilinear import polar_values
 from perception.vision.finding.circles import Circle, find_circles
 from perception.vision.finding.shapes import find_edges
-from perception.vision.image import Image
 
 SIDE_PX = 220
 LEAST_SIDE_PX = 90

@@ -12,14 +12,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from hal.arrays import Array
-from perception.vision.image import Image
+from hal.arrays import Array, Image
+from hal.jit import compiled
 from perception.vision.noise import noise_sigma
-from perception.vision.status.comb import LIT_SHARES
-from perception.vision.status.comb_jit import Float32, cell_boxes
+from perception.vision.status.digit_grid import LIT_SHARES
+from perception.vision.status.digit_grid_worth import Float32, cell_boxes
 
 CELL_PX = 24.0  # between the axes of the top and bottom segments
 STRIDE = 2
@@ -38,7 +37,7 @@ SAME_HEIGHT, SAME_ROW, NEXT_CELL = 1.35, 0.3, 2.2  # cells of one row: ratio of 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Cell:
+class DigitCell:
     """A place that looks like a digit: upper left corner of its axes, size, all px of the picture; and how well, 0 to 1."""
 
     u: float
@@ -69,7 +68,7 @@ def find_digit_rows(gray: Image) -> list[DigitRow]:
         gray: (H, W) uint8.
     """
     cells = sorted(_cells(gray), key=lambda cell: cell.score, reverse=True)
-    kept: list[Cell] = []
+    kept: list[DigitCell] = []
     for cell in cells:
         if len(kept) >= MOST_CELLS:
             break
@@ -78,7 +77,7 @@ def find_digit_rows(gray: Image) -> list[DigitRow]:
     return _rows(kept)
 
 
-def _cells(gray: Image) -> Iterator[Cell]:
+def _cells(gray: Image) -> Iterator[DigitCell]:
     height = LEAST_PX
     while height <= MOST_SHARE * min(gray.shape):
         scale = CELL_PX / height
@@ -98,7 +97,7 @@ def _ink(small: Image, is_dark: bool) -> Float32:
     return np.asarray(np.maximum(hat - 1.0 - NOISE_SIGMAS * 0.5 * noise_sigma(small), 0.0), np.float32)
 
 
-def _cells_of_height(ink: Float32, is_dark: bool, scale: float) -> Iterator[Cell]:
+def _cells_of_height(ink: Float32, is_dark: bool, scale: float) -> Iterator[DigitCell]:
     middle = (len(ink) - 1) / 2
     for slant in SLANTS:
         shear = np.array([[1.0, -slant, slant * middle], [0.0, 1.0, 0.0]])
@@ -112,7 +111,7 @@ def _cells_of_height(ink: Float32, is_dark: bool, scale: float) -> Iterator[Cell
             for i, j in zip(*_peaks(scores), strict=True):
                 v = float(i * STRIDE)
                 u = j * STRIDE - slant * (v + CELL_PX / 2 - middle)
-                yield Cell(u=u / scale, v=v / scale, width=width / scale, height=CELL_PX / scale, is_dark=is_dark,
+                yield DigitCell(u=u / scale, v=v / scale, width=width / scale, height=CELL_PX / scale, is_dark=is_dark,
                            score=float(scores[i, j]))  # fmt: skip
 
 
@@ -123,13 +122,13 @@ def _peaks(scores: Float32) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return rows, columns
 
 
-@njit(cache=True)
-def cell_scores(sums: Array, squares: Array, boxes: Array, width: float, lit: Array) -> Float32:  # pragma: no cover
+@compiled
+def cell_scores(sums: Array, squares: Array, boxes: Array, width: float, lit: Array) -> Float32:
     """Share of the ink's energy around a cell that its best character explains, for cells at every STRIDE px.
 
     Args:
         sums, squares: integral images of the upright ink, and of its square.
-        boxes: (9, 4) of a cell at the origin (see `comb_jit.cell_boxes`).
+        boxes: (9, 4) of a cell at the origin (see `digit_grid_worth.cell_boxes`).
         lit: (characters, 7) 1 where a segment is lit.
     """
     rows, columns = sums.shape[0] - 1, sums.shape[1] - 1
@@ -168,14 +167,14 @@ def cell_scores(sums: Array, squares: Array, boxes: Array, width: float, lit: Ar
     return out
 
 
-def _overlap(a: Cell, b: Cell) -> bool:
+def _overlap(a: DigitCell, b: DigitCell) -> bool:
     """Whether two cells cover each other by a third or more."""
     across = min(a.u + a.width, b.u + b.width) - max(a.u, b.u)
     down = min(a.v + a.height, b.v + b.height) - max(a.v, b.v)
     return across > 0 and down > 0 and across * down > 0.33 * min(a.width * a.height, b.width * b.height)
 
 
-def _rows(cells: list[Cell]) -> list[DigitRow]:
+def _rows(cells: list[DigitCell]) -> list[DigitRow]:
     """Cells joined into rows from the best on."""
     free = list(cells)
     rows: list[DigitRow] = []
@@ -191,7 +190,7 @@ def _rows(cells: list[Cell]) -> list[DigitRow]:
     return sorted(rows, key=lambda row: row.score, reverse=True)
 
 
-def _beside(a: Cell, b: Cell) -> bool:
+def _beside(a: DigitCell, b: DigitCell) -> bool:
     height = max(a.height, b.height)
     gap = max(a.u, b.u) - min(a.u + a.width, b.u + b.width)
     return (
@@ -202,7 +201,7 @@ def _beside(a: Cell, b: Cell) -> bool:
     )
 
 
-def _row(cells: list[Cell]) -> DigitRow:
+def _row(cells: list[DigitCell]) -> DigitRow:
     weights = np.array([cell.score for cell in cells])
     height = float(np.average([cell.height for cell in cells], weights=weights))
     return DigitRow(

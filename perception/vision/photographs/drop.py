@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.arrays import Array
-from perception.vision.image import WHITE_LEVEL, Image, as_gray
+from hal.arrays import Array, Image
+from perception.vision.image import WHITE_LEVEL, as_gray
 from perception.vision.reading import probability
 from perception.vision.status.pointer import PointerFit, wrapped
 
@@ -63,7 +63,7 @@ class Sides:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Plane:
+class ColourPlane:
     """One channel and polarity of the picture, (H, W), within a dial: `part` is high where a pointer may be."""
 
     part: NDArray[np.float32]
@@ -81,7 +81,7 @@ def find_drop(image: Image, u: float, v: float, radius: float) -> tuple[Drop | N
     sides = [found for plane in planes if (found := _sides(plane, plane.mask, middle, radius)) is not None]
     best = max(sides, key=lambda found: found.score, default=None)
     by_sides = None if best is None else Drop(fit=_fit_of(best), most=_worth(best))
-    outlined: tuple[float, NDArray[np.bool_], Plane] | None = None
+    outlined: tuple[float, NDArray[np.bool_], ColourPlane] | None = None
     for plane in planes:
         region, separation = _region(plane, (round(u), round(v)))
         if region is not None and (outlined is None or separation > outlined[0]):
@@ -129,7 +129,7 @@ def _worth(sides: Sides) -> float:
     return MOST_BY_SIDES * probability([(sides.score, *SCORE), (sides.lead, *LEAD)])
 
 
-def _planes(image: Image, u: float, v: float, radius: float) -> Iterator[Plane]:
+def _planes(image: Image, u: float, v: float, radius: float) -> Iterator[ColourPlane]:
     """Lightness and both colour axes, bright and dark, parted into face and what stands out of it."""
     planes: list[NDArray[Any]] = [as_gray(image)]
     if image.ndim == 3:
@@ -146,10 +146,10 @@ def _planes(image: Image, u: float, v: float, radius: float) -> Iterator[Plane]:
                 continue
             coded = np.clip((part - low) / (high - low) * 255, 0, 255).astype(np.uint8)
             threshold, _ = cv2.threshold(coded[disc][None], 0, 1, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-            yield Plane(part=part, mask=(coded > threshold) & disc, disc=disc)
+            yield ColourPlane(part=part, mask=(coded > threshold) & disc, disc=disc)
 
 
-def _region(plane: Plane, middle: tuple[int, int]) -> tuple[NDArray[np.bool_] | None, float]:
+def _region(plane: ColourPlane, middle: tuple[int, int]) -> tuple[NDArray[np.bool_] | None, float]:
     """The coloured region about the middle and how many spreads of the face it stands out by; None if it is no pointer."""
     disc = plane.disc
     mask = _opened(plane.mask, 3)
@@ -171,7 +171,7 @@ def _opened(mask: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
     return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0)
 
 
-def _sides(plane: Plane, mask: NDArray[np.bool_], middle: tuple[float, float], radius: float) -> Sides | None:
+def _sides(plane: ColourPlane, mask: NDArray[np.bool_], middle: tuple[float, float], radius: float) -> Sides | None:
     """The direction in which two edges run from a hub about the middle to a tip; None without such a hub.
 
     Args:

@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.vision.image import Image, as_gray
+from hal.arrays import Image
+from perception.vision.image import as_gray
 from perception.vision.photographs.digit_search import DigitRow, find_digit_rows
-from perception.vision.reading import ANSWER_AT, Status, answer_at, gated, limited, refused
-from perception.vision.status.comb_jit import slant_energies
+from perception.vision.reading import ANSWER_AT, PatchReading, answer_at, gated, limited, refused
+from perception.vision.status.digit_grid_worth import slant_energies
 from perception.vision.status.display import read_window
 from perception.vision.status.glyphs import lit_segments
 
@@ -26,7 +27,7 @@ FEW, FEW_OF_SCENE = 4.0, 5.6  # segments, see `_agreed`: of a scene, four are an
 FRAME = 0.08  # of a crop's height that a frame may take
 
 
-def read_photograph(image: NDArray[Any], *, scene: bool, least_confidence: float = ANSWER_AT) -> Status:
+def read_photograph(image: NDArray[Any], *, scene: bool, least_confidence: float = ANSWER_AT) -> PatchReading:
     """Text of the display in a photograph.
 
     Args:
@@ -45,7 +46,7 @@ def read_photograph(image: NDArray[Any], *, scene: bool, least_confidence: float
     return answer_at(_agreed(answers, FEW_OF_SCENE if scene else FEW), least_confidence)
 
 
-def _read(place: tuple[Image, bool | None, float]) -> list[tuple[float, Status]]:
+def _read(place: tuple[Image, bool | None, float]) -> list[tuple[float, PatchReading]]:
     """What a window says, with the weight of its place: with and without what touches its border."""
     window, dark, share = place
     straight = _straight(_scaled(window))
@@ -54,7 +55,9 @@ def _read(place: tuple[Image, bool | None, float]) -> list[tuple[float, Status]]
     ]
 
 
-def _with_rows(whole: list[tuple[float, Status]], rows: list[tuple[float, Status]]) -> list[tuple[float, Status]]:
+def _with_rows(
+    whole: list[tuple[float, PatchReading]], rows: list[tuple[float, PatchReading]]
+) -> list[tuple[float, PatchReading]]:
     """The readings of a crop, and those of rows of digits found in it.
 
     A row may lack digits, but has no frame and no words beside it: what it says counts in full where the crop at least guesses the
@@ -64,7 +67,7 @@ def _with_rows(whole: list[tuple[float, Status]], rows: list[tuple[float, Status
     return whole + [(1.0 if answer.text in supposed else ROW * share, answer) for share, answer in rows]
 
 
-def _agreed(answers: list[tuple[float, Status]], few: float = FEW) -> Status:
+def _agreed(answers: list[tuple[float, PatchReading]], few: float = FEW) -> PatchReading:
     """The answer that says most, less sure for every rival, in a doubtful place, and of few segments, as any bar makes a 1;
     the likeliest refusal where nothing was read.
 

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from hal.arrays import Array
-from perception.vision.image import Image
+from hal.arrays import Array, Image
 
 SAMPLES = 1440  # of a turn
 RINGS = np.linspace(0.45, 1.0, 28)  # share of the radius
@@ -94,8 +93,8 @@ def _longest(profile: Array) -> TickRun | None:
 
 def _follow(profile: Array, step: int) -> TickRun | None:
     """From where five ticks show best, both ways to the last one; None for a run that is none of a scale."""
-    comb = sum(np.roll(profile, -k * step) - np.roll(profile, -k * step - step // 2) for k in range(-2, 3))
-    start, contrast = _tick(profile, int(np.argmax(comb)), step)
+    grid = sum(np.roll(profile, -k * step) - np.roll(profile, -k * step - step // 2) for k in range(-2, 3))
+    start, contrast = _tick(profile, int(np.argmax(grid)), step)
     contrasts, ends, most_missing = [contrast], [], max(1, HIDDEN_SAMPLES // step)
     for way in (1, -1):
         at, last, missing = start, start, 0

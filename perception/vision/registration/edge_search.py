@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hal.arrays import Array
+from hal.jit import compiled
 from perception.vision.bilinear import value_at
 
 STEP_PX = 0.5
 
 
-@njit(cache=True)
+@compiled
 def strongest_edges(
     smooth: NDArray[np.float32], points_px: Array, normals_px: Array, window_px: float
-) -> tuple[Array, Array, NDArray[np.bool_]]:  # pragma: no cover
+) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Where the slope along every normal is steepest, a gaussian of `window_px` preferring what is near.
 
     Args:

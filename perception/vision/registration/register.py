@@ -14,13 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.arrays import Array
+from hal.arrays import Array, Image
 from hal.panel import Panel
-from perception.vision.image import Image
 from perception.vision.noise import noise_sigma
+from perception.vision.projection import PanelProjection
 from perception.vision.registration.edge_search import strongest_edges
 from perception.vision.registration.outline import Outline, edges_of, plate_edges
-from perception.vision.view import View
 
 WINDOWS_PX = (8.0, 5.0, 3.0, 2.0)  # search to either side; the pose is known to a few pixels
 LAST_LOOK_PX, NEAR_PX = 2.5, 2.0  # search at the end, and how near an edge confirms the model
@@ -35,7 +34,7 @@ REGISTERED_SIGMA_PX = 0.15  # of the panel as a whole
 MIN_VISIBLE = 16  # fewer edge samples in the image say nothing about the panel
 
 
-V = TypeVar("V", bound=View)
+V = TypeVar("V", bound=PanelProjection)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,7 +51,7 @@ class Registration:
         edge_share: per object name, the share of its own edges found; NaN for kinds without fixed edges.
     """
 
-    view: View
+    view: PanelProjection
     covariance: Array
     support: float
     rms_px: float
@@ -61,7 +60,7 @@ class Registration:
     edge_share: dict[str, float]
 
 
-def register(gray: Image, view: View, panel: Panel) -> Registration:
+def register(gray: Image, view: PanelProjection, panel: Panel) -> Registration:
     """Move `view` so that the panel's edges lie on the image's.
 
     Args:
@@ -120,7 +119,7 @@ def follow_edges(image: EdgeImage, view: V, outline: Outline, windows_px: Sequen
     return view.moved(delta)
 
 
-def confirmed(image: EdgeImage, view: View, outline: Outline) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def confirmed(image: EdgeImage, view: PanelProjection, outline: Outline) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """(N,) which samples of the outline the image shows, and which of them have an edge within `NEAR_PX`."""
     found = _look(image.smooth, image.slope_noise, view, outline, LAST_LOOK_PX)
     return found.visible, found.ok & (np.abs(found.offset_px) <= NEAR_PX)
@@ -134,7 +133,9 @@ class _Found:
     ok: NDArray[np.bool_]
 
 
-def _look(smooth: NDArray[np.float32], slope_noise: float, view: View, edges: Outline, window_px: float) -> _Found:
+def _look(
+    smooth: NDArray[np.float32], slope_noise: float, view: PanelProjection, edges: Outline, window_px: float
+) -> _Found:
     """The strongest image edge along every model normal: signed offset in px."""
     points = view.project(edges.points_m)
     ahead = view.project(
@@ -148,14 +149,14 @@ def _look(smooth: NDArray[np.float32], slope_noise: float, view: View, edges: Ou
     return _Found(offset_px=offset, normals_px=normals, visible=visible, ok=ok)
 
 
-def _ahead(view: View, edges: Outline) -> Array:
+def _ahead(view: PanelProjection, edges: Outline) -> Array:
     """(N, 2) what a step along every normal is in the image, px."""
     step = NORMAL_STEP_M * np.column_stack([edges.normals, np.zeros(len(edges.normals))])
     return view.project(edges.points_m + step) - view.project(edges.points_m)
 
 
 def _step(
-    smooth: NDArray[np.float32], slope_noise: float, reference: View, delta: Array, *, edges: Outline, window_px: float,
+    smooth: NDArray[np.float32], slope_noise: float, reference: PanelProjection, delta: Array, *, edges: Outline, window_px: float,
     motion: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Two Gauss-Newton steps on the edges found in one window; `motion` (N, 2, P) is what `_motion` gives."""
@@ -176,7 +177,7 @@ def _step(
     return delta, np.asarray(np.linalg.inv(N), float)
 
 
-def _motion(reference: View, delta: Array, points_m: Array) -> Array:
+def _motion(reference: PanelProjection, delta: Array, points_m: Array) -> Array:
     """(N, 2, P) what the projected points do per unit of every motion parameter, by differences."""
     base = reference.moved(delta).project(points_m)
     out = np.empty((len(points_m), 2, len(delta)))
@@ -188,7 +189,7 @@ def _motion(reference: View, delta: Array, points_m: Array) -> Array:
 
 
 def _local_shift(
-    smooth: NDArray[np.float32], slope_noise: float, view: View, edges: Outline, built_m: float
+    smooth: NDArray[np.float32], slope_noise: float, view: PanelProjection, edges: Outline, built_m: float
 ) -> tuple[Array, float, float]:
     """An object's own (2,) shift in px, its sigma, and the share of its edges found near the model.
 

@@ -1,1 +1,1 @@
-"""One reader a kind: a rectified patch and the panel file's description in, a `Status` out."""
+"""One reader a kind: a rectified patch and the panel file's description in, a `PatchReading` out."""

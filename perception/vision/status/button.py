@@ -6,7 +6,7 @@ import numpy as np
 
 from hal.panel import Button, Mushroom
 from perception.vision.patch import Patch
-from perception.vision.reading import Status, doubted, gated, refused
+from perception.vision.reading import PatchReading, doubted, gated, refused
 from perception.vision.status.press import cap_height
 from perception.vision.status.shade import cap_shades
 
@@ -22,12 +22,12 @@ ALIKE = "pressed and released look alike from here: look from the side or closer
 UNSEEN = "the button cannot be seen (glare, shadow or cover): change the angle or the light"
 
 
-def read_button(patch: Patch, spec: Button) -> Status:
+def read_button(patch: Patch, spec: Button) -> PatchReading:
     """State of a push button. `patch` shows any plane near the cap."""
     return read_cap(patch, spec)
 
 
-def read_cap(patch: Patch, spec: Button | Mushroom) -> Status:
+def read_cap(patch: Patch, spec: Button | Mushroom) -> PatchReading:
     """`pressed` or `released` by the height of the cap, else by its one-sided shade."""
     R = spec.radius_m
     a = np.linspace(0, 2 * np.pi, 24)
@@ -41,8 +41,8 @@ def read_cap(patch: Patch, spec: Button | Mushroom) -> Status:
     confidence = float(1.0 / (1.0 + np.exp(-abs(evidence)))) * (1.0 if by_height else min(1.0, seen + 0.2))
     state = "pressed" if evidence < 0 else "released"
     if confidence < 0.75:
-        return doubted(Status(state=state, confidence=max(0.0, 2 * confidence - 1)), ALIKE)
-    return gated(Status(state=state, confidence=confidence))
+        return doubted(PatchReading(state=state, confidence=max(0.0, 2 * confidence - 1)), ALIKE)
+    return gated(PatchReading(state=state, confidence=confidence))
 
 
 def _by_height(patch: Patch, spec: Button | Mushroom) -> float | None:

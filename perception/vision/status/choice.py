@@ -9,10 +9,10 @@ import numpy as np
 from hal.arrays import Array
 from perception.vision.bilinear import step_counts
 from perception.vision.patch import Patch
-from perception.vision.reading import Status, doubted, gated, probability, refused
+from perception.vision.reading import PatchReading, doubted, gated, probability, refused
 
 
-def choose(names: Sequence[str], evidence: Array, *, noise: float, seen: float, what: str) -> Status:
+def choose(names: Sequence[str], evidence: Array, *, noise: float, seen: float, what: str) -> PatchReading:
     """The state with the most evidence, unless a state of another name comes near.
 
     Args:
@@ -37,7 +37,7 @@ def choose(names: Sequence[str], evidence: Array, *, noise: float, seen: float, 
             (seen, 0.55, 0.1),
         ]
     )
-    status = Status(state=names[best], confidence=confidence)
+    status = PatchReading(state=names[best], confidence=confidence)
     return gated(status) if peak >= 1.5 * noise else doubted(status, f"no {what} stands out: come closer or add light")
 
 

@@ -1,4 +1,4 @@
-"""Seven-segment displays by geometry: ink, comb of digit cells, level of every segment, the likeliest number.
+"""Seven-segment displays by geometry: ink, grid of digit cells, level of every segment, the likeliest number.
 
 What hides a part (a cable, saturation) is found first and says nothing about the segments behind it. The numbers that what
 is left allows are weighed by their likelihood, by the display's range and by the previous reading; when two stay about
@@ -14,27 +14,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.arrays import Array
+from hal.arrays import Array, Image
 from hal.panel import Display
-from perception.vision.image import Image
 from perception.vision.patch import Patch
-from perception.vision.reading import Possible, Status, doubted, gated, probability, refused
-from perception.vision.status.band import hidden_by_bands
-from perception.vision.status.comb import Comb, find_combs
-from perception.vision.status.comb_jit import Float32, apartness
+from perception.vision.reading import PatchReading, Possible, doubted, gated, probability, refused
+from perception.vision.status.decimal_point import DecimalPoint, find_colon, find_decimal_point
+from perception.vision.status.digit_grid import DigitGrid, find_digit_grids
+from perception.vision.status.digit_grid_worth import Float32, apartness
 from perception.vision.status.glyphs import CLOSE, LEAST_SEEN, LIT, NAMES, Number, likelihoods, numbers, separate
 from perception.vision.status.ink import segment_ink, without_border
 from perception.vision.status.levels import loop_levels, segment_levels, with_hidden_ends, without_frames
-from perception.vision.status.point import Point, find_colon, find_point
+from perception.vision.status.occluder_bands import hidden_by_bands
 from perception.vision.status.stray import leaves_out, stray_ink
 
 MARGIN = 0.09  # share of the smaller side that a frame may take
 WORK_ROWS = 64  # a window is read with so many rows: a stroke is 4 px wide then
 MOST_CELLS = 8  # of a display that nobody has counted
-CELL_COST = 0.008  # a comb with one more cell must explain that much more
+CELL_COST = 0.008  # a grid with one more cell must explain that much more
 FITS = 12.0  # nats a character whose segments' levels agree: nothing fits better
 SAME_COMB = 0.05  # of the digit height
-WORTH_WEIGHT = 8.0  # nats a character that a comb of e times the worth may fit worse
+WORTH_WEIGHT = 8.0  # nats a character that a grid of e times the worth may fit worse
 TEMPERATURE = 2.0  # what is wrong with one segment is wrong with its neighbours too: they count half
 KNOWN_FREE, FREE = 0.35, 0.5  # how far the digits may sit from the middle, over the width
 
@@ -51,10 +50,10 @@ MOST_POSSIBLE = 10  # numbers that a refusal lists for programs
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Decoded:
-    """The numbers that one comb may show, best first.
+    """The numbers that one grid may show, best first.
 
     Attributes:
-        ink, seen: (H, W) what the comb was laid on.
+        ink, seen: (H, W) what the grid was laid on.
         explained: share of the ink.
         lit_levels: (cells, 7) level of the best number's lit segments, 0 for the others.
         weakest: level of its weakest digit over the typical one.
@@ -65,13 +64,15 @@ class Decoded:
     seen: Float32
     listed: Sequence[Number]
     explained: float
-    comb: Comb
+    grid: DigitGrid
     lit_levels: Array
     weakest: float
     fit: float
 
 
-def read_display(patch: Patch, spec: Display, *, digits_taught: bool = True, before: float | None = None) -> Status:
+def read_display(
+    patch: Patch, spec: Display, *, digits_taught: bool = True, before: float | None = None
+) -> PatchReading:
     """Text and value of a display. `patch` shows its window and the plate round it, origin at the middle.
 
     Args:
@@ -101,7 +102,7 @@ def read_window(
     gray: Image, *, digits: int | None, decimals: int | None, dark: bool | None, unit: str = "",
     limits: tuple[float, float] | None = None, hidden: NDArray[np.bool_] | None = None, before: float | None = None,
     framed: bool = False, bare: bool = False,
-) -> Status:  # fmt: skip
+) -> PatchReading:  # fmt: skip
     """Text of an upright window of digits.
 
     Args:
@@ -119,18 +120,18 @@ def read_window(
     ]
     if not found:
         return refused("no digits stand out: come closer, or change the angle or the light", unit=unit)
-    best = max(found, key=lambda d: d.explained * apartness(d.comb.gap) - CELL_COST * d.comb.count)
-    where = best.ink, best.seen, best.comb, best.lit_levels
+    best = max(found, key=lambda d: d.explained * apartness(d.grid.gap) - CELL_COST * d.grid.count)
+    where = best.ink, best.seen, best.grid, best.lit_levels
     colon = find_colon(*where) if decimals is None and not bare else None
     if colon is not None:
-        no_point = Point(place=None, probability=1.0)
+        no_point = DecimalPoint(place=None, probability=1.0)
         return _as_time(_answer(best, no_point, unit, None, limits, before, covered=False, bare=bare), best, colon)
-    point = find_point(*where) if decimals is None else None
+    point = find_decimal_point(*where) if decimals is None else None
     is_covered = hidden is not None and bool(hidden.any())
     return _answer(best, point, unit, decimals, limits, before, covered=is_covered, bare=bare)
 
 
-def _as_time(number: Status, found: Decoded, place: int) -> Status:
+def _as_time(number: PatchReading, found: Decoded, place: int) -> PatchReading:
     """What a clock shows, which is text and no value: a colon, and as digits stand beside one; else doubted."""
     characters = found.listed[0].characters
     before, after = characters[:place].strip(), characters[place:]
@@ -152,52 +153,52 @@ def _decoded(
     if lost is not None:
         seen = np.asarray(np.where(lost, 0.0, seen), np.float32)
     most = digits or MOST_CELLS
-    combs = find_combs(ink, seen, most=most, free=KNOWN_FREE if digits else FREE)
+    grids = find_digit_grids(ink, seen, most=most, free=KNOWN_FREE if digits else FREE)
     if not seen.all():
-        combs = [(worth, with_hidden_ends(seen, comb, most)) for worth, comb in combs]
+        grids = [(worth, with_hidden_ends(seen, grid, most)) for worth, grid in grids]
     best: Decoded | None = None
     most_worth = score = 0.0
-    for worth, comb in combs:
-        if worth <= 0 or (best is not None and (best.fit > FITS or _same(best.comb, comb))):
+    for worth, grid in grids:
+        if worth <= 0 or (best is not None and (best.fit > FITS or _same(best.grid, grid))):
             break
-        decoded = decode(ink, seen, comb, all_cells=digits is not None)
+        decoded = decode(ink, seen, grid, all_cells=digits is not None)
         if decoded is None:
             continue
         most_worth = most_worth or worth
-        # A comb that is too high claims ink by its size that it has not: its segments' levels do not agree.
+        # A grid that is too high claims ink by its size that it has not: its segments' levels do not agree.
         this = decoded.fit + WORTH_WEIGHT * float(np.log(worth / most_worth))
         if best is None or this > score:
             best, score = decoded, this
     return best
 
 
-def _same(a: Comb, b: Comb) -> bool:
-    """Whether two combs lie on the same digits, so that one of them needs to be read."""
+def _same(a: DigitGrid, b: DigitGrid) -> bool:
+    """Whether two grids lie on the same digits, so that one of them needs to be read."""
     off = np.abs(a.numbers - b.numbers)  # left, pitch, width, top, bottom
     return a.count == b.count and bool(off[:5].max() < SAME_COMB * a.height_px)
 
 
-def decode(ink: Float32, seen: Float32, comb: Comb, *, all_cells: bool = False) -> Decoded | None:
-    """What a comb may show; None when lit and unlit do not separate.
+def decode(ink: Float32, seen: Float32, grid: DigitGrid, *, all_cells: bool = False) -> Decoded | None:
+    """What a grid may show; None when lit and unlit do not separate.
 
     Args:
-        all_cells: the comb's last cell is the display's; else blank ones at its end are no part of it.
+        all_cells: the grid's last cell is the display's; else blank ones at its end are no part of it.
     """
-    segments, shares = segment_levels(ink, seen, comb)
-    levels = separate(without_frames(ink, comb, segments), shares, *loop_levels(ink, seen, comb))
+    segments, shares = segment_levels(ink, seen, grid)
+    levels = separate(without_frames(ink, grid, segments), shares, *loop_levels(ink, seen, grid))
     if levels is None:
         return None
     characters, blank = likelihoods(levels)
     listed = numbers(characters, blank) if all_cells else _of_any_length(characters, blank)
     count = len(listed[0].characters)
-    comb = replace(comb, count=count)
+    grid = replace(grid, count=count)
     shown = np.array([_lit(c) for c in listed[0].characters])
     lit_levels = np.where(shown, levels.ink[:count], 0.0)
-    explained = _explained(ink, comb, lit_levels)
+    explained = _explained(ink, grid, lit_levels)
     written = shown.any(axis=1)
     fit = float(characters[:count].max(axis=1)[written].mean()) if written.any() else -np.inf
     return Decoded(
-        ink=ink, seen=seen, listed=listed, explained=explained, comb=comb, lit_levels=lit_levels, fit=fit,
+        ink=ink, seen=seen, listed=listed, explained=explained, grid=grid, lit_levels=lit_levels, fit=fit,
         weakest=_weakest(levels.ink[:count], shown & (shares[:count] >= LEAST_SEEN), listed[0].characters),
     )  # fmt: skip
 
@@ -227,18 +228,25 @@ def _lit(character: str) -> NDArray[np.bool_]:
     return LIT[NAMES.index(character)] if character in NAMES else np.zeros(7, bool)
 
 
-def _explained(ink: Float32, comb: Comb, lit_levels: Array) -> float:
+def _explained(ink: Float32, grid: DigitGrid, lit_levels: Array) -> float:
     """How much of the picture's ink the lit segments are, 0 to 1: squared level times area over the sum of squares."""
-    h = comb.height_px
-    area = np.where([True, False, False, True, False, False, True], comb.width_px, h / 2) * 0.08 * h
+    h = grid.height_px
+    area = np.where([True, False, False, True, False, False, True], grid.width_px, h / 2) * 0.08 * h
     total = float((ink.astype(float) ** 2).sum())
     return float((lit_levels**2 * area).sum() / max(total, 1e-9))
 
 
 def _answer(
-    found: Decoded, point: Point | None, unit: str, decimals: int | None, limits: tuple[float, float] | None, before: float | None,
-    *, covered: bool, bare: bool,
-) -> Status:  # fmt: skip
+    found: Decoded,
+    point: DecimalPoint | None,
+    unit: str,
+    decimals: int | None,
+    limits: tuple[float, float] | None,
+    before: float | None,
+    *,
+    covered: bool,
+    bare: bool,
+) -> PatchReading:
     """The likeliest number within the range, or why there is none."""
     texts = [(_with_point(n.characters, point, decimals), n.log_likelihood) for n in found.listed]
     valued = [(text, value, score) for text, score in texts if (value := _value(text)) is not None]
@@ -255,10 +263,10 @@ def _answer(
     share /= share.sum()
     trust = (point.probability if point else 1.0) * probability([(found.explained, 0.3, 0.06)]) / SURE
     if bare:
-        stray = stray_ink(found.ink, found.comb, found.lit_levels)
+        stray = stray_ink(found.ink, found.grid, found.lit_levels)
         trust *= probability([(-stray, -STRAY, STRAY_SCALE)]) / SURE
         trust *= probability([(found.weakest, WEAK, WEAK_SCALE)]) / SURE
-    elif leaves_out(found.ink, found.comb, found.lit_levels):
+    elif leaves_out(found.ink, found.grid, found.lit_levels):
         trust *= LEFT_OUT
     rivals = _ranked([(text, value) for text, value, _ in possible], share, trust)
     named = [rival.text for rival in rivals[:MOST_NAMED] if rival.probability > NAMED * trust]
@@ -269,7 +277,7 @@ def _answer(
         else f"the evidence is too weak{maybe}: come closer, change the angle or the light"
     )
     best = rivals[0]
-    said = Status(
+    said = PatchReading(
         value=best.value, unit=unit, uncertainty=best.half_digit, text=best.text, confidence=min(best.probability, 0.97),
     )  # fmt: skip
     return gated(said, why, rivals[:MOST_POSSIBLE])
@@ -291,7 +299,7 @@ def _expected(value: float, before: float | None, span: float) -> float:
     return float(np.log(0.05 + 0.95 * np.exp(-abs(value - before) / (0.05 * span))))
 
 
-def _with_point(characters: str, point: Point | None, decimals: int | None) -> str:
+def _with_point(characters: str, point: DecimalPoint | None, decimals: int | None) -> str:
     """Text with its decimal point: where the panel file says, else where a dot is lit at the foot of a gap."""
     place = (len(characters) - decimals if decimals else None) if point is None else point.place
     if place is not None and place >= len(characters):

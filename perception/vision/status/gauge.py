@@ -6,8 +6,8 @@ import numpy as np
 
 from hal.panel import Gauge, Scale
 from perception.vision.patch import Patch
-from perception.vision.reading import Status, doubted, gated, probability, refused
-from perception.vision.status.band import MOST_COVERED, lying_across
+from perception.vision.reading import PatchReading, doubted, gated, probability, refused
+from perception.vision.status.occluder_bands import MOST_COVERED, lying_across
 from perception.vision.status.pointer import PointerFit, find_pointer, wrapped
 
 POINTER_FROM, POINTER_TO = 0.25, 0.60  # share of the radius over which every gauge pointer has ink and no numeral is
@@ -24,7 +24,7 @@ SIGMA_RAD = (0.026, 0.003)  # .99 of them have less than 0.026
 LEAST_SHOWN = 0.52  # of the pointer's radii: beside a cable, a numeral alone would have as much
 
 
-def read_gauge(patch: Patch, spec: Gauge) -> Status:
+def read_gauge(patch: Patch, spec: Gauge) -> PatchReading:
     """Value of a round gauge. `patch` shows the plane of the face, origin at its middle."""
     R = spec.radius_m
     seen = _seen(patch, R)
@@ -42,7 +42,7 @@ def read_gauge(patch: Patch, spec: Gauge) -> Status:
     return status_of_pointer(fit, spec.scale, seen)
 
 
-def no_pointer(seen: float, unit: str) -> Status:
+def no_pointer(seen: float, unit: str) -> PatchReading:
     """The refusal of a face without a pointer, by the share of it that can be seen."""
     if seen < LEAST_SEEN:
         return refused("the face cannot be seen (glare, shadow or cover): change the angle or the light", unit=unit)
@@ -51,7 +51,7 @@ def no_pointer(seen: float, unit: str) -> Status:
 
 def status_of_pointer(
     fit: PointerFit, scale: Scale, seen: float, *, rival: tuple[float, float] = RIVAL, sigma_rad: tuple[float, float] = SIGMA_RAD
-) -> Status:  # fmt: skip
+) -> PatchReading:  # fmt: skip
     """Value and confidence of a pointer on a scale, or the refusal of a pointer that is off the scale.
 
     Args:
@@ -67,7 +67,7 @@ def status_of_pointer(
         )
     value = scale.value_at(place)
     slope = abs(scale.value_at(place + 1e-3) - scale.value_at(place - 1e-3)) / 2e-3
-    status = Status(
+    status = PatchReading(
         value=float(value),
         unit=scale.unit,
         uncertainty=float(slope * fit.sigma_rad),

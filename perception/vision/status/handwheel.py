@@ -12,7 +12,7 @@ from hal.arrays import Array
 from hal.panel import Handwheel
 from perception.vision.image import WHITE_LEVEL
 from perception.vision.patch import Patch
-from perception.vision.reading import Status, gated, probability, refused
+from perception.vision.reading import PatchReading, gated, probability, refused
 from perception.vision.status.choice import contrast_noise
 from perception.vision.status.pointer import unroll, wrapped
 
@@ -30,7 +30,7 @@ EVERY = 8  # steps between the directions whose gaps are looked at
 BESIDE = 28  # steps: 14 degrees, beyond a spoke and its mark
 
 
-def read_handwheel(patch: Patch, spec: Handwheel) -> Status:
+def read_handwheel(patch: Patch, spec: Handwheel) -> PatchReading:
     """Angle (rad, clockwise from straight up, -pi..pi) of the marked spoke. `patch` shows the wheel's plane."""
     R, n = spec.radius_m + spec.rim_m, spec.spokes
     angles = 2 * np.pi * np.arange(STEPS) / STEPS
@@ -73,7 +73,7 @@ def read_handwheel(patch: Patch, spec: Handwheel) -> Status:
         confidence *= FAINT
     sigma = max(0.35 / (patch.image_px_per_m * 0.6 * R * np.sqrt(n)), 0.5 / (patch.image_px_per_m * R))
     return gated(
-        Status(
+        PatchReading(
             value=float(wrapped(np.array(places[best]))), unit="rad", uncertainty=float(sigma), confidence=confidence
         )
     )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from perception.vision.image import Image
-from perception.vision.status.comb_jit import Float32
+from hal.arrays import Image
+from hal.jit import compiled
+from perception.vision.status.digit_grid_worth import Float32
 
 HEADROOM = 0.5  # of a lit segment: where less is left below white, nothing can be told
 SHOWS = 0.3  # of a lit segment: so much stands out that it is no noise
@@ -134,11 +134,15 @@ def _at_border(ink: Float32, least: float, framed: bool) -> tuple[NDArray[np.boo
     return np.asarray(gone), np.asarray(lost)
 
 
-@njit(cache=True)
-def level_at(ink: Float32, share: float) -> float:  # pragma: no cover
+def level_at(ink: Float32, share: float) -> float:
     """The level that this share of the ink (from 0 to 255) does not exceed, to a level."""
+    return _level_at(ink.ravel(), share)
+
+
+@compiled
+def _level_at(ink: Float32, share: float) -> float:
     counts = np.zeros(256, np.int64)
-    for value in ink.flat:
+    for value in ink:
         counts[min(255, int(value))] += 1
     level, upto = 0, counts[0]
     while upto < share * ink.size and level < 255:
@@ -147,8 +151,8 @@ def level_at(ink: Float32, share: float) -> float:  # pragma: no cover
     return float(level)
 
 
-@njit(cache=True)
-def column_levels(ink: Float32, share: float) -> Float32:  # pragma: no cover
+@compiled
+def column_levels(ink: Float32, share: float) -> Float32:
     """(W,) the level that this share of every column of the ink (from 0 to 255) does not exceed, to a level."""
     rows, columns = ink.shape
     out = np.zeros(columns, np.float32)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.arrays import Array
+from hal.arrays import Array, Image
 from hal.panel import Lamp
-from perception.vision.image import WHITE_LEVEL, Image
+from perception.vision.image import WHITE_LEVEL
 from perception.vision.patch import Patch, sample_at
-from perception.vision.reading import Status, gated, refused
-from perception.vision.status.band import cables_across
+from perception.vision.reading import PatchReading, gated, refused
+from perception.vision.status.occluder_bands import cables_across
 
 CORE, RIM, PLATE = (0.0, 0.15, 0.3), (0.5, 0.6, 0.7), (1.45, 1.6, 1.75)  # of the radius
 RING_PLACES, LEAST_SEEN = 108, 0.3  # places looked at in each; share that must not be hidden
@@ -20,7 +20,7 @@ MOST_WHITE = 0.2  # of the plate around
 FLAT_RATIO = 1.1  # middle over rim: of unlit lenses .95 have less than 1.1, of lit ones that do not saturate .97 more
 
 
-def read_lamp(patch: Patch, spec: Lamp) -> Status:
+def read_lamp(patch: Patch, spec: Lamp) -> PatchReading:
     """State of a lamp. `patch` shows the plate plane or the lens."""
     light = patch.gray if patch.colour is None else patch.colour.max(axis=2)
     beyond_m = CLEAR_OF_BEZEL * spec.radius_m
@@ -45,7 +45,9 @@ def read_lamp(patch: Patch, spec: Lamp) -> Status:
     if inside < 0.7:
         return refused("the lamp is outside the image: move the camera")
     confidence = float(1.0 / (1.0 + np.exp(-min(abs(evidence), 8.0))))
-    return gated(Status(state="on" if evidence > 0 else "off", confidence=float(np.clip(2 * confidence - 1, 0, 1))))
+    return gated(
+        PatchReading(state="on" if evidence > 0 else "off", confidence=float(np.clip(2 * confidence - 1, 0, 1)))
+    )
 
 
 def _ring(

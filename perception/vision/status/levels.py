@@ -1,15 +1,15 @@
-"""Levels of the segments of a comb, and of its loops, from the ink."""
+"""Levels of the segments of a grid, and of its loops, from the ink."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-from numba import njit
 
 from hal.arrays import Array
-from perception.vision.status.comb import AXES, Comb
-from perception.vision.status.comb_jit import BEYOND, INNER, STROKE, Float32
+from hal.jit import compiled, inlined
+from perception.vision.status.digit_grid import AXES, DigitGrid
+from perception.vision.status.digit_grid_worth import BEYOND, INNER, STROKE, Float32
 
 PARTS = 5  # places along a segment's axis
 CLEAR = 0.6  # of a pixel seen
@@ -20,19 +20,19 @@ LOOP_X = np.linspace(0.36, 0.64, 3)
 LOOP_Y = np.array([0.2, 0.25, 0.3, 0.7, 0.75, 0.8])
 
 
-def segment_levels(ink: Float32, seen: Float32, comb: Comb) -> tuple[Array, Array]:
+def segment_levels(ink: Float32, seen: Float32, grid: DigitGrid) -> tuple[Array, Array]:
     """(cells, 7) ink of every segment, the median along its axis of the best across its stroke, and its seen share."""
-    return _segments(ink, seen, comb.numbers, comb.count, AXES)
+    return _segments(ink, seen, grid.numbers, grid.count, AXES)
 
 
-def loop_levels(ink: Float32, seen: Float32, comb: Comb) -> tuple[Array, Array]:
+def loop_levels(ink: Float32, seen: Float32, grid: DigitGrid) -> tuple[Array, Array]:
     """(cells,) mean and standard deviation of the ink inside the loops of every cell, where no segment is; NaN unseen."""
-    return _loops(ink, seen, comb.numbers, comb.count, LOOP_X, LOOP_Y)
+    return _loops(ink, seen, grid.numbers, grid.count, LOOP_X, LOOP_Y)
 
 
-def without_frames(ink: Float32, comb: Comb, levels: Array) -> Array:
+def without_frames(ink: Float32, grid: DigitGrid, levels: Array) -> Array:
     """(cells, 7) levels with those uprights taken away that go on above and below the digit: a frame's side, no segment."""
-    beyond = _beyond(ink, comb.numbers, comb.count)
+    beyond = _beyond(ink, grid.numbers, grid.count)
     out = levels.copy()
     for side, (upper, lower) in enumerate(((5, 4), (1, 2))):
         drop = beyond[:, side] > FRAME_LEVEL * np.maximum(levels[:, upper], levels[:, lower])
@@ -40,36 +40,36 @@ def without_frames(ink: Float32, comb: Comb, levels: Array) -> Array:
     return out
 
 
-def with_hidden_ends(seen: Float32, comb: Comb, most: int) -> Comb:
-    """The comb with the cells beside its ends that are hidden in part: a digit that a cable crosses makes no character and
+def with_hidden_ends(seen: Float32, grid: DigitGrid, most: int) -> DigitGrid:
+    """The grid with the cells beside its ends that are hidden in part: a digit that a cable crosses makes no character and
     so no cell, and without it the number would be another one.
 
     Args:
         seen: (H, W) 1 where the display is seen.
         most: number of cells at most.
     """
-    for step_px in (comb.pitch_px, -comb.pitch_px):
-        while comb.count < most:
-            beyond = comb.count * comb.pitch_px if step_px > 0 else step_px
-            end = replace(comb, left_px=comb.left_px + beyond, count=1)
+    for step_px in (grid.pitch_px, -grid.pitch_px):
+        while grid.count < most:
+            beyond = grid.count * grid.pitch_px if step_px > 0 else step_px
+            end = replace(grid, left_px=grid.left_px + beyond, count=1)
             if not _fits(end, seen.shape[1]):
                 break
             _, shares = segment_levels(seen, seen, end)
             if shares.min() >= WHOLLY_SEEN:
                 break
-            comb = replace(comb, left_px=comb.left_px + min(step_px, 0.0), count=comb.count + 1)
-    return comb
+            grid = replace(grid, left_px=grid.left_px + min(step_px, 0.0), count=grid.count + 1)
+    return grid
 
 
-def _fits(cell: Comb, columns: int) -> bool:
+def _fits(cell: DigitGrid, columns: int) -> bool:
     """Whether a cell of its own lies inside the picture with its strokes."""
     u, _ = cell.place(np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.0, 1.0, 0.0, 1.0]), np.zeros(4))
     half = STROKE * cell.height_px
     return bool(u.min() >= half and u.max() <= columns - 1 - half)
 
 
-@njit(cache=True)
-def _value(image: Float32, u: float, v: float) -> float:  # pragma: no cover
+@inlined
+def _value(image: Float32, u: float, v: float) -> float:
     """Bilinear value; outside is 0, and fades in over a pixel."""
     height, width = image.shape
     if u <= -1.0 or v <= -1.0 or u >= width or v >= height:
@@ -84,11 +84,9 @@ def _value(image: Float32, u: float, v: float) -> float:  # pragma: no cover
     return value
 
 
-@njit(cache=True)
-def _segments(
-    ink: Float32, seen: Float32, comb: Array, count: int, axes: Array
-) -> tuple[Array, Array]:  # pragma: no cover
-    left, pitch, width, top, bottom, slant = comb
+@compiled
+def _segments(ink: Float32, seen: Float32, grid: Array, count: int, axes: Array) -> tuple[Array, Array]:
+    left, pitch, width, top, bottom, slant = grid
     height = bottom - top
     levels, shares = np.zeros((count, 7)), np.zeros((count, 7))
     best = np.zeros(PARTS)
@@ -117,11 +115,9 @@ def _segments(
     return levels, shares
 
 
-@njit(cache=True)
-def _loops(
-    ink: Float32, seen: Float32, comb: Array, count: int, xs: Array, ys: Array
-) -> tuple[Array, Array]:  # pragma: no cover
-    left, pitch, width, top, bottom, slant = comb
+@compiled
+def _loops(ink: Float32, seen: Float32, grid: Array, count: int, xs: Array, ys: Array) -> tuple[Array, Array]:
+    left, pitch, width, top, bottom, slant = grid
     means, spreads = np.full(count, np.nan), np.full(count, np.nan)
     for cell in range(count):
         n = 0
@@ -141,10 +137,10 @@ def _loops(
     return means, spreads
 
 
-@njit(cache=True)
-def _beyond(ink: Float32, comb: Array, count: int) -> Array:  # pragma: no cover
+@compiled
+def _beyond(ink: Float32, grid: Array, count: int) -> Array:
     """(cells, 2) least ink of the places above and below the left and the right uprights, each the best across."""
-    left, pitch, width, top, bottom, slant = comb
+    left, pitch, width, top, bottom, slant = grid
     height = bottom - top
     found = np.zeros((count, 2))
     for cell in range(count):

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from hal.arrays import Array
 from hal.panel import Lever
 from perception.vision.patch import Patch
-from perception.vision.reading import Status, doubted
-from perception.vision.status.band import cables_across
+from perception.vision.reading import PatchReading, doubted
 from perception.vision.status.bar import bar_contrast
 from perception.vision.status.choice import choose, contrast_noise
+from perception.vision.status.occluder_bands import cables_across
 
 BAR_FROM, BAR_TO = 0.40, 0.92  # share of the length: outside the hub, inside the tip
 FLANK = (1.35, 1.6)  # of the half width: pipes and flanges lie close by
@@ -32,7 +32,7 @@ MOST_IN_GLARE = 0.79  # of some thirty that the second look answered one was wro
 WOBBLE_RAD = np.deg2rad(np.linspace(-10, 10, 9))
 
 
-def read_lever(patch: Patch, spec: Lever) -> Status:
+def read_lever(patch: Patch, spec: Lever) -> PatchReading:
     """State of a lever valve. `patch` shows the plane of the bar; several states may share a name.
 
     Beside a glare one of the bar's sides hardly differs from it: what does not stand out is looked at without the light's slopes.
@@ -58,7 +58,7 @@ def read_lever(patch: Patch, spec: Lever) -> Status:
     return doubted(between, f"the lever stands between its states, at {angle:.2f} rad: turn it to its stop")
 
 
-def _direction(patch: Patch, spec: Lever, seen: float) -> tuple[Status, float, NDArray[np.bool_] | None]:
+def _direction(patch: Patch, spec: Lever, seen: float) -> tuple[PatchReading, float, NDArray[np.bool_] | None]:
     """The state whose bar stands out most, its direction, and what lies across."""
     L = spec.length_m
     angles = np.array([state.angle_rad for state in spec.states])

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from hal.panel import Mushroom
 from perception.vision.patch import Patch
-from perception.vision.reading import Status
+from perception.vision.reading import PatchReading
 from perception.vision.status.button import read_cap
 
 
-def read_mushroom(patch: Patch, spec: Mushroom) -> Status:
+def read_mushroom(patch: Patch, spec: Mushroom) -> PatchReading:
     """State of an emergency mushroom. `patch` shows any plane near the cap."""
     return read_cap(patch, spec)

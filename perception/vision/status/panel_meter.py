@@ -6,9 +6,9 @@ import numpy as np
 
 from hal.panel import PanelMeter
 from perception.vision.patch import Patch
-from perception.vision.reading import Status
-from perception.vision.status.band import MOST_COVERED, lying_across
+from perception.vision.reading import PatchReading
 from perception.vision.status.gauge import STOP_RAD, no_pointer, status_of_pointer
+from perception.vision.status.occluder_bands import MOST_COVERED, lying_across
 from perception.vision.status.pointer import find_pointer
 
 POINTER_FROM, POINTER_TO = 0.30, 0.85  # share of the needle's length that is in the window, before the ticks begin
@@ -16,7 +16,7 @@ RIVAL = (0.17, 0.02)  # nothing else stands there: of 240 on drawn hard panels r
 SIGMA_RAD = (0.0125, 0.0015)  # .98 of them have less than 0.009, half of those read wrong more
 
 
-def read_panel_meter(patch: Patch, spec: PanelMeter) -> Status:
+def read_panel_meter(patch: Patch, spec: PanelMeter) -> PatchReading:
     """Value of a panel meter. `patch` shows the plane of the face, origin at the middle of the housing."""
     lo, hi = sorted((spec.scale.at_min, spec.scale.at_max))
     pivot = (0.0, -spec.pivot_below_m)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hal.arrays import Array
+from hal.jit import compiled, inlined
 
 NUMERAL, PLAIN = 1.8, 35.0  # times the ink of a row at that percentile: numerals and ticks may be beside half of them
 HALF_LEVEL = 0.3  # of a row's strongest ink: less is the pointer's blur
@@ -17,10 +17,10 @@ BESIDE = 2  # columns: what is blurred by what is hidden
 PIVOTS_AT_MOST = 2.0  # weight of a row over the typical one's
 
 
-@njit(cache=True)
+@inlined
 def row_centres(
     ink: NDArray[np.float32], hidden: NDArray[np.bool_], offset: Array, middle: Array, half: Array
-) -> tuple[Array, Array, Array]:  # pragma: no cover
+) -> tuple[Array, Array, Array]:
     """(rows,) centre of the ink (rad), its mass and its width (rad), within `half` of `middle` in every row.
 
     A pointer is of one gray: rows where something stands out much more belong to a numeral or a tick beside it. Where ink
@@ -53,10 +53,10 @@ def row_centres(
     return centre, mass, width
 
 
-@njit(cache=True)
+@inlined
 def _goes_under(
     ink: NDArray[np.float32], hidden: NDArray[np.bool_], offset: Array, middle: float, half: float, top: float
-) -> bool:  # pragma: no cover
+) -> bool:
     """Whether the ink of a row that counts has something hidden beside it."""
     columns = len(ink)
     for j in range(columns):
@@ -67,10 +67,8 @@ def _goes_under(
     return False
 
 
-@njit(cache=True)
-def fitted_line(
-    r: Array, theta: Array, mass: Array, e_sigma: float, least_m: float
-) -> tuple[float, float, float]:  # pragma: no cover
+@compiled
+def fitted_line(r: Array, theta: Array, mass: Array, e_sigma: float, least_m: float) -> tuple[float, float, float]:
     """theta0, e and the variance of theta0 of theta(r) = theta0 + e / r, by Cauchy-weighted least squares.
 
     Args:
@@ -91,7 +89,7 @@ def fitted_line(
     return theta0, e, variance
 
 
-@njit(cache=True)
+@compiled
 def pointer_axis(
     ink: NDArray[np.float32],
     hidden: NDArray[np.bool_],
@@ -100,7 +98,7 @@ def pointer_axis(
     reach_rad: float,
     e_sigma: float,
     px_per_m: float,
-) -> tuple[float, float]:  # pragma: no cover
+) -> tuple[float, float]:
     """Angle (rad, as `offset`) of the pointer near offset 0 and its variance; NaN where too few rows have ink.
 
     What touches the pointer (a numeral, a tick) widens some rows: each round looks within the pointer's own width only.

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from hal.arrays import Array
 from perception.vision.patch import Patch, sample_at
-from perception.vision.status.band import cables_across
 from perception.vision.status.choice import contrast_noise
+from perception.vision.status.occluder_bands import cables_across
 
 EDGE_SIGMA_PX = 0.25  # of one edge point, image px, model error of a rendered or real cap included
 RESOLVED = 1.5  # widths of an edge: a wall that shows narrower runs into the face, and its foot cannot be told

@@ -6,7 +6,7 @@ import numpy as np
 
 from hal.panel import Rotary
 from perception.vision.patch import Patch
-from perception.vision.reading import Status
+from perception.vision.reading import PatchReading
 from perception.vision.status.bar import bar_contrast
 from perception.vision.status.choice import choose, contrast_noise
 
@@ -15,7 +15,7 @@ MARK_HALF_WIDTH = 0.06
 WOBBLE_RAD = np.deg2rad(np.linspace(-9, 9, 7))  # a detent may stand off its place by that much
 
 
-def read_rotary(patch: Patch, spec: Rotary) -> Status:
+def read_rotary(patch: Patch, spec: Rotary) -> PatchReading:
     """State of a selector. `patch` shows the plane of the knob's face."""
     R = spec.radius_m
     angles = np.array([state.angle_rad for state in spec.states])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hal.arrays import Array
 from perception.vision.image import WHITE_LEVEL
 from perception.vision.patch import Patch, sample_at
-from perception.vision.status.band import cables_across
+from perception.vision.status.occluder_bands import cables_across
 
 ANGLES = np.linspace(0, 2 * np.pi, 72, endpoint=False)
 WAVES = np.column_stack([np.ones(len(ANGLES)), np.cos(ANGLES), np.sin(ANGLES)])

@@ -12,10 +12,10 @@ from hal.arrays import Array
 from hal.panel import Slider
 from perception.vision.image import WHITE_LEVEL
 from perception.vision.patch import Patch, sample_at
-from perception.vision.reading import Status, doubted, gated, probability, refused
+from perception.vision.reading import PatchReading, doubted, gated, probability, refused
 from perception.vision.registration.outline import footprint_m
-from perception.vision.status.band import lying_across
 from perception.vision.status.choice import contrast_noise
+from perception.vision.status.occluder_bands import lying_across
 
 SLOT = 0.2  # of the cap's width: half of the slot and what blurs it
 EDGE_BOX = 0.22  # of the cap's length: a line across its middle is further from its edges
@@ -32,7 +32,7 @@ BEYOND, MOST_BEYOND = 0.8, 0.4  # of the cap's width from the track; share that 
 SIDES = np.linspace(-0.40, 0.40, 17)  # of the cap's width: inside the cap
 
 
-def read_slider(patch: Patch, spec: Slider) -> Status:
+def read_slider(patch: Patch, spec: Slider) -> PatchReading:
     """Value of a slider. `patch` shows the plane of the cap's top."""
     along, across = spec.cap_size_m[0], spec.cap_size_m[1]
     lo, hi = sorted((spec.scale.at_min, spec.scale.at_max))
@@ -66,7 +66,7 @@ def read_slider(patch: Patch, spec: Slider) -> Status:
     )
     if line_m is None:
         confidence *= NO_LINE
-    status = Status(
+    status = PatchReading(
         value=spec.scale.value_at(place),
         unit=spec.scale.unit,
         uncertainty=slope * 0.5 / patch.image_px_per_m,

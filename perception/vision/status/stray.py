@@ -1,4 +1,4 @@
-"""Ink among a display's cells that its number does not account for: a comb that lies wrong, or a cable taken for strokes."""
+"""Ink among a display's cells that its number does not account for: a grid that lies wrong, or a cable taken for strokes."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from hal.arrays import Array
-from perception.vision.status.comb import AXES, Comb
-from perception.vision.status.comb_jit import Float32
+from perception.vision.status.digit_grid import AXES, DigitGrid
+from perception.vision.status.digit_grid_worth import Float32
 
 THICK = 0.30  # of the digit height: a stroke with its blur
 NOISE = 0.05  # of the digit height
@@ -18,7 +18,7 @@ AS_CLEAR, AS_HIGH, SIGN = 0.45, 0.75, 0.2  # of the lit level; of the rows; of t
 BESIDE = 0.3  # of the digit height, and half of the gap at most: how far a cell's ink reaches
 
 
-def stray_ink(ink: Float32, comb: Comb, lit_levels: Array) -> float:
+def stray_ink(ink: Float32, grid: DigitGrid, lit_levels: Array) -> float:
     """Squared ink off the lit strokes in the worst cell, over what the strokes of a written cell have on average.
 
     Of 336 drawn hard displays read right .99 have less than .028, all less than .046; of 18 read wrong five have more than
@@ -28,12 +28,12 @@ def stray_ink(ink: Float32, comb: Comb, lit_levels: Array) -> float:
         ink: (H, W) from `segment_ink`.
         lit_levels: (cells, 7) levels of the lit segments, 0 for the others.
     """
-    left, pitch, width, top, _, slant = comb.numbers
-    height = comb.height_px
+    left, pitch, width, top, _, slant = grid.numbers
+    height = grid.height_px
     strokes = np.zeros(ink.shape, np.uint8)
     thick = max(1, round(THICK * height))
     for cell, segment in zip(*np.nonzero(lit_levels), strict=True):
-        u, v = comb.place(AXES[segment, :, 0], AXES[segment, :, 1], np.full(2, cell))
+        u, v = grid.place(AXES[segment, :, 0], AXES[segment, :, 1], np.full(2, cell))
         first, last = np.round(16 * np.column_stack([u, v])).astype(int).tolist()
         cv2.line(strokes, first, last, 1, thick, cv2.LINE_8, 4)
     smooth = np.asarray(cv2.GaussianBlur(ink, (0, 0), NOISE * height), float)
@@ -45,23 +45,23 @@ def stray_ink(ink: Float32, comb: Comb, lit_levels: Array) -> float:
     upright = np.arange(ink.shape[1]) - lean[:, None]
     room = min((pitch - width) / 2, BESIDE * height)
     worst = 0.0
-    for start in left + pitch * np.arange(comb.count):
+    for start in left + pitch * np.arange(grid.count):
         rest = part[off & (upright > start - room) & (upright < start + width + room)]
         if rest.size:  # in a dark picture noise lifts the ink everywhere: strokes stand out from that
             worst = max(worst, float((np.maximum(rest - np.median(rest), 0.0) ** 2).sum()))
     return worst / max(typical, 1e-6)
 
 
-def leaves_out(ink: Float32, comb: Comb, lit_levels: Array) -> bool:
-    """Whether something as high as a digit, or a bar at half height like a sign, stands right beside the comb.
+def leaves_out(ink: Float32, grid: DigitGrid, lit_levels: Array) -> bool:
+    """Whether something as high as a digit, or a bar at half height like a sign, stands right beside the grid.
 
     A frame is higher than the digits, and words beside them are lower.
     """
     written = np.flatnonzero((lit_levels > 0).any(axis=1))
     if len(written) == 0:
         return False
-    left, pitch, width, top, _, slant = comb.numbers
-    height, gap = comb.height_px, pitch - width
+    left, pitch, width, top, _, slant = grid.numbers
+    height, gap = grid.height_px, pitch - width
     rows = np.arange(max(0, round(top - BEYOND * height)), min(len(ink), round(top + (1 + BEYOND) * height) + 1))
     at = (rows - top) / height
     start, end = left + written[0] * pitch, left + written[-1] * pitch + width

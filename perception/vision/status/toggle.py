@@ -7,7 +7,7 @@ import numpy as np
 from hal.arrays import Array
 from hal.panel import Toggle
 from perception.vision.patch import Patch
-from perception.vision.reading import Status, doubted
+from perception.vision.reading import PatchReading, doubted
 from perception.vision.status.bar import bar_contrast
 from perception.vision.status.choice import choose, contrast_noise
 
@@ -26,7 +26,7 @@ AT_FOOT = (0.15, 0.5)  # of the length: there a bat of the plate's gray stands o
 AT_FOOT_NOISE = 3.0  # of the noise of a contrast: less tells nothing there
 
 
-def read_toggle(patch: Patch, spec: Toggle) -> Status:
+def read_toggle(patch: Patch, spec: Toggle) -> PatchReading:
     """State of a toggle switch. `patch` shows the plate (or any plane: heights are followed)."""
     reach = spec.bat_length_m * np.sin(spec.tilt_rad)
     y = np.linspace(-1, 1, 12)[:, None] * reach

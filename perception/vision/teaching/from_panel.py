@@ -17,17 +17,17 @@ from numpy.typing import NDArray
 from hal.arrays import Array
 from hal.errors import NotFound
 from hal.panel import Panel, PanelObject
-from perception.vision.finding.blind import Candidate, candidate_places, chosen
+from perception.vision.finding.blind import Detection, candidate_places, chosen
 from perception.vision.finding.features import PLATE_PX_PER_M, look_at
 from perception.vision.image import as_gray
-from perception.vision.knowledge import NOTHING, UNIT, Kind, Knowledge
+from perception.vision.inspection import inspect_view
+from perception.vision.knowledge import NOTHING, UNIT, Knowledge, TaughtKind
+from perception.vision.projection import CameraProjection, PanelProjection
 from perception.vision.reading import ObjectReading
 from perception.vision.registration.outline import footprint_m
 from perception.vision.registration.register import register
-from perception.vision.taught import inspect_view
 from perception.vision.teaching.condense import worth_keeping
 from perception.vision.teaching.teach import NOTHING_SIZE_M, SNAP_M, Overview, overview_of, under_pixels
-from perception.vision.view import CameraView, View
 
 # A sub-object this near to an object's middle is that object's, whichever of them blind recognition takes.
 PART_M = 0.0067
@@ -74,13 +74,13 @@ class PanelLooks:
     known_now: tuple[str, ...]
 
     @property
-    def kinds(self) -> tuple[Kind, ...]:
+    def kinds(self) -> tuple[TaughtKind, ...]:
         """The kinds that learned something."""
         return tuple(kind for kind in self.knowledge.kinds if kind.name in self.added)
 
 
 def teach_from_panel(
-    image: NDArray[Any], view: View, panel: Panel, knowledge: Knowledge, *, source: str = ""
+    image: NDArray[Any], view: PanelProjection, panel: Panel, knowledge: Knowledge, *, source: str = ""
 ) -> PanelLooks:
     """Learn what the objects of a known panel look like in an overview of it.
 
@@ -94,7 +94,7 @@ def teach_from_panel(
         NotFound, Ambiguous: no plate or two in the image, it does not show this panel there, or none of its objects.
     """
     gray = as_gray(image)
-    focal_px = view.intrinsics.fx_px if isinstance(view, CameraView) else None
+    focal_px = view.intrinsics.fx_px if isinstance(view, CameraProjection) else None
     overview = overview_of(gray, plate_m=(panel.width_m, panel.height_m), focal_px=focal_px)
     registered = register(gray, view, panel).view
     readings = inspect_view(image, gray, registered, panel)
@@ -122,7 +122,7 @@ def _check_most_are_there(readings: Sequence[ObjectReading], panel: Panel) -> No
 
 
 def _objects(
-    overview: Overview, view: View, panel: Panel, readings: Sequence[ObjectReading], places: Array
+    overview: Overview, view: PanelProjection, panel: Panel, readings: Sequence[ObjectReading], places: Array
 ) -> tuple[tuple[Shown, ...], dict[str, str]]:
     """The objects that can teach, and why the others cannot."""
     shown: list[Shown] = []
@@ -152,7 +152,7 @@ def _objects(
 
 
 def _nearest_sub_object(
-    overview: Overview, view: View, panel_object: PanelObject, shift_px: Array, places: Array
+    overview: Overview, view: PanelProjection, panel_object: PanelObject, shift_px: Array, places: Array
 ) -> tuple[Array, Array] | None:
     """The sub-object at the object's middle; else, as for a slider or a lever, the nearest in its box, and how the middle
     lies from it.
@@ -173,7 +173,7 @@ def _nearest_sub_object(
     return np.asarray(place), np.round(middle_m, 4)
 
 
-def _box(overview: Overview, view: View, panel_object: PanelObject, shift_px: Array) -> Array:
+def _box(overview: Overview, view: PanelProjection, panel_object: PanelObject, shift_px: Array) -> Array:
     """(2, 2) lowest and highest u and v of the object's box, foot to top, on the rectified plate."""
     half_width, half_height, height = footprint_m(panel_object)
     corners = np.array([[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (0.0, 1.0)])
@@ -187,7 +187,9 @@ def _on_ground(overview: Overview, pixels: Array) -> Array:
     return overview.on_ground(under_pixels(overview.view, pixels, overview.plate_m))
 
 
-def _of_nothing(overview: Overview, view: View, panel: Panel, shown: Sequence[Shown], places: Array) -> Array:
+def _of_nothing(
+    overview: Overview, view: PanelProjection, panel: Panel, shown: Sequence[Shown], places: Array
+) -> Array:
     """(N, LENGTH) looks of the sub-objects that are no object, nor where one may be that did not show."""
     middles = np.array([each.place_px for each in shown])
     away = np.linalg.norm(places[:, None] - middles, axis=2).min(axis=1)
@@ -218,7 +220,7 @@ def _grown(
             size_m = (2.0 * half_width, 2.0 * half_height)
             middles_m = shown[k].middle_m[None] if shown[k].middle_m.any() else None
         grown = grown.grown(
-            Kind(name=name, size_m=size_m, looks=looks[k : k + 1], taught_by=source, middles_m=middles_m)
+            TaughtKind(name=name, size_m=size_m, looks=looks[k : k + 1], taught_by=source, middles_m=middles_m)
         )
         added[name] = added.get(name, 0) + 1
     return grown, added
@@ -231,7 +233,7 @@ def _recognised(overview: Overview, places: Array, shown: Sequence[Shown], knowl
     return tuple(each.panel_object.name for each in shown if any(_is(each, candidate) for candidate in found))
 
 
-def _is(shown: Shown, candidate: Candidate) -> bool:
+def _is(shown: Shown, candidate: Detection) -> bool:
     if candidate.reason is not None or candidate.kind != shown.panel_object.kind:
         return False
     reach_px = 0.5 * float(np.ptp(shown.box_px, axis=0).max())

@@ -15,14 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from hal.arrays import Array
 from hal.errors import Ambiguous, InvalidRequest, NotFound
-from perception.vision.finding.blind import PLATE_M, Candidate, candidate_places, chosen, lay_out, recognise
+from perception.vision.finding.blind import PLATE_M, Detection, candidate_places, chosen, lay_out, recognise
 from perception.vision.finding.features import PLATE_PX_PER_M, Ground, look_at
 from perception.vision.finding.framing import one_plate
 from perception.vision.finding.match import distances
 from perception.vision.image import as_gray
-from perception.vision.knowledge import NOTHING, Kind, Knowledge
+from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind
+from perception.vision.projection import PanelProjection, homography
 from perception.vision.teaching.sub_object import SubObject, outline_at
-from perception.vision.view import View, homography
 
 SNAP_M = 0.004  # a click is taken to the middle of the sub-object that lies that near
 ABOUT_M = 0.012  # further middles of the same object: hub and face of a gauge are not quite concentric
@@ -35,7 +35,7 @@ NOTHING_SIZE_M = (0.010, 0.010)
 class Overview:
     """An image of one panel, laid straight: made once, taught from as often as wanted."""
 
-    view: View
+    view: PanelProjection
     ground: Ground
     plate_m: tuple[float, float]
 
@@ -92,7 +92,7 @@ class Lesson:
     """
 
     knowledge: Knowledge
-    kind: Kind
+    kind: TaughtKind
     example: Example
     is_new_kind: bool
     added: bool
@@ -105,7 +105,7 @@ class Lesson:
 
 def teach(
     image: NDArray[Any], knowledge: Knowledge, *, kind: str, clicks_px: Sequence[tuple[float, float]],
-    size_m: tuple[float, float] | None = None, plate_m: tuple[float, float] = PLATE_M, view: View | None = None,
+    size_m: tuple[float, float] | None = None, plate_m: tuple[float, float] = PLATE_M, view: PanelProjection | None = None,
     source: str = "",
 ) -> Lesson:  # fmt: skip
     """Teach that there is a `kind` at the clicked place.
@@ -129,7 +129,7 @@ def teach(
 
 
 def overview_of(
-    image: NDArray[Any], *, plate_m: tuple[float, float] = PLATE_M, view: View | None = None,
+    image: NDArray[Any], *, plate_m: tuple[float, float] = PLATE_M, view: PanelProjection | None = None,
     focal_px: float | None = None,
 ) -> Overview:  # fmt: skip
     """The image of one panel, ready to be taught from.
@@ -198,7 +198,7 @@ def teach_example(
     return Lesson(knowledge=grown, kind=made, example=example, is_new_kind=known is None, added=True)
 
 
-def likest(overview: Overview, example: Example, knowledge: Knowledge) -> Candidate | None:
+def likest(overview: Overview, example: Example, knowledge: Knowledge) -> Detection | None:
     """What the example is taken for now, with the reason if it is refused; None: unlike everything taught."""
     places = candidate_places(overview.ground.edges)
     middle = overview.on_ground(example.centre_m[None])[0]
@@ -212,7 +212,7 @@ def likest(overview: Overview, example: Example, knowledge: Knowledge) -> Candid
 
 def robbed_kinds(knowledge: Knowledge, kind: str, look: Array) -> tuple[str, ...]:
     """Kinds of which a taught look would be liker to the new look than to the rest of its own kind."""
-    new = Kind(name=kind, size_m=NOTHING_SIZE_M, looks=look[None])
+    new = TaughtKind(name=kind, size_m=NOTHING_SIZE_M, looks=look[None])
     robbed = []
     for other in knowledge.kinds:
         if other.name == kind:
@@ -225,22 +225,26 @@ def robbed_kinds(knowledge: Knowledge, kind: str, look: Array) -> tuple[str, ...
     return tuple(robbed)
 
 
-def _to_own_kind(knowledge: Knowledge, kind: Kind, index: int) -> float:
+def _to_own_kind(knowledge: Knowledge, kind: TaughtKind, index: int) -> float:
     """How far one look of a kind is from the kind's others; infinity for an only one."""
     if len(kind.looks) < 2:
         return float("inf")
-    rest = Kind(name=kind.name, size_m=kind.size_m, looks=np.delete(kind.looks, index, axis=0))
+    rest = TaughtKind(name=kind.name, size_m=kind.size_m, looks=np.delete(kind.looks, index, axis=0))
     return _distance(kind.looks[index], knowledge, rest)
 
 
 def check(
-    image: NDArray[Any], knowledge: Knowledge, *, plate_m: tuple[float, float] = PLATE_M, view: View | None = None
-) -> tuple[Candidate, ...]:
+    image: NDArray[Any],
+    knowledge: Knowledge,
+    *,
+    plate_m: tuple[float, float] = PLATE_M,
+    view: PanelProjection | None = None,
+) -> tuple[Detection, ...]:
     """What the system finds now: the objects first, then what it refuses and why."""
     return recognise(image, knowledge, plate_m=plate_m, view=view)
 
 
-def plate_points(view: View, clicks_px: ArrayLike, plate_m: tuple[float, float]) -> Array:
+def plate_points(view: PanelProjection, clicks_px: ArrayLike, plate_m: tuple[float, float]) -> Array:
     """(N, 2) plate points (m, origin in the middle, y up) under pixels.
 
     Raises:
@@ -252,7 +256,7 @@ def plate_points(view: View, clicks_px: ArrayLike, plate_m: tuple[float, float])
     return points
 
 
-def under_pixels(view: View, pixels: ArrayLike, plate_m: tuple[float, float]) -> Array:
+def under_pixels(view: PanelProjection, pixels: ArrayLike, plate_m: tuple[float, float]) -> Array:
     """(N, 2) points of the plate's plane (m, origin in the plate's middle, y up) under pixels, beside the plate too."""
     w, h = plate_m[0] / 2, plate_m[1] / 2
     corners = np.array([[-w, h], [w, h], [w, -h], [-w, -h]])
@@ -281,10 +285,10 @@ def _snapped(place: Array, candidates: Array) -> Array:
     return np.asarray(candidates[nearest] if away[nearest] < SNAP_M * PLATE_PX_PER_M else place)
 
 
-def _distance(look: Array, knowledge: Knowledge, kind: Kind) -> float:
+def _distance(look: Array, knowledge: Knowledge, kind: TaughtKind) -> float:
     """Of a (LENGTH,) look to the nearest of a kind's."""
     return float(distances(look[None], _only(knowledge, kind))[0, 0])
 
 
-def _only(knowledge: Knowledge, kind: Kind) -> Knowledge:
+def _only(knowledge: Knowledge, kind: TaughtKind) -> Knowledge:
     return replace(knowledge, kinds=(kind,))

@@ -12,7 +12,7 @@ from hal.calibration import CameraIntrinsics
 from hal.geometry import UncertainPose, perturbed
 from hal.panel import Panel
 from hal.strict import parse_toml
-from perception.vision.view import CameraView
+from perception.vision.projection import CameraProjection
 
 TOML = """
 schema = 1
@@ -79,7 +79,7 @@ def scene(
     )
     sigma = np.array([5e-4, 5e-4, 1e-3, 1.5e-3, 1.5e-3, 1.5e-3])
     covariance = np.diag(sigma**2)
-    view = CameraView(
+    view = CameraProjection(
         intrinsics=intrinsics, camera_from_panel=UncertainPose(parent_from_child=truth, covariance=covariance)
     )
     image = draw_panel(panel(), view, (size[1], size[0]), {**SHOWN, **(shown or {})}, disturbance)

@@ -9,13 +9,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from hal.calibration import CameraIntrinsics
 from hal.geometry import UncertainPose
 from perception.vision.patch import rectify
-from perception.vision.view import CameraView, PlaneView
+from perception.vision.projection import CameraProjection, PlateProjection
 
 SIZE = (480, 640)
 HALF_M, TOP_M = (0.07, 0.03), 0.016
 
 
-def camera_view(k1: float, *, beside_m: float) -> CameraView:
+def camera_view(k1: float, *, beside_m: float) -> CameraProjection:
     """A camera 0.34 m before the plate and `beside_m` to the right of the object."""
     lens = CameraIntrinsics(
         width_px=640, height_px=480, fx_px=460.0, fy_px=460.0, cx_px=319.5, cy_px=239.5, distortion=(k1, 0, 0, 0, 0)
@@ -23,7 +23,7 @@ def camera_view(k1: float, *, beside_m: float) -> CameraView:
     turn = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
     panel_from_camera = RigidTransform.from_components([beside_m, 0.02, 0.34], turn)
     pose = UncertainPose(parent_from_child=panel_from_camera.inv(), covariance=1e-8 * np.eye(6))
-    return CameraView(intrinsics=lens, camera_from_panel=pose)
+    return CameraProjection(intrinsics=lens, camera_from_panel=pose)
 
 
 def ramp(along: int, middle_px: np.ndarray) -> np.ndarray:
@@ -32,7 +32,7 @@ def ramp(along: int, middle_px: np.ndarray) -> np.ndarray:
     return np.asarray(np.clip(places - np.round(middle_px[along]) + 128, 0, 255), np.uint8)
 
 
-def places_px(view: CameraView, *, shift_px: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+def places_px(view: CameraProjection, *, shift_px: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     """(N, 2) image places that patches of two ramps say for points all over an object, and those of the view."""
     width_m, height_m = HALF_M
     ways = np.meshgrid(np.linspace(-0.9, 0.9, 7) * width_m, np.linspace(-0.9, 0.9, 5) * height_m)
@@ -61,7 +61,7 @@ def test_a_homography_alone_would_miss_by_more_than_a_pixel() -> None:
     view = camera_view(-0.25, beside_m=0.12)
     corners_m = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]) * np.array(HALF_M)
     corners = np.column_stack([corners_m, np.full(4, TOP_M)])
-    straight = PlaneView(px_from_plate=np.eye(3), corners_m=corners_m)
+    straight = PlateProjection(px_from_plate=np.eye(3), corners_m=corners_m)
     straight = straight.moved((view.project(corners) - corners_m).ravel())
     middle = np.array([[0.0, 0.0, TOP_M]])
     assert np.linalg.norm(straight.project(middle) - view.project(middle)) > 1.0

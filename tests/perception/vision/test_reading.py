@@ -12,8 +12,8 @@ from perception.vision.reading import (
     MOST_DOUBTED,
     Guess,
     ObjectReading,
+    PatchReading,
     Possible,
-    Status,
     answer_at,
     as_often_right,
     doubted,
@@ -21,7 +21,7 @@ from perception.vision.reading import (
     refused,
 )
 
-SHOWS = Status(value=4.5, unit="bar", uncertainty=0.1, confidence=0.3)
+SHOWS = PatchReading(value=4.5, unit="bar", uncertainty=0.1, confidence=0.3)
 NUMBERS = tuple(Possible(text=text, value=float(text), probability=0.3) for text in ("4.5", "4.8"))
 NOWHERE = ObjectReading(name="t", kind="gauge", present=False, centre_px=np.zeros(2), outline_px=np.zeros((4, 2)))
 
@@ -74,7 +74,7 @@ def test_a_display_keeps_its_possible_numbers_on_both_sides_of_the_gate() -> Non
 
 
 def test_what_a_reader_doubts_is_refused_however_sure_and_never_surer_than_an_answer() -> None:
-    doubt = doubted(Status(state="on", confidence=0.97), "no bat stands out: add light")
+    doubt = doubted(PatchReading(state="on", confidence=0.97), "no bat stands out: add light")
     assert not doubt.answered and doubt.confidence == MOST_DOUBTED < ANSWER_AT
     assert answer_at(doubt, 0.0).state == "on"
 

@@ -13,7 +13,7 @@ import pytest
 from hal.errors import InvalidRequest
 from hal.panel import load_panel
 from perception.vision.knowledge import load_knowledge, shipped_knowledge
-from perception.vision.view import CameraView
+from perception.vision.projection import CameraView
 from service.commands.teach import teach
 from tests.perception.vision.bench_panel import panel, scene
 

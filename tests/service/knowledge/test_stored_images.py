@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image as Pillow
 
-from perception.vision.view import CameraView
+from perception.vision.projection import CameraView
 from service.serve import Panelwright
 from tests.perception.vision.bench_panel import panel, scene
 from tests.service.shown_panel import PLATE, SHOWING_NO_PANEL, Shown, house, is_problem, png, shown, store, web

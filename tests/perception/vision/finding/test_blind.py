@@ -31,27 +31,27 @@ from perception.vision.finding.plate import TYPICAL_FOCAL, find_plate
 from perception.vision.finding.shapes import find_edges
 from perception.vision.knowledge import (
     NOTHING,
-    Kind,
     Knowledge,
+    TaughtKind,
     load_knowledge,
     shipped_knowledge,
     spread_of,
     write_kind,
 )
+from perception.vision.projection import CameraProjection, PlateProjection
 from perception.vision.teaching.teach import check, example_at, overview_of, plate_points, teach, teach_example
-from perception.vision.view import CameraView, PlaneView
 from tests.perception.vision.bench_panel import panel, scene
 
 PLATE = (0.60, 0.40)
 CORNERS_M = np.array([[-0.3, 0.2], [0.3, 0.2], [0.3, -0.2], [-0.3, -0.2]])
 
 
-def overview(**options: object) -> tuple[np.ndarray, CameraView]:
+def overview(**options: object) -> tuple[np.ndarray, CameraProjection]:
     image, intrinsics, pose = scene(tilt_deg=5.0, distance_m=0.66, pose_error=0.0, **options)
-    return image, CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+    return image, CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
 
 
-def pixel_of(view: CameraView, name: str) -> tuple[float, float]:
+def pixel_of(view: CameraProjection, name: str) -> tuple[float, float]:
     u, v = view.project([panel().object(name).point_m])[0]
     return float(u), float(v)
 
@@ -70,7 +70,7 @@ def test_a_plate_tilted_before_a_lens_that_is_not_typical_is_found(tilt_deg: flo
     image, intrinsics, pose = scene(
         tilt_deg=tilt_deg, azimuth_deg=azimuth_deg, distance_m=0.85, pose_error=0.0, size=(640, 480)
     )
-    view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+    view = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
     plate = find_plate(image, *PLATE)
     assert plate is not None and intrinsics.fx_px < 0.85 * TYPICAL_FOCAL * 640
     corners = np.column_stack([plate.view.corners_m, np.zeros(4)])
@@ -157,7 +157,7 @@ def test_a_look_that_would_rob_another_kind_is_refused() -> None:
         plate_m=PLATE,
     )
     look = twin.kind.looks[0]
-    filled = Kind(name="gauge", size_m=gauge.size_m, looks=np.vstack([gauge.looks, look + 0.01]))
+    filled = TaughtKind(name="gauge", size_m=gauge.size_m, looks=np.vstack([gauge.looks, look + 0.01]))
     crowded = Knowledge(
         kinds=tuple(filled if k.name == "gauge" else k for k in knowledge.kinds), spread=knowledge.spread
     )
@@ -183,7 +183,7 @@ def test_clicks_are_checked() -> None:
 def test_knowledge_survives_its_files(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     kinds = tuple(
-        Kind(name=name, size_m=(0.05, 0.04), looks=np.round(rng.normal(0, 1, (3, LENGTH)), 2))
+        TaughtKind(name=name, size_m=(0.05, 0.04), looks=np.round(rng.normal(0, 1, (3, LENGTH)), 2))
         for name in ("a", NOTHING)
     )
     for kind in kinds:
@@ -205,12 +205,12 @@ def test_a_look_written_without_directions_is_the_same_all_around(tmp_path: Path
 
 
 def _with_noisy_look(knowledge: Knowledge, name: str, look: np.ndarray) -> Knowledge:
-    return knowledge.grown(Kind(name=name, size_m=(0.05, 0.05), looks=look[None], noisy=np.array([True])))
+    return knowledge.grown(TaughtKind(name=name, size_m=(0.05, 0.05), looks=look[None], noisy=np.array([True])))
 
 
 def test_looks_of_noisy_images_survive_their_files_and_say_nothing_of_the_spread(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    kinds = (Kind(name="a", size_m=(0.05, 0.04), looks=np.round(rng.normal(0, 1, (3, LENGTH)), 2)),)
+    kinds = (TaughtKind(name="a", size_m=(0.05, 0.04), looks=np.round(rng.normal(0, 1, (3, LENGTH)), 2)),)
     knowledge = _with_noisy_look(Knowledge(kinds=kinds, spread=spread_of(kinds)), "a", np.full(LENGTH, 9.0))
     write_kind(knowledge.kinds[0], tmp_path)
     loaded = load_knowledge(tmp_path)
@@ -222,7 +222,9 @@ def test_looks_of_noisy_images_survive_their_files_and_say_nothing_of_the_spread
 
 
 def test_a_kind_of_noisy_images_only_is_no_kind_elsewhere() -> None:
-    known = Knowledge(kinds=(Kind(name="a", size_m=(0.05, 0.04), looks=np.zeros((1, LENGTH))),), spread=np.ones(LENGTH))
+    known = Knowledge(
+        kinds=(TaughtKind(name="a", size_m=(0.05, 0.04), looks=np.zeros((1, LENGTH))),), spread=np.ones(LENGTH)
+    )
     grown = _with_noisy_look(known, "ghost", np.ones(LENGTH))
     assert [kind.name for kind in grown.for_image(noisy=False).kinds] == ["a"]
     assert [kind.name for kind in grown.for_image(noisy=True).kinds] == ["a", "ghost"]
@@ -249,8 +251,8 @@ def test_one_look_that_is_near_by_chance_names_nothing_in_a_noisy_image(noisy: b
     place = np.array([[200.0, 150.0]])
     look = look_at(ground, place)
     off = {"chance": (0.0, 0.6, 0.6), "often": (0.1, 0.1, 0.1)}
-    kinds = tuple(Kind(name=n, size_m=(0.04, 0.04), looks=look + np.array(by)[:, None]) for n, by in off.items())
-    view = PlaneView(px_from_plate=np.diag([PLATE_PX_PER_M, -PLATE_PX_PER_M, 1.0]), corners_m=np.zeros((4, 2)))
+    kinds = tuple(TaughtKind(name=n, size_m=(0.04, 0.04), looks=look + np.array(by)[:, None]) for n, by in off.items())
+    view = PlateProjection(px_from_plate=np.diag([PLATE_PX_PER_M, -PLATE_PX_PER_M, 1.0]), corners_m=np.zeros((4, 2)))
     plate_m = (400 / PLATE_PX_PER_M, 300 / PLATE_PX_PER_M)
     (found,) = chosen(ground, place, look, Knowledge(kinds=kinds, spread=np.ones(LENGTH)), view, plate_m)
     assert (found.kind, found.reason) == (named, None)
@@ -273,7 +275,9 @@ def test_noise_says_nothing_of_which_way_is_up() -> None:
 
 
 def test_what_lies_far_from_a_middle_counts_in_good_images_only() -> None:
-    known = Knowledge(kinds=(Kind(name="a", size_m=(0.05, 0.04), looks=np.zeros((1, LENGTH))),), spread=np.ones(LENGTH))
+    known = Knowledge(
+        kinds=(TaughtKind(name="a", size_m=(0.05, 0.04), looks=np.zeros((1, LENGTH))),), spread=np.ones(LENGTH)
+    )
     rows = np.zeros((2, len(GROUPS), len(RADII_M)))
     rows[0, :, RADII_M > 0.036] = rows[1, :, RADII_M < 0.03] = 1.0
     looks = np.zeros((2, LENGTH))
@@ -316,9 +320,9 @@ def test_what_is_as_much_like_one_kind_as_another_is_refused_by_name() -> None:
     place = np.array([[200.0, 150.0]])
     look = look_at(ground, place)
     plate_m = (400 / PLATE_PX_PER_M, 300 / PLATE_PX_PER_M)
-    view = PlaneView(px_from_plate=np.diag([PLATE_PX_PER_M, -PLATE_PX_PER_M, 1.0]), corners_m=np.zeros((4, 2)))
-    near, far = (Kind(name=name, size_m=(0.04, 0.04), looks=look + off) for name, off in (("a", 0.0), ("b", 1.5)))
-    twin = Kind(name="b", size_m=(0.04, 0.04), looks=look + 0.001)
+    view = PlateProjection(px_from_plate=np.diag([PLATE_PX_PER_M, -PLATE_PX_PER_M, 1.0]), corners_m=np.zeros((4, 2)))
+    near, far = (TaughtKind(name=name, size_m=(0.04, 0.04), looks=look + off) for name, off in (("a", 0.0), ("b", 1.5)))
+    twin = TaughtKind(name="b", size_m=(0.04, 0.04), looks=look + 0.001)
     spread = np.ones(LENGTH)
     (clear,) = chosen(ground, place, look, Knowledge(kinds=(near, far), spread=spread), view, plate_m)
     (doubtful,) = chosen(ground, place, look, Knowledge(kinds=(near, twin), spread=spread), view, plate_m)
@@ -329,7 +333,8 @@ def test_what_is_as_much_like_one_kind_as_another_is_refused_by_name() -> None:
 def test_the_fast_match_agrees_with_the_plain_one() -> None:
     rng = np.random.default_rng(1)
     kinds = tuple(
-        Kind(name=name, size_m=(0.05, 0.04), looks=rng.normal(0, 1, (n, LENGTH))) for name, n in (("a", 4), ("b", 7))
+        TaughtKind(name=name, size_m=(0.05, 0.04), looks=rng.normal(0, 1, (n, LENGTH)))
+        for name, n in (("a", 4), ("b", 7))
     )
     knowledge = Knowledge(kinds=kinds, spread=spread_of(kinds))
     looks = rng.normal(0, 1, (9, LENGTH))

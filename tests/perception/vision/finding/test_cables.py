@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from hal.arrays import Image
 from perception.vision.finding.cables import without_cables
-from perception.vision.image import Image
 
 PLATE_GRAY = 140.0
 LINE = np.array([[250, -10], [290, 220], [210, 460]], np.int32)

@@ -14,7 +14,7 @@ from hal.calibration import CameraIntrinsics
 from hal.camera_model import project
 from hal.errors import InvalidRequest, PerceptionError
 from perception.vision.lights import CameraMoved, LightMissing, WrongLamp, assign_lights, find_lights, panel_pose
-from perception.vision.lights.registration import register
+from perception.vision.lights.alignment import register
 
 CAMERA = CameraIntrinsics(width_px=640, height_px=480, fx_px=700.0, fy_px=700.0, cx_px=319.5, cy_px=239.5)
 LIGHTS = np.array([[-0.2, 0.12, 0.0], [0.2, 0.12, 0.0], [0.2, -0.12, 0.0], [-0.2, -0.12, 0.0]])

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from benchmarks.display_drawing import draw_photograph
 from perception.vision.photographs.digit_search import CELL_PX, MARGIN, STRIDE, cell_scores, find_digit_rows
 from perception.vision.photographs.photo_display import FEW_OF_SCENE, ROWS_TRIED, _agreed, read_photograph
-from perception.vision.reading import Status, refused
-from perception.vision.status.comb import LIT_SHARES
-from perception.vision.status.comb_jit import cell_boxes
+from perception.vision.reading import PatchReading, refused
+from perception.vision.status.digit_grid import LIT_SHARES
+from perception.vision.status.digit_grid_worth import cell_boxes
 from perception.vision.status.display import read_window
 from perception.vision.status.glyphs import LIT
 from perception.vision.status.ink import without_border
@@ -88,7 +88,7 @@ def test_a_frame_that_stands_out_more_than_the_digits_is_left_aside() -> None:
 
 @given(st.lists(st.tuples(st.sampled_from(["260", "8.8", None]), st.floats(0.5, 0.97)), min_size=1, max_size=6))
 def test_rivals_make_an_answer_less_sure(read: list[tuple[str | None, float]]) -> None:
-    answers = [(1.0, Status(text=t, value=1.0, confidence=c) if t else refused("no")) for t, c in read]
+    answers = [(1.0, PatchReading(text=t, value=1.0, confidence=c) if t else refused("no")) for t, c in read]
     agreed = _agreed(answers)
     assert agreed.confidence <= max((c for t, c in read if t), default=0.0)
     if len({t for t, _ in read if t}) == 1:
@@ -97,13 +97,13 @@ def test_rivals_make_an_answer_less_sure(read: list[tuple[str | None, float]]) -
 
 @pytest.mark.parametrize("text", ["1", "-1", "7"])
 def test_a_few_strokes_alone_are_not_sure_since_any_bar_makes_some(text: str) -> None:
-    sure = Status(text=text, value=float(text), confidence=0.97)
+    sure = PatchReading(text=text, value=float(text), confidence=0.97)
     assert _agreed([(1.0, sure)], FEW_OF_SCENE).confidence < 0.5
     assert _agreed([(1.0, sure)]).confidence < 0.6
 
 
 def test_what_stands_in_a_doubtful_place_is_not_sure() -> None:
-    sure = Status(text="260", value=260.0, confidence=0.97)
+    sure = PatchReading(text="260", value=260.0, confidence=0.97)
     assert _agreed([(0.4, sure)]).confidence < 0.7
     assert _agreed([(0.4, sure), (1.0, sure)]).confidence == 0.97
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perception.vision.image import Image
+from hal.arrays import Image
 from perception.vision.photographs.scale_ends import scale_ends
 
 SIDE_PX, RADIUS_PX = 300, 130.0

@@ -15,12 +15,12 @@ from benchmarks.panel_scene import draw_scene
 from benchmarks.vision_held_out import found_blind, read_scene
 from hal.panel import Gauge, Lamp, Lever, Scale, Slider, State
 from perception.vision.patch import Patch
-from perception.vision.status.band import cables_across, lying_across
 from perception.vision.status.bar import bar_contrast
-from perception.vision.status.comb import Comb
+from perception.vision.status.digit_grid import DigitGrid
 from perception.vision.status.gauge import read_gauge, status_of_pointer
 from perception.vision.status.lamp import read_lamp
 from perception.vision.status.lever import read_lever
+from perception.vision.status.occluder_bands import cables_across, lying_across
 from perception.vision.status.panel_meter import RIVAL, SIGMA_RAD
 from perception.vision.status.pointer import PointerFit
 from perception.vision.status.slider import read_slider
@@ -228,25 +228,25 @@ def test_an_easy_drawn_panel_is_read_and_recognised() -> None:
 
 @pytest.mark.parametrize("seed", [20044, 20064])
 def test_a_number_that_leaves_strokes_over_is_refused(seed: int) -> None:
-    """A comb that lay wrong read 4.94 as 4.44 at .95, and a cable of the window's gray made 7.14 of 7.11."""
+    """A grid that lay wrong read 4.94 as 4.44 at .95, and a cable of the window's gray made 7.14 of 7.11."""
     case = draw_taught(seed, "hard")
     status = read_case(case, known=False)
     assert status.text in (case.text, None)
 
 
 def test_stray_ink_is_what_no_lit_segment_accounts_for() -> None:
-    comb = Comb(left_px=10.0, pitch_px=30.0, width_px=18.0, top_px=12.0, bottom_px=52.0, slant=0.0, count=2)
+    grid = DigitGrid(left_px=10.0, pitch_px=30.0, width_px=18.0, top_px=12.0, bottom_px=52.0, slant=0.0, count=2)
     lit = np.zeros((2, 7))
     lit[:, [1, 2]] = 100.0  # 11
     ink = np.zeros((64, 80), np.float32)
     for x in (28, 58):
         cv2.line(ink, (x, 14), (x, 50), 100.0, 4)
-    assert stray_ink(ink, comb, lit) < 0.01
-    assert stray_ink(ink + 15.0, comb, lit) < 0.02, "an even ground is no stroke"
+    assert stray_ink(ink, grid, lit) < 0.01
+    assert stray_ink(ink + 15.0, grid, lit) < 0.02, "an even ground is no stroke"
     cv2.line(ink, (42, 12), (54, 12), 100.0, 4)  # what makes the second one a 7
-    assert stray_ink(ink, comb, lit) > 0.1
+    assert stray_ink(ink, grid, lit) > 0.1
     lit[1, 0] = 100.0
-    assert stray_ink(ink, comb, lit) < 0.03
+    assert stray_ink(ink, grid, lit) < 0.03
 
 
 def test_a_sure_reading_proves_an_object_whose_outline_does_not_show() -> None:

@@ -1,4 +1,4 @@
-"""The parts of the display reader: characters by likelihood, the comb's worth, cables, the point; and own renderings."""
+"""The parts of the display reader: characters by likelihood, the grid's worth, cables, the point; and own renderings."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from benchmarks.display_drawing import draw_photograph, draw_taught
 from benchmarks.display_report import read_case
 from perception.vision.patch import Patch
 from perception.vision.photographs.photo_display import read_photograph
-from perception.vision.status.band import hidden_by_bands
-from perception.vision.status.comb import LIT_SHARES, Comb, find_combs, segment_means
-from perception.vision.status.comb_fit import comb_worth
-from perception.vision.status.comb_jit import LEFT_OVER, apartness, cell_worth
-from perception.vision.status.cover import ring_medians
+from perception.vision.status.decimal_point import dot_levels, find_decimal_point
+from perception.vision.status.digit_grid import LIT_SHARES, DigitGrid, find_digit_grids, segment_means
+from perception.vision.status.digit_grid_fit import grid_worth
+from perception.vision.status.digit_grid_worth import LEFT_OVER, apartness, cell_worth
 from perception.vision.status.display import read_window
 from perception.vision.status.glyphs import LIT, NAMES, Levels, likelihoods, numbers, separate
 from perception.vision.status.ink import segment_ink
 from perception.vision.status.levels import segment_levels, with_hidden_ends
-from perception.vision.status.point import dot_levels, find_point
+from perception.vision.status.occluder_bands import hidden_by_bands
+from perception.vision.status.occluders import ring_medians
 from tests.perception.vision.status.test_display import window
 
 
@@ -98,18 +98,18 @@ def test_a_cells_worth_is_what_its_best_character_explains_less_what_it_leaves()
         assert cell_worth(levels, areas, loops, LIT_SHARES) == pytest.approx(wanted)
 
 
-def test_the_true_comb_is_worth_more_than_any_shifted_one() -> None:
+def test_the_true_grid_is_worth_more_than_any_shifted_one() -> None:
     ink, seen = segment_ink(window("2048", slant=0.0), is_dark=False)
-    _, comb = find_combs(ink, seen)[0]
+    _, grid = find_digit_grids(ink, seen)[0]
     assert (
-        comb.count == 4 and comb.height_px == pytest.approx(40.0, abs=3.0) and comb.pitch_px == pytest.approx(30, abs=1)
+        grid.count == 4 and grid.height_px == pytest.approx(40.0, abs=3.0) and grid.pitch_px == pytest.approx(30, abs=1)
     )
-    means, shares = segment_means(ink, seen, True, comb.width_px, comb.height_px)
-    worth = comb_worth(means, shares, True, comb.numbers, 4, LIT_SHARES)
+    means, shares = segment_means(ink, seen, True, grid.width_px, grid.height_px)
+    worth = grid_worth(means, shares, True, grid.numbers, 4, LIT_SHARES)
     for k, step in ((0, 5.0), (0, -5.0), (1, 3.0), (3, 6.0), (4, -6.0)):
-        moved = comb.numbers
+        moved = grid.numbers
         moved[k] += step
-        assert comb_worth(means, shares, True, moved, 4, LIT_SHARES) < worth
+        assert grid_worth(means, shares, True, moved, 4, LIT_SHARES) < worth
 
 
 def test_neighbours_that_share_an_upright_count_less() -> None:
@@ -137,9 +137,9 @@ def test_strokes_stand_out_alike_in_glare() -> None:
     plain = window("8888", slant=0.0)
     for added, spread in ((0.0, 0.1), (0.3, 0.15), (0.6, 0.2)):
         ink, seen = segment_ink(in_glare(plain, added), is_dark=False)
-        _, comb = find_combs(ink, seen)[0]
-        cells = segment_levels(ink, seen, comb)[0].mean(axis=1)
-        assert comb.count == 4 and np.ptp(cells) < spread * cells.mean()
+        _, grid = find_digit_grids(ink, seen)[0]
+        cells = segment_levels(ink, seen, grid)[0].mean(axis=1)
+        assert grid.count == 4 and np.ptp(cells) < spread * cells.mean()
 
 
 @pytest.mark.parametrize("text", ["7669", "5.37", "3847"])
@@ -161,24 +161,24 @@ def test_a_blank_within_a_number_is_a_digit_that_nobody_saw() -> None:
 @pytest.mark.parametrize(("text", "place"), [("26.48", 2), ("2.648", 1), ("2648", None)])
 def test_a_dot_stands_out_from_gaps_without_one(text: str, place: int | None) -> None:
     ink, seen = segment_ink(window(text, slant=0.0), is_dark=False)
-    _, comb = find_combs(ink, seen)[0]
+    _, grid = find_digit_grids(ink, seen)[0]
     lit = np.array([LIT[NAMES.index(c)] * 150.0 for c in "2648"])
-    levels, clear = dot_levels(ink, seen, comb, lit)
+    levels, clear = dot_levels(ink, seen, grid, lit)
     assert clear.all()
     for gap, level in enumerate(levels, start=1):
         assert level > 0.8 if gap == place else level < 0.35
-    assert find_point(ink, seen, comb, lit).place == place
+    assert find_decimal_point(ink, seen, grid, lit).place == place
 
 
 def test_a_dot_that_a_cable_hides_in_part_is_found_and_a_bare_part_of_a_gap_says_nothing() -> None:
     lit = np.array([LIT[NAMES.index(c)] * 150.0 for c in "2648"])
     for text, place in (("26.48", 2), ("2648", None)):
         ink, seen = segment_ink(window(text, slant=0.0), is_dark=False)
-        _, comb = find_combs(ink, seen)[0]
-        middle = round(comb.left_px + 1.5 * comb.pitch_px + 0.5 * comb.width_px)
+        _, grid = find_digit_grids(ink, seen)[0]
+        middle = round(grid.left_px + 1.5 * grid.pitch_px + 0.5 * grid.width_px)
         seen[:, middle - 6 : middle] = 0.0  # the left half of the second gap
-        assert not dot_levels(ink, seen, comb, lit)[1][1]
-        found = find_point(ink, seen, comb, lit)
+        assert not dot_levels(ink, seen, grid, lit)[1][1]
+        found = find_decimal_point(ink, seen, grid, lit)
         assert found.place == place and (found.probability > 0.95 if place else found.probability < 0.8)
 
 
@@ -186,13 +186,13 @@ def test_a_dot_in_both_gaps_is_no_number_without_a_point() -> None:
     """What every gap seems to have is not what a bare gap has: strokes that are not where they are thought to be."""
     lit = np.array([LIT[NAMES.index(c)] * 150.0 for c in "264"])
     ink, seen = segment_ink(window("264", slant=0.0), is_dark=False)
-    _, comb = find_combs(ink, seen)[0]
+    _, grid = find_digit_grids(ink, seen)[0]
     for gap in range(2):
-        u = comb.left_px + gap * comb.pitch_px + 0.5 * (comb.width_px + comb.pitch_px)
-        radius = round(0.075 * comb.height_px)
-        cv2.circle(ink, (round(u), round(comb.bottom_px)), radius, float(ink.max()), -1, cv2.LINE_AA)
-    assert (dot_levels(ink, seen, comb, lit)[0] > 0.6).all()
-    assert find_point(ink, seen, comb, lit).probability < 0.8
+        u = grid.left_px + gap * grid.pitch_px + 0.5 * (grid.width_px + grid.pitch_px)
+        radius = round(0.075 * grid.height_px)
+        cv2.circle(ink, (round(u), round(grid.bottom_px)), radius, float(ink.max()), -1, cv2.LINE_AA)
+    assert (dot_levels(ink, seen, grid, lit)[0] > 0.6).all()
+    assert find_decimal_point(ink, seen, grid, lit).probability < 0.8
 
 
 def plate_patch(*, cable: tuple[int, int] | None, cable_gray: int = 60) -> Patch:
@@ -254,18 +254,18 @@ def test_a_digit_that_a_cable_crosses_is_not_left_out(seed: int) -> None:
     assert status.text in (None, case.text)
 
 
-def test_cells_beside_a_comb_belong_to_it_where_they_are_hidden() -> None:
+def test_cells_beside_a_grid_belong_to_it_where_they_are_hidden() -> None:
     seen = np.ones((40, 200), np.float32)
     seen[:, 150:165] = 0.0
-    comb = Comb(left_px=60.0, pitch_px=30.0, width_px=15.0, top_px=8.0, bottom_px=32.0, slant=0.1, count=3)
-    assert with_hidden_ends(seen, comb, 8) == replace(comb, count=4)
-    assert with_hidden_ends(seen, comb, 3) == comb  # the display has no more
-    assert with_hidden_ends(seen[:, ::-1].copy(), comb, 8) == replace(comb, left_px=30.0, count=4)
-    assert with_hidden_ends(seen[:, :160], comb, 8) == comb  # no room for a fourth
+    grid = DigitGrid(left_px=60.0, pitch_px=30.0, width_px=15.0, top_px=8.0, bottom_px=32.0, slant=0.1, count=3)
+    assert with_hidden_ends(seen, grid, 8) == replace(grid, count=4)
+    assert with_hidden_ends(seen, grid, 3) == grid  # the display has no more
+    assert with_hidden_ends(seen[:, ::-1].copy(), grid, 8) == replace(grid, left_px=30.0, count=4)
+    assert with_hidden_ends(seen[:, :160], grid, 8) == grid  # no room for a fourth
 
 
 @pytest.mark.parametrize(("seed", "level"), [(5010, "easy"), (5172, "hard")])
-def test_a_comb_that_is_too_high_does_not_win(seed: int, level: str) -> None:
+def test_a_grid_that_is_too_high_does_not_win(seed: int, level: str) -> None:
     case = draw_taught(seed, level)
     assert read_case(case, known=True).text == case.text
 

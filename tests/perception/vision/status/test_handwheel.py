@@ -10,25 +10,25 @@ from scipy.spatial.transform import RigidTransform
 from benchmarks.vision_drawing import Disturbance, camera, draw_panel, looking_at
 from hal.geometry import certain
 from hal.panel import Handwheel, Light, Panel
+from perception.vision.inspection import patch_of
 from perception.vision.patch import Patch
-from perception.vision.reading import Status
+from perception.vision.projection import CameraProjection
+from perception.vision.reading import PatchReading
 from perception.vision.status.handwheel import read_handwheel
 from perception.vision.status.pointer import wrapped
-from perception.vision.taught import patch_of
-from perception.vision.view import CameraView
 
 ANGLE_RAD = 0.7
 DISTANCE_M, HEIGHT_M = 0.30, 0.026
 CORNERS = ((-0.15, 0.12), (0.15, 0.12), (0.15, -0.12), (-0.15, -0.12))
 
 
-def read(spokes: int, *, beside_m: tuple[float, float], seed: int = 1) -> Status:
+def read(spokes: int, *, beside_m: tuple[float, float], seed: int = 1) -> PatchReading:
     """A small wheel 0.3 m away, read where it would be if the panel's pose were right."""
     wheel = Handwheel(name="trim", position_m=(0.0, 0.0), radius_m=0.026, rim_m=0.004, height_m=HEIGHT_M, spokes=spokes)
     lights = tuple(Light(name=f"light_{k}", position_m=(x, y, 0.0005)) for k, (x, y) in enumerate(CORNERS))
     panel = Panel(schema=1, name="small", width_m=0.34, height_m=0.28, lights=lights, objects=(wheel,))
     pose = certain(RigidTransform.from_matrix(looking_at(distance_m=DISTANCE_M, tilt_rad=0.08)))
-    view = CameraView(intrinsics=camera(focal_px=460.0), camera_from_panel=pose)
+    view = CameraProjection(intrinsics=camera(focal_px=460.0), camera_from_panel=pose)
     image = draw_panel(
         panel, view, (480, 640), {"trim": ANGLE_RAD}, Disturbance(noise_sigma=2.5, seed=seed, blur_sigma_px=0.7)
     )
@@ -51,7 +51,7 @@ def test_where_nothing_shows_nothing_is_read() -> None:
     """Heights of nothing over nothing were NaN, and the reader ended with an error."""
     wheel = Handwheel(name="trim", position_m=(0.0, 0.0), radius_m=0.026, rim_m=0.004, height_m=HEIGHT_M, spokes=4)
     pose = certain(RigidTransform.from_matrix(looking_at(distance_m=DISTANCE_M, tilt_rad=0.0)))
-    view = CameraView(intrinsics=camera(focal_px=460.0), camera_from_panel=pose)
+    view = CameraProjection(intrinsics=camera(focal_px=460.0), camera_from_panel=pose)
     image = np.full((480, 640), 120, np.uint8)
     status = read_handwheel(patch_of(image, image, view, wheel, np.zeros(2)), wheel)
     assert not status.answered

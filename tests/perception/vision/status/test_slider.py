@@ -11,10 +11,10 @@ from benchmarks.vision_drawing import Disturbance, camera, draw_panel, looking_a
 from hal.arrays import Array
 from hal.geometry import certain
 from hal.panel import Light, Panel, Scale, Slider
+from perception.vision.inspection import patch_of
 from perception.vision.patch import Patch
+from perception.vision.projection import CameraProjection
 from perception.vision.status.slider import read_slider
-from perception.vision.taught import patch_of
-from perception.vision.view import CameraView
 
 TRAVEL_M = 0.100
 CORNERS = ((-0.15, 0.12), (0.15, 0.12), (0.15, -0.12), (-0.15, -0.12))
@@ -29,7 +29,7 @@ def test_a_close_up_reads_a_cap_beside_the_middle_of_its_track(shown: float, ang
     lights = tuple(Light(name=f"light_{k}", position_m=(x, y, 0.0005)) for k, (x, y) in enumerate(CORNERS))
     panel = Panel(schema=1, name="small", width_m=0.34, height_m=0.28, lights=lights, objects=(slider,))
     pose = certain(RigidTransform.from_matrix(looking_at(distance_m=0.30)))
-    view = CameraView(intrinsics=camera(focal_px=460.0), camera_from_panel=pose)
+    view = CameraProjection(intrinsics=camera(focal_px=460.0), camera_from_panel=pose)
     image = draw_panel(
         panel, view, (480, 640), {"speed": shown}, Disturbance(noise_sigma=2.5, seed=1, blur_sigma_px=0.7)
     )

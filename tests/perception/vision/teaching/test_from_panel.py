@@ -10,11 +10,11 @@ import pytest
 from hal.errors import NotFound
 from hal.geometry import UncertainPose, perturbed
 from hal.panel import Lamp, Panel
-from perception.vision.finding.blind import Candidate, recognise
+from perception.vision.finding.blind import Detection, recognise
 from perception.vision.knowledge import NOTHING, Knowledge, load_knowledge, shipped_knowledge, write_kind
+from perception.vision.projection import CameraProjection
 from perception.vision.registration.outline import footprint_m
 from perception.vision.teaching.from_panel import PanelLooks, teach_from_panel
-from perception.vision.view import CameraView
 from tests.perception.vision.bench_panel import panel, scene
 
 PLATE_M = (0.60, 0.40)
@@ -23,7 +23,7 @@ PLATE_M = (0.60, 0.40)
 def learned(known_panel: Panel, **more: float) -> PanelLooks:
     image, intrinsics, pose = scene(tilt_deg=4.0, distance_m=0.66, **more)
     return teach_from_panel(
-        image, CameraView(intrinsics=intrinsics, camera_from_panel=pose), known_panel, shipped_knowledge()
+        image, CameraProjection(intrinsics=intrinsics, camera_from_panel=pose), known_panel, shipped_knowledge()
     )
 
 
@@ -32,7 +32,7 @@ def lesson() -> PanelLooks:
     return learned(panel())
 
 
-def right(knowledge: Knowledge) -> tuple[set[str], list[Candidate]]:
+def right(knowledge: Knowledge) -> tuple[set[str], list[Detection]]:
     """Names of the objects that are found in another overview with other states, and the accepted candidates."""
     image, _, _ = scene(
         tilt_deg=11.0, azimuth_deg=200.0, distance_m=0.7, shown={"pressure": 2.0, "mode": "low", "drain": -0.4}, seed=5
@@ -69,7 +69,7 @@ def test_the_lesson_says_what_it_did(lesson: PanelLooks) -> None:
 
 def test_the_same_overview_teaches_nothing_twice(lesson: PanelLooks) -> None:
     image, intrinsics, pose = scene(tilt_deg=4.0, distance_m=0.66)
-    view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+    view = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
     assert teach_from_panel(image, view, panel(), lesson.knowledge).added == {}
 
 
@@ -91,7 +91,7 @@ def test_a_panel_that_is_not_where_the_pose_has_it_teaches_nothing() -> None:
         parent_from_child=perturbed(pose.parent_from_child, np.array([0.06, 0.05, 0.0, 0.0, 0.0, 0.2])),
         covariance=pose.covariance,
     )
-    view = CameraView(intrinsics=intrinsics, camera_from_panel=elsewhere)
+    view = CameraProjection(intrinsics=intrinsics, camera_from_panel=elsewhere)
     with pytest.raises(NotFound, match="does not show panel"):
         teach_from_panel(image, view, panel(), shipped_knowledge())
 

@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from perception.vision.knowledge import Knowledge, shipped_knowledge
+from perception.vision.projection import CameraProjection
 from perception.vision.teaching.teach import check, teach
-from perception.vision.view import CameraView
 from tests.perception.vision.bench_panel import panel, scene
 
 Canvas = NDArray[np.uint8]
@@ -67,12 +67,12 @@ KINDS = (
 )
 
 
-def drawn(seed: int, *, taught: bool) -> tuple[Canvas, CameraView]:
+def drawn(seed: int, *, taught: bool) -> tuple[Canvas, CameraProjection]:
     """The test panel with one of each new kind in a state of its own, from another place for each seed."""
     random = np.random.default_rng([20261122, seed])
     tilt_deg, azimuth_deg = random.uniform(0.0, 8.0), random.uniform(0.0, 360.0)
     image, lens, pose = scene(tilt_deg=tilt_deg, azimuth_deg=azimuth_deg, distance_m=0.68, pose_error=0.0, seed=seed)
-    view = CameraView(intrinsics=lens, camera_from_panel=pose)
+    view = CameraProjection(intrinsics=lens, camera_from_panel=pose)
     for kind in KINDS:
         x, y = kind.taught_m if taught else kind.asked_m
         w, h = kind.size_m
@@ -86,7 +86,7 @@ def drawn(seed: int, *, taught: bool) -> tuple[Canvas, CameraView]:
     return np.asarray(image, np.uint8), view
 
 
-def clicks(view: CameraView, kind: NewKind) -> list[tuple[float, float]]:
+def clicks(view: CameraProjection, kind: NewKind) -> list[tuple[float, float]]:
     """Two opposite corners and the middle, as a person clicks them."""
     (x, y), (w, h) = kind.taught_m, kind.size_m
     points = view.project([[x - w / 2, y + h / 2, 0.0], [x + w / 2, y - h / 2, 0.0], [x, y, 0.0]])
@@ -105,7 +105,7 @@ def taught() -> Knowledge:
     return knowledge
 
 
-def found(image: Canvas, view: CameraView, knowledge: Knowledge) -> set[str]:
+def found(image: Canvas, view: CameraProjection, knowledge: Knowledge) -> set[str]:
     """Names of the panel's objects, and new kinds, that are found where they are."""
     hits = [c for c in check(image, knowledge, plate_m=PLATE, view=view) if c.reason is None]
     places = [(panel_object.name, str(panel_object.kind), panel_object.position_m) for panel_object in panel().objects]

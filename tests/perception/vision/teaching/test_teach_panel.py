@@ -13,14 +13,14 @@ from hal.panel import Panel
 from hal.strict import parse_toml
 from perception.vision.finding.framing import check_upright, one_plate
 from perception.vision.image import as_gray
+from perception.vision.inspection import inspect_view
 from perception.vision.knowledge import NOTHING, shipped_knowledge
+from perception.vision.projection import CameraProjection
 from perception.vision.registration.outline import footprint_m
-from perception.vision.taught import inspect_view
 from perception.vision.teaching.panel_lights import find_border_lights
 from perception.vision.teaching.panel_questions import kind_question, questions
 from perception.vision.teaching.panel_teach import PanelObjectDraft, panel_text
 from perception.vision.teaching.teach import Overview, example_at, likest, overview_of, teach, teach_example
-from perception.vision.view import CameraView
 from tests.perception.vision.bench_panel import SHOWN, panel, scene
 
 PLATE = (0.60, 0.40)
@@ -37,13 +37,13 @@ ANSWERS: dict[str, dict[str, str]] = {
 
 
 @pytest.fixture(scope="module")
-def seen() -> tuple[np.ndarray, CameraView, Overview]:
+def seen() -> tuple[np.ndarray, CameraProjection, Overview]:
     image, intrinsics, pose = scene(tilt_deg=2.0, distance_m=0.66, pose_error=0.0)
-    view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+    view = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
     return image, view, overview_of(image, plate_m=PLATE)
 
 
-def corners_of(view: CameraView, name: str) -> list[tuple[float, float]]:
+def corners_of(view: CameraProjection, name: str) -> list[tuple[float, float]]:
     """Two opposite corners around an object, as a person clicks them."""
     panel_object = panel().object(name)
     w, h, _ = footprint_m(panel_object)
@@ -51,12 +51,12 @@ def corners_of(view: CameraView, name: str) -> list[tuple[float, float]]:
     return [(float(u), float(v)) for u, v in view.project([[x - w, y + h, 0.0], [x + w, y - h, 0.0]])]
 
 
-def middle_of(view: CameraView, name: str) -> list[tuple[float, float]]:
+def middle_of(view: CameraProjection, name: str) -> list[tuple[float, float]]:
     u, v = view.project([panel().object(name).point_m])[0]
     return [(float(u), float(v))]
 
 
-def drafts(seen: tuple[np.ndarray, CameraView, Overview]) -> list[PanelObjectDraft]:
+def drafts(seen: tuple[np.ndarray, CameraProjection, Overview]) -> list[PanelObjectDraft]:
     _, view, overview = seen
     made = []
     for name, answers in ANSWERS.items():
@@ -67,7 +67,9 @@ def drafts(seen: tuple[np.ndarray, CameraView, Overview]) -> list[PanelObjectDra
 
 
 @pytest.mark.parametrize(("name", "shape"), [("pressure", "circle"), ("volts", "rectangle"), ("mode", "circle")])
-def test_one_click_finds_the_outline(seen: tuple[np.ndarray, CameraView, Overview], name: str, shape: str) -> None:
+def test_one_click_finds_the_outline(
+    seen: tuple[np.ndarray, CameraProjection, Overview], name: str, shape: str
+) -> None:
     _, view, overview = seen
     found = example_at(overview, middle_of(view, name))
     w, h, _ = footprint_m(panel().object(name))
@@ -76,7 +78,7 @@ def test_one_click_finds_the_outline(seen: tuple[np.ndarray, CameraView, Overvie
     assert np.allclose(overview.in_image([found.centre_m])[0], middle_of(view, name)[0], atol=8.0)
 
 
-def test_a_click_on_bare_plate_finds_nothing(seen: tuple[np.ndarray, CameraView, Overview]) -> None:
+def test_a_click_on_bare_plate_finds_nothing(seen: tuple[np.ndarray, CameraProjection, Overview]) -> None:
     _, view, overview = seen
     bare = [(float(u), float(v)) for u, v in view.project([[0.12, -0.15, 0.0], [0.14, -0.17, 0.0]])]
     for clicks in (bare[:1], bare):
@@ -86,7 +88,7 @@ def test_a_click_on_bare_plate_finds_nothing(seen: tuple[np.ndarray, CameraView,
 
 
 def test_what_is_clicked_on_is_named_and_after_a_lesson_named_rightly(
-    seen: tuple[np.ndarray, CameraView, Overview],
+    seen: tuple[np.ndarray, CameraProjection, Overview],
 ) -> None:
     _, view, overview = seen
     knowledge = shipped_knowledge()
@@ -99,7 +101,7 @@ def test_what_is_clicked_on_is_named_and_after_a_lesson_named_rightly(
 
 
 def test_a_taught_panel_is_a_panel_file_that_reads_the_same_image(
-    seen: tuple[np.ndarray, CameraView, Overview],
+    seen: tuple[np.ndarray, CameraProjection, Overview],
 ) -> None:
     image, _, overview = seen
     text = panel_text("taught", overview, find_border_lights(overview), drafts(seen))
@@ -115,7 +117,7 @@ def test_a_taught_panel_is_a_panel_file_that_reads_the_same_image(
     assert readings["mode"].state == SHOWN["mode"]
 
 
-def test_ends_of_a_scale_may_be_pointed_at(seen: tuple[np.ndarray, CameraView, Overview]) -> None:
+def test_ends_of_a_scale_may_be_pointed_at(seen: tuple[np.ndarray, CameraProjection, Overview]) -> None:
     _, view, overview = seen
     gauge = panel().object("pressure")
     angles = np.deg2rad([-135.0, 135.0])
@@ -129,7 +131,7 @@ def test_ends_of_a_scale_may_be_pointed_at(seen: tuple[np.ndarray, CameraView, O
     assert (scale.at_min, scale.at_max) == pytest.approx(tuple(angles), abs=0.05)
 
 
-def test_border_lights_are_seen_or_pointed_at(seen: tuple[np.ndarray, CameraView, Overview]) -> None:
+def test_border_lights_are_seen_or_pointed_at(seen: tuple[np.ndarray, CameraProjection, Overview]) -> None:
     _, view, overview = seen
     true_m = np.array([light.position_m for light in panel().lights])
     clicks = [(float(u) + 3, float(v) - 2) for u, v in view.project(true_m[[2, 0, 3, 1]])]
@@ -139,7 +141,7 @@ def test_border_lights_are_seen_or_pointed_at(seen: tuple[np.ndarray, CameraView
         find_border_lights(overview, clicks[:2])
 
 
-def test_lights_that_nobody_saw_are_called_a_guess(seen: tuple[np.ndarray, CameraView, Overview]) -> None:
+def test_lights_that_nobody_saw_are_called_a_guess(seen: tuple[np.ndarray, CameraProjection, Overview]) -> None:
     image, view, _ = seen
     blank = image.copy()
     for u, v in view.project([light.position_m for light in panel().lights]):
@@ -165,7 +167,7 @@ def test_lights_that_nobody_saw_are_called_a_guess(seen: tuple[np.ndarray, Camer
     ],
 )
 def test_answers_that_make_no_sense_are_refused(
-    seen: tuple[np.ndarray, CameraView, Overview], kind: str, answers: dict[str, str], error: type[Exception]
+    seen: tuple[np.ndarray, CameraProjection, Overview], kind: str, answers: dict[str, str], error: type[Exception]
 ) -> None:
     _, view, overview = seen
     draft = PanelObjectDraft(
@@ -183,7 +185,7 @@ def test_every_question_but_the_name_has_an_answer_that_stands() -> None:
         assert all(question.default in question.choices for question in rest if question.choices)
 
 
-def test_two_panels_are_ambiguous_and_one_is_not(seen: tuple[np.ndarray, CameraView, Overview]) -> None:
+def test_two_panels_are_ambiguous_and_one_is_not(seen: tuple[np.ndarray, CameraProjection, Overview]) -> None:
     image, _, _ = seen
     assert one_plate(image, PLATE)
     for both in (np.hstack([image, image]), np.vstack([image, image])):
@@ -191,7 +193,7 @@ def test_two_panels_are_ambiguous_and_one_is_not(seen: tuple[np.ndarray, CameraV
             teach(np.ascontiguousarray(both), shipped_knowledge(), kind="lamp", clicks_px=[(10, 10)], plate_m=PLATE)
 
 
-def test_a_panel_upside_down_is_refused(seen: tuple[np.ndarray, CameraView, Overview]) -> None:
+def test_a_panel_upside_down_is_refused(seen: tuple[np.ndarray, CameraProjection, Overview]) -> None:
     image, _, overview = seen
     check_upright(image, overview.view, panel())
     turned = np.ascontiguousarray(image[::-1, ::-1])
@@ -207,7 +209,7 @@ def test_a_panel_upside_down_is_refused(seen: tuple[np.ndarray, CameraView, Over
     ],
 )
 def test_a_panel_that_is_mirrored_is_refused(
-    seen: tuple[np.ndarray, CameraView, Overview], askew: Callable[[np.ndarray], np.ndarray], words: str
+    seen: tuple[np.ndarray, CameraProjection, Overview], askew: Callable[[np.ndarray], np.ndarray], words: str
 ) -> None:
     """A mirrored gauge was read, surely and wrong, and what was there taught the kinds."""
     image = np.ascontiguousarray(askew(seen[0]))
@@ -219,7 +221,7 @@ def test_a_second_example_takes_no_object_from_another_kind() -> None:
     """Every kind gets a second example from a new image; on further images each object found before is found after."""
     knowledge = shipped_knowledge()
     lesson_image, intrinsics, pose = scene(tilt_deg=4.0, distance_m=0.66, pose_error=0.0, azimuth_deg=120.0)
-    view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+    view = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
     tests = [
         scene(tilt_deg=t, azimuth_deg=a, distance_m=0.66, pose_error=0.0)[0] for t, a in ((3, 200), (8, 20), (12, 300))
     ]

@@ -10,16 +10,25 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.arrays import Array
+from hal.arrays import Array, Image
 from hal.calibration import CameraIntrinsics
 from hal.camera_model import check_size, rays
 from hal.errors import NotFound
 from hal.geometry import UncertainPose, matrix_of
 from hal.panel import Display, Panel, PanelObject, Scale
-from perception.vision.image import Image, as_gray
+from perception.vision.image import as_gray
 from perception.vision.noise import noise_sigma
 from perception.vision.patch import Patch, rectify
-from perception.vision.reading import ANSWER_AT, ObjectReading, Status, answer_at, as_often_right, doubted, refused
+from perception.vision.projection import CameraProjection, PanelProjection
+from perception.vision.reading import (
+    ANSWER_AT,
+    ObjectReading,
+    PatchReading,
+    answer_at,
+    as_often_right,
+    doubted,
+    refused,
+)
 from perception.vision.registration.outline import contour_m, footprint_m
 from perception.vision.registration.register import Registration, register
 from perception.vision.status.button import read_button
@@ -33,7 +42,6 @@ from perception.vision.status.panel_meter import read_panel_meter
 from perception.vision.status.rotary import read_rotary
 from perception.vision.status.slider import read_slider
 from perception.vision.status.toggle import read_toggle
-from perception.vision.view import CameraView, View
 
 MARGIN = 1.25  # of the footprint: readers look at the plate around the object too
 LAMP_MARGIN = 2.0
@@ -81,14 +89,14 @@ def inspect(
     """
     gray = as_gray(image)
     check_size(gray, intrinsics)
-    view = CameraView(intrinsics=intrinsics, camera_from_panel=camera_from_panel)
+    view = CameraProjection(intrinsics=intrinsics, camera_from_panel=camera_from_panel)
     return inspect_view(image, gray, view, panel, names=names, previous=previous, least_confidence=least_confidence)
 
 
 def inspect_view(
     image: NDArray[Any],
     gray: Image,
-    view: View,
+    view: PanelProjection,
     panel: Panel,
     *,
     names: Iterable[str] | None = None,
@@ -96,7 +104,7 @@ def inspect_view(
     digits_taught: bool = True,
     least_confidence: float = ANSWER_AT,
 ) -> tuple[ObjectReading, ...]:
-    """`inspect` for any view of the panel (see perception.vision.view).
+    """`inspect` for any view of the panel (see perception.vision.projection).
 
     `digits_taught` False: the panel file does not know how many digits and decimals its displays have.
     """
@@ -125,13 +133,15 @@ def inspect_view(
     return tuple(answer_at(reading, least_confidence) for reading in readings)
 
 
-def read_patch(patch: Patch, spec: PanelObject, *, digits_taught: bool = True, before: float | None = None) -> Status:
+def read_patch(
+    patch: Patch, spec: PanelObject, *, digits_taught: bool = True, before: float | None = None
+) -> PatchReading:
     """The status of one object by the reader of its kind; the value `before` tells between a display's likely numbers."""
     status = _by_kind(patch, spec, digits_taught=digits_taught, before=before)
     return as_often_right(status, GUESSES_RIGHT.get(spec.kind, 0.0))
 
 
-def _by_kind(patch: Patch, spec: PanelObject, *, digits_taught: bool, before: float | None) -> Status:
+def _by_kind(patch: Patch, spec: PanelObject, *, digits_taught: bool, before: float | None) -> PatchReading:
     match spec.kind:
         case "gauge":
             return read_gauge(patch, spec)
@@ -157,7 +167,7 @@ def _by_kind(patch: Patch, spec: PanelObject, *, digits_taught: bool, before: fl
             return read_mushroom(patch, spec)
 
 
-def patch_of(image: Image, gray: Image, view: View, spec: PanelObject, shift_px: Array) -> Patch:
+def patch_of(image: Image, gray: Image, view: PanelProjection, spec: PanelObject, shift_px: Array) -> Patch:
     """The rectified patch that the reader of this object wants."""
     half_width, half_height, height = footprint_m(spec)
     margin = LAMP_MARGIN if spec.kind in ("lamp", "button") else MARGIN
@@ -178,7 +188,7 @@ def patch_of(image: Image, gray: Image, view: View, spec: PanelObject, shift_px:
     )
 
 
-def _lean_m(view: View, spec: PanelObject, height_m: float) -> float:
+def _lean_m(view: PanelProjection, spec: PanelObject, height_m: float) -> float:
     """How far beside its foot a point at that height appears, in metres on the plate."""
     x, y = spec.position_m
     px = view.project([[x, y, 0.0], [x, y, height_m], [x + 0.01, y, 0.0], [x, y + 0.01, 0.0]])
@@ -234,7 +244,7 @@ def _is_bare(patch: Patch, noise: float) -> bool:
     return float(np.percentile(smooth, 97)) - float(np.percentile(smooth, 3)) < 1.5 * noise + 6.0
 
 
-def plausible(status: Status, spec: PanelObject, before: ObjectReading | None) -> Status:
+def plausible(status: PatchReading, spec: PanelObject, before: ObjectReading | None) -> PatchReading:
     """The status, or a refusal when it jumps from the previous value without strong evidence."""
     if before is None or before.value is None or status.value is None or status.confidence >= JUMP_CONFIDENCE:
         return status
@@ -256,7 +266,7 @@ def plausible(status: Status, spec: PanelObject, before: ObjectReading | None) -
 def _with_place(reading: ObjectReading, registration: Registration, spec: PanelObject) -> ObjectReading:
     """Adds the centre in panel metres: the pixel's ray cut with the plate, and the pixel's uncertainty there."""
     view = registration.view
-    if not isinstance(view, CameraView) or not np.isfinite(reading.centre_px).all():
+    if not isinstance(view, CameraProjection) or not np.isfinite(reading.centre_px).all():
         return reading
     camera_from_panel = view.camera_from_panel.parent_from_child
     ray = rays(reading.centre_px[None], view.intrinsics)[0]
@@ -275,7 +285,7 @@ def _with_place(reading: ObjectReading, registration: Registration, spec: PanelO
     return replace(reading, centre_m=point, centre_covariance_m2=covariance)
 
 
-def _plate_jacobian(view: View, point_m: tuple[float, float, float]) -> Array:
+def _plate_jacobian(view: PanelProjection, point_m: tuple[float, float, float]) -> Array:
     """(2, 2) metres on the plate per pixel at a panel point."""
     step = 1e-3
     base = np.array(point_m)

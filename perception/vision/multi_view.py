@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from perception.vision.reading import ANSWER_AT, ObjectReading, Status
+from perception.vision.reading import ANSWER_AT, ObjectReading, PatchReading
 
 UNLISTED = 0.01  # probability of a number that a look does not list: it may have been wrong
 MOST_CONFIDENT = 0.9  # of a number that no look alone could tell
 SIGMAS = 5.0  # two values may lie so far apart
 
 
-def joined(looks: Sequence[ObjectReading]) -> ObjectReading:
+def merge_views(looks: Sequence[ObjectReading]) -> ObjectReading:
     """What the looks say together.
 
     The surest answer holds unless another look contradicts it. Without an answer, numbers that each look of a display leaves
@@ -29,7 +29,7 @@ def joined(looks: Sequence[ObjectReading]) -> ObjectReading:
     if against is None:
         return best
     return best.saying(
-        Status(
+        PatchReading(
             unit=best.unit,
             possible=against.possible,
             reason=f"two looks contradict each other ({_said(best)} and {_said(against)}): look again, or change the light",
@@ -65,7 +65,7 @@ def _from_what_is_left(looks: Sequence[ObjectReading]) -> ObjectReading:
         return first
     number = numbers[best]
     return first.saying(
-        Status(
+        PatchReading(
             value=number.value, unit=first.unit, uncertainty=number.half_digit, text=number.text, confidence=confidence
         )
     )

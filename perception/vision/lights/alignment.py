@@ -27,7 +27,7 @@ class CameraMoved(PerceptionError):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Registration:
+class ImageAlignment:
     """How the first image lies on the second, and what remains of it there.
 
     Attributes:
@@ -48,7 +48,7 @@ class Registration:
     agreement: float
 
 
-def register(first: Image, second: Image, *, noise: float) -> Registration:
+def register(first: Image, second: Image, *, noise: float) -> ImageAlignment:
     """Motion and gain between two gray images, robust against what changed.
 
     Phase correlation of the half-size gradient images starts a Gauss-Newton fit of shift, turn, growth and brightness
@@ -90,7 +90,7 @@ class _Edges:
     gradients: tuple[Image, Image]
 
 
-def _refine(first: Image, second: Image, edges: _Edges, affine: Array, noise: float) -> Registration:
+def _refine(first: Image, second: Image, edges: _Edges, affine: Array, noise: float) -> ImageAlignment:
     rows, columns = edges.rows, edges.columns
     height, width = second.shape
     gx, gy = (g[rows, columns].astype(float) for g in edges.gradients)
@@ -120,7 +120,7 @@ def _refine(first: Image, second: Image, edges: _Edges, affine: Array, noise: fl
     return _result(first, second, edges, affine)
 
 
-def _result(first: Image, second: Image, edges: _Edges, affine: Array) -> Registration:
+def _result(first: Image, second: Image, edges: _Edges, affine: Array) -> ImageAlignment:
     import cv2
 
     height, width = second.shape
@@ -136,7 +136,7 @@ def _result(first: Image, second: Image, edges: _Edges, affine: Array) -> Regist
     b = np.concatenate([g[rows, columns] for g in edges.gradients])
     agreement = _robust_correlation(a, b)
     centre = affine @ [width / 2.0, height / 2.0, 1.0] - [width / 2.0, height / 2.0]
-    return Registration(
+    return ImageAlignment(
         second_from_first=affine, gain=float(gain), offset=float(offset), shift_px=(float(centre[0]), float(centre[1])),
         warped=warped, inside=inside, agreement=agreement,
     )  # fmt: skip
@@ -168,9 +168,9 @@ def _robust_correlation(a: NDArray[Any], b: NDArray[Any]) -> float:
     return float((a @ b) / np.sqrt(max((a @ a) * (b @ b), 1e-12)))
 
 
-def _unmoved(first: Image, second: Image) -> Registration:
+def _unmoved(first: Image, second: Image) -> ImageAlignment:
     gain, offset = _tones(first.ravel(), second.ravel())
-    return Registration(
+    return ImageAlignment(
         second_from_first=np.eye(3)[:2], gain=gain, offset=offset, shift_px=(0.0, 0.0),
         warped=(gain * first + offset).astype(np.float32), inside=np.ones(first.shape, bool), agreement=1.0,
     )  # fmt: skip

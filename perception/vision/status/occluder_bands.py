@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from hal.arrays import Array
 from perception.vision.patch import Patch, sample_at
-from perception.vision.status.cover import OUTSIDE, Crossing, border_crossings, followed_in, smoothed
+from perception.vision.status.occluders import OUTSIDE, Crossing, border_crossings, followed_in, smoothed
 
 SAME_GRAY = 16.0  # levels along a band; real cables shine a little
 GROUND_SHARE = 0.5  # of what a band within the window stands out by

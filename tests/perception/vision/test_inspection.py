@@ -13,9 +13,9 @@ from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest, NotFound, NotObservable
 from hal.geometry import UncertainPose
 from perception.vision.annotate import draw_annotated
+from perception.vision.inspection import inspect
+from perception.vision.projection import CameraProjection
 from perception.vision.reading import ObjectReading
-from perception.vision.taught import inspect
-from perception.vision.view import CameraView
 from tests.perception.vision.bench_panel import SHOWN, panel, scene
 
 VIEWS = [(0.0, 0.0, (1280, 960)), (8.0, 30.0, (1280, 960)), (15.0, 200.0, (640, 480)), (20.0, 100.0, (1280, 960))]
@@ -150,7 +150,7 @@ def behind_a_cable(offset_m: float) -> tuple[np.ndarray, CameraIntrinsics, Uncer
     """The panel with a dark cable before the display `flow`, so far right of its middle."""
     image, intrinsics, pose = scene(tilt_deg=3.0, distance_m=0.66, pose_error=0.0)
     x, y = panel().object("flow").position_m
-    view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+    view = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
     ends = view.project([[x + offset_m, y + 0.08, 0.0], [x + offset_m, y - 0.08, 0.0]])
     first, last = (tuple(int(value) for value in end) for end in ends)
     return np.asarray(cv2.line(image.copy(), first, last, 35, 9)), intrinsics, pose

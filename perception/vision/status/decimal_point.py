@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.special import erf
 
 from hal.arrays import Array
-from perception.vision.status.comb import AXES, Comb
-from perception.vision.status.comb_jit import Float32
+from hal.jit import compiled
+from perception.vision.status.digit_grid import AXES, DigitGrid
+from perception.vision.status.digit_grid_worth import Float32
 
 RADIUS = 0.075  # of the digit height
 LEVEL = 0.47  # of a lit segment: dots blurred by motion have .4 to .6, gaps without one up to .37 (of 1400 drawn ones)
@@ -25,7 +25,7 @@ HALF_STROKES = np.array([0.045, 0.065])  # of the digit height: tried, with ever
 BLURS = np.array([0.02, 0.05, 0.09])
 INSETS = (0.2, 0.08, 0.32)  # of a segment's axis, at either end, by which its stroke is shorter
 PLACES_X = np.linspace(0.25, 0.75, 6)  # of the gap
-MORE_PLACES_X = np.linspace(0.25, 1.05, 9)  # of one hidden in part: no stroke beside it says where the comb lies
+MORE_PLACES_X = np.linspace(0.25, 1.05, 9)  # of one hidden in part: no stroke beside it says where the grid lies
 PLACES_Y = np.linspace(-0.12, 0.06, 7)  # of the digit height, from the bottom segments' axis
 COLON_STRIP, COLON_LEVEL = (
     (0.0, 1.0),
@@ -37,14 +37,14 @@ STEPS = 8  # places a px at which a stroke's profile is tabled
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Point:
+class DecimalPoint:
     """Number of cells before the decimal point (None without one), and the probability that this is so."""
 
     place: int | None
     probability: float
 
 
-def find_point(ink: Float32, seen: Float32, comb: Comb, lit_levels: Array) -> Point:
+def find_decimal_point(ink: Float32, seen: Float32, grid: DigitGrid, lit_levels: Array) -> DecimalPoint:
     """Where the decimal point is.
 
     A dot template must reach a share of a lit segment's level and stand out from the other gaps.
@@ -52,11 +52,11 @@ def find_point(ink: Float32, seen: Float32, comb: Comb, lit_levels: Array) -> Po
     Args:
         lit_levels: (cells, 7) levels of the lit segments, 0 for the others.
     """
-    if comb.count < 2:
-        return Point(place=None, probability=1.0)
-    levels, clear = dot_levels(ink, seen, comb, lit_levels)
+    if grid.count < 2:
+        return DecimalPoint(place=None, probability=1.0)
+    levels, clear = dot_levels(ink, seen, grid, lit_levels)
     if not clear.any():
-        return Point(place=None, probability=0.5)
+        return DecimalPoint(place=None, probability=0.5)
     order = np.sort(levels[clear])
     typical = float(np.clip(np.median(order[:-1]), 0.0, MOST_TYPICAL)) if len(order) > 1 else 0.0
     odds = (levels - typical - LEVEL) / LEVEL_SPREAD
@@ -64,39 +64,45 @@ def find_point(ink: Float32, seen: Float32, comb: Comb, lit_levels: Array) -> Po
     odds = np.append(np.clip(odds, np.where(clear, -30.0, HIDDEN_ODDS), MOST_ODDS), 0.0)
     share = np.exp(odds - odds.max())
     k = int(share.argmax())
-    return Point(place=None if k == len(levels) else k + 1, probability=float(share[k] / share.sum()))
+    return DecimalPoint(place=None if k == len(levels) else k + 1, probability=float(share[k] / share.sum()))
 
 
-def find_colon(ink: Float32, seen: Float32, comb: Comb, lit_levels: Array) -> int | None:
+def find_colon(ink: Float32, seen: Float32, grid: DigitGrid, lit_levels: Array) -> int | None:
     """Number of cells before a clock's colon: a gap with one dot in its upper half and one in its lower; None without one."""
-    if comb.count < 2:
+    if grid.count < 2:
         return None
-    dots = [dot_levels(ink, seen, comb, lit_levels, strip=COLON_STRIP, places_y=ys)[0] for ys in COLON_Y]
+    dots = [dot_levels(ink, seen, grid, lit_levels, strip=COLON_STRIP, places_y=ys)[0] for ys in COLON_Y]
     both = np.minimum(*dots)
     k = int(both.argmax())
     return k + 1 if both[k] > COLON_LEVEL else None
 
 
 def dot_levels(
-    ink: Float32, seen: Float32, comb: Comb, lit_levels: Array, *, strip: tuple[float, float] = STRIP, places_y: Array = PLACES_Y
-) -> tuple[Array, NDArray[np.bool_]]:  # fmt: skip
+    ink: Float32,
+    seen: Float32,
+    grid: DigitGrid,
+    lit_levels: Array,
+    *,
+    strip: tuple[float, float] = STRIP,
+    places_y: Array = PLACES_Y,
+) -> tuple[Array, NDArray[np.bool_]]:
     """(cells - 1,) level of the best dot in every gap over that of lit segments beside it, and whether the gap is seen.
 
     Args:
         strip: rows that are looked at, over the digit height from its top.
         places_y: of the dot, over the digit height, from the bottom segments' axis.
     """
-    first, last = (round(comb.top_px + share * comb.height_px) for share in strip)
+    first, last = (round(grid.top_px + share * grid.height_px) for share in strip)
     first, last = max(0, first), min(len(ink), last)
     if last - first < 3:
-        return np.zeros(comb.count - 1), np.zeros(comb.count - 1, bool)
+        return np.zeros(grid.count - 1), np.zeros(grid.count - 1, bool)
     shown, clear = ink[first:last], seen[first:last]
-    drawn, sigma_px = _drawn(shown, clear, comb, lit_levels, first)
+    drawn, sigma_px = _drawn(shown, clear, grid, lit_levels, first)
     rest = (shown - drawn) * clear
-    dot = _dot(RADIUS * comb.height_px, sigma_px)
-    levels, visible = _best_dots(rest, clear, dot, comb.numbers, comb.count, first, PLACES_X, places_y)
+    dot = _dot(RADIUS * grid.height_px, sigma_px)
+    levels, visible = _best_dots(rest, clear, dot, grid.numbers, grid.count, first, PLACES_X, places_y)
     if not visible.all():
-        wide, _ = _best_dots(rest, clear, dot, comb.numbers, comb.count, first, MORE_PLACES_X, places_y)
+        wide, _ = _best_dots(rest, clear, dot, grid.numbers, grid.count, first, MORE_PLACES_X, places_y)
         levels = np.where(visible > 0, levels, wide)
     gain = float(np.percentile(drawn, 99.0)) / max(float(lit_levels.max()), 1e-6)
     return levels / np.maximum(gain * _beside(lit_levels), 1e-6), visible > 0
@@ -121,13 +127,13 @@ def _dot(radius_px: float, sigma_px: float) -> Float32:
     return np.asarray(cv2.GaussianBlur(disc, (0, 0), max(sigma_px, 0.3), borderType=cv2.BORDER_CONSTANT), np.float32)
 
 
-def _drawn(strip: Float32, clear: Float32, comb: Comb, lit_levels: Array, first: int) -> tuple[Float32, float]:
+def _drawn(strip: Float32, clear: Float32, grid: DigitGrid, lit_levels: Array, first: int) -> tuple[Float32, float]:
     """The lit segments as drawn strokes with the width and blur that leave the least, and that blur in px."""
-    h = comb.height_px
+    h = grid.height_px
     shapes = [(half * h, max(blur * h, 0.3)) for half in HALF_STROKES for blur in BLURS]
     distance = np.arange(0.0, (HALF_STROKES[-1] + 2.5 * BLURS[-1]) * h + 1.0, 1.0 / STEPS)
     tables = np.stack([_profile(distance, half, blur) for half, blur in shapes], axis=1).astype(np.float32)
-    where = (first, *strip.shape), comb.numbers, np.ascontiguousarray(lit_levels, float), AXES
+    where = (first, *strip.shape), grid.numbers, np.ascontiguousarray(lit_levels, float), AXES
     k, drawn, left = _closest(_strokes(*where, INSETS[0], tables), strip, clear)
     for inset in INSETS[1:]:
         _, other, other_left = _closest(_strokes(*where, inset, tables[:, k : k + 1].copy()), strip, clear)
@@ -152,17 +158,17 @@ def _profile(distance: Array, half_px: float, sigma_px: float) -> Array:
     return np.asarray(0.5 * (erf((half_px - distance) / scale) + erf((half_px + distance) / scale)))
 
 
-@njit(cache=True)
+@compiled
 def _strokes(
-    strip: tuple[int, int, int], comb: Array, lit_levels: Array, axes: Array, inset: float, tables: Float32
-) -> Float32:  # pragma: no cover
+    strip: tuple[int, int, int], grid: Array, lit_levels: Array, axes: Array, inset: float, tables: Float32
+) -> Float32:
     """(rows, columns, shapes) sum of the lit segments' strokes on a strip that begins at row strip[0].
 
     Args:
         tables: (N, shapes) height of a stroke at every 1 / STEPS px from its axis.
     """
     first, rows, columns = strip
-    left, pitch, width, top, bottom, slant = comb
+    left, pitch, width, top, bottom, slant = grid
     height = bottom - top
     shapes, reach = tables.shape[1], (tables.shape[0] - 1) / STEPS
     canvases = np.zeros((rows, columns, shapes), np.float32)
@@ -190,12 +196,12 @@ def _strokes(
     return canvases
 
 
-@njit(cache=True)
+@compiled
 def _best_dots(
-    rest: Float32, seen: Float32, dot: Float32, comb: Array, count: int, first: int, xs: Array, ys: Array
-) -> tuple[Array, Array]:  # pragma: no cover
+    rest: Float32, seen: Float32, dot: Float32, grid: Array, count: int, first: int, xs: Array, ys: Array
+) -> tuple[Array, Array]:
     """(count - 1,) least-squares height of the best dot over an even ground in every gap, and 1 where the gap is seen."""
-    left, pitch, width, top, bottom, slant = comb
+    left, pitch, width, top, bottom, slant = grid
     rows, columns = rest.shape
     half = dot.shape[0] // 2
     # What a dot's picture varies by, seen whole: a place that shows less of one cannot tell its height.

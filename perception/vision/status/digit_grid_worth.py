@@ -1,4 +1,4 @@
-"""Compiled sums behind the comb search: what cells of seven segments make a character, along rows of places and in one comb.
+"""Compiled sums behind the grid search: what cells of seven segments make a character, along rows of places and in one grid.
 
 A cell's worth is the ink energy that its best character explains by segments of one level, less what it leaves:
 P - k (T - P) with T = sum(area * level^2) over segments and loops, P = (sum of area * level over the lit ones)^2 / their
@@ -8,10 +8,10 @@ area, the projection on the character's flat template. Straddling two digits or 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hal.arrays import Array
+from hal.jit import compiled, inlined
 
 Float32 = NDArray[np.float32]
 
@@ -32,8 +32,8 @@ MIDDLES = np.array([[0.5, 1.0, 1.0, 0.5, 0.0, 0.0, 0.5], [0.0, 0.25, 0.75, 1.0, 
 FLAT = np.array([True, False, False, True, False, False, True])
 
 
-@njit(cache=True)
-def cell_worth(levels: Array, areas: Array, loops: float, lit: Array) -> float:  # pragma: no cover
+@inlined
+def cell_worth(levels: Array, areas: Array, loops: float, lit: Array) -> float:
     """Worth of one cell: (7,) levels and seen areas, energy in its loops, (characters, 7) 1 where a segment is lit."""
     total = loops
     for s in range(7):
@@ -51,8 +51,8 @@ def cell_worth(levels: Array, areas: Array, loops: float, lit: Array) -> float: 
     return max(0.0, best - LEFT_OVER * (total - best))
 
 
-@njit(cache=True)
-def cell_boxes(top: float, height: float, width: float) -> Array:  # pragma: no cover
+@compiled
+def cell_boxes(top: float, height: float, width: float) -> Array:
     """(13, 4) left, top, right, bottom of parts of a cell whose left upright is at column 0: its seven segments, its two
     loops, and what is above and below the left and the right uprights."""
     boxes = np.empty((13, 4))
@@ -71,16 +71,16 @@ def cell_boxes(top: float, height: float, width: float) -> Array:  # pragma: no 
     return boxes
 
 
-@njit(cache=True)
-def _at_most(value: float, most: int) -> int:  # pragma: no cover
+@inlined
+def _at_most(value: float, most: int) -> int:
     """The nearest integer from 0 to `most`."""
     return max(0, min(most, int(value + 0.5)))
 
 
-@njit(cache=True)
+@compiled
 def worth_along(
     ink: Array, seen: Array, whole: bool, place: tuple[float, float, float], stride: int, lit: Array, out: Array
-) -> None:  # pragma: no cover
+) -> None:
     """Worth of upright cells whose left upright stands at column 0, `stride`, ... of integral images `ink` and `seen`.
 
     Args:
@@ -120,22 +120,22 @@ def worth_along(
         most = max(most, out[k])
 
 
-@njit(cache=True)
-def apartness(gap: float) -> float:  # pragma: no cover
-    """What a comb's worth is multiplied by for its gaps (over the digit height): neighbours that all but share their
+@inlined
+def apartness(gap: float) -> float:
+    """What a grid's worth is multiplied by for its gaps (over the digit height): neighbours that all but share their
     uprights count the same ink twice."""
     return min(1.0, max(0.3, 0.3 + 0.7 * (gap - LEAST_GAP) / (FREE_GAP - LEAST_GAP)))
 
 
-@njit(cache=True)
+@compiled
 def best_pitch(
     worth: Array, stride: int, pitches: Array, size: tuple[float, float], columns: int, most: int, free: float
-) -> tuple[float, float, float, int]:  # pragma: no cover
-    """(worth, left column, pitch, cells) of the best comb of at most `most` cells over worths of cells `stride` apart.
+) -> tuple[float, float, float, int]:
+    """(worth, left column, pitch, cells) of the best grid of at most `most` cells over worths of cells `stride` apart.
 
     Args:
         pitches: to try, over the width; size: width and height of a cell, px.
-        free: how far the comb's middle may lie from the middle column, over `columns`; off the middle counts less.
+        free: how far the grid's middle may lie from the middle column, over `columns`; off the middle counts less.
     """
     width, height = size
     best, left, pitch, count = 0.0, 0.0, 0.0, 0
@@ -170,11 +170,11 @@ def best_pitch(
     return best, left, pitch, count
 
 
-@njit(cache=True)
+@compiled
 def guesses(
     ink: Array, seen: Array, whole: bool, rows: Array, widths: Array, pitches: Array, most: int, free: float, lit: Array
-) -> Array:  # pragma: no cover
-    """(rows x widths, 7) worth, left, pitch, width, top, height, cells of the best comb for every row pair and width.
+) -> Array:
+    """(rows x widths, 7) worth, left, pitch, width, top, height, cells of the best grid for every row pair and width.
 
     Args:
         ink, seen: integral images of the upright picture.
@@ -194,8 +194,8 @@ def guesses(
     return found
 
 
-@njit(cache=True)
-def slant_energies(uprights: Float32, slants: Array) -> Array:  # pragma: no cover
+@compiled
+def slant_energies(uprights: Float32, slants: Array) -> Array:
     """(slants,) sum of the squared column sums (of every second row) of the picture sheared by every slant: most when
     uprights stand."""
     rows, columns = uprights.shape
@@ -215,8 +215,8 @@ def slant_energies(uprights: Float32, slants: Array) -> Array:  # pragma: no cov
     return energies
 
 
-@njit(cache=True)
-def row_scores(profile: Array, heights: Array, step: float) -> Array:  # pragma: no cover
+@compiled
+def row_scores(profile: Array, heights: Array, step: float) -> Array:
     """(N, 3) score, top and height of digits whose flat segments would lie in rows of much flat ink and the loops' not."""
     rows = len(profile)
     found = np.zeros((len(heights) * (int(rows / step) + 1), 3))

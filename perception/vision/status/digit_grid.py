@@ -1,8 +1,8 @@
 """Where the digit cells of a seven-segment display are: slant, rows, pitch and width whose cells make the best characters.
 
 The slant is the one whose sheared picture has the sharpest columns. For every likely row pair and width, the worth of a cell
-is then known along the picture (see comb_jit); a comb is the pitch and phase that collect the most. The best few are refined
-continuously. How many cells there are need not be known: blank ones are worth nothing.
+is then known along the picture (see `digit_grid_worth`); a grid is the pitch and phase that collect the most. The best few are
+refined continuously. How many cells there are need not be known: blank ones are worth nothing.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from hal.arrays import Array
-from perception.vision.status.comb_fit import refine_comb
-from perception.vision.status.comb_jit import (
+from perception.vision.status.digit_grid_fit import refine_grid
+from perception.vision.status.digit_grid_worth import (
     INNER,
     LOOP,
     STROKE,
@@ -43,7 +43,7 @@ LIT_SHARES = LIT.astype(float)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Comb:
+class DigitGrid:
     """Evenly spaced digit cells.
 
     `left_px` is the axis of the first cell's left uprights at half height; `top_px` and `bottom_px` are the axes of the top
@@ -80,14 +80,14 @@ class Comb:
         return self.left_px + cell * self.pitch_px + x * self.width_px + lean, v
 
 
-def find_combs(ink: Float32, seen: Float32, *, most: int = 8, free: float = 0.5) -> list[tuple[float, Comb]]:
-    """(worth, comb) of the most promising combs, best first; none where no ink stands out.
+def find_digit_grids(ink: Float32, seen: Float32, *, most: int = 8, free: float = 0.5) -> list[tuple[float, DigitGrid]]:
+    """(worth, grid) of the most promising grids, best first; none where no ink stands out.
 
     Args:
         ink: (H, W) how much every pixel differs from the background, as segments do; 0 where nothing is seen.
         seen: (H, W) 1 where the display is seen, 0 where something hides it.
         most: number of cells at most.
-        free: how far the comb's middle may lie from the picture's, over its width.
+        free: how far the grid's middle may lie from the picture's, over its width.
     """
     even = _evened(ink)
     flat = _flat_ink(even)
@@ -108,15 +108,15 @@ def find_combs(ink: Float32, seen: Float32, *, most: int = 8, free: float = 0.5)
     return sorted(found, key=lambda f: f[0], reverse=True)
 
 
-def _refined(upright: Float32, clear: Float32, whole: bool, guess: Array, slant: float) -> tuple[float, Comb]:
-    """(worth, comb) near a guess, sought continuously."""
+def _refined(upright: Float32, clear: Float32, whole: bool, guess: Array, slant: float) -> tuple[float, DigitGrid]:
+    """(worth, grid) near a guess, sought continuously."""
     _, left, pitch, width, top, height, count = (float(value) for value in guess)
     place = np.array([left, pitch, width, top, top + height, 0.0])
     means, shares = segment_means(upright, clear, whole, width, height)
-    worth = refine_comb(means, shares, whole, place, int(count), LIT_SHARES, REFINE_STEPS, slant)
+    worth = refine_grid(means, shares, whole, place, int(count), LIT_SHARES, REFINE_STEPS, slant)
     left, pitch, width, top, bottom, rest = (float(value) for value in place)
     left += slant * ((len(upright) - 1) / 2 - (top + bottom) / 2)  # the shear left the picture's middle row in place
-    return float(worth), Comb(
+    return float(worth), DigitGrid(
         left_px=left, pitch_px=pitch, width_px=width, top_px=top, bottom_px=bottom, slant=slant + rest, count=int(count)
     )
 
@@ -124,7 +124,7 @@ def _refined(upright: Float32, clear: Float32, whole: bool, guess: Array, slant:
 def segment_means(
     upright: Float32, clear: Float32, whole: bool, width_px: float, height_px: float
 ) -> tuple[Float32, Float32]:
-    """What `comb_fit.comb_worth` looks up: means over boxes of the size of a segment of such cells, around every pixel."""
+    """What `digit_grid_fit.grid_worth` looks up: means over boxes of the size of a segment of such cells, around every pixel."""
     stroke = round(2 * STROKE * height_px) | 1
     boxes = (
         (round((1 - 2 * INNER) * width_px) | 1, stroke),

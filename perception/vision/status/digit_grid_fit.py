@@ -1,12 +1,12 @@
-"""Compiled continuous search around a rough comb: what it is worth by box means, and the steps that make it worth more."""
+"""Compiled continuous search around a rough grid: what it is worth by box means, and the steps that make it worth more."""
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hal.arrays import Array
-from perception.vision.status.comb_jit import (
+from hal.jit import compiled, inlined
+from perception.vision.status.digit_grid_worth import (
     FLAT,
     INNER,
     LEAST_GAP,
@@ -20,8 +20,8 @@ from perception.vision.status.comb_jit import (
 )
 
 
-@njit(cache=True)
-def _at(image: Float32, u: float, v: float) -> float:  # pragma: no cover
+@inlined
+def _at(image: Float32, u: float, v: float) -> float:
     """Bilinear value, 0 outside."""
     height, width = image.shape
     if u < 0.0 or v < 0.0 or u > width - 1 or v > height - 1:
@@ -32,17 +32,15 @@ def _at(image: Float32, u: float, v: float) -> float:  # pragma: no cover
     return float(above * (1 - b) + (image[y + 1, x] * (1 - a) + image[y + 1, x + 1] * a) * b)
 
 
-@njit(cache=True)
-def comb_worth(
-    means: Float32, shares: Float32, whole: bool, comb: Array, count: int, lit: Array
-) -> float:  # pragma: no cover
-    """Worth of a comb (left, pitch, width, top, bottom, slant) of `count` cells.
+@compiled
+def grid_worth(means: Float32, shares: Float32, whole: bool, grid: Array, count: int, lit: Array) -> float:
+    """Worth of a grid (left, pitch, width, top, bottom, slant) of `count` cells.
 
     Args:
         means: (3, H, W) mean ink of a flat segment, an upright one, and mean square in a loop, around every pixel.
         shares: (2, H, W) seen share of a flat and an upright segment around every pixel; not looked at when `whole`.
     """
-    left, pitch, width, top, bottom, slant = comb
+    left, pitch, width, top, bottom, slant = grid
     height = bottom - top
     long = (1 - 2 * INNER) * 2 * STROKE * height
     levels, areas = np.zeros(7), np.zeros(7)
@@ -63,19 +61,19 @@ def comb_worth(
     return total * (apartness((pitch - width) / height) if count > 1 else 1.0)
 
 
-@njit(cache=True)
-def refine_comb(
-    means: Float32, shares: Float32, whole: bool, comb: Array, count: int, lit: Array, steps: Array, lean: float
-) -> float:  # pragma: no cover
-    """Coordinate search around a comb, which is changed in place; its worth.
+@compiled
+def refine_grid(
+    means: Float32, shares: Float32, whole: bool, grid: Array, count: int, lit: Array, steps: Array, lean: float
+) -> float:
+    """Coordinate search around a grid, which is changed in place; its worth.
 
     Args:
-        means, shares, whole: as `comb_worth`.
-        comb: (6,) left, pitch, width, top, bottom, slant.
+        means, shares, whole: as `grid_worth`.
+        grid: (6,) left, pitch, width, top, bottom, slant.
         steps: search steps over the digit height, one round each.
         lean: slant that was taken out of the picture.
     """
-    score = comb_worth(means, shares, whole, comb, count, lit)
+    score = grid_worth(means, shares, whole, grid, count, lit)
     moves = np.array([
         [1.0, 0, 0, 0, 0, 0], [0, 1.0, 0, 0, 0, 0], [-1.0, 1.0, 0, 0, 0, 0], [-0.5, 0, 1.0, 0, 0, 0],
         [0, 0, 0, 1.0, 0, 0], [0, 0, 0, 0, 1.0, 0], [0, 0, 0, 1.0, 1.0, 0], [0, 0, 0, 0, 0, 1.0],
@@ -83,32 +81,32 @@ def refine_comb(
     tried = np.empty(6)
     for step in steps:
         for _ in range(3):
-            height = comb[4] - comb[3]
-            chosen, best = comb.copy(), score
+            height = grid[4] - grid[3]
+            chosen, best = grid.copy(), score
             for k in range(len(moves)):
                 for sign in (-1.0, 1.0):
                     for i in range(6):
                         tried[i] = sign * step * moves[k, i] * (height if i < 5 else 1.0)
                     if moves[k, 1] != 0.0:
                         tried[1] /= max(1, count - 1)
-                    tried += comb
+                    tried += grid
                     if not is_sound(tried, count, means.shape[1], means.shape[2], lean):
                         continue
-                    value = comb_worth(means, shares, whole, tried, count, lit)
+                    value = grid_worth(means, shares, whole, tried, count, lit)
                     if value > best:
                         chosen[:] = tried
                         best = value
             if best <= score:
                 break
-            comb[:] = chosen
+            grid[:] = chosen
             score = best
     return score
 
 
-@njit(cache=True)
-def is_sound(comb: Array, count: int, rows: int, columns: int, lean: float) -> bool:  # pragma: no cover
+@inlined
+def is_sound(grid: Array, count: int, rows: int, columns: int, lean: float) -> bool:
     """Whether cells keep apart (else neighbours would share an upright), stay in the picture and look like digits."""
-    left, pitch, width, top, bottom, slant = comb
+    left, pitch, width, top, bottom, slant = grid
     height = bottom - top
     right = left + (count - 1) * pitch + width
     return bool(

@@ -17,7 +17,7 @@ from hal.camera_model import project
 from hal.geometry import UncertainPose, perturbed
 
 
-class View(Protocol):
+class PanelProjection(Protocol):
     """Panel points (m, panel frame, z towards the viewer) to pixels, with small uncertain motion."""
 
     @property
@@ -35,7 +35,7 @@ class View(Protocol):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CameraView:
+class CameraProjection:
     """A calibrated camera before the panel; moves by `delta = (d, r)` of hal.geometry, m and rad, camera axes."""
 
     intrinsics: CameraIntrinsics
@@ -53,17 +53,17 @@ class CameraView:
 
         return np.asarray(project(points, self.intrinsics))
 
-    def moved(self, delta: Array) -> CameraView:
+    def moved(self, delta: Array) -> CameraProjection:
         """The view with the pose perturbed by `delta` (6,)."""
         pose = perturbed(self.camera_from_panel.parent_from_child, delta)
-        return CameraView(
+        return CameraProjection(
             intrinsics=self.intrinsics,
             camera_from_panel=UncertainPose(parent_from_child=pose, covariance=self.camera_from_panel.covariance),
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PlaneView:
+class PlateProjection:
     """A homography from the plate (x, y in m, y up) to pixels: heights do not matter.
 
     Moves by the shifts (px) of four control points, so that the prior is in pixels.
@@ -89,10 +89,10 @@ class PlaneView:
         u = np.column_stack([points, np.ones(len(points))]) @ self.px_from_plate.T
         return np.asarray(u[:, :2] / u[:, 2:])
 
-    def moved(self, delta: Array) -> PlaneView:
+    def moved(self, delta: Array) -> PlateProjection:
         """The view with the control points shifted by `delta` (8,), px."""
         shifted = self.project(self.corners_m) + delta.reshape(4, 2)
-        return PlaneView(
+        return PlateProjection(
             px_from_plate=homography(self.corners_m, shifted), corners_m=self.corners_m, sigma_px=self.sigma_px
         )
 

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from hal.arrays import Array
+from hal.arrays import Array, Image
+from hal.jit import compiled
 from perception.vision.bilinear import step_counts
-from perception.vision.image import Image
 from perception.vision.patch import Patch, sample_at
 
 STANDS_OUT = 14.0  # gray levels, and four sigmas of the noise; less in a dark picture, where everything does less
@@ -206,8 +205,8 @@ def _noise(patch: Patch) -> float:
     return float(np.searchsorted(np.cumsum(counts), 0.5 * counts.sum())) / 1.65
 
 
-@njit(cache=True)
-def ring_medians(values: NDArray[np.uint8], size: int) -> Array:  # pragma: no cover
+@compiled
+def ring_medians(values: NDArray[np.uint8], size: int) -> Array:
     """(N,) median of the `size` (odd, at most N) values around every one of a closed path: a histogram that slides along."""
     n, half = len(values), size // 2
     counts = np.zeros(256, np.int64)

@@ -1,11 +1,12 @@
-# mypy: disallow-untyped-defs=False
 """Compiled search for the taught quadrangle among blobs: every ordered triple, its poses, the fourth light."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from perception.vision.quadrangle.jit import jit
+from hal.arrays import Array
+from hal.jit import compiled, inlined
 from perception.vision.quadrangle.three_point import three_point
 
 SIZE_SPREAD = 0.2  # standard deviation of log diameter among equal lamps
@@ -21,8 +22,8 @@ UNLIKE = 1.2  # log ratio of diameters above which two blobs are not equal lamps
 SHOWN_WIDTH = 1.7725  # a lamp of radius r shows sqrt(area) = sqrt(pi) r f / z
 
 
-@jit
-def spread(values, n):
+@inlined
+def spread(values: Array, n: int) -> float:
     """Sum of squared deviations of the first n values from their mean."""
     mean = 0.0
     for i in range(n):
@@ -33,8 +34,8 @@ def spread(values, n):
     return total
 
 
-@jit
-def rays_of(centres, camera):
+@inlined
+def rays_of(centres: Array, camera: Array) -> Array:
     """(n, 3) unit rays through ideal pixels."""
     rays = np.empty((centres.shape[0], 3))
     for i in range(centres.shape[0]):
@@ -44,39 +45,50 @@ def rays_of(centres, camera):
     return rays
 
 
-@jit
-def turns(centres, i, j, k):
+@inlined
+def turns(centres: Array, i: int, j: int, k: int) -> float:
     """Twice the signed area of three blobs: its sign tells in which sense they follow each other."""
     ij, ik = centres[j] - centres[i], centres[k] - centres[i]
-    return ij[0] * ik[1] - ij[1] * ik[0]
+    return float(ij[0] * ik[1] - ij[1] * ik[0])
 
 
-@jit
-def pose_score(R, upright, roundness, prior):
+@compiled
+def pose_score(R: Array, upright: Array, roundness: float, prior: Array) -> float:
     """What a rotation costs that is tilted or rolled, or under which round lamps would look flatter than they do."""
     Q = R @ upright.T
     tilt = np.arccos(min(1.0, max(-1.0, Q[2, 2])))
     roll = np.arctan2(Q[1, 0] - Q[0, 1], Q[0, 0] + Q[1, 1])
     flat = max(roundness - Q[2, 2], 0.0)
-    return -0.5 * ((tilt / prior[0]) ** 2 + (roll / prior[1]) ** 2 + (flat / ROUNDER) ** 2)
+    return float(-0.5 * ((tilt / prior[0]) ** 2 + (roll / prior[1]) ** 2 + (flat / ROUNDER) ** 2))
 
 
-@jit
-def alike(sizes, contrasts, n):
+@inlined
+def alike(sizes: Array, contrasts: Array, n: int) -> float:
     """What it costs that the first n lamps differ in size and contrast."""
     return -0.5 * (spread(sizes, n) / SIZE_SPREAD**2 + spread(contrasts, n) / CONTRAST_SPREAD**2)
 
 
-@jit
-def unseen(u, v, frame):
+@inlined
+def unseen(u: float, v: float, frame: Array) -> float:
     """What a fourth light costs that is at a place and not seen there."""
     beyond = max(-u, u - frame[0], 0.0) + max(-v, v - frame[1], 0.0)
     missing = MISSING_OUTSIDE + OUTSIDE_PER_WIDTH * beyond / frame[0] if beyond > 0.0 else MISSING_INSIDE
     return -UNCHECKED - missing
 
 
-@jit
-def choose_fourth(centres, traits, q, camera, frame, prior, omit, order, sizes, contrasts):
+@compiled
+def choose_fourth(
+    centres: Array,
+    traits: Array,
+    q: Array,
+    camera: Array,
+    frame: Array,
+    prior: Array,
+    omit: int,
+    order: NDArray[np.int64],
+    sizes: Array,
+    contrasts: Array,
+) -> float:
     """The blob that serves best as the light `omit`, put into `order` (-1: none does); returns its score.
 
     Args:
@@ -98,8 +110,19 @@ def choose_fourth(centres, traits, q, camera, frame, prior, omit, order, sizes, 
     return score
 
 
-@jit
-def search(centres, traits, X, upright, camera, frame, prior, omit, best, chosen):
+@compiled
+def search(
+    centres: Array,
+    traits: Array,
+    X: Array,
+    upright: Array,
+    camera: Array,
+    frame: Array,
+    prior: Array,
+    omit: int,
+    best: Array,
+    chosen: NDArray[np.int64],
+) -> None:
     """The best hypotheses, highest score first, into best (M,) and chosen (M, 4) (-1 = not seen).
 
     Args:
@@ -143,8 +166,24 @@ def search(centres, traits, X, upright, camera, frame, prior, omit, best, chosen
                 )
 
 
-@jit
-def try_triple(P, f, names, base, centres, traits, X, upright, camera, frame, prior, omit, order, best, chosen):
+@compiled
+def try_triple(
+    P: Array,
+    f: Array,
+    names: NDArray[np.int64],
+    base: float,
+    centres: Array,
+    traits: Array,
+    X: Array,
+    upright: Array,
+    camera: Array,
+    frame: Array,
+    prior: Array,
+    omit: int,
+    order: NDArray[np.int64],
+    best: Array,
+    chosen: NDArray[np.int64],
+) -> None:
     """Score every pose that three blobs allow, each with the fourth blob that suits it best."""
     Rs, ts = np.empty((4, 3, 3)), np.empty((4, 3))
     sizes, contrasts = np.empty(4), np.empty(4)
@@ -165,8 +204,8 @@ def try_triple(P, f, names, base, centres, traits, X, upright, camera, frame, pr
         insert(score, order, best, chosen)
 
 
-@jit
-def insert(score, order, best, chosen):
+@compiled
+def insert(score: float, order: NDArray[np.int64], best: Array, chosen: NDArray[np.int64]) -> None:
     """Put a hypothesis into the list of the best ones, each set of blobs once."""
     m = best.shape[0]
     if score <= best[m - 1]:

@@ -1,17 +1,17 @@
-# mypy: disallow-untyped-defs=False
 """Compiled odds and ends round the four-light pose: pixels to ideal coordinates, the object's plane, covariances."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from hal.arrays import Array
+from hal.jit import compiled, inlined
 from perception.vision.quadrangle.cost import solve_damped
-from perception.vision.quadrangle.jit import jit
 from perception.vision.quadrangle.three_point import cofactors, real_cubic_root
 
 
-@jit
-def prepare(pixels, covariance, camera, m, A):
+@compiled
+def prepare(pixels: Array, covariance: Array, camera: Array, m: Array, A: Array) -> int:
     """Pixels (N, 2) with covariance (N, 2, 2) to ideal normalised coordinates m and information A (N, 3).
 
     `camera`: fx, fy, cx, cy, k1, k2, p1, p2, k3. The lens is inverted by Newton's method, see `camera_model`.
@@ -22,7 +22,7 @@ def prepare(pixels, covariance, camera, m, A):
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     k1, k2, p1, p2, k3 = camera[4], camera[5], camera[6], camera[7], camera[8]
     bent = k1 != 0.0 or k2 != 0.0 or p1 != 0.0 or p2 != 0.0 or k3 != 0.0
-    count = pixels.shape[0]
+    count: int = pixels.shape[0]
     for i in range(count):
         xd, yd = (pixels[i, 0] - cx) / fx, (pixels[i, 1] - cy) / fy
         x, y = xd, yd
@@ -62,8 +62,8 @@ def prepare(pixels, covariance, camera, m, A):
     return -1
 
 
-@jit
-def plane_of(X):
+@inlined
+def plane_of(X: Array) -> tuple[Array, float]:
     """Unit normal of the plane nearest to centred points X (N, 3), and their spread across their main line (m^2)."""
     M = np.zeros((3, 3))
     for n in range(X.shape[0]):
@@ -95,8 +95,8 @@ def plane_of(X):
     return normal, second * trace
 
 
-@jit
-def inverse6(N, out):
+@compiled
+def inverse6(N: Array, out: Array) -> bool:
     """Inverse of a positive definite 6x6 matrix, column by column; False when it is not."""
     g, x, L = np.zeros(6), np.empty(6), np.zeros((6, 6))
     for k in range(6):
@@ -113,8 +113,8 @@ def inverse6(N, out):
     return True
 
 
-@jit
-def log_det6(C):
+@inlined
+def log_det6(C: Array) -> float:
     """Log determinant of a positive definite 6x6 matrix."""
     g, x, L = np.zeros(6), np.empty(6), np.zeros((6, 6))
     solve_damped(C, C, 0.0, g, x, L)
@@ -124,8 +124,8 @@ def log_det6(C):
     return total
 
 
-@jit
-def move_origin(C, lever):
+@inlined
+def move_origin(C: Array, lever: Array) -> None:
     """Covariance for the origin at -lever (camera axes) of the point it was for: d <- d + [lever]x r, in place."""
     for _ in range(2):  # J C, then (J (J C)^T)^T by the same loop on the transpose
         for k in range(6):

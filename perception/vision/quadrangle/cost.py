@@ -1,4 +1,3 @@
-# mypy: disallow-untyped-defs=False
 """Compiled inner loops of the four-light pose: reprojection chi-square, its derivatives and its local minimiser.
 
 Everything works on normalised image coordinates `m` (4, 2) with information `A` (4, 3) = (a_uu, a_uv, a_vv) each and
@@ -10,14 +9,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.vision.quadrangle.jit import cross3, jit, mix3, product3
+from hal.arrays import Array
+from hal.jit import compiled, inlined
+from perception.vision.quadrangle.small_vectors import cross3, mix3, product3
 
 CONVERGED = 1e-9  # predicted fall of chi-square: 3e-5 of a standard deviation
 MAX_STEPS = 60
 
 
-@jit
-def rotation_of(w):
+@inlined
+def rotation_of(w: Array) -> Array:
     """Exp of a rotation vector (Rodrigues)."""
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     angle = np.sqrt(angle2)
@@ -37,8 +38,8 @@ def rotation_of(w):
     return R
 
 
-@jit
-def turn_onto(a, b):
+@inlined
+def turn_onto(a: Array, b: Array) -> Array:
     """The smallest rotation that carries unit vector a onto unit vector b (not its opposite)."""
     v = cross3(a, b)
     c = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
@@ -57,8 +58,8 @@ def turn_onto(a, b):
     return R
 
 
-@jit
-def chi_square(R, t, X, m, A):
+@compiled
+def chi_square(R: Array, t: Array, X: Array, m: Array, A: Array) -> float:
     """Reprojection chi-square of a pose; infinite when a point is behind the camera."""
     total = 0.0
     for i in range(X.shape[0]):
@@ -71,8 +72,8 @@ def chi_square(R, t, X, m, A):
     return total
 
 
-@jit
-def expand(R, t, X, m, A, g, N, H):
+@compiled
+def expand(R: Array, t: Array, X: Array, m: Array, A: Array, g: Array, N: Array, H: Array) -> float:
     """Chi-square; fills half its gradient g (6,), Gauss-Newton matrix N and half the exact Hessian H (6, 6)."""
     for a in range(6):
         g[a] = 0.0
@@ -124,8 +125,8 @@ def expand(R, t, X, m, A, g, N, H):
     return total
 
 
-@jit
-def bend(y0, y1, y2, iz, u, v, lu, lv, H):
+@inlined
+def bend(y0: float, y1: float, y2: float, iz: float, u: float, v: float, lu: float, lv: float, H: Array) -> None:
     """Adds to H (lower triangle) what one point gives beyond Gauss-Newton: l_u d2u + l_v d2v.
 
     Hq of the projection has only its last row and column; [-y]x = [[0, y2, -y1], [-y2, 0, y0], [y1, -y0, 0]].
@@ -165,8 +166,8 @@ def bend(y0, y1, y2, iz, u, v, lu, lv, H):
     H[5, 5] += gz * y2 - dot
 
 
-@jit
-def solve_damped(M, D, damping, g, x, L):
+@compiled
+def solve_damped(M: Array, D: Array, damping: float, g: Array, x: Array, L: Array) -> bool:
     """x = -(M + damping diag(D))^-1 g by Cholesky; False when that matrix is not positive definite."""
     n = g.shape[0]
     for i in range(n):
@@ -195,8 +196,8 @@ def solve_damped(M, D, damping, g, x, L):
     return True
 
 
-@jit
-def minimise(R, t, X, m, A):
+@compiled
+def minimise(R: Array, t: Array, X: Array, m: Array, A: Array) -> tuple[Array, Array, float, Array, int]:
     """The local minimum of chi-square below a start: damped Newton, Gauss-Newton where the Hessian is indefinite.
 
     Gauss-Newton alone crawls near fronto-parallel, where two minima merge.

@@ -1,18 +1,19 @@
 # ruff: noqa: PLR0912 - a compiled loop keeps one equation in one place
-# mypy: disallow-untyped-defs=False
 """Compiled search for every local minimum of the four-light reprojection error. Conventions as in `cost`."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from hal.arrays import Array
+from hal.jit import compiled, inlined
 from perception.vision.quadrangle.cost import chi_square, minimise, turn_onto
-from perception.vision.quadrangle.jit import cross3, dot3, jit, mix3, product3, put1, put2, times3, unit3
+from perception.vision.quadrangle.small_vectors import cross3, dot3, mix3, product3, put1, put2, times3, unit3
 from perception.vision.quadrangle.three_point import three_point
 
 
-@jit
-def rotation_distance(A, B):
+@inlined
+def rotation_distance(A: Array, B: Array) -> float:
     """1 - cos of the angle between two rotations, doubled: 3 - trace(A^T B)."""
     s = 3.0
     for i in range(3):
@@ -21,8 +22,8 @@ def rotation_distance(A, B):
     return s
 
 
-@jit
-def ordered_seeds(X, f, m, A, Rs, ts, costs):
+@compiled
+def ordered_seeds(X: Array, f: Array, m: Array, A: Array, Rs: Array, ts: Array, costs: Array) -> int:
     """Three-point poses of the four triples with their chi-square over all four points; returns how many.
 
     Rs (16, 3, 3), ts (16, 3), costs (16,) are filled.
@@ -48,8 +49,8 @@ def ordered_seeds(X, f, m, A, Rs, ts, costs):
     return count
 
 
-@jit
-def mirrored(R, t, normal):
+@inlined
+def mirrored(R: Array, t: Array, normal: Array) -> Array:
     """R with the normal (object axes) reflected about the line of sight through the centroid."""
     n = times3(R, normal)
     k = unit3(t)
@@ -59,8 +60,8 @@ def mirrored(R, t, normal):
     return product3(turn_onto(n, reflected), R)
 
 
-@jit
-def all_minima(X, m, A, normal, Rs, ts, costs, Ns):
+@compiled
+def all_minima(X: Array, m: Array, A: Array, normal: Array, Rs: Array, ts: Array, costs: Array, Ns: Array) -> int:
     """Distinct local minima of chi-square, lowest first, into Rs (M,3,3), ts, costs, Ns (M,6,6); returns how many.
 
     Starts: the best three-point pose, the mirror of its minimum, then every three-point pose far from these.

@@ -1,4 +1,3 @@
-# mypy: disallow-untyped-defs=False
 """Compiled posterior over the normal of the object: the profile at a given normal, and the mirror's share.
 
 Conventions as in `cost`.
@@ -8,8 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from hal.arrays import Array
+from hal.jit import compiled, inlined
 from perception.vision.quadrangle.cost import chi_square, expand, rotation_of, solve_damped, turn_onto
-from perception.vision.quadrangle.jit import back3, cross3, dot3, jit, mix3, product3, put1, times3, unit3
+from perception.vision.quadrangle.small_vectors import back3, cross3, dot3, mix3, product3, put1, times3, unit3
 
 MIRROR_TURN_COS = 0.99619469809  # 5 degrees: normals nearer than this are one pose, not two
 RING_STEP_RAD = 0.10471975512  # 6 degrees; 2.5 degrees gave the same mass (correlation 0.999, 8000 problems)
@@ -17,8 +18,10 @@ RING_COUNT = 12  # azimuths; 24 gave the same
 RING_END_RAD = 1.308996939  # 75 degrees
 
 
-@jit
-def profile(R, t, direction, X, m, A, normal):
+@compiled
+def profile(
+    R: Array, t: Array, direction: Array, X: Array, m: Array, A: Array, normal: Array
+) -> tuple[Array, Array, float, float]:
     """Chi-square minimised over position and roll while the object's normal points along `direction` (camera axes).
 
     Returns: R, t, chi-square, log determinant of the remaining 4x4 information.
@@ -63,8 +66,8 @@ def profile(R, t, direction, X, m, A, normal):
     return R, t, cost, log_det
 
 
-@jit
-def _contract(M, direction, out):
+@inlined
+def _contract(M: Array, direction: Array, out: Array) -> None:
     """The 4x4 block of M over position and roll about `direction`."""
     for i in range(3):
         for j in range(3):
@@ -80,8 +83,8 @@ def _contract(M, direction, out):
     out[3, 3] = s
 
 
-@jit
-def normal_spread(R, t, C, normal):
+@inlined
+def normal_spread(R: Array, t: Array, C: Array, normal: Array) -> tuple[float, float]:
     """Area sqrt(det) of the normal's covariance (sr), and the squared number of sigmas to the line of sight."""
     n = times3(R, normal)
     k = unit3(t)
@@ -101,18 +104,18 @@ def normal_spread(R, t, C, normal):
     return np.sqrt(max(caa * cbb - cab * cab, 0.0)), tilt * tilt / caa
 
 
-@jit
-def opposite(normal_camera, best, far):
+@inlined
+def opposite(normal_camera: Array, best: Array, far: float) -> bool:
     """Is this normal nearer to the mirror of the best one than to itself, and more than `far` (cosine) off it?
 
     Both face the camera (n . k > 0), in axes whose third is the line of sight k. The mirror of n is 2 (n.k) k - n.
     """
     lateral = normal_camera[0] * best[0] + normal_camera[1] * best[1]
-    return lateral < 1e-9 and lateral + normal_camera[2] * best[2] < far
+    return bool(lateral < 1e-9 and lateral + normal_camera[2] * best[2] < far)
 
 
-@jit
-def sight_frame(t):
+@inlined
+def sight_frame(t: Array) -> Array:
     """Rows: two axes across the line of sight to t, then the line of sight."""
     k = unit3(t)
     a = np.empty(3)
@@ -128,8 +131,10 @@ def sight_frame(t):
     return F
 
 
-@jit
-def ring_mass(R, t, cost, X, m, A, normal):
+@compiled
+def ring_mass(
+    R: Array, t: Array, cost: float, X: Array, m: Array, A: Array, normal: Array
+) -> tuple[float, float, Array, Array, float]:
     """Posterior mass of the normals on this and on the other side of the line of sight, and the middle pose there.
 
     The posterior over the normal is exp(-chi2 / 2) det(information of position and roll)^(-1/2); beforehand all

@@ -1,20 +1,32 @@
-# mypy: disallow-untyped-defs=False
 """Compiled whole of the four-light pose: minima with covariance, and how much of the posterior each of them holds."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from hal.arrays import Array
+from hal.jit import compiled, inlined
 from perception.vision.quadrangle.arrays import inverse6, log_det6, move_origin, plane_of, prepare
-from perception.vision.quadrangle.jit import jit, mix3, put1, put2, times3
 from perception.vision.quadrangle.minima import all_minima
 from perception.vision.quadrangle.posterior import MIRROR_TURN_COS, normal_spread, opposite, ring_mass, sight_frame
+from perception.vision.quadrangle.small_vectors import mix3, put1, put2, times3
 
 WORTHLESS = 60.0  # chi-square above the best at which a minimum has odds of 1 in 1e13
 
 
-@jit
-def solve(points, pixels, covariance, camera, near_sigmas2, Rs, ts, costs, Cs, masses):
+@compiled
+def solve(
+    points: Array,
+    pixels: Array,
+    covariance: Array,
+    camera: Array,
+    near_sigmas2: float,
+    Rs: Array,
+    ts: Array,
+    costs: Array,
+    Cs: Array,
+    masses: Array,
+) -> tuple[int, int, int]:
     """Everything about one view: minima with covariance and posterior mass, lowest chi-square first.
 
     Args:
@@ -60,8 +72,8 @@ def solve(points, pixels, covariance, camera, near_sigmas2, Rs, ts, costs, Cs, m
     return count, minima, 0
 
 
-@jit
-def centred(points, X):
+@inlined
+def centred(points: Array, X: Array) -> tuple[Array, float]:
     """Fills X (4, 3) with the points about their centroid; returns the centroid and the sum of squared distances."""
     c = np.zeros(3)
     for i in range(4):
@@ -75,8 +87,8 @@ def centred(points, X):
     return c, size
 
 
-@jit
-def weigh(Ns, costs, Cs, masses, count):
+@inlined
+def weigh(Ns: Array, costs: Array, Cs: Array, masses: Array, count: int) -> bool:
     """Fills covariances Cs and Laplace's masses over all six parameters, the best minimum's being 1.
 
     Returns: whether every Ns is positive definite.
@@ -90,8 +102,8 @@ def weigh(Ns, costs, Cs, masses, count):
     return True
 
 
-@jit
-def share(ratio, Rs, t, normal, masses, count):
+@inlined
+def share(ratio: float, Rs: Array, t: Array, normal: Array, masses: Array, count: int) -> bool:
     """Gives the minima on the other side of the line of sight to t the mass `ratio` together, where that is more.
 
     Returns: whether there is such a minimum with mass.

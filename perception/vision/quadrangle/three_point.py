@@ -1,4 +1,3 @@
-# mypy: disallow-untyped-defs=False
 """Compiled three-point poses: the first half of the paper's direct route (Section II-B), and seeds for the refinement.
 
 The code reads from `real_cubic_root` down to `three_point`; conventions as in `cost`.
@@ -8,11 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.vision.quadrangle.jit import cross3, dot3, jit, mix3, product3, put2, unit3
+from hal.arrays import Array
+from hal.jit import compiled, inlined
+from perception.vision.quadrangle.small_vectors import cross3, dot3, mix3, product3, put2, unit3
 
 
-@jit
-def real_cubic_root(b, c, d):
+@inlined
+def real_cubic_root(b: float, c: float, d: float) -> float:
     """The largest real root of x^3 + b x^2 + c x + d (Viete and Cardano, then two Newton steps)."""
     p = c - b * b / 3.0
     q = 2.0 * b * b * b / 27.0 - b * c / 3.0 + d
@@ -35,8 +36,8 @@ def real_cubic_root(b, c, d):
     return x
 
 
-@jit
-def cofactors(M):
+@inlined
+def cofactors(M: Array) -> Array:
     """Adjugate of a symmetric 3x3 matrix."""
     B = np.empty((3, 3))
     B[0, 0] = M[1, 1] * M[2, 2] - M[1, 2] * M[1, 2]
@@ -48,8 +49,8 @@ def cofactors(M):
     return B
 
 
-@jit
-def triad(p0, p1, p2):
+@inlined
+def triad(p0: Array, p1: Array, p2: Array) -> Array:
     """Orthonormal frame (columns) of three points: along p1 - p0, in their plane, normal to it."""
     a = unit3(mix3(1.0, p1, -1.0, p0))
     n = unit3(cross3(a, mix3(1.0, p2, -1.0, p0)))
@@ -60,8 +61,8 @@ def triad(p0, p1, p2):
     return F
 
 
-@jit
-def refine_depths(s, d2, cosines):
+@inlined
+def refine_depths(s: Array, d2: Array, cosines: Array) -> None:
     """Newton on the three law-of-cosines equations; leaves s where it does not help."""
     for _ in range(3):
         e0 = s[1] * s[1] + s[2] * s[2] - 2.0 * s[1] * s[2] * cosines[0] - d2[0]
@@ -86,8 +87,8 @@ def refine_depths(s, d2, cosines):
         s[2] -= x2
 
 
-@jit
-def laws_of_cosines(P, f, d2, cosines):
+@inlined
+def laws_of_cosines(P: Array, f: Array, d2: Array, cosines: Array) -> None:
     """Squared sides d2 and cosines between rays (3 each, opposite corner k) of points P (3, 3) and unit rays f (3, 3)."""
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
@@ -96,8 +97,8 @@ def laws_of_cosines(P, f, d2, cosines):
         cosines[k] = dot3(f[i], f[j])
 
 
-@jit
-def conics(d2, cosines):
+@inlined
+def conics(d2: Array, cosines: Array) -> tuple[Array, Array]:
     """D1 = d2[1] M0 - d2[0] M1 and D2 = d2[2] M0 - d2[0] M2 over d2[0], with M_k the form of law k: s^T D s = 0."""
     r1, r2 = d2[1] / d2[0], d2[2] / d2[0]
     D1, D2 = np.zeros((3, 3)), np.zeros((3, 3))
@@ -110,8 +111,8 @@ def conics(d2, cosines):
     return D1, D2
 
 
-@jit
-def line_pair(D1, D2, lines):
+@inlined
+def line_pair(D1: Array, D2: Array, lines: Array) -> bool:
     """Fill `lines` (2, 3) with the two lines of a degenerate conic of the pencil w1 D1 + w2 D2; False when there is none."""
     C1, C2 = cofactors(D1), cofactors(D2)
     c3 = c2 = c1 = c0 = 0.0
@@ -132,8 +133,8 @@ def line_pair(D1, D2, lines):
     return True
 
 
-@jit
-def split(D, lines):
+@inlined
+def split(D: Array, lines: Array) -> None:
     """The lines l, m of D = l m^T + m l^T: -adj(D) = p p^T with p their crossing, and D + [p]x has rank one."""
     B = cofactors(D)
     k = 0
@@ -161,8 +162,8 @@ def split(D, lines):
         lines[0, i], lines[1, i] = E[bi, i], E[i, bj]
 
 
-@jit
-def crossings(line, D1, S):
+@inlined
+def crossings(line: Array, D1: Array, S: Array) -> int:
     """Fill S (2, 3) with the ratios of depths where a line meets the conic D1; how many: 2, or 0 for no line."""
     k = 0
     for i in range(1, 3):
@@ -185,8 +186,8 @@ def crossings(line, D1, S):
     return 2
 
 
-@jit
-def sized(s, d2, cosines):
+@inlined
+def sized(s: Array, d2: Array, cosines: Array) -> bool:
     """Bring depths s, known up to a factor, to the sides' size and refine them; False where one is not in front."""
     sign = -1.0 if s[0] + s[1] + s[2] < 0.0 else 1.0
     for n in range(3):
@@ -210,8 +211,8 @@ def sized(s, d2, cosines):
     return True
 
 
-@jit
-def carried(P, f, s, R, t):
+@inlined
+def carried(P: Array, f: Array, s: Array, R: Array, t: Array) -> bool:
     """Fill R, t: the pose that carries points P (3, 3) to depths s (3,) along the rays f; False when it is no pose."""
     Q = np.empty((3, 3))
     for n in range(3):
@@ -228,8 +229,8 @@ def carried(P, f, s, R, t):
     return True
 
 
-@jit
-def three_point(P, f, Rs, ts):
+@compiled
+def three_point(P: Array, f: Array, Rs: Array, ts: Array) -> int:
     """Poses that carry three points (3, 3) onto three unit rays (3, 3); fills Rs, ts (4 of them), returns how many.
 
     The depths s solve three law-of-cosines equations. Two combinations without constant term are conics in s; the

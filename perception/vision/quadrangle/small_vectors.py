@@ -1,25 +1,18 @@
-# mypy: disallow-untyped-defs=False
-"""The compiler settings of the four-light pose, and the small vector arithmetic that its loops share.
+"""Arithmetic of three-vectors and 3x3 matrices that the loops of the four-light pose share.
 
 Array expressions, `np.cross` and `@` would read better, but each costs up to a second of compile time where it stands.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, cast
-
-import numba
 import numpy as np
 
-
-def jit(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile to machine code, cached beside the source; division by zero gives inf as in numpy."""
-    return cast("Callable[..., Any]", numba.njit(cache=True, error_model="numpy")(function))
+from hal.arrays import Array
+from hal.jit import inlined
 
 
-@jit
-def product3(A, B):
+@inlined
+def product3(A: Array, B: Array) -> Array:
     """A @ B, 3x3."""
     C = np.empty((3, 3))
     for i in range(3):
@@ -28,8 +21,8 @@ def product3(A, B):
     return C
 
 
-@jit
-def times3(M, v):
+@inlined
+def times3(M: Array, v: Array) -> Array:
     """M @ v, 3x3 and (3,)."""
     x = np.empty(3)
     for i in range(3):
@@ -37,8 +30,8 @@ def times3(M, v):
     return x
 
 
-@jit
-def back3(M, v, factor):
+@inlined
+def back3(M: Array, v: Array, factor: float) -> Array:
     """factor * M^T @ v, 3x3 and (3,)."""
     x = np.empty(3)
     for i in range(3):
@@ -46,14 +39,14 @@ def back3(M, v, factor):
     return x
 
 
-@jit
-def dot3(a, b):
+@inlined
+def dot3(a: Array, b: Array) -> float:
     """a . b, (3,) each."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
-@jit
-def cross3(a, b):
+@inlined
+def cross3(a: Array, b: Array) -> Array:
     """a x b, (3,) each."""
     x = np.empty(3)
     x[0] = a[1] * b[2] - a[2] * b[1]
@@ -62,8 +55,8 @@ def cross3(a, b):
     return x
 
 
-@jit
-def mix3(p, a, q, b):
+@inlined
+def mix3(p: float, a: Array, q: float, b: Array) -> Array:
     """p a + q b for numbers p, q and (3,) a, b."""
     x = np.empty(3)
     for i in range(3):
@@ -71,8 +64,8 @@ def mix3(p, a, q, b):
     return x
 
 
-@jit
-def unit3(a):
+@inlined
+def unit3(a: Array) -> Array:
     """a / |a|, (3,)."""
     norm = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
     x = np.empty(3)
@@ -81,15 +74,15 @@ def unit3(a):
     return x
 
 
-@jit
-def put1(into, values):
+@inlined
+def put1(into: Array, values: Array) -> None:
     """Copy a vector."""
     for i in range(values.shape[0]):
         into[i] = values[i]
 
 
-@jit
-def put2(into, values):
+@inlined
+def put2(into: Array, values: Array) -> None:
     """Copy a matrix."""
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):

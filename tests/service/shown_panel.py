@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from hal.config import load_cell
-from perception.vision.projection import CameraView
+from perception.vision.projection import CameraProjection
 from service.operations import OPERATIONS
 from service.serve import Options, Panelwright
 from tests.perception.vision.bench_panel import TOML, panel, scene
 from tests.service.conftest import WriteCell
 
 PLATE = [0.60, 0.40]
-Shown = tuple[np.ndarray, CameraView]
+Shown = tuple[np.ndarray, CameraProjection]
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def web(house: Panelwright) -> Iterator[httpx2.Client]:
 @pytest.fixture(scope="module")
 def shown() -> Shown:
     image, intrinsics, pose = scene(tilt_deg=3.0, distance_m=0.66, pose_error=0.0)
-    return image, CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+    return image, CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
 
 
 def png(image: np.ndarray) -> bytes:
@@ -55,7 +55,7 @@ def store(web: httpx2.Client, image: np.ndarray) -> str:
     return str(answer.json()["id"])
 
 
-def corners(view: CameraView, name: str, half_m: float) -> list[list[float]]:
+def corners(view: CameraProjection, name: str, half_m: float) -> list[list[float]]:
     x, y = panel().object(name).position_m
     return view.project([[x - half_m, y + half_m, 0.0], [x + half_m, y - half_m, 0.0]]).tolist()
 

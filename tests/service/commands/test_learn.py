@@ -13,7 +13,7 @@ import pytest
 from hal.config import load_cell
 from hal.errors import ConfigError, InvalidRequest, NotFound
 from hal.geometry import to_json
-from perception.vision.knowledge import Kind, load_knowledge, shipped_knowledge, write_kind
+from perception.vision.knowledge import TaughtKind, load_knowledge, shipped_knowledge, write_kind
 from service.commands.teach import teach
 from service.knowledge.store import KnowledgeStore
 from tests.perception.vision.bench_panel import TOML, panel, scene
@@ -114,8 +114,8 @@ def test_the_looks_of_a_cell_add_to_the_shipped_kinds_and_give_way_to_taught_one
     odd = np.full((1, lamp.looks.shape[1]), 0.5)
     of_cell, folder = tmp_path / "cell", tmp_path / "taught"
     of_cell.mkdir()
-    write_kind(Kind(name="lamp", size_m=lamp.size_m, looks=odd), of_cell)
-    write_kind(Kind(name="bell", size_m=(0.02, 0.02), looks=odd), of_cell)
+    write_kind(TaughtKind(name="lamp", size_m=lamp.size_m, looks=odd), of_cell)
+    write_kind(TaughtKind(name="bell", size_m=(0.02, 0.02), looks=odd), of_cell)
     store = KnowledgeStore(folder, of_cell=of_cell)
     known = store.knowledge()
     both, bell = known.kind("lamp"), known.kind("bell")
@@ -127,7 +127,7 @@ def test_the_looks_of_a_cell_add_to_the_shipped_kinds_and_give_way_to_taught_one
     (tmp_path / "shown" / "lamp.toml").write_text(files["lamp"].text())
     (read,) = load_knowledge(tmp_path / "shown").kinds
     np.testing.assert_array_equal(read.looks, both.looks)
-    store.write_kind(Kind(name="lamp", size_m=lamp.size_m, looks=odd))
+    store.write_kind(TaughtKind(name="lamp", size_m=lamp.size_m, looks=odd))
     alone = store.knowledge().kind("lamp")
     assert alone is not None and len(alone.looks) == 1
 

@@ -13,7 +13,7 @@ import pytest
 from hal.errors import InvalidRequest
 from hal.panel import load_panel
 from perception.vision.knowledge import load_knowledge, shipped_knowledge
-from perception.vision.projection import CameraView
+from perception.vision.projection import CameraProjection
 from service.commands.teach import teach
 from tests.perception.vision.bench_panel import panel, scene
 
@@ -22,7 +22,7 @@ def _example(path: Path) -> list[str]:
     """Write an overview to `path` and return two clicks around its emergency mushroom."""
     image, intrinsics, pose = scene(tilt_deg=5.0, distance_m=0.66, pose_error=0.0)
     cv2.imwrite(str(path), image)
-    view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+    view = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
     corners = panel().object("emergency").point_m + np.array([[-0.02, 0.02, 0.0], [0.02, -0.02, 0.0]])
     return [f"{u:.2f},{v:.2f}" for u, v in view.project(corners)]
 
@@ -59,7 +59,7 @@ def _talk(monkeypatch: pytest.MonkeyPatch, *lines: str) -> None:
 def _pixels(name: str, half_m: float = 0.0) -> str:
     """Clicks on an object of the example: its middle, or two corners."""
     _, intrinsics, pose = scene(tilt_deg=5.0, distance_m=0.66, pose_error=0.0)
-    view = CameraView(intrinsics=intrinsics, camera_from_panel=pose)
+    view = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
     steps = [[0.0, 0.0, 0.0]] if half_m == 0.0 else [[-half_m, half_m, 0.0], [half_m, -half_m, 0.0]]
     return " ".join(f"{u:.1f},{v:.1f}" for u, v in view.project(np.array(panel().object(name).point_m) + steps))
 

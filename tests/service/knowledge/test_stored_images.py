@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image as Pillow
 
-from perception.vision.projection import CameraView
+from perception.vision.projection import CameraProjection
 from service.serve import Panelwright
 from tests.perception.vision.bench_panel import panel, scene
 from tests.service.shown_panel import PLATE, SHOWING_NO_PANEL, Shown, house, is_problem, png, shown, store, web
@@ -113,7 +113,7 @@ def test_blind_recognition_draws_what_it_finds(web: httpx2.Client, shown: Shown)
     assert web.get(result["pictures"][0]).content.startswith(b"\x89PNG")
 
 
-def _bare(image: np.ndarray, view: CameraView) -> np.ndarray:
+def _bare(image: np.ndarray, view: CameraProjection) -> np.ndarray:
     """The image with the emergency mushroom painted over with plate."""
     u, v = np.rint(view.project([panel().object("emergency").point_m])[0]).astype(int)
     out = image.copy()

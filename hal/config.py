@@ -137,6 +137,15 @@ class Cell(Strict):
         """Names of the devices of a kind, in the order of the file."""
         return tuple(name for name, device in self.file.devices.items() if device.kind is kind)
 
+    @property
+    def panel_path(self) -> Path:
+        """The panel file.
+
+        Raises:
+            ConfigError: it is gone.
+        """
+        return _locate(self.file.cell.panel, self.path, "cell.panel")
+
     def calibration_path(self, name: str) -> Path:
         """The file of the calibration record called `name`.
 

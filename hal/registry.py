@@ -14,7 +14,7 @@ from hal.clock import Clock, WallClock
 from hal.config import Cell
 from hal.devices import Device
 from hal.emulation import EmulatorFactory
-from hal.errors import ConfigError
+from hal.errors import REINSTALL, ConfigError
 from hal.strict import Strict
 
 DEVICES = "panelwright.devices"
@@ -123,7 +123,7 @@ def _load(group: str, name: str, what: str) -> Any:
     except ImportError as error:
         raise ConfigError(
             f"{what} {name!r} does not import: {error}",
-            hint="run `make setup`; Python must be 3.11 (see `panelwright doctor`)",
+            hint=f"{REINSTALL}; `panelwright doctor` says what is wrong",
             driver=name,
         ) from error
 

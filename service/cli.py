@@ -12,11 +12,13 @@ def main() -> None:
     if sys.version_info[:2] != (3, 11):  # before any import that would fail with something less clear
         found = f"{sys.version_info[0]}.{sys.version_info[1]}"
         sys.stderr.write(
-            f"panelwright needs Python 3.11, this is {found}\n  try    run `make setup` with Python 3.11\n"
+            f"panelwright needs Python 3.11, this is {found}\n"
+            "  try    install it with Python 3.11 (`make setup` in a checkout)\n"
         )
         raise SystemExit(2)
+    os.environ["PYTHONSAFEPATH"] = "1"  # no child process takes a `drivers.py` of the current folder for ours
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # what it warns of comes as an error of ours, with a remedy
-    from hal.errors import CellError
+    from hal.errors import REINSTALL, CellError
     from service.commands.shutdown import leave
     from service.errors import of_file
 
@@ -34,7 +36,7 @@ def main() -> None:
     except KeyboardInterrupt:
         raise SystemExit(130) from None
     except ModuleNotFoundError as error:
-        sys.stderr.write(f"the Python package {error.name!r} is not installed\n  try    run `make setup`\n")
+        sys.stderr.write(f"the Python package {error.name!r} is not installed\n  try    {REINSTALL}\n")
         raise SystemExit(2) from None
 
 
@@ -45,6 +47,7 @@ def _app() -> Callable[[], None]:
     from service.commands.demo import demo
     from service.commands.develop import conform, emulate, new_driver
     from service.commands.doctor import doctor
+    from service.commands.init import init
     from service.commands.journal import journal
     from service.commands.learn import learn
     from service.commands.range import batch, range_image
@@ -60,6 +63,7 @@ def _app() -> Callable[[], None]:
     )
 
     app.callback()(root)
+    app.command()(init)
     app.command()(serve)
     app.command()(demo)
     app.command()(doctor)

@@ -7,7 +7,6 @@ import mmap
 import os
 import socket
 import subprocess
-import sys
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.child_python import module_command
 from hal.errors import DeviceUnavailable
 from simbackend.wire import DOUBLE, IMAGE_BYTES, REQUEST, SNAPSHOT, Op, WorldConfig, read_exactly
 
@@ -35,8 +35,8 @@ class WorldLink:
             file.truncate(IMAGE_BYTES)
             self._images = mmap.mmap(file.fileno(), IMAGE_BYTES)
             fds = (theirs.fileno(), file.fileno())
-            command = [sys.executable, "-m", "simbackend.world_process", *map(str, fds)]
-            self.process = subprocess.Popen(  # noqa: S603  # our own interpreter and module
+            command = module_command("simbackend.world_process", *map(str, fds))
+            self.process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
                 command, pass_fds=fds, env=_environment(), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
             )
         theirs.close()
@@ -118,6 +118,5 @@ def _vector(op: Op, *arguments: float) -> bytes:
 
 
 def _environment() -> dict[str, str]:
-    # The world finds its code where this process found it, and uses one core: the other belongs to the cell.
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    return {**os.environ, **threads, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    """The world uses one core, because the other belongs to the cell."""
+    return {**os.environ, **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")}

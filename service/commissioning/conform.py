@@ -65,7 +65,7 @@ def run(cell: Cell, *, devices: Sequence[str], level: str, report: Path | None =
     try:
         import pytest
     except ModuleNotFoundError:
-        raise ConfigError("the conformance kit needs pytest", hint="pip install 'panelwright[test]'") from None
+        raise ConfigError("the conformance kit needs pytest", hint="pip install 'panelwright[conform]'") from None
     from service.commissioning.conform_report import Notebook, write_report
 
     names = tuple(devices) or tuple(cell.file.devices)

@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from hal.clock import Deadline
 from hal.config import Cell, load_cell
-from hal.errors import CellError, ConfigError, detail_lines
+from hal.errors import REINSTALL, CellError, ConfigError, detail_lines
 from hal.registry import installed_drivers
 from service.client import Client
 from service.commands.common import console, find_cell
@@ -84,9 +84,9 @@ def _package(name: str, wanted: str) -> str:
     try:
         found = version(name)
     except PackageNotFoundError:
-        raise ConfigError(f"{name} is not installed", hint="run `make setup`") from None
+        raise ConfigError(f"{name} is not installed", hint=REINSTALL) from None
     if not found.startswith(wanted):
-        raise ConfigError(f"{name} is {found}, not {wanted}", hint="run `make setup`: it installs what fits together")
+        raise ConfigError(f"{name} is {found}, not {wanted}", hint=f"{REINSTALL}, with its constraints.txt")
     return found
 
 

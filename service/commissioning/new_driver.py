@@ -8,7 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 from hal.devices import DeviceKind
-from hal.errors import ConfigError
+from hal.errors import REINSTALL, ConfigError
 
 SHORT = {"scanner": DeviceKind.RANGE_SCANNER, "ft": DeviceKind.FORCE_TORQUE, "force": DeviceKind.FORCE_TORQUE}
 
@@ -89,6 +89,6 @@ def with_lines(text: str, lines: dict[str, str], path: Path) -> str:
 def _templates() -> ModuleType:
     points = list(entry_points(group="panelwright.scaffold"))
     if not points:
-        raise ConfigError("no installed package has templates of drivers", hint="run `make setup`")
+        raise ConfigError("no installed package has templates of drivers", hint=REINSTALL)
     module: ModuleType = points[0].load()
     return module

@@ -10,7 +10,7 @@ from itertools import combinations
 from scipy.spatial.transform import RigidTransform
 
 from hal.config import Cell, DeviceSection
-from hal.errors import ConfigError
+from hal.errors import REINSTALL, ConfigError
 from hal.frames import frame_tree
 from hal.registry import device_factory
 from hal.wires import claims_of, clash
@@ -72,7 +72,7 @@ def check_python() -> None:
     if sys.version_info[:2] != PYTHON:
         raise ConfigError(
             f"this is Python {sys.version_info[0]}.{sys.version_info[1]}; panelwright needs {PYTHON[0]}.{PYTHON[1]}",
-            hint="install Python 3.11 and run `make setup`",
+            hint=f"{REINSTALL}, with Python 3.11",
         )
 
 
@@ -81,6 +81,6 @@ def check_simulator(key: str) -> None:
     if find_spec("pybullet") is None:
         raise ConfigError(
             f"{key} is simulated, but PyBullet is not installed",
-            hint="run `make setup` (it installs pybullet 3.2.7, which needs Python 3.11)",
+            hint=f"{REINSTALL}; pybullet 3.2.7 comes with it and needs Python 3.11",
             key=key,
         )

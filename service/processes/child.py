@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import IO
 
+from hal.child_python import module_command
+
 GRACE_S = 3.0
 LAST_WORDS_S = 1.0
 
@@ -22,7 +24,7 @@ class Child:
     Being a session leader it does not get the terminal's Ctrl-C, and killing its group takes its own children along.
 
     Args:
-        module: run as `python -m module`.
+        module: run as by `python -m`, without the current folder on its import path.
         arguments: its command line; never secrets.
         pass_fds: descriptors that it inherits.
         on_line: called with each line that it prints, from a thread of this object.
@@ -41,7 +43,7 @@ class Child:
         self.module = module
         self.started_s = time.monotonic()
         self._process = subprocess.Popen(  # noqa: S603 - our own module
-            [sys.executable, "-m", module, *arguments],
+            module_command(module, *arguments),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=tuple(pass_fds),

@@ -20,11 +20,19 @@ from service.commands.demo import judged, reported
 from tests.service.conftest import WriteCell
 from tests.service.waiting import eventually
 
+SCRIPT = Path(sys.executable).with_name("panelwright")
+"""What users type. Unlike `python -m` it does not put the current folder on the import path."""
+OURS = ("drivers", "fusion", "hal", "manipulation", "perception", "service", "simbackend")
 PANELWRIGHT = [sys.executable, "-m", "service.cli"]
 
 
 def _run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*PANELWRIGHT, *arguments], capture_output=True, text=True, timeout=240, check=False, cwd=cwd)
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
 
 
 def _assert_refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
@@ -113,6 +121,27 @@ def test_a_missing_simulator_is_one_clear_message() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=240, check=False)
     _assert_refused(done, "PyBullet is not installed", "make setup")
+
+
+def test_files_of_the_user_that_are_called_like_ours_break_nothing(write_cell: WriteCell, tmp_path: Path) -> None:
+    for name in OURS:
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('a file of the user was taken for ours')\n")
+    command = [str(SCRIPT), "doctor", "--cell", str(write_cell()), "--port", str(_free_port())]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "cell process" in done.stdout  # a child has started, and its driver was found
+
+
+def test_init_copies_a_cell_that_doctor_accepts_and_never_overwrites(tmp_path: Path) -> None:
+    done = _run("init", "mine", "--cell", "cells/ur10e.toml", cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "panelwright doctor --cell cells/ur10e.toml" in done.stdout
+    folder = tmp_path / "mine"
+    (folder / "panels" / "bench.toml").write_text("name = 'other'")
+    _assert_refused(_run("init", "mine", "--cell", "cells/ur10e.toml", cwd=tmp_path), "exists already")
+    checked = _run("doctor", "--no-connect", "--cell", "cells/ur10e.toml", cwd=folder)
+    assert checked.returncode == 1  # it reads the copy, and not the shipped file
+    assert "panels/bench.toml" in checked.stdout
 
 
 class Served:

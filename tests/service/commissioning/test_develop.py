@@ -12,6 +12,9 @@ import pytest
 
 from drivers.emulators import tfmini
 from drivers.emulators.scripted import ScriptedProximity
+from hal.config import load_cell
+from hal.errors import ConfigError
+from service.commissioning.conform import run
 from service.commissioning.conform_report import Notebook
 from tests.service.conftest import WriteCell
 
@@ -38,6 +41,16 @@ def test_the_kit_runs_on_a_cell_file_and_reports_what_was_not_tried(write_cell: 
     assert outcomes["close twice is once"] == ("passed", "")
     assert outcomes["later samples have later stamps and numbers"] == ("not tried", "level read was not asked for")
     assert "| later samples have later stamps and numbers | read | not tried |" in text
+
+
+def test_without_pytest_the_kit_says_what_to_install(
+    write_cell: WriteCell, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    cell = load_cell(write_cell())
+    monkeypatch.setitem(sys.modules, "pytest", None)
+    with pytest.raises(ConfigError, match="needs pytest") as refused:
+        run(cell, devices=(), level="static", report=tmp_path / "report")
+    assert "panelwright[conform]" in refused.value.hint
 
 
 def test_the_kit_finds_a_broken_promise(write_cell: WriteCell, tmp_path: Path) -> None:

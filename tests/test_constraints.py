@@ -1,0 +1,53 @@
+"""`constraints.txt` pins what `make setup` installs, each package at the version that is installed, and nothing else."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable
+from importlib.metadata import requires, version
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[1]
+INSTALLED_EXTRAS = ("certify", "conform", "test")
+INSTALLER = "uv"
+
+
+def _asked_for() -> list[str]:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = (project["optional-dependencies"][extra] for extra in INSTALLED_EXTRAS)
+    return [INSTALLER, *project["dependencies"], *(line for extra in extras for line in extra)]
+
+
+def _with_all_that_they_need(lines: Iterable[str]) -> set[str]:
+    seen: set[tuple[str, str]] = set()
+    waiting = [(Requirement(line), "") for line in lines]
+    while waiting:
+        requirement, for_extra = waiting.pop()
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": for_extra}):
+            continue
+        name = canonicalize_name(requirement.name)
+        for extra in ("", *requirement.extras):
+            if (name, extra) not in seen:
+                seen.add((name, extra))
+                waiting += [(Requirement(line), extra) for line in requires(name) or ()]
+    return {name for name, _ in seen}
+
+
+def _pinned() -> dict[str, str]:
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pins = [line.split("==") for line in lines if line and not line.startswith("#")]
+    return {canonicalize_name(name): pin for name, pin in pins}
+
+
+def test_every_pin_is_installed_and_every_installed_package_is_pinned() -> None:
+    pinned, needed = _pinned(), _with_all_that_they_need(_asked_for())
+    assert sorted(needed - pinned.keys() - {"pip", "setuptools"}) == [], "not pinned"
+    assert sorted(pinned.keys() - needed) == [], "pinned, but nothing needs it"
+
+
+def test_the_installed_versions_are_the_pinned_ones() -> None:
+    pinned = _pinned()
+    assert {name: version(name) for name in pinned} == pinned

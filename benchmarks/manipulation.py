@@ -19,15 +19,8 @@ import numpy as np
 
 from benchmarks.simcell import SimBench, open_bench
 from hal.errors import CellError
-from manipulation.skills.button import button
-from manipulation.skills.handwheel import handwheel
-from manipulation.skills.lever import lever
-from manipulation.skills.mushroom import mushroom
 from manipulation.skills.outcome import ObjectState, Outcome, SkillReport
 from manipulation.skills.retreat import park
-from manipulation.skills.rotary import rotary
-from manipulation.skills.slider import slider
-from manipulation.skills.toggle import toggle
 
 ANGLE_SIGMA_RAD = np.radians(1.0)  # of the looks that the skills are given
 SLIDER_SIGMA = 0.4  # per cent of the scale: 0.4 mm
@@ -72,7 +65,7 @@ def _lever(bench: SimBench) -> Judged:
     def look() -> ObjectState:
         return bench.look("main_valve", angle_sigma_rad=ANGLE_SIGMA_RAD)
 
-    report = lever(bench.context, "main_valve", goal, current=look(), verify=look)
+    report = bench.operate("main_valve", goal, current=look(), verify=look)
     error = float(bench.truth("main_valve").value or 0.0) - angle
     return report, abs(error) <= LEVER_TOLERANCE_RAD, error
 
@@ -85,7 +78,7 @@ def _slider(bench: SimBench) -> Judged:
     def look() -> ObjectState:
         return bench.look("setpoint", value_sigma=SLIDER_SIGMA)
 
-    report = slider(bench.context, "setpoint", goal, current=look(), verify=look)
+    report = bench.operate("setpoint", goal, current=look(), verify=look)
     error_m = (float(bench.truth("setpoint").value or 0.0) - goal) * 1e-3
     return report, abs(error_m) <= SLIDER_TOLERANCE_M, error_m
 
@@ -93,14 +86,14 @@ def _slider(bench: SimBench) -> Judged:
 def _button(bench: SimBench) -> Judged:
     before = float(bench.truth("start").value or 0.0)
     expected = "off" if bench.truth("run_lamp").state == "on" else "on"
-    report = button(bench.context, "start", expected=expected, verify=lambda: bench.look("run_lamp"))
+    report = bench.operate("start", expected, verify=lambda: bench.look("run_lamp"))
     presses = float(bench.truth("start").value or 0.0) - before
     return report, presses == 1.0, presses - 1.0
 
 
 def _toggle(bench: SimBench) -> Judged:
     goal = "off" if bench.truth("pump").state == "on" else "on"
-    report = toggle(bench.context, "pump", goal, verify=lambda: bench.look("pump"))
+    report = bench.operate("pump", goal, verify=lambda: bench.look("pump"))
     return report, bench.truth("pump").state == goal, 0.0
 
 
@@ -112,7 +105,7 @@ def _rotary(bench: SimBench) -> Judged:
     def look() -> ObjectState:
         return bench.look("mode")
 
-    report = rotary(bench.context, "mode", goal, current=look(), verify=look)
+    report = bench.operate("mode", goal, current=look(), verify=look)
     return report, bench.truth("mode").state == goal, 0.0
 
 
@@ -123,13 +116,13 @@ def _handwheel(bench: SimBench) -> Judged:
     def look() -> ObjectState:
         return bench.look("bypass", angle_sigma_rad=ANGLE_SIGMA_RAD)
 
-    report = handwheel(bench.context, "bypass", goal, current=look(), verify=look)
+    report = bench.operate("bypass", goal, current=look(), verify=look)
     error = float(bench.truth("bypass").value or 0.0) - goal
     return report, abs(error) <= WHEEL_TOLERANCE_RAD, error
 
 
 def _mushroom(bench: SimBench) -> Judged:
-    report = mushroom(bench.context, "emergency", verify=lambda: bench.look("emergency"))
+    report = bench.operate("emergency", "pressed", verify=lambda: bench.look("emergency"))
     return report, bench.truth("emergency").state == "pressed", 0.0
 
 

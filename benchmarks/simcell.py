@@ -22,7 +22,8 @@ from hal.simulated import ObjectTruth
 from manipulation.control.controller import Controller
 from manipulation.planning.time_parameterization import SpeedLimits
 from manipulation.skills.context import SkillContext
-from manipulation.skills.outcome import ObjectState
+from manipulation.skills.operate import operate
+from manipulation.skills.outcome import ObjectState, SkillReport, Verify
 from service.processes.motion import controller_of, flange_from
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -66,6 +67,12 @@ class SimBench:
             value=truth.value + value_sigma * float(self.rng.standard_normal()),
             angle_rad=truth.value + angle_sigma_rad * float(self.rng.standard_normal()),
         )
+
+    def operate(
+        self, name: str, goal: str | float, *, current: ObjectState | None = None, verify: Verify | None = None
+    ) -> SkillReport:
+        """Work a control of the panel by the skill of its kind."""
+        return operate(self.context, self.context.panel.object(name), goal, current=current, verify=verify)
 
     def close(self) -> None:
         """End controller and world."""

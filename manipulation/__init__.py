@@ -14,17 +14,11 @@ if TYPE_CHECKING:
     from manipulation.planning.time_parameterization import SpeedLimits
     from manipulation.planning.transfer import QUICK, THOROUGH, Effort
     from manipulation.skills.attempt import Attempt
-    from manipulation.skills.button import button
     from manipulation.skills.context import SkillContext
-    from manipulation.skills.handwheel import handwheel
-    from manipulation.skills.lever import lever
-    from manipulation.skills.mushroom import mushroom
+    from manipulation.skills.operate import operate
     from manipulation.skills.outcome import ObjectState, SkillFailure, SkillReport, Verify
     from manipulation.skills.probe import proximity_probe, touch_probe
     from manipulation.skills.retreat import park, retreat
-    from manipulation.skills.rotary import rotary
-    from manipulation.skills.slider import slider
-    from manipulation.skills.toggle import toggle
     from manipulation.warm import warm_up
 
 __all__ = [
@@ -42,16 +36,10 @@ __all__ = [
     "SkillReport",
     "SpeedLimits",
     "Verify",
-    "button",
-    "handwheel",
-    "lever",
-    "mushroom",
+    "operate",
     "park",
     "proximity_probe",
     "retreat",
-    "rotary",
-    "slider",
-    "toggle",
     "touch_probe",
     "warm_up",
 ]

@@ -6,16 +6,15 @@ from dataclasses import replace
 
 from hal.panel import Button
 from manipulation.skills.context import SkillContext
-from manipulation.skills.initial_state import object_of_kind
 from manipulation.skills.outcome import ObjectState, Outcome, SkillReport, Verify
 from manipulation.skills.press import press
 
 
 def button(
     context: SkillContext,
-    name: str,
-    *,
+    push_button: Button,
     expected: str | None = None,
+    *,
     current: ObjectState | None = None,
     verify: Verify | None = None,
 ) -> SkillReport:
@@ -25,19 +24,17 @@ def button(
 
     Args:
         expected: the state that the read-back must show afterwards: `pressed` or `released` of a latching button, or
-        the state of the lamp that it works. None: any read-back will do that says something.
-        current: what the last look said of what the button works.
+            the state of the lamp that it works. None accepts any read-back that gives an answer.
+        current: what the last look showed of what the button works.
         verify: the caller's second look.
 
     Raises:
-        InvalidRequest: it is not a button.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    panel_object = object_of_kind(context, name, Button, "button")
-    shows = panel_object.latching or panel_object.lights_lamp is not None
+    shows = push_button.latching or push_button.lights_lamp is not None
     report = press(
         context,
-        panel_object,
+        push_button,
         skill="button",
         target=expected or "pressed once",
         is_reached=lambda seen: expected is None or seen.state == expected,

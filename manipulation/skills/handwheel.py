@@ -15,7 +15,7 @@ from manipulation.planning.cartesian_path import arc
 from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import against_turn, centre_between
 from manipulation.skills.context import SkillContext, panel_from_grip
-from manipulation.skills.initial_state import InitialState, object_of_kind
+from manipulation.skills.initial_state import InitialState
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
 from manipulation.skills.perform import perform
 
@@ -46,7 +46,7 @@ RADIAL = Compliance(
 
 def handwheel(
     context: SkillContext,
-    name: str,
+    wheel: Handwheel,
     target_rad: float,
     *,
     current: ObjectState | None = None,
@@ -54,32 +54,32 @@ def handwheel(
 ) -> SkillReport:
     """Turn the wheel until its marked spoke has come from the present angle to `target_rad` (clockwise from up).
 
-    A turn of more than about 100 degrees is made by several holds.
+    A turn of more than about 100 degrees takes several grasps. The mechanical estimate in the report is the angle
+    reached.
 
     Args:
-        current: what the last look said (angle); without it `verify` is asked.
-
-    The mechanical estimate is the angle reached.
+        current: what the last look showed (angle); without it `verify` is asked.
+        verify: the caller's second look.
 
     Raises:
-        InvalidRequest: not a wheel, a target beyond its stops, or nobody knows its angle.
+        InvalidRequest: the target is beyond the wheel's stops, or nobody knows its angle.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    panel_object = object_of_kind(context, name, Handwheel, "handwheel")
-    if not panel_object.minimum_rad <= target_rad <= panel_object.maximum_rad:
+    name = wheel.name
+    if not wheel.minimum_rad <= target_rad <= wheel.maximum_rad:
         raise InvalidRequest(
             f"{target_rad:.2f} rad is beyond the stops of {name}",
-            hint=f"{panel_object.minimum_rad:.2f} to {panel_object.maximum_rad:.2f} rad",
+            hint=f"{wheel.minimum_rad:.2f} to {wheel.maximum_rad:.2f} rad",
         )
     where = InitialState(lambda seen: seen.angle_rad, what=f"the angle of {name}", current=current, verify=verify)
     tries = itertools.count()
 
     def stroke(attempt: Attempt) -> float:
-        grip_n = grip_force_n(panel_object, tries=next(tries))
+        grip_n = grip_force_n(wheel, tries=next(tries))
         angle_rad = where.known
         while abs(target_rad - angle_rad) > 0.3 * TOLERANCE_RAD:
             part = float(np.clip(target_rad - angle_rad, -LONGEST_RAD, LONGEST_RAD))
-            angle_rad = where.moved_to(angle_rad + _carry(attempt, panel_object, angle_rad, part, grip_n))
+            angle_rad = where.moved_to(angle_rad + _carry(attempt, wheel, angle_rad, part, grip_n))
         return angle_rad
 
     return perform(
@@ -93,46 +93,44 @@ def handwheel(
     )
 
 
-def grip_force_n(panel_object: Handwheel, *, tries: int = 0) -> float:
+def grip_force_n(wheel: Handwheel, *, tries: int = 0) -> float:
     """Force of each pad so that friction carries the wheel, 2 mu F r = torque; firmer after each try that slipped."""
-    needed = panel_object.torque_nm / (2.0 * FRICTION * panel_object.radius_m)
+    needed = wheel.torque_nm / (2.0 * FRICTION * wheel.radius_m)
     return float(np.clip(needed * FIRMER_RATIO**tries, GRIP_FLOOR_N, LARGEST_GRIP_N))
 
 
-def free_side_m(panel_object: Handwheel, finger_m: float) -> float:
+def free_side_m(wheel: Handwheel, finger_m: float) -> float:
     """Room on each side of the rim, such that a hand moved inwards meets the rim before its inner finger meets the hub.
 
     The outer finger meets the rim at radius R - side, the inner one the hub at hub + finger + rim + side.
     """
-    most = 0.5 * (panel_object.radius_m - panel_object.rim_m - HUB_M - finger_m - SPARE_M)
+    most = 0.5 * (wheel.radius_m - wheel.rim_m - HUB_M - finger_m - SPARE_M)
     return float(np.clip(most, 0.003, SIDE_M))
 
 
-def _carry(attempt: Attempt, panel_object: Handwheel, angle_rad: float, span_rad: float, grip_n: float) -> float:
+def _carry(attempt: Attempt, wheel: Handwheel, angle_rad: float, span_rad: float, grip_n: float) -> float:
     """One hold and turn; returns the signed angle by which the wheel turned."""
     context, sign = attempt.context, float(np.sign(span_rad))
-    side_m = free_side_m(panel_object, context.hand.finger_thickness_m)
-    open_m = 2.0 * (panel_object.rim_m + side_m)
-    gap = np.pi / panel_object.spokes
-    between = [angle_rad + (2 * k + 1) * gap for k in range(panel_object.spokes)]
-    ways = [_way(panel_object, place, span_rad, flip) for place in between for flip in (0.0, np.pi)]
-    way = attempt.begin(ways, may_touch=(panel_object.name,), width_m=open_m, name=panel_object.name)
-    down = attempt.advance(STANDOFF_M + panel_object.rim_m + TIP_DEPTH_M, name="approach")
+    side_m = free_side_m(wheel, context.hand.finger_thickness_m)
+    open_m = 2.0 * (wheel.rim_m + side_m)
+    gap = np.pi / wheel.spokes
+    between = [angle_rad + (2 * k + 1) * gap for k in range(wheel.spokes)]
+    ways = [_way(wheel, place, span_rad, flip) for place in between for flip in (0.0, np.pi)]
+    way = attempt.begin(ways, may_touch=(wheel.name,), width_m=open_m, name=wheel.name)
+    down = attempt.advance(STANDOFF_M + wheel.rim_m + TIP_DEPTH_M, name="approach")
     if down.tripped is not None:
         raise SkillFailure(Outcome.MISSED, "a finger landed on the wheel")
     centre_between(attempt, room_m=2.0 * side_m, what="rim")
-    hub = _hub(attempt, panel_object, between[way // 2])
+    hub = _hub(attempt, wheel, between[way // 2])
     width = attempt.grasp(grip_n, name="hold the rim")
-    if width < panel_object.rim_m:
+    if width < wheel.rim_m:
         raise SkillFailure(Outcome.MISSED, f"the fingers closed to {1e3 * width:.1f} mm; no rim between them")
     start = attempt.pose()
     axis = context.panel_pose.rotation.apply([0.0, 0.0, -1.0])  # clockwise seen from the front
-    stop_n = min(LARGEST_STOP_N, EFFORT_SPREAD * panel_object.torque_nm / panel_object.radius_m + EFFORT_FLOOR_N)
+    stop_n = min(LARGEST_STOP_N, EFFORT_SPREAD * wheel.torque_nm / wheel.radius_m + EFFORT_FLOOR_N)
     against = against_turn(start, hub, sign * axis)
     guard = Guard(name="effort", quantity=Quantity.FORCE, limit=stop_n, axis=against)
-    lag = panel_object.torque_nm / (
-        2.0 * context.hand.pad_stiffness_n_per_m * panel_object.radius_m**2
-    )  # what both pads give
+    lag = wheel.torque_nm / (2.0 * context.hand.pad_stiffness_n_per_m * wheel.radius_m**2)  # what both pads give
     poses = arc(start, centre_m=hub, axis=axis, angle_rad=span_rad + sign * lag)
     report = attempt.along(poses, name="turn", speed_m_per_s=TURN_M_PER_S, guards=(guard,), compliance=RADIAL)
     turned = sign * float(np.linalg.norm((report.base_from_tool.rotation * start.rotation.inv()).as_rotvec()))
@@ -140,27 +138,27 @@ def _carry(attempt: Attempt, panel_object: Handwheel, angle_rad: float, span_rad
         outcome = Outcome.STIFF if abs(turned) < 0.2 else Outcome.STALLED
         raise SkillFailure(outcome, f"it did not give way at {report.peak_force_n:.0f} N", reached=angle_rad + turned)
     attempt.open_to(open_m, name="let go")
-    attempt.leave(STANDOFF_M + panel_object.rim_m + TIP_DEPTH_M)
+    attempt.leave(STANDOFF_M + wheel.rim_m + TIP_DEPTH_M)
     return turned - sign * lag
 
 
-def _hub(attempt: Attempt, panel_object: Handwheel, place_rad: float) -> Array:
+def _hub(attempt: Attempt, wheel: Handwheel, place_rad: float) -> Array:
     """The hub in the base frame: the panel's pose, moved along the radius by what the fingers found of the rim."""
     panel = attempt.context.panel_pose
     tool = (panel.inv() * attempt.pose()).translation
     radial = np.array([np.sin(place_rad), np.cos(place_rad), 0.0])
-    offset = (tool - np.array(panel_object.point_m)) @ radial - panel_object.radius_m
-    return np.asarray(panel.apply(np.array(panel_object.point_m) + offset * radial + [0.0, 0.0, tool[2]]))
+    offset = (tool - np.array(wheel.point_m)) @ radial - wheel.radius_m
+    return np.asarray(panel.apply(np.array(wheel.point_m) + offset * radial + [0.0, 0.0, tool[2]]))
 
 
-def _way(panel_object: Handwheel, start_rad: float, span_rad: float, flip: float) -> list[RigidTransform]:
+def _way(wheel: Handwheel, start_rad: float, span_rad: float, flip: float) -> list[RigidTransform]:
     """Grip poses with the closing direction along the radius, from the standoff round the turn."""
 
     def at(angle: float, z: float) -> RigidTransform:
-        x, y = panel_object.position_m
-        point = (x + panel_object.radius_m * np.sin(angle), y + panel_object.radius_m * np.cos(angle), z)
+        x, y = wheel.position_m
+        point = (x + wheel.radius_m * np.sin(angle), y + wheel.radius_m * np.cos(angle), z)
         return panel_from_grip(point, np.pi / 2 - angle + flip)  # the radius points at pi/2 - angle from the panel's x
 
-    low = panel_object.height_m - panel_object.rim_m - TIP_DEPTH_M
+    low = wheel.height_m - wheel.rim_m - TIP_DEPTH_M
     steps = np.linspace(start_rad, start_rad + span_rad, max(6, int(abs(span_rad) / 0.08)))
-    return [at(start_rad, panel_object.height_m + STANDOFF_M), *(at(float(a), low) for a in steps)]
+    return [at(start_rad, wheel.height_m + STANDOFF_M), *(at(float(a), low) for a in steps)]

@@ -15,7 +15,7 @@ from manipulation.planning.cartesian_path import arc
 from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import against_turn, centre_between
 from manipulation.skills.context import SkillContext, panel_from_grip
-from manipulation.skills.initial_state import InitialState, object_of_kind
+from manipulation.skills.initial_state import InitialState
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.perform import perform
 
@@ -59,22 +59,28 @@ class _Turn:
 
 
 def lever(
-    context: SkillContext, name: str, target: str, *, current: ObjectState | None = None, verify: Verify | None = None
+    context: SkillContext,
+    valve: Lever,
+    target: str,
+    *,
+    current: ObjectState | None = None,
+    verify: Verify | None = None,
 ) -> SkillReport:
     """Turn the lever to a state of the panel file.
 
-    Args:
-        current: what the last look said; with an angle the fingers come down where the bar is. Without it `verify`
-        is asked. verify: the caller's second look.
+    The mechanical estimate in the report is the angle reached, rad clockwise from up.
 
-    The mechanical estimate is the angle reached, rad clockwise from up.
+    Args:
+        current: what the last look showed; the fingers come down where its angle has the bar. Without it `verify` is
+            asked.
+        verify: the caller's second look.
 
     Raises:
-        InvalidRequest: not a lever, no such state, or nobody knows where the bar is.
+        InvalidRequest: the lever has no such state, or nobody knows where the bar is.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    panel_object = object_of_kind(context, name, Lever, "lever")
-    angles = {state.name: state.angle_rad for state in panel_object.states}
+    name = valve.name
+    angles = {state.name: state.angle_rad for state in valve.states}
     if target not in angles:
         raise InvalidRequest(f"{name} has no state {target!r}", hint=f"states: {', '.join(angles)}")
     goal = angles[target]
@@ -86,7 +92,7 @@ def lever(
         turn = _Turn(start_rad=where.known, goal_rad=goal)
         if abs(turn.span_rad) < np.radians(2.0):
             return turn.start_rad
-        return _turn_lever(attempt, panel_object, turn)
+        return _turn_lever(attempt, valve, turn)
 
     return perform(
         context,
@@ -111,47 +117,47 @@ def _is_at(seen: ObjectState, target: str, goal_rad: float) -> bool:
     return seen.state == target
 
 
-def _turn_lever(attempt: Attempt, panel_object: Lever, turn: _Turn) -> float:
+def _turn_lever(attempt: Attempt, valve: Lever, turn: _Turn) -> float:
     """One stroke; returns the angle reached by the bar, as the tool tells it."""
-    open_m = panel_object.width_m + 2.0 * APPROACH_SIDE_M
-    radius = panel_object.length_m - FROM_END_M
-    ways = [_way(panel_object, turn, radius, flip) for flip in (0.0, np.pi)]
-    attempt.begin(ways, may_touch=(panel_object.name,), width_m=open_m, name=panel_object.name)
+    open_m = valve.width_m + 2.0 * APPROACH_SIDE_M
+    radius = valve.length_m - FROM_END_M
+    ways = [_way(valve, turn, radius, flip) for flip in (0.0, np.pi)]
+    attempt.begin(ways, may_touch=(valve.name,), width_m=open_m, name=valve.name)
     down = attempt.advance(STANDOFF_M + OVERLAP_M, name="approach")
     if down.tripped is not None:
         raise SkillFailure(Outcome.MISSED, "a finger landed on the bar")
     centre_between(attempt, room_m=2.0 * APPROACH_SIDE_M, what="bar")
-    hub = _hub(attempt, panel_object, turn.start_rad)
-    attempt.open_to(panel_object.width_m + 2.0 * CAGE_SIDE_M, name="cage")
-    turned = _carry(attempt, panel_object, turn, hub)
+    hub = _hub(attempt, valve, turn.start_rad)
+    attempt.open_to(valve.width_m + 2.0 * CAGE_SIDE_M, name="cage")
+    turned = _carry(attempt, valve, turn, hub)
     attempt.open_to(open_m, name="let go")
     attempt.leave(STANDOFF_M + OVERLAP_M)
     return turn.start_rad + turned
 
 
-def _way(panel_object: Lever, turn: _Turn, radius: float, flip: float) -> list[RigidTransform]:
+def _way(valve: Lever, turn: _Turn, radius: float, flip: float) -> list[RigidTransform]:
     """Standoff, down, and round: grip poses in the panel frame with the closing direction across the bar."""
 
     def at(angle: float, z: float) -> RigidTransform:
-        x, y = panel_object.position_m
+        x, y = valve.position_m
         return panel_from_grip((x + radius * np.sin(angle), y + radius * np.cos(angle), z), flip - angle)
 
-    low = panel_object.height_m - OVERLAP_M
+    low = valve.height_m - OVERLAP_M
     over = OVERTRAVEL_RAD * np.sign(turn.span_rad)
     steps = np.linspace(turn.start_rad, turn.goal_rad + over, max(8, int(abs(turn.span_rad) / 0.05)))
-    return [at(turn.start_rad, panel_object.height_m + STANDOFF_M), *(at(float(a), low) for a in steps)]
+    return [at(turn.start_rad, valve.height_m + STANDOFF_M), *(at(float(a), low) for a in steps)]
 
 
-def _hub(attempt: Attempt, panel_object: Lever, angle_rad: float) -> Array:
+def _hub(attempt: Attempt, valve: Lever, angle_rad: float) -> Array:
     """The hub in the base frame: where the panel's pose says, moved across the bar by what the fingers found."""
     panel = attempt.context.panel_pose
     tool = (panel.inv() * attempt.pose()).translation
     across = np.array([np.cos(angle_rad), -np.sin(angle_rad), 0.0])
-    offset = (tool - np.array(panel_object.point_m)) @ across
-    return np.asarray(panel.apply(np.array(panel_object.point_m) + offset * across + [0.0, 0.0, tool[2]]))
+    offset = (tool - np.array(valve.point_m)) @ across
+    return np.asarray(panel.apply(np.array(valve.point_m) + offset * across + [0.0, 0.0, tool[2]]))
 
 
-def _carry(attempt: Attempt, panel_object: Lever, turn: _Turn, hub: Array) -> float:
+def _carry(attempt: Attempt, valve: Lever, turn: _Turn, hub: Array) -> float:
     """The stroke in two parts: fast to 9 degrees before the end, then slowly onto the end stop.
 
     Returns the signed angle by which the bar turned: that of the tool less the play of the cage and the give of the
@@ -160,8 +166,8 @@ def _carry(attempt: Attempt, panel_object: Lever, turn: _Turn, hub: Array) -> fl
     context, span_rad = attempt.context, turn.span_rad
     sign = float(np.sign(span_rad))
     axis = context.panel_pose.rotation.apply([0.0, 0.0, -1.0])  # clockwise seen from the front
-    radius = panel_object.length_m - FROM_END_M
-    stop_n = min(LARGEST_STOP_N, EFFORT_SPREAD * panel_object.torque_nm / radius + EFFORT_FLOOR_N)
+    radius = valve.length_m - FROM_END_M
+    stop_n = min(LARGEST_STOP_N, EFFORT_SPREAD * valve.torque_nm / radius + EFFORT_FLOOR_N)
     start = attempt.pose()
     against = against_turn(start, hub, sign * axis)
     strong = Guard(name="effort", quantity=Quantity.FORCE, limit=stop_n, axis=against)

@@ -12,7 +12,7 @@ from manipulation.planning.cartesian_path import arc
 from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import centre_between
 from manipulation.skills.context import SkillContext, panel_from_grip
-from manipulation.skills.initial_state import InitialState, object_of_kind
+from manipulation.skills.initial_state import InitialState
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.perform import perform
 
@@ -35,21 +35,27 @@ YIELDING = Compliance(
 
 
 def rotary(
-    context: SkillContext, name: str, target: str, *, current: ObjectState | None = None, verify: Verify | None = None
+    context: SkillContext,
+    selector: Rotary,
+    target: str,
+    *,
+    current: ObjectState | None = None,
+    verify: Verify | None = None,
 ) -> SkillReport:
     """Turn the selector to a state of the panel file.
 
-    Args:
-        current: what the last look said (angle or state); without it `verify` is asked.
+    The mechanical estimate in the report is the angle reached, rad clockwise from up.
 
-    The mechanical estimate is the angle reached, rad clockwise from up.
+    Args:
+        current: what the last look showed (angle or state); without it `verify` is asked.
+        verify: the caller's second look.
 
     Raises:
-        InvalidRequest: not a selector, no such state, or nobody knows where it points.
+        InvalidRequest: the selector has no such state, or nobody knows where it points.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    panel_object = object_of_kind(context, name, Rotary, "rotary selector")
-    angles = {state.name: state.angle_rad for state in panel_object.states}
+    name = selector.name
+    angles = {state.name: state.angle_rad for state in selector.states}
     if target not in angles:
         raise InvalidRequest(f"{name} has no state {target!r}", hint=f"states: {', '.join(angles)}")
     where = InitialState(
@@ -57,7 +63,7 @@ def rotary(
     )
     return perform(
         context,
-        lambda attempt: _turn(attempt, panel_object, where.known, angles[target]),
+        lambda attempt: _turn(attempt, selector, where.known, angles[target]),
         skill="rotary",
         object_name=name,
         target=target,
@@ -79,18 +85,18 @@ def _is_at(seen: ObjectState, target: str, angle_rad: float) -> bool:
     return seen.angle_rad is not None and abs(seen.angle_rad - angle_rad) <= TOLERANCE_RAD
 
 
-def _turn(attempt: Attempt, panel_object: Rotary, start_rad: float, goal_rad: float) -> float:
+def _turn(attempt: Attempt, selector: Rotary, start_rad: float, goal_rad: float) -> float:
     context = attempt.context
-    bar_m = BAR_RATIO * panel_object.radius_m
+    bar_m = BAR_RATIO * selector.radius_m
     open_m = bar_m + 2.0 * SIDE_M
-    seat = panel_object.height_m / 2  # the shoulder under the bar
-    ways = [_way(panel_object, start_rad, goal_rad, seat, flip) for flip in (0.0, np.pi)]
-    attempt.begin(ways, may_touch=(panel_object.name,), width_m=open_m, name=panel_object.name)
+    seat = selector.height_m / 2  # the shoulder under the bar
+    ways = [_way(selector, start_rad, goal_rad, seat, flip) for flip in (0.0, np.pi)]
+    attempt.begin(ways, may_touch=(selector.name,), width_m=open_m, name=selector.name)
     down = attempt.advance(
-        STANDOFF_M + panel_object.height_m - seat + 0.004, name="approach", speed_m_per_s=0.04, stop_n=SEAT_N
+        STANDOFF_M + selector.height_m - seat + 0.004, name="approach", speed_m_per_s=0.04, stop_n=SEAT_N
     )
     height = float((context.panel_pose.inv() * attempt.pose()).translation[2])
-    if down.tripped is not None and height > panel_object.height_m - 0.002:
+    if down.tripped is not None and height > selector.height_m - 0.002:
         raise SkillFailure(Outcome.MISSED, "a finger landed on the bar")
     if down.tripped is not None:
         attempt.advance(-LIFT_M, name="lift off the shoulder", speed_m_per_s=0.03)
@@ -106,15 +112,15 @@ def _turn(attempt: Attempt, panel_object: Rotary, start_rad: float, goal_rad: fl
     report = attempt.along(poses, name="turn", speed_m_per_s=TURN_M_PER_S, guards=(guard,), compliance=YIELDING)
     turned = float(np.linalg.norm((report.base_from_tool.rotation * start.rotation.inv()).as_rotvec()))
     attempt.open_to(open_m, name="let go")
-    attempt.leave(STANDOFF_M + panel_object.height_m - seat)
+    attempt.leave(STANDOFF_M + selector.height_m - seat)
     reached = start_rad + float(np.sign(goal_rad - start_rad)) * turned
     if report.tripped is not None:
         raise SkillFailure(Outcome.STALLED, f"it stopped against {report.peak_force_n:.0f} N", reached=reached)
     return reached
 
 
-def _way(panel_object: Rotary, start_rad: float, goal_rad: float, seat_m: float, flip: float) -> list[RigidTransform]:
-    x, y = panel_object.position_m
+def _way(selector: Rotary, start_rad: float, goal_rad: float, seat_m: float, flip: float) -> list[RigidTransform]:
+    x, y = selector.position_m
     steps = np.linspace(start_rad, goal_rad, max(3, int(abs(goal_rad - start_rad) / 0.1)))
     down = [panel_from_grip((x, y, seat_m + LIFT_M), flip - float(a)) for a in steps]
-    return [panel_from_grip((x, y, panel_object.height_m + STANDOFF_M), flip - start_rad), *down]
+    return [panel_from_grip((x, y, selector.height_m + STANDOFF_M), flip - start_rad), *down]

@@ -14,7 +14,7 @@ from manipulation.planning.cartesian_path import shifted
 from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import force_at_rest_n, meet
 from manipulation.skills.context import SkillContext, panel_from_grip
-from manipulation.skills.initial_state import InitialState, object_of_kind
+from manipulation.skills.initial_state import InitialState
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
 from manipulation.skills.perform import perform
 
@@ -42,40 +42,39 @@ class _Push:
 
 def slider(
     context: SkillContext,
-    name: str,
+    fader: Slider,
     target: float,
     *,
     current: ObjectState | None = None,
     verify: Verify | None = None,
-    tolerance: float | None = None,
 ) -> SkillReport:
     """Push the slider to a value of its scale.
 
     The distance to push is the difference of two values and the cap's face is found by touch, so an error of the
     panel's pose does not enter the result.
 
-    Args:
-        current: what the last look said; without it `verify` is asked first.
-        tolerance: in units of the scale; 2 % of its span by default.
+    The mechanical estimate in the report is the value reached.
 
-    The mechanical estimate is the value reached.
+    Args:
+        current: what the last look showed; without it `verify` is asked first.
+        verify: the caller's second look.
 
     Raises:
-        InvalidRequest: not a slider, a value off its scale, or nobody knows where the cap is.
+        InvalidRequest: the value is off the scale, or nobody knows where the cap is.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    panel_object = object_of_kind(context, name, Slider, "slider")
-    scale = panel_object.scale
+    name = fader.name
+    scale = fader.scale
     if not scale.minimum <= target <= scale.maximum:
         raise InvalidRequest(
             f"{target} {scale.unit} is off the scale of {name}", hint=f"{scale.minimum} to {scale.maximum} {scale.unit}"
         )
     where = InitialState(lambda seen: seen.value, what=f"the value of {name}", current=current, verify=verify)
-    allowed = tolerance if tolerance is not None else TOLERANCE_RATIO * (scale.maximum - scale.minimum)
+    allowed = TOLERANCE_RATIO * (scale.maximum - scale.minimum)
 
     def stroke(attempt: Attempt) -> float:
         push = _Push(start_m=scale.place_of(where.known), goal_m=scale.place_of(target))
-        return where.moved_to(scale.value_at(push.start_m + _push(attempt, panel_object, push)))
+        return where.moved_to(scale.value_at(push.start_m + _push(attempt, fader, push)))
 
     return perform(
         context,
@@ -88,23 +87,21 @@ def slider(
     )
 
 
-def _push(attempt: Attempt, panel_object: Slider, push: _Push) -> float:
+def _push(attempt: Attempt, fader: Slider, push: _Push) -> float:
     """One push; returns how far the cap moved along the track, m, signed."""
     context = attempt.context
     half_x, half_y = context.hand.closed_half_m
     turns = ((0.0, half_x), (np.pi, half_x), (np.pi / 2, half_y), (-np.pi / 2, half_y))
-    ways = [_way(panel_object, push, turn, half) for turn, half in turns]
-    attempt.begin(ways, may_touch=(panel_object.name,), width_m=0.0, name=panel_object.name)
-    top = panel_object.cap_size_m[2]
+    ways = [_way(fader, push, turn, half) for turn, half in turns]
+    attempt.begin(ways, may_touch=(fader.name,), width_m=0.0, name=fader.name)
+    top = fader.cap_size_m[2]
     down = attempt.advance(STANDOFF_M + top - TIP_HEIGHT_M, name="approach")
     if down.tripped is not None:
         height = (context.panel_pose.inv() * attempt.pose()).translation[2]
         if height > 0.6 * top:
             raise SkillFailure(Outcome.MISSED, "the fingertip landed on the cap")
         attempt.advance(-0.002, name="lift off the plate", speed_m_per_s=0.03)
-    ahead = push.sign * context.panel_pose.rotation.apply(
-        [np.cos(panel_object.angle_rad), np.sin(panel_object.angle_rad), 0.0]
-    )
+    ahead = push.sign * context.panel_pose.rotation.apply([np.cos(fader.angle_rad), np.sin(fader.angle_rad), 0.0])
     begun = attempt.pose().translation
     met = meet(
         attempt,
@@ -119,24 +116,24 @@ def _push(attempt: Attempt, panel_object: Slider, push: _Push) -> float:
     face = float(met.way_m - (attempt.pose().translation - begun) @ ahead)  # from here back to the face, not positive
     length = abs(push.goal_m - push.start_m)
     start = attempt.pose().translation
-    _go(attempt, panel_object, ahead, max(0.0, length + face - SHORT_M), "push")
+    _go(attempt, fader, ahead, max(0.0, length + face - SHORT_M), "push")
     give = _give_m(attempt, ahead)
     so_far = float((attempt.pose().translation - start) @ ahead)
-    _go(attempt, panel_object, ahead, max(0.0, length + face + give - so_far), "push to the end")
+    _go(attempt, fader, ahead, max(0.0, length + face + give - so_far), "push to the end")
     moved = float((attempt.pose().translation - start) @ ahead) - face - _give_m(attempt, ahead)
-    _go(attempt, panel_object, -ahead, 0.004, "let go")
+    _go(attempt, fader, -ahead, 0.004, "let go")
     attempt.leave()
     return push.sign * moved
 
 
-def _way(panel_object: Slider, push: _Push, turn: float, half: float) -> list[RigidTransform]:
-    along = np.array([np.cos(panel_object.angle_rad), np.sin(panel_object.angle_rad)])
-    beside = panel_object.cap_size_m[0] / 2 + half + SIDE_M
-    middle = np.array(panel_object.position_m)
+def _way(fader: Slider, push: _Push, turn: float, half: float) -> list[RigidTransform]:
+    along = np.array([np.cos(fader.angle_rad), np.sin(fader.angle_rad)])
+    beside = fader.cap_size_m[0] / 2 + half + SIDE_M
+    middle = np.array(fader.position_m)
     start = middle + (push.start_m - push.sign * beside) * along
     end = middle + (push.goal_m - push.sign * (beside - SIDE_M)) * along
-    top = panel_object.cap_size_m[2]
-    angle = panel_object.angle_rad + turn
+    top = fader.cap_size_m[2]
+    angle = fader.angle_rad + turn
     return [
         panel_from_grip((*start, top + STANDOFF_M), angle),
         panel_from_grip((*start, TIP_HEIGHT_M), angle),
@@ -150,10 +147,10 @@ def _moved(attempt: Attempt, way_m: np.ndarray) -> RigidTransform:
     return shifted(pose, pose.rotation.inv().apply(way_m))
 
 
-def _go(attempt: Attempt, panel_object: Slider, ahead: np.ndarray, distance_m: float, name: str) -> None:
+def _go(attempt: Attempt, fader: Slider, ahead: np.ndarray, distance_m: float, name: str) -> None:
     if distance_m < 1e-4:
         return
-    limit = 3.0 * panel_object.friction_n + 15.0
+    limit = 3.0 * fader.friction_n + 15.0
     guard = Guard(name="effort", quantity=Quantity.FORCE, limit=limit)
     report = attempt.straight(
         _moved(attempt, distance_m * ahead), name=name, speed_m_per_s=PUSH_M_PER_S, guards=(guard,)

@@ -13,7 +13,6 @@ from manipulation.planning.cartesian_path import shifted
 from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import SOFT_PUSH
 from manipulation.skills.context import SkillContext, panel_from_grip
-from manipulation.skills.initial_state import object_of_kind
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.perform import perform
 
@@ -27,21 +26,26 @@ END_N = 4.0  # above what the detent needs: the bat stands on its stop
 
 
 def toggle(
-    context: SkillContext, name: str, target: str, *, current: ObjectState | None = None, verify: Verify | None = None
+    context: SkillContext,
+    switch: Toggle,
+    target: str,
+    *,
+    current: ObjectState | None = None,
+    verify: Verify | None = None,
 ) -> SkillReport:
     """Throw the toggle to `on` (up) or `off` (down); one that stands there already is only looked at.
 
+    The mechanical estimate in the report is how far past the pivot the fingertip's face came, m; more than 0 has thrown
+    the toggle.
+
     Args:
-        current: what the last look said.
+        current: what the last look showed.
         verify: the caller's second look.
 
-    The mechanical estimate is how far past the pivot the fingertip's face came, in metres; more than 0 has thrown it.
-
     Raises:
-        InvalidRequest: not a toggle, or no such state.
+        InvalidRequest: a toggle has no such state.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    panel_object = object_of_kind(context, name, Toggle, "toggle")
     if target not in ("on", "off"):
         raise InvalidRequest(f"a toggle has no state {target!r}", hint="on (up) or off (down)")
     up = 1.0 if target == "on" else -1.0
@@ -51,28 +55,28 @@ def toggle(
         is_said_there = current is not None and current.state == target and next(tries) == 0
         if is_said_there and verify is not None and (seen := verify()) is not None and seen.state == target:
             return None
-        return _throw(attempt, panel_object, up)
+        return _throw(attempt, switch, up)
 
     return perform(
         context,
         stroke,
         skill="toggle",
-        object_name=name,
+        object_name=switch.name,
         target=target,
         is_reached=lambda seen: seen.state == target,
         verify=verify,
     )
 
 
-def _throw(attempt: Attempt, panel_object: Toggle, up: float) -> float:
+def _throw(attempt: Attempt, switch: Toggle, up: float) -> float:
     """Come down beside the bat and sweep it over, `up` 1 or -1; returns how far past the pivot the face came, m."""
     half = max(attempt.context.hand.closed_half_m)
     # The bat leans away from the target; come down beyond it.
-    lean = panel_object.bat_length_m * np.sin(panel_object.tilt_rad) + panel_object.bat_radius_m
-    y = panel_object.position_m[1]
+    lean = switch.bat_length_m * np.sin(switch.tilt_rad) + switch.bat_radius_m
+    y = switch.position_m[1]
     start, end = y - up * (lean + half + SIDE_M), y + up * (BEYOND_M - half)
-    _come_down(attempt, panel_object, start, end)
-    stop_n = stop_force_n(panel_object)
+    _come_down(attempt, switch, start, end)
+    stop_n = stop_force_n(switch)
     moved = _sweep(attempt, end - start, stop_n)
     past = float(moved - (abs(end - start) - BEYOND_M))
     if past < -0.004:
@@ -81,21 +85,21 @@ def _throw(attempt: Attempt, panel_object: Toggle, up: float) -> float:
     return past
 
 
-def stop_force_n(panel_object: Toggle) -> float:
+def stop_force_n(switch: Toggle) -> float:
     """Force that tells the bat stands on its stop, N: its own effort acts at its tip, the fingertip pushes lower down."""
-    return EFFORT_SPREAD * panel_object.force_n / GRIP_RATIO + END_N
+    return EFFORT_SPREAD * switch.force_n / GRIP_RATIO + END_N
 
 
-def _come_down(attempt: Attempt, panel_object: Toggle, start_m: float, end_m: float) -> None:
+def _come_down(attempt: Attempt, switch: Toggle, start_m: float, end_m: float) -> None:
     """The fingertip beside the bat, at panel height `start_m`, from where the sweep to `end_m` is free."""
-    reach = PIVOT_M + GRIP_RATIO * panel_object.bat_length_m
-    x, above = panel_object.position_m[0], reach + panel_object.bat_length_m + STANDOFF_M
+    reach = PIVOT_M + GRIP_RATIO * switch.bat_length_m
+    x, above = switch.position_m[0], reach + switch.bat_length_m + STANDOFF_M
     ways = [
         [panel_from_grip(point, turn) for point in ((x, start_m, above), (x, start_m, reach), (x, end_m, reach))]
         for turn in (0.0, np.pi, np.pi / 2, -np.pi / 2)
     ]
-    attempt.begin(ways, may_touch=(panel_object.name,), width_m=0.0, name=panel_object.name)
-    down = attempt.advance(panel_object.bat_length_m + STANDOFF_M, name="approach")
+    attempt.begin(ways, may_touch=(switch.name,), width_m=0.0, name=switch.name)
+    down = attempt.advance(switch.bat_length_m + STANDOFF_M, name="approach")
     if down.tripped is None:
         return
     left_m = float((attempt.context.panel_pose.inv() * attempt.pose()).translation[2]) - reach

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from hal.errors import PerceptionError, Unreachable
-from hal.panel import Button, Handwheel, Lever, Mushroom, PanelObject, Rotary, Slider, Toggle
-from manipulation import ObjectState, SkillReport, Verify, button, handwheel, lever, mushroom, rotary, slider, toggle
+from hal.panel import Button, Handwheel, Lever, PanelObject, Rotary
+from manipulation import ObjectState, SkillReport, Verify, operate
 from perception.vision import ObjectReading, said
 from service.operations.inspect import ensure_located, look_close, look_past
 from service.operations.requests import ActionBody, ManipulateRequest
 from service.operations.session import Session
-from service.operations.targets import target_of, unworkable
+from service.operations.targets import target_of
 from service.operations.travel import skill_context
 from service.report.plots import png_of
 from service.report.record import Action, Picture
@@ -40,13 +40,14 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
     target = target_of(panel_object, body)
     eye = _Eye(session, panel_object, verify)
     before = eye.before()
-    report = _perform(session, panel_object, target, eye, before)
+    current = None if before is None else state_of(before, eye.witness)
+    report = operate(skill_context(session), panel_object, target, current=current, verify=eye.verify())
     reached = report.is_done
     return Deed(
         action=Action(
             object=panel_object.name,
             skill=report.skill,
-            target=target,
+            target=target if isinstance(target, str) else f"{target:g}",
             outcome=str(report.outcome),
             detail="" if reached else report.cause,
             before="not read" if before is None else said(before),
@@ -79,7 +80,7 @@ class _Eye:
 
     def __init__(self, session: Session, panel_object: PanelObject, is_open: bool) -> None:
         self._session = session
-        self._thing = panel_object
+        self._panel_object = panel_object
         self._is_open = is_open
         self.witness = _witness(session, panel_object)
         self.last: ObjectReading | None = None
@@ -98,7 +99,7 @@ class _Eye:
 
     def _verify(self) -> ObjectState | None:
         self._session.world.forget_reading(self.witness.name)
-        self._session.world.forget_reading(self._thing.name)
+        self._session.world.forget_reading(self._panel_object.name)
         self.last = self._look()
         return None if self.last is None else state_of(self.last, self.witness)
 
@@ -109,7 +110,7 @@ class _Eye:
         except (PerceptionError, Unreachable):
             return None  # "cannot tell" is an answer; the outcome will be `unverified`
         self.picture = Picture(
-            name=f"after-{self._thing.name}",
+            name=f"after-{self._panel_object.name}",
             title=f"second look at {self.witness.name}",
             png=png_of(found.pictures[-1].pixels),
         )
@@ -124,29 +125,6 @@ def state_of(reading: ObjectReading, panel_object: PanelObject) -> ObjectState:
         angle_rad = next((s.angle_rad for s in panel_object.states if s.name == reading.state), None)
     sigma = 0.0 if reading.uncertainty is None else reading.uncertainty
     return ObjectState(name=reading.name, state=reading.state, value=reading.value, angle_rad=angle_rad, sigma=sigma)
-
-
-def _perform(
-    session: Session, panel_object: PanelObject, target: str, eye: _Eye, before: ObjectReading | None
-) -> SkillReport:
-    context, verify = skill_context(session), eye.verify()
-    current = None if before is None else state_of(before, eye.witness)
-    match panel_object:
-        case Lever():
-            return lever(context, panel_object.name, target, current=current, verify=verify)
-        case Slider():
-            return slider(context, panel_object.name, float(target), current=current, verify=verify)
-        case Toggle():
-            return toggle(context, panel_object.name, target, current=current, verify=verify)
-        case Rotary():
-            return rotary(context, panel_object.name, target, current=current, verify=verify)
-        case Handwheel():
-            return handwheel(context, panel_object.name, float(target), current=current, verify=verify)
-        case Mushroom():
-            return mushroom(context, panel_object.name, verify=verify)
-        case Button():
-            return button(context, panel_object.name, expected=target, current=current, verify=verify)
-    raise unworkable(panel_object)
 
 
 def _witness(session: Session, panel_object: PanelObject) -> PanelObject:

@@ -8,8 +8,8 @@ from hal.panel import Button, Handwheel, Lever, Mushroom, PanelObject, Rotary, S
 from service.operations.requests import ActionBody, InspectRequest, ManipulateRequest, MissionRequest, RecogniseRequest
 
 
-def target_of(panel_object: PanelObject, body: ActionBody) -> str:
-    """What shall be reached, as text; the usual deed of its kind when nothing is asked.
+def target_of(panel_object: PanelObject, body: ActionBody) -> str | float:
+    """The state or number that shall be reached; the usual one of its kind when nothing is asked.
 
     Raises:
         InvalidRequest: the object cannot be worked, or has no such state or value.
@@ -81,13 +81,13 @@ def _only(panel_object: PanelObject, body: ActionBody, key: str) -> None:
             )
 
 
-def _number(panel_object: PanelObject, asked: float | None, low: float, high: float, unit: str, key: str) -> str:
+def _number(panel_object: PanelObject, asked: float | None, low: float, high: float, unit: str, key: str) -> float:
     if asked is None or not low <= asked <= high:
         raise InvalidRequest(
             f"{panel_object.name} needs {key} from {low:g} to {high:g} {unit}".rstrip(),
             hint=f"send {{'object': '{panel_object.name}', '{key}': ...}}",
         )
-    return f"{asked:g}"
+    return asked
 
 
 def _one_of(panel_object: PanelObject, state: str | None, states: tuple[str, ...]) -> str:

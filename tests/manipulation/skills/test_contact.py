@@ -12,16 +12,16 @@ from hypothesis import strategies as st
 from hal.errors import Cancelled, DeviceFault, InvalidRequest, Stopped
 from hal.geometry import certain, transform_rpy
 from hal.motion import DeclaredMotion, Hold, MotionLog, MotionOutcome, MotionReport, RobotState
+from hal.panel import Lamp
 from manipulation.arm.kinematics import Kinematics
 from manipulation.planning.time_parameterization import SpeedLimits
 from manipulation.skills.attempt import Attempt
 from manipulation.skills.contact import onset
 from manipulation.skills.context import SkillContext
-from manipulation.skills.lever import lever
+from manipulation.skills.operate import operate
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, surely_within, wrapped
 from manipulation.skills.perform import perform
 from manipulation.skills.probe import contact_of
-from manipulation.skills.slider import slider
 from tests.manipulation.arms import T3
 from tests.manipulation.planning.test_collision import make_panel
 from tests.manipulation.rig import HOME
@@ -188,15 +188,15 @@ def test_what_ends_a_motion_decides_what_is_raised(answer: MotionReport, error: 
 def test_a_deed_without_knowledge_of_the_object_is_refused_before_anything_moves() -> None:
     work = context(COMPLETED)
     with pytest.raises(InvalidRequest, match="not known"):
-        lever(work, "valve", "closed")
+        operate(work, work.panel.object("valve"), "closed")
     with pytest.raises(InvalidRequest, match="not known"):
-        slider(work, "fader", 0.5)
+        operate(work, work.panel.object("fader"), 0.5)
     with pytest.raises(InvalidRequest, match="no state"):
-        lever(work, "valve", "ajar")
+        operate(work, work.panel.object("valve"), "ajar")
     with pytest.raises(InvalidRequest, match="off the scale"):
-        slider(work, "fader", 7.0)
-    with pytest.raises(InvalidRequest, match="not a lever"):
-        lever(work, "fader", "closed")
+        operate(work, work.panel.object("fader"), 7.0)
+    with pytest.raises(InvalidRequest, match="cannot be worked"):
+        operate(work, Lamp(name="lit", position_m=(0.0, 0.0), radius_m=0.01), "on")
     assert work.mover.asked == []
 
 

@@ -14,7 +14,6 @@ from hal.simulated import Fault
 from manipulation.skills.outcome import Outcome
 from manipulation.skills.probe import touch_probe
 from manipulation.skills.retreat import park
-from manipulation.skills.toggle import toggle
 
 pytestmark = pytest.mark.slow
 
@@ -48,7 +47,7 @@ def test_a_skill_does_what_it_says(bench: SimBench, skill: str) -> None:
 
 def test_a_skill_without_a_look_claims_nothing(bench: SimBench) -> None:
     goal = "off" if bench.truth("pump").state == "on" else "on"
-    report = toggle(bench.context, "pump", goal)
+    report = bench.operate("pump", goal)
     assert report.outcome is Outcome.UNVERIFIED
     assert bench.truth("pump").state == goal
 
@@ -56,7 +55,7 @@ def test_a_skill_without_a_look_claims_nothing(bench: SimBench) -> None:
 def test_a_stop_in_the_middle_is_raised_and_the_arm_rests(bench: SimBench) -> None:
     bench.latched[0] = True
     with pytest.raises(Stopped):
-        toggle(bench.context, "pump", "on")
+        bench.operate("pump", "on")
     bench.latched[0] = False
     assert np.abs(bench.context.mover.state().velocity_rad_per_s).max() < 0.01
 
@@ -64,7 +63,7 @@ def test_a_stop_in_the_middle_is_raised_and_the_arm_rests(bench: SimBench) -> No
 def test_a_dead_wrist_sensor_ends_the_deed_with_its_name(bench: SimBench) -> None:
     bench.devices["wrist_ft"].inject_fault(Fault.SILENT)
     with pytest.raises(DeviceFault) as caught:
-        toggle(bench.context, "pump", "on")
+        bench.operate("pump", "on")
     bench.devices["wrist_ft"].inject_fault(None)
     assert caught.value.details["device"] == "wrist_ft"
     park(bench.context)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,12 +20,11 @@ from manipulation.skills.attempt import Attempt
 from manipulation.skills.button import button
 from manipulation.skills.context import SkillContext
 from manipulation.skills.handwheel import GRIP_FLOOR_N, LARGEST_GRIP_N, grip_force_n
-from manipulation.skills.lever import lever
+from manipulation.skills.operate import operate
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport
 from manipulation.skills.press import stop_force_n, travelled_m
 from manipulation.skills.probe import proximity_probe
 from manipulation.skills.retreat import PULLS, park, retreat
-from manipulation.skills.rotary import rotary
 from manipulation.skills.toggle import toggle
 from tests.manipulation.arms import T3
 from tests.manipulation.rig import HOME
@@ -69,6 +68,11 @@ def before_the_bench(answers: dict[str, MotionReport]) -> tuple[SkillContext, Na
     return context, mover
 
 
+def press(context: SkillContext, name: str, expected: str | None = None, **looks: Any) -> SkillReport:
+    """Press the button of that name."""
+    return button(context, context.panel.object(name), expected, **looks)
+
+
 def pressed(free_m: float, travel_m: float, force_n: float, *, tripped: bool = True) -> MotionReport:
     """A push down: free, then onto a cap that gives way by `travel_m` and pads that give way by the force."""
     deepest = free_m + travel_m + force_n / PAD_N_PER_M
@@ -100,14 +104,14 @@ def test_the_travel_of_a_cap_is_that_of_the_tip_under_force_less_what_the_pads_g
 )
 def test_a_button_says_how_its_press_ended(push: MotionReport, outcome: Outcome) -> None:
     context, _ = before_the_bench({"press": push})
-    told = button(context, "start", expected="on")
+    told = press(context, "start", "on")
     assert told.outcome is outcome
     assert told.reached == pytest.approx(travelled_m(push, PAD_N_PER_M))
 
 
 def test_a_button_whose_lamp_stays_dark_is_not_pressed_again() -> None:
     context, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
-    told = button(context, "start", expected="on", verify=lambda: ObjectState(name="start", state="off"))
+    told = press(context, "start", "on", verify=lambda: ObjectState(name="start", state="off"))
     assert (told.outcome, mover.asked.count("press")) == (Outcome.SLIPPED, 1)
 
 
@@ -122,7 +126,11 @@ def test_a_button_whose_lamp_is_as_wanted_is_left_alone_unless_the_look_says_oth
     shown = iter(looks)
     lit = ObjectState(name="run_lamp", state="on")
     told = button(
-        context, "start", expected="on", current=lit, verify=lambda: ObjectState(name="run_lamp", state=next(shown))
+        context,
+        context.panel.object("start"),
+        expected="on",
+        current=lit,
+        verify=lambda: ObjectState(name="run_lamp", state=next(shown)),
     )
     assert (told.is_done, mover.asked.count("press"), told.attempts) == (looks[-1] == "on", presses, tries)
 
@@ -149,7 +157,7 @@ def test_a_toggle_that_stands_there_already_is_looked_at_and_thrown_only_when_in
         return None if state is None else ObjectState(name="pump", state=state)
 
     current = None if before is None else ObjectState(name="pump", state=before)
-    told = toggle(context, "pump", "on", current=current, verify=look)
+    told = toggle(context, context.panel.object("pump"), "on", current=current, verify=look)
     assert next(shown, "no more") == "no more"
     assert (told.is_done, mover.asked.count("to pump")) == (True, sweeps)
 
@@ -158,25 +166,30 @@ def test_a_button_that_nothing_shows_is_pressed_and_not_confirmed() -> None:
     panel_object = PANEL.object("start").model_copy(update={"lights_lamp": None})
     context, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
     context = replace(context, panel=PANEL.model_copy(update={"objects": (panel_object,)}))
-    told = button(context, "start", expected="pressed", verify=lambda: ObjectState(name="start", state="released"))
+    told = button(
+        context,
+        context.panel.object("start"),
+        expected="pressed",
+        verify=lambda: ObjectState(name="start", state="released"),
+    )
     assert (told.outcome, mover.asked.count("press")) == (Outcome.UNVERIFIED, 1)
     assert "springs back" in told.cause
 
 
 def test_a_look_that_cannot_tell_is_not_called_no_look() -> None:
     context, _ = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
-    told = button(context, "start", expected="on", verify=lambda: None)
+    told = press(context, "start", "on", verify=lambda: None)
     assert (told.outcome, told.cause) == (
         Outcome.UNVERIFIED,
         "the stroke ended as declared; the look afterwards could not tell",
     )
-    assert button(context, "start", expected="on").cause.endswith("nobody looked")
+    assert press(context, "start", "on").cause.endswith("nobody looked")
 
 
 def test_a_press_that_may_have_counted_is_not_repeated_when_nobody_can_tell() -> None:
     """A latching cap that gave way by little was pressed twice, which may have undone it."""
     context, mover = before_the_bench({"press": pressed(0.004, 0.0003, 20.0)})
-    told = button(context, "hold", expected="pressed", verify=lambda: None)
+    told = press(context, "hold", "pressed", verify=lambda: None)
     assert (told.outcome, mover.asked.count("press")) == (Outcome.STALLED, 1)
     assert "gave way by only" in told.cause and "undo" in told.cause
 
@@ -195,7 +208,7 @@ def test_closed_pads_that_shall_be_closed_are_left_alone(width_m: float, wanted_
 
 def test_a_press_is_guarded_by_more_than_the_springs_of_the_cap() -> None:
     context, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
-    button(context, "start")
+    press(context, "start")
     cap = PANEL.object("start")
     (push,) = (m for m in mover.motions if m.name == "press")
     assert push.guards[0].limit == stop_force_n(cap) > cap.preload_n + cap.spring_n_per_m * cap.travel_m
@@ -232,21 +245,19 @@ def test_a_wheel_that_slipped_is_held_more_firmly_up_to_what_a_hand_may() -> Non
     assert forces[0] >= GRIP_FLOOR_N and forces[-1] == LARGEST_GRIP_N
 
 
-def _turned(skill: Callable[..., SkillReport], name: str, target: str, now: ObjectState, seen: ObjectState) -> Outcome:
+def _turned(name: str, target: str, now: ObjectState, seen: ObjectState) -> Outcome:
     """The hand finds nothing between its fingers, so that the look alone decides."""
     context, _ = before_the_bench({})
-    return skill(context, name, target, current=now, verify=lambda: seen).outcome
+    return operate(context, context.panel.object(name), target, current=now, verify=lambda: seen).outcome
 
 
 @pytest.mark.parametrize(("off_deg", "outcome"), [(5.0, Outcome.DONE), (40.0, Outcome.MISSED)])
-@pytest.mark.parametrize(("skill", "name"), [(rotary, "mode"), (lever, "main_valve")])
-def test_an_angle_that_was_seen_is_a_state_only_near_it(
-    skill: Callable[..., SkillReport], name: str, off_deg: float, outcome: Outcome
-) -> None:
+@pytest.mark.parametrize("name", ["mode", "main_valve"])
+def test_an_angle_that_was_seen_is_a_state_only_near_it(name: str, off_deg: float, outcome: Outcome) -> None:
     first, last = PANEL.object(name).states[0], PANEL.object(name).states[-1]
     now = ObjectState(name=name, angle_rad=first.angle_rad)
     seen = ObjectState(name=name, angle_rad=last.angle_rad - np.radians(off_deg))
-    assert _turned(skill, name, last.name, now, seen) is outcome
+    assert _turned(name, last.name, now, seen) is outcome
 
 
 @pytest.mark.parametrize("seen", [5, 10])

@@ -22,8 +22,8 @@ CELL = load_cell(Path(__file__).parents[3] / "cells/bench.toml")
 @pytest.mark.parametrize(
     ("body", "target"),
     [
-        ({"object": "setpoint", "value": 40.0}, "40"),
-        ({"object": "bypass", "angle_rad": 0.5}, "0.5"),
+        ({"object": "setpoint", "value": 40.0}, 40.0),
+        ({"object": "bypass", "angle_rad": 0.5}, 0.5),
         ({"object": "main_valve", "state": "open"}, "open"),
         ({"object": "pump", "state": "on"}, "on"),
         ({"object": "emergency"}, "pressed"),
@@ -32,7 +32,7 @@ CELL = load_cell(Path(__file__).parents[3] / "cells/bench.toml")
         ({"object": "hold", "state": "released"}, "released"),
     ],
 )
-def test_a_deed_says_what_it_shall_reach(body: dict[str, Any], target: str) -> None:
+def test_a_deed_says_what_it_shall_reach(body: dict[str, Any], target: str | float) -> None:
     assert target_of(CELL.panel.object(body["object"]), ActionBody(**body)) == target
 
 

@@ -1,0 +1,77 @@
+"""The one door to the skills: the skill is found by the kind of the object."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from hal.errors import InvalidRequest
+from hal.panel import PanelObject
+from manipulation.skills.button import button
+from manipulation.skills.context import SkillContext
+from manipulation.skills.handwheel import handwheel
+from manipulation.skills.lever import lever
+from manipulation.skills.mushroom import mushroom
+from manipulation.skills.outcome import ObjectState, SkillReport, Verify
+from manipulation.skills.rotary import rotary
+from manipulation.skills.slider import slider
+from manipulation.skills.toggle import toggle
+
+
+class Skill(Protocol):
+    """A function that works one kind of control.
+
+    Its panel object is of its kind. Its goal is one of that kind's states, or a number in the unit of its scale (an angle
+    in rad where the kind has no scale).
+    """
+
+    def __call__(
+        self,
+        context: SkillContext,
+        panel_object: Any,
+        goal: Any,
+        /,
+        *,
+        current: ObjectState | None = None,
+        verify: Verify | None = None,
+    ) -> SkillReport:
+        """Work the object until `goal` is reached, as far as `verify` shows it; `current` is the last look before."""
+        ...
+
+
+SKILLS: dict[str, Skill] = {
+    "button": button,
+    "handwheel": handwheel,
+    "lever": lever,
+    "mushroom": mushroom,
+    "rotary": rotary,
+    "slider": slider,
+    "toggle": toggle,
+}
+
+
+def operate(
+    context: SkillContext,
+    panel_object: PanelObject,
+    goal: str | float,
+    *,
+    current: ObjectState | None = None,
+    verify: Verify | None = None,
+) -> SkillReport:
+    """Work a control of the panel by the skill of its kind.
+
+    Args:
+        goal: a state of the object, or a number: a value of its scale, or an angle in rad, clockwise from up.
+        current: what the last look showed of it; without it `verify` is asked where the skill must know.
+        verify: the caller's second look. Without it nothing is confirmed, and a finished stroke is `unverified`.
+
+    Raises:
+        InvalidRequest: the kind has no skill, or the object has no such state or value.
+        DeviceFault, Stopped, Cancelled: the cell cannot go on.
+    """
+    skill = SKILLS.get(panel_object.kind)
+    if skill is None:
+        raise InvalidRequest(
+            f"{panel_object.name} is a {panel_object.kind}, which cannot be worked",
+            hint=f"these kinds can: {', '.join(SKILLS)}",
+        )
+    return skill(context, panel_object, goal, current=current, verify=verify)

@@ -113,7 +113,7 @@ def _show_record(result: dict[str, Any]) -> None:
     console.print(f"[bold]{record['device']}[/] version {record['version']}, {record['method']}, {record['date']}")
     if result["what"] != "tool":
         console.print(f"  mount    one sigma {_sigma(record['mount'])}; moved by {_moved(change)}")
-    if "intrinsics" in record and result["what"] != "tool":
+    if record.get("intrinsics") is not None and result["what"] != "tool":
         lens = record["intrinsics"]
         sigma = lens["fx_px"] * lens["sigma_focal_ratio"]
         console.print(f"  lens     focal length {lens['fx_px']:.2f} ± {sigma:.2f} px, residual {lens['rms_px']:.3f} px")

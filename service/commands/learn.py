@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.markup import escape
@@ -11,6 +11,7 @@ from rich.markup import escape
 from service.client import Client
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console
 from service.commands.own_cell import ServiceUrl, run_on_cell, run_task
+from service.schema.results import LearnResult
 
 
 def learn(
@@ -31,19 +32,19 @@ def _learn(client: Client) -> bool:
     result = run_task(client, "/v1/learn", {})["result"]
     if result is None:
         return False
-    tell(result)
+    tell(LearnResult.model_validate(result))
     return True
 
 
-def tell(learned: dict[str, Any]) -> None:
-    """What an overview of a known panel taught (`service.knowledge.teach.Learned.told`), for people."""
-    added, seen = learned["added"], len(learned["taught_by"])
+def tell(learned: LearnResult) -> None:
+    """Print what an overview of a known panel taught."""
+    added, seen = learned.added, len(learned.taught_by)
     looks = ", ".join(f"{name} {count}" for name, count in sorted(added.items())) or "none, everything was known"
-    console.print(f"panel [bold]{learned['panel']}[/]: {seen} objects looked at; new looks: {looks}")
+    console.print(f"panel [bold]{learned.panel}[/]: {seen} objects looked at; new looks: {looks}")
     console.print(
-        f"recognised blind in this overview: {len(learned['known_before'])} of {seen} before, {len(learned['known_now'])} now"
+        f"recognised blind in this overview: {len(learned.known_before)} of {seen} before, {len(learned.known_now)} now"
     )
-    for name, why in learned["left_out"].items():
+    for name, why in learned.left_out.items():
         console.print(escape(f"  {name} taught nothing: {why}"))
-    if files := [Path(file) for file in learned["files"]]:
+    if files := [Path(file) for file in learned.files]:
         console.print(escape(f"written  {files[0].parent}: {', '.join(file.name for file in files)}"))

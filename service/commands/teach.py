@@ -106,10 +106,10 @@ def _by_clicks(
     clicks_px = tuple(_pair(text, "--click") for text in clicks)
     with patience():
         taught = teach_kind(store, pixels, plate_m, kind=kind, clicks_px=clicks_px)
-    if not taught["added"]:
+    if not taught.added:
         console.print(f"{kind} looks like that already: nothing was written", markup=False)
         return
-    console.print(f"wrote {taught['path']}", markup=False)
+    console.print(f"wrote {taught.path}", markup=False)
 
 
 def _by_panel(store: KnowledgeStore, pixels: NDArray[np.uint8], panel_file: Path) -> None:
@@ -123,7 +123,7 @@ def _by_panel(store: KnowledgeStore, pixels: NDArray[np.uint8], panel_file: Path
         view = one_plate(gray, (panel.width_m, panel.height_m)).view
         check_upright(gray, view, panel)
         learned = learn_panel(store, pixels, view, panel)
-    tell(learned.told())
+    tell(learned.result())
 
 
 def read_image(image: Path) -> NDArray[np.uint8]:

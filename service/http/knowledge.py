@@ -17,7 +17,15 @@ from service.http.images import store_of
 from service.http.problems import RESPONSES
 from service.http.state import AppState, State
 from service.knowledge.store import KnowledgeFile, KnowledgeStore, NoSuchKnowledge
-from service.knowledge.teach import OutlineRequest, TeachRequest, find_outline, questions_of, teach
+from service.knowledge.teach import (
+    OutlineRequest,
+    OutlineView,
+    TaughtView,
+    TeachRequest,
+    find_outline,
+    questions_of,
+    teach,
+)
 
 router = APIRouter(prefix="/v1/knowledge", tags=["knowledge"], responses=RESPONSES)
 PlainName = Annotated[str, Path(max_length=64, examples=["mushroom"])]
@@ -81,32 +89,6 @@ class QuestionList(BaseModel):
     questions: list[QuestionView]
 
 
-class OutlineView(BaseModel):
-    """What was found at the clicks, and what it is taken for now."""
-
-    shape: str
-    outline_px: list[list[float]]
-    centre_px: list[float]
-    centre_m: list[float]
-    size_m: list[float]
-    taken_for: str | None
-    confidence: float | None
-    reason: str | None
-
-
-class TaughtView(BaseModel):
-    """What a lesson wrote. `added` False: the look was known already and nothing was written."""
-
-    what: Literal["kind", "panel"]
-    name: str
-    added: bool
-    is_new: bool
-    path: str | None
-    toml: str
-    outline: OutlineView | None = None
-    lights_are_seen: bool | None = None
-
-
 V = TypeVar("V", KindView, PanelView)
 
 
@@ -136,8 +118,7 @@ async def list_questions(
 async def outline(
     state: State, request: Annotated[OutlineRequest, DependsOn(strict_body(OutlineRequest))]
 ) -> OutlineView:
-    found = await state.in_thread(functools.partial(find_outline, store_of(state), _store(state), request))
-    return OutlineView(**found)
+    return await state.in_thread(functools.partial(find_outline, store_of(state), _store(state), request))
 
 
 @router.post(
@@ -150,8 +131,8 @@ async def teach_something(
     state: State, request: Annotated[TeachRequest, DependsOn(strict_body(TeachRequest))]
 ) -> TaughtView:
     taught = await state.in_thread(functools.partial(teach, store_of(state), _store(state), request))
-    state.service.note("taught", {"what": taught["what"], "name": taught["name"], "added": taught["added"]})
-    return TaughtView(**taught)
+    state.service.note("taught", {"what": taught.what, "name": taught.name, "added": taught.added})
+    return taught
 
 
 @router.get("/kinds/{name}", summary="One kind, with its TOML", operation_id="show_kind")

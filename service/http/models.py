@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field, create_model
 
 from hal.config import Mount
 from hal.devices import DeviceKind
@@ -43,7 +43,7 @@ class TaskView(BaseModel):
     fraction: Annotated[float, Field(ge=0, le=1)]
     step: str
     request: dict[str, Any]
-    result: Any = None
+    result: Annotated[Any, Field(description="of the verb's result model, see its POST")] = None
     problem: dict[str, Any] | None = None
     artefacts: list[ArtefactView] = []
     holder: str | None = None
@@ -82,6 +82,13 @@ class TaskView(BaseModel):
             ended_s=task.ended_s,
             events_url=f"/v1/tasks/{task.id}/events",
         )
+
+
+def task_view(result: type[BaseModel]) -> type[TaskView]:
+    """The view of a task whose `result` is of this model, for the API document: `PanelPoseTask` for `PanelPoseResult`."""
+    name = f"{result.__name__.removesuffix('Result')}Task"
+    annotation: Any = result | None
+    return create_model(name, __base__=TaskView, __doc__=TaskView.__doc__, result=(annotation, None))
 
 
 class TaskList(BaseModel):

@@ -10,7 +10,7 @@ from fastapi import Depends as DependsOn
 from starlette.responses import JSONResponse
 
 from service.http.body import body_schema, strict_body
-from service.http.models import TaskView
+from service.http.models import TaskView, task_view
 from service.http.problems import MEDIA, RESPONSES
 from service.http.state import IdempotencyKey, LeaseToken, State
 from service.operations.context import Operation
@@ -48,6 +48,7 @@ def _add(routes: APIRouter, operation: Operation) -> None:
         return answer(task)
 
     name = operation.name.replace("-", "_")
+    view = task_view(operation.result_model)
     routes.add_api_route(
         f"/v1/{operation.name}",
         start,
@@ -55,10 +56,10 @@ def _add(routes: APIRouter, operation: Operation) -> None:
         name=name,
         operation_id=name,
         summary=operation.summary,
-        response_model=TaskView,
+        response_model=view,
         responses={
-            200: {"description": "the task has ended in time; `result` holds the answer", "model": TaskView},
-            202: {"description": "the task goes on; `Location` says where to look", "model": TaskView},
+            200: {"description": "the task has ended in time; `result` holds the answer", "model": view},
+            202: {"description": "the task goes on; `Location` says where to look", "model": view},
         },
         openapi_extra=body_schema(operation.request_model, operation.example),
     )

@@ -1,10 +1,10 @@
-"""Lessons as requests and as the dialogue has them: an image, clicks, a name, and for panels the answers."""
+"""Teaching from an image: a kind by clicks, or a whole panel by clicks and answers; requests, answers and the work."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -13,7 +13,8 @@ from hal.panel import Panel
 from hal.strict import Strict
 from service.knowledge.images import ImageStore
 from service.knowledge.store import KnowledgeStore, check_name
-from service.operations.requests import ImageId, ObjectName, PlateSize
+from service.schema.requests import ImageId, ObjectName, PlateSize
+from service.schema.results import LearnResult, Numbers, Result, Rows
 
 if TYPE_CHECKING:
     import numpy as np
@@ -74,6 +75,32 @@ class TeachRequest(Strict):
         return self
 
 
+class OutlineView(Result):
+    """What was found at the clicks, and what it is taken for now."""
+
+    shape: str
+    outline_px: Rows
+    centre_px: Numbers
+    centre_m: Numbers
+    size_m: Numbers
+    taken_for: str | None
+    confidence: float | None
+    reason: str | None
+
+
+class TaughtView(Result):
+    """What was written. `added` False: the look was known already and nothing was written."""
+
+    what: Literal["kind", "panel"]
+    name: str
+    added: bool
+    is_new: bool
+    path: str | None
+    toml: str
+    outline: OutlineView | None = None
+    lights_are_seen: bool | None = None
+
+
 def questions_of(kind: str) -> tuple[Question, ...]:
     """What the dialogue asks about an object of this kind."""
     from perception.vision import questions
@@ -81,7 +108,7 @@ def questions_of(kind: str) -> tuple[Question, ...]:
     return questions(kind)
 
 
-def find_outline(images: ImageStore, store: KnowledgeStore, request: OutlineRequest) -> dict[str, Any]:
+def find_outline(images: ImageStore, store: KnowledgeStore, request: OutlineRequest) -> OutlineView:
     """The outline at the clicks and what it is taken for; writes nothing.
 
     Raises:
@@ -93,7 +120,7 @@ def find_outline(images: ImageStore, store: KnowledgeStore, request: OutlineRequ
     return described(overview, example_at(overview, request.clicks_px), store)
 
 
-def teach(images: ImageStore, store: KnowledgeStore, request: TeachRequest) -> dict[str, Any]:
+def teach(images: ImageStore, store: KnowledgeStore, request: TeachRequest) -> TaughtView:
     """Learn what the request says and write it down.
 
     Raises:
@@ -115,7 +142,7 @@ def teach_kind(
     kind: str,
     clicks_px: tuple[Click, ...],
     size_m: tuple[float, float] | None = None,
-) -> dict[str, Any]:
+) -> TaughtView:
     """Teach one example of a kind and keep it; see `teach`."""
     from perception.vision import NOTHING, example_at, overview_of, teach_example
 
@@ -125,20 +152,20 @@ def teach_kind(
     lesson = teach_example(example, store.knowledge(), kind=kind, size_m=size_m, source="panelwright teach")
     path = store.write_kind(lesson.kind) if lesson.added else None
     file = next(file for file in store.kinds() if file.name == kind)
-    return {
-        "what": "kind",
-        "name": kind,
-        "added": lesson.added,
-        "is_new": lesson.is_new_kind,
-        "path": None if path is None else str(path),
-        "toml": file.text(),
-        "outline": None if example.outline is None else described(overview, example, store),
-    }
+    return TaughtView(
+        what="kind",
+        name=kind,
+        added=lesson.added,
+        is_new=lesson.is_new_kind,
+        path=None if path is None else str(path),
+        toml=file.text(),
+        outline=None if example.outline is None else described(overview, example, store),
+    )
 
 
 def teach_panel(
     store: KnowledgeStore, pixels: NDArray[np.uint8], plate_m: tuple[float, float], lesson: PanelLesson
-) -> dict[str, Any]:
+) -> TaughtView:
     """Write a whole panel's file from clicks and answers; see `teach`."""
     from perception.vision import PanelObjectDraft, example_at, find_border_lights, overview_of, panel_text
 
@@ -156,15 +183,15 @@ def teach_panel(
     ]
     text = panel_text(lesson.name, overview, lights, drafts)
     is_new = lesson.name not in {file.name for file in store.panels()}
-    return {
-        "what": "panel",
-        "name": lesson.name,
-        "added": True,
-        "is_new": is_new,
-        "path": str(store.write_panel(lesson.name, text)),
-        "toml": text,
-        "lights_are_seen": lights.are_seen,
-    }
+    return TaughtView(
+        what="panel",
+        name=lesson.name,
+        added=True,
+        is_new=is_new,
+        path=str(store.write_panel(lesson.name, text)),
+        toml=text,
+        lights_are_seen=lights.are_seen,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,17 +202,17 @@ class Learned:
     looks: PanelLooks
     files: tuple[Path, ...]
 
-    def told(self) -> dict[str, Any]:
-        """The same in words and numbers: objects by name, looks by kind."""
-        return {
-            "panel": self.panel,
-            "added": self.looks.added,
-            "taught_by": [each.panel_object.name for each in self.looks.shown],
-            "left_out": self.looks.left_out,
-            "known_before": list(self.looks.known_before),
-            "known_now": list(self.looks.known_now),
-            "files": [str(path) for path in self.files],
-        }
+    def result(self) -> LearnResult:
+        """The same as an answer: objects by name, looks by kind."""
+        return LearnResult(
+            panel=self.panel,
+            added=self.looks.added,
+            taught_by=[each.panel_object.name for each in self.looks.shown],
+            left_out=self.looks.left_out,
+            known_before=list(self.looks.known_before),
+            known_now=list(self.looks.known_now),
+            files=[str(path) for path in self.files],
+        )
 
 
 def learn_panel(store: KnowledgeStore, pixels: NDArray[np.uint8], view: PanelProjection, panel: Panel) -> Learned:
@@ -200,20 +227,20 @@ def learn_panel(store: KnowledgeStore, pixels: NDArray[np.uint8], view: PanelPro
     return Learned(panel=panel.name, looks=looks, files=tuple(store.write_kind(kind) for kind in looks.kinds))
 
 
-def described(overview: Overview, example: Example, store: KnowledgeStore) -> dict[str, Any]:
+def described(overview: Overview, example: Example, store: KnowledgeStore) -> OutlineView:
     """An example for people and pages: its outline in the image, and what it is taken for now."""
     from perception.vision import likest
 
     if example.outline is None:
         raise InvalidRequest("nothing was pointed at", hint="click on an object")
     taken = likest(overview, example, store.knowledge())
-    return {
-        "shape": example.outline.shape,
-        "outline_px": example.outline_px.tolist(),
-        "centre_px": overview.in_image(example.centre_m[None])[0].tolist(),
-        "centre_m": example.centre_m.tolist(),
-        "size_m": list(example.size_m),
-        "taken_for": None if taken is None else taken.kind,
-        "confidence": None if taken is None else taken.confidence,
-        "reason": None if taken is None else taken.reason,
-    }
+    return OutlineView(
+        shape=example.outline.shape,
+        outline_px=example.outline_px.tolist(),
+        centre_px=overview.in_image(example.centre_m[None])[0].tolist(),
+        centre_m=example.centre_m.tolist(),
+        size_m=list(example.size_m),
+        taken_for=None if taken is None else taken.kind,
+        confidence=None if taken is None else taken.confidence,
+        reason=None if taken is None else taken.reason,
+    )

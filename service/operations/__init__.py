@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from service.operations import requests, targets
+from service.operations import targets
 from service.operations.context import Operation, OperationContext
+from service.schema import requests, results
 
 __all__ = ["OPERATIONS", "Operation", "OperationContext"]
 
@@ -21,26 +22,28 @@ MEASUREMENT_EXAMPLE = {
 }
 
 
-def _in_session(module: str, function: str) -> Callable[[OperationContext, Any], Any]:
+def _in_session(module: str, function: str) -> Callable[[OperationContext, Any], results.Result]:
     """`service.operations.<module>.<function>(session, request)`, imported when first used: the service is up fast."""
 
-    def run(context: OperationContext, request: Any) -> Any:
+    def run(context: OperationContext, request: Any) -> results.Result:
         from importlib import import_module
 
         from service.operations.session import Session
 
-        return getattr(import_module(f"service.operations.{module}"), function)(Session(context=context), request)
+        verb = getattr(import_module(f"service.operations.{module}"), function)
+        answer: results.Result = verb(Session(context=context), request)
+        return answer
 
     return run
 
 
-def _mission(context: OperationContext, request: requests.MissionRequest) -> Any:
+def _mission(context: OperationContext, request: requests.MissionRequest) -> results.MissionResult:
     from service.operations.mission import run_mission
 
     return run_mission(context, request)
 
 
-def _evaluate(context: OperationContext, request: requests.EvaluateRequest) -> Any:
+def _evaluate(context: OperationContext, request: requests.EvaluateRequest) -> results.EvaluateResult:
     from service.operations.evaluate import evaluate
 
     return evaluate(context.connection, context.runs_dir / request.mission)
@@ -56,6 +59,7 @@ OPERATIONS: dict[str, Operation] = {
         Operation(
             name="panel-pose",
             request_model=requests.PanelPoseRequest,
+            result_model=results.PanelPoseResult,
             run=_in_session("locate", "run_panel_pose"),
             summary="Locate the panel by its four lights; pose with covariance",
             example={"move": True},
@@ -63,6 +67,7 @@ OPERATIONS: dict[str, Operation] = {
         Operation(
             name="recognise",
             request_model=requests.RecogniseRequest,
+            result_model=results.RecogniseResult,
             run=_in_session("recognise", "run_recognise"),
             summary="Find the panel's objects in the camera's image or surfaces in the range image",
             example={"use": ["vision"], "mode": "taught"},
@@ -72,6 +77,7 @@ OPERATIONS: dict[str, Operation] = {
         Operation(
             name="learn",
             request_model=requests.LearnRequest,
+            result_model=results.LearnResult,
             run=_in_session("learn", "run_learn"),
             summary="Let the located panel teach its own looks: blind recognition then knows its objects",
             example={"move": True},
@@ -80,6 +86,7 @@ OPERATIONS: dict[str, Operation] = {
         Operation(
             name="inspect",
             request_model=requests.InspectRequest,
+            result_model=results.InspectResult,
             run=_in_session("inspect", "run_inspect"),
             summary="Read instruments, lamps, switches and valves from close up",
             example={"objects": ["pressure", "main_valve"], "least_confidence": 0.5},
@@ -89,6 +96,7 @@ OPERATIONS: dict[str, Operation] = {
         Operation(
             name="fuse",
             request_model=requests.FuseRequest,
+            result_model=results.FuseResult,
             run=_in_session("sense", "run_fuse"),
             summary="Fuse measurements of nine kinds into one pose, or collect them first",
             example={"measurements": [MEASUREMENT_EXAMPLE]},
@@ -96,6 +104,7 @@ OPERATIONS: dict[str, Operation] = {
         Operation(
             name="manipulate",
             request_model=requests.ManipulateRequest,
+            result_model=results.ManipulateResult,
             run=_in_session("manipulate", "run_manipulate"),
             summary="Work one control and look whether it worked",
             example={"object": "main_valve", "state": "open"},
@@ -104,6 +113,7 @@ OPERATIONS: dict[str, Operation] = {
         Operation(
             name="missions",
             request_model=requests.MissionRequest,
+            result_model=results.MissionResult,
             run=_mission,
             summary="Run the whole mission and write its report",
             example={"touches": 4},
@@ -112,6 +122,7 @@ OPERATIONS: dict[str, Operation] = {
         Operation(
             name="calibrations",
             request_model=requests.CalibrationRequest,
+            result_model=results.CalibrationResult,
             run=_in_session("calibrate", "run_calibrations"),
             summary="Calibrate camera, hand-eye, range scanner or tool: the arm drives through poses, the record is kept",
             example={"what": "hand-eye", "poses": 12},
@@ -120,6 +131,7 @@ OPERATIONS: dict[str, Operation] = {
         Operation(
             name="judge",
             request_model=requests.EvaluateRequest,
+            result_model=results.EvaluateResult,
             run=_evaluate,
             summary="Compare a finished mission with the simulator's truth (simulated cells only)",
             example={"mission": "20261120T231502-a1b2c3"},

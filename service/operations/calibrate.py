@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
 
@@ -23,10 +22,11 @@ from service.operations.calibrate_sensors import (
     tool_joints,
 )
 from service.operations.locate import go_to_overview, locate
-from service.operations.requests import CalibrationRequest
 from service.operations.session import Session
 from service.operations.travel import kinematics, park
 from service.report.plots import stations_picture
+from service.schema.requests import CalibrationRequest
+from service.schema.results import CalibrationChange, CalibrationResult, StationResult
 
 KINDS = {
     "camera": DeviceKind.CAMERA,
@@ -36,11 +36,12 @@ KINDS = {
 }
 
 
-def run_calibrations(session: Session, request: CalibrationRequest) -> dict[str, Any]:
+def run_calibrations(session: Session, request: CalibrationRequest) -> CalibrationResult:
     """Measure, solve, keep the record. Nothing is written unless the result is good enough."""
     device = _device(session, request)
     if request.dry_run:
-        return {"what": request.what, "device": device, "dry_run": True, "stations": _planned(session, request, device)}
+        stations = _planned(session, request, device)
+        return CalibrationResult(what=request.what, device=device, dry_run=True, stations=stations)
     found = _measure(session, request, device)
     session.progress(0.95, "keep the record")
     current = session.cell.calibration_of(device)
@@ -50,16 +51,16 @@ def run_calibrations(session: Session, request: CalibrationRequest) -> dict[str,
         session.world.forget_panel()  # it was seen through the mount of before
     session.progress(0.97, "back to the parking place")
     park(session)
-    return {
-        "what": request.what,
-        "device": device,
-        "dry_run": False,
-        "record": record.model_dump(mode="json", by_alias=True, exclude_none=True),
-        "path": str(path),
-        "change": _change(current, record),
-        "pictures": _pictures(session, found),
-        "in_use_from": "the next start of the service" if request.what == "tool" else "now",
-    }
+    return CalibrationResult(
+        what=request.what,
+        device=device,
+        dry_run=False,
+        record=record,
+        path=str(path),
+        change=_change(current, record),
+        pictures=_pictures(session, found),
+        in_use_from="the next start of the service" if request.what == "tool" else "now",
+    )
 
 
 def _device(session: Session, request: CalibrationRequest) -> str:
@@ -95,19 +96,20 @@ def _measure(
     )
 
 
-def _planned(session: Session, request: CalibrationRequest, device: str) -> list[dict[str, Any]]:
+def _planned(session: Session, request: CalibrationRequest, device: str) -> list[StationResult]:
     """The stations that would be tried first, as flange poses, from what is believed of the panel now."""
     if request.what == "tool":
         arm = kinematics(session)
         return [
-            {"joints_rad": q.tolist(), **to_json(arm.flange(q))} for q in tool_joints(session, device)[: request.poses]
+            StationResult(**to_json(arm.flange(q)), joints_rad=q.tolist())
+            for q in tool_joints(session, device)[: request.poses]
         ]
     if request.what == "scanner":
         flanges = scanner_stations(session, device, request.poses)
     else:
         known = beforehand(session, device, is_lens_known=request.what == "hand-eye")
         flanges = camera_stations(session, device, request.poses, known)
-    return [to_json(flange) for flange in flanges[: request.poses]]
+    return [StationResult(**to_json(flange)) for flange in flanges[: request.poses]]
 
 
 def _pictures(session: Session, found: InHandCalibration | ScannerCalibration | WrenchCalibration) -> list[str]:
@@ -119,15 +121,18 @@ def _pictures(session: Session, found: InHandCalibration | ScannerCalibration | 
     return [session.context.task.artefact("stations.png", picture, "image/png")]
 
 
-def _change(before: CalibrationRecord, after: CalibrationRecord) -> dict[str, float]:
-    """How far the new record is from the one before, m, rad, px, kg."""
-    change: dict[str, float] = {}
+def _change(before: CalibrationRecord, after: CalibrationRecord) -> CalibrationChange:
+    """How far the new record is from the one before."""
+    moved = focal_px = mass_kg = None
     if before.mount is not None and after.mount is not None:
-        d = difference(after.mount.pose().parent_from_child, before.mount.pose().parent_from_child)
-        change["moved_m"] = float(np.linalg.norm(d[:3]))
-        change["turned_rad"] = float(np.linalg.norm(d[3:]))
+        moved = difference(after.mount.pose().parent_from_child, before.mount.pose().parent_from_child)
     if before.intrinsics is not None and after.intrinsics is not None:
-        change["focal_px"] = after.intrinsics.fx_px - before.intrinsics.fx_px
+        focal_px = after.intrinsics.fx_px - before.intrinsics.fx_px
     if before.load is not None and after.load is not None:
-        change["mass_kg"] = after.load.mass_kg - before.load.mass_kg
-    return change
+        mass_kg = after.load.mass_kg - before.load.mass_kg
+    return CalibrationChange(
+        moved_m=None if moved is None else float(np.linalg.norm(moved[:3])),
+        turned_rad=None if moved is None else float(np.linalg.norm(moved[3:])),
+        focal_px=focal_px,
+        mass_kg=mass_kg,
+    )

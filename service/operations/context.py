@@ -32,7 +32,8 @@ class Operation:
     Attributes:
         name: path of the verb, e.g. `panel-pose`.
         request_model: strict model of the body.
-        run: does the work in a worker thread; returns what JSON can hold; raises `CellError`.
+        result_model: what a task of this verb ends with.
+        run: does the work in a worker thread; returns a `result_model`; raises `CellError`.
         summary: one line for the API document.
         example: a body that works on the shipped cell.
         moves: whether it may move the arm (needs the lease when one is held, and excludes other motion tasks).
@@ -42,7 +43,8 @@ class Operation:
 
     name: str
     request_model: type[BaseModel]
-    run: Callable[[OperationContext, Any], BaseModel | dict[str, Any]]
+    result_model: type[BaseModel]
+    run: Callable[[OperationContext, Any], BaseModel]
     summary: str
     example: dict[str, Any] = field(default_factory=dict)
     moves: bool = True

@@ -7,7 +7,7 @@ stands elsewhere after the second look is not worked.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtri
@@ -27,6 +27,7 @@ from service.operations.views import close_up_poses
 from service.report.plots import png_of
 from service.report.record import Picture
 from service.report.surfaces import surfaces_picture
+from service.schema.results import SurfaceCheck
 
 ELSEWHERE_P = 1e-3  # one object in a thousand that stands in its place is looked at twice
 TURN_SLACK_RAD = 0.1  # a wheel's angle by its spokes and by its mark, beside three sigmas
@@ -41,36 +42,6 @@ class SurfaceView:
     scan: Scan
     scene: RangeScene
     sightings: tuple[Sighting, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SurfaceCheck:
-    """What the surfaces of one object say beside layout and vision.
-
-    Attributes:
-        centre_in_base_m: (3,) its middle on the plate, base frame.
-        off_m: along the plate, from its place in the panel file under the panel's newest pose; `sigma_m` one standard
-            deviation of that, `chi_square` its square in sigmas on two degrees of freedom. None when it was not found.
-        off_vision_m: along the plate, from where the newest image has it.
-        shows, vision_shows: its state by surfaces, and by vision.
-        agrees: place and state agree; None when it was not found.
-        finding: all that as a sentence.
-    """
-
-    name: str
-    kind: str
-    seen_from: str
-    found: bool
-    agrees: bool | None
-    centre_in_base_m: tuple[float, float, float] | None
-    off_m: float | None
-    sigma_m: float | None
-    chi_square: float | None
-    off_vision_m: float | None
-    shows: str | None
-    vision_shows: str | None
-    stands_elsewhere: bool
-    finding: str
 
 
 def view_surfaces(session: Session, plane: ScannedPlane, place: str) -> SurfaceView:
@@ -101,7 +72,7 @@ def check_surfaces(session: Session, first: SurfaceView) -> tuple[list[SurfaceCh
                 closer = compared(second, base_from_panel, session.panel.tolerances.position_m, shown.get(name), CLOSER)
                 check = after_both(check, closer)
             else:
-                check = replace(check, finding=f"{check.finding}; no closer look: {again}")
+                check = check.model_copy(update={"finding": f"{check.finding}; no closer look: {again}"})
         checks.append(check)
     return checks, pictures
 
@@ -147,7 +118,8 @@ def compared(
 def after_both(first: SurfaceCheck, second: SurfaceCheck) -> SurfaceCheck:
     """What two looks say together: the closer one where it found the object, and both are told."""
     newest = second if second.found else first
-    return replace(newest, finding=f"from {first.seen_from} {first.finding}; from {second.seen_from} {second.finding}")
+    both = f"from {first.seen_from} {first.finding}; from {second.seen_from} {second.finding}"
+    return newest.model_copy(update={"finding": both})
 
 
 def need_its_place(checks: Iterable[SurfaceCheck], name: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,20 +11,23 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtri
 
+from hal.arrays import Array
 from hal.devices import DeviceKind
 from hal.errors import InvalidRequest, Unsupported
 from hal.geometry import difference
 from hal.panel import Button, Panel, PanelObject
 from hal.simulated import ObjectTruth, Truth
+from service.jsonable import jsonable
 from service.processes.connection import CellConnection
 from service.report.write import render, write_json
+from service.schema.results import ActionClaim, EvaluateResult, ReadingClaim, UnaskedMotion
 
 GAUGE_SHARE = 0.02  # of full scale: a reading further off is wrong
 WHEEL_RAD = 0.105
 AFTER = "after the actions"
 
 
-def evaluate(connection: CellConnection, folder: Path) -> dict[str, Any]:
+def evaluate(connection: CellConnection, folder: Path) -> EvaluateResult:
     """Add `judge` to the report in `folder` and draw it again; returns that part.
 
     Raises:
@@ -42,7 +46,7 @@ def evaluate(connection: CellConnection, folder: Path) -> dict[str, Any]:
             )
     began_s = report.get("started_cell_s", -np.inf)  # reports of older versions do not say
     verdict = compare(report, truth_of(connection, connection.clock.now_s() - began_s), connection.cell.panel)
-    write_json(folder, {**report, "judge": verdict})
+    write_json(folder, {**report, "judge": jsonable(verdict)})
     render(folder)
     return verdict
 
@@ -60,7 +64,7 @@ def truth_of(connection: CellConnection, ago_s: float) -> Truth:
     )
 
 
-def compare(report: dict[str, Any], truth: Truth, panel: Panel) -> dict[str, Any]:
+def compare(report: dict[str, Any], truth: Truth, panel: Panel) -> EvaluateResult:
     """Pose error, reading errors and what really moved, against a report's claims.
 
     The simulator tells how the mission ended: of several deeds with one control only the last can be judged.
@@ -74,43 +78,50 @@ def compare(report: dict[str, Any], truth: Truth, panel: Panel) -> dict[str, Any
     ]
     newest = {_shown_by(action["object"], panel): action for action in report["actions"]}
     actions = [_action_claim(action, before, after, panel) for action in newest.values()]
-    return {
-        **_pose_verdict(report.get("fused"), truth),
-        "claims": claims + actions,
-        "readings_right": sum(claim["right"] for claim in claims),
-        "readings_given": len(claims),
-        "actions_confirmed": sum(action["confirmed"] for action in report["actions"]),
-        "agrees": all(action["right"] for action in actions),
-        "moved_unasked": _moved_unasked(report["actions"], before, after, panel),
-        "peak_force_n": truth.peak_force_n,
-        "sim_time_s": truth.sim_time_s,
-    }
+    pose = _pose_error(report.get("fused"), truth)
+    return EvaluateResult(
+        pose_error_m=None if pose is None else float(np.linalg.norm(pose.delta[:3])),
+        pose_error_rad=None if pose is None else float(np.linalg.norm(pose.delta[3:])),
+        pose_error=None if pose is None else pose.delta.tolist(),
+        mahalanobis=None if pose is None else pose.mahalanobis,
+        inside_95=None if pose is None else bool(pose.mahalanobis <= chdtri(6, 0.05)),
+        claims=[*claims, *actions],
+        readings_right=sum(claim.right for claim in claims),
+        readings_given=len(claims),
+        actions_confirmed=sum(action["confirmed"] for action in report["actions"]),
+        agrees=all(action.right for action in actions),
+        moved_unasked=_moved_unasked(report["actions"], before, after, panel),
+        peak_force_n=truth.peak_force_n,
+        sim_time_s=truth.sim_time_s,
+    )
 
 
-def _pose_verdict(fused: dict[str, Any] | None, truth: Truth) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseError:
+    """How far the fused pose is from the truth: `delta` (6,) translation (m), then rotation (rad), and in sigmas squared."""
+
+    delta: Array
+    mahalanobis: float
+
+
+def _pose_error(fused: dict[str, Any] | None, truth: Truth) -> PoseError | None:
     if not fused:
-        return {"pose_error_m": None, "pose_error_rad": None, "mahalanobis": None, "inside_95": None}
+        return None
     estimate = RigidTransform.from_components(fused["translation_m"], Rotation.from_quat(fused["quaternion_xyzw"]))
     delta = difference(RigidTransform.from_matrix(truth.base_from_panel_matrix), estimate)
     distance = float(delta @ np.linalg.solve(np.array(fused["covariance"]), delta))
-    return {
-        "pose_error_m": float(np.linalg.norm(delta[:3])),
-        "pose_error_rad": float(np.linalg.norm(delta[3:])),
-        "pose_error": delta.tolist(),
-        "mahalanobis": distance,
-        "inside_95": bool(distance <= chdtri(6, 0.05)),
-    }
+    return PoseError(delta=delta, mahalanobis=distance)
 
 
-def _reading_claim(reading: dict[str, Any], truth: ObjectTruth, panel: Panel) -> dict[str, Any]:
+def _reading_claim(reading: dict[str, Any], truth: ObjectTruth, panel: Panel) -> ReadingClaim:
     spec = panel.object(reading["name"])
-    return {
-        "name": reading["name"],
-        "what": f"read {reading['when']}",
-        "claimed": reading["shows"],
-        "truth": _shown(truth),
-        "right": agrees(spec, truth, value=reading["value"], state=reading["state"], text=reading["text"]),
-    }
+    return ReadingClaim(
+        name=reading["name"],
+        what=f"read {reading['when']}",
+        claimed=reading["shows"],
+        truth=_shown(truth),
+        right=agrees(spec, truth, value=reading["value"], state=reading["state"], text=reading["text"]),
+    )
 
 
 def agrees(
@@ -132,19 +143,19 @@ def agrees(
 
 def _action_claim(
     action: dict[str, Any], before: dict[str, ObjectTruth], after: dict[str, ObjectTruth], panel: Panel
-) -> dict[str, Any]:
+) -> ActionClaim:
     """A confirmed action must be true; an unconfirmed one must not claim anything."""
     name = action["object"]
     spec = panel.object(name)
     reached = _reached(spec, action, after)
-    return {
-        "name": name,
-        "what": f"{action['skill']} to {action['target']}",
-        "claimed": f"{action['outcome']}, {'confirmed' if action['confirmed'] else 'not confirmed'}",
-        "truth": f"{_shown(before[name])} to {_shown(after[name])}",
-        "right": reached or not action["confirmed"],
-        "reached": reached,
-    }
+    return ActionClaim(
+        name=name,
+        what=f"{action['skill']} to {action['target']}",
+        claimed=f"{action['outcome']}, {'confirmed' if action['confirmed'] else 'not confirmed'}",
+        truth=f"{_shown(before[name])} to {_shown(after[name])}",
+        right=reached or not action["confirmed"],
+        reached=reached,
+    )
 
 
 def _is_outdated(k: int, readings: list[dict[str, Any]]) -> bool:
@@ -161,7 +172,7 @@ def _shown_by(name: str, panel: Panel) -> str:
 
 def _moved_unasked(
     actions: list[dict[str, Any]], before: dict[str, ObjectTruth], after: dict[str, ObjectTruth], panel: Panel
-) -> list[dict[str, str]]:
+) -> list[UnaskedMotion]:
     """What shows something else than before and was not worked, nor is lit by what was."""
     worked = {action["object"] for action in actions}
     worked |= {
@@ -170,7 +181,7 @@ def _moved_unasked(
         if isinstance(panel_object, Button) and panel_object.name in worked
     }
     return [
-        {"name": name, "truth": f"{_shown(was)} to {_shown(after[name])}"}
+        UnaskedMotion(name=name, truth=f"{_shown(was)} to {_shown(after[name])}")
         for name, was in before.items()
         if name not in worked
         and not agrees(panel.object(name), after[name], value=was.value, state=was.state, text=was.text)

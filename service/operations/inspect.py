@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +17,14 @@ from perception.vision import ALIKE, NO_EDGE, ObjectReading, answer_at, draw_ann
 from perception.vision import inspect as inspect_image
 from service.operations.acquisition import Look, base_from, look, settle
 from service.operations.locate import go_to_overview, locate
-from service.operations.requests import InspectRequest, RecogniseRequest
 from service.operations.session import Session, panel_object_or_all
-from service.operations.stored import read_stored, reading_row_json
+from service.operations.stored import object_result, read_stored
 from service.operations.tours import short_tour
 from service.operations.travel import go_to_camera_view, skill_context
 from service.operations.views import CLOSE_UP_M, FOR_ALIKE, NEAR_M, SIDES, close_up_groups, close_up_poses, poses_from
 from service.report.plots import png_of
-from service.report.record import Reading
+from service.schema.requests import InspectRequest, RecogniseRequest
+from service.schema.results import InspectResult, ReadingResult
 
 TIPS_M = 0.085  # of the finger tips before the plate in a look from the side: what hides an object hangs there
 MOST_UNREAD = 4  # more than these at once: the light or the lens, and no cable
@@ -173,9 +172,9 @@ def _told(looks: Sequence[ObjectReading]) -> ObjectReading:
     return replace(told, reason=f"{told.reason} ({len(looks) - 1} looks from the sides did not tell either)")
 
 
-def reading_row(reading: ObjectReading, when: str) -> Reading:
+def reading_result(reading: ObjectReading, when: str) -> ReadingResult:
     """A reading as the report keeps it."""
-    return Reading(
+    return ReadingResult(
         name=reading.name,
         kind=reading.kind,
         present=reading.present,
@@ -191,17 +190,7 @@ def reading_row(reading: ObjectReading, when: str) -> Reading:
     )
 
 
-def reading_json(session: Session, reading: ObjectReading) -> dict[str, Any]:
-    """A reading as the API gives it; the place in the base frame when the panel's pose is known."""
-    row = reading_row_json(reading)
-    panel = session.world.base_from_panel
-    if reading.centre_m is not None and panel is not None:
-        row["centre_in_panel_m"] = list(reading.centre_m)
-        row["centre_in_base_m"] = list(panel.parent_from_child.apply(reading.centre_m))
-    return row
-
-
-def run_inspect(session: Session, request: InspectRequest) -> dict[str, Any]:
+def run_inspect(session: Session, request: InspectRequest) -> InspectResult:
     """The verb `inspect`."""
     if request.image is not None:
         session.progress(0.1, "look at the stored image")
@@ -212,7 +201,7 @@ def run_inspect(session: Session, request: InspectRequest) -> dict[str, Any]:
     return _answer(session, found, request.least_confidence)
 
 
-def run_recognise_taught(session: Session, request: RecogniseRequest) -> dict[str, Any]:
+def run_recognise_taught(session: Session, request: RecogniseRequest) -> InspectResult:
     """The verb `recognise` with a taught panel, by vision."""
     names = panel_object_or_all(session.panel, request.objects)
     if request.move:
@@ -253,17 +242,16 @@ def need_all_present(found: Inspection, session: Session) -> None:
         )
 
 
-def _answer(session: Session, found: Inspection, least_confidence: float) -> dict[str, Any]:
+def _answer(session: Session, found: Inspection, least_confidence: float) -> InspectResult:
     """The answer to a caller to whom so much confidence is enough; what the cell remembers and draws is the default's."""
     readings = [answer_at(reading, least_confidence) for reading in found.readings.values()]
     pictures = [
         session.context.task.artefact(f"annotated-{k}.png", png_of(picture.pixels), "image/png")
         for k, picture in enumerate(found.pictures)
     ]
-    return {
-        "objects": [reading_json(session, reading) for reading in readings],
-        "missing": list(
-            missing(found.readings.values(), [t for t in session.panel.objects if t.name in found.readings])
-        ),
-        "pictures": pictures,
-    }
+    asked = [panel_object for panel_object in session.panel.objects if panel_object.name in found.readings]
+    return InspectResult(
+        objects=[object_result(reading, session.world.base_from_panel) for reading in readings],
+        missing=list(missing(found.readings.values(), asked)),
+        pictures=pictures,
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hal.geometry import compose
 from service.knowledge.store import KnowledgeStore
@@ -10,17 +10,18 @@ from service.knowledge.teach import learn_panel
 from service.operations.acquisition import look, settle
 from service.operations.inspect import ensure_located
 from service.operations.locate import go_to_overview
-from service.operations.requests import LearnRequest
 from service.operations.session import Session
 from service.operations.stored import Pixels, panel_of, shown, stored_view
 from service.report.plots import png_of
+from service.schema.requests import LearnRequest
+from service.schema.results import LearnResult
 
 if TYPE_CHECKING:
     from hal.panel import Panel
     from perception.vision import PanelLooks, PanelProjection
 
 
-def run_learn(session: Session, request: LearnRequest) -> dict[str, Any]:
+def run_learn(session: Session, request: LearnRequest) -> LearnResult:
     """Learn the looks of the panel's objects from an overview of now, or from a stored one.
 
     Raises:
@@ -45,12 +46,13 @@ def run_learn(session: Session, request: LearnRequest) -> dict[str, Any]:
     return _learn(session, seen.pixels, live, session.panel)
 
 
-def _learn(session: Session, pixels: Pixels, view: PanelProjection, panel: Panel) -> dict[str, Any]:
+def _learn(session: Session, pixels: Pixels, view: PanelProjection, panel: Panel) -> LearnResult:
     session.progress(0.9, "learn")
     store = KnowledgeStore.of_runs(session.context.runs_dir, session.cell)
     learned = learn_panel(store, pixels, view, panel)
     picture = png_of(shown(_drawn(pixels, learned.looks)))
-    return {**learned.told(), "pictures": [session.context.task.artefact("learned.png", picture, "image/png")]}
+    kept = session.context.task.artefact("learned.png", picture, "image/png")
+    return learned.result().model_copy(update={"pictures": [kept]})
 
 
 def _drawn(pixels: Pixels, looks: PanelLooks) -> Pixels:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -11,15 +10,16 @@ from scipy.spatial.transform import RigidTransform
 from fusion import PixelObservation, PlaneObservation
 from hal.arrays import Array
 from hal.errors import Ambiguous, NotFound
-from hal.geometry import UncertainPose, compose, difference, matrix_of, to_json
+from hal.geometry import UncertainPose, compose, difference, matrix_of
 from perception.range import PinholeSensor, PlaneFit, fit_plane_near
 from perception.vision import AssignedLights, QuadranglePose, assign_lights, estimate, find_lights
 from service.operations.acquisition import LightPair, Look, Scan, look_with_lights, scan
-from service.operations.requests import PanelPoseRequest
 from service.operations.session import Session
 from service.operations.travel import go_to_camera_view, leave_the_panel
 from service.operations.views import overview_poses
 from service.operations.world_model import expected_panel
+from service.schema.requests import PanelPoseRequest
+from service.schema.results import PanelPoseResult, PlateInScanner, estimated
 
 WRONG_FIT_P = 1e-4  # a worse fit than one in ten thousand means a wrong lamp, panel file or lens
 
@@ -159,37 +159,26 @@ def plate_in(session: Session, image: Scan) -> ScannedPlane:
     return ScannedPlane(fit=fit, scan=image, observation=observation)
 
 
-def run_panel_pose(session: Session, request: PanelPoseRequest) -> dict[str, Any]:
+def run_panel_pose(session: Session, request: PanelPoseRequest) -> PanelPoseResult:
     """The verb `panel-pose`."""
     if request.move:
         session.progress(0.05, "drive to the overview")
         go_to_overview(session)
     found = locate(session)
-    answer: dict[str, Any] = {
-        "base_from_panel": pose_json(found.base_from_panel),
-        "chi_square": found.pose.chi_square,
-        "ambiguous": found.pose.ambiguous,
-        "alternatives": len(found.pose.alternatives),
-        "lights_px": {
-            light.name: list(pixel) for light, pixel in zip(session.panel.lights, found.lights_px, strict=True)
-        },
-    }
+    plate = None
     if request.scan:
         session.progress(0.9, "scan the plate")
         feature = scan_plate(session).fit.feature
-        answer["plate_in_scanner"] = {"point_m": list(feature.point_m), "normal": list(feature.direction)}
-    return answer
-
-
-def pose_json(pose: UncertainPose) -> dict[str, Any]:
-    """A pose with its covariance, and one sigma of each axis for people."""
-    sigma = np.sqrt(np.diag(pose.covariance))
-    return {
-        **to_json(pose.parent_from_child),
-        "covariance": pose.covariance.tolist(),
-        "sigma_m": sigma[:3].tolist(),
-        "sigma_rad": sigma[3:].tolist(),
-    }
+        plate = PlateInScanner(point_m=feature.point_m.tolist(), normal=feature.direction.tolist())
+    lights = zip(session.panel.lights, found.lights_px, strict=True)
+    return PanelPoseResult(
+        base_from_panel=estimated(found.base_from_panel),
+        chi_square=found.pose.chi_square,
+        ambiguous=found.pose.ambiguous,
+        alternatives=len(found.pose.alternatives),
+        lights_px={light.name: pixel for light, pixel in lights},
+        plate_in_scanner=plate,
+    )
 
 
 def _check_fit(session: Session, pose: QuadranglePose) -> None:

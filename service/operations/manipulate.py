@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from hal.errors import PerceptionError, Unreachable
 from hal.panel import Button, Handwheel, Lever, PanelObject, Rotary
 from manipulation import ObjectState, SkillReport, Verify, operate
 from perception.vision import ObjectReading, said
 from service.operations.inspect import ensure_located, look_close, look_past
-from service.operations.requests import ActionBody, ManipulateRequest
 from service.operations.session import Session
 from service.operations.targets import target_of
 from service.operations.travel import skill_context
 from service.report.plots import png_of
-from service.report.record import Action, Picture
+from service.report.record import Picture
+from service.schema.requests import ActionBody, ManipulateRequest
+from service.schema.results import ActionResult, ManipulateResult
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Deed:
     """A control that was worked: the skill's report and the looks before and after."""
 
-    action: Action
+    action: ActionResult
     report: SkillReport
     before: ObjectReading | None
     after: ObjectReading | None
@@ -44,7 +44,7 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
     report = operate(skill_context(session), panel_object, target, current=current, verify=eye.verify())
     reached = report.is_done
     return Deed(
-        action=Action(
+        action=ActionResult(
             object=panel_object.name,
             skill=report.skill,
             target=target if isinstance(target, str) else f"{target:g}",
@@ -64,7 +64,7 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
     )
 
 
-def run_manipulate(session: Session, request: ManipulateRequest) -> dict[str, Any]:
+def run_manipulate(session: Session, request: ManipulateRequest) -> ManipulateResult:
     """The verb `manipulate`."""
     ensure_located(session.part(0.0, 0.3))
     session.progress(0.3, f"work {request.object}")
@@ -72,7 +72,7 @@ def run_manipulate(session: Session, request: ManipulateRequest) -> dict[str, An
     pictures = []
     if deed.picture is not None:
         pictures.append(session.context.task.artefact("after.png", deed.picture.png, "image/png"))
-    return {"action": deed.action, "pictures": pictures}
+    return ManipulateResult(action=deed.action, pictures=pictures)
 
 
 class _Eye:

@@ -7,7 +7,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,13 +17,12 @@ from hal.panel import Button, Lever, PanelObject, Slider, Toggle
 from perception.vision import ObjectReading
 from service.operations.acquisition import settle
 from service.operations.context import OperationContext
-from service.operations.cross_check import OVERVIEW, SurfaceCheck, check_surfaces, need_its_place, view_surfaces
+from service.operations.cross_check import OVERVIEW, check_surfaces, need_its_place, view_surfaces
 from service.operations.evaluate import AFTER
-from service.operations.inspect import Inspection, inspect_close, inspect_here, need_all_present, reading_row
-from service.operations.locate import Located, ScannedPlane, go_to_overview, locate, pose_json, scan_plate
+from service.operations.inspect import Inspection, inspect_close, inspect_here, need_all_present, reading_result
+from service.operations.locate import Located, ScannedPlane, go_to_overview, locate, scan_plate
 from service.operations.manipulate import work
-from service.operations.requests import ActionBody, MissionRequest
-from service.operations.sense import feel, fuse_and_remember, fused_json, light_observations
+from service.operations.sense import feel, fuse_and_remember, fused_result, light_observations
 from service.operations.session import Session
 from service.operations.travel import leave_the_panel, park
 from service.problem import problem_of
@@ -32,12 +30,14 @@ from service.report.drawing import panel_drawing
 from service.report.plots import joints_picture, lights_picture, png_of, range_picture, wrench_picture
 from service.report.record import MissionRecord, Picture
 from service.report.write import write_report
+from service.schema.requests import ActionBody, MissionRequest
+from service.schema.results import FittedPlate, MissionResult, ObjectPlace, SurfaceCheck, estimated
 
 log = logging.getLogger(__name__)
 BEFORE = "before the actions"
 
 
-def run_mission(context: OperationContext, request: MissionRequest) -> dict[str, Any]:
+def run_mission(context: OperationContext, request: MissionRequest) -> MissionResult:
     """The verb `missions`.
 
     Whatever happens, the arm is parked if it still obeys and has not failed itself, and the report tells what is known.
@@ -75,15 +75,15 @@ def run_mission(context: OperationContext, request: MissionRequest) -> dict[str,
     finally:
         _finish(record)
         is_reported = _report(record, context.runs_dir / name)
-    return {
-        "mission": name,
-        "succeeded": record.succeeded,
-        "report": f"/v1/missions/{name}/report.html" if is_reported else None,
-        "actions": record.actions,
-        "fused": record.facts.get("fused"),
-        "cell_s": sum(step.cell_s for step in record.steps),
-        "wall_s": sum(step.wall_s for step in record.steps),
-    }
+    return MissionResult(
+        mission=name,
+        succeeded=record.succeeded,
+        report=f"/v1/missions/{name}/report.html" if is_reported else None,
+        actions=record.actions,
+        fused=record.fused,
+        cell_s=sum(step.cell_s for step in record.steps),
+        wall_s=sum(step.wall_s for step in record.steps),
+    )
 
 
 def _report(record: MissionRecord, folder: Path) -> bool:
@@ -120,23 +120,23 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
         found = inspect_here(part, [panel_object.name for panel_object in session.panel.objects])
         _note_pictures(record, found, "recognised")
         need_all_present(found, session)
-        record.facts["objects"] = _places(session, found)
+        record.objects = _places(session, found)
     with _step(session, "read", 0.22, 0.38) as part:
         found = inspect_close(part, [panel_object.name for panel_object in session.panel.objects])
         _note_pictures(record, found, "read")
-        record.readings += [reading_row(reading, BEFORE) for reading in found.readings.values()]
+        record.readings += [reading_result(reading, BEFORE) for reading in found.readings.values()]
     with _step(session, "touch", 0.38, 0.55) as part:
         felt = feel(part, request.touches)
     with _step(session, "fuse", 0.55, 0.57) as part:
         part.progress(0.0, "fuse light rays, range plane, distances and touches")
         answer = fuse_and_remember(part, (*light_observations([first, located]), plane.observation, *felt.observations))
-        record.facts["fused"] = fused_json(answer)
-        record.facts["by_lights"] = pose_json(located.base_from_panel)
+        record.fused = fused_result(answer)
+        record.by_lights = estimated(located.base_from_panel)
         record.pictures.append(_drawing(session, located))
     with _step(session, "check by surfaces", 0.57, 0.58) as part:
         part.progress(0.0, "mushroom and wheel where layout and vision have them?")
         checks, pictures = check_surfaces(part, by_surfaces)
-        record.facts["by_surfaces"] = checks
+        record.by_surfaces = checks
         record.pictures += pictures
     _work_all(session, record, request, checks)
     with _step(session, "retreat", 0.96, 1.0) as part:
@@ -154,7 +154,7 @@ def _work_all(session: Session, record: MissionRecord, request: MissionRequest, 
             deed = work(part, body)
             record.actions.append(deed.action)
             if deed.after is not None:
-                record.readings.append(reading_row(deed.after, AFTER))
+                record.readings.append(reading_result(deed.after, AFTER))
             if deed.picture is not None:
                 record.pictures.append(deed.picture)
 
@@ -211,14 +211,14 @@ def _park_after(session: Session, record: MissionRecord, error: Exception) -> No
     An arm that failed itself is left where it stands: whoever goes near it must not see it move.
     """
     if isinstance(error, DeviceError) and error.details.get("device") in session.cell.names_of(DeviceKind.ARM):
-        record.facts["not_parked"] = f"{error.what}: the arm was not parked; look at it, then reset the stop"
+        record.not_parked = f"{error.what}: the arm was not parked; look at it, then reset the stop"
         return
     try:
         with record.step("park after the error"):
             settle(session)
             park(session)
     except CellError as second:
-        record.facts["not_parked"] = f"after {error}: {second.what}"
+        record.not_parked = f"after {error}: {second.what}"
 
 
 def _finish(record: MissionRecord) -> None:
@@ -249,11 +249,11 @@ def _note_plane(record: MissionRecord, plane: ScannedPlane) -> None:
             png=range_picture(depth, -(points - feature.point_m) @ (-feature.direction)),
         )
     )
-    record.facts["plate_in_scanner"] = {
-        "point_m": list(feature.point_m),
-        "normal": list(feature.direction),
-        "rms_m": float(np.sqrt(np.trace(feature.point_covariance))),
-    }
+    record.plate_in_scanner = FittedPlate(
+        point_m=feature.point_m.tolist(),
+        normal=feature.direction.tolist(),
+        rms_m=float(np.sqrt(np.trace(feature.point_covariance))),
+    )
 
 
 def _note_pictures(record: MissionRecord, found: Inspection, name: str) -> None:
@@ -261,11 +261,11 @@ def _note_pictures(record: MissionRecord, found: Inspection, name: str) -> None:
         record.pictures.append(Picture(name=f"{name}-{k}", title=picture.title, png=png_of(picture.pixels)))
 
 
-def _places(session: Session, found: Inspection) -> list[dict[str, Any]]:
+def _places(session: Session, found: Inspection) -> list[ObjectPlace]:
     """Every object in 3-D: base frame, metres."""
     pose = session.known_panel().parent_from_child
     return [
-        {"name": r.name, "kind": r.kind, "centre_in_base_m": pose.apply(r.centre_m).tolist()}
+        ObjectPlace(name=r.name, kind=r.kind, centre_in_base_m=pose.apply(r.centre_m))
         for r in found.readings.values()
         if r.centre_m is not None
     ]

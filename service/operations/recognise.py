@@ -2,36 +2,39 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from hal.errors import NotFound
+from perception.range import Surface
+from service.jsonable import jsonable
 from service.operations.acquisition import look, scan, settle
 from service.operations.inspect import ensure_located, run_recognise_taught
 from service.operations.locate import go_to_overview, plate_in
-from service.operations.relief import Sighting, find_by_surfaces, mark_of, sighting_json, surfaces_in
-from service.operations.requests import RecogniseRequest
+from service.operations.relief import Sighting, find_by_surfaces, mark_of, surfaces_in
 from service.operations.session import Session
 from service.operations.stored import blind_answer, blind_in_stored, read_stored
 from service.report.plots import png_of
 from service.report.surfaces import surfaces_picture
+from service.schema.requests import RecogniseRequest
+from service.schema.results import RecogniseResult, SurfaceResult, SurfaceSighting, estimated, fields_of
 
 
-def run_recognise(session: Session, request: RecogniseRequest) -> dict[str, Any]:
+def run_recognise(session: Session, request: RecogniseRequest) -> RecogniseResult:
     """Objects of the panel file or of any panel in the image, and surfaces in the range image, as asked."""
     if request.image is not None:
         session.progress(0.1, "look at the stored image")
-        return blind_in_stored(session, request) if request.mode == "blind" else read_stored(session, request)
-    answer: dict[str, Any] = {}
-    if "vision" in request.use:
-        answer |= run_recognise_taught(session, request) if request.mode == "taught" else _blind(session, request)
-    if "range" in request.use:
-        answer |= _by_range(session, request)
-    return answer
+        if request.mode == "blind":
+            return blind_in_stored(session, request)
+        return RecogniseResult(**fields_of(read_stored(session, request)))
+    answer = RecogniseResult()
+    if "vision" in request.use and request.mode == "taught":
+        answer = RecogniseResult(**fields_of(run_recognise_taught(session, request)))
+    elif "vision" in request.use:
+        answer = _blind(session, request)
+    return answer.model_copy(update=_by_range(session, request)) if "range" in request.use else answer
 
 
-def _blind(session: Session, request: RecogniseRequest) -> dict[str, Any]:
+def _blind(session: Session, request: RecogniseRequest) -> RecogniseResult:
     """Which kinds of object are where in this image, without a panel file."""
     if request.move:
         session.progress(0.1, "drive to the overview")
@@ -44,8 +47,8 @@ def _blind(session: Session, request: RecogniseRequest) -> dict[str, Any]:
     )
 
 
-def _by_range(session: Session, request: RecogniseRequest) -> dict[str, Any]:
-    """The surfaces of one range image, and the objects of the panel file whose surfaces are among them."""
+def _by_range(session: Session, request: RecogniseRequest) -> dict[str, object]:
+    """The fields of an answer that one range image gives: its surfaces, and the objects whose surfaces are among them."""
     if request.move and "vision" not in request.use:
         ensure_located(session.part(0.0, 0.6))
         session.progress(0.6, "drive to the overview")
@@ -54,21 +57,48 @@ def _by_range(session: Session, request: RecogniseRequest) -> dict[str, Any]:
     session.progress(0.9, "scan")
     image = scan(session)
     scene, believed = surfaces_in(image), session.believed_panel()
-    answer: dict[str, Any] = {
-        "surfaces": [
-            {"label": s.label, "type": str(s.type), "primitive": s.primitive, "pixels": s.pixels, "rms_m": s.rms_m}
-            for s in scene.surfaces
-        ],
-        "plate": None,
-        "by_surfaces": [],
-    }
+    plate: int | None = None
+    no_plate: str | None = None
     sightings: list[Sighting] = []
     try:
         fit = plate_in(session, image).fit
         sightings = find_by_surfaces(scene, image, session.panel, believed, fit.surface)
-        label = int(np.bincount(scene.labels[fit.inliers]).argmax())
-        answer |= {"plate": label or None, "by_surfaces": [sighting_json(s) for s in sightings]}
+        plate = int(np.bincount(scene.labels[fit.inliers]).argmax()) or None
     except NotFound as error:
-        answer["no_plate"] = error.what  # what else is seen is an answer, too
+        no_plate = error.what  # what else is seen is an answer, too
     drawn = surfaces_picture(scene, [mark_of(sighting, image, believed) for sighting in sightings])
-    return answer | {"range_picture": session.context.task.artefact("surfaces.png", png_of(drawn), "image/png")}
+    return {
+        "surfaces": [_surface_result(surface) for surface in scene.surfaces],
+        "plate": plate,
+        "by_surfaces": [_sighting_result(sighting) for sighting in sightings],
+        "no_plate": no_plate,
+        "range_picture": session.context.task.artefact("surfaces.png", png_of(drawn), "image/png"),
+    }
+
+
+def _surface_result(surface: Surface) -> SurfaceResult:
+    return SurfaceResult(
+        label=surface.label,
+        type=str(surface.type),
+        primitive=jsonable(surface.primitive),
+        pixels=surface.pixels,
+        rms_m=surface.rms_m,
+    )
+
+
+def _sighting_result(sighting: Sighting) -> SurfaceSighting:
+    panel_object, match = sighting.panel_object, sighting.match
+    if match is None or sighting.base_from_object is None:
+        return SurfaceSighting(name=panel_object.name, kind=panel_object.kind, found=False, why=sighting.why)
+    return SurfaceSighting(
+        name=panel_object.name,
+        kind=panel_object.kind,
+        found=True,
+        base_from_object=estimated(sighting.base_from_object),
+        off_panel_file_m=sighting.off_m,
+        state=sighting.state,
+        state_sigma=match.state_sigma,
+        seen=match.seen,
+        score=match.score,
+        surfaces=match.labels,
+    )

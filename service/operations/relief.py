@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -15,7 +14,6 @@ from hal.geometry import UncertainPose, compose, point_covariance
 from hal.panel import Handwheel, Mushroom, Panel
 from perception.range import ComponentModel, Match, PinholeSensor, RangeScene, Surface, analyse, match_models
 from service.operations.acquisition import Scan
-from service.operations.locate import pose_json
 from service.operations.relief_models import models_of
 from service.operations.spots import half_footprint_m
 from service.report.surfaces import Mark
@@ -109,23 +107,6 @@ def _state(panel_object: Mushroom | Handwheel, match: Match, panel_from_object: 
         return match.state
     x, y, _ = panel_from_object.rotation.apply([1.0, 0.0, 0.0])
     return float(-np.arctan2(y, x) % (2.0 * np.pi / panel_object.spokes))
-
-
-def sighting_json(sighting: Sighting) -> dict[str, Any]:
-    """A sighting as the API gives it."""
-    panel_object, match = sighting.panel_object, sighting.match
-    row: dict[str, Any] = {"name": panel_object.name, "kind": panel_object.kind, "found": match is not None}
-    if match is None or sighting.base_from_object is None:
-        return row | {"why": sighting.why}
-    return row | {
-        "base_from_object": pose_json(sighting.base_from_object),
-        "off_panel_file_m": sighting.off_m,
-        "state": sighting.state,
-        "state_sigma": match.state_sigma,
-        "seen": match.seen,
-        "score": match.score,
-        "surfaces": match.labels,
-    }
 
 
 def mark_of(sighting: Sighting, image: Scan, base_from_panel: UncertainPose) -> Mark:

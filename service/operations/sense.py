@@ -38,12 +38,23 @@ from manipulation import SkillFailure, proximity_probe, touch_probe
 from service.operations.acquisition import settle
 from service.operations.doubted_proximity import DoubtedProximity
 from service.operations.inspect import ensure_located
-from service.operations.locate import Located, go_to_overview, locate, pose_json, scan_plate
-from service.operations.requests import BoxBody, CylinderBody, FeatureSetBody, FuseRequest, MeasurementBody
+from service.operations.locate import Located, go_to_overview, locate, scan_plate
 from service.operations.session import Session
 from service.operations.spots import bare_spots
 from service.operations.tours import short_tour
 from service.operations.travel import skill_context
+from service.schema.requests import BoxBody, CylinderBody, FeatureSetBody, FuseRequest, MeasurementBody
+from service.schema.results import (
+    AlternativePose,
+    CertificateResult,
+    FuseResult,
+    MeasurementResult,
+    ProvenSetResult,
+    RejectedMeasurement,
+    ShapeResult,
+    estimated,
+    fields_of,
+)
 
 HOVER_M = 0.05  # of the finger tips above the plate while the proximity sensors look
 LEAST_TOUCHES = 3
@@ -113,17 +124,16 @@ def fuse_and_remember(session: Session, observations: Sequence[Observation]) -> 
     return fused
 
 
-def fused_json(answer: FusedObservations) -> dict[str, Any]:
+def fused_result(answer: FusedObservations) -> FuseResult:
     """The fused pose as reports and the API give it."""
-    fused = answer.fused
-    return {**pose_json(answer.base_from_panel), **_account(fused, answer.measurements)}
+    return _answer(answer.base_from_panel, answer.fused, answer.measurements)
 
 
-def run_fuse(session: Session, request: FuseRequest) -> dict[str, Any]:
+def run_fuse(session: Session, request: FuseRequest) -> FuseResult:
     """The verb `fuse`: measurements that are given, or collected."""
     if request.collect:
         observations = collect(session, request.touches)
-        return fused_json(fuse_and_remember(session, observations))
+        return fused_result(fuse_and_remember(session, observations))
     measurements = [_measurement(body) for body in request.measurements]
     prior = request.prior.pose() if request.prior is not None else None
     fused = fuse(
@@ -133,7 +143,7 @@ def run_fuse(session: Session, request: FuseRequest) -> dict[str, Any]:
         certify=request.certify,
         prove_set_within_s=request.prove_set_within_s,
     )
-    return {**pose_json(fused.base_from_object), **_account(fused, measurements)}
+    return _answer(fused.base_from_object, fused, measurements)
 
 
 def collect(session: Session, touches: int) -> tuple[Observation, ...]:
@@ -267,41 +277,40 @@ def shape_of(body: CylinderBody | BoxBody | FeatureSetBody) -> Shape:
     )
 
 
-def _account(fused: FusedPose, measurements: Sequence[Measurement]) -> dict[str, Any]:
+def _answer(pose: UncertainPose, fused: FusedPose, measurements: Sequence[Measurement]) -> FuseResult:
     rejected = {r.index: r for r in fused.rejected}
-    return {
-        "chi_square": fused.chi_square,
-        "dof": fused.dof,
-        "warnings": warnings_of(fused.chi_square, fused.dof),
-        "ambiguous": fused.is_ambiguous,
-        "unobservable": [direction.words for direction in fused.unobservable],
-        "measurements": [
-            {
-                "label": m.label,
-                "sensor": m.sensor,
-                "sensing": m.cls.words,
-                "value": float(fused.values[i]),
-                "dof": m.dof,
-                "rejected": i in rejected,
-                "reason": rejected[i].reason if i in rejected else None,
-            }
+    return FuseResult(
+        **fields_of(estimated(pose)),
+        chi_square=fused.chi_square,
+        dof=fused.dof,
+        warnings=warnings_of(fused.chi_square, fused.dof),
+        ambiguous=fused.is_ambiguous,
+        unobservable=[direction.words for direction in fused.unobservable],
+        measurements=[
+            MeasurementResult(
+                label=m.label,
+                sensor=m.sensor,
+                sensing=m.cls.words,
+                value=float(fused.values[i]),
+                dof=m.dof,
+                rejected=i in rejected,
+                reason=rejected[i].reason if i in rejected else None,
+            )
             for i, m in enumerate(measurements)
         ],
-        "rejected": [
-            {"index": r.index, "label": r.label, "value": r.value, "reason": r.reason} for r in fused.rejected
-        ],
-        "alternatives": [
-            {
-                **pose_json(UncertainPose(parent_from_child=a.pose, covariance=a.covariance)),
-                "odds": a.odds,
-                "rejected": list(a.rejected),
-            }
+        rejected=[RejectedMeasurement.model_validate(r) for r in fused.rejected],
+        alternatives=[
+            AlternativePose(
+                **fields_of(estimated(UncertainPose(parent_from_child=a.pose, covariance=a.covariance))),
+                odds=a.odds,
+                rejected=list(a.rejected),
+            )
             for a in fused.alternatives
         ],
-        "certificate": fused.certificate,
-        "proven_set": fused.proven_set,
-        "shape": _shape_json(fused.shape),
-    }
+        certificate=None if fused.certificate is None else CertificateResult.model_validate(fused.certificate),
+        proven_set=None if fused.proven_set is None else ProvenSetResult.model_validate(fused.proven_set),
+        shape=None if fused.shape is None else _shape_result(fused.shape),
+    )
 
 
 def warnings_of(chi_square: float, dof: int) -> list[str]:
@@ -318,12 +327,10 @@ def warnings_of(chi_square: float, dof: int) -> list[str]:
     ]
 
 
-def _shape_json(shape: ShapeEstimate | None) -> dict[str, Any] | None:
-    if shape is None:
-        return None
-    return {
-        "names": list(shape.names),
-        "values": shape.values.tolist(),
-        "sigma": np.sqrt(np.diag(shape.covariance)).tolist(),
-        "covariance": shape.covariance.tolist(),
-    }
+def _shape_result(shape: ShapeEstimate) -> ShapeResult:
+    return ShapeResult(
+        names=list(shape.names),
+        values=shape.values.tolist(),
+        sigma=np.sqrt(np.diag(shape.covariance)).tolist(),
+        covariance=shape.covariance.tolist(),
+    )

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -16,9 +15,10 @@ from hal.panel import Panel
 from perception.vision import ObjectReading
 from service.knowledge.images import ImageStore
 from service.knowledge.store import KnowledgeStore
-from service.operations.requests import InspectRequest, RecogniseRequest, StoredLook
 from service.operations.session import Session, panel_object_or_all
 from service.report.plots import png_of
+from service.schema.requests import InspectRequest, RecogniseRequest, StoredLook
+from service.schema.results import CandidateResult, InspectResult, ObjectResult, PossibleNumber, RecogniseResult
 
 if TYPE_CHECKING:
     from perception.vision import PanelProjection
@@ -28,7 +28,7 @@ PICTURE_WIDTH_PX = 1600  # wider pictures are shown smaller: nobody looks at 40 
 BORDER_SIGMA_PX = 1.0  # of a corner of the plate where two of its sides meet
 
 
-def read_stored(session: Session, request: RecogniseRequest | InspectRequest) -> dict[str, Any]:
+def read_stored(session: Session, request: RecogniseRequest | InspectRequest) -> InspectResult:
     """A taught panel in a stored image: every object with what it says, and the annotated picture.
 
     Raises:
@@ -44,15 +44,15 @@ def read_stored(session: Session, request: RecogniseRequest | InspectRequest) ->
         pixels, as_gray(pixels), view, panel, names=names, least_confidence=request.least_confidence
     )
     picture = shown(draw_annotated(pixels, readings))
-    return {
-        "panel": panel.name,
-        "objects": [reading_row_json(reading) for reading in readings],
-        "missing": [reading.name for reading in readings if not reading.present],
-        "pictures": [session.context.task.artefact("annotated.png", png_of(picture), "image/png")],
-    }
+    return InspectResult(
+        panel=panel.name,
+        objects=[object_result(reading) for reading in readings],
+        missing=[reading.name for reading in readings if not reading.present],
+        pictures=[session.context.task.artefact("annotated.png", png_of(picture), "image/png")],
+    )
 
 
-def blind_in_stored(session: Session, request: RecogniseRequest) -> dict[str, Any]:
+def blind_in_stored(session: Session, request: RecogniseRequest) -> RecogniseResult:
     """Which kinds of object are where in a stored image.
 
     Raises:
@@ -73,7 +73,7 @@ def blind_in_stored(session: Session, request: RecogniseRequest) -> dict[str, An
 
 def blind_answer(
     session: Session, pixels: Pixels, plate_m: tuple[float, float], *, focal_px: float | None
-) -> dict[str, Any]:
+) -> RecogniseResult:
     """All candidates, refused ones with their reasons, and a picture of the others."""
     from perception.vision import GREEN, draw_outlines, recognise
 
@@ -82,10 +82,10 @@ def blind_answer(
     texts = [f"{candidate.kind} {candidate.confidence:.2f}" for candidate in taken]
     outlined = draw_outlines(pixels, [candidate.box_px for candidate in taken], texts, [GREEN] * len(taken))
     picture = png_of(shown(outlined))
-    return {
-        "candidates": list(found),
-        "pictures": [session.context.task.artefact("blind.png", picture, "image/png")],
-    }
+    return RecogniseResult(
+        candidates=[CandidateResult.model_validate(candidate) for candidate in found],
+        pictures=[session.context.task.artefact("blind.png", picture, "image/png")],
+    )
 
 
 def panel_of(session: Session, name: str | None) -> Panel:
@@ -99,22 +99,28 @@ def panel_of(session: Session, name: str | None) -> Panel:
     return _stores(session)[1].panel(name)
 
 
-def reading_row_json(reading: ObjectReading) -> dict[str, Any]:
-    """A reading as the API gives it, without a place in the room."""
-    return {
-        "name": reading.name,
-        "kind": reading.kind,
-        "present": reading.present,
-        "value": reading.value,
-        "unit": reading.unit,
-        "uncertainty": reading.uncertainty,
-        "state": reading.state,
-        "text": reading.text,
-        "confidence": reading.confidence,
-        "reason": reading.reason,
-        "possible": [asdict(number) for number in reading.possible],
-        "centre_px": list(reading.centre_px),
-    }
+def object_result(reading: ObjectReading, base_from_panel: UncertainPose | None = None) -> ObjectResult:
+    """A reading as the API gives it; with places in the panel and in the base frame when the panel's pose is known."""
+    in_panel_m = reading.centre_m if base_from_panel is not None else None
+    in_base_m = None
+    if in_panel_m is not None and base_from_panel is not None:
+        in_base_m = base_from_panel.parent_from_child.apply(in_panel_m).tolist()
+    return ObjectResult(
+        name=reading.name,
+        kind=reading.kind,
+        present=reading.present,
+        value=reading.value,
+        unit=reading.unit,
+        uncertainty=reading.uncertainty,
+        state=reading.state,
+        text=reading.text,
+        confidence=reading.confidence,
+        reason=reading.reason,
+        possible=[PossibleNumber.model_validate(number) for number in reading.possible],
+        centre_px=reading.centre_px.tolist(),
+        centre_in_panel_m=None if in_panel_m is None else in_panel_m.tolist(),
+        centre_in_base_m=in_base_m,
+    )
 
 
 def shown(picture: Pixels) -> Pixels:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hal.config import Cell
 from hal.errors import InvalidRequest
 from hal.panel import Button, Handwheel, Lever, Mushroom, PanelObject, Rotary, Slider, Toggle
-from service.operations.requests import ActionBody, InspectRequest, ManipulateRequest, MissionRequest, RecogniseRequest
+from service.schema.requests import ActionBody, InspectRequest, ManipulateRequest, MissionRequest, RecogniseRequest
 
 
 def target_of(panel_object: PanelObject, body: ActionBody) -> str | float:

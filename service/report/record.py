@@ -10,6 +10,18 @@ from typing import Any
 
 from hal.errors import CellError
 from hal.motion import MotionReport
+from service.schema.results import (
+    ActionResult,
+    EstimatedPose,
+    FittedPlate,
+    FuseResult,
+    ObjectPlace,
+    ReadingResult,
+    SurfaceCheck,
+)
+
+# Fields of a record that a report has once they are known.
+FINDINGS = ("plate_in_scanner", "objects", "fused", "by_lights", "by_surfaces", "not_parked")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,41 +33,6 @@ class Step:
     cell_s: float
     ok: bool
     detail: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reading:
-    """What one object said at one look."""
-
-    name: str
-    kind: str
-    present: bool
-    shows: str
-    value: float | None
-    unit: str
-    uncertainty: float | None
-    state: str | None
-    text: str | None
-    confidence: float
-    reason: str | None
-    when: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Action:
-    """One deed: what was asked, what the skill says, what a second look says."""
-
-    object: str
-    skill: str
-    target: str
-    outcome: str
-    detail: str
-    before: str
-    after: str
-    confirmed: bool
-    attempts: int
-    peak_force_n: float
-    cell_s: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,7 +50,11 @@ class MissionRecord:
 
     Attributes:
         now_s: the cell's clock.
-        facts: named results (poses, fusion, planes) as plain JSON values.
+        plate_in_scanner: the plate's plane as the first scan has it.
+        objects: where each object is in 3-D.
+        fused, by_lights: the panel's pose by all senses, and by its lights alone.
+        by_surfaces: what the surfaces of objects say beside layout and vision.
+        not_parked: why the arm was left where it stands after an error.
     """
 
     mission: str
@@ -84,11 +65,16 @@ class MissionRecord:
     now_s: Callable[[], float]
     started_wall: float = field(default_factory=time.time)
     steps: list[Step] = field(default_factory=list)
-    readings: list[Reading] = field(default_factory=list)
-    actions: list[Action] = field(default_factory=list)
+    readings: list[ReadingResult] = field(default_factory=list)
+    actions: list[ActionResult] = field(default_factory=list)
     pictures: list[Picture] = field(default_factory=list)
     motions: list[MotionReport] = field(default_factory=list)
-    facts: dict[str, Any] = field(default_factory=dict)
+    plate_in_scanner: FittedPlate | None = None
+    objects: list[ObjectPlace] | None = None
+    fused: FuseResult | None = None
+    by_lights: EstimatedPose | None = None
+    by_surfaces: list[SurfaceCheck] | None = None
+    not_parked: str | None = None
     problem: dict[str, Any] | None = None
     started_cell_s: float = field(init=False)
 
@@ -140,7 +126,7 @@ class MissionRecord:
             "steps": self.steps,
             "readings": self.readings,
             "actions": self.actions,
-            **self.facts,
+            **{name: value for name in FINDINGS if (value := getattr(self, name)) is not None},
             "pictures": [f"{picture.name}.png" for picture in self.pictures],
             "problem": self.problem,
         }

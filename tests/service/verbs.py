@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from hal.clock import Deadline
 from hal.config import Cell
@@ -35,11 +35,31 @@ class FailRequest(Strict):
     defect: bool = False
 
 
-def echo(context: OperationContext, request: EchoRequest) -> dict[str, Any]:
+class EchoResult(BaseModel):
+    """What was said."""
+
+    text: str
+    number: float
+    nothing: float | None
+
+
+class HoldResult(BaseModel):
+    """How long it stood still."""
+
+    held_s: float
+
+
+class MeasureResult(BaseModel):
+    """What the sensor says."""
+
+    distance_m: float
+
+
+def echo(context: OperationContext, request: EchoRequest) -> EchoResult:
     context.task.progress(0.25, "listening")
     context.task.progress(0.75, "speaking", request.text)
     context.task.artefact("said.txt", request.text.encode(), "text/plain")
-    return {"text": request.text, "number": request.number, "nothing": float("nan")}
+    return EchoResult(text=request.text, number=request.number, nothing=float("nan"))
 
 
 def refuse_shouting(_cell: Cell, request: EchoRequest) -> None:
@@ -47,7 +67,7 @@ def refuse_shouting(_cell: Cell, request: EchoRequest) -> None:
         raise InvalidRequest("no shouting", hint="lower the voice")
 
 
-def hold(context: OperationContext, request: HoldRequest) -> dict[str, Any]:
+def hold(context: OperationContext, request: HoldRequest) -> HoldResult:
     """Moves until it is cancelled."""
     mover = context.connection.mover
     done_s = 0.0
@@ -58,26 +78,26 @@ def hold(context: OperationContext, request: HoldRequest) -> dict[str, Any]:
         if report.outcome == "stopped":
             raise DeviceTimeout("the arm was stopped", hint="reset", device="arm")
         threading.Event().wait(0.001)
-    return {"held_s": done_s}
+    return HoldResult(held_s=done_s)
 
 
-def wait(context: OperationContext, request: HoldRequest) -> dict[str, Any]:
+def wait(context: OperationContext, request: HoldRequest) -> HoldResult:
     """Waits without an arm until it is cancelled."""
     while True:
         context.task.check_cancelled()
         threading.Event().wait(0.001)
 
 
-def fail(context: OperationContext, request: FailRequest) -> dict[str, Any]:
+def fail(context: OperationContext, request: FailRequest) -> HoldResult:
     if request.defect:
         raise ZeroDivisionError("planted")
     raise DeviceTimeout("wrist_ft silent for 0.50 s", hint="check power and cable", device="wrist_ft")
 
 
-def measure(context: OperationContext, request: EchoRequest) -> dict[str, Any]:
+def measure(context: OperationContext, request: EchoRequest) -> MeasureResult:
     device = context.connection.device("finger_proximity")
     deadline = Deadline.after(context.connection.clock, 1.0)
-    return {"distance_m": device.read_distance_m(deadline=deadline).value}
+    return MeasureResult(distance_m=device.read_distance_m(deadline=deadline).value)
 
 
 OPERATIONS = {
@@ -86,17 +106,45 @@ OPERATIONS = {
         Operation(
             name="echo",
             request_model=EchoRequest,
+            result_model=EchoResult,
             run=echo,
             summary="Echo",
             example={"text": "a"},
             moves=False,
             check=refuse_shouting,
         ),
-        Operation(name="hold", request_model=HoldRequest, run=hold, summary="Hold", example={"seconds": 0.1}),
-        Operation(name="wait", request_model=HoldRequest, run=wait, summary="Wait", example={"seconds": 0.1}),
         Operation(
-            name="fail", request_model=FailRequest, run=fail, summary="Fail", example={"defect": False}, moves=False
+            name="hold",
+            request_model=HoldRequest,
+            result_model=HoldResult,
+            run=hold,
+            summary="Hold",
+            example={"seconds": 0.1},
         ),
-        Operation(name="measure", request_model=EchoRequest, run=measure, summary="Measure", moves=False),
+        Operation(
+            name="wait",
+            request_model=HoldRequest,
+            result_model=HoldResult,
+            run=wait,
+            summary="Wait",
+            example={"seconds": 0.1},
+        ),
+        Operation(
+            name="fail",
+            request_model=FailRequest,
+            result_model=HoldResult,
+            run=fail,
+            summary="Fail",
+            example={"defect": False},
+            moves=False,
+        ),
+        Operation(
+            name="measure",
+            request_model=EchoRequest,
+            result_model=MeasureResult,
+            run=measure,
+            summary="Measure",
+            moves=False,
+        ),
     )
 }

@@ -246,13 +246,13 @@ from hal.config import load_cell
 from service.commands.serve import run_to_end
 from service.operations.context import Operation
 from service.serve import Options, Panelwright
-from tests.service.verbs import EchoRequest
+from tests.service.verbs import EchoRequest, HoldResult
 
 def stubborn(context, request):
     while True:  # computes, and never asks whether it was cancelled
         sum(range(10_000))
 
-operation = Operation(name="stubborn", request_model=EchoRequest, run=stubborn, summary="Never ends")
+operation = Operation(name="stubborn", request_model=EchoRequest, result_model=HoldResult, run=stubborn, summary="Never ends")
 options = Options(port=int(sys.argv[2]), stop_port=0, runs_dir=Path(sys.argv[3]), warm=False)
 run_to_end(Panelwright(load_cell(Path(sys.argv[1])), options, operations={"stubborn": operation}))
 """

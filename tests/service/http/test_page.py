@@ -16,7 +16,7 @@ from service.operations.context import Operation
 from service.serve import Options, Panelwright
 from tests.service.browser import NEEDS_CHROMIUM, browser, new_tab, until
 from tests.service.conftest import WriteCell
-from tests.service.verbs import OPERATIONS, HoldRequest, hold
+from tests.service.verbs import OPERATIONS, HoldRequest, HoldResult, hold
 from tests.service.waiting import eventually
 
 __all__ = ["browser"]  # a fixture
@@ -26,7 +26,9 @@ pytestmark = NEEDS_CHROMIUM
 @pytest.fixture(scope="module")
 def served_page(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Panelwright]:
     """A cell of fakes whose mission stands still for a long time."""
-    missions = Operation(name="missions", request_model=HoldRequest, run=hold, summary="Hold", moves=True)
+    missions = Operation(
+        name="missions", request_model=HoldRequest, result_model=HoldResult, run=hold, summary="Hold", moves=True
+    )
     runs = tmp_path_factory.mktemp("runs")
     (runs / "2026-01-02T03-04-05").mkdir()
     (runs / "2026-01-02T03-04-05" / "report.json").write_text("{}")

@@ -13,7 +13,7 @@ from hal.errors import ConfigError
 from perception.calibration.records import renewed
 from service.knowledge.calibrations import Calibrations, NoSuchCalibration
 from service.operations import OPERATIONS
-from service.operations.requests import CalibrationRequest
+from service.schema.requests import CalibrationRequest
 from service.serve import Options, Panelwright
 from tests.service.conftest import WriteCell
 from tests.service.shown_panel import house, is_problem, web

@@ -18,12 +18,13 @@ from service.knowledge.calibrations import Calibrations
 from service.operations.acquisition import settle
 from service.operations.calibrate import run_calibrations
 from service.operations.context import OperationContext
-from service.operations.requests import CalibrationRequest
 from service.operations.session import Session
 from service.operations.travel import kinematics
 from service.operations.world_model import WorldModel
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection
+from service.schema.requests import CalibrationRequest
+from service.schema.results import CalibrationResult
 from service.tasks.gate import GatedConnection
 from service.tasks.model import Task
 from service.tasks.store import TaskContext
@@ -52,7 +53,7 @@ class Rig:
         connection = GatedConnection(local, task.check_cancelled, cell=applied)
         return Session(context=OperationContext(connection=connection, task=task, runs_dir=self.runs, world=self.world))
 
-    def calibrate(self, what: str, **more: Any) -> dict[str, Any]:
+    def calibrate(self, what: str, **more: Any) -> CalibrationResult:
         return run_calibrations(self.session(), CalibrationRequest(what=what, **more))
 
 
@@ -91,38 +92,36 @@ def test_a_dry_run_plans_and_neither_moves_nor_writes(rig: Rig) -> None:
     before = rig.session().mover.state().position_rad
     for what in ("hand-eye", "scanner", "tool"):
         plan = rig.calibrate(what, poses=5, dry_run=True)
-        assert len(plan["stations"]) == 5
+        assert len(plan.stations) == 5
     np.testing.assert_array_equal(rig.session().mover.state().position_rad, before)
     assert not (rig.runs / "calibrations").exists()
 
 
 def test_hand_eye_with_twelve_poses_then_the_scanner(rig: Rig) -> None:
     result = rig.calibrate("hand-eye", poses=12)
-    shift_m, turn_deg = off_by(rig, "wrist_camera", result["path"])
+    shift_m, turn_deg = off_by(rig, "wrist_camera", result.path)
     assert shift_m < 1e-3 and turn_deg < 0.2
-    quality = result["record"]["quality"]
+    quality = result.record.quality
     assert quality["views"] >= 10 and 0.2 < quality["chi_square_ratio"] < 3.0
-    assert result["record"]["version"] == 2 and result["in_use_from"] == "now"
-    assert rig.session().mount("wrist_camera").covariance[0, 0] == pytest.approx(
-        result["record"]["mount"]["sigma_m"][0] ** 2
-    )
+    assert result.record.version == 2 and result.in_use_from == "now"
+    assert rig.session().mount("wrist_camera").covariance[0, 0] == pytest.approx(result.record.mount.sigma_m[0] ** 2)
     settle(rig.session(), 0.3)
     home = kinematics(rig.session()).flange(np.array(rig.cell.file.workspace.park_rad))
     assert np.linalg.norm((home.inv() * rig.session().mover.state().base_from_flange).translation) < 0.005
     scanned = rig.calibrate("scanner", poses=8)
-    shift_m, turn_deg = off_by(rig, "range_scanner", scanned["path"])
+    shift_m, turn_deg = off_by(rig, "range_scanner", scanned.path)
     assert shift_m < 2e-3 and turn_deg < 0.2
 
 
 def test_the_tool_is_weighed_and_the_bias_found(rig: Rig) -> None:
     result = rig.calibrate("tool", poses=8)
-    found = load_calibration(Path(result["path"])).load
+    found = load_calibration(Path(result.path)).load
     built = rig.cell.calibration_of("wrist_ft").load
     assert found is not None and built is not None
     truth = Draws(SEED).load("wrist_ft", built.load())
     assert abs(found.mass_kg - truth.mass_kg) < 0.02
     assert np.linalg.norm(np.subtract(found.bias_force_n, truth.bias[:3])) < 0.5  # its own drift is 0.15 N an axis
-    assert result["in_use_from"] == "the next start of the service"
+    assert result.in_use_from == "the next start of the service"
 
 
 def test_a_cancelled_calibration_writes_nothing(rig: Rig) -> None:

@@ -17,6 +17,7 @@ from hal.panel import load_panel
 from hal.simulated import ObjectTruth, Truth
 from service.operations.evaluate import AFTER, agrees, compare, evaluate
 from service.processes.connection import CellConnection
+from service.schema.results import UnaskedMotion
 
 PANEL = load_panel(Path(__file__).parents[3] / "panels/bench.toml")
 POSE = transform_rpy((0.95, 0.0, 0.55), (1.57, 0.0, -1.57))
@@ -63,26 +64,26 @@ ALL_DONE = [action("main_valve", "open"), action("setpoint", "70"), action("star
 
 def test_true_claims_are_agreed_with() -> None:
     verdict = compare(report(actions=ALL_DONE, readings=[reading("pressure", value=4.1)]), truth(), PANEL)
-    assert verdict["agrees"]
-    assert (verdict["readings_right"], verdict["readings_given"]) == (1, 1)
-    assert verdict["pose_error_m"] == pytest.approx(5e-4)
-    assert verdict["pose_error_rad"] == pytest.approx(1e-3)
-    assert verdict["inside_95"]
+    assert verdict.agrees
+    assert (verdict.readings_right, verdict.readings_given) == (1, 1)
+    assert verdict.pose_error_m == pytest.approx(5e-4)
+    assert verdict.pose_error_rad == pytest.approx(1e-3)
+    assert verdict.inside_95
 
 
 @pytest.mark.parametrize("lie", [{"valve": "closed"}, {"slider": 60.0}, {"lamp": "off"}])
 def test_one_false_done_is_disagreed_with(lie: dict[str, Any]) -> None:
-    assert not compare(report(actions=ALL_DONE), truth(**lie), PANEL)["agrees"]
+    assert not compare(report(actions=ALL_DONE), truth(**lie), PANEL).agrees
 
 
 def test_what_moved_though_nobody_asked_is_told() -> None:
     asked = report(actions=[action("main_valve", "open"), action("start", "on")])
     knocked = compare(asked, truth(slider=60.0), PANEL)
-    assert knocked["moved_unasked"] == [{"name": "setpoint", "truth": "20 to 60"}]
-    assert compare(asked, truth(slider=20.5), PANEL)["moved_unasked"] == [], "within what a reading may be off"
-    assert compare(report(actions=ALL_DONE), truth(), PANEL)["moved_unasked"] == [], "the lamp is the button's"
+    assert knocked.moved_unasked == [UnaskedMotion(name="setpoint", truth="20 to 60")]
+    assert compare(asked, truth(slider=20.5), PANEL).moved_unasked == [], "within what a reading may be off"
+    assert compare(report(actions=ALL_DONE), truth(), PANEL).moved_unasked == [], "the lamp is the button's"
     lit = compare(report(actions=[action("main_valve", "open")]), truth(slider=20.0), PANEL)
-    assert [moved["name"] for moved in lit["moved_unasked"]] == ["run_lamp"]
+    assert [moved.name for moved in lit.moved_unasked] == ["run_lamp"]
 
 
 def test_of_several_deeds_with_one_control_the_last_is_judged() -> None:
@@ -90,30 +91,30 @@ def test_of_several_deeds_with_one_control_the_last_is_judged() -> None:
     deeds = [action("start", "on"), action("start", "off")]
     looks = [reading("run_lamp", AFTER, state="on"), reading("run_lamp", AFTER, state="off")]
     verdict = compare(report(actions=deeds, readings=looks), truth(lamp="off"), PANEL)
-    assert verdict["agrees"] and (verdict["readings_right"], verdict["readings_given"]) == (1, 1)
+    assert verdict.agrees and (verdict.readings_right, verdict.readings_given) == (1, 1)
     verdict = compare(report(actions=deeds[::-1], readings=looks), truth(lamp="off"), PANEL)
-    assert not verdict["agrees"] and verdict["readings_right"] == 1
+    assert not verdict.agrees and verdict.readings_right == 1
 
 
 def test_a_failure_that_is_told_is_no_lie() -> None:
     verdict = compare(report(actions=[action("main_valve", "open", confirmed=False)]), truth(valve="closed"), PANEL)
-    assert verdict["agrees"]
-    assert verdict["actions_confirmed"] == 0
+    assert verdict.agrees
+    assert verdict.actions_confirmed == 0
 
 
 def test_a_pose_outside_its_ellipsoid_is_said_to_be() -> None:
     covariance = (np.diag([1e-4] * 6) ** 2).tolist()
     fused = {**to_json(perturbed(POSE, [5e-4, 0, 0, 0, 0, 0])), "covariance": covariance}
-    assert not compare(report(fused=fused), truth(), PANEL)["inside_95"]
+    assert not compare(report(fused=fused), truth(), PANEL).inside_95
 
 
 def test_a_mission_without_a_pose_is_judged_without_one() -> None:
-    assert compare(report(fused=None), truth(), PANEL)["pose_error_m"] is None
+    assert compare(report(fused=None), truth(), PANEL).pose_error_m is None
 
 
 def test_readings_are_held_against_their_own_time() -> None:
     rows = [reading("main_valve", state="closed"), reading("main_valve", AFTER, state="open")]
-    assert compare(report(readings=rows), truth(), PANEL)["readings_right"] == 2
+    assert compare(report(readings=rows), truth(), PANEL).readings_right == 2
 
 
 @pytest.mark.parametrize(
@@ -172,4 +173,4 @@ def test_a_mission_is_compared_with_what_its_own_beginning_showed(
     )
     monkeypatch.setattr("service.operations.evaluate.render", lambda folder: None)
     verdict = evaluate(cast(CellConnection, connection), tmp_path)
-    assert asked[-1] == 80.0 and verdict["moved_unasked"] == []
+    assert asked[-1] == 80.0 and verdict.moved_unasked == []

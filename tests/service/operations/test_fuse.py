@@ -13,9 +13,9 @@ from fusion.measurement import Measurement
 from fusion.simulate import CODES, problem
 from hal.errors import InvalidRequest
 from service.jsonable import jsonable
-from service.operations.examples import FUSE_EXAMPLES, NINE_KINDS, ROUND_POST
-from service.operations.requests import FuseRequest
 from service.operations.sense import run_fuse
+from service.schema.examples import FUSE_EXAMPLES, NINE_KINDS, ROUND_POST
+from service.schema.requests import FuseRequest
 
 
 def fused(body: dict[str, Any]) -> dict[str, Any]:

@@ -14,11 +14,11 @@ from hal.errors import NotFound
 from service.operations.context import OperationContext
 from service.operations.learn import run_learn
 from service.operations.recognise import run_recognise
-from service.operations.requests import LearnRequest, RecogniseRequest
 from service.operations.session import Session
 from service.operations.world_model import WorldModel
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection
+from service.schema.requests import LearnRequest, RecogniseRequest
 from service.tasks.model import Task
 from service.tasks.store import TaskContext
 
@@ -43,7 +43,7 @@ def session(runtime: CellRuntime, cell: Cell, folder: Path, memory: WorldModel) 
 
 
 def blind(session: Session, cell: Cell) -> Any:
-    found = run_recognise(session, RecogniseRequest(mode="blind"))["candidates"]
+    found = run_recognise(session, RecogniseRequest(mode="blind")).candidates
     rows = [{"reason": c.reason, "centre_m": c.centre_m, "kind": c.kind, "confidence": c.confidence} for c in found]
     return judged(cell, SEED, rows)
 
@@ -54,7 +54,7 @@ def test_one_overview_teaches_the_cell_its_panel(runtime: CellRuntime, tmp_path:
     with pytest.raises(NotFound, match="not been located"):
         run_learn(session(runtime, cell, tmp_path, WorldModel()), LearnRequest(move=False))
     taught = run_learn(session(runtime, cell, tmp_path, memory), LearnRequest())
-    assert len(taught["taught_by"]) == len(cell.panel.objects) and not taught["left_out"]
+    assert len(taught.taught_by) == len(cell.panel.objects) and not taught.left_out
     now = blind(session(runtime, cell, tmp_path, memory), cell)
     assert len(before.missed) >= 4 and len(now.missed) <= 1
     assert all(answer.is_right for answer in now.answers)

@@ -17,8 +17,8 @@ from hal.simulated import Fault
 from perception.vision.reading import ANSWER_AT, ObjectReading
 from service.operations import inspect
 from service.operations.inspect import Inspection, close_ups, inspect_close
-from service.operations.requests import InspectRequest
 from service.operations.session import Session
+from service.schema.requests import InspectRequest
 
 ROOT = Path(__file__).parents[3]
 pytestmark = pytest.mark.timeout(300)
@@ -106,10 +106,10 @@ def test_a_guess_is_answered_to_who_asks_for_it_and_not_remembered(
 ) -> None:
     monkeypatch.setattr(inspect, "FOR_ALIKE", ())
     session.world.forget_reading("hold")
-    (refusal,) = inspect.run_inspect(session, InspectRequest(objects=("hold",)))["objects"]
-    (guess,) = inspect.run_inspect(session, InspectRequest(objects=("hold",), least_confidence=0.0))["objects"]
-    assert refusal["state"] is None and refusal["reason"]
-    assert guess["state"] in ("pressed", "released") and guess["reason"] is None and guess["confidence"] < ANSWER_AT
+    (refusal,) = inspect.run_inspect(session, InspectRequest(objects=("hold",))).objects
+    (guess,) = inspect.run_inspect(session, InspectRequest(objects=("hold",), least_confidence=0.0)).objects
+    assert refusal.state is None and refusal.reason
+    assert guess.state in ("pressed", "released") and guess.reason is None and guess.confidence < ANSWER_AT
     assert "hold" not in session.world.readings, "missions go by what is sure"
 
 

@@ -22,12 +22,12 @@ from service.operations.evaluate import evaluate
 from service.operations.inspect import look_close
 from service.operations.locate import go_to_overview, locate, scan_plate
 from service.operations.mission import run_mission
-from service.operations.requests import ActionBody, MissionRequest
 from service.operations.session import Session
 from service.operations.travel import go_to_joints
 from service.operations.world_model import WorldModel
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection
+from service.schema.requests import ActionBody, MissionRequest
 from service.tasks.model import Task
 from service.tasks.store import TaskContext
 
@@ -95,7 +95,7 @@ def test_a_planted_wrong_truth_changes_nothing_but_the_judgement(tmp_path: Path)
                 true_truth = arm.truth
                 arm.truth = lambda *at, ask=true_truth: lie(ask(*at))
             answer = run_mission(context, request)
-            evaluate(context.connection, tmp_path / name / "runs" / answer["mission"])
+            evaluate(context.connection, tmp_path / name / "runs" / answer.mission)
     honest, planted = report_of(tmp_path / "honest"), report_of(tmp_path / "planted")
     assert without_wall_time(honest) == without_wall_time(planted)
     assert honest["judge"]["agrees"] and honest["judge"]["pose_error_m"] < 0.005

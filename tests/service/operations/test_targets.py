@@ -12,9 +12,9 @@ from hal.config import load_cell
 from hal.errors import InvalidRequest
 from service.operations import OPERATIONS
 from service.operations.mission import usual_actions
-from service.operations.requests import ActionBody
 from service.operations.targets import target_of
 from service.operations.world_model import WorldModel
+from service.schema.requests import ActionBody
 
 CELL = load_cell(Path(__file__).parents[3] / "cells/bench.toml")
 

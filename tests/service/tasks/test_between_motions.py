@@ -18,7 +18,7 @@ from service.operations.context import Operation, OperationContext
 from service.serve import Options, Panelwright
 from service.tasks.model import Task, TaskState
 from tests.service.conftest import WriteCell
-from tests.service.verbs import OPERATIONS, HoldRequest
+from tests.service.verbs import OPERATIONS, HoldRequest, HoldResult
 from tests.service.waiting import eventually
 
 PATIENCE_S = 20.0
@@ -36,7 +36,7 @@ class Thinker:
         self.thinks.set()
         assert self.may_go_on.wait(PATIENCE_S)
         self._move(context)
-        return {}
+        return HoldResult(held_s=0.0)
 
     def _move(self, context: OperationContext) -> None:
         context.connection.mover.execute(Hold(name="hold", duration_s=0.01))
@@ -50,7 +50,9 @@ def thinker() -> Thinker:
 
 @pytest.fixture
 def service(write_cell: WriteCell, tmp_path: Path, thinker: Thinker) -> Iterator[Service]:
-    think = Operation(name="think", request_model=HoldRequest, run=thinker.run, summary="Think")
+    think = Operation(
+        name="think", request_model=HoldRequest, result_model=HoldResult, run=thinker.run, summary="Think"
+    )
     service = Service(
         load_cell(write_cell(robot=True)), {**OPERATIONS, "think": think}, runs_dir=tmp_path / "runs", inline=True
     )

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from hal.geometry import UncertainPose, from_json
 from hal.strict import Strict
-from service.operations.examples import FUSE_EXAMPLES
+from service.schema.examples import FUSE_EXAMPLES
 
 Vector3 = tuple[float, float, float]
 

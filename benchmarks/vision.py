@@ -26,7 +26,8 @@ from hal.strict import validate
 from perception.vision.finding.blind import recognise
 from perception.vision.image import as_gray, decode
 from perception.vision.inspection import inspect_view
-from perception.vision.knowledge import Knowledge, shipped_knowledge
+from perception.vision.knowledge import Knowledge
+from perception.vision.knowledge_files import load_knowledge
 from perception.vision.lights import assign_lights, find_lights
 from perception.vision.photographs.dial import read_dial
 from perception.vision.photographs.photo_display import read_photograph
@@ -253,7 +254,7 @@ def answer(job: Job, folder: Path, *, least_confidence: float = ANSWER_AT) -> di
 
 @cache
 def _knowledge() -> Knowledge:
-    return shipped_knowledge()
+    return load_knowledge()
 
 
 def run(jobs: list[Job], folder: Path, *, timed: bool, least_confidence: float = ANSWER_AT) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """Teach the shipped kinds from labelled overviews, and try what was taught on overviews that it has not seen.
 
 `python -m benchmarks.vision_knowledge FOLDER` prints recall, precision and calibration of three folds of the overviews
-beside the repository, then writes one TOML a kind, taught on all of them, into FOLDER. The shipped files were made this
-way: one look an object at its true middle, the looks of places that are no object, and of both only those that the ones
+beside the repository, then writes one archive (`.npz`) per kind, taught on all of them, into FOLDER. The shipped files were made
+this way: one look an object at its true middle, the looks of places that are no object, and of both only those that the ones
 kept so far do not tell with a margin (`perception.vision.teaching.condense`). Overviews in good light also teach what they
 would look like in bad light: drawn again with slopes of light, glare, shadow, cables, blur and noise (`panel_scene`), they
 give further looks, which count in noisy images only. With `--only-noisy` these alone are taught, beside what is shipped for
@@ -27,7 +27,8 @@ from hal.arrays import Array, Image
 from perception.vision.finding.blind import PLATE_M, Detection, candidate_places, chosen, lay_out
 from perception.vision.finding.features import PLATE_PX_PER_M, Ground, look_at
 from perception.vision.finding.plate import find_plate
-from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind, shipped_knowledge, spread_of, write_kind
+from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind, spread_of
+from perception.vision.knowledge_files import load_knowledge, write_generated_kind
 from perception.vision.projection import PlateProjection
 from perception.vision.teaching.condense import worth_keeping
 
@@ -208,9 +209,9 @@ def main() -> int:
     _print_folds(everything)
     folder = Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)
-    shipped = shipped_knowledge().for_image(noisy=False)
+    shipped = load_knowledge().for_image(noisy=False)
     for kind in (with_noisy(shipped, everything) if only_noisy else knowledge_of(everything)).kinds:
-        write_kind(kind, folder)
+        write_generated_kind(kind, folder)
         print(f"{kind.name}: {len(kind.looks)} looks")
     return 0
 

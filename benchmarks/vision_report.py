@@ -31,7 +31,7 @@ from hal.panel import PanelObject
 from perception.vision.finding.blind import recognise
 from perception.vision.finding.segment import grow_regions
 from perception.vision.inspection import patch_of, read_patch
-from perception.vision.knowledge import shipped_knowledge
+from perception.vision.knowledge_files import load_knowledge
 from perception.vision.projection import CameraProjection
 
 LEVELS = ("easy", "medium", "hard")
@@ -223,7 +223,7 @@ def _real(truth: dict[str, Any], answers: dict[str, Any], score: ModuleType) -> 
 def _speed(folder: Path) -> None:
     images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted(folder.glob("p24_0*.png"))[:6]]
     pictures: list[Image] = [np.asarray(image, np.uint8) for image in images if image is not None]
-    knowledge = shipped_knowledge()
+    knowledge = load_knowledge()
     blur = _best([partial(cv2.GaussianBlur, g, (5, 5), 0) for g in pictures], 30)
     regions = _best([partial(grow_regions, g) for g in pictures], 6)
     _line("segmentation with sums, blurs", [regions / blur], (30,), at_most=True)

@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.cell import clear_stop, run_to_end
 from hal.config import Cell, load_cell
-from perception.vision.knowledge import load_knowledge, shipped_knowledge, write_kind
+from perception.vision.knowledge_files import load_knowledge, write_kind
 from perception.vision.registration.outline import footprint_m
 from service.client import Client
 from service.serve import Options, Panelwright
@@ -144,7 +144,7 @@ def teach(cell_path: Path, seeds: Sequence[int], folder: Path) -> None:
                 ):  # as far off as an unknown panel is looked at, and nearer
                     learned = run_to_end(client, "/v1/learn", body)["result"]
                     print(f"seed {seed}: {sum(learned['added'].values())} looks; left out: {learned['left_out']}")
-        taught, shipped = load_knowledge(Path(runs) / "knowledge"), shipped_knowledge()
+        taught, shipped = load_knowledge(Path(runs) / "knowledge"), load_knowledge()
     folder.mkdir(parents=True, exist_ok=True)
     for kind in taught.kinds:
         known = shipped.kind(kind.name)

@@ -6,12 +6,12 @@ import numpy as np
 
 from hal.calibration import CalibrationRecord, IntrinsicsRecord, LoadRecord, MountRecord, Vector3
 from hal.geometry import UncertainPose
+from hal.toml_text import toml_edited, toml_text
 from perception.calibration.hand_eye import HandEye
 from perception.calibration.in_hand import FREE, InHandCalibration
 from perception.calibration.intrinsics import CameraCalibration
 from perception.calibration.scanner import ScannerCalibration
 from perception.calibration.wrench import WrenchCalibration
-from perception.toml_text import toml_lines
 
 
 def mount_of(parent_from_device: UncertainPose) -> MountRecord:
@@ -69,14 +69,14 @@ def renewed(current: CalibrationRecord, found: CalibrationRecord) -> Calibration
     return current.model_copy(update=update | about)
 
 
-def to_toml(record: CalibrationRecord) -> str:
-    """The record as a file has it: scalars first, then one table a part."""
-    data = record.model_dump(by_alias=True, exclude_none=True)
-    lines = toml_lines({key: value for key, value in data.items() if not isinstance(value, dict)})
-    for key, table in data.items():
-        if isinstance(table, dict):
-            lines += ["", f"[{key}]", *toml_lines(table)]
-    return "\n".join(lines) + "\n"
+def to_toml(record: CalibrationRecord, *, over: str | None = None) -> str:
+    """The record as a file has it: scalars first, then one table per part.
+
+    Args:
+        over: text of the file that it replaces, whose comments stay.
+    """
+    data = record.model_dump(mode="json", by_alias=True, exclude_none=True)
+    return toml_text(data) if over is None else toml_edited(over, data)
 
 
 def _in_hand_record(device: str, result: InHandCalibration, date: str) -> CalibrationRecord:

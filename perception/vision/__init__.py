@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from perception.vision.finding.framing import check_upright, one_plate
     from perception.vision.image import as_gray, check_image, decode
     from perception.vision.inspection import inspect, inspect_view
-    from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind, load_knowledge, write_kind
+    from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind
+    from perception.vision.knowledge_files import kind_files, kind_text, load_kind, load_knowledge, write_kind
     from perception.vision.lights import find_lights
     from perception.vision.lights.assign import AssignedLights, assign_lights
     from perception.vision.multi_view import merge_views
@@ -71,8 +72,11 @@ __all__ = [
     "find_lights",
     "inspect",
     "inspect_view",
+    "kind_files",
     "kind_question",
+    "kind_text",
     "likest",
+    "load_kind",
     "load_knowledge",
     "merge_views",
     "object_row",

@@ -1,8 +1,8 @@
-"""What the system knows of kinds of objects: readable TOML, one file a kind, written by teaching or by hand.
+"""What the system knows of kinds of objects (files: `knowledge_files`).
 
 A kind has a size and looks. A look is what one taught example looked like (see `features`): four rows of numbers over the
-distance from the middle, in hundredths, and two tables with such a row a direction. The file `nothing.toml` holds looks
-of what is *not* an object: screws, labels, parts of objects. Adding a look to one kind changes no other kind's looks.
+distance from the middle, and two tables with such a row per direction. The kind `nothing` holds looks of what is *not* an
+object: screws, labels, parts of objects. Adding a look to one kind changes no other kind's looks.
 
 Some looks are of noisy images, as a camera takes them in bad light, and only noisy images are compared with these: there a
 blurred, half shaded thing is worth knowing, and in a good image it would be taken for others.
@@ -13,81 +13,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
 
 from hal.arrays import Array
-from hal.atomic_write import write_atomically
-from hal.errors import ConfigError
-from hal.strict import Strict, load_toml
-from perception.vision.finding.features import (
-    AROUND_GROUPS,
-    DIRECTIONS,
-    GROUPS,
-    LENGTH,
-    NOISY_WEIGHTS,
-    RADII_M,
-    RINGS,
-    WEIGHTS,
-)
+from perception.vision.finding.features import NOISY_WEIGHTS, WEIGHTS
 
 NOTHING = "nothing"
-UNIT = 100.0  # looks are stored in hundredths
-
-Row = Annotated[tuple[int, ...], Field(min_length=len(RADII_M), max_length=len(RADII_M))]
-
-RingRow = Annotated[tuple[int, ...], Field(min_length=RINGS, max_length=RINGS)]
-Around = Annotated[tuple[RingRow, ...], Field(min_length=DIRECTIONS, max_length=DIRECTIONS)]
-
-
-class LookRecord(Strict):
-    """One example: relative gray, unevenness, edges and strong edges over the distance from the middle, hundredths.
-
-    `middle_m`: from the place that looks so to the object's middle, x right and y up, where a part of the object or its
-    label shows better than its middle.
-
-    `gray_around` and `edge_around` have a row a direction, clockwise from straight up; left out, every direction is as
-    `gray` and `edge` are all around. `noisy`: counts in noisy images only.
-    """
-
-    gray: Row
-    uneven: Row
-    edge: Row
-    strong_edge: Row
-    gray_around: Around | None = None
-    edge_around: Around | None = None
-    middle_m: tuple[float, float] = (0.0, 0.0)
-    noisy: bool = False
-
-    @property
-    def look(self) -> Array:
-        """(LENGTH,) in the order of `features`."""
-        around = [
-            np.asarray(given, float).ravel() if given is not None else np.tile(_ring_means(row), DIRECTIONS)
-            for given, row in ((self.gray_around, self.gray), (self.edge_around, self.edge))
-        ]
-        rows = np.array([*self.gray, *self.uneven, *self.edge, *self.strong_edge], float)
-        return np.concatenate([rows, *around]) / UNIT
-
-
-class KindRecord(Strict):
-    """A kind's file."""
-
-    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}$")]
-    width_m: Annotated[float, Field(gt=0, le=1.0)]
-    height_m: Annotated[float, Field(gt=0, le=1.0)]
-    taught_by: str = ""
-    looks: tuple[LookRecord, ...] = ()
-
-    @model_validator(mode="after")
-    def _has_looks(self) -> KindRecord:
-        if not self.looks:
-            raise ValueError("a kind needs at least one look")
-        return self
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -179,26 +113,6 @@ class Knowledge:
         return grown
 
 
-def shipped_knowledge() -> Knowledge:
-    """The kinds that come with the system."""
-    return load_knowledge(Path(__file__).parent / "knowledge")
-
-
-def load_knowledge(folder: Path) -> Knowledge:
-    """All kinds of a folder: `*.toml` with looks.
-
-    Raises:
-        ConfigError: a file is malformed, or the folder holds no kind.
-    """
-    records = [
-        load_toml(path, KindRecord, "knowledge file") for path in sorted(folder.glob("*.toml")) if not _is_other(path)
-    ]
-    if not records:
-        raise ConfigError(f"no kinds in {folder}", hint="teach one: panelwright teach IMAGE", file=str(folder))
-    kinds = tuple(_kind(record) for record in records)
-    return Knowledge(kinds=kinds, spread=spread_of(kinds))
-
-
 @lru_cache(maxsize=8)
 def _for_image(knowledge: Knowledge, *, noisy: bool) -> Knowledge:
     """See `Knowledge.for_image`: the same object every time, as `prepared` wants it."""
@@ -217,54 +131,3 @@ def spread_of(kinds: Iterable[TaughtKind]) -> Array:
     means = np.array([kind.looks.mean(axis=0) for kind in kinds])
     within = np.array([kind.looks.var(axis=0) for kind in kinds]).mean(axis=0)
     return np.asarray(np.maximum(np.sqrt(within + means.var(axis=0)), 0.05))
-
-
-def write_kind(kind: TaughtKind, folder: Path) -> Path:
-    """Write one kind's file and return its path."""
-    lines = [
-        f"# What a {kind.name.replace('_', ' ')} looks like: rows over the distance from its middle, "
-        f"{RADII_M[0] * 1e3:g} to {RADII_M[-1] * 1e3:g} mm, in hundredths.",
-        f'name = "{kind.name}"',
-        f"width_m = {kind.size_m[0]:.4f}",
-        f"height_m = {kind.size_m[1]:.4f}",
-    ]
-    if kind.taught_by:
-        lines.append(f'taught_by = "{kind.taught_by}"')
-    for k, look in enumerate(kind.looks):
-        lines.append("\n[[looks]]")
-        if kind.middles_m is not None and kind.middles_m[k].any():
-            lines.append("middle_m = [{:.4f}, {:.4f}]".format(*kind.middles_m[k]))
-        if kind.noisy is not None and kind.noisy[k]:
-            lines.append("noisy = true")
-        rows = look[: len(GROUPS) * len(RADII_M)].reshape(len(GROUPS), -1)
-        lines += [f"{name} = {_written(row)}" for name, row in zip(GROUPS, rows, strict=True)]
-        tables = look[len(GROUPS) * len(RADII_M) :].reshape(len(AROUND_GROUPS), DIRECTIONS, RINGS)
-        for name, table in zip(AROUND_GROUPS, tables, strict=True):
-            lines.append(f"{name} = [{', '.join(_written(row) for row in table)}]")
-    return write_atomically(folder / f"{kind.name}.toml", "\n".join(lines) + "\n")
-
-
-def _is_other(path: Path) -> bool:
-    return path.stem == "proportions"
-
-
-def _kind(record: KindRecord) -> TaughtKind:
-    middles_m = np.array([look.middle_m for look in record.looks])
-    noisy = np.array([look.noisy for look in record.looks])
-    return TaughtKind(
-        name=record.name,
-        size_m=(record.width_m, record.height_m),
-        looks=np.array([look.look for look in record.looks]).reshape(-1, LENGTH),
-        taught_by=record.taught_by,
-        middles_m=middles_m if middles_m.any() else None,
-        noisy=noisy if noisy.any() else None,
-    )
-
-
-def _ring_means(row: tuple[int, ...]) -> Array:
-    """(RINGS,) of a row over all radii."""
-    return np.asarray(np.array(row[: 2 * RINGS], float).reshape(RINGS, 2).mean(axis=1))
-
-
-def _written(row: Array) -> str:
-    return f"[{', '.join(str(round(float(v) * UNIT)) for v in row)}]"

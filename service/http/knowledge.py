@@ -11,7 +11,7 @@ from fastapi import Depends as DependsOn
 from pydantic import BaseModel, Field
 
 from hal.panel import Panel, load_panel
-from perception.toml_text import toml_document
+from hal.toml_text import toml_text
 from service.http.body import body_schema, strict_body
 from service.http.images import store_of
 from service.http.problems import RESPONSES
@@ -197,9 +197,7 @@ def _knowledge(state: AppState, *, with_text: bool) -> KnowledgeView:
 
 def _text_of(panel: Panel) -> str:
     """The cell's panel as a panel file has it, defaults written out."""
-    data = panel.model_dump(mode="json", by_alias=True, exclude_none=True)
-    top = {key: value for key, value in data.items() if key not in ("lights", "objects")}
-    return toml_document(top, {"lights": data["lights"], "objects": data["objects"]})
+    return toml_text(panel.model_dump(mode="json", by_alias=True, exclude_none=True))
 
 
 def _kind(file: KnowledgeFile, *, with_text: bool) -> KindView:

@@ -123,8 +123,9 @@ class Calibrations:
         with self._lock:
             (self.folder / OLDER).mkdir(parents=True, exist_ok=True)
             fresh = path.with_suffix(".new")
-            fresh.write_text(to_toml(record), encoding="utf-8")
-            if path.exists():
+            before = path.read_text(encoding="utf-8") if path.exists() else None
+            fresh.write_text(to_toml(record, over=before), encoding="utf-8")
+            if before is not None:
                 version = load_calibration(path).version
                 os.link(path, _unused(self.folder / OLDER / f"{path.stem}.v{version}.toml"))
             fresh.replace(path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import threading
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hal.atomic_write import write_atomically
-from hal.errors import ConfigError, InvalidRequest
+from hal.errors import InvalidRequest
 from hal.panel import Panel, load_panel
 from service.errors import NoSuchTask
 
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from perception.vision import Knowledge, TaughtKind
 
 FOLDER = "knowledge"
-SHIPPED = Path(__file__).parents[2] / "perception" / "vision" / "knowledge"
 PLAIN_NAME = re.compile(r"[a-z][a-z0-9_]{0,40}")
 
 
@@ -40,7 +38,7 @@ class KindSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KnowledgeFile:
-    """One TOML file of the knowledge; `is_taught` False: shipped with the system.
+    """One file of the knowledge; `is_taught` False: shipped with the system.
 
     `of_cell`: the file with the looks that the cell's own panel adds to it.
     """
@@ -52,11 +50,9 @@ class KnowledgeFile:
 
     def text(self) -> str:
         """Its TOML, with the looks of the cell's own panel at its end."""
-        text = self.path.read_text(encoding="utf-8")
-        if self.of_cell is None:
-            return text
-        _, mark, looks = self.of_cell.read_text(encoding="utf-8").partition("\n[[looks]]")
-        return f"{text}\n# of the cell's own panel\n{mark}{looks}"
+        if self.path.suffix == ".toml" and self.of_cell is None:
+            return self.path.read_text(encoding="utf-8")
+        return _text_of(*(_stamped(path) for path in (self.path, self.of_cell) if path is not None))
 
     def summary(self) -> KindSummary:
         """What a kind's file says, without the numbers of its looks.
@@ -64,11 +60,9 @@ class KnowledgeFile:
         Raises:
             ConfigError: it is malformed.
         """
-        own = _summary(self.path, self.path.stat().st_mtime_ns)
-        if self.of_cell is None:
-            return own
-        added = _summary(self.of_cell, self.of_cell.stat().st_mtime_ns)
-        return replace(own, looks=own.looks + added.looks)
+        own, *added = (_kind_in(_stamped(path)) for path in (self.path, self.of_cell) if path is not None)
+        width_m, height_m = own.size_m
+        return KindSummary(width_m=width_m, height_m=height_m, looks=sum(len(kind.looks) for kind in (own, *added)))
 
 
 class KnowledgeStore:
@@ -93,10 +87,8 @@ class KnowledgeStore:
         """
         from perception.vision import Knowledge
 
-        shipped = _kinds_in(SHIPPED, _stamps(SHIPPED))
-        if self.of_cell is not None:
-            shipped = _with_looks_in(self.of_cell, _stamps(self.of_cell), _stamps(SHIPPED))
-        if not any(self.folder.glob("*.toml")):
+        shipped = _shipped() if self.of_cell is None else _with_looks_in(self.of_cell, _stamps(self.of_cell))
+        if not _kinds_of(self.folder):
             return shipped
         taught = _kinds_in(self.folder, _stamps(self.folder)).kinds
         names = {kind.name for kind in taught}
@@ -105,16 +97,16 @@ class KnowledgeStore:
 
     def kinds(self) -> list[KnowledgeFile]:
         """Files of all kinds in use, by name."""
-        files = {path.stem: KnowledgeFile(name=path.stem, path=path, is_taught=False) for path in _toml(SHIPPED)}
-        files.pop("proportions", None)  # how parts lie in a panel meter: no kind
-        for path in () if self.of_cell is None else _toml(self.of_cell):
+        files = {path.stem: KnowledgeFile(name=path.stem, path=path, is_taught=False) for path in _kinds_of(None)}
+        for path in () if self.of_cell is None else _kinds_of(self.of_cell):
             known = files.get(path.stem)
             files[path.stem] = (
                 KnowledgeFile(name=path.stem, path=path, is_taught=False)
                 if known is None
                 else replace(known, of_cell=path)
             )
-        files |= {path.stem: KnowledgeFile(name=path.stem, path=path, is_taught=True) for path in _toml(self.folder)}
+        taught = _kinds_of(self.folder)
+        files |= {path.stem: KnowledgeFile(name=path.stem, path=path, is_taught=True) for path in taught}
         return [files[name] for name in sorted(files)]
 
     def panels(self) -> list[KnowledgeFile]:
@@ -174,37 +166,58 @@ def _toml(folder: Path) -> Iterator[Path]:
     return (path for path in sorted(folder.glob("*.toml")) if PLAIN_NAME.fullmatch(path.stem))
 
 
+def _kinds_of(folder: Path | None) -> list[Path]:
+    """The files of a folder's kinds, or of the shipped ones; none where there is no such folder."""
+    from perception.vision import kind_files
+
+    return [path for path in kind_files(folder) if PLAIN_NAME.fullmatch(path.stem)]
+
+
 def _stamps(folder: Path) -> tuple[tuple[str, int, int], ...]:
     """What tells that a folder's files are as they were when they were read."""
-    return tuple((path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in sorted(folder.glob("*.toml")))
+    return tuple((path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in _kinds_of(folder))
 
 
 @lru_cache(maxsize=8)
 def _kinds_in(folder: Path, stamps: tuple[tuple[str, int, int], ...]) -> Knowledge:
-    """The kinds of a folder, read once: they are two megabytes of numbers."""
+    """The kinds of a folder, read once."""
     del stamps
     from perception.vision import load_knowledge
 
     return load_knowledge(folder)
 
 
+@lru_cache(maxsize=1)
+def _shipped() -> Knowledge:
+    from perception.vision import load_knowledge
+
+    return load_knowledge()
+
+
 @lru_cache(maxsize=8)
-def _with_looks_in(
-    folder: Path, stamps: tuple[tuple[str, int, int], ...], shipped: tuple[tuple[str, int, int], ...]
-) -> Knowledge:
+def _with_looks_in(folder: Path, stamps: tuple[tuple[str, int, int], ...]) -> Knowledge:
     """The shipped kinds with the looks of a cell's folder."""
-    return _kinds_in(SHIPPED, shipped).with_looks_of(_kinds_in(folder, stamps).kinds)
+    return _shipped().with_looks_of(_kinds_in(folder, stamps).kinds)
+
+
+def _stamped(path: Path) -> tuple[Path, int]:
+    """A file, and what tells that it is as it was when it was read."""
+    return path, path.stat().st_mtime_ns
 
 
 @lru_cache(maxsize=256)
-def _summary(path: Path, stamp_ns: int) -> KindSummary:
-    del stamp_ns
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-        return KindSummary(width_m=float(data["width_m"]), height_m=float(data["height_m"]), looks=len(data["looks"]))
-    except (ValueError, KeyError, TypeError) as error:
-        raise ConfigError(
-            f"knowledge file {path} is malformed: {error}",
-            hint="mend it, or delete it and teach the kind again",
-            file=str(path),
-        ) from error
+def _kind_in(stamped: tuple[Path, int]) -> TaughtKind:
+    from perception.vision import load_kind
+
+    return load_kind(stamped[0])
+
+
+@lru_cache(maxsize=256)
+def _text_of(*stamped: tuple[Path, int]) -> str:
+    """The TOML of a kind that is no TOML, or whose looks are in two files."""
+    from perception.vision import kind_text
+
+    own, *added = (_kind_in(each) for each in stamped)
+    for kind in added:
+        own = own.joined(kind)
+    return kind_text(own)

@@ -21,7 +21,8 @@ from perception.vision.finding.blind import Detection, candidate_places, chosen
 from perception.vision.finding.features import PLATE_PX_PER_M, look_at
 from perception.vision.image import as_gray
 from perception.vision.inspection import inspect_view
-from perception.vision.knowledge import NOTHING, UNIT, Knowledge, TaughtKind
+from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind
+from perception.vision.knowledge_files import UNIT
 from perception.vision.projection import CameraProjection, PanelProjection
 from perception.vision.reading import ObjectReading
 from perception.vision.registration.outline import footprint_m

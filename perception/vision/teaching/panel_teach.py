@@ -16,7 +16,7 @@ from hal.arrays import Array
 from hal.errors import InvalidRequest
 from hal.panel import Panel
 from hal.strict import validate
-from perception.toml_text import toml_document
+from hal.toml_text import toml_text
 from perception.vision.teaching.panel_lights import LightsFound
 from perception.vision.teaching.panel_questions import Question, questions
 from perception.vision.teaching.teach import Example, Overview, plate_points
@@ -50,10 +50,12 @@ def panel_text(name: str, overview: Overview, lights: LightsFound, objects: Sequ
         for corner, place in zip(CORNERS, lights.places_m, strict=True)
     ]
     object_rows = [object_row(draft, overview) for draft in objects]
-    validate({**top, "lights": light_rows, "objects": object_rows}, Panel, source=f"panel {name!r}")
-    note = [] if lights.are_seen else ["# No border lights were seen: their places are a guess. Measure them.\n"]
-    remark = "# Taught from one image: places and sizes are as good as its overview.\n"
-    return remark + "".join(note) + toml_document(top, {"lights": light_rows, "objects": object_rows})
+    data = {**top, "lights": light_rows, "objects": object_rows}
+    validate(data, Panel, source=f"panel {name!r}")
+    remarks = ["Taught from one image: places and sizes are as good as its overview."]
+    if not lights.are_seen:
+        remarks.append("No border lights were seen: their places are a guess. Measure them.")
+    return toml_text(data, remarks=remarks)
 
 
 def object_row(draft: PanelObjectDraft, overview: Overview) -> dict[str, Any]:

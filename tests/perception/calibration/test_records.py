@@ -6,10 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from hal.calibration import MountRecord, load_calibration
+from hal.calibration import CalibrationRecord, MountRecord, load_calibration
 from hal.geometry import UncertainPose, difference, transform_rpy
+from hal.strict import parse_toml
 from perception.calibration.hand_eye import calibrate_hand_eye
 from perception.calibration.in_hand import calibrate_in_hand
 from perception.calibration.intrinsics import calibrate_camera
@@ -90,3 +93,15 @@ def test_lens_and_mount_found_together_make_one_record(tmp_path: Path) -> None:
     assert np.allclose(difference(pose.parent_from_child, result.flange_from_camera.parent_from_child), 0.0, atol=1e-12)
     assert np.allclose(np.diag(pose.covariance), np.diag(result.flange_from_camera.covariance))
     assert 0.0 < back.quality["sigma_m"] < 1e-3 and back.quality["views"] == 12.0
+
+
+@given(st.text(), st.dictionaries(st.text(min_size=1), st.floats(allow_nan=False, allow_infinity=False), max_size=3))
+def test_any_text_of_a_record_survives_and_comments_of_the_file_before_stay(
+    method: str, quality: dict[str, float]
+) -> None:
+    record = CalibrationRecord(device="wrist\ncamera", date="2026-11-21", method=method, quality=quality)
+    assert parse_toml(to_toml(record), CalibrationRecord, source="record") == record
+    before = "# bolted on by hand\n" + to_toml(record.model_copy(update={"method": "older", "quality": {"a": 1.0}}))
+    text = to_toml(record, over=before)
+    assert parse_toml(text, CalibrationRecord, source="record") == record
+    assert text.startswith("# bolted on by hand")

@@ -13,7 +13,8 @@ import pytest
 from hal.config import load_cell
 from hal.errors import ConfigError, InvalidRequest, NotFound
 from hal.geometry import to_json
-from perception.vision.knowledge import TaughtKind, load_knowledge, shipped_knowledge, write_kind
+from perception.vision.knowledge import TaughtKind
+from perception.vision.knowledge_files import load_knowledge, write_kind
 from service.commands.teach import teach
 from service.knowledge.store import KnowledgeStore
 from tests.perception.vision.bench_panel import TOML, panel, scene
@@ -108,7 +109,7 @@ def test_a_panel_file_teaches_from_an_image_file(tmp_path: Path, capsys: pytest.
 
 
 def test_the_looks_of_a_cell_add_to_the_shipped_kinds_and_give_way_to_taught_ones(tmp_path: Path) -> None:
-    shipped = shipped_knowledge()
+    shipped = load_knowledge()
     lamp = shipped.kind("lamp")
     assert lamp is not None
     odd = np.full((1, lamp.looks.shape[1]), 0.5)

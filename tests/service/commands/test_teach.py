@@ -12,7 +12,7 @@ import pytest
 
 from hal.errors import InvalidRequest
 from hal.panel import load_panel
-from perception.vision.knowledge import load_knowledge, shipped_knowledge
+from perception.vision.knowledge_files import load_knowledge
 from perception.vision.projection import CameraProjection
 from service.commands.teach import teach
 from tests.perception.vision.bench_panel import panel, scene
@@ -29,7 +29,7 @@ def _example(path: Path) -> list[str]:
 
 def test_a_new_kind_is_found_after_two_clicks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     clicks, folder = _example(tmp_path / "panel.png"), tmp_path / "kinds"
-    assert shipped_knowledge().kind("mushroom") is None
+    assert load_knowledge().kind("mushroom") is None
     teach(tmp_path / "panel.png", folder=folder, kind="mushroom", click=clicks)
     assert [kind.name for kind in load_knowledge(folder).kinds] == ["mushroom"]
     capsys.readouterr()

@@ -29,15 +29,8 @@ from perception.vision.finding.features import (
 from perception.vision.finding.match import distances, distances_reference, nearest, prepared
 from perception.vision.finding.plate import TYPICAL_FOCAL, find_plate
 from perception.vision.finding.shapes import find_edges
-from perception.vision.knowledge import (
-    NOTHING,
-    Knowledge,
-    TaughtKind,
-    load_knowledge,
-    shipped_knowledge,
-    spread_of,
-    write_kind,
-)
+from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind, spread_of
+from perception.vision.knowledge_files import load_knowledge, write_kind
 from perception.vision.projection import CameraProjection, PlateProjection
 from perception.vision.teaching.teach import check, example_at, overview_of, plate_points, teach, teach_example
 from tests.perception.vision.bench_panel import panel, scene
@@ -112,11 +105,11 @@ def test_a_picture_without_a_plate_is_refused() -> None:
     noise = np.random.default_rng(3).integers(0, 40, (240, 320), dtype=np.uint8)
     noise[100:110, 100:110] = 200
     with pytest.raises(NotFound):
-        recognise(noise, shipped_knowledge())
+        recognise(noise, load_knowledge())
 
 
 def test_a_kind_that_did_not_exist_is_taught_by_two_clicks_and_found_again() -> None:
-    knowledge = shipped_knowledge()
+    knowledge = load_knowledge()
     assert knowledge.kind("mushroom") is None
     image, view = overview()
     (u, v), radius_px = pixel_of(view, "emergency"), 46.0
@@ -133,7 +126,7 @@ def test_teaching_the_same_look_again_teaches_nothing() -> None:
     image, view = overview()
     first = teach(
         image,
-        shipped_knowledge(),
+        load_knowledge(),
         kind="mushroom",
         clicks_px=[pixel_of(view, "emergency")],
         size_m=(0.04, 0.04),
@@ -144,7 +137,7 @@ def test_teaching_the_same_look_again_teaches_nothing() -> None:
 
 
 def test_a_look_that_would_rob_another_kind_is_refused() -> None:
-    knowledge = shipped_knowledge()
+    knowledge = load_knowledge()
     gauge = knowledge.kind("gauge")
     assert gauge is not None
     image, view = overview()
@@ -175,7 +168,7 @@ def test_a_look_that_would_rob_another_kind_is_refused() -> None:
 def test_clicks_are_checked() -> None:
     image, view = overview()
     with pytest.raises(InvalidRequest):
-        teach(image, shipped_knowledge(), kind="gauge", clicks_px=[], plate_m=PLATE)
+        teach(image, load_knowledge(), kind="gauge", clicks_px=[], plate_m=PLATE)
     with pytest.raises(NotFound):
         plate_points(view, [(2.0, 2.0)], PLATE)
 
@@ -236,7 +229,7 @@ def test_only_a_noisy_image_is_compared_with_looks_of_noisy_images(sigma: float,
     ground = lay_out(image, view, PLATE)
     at = (np.array(panel().object("mode").point_m[:2]) * [1.0, -1.0] + np.array(PLATE) / 2) * PLATE_PX_PER_M
     look = look_at(ground, at)
-    knowledge = _with_noisy_look(shipped_knowledge(), "ghost", look[0])
+    knowledge = _with_noisy_look(load_knowledge(), "ghost", look[0])
     found = chosen(ground, at[None], look, knowledge, view, PLATE)
     assert ground.noisy is noisy
     assert any(candidate.kind == "ghost" for candidate in found) is noisy
@@ -260,7 +253,7 @@ def test_one_look_that_is_near_by_chance_names_nothing_in_a_noisy_image(noisy: b
 
 def test_noise_says_nothing_of_which_way_is_up() -> None:
     image, view = overview()
-    ground, knowledge = lay_out(image, view, PLATE), shipped_knowledge()
+    ground, knowledge = lay_out(image, view, PLATE), load_knowledge()
     at = (
         np.array([panel_object.point_m[:2] for panel_object in panel().objects]) * [1.0, -1.0] + np.array(PLATE) / 2
     ) * PLATE_PX_PER_M
@@ -290,7 +283,7 @@ def test_what_lies_far_from_a_middle_counts_in_good_images_only() -> None:
 def test_looks_of_noisy_images_refuse_no_lesson_of_a_good_one() -> None:
     image, view = overview()
     example = example_at(overview_of(image, plate_m=PLATE), [pixel_of(view, "emergency")])
-    others = shipped_knowledge()
+    others = load_knowledge()
     twice = _with_noisy_look(_with_noisy_look(others, "ghost", example.look), "ghost", example.look + 1.0)
     assert not example.noisy
     assert teach_example(example, twice, kind="mushroom").added
@@ -380,7 +373,7 @@ def test_a_panel_upside_down_is_refused(name: str) -> None:
     gray = cv2.imread(str(OVERVIEWS / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
     assert gray is not None
     upright = np.asarray(gray, np.uint8)
-    knowledge = shipped_knowledge()
+    knowledge = load_knowledge()
     assert recognise(upright, knowledge)
     with pytest.raises(NotFound, match="upside down"):
         recognise(np.ascontiguousarray(upright[::-1, ::-1]), knowledge)
@@ -389,15 +382,15 @@ def test_a_panel_upside_down_is_refused(name: str) -> None:
 @pytest.mark.parametrize("quarters", [1, 3])
 def test_a_panel_turned_by_a_quarter_is_no_plate_of_its_size(quarters: int) -> None:
     image, _ = overview()
-    assert recognise(image, shipped_knowledge(), plate_m=PLATE)
+    assert recognise(image, load_knowledge(), plate_m=PLATE)
     with pytest.raises(NotFound, match="no plate"):
-        recognise(np.ascontiguousarray(np.rot90(image, quarters)), shipped_knowledge(), plate_m=PLATE)
+        recognise(np.ascontiguousarray(np.rot90(image, quarters)), load_knowledge(), plate_m=PLATE)
 
 
 def test_two_panels_are_ambiguous_blind_too() -> None:
     image, _ = overview()
     with pytest.raises(Ambiguous, match="two panels"):
-        recognise(np.ascontiguousarray(np.hstack([image, image])), shipped_knowledge(), plate_m=PLATE)
+        recognise(np.ascontiguousarray(np.hstack([image, image])), load_knowledge(), plate_m=PLATE)
 
 
 def test_a_border_that_neither_edges_nor_objects_confirm_is_no_plate() -> None:
@@ -406,11 +399,11 @@ def test_a_border_that_neither_edges_nor_objects_confirm_is_no_plate() -> None:
     plate = find_plate(bare, *PLATE)
     assert plate is not None and not plate.is_sure
     with pytest.raises(NotFound, match="not confirmed"):
-        recognise(bare, shipped_knowledge(), plate_m=PLATE)
+        recognise(bare, load_knowledge(), plate_m=PLATE)
     bare[400:], bare[:, 570:] = 60, 60
     whole = find_plate(bare, *PLATE)
     assert whole is not None and whole.is_sure
-    assert not any(c.reason is None for c in recognise(bare, shipped_knowledge(), plate_m=PLATE))
+    assert not any(c.reason is None for c in recognise(bare, load_knowledge(), plate_m=PLATE))
 
 
 @pytest.mark.skipif(not OVERVIEWS.exists(), reason="no overviews beside the repository")
@@ -418,4 +411,4 @@ def test_a_close_up_of_one_object_is_not_taken_for_a_panel() -> None:
     for file in sorted(OVERVIEWS.glob("p22_*.png")):
         gray = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
         with pytest.raises(NotFound):
-            recognise(np.asarray(gray, np.uint8), shipped_knowledge())
+            recognise(np.asarray(gray, np.uint8), load_knowledge())

@@ -11,7 +11,8 @@ from hal.errors import NotFound
 from hal.geometry import UncertainPose, perturbed
 from hal.panel import Lamp, Panel
 from perception.vision.finding.blind import Detection, recognise
-from perception.vision.knowledge import NOTHING, Knowledge, load_knowledge, shipped_knowledge, write_kind
+from perception.vision.knowledge import NOTHING, Knowledge
+from perception.vision.knowledge_files import load_knowledge, write_kind
 from perception.vision.projection import CameraProjection
 from perception.vision.registration.outline import footprint_m
 from perception.vision.teaching.from_panel import PanelLooks, teach_from_panel
@@ -23,7 +24,7 @@ PLATE_M = (0.60, 0.40)
 def learned(known_panel: Panel, **more: float) -> PanelLooks:
     image, intrinsics, pose = scene(tilt_deg=4.0, distance_m=0.66, **more)
     return teach_from_panel(
-        image, CameraProjection(intrinsics=intrinsics, camera_from_panel=pose), known_panel, shipped_knowledge()
+        image, CameraProjection(intrinsics=intrinsics, camera_from_panel=pose), known_panel, load_knowledge()
     )
 
 
@@ -49,7 +50,7 @@ def right(knowledge: Knowledge) -> tuple[set[str], list[Detection]]:
 
 
 def test_what_one_overview_taught_is_found_in_another(lesson: PanelLooks) -> None:
-    before, _ = right(shipped_knowledge())
+    before, _ = right(load_knowledge())
     now, given = right(lesson.knowledge)
     assert "emergency" not in before and "emergency" in now
     assert len(now) >= len(panel().objects) - 1 and len(now) >= len(before)
@@ -61,7 +62,7 @@ def test_the_lesson_says_what_it_did(lesson: PanelLooks) -> None:
     assert {kind.name for kind in lesson.kinds} == set(lesson.added)
     assert [each.panel_object.name for each in lesson.shown] == [panel_object.name for panel_object in panel().objects]
     assert set(lesson.known_before) < set(lesson.known_now) and not lesson.left_out
-    shipped = shipped_knowledge()
+    shipped = load_knowledge()
     for kind in lesson.knowledge.kinds:
         known = shipped.kind(kind.name)
         assert len(kind.looks) == lesson.added.get(kind.name, 0) + (0 if known is None else len(known.looks))
@@ -93,7 +94,7 @@ def test_a_panel_that_is_not_where_the_pose_has_it_teaches_nothing() -> None:
     )
     view = CameraProjection(intrinsics=intrinsics, camera_from_panel=elsewhere)
     with pytest.raises(NotFound, match="does not show panel"):
-        teach_from_panel(image, view, panel(), shipped_knowledge())
+        teach_from_panel(image, view, panel(), load_knowledge())
 
 
 def test_a_panel_of_which_most_is_elsewhere_teaches_nothing() -> None:
@@ -115,7 +116,7 @@ def test_what_is_written_is_what_was_learned(lesson: PanelLooks, tmp_path: Path)
 
 
 def test_looks_are_added_once_and_new_names_make_new_kinds(lesson: PanelLooks) -> None:
-    shipped = shipped_knowledge()
+    shipped = load_knowledge()
     grown = shipped.with_looks_of(lesson.kinds)
     assert {kind.name: len(kind.looks) for kind in grown.kinds} == {
         kind.name: len(kind.looks) for kind in lesson.knowledge.kinds

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from perception.vision.knowledge import Knowledge, shipped_knowledge
+from perception.vision.knowledge import Knowledge
+from perception.vision.knowledge_files import load_knowledge
 from perception.vision.projection import CameraProjection
 from perception.vision.teaching.teach import check, teach
 from tests.perception.vision.bench_panel import panel, scene
@@ -96,7 +97,7 @@ def clicks(view: CameraProjection, kind: NewKind) -> list[tuple[float, float]]:
 @pytest.fixture(scope="module")
 def taught() -> Knowledge:
     """Three examples each: a bar graph with other bars lit looks different."""
-    knowledge = shipped_knowledge()
+    knowledge = load_knowledge()
     for seed in (1, 11, 12):
         image, view = drawn(seed, taught=True)
         for kind in KINDS:
@@ -122,6 +123,6 @@ def found(image: Canvas, view: CameraProjection, knowledge: Knowledge) -> set[st
 @pytest.mark.parametrize("seed", [2, 3])
 def test_new_kinds_are_found_elsewhere_in_other_states_and_cost_no_known_one(taught: Knowledge, seed: int) -> None:
     image, view = drawn(seed, taught=False)
-    before, now = found(image, view, shipped_knowledge()), found(image, view, taught)
+    before, now = found(image, view, load_knowledge()), found(image, view, taught)
     assert {kind.name for kind in KINDS} <= now
     assert before <= now

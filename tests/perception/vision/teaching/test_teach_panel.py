@@ -7,6 +7,8 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from hal.errors import Ambiguous, ConfigError, InvalidRequest, NotFound
 from hal.panel import Panel
@@ -14,7 +16,8 @@ from hal.strict import parse_toml
 from perception.vision.finding.framing import check_upright, one_plate
 from perception.vision.image import as_gray
 from perception.vision.inspection import inspect_view
-from perception.vision.knowledge import NOTHING, shipped_knowledge
+from perception.vision.knowledge import NOTHING
+from perception.vision.knowledge_files import load_knowledge
 from perception.vision.projection import CameraProjection
 from perception.vision.registration.outline import footprint_m
 from perception.vision.teaching.panel_lights import find_border_lights
@@ -91,7 +94,7 @@ def test_what_is_clicked_on_is_named_and_after_a_lesson_named_rightly(
     seen: tuple[np.ndarray, CameraProjection, Overview],
 ) -> None:
     _, view, overview = seen
-    knowledge = shipped_knowledge()
+    knowledge = load_knowledge()
     knob = likest(overview, example_at(overview, middle_of(view, "mode")), knowledge)
     assert knob is not None and knob.kind == "rotary"
     stop = example_at(overview, middle_of(view, "emergency"))
@@ -178,7 +181,7 @@ def test_answers_that_make_no_sense_are_refused(
 
 
 def test_every_question_but_the_name_has_an_answer_that_stands() -> None:
-    for kind in kind_question(shipped_knowledge()).choices:
+    for kind in kind_question(load_knowledge()).choices:
         name, *rest = questions(kind)
         assert name.key == "name"
         assert all(question.default or question.key == "unit" for question in rest)
@@ -190,7 +193,7 @@ def test_two_panels_are_ambiguous_and_one_is_not(seen: tuple[np.ndarray, CameraP
     assert one_plate(image, PLATE)
     for both in (np.hstack([image, image]), np.vstack([image, image])):
         with pytest.raises(Ambiguous, match="two panels"):
-            teach(np.ascontiguousarray(both), shipped_knowledge(), kind="lamp", clicks_px=[(10, 10)], plate_m=PLATE)
+            teach(np.ascontiguousarray(both), load_knowledge(), kind="lamp", clicks_px=[(10, 10)], plate_m=PLATE)
 
 
 def test_a_panel_upside_down_is_refused(seen: tuple[np.ndarray, CameraProjection, Overview]) -> None:
@@ -219,7 +222,7 @@ def test_a_panel_that_is_mirrored_is_refused(
 
 def test_a_second_example_takes_no_object_from_another_kind() -> None:
     """Every kind gets a second example from a new image; on further images each object found before is found after."""
-    knowledge = shipped_knowledge()
+    knowledge = load_knowledge()
     lesson_image, intrinsics, pose = scene(tilt_deg=4.0, distance_m=0.66, pose_error=0.0, azimuth_deg=120.0)
     view = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
     tests = [
@@ -257,3 +260,15 @@ def _found(image: np.ndarray, knowledge: object) -> set[str]:
         for c in hits
         if c.kind == panel_object.kind and np.linalg.norm(c.centre_m - panel_object.position_m) < 0.015
     }
+
+
+@settings(max_examples=30, deadline=None)
+@given(unit=st.text())
+@example(unit='l/min\nof "air" \\ # no comment')
+def test_any_unit_survives_the_panel_file(seen: tuple[np.ndarray, CameraProjection, Overview], unit: str) -> None:
+    _, view, overview = seen
+    gauge = example_at(overview, corners_of(view, "pressure"))
+    draft = PanelObjectDraft(kind="gauge", name="pressure", example=gauge, answers={"unit": unit})
+    text = panel_text("taught", overview, find_border_lights(overview), [draft])
+    said = parse_toml(text, Panel, source="taught").objects[0].scale.unit
+    assert said == unit.strip() or not unit.strip()

@@ -1,0 +1,228 @@
+"""Files of kinds: TOML where a person taught or wrote it, a numpy archive (`.npz`) where a benchmark generated it.
+
+Both hold the same: name, size, and looks in hundredths. An archive is read some hundred times faster, and nobody reads
+thousands of generated rows. A folder holds each kind once.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from hal.arrays import Array
+from hal.atomic_write import write_atomically
+from hal.errors import ConfigError
+from hal.strict import Strict, load_toml
+from hal.toml_text import toml_text
+from perception.vision.finding.features import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
+from perception.vision.knowledge import Knowledge, TaughtKind, spread_of
+
+SHIPPED = Path(__file__).parent / "knowledge"
+OTHER_FILES = frozenset({"proportions"})  # of a knowledge folder: no kinds
+UNIT = 100.0  # looks are stored in hundredths
+REPAIR = "restore it, or delete it and teach the kind again"
+
+Row = Annotated[tuple[int, ...], Field(min_length=len(RADII_M), max_length=len(RADII_M))]
+
+RingRow = Annotated[tuple[int, ...], Field(min_length=RINGS, max_length=RINGS)]
+Around = Annotated[tuple[RingRow, ...], Field(min_length=DIRECTIONS, max_length=DIRECTIONS)]
+
+
+class LookRecord(Strict):
+    """One example: relative gray, unevenness, edges and strong edges over the distance from the middle, hundredths.
+
+    `middle_m`: from the place that looks so to the object's middle, x right and y up, where a part of the object or its
+    label shows better than its middle.
+
+    `gray_around` and `edge_around` have a row a direction, clockwise from straight up; left out, every direction is as
+    `gray` and `edge` are all around. `noisy`: counts in noisy images only.
+    """
+
+    gray: Row
+    uneven: Row
+    edge: Row
+    strong_edge: Row
+    gray_around: Around | None = None
+    edge_around: Around | None = None
+    middle_m: tuple[float, float] = (0.0, 0.0)
+    noisy: bool = False
+
+    @property
+    def look(self) -> Array:
+        """(LENGTH,) in the order of `features`."""
+        around = [
+            np.asarray(given, float).ravel() if given is not None else np.tile(_ring_means(row), DIRECTIONS)
+            for given, row in ((self.gray_around, self.gray), (self.edge_around, self.edge))
+        ]
+        rows = np.array([*self.gray, *self.uneven, *self.edge, *self.strong_edge], float)
+        return np.concatenate([rows, *around]) / UNIT
+
+
+class KindRecord(Strict):
+    """A kind's file."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}$")]
+    width_m: Annotated[float, Field(gt=0, le=1.0)]
+    height_m: Annotated[float, Field(gt=0, le=1.0)]
+    taught_by: str = ""
+    looks: tuple[LookRecord, ...] = ()
+
+    @model_validator(mode="after")
+    def _has_looks(self) -> KindRecord:
+        if not self.looks:
+            raise ValueError("a kind needs at least one look")
+        return self
+
+
+def load_knowledge(folder: Path | None = None) -> Knowledge:
+    """All kinds of a folder, by name; the shipped ones if none is given.
+
+    Raises:
+        ConfigError: a file is malformed, a kind has two files, or the folder holds no kind.
+    """
+    files = kind_files(folder)
+    if not files:
+        raise ConfigError(f"no kinds in {folder}", hint="teach one: panelwright teach IMAGE", file=str(folder))
+    kinds = tuple(load_kind(path) for path in files)
+    return Knowledge(kinds=kinds, spread=spread_of(kinds))
+
+
+def kind_files(folder: Path | None = None) -> list[Path]:
+    """The files of a folder's kinds, by name; the shipped ones if none is given.
+
+    Raises:
+        ConfigError: a kind has two files.
+    """
+    found: dict[str, Path] = {}
+    folder = SHIPPED if folder is None else folder
+    for path in sorted([*folder.glob("*.toml"), *folder.glob("*.npz")]):
+        if path.stem in OTHER_FILES:
+            continue
+        if path.stem in found:
+            raise ConfigError(
+                f"kind {path.stem!r} has two files in {folder}", hint=f"keep {path.name} or {found[path.stem].name}",
+                file=str(path),
+            )  # fmt: skip
+        found[path.stem] = path
+    return [found[name] for name in sorted(found)]
+
+
+def load_kind(path: Path) -> TaughtKind:
+    """The kind of one file.
+
+    Raises:
+        ConfigError: the file is malformed or damaged; names it and what helps.
+    """
+    return _archived(path) if path.suffix == ".npz" else _kind(load_toml(path, KindRecord, "knowledge file"))
+
+
+def write_kind(kind: TaughtKind, folder: Path) -> Path:
+    """Write one kind's TOML and return its path; where only looks are new, they are added at the end of the file that is there."""
+    path = folder / f"{kind.name}.toml"
+    known = load_kind(path) if path.exists() else None
+    if known is not None and _is_continued(known, kind):
+        more = _looks_text(kind.of(np.arange(len(known.looks), len(kind.looks))))
+        return write_atomically(path, path.read_text(encoding="utf-8").rstrip("\n") + "\n" + more)
+    return write_atomically(path, kind_text(kind))
+
+
+def kind_text(kind: TaughtKind) -> str:
+    """The TOML of one kind."""
+    remark = (
+        f"What a {kind.name.replace('_', ' ')} looks like: rows over the distance from its middle, "
+        f"{RADII_M[0] * 1e3:g} to {RADII_M[-1] * 1e3:g} mm, in hundredths."
+    )
+    head = {"name": kind.name, "width_m": round(float(kind.size_m[0]), 4), "height_m": round(float(kind.size_m[1]), 4)}
+    taught_by = {"taught_by": kind.taught_by} if kind.taught_by else {}
+    return toml_text({**head, **taught_by}, remarks=[remark]) + _looks_text(kind)
+
+
+def write_generated_kind(kind: TaughtKind, folder: Path) -> Path:
+    """Write one kind as a numpy archive and return its path."""
+    path = folder / f"{kind.name}.npz"
+    count = len(kind.looks)
+    np.savez_compressed(
+        path,
+        name=np.array(kind.name),
+        taught_by=np.array(kind.taught_by),
+        size_m=np.round(np.asarray(kind.size_m, float), 4),
+        looks=np.round(UNIT * kind.looks).astype(np.int16),
+        middles_m=np.zeros((count, 2)) if kind.middles_m is None else np.round(kind.middles_m, 4),
+        noisy=np.zeros(count, bool) if kind.noisy is None else kind.noisy,
+    )
+    return path
+
+
+def _archived(path: Path) -> TaughtKind:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            name, taught_by, size_m = str(file["name"]), str(file["taught_by"]), file["size_m"]
+            looks, middles_m, noisy = file["looks"], file["middles_m"], file["noisy"]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ConfigError(f"knowledge file {path} cannot be read: {error}", hint=REPAIR, file=str(path)) from error
+    count = len(looks) if looks.ndim else 0
+    shapes = {"size_m": (2,), "looks": (count, LENGTH), "middles_m": (count, 2), "noisy": (count,)}
+    given = {"size_m": size_m, "looks": looks, "middles_m": middles_m, "noisy": noisy}
+    wrong = next((key for key, shape in shapes.items() if given[key].shape != shape), None)
+    if wrong is not None or count == 0 or looks.dtype.kind != "i" or noisy.dtype.kind != "b" or name != path.stem:
+        raise ConfigError(
+            f"knowledge file {path} holds no kind of this name: {wrong or 'its looks'} cannot be", hint=REPAIR,
+            file=str(path),
+        )  # fmt: skip
+    return TaughtKind(
+        name=name,
+        size_m=(float(size_m[0]), float(size_m[1])),
+        looks=np.asarray(looks, float) / UNIT,
+        taught_by=taught_by,
+        middles_m=middles_m if middles_m.any() else None,
+        noisy=noisy if noisy.any() else None,
+    )
+
+
+def _is_continued(known: TaughtKind, kind: TaughtKind) -> bool:
+    """Whether a kind is the known one with further looks."""
+    first = kind.of(np.arange(min(len(known.looks), len(kind.looks))))
+    return (known.name, known.taught_by) == (kind.name, kind.taught_by) and _looks_text(first) == _looks_text(known)
+
+
+def _looks_text(kind: TaughtKind) -> str:
+    """One table per look; whole numbers only, which need no escaping."""
+    lines = []
+    for k, look in enumerate(kind.looks):
+        lines.append("\n[[looks]]")
+        if kind.middles_m is not None and kind.middles_m[k].any():
+            lines.append("middle_m = [{:.4f}, {:.4f}]".format(*kind.middles_m[k]))
+        if kind.noisy is not None and kind.noisy[k]:
+            lines.append("noisy = true")
+        rows = look[: len(GROUPS) * len(RADII_M)].reshape(len(GROUPS), -1)
+        lines += [f"{name} = {_written(row)}" for name, row in zip(GROUPS, rows, strict=True)]
+        tables = look[len(GROUPS) * len(RADII_M) :].reshape(len(AROUND_GROUPS), DIRECTIONS, RINGS)
+        for name, table in zip(AROUND_GROUPS, tables, strict=True):
+            lines.append(f"{name} = [{', '.join(_written(row) for row in table)}]")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _kind(record: KindRecord) -> TaughtKind:
+    middles_m = np.array([look.middle_m for look in record.looks])
+    noisy = np.array([look.noisy for look in record.looks])
+    return TaughtKind(
+        name=record.name,
+        size_m=(record.width_m, record.height_m),
+        looks=np.array([look.look for look in record.looks]).reshape(-1, LENGTH),
+        taught_by=record.taught_by,
+        middles_m=middles_m if middles_m.any() else None,
+        noisy=noisy if noisy.any() else None,
+    )
+
+
+def _ring_means(row: tuple[int, ...]) -> Array:
+    """(RINGS,) of a row over all radii."""
+    return np.asarray(np.array(row[: 2 * RINGS], float).reshape(RINGS, 2).mean(axis=1))
+
+
+def _written(row: Array) -> str:
+    return f"[{', '.join(str(round(float(v) * UNIT)) for v in row)}]"

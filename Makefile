@@ -11,7 +11,7 @@ PIP_IN_SHORT = awk ' \
     /^Installing collected/ { print "setup: installing " (n + 0) " packages"; fflush() } \
     /^ERROR|^error/ { print }'
 
-.PHONY: help setup warm test-packages demo serve test test-wire test-fast lint lint-style lint-types lint-layers format bench-cell bench-missions bench-pose bench-fusion bench-range bench-vision bench-cables bench-drivers clean
+.PHONY: docs help setup warm test-packages demo serve test test-wire test-fast lint lint-style lint-types lint-layers format bench-cell bench-missions bench-pose bench-fusion bench-range bench-vision bench-cables bench-drivers clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 16
@@ -36,7 +36,7 @@ warm:  # hot loops are compiled while the packages that only tests need arrive
 	@$(BIN)/panelwright warm
 
 test-packages:  # the project itself is left as it is: it runs beside this
-	@$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["test"], sep="\n")' | \
+	@$(BIN)/python -c 'import tomllib; extras = tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]; print(*extras["docs"], *extras["test"], sep="\n")' | \
 	    $(BIN)/python -m pip install --progress-bar off -c constraints.txt -r /dev/stdin 2>&1 | $(PIP_IN_SHORT)
 	@$(BIN)/python -c 'import hypothesis, playwright, pytest, schemathesis' || { echo "error: the test packages are not complete; the lines above say why"; exit 2; }
 
@@ -67,6 +67,10 @@ lint-types:
 lint-layers:
 	@$(BIN)/lint-imports
 
+docs: setup  ## Build the pages into site/, with search
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet && echo "docs: open site/index.html"
+
+
 format: setup  ## Put the code into shape
 	@$(BIN)/ruff format . && $(BIN)/ruff check --fix .
 
@@ -77,4 +81,4 @@ bench-cell bench-missions bench-fusion bench-pose bench-range bench-vision bench
 	@$(BIN)/python -m benchmarks.$*
 
 clean:  ## Remove what was made
-	rm -rf .venv build runs *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv build runs site *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

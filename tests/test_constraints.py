@@ -11,7 +11,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
-INSTALLED_EXTRAS = ("certify", "conform", "test")
+INSTALLED_EXTRAS = ("certify", "conform", "docs", "test")
 INSTALLER = "uv"
 
 

@@ -18,8 +18,8 @@ from hal.calibration import CameraIntrinsics
 from hal.geometry import UncertainPose
 from manipulation.skills.outcome import Outcome
 from perception.range import SurfaceType
+from tests.docs.blocks import ROOT
 
-ROOT = Path(__file__).parents[1]
 FACING = Rotation.from_matrix(
     [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
 )  # a camera that looks down on z = 0
@@ -45,7 +45,7 @@ def placed(x_m: float, y_m: float, z_m: float, *, facing: Rotation | None = None
 
 
 def test_the_range_page_finds_its_wall() -> None:
-    found = run("range.md")
+    found = run("explanation/range.md")
     assert found["wall"].type is SurfaceType.PLANE
     tilt_rad = np.arccos(abs(found["fit"].feature.direction @ found["wall"].primitive.normal))
     assert tilt_rad < 1e-4
@@ -58,7 +58,7 @@ def test_the_fusion_page_fuses_an_edge_and_a_touch() -> None:
     above_m = height_m * (row_px - camera.cy_px) / focal_px
     base_from_camera = placed(0.4, above_m, height_m, facing=FACING)
     found = run(
-        "fusion.md",
+        "explanation/fusion.md",
         camera=camera,
         base_from_camera=base_from_camera,
         base_from_finger=placed(0.4, 0.25, 0.001),  # a millimetre before where the face is thought
@@ -73,7 +73,13 @@ def test_the_fusion_page_fuses_an_edge_and_a_touch() -> None:
 
 
 def test_the_pose_page_finds_the_drawn_panel() -> None:
-    found = run("pose.md", image_off=drawn(lit=False), image_on=drawn(lit=True), lights_m=LIGHTS_M, intrinsics=LENS)
+    found = run(
+        "explanation/panel-pose.md",
+        image_off=drawn(lit=False),
+        image_on=drawn(lit=True),
+        lights_m=LIGHTS_M,
+        intrinsics=LENS,
+    )
     pose = found["seen"].pose
     miss = pose.camera_from_object * CAMERA_FROM_PANEL.inv()
     assert np.linalg.norm(miss.translation) < 0.002
@@ -103,7 +109,7 @@ def test_the_manipulation_page_opens_the_valve() -> None:
     try:
         assert bench.truth("main_valve").state == "closed"
         found = run(
-            "manipulation.md",
+            "explanation/manipulation.md",
             context=bench.context,
             known=bench.look("main_valve"),
             look_again=lambda: bench.look("main_valve"),
@@ -115,12 +121,12 @@ def test_the_manipulation_page_opens_the_valve() -> None:
         bench.close()
 
 
-def test_the_vision_page_teaches_a_mushroom(
+def test_the_tutorial_teaches_a_mushroom(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "docs").symlink_to(ROOT / "docs")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "kinds").mkdir()
-    run("vision.md")
+    run("tutorials/teach-a-kind.md")
     assert (tmp_path / "kinds" / "mushroom.toml").is_file()
     assert re.search(r"^mushroom (1\.0|0\.99)", capsys.readouterr().out, flags=re.MULTILINE)

@@ -12,13 +12,13 @@ from typer.testing import CliRunner
 from hal.config import load_cell
 from hal.panel import load_panel
 from service.cli import _app
+from tests.docs import commands_page
+from tests.docs.blocks import PAGES, ROOT, page_name
 
-ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 LINK = re.compile(r"\[[^\]]*\]\(([^)#]+)(?:#[^)]*)?\)")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
 def test_every_link_leads_somewhere(page: Path) -> None:
     targets = [target for target in LINK.findall(page.read_text(encoding="utf-8")) if "://" not in target]
     missing = [target for target in targets if not (page.parent / target).exists()]
@@ -45,10 +45,17 @@ def test_every_command_that_the_pages_name_exists() -> None:
     assert not {command for command in commands if f" {command} " not in known}
 
 
-def test_python_in_the_pages_is_python() -> None:
-    for page in PAGES:
-        for block in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL):
-            compile(block, str(page), "exec")
+def test_the_page_of_commands_is_what_the_commands_say() -> None:
+    written = commands_page.PAGE.read_text(encoding="utf-8")
+    assert written == commands_page.text(), "run: python -m tests.docs.commands_page"
+
+
+def test_every_page_is_in_the_site_and_every_entry_is_a_page() -> None:
+    listed = set(
+        re.findall(r": ([\w/.-]+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    )
+    there = {page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")}
+    assert listed == there
 
 
 def test_nothing_in_the_tree_names_a_machine_or_a_registry() -> None:

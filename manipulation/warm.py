@@ -1,24 +1,25 @@
-"""Compiles, or loads from the cache, what planning computes with, so that the first plan is as fast as any."""
+"""Compiles, or loads from the cache, what control and planning compute with, so that the first plan is as fast as any."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from manipulation.arm import kernels
-from manipulation.control import braking
+from manipulation.arm import kernels as arm_kernels
+from manipulation.control import braking, kernels
 from manipulation.planning import clearance
 
 
 def warm_up() -> None:
-    """Executor every compiled function of kinematics, control and clearance once, on an arm of six joints and one box."""
+    """Run every compiled function of kinematics, control and clearance once, on an arm of six joints and one box."""
     dh, q = np.zeros((6, 4)), np.full(6, 0.1)
     dh[:, 1] = 0.2
     kernels.warm(dh)
     braking.warm(dh)
-    kernels.follow_pose(dh, np.eye(4), q, kernels.frames(dh, q)[-1], 0.01, 1)
+    arm_kernels.tool_and_jacobian(dh, q, np.eye(4))
     tool_ends, radii = np.zeros((1, 2, 3)), np.full(7, 0.01)
     box = (np.eye(3)[None], np.full((1, 3), 2.0), np.full((1, 3), 0.1))
     watched, pairs = np.ones((7, 1), bool), np.array([[0, 3]])
+    clearance.least_clearance(dh, q, tool_ends, radii, *box, watched, pairs, 0.01)
     clearance.first_hit(dh, q, q + 0.1, 0.05, tool_ends, radii, *box, watched, pairs, 0.01)
     clearance.overlap_counts(dh, q[None], tool_ends, radii, pairs)
     ends = clearance.capsule_ends(dh, q, tool_ends)

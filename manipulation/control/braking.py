@@ -1,46 +1,44 @@
 """The last filter before the drive: joint range, speed and acceleration, braking ahead, and the speed of the tip.
 
-Compiled as `kernels` is. Ways and speeds are of one tick, `most` is the change of speed in a tick.
+Ways and speeds are of one tick, `most` is the change of speed in a tick.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numba import njit
 
 from hal.arrays import Array
+from hal.jit import compiled, inlined
 from manipulation.arm.kernels import tool_and_jacobian
 
 
-@njit(cache=True)
-def rest_way(speed: float, most: float) -> Any:
-    """The way still to go of something that just went `speed` a tick and slows down by `most` with each further one."""
+@inlined
+def rest_way(speed: float, most: float) -> float:
+    """Way that is still covered after a tick at `speed` when each further tick is slower by `most`."""
     ticks = np.floor(speed / most)
-    return ticks * speed - 0.5 * ticks * (ticks + 1.0) * most
+    return float(ticks * speed - 0.5 * ticks * (ticks + 1.0) * most)
 
 
-@njit(cache=True)
-def fastest_to_rest(way: float, most: float) -> Any:
-    """The speed a tick that comes to rest exactly after `way`: v + rest_way(v, most) = way."""
+@inlined
+def fastest_to_rest(way: float, most: float) -> float:
+    """Speed per tick that comes to rest exactly after `way`: v + rest_way(v, most) = way."""
     ticks = max(1.0, np.ceil(0.5 * (np.sqrt(1.0 + 8.0 * way / most) - 1.0)))
-    return way / ticks + 0.5 * (ticks - 1.0) * most
+    return float(way / ticks + 0.5 * (ticks - 1.0) * most)
 
 
-@njit(cache=True)
-def rest_place(place: float, speed: float, most: float) -> Any:
-    """Where something that has just come to `place` at `speed` a tick comes to rest."""
-    return place + np.sign(speed) * rest_way(abs(speed), most)
+@inlined
+def rest_place(place: float, speed: float, most: float) -> float:
+    """Place of rest of what has just reached `place` at `speed` per tick."""
+    return float(place + np.sign(speed) * rest_way(abs(speed), most))
 
 
-@njit(cache=True)
-def step_to_rest(way: float, most: float) -> Any:
-    """`fastest_to_rest`, either way."""
-    return np.sign(way) * fastest_to_rest(abs(way), most)
+@inlined
+def step_to_rest(way: float, most: float) -> float:
+    """`fastest_to_rest` with the sign of `way`."""
+    return float(np.sign(way) * fastest_to_rest(abs(way), most))
 
 
-@njit(cache=True)
+@inlined
 def limited_step(
     wanted: Array,
     wanted_before: Array,
@@ -51,7 +49,7 @@ def limited_step(
     lower: Array,
     upper: Array,
     dt_s: float,
-) -> Any:
+) -> Array:
     """The set-point (n,) nearest to `wanted` that respects range, speed and acceleration limits per joint.
 
     It goes no faster than it can brake ahead of where the wanted one would come to rest if that braked from now on:
@@ -78,10 +76,10 @@ def limited_step(
     return out
 
 
-@njit(cache=True)
+@inlined
 def slowed_step(
     jacobian: Array, step: Array, last_step: Array, most: Array, below: Array, above: Array, tip_m: float
-) -> Any:
+) -> Array:
     """The joint step (n,) nearest to `step` that moves the tip by `tip_m` at most.
 
     On the way from `step` to the one that keeps its direction and brakes as hard as acceleration allows (`most` (n,) a
@@ -109,7 +107,7 @@ def slowed_step(
     return brake + (step - brake) * ((np.sqrt(b * b - a * c) - b) / a)
 
 
-@njit(cache=True)
+@compiled
 def safe_step(
     dh: Array,
     flange_from_tool: Array,
@@ -123,7 +121,7 @@ def safe_step(
     upper: Array,
     tip_limit_m_per_s: float,
     dt_s: float,
-) -> Any:
+) -> Array:
     """The last filter before the drive: joint range, speed and acceleration, and the speed of the tool's tip."""
     out = limited_step(wanted, wanted_before, last, last_velocity, velocity, acceleration, lower, upper, dt_s)
     out = np.minimum(np.maximum(out, lower), upper)

@@ -31,9 +31,9 @@ from hal.motion import (
     MotionReport,
     RobotState,
 )
-from manipulation.arm import kernels
+from manipulation.arm import kernels as arm_kernels
 from manipulation.arm.kinematics import Kinematics
-from manipulation.control import braking
+from manipulation.control import braking, kernels
 from manipulation.control.control_thread import ControlThread
 from manipulation.control.drives import Drives
 from manipulation.control.executors import Executor, GripperExecutor, Tick, begin
@@ -335,7 +335,7 @@ class Controller:
                 self._send(self._filter.last_rad)
                 self._drives.pass_tick()
                 sample = self._newest = self._read()
-                flange = kernels.frames(self.kinematics.dh, sample.position_rad)[-1]
+                flange = arm_kernels.frames(self.kinematics.dh, sample.position_rad)[-1]
                 free.append(sample.raw_wrench - self._contact.weight(flange))
         except DeviceFailure as failure:
             self._standing.give_up(failure.device)
@@ -384,7 +384,7 @@ class Controller:
         )
 
     def _state_of(self, sample: Sample) -> RobotState:
-        flange = kernels.frames(self.kinematics.dh, sample.position_rad)[-1]
+        flange = arm_kernels.frames(self.kinematics.dh, sample.position_rad)[-1]
         return RobotState(
             stamp_s=sample.stamp_s,
             position_rad=sample.position_rad,

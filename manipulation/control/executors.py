@@ -14,8 +14,9 @@ from hal.clock import Clock, Deadline
 from hal.devices import Gripper
 from hal.errors import CellError
 from hal.motion import CartesianPath, Compliance, GripperMotion, Hold, JointTrajectory
-from manipulation.arm import kernels
+from manipulation.arm import kernels as arm_kernels
 from manipulation.arm.kinematics import Kinematics
+from manipulation.control import kernels
 from manipulation.control.plausibility import check_width
 from manipulation.control.sensing import Sample, command_wait_s
 
@@ -84,8 +85,8 @@ class PathExecutor:
         self._w = np.array(turns).reshape(-1, 3)
         self._ways, self._speeds = smooth_ways(self._t, self._p, self._w)
         first = np.ascontiguousarray(poses[0].as_matrix())
-        measured, _ = kernels.tool_and_jacobian(self._dh, start_rad, self._tool)
-        self._gap = kernels.pose_error(measured, first)
+        measured, _ = arm_kernels.tool_and_jacobian(self._dh, start_rad, self._tool)
+        self._gap = arm_kernels.pose_error(measured, first)
         self._admittance = None if motion.compliance is None else Admittance(motion.compliance)
 
     def wanted(self, tick: Tick) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hal.arrays import Array
-from manipulation.arm import kernels
+from manipulation.arm import kernels as arm_kernels
 from manipulation.arm.kinematics import Kinematics
 from manipulation.control.drives import Drives
 from manipulation.control.sensing import DeviceFailure
@@ -61,7 +61,7 @@ class FollowingErrorMonitor:
             self._drives.switch_off()
 
     def _check_near(self, measured_rad: Array, other_rad: Array, how: str) -> None:
-        tips = [(kernels.frames(self._kinematics.dh, q)[-1] @ self._grip)[:3, 3] for q in (measured_rad, other_rad)]
+        tips = [(arm_kernels.frames(self._kinematics.dh, q)[-1] @ self._grip)[:3, 3] for q in (measured_rad, other_rad)]
         apart_m = float(np.linalg.norm(tips[0] - tips[1]))
         if apart_m >= TRACKING_LIMIT_M:
             raise DeviceFailure(self._arm, f"{self._arm} does not follow: {how.format(1e3 * apart_m)}")

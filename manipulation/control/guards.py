@@ -11,7 +11,7 @@ import numpy as np
 
 from hal.arrays import Array
 from hal.motion import Guard, Quantity
-from manipulation.arm import kernels
+from manipulation.arm import kernels as arm_kernels
 
 RISE_WINDOW_S = 0.4
 RISE_AFTER_S = 0.15  # a motion that begins under load takes it up again first; an arm behind a wire is 50 ms later
@@ -79,7 +79,9 @@ class _GuardMonitor:
                 moved = now.base_from_tool[:3, 3] - self._start[:3, 3]
                 return self._along(self._start[:3, :3].T @ moved)
             case Quantity.ROTATION:
-                turn = kernels.rotation_log(np.ascontiguousarray(now.base_from_tool[:3, :3] @ self._start[:3, :3].T))
+                turn = arm_kernels.rotation_log(
+                    np.ascontiguousarray(now.base_from_tool[:3, :3] @ self._start[:3, :3].T)
+                )
                 return math.sqrt(float(turn @ turn))
             case Quantity.TRACKING:
                 gap = now.base_from_tool[:3, 3] - now.commanded_tip_m

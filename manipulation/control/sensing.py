@@ -17,7 +17,7 @@ from hal.clock import Clock, Deadline, PacedClock, SimClock
 from hal.devices import Arm, ForceTorque, Gripper, JointState, Proximity, Touch
 from hal.errors import CellError, DeviceError, DeviceTimeout, StaleReading
 from hal.readings import Cause, Quality, Stamped
-from manipulation.arm import kernels
+from manipulation.control import kernels
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from hal.arrays import Array
+from hal.arrays import Array, Mask
+from hal.jit import compiled, inlined
 from manipulation.arm.kernels import frames
 
 Index = NDArray[np.int64]
@@ -17,7 +15,7 @@ GOLDEN = 0.6180339887498949
 SEARCH_STEPS = 16  # 0.618^16 of a 0.5 m link: 0.2 mm of arc, far less in distance near the minimum
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def point_box(x: float, y: float, z: float, half: Array) -> float:
     """Signed distance from a point in box axes to the box: negative inside."""
     dx, dy, dz = abs(x) - half[0], abs(y) - half[1], abs(z) - half[2]
@@ -25,7 +23,7 @@ def point_box(x: float, y: float, z: float, half: Array) -> float:
     return float(np.sqrt(ox * ox + oy * oy + oz * oz) + min(max(dx, dy, dz), 0.0))
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def segment_box(start: Array, end: Array, rotation: Array, middle: Array, half: Array) -> float:
     """Least signed distance between the segment and the box (rotation: base_from_box)."""
     a, b = np.empty(3), np.empty(3)
@@ -54,7 +52,7 @@ def segment_box(start: Array, end: Array, rotation: Array, middle: Array, half: 
     return best
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def segment_segment(p1: Array, q1: Array, p2: Array, q2: Array) -> float:
     """Least distance between two segments.
 
@@ -84,8 +82,8 @@ def segment_segment(p1: Array, q1: Array, p2: Array, q2: Array) -> float:
     return float(np.sqrt(np.dot(gap, gap)))
 
 
-@njit(cache=True, nogil=True)
-def capsule_ends(dh: Array, q: Array, tool_ends: Array) -> Any:
+@compiled
+def capsule_ends(dh: Array, q: Array, tool_ends: Array) -> Array:
     """Ends (n + m, 2, 3) in the base of all capsules: n links from joint to joint, then the m of the tool on the
     flange.
     """
@@ -105,7 +103,7 @@ def capsule_ends(dh: Array, q: Array, tool_ends: Array) -> Any:
     return out
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def least_clearance(
     dh: Array,
     q: Array,
@@ -114,7 +112,7 @@ def least_clearance(
     rotations: Array,
     middles: Array,
     halves: Array,
-    watched: NDArray[np.bool_],
+    watched: Mask,
     pairs: Index,
     enough: float,
 ) -> float:
@@ -150,7 +148,7 @@ def least_clearance(
     return float(least)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def first_hit(
     dh: Array,
     start: Array,
@@ -161,7 +159,7 @@ def first_hit(
     rotations: Array,
     middles: Array,
     halves: Array,
-    watched: NDArray[np.bool_],
+    watched: Mask,
     pairs: Index,
     margin: float,
 ) -> float:
@@ -177,8 +175,8 @@ def first_hit(
     return 1.0
 
 
-@njit(cache=True, nogil=True)
-def overlap_counts(dh: Array, configurations: Array, tool_ends: Array, radii: Array, pairs: Index) -> Any:
+@compiled
+def overlap_counts(dh: Array, configurations: Array, tool_ends: Array, radii: Array, pairs: Index) -> Array:
     """How many of the configurations (m, n) make each pair of capsules overlap, (k,)."""
     out = np.zeros(pairs.shape[0])
     for c in range(configurations.shape[0]):

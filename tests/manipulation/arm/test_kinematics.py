@@ -12,6 +12,7 @@ from hal.geometry import difference, interpolate, perturbed, transform_rpy
 from manipulation.arm import kernels
 from manipulation.arm.kinematics import Kinematics
 from manipulation.control import braking
+from manipulation.control import kernels as control_kernels
 from tests.manipulation.arms import T3, UR, forward
 
 ARMS = pytest.mark.parametrize("arm", [T3, UR], ids=lambda arm: arm.model)
@@ -112,7 +113,7 @@ def test_a_path_is_interpolated_as_the_house_interpolates(a: np.ndarray, b: np.n
     turn = (end.rotation * start.rotation.inv()).as_rotvec()
     points, rotations = np.array([a, b]), np.array([start.rotation.as_matrix(), end.rotation.as_matrix()])
     times, ways = np.array([1.0, 3.0]), np.array([0.0, 1.0])
-    pose = kernels.pose_on_path(times, ways, np.array([0.5, 0.5]), points, rotations, turn[None], 1.0 + 2.0 * f)
+    pose = control_kernels.pose_on_path(times, ways, np.array([0.5, 0.5]), points, rotations, turn[None], 1.0 + 2.0 * f)
     assert np.abs(pose - interpolate(start, end, f).as_matrix()).max() < 1e-9
 
 
@@ -130,7 +131,7 @@ def test_a_wrench_does_the_same_work_in_either_frame(
     f: np.ndarray, t: np.ndarray, d: np.ndarray, r: np.ndarray
 ) -> None:
     parent_from_child = RigidTransform.from_components(d, Rotation.from_rotvec(r))
-    seen = kernels.wrench_at(np.concatenate([f, t]), parent_from_child.inv().as_matrix())
+    seen = control_kernels.wrench_at(np.concatenate([f, t]), parent_from_child.inv().as_matrix())
     # Virtual work of a rigid motion (v, w) of the body, given at the parent's origin and at the child's.
     for v, w in ((np.array([1.0, 2.0, -1.0]), np.array([0.3, -0.2, 0.5])), (np.zeros(3), np.array([1.0, 0.0, 2.0]))):
         at_child = v + np.cross(w, d)
@@ -146,7 +147,7 @@ def test_admittance_settles_at_force_over_stiffness_and_rigid_axes_stay() -> Non
     wrench = np.array([5.0, 50.0, 4.0, 0.1, 1.0, 1.0])
     bound = np.array([0.05, 0.05, 0.05, 0.3, 0.3, 0.3])
     for _ in range(20000):
-        kernels.admittance_step(state, wrench, stiffness, damping, mass, bound, 0.002)
+        control_kernels.admittance_step(state, wrench, stiffness, damping, mass, bound, 0.002)
     assert state[0, 0] == pytest.approx(0.01, rel=1e-3)
     assert state[0, 1] == 0.0
     assert state[0, 2] == 0.05  # a free axis drifts to its bound and stays there

@@ -235,6 +235,11 @@ class RangeScannerCapabilities:
     first_angle_rad: float = 0.0
     step_angle_rad: float = 0.0
 
+    @property
+    def needs_sweep(self) -> bool:
+        """Is one reading only a line, which becomes an image when the wrist sweeps the scanner (`SweptScanner`)?"""
+        return self.projection == "polar"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RangeImage:
@@ -253,6 +258,19 @@ class RangeScanner(Device, Protocol):
 
     def read_range(self, *, deadline: Deadline) -> Stamped[RangeImage]:
         """A range image whose scan began after this call was made."""
+        ...
+
+
+@runtime_checkable
+class SweptScanner(RangeScanner, Protocol):
+    """A line scanner, whose scans are kept one by one while the wrist sweeps it."""
+
+    def start_recording(self, *, deadline: Deadline) -> None:
+        """Keep every scan that ends from now on; what an earlier recording kept is dropped."""
+        ...
+
+    def end_recording(self, *, deadline: Deadline) -> tuple[Stamped[RangeImage], ...]:
+        """Stop keeping scans; returns those kept since `start_recording`, oldest first, each stamped with its end."""
         ...
 
 

@@ -130,12 +130,13 @@ class MotionOutcome(StrEnum):
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionLog:
     """What happened, sampled every `1/rate_hz`: times (N,), joints (N, n), contact wrench in tool axes (N, 6),
-    tip (N, 3)."""
+    tip (N, 3); `started_s` is the cell clock's time of the first sample."""
 
     times_s: Array
     positions_rad: Array
     wrench: Array
     tip_m: Array
+    started_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from manipulation.skills.outcome import ObjectState, SkillFailure, SkillReport, Verify
     from manipulation.skills.probe import proximity_probe, touch_probe
     from manipulation.skills.retreat import park, retreat
+    from manipulation.skills.sweep import plan_sweep
     from manipulation.warm import warm_up
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "Verify",
     "operate",
     "park",
+    "plan_sweep",
     "proximity_probe",
     "retreat",
     "touch_probe",

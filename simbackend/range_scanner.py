@@ -3,42 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import Field
 
 from hal.clock import Deadline
 from hal.devices import DeviceKind, RangeImage, RangeScannerCapabilities
 from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
 from simbackend.client import CameraView, Frame, true_mount
-from simbackend.device import VALID, SimDevice, SimOptions, parse
+from simbackend.device import VALID, SimDevice, parse
+from simbackend.line_scanner import SimLineScanner
+from simbackend.range_sensor import MAX_RANGE_M, MIN_RANGE_M, RangeOptions, corrupt
 
-Depth = NDArray[np.float32]
-
-MIN_RANGE_M, MAX_RANGE_M = 0.10, 1.50
 RATE_HZ = 5.0
-JUMP_M = 0.008  # neighbours further apart than this share a beam
-
-
-class RangeOptions(SimOptions):
-    """Size, field of view and corruption.
-
-    `sigma_m`: noise at 0.5 m, growing with the square of the distance. `bits` = 8 quantises the range from 0.10 to
-    1.50 m to 256 steps as the paper's scanner did. `mixed_ratio` of the pixels at a jump report a depth between the
-    two surfaces, and `loss_ratio` of all pixels see nothing.
-    """
-
-    width: Annotated[int, Field(ge=16, le=512)] = 128
-    height: Annotated[int, Field(ge=16, le=512)] = 128
-    field_of_view_rad: Annotated[float, Field(gt=0.1, lt=2.0)] = 0.96  # wider, and the finger tips come into view
-    sigma_m: Annotated[float, Field(ge=0, le=0.1)] = 0.0006
-    bits: Annotated[int, Field(ge=6, le=24)] = 16
-    mixed_ratio: Annotated[float, Field(ge=0, le=1)] = 0.5
-    loss_ratio: Annotated[float, Field(ge=0, le=1)] = 0.003
 
 
 class SimRangeScanner(SimDevice[RangeImage]):
@@ -92,21 +70,7 @@ class SimRangeScanner(SimDevice[RangeImage]):
         return newest[2], *VALID
 
 
-def corrupt(depth_m: Depth, options: RangeOptions, random: np.random.Generator) -> Depth:
-    """Mixed pixels at jumps, noise growing with the square of the distance, lost pixels, range limits, last digit."""
-    seen = np.where(np.isfinite(depth_m), depth_m, np.float32(2.0 * MAX_RANGE_M))
-    kernel = np.ones((3, 3), np.uint8)
-    near, far = cv2.erode(seen, kernel), cv2.dilate(seen, kernel)
-    u = random.random((3, *depth_m.shape), np.float32)
-    is_mixed = (far - near > JUMP_M) & (u[0] < options.mixed_ratio) & (far < MAX_RANGE_M)
-    out = np.where(is_mixed, near + u[1] * (far - near), depth_m)
-    sigma = np.float32(options.sigma_m) * (out / np.float32(0.5)) ** 2
-    out = out + sigma * random.standard_normal(depth_m.shape, np.float32)
-    out = np.where((u[2] < options.loss_ratio) | (out < MIN_RANGE_M) | (out > MAX_RANGE_M), np.float32(np.nan), out)
-    step_m = np.float32((MAX_RANGE_M - MIN_RANGE_M) / (2**options.bits - 1))
-    return (np.round((out - np.float32(MIN_RANGE_M)) / step_m) * step_m + np.float32(MIN_RANGE_M)).astype(np.float32)
-
-
-def connect(context: Context, options: dict[str, Any]) -> SimRangeScanner:
-    """Entry point `sim:range_scanner`."""
-    return SimRangeScanner(context, parse(options, RangeOptions, context))
+def connect(context: Context, options: dict[str, Any]) -> SimRangeScanner | SimLineScanner:
+    """Entry point `sim:range_scanner`: a range camera or, with `model = "polar"`, a line scanner."""
+    parsed = parse(options, RangeOptions, context)
+    return SimLineScanner(context, parsed) if parsed.model == "polar" else SimRangeScanner(context, parsed)

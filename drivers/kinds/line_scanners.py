@@ -1,8 +1,9 @@
-"""What line scanners share: one row of beams in a plane, as a range image one pixel high."""
+"""What line scanners share: one row of beams in a plane, as a range image one pixel high, kept during a sweep."""
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,8 @@ from hal.clock import Deadline
 from hal.devices import DeviceKind, RangeImage, RangeScannerCapabilities
 from hal.errors import DeviceUnavailable
 from hal.readings import Cause, Quality, Stamped
+
+MOST_KEPT = 4000  # scans of one sweep: 50 s of the fastest scanner
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,6 +36,7 @@ class LineScanner(StreamDevice[RangeImage]):
     kind = DeviceKind.RANGE_SCANNER
     beams: Beams | None = None
     sigma_m = 0.01
+    _kept: deque[Stamped[RangeImage]] | None = None
 
     def capabilities(self) -> RangeScannerCapabilities:
         """As the device reported at its last set-up.
@@ -64,6 +68,21 @@ class LineScanner(StreamDevice[RangeImage]):
         scan_s = self.beams.scan_s if self.beams is not None else 0.0
         return self.newest(deadline, not_before_s=self.context.clock.now_s() + scan_s)
 
+    def start_recording(self, *, deadline: Deadline) -> None:
+        """Keep every scan that ends from now on, at most the newest 4000."""
+        self.newest(deadline)  # a scanner that is silent now is told before the arm moves
+        self._kept = deque(maxlen=MOST_KEPT)
+
+    def end_recording(self, *, deadline: Deadline) -> tuple[Stamped[RangeImage], ...]:
+        """The scans since `start_recording`, oldest first.
+
+        Raises:
+            DeviceTimeout, DeviceUnavailable, DeviceFault: the scanner has failed meanwhile.
+        """
+        self.newest(deadline)
+        kept, self._kept = self._kept, None
+        return tuple(kept or ())
+
     def publish_scan(
         self,
         range_m: Array,
@@ -89,6 +108,9 @@ class LineScanner(StreamDevice[RangeImage]):
             cause=cause,
             missed=missed,
         )
+        kept, newest = self._kept, self.mailbox.peek()
+        if kept is not None and newest is not None:
+            kept.append(newest)
 
 
 def within(range_m: Array, beams: Beams) -> Array:

@@ -6,10 +6,11 @@ import math
 from typing import Any
 
 import numpy as np
+import pytest
 
 from hal.conformance.device import DeviceContract, level
 from hal.conformance.rig import Level, Rig
-from hal.devices import Camera, DeviceKind, ForceTorque, Proximity, RangeScanner, Touch
+from hal.devices import Camera, DeviceKind, ForceTorque, Proximity, RangeScanner, SweptScanner, Touch
 from hal.readings import Quality, Stamped
 
 
@@ -53,6 +54,22 @@ class RangeScannerContract(DeviceContract[RangeScanner]):
         seen = value.depth_m[np.isfinite(value.depth_m)]
         assert not np.any(np.isinf(value.depth_m))
         assert np.all((seen >= 0.5 * c.min_range_m) & (seen <= 1.1 * c.max_range_m))
+
+    @level(Level.READ)
+    def test_a_line_scanner_keeps_every_scan_of_a_recording(self, rig: Rig[RangeScanner]) -> None:
+        c = rig.device.capabilities()
+        if not c.needs_sweep:
+            pytest.skip("it gives whole images")
+        assert isinstance(rig.device, SweptScanner)
+        rig.device.start_recording(deadline=rig.deadline())
+        began_s = rig.clock.now_s()
+        rig.clock.sleep(5.0 / c.rate_hz)
+        scans = rig.device.end_recording(deadline=rig.deadline())
+        stamps_s = [scan.host_time_s for scan in scans]
+        assert len(scans) >= 2 and stamps_s == sorted(set(stamps_s))
+        assert stamps_s[-1] > began_s
+        for scan in scans:
+            self.check_value(rig, scan.value)
 
 
 class ProximityContract(DeviceContract[Proximity]):

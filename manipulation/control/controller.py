@@ -243,7 +243,7 @@ class Controller:
     def _run(
         self, motion: DeclaredMotion, run: Executor, sample: Sample, view: ToolView, recorder: Recorder
     ) -> Termination:
-        started_s = sample.stamp_s
+        started_s = recorder.started_s = sample.stamp_s
         look = view.look(sample, self._filter.last_rad)
         watch = TerminationMonitor(
             motion.guards,

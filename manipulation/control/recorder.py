@@ -20,6 +20,7 @@ class Recorder:
         self._ticks = 0
         self._rows: list[tuple[float, Array, Array, Array]] = []
         self.peak_force_n = 0.0
+        self.started_s = 0.0  # cell clock, of the first sample
 
     def note(self, elapsed_s: float, q_rad: Array, wrench: Array, tip_m: Array) -> None:
         """Take one tick in."""
@@ -40,5 +41,9 @@ class Recorder:
             )
         times, positions, wrenches, tips = zip(*self._rows, strict=True)
         return MotionLog(
-            times_s=np.array(times), positions_rad=np.array(positions), wrench=np.array(wrenches), tip_m=np.array(tips)
+            times_s=np.array(times),
+            positions_rad=np.array(positions),
+            wrench=np.array(wrenches),
+            tip_m=np.array(tips),
+            started_s=self.started_s,
         )

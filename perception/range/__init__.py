@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from perception.range.recordings import Reading, assumptions, load_recording
     from perception.range.render import MARK, match_json, picture, scene_json, write_ply, write_png
     from perception.range.sensor import OrthographicSensor, PinholeSensor, RangeSensorModel
+    from perception.range.sweep import image_from_sweep
     from perception.range.warm import warm_up
 
 __all__ = [
@@ -48,6 +49,7 @@ __all__ = [
     "batch_range",
     "estimate_noise",
     "fit_plane_near",
+    "image_from_sweep",
     "load_models",
     "load_recording",
     "match_json",

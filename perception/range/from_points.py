@@ -1,20 +1,25 @@
-"""Points, as a scanner that the wrist sweeps gives them (`drivers/sweep.py`), made into one depth image."""
+"""Depth image of points, as a scanner that the wrist sweeps gives them."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.errors import NotFound
-from perception.range.sensor import PinholeSensor, RangeSensorModel
+from perception.range.sensor import RangeSensorModel
 
+SAME_SURFACE_M = 0.004  # points of one pixel within this of its nearest one are averaged: the nearest alone is biased
 FILL_NEIGHBOURS = 3  # an empty pixel between this many measured ones of one surface is filled by their mean
-FILL_SWEEPS = 2
+FILL_PASSES = 2
 
 
-def depth_image(points_base_m: Array, base_from_view: RigidTransform, sensor: RangeSensorModel) -> Array:
-    """(H, W) depth seen from a virtual sensor at `base_from_view`: the nearest point of each pixel, small gaps filled.
+def image_from_points(points_base_m: Array, base_from_view: RigidTransform, sensor: RangeSensorModel) -> Array:
+    """(H, W) depth, m, of (N, 3) points seen from a virtual sensor at `base_from_view`; NaN where there is none.
+
+    A pixel holds the mean of its points on the nearest surface, carried along the surface to the pixel's centre. Small
+    gaps are filled.
 
     Raises:
         NotFound: no point falls into the view.
@@ -23,45 +28,51 @@ def depth_image(points_base_m: Array, base_from_view: RigidTransform, sensor: Ra
     perspective, fx, fy, cx, cy = sensor.packed()
     P = P[P[:, 2] > 1e-6] if perspective and len(P) else P
     scale = P[:, 2] if perspective else np.ones(len(P))
-    u, v = np.rint(P[:, 0] / scale * fx + cx).astype(int), np.rint(P[:, 1] / scale * fy + cy).astype(int)
-    inside = (u >= 0) & (v >= 0) & (u < sensor.width_px) & (v < sensor.height_px)
+    place = np.stack([P[:, 1] / scale * fy + cy, P[:, 0] / scale * fx + cx], axis=1)  # row, column
+    pixel = np.rint(place).astype(int)
+    shape = (sensor.height_px, sensor.width_px)
+    inside = np.all((pixel >= 0) & (pixel < shape), axis=1)
     if not inside.any():
         raise NotFound("none of the points falls into the view", hint="check the arm poses and the virtual sensor")
-    depth = np.full((sensor.height_px, sensor.width_px), np.inf)
-    np.minimum.at(depth, (v[inside], u[inside]), P[inside, 2])
-    depth[~np.isfinite(depth)] = np.nan
-    for _ in range(FILL_SWEEPS):
+    # Over a plane the inverse depth of a perspective image, and the depth of an orthographic one, is linear in the pixel.
+    value = 1.0 / P[inside, 2] if perspective else P[inside, 2]
+    index = np.ravel_multi_index(tuple(pixel[inside].T), shape)
+    centred = _at_centres(_means(index, P[inside, 2], value, place[inside] - pixel[inside], shape))
+    depth = 1.0 / centred if perspective else centred
+    for _ in range(FILL_PASSES):
         depth = _filled_once(depth, 4.0 * sensor.pitch_m(float(np.nanmedian(depth))))
     return depth
 
 
-def fitting_view(
-    points_base_m: Array, base_from_view: RigidTransform, *, width_px: int, height_px: int
-) -> PinholeSensor:
-    """A pinhole at `base_from_view` whose image just holds the points, with square pixels.
+def _means(index: NDArray[np.int64], depth_m: Array, value: Array, offset_px: Array, shape: tuple[int, int]) -> Array:
+    """(3, H, W): mean value and mean offset (rows, columns) from the pixel's centre of its points on the nearest surface."""
+    nearest = np.full(shape[0] * shape[1], np.inf)
+    np.minimum.at(nearest, index, depth_m)
+    chosen = depth_m <= nearest[index] + SAME_SURFACE_M
+    columns = np.column_stack([np.ones(len(value)), value, offset_px])[chosen]
+    count, *sums = (np.bincount(index[chosen], weights=column, minlength=len(nearest)) for column in columns.T)
+    with np.errstate(invalid="ignore"):
+        return np.stack([total / count for total in sums]).reshape(3, *shape)
 
-    Raises:
-        NotFound: no point lies before the view.
-    """
-    P = base_from_view.inv().apply(points_base_m) if len(points_base_m) else np.empty((0, 3))
-    P = P[P[:, 2] > 1e-6]
-    if not len(P):
-        raise NotFound("no point lies before the view", hint="let z of the view point at the scene")
-    low, high = (np.quantile(P[:, :2] / P[:, 2:], q, axis=0) for q in (0.005, 0.995))
-    span = np.maximum(high - low, 1e-6)
-    f = 0.95 * min(width_px / span[0], height_px / span[1])
-    middle = 0.5 * (low + high)
-    return PinholeSensor(
-        width_px=width_px,
-        height_px=height_px,
-        fx_px=f,
-        fy_px=f,
-        cx_px=(width_px - 1) / 2 - f * middle[0],
-        cy_px=(height_px - 1) / 2 - f * middle[1],
-    )
+
+def _at_centres(means: Array) -> Array:
+    """(H, W) values carried to the pixels' centres by the slope between their neighbours on both sides."""
+    value, *offsets = means
+    out = value.copy()
+    for axis, offset in enumerate(offsets):
+        before, after = (np.roll(np.stack([value, offset]), turn, axis=axis + 1) for turn in (1, -1))
+        # The neighbours' values stand at their own offsets, 2 px and the difference of these apart.
+        slope = (after[0] - before[0]) / (2.0 + after[1] - before[1])
+        is_smooth = np.abs(after[0] + before[0] - 2.0 * value) < np.abs(after[0] - before[0]) + 0.01 * np.abs(value)
+        is_smooth &= np.abs(slope) < 0.02 * np.abs(value)  # no jump: 1 cm a pixel at half a metre
+        edge = [0, -1]
+        is_smooth[(edge, slice(None)) if axis == 0 else (slice(None), edge)] = False
+        out = out - np.where(is_smooth, slope * offset, 0.0)
+    return np.asarray(out)
 
 
 def _filled_once(depth: Array, tolerance_m: float) -> Array:
+    """The image with its empty pixels filled where enough neighbours lie on one surface."""
     padded = np.pad(depth, 1, constant_values=np.nan)
     h, w = depth.shape
     around = np.stack(

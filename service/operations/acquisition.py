@@ -19,6 +19,7 @@ from hal.geometry import UncertainPose
 from hal.motion import Hold, MotionOutcome
 from hal.readings import Cause, Stamped
 from service.operations.session import Session
+from service.operations.sweep import sweep_scanner
 from service.operations.world_model import Frame
 
 READ_S = 5.0  # wall seconds for one device call; a software renderer on a busy machine takes up to 0.5 s
@@ -116,8 +117,19 @@ def look_with_lights(session: Session) -> LightPair:
 
 
 def scan(session: Session) -> Scan:
-    """One range image from where the arm stands now; the arm must be at rest."""
+    """One range image from where the arm stands now; the arm must be at rest. A line scanner is swept for it."""
     name, device = only_device(session, DeviceKind.RANGE_SCANNER)
+    capabilities = device.capabilities()
+    if capabilities.needs_sweep:
+        swept = sweep_scanner(session, name, device)
+        _refuse_frozen(session, name, swept.newest, swept.newest.value.depth_m)
+        return Scan(
+            depth_m=swept.depth_m,
+            stamp_s=swept.newest.host_time_s,
+            scanner=name,
+            capabilities=swept.capabilities,
+            base_from_scanner=base_from(session, name),
+        )
     asked_s = session.connection.clock.now_s()
     sample = device.read_range(deadline=deadline())
     depth_m = sample.usable(now_s=asked_s, max_age_s=OLDEST_S, device=name).depth_m
@@ -126,7 +138,7 @@ def scan(session: Session) -> Scan:
         depth_m=depth_m,
         stamp_s=sample.host_time_s,
         scanner=name,
-        capabilities=device.capabilities(),
+        capabilities=capabilities,
         base_from_scanner=base_from(session, name),
     )
 

@@ -135,7 +135,7 @@ def plate_in(session: Session, image: Scan) -> ScannedPlane:
     if c.projection != "pinhole":
         raise NotFound(
             f"{image.scanner} has {c.projection} projection; the plate is fitted to pinhole range images",
-            hint="sweep the scanner with the wrist first",
+            hint="use a range camera, or a line scanner, which is swept with the wrist",
         )
     pose = scanner_from_panel.parent_from_child
     sigma = np.sqrt(np.diag(scanner_from_panel.covariance))

@@ -49,6 +49,13 @@ class TestSimRangeScanner(RangeScannerContract):
         return rig_of(bench, "range_scanner")
 
 
+class TestSimLineScanner(RangeScannerContract):
+    @pytest.fixture
+    def rig(self, bench: SimCell) -> Rig[Any]:
+        device = bench.connect("range_scanner", model="polar")
+        return Rig(device=device, clock=bench.clock, sample_period_s=0.01, inject=injector(device))
+
+
 class TestSimProximity(ProximityContract):
     @pytest.fixture
     def rig(self, bench: SimCell) -> Rig[Any]:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 from simbackend.arm_model import base_from_flange, t3
 from simbackend.client import true_mount
 from simbackend.draws import Draws
-from simbackend.range_scanner import MAX_RANGE_M, MIN_RANGE_M, RangeOptions, corrupt
+from simbackend.range_sensor import MAX_RANGE_M, MIN_RANGE_M, RangeOptions, corrupt
 from tests.simbackend.rig import SimCell
 
 CLEAN = {"sigma_m": 0.0, "mixed_ratio": 0.0, "loss_ratio": 0.0, "bits": 24}
@@ -77,3 +77,30 @@ def test_lost_and_distant_pixels_are_nan() -> None:
     assert np.isnan(corrupt(depth(np.nan), RangeOptions(**CLEAN), random())).all()
     lost = np.isnan(corrupt(depth(), RangeOptions(**{**CLEAN, "loss_ratio": 0.1}), random())).mean()
     assert lost == pytest.approx(0.1, abs=0.02)
+
+
+def test_a_line_scanner_keeps_its_scans_while_it_records_and_each_is_of_its_own_time(bench: SimCell) -> None:
+    scanner = bench.connect("range_scanner", model="polar", width=33, line_rate_hz=25.0, **CLEAN)
+    line = scanner.read_range(deadline=bench.deadline()).value.depth_m
+    assert line.shape == (1, 33) and np.isfinite(line).any()
+    scanner.start_recording(deadline=bench.deadline())
+    bench.clock.sleep(0.3)
+    scans = scanner.end_recording(deadline=bench.deadline())
+    assert 6 <= len(scans) <= 8
+    np.testing.assert_allclose(np.diff([scan.host_time_s for scan in scans]), 0.04, atol=0.0021)
+    for scan in scans:  # the arm rests, so that every line is the first one
+        np.testing.assert_allclose(scan.value.depth_m, line, atol=2e-5)
+    bench.clock.sleep(0.2)
+    assert scanner.end_recording(deadline=bench.deadline()) == ()
+
+
+def test_a_line_of_beams_lies_in_the_middle_row_of_a_range_image(bench: SimCell) -> None:
+    camera = bench.connect("range_scanner", width=257, height=257, field_of_view_rad=0.9, **CLEAN)
+    row = camera.read_range(deadline=bench.deadline()).value.depth_m[128]
+    c = camera.capabilities()
+    polar = bench.connect("range_scanner", model="polar", width=65, field_of_view_rad=0.9, **CLEAN)
+    line, p = polar.read_range(deadline=bench.deadline()).value.depth_m[0], polar.capabilities()
+    angle = p.first_angle_rad + np.arange(65) * p.step_angle_rad
+    along_the_row = np.interp(c.fx * np.tan(angle) + c.cx, np.arange(257), row) / np.cos(angle)
+    assert p.needs_sweep and not c.needs_sweep
+    assert np.nanmedian(np.abs(line - along_the_row)) < 1e-4

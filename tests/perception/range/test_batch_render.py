@@ -17,9 +17,10 @@ from perception.range import FeatureKind, SurfaceType, analyse
 from perception.range.batch import analyse_files, batch_range, recordings_in, tasks_of
 from perception.range.batch_results import write_results
 from perception.range.features import corner_point, crease_line
-from perception.range.from_points import depth_image, fitting_view
+from perception.range.from_points import image_from_points
 from perception.range.recordings import Reading, assumptions, load_recording
 from perception.range.render import MARK, picture, scene_json, write_ply, write_png
+from perception.range.sensor import PinholeSensor
 from tests.perception.range.scenes import PINHOLE, ball_on_table, nearest, noisy, plane_depth
 
 META = {"unit": "m", "sensor": {"kind": "pinhole", "shape": [120, 160], "f": 180.0, "cx": 79.5, "cy": 59.5}}
@@ -203,8 +204,8 @@ def test_the_points_of_a_sweep_become_a_plane_in_the_base_frame():
         scans.append(pose.apply(ranges[:, None] * beams))
     points = np.concatenate(scans)
     view = RigidTransform.from_components([0.3, 0.0, 0.6], down)
-    sensor = fitting_view(points, view, width_px=120, height_px=110)
-    plane = analyse(depth_image(points, view, sensor), sensor).largest_plane()
+    sensor = PinholeSensor(width_px=120, height_px=110, fx_px=150.0, fy_px=150.0, cx_px=59.5, cy_px=54.5)
+    plane = analyse(image_from_points(points, view, sensor), sensor).largest_plane()
     normal = view.rotation.apply(plane.primitive.normal)
     assert np.degrees(np.arccos(normal @ [0, 0, 1])) < 0.1
     assert view.apply(plane.primitive.point_m)[2] == pytest.approx(0.1, abs=0.0005)
@@ -212,13 +213,13 @@ def test_the_points_of_a_sweep_become_a_plane_in_the_base_frame():
 
 def test_an_image_of_points_shows_the_nearest_in_each_pixel_and_needs_one():
     here = RigidTransform.identity()
-    depth_m = depth_image(
+    depth_m = image_from_points(
         np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.7], [0.1, 0.0, 1.0], [0.0, 0.0, -1.0]]), here, PINHOLE
     )
     assert sorted(depth_m[np.isfinite(depth_m)]) == [0.7, 1.0]
     for unseen in (np.empty((0, 3)), np.array([[0.0, 0.0, -1.0], [90.0, 0.0, 1.0]])):
         with pytest.raises(NotFound):
-            depth_image(unseen, here, PINHOLE)
+            image_from_points(unseen, here, PINHOLE)
 
 
 def three_walls(seed):

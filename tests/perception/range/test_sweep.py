@@ -1,0 +1,165 @@
+"""A line scanner swept by the wrist: planes come out flat though the wrist moved during each scan."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from hal.devices import RangeImage, RangeScannerCapabilities
+from hal.errors import InvalidRequest, NotFound, StaleReading
+from hal.geometry import identity, transform_rpy
+from hal.readings import Cause, Quality, Stamped
+from perception.range import fit_plane_near
+from perception.range.sweep import ScannerTrack, beam_times_s, image_from_sweep, scan_points
+
+LINE = RangeScannerCapabilities(
+    projection="polar",
+    width=181,
+    height=1,
+    fx=1.0,
+    fy=1.0,
+    cx=0.0,
+    cy=0.0,
+    min_range_m=0.02,
+    max_range_m=4.0,
+    sigma_m=0.01,
+    rate_hz=10.0,
+    first_angle_rad=-np.pi / 4,
+    step_angle_rad=np.pi / 360,
+)
+IMAGE = RangeScannerCapabilities(
+    projection="orthographic",
+    width=64,
+    height=48,
+    fx=100.0,
+    fy=100.0,
+    cx=32.0,
+    cy=24.0,
+    min_range_m=0.1,
+    max_range_m=4.0,
+    sigma_m=0.01,
+    rate_hz=1.0,
+)
+WRIST_FROM_SCANNER = transform_rpy([0.02, -0.01, 0.05], [0.02, -0.03, 0.1])
+PLANE_Z_M = 1.0
+
+
+def wrist_at(time_s: float) -> RigidTransform:
+    """Moving at 0.3 m/s and nodding at 0.4 rad/s, with the scanner looking along the base's z."""
+    return RigidTransform.from_components(
+        [0.05 * np.sin(time_s), 0.3 * (time_s - 0.5), 0.02 * time_s], Rotation.from_rotvec([0.4 * time_s, 0.1, 0.0])
+    )
+
+
+def track() -> ScannerTrack:
+    times_s = list(np.arange(-0.2, 1.4, 0.008))
+    return ScannerTrack(times_s=times_s, base_from_scanner=[wrist_at(t) * WRIST_FROM_SCANNER for t in times_s])
+
+
+def scan_of_the_plane(end_s: float) -> Stamped[RangeImage]:
+    """Each beam meets z = 1 m of the base from where the scanner was at the beam's own time."""
+    range_m = []
+    for k, t in enumerate(beam_times_s(end_s, LINE)):
+        base_from_scanner = wrist_at(float(t)) * WRIST_FROM_SCANNER
+        angle = LINE.first_angle_rad + k * LINE.step_angle_rad
+        along = base_from_scanner.rotation.apply([np.sin(angle), 0.0, np.cos(angle)])
+        range_m.append((PLANE_Z_M - base_from_scanner.translation[2]) / along[2])
+    depth_m = np.array([range_m], np.float32)
+    return Stamped(value=RangeImage(depth_m=depth_m), host_time_s=end_s, sequence=1)
+
+
+def test_the_points_of_a_moving_scanner_lie_on_the_plane() -> None:
+    scans = [scan_of_the_plane(0.1 * i) for i in range(1, 10)]
+    points = np.concatenate([scan_points(scan, LINE, track()) for scan in scans])
+    assert len(points) == 9 * LINE.width
+    assert np.max(np.abs(points[:, 2] - PLANE_Z_M)) < 2e-4
+
+
+def test_poses_of_another_time_would_bend_it() -> None:
+    late = Stamped(value=scan_of_the_plane(0.5).value, host_time_s=0.6, sequence=1)
+    assert np.max(np.abs(scan_points(late, LINE, track())[:, 2] - PLANE_Z_M)) > 5e-3
+
+
+def test_the_last_beam_ends_the_scan_and_the_scanner_turns_steadily() -> None:
+    times_s = beam_times_s(2.0, LINE)
+    assert times_s[-1] == 2.0
+    assert times_s[0] == pytest.approx(2.0 - 0.1 * 90 / 360)
+
+
+def test_unseen_beams_and_invalid_scans_give_no_points() -> None:
+    depth_m = np.full((1, LINE.width), np.nan, np.float32)
+    depth_m[0, 90] = 1.0
+    one = Stamped(value=RangeImage(depth_m=depth_m), host_time_s=0.5, sequence=1)
+    bad = Stamped(value=one.value, host_time_s=0.5, sequence=2, quality=Quality.INVALID, cause=Cause.OUT_OF_RANGE)
+    assert scan_points(one, LINE, track()).shape == (1, 3)
+    assert scan_points(bad, LINE, track()).shape == (0, 3)
+
+
+def test_times_without_poses_are_refused() -> None:
+    with pytest.raises(StaleReading, match="no arm pose"):
+        track().at(5.0)
+    with pytest.raises(StaleReading, match="gap"):
+        ScannerTrack(times_s=[0.0, 0.5], base_from_scanner=[identity(), identity()]).at(0.25)
+
+
+def test_only_lines_are_swept() -> None:
+    with pytest.raises(InvalidRequest, match="lines"):
+        scan_points(scan_of_the_plane(0.5), IMAGE, track())
+
+
+def nodding_over_a_plane(seed: int, sigma_m: float) -> dict[str, Any]:
+    """A scanner that nods at 0.4 rad/s before a tilted plane; its scans and poses, as `image_from_sweep` wants them."""
+    rng = np.random.default_rng(seed)
+    times_s = np.arange(0.0, 2.5, 0.008)
+    poses = [RigidTransform.from_rotation(Rotation.from_rotvec([0.4 * (1.25 - t), 0.0, 0.0])) for t in times_s]
+    scans = []
+    for k, end_s in enumerate(np.arange(0.06, 2.45, 0.02)):
+        range_m = []
+        for beam, t in enumerate(beam_times_s(float(end_s), FINE)):
+            turn = Rotation.from_rotvec([0.4 * (1.25 - t), 0.0, 0.0])
+            angle = FINE.first_angle_rad + beam * FINE.step_angle_rad
+            along = turn.apply([np.sin(angle), 0.0, np.cos(angle)])
+            range_m.append(NORMAL @ POINT_M / (NORMAL @ along) + rng.normal(0.0, sigma_m))
+        scans.append(
+            Stamped(value=RangeImage(depth_m=np.array([range_m], np.float32)), host_time_s=float(end_s), sequence=k)
+        )
+    return {"scans": scans, "times_s": list(times_s), "base_from_scanner": poses}
+
+
+NORMAL = np.array([0.2, -0.1, -0.97]) / np.linalg.norm([0.2, -0.1, -0.97])
+POINT_M = np.array([0.0, 0.0, 0.6])
+FINE = replace(LINE, width=128, rate_hz=50.0, first_angle_rad=-0.4, step_angle_rad=0.8 / 127)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_image_of_a_sweep_gives_the_plane_within_its_covariance(seed: int) -> None:
+    given = nodding_over_a_plane(seed, 0.0006)
+    depth_m, view = image_from_sweep(
+        given["scans"],
+        FINE,
+        times_s=given["times_s"],
+        base_from_scanner=given["base_from_scanner"],
+        base_from_view=identity(),
+        half_height_rad=0.45,
+    )
+    assert np.isfinite(depth_m).mean() > 0.9
+    fit = fit_plane_near(depth_m, view, point_m=POINT_M, normal=NORMAL, sigma_offset_m=0.01, sigma_angle_rad=0.02)
+    feature = fit.feature
+    sigma_m = np.sqrt(NORMAL @ feature.point_covariance @ NORMAL)
+    assert abs(NORMAL @ (feature.point_m - POINT_M)) < 4.0 * sigma_m < 2e-4
+    assert np.linalg.norm(np.cross(feature.direction, NORMAL)) < 4.0 * np.sqrt(np.trace(feature.direction_covariance))
+
+
+def test_scans_before_the_first_pose_are_left_out_and_none_at_all_is_said() -> None:
+    given = nodding_over_a_plane(0, 0.0)
+    with pytest.raises(NotFound, match="none of the points"):
+        image_from_sweep(
+            given["scans"],
+            FINE,
+            times_s=[9.0, 9.1],
+            base_from_scanner=[identity(), identity()],
+            base_from_view=identity(),
+            half_height_rad=0.45,
+        )

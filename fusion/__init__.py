@@ -23,14 +23,17 @@ if TYPE_CHECKING:
         ProximityObservation,
         TouchObservation,
     )
+    from fusion.planning import CandidateSensing, PoseTolerance, SensingChoice, next_measurement
     from fusion.robust import FusedPose, ShapeEstimate, fuse
     from fusion.shapes import Box, Cylinder, FeatureSet, MovingPart, Shape
-    from fusion.shared_errors import FusedObservations, fuse_observations
+    from fusion.shared_errors import ErrorBudget, FusedObservations, error_budget, fuse_observations
     from fusion.warm import warm_up
 
 __all__ = [
     "Box",
+    "CandidateSensing",
     "Cylinder",
+    "ErrorBudget",
     "Feature",
     "FeatureSet",
     "FusedObservations",
@@ -41,13 +44,17 @@ __all__ = [
     "Observation",
     "PixelObservation",
     "PlaneObservation",
+    "PoseTolerance",
     "ProximityObservation",
+    "SensingChoice",
     "SensingClass",
     "Shape",
     "ShapeEstimate",
     "TouchObservation",
+    "error_budget",
     "fuse",
     "fuse_observations",
+    "next_measurement",
     "plane",
     "point",
     "unit",

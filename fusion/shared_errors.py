@@ -1,9 +1,11 @@
 """Covariance of a pose whose measurements share the errors of their sensors' mountings.
 
-All readings of one sensor share the error of its mounting. Each measurement carries that error in its weight, as if it
-were its own; the covariance of the answer is then summed over the errors that are really independent: each reading's
-own, and each mounting's once. Each error in turn is set to one sigma and the pose solved again:
-`covariance = sum_k delta_k delta_k^T`, `delta_k` the change of the pose (linear error propagation).
+All readings of one sensor share the error of its mounting, and all rays of one camera those of its lens. Each measurement
+carries the mounting's error in its weight, as if it were its own; the covariance of the answer is then summed over the
+errors that are really independent. An error that is one sigma large changes the whitened residuals r by dr, and so moves the
+estimate by A^-1 g with g = J^T dr and A = J^T J (linear error propagation):
+
+    covariance = A^-1 (sum_k g_k g_k^T) A^-1
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from fusion.batch import pack
+from fusion.distance.rows import whitened_all
 from fusion.measurement import Measurement
 from fusion.observations import Observation, PixelObservation
 from fusion.robust import FusedPose, fuse
@@ -22,6 +25,38 @@ from fusion.solve import local_solution
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.geometry import UncertainPose, certain, compose, difference, matrix_of, perturbed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ErrorBudget:
+    """What a set of observations tells about a pose, and every independent error in it.
+
+    Attributes:
+        information: (6, 6) A = sum of J^T J, translation then rotation, base axes.
+        own: (6, 6) sum of g g^T over the errors that belong to one reading each.
+        shared: for every mounting and lens, (6, k) the g of each of its errors.
+    """
+
+    information: Array
+    own: Array
+    shared: Mapping[str, Array]
+
+    def plus(self, other: ErrorBudget) -> ErrorBudget:
+        """Return the budget of both sets of observations together."""
+        names = sorted({*self.shared, *other.shared})
+        return ErrorBudget(
+            information=self.information + other.information,
+            own=self.own + other.own,
+            shared={name: np.asarray(self.shared.get(name, 0.0) + other.shared.get(name, 0.0)) for name in names},
+        )
+
+    @property
+    def covariance(self) -> Array:
+        """(6, 6) of the pose: the true one has translation t + d and rotation Exp(r) R, base axes."""
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(self.information), 1e-300))  # metres beside radians
+        inverse = np.linalg.inv(self.information * np.outer(scale, scale)) * np.outer(scale, scale)
+        spread = self.own + sum((G @ G.T for G in self.shared.values()), np.zeros((6, 6)))
+        return np.asarray(inverse @ spread @ inverse)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,6 +69,7 @@ class FusedObservations:
     base_from_panel: UncertainPose
     measurements: tuple[Measurement, ...]
     fused: FusedPose
+    budget: ErrorBudget
 
 
 def fuse_observations(
@@ -60,17 +96,46 @@ def fuse_observations(
     rejected = {r.index for r in fused.rejected}
     good = [i for i in range(len(observations)) if i not in rejected]
     pose = _solve([measurements[i] for i in good], start)
-    covariance = np.zeros((6, 6))
-    used = [observations[i] for i in good]
-    for changed in (*_one_sigma_changes(used, mounts), *_lens_changes(used, mounts, lenses or {})):
-        moved = [changed.get(k, measurements[i]) for k, i in enumerate(good)]
-        delta = difference(_solve(moved, pose), pose)
-        covariance += np.outer(delta, delta)
-    fused = replace(fused, pose=pose)
+    budget = error_budget([observations[i] for i in good], mounts, pose, lenses=lenses)
+    covariance = fused.covariance if fused.unobservable else budget.covariance
     return FusedObservations(
         base_from_panel=UncertainPose(parent_from_child=pose, covariance=covariance),
         measurements=measurements,
-        fused=fused,
+        fused=replace(fused, pose=pose),
+        budget=budget,
+    )
+
+
+def error_budget(
+    observations: Sequence[Observation],
+    mounts: Mapping[str, UncertainPose],
+    base_from_panel: RigidTransform,
+    *,
+    lenses: Mapping[str, Sequence[CameraIntrinsics]] | None = None,
+) -> ErrorBudget:
+    """Return what observations tell about a pose and which errors they share; arguments as `fuse_observations`.
+
+    It depends on where the sensors stand and hardly on what they read, so it also holds for readings that are only expected.
+    """
+    nominal = [_measure(o, mounts[o.sensor], np.zeros(len(o.sigmas))) for o in observations]
+    own = [{i: _measure(o, mounts[o.sensor], error)} for i, o in enumerate(observations) for error in np.diag(o.sigmas)]
+    shared = {
+        **_mounting_errors(observations, mounts, nominal),
+        **_lens_errors(observations, mounts, lenses or {}),
+    }
+    changes = [*own, *(change for errors in shared.values() for change in errors)]
+    informations, gradients = _linearised(
+        [*nominal, *(m for change in changes for m in change.values())], base_from_panel
+    )
+    concerned = [(k, i) for k, change in enumerate(changes) for i in change]
+    g = np.zeros((len(changes), 6))
+    for n, (k, i) in enumerate(concerned, len(nominal)):
+        g[k] += gradients[n] - gradients[i]
+    ends = np.cumsum([len(own), *(len(errors) for errors in shared.values())])
+    return ErrorBudget(
+        information=informations[: len(nominal)].sum(axis=0),
+        own=g[: len(own)].T @ g[: len(own)],
+        shared={name: g[a:b].T for name, a, b in zip(shared, ends[:-1], ends[1:], strict=True)},
     )
 
 
@@ -78,43 +143,56 @@ def _measure(o: Observation, mount: UncertainPose, errors: Array) -> Measurement
     return o.measurement(compose(certain(o.base_from_flange), mount), errors)
 
 
-def _one_sigma_changes(
-    observations: Sequence[Observation], mounts: Mapping[str, UncertainPose]
-) -> list[dict[int, Measurement]]:
-    """For each independent error, the measurements that it changes when it is one sigma large."""
-    changes: list[dict[int, Measurement]] = []
-    for k, o in enumerate(observations):
-        changes += [{k: _measure(o, mounts[o.sensor], error)} for error in np.diag(o.sigmas)]
-    nominal = [_measure(o, mounts[o.sensor], np.zeros(len(o.sigmas))) for o in observations]
+Change = dict[int, Measurement]
+"""What an error makes of the measurements that it concerns, by their index."""
+
+
+def _mounting_errors(
+    observations: Sequence[Observation], mounts: Mapping[str, UncertainPose], nominal: Sequence[Measurement]
+) -> dict[str, list[Change]]:
+    """For each sensor, its measurements when one independent error of its mounting is one sigma large."""
+    errors: dict[str, list[Change]] = {}
     for sensor in sorted({o.sensor for o in observations}):
         mount = mounts[sensor]
-        for error in _one_sigma(mount.covariance):
-            wrong = perturbed(mount.parent_from_child, error) * mount.parent_from_child.inv()
-            changes.append(
-                {
-                    k: _carried(nominal[k], o.base_from_flange * wrong * o.base_from_flange.inv())
-                    for k, o in enumerate(observations)
-                    if o.sensor == sensor
-                }
-            )
-    return changes
+        wrong = [perturbed(mount.parent_from_child, error) for error in _one_sigma(mount.covariance)]
+        errors[f"mounting of {sensor}"] = [
+            {
+                i: _carried(
+                    nominal[i], o.base_from_flange * pose * (o.base_from_flange * mount.parent_from_child).inv()
+                )
+                for i, o in enumerate(observations)
+                if o.sensor == sensor
+            }
+            for pose in wrong
+        ]
+    return errors
 
 
-def _lens_changes(
+def _lens_errors(
     observations: Sequence[Observation],
     mounts: Mapping[str, UncertainPose],
     lenses: Mapping[str, Sequence[CameraIntrinsics]],
-) -> list[dict[int, Measurement]]:
-    """For each independent error of each lens, the rays that it turns."""
-    return [
-        {
-            k: _measure(replace(o, intrinsics=wrong), mounts[o.sensor], np.zeros(2))
-            for k, o in enumerate(observations)
-            if isinstance(o, PixelObservation) and o.sensor == camera
-        }
+) -> dict[str, list[Change]]:
+    """For each camera, its rays when one independent error of its lens is one sigma large."""
+    return {
+        f"lens of {camera}": [
+            {
+                i: _measure(replace(o, intrinsics=wrong), mounts[o.sensor], np.zeros(2))
+                for i, o in enumerate(observations)
+                if isinstance(o, PixelObservation) and o.sensor == camera
+            }
+            for wrong in wrong_lenses
+        ]
         for camera, wrong_lenses in lenses.items()
-        for wrong in wrong_lenses
-    ]
+    }
+
+
+def _linearised(measurements: Sequence[Measurement], pose: RigidTransform) -> tuple[Array, Array]:
+    """J^T J (N, 6, 6) and J^T r (N, 6) of each measurement at a pose."""
+    R, t = np.array(matrix_of(pose), order="C"), np.array(pose.translation, order="C")
+    r, J = np.zeros((len(measurements), 6)), np.zeros((len(measurements), 6, 6))
+    whitened_all(pack(measurements), R, t, r, J)
+    return np.einsum("nki,nkj->nij", J, J), np.einsum("nki,nk->ni", J, r)
 
 
 def _carried(m: Measurement, motion: RigidTransform) -> Measurement:

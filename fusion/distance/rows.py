@@ -210,17 +210,3 @@ def whitened_all(b: Batch, R: Array, t: Array, r: Array, J: Array) -> None:
             r[i, k] = own_r[k]
             for c in range(6):
                 J[i, k, c] = own_j[k, c]
-
-
-@compiled
-def informations(b: Batch, R: Array, t: Array, out: Array) -> None:
-    """out (N, 6, 6) = J^T J of each entry alone."""
-    r, J, V = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
-    for i in range(b.cls.size):
-        n = whitened(b, i, R, t, NEAR, r, J, V)
-        for p in range(6):
-            for c in range(6):
-                s = 0.0
-                for k in range(n):
-                    s += J[k, p] * J[k, c]
-                out[i, p, c] = s

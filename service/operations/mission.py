@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fusion import Observation
 from hal.devices import DeviceKind
 from hal.errors import CellError, DeviceError
 from hal.geometry import compose
@@ -22,8 +23,9 @@ from service.operations.evaluate import AFTER
 from service.operations.inspect import Inspection, inspect_close, inspect_here, need_all_present, reading_result
 from service.operations.locate import Located, ScannedPlane, go_to_overview, locate, scan_plate
 from service.operations.manipulate import work
-from service.operations.sense import feel, fuse_and_remember, fused_result, light_observations
+from service.operations.sense import fuse_and_remember, fused_result, light_observations
 from service.operations.session import Session
+from service.operations.touches import feel
 from service.operations.travel import leave_the_panel, park
 from service.problem import problem_of
 from service.report.drawing import panel_drawing
@@ -126,11 +128,12 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
         _note_pictures(record, found, "read")
         record.readings += [reading_result(reading, BEFORE) for reading in found.readings.values()]
     with _step(session, "touch", 0.38, 0.55) as part:
-        felt = feel(part, request.touches)
+        known: tuple[Observation, ...] = (*light_observations([first, located]), plane.observation)
+        felt = feel(part, request.touches, known, request.wanted.tolerance())
     with _step(session, "fuse", 0.55, 0.57) as part:
         part.progress(0.0, "fuse light rays, range plane, distances and touches")
-        answer = fuse_and_remember(part, (*light_observations([first, located]), plane.observation, *felt.observations))
-        record.fused = fused_result(answer)
+        answer = fuse_and_remember(part, (*known, *felt.observations))
+        record.fused = fused_result(answer, felt)
         record.by_lights = estimated(located.base_from_panel)
         record.pictures.append(_drawing(session, located))
     with _step(session, "check by surfaces", 0.57, 0.58) as part:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -21,28 +19,18 @@ from fusion import (
     MovingPart,
     Observation,
     PixelObservation,
-    ProximityObservation,
     SensingClass,
     Shape,
     ShapeEstimate,
-    TouchObservation,
     fuse,
     fuse_observations,
     unit,
 )
-from hal.arrays import Array
-from hal.devices import DeviceKind
-from hal.errors import MotionError, NotFound, Stopped
 from hal.geometry import UncertainPose
-from manipulation import SkillFailure, proximity_probe, touch_probe
-from service.operations.acquisition import settle
-from service.operations.doubted_proximity import DoubtedProximity
 from service.operations.inspect import ensure_located
 from service.operations.locate import Located, go_to_overview, locate, scan_plate
 from service.operations.session import Session
-from service.operations.spots import bare_spots
-from service.operations.tours import short_tour
-from service.operations.travel import skill_context
+from service.operations.touches import Felt, feel, mounts_of
 from service.schema.requests import BoxBody, CylinderBody, FeatureSetBody, FuseRequest, MeasurementBody
 from service.schema.results import (
     AlternativePose,
@@ -56,84 +44,33 @@ from service.schema.results import (
     fields_of,
 )
 
-HOVER_M = 0.05  # of the finger tips above the plate while the proximity sensors look
-LEAST_TOUCHES = 3
 ONE_IN = 1e5
 NO_NOISE = 1e-9  # a chi-square a degree of freedom that no sensor's noise gives, in whatever unit
-REST_S = 0.02  # two readings of a proximity sensor
-SPARE_SPOTS = 2  # a spot that the arm cannot reach is replaced
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Felt:
-    """What the fingers found: observations, and the spots (panel frame, m) that gave it."""
-
-    observations: tuple[Observation, ...]
-    spots: tuple[Array, ...]
-    skipped: tuple[str, ...]
-
-
-def feel(session: Session, touches: int) -> Felt:
-    """Hover over and touch bare places of the plate.
-
-    Raises:
-        NotFound: fewer than three places could be touched; says why.
-        Stopped: somebody stopped the cell.
-    """
-    observations: list[Observation] = []
-    spots: list[Array] = []
-    skipped: list[str] = []
-    doubted = DoubtedProximity(session.panel)
-    wanted = bare_spots(session.panel, touches + SPARE_SPOTS)
-    first = short_tour(_fingers_over_panel(session), wanted[:touches])
-    for spot in wanted[[*first, *range(touches, len(wanted))]]:
-        if len(spots) == touches:
-            break
-        session.progress(len(spots) / touches, "touch the plate", f"at ({spot[0]:.3f}, {spot[1]:.3f}) m")
-        try:
-            observations += _feel_at(session, spot, doubted)
-            spots.append(spot)
-        except Stopped:
-            raise  # no spot is at fault
-        except (SkillFailure, MotionError) as failure:
-            skipped.append(f"({spot[0]:.3f}, {spot[1]:.3f}) m: {failure}")
-    if len(spots) < LEAST_TOUCHES:
-        raise NotFound(
-            f"only {len(spots)} of {touches} places of the plate could be touched: {'; '.join(skipped)}",
-            hint="is the panel where the lights say? is something in the way?",
-        )
-    return Felt(observations=tuple(observations), spots=tuple(spots), skipped=tuple(skipped))
-
-
-def mounts_of(session: Session, observations: Sequence[Observation]) -> dict[str, UncertainPose]:
-    """`flange_from_sensor` of every sensor that gave observations."""
-    return {sensor: session.mount(sensor) for sensor in sorted({o.sensor for o in observations})}
 
 
 def fuse_and_remember(session: Session, observations: Sequence[Observation]) -> FusedObservations:
     """One pose from all observations; the cell believes it from now on."""
-    lenses = {
-        camera: record.one_sigma_lenses()
-        for camera in session.cell.names_of(DeviceKind.CAMERA)
-        if (record := session.cell.calibration_of(camera).intrinsics) is not None
-    }
     fused = fuse_observations(
-        observations, mounts_of(session, observations), lenses=lenses, prior=session.believed_panel()
+        observations,
+        mounts_of(session, observations),
+        lenses=session.one_sigma_lenses(),
+        prior=session.believed_panel(),
     )
     session.world.believe_panel(fused.base_from_panel)
     return fused
 
 
-def fused_result(answer: FusedObservations) -> FuseResult:
+def fused_result(answer: FusedObservations, felt: Felt) -> FuseResult:
     """The fused pose as reports and the API give it."""
-    return _answer(answer.base_from_panel, answer.fused, answer.measurements)
+    result = _answer(answer.base_from_panel, answer.fused, answer.measurements)
+    return result.model_copy(update={"touching": felt.account})
 
 
 def run_fuse(session: Session, request: FuseRequest) -> FuseResult:
     """The verb `fuse`: measurements that are given, or collected."""
     if request.collect:
-        observations = collect(session, request.touches)
-        return fused_result(fuse_and_remember(session, observations))
+        observations, felt = collect(session, request)
+        return fused_result(fuse_and_remember(session, observations), felt)
     measurements = [_measurement(body) for body in request.measurements]
     prior = request.prior.pose() if request.prior is not None else None
     fused = fuse(
@@ -146,86 +83,20 @@ def run_fuse(session: Session, request: FuseRequest) -> FuseResult:
     return _answer(fused.base_from_object, fused, measurements)
 
 
-def collect(session: Session, touches: int) -> tuple[Observation, ...]:
-    """Look, scan, hover and touch."""
+def collect(session: Session, request: FuseRequest) -> tuple[tuple[Observation, ...], Felt]:
+    """Look, scan, hover and touch: all observations, and what was felt."""
     ensure_located(session.part(0.0, 0.2))
     go_to_overview(session)
     found: Located = locate(session.part(0.2, 0.3))
     session.progress(0.3, "scan the plate")
-    plane = scan_plate(session)
-    felt = feel(session.part(0.35, 1.0), touches)
-    return (*found.observations, plane.observation, *felt.observations)
+    known: tuple[Observation, ...] = (*found.observations, scan_plate(session).observation)
+    felt = feel(session.part(0.35, 1.0), request.touches, known, request.wanted.tolerance())
+    return (*known, *felt.observations), felt
 
 
 def light_observations(located: Sequence[Located]) -> tuple[PixelObservation, ...]:
     """The rays of several looks together."""
     return tuple(ray for found in located for ray in found.observations)
-
-
-def _fingers_over_panel(session: Session) -> Array:
-    """(2,) panel point that the finger tips are over."""
-    context = skill_context(session)
-    tip = context.mover.state().base_from_flange * context.flange_from_grip
-    return np.asarray(context.panel_pose.inv().apply(tip.translation)[:2])
-
-
-def _feel_at(session: Session, spot: Array, doubted: DoubtedProximity) -> list[Observation]:
-    context = skill_context(session)
-    place = (float(spot[0]), float(spot[1]), 0.0)
-    observations: list[Observation] = []
-    proximities = session.cell.names_of(DeviceKind.PROXIMITY)
-    names = [name for name in proximities if session.has_mount(name)]
-    of = {name: session.connection.device(name).capabilities() for name in names}
-    mounts = [session.mount(name).parent_from_child for name in names]
-    hovered = context.mover.state()
-    if names:
-        sigma_m = max(each.sigma_m for each in of.values())
-        points = proximity_probe(
-            context, place, flange_from_sensors=mounts, distance_m=HOVER_M, samples=5, sigma_m=sigma_m
-        )
-        hovered = context.mover.state()
-        flange = hovered.base_from_flange
-        for point in points:
-            name = _whose(names, mounts, flange, point.base_from_sensor)
-            observations.append(
-                ProximityObservation(
-                    sensor=name,
-                    base_from_flange=flange,
-                    distance_m=point.distance_m,
-                    sigma_m=point.sigma_m,
-                    label=f"{name} at ({spot[0]:.3f}, {spot[1]:.3f})",
-                )
-            )
-    touched = touch_probe(context, place)
-    settle(session, REST_S)
-    for name, mount in zip(names, mounts, strict=True):
-        k = proximities.index(name)
-        doubted.check(
-            name,
-            of[name],
-            [(state.base_from_flange * mount, state.proximity_m[k]) for state in (hovered, context.mover.state())],
-            base_from_panel=context.panel_pose,
-            touched_m=touched.point_m,
-        )
-    base_from_grip = touched.report.base_from_tool
-    tip = base_from_grip.inv().apply(touched.point_m)
-    normal_sigma = float(np.sqrt(touched.normal @ touched.covariance @ touched.normal))
-    observations.append(
-        TouchObservation(
-            sensor=session.first(DeviceKind.GRIPPER),
-            base_from_flange=base_from_grip * context.flange_from_grip.inv(),
-            tip_m=tip,
-            sigma_m=normal_sigma,
-            label=f"touch at ({spot[0]:.3f}, {spot[1]:.3f})",
-        )
-    )
-    return observations
-
-
-def _whose(names: Sequence[str], mounts: Sequence[Any], flange: Any, base_from_sensor: Any) -> str:
-    """Which sensor stood there: the probe leaves out sensors that saw nothing."""
-    gaps = [np.linalg.norm((flange * mount).translation - base_from_sensor.translation) for mount in mounts]
-    return names[int(np.argmin(gaps))]
 
 
 def _measurement(body: MeasurementBody) -> Measurement:

@@ -149,6 +149,13 @@ class Session:
         """`flange_from_device` of a mounted device, with the covariance of its calibration."""
         return frame_tree(self.cell, identity()).base_from(device)
 
+    def one_sigma_lenses(self) -> dict[str, tuple[CameraIntrinsics, ...]]:
+        """For each camera, its lens with one independent error one sigma large at a time."""
+        records = {
+            camera: self.cell.calibration_of(camera).intrinsics for camera in self.cell.names_of(DeviceKind.CAMERA)
+        }
+        return {camera: record.one_sigma_lenses() for camera, record in records.items() if record is not None}
+
     def lens(self, camera: str | None = None) -> CameraIntrinsics:
         """Intrinsics of the camera (the first one by default).
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from hal.geometry import UncertainPose, from_json
 from hal.strict import Strict
 from service.schema.examples import FUSE_EXAMPLES
+
+if TYPE_CHECKING:
+    from fusion import PoseTolerance
 
 Vector3 = tuple[float, float, float]
 
@@ -216,6 +219,22 @@ class FeatureSetBody(Strict):
 ShapeBody = Annotated[CylinderBody | BoxBody | FeatureSetBody, Field(discriminator="kind")]
 
 
+Touches = Annotated[int, Field(ge=3, le=12, description="at most so many touches; fewer when the pose is good enough")]
+
+
+class WantedPose(Strict):
+    """How well the panel's pose is wanted: one standard deviation over all axes. Touching ends when it is that good."""
+
+    position_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.001
+    angle_rad: Annotated[float, Field(gt=0.0, le=1.0)] = 0.0012
+
+    def tolerance(self) -> PoseTolerance:
+        """The same as the planning of measurements takes it."""
+        from fusion import PoseTolerance
+
+        return PoseTolerance(position_m=self.position_m, angle_rad=self.angle_rad)
+
+
 class FuseRequest(Strict):
     """Fuse measurements into one pose: those given, or those that the cell collects itself."""
 
@@ -223,7 +242,8 @@ class FuseRequest(Strict):
 
     measurements: Annotated[tuple[MeasurementBody, ...], Field(max_length=10_000)] = ()
     collect: Annotated[bool, Field(description="look, scan, touch and measure distances first")] = False
-    touches: Annotated[int, Field(ge=3, le=12, description="how many touches to collect")] = 4
+    touches: Touches = 4
+    wanted: WantedPose = WantedPose()
     prior: PoseBody | None = None
     certify: Annotated[bool, Field(description="prove global optimality by a semidefinite relaxation")] = False
     prove_set_within_s: Annotated[
@@ -274,7 +294,8 @@ class MissionRequest(Strict):
     """The whole mission. Without actions: lever, slider, button and toggle of the panel file, one each."""
 
     actions: Annotated[tuple[ActionBody, ...], Field(max_length=50)] | None = None
-    touches: Annotated[int, Field(ge=3, le=12)] = 4
+    touches: Touches = 4
+    wanted: WantedPose = WantedPose()
 
 
 class CalibrationRequest(Strict):

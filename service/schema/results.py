@@ -268,6 +268,31 @@ class ShapeResult(Result):
     covariance: Rows
 
 
+class TouchResult(Result):
+    """What a touched place was expected to bring, and what it brought.
+
+    Attributes:
+        spot_m: the place, panel frame.
+        error_before, error_expected, error_after: mean square error of the pose in units of the wanted one: before the
+            touch, as expected after it, and after it with the readings that really came.
+        words: the same as a sentence.
+    """
+
+    spot_m: Numbers
+    error_before: float
+    error_expected: float
+    error_after: float
+    words: str
+
+
+class TouchingResult(Result):
+    """The places touched in order, those that could not be touched and why, and why touching ended."""
+
+    touches: list[TouchResult]
+    skipped: list[str]
+    ended: str
+
+
 class FuseResult(EstimatedPose):
     """The fused pose (`base_from_object`), and how each measurement agrees with it."""
 
@@ -282,6 +307,9 @@ class FuseResult(EstimatedPose):
     certificate: CertificateResult | None
     proven_set: ProvenSetResult | None
     shape: ShapeResult | None
+    touching: Annotated[TouchingResult | None, Field(description="when the cell collected the measurements itself")] = (
+        None
+    )
 
 
 # -- manipulate, missions ---------------------------------------------------------------------------------------------

@@ -1,0 +1,103 @@
+"""Choose what to sense next: of the sensings that could be made, the one that tells most about the pose per second.
+
+What a sensing at the believed pose will tell is known before it is made: its information depends on the geometry and not on
+the reading, and so do the errors that it shares with what was sensed before (`fusion.shared_errors`). The measure is the mean
+square error of the pose in units of what the task tolerates: 1 is "on average just tolerable".
+
+Source: V. V. Fedorov, Theory of Optimal Experiments, Academic Press 1972, ch. 2: sequential design, A-optimality.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from fusion.shared_errors import ErrorBudget
+from hal.arrays import Array
+from hal.errors import InvalidRequest
+from hal.geometry import matrix_of, skew
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseTolerance:
+    """How well a pose is wanted: position and angle, one standard deviation over all axes, and where on the object."""
+
+    position_m: float = 0.001
+    angle_rad: float = 0.0012  # a third of a millimetre over half the width of a panel
+    at_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def error_of(self, covariance: Array, base_from_object: RigidTransform) -> float:
+        """Return the mean square error of a pose in units of this tolerance, half of it position and half angle.
+
+        Args:
+            covariance: (6, 6) translation then rotation, base axes, m and rad.
+            base_from_object: the pose itself.
+        """
+        lever = matrix_of(base_from_object) @ np.asarray(self.at_m, float)
+        J = np.hstack([np.eye(3), -skew(lever)])  # moves the place that matters
+        at_place = float(np.trace(J @ covariance @ J.T))
+        turned = float(np.trace(covariance[3:, 3:]))
+        return 0.5 * (at_place / self.position_m**2 + turned / self.angle_rad**2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CandidateSensing:
+    """A sensing that could be made.
+
+    Attributes:
+        budget: what its observations would tell, with the errors that they share with others.
+        cost_s: time that it takes, s.
+    """
+
+    budget: ErrorBudget
+    cost_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensingChoice:
+    """The candidate chosen.
+
+    Attributes:
+        index: its place among the candidates given.
+        error_before, error_after: mean square error in units of the tolerance, now and as expected after the sensing.
+        gain_per_s: log(error_before / error_after) per second of its cost.
+    """
+
+    index: int
+    error_before: float
+    error_after: float
+    gain_per_s: float
+
+
+def next_measurement(
+    budget: ErrorBudget,
+    base_from_object: RigidTransform,
+    candidates: Sequence[CandidateSensing],
+    *,
+    tolerance: PoseTolerance | None = None,
+) -> SensingChoice:
+    """Return the candidate that shrinks the pose's error most per second.
+
+    Args:
+        budget: of what has been observed so far.
+        base_from_object: the pose now.
+        candidates: what could be sensed.
+        tolerance: how well the pose is wanted.
+
+    Raises:
+        InvalidRequest: no candidate, or a cost that is not positive.
+    """
+    if not candidates:
+        raise InvalidRequest("no candidate sensing", hint="offer at least one")
+    for i, candidate in enumerate(candidates):
+        if not candidate.cost_s > 0.0:
+            raise InvalidRequest(f"candidate {i} costs {candidate.cost_s} s", hint="a cost is a positive time", index=i)
+    wanted = tolerance or PoseTolerance()
+    before = wanted.error_of(budget.covariance, base_from_object)
+    after = [wanted.error_of(budget.plus(candidate.budget).covariance, base_from_object) for candidate in candidates]
+    gains = [np.log(before / error) / c.cost_s for error, c in zip(after, candidates, strict=True)]
+    best = int(np.argmax(gains))
+    return SensingChoice(index=best, error_before=before, error_after=after[best], gain_per_s=float(gains[best]))

@@ -1,13 +1,14 @@
-"""A small client of the HTTP API, standard library only: the command line uses it, and others may copy it."""
+"""A small client of the HTTP API over httpx: the command line uses it, and others may copy it."""
 
 from __future__ import annotations
 
-import http.client
 import json
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
-from urllib.parse import urlsplit
+
+import httpx2
 
 from hal.errors import CellError, ConfigError, DeviceUnavailable, Retry, detail_lines
 
@@ -76,13 +77,13 @@ class Client:
             ApiError: the service answered with a problem.
             DeviceUnavailable: neither of them answers.
         """
-        host, port = self._address()
+        url = self._address()
         try:
             return Client(url=self.url, timeout_s=STOP_WAIT_S).post("/v1/stop")
         except DeviceUnavailable as error:
-            name = f"[{host}]" if ":" in host else host
+            beside = url.copy_with(port=(url.port or 80) + 1)
             try:
-                return Client(url=f"http://{name}:{(port or 80) + 1}", timeout_s=STOP_WAIT_S).post("/v1/stop")
+                return Client(url=str(beside), timeout_s=STOP_WAIT_S).post("/v1/stop")
             except CellError:
                 raise DeviceUnavailable(
                     f"{error.what}; nor does a stop process on the next port",
@@ -95,65 +96,52 @@ class Client:
 
     def fetch(self, method: str, path: str, body: Any = None, *, headers: dict[str, str] | None = None) -> bytes:
         """The raw answer; errors as for `get`."""
-        connection, answer = self._ask(method, path, body, headers or {})
-        try:
-            data = answer.read()
-        except (OSError, http.client.HTTPException) as error:  # it may end in the middle of its answer
-            raise self._lost(error) from error
-        finally:
-            connection.close()
-        if answer.status >= 400:
-            raise ApiError(_problem(data, answer.status))
-        return data
+        with self._stream(method, path, body, headers or {}) as answer:
+            return answer.read()
 
     def events(self, task_id: str) -> Iterator[dict[str, Any]]:
         """The events of a task as they come, until it ends. A lost connection is taken up where it broke."""
         seen = 0
         while True:
-            for event in self._stream(f"/v1/tasks/{task_id}/events", seen):
+            for event in self._events(f"/v1/tasks/{task_id}/events", seen):
                 seen = int(event["sequence"])
                 yield event
             if self.get(f"/v1/tasks/{task_id}")["state"] in FINAL:
                 return
 
-    def _stream(self, path: str, last: int) -> Iterator[dict[str, Any]]:
-        connection, answer = self._ask("GET", path, None, {"Last-Event-ID": str(last)})
-        try:
-            if answer.status >= 400:
-                raise ApiError(_problem(answer.read(), answer.status))
-            for line in answer:
-                if line.startswith(b"data: "):
-                    yield json.loads(line[6:])
-        except (OSError, http.client.HTTPException):
-            return  # the caller looks whether the task has ended, and comes back if not
-        finally:
-            connection.close()
+    def _events(self, path: str, last: int) -> Iterator[dict[str, Any]]:
+        with self._stream("GET", path, None, {"Last-Event-ID": str(last), "Accept": "text/event-stream"}) as answer:
+            try:
+                for event in httpx2.EventSource(answer):
+                    yield json.loads(event.data)
+            except httpx2.RequestError:
+                return  # the caller looks whether the task has ended, and comes back if not
 
-    def _ask(
-        self, method: str, path: str, body: Any, headers: dict[str, str]
-    ) -> tuple[http.client.HTTPConnection, http.client.HTTPResponse]:
-        connection = http.client.HTTPConnection(*self._address(), timeout=self.timeout_s)
-        data = None if body is None else json.dumps(body)
-        typed = headers if data is None else {**headers, "Content-Type": "application/json"}
-        try:
-            connection.request(method, path, data, typed)
-            return connection, connection.getresponse()
-        except (OSError, http.client.HTTPException) as error:
-            connection.close()
-            raise self._lost(error) from error
+    @contextmanager
+    def _stream(self, method: str, path: str, body: Any, headers: dict[str, str]) -> Iterator[httpx2.Response]:
+        """An answer that is no problem, while it is being read; a connection that breaks then is a service that is gone."""
+        url = self._address().join(path)
+        # A proxy of the environment is for the world outside: a cell is reached directly.
+        with httpx2.Client(timeout=self.timeout_s, trust_env=False) as connection:
+            try:
+                with connection.stream(method, url, json=body, headers=headers) as answer:
+                    if answer.status_code >= httpx2.codes.BAD_REQUEST:
+                        raise ApiError(_problem(answer.read(), answer.status_code))
+                    yield answer
+            except httpx2.RequestError as error:
+                raise self._lost(error) from error
 
-    def _address(self) -> tuple[str, int | None]:
-        parts = urlsplit(self.url if "//" in self.url else f"//{self.url}", scheme="http")  # as curl takes it
+    def _address(self) -> httpx2.URL:
         try:
-            host, port = parts.hostname, parts.port
-        except ValueError:
-            host = port = None
-        if host is None or parts.scheme != "http":
+            url = httpx2.URL(self.url if "//" in self.url else f"http://{self.url}")  # as curl takes it
+        except httpx2.InvalidURL:
+            url = httpx2.URL("")
+        if not url.host or url.scheme != "http":
             raise ConfigError(f"{self.url!r} is no address of a service", hint=f"for example {DEFAULT_URL}")
-        return host, port
+        return url
 
     def _lost(self, error: Exception) -> DeviceUnavailable:
-        why = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        why = str(error).partition("] ")[2] or str(error) or type(error).__name__  # without the number of the error
         return DeviceUnavailable(
             f"no panelwright answers at {self.url}: {why}",
             hint="start one with `panelwright serve`, or name its address with --url",

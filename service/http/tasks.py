@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import functools
-import json
 from collections.abc import AsyncIterator
 from typing import Annotated
 
-from fastapi import APIRouter, Header, Path, Query
-from starlette.responses import FileResponse, StreamingResponse
+from fastapi import APIRouter, Depends, Header, Path, Query
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+from starlette.responses import FileResponse
 
-from service.http.hub import Hub
 from service.http.models import TaskList, TaskView, event_data
 from service.http.problems import RESPONSES
 from service.http.state import LeaseToken, State
@@ -20,7 +18,6 @@ from service.tasks.model import Task, TaskState
 
 router = APIRouter(prefix="/v1/tasks", tags=["tasks"], responses=RESPONSES)
 TaskId = Annotated[str, Path(max_length=64, examples=["3f9c2a7be01d4c55"])]
-KEEPALIVE_S = 10.0
 
 
 @router.get("", summary="Kept tasks, newest first", operation_id="list_tasks")
@@ -51,28 +48,35 @@ async def cancel_task(state: State, task_id: TaskId, lease_token: LeaseToken = N
     return TaskView.of(task)
 
 
+def _watched(state: State, task_id: TaskId) -> Task:
+    """The task, found before the stream begins: what is not there is a 404 and no empty stream."""
+    return state.service.tasks.get(task_id)
+
+
 @router.get(
     "/{task_id}/events",
     summary="Progress as server-sent events; resume with Last-Event-ID",
     operation_id="watch_task",
-    response_class=StreamingResponse,
-    responses={
-        200: {
-            "description": "one event a change: `id` counts up, `event` is state, progress or artefact, `data` is "
-            "JSON; the stream ends with the task",
-            "content": {"text/event-stream": {"schema": {"type": "string"}}},
-        }
-    },
+    response_class=EventSourceResponse,
+    response_description="one event a change: `id` counts up, `event` is state, progress or artefact, `data` is JSON; the "
+    "stream ends with the task",
 )
 async def watch_task(
     state: State,
-    task_id: TaskId,
+    task: Annotated[Task, Depends(_watched)],
     last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", max_length=20)] = None,
-) -> StreamingResponse:
-    task = state.service.tasks.get(task_id)
+) -> AsyncIterator[ServerSentEvent]:
     seen = int(last_event_id) if last_event_id and last_event_id.isascii() and last_event_id.isdigit() else 0
-    headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-    return StreamingResponse(_events(state.hub, task, seen), media_type="text/event-stream", headers=headers)
+    with state.hub.watch() as changed:
+        while True:
+            changed.clear()
+            is_over = task.state.is_final or state.hub.is_closing  # looked at before the events, so that none is missed
+            for event in task.events_after(seen):
+                seen = event.sequence
+                yield ServerSentEvent(id=str(seen), event=event.kind, data=event_data(event))
+            if is_over:
+                return
+            await changed.wait()
 
 
 @router.get(
@@ -85,19 +89,3 @@ async def watch_task(
 async def fetch_artefact(state: State, task_id: TaskId, name: Annotated[str, Path(max_length=100)]) -> FileResponse:
     path, artefact = state.service.tasks.artefact_path(task_id, name)
     return FileResponse(path, media_type=artefact.media_type, filename=name, content_disposition_type="inline")
-
-
-async def _events(hub: Hub, task: Task, seen: int) -> AsyncIterator[str]:
-    with hub.watch() as changed:
-        while True:
-            changed.clear()
-            is_over = task.state.is_final or hub.is_closing  # looked at before the events, so that none is missed
-            for event in task.events_after(seen):
-                seen = event.sequence
-                yield f"id: {seen}\nevent: {event.kind}\ndata: {json.dumps(event_data(event))}\n\n"
-            if is_over:
-                return
-            try:
-                await asyncio.wait_for(changed.wait(), KEEPALIVE_S)
-            except TimeoutError:
-                yield ": still here\n\n"

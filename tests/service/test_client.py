@@ -1,16 +1,19 @@
-"""Stopping from the command line: when the service does not answer, and by Ctrl-C."""
+"""The client of the HTTP API: what it makes of a broken, a foreign and no service, and stopping by it."""
 
 from __future__ import annotations
 
+import json
 import socket
+import threading
 from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import pytest
 
 from hal.errors import ConfigError, DeviceUnavailable
-from service.client import Client
+from service.client import ApiError, Client
 from service.commands.own_cell import run_task
 from service.processes.latch import Latch
 from service.processes.stop_host import InlineStop, bound_socket
@@ -81,3 +84,84 @@ def test_ctrl_c_ends_a_task_on_a_running_service_too(capsys: pytest.CaptureFixtu
         run_task(cast("Client", client), "/v1/calibrations", {"what": "tool"})
     assert client.posted == ["/v1/calibrations", "/v1/tasks/7/cancel"]
     assert "the arm stops" in capsys.readouterr().out
+
+
+class Scripted(BaseHTTPRequestHandler):
+    """A service that breaks the event stream after the second event, and has ended the task when asked for the rest."""
+
+    resumed_at: ClassVar[list[str]] = []
+
+    def do_GET(self) -> None:
+        if self.path.endswith("/events"):
+            self.resumed_at.append(self.headers["Last-Event-ID"])
+            first = int(self.headers["Last-Event-ID"]) + 1
+            events = "".join(f'id: {k}\nevent: progress\ndata: {{"sequence": {k}}}\n\n' for k in (first, first + 1))
+            self._answer(200, "text/event-stream", events.encode(), length=len(events) + (100 if first == 1 else 0))
+        elif self.path == "/v1/tasks/7":
+            state = "succeeded" if len(self.resumed_at) > 1 else "running"
+            self._answer(200, "application/json", json.dumps({"state": state}).encode())
+        elif self.path == "/v1/page":
+            self._answer(200, "text/html", b"<p>something else</p>")
+        else:
+            problem = {
+                "title": "Busy",
+                "detail": "17 tasks wait",
+                "hint": "wait",
+                "retry": "safe",
+                "details": {"n": 17},
+            }
+            self._answer(503, "application/problem+json", json.dumps(problem).encode())
+
+    def _answer(self, status: int, media: str, data: bytes, *, length: int | None = None) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", media)
+        self.send_header("Content-Length", str(len(data) if length is None else length))
+        self.end_headers()
+        self.wfile.write(data)
+
+    def log_message(self, *_args: object) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture
+def scripted() -> Iterator[Client]:
+    Scripted.resumed_at.clear()
+    with ThreadingHTTPServer(("127.0.0.1", 0), Scripted) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+        thread.start()
+        yield Client(url=f"127.0.0.1:{server.server_port}")
+        server.shutdown()
+        thread.join()
+
+
+def test_a_broken_event_stream_is_taken_up_where_it_broke(scripted: Client) -> None:
+    assert [event["sequence"] for event in scripted.events("7")] == [1, 2, 3, 4]
+    assert Scripted.resumed_at == ["0", "2"]
+
+
+def test_a_problem_is_an_error_with_its_hint_and_details(scripted: Client) -> None:
+    with pytest.raises(ApiError, match="17 tasks wait") as refusal:
+        scripted.get("/v1/tasks")
+    assert (refusal.value.hint, refusal.value.details["n"]) == ("wait", 17)
+    assert "retry  safe" in refusal.value.for_people()
+
+
+def test_another_server_at_the_address_is_told_apart_from_none(scripted: Client) -> None:
+    with pytest.raises(ConfigError, match="no panelwright"):
+        scripted.get("/v1/page")
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))  # bound, and nobody listens
+        with pytest.raises(DeviceUnavailable, match=r"no panelwright answers at .*: Connection refused") as refusal:
+            Client(url=f"http://127.0.0.1:{unused.getsockname()[1]}").get("/v1/info")
+    assert "--url" in refusal.value.hint
+
+
+@pytest.mark.parametrize("url", ["", "ftp://localhost", "http://", "http://[::1", "https://localhost:1"])
+def test_what_is_no_address_is_refused_before_anything_is_sent(url: str) -> None:
+    with pytest.raises(ConfigError, match="no address of a service"):
+        Client(url=url).get("/v1/info")
+
+
+def test_a_proxy_of_the_environment_is_not_asked(scripted: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HTTP_PROXY", "http://127.0.0.1:1")
+    assert scripted.get("/v1/tasks/7")["state"] == "running"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,20 +9,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from service.client import DEFAULT_URL, Client
+from service.terminal import console, find_cell
 
 if TYPE_CHECKING:
     from hal.config import Cell  # imports scipy: a client's command shall not wait for that
 
-ROOT = Path(__file__).parents[2]
-PATIENCE_S = 4.0
-LOG_WIDTH = 160  # where there is no terminal: a table cut at 80 columns loses the names of the devices
-console = Console(
-    highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else LOG_WIDTH
-)
+__all__ = [
+    "DEFAULT_CELL",
+    "PATIENCE_S",
+    "CellOption",
+    "SeedOption",
+    "Url",
+    "UrlDefault",
+    "client_of",
+    "console",
+    "find_cell",
+    "patience",
+    "read_cell",
+    "state_style",
+]
 
+PATIENCE_S = 4.0
 Url = Annotated[str, typer.Option("--url", help="Address of a running service.", show_default=True)]
 CellOption = Annotated[
     Path, typer.Option("--cell", help="Cell file (TOML); shipped ones are found by their path in the project.")
@@ -50,13 +57,6 @@ def patience(after_s: float = PATIENCE_S) -> Iterator[None]:
 def client_of(url: str) -> Client:
     """A client of the service at `url`."""
     return Client(url=url.rstrip("/"))
-
-
-def find_cell(path: Path) -> Path:
-    """`path` as given, or the shipped file of that name when there is none here."""
-    shipped = ROOT / path
-    is_elsewhere = not path.exists() and not path.is_absolute() and shipped.parent.is_dir()
-    return shipped if is_elsewhere and (shipped.exists() or not path.parent.is_dir()) else path
 
 
 def read_cell(path: Path, seed: int | None) -> Cell:

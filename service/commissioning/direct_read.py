@@ -20,9 +20,9 @@ from hal.errors import CellError, ConfigError
 from hal.readings import Stamped
 from hal.registry import Context, Shared
 from hal.registry import connect as connect_device
-from service.http.readings import READS, described
 from service.jsonable import jsonable
 from service.processes.cell import clock_for, start_emulators
+from service.readings import READS, described
 
 CONNECT_ATTEMPTS = 3  # a device that gives nothing three times in a row is not there
 LOOK_AGAIN_S = 0.0005

@@ -15,9 +15,9 @@ from hal.config import Cell, load_cell
 from hal.errors import REINSTALL, CellError, ConfigError, detail_lines
 from hal.registry import installed_drivers
 from service.client import Client
-from service.commands.common import console, find_cell
 from service.commissioning.preflight import check_machine, check_python, check_simulator
 from service.processes.stop_host import bound_socket
+from service.terminal import console, find_cell
 
 PINNED = {"pybullet": "3.2.7", "numpy": "2.", "opencv-python-headless": "4."}
 READS = 20
@@ -144,8 +144,8 @@ def _timer() -> str:
 
 
 def _devices(cell: Cell) -> str:
-    from service.http.readings import READS as METHODS
     from service.processes.supervisor import Supervisor
+    from service.readings import READS as METHODS
 
     supervisor = Supervisor(cell)
     try:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hal.config import load_cell
 from hal.errors import ConfigError
-from service.commands.common import find_cell
+from service.terminal import find_cell
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

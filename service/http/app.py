@@ -36,9 +36,9 @@ from service.http.models import FaultRequest, LeaseRequest, ResetRequest, SwapRe
 from service.http.page import Page
 from service.http.problems import Problem, install
 from service.http.query import check_query
-from service.http.readings import ReadingDesk
 from service.http.state import AppState
 from service.knowledge.teach import OutlineRequest, TeachRequest
+from service.readings import ReadingDesk
 
 WEB = Path(__file__).parents[1] / "web"
 DESCRIPTION = f"""

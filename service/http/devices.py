@@ -16,11 +16,11 @@ from service.errors import NoSuchDevice
 from service.http.body import body_schema, strict_body
 from service.http.models import DeviceDetail, DeviceList, DeviceView, FaultRequest, HealthView, ReadingView, SwapRequest
 from service.http.problems import RESPONSES
-from service.http.readings import as_json
 from service.http.state import AppState, LeaseToken, State
 from service.http.swap_files import with_recordings
 from service.jsonable import jsonable
 from service.processes.connection import check_name
+from service.readings import as_json
 
 router = APIRouter(prefix="/v1/devices", tags=["devices"], responses=RESPONSES)
 Name = Annotated[str, Path(max_length=64, examples=["wrist_camera"])]

@@ -9,7 +9,7 @@ from fastapi import FastAPI
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.http.problems import problem_response
+from service.http.problems import BodyTooLarge, problem_response
 from service.knowledge.images import MAX_IMAGE_BYTES
 
 MAX_BODY_BYTES = 1_000_000
@@ -25,10 +25,6 @@ SECURITY_HEADERS = [
         b"http://127.0.0.1:* http://localhost:*; frame-ancestors 'none'",
     ),
 ]
-
-
-class BodyTooLarge(Exception):
-    """More bytes arrived than a request may have."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

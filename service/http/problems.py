@@ -108,9 +108,12 @@ class BadBody(Exception):
         self.faults = faults
 
 
+class BodyTooLarge(Exception):
+    """More bytes arrived than a request may have."""
+
+
 def install(app: FastAPI, *, paths: Sequence[str]) -> None:
     """Register the handlers; `paths` are what a mistyped one may have meant."""
-    from service.http.guard import BodyTooLarge
 
     @app.exception_handler(CellError)
     async def _cell_error(_request: Request, error: CellError) -> Response:

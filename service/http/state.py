@@ -15,7 +15,7 @@ from service.core import Service
 from service.errors import Busy
 from service.http.hub import Hub
 from service.http.metrics import Metrics
-from service.http.readings import ReadingDesk
+from service.readings import ReadingDesk
 
 T = TypeVar("T")
 DEVICE_THREADS = 6

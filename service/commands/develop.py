@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hal.errors import ConfigError
-from service.commands.common import DEFAULT_CELL, ROOT, SeedOption, console, read_cell
+from service.commands.common import DEFAULT_CELL, SeedOption, console, read_cell
+from service.terminal import ROOT
 
 if TYPE_CHECKING:
     from hal.config import Cell

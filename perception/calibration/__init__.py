@@ -1,4 +1,7 @@
-"""Where camera and scanner sit, what the lens does and what the tool weighs, found from the cell's own views."""
+"""Where camera and scanner sit, what the lens does and what the tool weighs, found from the cell's own views.
+
+The module `calibration_poses` says where to measure from.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,6 @@ from hal.face import load_on_first_use
 
 if TYPE_CHECKING:
     from perception.calibration.boards import BoardView, Charuco, Dots
-    from perception.calibration.hand_eye import HandEyeView, propose_next, stations
     from perception.calibration.in_hand import (
         UNKNOWN_LENS,
         Beforehand,
@@ -29,7 +31,6 @@ __all__ = [
     "BoardView",
     "Charuco",
     "Dots",
-    "HandEyeView",
     "InHandCalibration",
     "InHandState",
     "InHandView",
@@ -40,11 +41,9 @@ __all__ = [
     "calibrate_in_hand",
     "calibrate_scanner",
     "calibrate_wrench",
-    "propose_next",
     "propose_view",
     "record_of",
     "renewed",
-    "stations",
     "to_toml",
 ]
 __getattr__ = load_on_first_use(__name__, __file__)

@@ -7,21 +7,19 @@ from typing import TYPE_CHECKING
 from hal.face import load_on_first_use
 
 if TYPE_CHECKING:
-    from perception.vision.annotate import AMBER, GREEN, draw_annotated, draw_outlines, said
+    from perception.vision.annotate import draw_annotated, draw_outlines, said
     from perception.vision.finding.blind import recognise
     from perception.vision.finding.framing import check_upright, one_plate
     from perception.vision.image import as_gray, check_image, decode
     from perception.vision.inspection import inspect, inspect_view
-    from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind
+    from perception.vision.knowledge import Knowledge, TaughtKind
     from perception.vision.knowledge_files import kind_files, kind_text, load_kind, load_knowledge, write_kind
-    from perception.vision.lights import find_lights
-    from perception.vision.lights.assign import AssignedLights, assign_lights
+    from perception.vision.lights import AssignedLights, PanelPrior, find_panel, find_panel_lights
     from perception.vision.multi_view import merge_views
     from perception.vision.projection import CameraProjection, PanelProjection
     from perception.vision.quadrangle import QuadranglePose, estimate
     from perception.vision.reading import ObjectReading, answer_at
     from perception.vision.registration.outline import contour_m
-    from perception.vision.status.button import ALIKE, NO_EDGE
     from perception.vision.teaching.from_panel import PanelLooks, teach_from_panel
     from perception.vision.teaching.panel_lights import LightsFound, find_border_lights
     from perception.vision.teaching.panel_questions import Question, kind_question, questions
@@ -38,11 +36,6 @@ if TYPE_CHECKING:
     from perception.vision.warm import warm_up
 
 __all__ = [
-    "ALIKE",
-    "AMBER",
-    "GREEN",
-    "NOTHING",
-    "NO_EDGE",
     "AssignedLights",
     "CameraProjection",
     "Example",
@@ -52,13 +45,13 @@ __all__ = [
     "Overview",
     "PanelLooks",
     "PanelObjectDraft",
+    "PanelPrior",
     "PanelProjection",
     "QuadranglePose",
     "Question",
     "TaughtKind",
     "answer_at",
     "as_gray",
-    "assign_lights",
     "check",
     "check_image",
     "check_upright",
@@ -69,7 +62,8 @@ __all__ = [
     "estimate",
     "example_at",
     "find_border_lights",
-    "find_lights",
+    "find_panel",
+    "find_panel_lights",
     "inspect",
     "inspect_view",
     "kind_files",

@@ -29,13 +29,20 @@ def draw_annotated(image: NDArray[Any], readings: Iterable[ObjectReading]) -> Im
     drawn = [reading for reading in readings if np.isfinite(reading.outline_px).all()]
     texts = [f"{reading.name}: {said(reading)}" for reading in drawn]
     colours = [GREEN if reading.answered else AMBER if reading.present else RED for reading in drawn]
-    return draw_outlines(image, [reading.outline_px for reading in drawn], texts, colours)
+    return _draw(image, [reading.outline_px for reading in drawn], texts, colours)
 
 
 def draw_outlines(
+    image: NDArray[Any], outlines_px: Sequence[NDArray[Any]], texts: Sequence[str], is_sure: Sequence[bool]
+) -> Image:
+    """RGB uint8 (H, W, 3): closed outlines, (N, 2) px each, green where sure and else amber, with a text beside each."""
+    return _draw(image, outlines_px, texts, [GREEN if sure else AMBER for sure in is_sure])
+
+
+def _draw(
     image: NDArray[Any], outlines_px: Sequence[NDArray[Any]], texts: Sequence[str], colours: Sequence[Colour]
 ) -> Image:
-    """RGB uint8 (H, W, 3): closed outlines, (N, 2) px each, with a text beside each that covers no other."""
+    """No text covers another."""
     check_image(image)
     rgb = np.repeat(image[:, :, None], 3, axis=2) if image.ndim == 2 else image[:, :, :3].copy()
     picture: Image = np.ascontiguousarray(rgb)

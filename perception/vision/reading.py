@@ -12,6 +12,8 @@ from hal.arrays import Array
 
 ANSWER_AT = 0.5  # below this confidence a reading is refused, unless the caller asks for less or for more
 MOST_DOUBTED = 0.49  # confidence of a guess that a reader has a reason to refuse
+NO_EDGE = "the cap's edge cannot be found: come closer or add light"
+ALIKE = "pressed and released look alike from here: look from the side or closer"
 TOO_WEAK = "the evidence is too weak: come closer, change the angle or the light"
 
 
@@ -100,6 +102,11 @@ class ObjectReading(Answer):
     def answered(self) -> bool:
         """Whether the object was read."""
         return self.present and self.reason is None
+
+    @property
+    def needs_closer_sides(self) -> bool:
+        """Whether the refusal is that two states look alike from here, so that a nearer look from a side would tell."""
+        return self.reason in (NO_EDGE, ALIKE)
 
     def saying(self, status: PatchReading) -> ObjectReading:
         """The object, found where it should be, with what its reader says of it."""

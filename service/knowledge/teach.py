@@ -144,11 +144,11 @@ def teach_kind(
     size_m: tuple[float, float] | None = None,
 ) -> TaughtView:
     """Teach one example of a kind and keep it; see `teach`."""
-    from perception.vision import NOTHING, example_at, overview_of, teach_example
+    from perception.vision import example_at, overview_of, teach_example
 
     check_name(kind)
     overview = overview_of(pixels, plate_m=plate_m)
-    example = example_at(overview, clicks_px, needs_outline=kind != NOTHING)
+    example = example_at(overview, clicks_px, kind=kind)
     lesson = teach_example(example, store.knowledge(), kind=kind, size_m=size_m, source="panelwright teach")
     path = store.write_kind(lesson.kind) if lesson.added else None
     file = next(file for file in store.kinds() if file.name == kind)

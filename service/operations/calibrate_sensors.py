@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.devices import DeviceKind
-from hal.errors import NotObservable
+from hal.errors import Ambiguous, NotFound, NotObservable, Unreachable
 from hal.geometry import matrix_of
 from hal.motion import Hold
 from perception.calibration import (
@@ -24,24 +26,14 @@ from perception.calibration import (
     calibrate_in_hand,
     calibrate_scanner,
     calibrate_wrench,
+    calibration_poses,
     propose_view,
 )
+from perception.vision import viewpoints
 from service.operations.acquisition import OLDEST_S, deadline, look_with_lights, settle
 from service.operations.locate import lights_in, scan_plate
 from service.operations.session import Session
-from service.operations.stations import (
-    LIGHTS_CONE_RAD,
-    PLATE_CONE_RAD,
-    REACH_STEPS,
-    around,
-    by_plate,
-    in_view,
-    order,
-    visit,
-    wrist_turns,
-)
-from service.operations.travel import go_to_joints, kinematics
-from service.operations.views import overview_distance_m
+from service.operations.travel import go_to_first, go_to_joints, kinematics, reachable
 
 MOST_SCATTER = 9.0  # chi-square a degree: three times the stated noise is no noise any more
 LEAST_LENS = (1e-5, 0.01, 1e-5)  # a record without sigmas does not mean a lens without error
@@ -51,6 +43,9 @@ POINTS_A_SCAN = 400
 WRENCH_SAMPLES = 40
 WRENCH_STEP_S = 0.01
 WEIGH_REST_S = 0.3  # the hand swings a little after a motion
+REST_S = 0.2  # servos trail by tens of milliseconds
+
+T = TypeVar("T")
 
 
 # -- camera: lens and mount by the panel's lights ---------------------------------------------------------------------
@@ -60,9 +55,11 @@ def camera_stations(session: Session, camera: str, count: int, known: Beforehand
     """Flange poses from which all four lights are in view; the `count` that together tell most come first."""
     start, points_m = _nominal(session, camera), _lights_m(session)
     x, z, lens = start.flange_from_camera, start.base_from_target, start.intrinsics
-    nearest_m = overview_distance_m(session.panel, lens, 0.0)
-    candidates = around(z, x, nearest_m, steps=REACH_STEPS, cone_rad=LIGHTS_CONE_RAD)
-    seen = [flange for flange in candidates if in_view(flange, x, z, points_m, lens)]
+    nearest_m = viewpoints.overview_distance_m(session.panel, lens, 0.0)
+    candidates = calibration_poses.around(
+        z, x, nearest_m, steps=calibration_poses.REACH_STEPS, cone_rad=calibration_poses.LIGHTS_CONE_RAD
+    )
+    seen = [flange for flange in candidates if calibration_poses.in_view(flange, x, z, points_m, lens)]
     return order(session, seen, lambda done, left: propose_view(done, left, points_m, start, known)[0], count=count)
 
 
@@ -123,8 +120,10 @@ def beforehand(session: Session, camera: str, *, is_lens_known: bool) -> Beforeh
 def scanner_stations(session: Session, scanner: str, count: int) -> list[RigidTransform]:
     """Flange poses that look at the plate; the `count` that together tell most come first."""
     x, z = session.mount(scanner).parent_from_child, session.believed_panel().parent_from_child
-    candidates = around(z, x, SCANNER_DISTANCE_M, steps=SCANNER_STEPS, cone_rad=PLATE_CONE_RAD)
-    return order(session, candidates, by_plate(x, z), count=count)
+    candidates = calibration_poses.around(
+        z, x, SCANNER_DISTANCE_M, steps=SCANNER_STEPS, cone_rad=calibration_poses.PLATE_CONE_RAD
+    )
+    return order(session, candidates, calibration_poses.by_plate(x, z), count=count)
 
 
 def measure_scanner(session: Session, scanner: str, count: int) -> ScannerCalibration:
@@ -161,7 +160,11 @@ def tool_joints(session: Session, sensor: str) -> list[Array]:
     """Joint vectors about the parking place, those first that turn gravity furthest in sensor axes."""
     arm = kinematics(session)
     turn = matrix_of(session.mount(sensor).parent_from_child)
-    return wrist_turns(arm, np.array(session.cell.file.workspace.park_rad), lambda q: matrix_of(arm.flange(q)) @ turn)
+    return calibration_poses.wrist_turns(
+        np.array(session.cell.file.workspace.park_rad),
+        (np.array(arm.capabilities.lower_rad), np.array(arm.capabilities.upper_rad)),
+        lambda q: matrix_of(arm.flange(q)) @ turn,
+    )
 
 
 def measure_tool(session: Session, sensor: str, count: int) -> WrenchCalibration:
@@ -196,6 +199,56 @@ def _rest_wrench(session: Session, sensor: str) -> Array:
         wrench = device.read_wrench(deadline=deadline()).usable(now_s=now_s, max_age_s=OLDEST_S, device=sensor)
         readings.append(np.concatenate([wrench.force_n, wrench.torque_nm]))
     return np.asarray(np.mean(readings, axis=0))
+
+
+# -- driving through the poses ----------------------------------------------------------------------------------------
+
+
+def order(
+    session: Session, candidates: Sequence[RigidTransform], propose: calibration_poses.Propose, *, count: int
+) -> list[RigidTransform]:
+    """All candidates that the arm can stand in; the `count` that together tell most come first.
+
+    Raises:
+        Unreachable: fewer than `count` are left.
+    """
+    free = [candidates[k] for k in reachable(session, candidates)]
+    if len(free) < count:
+        raise Unreachable(
+            f"the arm reaches {len(free)} of {len(candidates)} stations before the panel, {count} are wanted",
+            hint="ask for fewer poses, or put the panel where the arm can look at it from several sides",
+        )
+    chosen: list[RigidTransform] = []
+    while len(chosen) < count:
+        chosen.append(free.pop(propose(chosen, free)))
+    return chosen + free
+
+
+def visit(
+    session: Session, flanges: Sequence[RigidTransform], measure: Callable[[], T], *, count: int, name: str
+) -> list[T]:
+    """Drive to one station after the other and measure at each; those without a free way or without a sight are left out.
+
+    Raises:
+        Unreachable: the stations are used up before `count` were measured from; says why the last one was not.
+    """
+    found: list[T] = []
+    why = ""
+    for flange in flanges:
+        session.progress(0.1 + 0.8 * len(found) / count, f"{name}: station {len(found) + 1} of {count}", why)
+        try:
+            go_to_first(session, [flange], name=f"{name} {len(found) + 1}", thorough=False)
+            settle(session, REST_S)
+            found.append(measure())
+        except (Unreachable, NotFound, Ambiguous) as error:
+            why = f"one left out: {error.what}"
+            continue
+        if len(found) == count:
+            return found
+    raise Unreachable(
+        f"only {len(found)} of {count} stations could be measured from; {why or 'no other is left'}",
+        hint="ask for fewer poses, or give the arm more room before the panel",
+    )
 
 
 def _check_scatter(chi_square: float, degrees: int, what_to_check: str) -> None:

@@ -17,13 +17,12 @@ from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import UncertainPose, compose
 from hal.panel import Handwheel, Mushroom
 from perception.range import RangeScene
-from perception.vision import ObjectReading
+from perception.vision import ObjectReading, viewpoints
 from service.operations.acquisition import Scan, settle
 from service.operations.locate import ScannedPlane, scan_plate
 from service.operations.relief import Sighting, find_by_surfaces, mark_of, surfaces_in
 from service.operations.session import Session
 from service.operations.travel import go_to_first
-from service.operations.views import close_up_poses
 from service.report.plots import png_of
 from service.report.record import Picture
 from service.report.surfaces import surfaces_picture
@@ -172,7 +171,7 @@ def _shows_alike(sighting: Sighting, reading: ObjectReading | None) -> bool:
 def _look_closer(session: Session, panel_object: Mushroom | Handwheel) -> SurfaceView | str:
     """The scanner square before the object; text says why not."""
     flange_from_scanner = session.mount(session.first(DeviceKind.RANGE_SCANNER)).parent_from_child
-    views = close_up_poses(session.known_panel().parent_from_child, panel_object.point_m)
+    views = viewpoints.close_up_poses(session.known_panel().parent_from_child, panel_object.point_m)
     try:
         go_to_first(
             session, (v * flange_from_scanner.inv() for v in views), name=f"closer look at {panel_object.name}"[:60]

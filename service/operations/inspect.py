@@ -13,7 +13,7 @@ from hal.devices import DeviceKind
 from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import compose
 from hal.panel import PanelObject
-from perception.vision import ALIKE, NO_EDGE, ObjectReading, answer_at, draw_annotated, merge_views, said
+from perception.vision import ObjectReading, answer_at, draw_annotated, merge_views, said, viewpoints
 from perception.vision import inspect as inspect_image
 from service.operations.acquisition import Look, base_from, look, settle
 from service.operations.locate import go_to_overview, locate
@@ -21,7 +21,6 @@ from service.operations.session import Session, panel_object_or_all
 from service.operations.stored import object_result, read_stored
 from service.operations.tours import short_tour
 from service.operations.travel import go_to_camera_view, skill_context
-from service.operations.views import CLOSE_UP_M, FOR_ALIKE, NEAR_M, SIDES, close_up_groups, close_up_poses, poses_from
 from service.report.plots import png_of
 from service.schema.requests import InspectRequest, RecogniseRequest
 from service.schema.results import InspectResult, ReadingResult
@@ -82,7 +81,7 @@ def inspect_close(session: Session, names: Collection[str]) -> Inspection:
 def close_ups(session: Session, names: Collection[str]) -> Inspection:
     """Read objects from as few close-ups as show them all."""
     objects = [session.panel.object(name) for name in names]
-    groups = close_up_groups(objects, session.lens())
+    groups = viewpoints.close_up_groups(objects, session.lens())
     groups = [groups[k] for k in short_tour(_camera_over_panel(session), [centre_m for centre_m, _ in groups])]
     readings: dict[str, ObjectReading] = {}
     pictures: list[AnnotatedView] = []
@@ -105,7 +104,7 @@ def look_close(session: Session, centre_m: Iterable[float], names: Collection[st
     """Drive the camera close before a panel point and read what is there."""
     pose = session.known_panel().parent_from_child
     title = f"close-up of {', '.join(names)}"
-    go_to_camera_view(session, close_up_poses(pose, tuple(centre_m)), name=title[:60])
+    go_to_camera_view(session, viewpoints.close_up_poses(pose, tuple(centre_m)), name=title[:60])
     settle(session)
     return inspect_here(session, names, title=title)
 
@@ -119,11 +118,17 @@ def look_past(session: Session, found: Inspection) -> Inspection:
     if len(unread) > MOST_UNREAD:
         return found
     looks = {reading.name: [reading] for reading in unread}
-    alike = [reading.name for reading in unread if reading.reason in (NO_EDGE, ALIKE)]
+    alike = [reading.name for reading in unread if reading.needs_closer_sides]
     hidden = [name for name in looks if name not in alike]
     pictures = list(found.pictures)
-    for names, sides, distance_m in ((hidden, tuple(SIDES), CLOSE_UP_M), (alike, FOR_ALIKE, NEAR_M)):
-        for _, group in close_up_groups([session.panel.object(name) for name in names], session.lens(), distance_m):
+    ways = (
+        (hidden, tuple(viewpoints.SIDES), viewpoints.CLOSE_UP_M),
+        (alike, viewpoints.CLOSE_SIDES, viewpoints.NEAR_M),
+    )
+    for names, sides, distance_m in ways:
+        for _, group in viewpoints.close_up_groups(
+            [session.panel.object(name) for name in names], session.lens(), distance_m
+        ):
             pictures += _from_the_sides(session, group, looks, sides)
     told = {name: _told(each) for name, each in looks.items()}
     for name in told:
@@ -148,7 +153,7 @@ def _from_the_sides(
     for side in sides:
         title = f"{', '.join(unread)} from {side}"
         session.progress(1.0, "look past what hides it", title)
-        poses = poses_from(pose, tuple(middle_m), side)
+        poses = viewpoints.poses_from(pose, tuple(middle_m), side)
         clear = (view for view in poses if (pose.inv() * view * camera_from_tips).translation[2] >= TIPS_M)
         try:
             go_to_camera_view(session, clear, name=title[:60])

@@ -57,11 +57,11 @@ def _learn(session: Session, pixels: Pixels, view: PanelProjection, panel: Panel
 
 def _drawn(pixels: Pixels, looks: PanelLooks) -> Pixels:
     """The overview with the objects that taught: green are recognised blind now, amber are not."""
-    from perception.vision import AMBER, GREEN, draw_outlines
+    from perception.vision import draw_outlines
 
     return draw_outlines(
         pixels,
         [each.box_px for each in looks.shown],
         [f"{each.panel_object.name}: {each.panel_object.kind}" for each in looks.shown],
-        [GREEN if each.panel_object.name in looks.known_now else AMBER for each in looks.shown],
+        [each.panel_object.name in looks.known_now for each in looks.shown],
     )

@@ -5,23 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from fusion import PixelObservation, PlaneObservation
 from hal.arrays import Array
-from hal.errors import Ambiguous, NotFound
-from hal.geometry import UncertainPose, compose, difference, matrix_of
+from hal.errors import NotFound
+from hal.geometry import UncertainPose, compose, matrix_of
 from perception.range import PinholeSensor, PlaneFit, fit_plane_near
-from perception.vision import AssignedLights, QuadranglePose, assign_lights, estimate, find_lights
+from perception.vision import AssignedLights, PanelPrior, QuadranglePose, find_panel, find_panel_lights, viewpoints
 from service.operations.acquisition import LightPair, Look, Scan, look_with_lights, scan
 from service.operations.session import Session
 from service.operations.travel import go_to_camera_view, leave_the_panel
-from service.operations.views import overview_poses
 from service.operations.world_model import expected_panel
 from service.schema.requests import PanelPoseRequest
 from service.schema.results import PanelPoseResult, PlateInScanner, estimated
-
-WRONG_FIT_P = 1e-4  # a worse fit than one in ten thousand means a wrong lamp, panel file or lens
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -57,7 +53,7 @@ def go_to_overview(session: Session) -> None:
     slack_m = 0.01 if known is not None else 0.6 * session.cell.file.workspace.position_tolerance_m
     pose = session.believed_panel().parent_from_child
     lens = session.lens()
-    go_to_camera_view(session, overview_poses(pose, session.panel, lens, slack_m), name="overview")
+    go_to_camera_view(session, viewpoints.overview_poses(pose, session.panel, lens, slack_m), name="overview")
 
 
 def locate(session: Session) -> Located:
@@ -76,21 +72,28 @@ def locate(session: Session) -> Located:
 
 def locate_in(session: Session, pair: LightPair) -> Located:
     """The panel's pose in a pair of images."""
-    look = pair.on
-    expected = session.believed_panel().parent_from_child
-    chosen = lights_in(session, pair)
-    lights_m = np.array([light.position_m for light in session.panel.lights])
-    covariance_px = chosen.covariance_px + model_sigma_px(session, look, expected) ** 2 * np.eye(2)
-    pose = estimate(lights_m, chosen.points_px, covariance_px, look.intrinsics)
-    _check_fit(session, pose)
-    camera_from_panel, covariance = _plausible(session, look, pose)
-    seen = UncertainPose(parent_from_child=camera_from_panel, covariance=covariance)
+    look, workspace = pair.on, session.cell.file.workspace
+    camera_from_base = look.base_from_camera.parent_from_child.inv()
+    found = find_panel(
+        pair.off.pixels,
+        pair.on.pixels,
+        _lights_m(session),
+        look.intrinsics,
+        prior=PanelPrior(
+            camera_from_panel=camera_from_base * session.believed_panel().parent_from_child,
+            camera_from_expected=camera_from_base * expected_panel(session.cell).parent_from_child,
+            position_tolerance_m=workspace.position_tolerance_m,
+            angle_tolerance_rad=workspace.angle_tolerance_rad,
+        ),
+        lens_rms_px=session.lens_rms_px(look.camera),
+        light_sigma_m=session.panel.tolerances.light_m,
+    )
     return Located(
-        base_from_panel=compose(look.base_from_camera, seen),
-        pose=pose,
+        base_from_panel=compose(look.base_from_camera, found.camera_from_panel),
+        pose=found.pose,
         pair=pair,
-        lights_px=chosen.points_px,
-        observations=_light_observations(session, look, chosen.points_px, covariance_px),
+        lights_px=found.lights.points_px,
+        observations=_light_observations(session, look, found.lights.points_px, found.covariance_px),
     )
 
 
@@ -102,20 +105,13 @@ def lights_in(session: Session, pair: LightPair) -> AssignedLights:
     """
     look = pair.on
     upright = look.base_from_camera.parent_from_child.inv() * session.believed_panel().parent_from_child
-    return assign_lights(
-        find_lights(pair.off.pixels, pair.on.pixels),
-        np.array([light.position_m for light in session.panel.lights]),
-        image_size_px=(look.intrinsics.width_px, look.intrinsics.height_px),
-        intrinsics=look.intrinsics,
-        upright=matrix_of(upright),
+    return find_panel_lights(
+        pair.off.pixels, pair.on.pixels, _lights_m(session), look.intrinsics, upright=matrix_of(upright)
     )
 
 
-def model_sigma_px(session: Session, look: Look, base_from_panel: RigidTransform) -> float:
-    """What a light in the image may be off beside noise: the lens as calibrated, and the place of the lamp."""
-    distance_m = float((look.base_from_camera.parent_from_child.inv() * base_from_panel).translation[2])
-    lamp_px = session.panel.tolerances.light_m * look.intrinsics.fx_px / max(distance_m, 0.05)
-    return float(np.hypot(session.lens_rms_px(look.camera), lamp_px))
+def _lights_m(session: Session) -> Array:
+    return np.array([light.position_m for light in session.panel.lights])
 
 
 def scan_plate(session: Session) -> ScannedPlane:
@@ -178,49 +174,6 @@ def run_panel_pose(session: Session, request: PanelPoseRequest) -> PanelPoseResu
         alternatives=len(found.pose.alternatives),
         lights_px={light.name: pixel for light, pixel in lights},
         plate_in_scanner=plate,
-    )
-
-
-def _check_fit(session: Session, pose: QuadranglePose) -> None:
-    if pose.p_value < WRONG_FIT_P:
-        raise NotFound(
-            f"four lights were seen, but not where panel {session.panel.name!r} has them"
-            f" (chi-square {pose.chi_square:.0f} on 2 degrees of freedom)",
-            hint="check the panel file's light positions, the lens calibration, and for reflections",
-        )
-
-
-def _plausible(session: Session, look: Look, pose: QuadranglePose) -> tuple[RigidTransform, Array]:
-    """The pose that agrees with where the panel can be; of several, the only one that does."""
-    candidates = [(pose.camera_from_object, pose.covariance)]
-    if pose.ambiguous:
-        candidates += [(a.camera_from_object, a.covariance) for a in pose.alternatives if a.covariance is not None]
-    fitting = [c for c in candidates if _is_expected(session, look.base_from_camera.parent_from_child * c[0])]
-    if not fitting:
-        offset = difference(
-            look.base_from_camera.parent_from_child * pose.camera_from_object,
-            expected_panel(session.cell).parent_from_child,
-        )
-        raise NotFound(
-            f"the lights put the panel {np.linalg.norm(offset[:3]):.3f} m and {np.linalg.norm(offset[3:]):.3f} rad from"
-            " where the cell file expects it",
-            hint="correct workspace.panel_position_m and panel_rpy_rad, or widen their tolerances",
-        )
-    if len(fitting) > 1:
-        raise Ambiguous(
-            "two panel poses fit the four lights equally well",
-            hint="look from another side: tilt the camera 15 degrees or come nearer",
-        )
-    return fitting[0]
-
-
-def _is_expected(session: Session, base_from_panel: RigidTransform) -> bool:
-    w = session.cell.file.workspace
-    offset = difference(base_from_panel, expected_panel(session.cell).parent_from_child)
-    # The tolerances bound each axis; their corners lie a factor sqrt(3) further out.
-    return bool(
-        np.linalg.norm(offset[:3]) <= 1.75 * w.position_tolerance_m
-        and np.linalg.norm(offset[3:]) <= 1.75 * w.angle_tolerance_rad
     )
 
 

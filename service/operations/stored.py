@@ -75,12 +75,12 @@ def blind_answer(
     session: Session, pixels: Pixels, plate_m: tuple[float, float], *, focal_px: float | None
 ) -> RecogniseResult:
     """All candidates, refused ones with their reasons, and a picture of the others."""
-    from perception.vision import GREEN, draw_outlines, recognise
+    from perception.vision import draw_outlines, recognise
 
     found = recognise(pixels, _stores(session)[1].knowledge(), plate_m=plate_m, focal_px=focal_px)
     taken = [candidate for candidate in found if candidate.reason is None]
     texts = [f"{candidate.kind} {candidate.confidence:.2f}" for candidate in taken]
-    outlined = draw_outlines(pixels, [candidate.box_px for candidate in taken], texts, [GREEN] * len(taken))
+    outlined = draw_outlines(pixels, [candidate.box_px for candidate in taken], texts, [True] * len(taken))
     picture = png_of(shown(outlined))
     return RecogniseResult(
         candidates=[CandidateResult.model_validate(candidate) for candidate in found],

@@ -6,7 +6,7 @@ import numpy as np
 
 from hal.panel import Button, Mushroom
 from perception.vision.patch import Patch
-from perception.vision.reading import PatchReading, doubted, gated, refused
+from perception.vision.reading import ALIKE, NO_EDGE, PatchReading, doubted, gated, refused
 from perception.vision.status.press import cap_height
 from perception.vision.status.shade import cap_shades
 
@@ -17,8 +17,6 @@ SHADE_ODDS, SPOT_ODDS = (-1.5, 3.0), (-2.5, 6.0)  # a cap a pixel beside its pla
 BELOW_FROM, BELOW_SCALE, BELOW_ODDS = 0.0075, 0.0015, 4.5
 ALONE = 1.3  # log odds at most, of a shade without a face, and of no shine without a ring
 MODEL_SHARE = 0.25
-NO_EDGE = "the cap's edge cannot be found: come closer or add light"
-ALIKE = "pressed and released look alike from here: look from the side or closer"
 UNSEEN = "the button cannot be seen (glare, shadow or cover): change the angle or the light"
 
 

@@ -123,7 +123,7 @@ def teach(
     """
     overview = overview_of(image, plate_m=plate_m, view=view)
     return teach_example(
-        example_at(overview, clicks_px, needs_outline=kind != NOTHING),
+        example_at(overview, clicks_px, kind=kind),
         knowledge, kind=kind, size_m=size_m, source=source,
     )  # fmt: skip
 
@@ -143,7 +143,7 @@ def overview_of(
     return Overview(view=view, ground=lay_out(gray, view, plate_m), plate_m=plate_m)
 
 
-def example_at(overview: Overview, clicks_px: Sequence[tuple[float, float]], *, needs_outline: bool = True) -> Example:
+def example_at(overview: Overview, clicks_px: Sequence[tuple[float, float]], *, kind: str = "") -> Example:
     """The object at one to three clicks.
 
     Raises:
@@ -154,7 +154,7 @@ def example_at(overview: Overview, clicks_px: Sequence[tuple[float, float]], *, 
         raise InvalidRequest(f"{len(clicks_px)} clicks", hint="click the middle, or two opposite corners, or both")
     clicks_m = plate_points(overview.view, clicks_px, overview.plate_m)
     clicks = overview.on_ground(clicks_m)
-    outline = outline_at(overview.ground, clicks) if needs_outline else None
+    outline = outline_at(overview.ground, clicks) if kind != NOTHING else None
     middle = clicks[0] if len(clicks) == 1 else clicks[:2].mean(axis=0) if len(clicks) == 2 else clicks[2]
     place = _snapped(middle, candidate_places(overview.ground.edges))
     empty = np.zeros((0, 2))

@@ -11,7 +11,7 @@ import pytest
 
 from hal.panel import Panel
 from hal.strict import parse_toml
-from perception.vision.knowledge import KindRecord
+from perception.vision.knowledge_files import KindRecord
 from service.serve import Panelwright
 from tests.perception.vision.bench_panel import panel
 from tests.service.shown_panel import (

@@ -1,4 +1,4 @@
-"""Where to look and where to touch: views show what they promise, spots are bare."""
+"""Where to touch: spots are bare."""
 
 from __future__ import annotations
 
@@ -7,77 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from hal.calibration import load_calibration
-from hal.camera_model import project
 from hal.errors import NotFound
-from hal.geometry import transform_rpy
 from hal.panel import Panel, load_panel
 from service.operations.spots import EDGE_M, bare_spots, half_footprint_m
-from service.operations.views import SIDES, close_up_groups, facing, overview_distance_m, overview_poses, side_poses
 
 ROOT = Path(__file__).parents[3]
 PANEL = load_panel(ROOT / "panels/bench.toml")
-RECORD = load_calibration(ROOT / "cells/calibrations/wrist_camera.toml").intrinsics
-assert RECORD is not None
-LENS = RECORD.intrinsics()
-BASE_FROM_PANEL = transform_rpy((0.95, 0.03, 0.55), (1.5, 0.1, -1.6))
-
-
-@given(
-    st.tuples(st.floats(-0.3, 0.3), st.floats(-0.2, 0.2)),
-    st.floats(0.2, 1.0),
-    st.floats(-3.0, 3.0),
-    st.floats(-0.4, 0.4),
-)
-@settings(max_examples=40)
-def test_a_facing_camera_sees_its_point_in_the_middle(
-    point: tuple[float, float], distance_m: float, roll_rad: float, tilt_rad: float
-) -> None:
-    camera = facing(BASE_FROM_PANEL, (*point, 0.0), distance_m, roll_rad=roll_rad, tilt_rad=(tilt_rad, -tilt_rad))
-    seen = (camera.inv() * BASE_FROM_PANEL).apply([*point, 0.0])
-    np.testing.assert_allclose(seen, [0.0, 0.0, distance_m], atol=1e-9)
-
-
-def test_an_upright_view_shows_the_panel_upright() -> None:
-    camera_from_panel = facing(BASE_FROM_PANEL, (0.0, 0.0, 0.0), 0.5).inv() * BASE_FROM_PANEL
-    right, up = project(camera_from_panel.apply(np.array([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])), LENS)
-    assert right[0] > LENS.cx_px
-    assert up[1] < LENS.cy_px
-
-
-@pytest.mark.parametrize(
-    ("side", "axis", "sign"), [("the right", 0, 1), ("the left", 0, -1), ("above", 1, 1), ("below", 1, -1)]
-)
-def test_a_look_from_a_side_stands_on_that_side(side: str, axis: int, sign: int) -> None:
-    for camera in side_poses(BASE_FROM_PANEL, (0.1, 0.05, 0.0), SIDES[side]):
-        stands = (BASE_FROM_PANEL.inv() * camera).translation - (0.1, 0.05, 0.0)
-        assert sign * stands[axis] > 0.08
-        assert abs(stands[1 - axis]) < 1e-9
-
-
-@pytest.mark.parametrize("slack_m", [0.0, 0.06])
-def test_the_overview_holds_the_whole_plate_wherever_it_is(slack_m: float) -> None:
-    camera = next(overview_poses(BASE_FROM_PANEL, PANEL, LENS, slack_m))
-    x, y = PANEL.width_m / 2 + slack_m, PANEL.height_m / 2 + slack_m
-    corners = np.array([[sx * x, sy * y, 0.0] for sx, sy in itertools.product((-1, 1), (-1, 1))])
-    pixels = project((camera.inv() * BASE_FROM_PANEL).apply(corners), LENS)
-    assert np.all(pixels >= 0) and np.all(pixels <= [LENS.width_px - 1, LENS.height_px - 1])
-    assert overview_distance_m(PANEL, LENS, slack_m) < 0.8
-
-
-def test_close_ups_show_every_object_once_and_whole() -> None:
-    groups = close_up_groups(PANEL.objects, LENS)
-    names = [name for _, group in groups for name in group]
-    assert sorted(names) == sorted(panel_object.name for panel_object in PANEL.objects)
-    assert len(groups) <= 5
-    for centre_m, group in groups:
-        camera_from_panel = facing(BASE_FROM_PANEL, tuple(centre_m), 0.30).inv() * BASE_FROM_PANEL
-        for name in group:
-            pixel = project(camera_from_panel.apply(np.array([PANEL.object(name).point_m])), LENS)[0]
-            assert 20 < pixel[0] < LENS.width_px - 20 and 20 < pixel[1] < LENS.height_px - 20
 
 
 @pytest.mark.parametrize("count", [3, 4, 6])

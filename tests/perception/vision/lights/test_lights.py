@@ -12,9 +12,11 @@ from benchmarks.pose_lights import drawn_pairs, seen_lights, stored_pairs
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.camera_model import project
-from hal.errors import InvalidRequest, PerceptionError
-from perception.vision.lights import CameraMoved, LightMissing, WrongLamp, assign_lights, find_lights, panel_pose
+from hal.errors import InvalidRequest, NotFound, PerceptionError
+from hal.geometry import transform, transform_rpy
+from perception.vision.lights import CameraMoved, LightMissing, WrongLamp, assign_lights, find_lights, find_panel
 from perception.vision.lights.alignment import register
+from perception.vision.lights.panel_finder import PanelPrior
 
 CAMERA = CameraIntrinsics(width_px=640, height_px=480, fx_px=700.0, fy_px=700.0, cx_px=319.5, cy_px=239.5)
 LIGHTS = np.array([[-0.2, 0.12, 0.0], [0.2, 0.12, 0.0], [0.2, -0.12, 0.0], [-0.2, -0.12, 0.0]])
@@ -67,16 +69,17 @@ def pair(
 
 @pytest.mark.parametrize("shift_px", [(0.0, 0.0), (2.6, -1.7), (-9.3, 6.4)])
 def test_the_pose_comes_out_of_two_images_although_the_camera_moved(shift_px: tuple[float, float]) -> None:
-    seen = panel_pose(*pair(shift_px=shift_px), LIGHTS, CAMERA)
+    images = pair(shift_px=shift_px)
+    seen = find_panel(*images, LIGHTS, CAMERA)
     np.testing.assert_allclose(seen.lights.points_px, light_pixels(), atol=0.15)
-    np.testing.assert_allclose(seen.blobs.shift_px, shift_px, atol=0.1)
+    np.testing.assert_allclose(find_lights(*images).shift_px, shift_px, atol=0.1)
     assert np.degrees(Rotation.from_matrix(seen.pose.rotation @ R_TRUE.T).magnitude()) < 0.5
     np.testing.assert_allclose(seen.pose.translation_m, T_TRUE, atol=2e-3)
 
 
 def test_colour_images_work_too() -> None:
     off, on = (np.repeat(image[:, :, None], 3, axis=2) for image in pair())
-    np.testing.assert_allclose(panel_pose(off, on, LIGHTS, CAMERA).lights.points_px, light_pixels(), atol=0.15)
+    np.testing.assert_allclose(find_panel(off, on, LIGHTS, CAMERA).lights.points_px, light_pixels(), atol=0.15)
 
 
 def test_centres_err_as_their_covariance_says() -> None:
@@ -98,7 +101,7 @@ def test_centres_err_as_their_covariance_says() -> None:
 
 def test_a_missing_light_is_refused_by_its_number() -> None:
     with pytest.raises(LightMissing, match="light 2 ") as refused:
-        panel_pose(*pair(leave_out=(2,)), LIGHTS, CAMERA)
+        find_panel(*pair(leave_out=(2,)), LIGHTS, CAMERA)
     assert refused.value.details["missing"] == "2"
 
 
@@ -112,25 +115,26 @@ def test_three_lights_are_named_when_three_are_enough() -> None:
 
 def test_lights_that_do_not_switch_are_refused() -> None:
     with pytest.raises(LightMissing, match="0 lamp-like blobs"):
-        panel_pose(*pair(leave_out=(0, 1, 2, 3)), LIGHTS, CAMERA)
+        find_panel(*pair(leave_out=(0, 1, 2, 3)), LIGHTS, CAMERA)
 
 
 def test_other_lamps_do_not_mislead_the_choice() -> None:
-    seen = panel_pose(*pair(others=((200.0, 200.0), (330.0, 260.0), (420.0, 180.0), (300.0, 330.0))), LIGHTS, CAMERA)
+    images = pair(others=((200.0, 200.0), (330.0, 260.0), (420.0, 180.0), (300.0, 330.0)))
+    seen = find_panel(*images, LIGHTS, CAMERA)
     np.testing.assert_allclose(seen.lights.points_px, light_pixels(), atol=0.2)
-    assert len(seen.blobs) >= 8
+    assert len(find_lights(*images)) >= 8
 
 
 def test_a_wrong_lamp_in_place_of_a_light_is_never_taken() -> None:
     wrong = tuple(light_pixels()[2] + [-60.0, -45.0])
     with pytest.raises((LightMissing, WrongLamp)):
-        panel_pose(*pair(leave_out=(2,), others=(wrong,)), LIGHTS, CAMERA)
+        find_panel(*pair(leave_out=(2,), others=(wrong,)), LIGHTS, CAMERA)
 
 
 def test_another_quadrangle_is_a_wrong_lamp() -> None:
     places = ((120.0, 100.0), (300.0, 380.0), (330.0, 110.0), (500.0, 300.0), (210.0, 240.0))
     with pytest.raises((LightMissing, WrongLamp)):
-        panel_pose(*pair(leave_out=(0, 1, 2, 3), others=places), LIGHTS, CAMERA)
+        find_panel(*pair(leave_out=(0, 1, 2, 3), others=places), LIGHTS, CAMERA)
 
 
 def test_glare_that_wanders_over_the_plate_does_not_matter() -> None:
@@ -138,7 +142,7 @@ def test_glare_that_wanders_over_the_plate_does_not_matter() -> None:
     v, u = np.mgrid[:480, :640]
     spots = [90.0 * np.exp(-0.5 * ((u - x) ** 2 + (v - 250.0) ** 2) / 35.0**2) for x in (280.0, 315.0)]
     glaring = [np.clip(image + spot, 0, 255).astype(np.uint8) for image, spot in zip((off, on), spots, strict=True)]
-    np.testing.assert_allclose(panel_pose(*glaring, LIGHTS, CAMERA).lights.points_px, light_pixels(), atol=0.3)
+    np.testing.assert_allclose(find_panel(*glaring, LIGHTS, CAMERA).lights.points_px, light_pixels(), atol=0.3)
 
 
 def test_another_scene_is_a_moved_camera() -> None:
@@ -151,7 +155,7 @@ def test_a_dark_room_without_any_texture_still_shows_its_lights() -> None:
     off, on = np.full((480, 640), 12.0, np.float32), np.full((480, 640), 12.0, np.float32)
     for place in light_pixels():
         disc(on, place, 5.0, 150.0)
-    seen = panel_pose(shot(off, 1), shot(on, 2), LIGHTS, CAMERA)
+    seen = find_panel(shot(off, 1), shot(on, 2), LIGHTS, CAMERA)
     np.testing.assert_allclose(seen.lights.points_px, light_pixels(), atol=0.1)
 
 
@@ -178,7 +182,7 @@ def test_black_and_saturated_images_show_no_lights(level: int) -> None:
 def test_the_wrong_calibration_is_refused() -> None:
     other = CameraIntrinsics(width_px=320, height_px=240, fx_px=350.0, fy_px=350.0, cx_px=160.0, cy_px=120.0)
     with pytest.raises(InvalidRequest, match="640x480"):
-        panel_pose(*pair(), LIGHTS, other)
+        find_panel(*pair(), LIGHTS, other)
 
 
 def test_lights_that_are_no_quadrangle_are_refused() -> None:
@@ -235,7 +239,7 @@ def test_blue_lamps_are_as_good_as_white_ones() -> None:
     for place in light_pixels():
         disc(lamps, place, 5.5, 110.0)
     blue[:, :, 2] += lamps
-    seen = panel_pose(off, np.clip(blue, 0, 255).astype(np.uint8), LIGHTS, CAMERA)
+    seen = find_panel(off, np.clip(blue, 0, 255).astype(np.uint8), LIGHTS, CAMERA)
     np.testing.assert_allclose(seen.lights.points_px, light_pixels(), atol=0.3)
 
 
@@ -246,6 +250,48 @@ def test_an_upside_down_trapezium_is_not_taken_for_an_upright_one() -> None:
     for place in project(trapezium @ upside_down.T + [0.0, 0.0, 0.62], CAMERA):
         disc(on, place, 5.5, 80.0)
     with pytest.raises((WrongLamp, LightMissing)):
-        panel_pose(shot(off, 1), shot(on, 2), trapezium, CAMERA)
-    turned = panel_pose(shot(off, 1), shot(on, 2), trapezium, CAMERA, upright=upside_down)
+        find_panel(shot(off, 1), shot(on, 2), trapezium, CAMERA)
+    turned = find_panel(
+        shot(off, 1),
+        shot(on, 2),
+        trapezium,
+        CAMERA,
+        prior=PanelPrior(camera_from_panel=transform(upside_down, (0.0, 0.0, 0.6))),
+    )
     assert np.degrees(Rotation.from_matrix(turned.pose.rotation @ upside_down.T).magnitude()) < 2.0
+
+
+def _expected(offset_m: float, turn_rad: float, *, tolerance_m: float, tolerance_rad: float) -> PanelPrior:
+    true = transform(R_TRUE, T_TRUE)
+    return PanelPrior(
+        camera_from_panel=true,
+        camera_from_expected=true * transform_rpy((offset_m, 0.0, 0.0), (0.0, 0.0, turn_rad)),
+        position_tolerance_m=tolerance_m,
+        angle_tolerance_rad=tolerance_rad,
+    )
+
+
+@pytest.mark.parametrize(("offset_m", "turn_rad"), [(0.1, 0.0), (0.0, 0.3)])
+def test_a_panel_where_it_cannot_be_is_refused_and_within_the_tolerance_it_is_not(
+    offset_m: float, turn_rad: float
+) -> None:
+    images = pair()
+    narrow = _expected(offset_m, turn_rad, tolerance_m=0.05, tolerance_rad=0.15)
+    with pytest.raises(NotFound, match="where the cell file expects it"):
+        find_panel(*images, LIGHTS, CAMERA, prior=narrow)
+    wide = _expected(offset_m, turn_rad, tolerance_m=0.08, tolerance_rad=0.2)
+    found = find_panel(*images, LIGHTS, CAMERA, prior=wide)
+    np.testing.assert_allclose(found.camera_from_panel.parent_from_child.translation, T_TRUE, atol=2e-3)
+
+
+def test_loose_lamps_and_a_bad_lens_make_the_pose_less_certain() -> None:
+    images = pair()
+    exact, loose, bad = (
+        find_panel(*images, LIGHTS, CAMERA, **more) for more in ({}, {"light_sigma_m": 1e-3}, {"lens_rms_px": 1.0})
+    )
+    for other in (loose, bad):
+        assert (np.diag(other.camera_from_panel.covariance) > np.diag(exact.camera_from_panel.covariance)).all()
+    usual_m = 1e-3 * CAMERA.fx_px / 1.0  # nobody said how far away: a metre
+    np.testing.assert_allclose(
+        loose.covariance_px - exact.covariance_px, np.tile(usual_m**2 * np.eye(2), (4, 1, 1)), rtol=1e-9, atol=1e-9
+    )

@@ -87,7 +87,7 @@ def test_a_click_on_bare_plate_finds_nothing(seen: tuple[np.ndarray, CameraProje
     for clicks in (bare[:1], bare):
         with pytest.raises(NotFound, match="nothing but plate"):
             example_at(overview, clicks)
-    assert example_at(overview, bare, needs_outline=False).outline is None
+    assert example_at(overview, bare, kind="nothing").outline is None
 
 
 def test_what_is_clicked_on_is_named_and_after_a_lesson_named_rightly(

@@ -1,4 +1,7 @@
-"""Where to put the camera: square in front of what it shall see, near enough to read, far enough to see all."""
+"""Where to put the camera: square in front of what it shall see, near enough to read, far enough to see all.
+
+Every function gives `base_from_camera` poses, best first; the caller takes the first that its arm can reach.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ SIDES = {  # turns about the panel's x and y; round the object, for the way acro
 SIDE_RAD = (0.42, 0.32)  # readers stand a tilt of 0.5; a cable 30 mm before a display moves by 13 mm
 NEAR_M = 0.25  # aslant the fingers reach 10 cm ahead of the camera
 NEAR_SIDES = {"close by below": (0.45, 0.0), "close by the right": (0.0, 0.2)}  # tilts, rad
-FOR_ALIKE = (*NEAR_SIDES, "the right")  # where two states look alike from further off
+CLOSE_SIDES = (*NEAR_SIDES, "the right")  # for two states that look alike from further off
 REACH_M = 0.045  # half size that a close-up leaves round an object's middle
 
 

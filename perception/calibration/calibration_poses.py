@@ -1,9 +1,8 @@
-"""Where to measure from when a sensor on the hand is calibrated: stations that tell most, that the arm can reach."""
+"""Where to measure from when a sensor on the hand is calibrated: the poses that tell most."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TypeVar
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -11,25 +10,18 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.camera_model import project
-from hal.errors import Ambiguous, NotFound, Unreachable
 from hal.geometry import certain, matrix_of, transform
-from manipulation import Kinematics
-from perception.calibration import HandEyeView, propose_next, stations
-from service.operations.acquisition import settle
-from service.operations.session import Session
-from service.operations.travel import go_to_first, reachable
+from perception.calibration.hand_eye import HandEyeView, propose_next, stations
 
 EDGE_PX = 24.0  # a light this near the image's edge may be cut
 LIGHTS_CONE_RAD = 0.95  # 0.6 rad leave the camera's depth in the hand uncertain by half as much again
 PLATE_CONE_RAD = 0.6
 REACH_STEPS = (0.8, 1.0, 1.2, 1.45, 1.7)  # distances, as shares of the nearest that shows everything upright
-REST_S = 0.2  # servos trail by tens of milliseconds
 PLATE_SIGMA = (1.0, 1.0, 2e-4, 5e-4, 5e-4, 1.0)  # a plane says nothing of shifts in it and of turns about its normal
 WRIST_RAD = (-2.4, -1.6, -0.8, 0.0, 0.8, 1.6, 2.4)
 
-T = TypeVar("T")
 Propose = Callable[[Sequence[RigidTransform], Sequence[RigidTransform]], int]
-"""Given the stations so far and the candidates: which of these is best next."""
+"""Given the flange poses so far and the candidates: which of these is best next."""
 
 
 def around(
@@ -83,60 +75,16 @@ def by_plate(flange_from_sensor: RigidTransform, base_from_plate: RigidTransform
     return propose
 
 
-def order(
-    session: Session, candidates: Sequence[RigidTransform], propose: Propose, *, count: int
-) -> list[RigidTransform]:
-    """All candidates that the arm can stand in; the `count` that together tell most come first.
-
-    Raises:
-        Unreachable: fewer than `count` are left.
-    """
-    free = [candidates[k] for k in reachable(session, candidates)]
-    if len(free) < count:
-        raise Unreachable(
-            f"the arm reaches {len(free)} of {len(candidates)} stations before the panel, {count} are wanted",
-            hint="ask for fewer poses, or put the panel where the arm can look at it from several sides",
-        )
-    chosen: list[RigidTransform] = []
-    while len(chosen) < count:
-        chosen.append(free.pop(propose(chosen, free)))
-    return chosen + free
-
-
-def visit(
-    session: Session, flanges: Sequence[RigidTransform], measure: Callable[[], T], *, count: int, name: str
-) -> list[T]:
-    """Drive to one station after the other and measure at each; those without a free way or without a sight are left out.
-
-    Raises:
-        Unreachable: the stations are used up before `count` were measured from; says why the last one was not.
-    """
-    found: list[T] = []
-    why = ""
-    for flange in flanges:
-        session.progress(0.1 + 0.8 * len(found) / count, f"{name}: station {len(found) + 1} of {count}", why)
-        try:
-            go_to_first(session, [flange], name=f"{name} {len(found) + 1}", thorough=False)
-            settle(session, REST_S)
-            found.append(measure())
-        except (Unreachable, NotFound, Ambiguous) as error:
-            why = f"one left out: {error.what}"
-            continue
-        if len(found) == count:
-            return found
-    raise Unreachable(
-        f"only {len(found)} of {count} stations could be measured from; {why or 'no other is left'}",
-        hint="ask for fewer poses, or give the arm more room before the panel",
-    )
-
-
-def wrist_turns(kinematics: Kinematics, park_rad: Array, base_from_sensor: Callable[[Array], Array]) -> list[Array]:
+def wrist_turns(
+    park_rad: Array, limits_rad: tuple[Array, Array], base_from_sensor: Callable[[Array], Array]
+) -> list[Array]:
     """Joint vectors about the parking place with the wrist turned every way, those first that spread gravity most.
 
     Args:
+        limits_rad: lowest and highest joint vector.
         base_from_sensor: (3, 3) rotation of the sensor at a joint vector.
     """
-    low, high = np.array(kinematics.capabilities.lower_rad), np.array(kinematics.capabilities.upper_rad)
+    low, high = limits_rad
     grid = [
         park_rad + np.concatenate([np.zeros(len(park_rad) - 3), turn])
         for turn in np.array(np.meshgrid(WRIST_RAD, WRIST_RAD, (-1.2, 0.0, 1.2))).reshape(3, -1).T

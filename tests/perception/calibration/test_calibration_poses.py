@@ -12,9 +12,7 @@ from hal.config import load_cell
 from hal.errors import NotObservable
 from hal.geometry import certain, matrix_of, transform_rpy
 from manipulation.arm.kinematics import Kinematics
-from perception.calibration.hand_eye import HandEyeView, check_turns
-from perception.calibration.wrench import GRAVITY_M_PER_S2, calibrate_wrench
-from service.operations.stations import (
+from perception.calibration.calibration_poses import (
     EDGE_PX,
     around,
     by_plate,
@@ -22,6 +20,8 @@ from service.operations.stations import (
     plate_view,
     wrist_turns,
 )
+from perception.calibration.hand_eye import HandEyeView, check_turns
+from perception.calibration.wrench import GRAVITY_M_PER_S2, calibrate_wrench
 
 ROOT = Path(__file__).parents[3]
 CELL = load_cell(ROOT / "cells/bench.toml")
@@ -75,8 +75,9 @@ def test_wrist_turns_tell_weight_from_bias_within_the_limits() -> None:
 
     capabilities = t3().capabilities
     arm = Kinematics.of(capabilities)
-    ordered = wrist_turns(arm, np.array(CELL.file.workspace.park_rad), lambda q: matrix_of(arm.flange(q)))
     low, high = np.array(capabilities.lower_rad), np.array(capabilities.upper_rad)
+    park_rad = np.array(CELL.file.workspace.park_rad)
+    ordered = wrist_turns(park_rad, (low, high), lambda q: matrix_of(arm.flange(q)))
     assert all((q > low).all() and (q < high).all() for q in ordered)
     rotations = np.array([matrix_of(arm.flange(q)) for q in ordered[:8]])
     down = np.einsum("nji,j->ni", rotations, [0.0, 0.0, -GRAVITY_M_PER_S2])

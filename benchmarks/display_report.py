@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.display_drawing import LEVELS, PHOTOGRAPHS, DisplayCase, draw_photograph, draw_taught
 from hal.panel import Display
 from perception.vision.inspection import patch_of
-from perception.vision.photographs.photo_display import read_photograph
+from perception.vision.photographs.photo_display import read_photographed_display
 from perception.vision.projection import PlateProjection, homography
 from perception.vision.reading import PatchReading
 from perception.vision.status.display import read_display
@@ -45,7 +45,7 @@ def display_lines(count: int = CASES) -> None:
             _line(f"taught, {'digits known' if known else 'digits unknown'}, {level}",
                   [(case.text, read_case(case, known=known)) for case in cases])  # fmt: skip
     for kind in PHOTOGRAPHS:
-        read = partial(read_photograph, scene=kind == "scene")
+        read = partial(read_photographed_display, scene=kind == "scene")
         drawn = (draw_photograph(seed, kind) for seed in range(count))
         _line(f"photograph-like, {kind}", [(case.text, read(case.image)) for case in drawn], PASS[kind])
 

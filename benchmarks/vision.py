@@ -30,7 +30,7 @@ from perception.vision.knowledge import Knowledge
 from perception.vision.knowledge_files import load_knowledge
 from perception.vision.lights import assign_lights, find_lights
 from perception.vision.photographs.dial import read_dial
-from perception.vision.photographs.photo_display import read_photograph
+from perception.vision.photographs.photo_display import read_photographed_display
 from perception.vision.projection import PlateProjection
 from perception.vision.reading import ANSWER_AT, ObjectReading, PatchReading
 
@@ -246,7 +246,7 @@ def answer(job: Job, folder: Path, *, least_confidence: float = ANSWER_AT) -> di
                 )  # fmt: skip
                 return status_answer(status, "reading")
             case _:
-                status = read_photograph(image, scene=bool(job["scene"]), least_confidence=least_confidence)
+                status = read_photographed_display(image, scene=bool(job["scene"]), least_confidence=least_confidence)
                 return status_answer(status, "text")
     except CellError as error:
         return {"refused": error.what, "hint": error.hint}

@@ -51,6 +51,7 @@ def _app() -> Callable[[], None]:
     from service.commands.journal import journal
     from service.commands.learn import learn
     from service.commands.range import batch, range_image
+    from service.commands.read import read
     from service.commands.serve import serve
     from service.commands.teach import teach
     from service.commands.version import root
@@ -75,6 +76,7 @@ def _app() -> Callable[[], None]:
     app.command()(warm)
     app.command()(teach)
     app.command()(learn)
+    app.command()(read)
     app.add_typer(calibrate.app, name="calibrate")
     app.command("range")(range_image)
     app.add_typer(batch, name="batch")

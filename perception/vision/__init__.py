@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from perception.vision.knowledge_files import kind_files, kind_text, load_kind, load_knowledge, write_kind
     from perception.vision.lights import AssignedLights, PanelPrior, find_panel, find_panel_lights
     from perception.vision.multi_view import merge_views
+    from perception.vision.photographs.reader import PhotographKind, read_photograph
     from perception.vision.projection import CameraProjection, PanelProjection
     from perception.vision.quadrangle import QuadranglePose, estimate
     from perception.vision.reading import ObjectReading, answer_at
@@ -47,6 +48,7 @@ __all__ = [
     "PanelObjectDraft",
     "PanelPrior",
     "PanelProjection",
+    "PhotographKind",
     "QuadranglePose",
     "Question",
     "TaughtKind",
@@ -78,6 +80,7 @@ __all__ = [
     "overview_of",
     "panel_text",
     "questions",
+    "read_photograph",
     "recognise",
     "said",
     "teach_example",

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from perception.vision import lights, quadrangle
 from perception.vision.photographs.dial import read_dial
-from perception.vision.photographs.photo_display import read_photograph
+from perception.vision.photographs.photo_display import read_photographed_display
 from perception.vision.status.display import read_window
 
 DIGIT_PX = (72, 40)  # height and width
@@ -23,7 +23,7 @@ def warm_up() -> None:
     hidden = np.zeros(window.shape, bool)
     hidden[:, -6:] = True
     read_window(window, digits=3, decimals=1, dark=True, hidden=hidden)
-    read_photograph(window, scene=True)
+    read_photographed_display(window, scene=True)
     read_dial(upright_pointer(), minimum=0.0, maximum=1.0, circular=True)
 
 

@@ -317,3 +317,23 @@ class EvaluateRequest(Strict):
     """Compare a finished mission's report with what the simulator says (simulated cells only)."""
 
     mission: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,80}$")]
+
+
+class ReadPhotographRequest(Strict):
+    """Read one instrument in a stored photograph, with nothing taught but its kind and its scale."""
+
+    image: Annotated[ImageId, Field(description="id of a stored image (POST /v1/images)")]
+    kind: Annotated[
+        Literal["gauge", "dial", "display"],
+        Field(description="gauge: part of a turn; dial: a full turn that begins straight up; display: seven segments"),
+    ]
+    scale: Annotated[
+        tuple[float, float] | None, Field(description="least and greatest value of a gauge's or a dial's scale")
+    ] = None
+    ends_rad: Annotated[
+        tuple[float, float] | None,
+        Field(description="a gauge's pointer angles there, clockwise from straight up; else its ticks tell"),
+    ] = None
+    unit: Annotated[str, Field(max_length=40, description="of the scale, repeated in the answer")] = ""
+    is_scene: Annotated[bool, Field(description="the display is somewhere in the picture, not cropped")] = False
+    least_confidence: LeastConfidence = ANSWER_AT

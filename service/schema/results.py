@@ -478,3 +478,28 @@ class EvaluateResult(Result):
     moved_unasked: list[UnaskedMotion]
     peak_force_n: float
     sim_time_s: float
+
+
+class PhotographGuess(Result):
+    """What a refusal would have said."""
+
+    value: float | None
+    uncertainty: float | None
+    text: str | None
+
+
+class PhotographReading(Result):
+    """What an instrument in a photograph shows, or why that cannot be told.
+
+    `confidence` is the expected share of right answers among such readings; of a refusal, that its guess is right.
+    """
+
+    kind: str
+    answered: bool
+    value: Annotated[float | None, Field(description="in `unit`; of a display, the number that its text is")]
+    unit: str
+    uncertainty: Annotated[float | None, Field(description="one standard deviation of `value`")]
+    text: Annotated[str | None, Field(description="what a display shows")]
+    confidence: float
+    reason: Annotated[str | None, Field(description="why there is no answer, and what would help")]
+    guess: PhotographGuess | None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from perception.vision import warm as vision
-from perception.vision.photographs.photo_display import read_photograph
+from perception.vision.photographs.photo_display import read_photographed_display
 from service.warm import STAGES, run_stage
 
 
@@ -16,4 +16,4 @@ def test_a_stage_runs_through_and_says_its_name(stage: str) -> None:
 
 
 def test_the_picture_that_warms_the_display_reader_is_read() -> None:
-    assert read_photograph(vision.three_eights(), scene=True).text == "88.8"
+    assert read_photographed_display(vision.three_eights(), scene=True).text == "88.8"

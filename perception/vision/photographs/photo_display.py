@@ -27,7 +27,7 @@ FEW, FEW_OF_SCENE = 4.0, 5.6  # segments, see `_agreed`: of a scene, four are an
 FRAME = 0.08  # of a crop's height that a frame may take
 
 
-def read_photograph(image: NDArray[Any], *, scene: bool, least_confidence: float = ANSWER_AT) -> PatchReading:
+def read_photographed_display(image: NDArray[Any], *, scene: bool, least_confidence: float = ANSWER_AT) -> PatchReading:
     """Text of the display in a photograph.
 
     Args:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from benchmarks.display_drawing import draw_photograph
 from perception.vision.photographs.digit_search import CELL_PX, MARGIN, STRIDE, cell_scores, find_digit_rows
-from perception.vision.photographs.photo_display import FEW_OF_SCENE, ROWS_TRIED, _agreed, read_photograph
+from perception.vision.photographs.photo_display import FEW_OF_SCENE, ROWS_TRIED, _agreed, read_photographed_display
 from perception.vision.reading import PatchReading, refused
 from perception.vision.status.digit_grid import LIT_SHARES
 from perception.vision.status.digit_grid_worth import cell_boxes
@@ -56,7 +56,7 @@ def test_a_cells_score_is_the_share_that_its_best_character_explains() -> None:
 def test_nothing_is_found_in_an_even_picture() -> None:
     gray = np.full((120, 160), 90, np.uint8)
     assert find_digit_rows(gray) == []
-    assert not read_photograph(gray, scene=True).answered
+    assert not read_photographed_display(gray, scene=True).answered
 
 
 def test_a_frames_sides_are_no_ones() -> None:
@@ -72,7 +72,8 @@ def test_a_turned_crop_is_straightened(turned_deg: float) -> None:
     size = gray.shape[::-1]
     turn = cv2.getRotationMatrix2D((size[0] / 2, size[1] / 2), turned_deg, 1.0)
     assert (
-        read_photograph(cv2.warpAffine(gray, turn, size, borderMode=cv2.BORDER_REPLICATE), scene=False).text == "26.08"
+        read_photographed_display(cv2.warpAffine(gray, turn, size, borderMode=cv2.BORDER_REPLICATE), scene=False).text
+        == "26.08"
     )
 
 
@@ -114,7 +115,7 @@ def test_two_dots_between_digits_are_a_clocks_colon(high: float, low: float | No
     for y in (high, low):
         if y is not None:
             cv2.circle(gray, (gray.shape[1] // 2, round(60 * (0.35 + y))), 5, 40, -1, cv2.LINE_AA)
-    status = read_photograph(gray, scene=False)
+    status = read_photographed_display(gray, scene=False)
     assert status.text == text if text else ":" not in (status.text or "")
     assert status.value is None if text else True
 
@@ -135,4 +136,4 @@ def test_a_digit_or_a_sign_beside_those_that_were_read_is_a_doubt(shown: str) ->
 
 def test_own_scenes_are_read_by_and_large() -> None:
     cases = [draw_photograph(seed, "scene") for seed in range(5)]
-    assert sum(read_photograph(case.image, scene=True).text == case.text for case in cases) >= 3
+    assert sum(read_photographed_display(case.image, scene=True).text == case.text for case in cases) >= 3

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from benchmarks.vision_drawing import SEGMENTS
 from perception.vision.photographs.dial import read_dial
-from perception.vision.photographs.photo_display import read_photograph
+from perception.vision.photographs.photo_display import read_photographed_display
 from perception.vision.status.display import read_window
 
 ENDS = {
@@ -108,7 +108,7 @@ def test_a_value_outside_the_range_is_refused() -> None:
 def test_a_cropped_photograph_is_read_whatever_its_polarity() -> None:
     for dark in (True, False):
         image = cv2.resize(window("27.4", dark=dark), None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC)
-        assert read_photograph(image, scene=False).text == "27.4"
+        assert read_photographed_display(image, scene=False).text == "27.4"
 
 
 @pytest.mark.parametrize("value", [0.6, 2.2, 4.9, 7.7, 9.3])

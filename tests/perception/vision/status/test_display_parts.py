@@ -11,7 +11,7 @@ import pytest
 from benchmarks.display_drawing import draw_photograph, draw_taught
 from benchmarks.display_report import read_case
 from perception.vision.patch import Patch
-from perception.vision.photographs.photo_display import read_photograph
+from perception.vision.photographs.photo_display import read_photographed_display
 from perception.vision.status.decimal_point import dot_levels, find_decimal_point
 from perception.vision.status.digit_grid import LIT_SHARES, DigitGrid, find_digit_grids, segment_means
 from perception.vision.status.digit_grid_fit import grid_worth
@@ -272,7 +272,7 @@ def test_a_grid_that_is_too_high_does_not_win(seed: int, level: str) -> None:
 
 def test_photographs_of_low_contrast_are_read_by_and_large() -> None:
     cases = [draw_photograph(seed, "low contrast") for seed in range(6)]
-    assert sum(read_photograph(case.image, scene=False).text == case.text for case in cases) >= 4
+    assert sum(read_photographed_display(case.image, scene=False).text == case.text for case in cases) >= 4
 
 
 def washed_out(text: str, *, glare_from: float) -> np.ndarray:

@@ -1,0 +1,75 @@
+"""One instrument in a photograph, with nothing taught but its kind and its scale."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.errors import InvalidRequest
+from perception.vision.photographs.dial import read_dial
+from perception.vision.photographs.photo_display import read_photographed_display
+from perception.vision.reading import ANSWER_AT, PatchReading
+
+PhotographKind = Literal["gauge", "dial", "display"]
+
+
+def read_photograph(
+    image: NDArray[Any],
+    kind: PhotographKind,
+    *,
+    scale: tuple[float, float] | None = None,
+    ends_rad: tuple[float, float] | None = None,
+    is_scene: bool = False,
+    least_confidence: float = ANSWER_AT,
+) -> PatchReading:
+    """Read the instrument that fills a photograph, or is somewhere in it.
+
+    Args:
+        image: (H, W) gray or (H, W, 3) RGB uint8.
+        kind: `gauge`: a pointer over a part of a turn; `dial`: a pointer over a full turn that begins straight up, as in a
+            water meter; `display`: seven-segment digits.
+        scale: least and greatest value of a gauge's or a dial's scale.
+        ends_rad: a gauge's pointer angles there, clockwise from straight up; None: where its ticks end, and three quarters
+            of a turn where they do not tell.
+        is_scene: the display is somewhere in the picture, not cropped. A pointer's dial must fill it.
+        least_confidence: 0 to 1; less sure readings are refused, with the guess that they would have been.
+
+    Raises:
+        InvalidRequest: a scale is missing, or given where there is none; a bad image.
+        NotObservable: the image shows nothing.
+    """
+    _check(kind, scale=scale, ends_rad=ends_rad, is_scene=is_scene)
+    if scale is None:
+        return read_photographed_display(image, scene=is_scene, least_confidence=least_confidence)
+    low, high = scale
+    return read_dial(
+        image, minimum=low, maximum=high, circular=kind == "dial", ends_rad=ends_rad, least_confidence=least_confidence
+    )
+
+
+def _check(
+    kind: PhotographKind, *, scale: tuple[float, float] | None, ends_rad: tuple[float, float] | None, is_scene: bool
+) -> None:
+    if kind == "display":
+        if scale is not None or ends_rad is not None:
+            raise InvalidRequest("a display has no scale", hint="leave scale and ends out, or say which kind it is")
+        return
+    if is_scene:
+        raise InvalidRequest(f"a {kind} is not looked for in a scene", hint="crop the picture to the instrument")
+    if scale is None:
+        raise InvalidRequest(f"a {kind} is read by its scale", hint="give the values at its ends, for example 0 to 10")
+    if not np.isfinite(scale).all() or scale[0] >= scale[1]:
+        raise InvalidRequest(
+            f"a scale from {scale[0]:g} to {scale[1]:g} cannot be", hint="the smaller value first; of a scale that runs the other way, swap the pointer angles instead"
+        )
+    if ends_rad is None:
+        return
+    if kind == "dial":
+        raise InvalidRequest("a dial is a full turn that begins straight up", hint="leave the ends out, or say gauge")
+    if not 0.0 < abs(ends_rad[1] - ends_rad[0]) <= 2 * np.pi or max(map(abs, ends_rad)) > 2 * np.pi:
+        raise InvalidRequest(
+            f"pointer angles of {ends_rad[0]:g} and {ends_rad[1]:g} rad cannot be",
+            hint="give radians clockwise from straight up, at most a turn apart; 135 degrees are 2.356",
+        )

@@ -1,0 +1,59 @@
+"""Instruments in photographs that users bring: read by kind and scale, with nothing taught."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.schema.results import PhotographGuess, PhotographReading
+
+if TYPE_CHECKING:
+    from perception.vision import PhotographKind
+    from service.knowledge.images import ImageStore
+    from service.schema.requests import ReadPhotographRequest
+
+
+def read_stored_photograph(images: ImageStore, request: ReadPhotographRequest) -> PhotographReading:
+    """What a stored photograph shows.
+
+    Raises:
+        NoSuchImage: there is no such image.
+        InvalidRequest: the scale does not go with the kind.
+        NotObservable: the image shows nothing.
+    """
+    return read_pixels(
+        images.pixels(request.image), request.kind, scale=request.scale, ends_rad=request.ends_rad, unit=request.unit,
+        is_scene=request.is_scene, least_confidence=request.least_confidence,
+    )  # fmt: skip
+
+
+def read_pixels(
+    pixels: NDArray[np.uint8],
+    kind: PhotographKind,
+    *,
+    scale: tuple[float, float] | None,
+    ends_rad: tuple[float, float] | None,
+    unit: str,
+    is_scene: bool,
+    least_confidence: float,
+) -> PhotographReading:
+    """What a photograph shows; errors as `read_stored_photograph`."""
+    from perception.vision import read_photograph
+
+    found = read_photograph(
+        pixels, kind, scale=scale, ends_rad=ends_rad, is_scene=is_scene, least_confidence=least_confidence
+    )
+    guess = found.guess
+    return PhotographReading(
+        kind=kind,
+        answered=found.answered,
+        value=found.value,
+        unit=unit,
+        uncertainty=found.uncertainty,
+        text=found.text,
+        confidence=found.confidence,
+        reason=found.reason,
+        guess=None if guess is None else PhotographGuess.model_validate(guess),
+    )

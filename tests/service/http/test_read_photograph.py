@@ -1,0 +1,83 @@
+"""`POST /v1/read-photograph` and `panelwright read`: the same answer, refusals with a hint, errors as problems."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import httpx2
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from benchmarks.vision_manometers import draw_manometer
+from hal.errors import InvalidRequest
+from perception.vision.warm import three_eights
+from service.cli import _app
+from service.http.photographs import EXAMPLE
+from service.schema.requests import ReadPhotographRequest
+from tests.service.shown_panel import house, is_problem, store, web
+
+__all__ = ["house", "web"]  # fixtures
+
+
+def run(*words: object) -> Result:
+    return CliRunner().invoke(_app(), [str(word) for word in words])
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> Path:
+    cv2.imwrite(str(tmp_path / "gauge.png"), cv2.cvtColor(draw_manometer(5).image, cv2.COLOR_RGB2BGR))
+    return tmp_path / "gauge.png"
+
+
+def test_both_ways_give_the_same_reading(web: httpx2.Client, photo: Path) -> None:
+    image = web.post("/v1/images", content=photo.read_bytes(), headers={"Content-Type": "image/png"}).json()["id"]
+    body = {"image": image, "kind": "gauge", "scale": [0.0, 10.0], "unit": "bar"}
+    told = web.post("/v1/read-photograph", json=body).json()
+    assert told["answered"] and told["reason"] is None and told["unit"] == "bar" and 0.5 < told["confidence"] <= 1.0
+    printed = run("read", photo, "--kind", "gauge", "--scale", "0..10", "--unit", "bar", "--json")
+    assert printed.exit_code == 0 and json.loads(printed.output) == told
+    spoken = run("read", photo, "--kind", "gauge", "--scale", "0..10", "--unit", "bar")
+    assert f"{told['value']:.4g} bar" in spoken.output
+
+
+def test_a_display_in_a_scene_is_read(web: httpx2.Client) -> None:
+    body = {"image": store(web, three_eights()), "kind": "display", "is_scene": True}
+    told = web.post("/v1/read-photograph", json=body).json()
+    assert (told["text"], told["value"]) == ("88.8", 88.8)
+
+
+def test_what_cannot_be_told_is_refused_with_a_reason_and_its_guess(web: httpx2.Client, photo: Path) -> None:
+    image = web.post("/v1/images", content=photo.read_bytes(), headers={"Content-Type": "image/png"}).json()["id"]
+    body = {"image": image, "kind": "gauge", "scale": [0.0, 10.0], "least_confidence": 1.0}
+    told = web.post("/v1/read-photograph", json=body).json()
+    assert not told["answered"] and told["value"] is None and told["reason"] and told["guess"]["value"] is not None
+    result = run("read", photo, "--kind", "gauge", "--scale", "0..10", "--least-confidence", "1.0")
+    assert result.exit_code == 1 and "cannot tell" in result.output
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "kind", "words"),
+    [
+        ({"kind": "gauge"}, 422, "invalid-request", "by its scale"),
+        ({"kind": "display", "scale": [0.0, 1.0]}, 422, "invalid-request", "no scale"),
+        ({"kind": "lever"}, 422, "bad-body", "kind"),
+        ({"kind": "gauge", "scale": [0.0, 1.0], "image": "0" * 24}, 404, "no-such-image", "image"),
+    ],
+)
+def test_what_cannot_be_meant_is_a_problem(
+    web: httpx2.Client, body: dict[str, object], status: int, kind: str, words: str
+) -> None:
+    answer = web.post("/v1/read-photograph", json={"image": store(web, three_eights()), **body})
+    is_problem(answer, status, kind, words)
+
+
+def test_a_range_that_is_none_is_refused(photo: Path) -> None:
+    result = run("read", photo, "--kind", "gauge", "--scale", "10")
+    assert isinstance(result.exception, InvalidRequest) and "--scale=0..10" in result.exception.hint
+
+
+def test_the_example_is_a_request() -> None:
+    ReadPhotographRequest.model_validate_json(json.dumps(EXAMPLE))

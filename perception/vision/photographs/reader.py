@@ -62,7 +62,8 @@ def _check(
         raise InvalidRequest(f"a {kind} is read by its scale", hint="give the values at its ends, for example 0 to 10")
     if not np.isfinite(scale).all() or scale[0] >= scale[1]:
         raise InvalidRequest(
-            f"a scale from {scale[0]:g} to {scale[1]:g} cannot be", hint="the smaller value first; of a scale that runs the other way, swap the pointer angles instead"
+            f"a scale from {scale[0]:g} to {scale[1]:g} cannot be",
+            hint="the smaller value first; swap the pointer angles instead",
         )
     if ends_rad is None:
         return

@@ -17,11 +17,11 @@ import numpy as np
 
 from hal.config import CableSection, Cell, SimulationSection, load_cell
 from hal.errors import CellError
-from hal.panel import PanelObject
+from hal.panel import PanelObject, Shown
 from hal.simulated import ObjectTruth
 from perception.vision.reading import ObjectReading
 from service.operations.context import OperationContext
-from service.operations.evaluate import agrees
+from service.operations.evaluate import shown_of
 from service.operations.inspect import close_ups, look_past
 from service.operations.locate import go_to_overview, locate
 from service.operations.session import Session
@@ -90,7 +90,7 @@ def verdict(reading: ObjectReading, spec: PanelObject, truth: ObjectTruth) -> st
     """`right`, `wrong` or `refused`."""
     if not reading.answered:
         return "refused"
-    is_right = agrees(spec, truth, value=reading.value, state=reading.state, text=reading.text)
+    is_right = spec.is_right(Shown(value=reading.value, state=reading.state, text=reading.text), shown_of(truth))
     return "right" if is_right else "wrong"
 
 

@@ -13,11 +13,11 @@ import numpy as np
 
 from benchmarks.display_drawing import LEVELS, PHOTOGRAPHS, DisplayCase, draw_photograph, draw_taught
 from hal.panel import Display
-from perception.vision.inspection import patch_of
 from perception.vision.photographs.photo_display import read_photographed_display
 from perception.vision.projection import PlateProjection, homography
 from perception.vision.reading import PatchReading
 from perception.vision.status.display import read_display
+from perception.vision.status.reader import patch_of
 
 CASES = 40
 SURE = 0.8

@@ -13,7 +13,20 @@ from benchmarks.vision_reliability import Answer
 from hal.config import load_cell
 from hal.errors import CellError
 from hal.geometry import certain
-from hal.panel import Panel
+from hal.panel import (
+    Button,
+    Display,
+    Gauge,
+    Handwheel,
+    Lamp,
+    Lever,
+    Mushroom,
+    Panel,
+    PanelMeter,
+    Rotary,
+    Slider,
+    Toggle,
+)
 from perception.vision.inspection import inspect
 from perception.vision.projection import CameraProjection
 
@@ -94,22 +107,22 @@ def random_state(panel: Panel, seed: int) -> dict[str, Shown]:
     shown: dict[str, Shown] = {}
     for panel_object in panel.objects:
         share = float(random.uniform(0.05, 0.95))
-        match panel_object.kind:
-            case "gauge" | "panel_meter" | "slider":
+        match panel_object:
+            case Gauge() | PanelMeter() | Slider():
                 shown[panel_object.name] = panel_object.scale.minimum + share * (
                     panel_object.scale.maximum - panel_object.scale.minimum
                 )
-            case "display":
+            case Display():
                 shown[panel_object.name] = (
                     f"{panel_object.minimum + share * (panel_object.maximum - panel_object.minimum):.{panel_object.decimals}f}"
                 )
-            case "lamp" | "toggle":
+            case Lamp() | Toggle():
                 shown[panel_object.name] = "on" if share > 0.5 else "off"
-            case "button" | "mushroom":
+            case Button() | Mushroom():
                 shown[panel_object.name] = "pressed" if share > 0.5 else "released"
-            case "rotary" | "lever":
+            case Rotary() | Lever():
                 shown[panel_object.name] = panel_object.states[int(share * len(panel_object.states))].name
-            case "handwheel":
+            case Handwheel():
                 shown[panel_object.name] = 4.0 * share - 2.0
     return shown
 
@@ -122,5 +135,6 @@ def _error(panel: Panel, reading: Any, shown: Shown) -> float | None:
         return 0.0 if shown in (reading.text, reading.state) else 100.0
     if reading.kind == "handwheel":
         return float(abs((reading.value - float(shown) + np.pi) % (2 * np.pi) - np.pi) / (2 * np.pi) * 100)
-    scale = panel.object(reading.name).scale  # type: ignore[union-attr]  # all other kinds have one
-    return float(abs(reading.value - float(shown)) / (scale.maximum - scale.minimum) * 100)
+    span = panel.object(reading.name).full_scale
+    assert span is not None  # all other kinds have one
+    return float(abs(reading.value - float(shown)) / span * 100)

@@ -30,9 +30,9 @@ from hal.geometry import certain
 from hal.panel import PanelObject
 from perception.vision.finding.blind import recognise
 from perception.vision.finding.segment import grow_regions
-from perception.vision.inspection import patch_of, read_patch
 from perception.vision.knowledge_files import load_knowledge
 from perception.vision.projection import CameraProjection
+from perception.vision.status.reader import patch_of, read_patch
 
 LEVELS = ("easy", "medium", "hard")
 PASS = {

@@ -22,7 +22,6 @@ import numpy as np
 from benchmarks.cell import clear_stop, run_to_end
 from hal.config import Cell, load_cell
 from perception.vision.knowledge_files import load_knowledge, write_kind
-from perception.vision.registration.outline import footprint_m
 from service.client import Client
 from service.serve import Options, Panelwright
 from simbackend.draws import Draws
@@ -94,7 +93,8 @@ def judged(cell: Cell, seed: int, candidates: Sequence[dict[str, Any]]) -> Overv
             continue
         away = {name: float(np.linalg.norm(place - candidate["centre_m"])) for name, place in places.items()}
         name = min(away, key=lambda key: away[key])
-        is_there = away[name] < max(footprint_m(built[name].panel_object)[:2])
+        face = built[name].panel_object.face
+        is_there = away[name] < max(face.half_width_m, face.half_height_m)
         is_right = is_there and built[name].panel_object.kind == candidate["kind"]
         if is_right:
             found.add(name)

@@ -6,15 +6,14 @@ import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from difflib import get_close_matches
-from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
 from hal.clock import Clock, WallClock
 from hal.config import Cell
 from hal.devices import Device
 from hal.emulation import EmulatorFactory
-from hal.errors import REINSTALL, ConfigError
+from hal.entry_points import load, registered
+from hal.errors import ConfigError
 from hal.strict import Strict
 
 DEVICES = "panelwright.devices"
@@ -93,7 +92,7 @@ def device_factory(driver: str) -> Factory:
     Raises:
         ConfigError: unknown name (with the nearest known one), or its package does not import.
     """
-    factory: Factory = _load(DEVICES, driver, "driver")
+    factory: Factory = load(DEVICES, driver, "driver")
     return factory
 
 
@@ -103,29 +102,13 @@ def emulator_factory(name: str) -> EmulatorFactory:
     Raises:
         ConfigError: as `device_factory`.
     """
-    factory: EmulatorFactory = _load(EMULATORS, name, "emulator")
+    factory: EmulatorFactory = load(EMULATORS, name, "emulator")
     return factory
 
 
 def installed_drivers() -> tuple[str, ...]:
     """Names of all registered drivers."""
-    return tuple(sorted(point.name for point in entry_points(group=DEVICES)))
-
-
-def _load(group: str, name: str, what: str) -> Any:
-    known: dict[str, EntryPoint] = {point.name: point for point in entry_points(group=group)}
-    if name not in known:
-        near = get_close_matches(name, known, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"installed: {', '.join(sorted(known)) or 'none'}"
-        raise ConfigError(f"no {what} called {name!r}", hint=hint, driver=name)
-    try:
-        return known[name].load()
-    except ImportError as error:
-        raise ConfigError(
-            f"{what} {name!r} does not import: {error}",
-            hint=f"{REINSTALL}; `panelwright doctor` says what is wrong",
-            driver=name,
-        ) from error
+    return registered(DEVICES)
 
 
 def _in_file(details: dict[str, Any], cell: Cell | None) -> dict[str, Any]:

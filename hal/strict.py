@@ -83,11 +83,13 @@ def _fault(item: Any, model: type[BaseModel]) -> tuple[str, str, str]:
     path = _path_in_file(item["loc"], model)
     key = ".".join(str(part) for part in path)
     if item["type"] == "extra_forbidden":
-        known = _fields_at(model, list(item["loc"][:-1]))
-        return key, f"unknown key {path[-1]!r}", _did_you_mean(str(path[-1]), known)
+        hint = item.get("ctx", {}).get("hint") or unknown_key_hint(model, item["loc"])
+        return key, f"unknown key {path[-1]!r}", hint
     if item["type"] == "missing":
         return key, "is missing", f"add {key}; the reference is in docs/"
-    given = repr(item.get("input"))
+    given, hint = repr(item.get("input")), item.get("ctx", {}).get("hint")
+    if hint is not None:  # the model knows what helps
+        return key, item["msg"], hint
     if item["type"] == "value_error":
         return key, item["msg"].removeprefix("Value error, "), "see the file reference in docs/"
     return key, f"{item['msg']} (given: {given[:60]})", "see the file reference in docs/ for type, unit and range"
@@ -105,13 +107,14 @@ def unknown_key_hint(model: type[BaseModel], location: tuple[int | str, ...]) ->
 
 def _path_in_file(location: tuple[Any, ...], model: type[BaseModel]) -> list[Any]:
     # A discriminated union puts its tag into the path, where a reader of the file sees none.
-    tags = {tag for m in _reachable(model) if (tag := _tag_of(m))}
+    tags = {tag for m in reachable(model) if (tag := _tag_of(m))}
     return [
         part for i, part in enumerate(location) if not (part in tags and i > 0 and isinstance(location[i - 1], int))
     ]
 
 
-def _reachable(model: type[BaseModel]) -> set[type[BaseModel]]:
+def reachable(model: type[BaseModel]) -> set[type[BaseModel]]:
+    """The model and all models that its fields are made of."""
     found: set[type[BaseModel]] = set()
     waiting = [model]
     while waiting:

@@ -10,32 +10,14 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.config import CableSection, Cell
-from hal.panel import (
-    Button,
-    Handwheel,
-    Lamp,
-    Lever,
-    Mushroom,
-    Panel,
-    Rotary,
-    Slider,
-    Toggle,
-)
+from hal.panel import Panel
 from hal.simulated import ObjectTruth
 from simbackend import textures
+from simbackend.bodies.body import body_of
+from simbackend.bodies.parts import PAINT, Quad, Shine, light_urdf, robot
 from simbackend.draws import Draws
-from simbackend.mechanisms import (
-    JOINT,
-    SLIDE_DAMPING_N_S_PER_M,
-    TURN_DAMPING_NM_S_PER_RAD,
-    Detent,
-    Friction,
-    Mechanism,
-    Spring,
-)
-from simbackend.panel_model import PAINT, Quad, light_urdf, object_model, robot
+from simbackend.mechanisms import JOINT, Detent, Friction, Mechanism, Spring
 from simbackend.panel_state import Built, build
-from simbackend.panel_truth import truth_of
 from simbackend.scene import Scene
 from simbackend.urdf import Colour
 from simbackend.wire import Emitter
@@ -75,6 +57,7 @@ class PanelWorld:
         self._pictures: list[tuple[Quad, RigidTransform]] = []
         self._load_room(cell.file.workspace.floor_z_m)
         self._load_plate()
+        self._shines: dict[str, Shine] = {}
         self._light_places: list[tuple[float, float, float]] = []
         for light in cell.panel.lights:
             jitter = cell.panel.tolerances.light_m * draws.stream(f"light/{light.name}").standard_normal(3)
@@ -85,9 +68,7 @@ class PanelWorld:
             self._load_cable(k, cable)
         self._keep_apart()
         self.scene = self._draw_up()
-        self.lamps_on = {
-            name: built.is_on for name, built in self.built.items() if isinstance(built.panel_object, Lamp)
-        }
+        self.lamps_on = {name: self.built[name].start.is_on for name in self._shines}
         for name, on in self.lamps_on.items():
             self._paint_lamp(name, on=on)
         for light in cell.panel.lights:
@@ -178,8 +159,11 @@ class PanelWorld:
     def _load_object(self, built: Built) -> None:
         name = built.panel_object.name
         pose = self.object_pose(built)
-        model = object_model(built)
+        body_kind = body_of(built.panel_object.kind)
+        model = body_kind.model(built.panel_object, built.start)
         self._pictures += [(quad, pose) for quad in model.quads]
+        if model.shine is not None:
+            self._shines[name] = model.shine
         if not model.urdf:
             return
         body = self._load_urdf(name, robot(model.urdf), pose)
@@ -188,42 +172,9 @@ class PanelWorld:
             for link in (-1, JOINT):
                 # The pads' own friction factor multiplies this one.
                 self.engine.changeDynamics(body, link, lateralFriction=1.0, jointDamping=0.0)
-            self.mechanisms[name] = self._mechanism(built, body)
-
-    def _mechanism(self, built: Built, body: int) -> Mechanism:
-        panel_object, ratio = built.panel_object, built.effort_ratio
-        match panel_object:
-            case Button() | Mushroom():
-                spring = Spring(
-                    engine=self.engine,
-                    body=body,
-                    travel_m=panel_object.travel_m,
-                    spring_n_per_m=panel_object.spring_n_per_m * ratio,
-                    preload_n=panel_object.preload_n * ratio,
-                    latching=isinstance(panel_object, Mushroom) or panel_object.latching,
-                    releases=isinstance(panel_object, Button),
-                    is_latched=built.is_on,
-                )
-                if built.is_on:
-                    self.engine.resetJointState(body, JOINT, -spring.latched_depth_m)
-                return spring
-            case Toggle():
-                ends = (-panel_object.tilt_rad, panel_object.tilt_rad)
-                effort = panel_object.force_n * panel_object.bat_length_m * ratio
-                return Detent(engine=self.engine, body=body, places=ends, effort=effort, max_speed=8.0)
-            case Rotary():
-                places = tuple(state.angle_rad for state in panel_object.states)
-                return Detent(
-                    engine=self.engine, body=body, places=places, effort=panel_object.torque_nm * ratio, max_speed=6.0
-                )
-            case Slider():
-                friction_n = panel_object.friction_n * ratio
-                return Friction(engine=self.engine, body=body, effort=friction_n, damping=SLIDE_DAMPING_N_S_PER_M)
-            case Lever() | Handwheel():
-                torque_nm = panel_object.torque_nm * ratio
-                return Friction(engine=self.engine, body=body, effort=torque_nm, damping=TURN_DAMPING_NM_S_PER_RAD)
-            case _:  # a needle: its movement holds it
-                return Friction(engine=self.engine, body=body, effort=1.0)
+            self.mechanisms[name] = body_kind.mechanism(
+                self.engine, body, built.panel_object, built.start, built.effort_ratio
+            )
 
     def object_pose(self, built: Built) -> RigidTransform:
         """base_from_object as built."""
@@ -269,15 +220,13 @@ class PanelWorld:
         if button.presses == self._presses[name]:
             return
         self._presses[name] = button.presses
-        lamp = getattr(self.built[name].panel_object, "lights_lamp", None)
-        if lamp is not None:
+        lamp = self.built[name].panel_object.shown_by
+        if lamp in self.lamps_on:
             self.lamps_on[lamp] = not self.lamps_on[lamp]
             self._paint_lamp(lamp, on=self.lamps_on[lamp])
 
     def _paint_lamp(self, name: str, *, on: bool) -> None:
-        panel_object = self.built[name].panel_object
-        assert isinstance(panel_object, Lamp)  # noqa: S101 - the panel file lets a button light lamps only
-        colour = panel_object.colour
+        colour = self._shines[name].colour
         self._paint(name, GLOW[colour] if on else PAINT[colour], LAMP_RADIANCE if on else DIM, on=on)
 
     def _paint(self, name: str, colour: Colour, level: float, *, on: bool) -> None:
@@ -303,14 +252,13 @@ class PanelWorld:
         ]
         for name, on in self.lamps_on.items():
             if on:
-                panel_object = self.built[name].panel_object
-                assert isinstance(panel_object, Lamp)  # noqa: S101 - for mypy
-                place = self.object_pose(self.built[name]).apply([0, 0, panel_object.height_m])
+                shine = self._shines[name]
+                place = self.object_pose(self.built[name]).apply([0, 0, shine.height_m])
                 lit.append(
                     Emitter(
-                        colour=GLOW[panel_object.colour],
+                        colour=GLOW[shine.colour],
                         position_m=(float(place[0]), float(place[1]), float(place[2])),
-                        radius_m=panel_object.radius_m,
+                        radius_m=shine.radius_m,
                         is_border_light=False,
                     )
                 )
@@ -319,7 +267,9 @@ class PanelWorld:
     def truth(self) -> tuple[ObjectTruth, ...]:
         """What each object shows at this tick: for the judge."""
         return tuple(
-            truth_of(built, self.mechanisms.get(name), lamp_is_on=self.lamps_on.get(name, False))
+            body_of(built.panel_object.kind).truth(
+                built.panel_object, built.start, self.mechanisms.get(name), is_lit=self.lamps_on.get(name, False)
+            )
             for name, built in self.built.items()
         )
 

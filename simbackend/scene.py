@@ -15,9 +15,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.arrays import Array
 from simbackend import meshes
+from simbackend.canvas import Pixels
 from simbackend.meshes import Mesh
 from simbackend.raster import rasterise
-from simbackend.textures import Pixels
 
 Float32 = NDArray[np.float32]
 Pose = tuple[tuple[float, ...], tuple[float, ...]]  # position and quaternion, as the engine gives them

@@ -6,24 +6,13 @@ found by a golden-section search; that makes a whole check of arm against panel 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from scipy.spatial.transform import RigidTransform
 
 from hal.geometry import identity, transform_rpy
-from hal.panel import (
-    Button,
-    Handwheel,
-    Lever,
-    Mushroom,
-    Panel,
-    PanelObject,
-    Rotary,
-    Slider,
-    Toggle,
-)
+from hal.panel import Panel, PanelObject
 
 Vector3 = tuple[float, float, float]
 
@@ -76,53 +65,14 @@ def panel_boxes(panel: Panel, angles_rad: Mapping[str, float] | None = None) -> 
 
 
 def envelope(panel_object: PanelObject, *, angle_rad: float | None = None) -> CollisionBox:
-    """A box in the panel frame that holds the object in any state, or a lever at `angle_rad`."""
-    if isinstance(panel_object, Lever) and angle_rad is not None:
-        return _bar(panel_object, angle_rad)
-    half_x, half_y, height = _half_sizes(panel_object)
-    turn = panel_object.angle_rad if isinstance(panel_object, Slider) else 0.0
+    """A box in the panel frame that holds the object in any state, or, if that is smaller, at `angle_rad`."""
+    room = panel_object.envelope(angle_rad)
+    foot = transform_rpy((*panel_object.position_m, 0.0), (0.0, 0.0, room.turn_rad))
     return CollisionBox(
         name=panel_object.name,
-        parent_from_box=transform_rpy((*panel_object.position_m, height / 2), (0.0, 0.0, turn)),
-        half_m=(half_x, half_y, height / 2),
+        parent_from_box=foot * transform_rpy((*room.middle_m, room.height_m / 2), (0.0, 0.0, 0.0)),
+        half_m=(*room.half_m, room.height_m / 2),
     )
-
-
-def _bar(lever: Lever, angle_rad: float) -> CollisionBox:
-    # Hub and bar: from half a width behind the hub to the far end.
-    along = lever.length_m / 2
-    turned = transform_rpy((*lever.position_m, 0.0), (0.0, 0.0, -angle_rad))
-    return CollisionBox(
-        name=lever.name,
-        parent_from_box=turned * transform_rpy((0.0, along, lever.height_m / 2), (0.0, 0.0, 0.0)),
-        half_m=(lever.width_m, along + lever.width_m, lever.height_m / 2),
-    )
-
-
-def _half_sizes(panel_object: PanelObject) -> tuple[float, float, float]:
-    """Half width, half height and full height out of the plate."""
-    match panel_object:
-        case Lever():
-            reach = panel_object.length_m + panel_object.width_m
-            return reach, reach, panel_object.height_m
-        case Slider():
-            along, across, out = panel_object.cap_size_m
-            return (panel_object.travel_m + along) / 2, across / 2, out
-        case Toggle():
-            # The bat swings in the vertical plane.
-            half = panel_object.bat_length_m * math.sin(panel_object.tilt_rad) + 2 * panel_object.bat_radius_m
-            return 2 * panel_object.bat_radius_m, half, panel_object.bat_length_m + panel_object.bat_radius_m
-        case Rotary() | Button() | Mushroom():
-            return panel_object.radius_m, panel_object.radius_m, panel_object.height_m
-        case Handwheel():
-            reach = panel_object.radius_m + panel_object.rim_m
-            return reach, reach, panel_object.height_m + panel_object.rim_m
-    radius = getattr(panel_object, "radius_m", None)
-    half_x = radius if radius is not None else getattr(panel_object, "width_m", 0.02) / 2
-    half_y = radius if radius is not None else getattr(panel_object, "height_m", 0.02) / 2
-    depth = getattr(panel_object, "depth_m", 0.0)
-    lamp = getattr(panel_object, "height_m", 0.0) if panel_object.kind == "lamp" else 0.0
-    return half_x, half_y, max(depth, lamp, 0.004)
 
 
 def floor_box(z_m: float) -> CollisionBox:

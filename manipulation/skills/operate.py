@@ -4,17 +4,10 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from hal.errors import InvalidRequest
+from hal.kinds import SKILLS, part_of
 from hal.panel import PanelObject
-from manipulation.skills.button import button
 from manipulation.skills.context import SkillContext
-from manipulation.skills.handwheel import handwheel
-from manipulation.skills.lever import lever
-from manipulation.skills.mushroom import mushroom
 from manipulation.skills.outcome import ObjectState, SkillReport, Verify
-from manipulation.skills.rotary import rotary
-from manipulation.skills.slider import slider
-from manipulation.skills.toggle import toggle
 
 
 class Skill(Protocol):
@@ -38,17 +31,6 @@ class Skill(Protocol):
         ...
 
 
-SKILLS: dict[str, Skill] = {
-    "button": button,
-    "handwheel": handwheel,
-    "lever": lever,
-    "mushroom": mushroom,
-    "rotary": rotary,
-    "slider": slider,
-    "toggle": toggle,
-}
-
-
 def operate(
     context: SkillContext,
     panel_object: PanelObject,
@@ -65,13 +47,9 @@ def operate(
         verify: the caller's second look. Without it nothing is confirmed, and a finished stroke is `unverified`.
 
     Raises:
-        InvalidRequest: the kind has no skill, or the object has no such state or value.
+        Unsupported: the kind has no skill: it is read only.
+        InvalidRequest: the object has no such state or value.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    skill = SKILLS.get(panel_object.kind)
-    if skill is None:
-        raise InvalidRequest(
-            f"{panel_object.name} is a {panel_object.kind}, which cannot be worked",
-            hint=f"these kinds can: {', '.join(SKILLS)}",
-        )
+    skill: Skill = part_of(SKILLS, panel_object.kind)
     return skill(context, panel_object, goal, current=current, verify=verify)

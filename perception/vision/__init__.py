@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from perception.vision.registration.outline import contour_m
     from perception.vision.teaching.from_panel import PanelLooks, teach_from_panel
     from perception.vision.teaching.panel_lights import LightsFound, find_border_lights
-    from perception.vision.teaching.panel_questions import Question, kind_question, questions
+    from perception.vision.teaching.panel_questions import kind_question, questions
     from perception.vision.teaching.panel_teach import PanelObjectDraft, object_row, panel_text
     from perception.vision.teaching.teach import (
         Example,
@@ -50,7 +50,6 @@ __all__ = [
     "PanelProjection",
     "PhotographKind",
     "QuadranglePose",
-    "Question",
     "TaughtKind",
     "answer_at",
     "as_gray",

@@ -15,48 +15,21 @@ from hal.calibration import CameraIntrinsics
 from hal.camera_model import check_size, rays
 from hal.errors import NotFound
 from hal.geometry import UncertainPose, matrix_of
-from hal.panel import Display, Panel, PanelObject, Scale
+from hal.panel import Panel, PanelObject
 from perception.vision.image import as_gray
 from perception.vision.noise import noise_sigma
-from perception.vision.patch import Patch, rectify
+from perception.vision.patch import Patch
 from perception.vision.projection import CameraProjection, PanelProjection
-from perception.vision.reading import (
-    ANSWER_AT,
-    ObjectReading,
-    PatchReading,
-    answer_at,
-    as_often_right,
-    doubted,
-    refused,
-)
-from perception.vision.registration.outline import contour_m, footprint_m
+from perception.vision.reading import ANSWER_AT, ObjectReading, PatchReading, answer_at, doubted, refused
+from perception.vision.registration.outline import contour_m
 from perception.vision.registration.register import Registration, register
-from perception.vision.status.button import read_button
-from perception.vision.status.display import read_display
-from perception.vision.status.gauge import read_gauge
-from perception.vision.status.handwheel import read_handwheel
-from perception.vision.status.lamp import read_lamp
-from perception.vision.status.lever import read_lever
-from perception.vision.status.mushroom import read_mushroom
-from perception.vision.status.panel_meter import read_panel_meter
-from perception.vision.status.rotary import read_rotary
-from perception.vision.status.slider import read_slider
-from perception.vision.status.toggle import read_toggle
+from perception.vision.status.reader import patch_of, read_patch, reader_of
 
-MARGIN = 1.25  # of the footprint: readers look at the plate around the object too
-LAMP_MARGIN = 2.0
 MIN_SUPPORT = 0.25  # share of the model's edges that must be found for the panel to be this one
 MIN_EDGE_SHARE = 0.2  # the same for one object
-# Kinds whose reading, when sure, is proof of the object where its outline has the plate's gray, and from which confidence on.
-TELLING, TELLS = frozenset({"gauge", "panel_meter", "display", "rotary"}), 0.9
+TELLS = 0.9  # from this confidence on a reading proves the object although its outline has the plate's gray
 NO_OUTLINE = "the object's outline is not where it should be: check the panel file, or something covers it"
 MIN_RESOLUTION_PX = 10.0  # smaller objects cannot be read
-# Share of a kind's guesses that are right however weak the evidence, but no more than a guess may claim (of 8218 objects on 800
-# drawn hard panels): of two states one is right soon, of many numbers none.
-GUESSES_RIGHT = {
-    "toggle": 0.45, "lever": 0.45, "button": 0.42, "lamp": 0.4, "rotary": 0.4, "handwheel": 0.38, "slider": 0.38,
-    "display": 0.06,
-}  # fmt: skip
 JUMP = 0.25  # of the scale: a larger change since the last reading needs a confident reading
 JUMP_CONFIDENCE = 0.9
 
@@ -133,69 +106,6 @@ def inspect_view(
     return tuple(answer_at(reading, least_confidence) for reading in readings)
 
 
-def read_patch(
-    patch: Patch, spec: PanelObject, *, digits_taught: bool = True, before: float | None = None
-) -> PatchReading:
-    """The status of one object by the reader of its kind; the value `before` tells between a display's likely numbers."""
-    status = _by_kind(patch, spec, digits_taught=digits_taught, before=before)
-    return as_often_right(status, GUESSES_RIGHT.get(spec.kind, 0.0))
-
-
-def _by_kind(patch: Patch, spec: PanelObject, *, digits_taught: bool, before: float | None) -> PatchReading:
-    match spec.kind:
-        case "gauge":
-            return read_gauge(patch, spec)
-        case "panel_meter":
-            return read_panel_meter(patch, spec)
-        case "display":
-            return read_display(patch, spec, digits_taught=digits_taught, before=before)
-        case "lamp":
-            return read_lamp(patch, spec)
-        case "button":
-            return read_button(patch, spec)
-        case "toggle":
-            return read_toggle(patch, spec)
-        case "rotary":
-            return read_rotary(patch, spec)
-        case "slider":
-            return read_slider(patch, spec)
-        case "lever":
-            return read_lever(patch, spec)
-        case "handwheel":
-            return read_handwheel(patch, spec)
-        case "mushroom":
-            return read_mushroom(patch, spec)
-
-
-def patch_of(image: Image, gray: Image, view: PanelProjection, spec: PanelObject, shift_px: Array) -> Patch:
-    """The rectified patch that the reader of this object wants."""
-    half_width, half_height, height = footprint_m(spec)
-    margin = LAMP_MARGIN if spec.kind in ("lamp", "button") else MARGIN
-    plane = 0.0 if spec.kind == "toggle" else height
-    # What stands out appears beside its foot: the patch must hold both.
-    side = 0.012 if spec.kind == "slider" else 0.003
-    if spec.kind == "toggle":  # and the plate beyond its tip, where it must have ended
-        side += _lean_m(view, spec, height) + 2.0 * spec.bat_radius_m
-    return rectify(
-        image,
-        view,
-        spec.position_m,
-        half_width_m=margin * half_width + side,
-        half_height_m=margin * half_height + side,
-        plane_z_m=plane,
-        shift_px=shift_px,
-        gray=gray,
-    )
-
-
-def _lean_m(view: PanelProjection, spec: PanelObject, height_m: float) -> float:
-    """How far beside its foot a point at that height appears, in metres on the plate."""
-    x, y = spec.position_m
-    px = view.project([[x, y, 0.0], [x, y, height_m], [x + 0.01, y, 0.0], [x, y + 0.01, 0.0]])
-    scale = min(float(np.linalg.norm(px[2] - px[0])), float(np.linalg.norm(px[3] - px[0]))) / 0.01
-    return float(np.linalg.norm(px[1] - px[0])) / max(scale, 1e-9)
-
-
 def _inspect_one(
     gray: Image,
     colour: NDArray[Any] | None,
@@ -226,9 +136,9 @@ def _inspect_one(
     if _is_bare(patch, noise):
         return replace(reading, reason="nothing but bare plate where the object should be")
     is_outlined = not registration.edge_share.get(spec.name, float("nan")) < MIN_EDGE_SHARE
-    if not is_outlined and spec.kind not in TELLING:
+    if not is_outlined and not reader_of(spec.kind).is_telling:
         return replace(reading, reason=NO_OUTLINE)
-    if 2 * max(footprint_m(spec)[:2]) * patch.image_px_per_m < MIN_RESOLUTION_PX:
+    if 2 * max(spec.face.half_width_m, spec.face.half_height_m) * patch.image_px_per_m < MIN_RESOLUTION_PX:
         status = refused("the object is too small in this image: come closer")
     else:
         last = None if before is None else before.value
@@ -248,14 +158,9 @@ def plausible(status: PatchReading, spec: PanelObject, before: ObjectReading | N
     """The status, or a refusal when it jumps from the previous value without strong evidence."""
     if before is None or before.value is None or status.value is None or status.confidence >= JUMP_CONFIDENCE:
         return status
-    scale: Scale | None = getattr(spec, "scale", None)
-    if scale is not None:
-        span = scale.maximum - scale.minimum
-    elif isinstance(spec, Display):
-        span = spec.maximum - spec.minimum
-    else:
+    if spec.full_scale is None:
         return status
-    if abs(status.value - before.value) <= JUMP * span:
+    if abs(status.value - before.value) <= JUMP * spec.full_scale:
         return status
     return doubted(
         status,

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from perception.vision import Question
+    from hal.panel import Question
     from service.knowledge.store import KnowledgeStore
 
 MOST_PLATE_M = 10.0

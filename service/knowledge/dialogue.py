@@ -12,12 +12,12 @@ from functools import partial
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from hal.errors import CellError, InvalidRequest
-from hal.panel import OBJECT_KINDS
+from hal.kinds import installed_kinds
+from hal.panel import Question
 from perception.vision import (
     Example,
     Overview,
     PanelObjectDraft,
-    Question,
     check,
     example_at,
     find_border_lights,
@@ -120,8 +120,8 @@ class Dialogue:
     def _object(self, taken: set[str]) -> PanelObjectDraft:
         example, knowledge = self._example()
         seen = likest(self.overview, example, knowledge)
-        suggested = seen.kind if seen is not None and seen.kind in OBJECT_KINDS else ""
-        question = Question(key="kind", text="What kind of object is it?", choices=OBJECT_KINDS, default=suggested)
+        suggested = seen.kind if seen is not None and seen.kind in installed_kinds() else ""
+        question = Question(key="kind", text="What kind of object is it?", choices=installed_kinds(), default=suggested)
         kind = self._until_good(lambda: self._answer(question))
         name_question, *rest = questions(kind)
 

@@ -15,7 +15,7 @@ from scipy.special import chdtri
 from hal.devices import DeviceKind
 from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import UncertainPose, compose
-from hal.panel import Handwheel, Mushroom
+from hal.panel import PanelObject
 from perception.range import RangeScene
 from perception.vision import ObjectReading, viewpoints
 from service.operations.acquisition import Scan, settle
@@ -137,38 +137,38 @@ def need_its_place(checks: Iterable[SurfaceCheck], name: str) -> None:
 
 def _shown(sighting: Sighting) -> str | None:
     """The state by surfaces in the words of vision; a wheel's spokes look the same after each."""
-    panel_object, state = sighting.panel_object, sighting.state
-    if state is None:
+    relief, state = sighting.panel_object.relief, sighting.state
+    if state is None or relief is None:
         return None
-    if isinstance(panel_object, Mushroom):
-        return "pressed" if state < -0.5 * panel_object.pressed_depth_m else "released"
-    return f"{np.degrees(state):.0f} deg (modulo {360 / panel_object.spokes:.0f})"
+    if relief.motion == "slide":
+        return relief.state_name(state)
+    return f"{np.degrees(state):.0f} deg (modulo {360 / relief.turns:.0f})"
 
 
-def _said(panel_object: Mushroom | Handwheel, reading: ObjectReading | None) -> str | None:
+def _said(panel_object: PanelObject, reading: ObjectReading | None) -> str | None:
     if reading is None or not reading.answered:
         return None
-    if isinstance(panel_object, Mushroom) or reading.value is None:
+    if not panel_object.value_is_angle or reading.value is None:
         return reading.state
     return f"{np.degrees(reading.value):.0f} deg"
 
 
 def _shows_alike(sighting: Sighting, reading: ObjectReading | None) -> bool:
     """Do surfaces and vision give the same state? Where one of them gives none, nothing contradicts."""
-    panel_object, match, state = sighting.panel_object, sighting.match, sighting.state
-    if match is None or state is None or reading is None or not reading.answered:
+    relief, match, state = sighting.panel_object.relief, sighting.match, sighting.state
+    if relief is None or match is None or state is None or reading is None or not reading.answered:
         return True
-    if isinstance(panel_object, Mushroom):
+    if relief.motion == "slide":
         return reading.state is None or _shown(sighting) == reading.state
     if reading.value is None:
         return True
-    spoke = 2.0 * np.pi / panel_object.spokes
+    spoke = 2.0 * np.pi / relief.turns
     apart = abs((state - reading.value + 0.5 * spoke) % spoke - 0.5 * spoke)
     sigma = np.hypot(match.state_sigma or 0.0, reading.uncertainty or 0.0)
     return bool(apart <= TURN_SLACK_RAD + 3.0 * sigma)
 
 
-def _look_closer(session: Session, panel_object: Mushroom | Handwheel) -> SurfaceView | str:
+def _look_closer(session: Session, panel_object: PanelObject) -> SurfaceView | str:
     """The scanner square before the object; text says why not."""
     flange_from_scanner = session.mount(session.first(DeviceKind.RANGE_SCANNER)).parent_from_child
     views = viewpoints.close_up_poses(session.known_panel().parent_from_child, panel_object.point_m)

@@ -15,15 +15,13 @@ from hal.arrays import Array
 from hal.devices import DeviceKind
 from hal.errors import InvalidRequest, Unsupported
 from hal.geometry import difference
-from hal.panel import Button, Panel, PanelObject
+from hal.panel import Panel, PanelObject, Shown
 from hal.simulated import ObjectTruth, Truth
 from service.jsonable import jsonable
 from service.processes.connection import CellConnection
 from service.report.write import render, write_json
 from service.schema.results import ActionClaim, EvaluateResult, ReadingClaim, UnaskedMotion
 
-GAUGE_SHARE = 0.02  # of full scale: a reading further off is wrong
-WHEEL_RAD = 0.105
 AFTER = "after the actions"
 
 
@@ -76,7 +74,7 @@ def compare(report: dict[str, Any], truth: Truth, panel: Panel) -> EvaluateResul
         for k, reading in enumerate(report["readings"])
         if reading["reason"] is None and reading["present"] and not _is_outdated(k, report["readings"])
     ]
-    newest = {_shown_by(action["object"], panel): action for action in report["actions"]}
+    newest = {panel.object(action["object"]).shown_by: action for action in report["actions"]}
     actions = [_action_claim(action, before, after, panel) for action in newest.values()]
     pose = _pose_error(report.get("fused"), truth)
     return EvaluateResult(
@@ -120,25 +118,13 @@ def _reading_claim(reading: dict[str, Any], truth: ObjectTruth, panel: Panel) ->
         what=f"read {reading['when']}",
         claimed=reading["shows"],
         truth=_shown(truth),
-        right=agrees(spec, truth, value=reading["value"], state=reading["state"], text=reading["text"]),
+        right=spec.is_right(Shown(**{key: reading[key] for key in ("value", "state", "text")}), shown_of(truth)),
     )
 
 
-def agrees(
-    spec: PanelObject, truth: ObjectTruth, *, value: float | None, state: str | None, text: str | None = None
-) -> bool:
-    """Is what was said of an object true, within 2 % of full scale (6 degrees for a wheel) and exactly for states?"""
-    if spec.kind == "display":
-        return text is not None and text.strip() == (truth.text or "").strip()
-    if truth.state is not None:
-        return state == truth.state
-    if value is None or truth.value is None:
-        return False
-    if spec.kind == "handwheel":
-        return bool(abs((value - truth.value + np.pi) % (2 * np.pi) - np.pi) <= WHEEL_RAD)
-    scale = getattr(spec, "scale", None)
-    span = scale.maximum - scale.minimum if scale is not None else 1.0
-    return bool(abs(value - truth.value) <= GAUGE_SHARE * span)
+def shown_of(truth: ObjectTruth) -> Shown:
+    """The simulator's answer in the words of the panel file."""
+    return Shown(value=truth.value, state=truth.state, text=truth.text)
 
 
 def _action_claim(
@@ -164,40 +150,22 @@ def _is_outdated(k: int, readings: list[dict[str, Any]]) -> bool:
     return readings[k]["when"] == AFTER and asked in [(later["name"], later["when"]) for later in readings[k + 1 :]]
 
 
-def _shown_by(name: str, panel: Panel) -> str:
-    """What shows that a control was worked: itself, or the lamp of a button."""
-    spec = panel.object(name)
-    return spec.lights_lamp if isinstance(spec, Button) and spec.lights_lamp is not None else name
-
-
 def _moved_unasked(
     actions: list[dict[str, Any]], before: dict[str, ObjectTruth], after: dict[str, ObjectTruth], panel: Panel
 ) -> list[UnaskedMotion]:
     """What shows something else than before and was not worked, nor is lit by what was."""
     worked = {action["object"] for action in actions}
-    worked |= {
-        panel_object.lights_lamp
-        for panel_object in panel.objects
-        if isinstance(panel_object, Button) and panel_object.name in worked
-    }
+    worked |= {panel.object(name).shown_by for name in worked}
     return [
         UnaskedMotion(name=name, truth=f"{_shown(was)} to {_shown(after[name])}")
         for name, was in before.items()
-        if name not in worked
-        and not agrees(panel.object(name), after[name], value=was.value, state=was.state, text=was.text)
+        if name not in worked and not panel.object(name).is_right(shown_of(was), shown_of(after[name]))
     ]
 
 
 def _reached(spec: PanelObject, action: dict[str, Any], after: dict[str, ObjectTruth]) -> bool:
-    target, now = action["target"], after[spec.name]
-    if spec.kind == "button" and spec.lights_lamp is not None:
-        return bool(after[spec.lights_lamp].state == target)  # a button springs back: what it works is what counts
-    if spec.kind == "slider":
-        span = spec.scale.maximum - spec.scale.minimum
-        return now.value is not None and bool(abs(now.value - float(target)) <= GAUGE_SHARE * span)
-    if spec.kind == "handwheel":
-        return now.value is not None and bool(abs(now.value - float(target)) <= WHEEL_RAD)
-    return bool(now.state == target)
+    """Whether what shows the deed truly shows its target."""
+    return spec.goal is not None and spec.goal.is_reached(action["target"], shown_of(after[spec.shown_by]))
 
 
 def _shown(truth: ObjectTruth) -> str:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from hal.errors import PerceptionError, Unreachable
-from hal.panel import Button, Handwheel, Lever, PanelObject, Rotary
+from hal.panel import PanelObject
 from manipulation import ObjectState, SkillReport, Verify, operate
 from perception.vision import ObjectReading, said
 from service.operations.inspect import ensure_located, look_close, look_past
 from service.operations.session import Session
-from service.operations.targets import target_of
+from service.operations.targets import target_of, text_of
 from service.operations.travel import skill_context
 from service.report.plots import png_of
 from service.report.record import Picture
@@ -47,7 +47,7 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
         action=ActionResult(
             object=panel_object.name,
             skill=report.skill,
-            target=target if isinstance(target, str) else f"{target:g}",
+            target=text_of(panel_object, target),
             outcome=str(report.outcome),
             detail="" if reached else report.cause,
             before="not read" if before is None else said(before),
@@ -82,7 +82,7 @@ class _Eye:
         self._session = session
         self._panel_object = panel_object
         self._is_open = is_open
-        self.witness = _witness(session, panel_object)
+        self.witness = session.panel.object(panel_object.shown_by)
         self.last: ObjectReading | None = None
         self.picture: Picture | None = None
 
@@ -120,15 +120,8 @@ class _Eye:
 
 def state_of(reading: ObjectReading, panel_object: PanelObject) -> ObjectState:
     """A reading in the words of the skills."""
-    angle_rad = reading.value if isinstance(panel_object, Handwheel | Lever) else None
-    if angle_rad is None and isinstance(panel_object, Lever | Rotary) and reading.state is not None:
-        angle_rad = next((s.angle_rad for s in panel_object.states if s.name == reading.state), None)
+    angle_rad = reading.value if panel_object.value_is_angle else None
+    if angle_rad is None and reading.state is not None:
+        angle_rad = panel_object.resting_angles.get(reading.state)
     sigma = 0.0 if reading.uncertainty is None else reading.uncertainty
     return ObjectState(name=reading.name, state=reading.state, value=reading.value, angle_rad=angle_rad, sigma=sigma)
-
-
-def _witness(session: Session, panel_object: PanelObject) -> PanelObject:
-    """What shows that the deed worked: a button that springs back shows it by its lamp."""
-    if isinstance(panel_object, Button) and panel_object.lights_lamp is not None:
-        return session.panel.object(panel_object.lights_lamp)
-    return panel_object

@@ -12,9 +12,9 @@ import numpy as np
 
 from fusion import Observation
 from hal.devices import DeviceKind
-from hal.errors import CellError, DeviceError
+from hal.errors import CellError, DeviceError, InvalidRequest
 from hal.geometry import compose
-from hal.panel import Button, Lever, PanelObject, Slider, Toggle
+from hal.panel import PanelObject, Shown
 from perception.vision import ObjectReading
 from service.operations.acquisition import settle
 from service.operations.context import OperationContext
@@ -163,40 +163,22 @@ def _work_all(session: Session, record: MissionRecord, request: MissionRequest, 
 
 
 def usual_actions(session: Session) -> tuple[ActionBody, ...]:
-    """The first lever by 90 degrees, the first slider to another value, a button that shows it, the first toggle."""
+    """For each kind that ranks itself, its best-placed object is brought to another state or value than it shows now."""
     readings = session.world.readings
-    actions: list[ActionBody] = []
-    for kind in (Lever, Slider, Button, Toggle):
-        things = [panel_object for panel_object in session.panel.objects if isinstance(panel_object, kind)]
-        if kind is Button:  # one that springs back and works no lamp shows nothing that could be confirmed
-            buttons = [panel_object for panel_object in things if isinstance(panel_object, Button)]
-            lit = [button for button in buttons if button.lights_lamp is not None]
-            things = [*lit, *(button for button in buttons if button.latching)]
-        if things:
-            actions.append(_other(things[0], readings))
-    return tuple(actions)
+    ranked = [(one.mission_rank, one) for one in session.panel.objects if one.mission_rank is not None]
+    first: dict[str, PanelObject] = {}
+    for _, panel_object in sorted(ranked, key=lambda pair: pair[0]):
+        first.setdefault(panel_object.kind, panel_object)
+    return tuple(_other(panel_object, readings) for panel_object in first.values())
 
 
 def _other(panel_object: PanelObject, readings: Mapping[str, ObjectReading]) -> ActionBody:
-    """The deed that changes what the object shows now."""
-    reading = readings.get(panel_object.name)
-    state = reading.state if reading is not None else None
-    match panel_object:
-        case Lever():
-            return ActionBody(
-                object=panel_object.name, state=next(s.name for s in panel_object.states if s.name != state)
-            )
-        case Slider():
-            low, high = panel_object.scale.minimum, panel_object.scale.maximum
-            near, far = low + 0.3 * (high - low), low + 0.7 * (high - low)
-            shown = reading.value if reading is not None and reading.value is not None else low
-            return ActionBody(object=panel_object.name, value=far if abs(far - shown) > abs(near - shown) else near)
-        case Button(lights_lamp=str(lamp)):
-            lit = lamp in readings and readings[lamp].state == "on"
-            return ActionBody(object=panel_object.name, state="off" if lit else "on")
-        case Button():
-            return ActionBody(object=panel_object.name, state="released" if state == "pressed" else "pressed")
-    return ActionBody(object=panel_object.name, state="off" if state == "on" else "on")
+    """The deed that changes what the object, or what it works, shows now."""
+    reading, goal = readings.get(panel_object.shown_by), panel_object.goal
+    if goal is None:
+        raise InvalidRequest(f"{panel_object.name} is read only", hint="leave it out of the mission")
+    shown = Shown() if reading is None else Shown(value=reading.value, state=reading.state, text=reading.text)
+    return ActionBody.model_validate({"object": panel_object.name, goal.key: goal.other_than(shown)})
 
 
 @contextmanager

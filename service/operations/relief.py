@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,11 +10,18 @@ from scipy.spatial.transform import RigidTransform
 from hal.arrays import Array
 from hal.errors import Unsupported
 from hal.geometry import UncertainPose, compose, point_covariance
-from hal.panel import Handwheel, Mushroom, Panel
-from perception.range import ComponentModel, Match, PinholeSensor, RangeScene, Surface, analyse, match_models
+from hal.panel import Panel, PanelObject, Relief
+from perception.range import (
+    ComponentModel,
+    Match,
+    PinholeSensor,
+    RangeScene,
+    Surface,
+    analyse,
+    match_models,
+    models_from,
+)
 from service.operations.acquisition import Scan
-from service.operations.relief_models import models_of
-from service.operations.spots import half_footprint_m
 from service.report.surfaces import Mark
 
 NEAR_M = 0.02  # a match further from where the file has its object is another thing; three sigmas of the belief beside
@@ -33,7 +39,7 @@ class Sighting:
         state: how far a mushroom is pressed in (m, 0 to -travel), or a wheel's angle clockwise (rad, modulo one spoke).
     """
 
-    panel_object: Mushroom | Handwheel
+    panel_object: PanelObject
     match: Match | None = None
     base_from_object: UncertainPose | None = None
     off_m: float | None = None
@@ -55,6 +61,13 @@ def surfaces_in(image: Scan) -> RangeScene:
     return analyse(image.depth_m, sensor)
 
 
+def models_of(panel: Panel) -> dict[str, ComponentModel]:
+    """A model for each object of the panel file that range images are searched for, by the object's name."""
+    tables = {one.name: one.relief.table() for one in panel.objects if one.relief is not None}
+    models = models_from({"model": tables}, where=f"panel {panel.name}") if tables else ()
+    return {model.name: model for model in models}
+
+
 def find_by_surfaces(
     scene: RangeScene, image: Scan, panel: Panel, base_from_panel: UncertainPose, plate: Surface
 ) -> list[Sighting]:
@@ -64,31 +77,34 @@ def find_by_surfaces(
         plate: the plane that they stand on, in the scanner's frame.
         base_from_panel: where the panel is believed to be; it tells two of a kind apart.
     """
-    models = models_of(panel)
-    things = [panel_object for panel_object in panel.objects if isinstance(panel_object, Mushroom | Handwheel)]
-    if not things:
+    reliefs = {one.name: one.relief for one in panel.objects if one.relief is not None}
+    if not reliefs:
         return []
+    models = models_of(panel)
     depth = np.asarray(image.depth_m, float)
     panel_from_scanner = base_from_panel.parent_from_child.inv() * image.base_from_scanner.parent_from_child
     points = panel_from_scanner.apply(scene.sensor.points(depth).reshape(-1, 3)).reshape(*depth.shape, 3)
-    return [_sighting(panel_object, models, scene, image, points, base_from_panel, plate) for panel_object in things]
+    return [
+        _sighting(panel.object(name), relief, models[name], scene, image, points, base_from_panel, plate)
+        for name, relief in reliefs.items()
+    ]
 
 
 def _sighting(
-    panel_object: Mushroom | Handwheel, models: Mapping[str, ComponentModel], scene: RangeScene, image: Scan, points: Array,
+    panel_object: PanelObject, relief: Relief, model: ComponentModel, scene: RangeScene, image: Scan, points: Array,
     base_from_panel: UncertainPose, plate: Surface,
 ) -> Sighting:  # fmt: skip
     """Of `points` (H, W, 3), in the panel's frame, only those about the object are looked at: that is what keeps it quick."""
     away = np.abs(points[..., :2] - panel_object.position_m).max(axis=-1)
-    half = max(half_footprint_m(panel_object))
+    half = max(panel_object.half_footprint_m)
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(point_covariance(base_from_panel, panel_object.point_m))[-1]))
     reach_m = NEAR_M + 3.0 * sigma_m
     if np.count_nonzero(away < half + 3.0 * sigma_m) < LEAST_PIXELS:
         return Sighting(panel_object=panel_object, why="not in the scanner's view")
-    near = np.where(away < half + panel_object.height_m + reach_m, np.asarray(image.depth_m, float), np.nan)
+    near = np.where(away < half + relief.height_m + reach_m, np.asarray(image.depth_m, float), np.nan)
     expected = base_from_panel.parent_from_child.apply([*panel_object.position_m, 0.0])
     found = []
-    for match in match_models(scene, near, (models[panel_object.name],), panel=plate):
+    for match in match_models(scene, near, (model,), panel=plate):
         pose = compose(image.base_from_scanner, match.sensor_from_object)
         found.append((float(np.linalg.norm(pose.parent_from_child.translation - expected)), pose, match))
     if not found:
@@ -98,15 +114,15 @@ def _sighting(
         return Sighting(
             panel_object=panel_object, why=f"the nearest like it stands {1e3 * off_m:.0f} mm from its place"
         )
-    state = _state(panel_object, match, base_from_panel.parent_from_child.inv() * pose.parent_from_child)
+    state = _state(relief, match, base_from_panel.parent_from_child.inv() * pose.parent_from_child)
     return Sighting(panel_object=panel_object, match=match, base_from_object=pose, off_m=off_m, state=state)
 
 
-def _state(panel_object: Mushroom | Handwheel, match: Match, panel_from_object: RigidTransform) -> float | None:
-    if isinstance(panel_object, Mushroom):
+def _state(relief: Relief, match: Match, panel_from_object: RigidTransform) -> float | None:
+    if relief.motion == "slide":
         return match.state
     x, y, _ = panel_from_object.rotation.apply([1.0, 0.0, 0.0])
-    return float(-np.arctan2(y, x) % (2.0 * np.pi / panel_object.spokes))
+    return float(-np.arctan2(y, x) % (2.0 * np.pi / relief.turns))
 
 
 def mark_of(sighting: Sighting, image: Scan, base_from_panel: UncertainPose) -> Mark:
@@ -119,10 +135,9 @@ def mark_of(sighting: Sighting, image: Scan, base_from_panel: UncertainPose) -> 
         else base_from_panel.parent_from_child * RigidTransform.from_translation([*panel_object.position_m, 0.0])
     )
     turn = np.linspace(0.0, 2.0 * np.pi, OUTLINE_POINTS, endpoint=False)
-    radius = max(half_footprint_m(panel_object))
-    ring = np.stack(
-        [radius * np.cos(turn), radius * np.sin(turn), np.full(OUTLINE_POINTS, panel_object.height_m)], axis=-1
-    )
+    radius, relief = max(panel_object.half_footprint_m), panel_object.relief
+    height_m = 0.0 if relief is None else relief.height_m
+    ring = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(OUTLINE_POINTS, height_m)], axis=-1)
     x, y, z = (image.base_from_scanner.parent_from_child.inv() * base_from_object).apply(ring).T
     c, depth = image.capabilities, np.maximum(z, 1e-3)
     return Mark(

@@ -54,26 +54,6 @@ def room_m(panel: Panel, points: Array) -> Array:
 
 def _distance_to(points: Array, panel_object: PanelObject) -> Array:
     """From (N, 2) panel points to the footprint of an object, in any of its states; negative inside."""
-    half = np.array(half_footprint_m(panel_object))
+    half = np.array(panel_object.half_footprint_m)
     outside = np.abs(points - np.array(panel_object.position_m)) - half
     return np.asarray(np.linalg.norm(np.maximum(outside, 0.0), axis=1) + np.minimum(outside.max(axis=1), 0.0))
-
-
-def half_footprint_m(panel_object: PanelObject) -> tuple[float, float]:
-    """Half width and half height of the upright box on the plate that holds an object in any state."""
-    match panel_object.kind:
-        case "lever":
-            reach = panel_object.length_m + panel_object.width_m
-            return reach, reach
-        case "slider":
-            along = panel_object.travel_m / 2 + panel_object.cap_size_m[0] / 2
-            c, s = abs(np.cos(panel_object.angle_rad)), abs(np.sin(panel_object.angle_rad))
-            across = panel_object.cap_size_m[1] / 2
-            return float(c * along + s * across), float(s * along + c * across)
-        case "toggle":
-            return panel_object.bat_length_m, panel_object.bat_length_m
-        case "panel_meter" | "display":
-            return panel_object.width_m / 2, panel_object.height_m / 2
-        case "handwheel":
-            return panel_object.radius_m + panel_object.rim_m, panel_object.radius_m + panel_object.rim_m
-    return panel_object.radius_m, panel_object.radius_m

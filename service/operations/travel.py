@@ -15,7 +15,6 @@ from hal.devices import DeviceKind
 from hal.errors import Unreachable
 from hal.geometry import transform_rpy
 from hal.motion import MotionReport
-from hal.panel import Lever
 from manipulation import (
     QUICK,
     THOROUGH,
@@ -170,14 +169,12 @@ def kinematics(session: Session) -> Kinematics:
 
 
 def lever_angles(session: Session) -> Mapping[str, float]:
-    """Angles of the levers whose state has been read."""
+    """Angles of the levers and selectors whose state has been read."""
     readings = session.world.readings
     return {
-        lever.name: state.angle_rad
-        for lever in session.panel.objects
-        if isinstance(lever, Lever) and lever.name in readings
-        for state in lever.states
-        if state.name == readings[lever.name].state
+        name: angles[state]
+        for name, angles in ((one.name, one.resting_angles) for one in session.panel.objects)
+        if name in readings and (state := readings[name].state) is not None and state in angles
     }
 
 

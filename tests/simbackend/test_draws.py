@@ -11,8 +11,9 @@ from hal.calibration import CameraIntrinsics, MountRecord, ToolLoad
 from hal.config import load_cell
 from hal.geometry import difference, transform_rpy
 from hal.panel import Button, Display, Gauge, Lamp, PanelMeter, Slider
+from simbackend.bodies.display import display_text
 from simbackend.draws import Draws
-from simbackend.panel_state import build, display_text
+from simbackend.panel_state import build
 from tests.simbackend.rig import BENCH
 
 CELL = load_cell(BENCH)
@@ -77,13 +78,13 @@ def test_what_a_seeded_panel_shows_is_within_its_scales(seed: int) -> None:
     for item in built.values():
         panel_object = item.panel_object
         if isinstance(panel_object, (Gauge, PanelMeter, Slider)):
-            assert item.value is not None
-            assert panel_object.scale.minimum <= item.value <= panel_object.scale.maximum
-            assert panel_object.scale.value_at(item.place) == pytest.approx(item.value)
+            assert item.start.value is not None
+            assert panel_object.scale.minimum <= item.start.value <= panel_object.scale.maximum
+            assert panel_object.scale.value_at(item.start.place) == pytest.approx(item.start.value)
         if isinstance(panel_object, Display):
-            assert float(item.text or "nan") == pytest.approx(item.value)
+            assert float(item.start.text or "nan") == pytest.approx(item.start.value)
         if isinstance(panel_object, Button) and not panel_object.latching:
-            assert not item.is_on
+            assert not item.start.is_on
 
 
 def test_a_lamp_that_a_button_lights_begins_dark() -> None:
@@ -96,11 +97,11 @@ def test_a_lamp_that_a_button_lights_begins_dark() -> None:
     for seed in range(20):
         for item in build(CELL.panel, Draws(seed)):
             if isinstance(item.panel_object, Lamp) and item.panel_object.name in lit:
-                assert not item.is_on
+                assert not item.start.is_on
 
 
 def test_states_differ_from_seed_to_seed() -> None:
-    shown = {tuple(round(item.place, 6) for item in build(CELL.panel, Draws(seed))) for seed in range(5)}
+    shown = {tuple(round(item.start.place, 6) for item in build(CELL.panel, Draws(seed))) for seed in range(5)}
     assert len(shown) == 5
 
 

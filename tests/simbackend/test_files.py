@@ -10,7 +10,8 @@ import pytest
 
 from hal.config import load_cell
 from hal.errors import ConfigError
-from hal.panel import OBJECT_KINDS, Gauge, Lever, load_panel
+from hal.kinds import installed_kinds
+from hal.panel import Gauge, Lever, load_panel
 from tests.simbackend.rig import ROOT, SimCell, sim_cell
 
 PANEL = load_panel(ROOT / "panels" / "bench.toml")
@@ -18,7 +19,7 @@ WORKED = {"button", "toggle", "rotary", "slider", "lever", "handwheel", "mushroo
 
 
 def test_the_bench_panel_has_every_kind_and_a_gauge_that_is_not_linear() -> None:
-    assert {panel_object.kind for panel_object in PANEL.objects} == set(OBJECT_KINDS)
+    assert {panel_object.kind for panel_object in PANEL.objects} == set(installed_kinds())
     gauges = [panel_object for panel_object in PANEL.objects if isinstance(panel_object, Gauge)]
     assert len(gauges) == 2
     assert sorted(bool(gauge.scale.table) for gauge in gauges) == [False, True]

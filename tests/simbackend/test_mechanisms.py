@@ -10,9 +10,9 @@ import pybullet
 import pytest
 
 from hal.panel import Button, Lever, Mushroom, Scale, Slider, State, Toggle
+from simbackend.bodies.body import Start, body_of
+from simbackend.bodies.parts import robot
 from simbackend.mechanisms import JOINT, Detent, Friction, Spring
-from simbackend.panel_model import object_model, robot
-from simbackend.panel_state import Built
 
 DT_S = 0.002
 
@@ -39,9 +39,9 @@ def engine() -> Iterator[Engine]:
 
 
 def load(engine: Engine, folder: Path, panel_object: Any, place: float = 0.0) -> int:
-    built = Built(panel_object=panel_object, offset_m=(0.0, 0.0), effort_ratio=1.0, place=place)
+    model = body_of(panel_object.kind).model(panel_object, Start(place=place))
     path = folder / "part.urdf"
-    path.write_text(robot(object_model(built).urdf), encoding="ascii")
+    path.write_text(robot(model.urdf), encoding="ascii")
     body = int(engine.loadURDF(str(path), useFixedBase=True, flags=engine.URDF_USE_INERTIA_FROM_FILE))
     engine.resetJointState(body, JOINT, place)
     return body

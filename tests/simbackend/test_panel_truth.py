@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from hal.panel import Gauge, Lamp, Lever, Scale, State, Toggle
-from simbackend.panel_state import Built
-from simbackend.panel_truth import nearest_state, truth_of
+from simbackend.bodies.body import Start, body_of
+from simbackend.bodies.parts import nearest_state
 
 STATES = (State(name="open", angle_rad=0.0), State(name="closed", angle_rad=1.57))
 
@@ -32,7 +32,7 @@ class At:
 
 
 def truth(panel_object: Any, place: float, *, lamp: bool = False) -> Any:
-    return truth_of(Built(panel_object=panel_object, offset_m=(0.0, 0.0), effort_ratio=1.0), At(place), lamp_is_on=lamp)
+    return body_of(panel_object.kind).truth(panel_object, Start(), At(place), is_lit=lamp)
 
 
 @pytest.mark.parametrize(("angle", "state"), [(0.1, "open"), (1.5, "closed"), (0.8, None), (-0.5, None)])

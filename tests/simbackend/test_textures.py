@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from hal.arrays import Array
 from hal.panel import Display, Gauge, Scale, load_panel
 from simbackend import textures
+from simbackend.bodies.display import SEGMENTS, display_face
+from simbackend.bodies.gauge import gauge_face
 from tests.simbackend.rig import ROOT
 
 TABLE = ((-1.2, 20.0), (0.6, 60.0))
@@ -34,14 +36,14 @@ def at_angle(face: Array, angle_rad: float, radius_ratio: float) -> float:
 
 
 def test_major_ticks_stand_where_the_scale_puts_its_values() -> None:
-    face = grey(textures.gauge_face(GAUGE))
+    face = grey(gauge_face(GAUGE))
     for value in np.linspace(0.0, 100.0, 6):
         assert at_angle(face, GAUGE.scale.place_of(float(value)), 0.78) < 120, value
     assert at_angle(face, np.pi, 0.78) > 200  # the gap at the bottom
 
 
 def test_the_face_has_a_dark_rim_and_a_white_ground() -> None:
-    face = grey(textures.gauge_face(GAUGE))
+    face = grey(gauge_face(GAUGE))
     assert at_angle(face, 0.3, 0.96) < 60
     assert at_angle(face, np.pi, 0.2) > 220
 
@@ -49,16 +51,16 @@ def test_the_face_has_a_dark_rim_and_a_white_ground() -> None:
 @pytest.mark.parametrize("digit", "0123456789")
 def test_every_digit_lights_its_own_segments(digit: str) -> None:
     panel_object = Display(name="d", position_m=(0.0, 0.0), width_m=0.03, height_m=0.04, digits=1)
-    face = grey(textures.display_face(panel_object, digit))
+    face = grey(display_face(panel_object, digit))
     lit = np.count_nonzero(face > 80)
-    full = np.count_nonzero(grey(textures.display_face(panel_object, "8")) > 80)
-    expected = len(textures.SEGMENTS[digit]) / 7
+    full = np.count_nonzero(grey(display_face(panel_object, "8")) > 80)
+    expected = len(SEGMENTS[digit]) / 7
     assert lit / full == pytest.approx(expected, abs=0.05)
 
 
 def test_ten_digits_make_ten_pictures() -> None:
     panel_object = Display(name="d", position_m=(0.0, 0.0), width_m=0.03, height_m=0.04, digits=1)
-    assert len({textures.display_face(panel_object, str(digit)).tobytes() for digit in range(10)}) == 10
+    assert len({display_face(panel_object, str(digit)).tobytes() for digit in range(10)}) == 10
 
 
 def test_the_plate_is_light_and_printed(tmp_path: Path) -> None:

@@ -28,23 +28,16 @@ class Outline:
 
 def edges_of(panel_object: PanelObject) -> Outline | None:
     """The edges that every state shows; None for kinds whose fixed parts the panel file leaves open."""
+    rim = panel_object.rim
+    if rim is None:
+        return None
     x, y = panel_object.position_m
-    match panel_object.kind:
-        case "gauge":
-            # The rim lies at the plate; only the needle stands `depth_m` above it. The face begins inside the rim.
-            return replace(_circle(x, y, 0.0, panel_object.radius_m), reach_m=0.12 * panel_object.radius_m)
-        case "lamp":
-            return _circle(x, y, 0.0, panel_object.radius_m)
-        case "handwheel":
-            return _circle(x, y, panel_object.height_m - panel_object.rim_m, panel_object.radius_m + panel_object.rim_m)
-        case "rotary":
-            return _circle(x, y, panel_object.height_m / 2, panel_object.radius_m)
-        case "panel_meter":
-            return rectangle(x, y, 0.0, width_m=panel_object.width_m, height_m=panel_object.height_m, count=SIDE_POINTS)
-        case "display":
-            return rectangle(x, y, 0.0, width_m=panel_object.width_m, height_m=panel_object.height_m, count=SIDE_POINTS)
-        case _:
-            return None
+    if rim.shape == "circle":
+        edges = _circle(x, y, rim.above_plate_m, rim.width_m / 2)
+    else:
+        size = {"width_m": rim.width_m, "height_m": rim.height_m}
+        edges = rectangle(x, y, rim.above_plate_m, **size, count=SIDE_POINTS)
+    return replace(edges, reach_m=rim.reach_m)
 
 
 def plate_edges(panel: Panel) -> Outline:
@@ -52,36 +45,10 @@ def plate_edges(panel: Panel) -> Outline:
     return rectangle(0.0, 0.0, 0.0, width_m=panel.width_m, height_m=panel.height_m, count=PLATE_POINTS)
 
 
-def footprint_m(panel_object: PanelObject) -> tuple[float, float, float]:
-    """Half width, half height and the height above the plate of the box that holds the object, metres."""
-    match panel_object.kind:
-        case "gauge":
-            return panel_object.radius_m, panel_object.radius_m, panel_object.depth_m
-        case "panel_meter":
-            return panel_object.width_m / 2, panel_object.height_m / 2, panel_object.depth_m
-        case "display":
-            return panel_object.width_m / 2, panel_object.height_m / 2, 0.0
-        case "lamp" | "button" | "mushroom" | "rotary":
-            return panel_object.radius_m, panel_object.radius_m, panel_object.height_m
-        case "handwheel":
-            outer = panel_object.radius_m + panel_object.rim_m
-            return outer, outer, panel_object.height_m - panel_object.rim_m
-        case "toggle":
-            reach = panel_object.bat_length_m * np.sin(panel_object.tilt_rad) + panel_object.bat_radius_m
-            half_width = max(3.0 * panel_object.bat_radius_m, 0.010)
-            return half_width, max(reach, half_width), panel_object.bat_length_m * np.cos(panel_object.tilt_rad)
-        case "slider":
-            along = panel_object.travel_m / 2 + panel_object.cap_size_m[0] / 2
-            across = panel_object.cap_size_m[1] / 2
-            c, s = abs(np.cos(panel_object.angle_rad)), abs(np.sin(panel_object.angle_rad))
-            return along * c + across * s, along * s + across * c, panel_object.cap_size_m[2]
-        case "lever":
-            return panel_object.length_m, panel_object.length_m, panel_object.height_m
-
-
 def box_m(panel_object: PanelObject) -> Array:
     """(4, 3) corners of the object's footprint, upper left first and clockwise as the viewer sees it."""
-    w, h, z = footprint_m(panel_object)
+    face = panel_object.face
+    w, h, z = face.half_width_m, face.half_height_m, face.height_m
     x, y = panel_object.position_m
     return np.array([[x - w, y + h, z], [x + w, y + h, z], [x + w, y - h, z], [x - w, y - h, z]])
 
@@ -91,8 +58,8 @@ def contour_m(panel_object: PanelObject) -> Array:
     edges = edges_of(panel_object)
     if edges is not None:
         return edges.points_m
-    if panel_object.kind in ("button", "mushroom"):
-        return _circle(*panel_object.position_m, footprint_m(panel_object)[2], footprint_m(panel_object)[0]).points_m
+    if panel_object.is_round:
+        return _circle(*panel_object.position_m, panel_object.face.height_m, panel_object.face.half_width_m).points_m
     return box_m(panel_object)
 
 

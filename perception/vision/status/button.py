@@ -8,6 +8,7 @@ from hal.panel import Button, Mushroom
 from perception.vision.patch import Patch
 from perception.vision.reading import ALIKE, NO_EDGE, PatchReading, doubted, gated, refused
 from perception.vision.status.press import cap_height
+from perception.vision.status.reader import LAMP_MARGIN, Reader
 from perception.vision.status.shade import cap_shades
 
 SHADE_HALF, SHADE_SCALE = 0.06, 0.03  # .95 of 179 drawn flush caps stay below 0.062, half of the others exceed 0.068
@@ -22,18 +23,22 @@ UNSEEN = "the button cannot be seen (glare, shadow or cover): change the angle o
 
 def read_button(patch: Patch, spec: Button) -> PatchReading:
     """State of a push button. `patch` shows any plane near the cap."""
-    return read_cap(patch, spec)
+    return read_cap(patch, spec, foot_m=0.0)
 
 
-def read_cap(patch: Patch, spec: Button | Mushroom) -> PatchReading:
-    """`pressed` or `released` by the height of the cap, else by its one-sided shade."""
+def read_cap(patch: Patch, spec: Button | Mushroom, *, foot_m: float | None) -> PatchReading:
+    """`pressed` or `released` by the height of the cap, else by its one-sided shade.
+
+    Args:
+        foot_m: height of the foot of its wall; None when the wall moves with the cap.
+    """
     R = spec.radius_m
     a = np.linspace(0, 2 * np.pi, 24)
     seen = patch.seen(np.outer([0.5, 0.8, 1.0], np.sin(a)) * R, np.outer([0.5, 0.8, 1.0], np.cos(a)) * R)
     by_height = patch.growth_per_m > 0
     if seen < 0.4 and not by_height:  # edges show beside saturation, shades do not
         return refused(UNSEEN)
-    evidence = _by_height(patch, spec) if by_height else _by_shade(patch, R)
+    evidence = _by_height(patch, spec, foot_m) if by_height else _by_shade(patch, R)
     if evidence is None:
         return refused(UNSEEN if seen < 0.4 else NO_EDGE)
     confidence = float(1.0 / (1.0 + np.exp(-abs(evidence)))) * (1.0 if by_height else min(1.0, seen + 0.2))
@@ -43,11 +48,10 @@ def read_cap(patch: Patch, spec: Button | Mushroom) -> PatchReading:
     return gated(PatchReading(state=state, confidence=confidence))
 
 
-def _by_height(patch: Patch, spec: Button | Mushroom) -> float | None:
+def _by_height(patch: Patch, spec: Button | Mushroom, foot_m: float | None) -> float | None:
     """Log odds of `released` from the measured height."""
-    foot = 0.0 if spec.kind == "button" else None  # a mushroom's head moves as a whole
     lowest, high = spec.height_m - spec.travel_m, spec.height_m
-    cap = cap_height(patch, radius_m=spec.radius_m, low_m=lowest, high_m=high, foot_m=foot)
+    cap = cap_height(patch, radius_m=spec.radius_m, low_m=lowest, high_m=high, foot_m=foot_m)
     if cap is None:
         return None
     depth = spec.pressed_depth_m
@@ -64,3 +68,6 @@ def _by_shade(patch: Patch, radius_m: float) -> float | None:
     if np.isnan(spot):
         return None if np.isnan(shade) else float(np.clip(shade, -ALONE, ALONE)) + below
     return (max(spot, -ALONE) if np.isnan(shade) else shade + spot) + below
+
+
+READER = Reader[Button](read=read_button, guesses_right=0.42, margin=LAMP_MARGIN)

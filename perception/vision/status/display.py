@@ -25,6 +25,7 @@ from perception.vision.status.glyphs import CLOSE, LEAST_SEEN, LIT, NAMES, Numbe
 from perception.vision.status.ink import segment_ink, without_border
 from perception.vision.status.levels import loop_levels, segment_levels, with_hidden_ends, without_frames
 from perception.vision.status.occluder_bands import hidden_by_bands
+from perception.vision.status.reader import Hints, Reader
 from perception.vision.status.stray import leaves_out, stray_ink
 
 MARGIN = 0.09  # share of the smaller side that a frame may take
@@ -334,3 +335,14 @@ def _working_size(gray: Image, hidden: NDArray[np.bool_] | None) -> tuple[Image,
     if hidden is None or not hidden.any():
         return small, None
     return small, cv2.resize(hidden.astype(np.uint8) * 4, size, interpolation=cv2.INTER_LINEAR) > 1
+
+
+class _DisplayReader(Reader[Display]):
+    """Tells a display's reader how many digits were taught, and what it showed before."""
+
+    def status(self, patch: Patch, spec: Display, hints: Hints) -> PatchReading:
+        """Text and value of a display."""
+        return read_display(patch, spec, digits_taught=hints.digits_taught, before=hints.before)
+
+
+READER = _DisplayReader(read=read_display, guesses_right=0.06, is_telling=True)

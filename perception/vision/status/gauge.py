@@ -9,6 +9,7 @@ from perception.vision.patch import Patch
 from perception.vision.reading import PatchReading, doubted, gated, probability, refused
 from perception.vision.status.occluder_bands import MOST_COVERED, lying_across
 from perception.vision.status.pointer import PointerFit, find_pointer, wrapped
+from perception.vision.status.reader import Reader
 
 POINTER_FROM, POINTER_TO = 0.25, 0.60  # share of the radius over which every gauge pointer has ink and no numeral is
 FINE_TO = 0.48  # numerals begin at half of the radius: blurred, they pulled pointers beside them by up to 6 degrees
@@ -109,3 +110,6 @@ def _seen(patch: Patch, radius_m: float) -> float:
     a = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     r = np.array([0.2, 0.4, 0.6, 0.75])[:, None] * radius_m
     return patch.seen(r * np.sin(a), r * np.cos(a))
+
+
+READER = Reader[Gauge](read=read_gauge, is_telling=True)

@@ -15,6 +15,7 @@ from perception.vision.patch import Patch
 from perception.vision.reading import PatchReading, gated, probability, refused
 from perception.vision.status.choice import contrast_noise
 from perception.vision.status.pointer import unroll, wrapped
+from perception.vision.status.reader import Reader
 
 STEPS = 720
 GLARE = 0.25  # of the radius: marks are smaller
@@ -192,3 +193,6 @@ def _glare(patch: Patch, radius_m: float) -> Patch:
     round_ = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     wide = cv2.morphologyEx(white, cv2.MORPH_OPEN, round_)
     return replace(patch, gray=np.asarray(cv2.dilate(wide, np.ones((size // 2 | 1,) * 2, np.uint8)), np.uint8))
+
+
+READER = Reader[Handwheel](read=read_handwheel, guesses_right=0.38)

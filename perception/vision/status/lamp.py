@@ -11,6 +11,7 @@ from perception.vision.image import WHITE_LEVEL
 from perception.vision.patch import Patch, sample_at
 from perception.vision.reading import PatchReading, gated, refused
 from perception.vision.status.occluder_bands import cables_across
+from perception.vision.status.reader import LAMP_MARGIN, Reader
 
 CORE, RIM, PLATE = (0.0, 0.15, 0.3), (0.5, 0.6, 0.7), (1.45, 1.6, 1.75)  # of the radius
 RING_PLACES, LEAST_SEEN = 108, 0.3  # places looked at in each; share that must not be hidden
@@ -59,3 +60,6 @@ def _ring(
     u, v = patch.pixel_of(r * np.sin(a), r * np.cos(a))
     values = np.asarray(sample_at(light, u, v), float).ravel()
     return values if hidden is None else values[(sample_at(hidden.astype(np.uint8), u, v) < 0.5).ravel()]
+
+
+READER = Reader[Lamp](read=read_lamp, guesses_right=0.4, margin=LAMP_MARGIN)

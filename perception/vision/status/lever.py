@@ -15,6 +15,7 @@ from perception.vision.reading import PatchReading, doubted
 from perception.vision.status.bar import bar_contrast
 from perception.vision.status.choice import choose, contrast_noise
 from perception.vision.status.occluder_bands import cables_across
+from perception.vision.status.reader import Reader
 
 BAR_FROM, BAR_TO = 0.40, 0.92  # share of the length: outside the hub, inside the tip
 FLANK = (1.35, 1.6)  # of the half width: pipes and flanges lie close by
@@ -133,3 +134,6 @@ def _bar_angle(patch: Patch, spec: Lever, nominal: float, hidden: NDArray[np.boo
     )
     smooth = np.convolve(contrast, np.ones(5) / 5.0, "same")
     return float(tried[2 + int(np.argmax(smooth[2:-2]))])
+
+
+READER = Reader[Lever](read=read_lever, guesses_right=0.45)

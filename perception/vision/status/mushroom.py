@@ -6,8 +6,12 @@ from hal.panel import Mushroom
 from perception.vision.patch import Patch
 from perception.vision.reading import PatchReading
 from perception.vision.status.button import read_cap
+from perception.vision.status.reader import Reader
 
 
 def read_mushroom(patch: Patch, spec: Mushroom) -> PatchReading:
     """State of an emergency mushroom. `patch` shows any plane near the cap."""
-    return read_cap(patch, spec)
+    return read_cap(patch, spec, foot_m=None)  # the head moves as a whole
+
+
+READER = Reader[Mushroom](read=read_mushroom)

@@ -10,6 +10,7 @@ from perception.vision.reading import PatchReading
 from perception.vision.status.gauge import STOP_RAD, no_pointer, status_of_pointer
 from perception.vision.status.occluder_bands import MOST_COVERED, lying_across
 from perception.vision.status.pointer import find_pointer
+from perception.vision.status.reader import Reader
 
 POINTER_FROM, POINTER_TO = 0.30, 0.85  # share of the needle's length that is in the window, before the ticks begin
 RIVAL = (0.17, 0.02)  # nothing else stands there: of 240 on drawn hard panels read right .99 have less than 0.13
@@ -44,3 +45,6 @@ def _seen(patch: Patch, spec: PanelMeter, lo: float, hi: float) -> float:
     a = np.linspace(lo, hi, 24)
     r = np.array([0.5, 0.65, 0.8, 0.95])[:, None] * spec.needle_m
     return patch.seen(r * np.sin(a), r * np.cos(a) - spec.pivot_below_m)
+
+
+READER = Reader[PanelMeter](read=read_panel_meter, is_telling=True)

@@ -9,6 +9,7 @@ from perception.vision.patch import Patch
 from perception.vision.reading import PatchReading
 from perception.vision.status.bar import bar_contrast
 from perception.vision.status.choice import choose, contrast_noise
+from perception.vision.status.reader import Reader
 
 MARK_FROM, MARK_TO = 0.35, 0.80  # share of the knob's radius over which the mark runs
 MARK_HALF_WIDTH = 0.06
@@ -26,3 +27,6 @@ def read_rotary(patch: Patch, spec: Rotary) -> PatchReading:
     a = np.linspace(0, 2 * np.pi, 24)
     seen = patch.seen(np.outer([0.4, 0.7], np.sin(a)) * R, np.outer([0.4, 0.7], np.cos(a)) * R)
     return choose([s.name for s in spec.states], evidence, noise=contrast_noise(patch), seen=seen, what="knob mark")
+
+
+READER = Reader[Rotary](read=read_rotary, guesses_right=0.4, is_telling=True)

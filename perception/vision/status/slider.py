@@ -13,9 +13,9 @@ from hal.panel import Slider
 from perception.vision.image import WHITE_LEVEL
 from perception.vision.patch import Patch, sample_at
 from perception.vision.reading import PatchReading, doubted, gated, probability, refused
-from perception.vision.registration.outline import footprint_m
 from perception.vision.status.choice import contrast_noise
 from perception.vision.status.occluder_bands import lying_across
+from perception.vision.status.reader import Reader
 
 SLOT = 0.2  # of the cap's width: half of the slot and what blurs it
 EDGE_BOX = 0.22  # of the cap's length: a line across its middle is further from its edges
@@ -198,7 +198,7 @@ def _uncovered(patch: Patch, spec: Slider, s: Array, profile: Array, lean_m: flo
     # The cap stands out and may lean over the footprint: look for what comes in from further away.
     lean_px = float(np.linalg.norm(patch.parallax_px_per_m)) * spec.cap_size_m[2]
     room_m = 0.004 + lean_px / patch.px_per_m
-    width, height, _ = footprint_m(spec)
+    width, height = spec.half_footprint_m
     cover = lying_across(
         patch, half_width_m=width + room_m, half_height_m=height + room_m, is_round=False, through=True
     )
@@ -279,3 +279,6 @@ def _place(angle_rad: float, s: Array, across: Array) -> tuple[Array, Array]:
 
 def _profile(patch: Patch, angle_rad: float, s: Array, across: Array) -> Array:
     return np.asarray(patch.sample(*_place(angle_rad, s, across)).mean(axis=1), float)
+
+
+READER = Reader[Slider](read=read_slider, guesses_right=0.38, side_m=0.012)

@@ -10,6 +10,7 @@ from perception.vision.patch import Patch
 from perception.vision.reading import PatchReading, doubted
 from perception.vision.status.bar import bar_contrast
 from perception.vision.status.choice import choose, contrast_noise
+from perception.vision.status.reader import Reader
 
 STATES, LEANS = ("on", "off"), (0.0, np.pi)  # clockwise from up
 BAT_FROM, BAT_TO = 0.62, 0.95  # of the length: the nut around the foot looks like a bar too
@@ -94,3 +95,6 @@ def _bat(patch: Patch, spec: Toggle, angle_rad: float, flank: tuple[float, float
     )
     goes_on = max(beyond, 0.0) if bat > 0 else max(-beyond, -behind, 0.0)  # behind a bright bat its nut may shine
     return float(np.sign(bat) * max(abs(bat) - GOES_ON * goes_on, 0.0))
+
+
+READER = Reader[Toggle](read=read_toggle, guesses_right=0.45, leans=True)

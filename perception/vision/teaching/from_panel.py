@@ -25,7 +25,6 @@ from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind
 from perception.vision.knowledge_files import UNIT
 from perception.vision.projection import CameraProjection, PanelProjection
 from perception.vision.reading import ObjectReading
-from perception.vision.registration.outline import footprint_m
 from perception.vision.registration.register import register
 from perception.vision.teaching.condense import worth_keeping
 from perception.vision.teaching.teach import NOTHING_SIZE_M, SNAP_M, Overview, overview_of, under_pixels
@@ -159,7 +158,7 @@ def _nearest_sub_object(
     lies from it.
     """
     x, y = panel_object.position_m
-    stem = np.column_stack([np.tile([x, y], (3, 1)), footprint_m(panel_object)[2] * FOOT_TO_TOP])
+    stem = np.column_stack([np.tile([x, y], (3, 1)), panel_object.face.height_m * FOOT_TO_TOP])
     line = _on_ground(overview, view.project(stem) + shift_px)
     away = np.linalg.norm(places[:, None] - line, axis=2)
     is_near = away.min(axis=1) < SNAP_M * PLATE_PX_PER_M
@@ -176,7 +175,8 @@ def _nearest_sub_object(
 
 def _box(overview: Overview, view: PanelProjection, panel_object: PanelObject, shift_px: Array) -> Array:
     """(2, 2) lowest and highest u and v of the object's box, foot to top, on the rectified plate."""
-    half_width, half_height, height = footprint_m(panel_object)
+    face = panel_object.face
+    half_width, half_height, height = face.half_width_m, face.half_height_m, face.height_m
     corners = np.array([[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (0.0, 1.0)])
     box = corners * [half_width, half_height, height] + [*panel_object.position_m, 0.0]
     at = _on_ground(overview, view.project(box) + shift_px)
@@ -217,7 +217,8 @@ def _grown(
         name = str(names[k])
         size_m, middles_m = NOTHING_SIZE_M, None
         if name != NOTHING:
-            half_width, half_height, _ = footprint_m(shown[k].panel_object)
+            face = shown[k].panel_object.face
+            half_width, half_height = face.half_width_m, face.half_height_m
             size_m = (2.0 * half_width, 2.0 * half_height)
             middles_m = shown[k].middle_m[None] if shown[k].middle_m.any() else None
         grown = grown.grown(

@@ -13,9 +13,9 @@ import pytest
 
 from hal.errors import InvalidRequest
 from hal.geometry import perturbed, to_json, transform_rpy
-from hal.panel import load_panel
+from hal.panel import Shown, load_panel
 from hal.simulated import ObjectTruth, Truth
-from service.operations.evaluate import AFTER, agrees, compare, evaluate
+from service.operations.evaluate import AFTER, compare, evaluate, shown_of
 from service.processes.connection import CellConnection
 from service.schema.results import UnaskedMotion
 
@@ -134,8 +134,7 @@ def test_right_means_two_per_cent_of_the_scale_or_the_very_state(
     name: str, said: dict[str, Any], is_right: bool
 ) -> None:
     now = {panel_object.name: panel_object for panel_object in truth().objects}[name]
-    answer = {"value": None, "state": None, "text": None, **said}
-    assert agrees(PANEL.object(name), now, **answer) is is_right
+    assert PANEL.object(name).is_right(Shown(**said), shown_of(now)) is is_right
 
 
 def test_a_mission_without_a_report_is_refused_before_anything_is_asked(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from hal.errors import NotFound
 from hal.panel import Panel, load_panel
-from service.operations.spots import EDGE_M, bare_spots, half_footprint_m
+from service.operations.spots import EDGE_M, bare_spots
 
 ROOT = Path(__file__).parents[3]
 PANEL = load_panel(ROOT / "panels/bench.toml")
@@ -23,7 +23,7 @@ def test_spots_are_bare_and_far_apart(count: int) -> None:
     for x, y in spots:
         assert abs(x) <= PANEL.width_m / 2 - EDGE_M + 1e-9 and abs(y) <= PANEL.height_m / 2 - EDGE_M + 1e-9
         for panel_object in PANEL.objects:
-            half_x, half_y = half_footprint_m(panel_object)
+            half_x, half_y = panel_object.half_footprint_m
             gap = np.hypot(
                 max(abs(x - panel_object.position_m[0]) - half_x, 0.0),
                 max(abs(y - panel_object.position_m[1]) - half_y, 0.0),

@@ -10,12 +10,12 @@ from scipy.spatial.transform import RigidTransform
 from benchmarks.vision_drawing import Disturbance, camera, draw_panel, looking_at
 from hal.geometry import certain
 from hal.panel import Handwheel, Light, Panel
-from perception.vision.inspection import patch_of
 from perception.vision.patch import Patch
 from perception.vision.projection import CameraProjection
 from perception.vision.reading import PatchReading
 from perception.vision.status.handwheel import read_handwheel
 from perception.vision.status.pointer import wrapped
+from perception.vision.status.reader import patch_of
 
 ANGLE_RAD = 0.7
 DISTANCE_M, HEIGHT_M = 0.30, 0.026

@@ -11,9 +11,9 @@ from benchmarks.vision_drawing import Disturbance, camera, draw_panel, looking_a
 from hal.arrays import Array
 from hal.geometry import certain
 from hal.panel import Light, Panel, Scale, Slider
-from perception.vision.inspection import patch_of
 from perception.vision.patch import Patch
 from perception.vision.projection import CameraProjection
+from perception.vision.status.reader import patch_of
 from perception.vision.status.slider import read_slider
 
 TRAVEL_M = 0.100

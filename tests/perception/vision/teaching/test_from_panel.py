@@ -14,7 +14,6 @@ from perception.vision.finding.blind import Detection, recognise
 from perception.vision.knowledge import NOTHING, Knowledge
 from perception.vision.knowledge_files import load_knowledge, write_kind
 from perception.vision.projection import CameraProjection
-from perception.vision.registration.outline import footprint_m
 from perception.vision.teaching.from_panel import PanelLooks, teach_from_panel
 from tests.perception.vision.bench_panel import panel, scene
 
@@ -44,7 +43,8 @@ def right(knowledge: Knowledge) -> tuple[set[str], list[Detection]]:
         for panel_object in panel().objects
         for c in given
         if c.kind == panel_object.kind
-        and np.linalg.norm(c.centre_m - panel_object.position_m) < max(footprint_m(panel_object)[:2])
+        and np.linalg.norm(c.centre_m - panel_object.position_m)
+        < max((panel_object.face.half_width_m, panel_object.face.half_height_m))
     }
     return names, given
 

@@ -19,7 +19,6 @@ from perception.vision.inspection import inspect_view
 from perception.vision.knowledge import NOTHING
 from perception.vision.knowledge_files import load_knowledge
 from perception.vision.projection import CameraProjection
-from perception.vision.registration.outline import footprint_m
 from perception.vision.teaching.panel_lights import find_border_lights
 from perception.vision.teaching.panel_questions import kind_question, questions
 from perception.vision.teaching.panel_teach import PanelObjectDraft, panel_text
@@ -49,7 +48,7 @@ def seen() -> tuple[np.ndarray, CameraProjection, Overview]:
 def corners_of(view: CameraProjection, name: str) -> list[tuple[float, float]]:
     """Two opposite corners around an object, as a person clicks them."""
     panel_object = panel().object(name)
-    w, h, _ = footprint_m(panel_object)
+    w, h = panel_object.face.half_width_m, panel_object.face.half_height_m
     x, y = panel_object.position_m
     return [(float(u), float(v)) for u, v in view.project([[x - w, y + h, 0.0], [x + w, y - h, 0.0]])]
 
@@ -75,7 +74,8 @@ def test_one_click_finds_the_outline(
 ) -> None:
     _, view, overview = seen
     found = example_at(overview, middle_of(view, name))
-    w, h, _ = footprint_m(panel().object(name))
+    face = panel().object(name).face
+    w, h = face.half_width_m, face.half_height_m
     assert found.outline is not None and found.outline.shape == shape
     assert np.allclose(found.size_m, (2 * w, 2 * h), atol=0.009)  # bezel or face: both are the gauge's
     assert np.allclose(overview.in_image([found.centre_m])[0], middle_of(view, name)[0], atol=8.0)

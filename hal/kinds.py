@@ -1,0 +1,75 @@
+"""Kinds of objects by name: model, reader, skill and simulated body, each found through an entry-point group.
+
+A package brings a kind by registering its name in these groups; the product's own kinds are registered in the same way.
+Only the model is needed: a kind without a skill is read only, without a reader it is not read, without a body it cannot
+be simulated.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+from hal.entry_points import load, near_or_all, registered
+from hal.errors import ConfigError, Unsupported
+
+if TYPE_CHECKING:
+    from hal.panel import PanelObject
+
+KINDS = "panelwright.kinds"
+READERS = "panelwright.readers"
+SKILLS = "panelwright.skills"
+BODIES = "panelwright.bodies"
+LACKS = {
+    READERS: ("a reader", "it can be found, not read"),
+    SKILLS: ("a skill", "it is read only"),
+    BODIES: ("a simulated body", "it is not simulated: use a panel without it, or a real cell"),
+}
+
+
+def installed_kinds() -> tuple[str, ...]:
+    """Names of all kinds that a panel file may have."""
+    return registered(KINDS)
+
+
+@cache
+def kind_model(kind: str) -> type[PanelObject]:
+    """The model of a kind's objects.
+
+    Raises:
+        ConfigError: no such kind (with the nearest known one), its package does not import, or it says another name.
+    """
+    model: type[PanelObject] = load(KINDS, kind, "kind of object")
+    if model.model_fields["kind"].default != kind:
+        raise ConfigError(
+            f"the kind of object registered as {kind!r} calls itself {model.model_fields['kind'].default!r}",
+            hint="give the entry point and the `kind` of its model the same name",
+        )
+    return model
+
+
+def has_part(group: str, kind: str) -> bool:
+    """Whether there is a reader, a skill or a body (by the group) for a kind."""
+    return kind in registered(group)
+
+
+@cache
+def part_of(group: str, kind: str) -> Any:
+    """The reader, skill or body (by the group) of a kind.
+
+    Raises:
+        Unsupported: the kind has none; says what that means.
+        ConfigError: its package does not import.
+    """
+    what, meaning = LACKS[group]
+    if not has_part(group, kind):
+        raise Unsupported(
+            f"a {kind} has no {what.split(maxsplit=1)[1]}: {meaning}",
+            hint=f"kinds with {what}: {', '.join(registered(group)) or 'none; run `make setup`'}",
+        )
+    return load(group, kind, f"{what.split(maxsplit=1)[1]} of a {kind}")
+
+
+def hint_for(kind: str) -> str:
+    """What helps against the name of a kind that is not installed."""
+    return near_or_all(kind, installed_kinds())

@@ -1,0 +1,86 @@
+"""The panel file: what a panel is. Perception recognises with it, manipulation acts with it, simulators build it.
+
+Panel frame: origin in the middle of the plate's front face, x right and y up as the viewer sees it, z out of the plate
+towards the viewer. Angles of needles, levers and knobs are clockwise from straight up as the viewer sees them (so a
+positive angle is a negative turn about z).
+
+One file a kind of object. Kinds are found by name through the entry-point group `panelwright.kinds` (see `hal.kinds`),
+so that a package can bring further ones.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hal.face import load_on_first_use
+
+if TYPE_CHECKING:
+    from hal.panel.base import PanelObject
+    from hal.panel.button import Button
+    from hal.panel.display import Display
+    from hal.panel.form import Envelope, Face, Relief, Rim, circle
+    from hal.panel.gauge import Gauge
+    from hal.panel.goals import GAUGE_SHARE, Goal, NumberGoal, Shown, StateGoal
+    from hal.panel.handwheel import Handwheel
+    from hal.panel.lamp import Lamp
+    from hal.panel.layout import Panel, Tolerances, load_panel
+    from hal.panel.lever import Lever
+    from hal.panel.mushroom import Mushroom
+    from hal.panel.panel_meter import PanelMeter
+    from hal.panel.parts import (
+        LATCHED_SHARE,
+        Light,
+        Name,
+        NotNegative,
+        Positive,
+        Scale,
+        State,
+        States,
+        Vector2,
+        Vector3,
+    )
+    from hal.panel.questions import Question, Taught
+    from hal.panel.rotary import Rotary
+    from hal.panel.slider import Slider
+    from hal.panel.toggle import Toggle
+
+__all__ = [
+    "GAUGE_SHARE",
+    "LATCHED_SHARE",
+    "Button",
+    "Display",
+    "Envelope",
+    "Face",
+    "Gauge",
+    "Goal",
+    "Handwheel",
+    "Lamp",
+    "Lever",
+    "Light",
+    "Mushroom",
+    "Name",
+    "NotNegative",
+    "NumberGoal",
+    "Panel",
+    "PanelMeter",
+    "PanelObject",
+    "Positive",
+    "Question",
+    "Relief",
+    "Rim",
+    "Rotary",
+    "Scale",
+    "Shown",
+    "Slider",
+    "State",
+    "StateGoal",
+    "States",
+    "Taught",
+    "Toggle",
+    "Tolerances",
+    "Vector2",
+    "Vector3",
+    "circle",
+    "load_panel",
+]
+__getattr__ = load_on_first_use(__name__, __file__)

@@ -1,0 +1,67 @@
+"""Angles of a panel file: radians, or degrees under keys that end in `_deg`."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, get_args
+
+from pydantic import BaseModel
+from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic_core.core_schema import ErrorType
+
+from hal.strict import unknown_key_hint
+
+UNITLESS = {"at_min", "at_max", "table"}  # keys of a scale, whose places are angles or lengths as its object says
+KNOWN_TYPES = frozenset(get_args(ErrorType))
+Location = tuple[str | int, ...]
+
+
+def fault(at: Location, given: object, what: str, hint: str) -> InitErrorDetails:
+    """A fault of a file: where, the value that is given there, what is wrong with it, and what helps."""
+    kind = PydanticCustomError("cannot_be_meant", "{what}", {"what": what, "hint": hint})
+    return InitErrorDetails(type=kind, loc=at, input=given)
+
+
+def again(item: Any, model: type[BaseModel]) -> InitErrorDetails:
+    """A fault that `model` has found, so that it can be raised together with others."""
+    context = dict(item.get("ctx", {}))
+    if item["type"] == "extra_forbidden":
+        context["hint"] = unknown_key_hint(model, item["loc"])
+    elif item["type"] in KNOWN_TYPES:
+        return InitErrorDetails(type=item["type"], loc=item["loc"], input=item["input"], ctx=context)
+    kind = PydanticCustomError(item["type"], "{message}", {**context, "message": item["msg"]})
+    return InitErrorDetails(type=kind, loc=item["loc"], input=item["input"])
+
+
+def in_radians(table: Any, known: frozenset[str], at: Location = ()) -> tuple[Any, list[InitErrorDetails]]:
+    """A table of a panel file with every angle in radians, and the faults of those that are given twice.
+
+    Args:
+        known: keys of the models that will read it: what would be none of them stays, and is refused under its own name.
+    """
+    if isinstance(table, list):
+        pairs = [in_radians(item, known, (*at, k)) for k, item in enumerate(table)]
+        return [item for item, _ in pairs], [one for _, faults in pairs for one in faults]
+    if not isinstance(table, dict):
+        return table, []
+    out: dict[str, Any] = {}
+    faults: list[InitErrorDetails] = []
+    for key, value in table.items():
+        stem = key.removesuffix("_deg")
+        target = stem if stem in UNITLESS else f"{stem}_rad"
+        if stem == key or target not in known:
+            out[key], more = in_radians(value, known, (*at, key))
+            faults += more
+        elif target in table:
+            what = f"the same angle is given as {target} and as {key}"
+            faults.append(fault((*at, key), value, what, f"keep one of {target} and {key}"))
+        else:
+            out[target] = _radians(value, is_table=stem == "table")
+    return out, faults
+
+
+def _radians(value: Any, *, is_table: bool) -> Any:
+    """Degrees as radians; what is no number stays, for its model to refuse."""
+    if is_table and isinstance(value, list):  # pairs of place and value
+        return [[_radians(p[0], is_table=False), *p[1:]] if isinstance(p, list) and p else p for p in value]
+    return math.radians(value) if isinstance(value, int | float) and not isinstance(value, bool) else value

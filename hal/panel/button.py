@@ -1,0 +1,76 @@
+"""Push buttons."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from hal.panel.base import PanelObject
+from hal.panel.form import Envelope, Face
+from hal.panel.goals import StateGoal
+from hal.panel.parts import LATCHED_SHARE, Name, NotNegative, Positive, Vector2
+from hal.panel.questions import COLOURS, Question, Taught, radius_of
+
+
+class Button(PanelObject):
+    """Push button; `latching` ones stay in. States `pressed` and `released`."""
+
+    kind: Literal["button"] = "button"
+    radius_m: Positive
+    height_m: Positive = 0.008
+    travel_m: Positive = 0.005
+    spring_n_per_m: Positive = 1000.0
+    preload_n: NotNegative = 2.0
+    latching: bool = False
+    colour: Literal["red", "green", "amber", "blue", "white", "black"] = "green"
+    lights_lamp: Name | None = None
+
+    is_round: ClassVar[bool] = True
+    asked: ClassVar[tuple[Question, ...]] = (
+        Question(key="colour", text="Which colour?", choices=(*COLOURS, "black"), default="green"),
+        Question(key="latching", text="Does it stay in when pressed?", choices=("no", "yes"), default="no"),
+    )
+
+    @property
+    def pressed_depth_m(self) -> float:
+        """How much lower the cap is where it is read as pressed: held down, or latched."""
+        return LATCHED_SHARE * self.travel_m if self.latching else self.travel_m
+
+    @property
+    def face(self) -> Face:
+        """The cap, in the plane of its top."""
+        return Face(half_width_m=self.radius_m, half_height_m=self.radius_m, height_m=self.height_m)
+
+    @property
+    def half_footprint_m(self) -> Vector2:
+        """Its radius."""
+        return self.radius_m, self.radius_m
+
+    def envelope(self, angle_rad: float | None = None) -> Envelope:
+        """A box about the cap."""
+        return Envelope(half_m=self.half_footprint_m, height_m=self.height_m)
+
+    @property
+    def goal(self) -> StateGoal:
+        """States of its lamp, or of the cap itself, which only stays in when it latches."""
+        if self.lights_lamp is not None:
+            states: tuple[str, ...] = ("on", "off")
+        else:
+            states = ("pressed", "released") if self.latching else ("pressed",)
+        return StateGoal(states=states, usual=states[0])
+
+    @property
+    def shown_by(self) -> str:
+        """Its lamp, where it has one: a button springs back, and what it works is what counts."""
+        return self.name if self.lights_lamp is None else self.lights_lamp
+
+    @property
+    def mission_rank(self) -> float | None:
+        """One with a lamp first, then one that latches; any other shows nothing that could be confirmed."""
+        if self.lights_lamp is not None:
+            return 3.0
+        return 3.5 if self.latching else None
+
+    @classmethod
+    def keys_of(cls, taught: Taught) -> dict[str, Any]:
+        """Radius, colour, and whether it latches."""
+        return {**radius_of(taught), "colour": taught.text("colour"), "latching": taught.text("latching") == "yes"}

@@ -1,0 +1,53 @@
+"""Round pointer instruments."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from hal.panel.base import PanelObject
+from hal.panel.form import Envelope, Face, Rim, circle
+from hal.panel.parts import NotNegative, Positive, Scale, Vector2
+from hal.panel.questions import Question, Taught, about_a_pointer, pointer_scale, radius_of
+
+LEAST_HEIGHT_M = 0.004
+"""Of what a hand keeps clear of: a flat instrument is taken for that thick."""
+
+
+class Gauge(PanelObject):
+    """Round pointer instrument; the scale's places are needle angles."""
+
+    kind: Literal["gauge"] = "gauge"
+    radius_m: Positive
+    scale: Scale
+    depth_m: NotNegative = 0.004
+
+    asked: ClassVar[tuple[Question, ...]] = about_a_pointer("-135", "135")
+
+    @property
+    def face(self) -> Face:
+        """The whole instrument, in the plane of its needle."""
+        return Face(half_width_m=self.radius_m, half_height_m=self.radius_m, height_m=self.depth_m)
+
+    @property
+    def half_footprint_m(self) -> Vector2:
+        """Its radius."""
+        return self.radius_m, self.radius_m
+
+    def envelope(self, angle_rad: float | None = None) -> Envelope:
+        """A flat box."""
+        return Envelope(half_m=self.half_footprint_m, height_m=max(self.depth_m, LEAST_HEIGHT_M))
+
+    @property
+    def rim(self) -> Rim:
+        """The rim lies at the plate; only the needle stands `depth_m` above it. The face begins inside the rim."""
+        return circle(self.radius_m, reach_m=0.12 * self.radius_m)
+
+    @property
+    def full_scale(self) -> float:
+        """The span of its scale."""
+        return self.scale.span
+
+    @classmethod
+    def keys_of(cls, taught: Taught) -> dict[str, Any]:
+        """Radius and scale."""
+        return {**radius_of(taught), "scale": pointer_scale(taught)}

@@ -1,0 +1,102 @@
+"""What may be asked of a control: one of several states, or a number within limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from hal.errors import InvalidRequest
+
+GAUGE_SHARE = 0.02
+"""Of full scale: a reading or a control that is further off is wrong."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shown:
+    """What an object shows, as far as somebody can tell: a value in the unit of its kind, a state, a text."""
+
+    value: float | None = None
+    state: str | None = None
+    text: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StateGoal:
+    """One of several states.
+
+    Attributes:
+        usual: what is meant when nothing is said; None when it must be said.
+    """
+
+    states: tuple[str, ...]
+    usual: str | None = None
+
+    key = "state"
+
+    def checked(self, name: str, asked: str | float | None) -> str:
+        """The state asked for.
+
+        Raises:
+            InvalidRequest: no state is given, or the object called `name` has no such state.
+        """
+        state = self.usual if asked is None else asked
+        hint = f"states: {', '.join(self.states)}"
+        if state is None:
+            raise InvalidRequest(f"{name} needs a state", hint=hint)
+        if state not in self.states:
+            raise InvalidRequest(f"{name} has no state {state!r}", hint=hint)
+        return str(state)
+
+    def text(self, target: str | float) -> str:
+        """The target as a report has it."""
+        return str(target)
+
+    def is_reached(self, target: str | float, truth: Shown) -> bool:
+        """Whether what the object truly shows is the target."""
+        return truth.state == target
+
+    def other_than(self, shown: Shown) -> str:
+        """The first state that is not shown now."""
+        return next(state for state in self.states if state != shown.state)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NumberGoal:
+    """A number from `low` to `high`, asked for under `key`, reached when it is within `tolerance`."""
+
+    key: Literal["value", "angle_rad"]
+    low: float
+    high: float
+    unit: str
+    tolerance: float
+
+    def checked(self, name: str, asked: str | float | None) -> float:
+        """The number asked for.
+
+        Raises:
+            InvalidRequest: no number is given, or it is not within the limits of the object called `name`.
+        """
+        if not isinstance(asked, float | int) or not self.low <= asked <= self.high:
+            raise InvalidRequest(
+                f"{name} needs {self.key} from {self.low:g} to {self.high:g} {self.unit}".rstrip(),
+                hint=f"send {{'object': '{name}', '{self.key}': ...}}",
+            )
+        return float(asked)
+
+    def text(self, target: str | float) -> str:
+        """The target as a report has it."""
+        return f"{float(target):g}"
+
+    def is_reached(self, target: str | float, truth: Shown) -> bool:
+        """Whether what the object truly shows is within the tolerance of the target."""
+        return truth.value is not None and abs(truth.value - float(target)) <= self.tolerance
+
+    def other_than(self, shown: Shown) -> float:
+        """Three or seven tenths of the range, whichever is further from what is shown now."""
+        span = self.high - self.low
+        near, far = self.low + 0.3 * span, self.low + 0.7 * span
+        value = self.low if shown.value is None else shown.value
+        return far if abs(far - value) > abs(near - value) else near
+
+
+Goal = StateGoal | NumberGoal

@@ -1,0 +1,66 @@
+"""Quarter-turn lever valves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
+
+from hal.panel.base import PanelObject
+from hal.panel.form import Envelope, Face
+from hal.panel.goals import StateGoal
+from hal.panel.parts import Positive, States, Vector2
+from hal.panel.questions import PLACES, Question, Taught
+
+
+class Lever(PanelObject):
+    """Quarter-turn lever valve: a bar that turns about its hub."""
+
+    kind: Literal["lever"] = "lever"
+    length_m: Positive = 0.070
+    width_m: Positive = 0.014
+    height_m: Positive = 0.030
+    states: States
+    torque_nm: Positive = 2.0
+
+    value_is_angle: ClassVar[bool] = True
+    asked: ClassVar[tuple[Question, ...]] = (Question(key="states", text=PLACES, default="closed=90, open=0"),)
+    turns_about_click: ClassVar[bool] = True
+
+    @property
+    def face(self) -> Face:
+        """All that its bar sweeps, in the plane of its top."""
+        return Face(half_width_m=self.length_m, half_height_m=self.length_m, height_m=self.height_m)
+
+    @property
+    def half_footprint_m(self) -> Vector2:
+        """All that its bar sweeps, and its end."""
+        reach = self.length_m + self.width_m
+        return reach, reach
+
+    def envelope(self, angle_rad: float | None = None) -> Envelope:
+        """All that it sweeps; at a known angle hub and bar, from half a width behind the hub to the far end."""
+        if angle_rad is None:
+            return Envelope(half_m=self.half_footprint_m, height_m=self.height_m)
+        along = self.length_m / 2
+        half = (self.width_m, along + self.width_m)
+        return Envelope(half_m=half, height_m=self.height_m, turn_rad=-angle_rad, middle_m=(0.0, along))
+
+    @property
+    def goal(self) -> StateGoal:
+        """One of its places."""
+        return StateGoal(states=tuple(state.name for state in self.states))
+
+    @property
+    def resting_angles(self) -> Mapping[str, float]:
+        """The angles of its places."""
+        return {state.name: state.angle_rad for state in self.states}
+
+    @property
+    def mission_rank(self) -> float:
+        """Before everything else."""
+        return 1.0
+
+    @classmethod
+    def keys_of(cls, taught: Taught) -> dict[str, Any]:
+        """Length and places."""
+        return {"length_m": round(taught.reach_m, 4), "states": taught.states("states")}

@@ -1,0 +1,70 @@
+"""Emergency mushrooms."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from hal.panel.base import PanelObject
+from hal.panel.form import Envelope, Face, Relief
+from hal.panel.goals import StateGoal
+from hal.panel.parts import LATCHED_SHARE, NotNegative, Positive, Vector2
+from hal.panel.questions import Taught, radius_of
+
+
+class Mushroom(PanelObject):
+    """Emergency mushroom; pressing it latches. States `pressed` and `released`."""
+
+    kind: Literal["mushroom"] = "mushroom"
+    radius_m: Positive = 0.020
+    height_m: Positive = 0.026
+    travel_m: Positive = 0.006
+    spring_n_per_m: Positive = 2000.0
+    preload_n: NotNegative = 8.0
+
+    is_round: ClassVar[bool] = True
+
+    @property
+    def pressed_depth_m(self) -> float:
+        """How much lower a latched head is."""
+        return LATCHED_SHARE * self.travel_m
+
+    @property
+    def face(self) -> Face:
+        """The head, in the plane of its top."""
+        return Face(half_width_m=self.radius_m, half_height_m=self.radius_m, height_m=self.height_m)
+
+    @property
+    def half_footprint_m(self) -> Vector2:
+        """The radius of its head."""
+        return self.radius_m, self.radius_m
+
+    def envelope(self, angle_rad: float | None = None) -> Envelope:
+        """A box about the head."""
+        return Envelope(half_m=self.half_footprint_m, height_m=self.height_m)
+
+    @property
+    def goal(self) -> StateGoal:
+        """It can be pressed; only a person frees it."""
+        return StateGoal(states=("pressed",), usual="pressed")
+
+    @property
+    def relief(self) -> Relief:
+        """A head, the upper half of its height, on a stem half as wide."""
+        up, head_m = [0.0, 0.0, 1.0], 0.5 * self.height_m
+        top: dict[str, Any] = {"direction": up, "size_m": self.radius_m}
+        cap = {"name": "cap", "moves": True, "type": "plane", "point_m": [0, 0, self.height_m], **top}
+        middle = [0, 0, self.height_m - 0.5 * head_m]
+        wall = {"name": "wall", "moves": True, "type": "cylinder", "point_m": middle, **top, "length_m": head_m}
+        return Relief(
+            surfaces=(cap, wall),
+            height_m=self.height_m,
+            motion="slide",
+            low=-self.travel_m,
+            high=0.0,
+            pressed_depth_m=self.pressed_depth_m,
+        )
+
+    @classmethod
+    def keys_of(cls, taught: Taught) -> dict[str, Any]:
+        """The radius."""
+        return radius_of(taught)

@@ -1,0 +1,94 @@
+"""What the kinds of a panel file are described with: numbers that must be positive, lights, scales and named places."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Annotated
+
+from pydantic import AfterValidator, Field, model_validator
+
+from hal.strict import Strict
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}$")]
+Vector2 = tuple[float, float]
+Vector3 = tuple[float, float, float]
+
+LATCHED_SHARE = 0.6
+"""Of its travel: how far a cap that latches stays in."""
+
+
+class Light(Strict):
+    """One border light: a lamp whose centre is known."""
+
+    name: Name
+    position_m: Vector3
+    radius_m: Positive = 0.008
+
+
+class Scale(Strict):
+    """How an angle (or a length) shows a value.
+
+    `at_min` and `at_max` are the pointer's places at `minimum` and `maximum`; `table` holds further (place, value)
+    pairs of a scale that is not linear, in rising order of place.
+    """
+
+    minimum: float
+    maximum: float
+    unit: str
+    at_min: float
+    at_max: float
+    major_ticks: Annotated[int, Field(ge=2, le=50)] = 6
+    table: tuple[Vector2, ...] = ()
+
+    @model_validator(mode="after")
+    def _is_a_scale(self) -> Scale:
+        if self.maximum <= self.minimum:
+            raise ValueError("maximum must be greater than minimum")
+        if self.at_max == self.at_min:
+            raise ValueError("at_max must differ from at_min")
+        steps = [(p1 - p0, v1 - v0) for (p0, v0), (p1, v1) in pairwise(self._points())]
+        if any(place == 0.0 or value == 0.0 or (value > 0.0) != (steps[0][1] > 0.0) for place, value in steps):
+            raise ValueError("the values of a scale and its table must all rise, or all fall, from place to place")
+        return self
+
+    @property
+    def span(self) -> float:
+        """The difference between the highest and the lowest value."""
+        return self.maximum - self.minimum
+
+    def value_at(self, place: float) -> float:
+        """The value shown at a place (rad or m), linear between taught pairs, going on straight beyond the ends."""
+        points = self._points()
+        for (p0, v0), (p1, v1) in pairwise(points):
+            if place <= p1 or (p1, v1) == points[-1]:
+                return v0 + (place - p0) * (v1 - v0) / (p1 - p0)
+        raise AssertionError("a scale has two points")
+
+    def place_of(self, value: float) -> float:
+        """The inverse of `value_at`."""
+        points = sorted((v, p) for p, v in self._points())
+        for (v0, p0), (v1, p1) in pairwise(points):
+            if value <= v1 or (v1, p1) == points[-1]:
+                return p0 + (value - v0) * (p1 - p0) / (v1 - v0)
+        raise AssertionError("a scale has two points")
+
+    def _points(self) -> list[Vector2]:
+        return sorted([(self.at_min, self.minimum), *self.table, (self.at_max, self.maximum)])
+
+
+class State(Strict):
+    """A named resting place of a control; `angle_rad` clockwise from straight up (toggle: tilt, up positive)."""
+
+    name: Name
+    angle_rad: float = 0.0
+
+
+def _all_different(states: tuple[State, ...]) -> tuple[State, ...]:
+    if len({state.name for state in states}) != len(states):
+        raise ValueError("two states have the same name")
+    return states
+
+
+States = Annotated[tuple[State, ...], Field(min_length=2), AfterValidator(_all_different)]

@@ -1,0 +1,101 @@
+"""What is asked about an object when a panel is taught, and what its kind needs of the answers.
+
+Angles are asked for in degrees, and panel files are written in degrees (`at_min_deg`, `angle_deg`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+COLOURS = ("green", "red", "amber", "blue", "white")
+MARKS = "degrees clockwise from straight up, or x,y of a pixel on the mark"
+PLACES = "Its places: name=degrees clockwise from straight up, separated by commas?"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Question:
+    """One step of the dialogue; `choices` is empty where any text or number will do. `default` stands if unanswered."""
+
+    key: str
+    text: str
+    choices: tuple[str, ...] = ()
+    default: str = ""
+
+
+class Taught(Protocol):
+    """An object that somebody clicked on and described: its outline in the image, and the answers about it."""
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height of the outline on the plate."""
+        ...
+
+    @property
+    def reach_m(self) -> float:
+        """From the place that was clicked to the far end of the outline."""
+        ...
+
+    def text(self, key: str) -> str:
+        """The answer to a question.
+
+        Raises:
+            InvalidRequest: it is none of the question's choices.
+        """
+        ...
+
+    def number(self, key: str) -> float:
+        """The answer to a question as a number.
+
+        Raises:
+            InvalidRequest: it is none.
+        """
+        ...
+
+    def mark_deg(self, key: str, *, pivot_below_m: float = 0.0) -> float:
+        """The answer as an angle, clockwise from straight up, about a pivot below the object's middle.
+
+        Raises:
+            InvalidRequest: it is neither an angle nor a pixel.
+        """
+        ...
+
+    def states(self, key: str) -> list[dict[str, Any]]:
+        """The answer as named places: tables of the panel file with `name` and `angle_deg`.
+
+        Raises:
+            InvalidRequest: an angle is no number.
+        """
+        ...
+
+
+ENDS = (
+    Question(key="minimum", text="Which value stands at the low end of the scale?", default="0"),
+    Question(key="maximum", text="Which value stands at the high end?", default="10"),
+    Question(key="unit", text="In which unit?", default="bar"),
+)
+
+
+def about_a_pointer(low_deg: str, high_deg: str) -> tuple[Question, ...]:
+    """The questions about a scale whose places are angles."""
+    return (
+        *ENDS,
+        Question(key="at_min", text=f"Where is the low end ({MARKS})?", default=low_deg),
+        Question(key="at_max", text=f"Where is the high end ({MARKS})?", default=high_deg),
+    )
+
+
+def ends_of(taught: Taught) -> dict[str, Any]:
+    """Least and greatest value of a scale, and its unit."""
+    return {"minimum": taught.number("minimum"), "maximum": taught.number("maximum"), "unit": taught.text("unit")}
+
+
+def pointer_scale(taught: Taught, *, pivot_below_m: float = 0.0) -> dict[str, Any]:
+    """The answers about a scale whose places are angles, as a table of the panel file."""
+    at_min, at_max = (taught.mark_deg(key, pivot_below_m=pivot_below_m) for key in ("at_min", "at_max"))
+    return {**ends_of(taught), "at_min_deg": at_min, "at_max_deg": at_max}
+
+
+def radius_of(taught: Taught) -> dict[str, Any]:
+    """The radius of a round object's outline."""
+    return {"radius_m": round(sum(taught.size_m) / 4, 4)}

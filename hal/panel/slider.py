@@ -1,0 +1,79 @@
+"""Sliders on straight tracks."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar, Literal
+
+from hal.panel.base import PanelObject
+from hal.panel.form import Envelope, Face
+from hal.panel.goals import GAUGE_SHARE, NumberGoal
+from hal.panel.parts import Positive, Scale, Vector2, Vector3
+from hal.panel.questions import ENDS, Question, Taught, ends_of
+
+CAP_M = 0.012  # of a slider that is taught, along its track
+
+
+class Slider(PanelObject):
+    """Slider on a straight track; the scale's places are metres from the track's middle along `angle_rad` from +x."""
+
+    kind: Literal["slider"] = "slider"
+    angle_rad: float = 0.0
+    travel_m: Positive
+    cap_size_m: Vector3 = (0.012, 0.024, 0.016)  # along the track, across it, out of the plate
+    scale: Scale
+    friction_n: Positive = 4.0
+
+    asked: ClassVar[tuple[Question, ...]] = (
+        *ENDS,
+        Question(
+            key="rises", text="Where does the value rise to?", choices=("right", "left", "up", "down"), default="right"
+        ),
+    )
+
+    @property
+    def half_footprint_m(self) -> Vector2:
+        """The cap at any place of its track."""
+        along = self.travel_m / 2 + self.cap_size_m[0] / 2
+        across = self.cap_size_m[1] / 2
+        c, s = abs(math.cos(self.angle_rad)), abs(math.sin(self.angle_rad))
+        return along * c + across * s, along * s + across * c
+
+    @property
+    def face(self) -> Face:
+        """Track and cap, in the plane of the cap's top."""
+        half_width, half_height = self.half_footprint_m
+        return Face(half_width_m=half_width, half_height_m=half_height, height_m=self.cap_size_m[2])
+
+    def envelope(self, angle_rad: float | None = None) -> Envelope:
+        """A box along the track."""
+        along, across, out = self.cap_size_m
+        half = ((self.travel_m + along) / 2, across / 2)
+        return Envelope(half_m=half, height_m=out, turn_rad=self.angle_rad)
+
+    @property
+    def goal(self) -> NumberGoal:
+        """A value of its scale."""
+        scale = self.scale
+        tolerance = GAUGE_SHARE * scale.span
+        return NumberGoal(key="value", low=scale.minimum, high=scale.maximum, unit=scale.unit, tolerance=tolerance)
+
+    @property
+    def mission_rank(self) -> float:
+        """After levers."""
+        return 2.0
+
+    @property
+    def full_scale(self) -> float:
+        """The span of its scale."""
+        return self.scale.span
+
+    @classmethod
+    def keys_of(cls, taught: Taught) -> dict[str, Any]:
+        """Travel and scale, from the outline of track and cap."""
+        rises = taught.text("rises")
+        is_flat = rises in ("right", "left")
+        travel = round(max(taught.size_m[0 if is_flat else 1] - CAP_M, 0.01), 4)
+        sign = 1.0 if rises in ("right", "up") else -1.0
+        scale = {**ends_of(taught), "at_min": -sign * travel / 2, "at_max": sign * travel / 2}
+        return {"angle_deg": 0.0 if is_flat else 90.0, "travel_m": travel, "scale": scale}

@@ -1,0 +1,55 @@
+"""Toggle switches."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+from hal.panel.base import PanelObject
+from hal.panel.form import Envelope, Face
+from hal.panel.goals import StateGoal
+from hal.panel.parts import Positive, Vector2
+from hal.panel.questions import Taught
+
+
+class Toggle(PanelObject):
+    """Two-way toggle switch; the bat tilts up or down by `tilt_rad`. States `on` (up) and `off` (down)."""
+
+    kind: Literal["toggle"] = "toggle"
+    bat_length_m: Positive = 0.020
+    bat_radius_m: Positive = 0.004
+    tilt_rad: Positive = 0.40
+    force_n: Positive = 6.0
+
+    @property
+    def face(self) -> Face:
+        """Nut and bat, which leans out of it; the height is that of its tip."""
+        reach = self.bat_length_m * math.sin(self.tilt_rad) + self.bat_radius_m
+        half_width = max(3.0 * self.bat_radius_m, 0.010)
+        tip = self.bat_length_m * math.cos(self.tilt_rad)
+        return Face(half_width_m=half_width, half_height_m=max(reach, half_width), height_m=tip)
+
+    @property
+    def half_footprint_m(self) -> Vector2:
+        """The length of its bat: what a finger needs about it."""
+        return self.bat_length_m, self.bat_length_m
+
+    def envelope(self, angle_rad: float | None = None) -> Envelope:
+        """The bat swings in the vertical plane."""
+        half = self.bat_length_m * math.sin(self.tilt_rad) + 2 * self.bat_radius_m
+        return Envelope(half_m=(2 * self.bat_radius_m, half), height_m=self.bat_length_m + self.bat_radius_m)
+
+    @property
+    def goal(self) -> StateGoal:
+        """On or off."""
+        return StateGoal(states=("on", "off"))
+
+    @property
+    def mission_rank(self) -> float:
+        """After levers, sliders and buttons."""
+        return 4.0
+
+    @classmethod
+    def keys_of(cls, taught: Taught) -> dict[str, Any]:
+        """Nothing: its outline tells little of a bat that stands out."""
+        return {}

@@ -1,0 +1,104 @@
+"""What a kind needs to be read: a function from a rectified patch to a status, and the patch that it wants."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from hal.arrays import Array, Image
+from hal.kinds import READERS, part_of
+from hal.panel import PanelObject
+from perception.vision.patch import Patch, rectify
+from perception.vision.projection import PanelProjection
+from perception.vision.reading import PatchReading, as_often_right
+
+MARGIN = 1.25  # of the face: readers look at the plate around the object too
+LAMP_MARGIN = 2.0
+K = TypeVar("K", bound=PanelObject)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hints:
+    """What is known beside the image.
+
+    Attributes:
+        before: the previous reading, which tells between numbers that are about equally likely.
+        digits_taught: whether the panel file knows how many digits and decimals its displays have.
+    """
+
+    before: float | None = None
+    digits_taught: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reader(Generic[K]):
+    """The reader of one kind.
+
+    Attributes:
+        read: status of an object by a patch that shows the plane of its face, origin at its middle.
+        guesses_right: share of its guesses that are right however weak the evidence, but no more than a guess may claim.
+        is_telling: whether its reading, when sure, proves that the object is there although its outline has the
+            plate's gray.
+        margin, side_m: the patch is so many times the object's face, and so much wider on every side: what stands out
+            appears beside its foot, and the patch must hold both.
+        leans: the object stands out like a bat: the patch shows the plane of the plate, and as far as its tip appears.
+    """
+
+    read: Callable[[Patch, K], PatchReading]
+    guesses_right: float = 0.0
+    is_telling: bool = False
+    margin: float = MARGIN
+    side_m: float = 0.003
+    leans: bool = False
+
+    def status(self, patch: Patch, spec: K, hints: Hints) -> PatchReading:  # noqa: ARG002 - of use to some
+        """The status of an object; `hints` help only kinds whose reader overrides this."""
+        return self.read(patch, spec)
+
+
+def reader_of(kind: str) -> Reader[Any]:
+    """The reader of a kind.
+
+    Raises:
+        Unsupported: the kind has none.
+    """
+    reader: Reader[Any] = part_of(READERS, kind)
+    return reader
+
+
+def read_patch(
+    patch: Patch, spec: PanelObject, *, digits_taught: bool = True, before: float | None = None
+) -> PatchReading:
+    """The status of one object by the reader of its kind; the value `before` tells between a display's likely numbers."""
+    reader = reader_of(spec.kind)
+    status = reader.status(patch, spec, Hints(before=before, digits_taught=digits_taught))
+    return as_often_right(status, reader.guesses_right)
+
+
+def patch_of(image: Image, gray: Image, view: PanelProjection, spec: PanelObject, shift_px: Array) -> Patch:
+    """The rectified patch that the reader of this object wants."""
+    face, reader = spec.face, reader_of(spec.kind)
+    side = reader.side_m
+    if reader.leans:  # and the plate beyond its tip, where it must have ended
+        side += _lean_m(view, spec, face.height_m) + spec.envelope().half_m[0]
+    return rectify(
+        image,
+        view,
+        spec.position_m,
+        half_width_m=reader.margin * face.half_width_m + side,
+        half_height_m=reader.margin * face.half_height_m + side,
+        plane_z_m=0.0 if reader.leans else face.height_m,
+        shift_px=shift_px,
+        gray=gray,
+    )
+
+
+def _lean_m(view: PanelProjection, spec: PanelObject, height_m: float) -> float:
+    """How far beside its foot a point at that height appears, in metres on the plate."""
+    x, y = spec.position_m
+    px = view.project([[x, y, 0.0], [x, y, height_m], [x + 0.01, y, 0.0], [x, y + 0.01, 0.0]])
+    scale = min(float(np.linalg.norm(px[2] - px[0])), float(np.linalg.norm(px[3] - px[0]))) / 0.01
+    return float(np.linalg.norm(px[1] - px[0])) / max(scale, 1e-9)

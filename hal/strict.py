@@ -20,6 +20,11 @@ class Strict(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
 
+    @classmethod
+    def further_faults(cls, data: dict[str, Any]) -> list[Any]:  # noqa: ARG003 - of use to models that override it
+        """Faults of `data` that validation does not come to when it finds others first, as pydantic gives errors."""
+        return []
+
 
 def load_toml(path: Path, model: type[M], what: str) -> M:
     """Read `path` and validate it as `model`.
@@ -66,7 +71,10 @@ def validate(data: dict[str, Any], model: type[M], *, source: str) -> M:
         return model.model_validate_json(json.dumps(data, default=str), strict=True)
     except ValidationError as error:
         # A misspelt key leaves its right one missing: the misspelling is what to mend, so it comes first.
-        items = sorted(error.errors(), key=lambda item: item["type"] != "extra_forbidden")
+        found = error.errors()
+        known = {(item["loc"], item["msg"]) for item in found}
+        found += [item for item in model.further_faults(data) if (item["loc"], item["msg"]) not in known]
+        items = sorted(found, key=lambda item: item["type"] != "extra_forbidden")
         faults = [_fault(item, model) for item in items]
         first_key, first_text, first_hint = faults[0]
         more = f" (and {len(faults) - 1} more {'fault' if len(faults) == 2 else 'faults'})" if len(faults) > 1 else ""
@@ -75,8 +83,13 @@ def validate(data: dict[str, Any], model: type[M], *, source: str) -> M:
             hint=first_hint,
             file=source,
             key=first_key,
-            faults=[_said(key, text) for key, text, _ in faults],
+            faults=[_with_remedy(*fault) for fault in faults],
         ) from error
+
+
+def _with_remedy(key: str, text: str, hint: str) -> str:
+    """A fault in one line, with its remedy unless that is a page for all of them."""
+    return _said(key, text) if hint.startswith(("add ", "see ")) else f"{_said(key, text)}; {hint}"
 
 
 def _fault(item: Any, model: type[BaseModel]) -> tuple[str, str, str]:

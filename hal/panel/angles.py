@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any, get_args
+from typing import Annotated, Any, get_args
 
-from pydantic import BaseModel
+from pydantic import AfterValidator, BaseModel, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 from pydantic_core.core_schema import ErrorType
 
+from hal.panel.parts import Scale
+from hal.panel.turn import TURN_RAD, beyond, meant_otherwise
 from hal.strict import unknown_key_hint
 
 UNITLESS = {"at_min", "at_max", "table"}  # keys of a scale, whose places are angles or lengths as its object says
@@ -18,8 +20,7 @@ Location = tuple[str | int, ...]
 
 def fault(at: Location, given: object, what: str, hint: str) -> InitErrorDetails:
     """A fault of a file: where, the value that is given there, what is wrong with it, and what helps."""
-    kind = PydanticCustomError("cannot_be_meant", "{what}", {"what": what, "hint": hint})
-    return InitErrorDetails(type=kind, loc=at, input=given)
+    return InitErrorDetails(type=meant_otherwise(what, hint), loc=at, input=given)
 
 
 def again(item: Any, model: type[BaseModel]) -> InitErrorDetails:
@@ -65,3 +66,25 @@ def _radians(value: Any, *, is_table: bool) -> Any:
     if is_table and isinstance(value, list):  # pairs of place and value
         return [[_radians(p[0], is_table=False), *p[1:]] if isinstance(p, list) and p else p for p in value]
     return math.radians(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+def _is_a_pointers(scale: Scale) -> Scale:
+    """A scale whose places are angles: its ends are within a turn, and so is the way between them."""
+    places: list[tuple[Location, float]] = [(("at_min",), scale.at_min), (("at_max",), scale.at_max)]
+    places += [(("table", k, 0), place) for k, (place, _) in enumerate(scale.table)]
+    faults = [
+        InitErrorDetails(type=beyond(str(at[0]), place), loc=at, input=place)
+        for at, place in places
+        if abs(place) > TURN_RAD
+    ]
+    if not faults and abs(scale.at_max - scale.at_min) > TURN_RAD:
+        what = f"from {scale.at_min:g} to {scale.at_max:g} rad is more than a full turn"
+        hint = f"angles are radians: if these are degrees, write at_min_deg = {scale.at_min:g}, at_max_deg = {scale.at_max:g}"
+        faults.append(fault(("at_max",), scale.at_max, what, hint))
+    if faults:
+        raise ValidationError.from_exception_data("scale", faults)
+    return scale
+
+
+PointerScale = Annotated[Scale, AfterValidator(_is_a_pointers)]
+"""A scale whose places are angles in radians, clockwise from straight up."""

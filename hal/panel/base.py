@@ -31,6 +31,8 @@ class PanelObject(Strict, ABC):
     """Whether its outline is drawn as a circle where it has no `rim`."""
     asked: ClassVar[tuple[Question, ...]] = ()
     """What must be asked, beside the name, when a panel with such an object is taught."""
+    places_are_lengths: ClassVar[bool] = False
+    """Whether the places of its scale are metres rather than angles."""
     turns_about_click: ClassVar[bool] = False
     """Whether teaching takes the place that was clicked for its middle, rather than the middle of its outline."""
 
@@ -48,6 +50,11 @@ class PanelObject(Strict, ABC):
     @abstractmethod
     def half_footprint_m(self) -> Vector2:
         """Half width and half height of the upright rectangle on the plate that holds it in any state."""
+
+    @property
+    def half_foot_m(self) -> Vector2:
+        """Half the sides of what stands on the plate itself, turned as its envelope is; nothing else may stand there."""
+        return self.half_footprint_m
 
     @abstractmethod
     def envelope(self, angle_rad: float | None = None) -> Envelope:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
+from hal.panel.angles import PointerScale
 from hal.panel.base import PanelObject
 from hal.panel.form import Envelope, Face, Rim, circle
-from hal.panel.parts import NotNegative, Positive, Scale, Vector2
+from hal.panel.parts import NotNegative, Positive, Vector2
 from hal.panel.questions import Question, Taught, about_a_pointer, pointer_scale, radius_of
 
 LEAST_HEIGHT_M = 0.004
@@ -18,7 +19,7 @@ class Gauge(PanelObject):
 
     kind: Literal["gauge"] = "gauge"
     radius_m: Positive
-    scale: Scale
+    scale: PointerScale
     depth_m: NotNegative = 0.004
 
     asked: ClassVar[tuple[Question, ...]] = about_a_pointer("-135", "135")

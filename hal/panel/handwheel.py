@@ -12,6 +12,7 @@ from hal.panel.form import Envelope, Face, Relief, Rim, circle
 from hal.panel.goals import NumberGoal, Shown
 from hal.panel.parts import Positive, Vector2
 from hal.panel.questions import Question, Taught, radius_of
+from hal.panel.turn import Turns
 
 RIGHT_RAD = 0.105
 """A wheel that is read or turned to within 6 degrees is right."""
@@ -27,8 +28,8 @@ class Handwheel(PanelObject):
     rim_m: Positive = 0.005
     height_m: Positive = 0.030
     spokes: Annotated[int, Field(ge=2, le=8)] = 3
-    minimum_rad: float = -6.2832
-    maximum_rad: float = 6.2832
+    minimum_rad: Turns = -6.2832
+    maximum_rad: Turns = 6.2832
     torque_nm: Positive = 0.8
 
     value_is_angle: ClassVar[bool] = True

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
+import math
+from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, GetJsonSchemaHandler, ValidationError, ValidationInfo, model_validator
-from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+from pydantic import Field, GetJsonSchemaHandler, TypeAdapter, ValidationError, ValidationInfo, model_validator
+from pydantic_core import CoreSchema, core_schema
 
 from hal import kinds
 from hal.errors import InvalidRequest
-from hal.panel.angles import again, in_radians
+from hal.panel.angles import UNITLESS, Location, again, fault, in_radians
 from hal.panel.base import PanelObject
 from hal.panel.parts import Light, Name, NotNegative, Positive
+from hal.panel.plate import faults_of
+from hal.panel.turn import meant_otherwise
 from hal.strict import Strict, load_toml, reachable
 
 
@@ -34,18 +38,17 @@ def _of_its_kind(data: Any, info: ValidationInfo) -> PanelObject:
     if isinstance(data, PanelObject):
         return data
     if not isinstance(data, dict):
-        raise PydanticCustomError("table_type", "must be a table with kind, name and position_m")
+        raise meant_otherwise("is no table", "write [[objects]] with kind, name and position_m")
     kind = data.get("kind")
-    if kind is None:
-        raise PydanticCustomError("kind_missing", "has no kind; {hint}", {"hint": kinds.hint_for("")})
     if kind not in kinds.installed_kinds():
-        words = {"kind": repr(kind), "hint": kinds.hint_for(str(kind))}
-        raise PydanticCustomError("kind_unknown", "{kind} is no kind that is installed; {hint}", words)
+        what = "has no kind" if kind is None else f"{kind!r} is no kind of object that is installed"
+        at = () if kind is None else ("kind",)
+        raise ValidationError.from_exception_data("object", [fault(at, kind, what, kinds.hint_for(str(kind or "")))])
     model = kinds.kind_model(kind)
     if info.mode != "json":
         return model.model_validate(data)
     known = frozenset(name for one in reachable(model) for name in one.model_fields)
-    table, faults = in_radians(data, known)
+    table, faults = in_radians(data, known - UNITLESS if model.places_are_lengths else known)
     try:
         # JSON mode takes lists for tuples, as TOML has them, and is strict all the same.
         made = model.model_validate_json(json.dumps(table))
@@ -56,6 +59,10 @@ def _of_its_kind(data: Any, info: ValidationInfo) -> PanelObject:
     if faults:
         raise ValidationError.from_exception_data(kind, faults)
     return made
+
+
+AnyObject = Annotated[PanelObject, _OfItsKind]
+_OBJECT: TypeAdapter[PanelObject] = TypeAdapter(AnyObject)
 
 
 class Tolerances(Strict):
@@ -75,26 +82,32 @@ class Panel(Strict):
     height_m: Positive
     thickness_m: Positive = 0.01
     lights: Annotated[tuple[Light, ...], Field(min_length=4, max_length=4)]
-    objects: tuple[Annotated[PanelObject, _OfItsKind], ...] = ()
+    objects: tuple[AnyObject, ...] = ()
     tolerances: Tolerances = Tolerances()
 
     @model_validator(mode="after")
-    def _names_are_unique_and_places_on_the_plate(self) -> Panel:
-        parts: list[Light | PanelObject] = [*self.lights, *self.objects]
-        names = [part.name for part in parts]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise ValueError(f"the name {twice[0]!r} is given twice")
-        for part in parts:
-            x, y = part.position_m[:2]
-            if abs(x) > self.width_m / 2 or abs(y) > self.height_m / 2:
-                raise ValueError(f"{part.name} at ({x}, {y}) m lies off the plate")
-        by_name = {panel_object.name: panel_object for panel_object in self.objects}
-        for panel_object in self.objects:
-            shown_by = panel_object.shown_by
-            if shown_by != panel_object.name and (shown_by not in by_name or by_name[shown_by].kind != "lamp"):
-                raise ValueError(f"{panel_object.name} lights {shown_by!r}, which is no lamp of the panel")
+    def _parts_have_their_own_names_and_places(self) -> Panel:
+        parts: dict[Location, Light | PanelObject] = {("lights", k): light for k, light in enumerate(self.lights)}
+        parts |= {("objects", k): panel_object for k, panel_object in enumerate(self.objects)}
+        faults = faults_of(self.width_m, self.height_m, parts)
+        if faults:
+            raise ValidationError.from_exception_data(self.name, faults)
         return self
+
+    @classmethod
+    def further_faults(cls, data: dict[str, Any]) -> list[Any]:
+        """Faults of the places of what is right in itself, beside something that is not."""
+        parts: dict[Location, Light | PanelObject] = {}
+        for key, model in (("lights", TypeAdapter(Light)), ("objects", _OBJECT)):
+            table = data.get(key)
+            for k, one in enumerate(table if isinstance(table, list) else ()):
+                with suppress(ValidationError):
+                    parts[(key, k)] = model.validate_json(json.dumps(one, default=str))
+        width, height = data.get("width_m"), data.get("height_m")
+        if not isinstance(width, float) or not isinstance(height, float):
+            width = height = math.inf
+        faults = faults_of(width, height, parts)
+        return ValidationError.from_exception_data("panel", faults).errors() if faults else []
 
     def object(self, name: str) -> PanelObject:
         """The object called `name`.

@@ -37,6 +37,11 @@ class Lever(PanelObject):
         reach = self.length_m + self.width_m
         return reach, reach
 
+    @property
+    def half_foot_m(self) -> Vector2:
+        """Its hub; the bar may pass over what is lower."""
+        return self.width_m / 2, self.width_m / 2
+
     def envelope(self, angle_rad: float | None = None) -> Envelope:
         """All that it sweeps; at a known angle hub and bar, from half a width behind the hub to the far end."""
         if angle_rad is None:

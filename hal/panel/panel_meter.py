@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
+from hal.panel.angles import PointerScale
 from hal.panel.base import PanelObject
 from hal.panel.form import Envelope, Face, Rim
 from hal.panel.gauge import LEAST_HEIGHT_M
-from hal.panel.parts import NotNegative, Positive, Scale, Vector2
+from hal.panel.parts import NotNegative, Positive, Vector2
 from hal.panel.questions import Question, Taught, about_a_pointer, pointer_scale
 
 PIVOT_SHARE, NEEDLE_SHARE = 0.28, 0.6  # of the height of a meter that is taught
@@ -21,7 +22,7 @@ class PanelMeter(PanelObject):
     height_m: Positive
     pivot_below_m: NotNegative
     needle_m: Positive
-    scale: Scale
+    scale: PointerScale
     depth_m: NotNegative = 0.004
 
     asked: ClassVar[tuple[Question, ...]] = about_a_pointer("-45", "45")

@@ -7,6 +7,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, model_validator
 
+from hal.panel.turn import Angle, meant_otherwise
 from hal.strict import Strict
 
 Positive = Annotated[float, Field(gt=0)]
@@ -45,12 +46,18 @@ class Scale(Strict):
     @model_validator(mode="after")
     def _is_a_scale(self) -> Scale:
         if self.maximum <= self.minimum:
-            raise ValueError("maximum must be greater than minimum")
+            raise meant_otherwise(
+                f"maximum must be greater than minimum, and {self.maximum:g} is not greater than {self.minimum:g}",
+                "swap them; a scale that falls has its at_min and at_max swapped instead",
+            )
         if self.at_max == self.at_min:
-            raise ValueError("at_max must differ from at_min")
+            raise meant_otherwise(f"at_max must differ from at_min, and both are {self.at_min:g}", "give both ends")
         steps = [(p1 - p0, v1 - v0) for (p0, v0), (p1, v1) in pairwise(self._points())]
         if any(place == 0.0 or value == 0.0 or (value > 0.0) != (steps[0][1] > 0.0) for place, value in steps):
-            raise ValueError("the values of a scale and its table must all rise, or all fall, from place to place")
+            raise meant_otherwise(
+                "the values of a scale and its table must all rise, or all fall, from place to place",
+                "look for a pair of the table that stands on the wrong side of its neighbours",
+            )
         return self
 
     @property
@@ -82,12 +89,12 @@ class State(Strict):
     """A named resting place of a control; `angle_rad` clockwise from straight up (toggle: tilt, up positive)."""
 
     name: Name
-    angle_rad: float = 0.0
+    angle_rad: Angle = 0.0
 
 
 def _all_different(states: tuple[State, ...]) -> tuple[State, ...]:
     if len({state.name for state in states}) != len(states):
-        raise ValueError("two states have the same name")
+        raise meant_otherwise("two states have the same name", "rename one, or leave it out")
     return states
 
 

@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from typing import Any, ClassVar, Literal
 
+from pydantic import ValidationError, model_validator
+
+from hal.panel.angles import fault
 from hal.panel.base import PanelObject
 from hal.panel.form import Envelope, Face
 from hal.panel.goals import GAUGE_SHARE, NumberGoal
 from hal.panel.parts import Positive, Scale, Vector2, Vector3
 from hal.panel.questions import ENDS, Question, Taught, ends_of
+from hal.panel.turn import Angle
 
 CAP_M = 0.012  # of a slider that is taught, along its track
 
@@ -18,18 +22,33 @@ class Slider(PanelObject):
     """Slider on a straight track; the scale's places are metres from the track's middle along `angle_rad` from +x."""
 
     kind: Literal["slider"] = "slider"
-    angle_rad: float = 0.0
+    angle_rad: Angle = 0.0
     travel_m: Positive
     cap_size_m: Vector3 = (0.012, 0.024, 0.016)  # along the track, across it, out of the plate
     scale: Scale
     friction_n: Positive = 4.0
 
+    places_are_lengths: ClassVar[bool] = True
     asked: ClassVar[tuple[Question, ...]] = (
         *ENDS,
         Question(
             key="rises", text="Where does the value rise to?", choices=("right", "left", "up", "down"), default="right"
         ),
     )
+
+    @model_validator(mode="after")
+    def _places_are_on_the_track(self) -> Slider:
+        """The scale's places are metres along the track."""
+        faults = [
+            fault(
+                ("scale", key), place, f"{place:g} m is beyond the track", f"the track ends {self.travel_m / 2:g} m off"
+            )
+            for key, place in (("at_min", self.scale.at_min), ("at_max", self.scale.at_max))
+            if abs(place) > 0.501 * self.travel_m
+        ]
+        if faults:
+            raise ValidationError.from_exception_data("slider", faults)
+        return self
 
     @property
     def half_footprint_m(self) -> Vector2:
@@ -38,6 +57,11 @@ class Slider(PanelObject):
         across = self.cap_size_m[1] / 2
         c, s = abs(math.cos(self.angle_rad)), abs(math.sin(self.angle_rad))
         return along * c + across * s, along * s + across * c
+
+    @property
+    def half_foot_m(self) -> Vector2:
+        """The cap at any place of its track, along the track and across it."""
+        return self.envelope().half_m
 
     @property
     def face(self) -> Face:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator
 
 from hal.panel.base import PanelObject
 from hal.panel.form import Envelope, Face
 from hal.panel.goals import StateGoal
 from hal.panel.parts import Positive, Vector2
 from hal.panel.questions import Taught
+from hal.panel.turn import below_a_quarter
 
 
 class Toggle(PanelObject):
@@ -18,7 +21,7 @@ class Toggle(PanelObject):
     kind: Literal["toggle"] = "toggle"
     bat_length_m: Positive = 0.020
     bat_radius_m: Positive = 0.004
-    tilt_rad: Positive = 0.40
+    tilt_rad: Annotated[Positive, AfterValidator(below_a_quarter)] = 0.40
     force_n: Positive = 6.0
 
     @property
@@ -28,6 +31,11 @@ class Toggle(PanelObject):
         half_width = max(3.0 * self.bat_radius_m, 0.010)
         tip = self.bat_length_m * math.cos(self.tilt_rad)
         return Face(half_width_m=half_width, half_height_m=max(reach, half_width), height_m=tip)
+
+    @property
+    def half_foot_m(self) -> Vector2:
+        """Its nut."""
+        return 1.8 * self.bat_radius_m, 1.8 * self.bat_radius_m
 
     @property
     def half_footprint_m(self) -> Vector2:

@@ -13,7 +13,8 @@ from hal.geometry import UncertainPose
 from hal.panel import Button, Handwheel, Light, Mushroom, Panel
 from perception.range.matching.solids import boxes_of, render, solid_of
 from service.operations.acquisition import Scan
-from service.operations.relief import Sighting, find_by_surfaces, mark_of, models_of, sighting_json, surfaces_in
+from service.operations.recognise import _sighting_result
+from service.operations.relief import Sighting, find_by_surfaces, mark_of, models_of, surfaces_in
 from service.report.surfaces import FOUND, LOST, surfaces_picture
 
 SIDE = 128
@@ -117,17 +118,17 @@ def test_both_are_found_where_they_stand_though_the_rim_is_two_pixels_wide(seed)
     turn = 0.4
     depth = np.minimum(plate_depth(), drawn(standing(MUSHROOM), MUSHROOM))
     seen = sightings(scan_of(np.minimum(depth, drawn(standing(WHEEL, turn), WHEEL)), seed=seed))
-    rows = [sighting_json(s) for s in seen.values()]
-    assert [(r["name"], r["found"]) for r in rows] == [("stop", True), ("bypass", True)]
-    assert all(r["off_panel_file_m"] < 0.0015 for r in rows)
-    assert abs(rows[0]["state"]) < 0.001 and "cap" in rows[0]["surfaces"]
-    off_rad = abs(rows[1]["state"] - (2 * np.pi / 3 - turn))
-    assert off_rad < 0.06 and off_rad < 4.0 * rows[1]["state_sigma"] and rows[1]["state_sigma"] < 0.03
+    rows = [_sighting_result(s) for s in seen.values()]
+    assert [(r.name, r.found) for r in rows] == [("stop", True), ("bypass", True)]
+    assert all(r.off_panel_file_m < 0.0015 for r in rows)
+    assert abs(rows[0].state) < 0.001 and "cap" in rows[0].surfaces
+    off_rad = abs(rows[1].state - (2 * np.pi / 3 - turn))
+    assert off_rad < 0.06 and off_rad < 4.0 * rows[1].state_sigma and rows[1].state_sigma < 0.03
 
 
 def test_a_bare_plate_shows_neither():
     seen = sightings(scan_of(plate_depth()))
-    assert [sighting_json(s)["found"] for s in seen.values()] == [False, False]
+    assert [_sighting_result(s).found for s in seen.values()] == [False, False]
     assert all("no surfaces" in s.why for s in seen.values())
 
 

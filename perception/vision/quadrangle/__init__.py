@@ -1,6 +1,6 @@
 """Pose of four known points in one image: `estimate`, with covariance, mirror poses and an honest flag.
 
-`three_point` gives the poses of three points, `direct` the paper's route from them, `minima` every minimum of `cost`,
+`three_point` gives the poses of three points, `minima` every minimum of `cost`,
 `posterior` their odds; `search` joins them. All below `pose` is compiled.
 """
 

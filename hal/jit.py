@@ -8,7 +8,7 @@
         return total
 
 A compiled function has Python type annotations, which mypy checks, and is called with one set of argument types only,
-because numba compiles it once more for every other set. The machine code is kept on disk beside the source.
+because numba compiles it once more for every other set. The machine code is kept on disk, see `hal.kernel_cache`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,10 @@ from typing import Any, TypeVar, cast, overload
 import numba
 import numpy as np
 from numba.extending import register_jitable
+
+from hal import kernel_cache
+
+kernel_cache.use(numba.config)
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T", bool, int)
@@ -52,6 +56,7 @@ def compiled(function: F | None = None, /, *, fastmath: frozenset[str] = frozens
 
 def inlined(function: F) -> F:
     """Let compiled functions call a small helper, which is compiled into each of them and is plain Python elsewhere."""
+    kernel_cache.register_helper(function)
     return register_jitable(error_model="numpy", nogil=True)(function)
 
 

@@ -5,11 +5,13 @@ PACKAGES := hal drivers simbackend perception fusion manipulation service benchm
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-# One line for every ten packages found, and what went wrong.
-PIP_IN_SHORT = awk ' \
-    /^Collecting/ { n++; if (n % 10 == 0) { print "setup: " n " packages found"; fflush() } } \
-    /^Installing collected/ { print "setup: installing " (n + 0) " packages"; fflush() } \
-    /^ERROR|^error/ { print }'
+# uv fetches packages side by side. It does not read pip's configuration: where it finds nothing, pip does the same.
+# Both say nothing while they fetch, so a line every five seconds does.
+define install
+( while sleep 5; do echo "setup: fetching packages"; done ) & ticker=$$!; trap 'kill $$ticker' EXIT; \
+$(BIN)/uv pip install --quiet --python $(BIN)/python -c constraints.txt $(1) || { echo "setup: pip takes over from uv"; \
+    $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt $(1); }
+endef
 
 .PHONY: docs help setup warm test-packages demo serve test test-wire test-fast lint lint-style lint-types lint-layers format bench-cell bench-missions bench-pose bench-fusion bench-range bench-vision bench-cables bench-drivers clean
 
@@ -23,21 +25,21 @@ setup: .venv/ready  ## Make .venv with everything in it
 	    echo "  try    install python3.11 and python3.11-venv, or give its path: make PYTHON=/path/to/python3.11"; exit 2; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { echo "error: $(PYTHON) is $$($(PYTHON) --version 2>&1), not 3.11."; \
 	    echo "  try    make PYTHON=/path/to/python3.11"; exit 2; }
-	@echo "setup: making .venv (about 120 packages, 2 GB, some minutes, mostly compiling)"
+	@echo "setup: making .venv (about 120 packages, 2 GB; then the kernels are compiled, once per installation)"
 	@$(PYTHON) -m venv .venv
-	@$(BIN)/python -m pip install --no-compile --progress-bar off -c constraints.txt -e . 2>&1 | $(PIP_IN_SHORT)
+	@$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt uv || true
+	@$(call install,-e .)
 	@$(BIN)/python -c 'import hal, numpy, cv2, pybullet' || { echo "error: the installation is not complete; the lines above say why"; exit 2; }
-	@$(BIN)/python -m compileall -q -j 0 .venv/lib >/dev/null || true  # some packages carry files for other Pythons
 	@$(MAKE) --no-print-directory -j 2 warm test-packages
 	@touch $@
 	@echo "setup: ready"
 
-warm:  # hot loops are compiled while the packages that only tests need arrive
+warm:  # kernels are compiled while the packages that only tests need arrive
 	@$(BIN)/panelwright warm
 
-test-packages:  # the project itself is left as it is: it runs beside this
-	@$(BIN)/python -c 'import tomllib; extras = tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]; print(*extras["docs"], *extras["test"], sep="\n")' | \
-	    $(BIN)/python -m pip install --progress-bar off -c constraints.txt -r /dev/stdin 2>&1 | $(PIP_IN_SHORT)
+test-packages:  # without the project itself, which runs beside this
+	@$(BIN)/python -c 'import tomllib; extras = tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]; print(*extras["docs"], *extras["test"], sep="\n")' > .venv/test-packages.txt
+	@$(call install,-r .venv/test-packages.txt)
 	@$(BIN)/python -c 'import hypothesis, playwright, pytest, schemathesis' || { echo "error: the test packages are not complete; the lines above say why"; exit 2; }
 
 demo: setup  ## Run the whole mission on the simulated cell and leave a report in runs/

@@ -1,13 +1,25 @@
-"""Compiles or loads the hot loops before somebody waits for them."""
+"""Compiles or loads the compiled kernels before somebody waits for them.
+
+Run as a module it is one worker of `service.compiling`: `python -m service.warm STAGE`, or `survey`.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import sys
+import threading
 from collections.abc import Callable, Mapping
+from importlib import import_module
+from pathlib import Path
+
+from service.processes.child import Lifeline, kill_own_group
+
+ROOT = Path(__file__).parents[1]
+ROOMS = ("fusion", "hal", "manipulation", "perception", "simbackend")
+SURVEY = "survey"
 
 
 def _imports() -> None:
-    from importlib import import_module
-
     # Everything that a mission computes, plans and draws with.
     for name in ("service.operations.mission", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         import_module(name)
@@ -37,23 +49,76 @@ def _planning() -> None:
     warm_up()
 
 
+def _cell() -> None:
+    """Start the simulated bench: control loop and world compile their own kernels when they start."""
+    from hal.config import load_cell
+    from service.processes.supervisor import Supervisor
+
+    supervisor = Supervisor(load_cell(ROOT / "cells" / "bench.toml"))
+    try:
+        supervisor.start()
+    finally:
+        supervisor.close()
+
+
 STAGES: Mapping[str, Callable[[], None]] = {
-    "imports": _imports,
     "range": _range,
     "vision": _vision,
     "fusion": _fusion,
     "planning": _planning,
+    "cell": _cell,
+    "imports": _imports,
 }
-"""What the service process computes with. The cell and world processes warm their own loops when they start."""
+"""What can be compiled side by side, longest first."""
+OF_SERVICE = ("imports", "range", "vision", "fusion", "planning")
+"""What the service process computes with. The cell and world processes load their own kernels when they start."""
 
 
 def warm() -> None:
-    """Run each stage in this process. The first time on a machine this compiles for minutes; the result stays on disk."""
-    for name in STAGES:
-        run_stage(name)
+    """Load the kernels of the service process into it, and compile those that are not compiled yet."""
+    for name in OF_SERVICE:
+        STAGES[name]()
 
 
-def run_stage(name: str) -> str:
-    """Run one stage of `STAGES`; returns its name, so that a pool can tell which one has ended."""
-    STAGES[name]()
-    return name
+def sources() -> list[Path]:
+    """Return the files that hold compiled kernels, or say how kernels are compiled."""
+    files = sorted(file for room in ROOMS for file in (ROOT / room).rglob("*.py"))
+    return [file for file in files if b"numba" in (text := file.read_bytes()) or b"hal.jit" in text]
+
+
+def hash_of_sources() -> str:
+    """Hash the files that hold kernels and Python's version, to tell whether all was compiled before."""
+    digest = hashlib.sha256(sys.version.encode())
+    for file in sources():
+        digest.update(file.relative_to(ROOT).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def survey() -> tuple[str, ...]:
+    """Import every module that holds kernels, and return the names under which the kernels are kept."""
+    from hal.kernel_cache import expected
+
+    for file in sources():
+        import_module(".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"))
+    return expected()
+
+
+def main() -> None:
+    """Run one stage, or print the names of all kernels; end when the parent ends."""
+    lifeline = Lifeline()
+
+    def end_with_parent() -> None:
+        lifeline.wait_for_end()
+        kill_own_group()
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    stage = sys.argv[1]
+    if stage == SURVEY:
+        for name in survey():
+            lifeline.write_line(name)
+    else:
+        STAGES[stage]()
+
+
+if __name__ == "__main__":
+    main()

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,7 +15,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DEFAULT_CELL",
-    "PATIENCE_S",
     "CellOption",
     "SeedOption",
     "Url",
@@ -26,12 +22,10 @@ __all__ = [
     "client_of",
     "console",
     "find_cell",
-    "patience",
     "read_cell",
     "state_style",
 ]
 
-PATIENCE_S = 4.0
 Url = Annotated[str, typer.Option("--url", help="Address of a running service.", show_default=True)]
 CellOption = Annotated[
     Path, typer.Option("--cell", help="Cell file (TOML); shipped ones are found by their path in the project.")
@@ -39,19 +33,6 @@ CellOption = Annotated[
 SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Replaces the seed of the cell file.")]
 DEFAULT_CELL = Path("cells/bench.toml")
 UrlDefault = DEFAULT_URL
-
-
-@contextmanager
-def patience(after_s: float = PATIENCE_S) -> Iterator[None]:
-    """Says once what takes so long when the work inside does: compiling, after an installation or an update."""
-    words = "still at work: after an update hot loops are compiled once, for a minute or two (`panelwright warm`)"
-    timer = threading.Timer(after_s, console.print, args=(words,), kwargs={"style": "dim", "markup": False})
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 def client_of(url: str) -> Client:

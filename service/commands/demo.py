@@ -15,6 +15,7 @@ from service.client import ApiError, Client
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console, read_cell
 from service.commands.shutdown import INTERRUPTED, leave, one_interrupt
 from service.commands.tasks import follow
+from service.commands.warm import compile_first
 
 JUDGE_S = 30  # most that is waited for a verdict
 
@@ -35,6 +36,7 @@ def demo(
 
     started_s, before = time.monotonic(), reports(runs)
     loaded = read_cell(cell, seed)
+    compile_first()
     exit_on_sigterm()
     panelwright = Panelwright(loaded, Options(port=port, runs_dir=runs, inline=inline))
     console.print(f"cell [bold]{loaded.name}[/], seed {loaded.file.cell.seed}: starting")

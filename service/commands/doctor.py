@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from service.commands.common import DEFAULT_CELL, CellOption, console
+from service.commands.warm import compile_first
 
 
 def doctor(
@@ -17,6 +18,8 @@ def doctor(
     """Check Python, packages, ports, the cell file and its devices; exit code 1 when something is wrong."""
     from service.commissioning.doctor import examine
 
+    if connect:
+        compile_first()
     if not examine(cell, port, connect=connect):
         raise typer.Exit(1)
     console.print("everything is in order: `panelwright serve` runs it")

@@ -13,6 +13,7 @@ from service.client import ApiError, Client
 from service.commands.common import client_of, console, read_cell
 from service.commands.shutdown import INTERRUPTED, leave, one_interrupt
 from service.commands.tasks import follow
+from service.commands.warm import compile_first
 
 ServiceUrl = Annotated[str | None, typer.Option("--url", help="Use this running service instead of starting the cell.")]
 
@@ -51,6 +52,7 @@ def run_on_cell(
     from service.serve import Options, Panelwright, exit_on_sigterm
 
     loaded = read_cell(cell, seed)
+    compile_first()
     exit_on_sigterm()
     panelwright = Panelwright(loaded, Options(port=0, runs_dir=runs))
     console.print(f"cell [bold]{loaded.name}[/], {loaded.file.cell.mode}, seed {loaded.file.cell.seed}: starting")

@@ -12,8 +12,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from hal.errors import CellError, InvalidRequest
-from service.commands.common import console, patience
+from service.commands.common import console
 from service.commands.shutdown import INTERRUPTED, one_interrupt
+from service.commands.warm import compile_first
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -61,10 +62,10 @@ def range_image(
 
     reading = _reading(scale, near, far, focal, centre, pitch)
     library = () if models is None else shipped_models() if models == "shipped" else load_models(Path(models))
-    with patience():
-        depth, sensor = load_recording(file, reading=reading)
-        scene = analyse(depth, sensor)
-        matches = match_models(scene, depth, library) if library else ()
+    compile_first()
+    depth, sensor = load_recording(file, reading=reading)
+    scene = analyse(depth, sensor)
+    matches = match_models(scene, depth, library) if library else ()
     assumed = assumptions(file, reading)
     _print_surfaces(scene)
     _print_matches(matches)
@@ -106,6 +107,7 @@ def batch_range_images(
     kept = KeptResults(out, folder, reading, afresh=afresh)
     if kept.goes_on:
         console.print(f"going on with {kept.part}; --afresh would begin anew", markup=False)
+    compile_first()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     try:
         with one_interrupt(), Progress(*columns, console=console) as bar:

@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console, read_cell
 from service.commands.shutdown import leave
+from service.commands.warm import compile_first
 
 if TYPE_CHECKING:
     from service.serve import Panelwright
@@ -39,6 +40,7 @@ def serve(
 
     check_host(host)
     loaded = read_cell(cell, seed)
+    compile_first()
     options = Options(host=host, port=port, stop_port=stop_port, runs_dir=runs, inline=inline, partial=True, warm=warm)
     panelwright = Panelwright(loaded, options)
     threading.Thread(target=_announce, args=(panelwright,), daemon=True).start()

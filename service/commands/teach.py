@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hal.errors import InvalidRequest
-from service.commands.common import console, patience
+from service.commands.common import console
+from service.commands.warm import compile_first
 
 if TYPE_CHECKING:
     import numpy as np
@@ -80,6 +81,7 @@ def teach(
         raise InvalidRequest(
             "nobody is there to ask", hint="give --kind, --from-panel, --check, or --dialogue with answers on stdin"
         )
+    compile_first()
     store = KnowledgeStore(folder)
     if kind is not None:
         _by_clicks(store, pixels, plate_m, kind=kind, clicks=click or [])
@@ -89,11 +91,9 @@ def teach(
         return
     from service.knowledge.dialogue import Dialogue
 
-    with patience():
-        talk = Dialogue.about(Terminal(), store, pixels, plate_m)
+    talk = Dialogue.about(Terminal(), store, pixels, plate_m)
     if check:
-        with patience():
-            talk.show_found()
+        talk.show_found()
     else:
         talk.run()
 
@@ -104,8 +104,7 @@ def _by_clicks(
     from service.knowledge.teach import teach_kind
 
     clicks_px = tuple(_pair(text, "--click") for text in clicks)
-    with patience():
-        taught = teach_kind(store, pixels, plate_m, kind=kind, clicks_px=clicks_px)
+    taught = teach_kind(store, pixels, plate_m, kind=kind, clicks_px=clicks_px)
     if not taught.added:
         console.print(f"{kind} looks like that already: nothing was written", markup=False)
         return
@@ -119,10 +118,9 @@ def _by_panel(store: KnowledgeStore, pixels: NDArray[np.uint8], panel_file: Path
     from service.knowledge.teach import learn_panel
 
     panel, gray = load_panel(panel_file), as_gray(pixels)
-    with patience():
-        view = one_plate(gray, (panel.width_m, panel.height_m)).view
-        check_upright(gray, view, panel)
-        learned = learn_panel(store, pixels, view, panel)
+    view = one_plate(gray, (panel.width_m, panel.height_m)).view
+    check_upright(gray, view, panel)
+    learned = learn_panel(store, pixels, view, panel)
     tell(learned.result())
 
 

@@ -1,46 +1,58 @@
-"""`panelwright warm`: compile everything once, so that the first mission is as fast as the second."""
+"""`panelwright warm`, and the same before any command that needs kernels which are not compiled yet."""
 
 from __future__ import annotations
 
 import time
-from concurrent.futures import Future, ProcessPoolExecutor, wait
-from multiprocessing import get_context
 
-from service.commands.common import DEFAULT_CELL, CellOption, console, read_cell
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-PROCESSES = 2
-REMINDER_S = 20.0
+from service.commands.common import console
+from service.commands.shutdown import one_interrupt
+
+WORDS = "compiling"
+ONCE = "once per installation"
+TICK_S = 10.0
+err_console = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
-def warm(cell: CellOption = DEFAULT_CELL) -> None:
-    """Compile the hot loops and keep them on disk; `make setup` does this. Takes a minute or two, later seconds."""
-    from service.processes.supervisor import Supervisor
-    from service.warm import STAGES, run_stage
-
+def warm() -> None:
+    """Compile all kernels and keep them on disk, so that the first mission is as fast as the second."""
     started_s = time.monotonic()
+    _compile()
+    console.print(f"all kernels are compiled ({time.monotonic() - started_s:.0f} s)")
 
-    def report(stage: str) -> None:
-        console.print(f"warm: {stage} ready after {time.monotonic() - started_s:.0f} s")
 
-    def report_ended(stage: Future[str]) -> None:
-        if stage.exception() is None:
-            report(stage.result())
+def compile_first() -> None:
+    """Compile what is not compiled yet, with progress on standard error; does nothing most of the time."""
+    from service.compiling import is_compiled
 
-    with ProcessPoolExecutor(PROCESSES, mp_context=get_context("spawn")) as pool:
-        stages = [pool.submit(run_stage, name) for name in STAGES]
-        for stage in stages:
-            stage.add_done_callback(report_ended)
-        supervisor = Supervisor(read_cell(cell, None))
-        try:
-            supervisor.start()  # beside the pool: its own processes compile the control loop and the world
-        finally:
-            supervisor.close()
-        report("control and simulation")
-        waiting = set(stages)
-        while waiting:
-            _, waiting = wait(waiting, timeout=REMINDER_S)
-            names = [name for name, stage in zip(STAGES, stages, strict=True) if stage in waiting]
-            if names:
-                console.print(f"warm: at work on {', '.join(names)} ({time.monotonic() - started_s:.0f} s)")
-        for stage in stages:
-            stage.result()
+    if not is_compiled():
+        _compile()
+
+
+def _compile() -> None:
+    from service.compiling import compile_kernels
+
+    err_console.print("looking for kernels that are not compiled yet")
+    with one_interrupt():
+        if not err_console.is_terminal:
+            compile_kernels(Lines().tell)
+            return
+        columns = (TextColumn(WORDS), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn(ONCE))
+        with Progress(*columns, console=err_console, transient=True) as progress:
+            bar = progress.add_task(WORDS, total=None)
+            compile_kernels(lambda done, total: progress.update(bar, completed=done, total=total))
+
+
+class Lines:
+    """Progress where nothing can move, as in a log: a line every few seconds."""
+
+    def __init__(self) -> None:
+        self._told_s = -TICK_S
+
+    def tell(self, done: int, total: int) -> None:
+        """Print a line unless one was printed just before."""
+        if time.monotonic() - self._told_s >= TICK_S:
+            self._told_s = time.monotonic()
+            err_console.print(f"{WORDS} {done} of {total} kernels, {ONCE}")

@@ -6,13 +6,12 @@ import pytest
 
 from perception.vision import warm as vision
 from perception.vision.photographs.photo_display import read_photographed_display
-from service.warm import STAGES, run_stage
+from service.warm import STAGES
 
 
 @pytest.mark.parametrize("stage", ["planning", "vision"])
-def test_a_stage_runs_through_and_says_its_name(stage: str) -> None:
-    assert stage in STAGES
-    assert run_stage(stage) == stage
+def test_a_stage_runs_through(stage: str) -> None:
+    STAGES[stage]()
 
 
 def test_the_picture_that_warms_the_display_reader_is_read() -> None:

@@ -19,14 +19,13 @@ from service.cli import _app
 from service.client import Client
 from service.commands import demo, devices, tasks, teach
 from service.commands import serve as serving
-from service.commands.common import patience, read_cell
+from service.commands.common import read_cell
 from service.errors import of_file
 from service.operations import mission
 from service.processes.stop_host import bound_socket
 from service.report.record import MissionRecord
 from service.serve import Panelwright
 from tests.service.conftest import WriteCell
-from tests.service.waiting import eventually
 
 
 def test_a_folder_that_is_not_there_is_one_clear_message(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -43,14 +42,6 @@ def test_a_folder_that_is_not_there_is_one_clear_message(capsys: pytest.CaptureF
     told = capsys.readouterr().err
     assert str(tmp_path / "nowhere" / "x.png") in told
     assert "try" in told
-
-
-def test_work_that_takes_long_is_explained_once_and_quick_work_is_not(capsys: pytest.CaptureFixture[str]) -> None:
-    with patience(60.0):
-        pass
-    assert capsys.readouterr().out == ""
-    with patience(0.0):
-        eventually(lambda: "compiled once" in capsys.readouterr().out)
 
 
 def test_a_name_that_is_like_another_by_its_ending_alone_is_not_proposed(tmp_path: Path) -> None:

@@ -8,8 +8,8 @@ import pytest
 
 from hal.config import load_cell
 from hal.errors import ConfigError
-from service.commands.common import ROOT
 from service.commissioning.new_cell import copy_cell
+from service.terminal import ROOT
 
 SHIPPED = sorted((ROOT / "cells").glob("*.toml"))
 

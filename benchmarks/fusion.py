@@ -22,14 +22,14 @@ from scipy.stats import chi2
 
 from benchmarks.fusion_peers import Row, peers
 from benchmarks.fusion_problems import Tally, codes, mismatched, mixed, random_measurement, rotation
+from benchmarks.fusion_reference import brute_force
+from benchmarks.fusion_simulation import TABLE_II, problem
 from benchmarks.pose import table as pose_table
 from fusion import Measurement, SensingClass, fuse, warm_up
 from fusion.certify import certificate
 from fusion.distance import local_value, local_values
-from fusion.distance.reference import brute_force
 from fusion.errors import Contradiction
 from fusion.robust import used_entries
-from fusion.simulate import TABLE_II, problem
 from fusion.solve import solve
 from hal.arrays import Array
 from hal.geometry import difference, matrix_of, perturbed, transform

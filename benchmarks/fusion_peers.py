@@ -11,9 +11,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from benchmarks.fusion_problems import codes, is_near
+from benchmarks.fusion_reference import residual
+from benchmarks.fusion_simulation import problem
 from fusion import Measurement
-from fusion.distance.reference import residual
-from fusion.simulate import problem
 from fusion.solve import solve, solve_from_many
 from hal.arrays import Array
 from hal.geometry import difference, matrix_of, perturbed, transform

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.fusion_simulation import CODES, Problem, problem
 from fusion import FusedPose, Measurement, SensingClass, fuse
 from fusion.errors import Contradiction
-from fusion.simulate import CODES, Problem, problem
 from fusion.solve import solve
 from hal.arrays import Array
 from hal.geometry import difference

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 from hal.face import load_on_first_use
 
 if TYPE_CHECKING:
-    from fusion.features import Feature, Kind, plane, point, unit
+    from fusion.errors import Contradiction
+    from fusion.features import Feature, Kind, unit
     from fusion.measurement import Measurement, SensingClass
     from fusion.observations import (
         Observation,
@@ -27,11 +28,13 @@ if TYPE_CHECKING:
     from fusion.robust import FusedPose, ShapeEstimate, fuse
     from fusion.shapes import Box, Cylinder, FeatureSet, MovingPart, Shape
     from fusion.shared_errors import ErrorBudget, FusedObservations, error_budget, fuse_observations
+    from fusion.solve import solve_from_many
     from fusion.warm import warm_up
 
 __all__ = [
     "Box",
     "CandidateSensing",
+    "Contradiction",
     "Cylinder",
     "ErrorBudget",
     "Feature",
@@ -55,8 +58,7 @@ __all__ = [
     "fuse",
     "fuse_observations",
     "next_measurement",
-    "plane",
-    "point",
+    "solve_from_many",
     "unit",
     "warm_up",
 ]

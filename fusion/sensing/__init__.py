@@ -8,11 +8,15 @@ x right, y down, z forward. Measurements from one sensor pose share its error; t
 
 from __future__ import annotations
 
-from fusion.sensing.camera import Pinhole, View, image_line, pixel
+from fusion.sensing.camera import Pinhole, image_line, pixel
 from fusion.sensing.contact import proximity, range_plane, range_point, touch
-from fusion.sensing.two_views import light_stripe, stereo_line, stereo_point
 
 __all__ = [
-    "Pinhole", "View", "image_line", "light_stripe", "pixel", "proximity", "range_plane", "range_point", "stereo_line",
-    "stereo_point", "touch",
-]  # fmt: skip
+    "Pinhole",
+    "image_line",
+    "pixel",
+    "proximity",
+    "range_plane",
+    "range_point",
+    "touch",
+]

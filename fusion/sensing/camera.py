@@ -12,7 +12,7 @@ from fusion.measurement import Measurement
 from fusion.sensing.propagation import sensed_by
 from hal.arrays import Array
 from hal.errors import InvalidRequest
-from hal.geometry import UncertainPose, matrix_of
+from hal.geometry import UncertainPose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,14 +29,6 @@ class Pinhole:
         u, v = np.asarray(pixel_px, float)
         ray = np.array([(u - self.cx_px) / self.fx_px, (v - self.cy_px) / self.fy_px, 1.0])
         return np.asarray(ray / np.linalg.norm(ray))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class View:
-    """A camera and where it stood: what one eye of a stereo pair is."""
-
-    base_from_camera: UncertainPose
-    camera: Pinhole
 
 
 def pixel(
@@ -88,15 +80,15 @@ def image_line(
     Raises:
         InvalidRequest: the two points are less than a pixel apart.
     """
-    ends = checked_ends(ends_px)
+    ends = _checked_ends(ends_px)
 
     def sensed(x: Array) -> tuple[Array, Array]:
-        return np.zeros(3), image_plane(camera, ends + x[:4].reshape(2, 2))
+        return np.zeros(3), _image_plane(camera, ends + x[:4].reshape(2, 2))
 
     return sensed_by(feature, Kind.PLANE, sensed, sigma_px**2 * np.eye(4), base_from_camera, label, sensor)
 
 
-def checked_ends(ends_px: ArrayLike) -> Array:
+def _checked_ends(ends_px: ArrayLike) -> Array:
     ends = np.asarray(ends_px, float)
     if ends.shape != (2, 2) or not np.isfinite(ends).all():
         raise InvalidRequest("an image line needs two points (u, v)", hint="give [[u1, v1], [u2, v2]] in pixels")
@@ -105,12 +97,6 @@ def checked_ends(ends_px: ArrayLike) -> Array:
     return ends
 
 
-def image_plane(camera: Pinhole, ends: Array) -> Array:
+def _image_plane(camera: Pinhole, ends: Array) -> Array:
     """(3,) unit normal, camera frame, of the plane through the lens and two image points."""
     return unit(np.cross(camera.ray(ends[0]), camera.ray(ends[1])))
-
-
-def middle_ray(view: View, ends: Array) -> tuple[Array, Array]:
-    """Lens and ray (base) of the middle of an image line: where along an endless line the sensor looked."""
-    pose = view.base_from_camera.parent_from_child
-    return np.asarray(pose.translation), matrix_of(pose) @ view.camera.ray(ends.mean(axis=0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusion.simulate import CODES, Problem, problem
+from benchmarks.fusion_simulation import CODES, Problem, problem
 
 
 def mixture(count: int, seed: int, bad: int = 0) -> Problem:

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.fusion_simulation import CODES, Problem, problem
 from fusion import Measurement, SensingClass, fuse
 from fusion.errors import Contradiction
 from fusion.features import line, plane
-from fusion.simulate import CODES, Problem, problem
 from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose, difference
 from tests.fusion.mixtures import mixture

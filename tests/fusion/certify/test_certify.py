@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.fusion_reference import residual
+from benchmarks.fusion_simulation import CODES, Problem, problem
 from fusion import fuse
 from fusion.batch import pack
 from fusion.certify import certificate
 from fusion.certify.dual import minimiser, seen_from
 from fusion.certify.proof import quadratic_forms
 from fusion.certify.relaxation import constraints, relaxed
-from fusion.distance.reference import residual
 from fusion.robust import used_entries
-from fusion.simulate import CODES, Problem, problem
 from fusion.solve import solve
 from hal.geometry import UncertainPose, difference, matrix_of, perturbed
 from tests.fusion.mixtures import mixture

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from benchmarks.fusion_reference import brute_force, residual
+from benchmarks.fusion_simulation import CODES, problem
 from fusion.distance import local_value, local_values, local_values_and_gradients
-from fusion.distance.reference import brute_force, residual
 from fusion.measurement import Measurement, SensingClass
-from fusion.simulate import CODES, problem
 from hal.arrays import Array
 from hal.geometry import matrix_of, perturbed, transform
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.fusion_reference import residual
 from fusion.batch import pack
-from fusion.distance.reference import residual
 from fusion.distance.rows import FAR, NEAR, values, whitened
 from fusion.measurement import SensingClass
 from hal.geometry import UncertainPose, difference, matrix_of, perturbed

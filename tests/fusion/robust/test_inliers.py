@@ -7,13 +7,13 @@ from itertools import count, product
 import numpy as np
 import pytest
 
+from benchmarks.fusion_simulation import CODES, problem
 from fusion import fuse
 from fusion.batch import Batch, pack
 from fusion.certify.dual import minimiser
 from fusion.certify.proof import quadratic_forms
 from fusion.robust.inliers import best_set
 from fusion.robust.minima import minima
-from fusion.simulate import CODES, problem
 from fusion.solve import LocalSolution
 from fusion.solve.local import middle_and_size
 from hal.arrays import Array

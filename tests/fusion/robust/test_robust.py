@@ -7,12 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from benchmarks.fusion_simulation import CODES, TABLE_II, Problem, problem
 from fusion import fuse
 from fusion.features import Kind, point
 from fusion.measurement import measurement
 from fusion.robust import used_entries
 from fusion.robust.evidence import log_evidence
-from fusion.simulate import CODES, TABLE_II, Problem, problem
 from fusion.solve import solve, solve_from_many
 from hal.geometry import UncertainPose, difference, perturbed, transform
 from tests.fusion.mixtures import mixture

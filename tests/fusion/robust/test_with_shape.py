@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from examples.cylinder_radius import arc_case, box_case, cylinder_case, sensed_point
+from examples.paper.cylinder_radius import arc_case, box_case, cylinder_case, sensed_point
 from fusion import fuse
 from fusion.errors import Contradiction
 from fusion.measurement import Measurement

@@ -12,7 +12,7 @@ from fusion import Measurement, SensingClass, sensing
 from fusion.distance import local_value
 from fusion.features import line, plane, point
 from hal.arrays import Array
-from hal.errors import InvalidRequest, NotObservable
+from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose, certain, matrix_of, perturbed, transform
 
 CAMERA = sensing.Pinhole(fx_px=800.0, fy_px=790.0, cx_px=320.0, cy_px=240.0)
@@ -30,7 +30,6 @@ class Scene:
         self.x, self.along, self.normal = self.pose.apply(POINT.point_m), R[:, 0], R[:, 2]
         self.cameras = [self.look_from(R @ np.array(p)) for p in ([0.1, -0.2, 1.0], [0.25, 0.3, 0.9])]
         self.known = [self.uncertain(c) for c in self.cameras]
-        self.views = [sensing.View(base_from_camera=k, camera=CAMERA) for k in self.known]
 
     def look_from(self, offset: Array) -> RigidTransform:
         z = -offset / np.linalg.norm(offset)
@@ -76,23 +75,6 @@ def edge_seen(s: Scene) -> Measurement:
     return sensing.image_line(LINE, s.known[0], ends_px=s.ends(0, s.along), sigma_px=0.5, camera=CAMERA)
 
 
-def seen_twice(s: Scene) -> Measurement:
-    return sensing.stereo_point(POINT, s.views, pixels_px=[s.pixel(0, s.x), s.pixel(1, s.x)], sigma_px=0.5)
-
-
-def edge_seen_twice(s: Scene) -> Measurement:
-    return sensing.stereo_line(LINE, s.views, ends_px=[s.ends(0, s.along), s.ends(1, s.along)], sigma_px=0.5)
-
-
-def striped(s: Scene) -> Measurement:
-    stripe = matrix_of(s.pose) @ np.array([np.cos(1.0), np.sin(1.0), 0.0])
-    source = np.asarray(s.cameras[1].translation)
-    sheet = np.cross(s.x - source, stripe)
-    sheet /= np.linalg.norm(sheet)
-    projector = transform(np.column_stack([np.cross(stripe, sheet), stripe, sheet]), source)
-    return sensing.light_stripe(PLANE, s.views[0], s.uncertain(projector), ends_px=s.ends(0, stripe), sigma_px=0.5)
-
-
 def ranged(s: Scene) -> Measurement:
     to_camera = s.cameras[0].inv()
     n = to_camera.rotation.apply(s.normal)
@@ -108,9 +90,6 @@ SENSES: dict[Callable[[Scene], Measurement], SensingClass] = {
     approached: SensingClass.POINT_PLANE,
     seen: SensingClass.LINE_POINT,
     edge_seen: SensingClass.PLANE_LINE,
-    seen_twice: SensingClass.POINT_POINT,
-    edge_seen_twice: SensingClass.LINE_LINE,
-    striped: SensingClass.LINE_PLANE,
     ranged: SensingClass.PLANE_PLANE,
 }
 
@@ -156,21 +135,6 @@ def test_a_known_turn_of_the_arm_is_a_lever_on_far_points() -> None:
     made = sensing.range_point(PLANE, turned, point_m=(1.0, 0, 0), covariance_m2=1e-8 * np.eye(3))
     assert made.C_m2[1, 1] == pytest.approx(1e-6 + 1e-8, rel=1e-3)
     assert made.C_m2[0, 0] == pytest.approx(1e-8, rel=0.2)
-
-
-def test_parallel_rays_are_refused() -> None:
-    pose = certain(transform(np.eye(3), np.zeros(3)))
-    views = [sensing.View(base_from_camera=pose, camera=CAMERA)] * 2
-    with pytest.raises(NotObservable, match="parallel"):
-        sensing.stereo_point(POINT, views, pixels_px=[[320, 240], [320, 240]], sigma_px=0.5)
-
-
-def test_one_plane_seen_twice_is_refused() -> None:
-    views = [
-        sensing.View(base_from_camera=certain(transform(np.eye(3), p)), camera=CAMERA) for p in ((0, 0, 0), (0.1, 0, 0))
-    ]
-    with pytest.raises(NotObservable):
-        sensing.stereo_line(LINE, views, ends_px=[[[100, 240], [500, 240]]] * 2, sigma_px=0.5)
 
 
 def test_an_image_line_needs_two_points() -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from benchmarks.fusion_simulation import CODES, problem
 from fusion.measurement import Measurement
-from fusion.simulate import CODES, problem
 from hal.errors import InvalidRequest
 from service.jsonable import jsonable
 from service.operations.sense import run_fuse

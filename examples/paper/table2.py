@@ -1,9 +1,9 @@
 """The paper's Table II and Fig. 13 again: a pose that improves measurement by measurement although the first one is bad.
 
-    python -m examples.table2 [--seed N] [--out FOLDER]
+    python -m examples.paper.table2 [--seed N] [--out FOLDER]
 
 Prints the paper's errors beside plain least squares over everything (its objective) beside the robust fusion, after each of the
-16 measurements, and draws the first six poses, as SVG and as one PNG.
+16 measurements, and draws the first six poses.
 """
 
 from __future__ import annotations
@@ -14,11 +14,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from fusion import FusedPose, fuse
-from fusion.draw import Drawing, Sight, axes, box_outlines, circle_outline, sight_of, svg
-from fusion.errors import Contradiction
-from fusion.simulate import TABLE_II, Problem, problem
-from fusion.solve import solve_from_many
+from benchmarks.fusion_simulation import TABLE_II, Problem, problem
+from examples.paper.outlines import Drawing, axes, box_outlines, circle_outline, sight_of
+from fusion import Contradiction, FusedPose, fuse, solve_from_many
 from hal.arrays import Array
 from hal.geometry import difference
 
@@ -91,7 +89,6 @@ def draw(made: Problem, folder: Path) -> None:
     for n, ax in enumerate(figure.subplots(2, 3).ravel(), 1):
         drawings = poses_after(made, n)
         title = f"after {n} measurement{'s' if n > 1 else ''}"
-        (folder / f"pose_{n}.svg").write_text(svg(drawings, sight, title=title))
         axes(ax, drawings, sight, title=title)
     named = dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
     figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=3)
@@ -118,15 +115,13 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=Path("runs/table2"), help="folder for the drawings [%(default)s]")
+    parser.add_argument("--out", type=Path, default=Path("runs/table2"), help="folder for the drawing [%(default)s]")
     args = parser.parse_args()
     made = problem(TABLE_II, np.random.default_rng(args.seed), bad=[0])
     print("\n".join(table(made)))
     draw(made, args.out)
-    print(f"drawings: {args.out / 'figure13.png'} and pose_1.svg to pose_6.svg beside it")
+    print(f"drawing: {args.out / 'figure13.png'}")
 
-
-__all__ = ["PAPER", "Sight", "draw", "errors", "outlines", "poses_after", "robust", "table"]
 
 if __name__ == "__main__":
     main()

@@ -1,11 +1,10 @@
-"""Line drawings of an object at one or more poses, as a camera would see it (paper, Fig. 13): SVG text or matplotlib axes."""
+"""Draw the outlines of an object at one or more poses as a camera would see it (paper, Fig. 13)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -31,7 +30,7 @@ class Drawing:
     Attributes:
         base_from_object: the pose.
         outlines_m: polylines, each (K, 3) in the object frame.
-        colour: any name or code that both SVG and matplotlib know, for example `#1f77b4`.
+        colour: any that matplotlib knows, for example `#1f77b4`.
         label: for the legend.
         dashed: broken lines, for example for the true pose.
     """
@@ -125,29 +124,8 @@ def _projected(points: Array, camera: Pinhole) -> Array:
     ])  # fmt: skip
 
 
-def svg(drawings: Sequence[Drawing], sight: Sight, *, title: str = "") -> str:
-    """The drawings as one SVG document (text), with a legend of their labels."""
-    parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {sight.width_px} {sight.height_px}" '
-        f'width="{sight.width_px}" height="{sight.height_px}" role="img" font-family="sans-serif" font-size="13">',
-        f"<title>{escape(title or 'object outlines')}</title>",
-        '<rect width="100%" height="100%" fill="white"/>',
-    ]
-    for row, drawing in enumerate(drawings):
-        dashes = ' stroke-dasharray="5 4"' if drawing.dashed else ""
-        style = f'fill="none" stroke="{escape(drawing.colour)}" stroke-width="1.4"{dashes}'
-        parts += [
-            f'<polyline points="{" ".join(f"{u:.1f},{v:.1f}" for u, v in line)}" {style}/>'
-            for line in seen(drawing, sight)
-        ]
-        if drawing.label:
-            place = f'x="10" y="{20 + 17 * row}"'
-            parts.append(f'<text {place} fill="{escape(drawing.colour)}">{escape(drawing.label)}</text>')
-    return "\n".join([*parts, "</svg>"])
-
-
 def axes(ax: Axes, drawings: Sequence[Drawing], sight: Sight, *, title: str = "") -> None:
-    """The same on matplotlib axes, in pixels with y down."""
+    """Draw on matplotlib axes, in pixels with y down."""
     for drawing in drawings:
         for k, line in enumerate(seen(drawing, sight)):
             ax.plot(

@@ -1,6 +1,6 @@
 """A radius from touches: the same fusion that finds a panel's pose also measures what stands on it.
 
-    python -m examples.cylinder_radius
+    python -m examples.paper.cylinder_radius
 
 A post of unknown radius and length is touched and ranged at places spread over its wall and top; two touches hit something
 else. `fuse` is called with a shape instead of fixed features, and gives pose, radius and length with their deviations. Then a
@@ -14,14 +14,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from fusion import FusedPose, Measurement, fuse
-from fusion.features import Kind, plane
-from fusion.measurement import measurement
-from fusion.shapes import Box, Cylinder, Shape
+from fusion import Box, Cylinder, FusedPose, Measurement, Shape, features, fuse, sensing
 from hal.arrays import Array
-from hal.geometry import UncertainPose, perturbed, transform_rpy
+from hal.geometry import UncertainPose, certain, perturbed, transform_rpy
 
 TOUCH_SIGMA_M, RANGE_SIGMA_M, ARC_SIGMA_M = 0.0002, 0.002, 0.0008
+BASE = certain(RigidTransform.identity())  # points are given in the base frame
 PRIOR_SIGMA = np.array([0.005] * 3 + [0.02] * 3)  # what the camera knew: 5 mm, 1.1 degrees
 
 
@@ -36,9 +34,8 @@ def sensed_point(
     """A noisy point of `part`, as touch or range gives it: point-plane."""
     feature = shape.feature(part, shape.start, on_object_m)
     seen = base_from_object.apply(on_object_m) + rng.normal(0.0, sigma_m, 3)
-    made = measurement(
-        feature, Kind.POINT, mu_m=seen, C_m2=sigma_m**2 * np.eye(3), label=f"{part} {1e3 * sigma_m:.1f} mm"
-    )
+    label = f"{part} {1e3 * sigma_m:.1f} mm"
+    made = sensing.range_point(feature, BASE, point_m=seen, covariance_m2=sigma_m**2 * np.eye(3), label=label)
     return replace(made, part=part)
 
 
@@ -68,11 +65,13 @@ def cylinder_case(seed: int = 0) -> tuple[FusedPose, Cylinder]:
         sensed_point(guess, part, place(part), base_from_post, RANGE_SIGMA_M, rng)
         for part in ["wall"] * 14 + ["top"] * 6
     ]
-    table = plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), name="table")  # a fixed feature: the length is counted from here
+    table = features.plane(
+        (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), name="table"
+    )  # a fixed feature: the length is counted from here
     foot = [
-        measurement(
-            table, Kind.POINT, mu_m=base_from_post.apply([x, y, 0.0]) + rng.normal(0.0, TOUCH_SIGMA_M, 3),
-            C_m2=TOUCH_SIGMA_M**2 * np.eye(3), label="table",
+        sensing.range_point(
+            table, BASE, point_m=base_from_post.apply([x, y, 0.0]) + rng.normal(0.0, TOUCH_SIGMA_M, 3),
+            covariance_m2=TOUCH_SIGMA_M**2 * np.eye(3), label="table",
         )
         for x, y in ((0.06, 0.0), (-0.04, 0.05), (-0.03, -0.06))
     ]  # fmt: skip

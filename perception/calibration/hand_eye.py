@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from hal.arrays import Array
 from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import UncertainPose, matrix_of, perturbed, skew, transform
-from perception.calibration.newton import Minimum, descend
+from hal.least_squares import Minimum, descend
 
 LEAST_AXIS_SPREAD = 0.02  # of sin^2 between the turns' axes: 8 degrees; with less, one coordinate of X is mostly noise
 LEAST_TURN_RAD = 0.05

@@ -21,9 +21,9 @@ from hal.calibration import CameraIntrinsics
 from hal.camera_model import disc_offset_px, project_with_jacobian
 from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose, certain, matrix_of, perturbed, skew
+from hal.least_squares import Minimum, descend
 from perception.calibration.hand_eye import HandEyeView, check_accuracy, check_turns
 from perception.calibration.intrinsics import NAMES, lens_jacobian, parameters, with_parameters
-from perception.calibration.newton import Minimum, descend
 
 FREE = ("fx", "fy", "cx", "cy", "k1")
 INDEX = [NAMES.index(name) for name in FREE]

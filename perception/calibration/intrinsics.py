@@ -17,9 +17,9 @@ from hal.calibration import CameraIntrinsics
 from hal.camera_model import disc_offset_px, distort, distortion_jacobian, project, undistort_pixels
 from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import matrix_of, perturbed, transform
+from hal.least_squares import Minimum, descend
 from perception.calibration.boards import FEWEST_POINTS, BoardView
 from perception.calibration.cubic_lens import CubicLens, fit_cubic
-from perception.calibration.newton import Minimum, descend
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 BOARD_FREE = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")  # k3 needs points in the corners of a wide lens

@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform
 from hal.arrays import Array
 from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import UncertainPose, matrix_of, perturbed
-from perception.calibration.newton import Minimum, descend
+from hal.least_squares import Minimum, descend
 
 LIMIT_M = 0.003
 LIMIT_RAD = 0.02

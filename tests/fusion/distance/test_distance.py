@@ -89,7 +89,7 @@ def test_extreme_matrices_agree_with_brute_force(cls: SensingClass, kind: str) -
         m = replace(m, C_m2=A @ np.diag([1e-4, 1e-4, 0.01]) @ A.T, M=A @ np.diag([0.0, 1e4, 1e4]) @ A.T)
     else:
         m = replace(m, mu_m=pose.apply(m.x_m) + rng.normal(0, 1e-4, 3))
-    assert local_value(m, pose) == pytest.approx(brute_force(m, pose), rel=1e-9, abs=1e-12)
+    assert local_value(m, pose) == pytest.approx(brute_force(m, pose), rel=1e-9, abs=1e-11)  # terms of 1e4 cancel
 
 
 @pytest.mark.parametrize("code", CODES)

@@ -20,11 +20,10 @@ from hal.errors import CellError
 from hal.panel import PanelObject, Shown
 from hal.simulated import ObjectTruth
 from perception.vision.reading import ObjectReading
-from service.operations.context import OperationContext
 from service.operations.evaluate import shown_of
 from service.operations.inspect import close_ups, look_past
 from service.operations.locate import go_to_overview, locate
-from service.operations.session import Session
+from service.operations.session import OperationContext, Session
 from service.operations.world_model import WorldModel
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection

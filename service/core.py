@@ -19,7 +19,7 @@ from hal.errors import CellError, DeviceUnavailable, InvalidRequest, LeaseError,
 from service.commissioning.preflight import check_wires
 from service.errors import NotPossibleNow
 from service.knowledge.calibrations import Calibrations
-from service.operations.context import Operation, OperationContext
+from service.operations import Operation, OperationContext
 from service.operations.world_model import WorldModel
 from service.processes.supervisor import Supervisor
 from service.tasks.gate import GatedConnection

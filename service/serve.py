@@ -19,7 +19,7 @@ from hal.config import Cell
 from hal.errors import CellError, ConfigError
 from hal.gc_freeze import freeze_loaded
 from service.core import Service
-from service.operations.context import Operation
+from service.operations import Operation
 from service.processes.stop_host import bound_socket
 
 if TYPE_CHECKING:

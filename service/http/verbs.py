@@ -13,7 +13,7 @@ from service.http.body import body_schema, strict_body
 from service.http.models import TaskView, task_view
 from service.http.problems import MEDIA, RESPONSES
 from service.http.state import IdempotencyKey, LeaseToken, State
-from service.operations.context import Operation
+from service.operations import Operation
 from service.tasks.model import Task, TaskState
 
 Wait = Annotated[

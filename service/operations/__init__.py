@@ -3,13 +3,49 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
+from pydantic import BaseModel
+
+from hal.config import Cell
 from service.operations import targets
-from service.operations.context import Operation, OperationContext
-from service.schema import requests, results
+from service.operations.session import OperationContext, Session
+from service.schema import fuse_request, fuse_results, mission_results, requests, results
 
 __all__ = ["OPERATIONS", "Operation", "OperationContext"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Operation:
+    """A verb of the API.
+
+    Attributes:
+        name: path of the verb, e.g. `panel-pose`.
+        request_model: strict model of the body.
+        result_model: what a task of this verb ends with.
+        run: does the work in a worker thread; returns a `result_model`; raises `CellError`.
+        summary: one line for the API document.
+        example: a body that works on the shipped cell.
+        moves: whether it may move the arm (needs the lease when one is held, and excludes other motion tasks).
+        is_still: tells of requests for which it does not, although it may.
+        check: raises `InvalidRequest` for a request that makes no sense in this cell, before there is a task.
+    """
+
+    name: str
+    request_model: type[BaseModel]
+    result_model: type[BaseModel]
+    run: Callable[[OperationContext, Any], BaseModel]
+    summary: str
+    example: dict[str, Any] = field(default_factory=dict)
+    moves: bool = True
+    is_still: Callable[[Any], bool] = field(default=lambda _request: False)
+    check: Callable[[Cell, Any], None] = field(default=lambda _cell, _request: None)
+
+    def may_move(self, request: BaseModel) -> bool:
+        """May the arm move for this request?"""
+        return self.moves and not self.is_still(request)
+
 
 MEASUREMENT_EXAMPLE = {
     "sensing": "point-plane",
@@ -28,8 +64,6 @@ def _in_session(module: str, function: str) -> Callable[[OperationContext, Any],
     def run(context: OperationContext, request: Any) -> results.Result:
         from importlib import import_module
 
-        from service.operations.session import Session
-
         verb = getattr(import_module(f"service.operations.{module}"), function)
         answer: results.Result = verb(Session(context=context), request)
         return answer
@@ -37,13 +71,13 @@ def _in_session(module: str, function: str) -> Callable[[OperationContext, Any],
     return run
 
 
-def _mission(context: OperationContext, request: requests.MissionRequest) -> results.MissionResult:
+def _mission(context: OperationContext, request: requests.MissionRequest) -> mission_results.MissionResult:
     from service.operations.mission import run_mission
 
     return run_mission(context, request)
 
 
-def _evaluate(context: OperationContext, request: requests.EvaluateRequest) -> results.EvaluateResult:
+def _evaluate(context: OperationContext, request: requests.EvaluateRequest) -> mission_results.EvaluateResult:
     from service.operations.evaluate import evaluate
 
     return evaluate(context.connection, context.runs_dir / request.mission)
@@ -78,7 +112,7 @@ OPERATIONS: dict[str, Operation] = {
             name="learn",
             request_model=requests.LearnRequest,
             result_model=results.LearnResult,
-            run=_in_session("learn", "run_learn"),
+            run=_in_session("recognise", "run_learn"),
             summary="Let the located panel teach its own looks: blind recognition then knows its objects",
             example={"move": True},
             is_still=_is_stored,
@@ -95,8 +129,8 @@ OPERATIONS: dict[str, Operation] = {
         ),
         Operation(
             name="fuse",
-            request_model=requests.FuseRequest,
-            result_model=results.FuseResult,
+            request_model=fuse_request.FuseRequest,
+            result_model=fuse_results.FuseResult,
             run=_in_session("sense", "run_fuse"),
             summary="Fuse measurements of nine kinds into one pose, or collect them first",
             example={"measurements": [MEASUREMENT_EXAMPLE]},
@@ -104,7 +138,7 @@ OPERATIONS: dict[str, Operation] = {
         Operation(
             name="manipulate",
             request_model=requests.ManipulateRequest,
-            result_model=results.ManipulateResult,
+            result_model=mission_results.ManipulateResult,
             run=_in_session("manipulate", "run_manipulate"),
             summary="Work one control and look whether it worked",
             example={"object": "main_valve", "state": "open"},
@@ -113,7 +147,7 @@ OPERATIONS: dict[str, Operation] = {
         Operation(
             name="missions",
             request_model=requests.MissionRequest,
-            result_model=results.MissionResult,
+            result_model=mission_results.MissionResult,
             run=_mission,
             summary="Run the whole mission and write its report",
             example={"touches": 4},
@@ -131,7 +165,7 @@ OPERATIONS: dict[str, Operation] = {
         Operation(
             name="judge",
             request_model=requests.EvaluateRequest,
-            result_model=results.EvaluateResult,
+            result_model=mission_results.EvaluateResult,
             run=_evaluate,
             summary="Compare a finished mission with the simulator's truth (simulated cells only)",
             example={"mission": "20261120T231502-a1b2c3"},

@@ -26,7 +26,7 @@ from service.operations.travel import go_to_first
 from service.report.plots import png_of
 from service.report.record import Picture
 from service.report.surfaces import surfaces_picture
-from service.schema.results import SurfaceCheck
+from service.schema.mission_results import SurfaceCheck
 
 ELSEWHERE_P = 1e-3  # one object in a thousand that stands in its place is looked at twice
 TURN_SLACK_RAD = 0.1  # a wheel's angle by its spokes and by its mark, beside three sigmas

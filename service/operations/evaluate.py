@@ -20,7 +20,7 @@ from hal.simulated import ObjectTruth, Truth
 from service.jsonable import jsonable
 from service.processes.connection import CellConnection
 from service.report.write import render, write_json
-from service.schema.results import ActionClaim, EvaluateResult, ReadingClaim, UnaskedMotion
+from service.schema.mission_results import ActionClaim, EvaluateResult, ReadingClaim, UnaskedMotion
 
 AFTER = "after the actions"
 

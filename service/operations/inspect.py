@@ -22,8 +22,9 @@ from service.operations.stored import object_result, read_stored
 from service.operations.tours import short_tour
 from service.operations.travel import go_to_camera_view, skill_context
 from service.report.plots import png_of
+from service.schema.mission_results import ReadingResult
 from service.schema.requests import InspectRequest, RecogniseRequest
-from service.schema.results import InspectResult, ReadingResult
+from service.schema.results import InspectResult
 
 TIPS_M = 0.085  # of the finger tips before the plate in a look from the side: what hides an object hangs there
 MOST_UNREAD = 4  # more than these at once: the light or the lens, and no cable

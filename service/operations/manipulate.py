@@ -14,8 +14,8 @@ from service.operations.targets import target_of, text_of
 from service.operations.travel import skill_context
 from service.report.plots import png_of
 from service.report.record import Picture
+from service.schema.mission_results import ActionResult, ManipulateResult
 from service.schema.requests import ActionBody, ManipulateRequest
-from service.schema.results import ActionResult, ManipulateResult
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

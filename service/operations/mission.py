@@ -17,14 +17,13 @@ from hal.geometry import compose
 from hal.panel import PanelObject, Shown
 from perception.vision import ObjectReading
 from service.operations.acquisition import settle
-from service.operations.context import OperationContext
 from service.operations.cross_check import OVERVIEW, check_surfaces, need_its_place, view_surfaces
 from service.operations.evaluate import AFTER
 from service.operations.inspect import Inspection, inspect_close, inspect_here, need_all_present, reading_result
 from service.operations.locate import Located, ScannedPlane, go_to_overview, locate, scan_plate
 from service.operations.manipulate import work
 from service.operations.sense import fuse_and_remember, fused_result, light_observations
-from service.operations.session import Session
+from service.operations.session import OperationContext, Session
 from service.operations.touches import feel
 from service.operations.travel import leave_the_panel, park
 from service.problem import problem_of
@@ -32,8 +31,9 @@ from service.report.drawing import panel_drawing
 from service.report.plots import joints_picture, lights_picture, png_of, range_picture, wrench_picture
 from service.report.record import MissionRecord, Picture
 from service.report.write import write_report
+from service.schema.mission_results import MissionResult, ObjectPlace, SurfaceCheck
 from service.schema.requests import ActionBody, MissionRequest
-from service.schema.results import FittedPlate, MissionResult, ObjectPlace, SurfaceCheck, estimated
+from service.schema.results import FittedPlate, estimated
 
 log = logging.getLogger(__name__)
 BEFORE = "before the actions"

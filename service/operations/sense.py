@@ -31,8 +31,8 @@ from service.operations.inspect import ensure_located
 from service.operations.locate import Located, go_to_overview, locate, scan_plate
 from service.operations.session import Session
 from service.operations.touches import Felt, feel, mounts_of
-from service.schema.requests import BoxBody, CylinderBody, FeatureSetBody, FuseRequest, MeasurementBody
-from service.schema.results import (
+from service.schema.fuse_request import BoxBody, CylinderBody, FeatureSetBody, FuseRequest, MeasurementBody
+from service.schema.fuse_results import (
     AlternativePose,
     CertificateResult,
     FuseResult,
@@ -40,9 +40,8 @@ from service.schema.results import (
     ProvenSetResult,
     RejectedMeasurement,
     ShapeResult,
-    estimated,
-    fields_of,
 )
+from service.schema.results import estimated, fields_of
 
 ONE_IN = 1e5
 NO_NOISE = 1e-9  # a chi-square a degree of freedom that no sensor's noise gives, in whatever unit

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
@@ -14,10 +15,20 @@ from hal.frames import frame_tree
 from hal.geometry import UncertainPose, identity
 from hal.motion import DeclaredMotion, MotionOutcome, MotionReport, Mover, RobotState
 from hal.panel import Panel
-from service.operations.context import OperationContext
 from service.operations.world_model import WorldModel, expected_panel
 from service.processes.connection import CellConnection
 from service.report.record import MissionRecord
+from service.tasks.store import TaskContext
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OperationContext:
+    """Handed to every operation. `runs_dir` is where missions leave their reports."""
+
+    connection: CellConnection
+    task: TaskContext
+    runs_dir: Path
+    world: WorldModel = field(default_factory=WorldModel)
 
 
 class NotedMover:

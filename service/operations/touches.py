@@ -30,7 +30,7 @@ from service.operations.doubted_proximity import DoubtedProximity
 from service.operations.session import Session
 from service.operations.spots import bare_spots
 from service.operations.travel import skill_context
-from service.schema.results import TouchingResult, TouchResult
+from service.schema.fuse_results import TouchingResult, TouchResult
 
 HOVER_M = 0.05  # of the fingertips above the plate while the proximity sensors look
 HOVER_SAMPLES = 5

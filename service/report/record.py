@@ -10,15 +10,9 @@ from typing import Any
 
 from hal.errors import CellError
 from hal.motion import MotionReport
-from service.schema.results import (
-    ActionResult,
-    EstimatedPose,
-    FittedPlate,
-    FuseResult,
-    ObjectPlace,
-    ReadingResult,
-    SurfaceCheck,
-)
+from service.schema.fuse_results import FuseResult
+from service.schema.mission_results import ActionResult, ObjectPlace, ReadingResult, SurfaceCheck
+from service.schema.results import EstimatedPose, FittedPlate
 
 # Fields of a record that a report has once they are known.
 FINDINGS = ("plate_in_scanner", "objects", "fused", "by_lights", "by_surfaces", "not_parked")

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
-from scipy.spatial.transform import RigidTransform
 
 from hal.calibration import CalibrationRecord
 from hal.geometry import UncertainPose, to_json
@@ -39,13 +38,6 @@ class Placement(Result):
 
     translation_m: Numbers
     quaternion_xyzw: Numbers
-
-
-def _placed(value: Any) -> Any:
-    return to_json(value) if isinstance(value, RigidTransform) else value
-
-
-PlacementField = Annotated[Placement, BeforeValidator(_placed)]
 
 
 class EstimatedPose(Placement):
@@ -204,206 +196,6 @@ class LearnResult(Result):
     pictures: Pictures = []
 
 
-# -- fuse -------------------------------------------------------------------------------------------------------------
-
-
-class MeasurementResult(Result):
-    """How one measurement agrees with the answer; `value` is its squared distance in sigmas on `dof`."""
-
-    label: str
-    sensor: str
-    sensing: str
-    value: float
-    dof: int
-    rejected: bool
-    reason: str | None
-
-
-class RejectedMeasurement(Result):
-    """A measurement that was not used; index -1 is the prior."""
-
-    index: int
-    label: str
-    value: float
-    reason: str
-
-
-class AlternativePose(EstimatedPose):
-    """Another pose that the measurements allow; `odds` relative to the answer."""
-
-    odds: float
-    rejected: list[int]
-
-
-class CertificateResult(Result):
-    """What the relaxation proves: `tight` means that no other pose fits the same measurements better."""
-
-    tight: bool
-    gap: float
-    lower_bound: float
-    value: float
-    distance_sigmas: float
-    base_from_object: PlacementField
-
-
-class ProvenSetResult(Result):
-    """Which measurements to believe, by branch and bound; `gap` is what the deadline left undecided."""
-
-    believed: list[int]
-    cost: float
-    lower_bound: float
-    gap: float
-    proven: bool
-    agrees: bool
-    nodes: int
-    base_from_object: PlacementField
-
-
-class ShapeResult(Result):
-    """The object's own measures, which were estimated with its pose, m."""
-
-    names: list[str]
-    values: Numbers
-    sigma: Numbers
-    covariance: Rows
-
-
-class TouchResult(Result):
-    """What a touched place was expected to bring, and what it brought.
-
-    Attributes:
-        spot_m: the place, panel frame.
-        error_before, error_expected, error_after: mean square error of the pose in units of the wanted one: before the
-            touch, as expected after it, and after it with the readings that really came.
-        words: the same as a sentence.
-    """
-
-    spot_m: Numbers
-    error_before: float
-    error_expected: float
-    error_after: float
-    words: str
-
-
-class TouchingResult(Result):
-    """The places touched in order, those that could not be touched and why, and why touching ended."""
-
-    touches: list[TouchResult]
-    skipped: list[str]
-    ended: str
-
-
-class FuseResult(EstimatedPose):
-    """The fused pose (`base_from_object`), and how each measurement agrees with it."""
-
-    chi_square: float
-    dof: int
-    warnings: list[str]
-    ambiguous: bool
-    unobservable: Annotated[list[str], Field(description="motions that the measurements leave free, in words")]
-    measurements: list[MeasurementResult]
-    rejected: list[RejectedMeasurement]
-    alternatives: list[AlternativePose]
-    certificate: CertificateResult | None
-    proven_set: ProvenSetResult | None
-    shape: ShapeResult | None
-    touching: Annotated[TouchingResult | None, Field(description="when the cell collected the measurements itself")] = (
-        None
-    )
-
-
-# -- manipulate, missions ---------------------------------------------------------------------------------------------
-
-
-class ReadingResult(Result):
-    """What one object showed at one look of a mission; `shows` is the same in words."""
-
-    name: str
-    kind: str
-    present: bool
-    shows: str
-    value: float | None
-    unit: str
-    uncertainty: float | None
-    state: str | None
-    text: str | None
-    confidence: float
-    reason: str | None
-    when: str
-
-
-class ActionResult(Result):
-    """One control that was worked: what was asked, what the skill reports, and what a second look showed."""
-
-    object: str
-    skill: str
-    target: str
-    outcome: str
-    detail: str
-    before: str
-    after: str
-    confirmed: bool
-    attempts: int
-    peak_force_n: float
-    cell_s: float
-
-
-class ManipulateResult(Result):
-    """The action, and a picture of the second look."""
-
-    action: ActionResult
-    pictures: Pictures
-
-
-class MissionResult(Result):
-    """How a mission ended; `report` is the address of its report, null when it could not be written."""
-
-    mission: str
-    succeeded: bool
-    report: str | None
-    actions: list[ActionResult]
-    fused: FuseResult | None
-    cell_s: float
-    wall_s: float
-
-
-class ObjectPlace(Result):
-    """An object in 3-D: its middle in the base frame, m."""
-
-    name: str
-    kind: str
-    centre_in_base_m: Numbers
-
-
-class SurfaceCheck(Result):
-    """What the surfaces of one object say beside layout and vision.
-
-    Attributes:
-        agrees: place and state agree; null when it was not found.
-        centre_in_base_m: (3,) its middle on the plate, base frame.
-        off_m: along the plate, from its place in the panel file under the panel's newest pose; `sigma_m` one standard
-            deviation of that, `chi_square` its square in sigmas on two degrees of freedom. Null when it was not found.
-        off_vision_m: along the plate, from where the newest image has it.
-        shows, vision_shows: its state by surfaces, and by vision.
-        finding: all that as a sentence.
-    """
-
-    name: str
-    kind: str
-    seen_from: str
-    found: bool
-    agrees: bool | None
-    centre_in_base_m: tuple[float, float, float] | None
-    off_m: float | None
-    sigma_m: float | None
-    chi_square: float | None
-    off_vision_m: float | None
-    shows: str | None
-    vision_shows: str | None
-    stands_elsewhere: bool
-    finding: str
-
-
 # -- calibrations -----------------------------------------------------------------------------------------------------
 
 
@@ -436,48 +228,7 @@ class CalibrationResult(Result):
     in_use_from: str | None = None
 
 
-# -- judge ------------------------------------------------------------------------------------------------------------
-
-
-class ReadingClaim(Result):
-    """What a report says of a reading, and what was true."""
-
-    name: str
-    what: str
-    claimed: str
-    truth: str
-    right: bool
-
-
-class ActionClaim(ReadingClaim):
-    """The same of an action; `reached`: the control really stands where it was asked to."""
-
-    reached: bool
-
-
-class UnaskedMotion(Result):
-    """Something that moved although nobody worked it."""
-
-    name: str
-    truth: str
-
-
-class EvaluateResult(Result):
-    """A mission's report against the simulator's truth."""
-
-    pose_error_m: float | None
-    pose_error_rad: float | None
-    pose_error: Numbers | None = None
-    mahalanobis: float | None
-    inside_95: bool | None
-    claims: list[ActionClaim | ReadingClaim]
-    readings_right: int
-    readings_given: int
-    actions_confirmed: int
-    agrees: bool
-    moved_unasked: list[UnaskedMotion]
-    peak_force_n: float
-    sim_time_s: float
+# -- photographs -------------------------------------------------------------------------------------------------------
 
 
 class PhotographGuess(Result):

@@ -12,7 +12,7 @@ from hal.config import Cell
 from hal.errors import DeviceTimeout, InvalidRequest
 from hal.motion import Hold
 from hal.strict import Strict
-from service.operations.context import Operation, OperationContext
+from service.operations import Operation, OperationContext
 
 
 class EchoRequest(Strict):

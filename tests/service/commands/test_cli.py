@@ -244,7 +244,7 @@ import sys, time
 from pathlib import Path
 from hal.config import load_cell
 from service.commands.serve import run_to_end
-from service.operations.context import Operation
+from service.operations import Operation
 from service.serve import Options, Panelwright
 from tests.service.verbs import EchoRequest, HoldResult
 

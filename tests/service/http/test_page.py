@@ -12,7 +12,7 @@ import pytest
 from hal.config import load_cell
 from hal.simulated import Fault
 from service.client import Client
-from service.operations.context import Operation
+from service.operations import Operation
 from service.serve import Options, Panelwright
 from tests.service.browser import NEEDS_CHROMIUM, browser, new_tab, until
 from tests.service.conftest import WriteCell

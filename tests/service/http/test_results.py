@@ -18,8 +18,9 @@ from service.jsonable import jsonable
 from service.operations import OPERATIONS
 from service.operations.sense import run_fuse
 from service.schema.examples import NINE_KINDS, ROUND_POST
-from service.schema.requests import FuseRequest
-from service.schema.results import ActionClaim, PanelPoseResult, ReadingClaim, estimated
+from service.schema.fuse_request import FuseRequest
+from service.schema.mission_results import ActionClaim, ReadingClaim
+from service.schema.results import PanelPoseResult, estimated
 
 DOCUMENT = get_openapi(title="verbs", version="0", routes=verbs.router(OPERATIONS).routes)
 SCHEMAS = DOCUMENT["components"]["schemas"]

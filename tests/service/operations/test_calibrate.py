@@ -17,8 +17,7 @@ from hal.geometry import difference
 from service.knowledge.calibrations import Calibrations
 from service.operations.acquisition import settle
 from service.operations.calibrate import run_calibrations
-from service.operations.context import OperationContext
-from service.operations.session import Session
+from service.operations.session import OperationContext, Session
 from service.operations.travel import kinematics
 from service.operations.world_model import WorldModel
 from service.processes.cell import CellRuntime

@@ -17,7 +17,7 @@ from hal.panel import Shown, load_panel
 from hal.simulated import ObjectTruth, Truth
 from service.operations.evaluate import AFTER, compare, evaluate, shown_of
 from service.processes.connection import CellConnection
-from service.schema.results import UnaskedMotion
+from service.schema.mission_results import UnaskedMotion
 
 PANEL = load_panel(Path(__file__).parents[3] / "panels/bench.toml")
 POSE = transform_rpy((0.95, 0.0, 0.55), (1.57, 0.0, -1.57))

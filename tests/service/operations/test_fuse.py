@@ -15,7 +15,7 @@ from hal.errors import InvalidRequest
 from service.jsonable import jsonable
 from service.operations.sense import run_fuse
 from service.schema.examples import FUSE_EXAMPLES, NINE_KINDS, ROUND_POST
-from service.schema.requests import FuseRequest
+from service.schema.fuse_request import FuseRequest
 
 
 def fused(body: dict[str, Any]) -> dict[str, Any]:

@@ -11,10 +11,8 @@ import pytest
 from benchmarks.vision_simulated import judged, without_looks
 from hal.config import Cell, load_cell
 from hal.errors import NotFound
-from service.operations.context import OperationContext
-from service.operations.learn import run_learn
-from service.operations.recognise import run_recognise
-from service.operations.session import Session
+from service.operations.recognise import run_learn, run_recognise
+from service.operations.session import OperationContext, Session
 from service.operations.world_model import WorldModel
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection

@@ -14,7 +14,7 @@ from hal.config import load_cell
 from hal.errors import LeaseError
 from hal.motion import Hold
 from service.core import Service
-from service.operations.context import Operation, OperationContext
+from service.operations import Operation, OperationContext
 from service.serve import Options, Panelwright
 from service.tasks.model import Task, TaskState
 from tests.service.conftest import WriteCell

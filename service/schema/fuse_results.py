@@ -1,0 +1,123 @@
+"""The answer of `fuse`: the pose, and how each measurement agrees with it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field
+from scipy.spatial.transform import RigidTransform
+
+from hal.geometry import to_json
+from service.schema.results import EstimatedPose, Numbers, Placement, Result, Rows
+
+
+def _placed(value: Any) -> Any:
+    return to_json(value) if isinstance(value, RigidTransform) else value
+
+
+PlacementField = Annotated[Placement, BeforeValidator(_placed)]
+
+
+class MeasurementResult(Result):
+    """How one measurement agrees with the answer; `value` is its squared distance in sigmas on `dof`."""
+
+    label: str
+    sensor: str
+    sensing: str
+    value: float
+    dof: int
+    rejected: bool
+    reason: str | None
+
+
+class RejectedMeasurement(Result):
+    """A measurement that was not used; index -1 is the prior."""
+
+    index: int
+    label: str
+    value: float
+    reason: str
+
+
+class AlternativePose(EstimatedPose):
+    """Another pose that the measurements allow; `odds` relative to the answer."""
+
+    odds: float
+    rejected: list[int]
+
+
+class CertificateResult(Result):
+    """What the relaxation proves: `tight` means that no other pose fits the same measurements better."""
+
+    tight: bool
+    gap: float
+    lower_bound: float
+    value: float
+    distance_sigmas: float
+    base_from_object: PlacementField
+
+
+class ProvenSetResult(Result):
+    """Which measurements to believe, by branch and bound; `gap` is what the deadline left undecided."""
+
+    believed: list[int]
+    cost: float
+    lower_bound: float
+    gap: float
+    proven: bool
+    agrees: bool
+    nodes: int
+    base_from_object: PlacementField
+
+
+class ShapeResult(Result):
+    """The object's own measures, which were estimated with its pose, m."""
+
+    names: list[str]
+    values: Numbers
+    sigma: Numbers
+    covariance: Rows
+
+
+class TouchResult(Result):
+    """What a touched place was expected to bring, and what it brought.
+
+    Attributes:
+        spot_m: the place, panel frame.
+        error_before, error_expected, error_after: mean square error of the pose in units of the wanted one: before the
+            touch, as expected after it, and after it with the readings that really came.
+        words: the same as a sentence.
+    """
+
+    spot_m: Numbers
+    error_before: float
+    error_expected: float
+    error_after: float
+    words: str
+
+
+class TouchingResult(Result):
+    """The places touched in order, those that could not be touched and why, and why touching ended."""
+
+    touches: list[TouchResult]
+    skipped: list[str]
+    ended: str
+
+
+class FuseResult(EstimatedPose):
+    """The fused pose (`base_from_object`), and how each measurement agrees with it."""
+
+    chi_square: float
+    dof: int
+    warnings: list[str]
+    ambiguous: bool
+    unobservable: Annotated[list[str], Field(description="motions that the measurements leave free, in words")]
+    measurements: list[MeasurementResult]
+    rejected: list[RejectedMeasurement]
+    alternatives: list[AlternativePose]
+    certificate: CertificateResult | None
+    proven_set: ProvenSetResult | None
+    shape: ShapeResult | None
+    touching: Annotated[TouchingResult | None, Field(description="when the cell collected the measurements itself")] = (
+        None
+    )

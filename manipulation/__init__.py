@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING
 from hal.face import load_on_first_use
 
 if TYPE_CHECKING:
+    from manipulation import plausibility
     from manipulation.arm.kinematics import Kinematics
     from manipulation.control.controller import Controller
     from manipulation.planning.collision import CollisionModel
     from manipulation.planning.shapes import CollisionBox
     from manipulation.planning.time_parameterization import SpeedLimits
+    from manipulation.planning.touch_points import touch_points
     from manipulation.planning.transfer import QUICK, THOROUGH, Effort
+    from manipulation.planning.visiting_order import visiting_order
     from manipulation.skills.attempt import Attempt
     from manipulation.skills.context import SkillContext
     from manipulation.skills.operate import operate
@@ -40,9 +43,12 @@ __all__ = [
     "operate",
     "park",
     "plan_sweep",
+    "plausibility",
     "proximity_probe",
     "retreat",
+    "touch_points",
     "touch_probe",
+    "visiting_order",
     "warm_up",
 ]
 __getattr__ = load_on_first_use(__name__, __file__)

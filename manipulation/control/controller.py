@@ -38,11 +38,21 @@ from manipulation.control.control_thread import ControlThread
 from manipulation.control.drives import Drives
 from manipulation.control.executors import Executor, GripperExecutor, Tick, begin
 from manipulation.control.following_error import FollowingErrorMonitor
-from manipulation.control.plausibility import DoubtedTouch, FrozenWrench
 from manipulation.control.recorder import Recorder
-from manipulation.control.sensing import ContactWrench, DeviceFailure, Devices, RangeReader, Sample, ToolView
+from manipulation.control.sensing import (
+    ContactWrench,
+    DeviceFailure,
+    Devices,
+    RangeReader,
+    Sample,
+    ToolReading,
+    ToolView,
+    refuse,
+)
 from manipulation.control.setpoint import SetPointLimiter, check, flange_matrix
 from manipulation.control.termination import Termination, TerminationMonitor
+from manipulation.plausibility.hand import TouchMonitor
+from manipulation.plausibility.repetition import RepeatedWrench
 
 RAN = "ran to its declared end"
 SETTLE_S = 0.3
@@ -95,8 +105,8 @@ class Controller:
             clock=clock,
             max_age_s=safety.max_reading_age_s,
         )
-        self._frozen_wrench = FrozenWrench(force_torque)
-        self._doubted_touch = DoubtedTouch(touch, force_torque)
+        self._repeated_wrench = RepeatedWrench(force_torque)
+        self._touch_monitor = TouchMonitor(touch, force_torque)
         capabilities = arm.capabilities()
         self.kinematics = Kinematics.of(capabilities)
         self._clock = clock
@@ -225,7 +235,7 @@ class Controller:
             end = Termination(outcome=MotionOutcome.FAULT, cause=f"{failure}; nothing moved", device=failure.device)
             return self._report(motion, end, started_s, view, recorder)
         self._is_moving = True
-        self._doubted_touch.begin(motion)
+        self._touch_monitor.begin(moves_pads=isinstance(motion, GripperMotion))
         self._drives.begin_rhythm()
         try:
             end = self._run(motion, run, sample, view, recorder)
@@ -262,7 +272,7 @@ class Controller:
             end = watch.ending(elapsed_s, sample, look)
             try:
                 if end is None:
-                    self._doubted_touch.check(sample, look.wrench, look.base_from_tool[:3, 3])
+                    self._check_touch(sample, look)
                     tick = Tick(elapsed_s - late_s, sample, look.wrench, self._filter.last_rad, self._dt_s)
                     wanted = run.wanted(tick)
                     if run.is_over(tick):
@@ -270,7 +280,7 @@ class Controller:
                         if self._has_settled(motion, wanted, sample, elapsed_s - over_since_s):
                             if isinstance(run, GripperExecutor):
                                 run.check_end(sample)
-                                self._doubted_touch.pads_moved(run.begun_m, sample)
+                                self._touch_monitor.pads_moved(run.begun_m, sample.pads)
                             return Termination(outcome=MotionOutcome.COMPLETED, cause=self._end_of(motion, wanted))
                     self._send(self._filter.apply(wanted))
                     self._drives.pass_tick()
@@ -348,12 +358,16 @@ class Controller:
     def _read(self, before: Sample | None = None) -> Sample:
         try:
             sample = self._devices.read(before)
-            self._frozen_wrench.check(sample)
+            refuse(self._repeated_wrench.note(sample.raw_wrench, stamp_s=sample.stamp_s))
         except DeviceFailure as failure:
             self._faults = self._faults or (str(failure),)  # who looks at the state sees that it is old
             raise
         self._faults = ()
         return sample
+
+    def _check_touch(self, sample: Sample, look: ToolReading) -> None:
+        tip_m = look.base_from_tool[:3, 3]
+        refuse(self._touch_monitor.note(sample.contacts, look.wrench, tip_m, stamp_s=sample.stamp_s))
 
     def _send(self, position_rad: Array) -> None:
         self._filter.sent(self._drives.send(position_rad))

@@ -17,8 +17,8 @@ from hal.motion import CartesianPath, Compliance, GripperMotion, Hold, JointTraj
 from manipulation.arm import kernels as arm_kernels
 from manipulation.arm.kinematics import Kinematics
 from manipulation.control import kernels
-from manipulation.control.plausibility import check_width
-from manipulation.control.sensing import Sample, command_wait_s
+from manipulation.control.sensing import Sample, command_wait_s, refuse
+from manipulation.plausibility.hand import wrong_width
 
 BLEND_S = 0.25  # the gap between the declared and the measured start is closed over this time
 TURN_ARM_M = 0.1  # a turn of 1 rad counts as this much way
@@ -196,7 +196,7 @@ class GripperExecutor:
             DeviceFailure: it cannot be.
         """
         if self._motion.must_arrive:
-            check_width(self._gripper.name, self._sent_m, self.begun_m, sample)
+            refuse(wrong_width(self._gripper.name, sample.pads, sent_m=self._sent_m, begun_m=self.begun_m))
 
     def wanted(self, tick: Tick) -> Array:
         """Where it is."""

@@ -8,9 +8,9 @@ from hal.arrays import Array
 from manipulation.arm import kernels as arm_kernels
 from manipulation.arm.kinematics import Kinematics
 from manipulation.control.drives import Drives
-from manipulation.control.sensing import DeviceFailure
+from manipulation.control.sensing import refuse
 from manipulation.control.setpoint import SetPointLimiter
-from manipulation.control.termination import TRACKING_LIMIT_M
+from manipulation.plausibility.arm import does_not_follow
 
 
 class FollowingErrorMonitor:
@@ -39,7 +39,7 @@ class FollowingErrorMonitor:
             DeviceFailure: the drives are on, and the arm says that it is far from where they hold it.
         """
         if self._drives.are_on:
-            self._check_near(measured_rad, held.last_rad, "{:.0f} mm from where it was sent")
+            self._check_near(measured_rad, held.last_rad, "{} from where it was sent")
 
     def resume(self, measured_rad: Array, filter_: SetPointLimiter) -> None:
         """Drives on, the set-point where the arm says that it is.
@@ -51,7 +51,7 @@ class FollowingErrorMonitor:
         self._drives.switch_on()
         if self._is_doubted:
             taken_rad = self._drives.send(filter_.last_rad)
-            self._check_near(measured_rad, taken_rad, "it says that it stands {:.0f} mm from where its drives have it")
+            self._check_near(measured_rad, taken_rad, "it says that it stands {} from where its drives have it")
             self._is_doubted = False
 
     def give_up(self, failed: str | None) -> None:
@@ -63,5 +63,4 @@ class FollowingErrorMonitor:
     def _check_near(self, measured_rad: Array, other_rad: Array, how: str) -> None:
         tips = [(arm_kernels.frames(self._kinematics.dh, q)[-1] @ self._grip)[:3, 3] for q in (measured_rad, other_rad)]
         apart_m = float(np.linalg.norm(tips[0] - tips[1]))
-        if apart_m >= TRACKING_LIMIT_M:
-            raise DeviceFailure(self._arm, f"{self._arm} does not follow: {how.format(1e3 * apart_m)}")
+        refuse(does_not_follow(self._arm, apart_m, how))

@@ -18,6 +18,8 @@ from hal.devices import Arm, ForceTorque, Gripper, JointState, Proximity, Touch
 from hal.errors import CellError, DeviceError, DeviceTimeout, StaleReading
 from hal.readings import Cause, Quality, Stamped
 from manipulation.control import kernels
+from manipulation.plausibility.finding import Finding
+from manipulation.plausibility.hand import Pads
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -44,6 +46,11 @@ class Sample:
     gripper_is_moving: bool
     gripper_is_holding: bool = False
 
+    @property
+    def pads(self) -> Pads:
+        """What the gripper said of its pads."""
+        return Pads(width_m=self.gripper_width_m, is_moving=self.gripper_is_moving, is_holding=self.gripper_is_holding)
+
 
 class DeviceFailure(Exception):
     """A device could not be used in this tick; `device` names it."""
@@ -52,6 +59,16 @@ class DeviceFailure(Exception):
         super().__init__(cause if cause.startswith(device) else f"{device}: {cause}")  # drivers name themselves
         self.device = device
         self.cause = cause
+
+
+def refuse(finding: Finding | None) -> None:
+    """End the motion if a device is not believed.
+
+    Raises:
+        DeviceFailure: there is a finding; with its cause.
+    """
+    if finding is not None:
+        raise DeviceFailure(finding.device, finding.cause)
 
 
 class RangeReader:

@@ -11,8 +11,8 @@ from hal.arrays import Array
 from hal.motion import Guard, MotionOutcome, Quantity, Reaction
 from manipulation.control.guards import GuardSet, Measured
 from manipulation.control.sensing import Sample, ToolReading
+from manipulation.plausibility.arm import FOLLOWING_LIMIT_M
 
-TRACKING_LIMIT_M = 0.02
 TRACKING_TICKS = 5
 LOADED_START_RATIO = 1.2  # otherwise a jammed hand could never be taken away
 UNITS = {
@@ -106,7 +106,7 @@ def _standing_guards(force_limit_n: float, wrench: Array) -> tuple[Guard, ...]:
         Guard(
             name="tracking",
             quantity=Quantity.TRACKING,
-            limit=TRACKING_LIMIT_M,
+            limit=FOLLOWING_LIMIT_M,
             ticks=TRACKING_TICKS,
             reaction=Reaction.FAULT,
         ),

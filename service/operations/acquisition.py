@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,10 +16,10 @@ from hal.errors import StaleReading
 from hal.frames import frame_tree
 from hal.geometry import UncertainPose
 from hal.motion import Hold, MotionOutcome
-from hal.readings import Cause, Stamped
+from hal.readings import Stamped
+from manipulation import plausibility
 from service.operations.session import Session
 from service.operations.sweep import sweep_scanner
-from service.operations.world_model import Frame
 
 READ_S = 5.0  # wall seconds for one device call; a software renderer on a busy machine takes up to 0.5 s
 OLDEST_S = 0.2  # before the call: a frame must be of the present, however long it takes to arrive
@@ -162,13 +161,8 @@ def _switch(session: Session, name: str, lights: Any, on: tuple[bool, ...], wait
 
 
 def _refuse_frozen(session: Session, name: str, sample: Stamped[Any], array: NDArray[Any]) -> None:
-    """Two frames of a live sensor are never equal to the last bit: its noise sees to that."""
-    digest = hashlib.blake2b(np.ascontiguousarray(array).tobytes(), digest_size=16).digest()
-    before = session.world.note_frame(name, Frame(stamp_s=sample.host_time_s, digest=digest))
-    if before is not None and before.digest == digest and before.stamp_s != sample.host_time_s:
-        raise StaleReading(
-            f"{name} repeats the same frame under a new stamp",
-            hint=f"{name} is frozen: power-cycle it; nothing was measured with the old frame",
-            device=name,
-            cause=str(Cause.FROZEN),
-        )
+    """Raise `StaleReading` where a camera or scanner repeats a frame under a new stamp."""
+    newest = plausibility.Frame.of(array, stamp_s=sample.host_time_s)
+    finding = plausibility.repeated_frame(name, session.world.note_frame(name, newest), newest)
+    if finding is not None:
+        raise finding.error()

@@ -13,13 +13,13 @@ from hal.devices import DeviceKind
 from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import compose
 from hal.panel import PanelObject
+from manipulation import visiting_order
 from perception.vision import ObjectReading, answer_at, draw_annotated, merge_views, said, viewpoints
 from perception.vision import inspect as inspect_image
 from service.operations.acquisition import Look, base_from, look, settle
 from service.operations.locate import go_to_overview, locate
 from service.operations.session import Session, panel_object_or_all
 from service.operations.stored import object_result, read_stored
-from service.operations.tours import short_tour
 from service.operations.travel import go_to_camera_view, skill_context
 from service.report.plots import png_of
 from service.schema.mission_results import ReadingResult
@@ -83,7 +83,7 @@ def close_ups(session: Session, names: Collection[str]) -> Inspection:
     """Read objects from as few close-ups as show them all."""
     objects = [session.panel.object(name) for name in names]
     groups = viewpoints.close_up_groups(objects, session.lens())
-    groups = [groups[k] for k in short_tour(_camera_over_panel(session), [centre_m for centre_m, _ in groups])]
+    groups = [groups[k] for k in visiting_order(_camera_over_panel(session), [centre_m for centre_m, _ in groups])]
     readings: dict[str, ObjectReading] = {}
     pictures: list[AnnotatedView] = []
     for k, (centre_m, group) in enumerate(groups):

@@ -24,11 +24,9 @@ from hal.arrays import Array
 from hal.devices import DeviceKind
 from hal.errors import MotionError, NotFound, Stopped
 from hal.geometry import UncertainPose
-from manipulation import SkillFailure, proximity_probe, touch_probe
+from manipulation import SkillFailure, plausibility, proximity_probe, touch_points, touch_probe
 from service.operations.acquisition import settle
-from service.operations.doubted_proximity import DoubtedProximity
 from service.operations.session import Session
-from service.operations.spots import bare_spots
 from service.operations.travel import skill_context
 from service.schema.fuse_results import TouchingResult, TouchResult
 
@@ -130,7 +128,7 @@ def follow(session: Session, plan: TouchPlan, touches: int) -> Felt:
     observations: list[Observation] = []
     accounts: list[TouchResult] = []
     skipped: list[str] = []
-    doubted = DoubtedProximity(session.panel)
+    monitor = plausibility.ProximityMonitor(session.panel)
     ended = "as many places as asked for"
     while len(accounts) < touches:
         choice = plan.choice()
@@ -146,7 +144,7 @@ def follow(session: Session, plan: TouchPlan, touches: int) -> Felt:
             f"at ({spot[0]:.3f}, {spot[1]:.3f}) m, expected to lower the pose's mean square error by {expected:.1f} %",
         )
         try:
-            found = _feel_at(session, spot, doubted)
+            found = _feel_at(session, spot, monitor)
         except Stopped:
             raise  # no place is at fault
         except (SkillFailure, MotionError) as failure:
@@ -186,7 +184,7 @@ def mounts_of(session: Session, observations: Sequence[Observation]) -> dict[str
 def touch_plan(session: Session, touches: int, known: Sequence[Observation], tolerance: PoseTolerance) -> TouchPlan:
     """Offer bare places of the plate, with what a touch at each would tell."""
     base_from_panel = session.known_panel().parent_from_child
-    spots_m = bare_spots(session.panel, touches + SPARE_SPOTS)
+    spots_m = touch_points(session.panel, touches + SPARE_SPOTS)
     expected = [_expected_at(session, base_from_panel, spot) for spot in spots_m]
     return TouchPlan(
         base_from_panel=base_from_panel,
@@ -239,7 +237,7 @@ def _fingers_over_panel(session: Session) -> Array:
     return np.asarray(context.panel_pose.inv().apply(tip.translation)[:2])
 
 
-def _feel_at(session: Session, spot: Array, doubted: DoubtedProximity) -> list[Observation]:
+def _feel_at(session: Session, spot: Array, monitor: plausibility.ProximityMonitor) -> list[Observation]:
     context = skill_context(session)
     place = (float(spot[0]), float(spot[1]), 0.0)
     observations: list[Observation] = []
@@ -270,13 +268,15 @@ def _feel_at(session: Session, spot: Array, doubted: DoubtedProximity) -> list[O
     settle(session, REST_S)
     for name, mount in zip(names, mounts, strict=True):
         k = proximities.index(name)
-        doubted.check(
+        finding = monitor.note(
             name,
             of[name],
             [(state.base_from_flange * mount, state.proximity_m[k]) for state in (hovered, context.mover.state())],
             base_from_panel=context.panel_pose,
             touched_m=touched.point_m,
         )
+        if finding is not None:
+            raise finding.error()
     base_from_grip = touched.report.base_from_tool
     tip = base_from_grip.inv().apply(touched.point_m)
     normal_sigma = float(np.sqrt(touched.normal @ touched.covariance @ touched.normal))

@@ -19,15 +19,8 @@ from hal.geometry import UncertainPose, transform_rpy
 
 if TYPE_CHECKING:
     from manipulation import Kinematics
+    from manipulation.plausibility import Frame
     from perception.vision import ObjectReading
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Frame:
-    """The newest frame of a sensor: when it was taken (cell clock, s) and a digest of its array."""
-
-    stamp_s: float
-    digest: bytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,10 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.clock import Clock, Deadline, PacedClock, SimClock, WallClock
-from hal.devices import ForceTorqueCapabilities, JointState, Wrench
+from hal.devices import JointState, Wrench
 from hal.errors import DeviceTimeout, StaleReading
 from hal.readings import Quality, Stamped
-from manipulation.control.plausibility import FrozenWrench
 from manipulation.control.sensing import (
     STALE_STEP_S,
     STALE_WAIT_S,
@@ -21,7 +19,6 @@ from manipulation.control.sensing import (
     DeviceFailure,
     Devices,
     RangeReader,
-    Sample,
     read_wait_s,
 )
 from tests.manipulation.rig import (
@@ -185,54 +182,3 @@ def test_at_rest_in_any_posture_weight_and_bias_leave_no_contact(turn: list[floa
     raw = np.concatenate([gravity, np.cross(LOAD.centre_of_mass_m, gravity)]) + np.asarray(LOAD.bias)
     found = ContactWrench(LOAD, SENSOR).in_flange(raw, np.ascontiguousarray(flange.as_matrix()))
     assert np.abs(found).max() < 1e-9
-
-
-def wrench_sample(stamp_s: float, force_n: float) -> Sample:
-    raw = np.array([force_n, 0.0, 0.0, 0.0, 0.0, 0.0])
-    return Sample(
-        stamp_s=stamp_s, position_rad=np.zeros(6), velocity_rad_per_s=np.zeros(6), raw_wrench=raw, contacts=(),
-        proximity_m=(), gripper_width_m=0.0, gripper_is_moving=False,
-    )  # fmt: skip
-
-
-class Wrist(FakeForceTorque):
-    """Of any noise and rate."""
-
-    def __init__(self, *, force_sigma_n: float = 0.3, rate_hz: float = 500.0) -> None:
-        super().__init__("wrist_ft", World())
-        self.stated = replace(super().capabilities(), force_sigma_n=force_sigma_n, rate_hz=rate_hz)
-
-    def capabilities(self) -> ForceTorqueCapabilities:
-        return self.stated
-
-
-def repeats_for_s(sensor: Wrist | None, *, every_s: float = 0.002, lasting_s: float = 2.0) -> float | None:
-    """How long one reading may repeat until it is a failure; None for ever."""
-    watch = FrozenWrench(sensor)
-    for tick in range(round(lasting_s / every_s)):
-        try:
-            watch.check(wrench_sample(tick * every_s, 1.0))
-        except DeviceFailure as failure:
-            assert failure.device == "wrist_ft" and "same reading under new stamps" in failure.cause
-            return tick * every_s
-    return None
-
-
-def test_a_wrench_that_repeats_under_new_stamps_is_a_failure_before_a_touch_grows_strong() -> None:
-    assert repeats_for_s(Wrist()) == pytest.approx(0.1, abs=0.003)
-
-
-def test_a_slow_sensor_repeats_itself_between_its_samples_and_few_ticks_prove_nothing() -> None:
-    assert repeats_for_s(Wrist(rate_hz=10.0)) == pytest.approx(0.4, abs=0.003)
-    assert repeats_for_s(Wrist(), every_s=0.05) == pytest.approx(0.5, abs=0.051)
-
-
-def test_a_sensor_without_noise_may_repeat_itself_and_so_may_none() -> None:
-    assert repeats_for_s(Wrist(force_sigma_n=0.0)) is None
-    assert repeats_for_s(None) is None
-
-
-def test_any_other_reading_begins_anew() -> None:
-    watch = FrozenWrench(Wrist())
-    for tick in range(500):
-        watch.check(wrench_sample(0.002 * tick, float(tick // 45)))

@@ -49,7 +49,7 @@ class Toucher:
         self.errors = list(errors)
         self.tried = 0
 
-    def __call__(self, session: Any, spot: Any, doubted: Any) -> list[Any]:
+    def __call__(self, session: Any, spot: Any, monitor: Any) -> list[Any]:
         self.tried += 1
         if self.errors:
             raise self.errors.pop(0)

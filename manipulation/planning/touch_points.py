@@ -12,11 +12,11 @@ GRID_M = 0.005
 EDGE_M = 0.025  # a finger that misses the plate finds nothing
 
 
-def bare_spots(panel: Panel, count: int, *, clearance_m: float = 0.030) -> Array:
-    """(count, 2) panel points far from every object and light, and far from each other.
+def touch_points(panel: Panel, count: int, *, clearance_m: float = 0.030) -> Array:
+    """Choose (count, 2) panel points far from every object and light, and far from each other.
 
-    Greedy farthest points, which for a plate with instruments are its bare corners and the gaps between rows: the
-    spread makes the touched plane's normal as well known as it can be.
+    Greedy farthest points, which for a plate with instruments are its bare corners and the gaps between rows: their
+    spread makes the normal of the touched plane as well known as it can be.
 
     Raises:
         NotFound: the panel has too few bare places.

@@ -1,4 +1,4 @@
-"""A proximity sensor that answers wrongly: what it says over the plate against the plate that the fingers touch there."""
+"""Proximity sensors against the plate that the fingers touch where the sensors looked."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.devices import ProximityCapabilities
-from hal.errors import DeviceFault
 from hal.panel import Panel
-from service.operations.spots import room_m
+from manipulation.planning.touch_points import room_m
+from manipulation.plausibility.finding import Finding, Symptom
 
 BARE_M = 0.010  # of plate round the beam's foot: no part of it sees an edge
 LEAST_OFF_M = 0.005  # mounts and plates are known better
 OFF_SIGMA = 6.0  # of one reading
 
 
-class DoubtedProximity:
-    """Doubts a sensor whose readings over the touched plate are off by the same at two places in a row.
+class ProximityMonitor:
+    """Watches for a sensor whose readings over the touched plate are off by the same at two places in a row.
 
     One place alone proves nothing: a cable may hang before the plate there.
     """
@@ -28,7 +28,7 @@ class DoubtedProximity:
         self._panel = panel
         self._off_before_m: dict[str, Array] = {}
 
-    def check(
+    def note(
         self,
         sensor: str,
         of: ProximityCapabilities,
@@ -36,39 +36,37 @@ class DoubtedProximity:
         *,
         base_from_panel: RigidTransform,
         touched_m: Array,
-    ) -> None:
-        """Note one place of the plate.
+    ) -> Finding | None:
+        """Take one place of the plate; finds that the sensor is off there as at the place before.
 
         Args:
             of: its range and noise.
             readings: `base_from_sensor` and what it said from there, m; NaN where it saw nothing.
             touched_m: (3,) where the fingers met the plate, base frame.
-
-        Raises:
-            DeviceFault: the sensor is off, here as at the place before.
         """
         expected_m: list[float] = []
         for place, _ in readings:
             distance_m = self._expected_m(of, place, base_from_panel, touched_m)
             if distance_m is None:
-                return
+                return None
             expected_m.append(distance_m)
         said_m = np.array([distance_m for _, distance_m in readings])
         off_m = said_m - np.array(expected_m)
         limit_m = max(LEAST_OFF_M, OFF_SIGMA * of.sigma_m)
         if np.all(np.abs(off_m) <= limit_m):  # NaN is not
             self._off_before_m.pop(sensor, None)
-            return
+            return None
         before_m, self._off_before_m[sensor] = self._off_before_m.get(sensor), off_m
         if before_m is None or not np.allclose(before_m, off_m, rtol=0.0, atol=limit_m, equal_nan=True):
-            return
+            return None
         worst = int(np.argmax(np.nan_to_num(np.abs(off_m), nan=np.inf)))
         says = "sees nothing" if np.isnan(said_m[worst]) else f"says {1e3 * said_m[worst]:.0f} mm"
-        raise DeviceFault(
-            f"{sensor} {says} where the plate, as the fingers touched it, is {1e3 * expected_m[worst]:.0f} mm away,"
-            " and was as wrong at the place before: it is frozen, off its zero or out of line",
-            hint="clean its window, check its mount and cable, switch it off and on, then send this again",
+        return Finding(
             device=sensor,
+            symptom=Symptom.BIASED,
+            what=f"{sensor} {says} where the plate, as the fingers touched it, is {1e3 * expected_m[worst]:.0f} mm away,"
+            " and was as wrong at the place before: it is frozen, off its zero or out of line",
+            remedy="clean its window, check its mount and cable, switch it off and on, then send this again",
         )
 
     def _expected_m(

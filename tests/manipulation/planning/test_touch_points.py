@@ -1,4 +1,4 @@
-"""Where to touch: spots are bare."""
+"""Where to touch: points of the plate that are bare and far apart."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ import pytest
 
 from hal.errors import NotFound
 from hal.panel import Panel, load_panel
-from service.operations.spots import EDGE_M, bare_spots
+from manipulation.planning.touch_points import EDGE_M, touch_points
 
-ROOT = Path(__file__).parents[3]
-PANEL = load_panel(ROOT / "panels/bench.toml")
+PANEL = load_panel(Path(__file__).parents[3] / "panels/bench.toml")
 
 
 @pytest.mark.parametrize("count", [3, 4, 6])
 def test_spots_are_bare_and_far_apart(count: int) -> None:
-    spots = bare_spots(PANEL, count)
+    spots = touch_points(PANEL, count)
     assert len(spots) == count
     for x, y in spots:
         assert abs(x) <= PANEL.width_m / 2 - EDGE_M + 1e-9 and abs(y) <= PANEL.height_m / 2 - EDGE_M + 1e-9
@@ -36,4 +35,4 @@ def test_spots_are_bare_and_far_apart(count: int) -> None:
 def test_a_crowded_panel_has_no_spots_and_says_so() -> None:
     crowded: Panel = PANEL.model_copy(update={"width_m": 0.05, "height_m": 0.05, "lights": PANEL.lights})
     with pytest.raises(NotFound, match="bare"):
-        bare_spots(crowded, 3)
+        touch_points(crowded, 3)

@@ -14,11 +14,12 @@ from hal.devices import ProximityCapabilities
 from hal.errors import DeviceFault
 from hal.geometry import transform_rpy
 from hal.panel import load_panel
-from service.operations.doubted_proximity import BARE_M, DoubtedProximity
-from service.operations.spots import bare_spots
+from manipulation.planning.touch_points import touch_points
+from manipulation.plausibility import ProximityMonitor
+from manipulation.plausibility.proximity import BARE_M
 
 PANEL = load_panel(Path(__file__).parents[3] / "panels" / "bench.toml")
-SPOTS = bare_spots(PANEL, 4)
+SPOTS = touch_points(PANEL, 4)
 OF = ProximityCapabilities(min_range_m=0.02, max_range_m=0.6, sigma_m=0.0008, rate_hz=100.0)
 BASE_FROM_PANEL = transform_rpy((0.75, 0.1, 0.6), (np.pi / 2, 0.05, -np.pi / 2))
 BULGE_M = 0.002  # the plate stands so far before where the panel's pose has it
@@ -31,15 +32,17 @@ def over(spot: Sequence[float], height_m: float) -> RigidTransform:
 
 
 def visit(
-    watch: DoubtedProximity, spot: Sequence[float], *said_m: float, heights_m: Sequence[float] = (0.12, 0.1)
+    watch: ProximityMonitor, spot: Sequence[float], *said_m: float, heights_m: Sequence[float] = (0.12, 0.1)
 ) -> None:
-    watch.check(
+    finding = watch.note(
         "left",
         OF,
         [(over(spot, height), said) for height, said in zip(heights_m, said_m, strict=True)],
         base_from_panel=BASE_FROM_PANEL,
         touched_m=np.asarray(BASE_FROM_PANEL.apply([spot[0] + 0.05, spot[1], BULGE_M])),
     )
+    if finding is not None:
+        raise finding.error()
 
 
 @pytest.mark.parametrize(
@@ -54,7 +57,7 @@ def visit(
 def test_a_sensor_that_is_off_by_the_same_at_two_places_is_named(
     first: Sequence[float], second: Sequence[float], words: str
 ) -> None:
-    watch = DoubtedProximity(PANEL)
+    watch = ProximityMonitor(PANEL)
     visit(watch, SPOTS[0], *first)
     with pytest.raises(DeviceFault, match=f"left {words}") as caught:
         visit(watch, SPOTS[1], *second)
@@ -62,10 +65,10 @@ def test_a_sensor_that_is_off_by_the_same_at_two_places_is_named(
 
 
 def test_noise_and_what_hangs_before_the_plate_at_one_place_is_no_fault() -> None:
-    watch = DoubtedProximity(PANEL)
+    watch = ProximityMonitor(PANEL)
     for spot, said in zip([*SPOTS, *SPOTS], [(0.123, 0.097), (0.06, 0.04), (0.12, 0.1), (0.06, 0.04)] * 2, strict=True):
         visit(watch, spot, *said)
-    watch = DoubtedProximity(PANEL)
+    watch = ProximityMonitor(PANEL)
     for spot, nearer in zip(SPOTS, (0.03, 0.06, 0.02, 0.07), strict=True):  # cables, nowhere the same
         visit(watch, spot, 0.12 - nearer, 0.1 - nearer)
 
@@ -74,9 +77,9 @@ def test_beams_that_may_meet_something_else_say_nothing() -> None:
     edge = PANEL.width_m / 2
     panel_object = PANEL.objects[0].position_m
     for foot in ((edge - 0.5 * BARE_M, 0.0), (edge + 0.05, 0.0), panel_object):
-        watch = DoubtedProximity(PANEL)
+        watch = ProximityMonitor(PANEL)
         for _ in range(3):
             visit(watch, foot, 0.3, 0.3)
-    watch = DoubtedProximity(PANEL)
+    watch = ProximityMonitor(PANEL)
     for spot in SPOTS:
         visit(watch, spot, math.nan, math.nan, heights_m=(0.01, 0.62))  # out of its range

@@ -5,36 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hal.motion import GripperMotion, Hold, MotionOutcome, RobotState
-from manipulation.control.plausibility import (
+from hal.motion import GripperMotion, MotionOutcome, RobotState
+from manipulation.control.sensing import DeviceFailure, refuse
+from manipulation.plausibility.hand import (
     FELT_N,
     FREE_WAY_M,
     NEAR_TIPS_M,
     QUIET_S,
     UNFELT_S,
-    DoubtedTouch,
-    check_width,
+    Pads,
+    TouchMonitor,
+    wrong_width,
 )
-from manipulation.control.sensing import DeviceFailure, Sample
 from tests.manipulation.rig import FakeForceTorque, FakeTouch, Rig, World, make_rig
 
 DT_S = 0.002
-HOLD = Hold(name="hold", duration_s=1.0)
-
-
-def sample(
-    *,
-    stamp_s: float = 0.0,
-    width_m: float = 0.0,
-    moving: bool = False,
-    holding: bool = False,
-    contacts: tuple[bool, ...] = (False, False),
-) -> Sample:
-    return Sample(
-        stamp_s=stamp_s, position_rad=np.zeros(6), velocity_rad_per_s=np.zeros(6), raw_wrench=np.zeros(6),
-        contacts=contacts, proximity_m=(), gripper_width_m=width_m, gripper_is_moving=moving,
-        gripper_is_holding=holding,
-    )  # fmt: skip
 
 
 # -- the gripper ---------------------------------------------------------------------------------------------------
@@ -54,7 +39,9 @@ def sample(
 def test_what_a_healthy_gripper_says_is_believed(
     begun_m: float, sent_m: float, said_m: float, holding: bool, moving: bool
 ) -> None:
-    check_width("pads", sent_m, begun_m, sample(width_m=said_m, holding=holding, moving=moving))
+    refuse(
+        wrong_width("pads", Pads(width_m=said_m, is_holding=holding, is_moving=moving), sent_m=sent_m, begun_m=begun_m)
+    )
 
 
 @pytest.mark.parametrize(
@@ -73,7 +60,11 @@ def test_a_width_that_contradicts_its_command_names_the_gripper(
     begun_m: float, sent_m: float, said_m: float, holding: bool, moving: bool
 ) -> None:
     with pytest.raises(DeviceFailure, match=f"^pads was sent to {1e3 * sent_m:.1f} mm") as caught:
-        check_width("pads", sent_m, begun_m, sample(width_m=said_m, holding=holding, moving=moving))
+        refuse(
+            wrong_width(
+                "pads", Pads(width_m=said_m, is_holding=holding, is_moving=moving), sent_m=sent_m, begun_m=begun_m
+            )
+        )
     assert caught.value.device == "pads" and "switch the gripper off and on" in caught.value.cause
 
 
@@ -111,21 +102,21 @@ class Hand:
 
     def __init__(self, *, threshold_n: float = 0.5) -> None:
         world = World()
-        self.watch = DoubtedTouch(FakeTouch("finger_touch", world), FakeForceTorque("wrist_ft", world))
+        self.watch = TouchMonitor(FakeTouch("finger_touch", world), FakeForceTorque("wrist_ft", world))
         self.now_s = 0.0
         self.tip_m = np.zeros(3)
-        self.watch.begin(HOLD)
+        self.watch.begin(moves_pads=False)
 
     def opens(self) -> Hand:
-        self.watch.begin(opening())
-        self.watch.pads_moved(0.0, sample(width_m=0.034))
-        self.watch.begin(HOLD)
+        self.watch.begin(moves_pads=True)
+        self.watch.pads_moved(0.0, Pads(width_m=0.034))
+        self.watch.begin(moves_pads=False)
         return self
 
     def closes(self) -> Hand:
-        self.watch.begin(GripperMotion(name="close", width_m=0.0, force_n=10.0))
-        self.watch.pads_moved(0.034, sample(width_m=0.014, holding=True))
-        self.watch.begin(HOLD)
+        self.watch.begin(moves_pads=True)
+        self.watch.pads_moved(0.034, Pads(width_m=0.014, is_holding=True))
+        self.watch.begin(moves_pads=False)
         return self
 
     def feels(
@@ -134,7 +125,7 @@ class Hand:
         ticks = round(lasting_s / DT_S)
         for _ in range(ticks + 1):
             wrench = np.array([0.0, 0.0, -force_n, force_n * lever_m, 0.0, 0.0])
-            self.watch.check(sample(stamp_s=self.now_s, contacts=(fingers, False)), wrench, self.tip_m)
+            refuse(self.watch.note((fingers, False), wrench, self.tip_m, stamp_s=self.now_s))
             self.now_s += DT_S
             self.tip_m = self.tip_m + np.array([way_m / ticks, 0.0, 0.0])
 
@@ -189,6 +180,7 @@ def test_a_hand_that_carries_or_rubs_or_has_just_let_go_may_say_contact() -> Non
 
 def test_fingers_are_believed_where_no_wrist_feels() -> None:
     world = World()
-    for watch in (DoubtedTouch(FakeTouch("finger_touch", world), None), DoubtedTouch(None, None)):
+    for watch in (TouchMonitor(FakeTouch("finger_touch", world), None), TouchMonitor(None, None)):
         for tick in range(1000):
-            watch.check(sample(stamp_s=tick * DT_S), np.array([0.0, 0.0, -50.0, 0.0, 0.0, 0.0]), np.zeros(3))
+            wrench = np.array([0.0, 0.0, -50.0, 0.0, 0.0, 0.0])
+            assert watch.note((False, False), wrench, np.zeros(3), stamp_s=tick * DT_S) is None

@@ -12,7 +12,7 @@ from hal.arrays import Array
 MOST_TRIED = 6  # 720 orders; more places are visited nearest first
 
 
-def short_tour(start_m: ArrayLike, places_m: ArrayLike) -> list[int]:
+def visiting_order(start_m: ArrayLike, places_m: ArrayLike) -> list[int]:
     """Indices of the places (N, k) in the order of a short way from `start_m` (k,) through them all, m.
 
     The shortest of all orders for at most `MOST_TRIED` places, each time the nearest for more.

@@ -1,0 +1,18 @@
+"""Is this device lying? Readings held against each other, against commands and against geometry.
+
+Nothing here reads a device or raises: readings go in, a `Finding` or None comes out, and callers say it in their own way.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hal.face import load_on_first_use
+
+if TYPE_CHECKING:
+    from manipulation.plausibility.finding import Finding, Symptom
+    from manipulation.plausibility.proximity import ProximityMonitor
+    from manipulation.plausibility.repetition import Frame, repeated_frame
+
+__all__ = ["Finding", "Frame", "ProximityMonitor", "Symptom", "repeated_frame"]
+__getattr__ = load_on_first_use(__name__, __file__)

@@ -15,7 +15,7 @@ from service.knowledge.teach import learn_panel
 from service.operations.acquisition import look, scan, settle
 from service.operations.inspect import ensure_located, run_recognise_taught
 from service.operations.locate import go_to_overview, plate_in
-from service.operations.relief import Sighting, find_by_surfaces, mark_of, surfaces_in
+from service.operations.range_detection import Sighting, find_by_surfaces, mark_of, surfaces_in
 from service.operations.session import Session
 from service.operations.stored import Pixels, blind_answer, blind_in_stored, panel_of, read_stored, shown, stored_view
 from service.report.plots import png_of

@@ -17,7 +17,7 @@ from hal.errors import DeviceError, StaleReading, Unsupported
 from hal.simulated import Fault
 from service.operations.acquisition import scan
 from service.operations.locate import ScannedPlane, go_to_overview, locate, plate_in
-from service.operations.relief import Sighting, find_by_surfaces, surfaces_in
+from service.operations.range_detection import Sighting, find_by_surfaces, surfaces_in
 from service.operations.session import OperationContext, Session
 from service.operations.sweep import sweep_rate_rad_per_s, sweep_scanner
 from service.operations.world_model import WorldModel

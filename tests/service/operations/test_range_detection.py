@@ -13,8 +13,8 @@ from hal.geometry import UncertainPose
 from hal.panel import Button, Handwheel, Light, Mushroom, Panel
 from perception.range.matching.solids import boxes_of, render, solid_of
 from service.operations.acquisition import Scan
+from service.operations.range_detection import Sighting, find_by_surfaces, mark_of, models_of, surfaces_in
 from service.operations.recognise import _sighting_result
-from service.operations.relief import Sighting, find_by_surfaces, mark_of, models_of, surfaces_in
 from service.report.surfaces import FOUND, LOST, surfaces_picture
 
 SIDE = 128

@@ -34,7 +34,8 @@ def load_on_first_use(package: str, file: str) -> Callable[[str], Any]:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module, original = homes[name]
-        value = getattr(import_module(module), original)
+        is_submodule = module == package  # `from manipulation import plausibility`, in manipulation itself
+        value = import_module(f"{package}.{original}") if is_submodule else getattr(import_module(module), original)
         setattr(sys.modules[package], name, value)  # the next use finds it without coming here
         return value
 

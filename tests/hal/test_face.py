@@ -1,0 +1,54 @@
+"""The face of a package: its names are loaded when they are first used."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FACE = """
+from typing import TYPE_CHECKING
+from hal.face import load_on_first_use
+if TYPE_CHECKING:
+    from house import attic
+    from house.cellar import LAMP as LIGHT
+__all__ = ["LIGHT", "attic"]
+__getattr__ = load_on_first_use(__name__, __file__)
+"""
+ROOT = Path(__file__).parents[2]
+
+
+def run(folder: Path, code: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys; sys.path[:0] = [{str(folder)!r}, {str(ROOT)!r}]; {code}"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return done.stdout.strip() or done.stderr.strip().splitlines()[-1]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "house").mkdir()
+    (tmp_path / "house" / "__init__.py").write_text(FACE)
+    (tmp_path / "house" / "attic.py").write_text("TRUNK = 1")
+    (tmp_path / "house" / "cellar.py").write_text("LAMP = 2")
+    return tmp_path
+
+
+def test_a_name_brings_its_module_along_and_no_other(folder: Path) -> None:
+    loaded = "print([m for m in ('house.attic', 'house.cellar') if m in sys.modules])"
+    assert run(folder, f"import house; {loaded}") == "[]"
+    assert run(folder, f"from house import LIGHT; assert LIGHT == 2; {loaded}") == "['house.cellar']"
+
+
+def test_a_module_of_the_package_may_be_a_name_of_its_face(folder: Path) -> None:
+    assert run(folder, "import house; print(house.attic.TRUNK)") == "1"
+    assert run(folder, "from house import attic; print(attic.TRUNK)") == "1"
+
+
+def test_what_the_face_does_not_have_is_an_attribute_error(folder: Path) -> None:
+    assert run(folder, "import house; house.roof") == "AttributeError: module 'house' has no attribute 'roof'"

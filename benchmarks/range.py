@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import range_matching, range_peers, range_rooms
+from benchmarks.range_filter_pass import filter_pass
 from benchmarks.range_sensors import SENSORS, table_top
 from benchmarks.range_soft import SCENES, VIEWS, soft_scene
 from hal.arrays import Array
@@ -138,7 +139,7 @@ def _cases(gen: ModuleType, scene: str, seeds: int, **kind: Any) -> list[dict[st
     return cases
 
 
-def _case_depth(case: dict[str, Any], codes: bool) -> Array:
+def case_depth(case: dict[str, Any], codes: bool) -> Array:
     if codes:
         u8 = case["meta"]["u8"]
         return Window(near_m=u8["near"] / MM, far_m=u8["far"] / MM).decode(case["u8"])
@@ -150,7 +151,7 @@ def _scored(
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     rows = []
     for case in cases:
-        scene = analyse(_case_depth(case, codes), sensor_from_meta(case["meta"]["sensor"], 1 / MM))
+        scene = analyse(case_depth(case, codes), sensor_from_meta(case["meta"]["sensor"], 1 / MM))
         rows.append(score.score_case(case, scene.labels, [prediction(s) for s in scene.surfaces], 0.8, bound))
     return score.summarise(rows), rows
 
@@ -292,12 +293,12 @@ def _time_lines(gen: ModuleType) -> list[Line]:
         whole, ratios = [], []
         for scene in ("polyhedra", "curved", "panel", "fig10"):
             case = _cases(gen, scene, 1, **kind)[0]
-            depth, sensor = _case_depth(case, False), sensor_from_meta(case["meta"]["sensor"], 1 / MM)
+            depth, sensor = case_depth(case, False), sensor_from_meta(case["meta"]["sensor"], 1 / MM)
             analyse(depth, sensor)
             # One thread's CPU time: other programs on the machine do not count.
             ms = _median_ms(partial(analyse, depth, sensor), 7, clock=time.process_time)
             whole.append(ms)
-            ratios.append(ms / _median_ms(_filter_pass(depth, sensor), 15, clock=time.process_time))
+            ratios.append(ms / _median_ms(filter_pass(depth, sensor), 15, clock=time.process_time))
         ms, ratio = statistics.median(whole), statistics.median(ratios)
         spread = f"{ms:.1f} ms ({min(whole):.0f} to {max(whole):.0f})"
         needed = f"<= {limit_ms:.0f} ms"
@@ -306,26 +307,6 @@ def _time_lines(gen: ModuleType) -> list[Line]:
             Line(name=f"chain / filter pass, {name}", needed="<= 40", measured=f"{ratio:.1f}", passed=ratio <= 40)
         )
     return out
-
-
-def _filter_pass(depth: Array, sensor: Any) -> Callable[[], object]:
-    """Median 5x5, gaussian, derivatives, normals, H and K of one image in single precision: the unit of times.
-
-    The fastest that we have: OpenCV's median and gaussian on one thread, and our fused, vectorised derivatives.
-    """
-    import cv2
-
-    from perception.range.geometry import geometry_of
-
-    cv2.setNumThreads(1)
-    single = depth.astype(np.float32)
-
-    def run() -> object:
-        smooth = cv2.GaussianBlur(cv2.medianBlur(single, 5), (0, 0), 1.5)
-        return geometry_of(np.asarray(smooth, np.float32), sensor, scale_px=1.5)
-
-    run()
-    return run
 
 
 def _median_ms(work: Callable[[], object], repeats: int, clock: Callable[[], float] = time.perf_counter) -> float:
@@ -340,7 +321,7 @@ def _median_ms(work: Callable[[], object], repeats: int, clock: Callable[[], flo
 def _peer_lines(gen: ModuleType, score: ModuleType) -> list[Line]:
     """Correct regions and time of other people's segmenters, where they are installed, and ours on the same images."""
     cases = [case for scene in ("polyhedra", "fig10", "curved") for case in _cases(gen, scene, PEER_SEEDS)]
-    seen = [(_case_depth(case, False), sensor_from_meta(case["meta"]["sensor"], 1 / MM)) for case in cases]
+    seen = [(case_depth(case, False), sensor_from_meta(case["meta"]["sensor"], 1 / MM)) for case in cases]
     peers = range_peers.peer_results(score, [(c, MM * s.points(d)) for c, (d, s) in zip(cases, seen, strict=True)])
     if not peers:
         print("no peers: `pip install -e '.[bench]'` brings Open3D and pyransac3d", file=sys.stderr)

@@ -27,18 +27,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.range_filter_pass import geometry_of
+from benchmarks.tiled_components import _merge_seam, _scan, merge_rounds
 from hal.arrays import Array
 from perception.range.analysis import analyse
 from perception.range.batch import IMAGES_A_TASK, _client, analyse_files, recordings_in, tasks_of
-from perception.range.components import _merge_seam, _scan, merge_rounds, tile_rows
 from perception.range.fitting.surfaces import SIZE
-from perception.range.geometry import geometry_of
 from perception.range.noise import estimate_noise
-from perception.range.segmentation.beside import contested_pixels
 from perception.range.segmentation.blocks import mean_blocks
-from perception.range.segmentation.claim import claim_again, claim_pixels
+from perception.range.segmentation.boundary_pixels import contested_pixels
+from perception.range.segmentation.pixel_assignment import assign_pixels, reassign_pixels
 from perception.range.segmentation.tangents import tangent_planes
 from perception.range.sensor import PinholeSensor
+from perception.range.tiles import tile_rows
 from perception.range.warm import warm_up
 
 SHARED_BARRIER_S = 10e-6
@@ -131,7 +132,7 @@ def _tiled_steps(depth: Array, sensor: PinholeSensor, labels: NDArray[np.int32])
     x, y, z, sigma, rms = (np.full((h, w), np.nan) for _ in range(5))
     normal, count = np.full((h, w, 3), np.nan), np.zeros((h, w), np.int32)
     mean_blocks(depth, packed, law, 2, x, y, z, sigma, count, 0, h)
-    mask, linked, parent = np.ones((H, W), bool), np.ones((H, W), bool), np.arange(H * W, dtype=np.int32)
+    mask, linked, parent = np.ones((H, W), bool), np.ones((H, W), bool), np.arange(H * W)
     n = int(labels.max())
     kinds, table = np.zeros(n + 1, np.int64), np.zeros((n + 1, SIZE))
     table[:, 2], table[:, 3] = -1.0, -0.6
@@ -144,13 +145,15 @@ def _tiled_steps(depth: Array, sensor: PinholeSensor, labels: NDArray[np.int32])
         return int(rows.size * row // H)
 
     return [
-        lambda a, b: geometry_of(depth[max(0, a - HALO_ROWS) : b + HALO_ROWS], sensor, scale_px=1.5),
+        lambda a, b: geometry_of(depth[max(0, a - HALO_ROWS) : b + HALO_ROWS], sensor),
         lambda a, b: mean_blocks(depth, packed, law, 2, x, y, z, sigma, count, a // 2, b // 2),
         lambda a, b: tangent_planes(x, y, z, count, sigma, True, 1, 5.0 / packed[1], normal, rms, a // 2, b // 2),
         lambda a, b: _scan(mask, linked, linked, parent, a, b),
-        lambda a, b: claim_pixels(depth, packed, law, blocks, 2, kinds, table, out, a // 2, b // 2),
+        lambda a, b: assign_pixels(depth, packed, law, blocks, 2, kinds, table, out, a // 2, b // 2),
         lambda a, b: contested_pixels(labels, 1, a, b),
-        lambda a, b: claim_again(depth, packed, law, labels, kinds, table, rows, columns, names, share(a), share(b)),
+        lambda a, b: reassign_pixels(
+            depth, packed, law, labels, kinds, table, rows, columns, names, share(a), share(b)
+        ),
     ]
 
 
@@ -160,7 +163,7 @@ def _slowest_tile(step: Callable[[int, int], object], rows: int, tiles: int, rep
 
 def _seam_s(side: int) -> float:
     mask, linked = np.ones((4, side), bool), np.ones((4, side), bool)
-    parent = np.arange(4 * side, dtype=np.int32)
+    parent = np.arange(4 * side)
     return _median_s(lambda: _merge_seam(mask, linked, parent, 2), 9)
 
 

@@ -43,7 +43,7 @@ STATES = ("toggle", "rotary", "button", "lamp", "lever")
 POINTERS = ("gauge", "panel_meter")
 ROOT = Path(__file__).resolve().parent.parent
 DRAWN_DIALS = range(200)
-FEW_GAUGES = range(86000, 86050)  # read once when all was settled
+FEW_GAUGES = range(86000, 86050)  # read once when all was icm_labels
 READINGS_TIMED = 40
 
 

@@ -16,3 +16,6 @@ Labels = NDArray[np.int32]
 
 Mask = NDArray[np.bool_]
 """One truth value an element."""
+
+Indices = NDArray[np.int64]
+"""Whole numbers: positions in another array, counts, kinds."""

@@ -6,31 +6,27 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from hal.arrays import Array
 from hal.errors import InvalidRequest, NotFound
+from hal.jit import compiled
 from perception.range.features import RangeFeature, features_of
 from perception.range.noise import NoiseModel, estimate_noise, typical_depths_m
 from perception.range.primitives import Plane, Surface, SurfaceType
 from perception.range.segmentation import finish, join, merge
-from perception.range.segmentation.claim import fill_small_gaps
-from perception.range.segmentation.compete import Candidates
-from perception.range.segmentation.faces import whole_faces
 from perception.range.segmentation.fillets import without_fillets
-from perception.range.segmentation.grid import Grid
-from perception.range.segmentation.grooves import cut_at_grooves
+from perception.range.segmentation.model_selection import Candidates
+from perception.range.segmentation.pixel_assignment import fill_small_gaps
 from perception.range.segmentation.regions import Regions, regions_of
-from perception.range.segmentation.segment import Task, segment, settled
-from perception.range.segmentation.steps import cut_at_steps
+from perception.range.segmentation.segment import Task, icm_labels, segment
 from perception.range.sensor import RangeSensorModel
 from perception.range.straight import doubt_about
 
 Labels = NDArray[np.int32]
 
 LEAST_VALID_PIXELS = 16
-SETTLING_SWEEPS = 4
+ICM_SWEEPS = 4
 LEAST_KEPT_PIXELS = 8
 CRUMB_SHARE = 0.5  # of the smallest surface that is looked for
 LARGEST_PIXELS = 2**26  # 8192 x 8192; 6.0 GB at most, measured
@@ -98,8 +94,8 @@ def analyse(
     depth, depths = checked_depth(depth_m, sensor)
     law = noise or estimate_noise(depth, sensor, depths_m=depths)
     task = Task(depth_m=depth, sensor=sensor, depths_m=depths, tiles=tiles, pool=pool)
-    labels, found, law, grid = segment(task, law)
-    labels, surfaces = _finished(task, law, _grouped(task, law, grid, labels, found), found)
+    labels, found, law = segment(task, law)
+    labels, surfaces = _finished(task, law, _grouped(task, law, labels, found), found)
     return RangeScene(
         labels=labels,
         surfaces=surfaces,
@@ -138,8 +134,8 @@ def checked_depth(depth_m: ArrayLike, sensor: RangeSensorModel) -> tuple[Array, 
     return depth, depths
 
 
-@njit(cache=True)
-def _drop_missing(depth, least):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _drop_missing(depth: Array, least: float) -> int:
     """Turn what is not finite or not beyond `least` into NaN; returns how many readings remain."""
     flat = depth.ravel()
     valid = 0
@@ -164,31 +160,25 @@ def _check_scale(middle: float, sensor: RangeSensorModel) -> None:
         )
 
 
-def _grouped(task: Task, noise: NoiseModel, grid: Grid, labels: Labels, found: Candidates) -> Regions:
-    """Regions after pieces of one surface were joined, faces in pieces made whole, and planes cut at grooves."""
+def _grouped(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) -> Regions:
+    """Regions after neighbours and pieces of one surface were joined."""
     packed, law = task.packed, noise.packed()
     regions = regions_of(task.depth_m, packed, law, labels, len(found.kinds))
     regions = regions.given_to(merge.merge_touching(regions, found.kinds, found.parameters))
-    regions = regions.given_to(join.join_pieces(regions, found.kinds, found.parameters))
-    labels = whole_faces(task, grid, regions.labels, found)
-    labels = cut_at_grooves(task, law, grid, labels, found)
-    labels = cut_at_steps(task, law, grid, labels, found)
-    if labels is regions.labels:
-        return regions
-    return regions_of(task.depth_m, packed, law, labels, len(found.kinds))
+    return regions.given_to(join.join_pieces(regions, found.kinds, found.parameters))
 
 
 def _finished(task: Task, noise: NoiseModel, regions: Regions, found: Candidates) -> tuple[Labels, tuple[Surface, ...]]:
     depth, packed, law = task.depth_m, task.packed, noise.packed()
     pixels = regions.pixels
     keep = sorted((k for k, n in enumerate(pixels, 1) if n >= LEAST_KEPT_PIXELS), key=lambda k: -pixels[k - 1])
-    surfaces, kinds, ths = finish.refine_surfaces(keep, found.kinds, found.parameters, found.slack, regions, noise)
+    surfaces, kinds, ths = finish.refine_surfaces(keep, found.kinds, found.parameters, regions, noise)
     final = Candidates()
     for kind, th in zip(kinds, ths, strict=True):
         final.add(kind, th)
     names = np.zeros(len(pixels) + 1, np.int32)
     names[keep] = np.arange(1, len(keep) + 1)
-    labels = settled(task, noise, regions.renamed(names), final, sweeps=SETTLING_SWEEPS)
+    labels = icm_labels(task, noise, regions.renamed(names), final, sweeps=ICM_SWEEPS)
     labels = without_fillets(depth, packed, law, labels, *final.arrays())
     labels, surfaces = finish.without_crumbs(labels, surfaces, max(LEAST_KEPT_PIXELS, CRUMB_SHARE * task.least_pixels))
     fill_small_gaps(labels, depth, 2)

@@ -12,10 +12,9 @@ from itertools import pairwise
 from math import sqrt
 
 import numpy as np
-from numba import njit
 
 from hal.arrays import Array
-from perception.range.fitting.surfaces import LEAN
+from hal.jit import compiled
 from perception.range.sensor import RangeSensorModel
 
 WINDOW = 5  # samples across; a window of 25 samples rarely holds a gross error
@@ -130,8 +129,8 @@ def typical_depths_m(depth_m: Array) -> Array:
     return np.asarray(sample[(np.array([0.1, 0.3, 0.5, 0.7, 0.9]) * (sample.size - 1)).astype(int)], float)
 
 
-@njit(cache=True)
-def valid_sample(depth, most):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def valid_sample(depth: Array, most: int) -> Array:
     """Every n-th of the valid depths in raster order, n so that about `most` remain."""
     flat = depth.ravel()
     valid = 0
@@ -180,11 +179,11 @@ def _fit_law(z2: Array, values: Array) -> tuple[float, float]:
     return float(a), float(b)
 
 
-@njit(cache=True, error_model="numpy")
-def _law_through(z2, values):  # type: ignore[no-untyped-def]  # numba types it
-    typical = np.median(values)
+@compiled
+def _law_through(z2: Array, values: Array) -> tuple[float, float]:
+    typical = float(np.median(values))
     if typical <= 0.0:
-        return np.mean(values), 0.0
+        return float(np.mean(values)), 0.0
     w = 1.0 / np.maximum(values, 0.1 * typical)
     a, b = typical, 0.0
     for _ in range(3):
@@ -195,8 +194,8 @@ def _law_through(z2, values):  # type: ignore[no-untyped-def]  # numba types it
     return a, b
 
 
-@njit(cache=True, error_model="numpy")
-def _two_non_negative(p, q, y):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _two_non_negative(p: Array, q: Array, y: Array) -> tuple[float, float]:
     """Least squares `y = a p + b q` with a, b >= 0: the free solution, or the better of the two edges."""
     pp, qq, pq, py, qy = np.sum(p * p), np.sum(q * q), np.sum(p * q), np.sum(p * y), np.sum(q * y)
     det = pp * qq - pq * pq
@@ -222,8 +221,10 @@ def quadratics(side: int) -> Array:
 BASIS = quadratics(WINDOW)
 
 
-@njit(cache=True)
-def window_rms(g, basis, first, spacing, stride, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def window_rms(
+    g: Array, basis: Array, first: int, spacing: int, stride: int, perspective: bool,
+) -> tuple[Array, Array, Array]:  # fmt: skip
     """Depth at the middle of each complete window, and the rms in metres that the first polynomials leave, and that all do.
 
     `basis` as `quadratics`, `first` of them; equal where `first` is all.
@@ -252,8 +253,11 @@ def window_rms(g, basis, first, spacing, stride, perspective):  # type: ignore[n
     return z_out[:n], first_out[:n], rms_out[:n]
 
 
-@njit(cache=True, **LEAN)
-def _squares_left(g, middle, basis, first, spacing, stride, values, dot, some, total):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _squares_left(
+    g: Array, middle: Array, basis: Array, first: int, spacing: int, stride: int, values: Array, dot: Array,
+    some: Array, total: Array,
+) -> None:  # fmt: skip
     """Of the windows that begin in the first row of `g` what the first polynomials leave in `some`, and all in `total`.
 
     All windows of a row at once: loops over them hold no branch.
@@ -272,21 +276,21 @@ def _squares_left(g, middle, basis, first, spacing, stride, values, dot, some, t
                 some[c] = total[c]
 
 
-@njit(cache=True, **LEAN)
-def _load_sample(samples, middle, values, total):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _load_sample(samples: Array, middle: Array, values: Array, total: Array) -> None:
     for c in range(values.shape[0]):
         value = samples[c] - middle[c]
         values[c] = value
         total[c] += value * value
 
 
-@njit(cache=True, **LEAN)
-def _add_multiple(factor, values, out):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _add_multiple(factor: float, values: Array, out: Array) -> None:
     for c in range(out.shape[0]):
         out[c] += factor * values[c]
 
 
-@njit(cache=True, **LEAN)
-def _subtract_square(values, out):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _subtract_square(values: Array, out: Array) -> None:
     for c in range(out.shape[0]):
         out[c] -= values[c] * values[c]

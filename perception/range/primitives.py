@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from numba import njit
 
 from hal.arrays import Array
-from perception.range.fitting.starts import principal_axes
+from hal.jit import compiled
+from perception.range.fitting.initialisation import principal_axes
 from perception.range.fitting.surfaces import CONE, CYLINDER, PLANE, QUADRIC, SIZE, SPHERE, frame_of, step_into
 
 
@@ -182,8 +182,8 @@ def named_covariance(kind: int, th: Array, covariance: Array) -> Array:
     return np.asarray(J @ covariance @ J.T)
 
 
-@njit(cache=True, error_model="numpy")
-def _shape_jacobian(th, step):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _shape_jacobian(th: Array, step: Array) -> Array:
     """(6, 9) central differences of centre and radii over the tangent parameters of a QUADRIC, `step` (9,) each way."""
     J, delta, frame = np.empty((6, 9)), np.zeros(9), np.zeros(6)
     before, after = np.empty(SIZE), np.empty(SIZE)
@@ -197,8 +197,8 @@ def _shape_jacobian(th, step):  # type: ignore[no-untyped-def]  # numba types it
     return J
 
 
-@njit(cache=True, error_model="numpy")
-def centre_and_radii(th):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def centre_and_radii(th: Array) -> Array:
     """(6,) centre and radii of a QUADRIC, as `ellipsoid_of`."""
     A = np.array(
         [[th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from perception.range.analysis import analyse
-from perception.range.geometry import local_geometry
 from perception.range.matching.match import match_models
 from perception.range.matching.models import shipped_models
 from perception.range.plane import fit_plane_near
@@ -28,7 +27,6 @@ def warm_up() -> None:
     sensors: tuple[RangeSensorModel, ...] = (pinhole, parallel)
     for sensor in sensors:
         scene = analyse(depth, sensor)
-        local_geometry(depth, sensor)
         match_models(scene, depth, shipped_models()[:1])
     analyse(depth + 10.0 * noise, pinhole)  # coarse: what only averages tell
     fit_plane_near(depth, pinhole, point_m=[0.0, 0.0, 0.61], normal=[0.0, 0.0, -1.0])

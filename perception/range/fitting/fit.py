@@ -8,8 +8,19 @@ at `TRIM_SIGMAS` and plain least squares (Levenberg's damping, Marquardt's scali
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from hal.arrays import Array, Mask
+from hal.jit import as_numpy_scalar, compiled
+from perception.range.fitting.initialisation import (
+    is_ellipsoid,
+    normal_axis,
+    quadric_of_sphere,
+    solve_positive,
+    start_cone,
+    start_cylinder,
+    start_plane,
+    start_sphere,
+)
 from perception.range.fitting.rays import (
     CHUNK,
     ERRED,
@@ -25,21 +36,10 @@ from perception.range.fitting.rays import (
     normal_equations,
     residuals_by_chunks,
 )
-from perception.range.fitting.starts import (
-    is_ellipsoid,
-    normal_axis,
-    quadric_of_sphere,
-    solve_positive,
-    start_cone,
-    start_cylinder,
-    start_plane,
-    start_sphere,
-)
 from perception.range.fitting.surfaces import (
     CONE,
     CYLINDER,
     FREEDOM,
-    LEAN,
     PLANE,
     QUADRIC,
     SIZE,
@@ -54,15 +54,18 @@ SCALE_PRECISION = 0.004
 FALLS = 0.95  # of the scale before: so much at least it must fall for another round under Cauchy weights
 ROUGH_SAMPLES = 36
 ROUGH_LIMIT = 5.0
+ROUGH_STEPS = as_numpy_scalar(2)
 ELLIPSOID_GIVE_UP = 14.0  # the mean square of what is simpler beyond which none is tried; a sphere is no close start
 LARGEST_RADIUS_M = 10.0
 LEAST_NORMALS = 10  # that tell where anything but a plane starts
 QUADRIC_PER_SAMPLE = 1.15  # a simple surface under white noise costs about 0.95 a sample, and its price
 STEP_GOAL = 1e-3  # of a standard deviation of each parameter: a step that small changes nothing that matters
+FIRST = as_numpy_scalar(0)
+AROUND_ZERO, AROUND_MEAN = as_numpy_scalar(False), as_numpy_scalar(True)  # what normals are scattered about
 
 
-@njit(cache=True, error_model="numpy")
-def new_scratch(samples):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def new_scratch(samples: int) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]:
     """What a fit works in: rows of `rays`, two systems (9, 9) and (9,), that of a step, two frames, a trial, residuals."""
     small = np.empty(3 * 81 + 3 * 9 + 2 * 6 + SIZE)  # one allocation in place of nine
     H, H2, A = small[:81].reshape((9, 9)), small[81:162].reshape((9, 9)), small[162:243].reshape((9, 9))
@@ -71,8 +74,12 @@ def new_scratch(samples):  # type: ignore[no-untyped-def]  # numba types it
     return np.empty(SCRATCH), H, g, H2, g2, A, step, frame, new_frame, trial, np.empty(samples)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed, scratch, held):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def refine(
+    kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, steps: int, scale: float,
+    trim: float, fixed: Mask,
+    scratch: tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array], held: int,
+) -> tuple[float, int, int]:  # fmt: skip
     """Minimise the ray residuals from `th`, which is moved.
 
     Args:
@@ -129,8 +136,8 @@ def refine(kind, th, x, y, z, sigma, perspective, steps, scale, trim, fixed, scr
     return cost, used, ERRED if is_fresh and held == LOADED else held
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def damped(H, g, fixed, damping, p, A, step):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def damped(H: Array, g: Array, fixed: Mask, damping: float, p: int, A: Array, step: Array) -> None:
     """The system of one step into `A` (p, p) and `step` (p,): fixed parameters stay where they are."""
     for a in range(p):
         for b in range(p):
@@ -139,17 +146,20 @@ def damped(H, g, fixed, damping, p, A, step):  # type: ignore[no-untyped-def]  #
         step[a] = 0.0 if fixed[a] else g[a]
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _load(x, y, z, sigma, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _load(x: Array, y: Array, z: Array, sigma: Array, work: Array) -> int:
     """Loads the samples into `work` if they have room there; returns what it holds then."""
     if x.shape[0] > CHUNK:
         return NOTHING
-    load_rows(x, y, z, sigma, 0, x.shape[0], work)
+    load_rows(x, y, z, sigma, FIRST, x.shape[0], work)
     return LOADED
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _fill_errors(kind, th, x, y, z, sigma, perspective, scratch, held):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _fill_errors(
+    kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool,
+    scratch: tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array], held: int,
+) -> int:  # fmt: skip
     """Residuals (N,) in sigmas into row ERROR if `scratch` holds the samples, else into its last array; and what it holds then."""
     work, frame, n = scratch[0], scratch[7], x.shape[0]
     if held == NOTHING:
@@ -162,8 +172,8 @@ def _fill_errors(kind, th, x, y, z, sigma, perspective, scratch, held):  # type:
     return held
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def middle_scale(e):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def middle_scale(e: Array) -> float:
     """Robust residual scale, 1.48 times the (upper) median of |e|, at least 1; NaN is a ray that misses. Overwrites e (N,).
 
     Good to `SCALE_PRECISION`: the value that halves the samples is closed in on by counting, which needs no branch;
@@ -188,20 +198,24 @@ def middle_scale(e):  # type: ignore[no-untyped-def]  # numba types it
         middle = 0.5 * (low + most)
 
 
-@njit(cache=True, error_model="numpy")
-def fit_robust(kind, th, x, y, z, sigma, perspective, fixed, rounds):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def fit_robust(
+    kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, fixed: Mask, rounds: int,
+) -> tuple[Array, float]:  # fmt: skip
     """Refine under Cauchy weights whose scale falls with the residuals; ends with the trimmed fit.
 
     Returns parameters and the trimmed cost.
     """
     th, scratch = th.copy(), new_scratch(x.shape[0])
-    # A constant would have all that is called compiled once more.
-    _, _, cost = _robust(np.int64(kind), th, x, y, z, sigma, perspective, fixed, np.int64(rounds), scratch)
+    _, _, cost = _robust(kind, th, x, y, z, sigma, perspective, fixed, rounds, scratch)
     return th, cost
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _robust(kind, th, x, y, z, sigma, perspective, fixed, rounds, scratch):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _robust(
+    kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, fixed: Mask, rounds: int,
+    scratch: tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array],
+) -> tuple[float, float, float]:  # fmt: skip
     """`fit_robust` that moves `th`; mean squared residual of the kept samples, share kept, and trimmed cost."""
     n = x.shape[0]
     e = scratch[0][ERROR : ERROR + n] if n <= CHUNK else scratch[10][:n]
@@ -224,12 +238,15 @@ def _robust(kind, th, x, y, z, sigma, perspective, fixed, rounds, scratch):  # t
     return max(kept, 0.0) / max(used - FREEDOM[kind], 1), used / max(n, 1), cost
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _rough(kind, th, x, y, z, sigma, perspective, fixed, scratch):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _rough(
+    kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, fixed: Mask,
+    scratch: tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array],
+) -> float:  # fmt: skip
     """Moves `th` by a few robust steps; the sum of squared residuals then, each at most `ROUGH_LIMIT` squared."""
     n = x.shape[0]
     e = scratch[0][ERROR : ERROR + n] if n <= CHUNK else scratch[10][:n]
-    held, steps = _load(x, y, z, sigma, scratch[0]), 2
+    held, steps = _load(x, y, z, sigma, scratch[0]), ROUGH_STEPS
     held = _fill_errors(kind, th, x, y, z, sigma, perspective, scratch, held)
     for _ in range(2):
         scale = middle_scale(e)
@@ -243,17 +260,20 @@ def _rough(kind, th, x, y, z, sigma, perspective, fixed, scratch):  # type: igno
     return cost
 
 
-@njit(cache=True, error_model="numpy")
-def rough_mean_square(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def rough_mean_square(kind: int, th: Array, samples: Array, perspective: bool) -> float:
     """Mean square in sigmas, each at most `ROUGH_LIMIT` squared, that a rough fit from `th` leaves of samples (4, N)."""
     few = np.ascontiguousarray(samples[:, :: max(1, samples.shape[1] // ROUGH_SAMPLES)])
     free, scratch = np.zeros(9, np.bool_), new_scratch(few.shape[1])
-    cost = _rough(np.int64(kind), th.copy(), few[0], few[1], few[2], few[3], perspective, free, scratch)
-    return cost / few.shape[1]
+    cost = _rough(kind, th.copy(), few[0], few[1], few[2], few[3], perspective, free, scratch)
+    return float(cost / few.shape[1])
 
 
-@njit(cache=True, error_model="numpy")
-def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_samples, give_up):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def fit_kinds(
+    points: Array, P: Array, N: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, kinds: Mask,
+    correlated_samples: float, give_up: float,
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Fit every kind in the (5,) mask `kinds` to one set of samples, `points` (N, 3).
 
     `P` and `N` (M, 3) are those points that have a tangent plane, and its normal; only starts use them. All starts
@@ -268,7 +288,6 @@ def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_sampl
     n = x.shape[0]
     price = np.log(max(n / correlated_samples, 2.0))
     free, scratch, rounds = np.zeros(9, np.bool_), new_scratch(n), np.array([2, 2, 2, 2, 3])
-    last = np.int64(QUADRIC)  # no constant: `fit_robust` says why
     stride = max(1, n // ROUGH_SAMPLES)
     rx, ry, rz, rs = x[::stride].copy(), y[::stride].copy(), z[::stride].copy(), sigma[::stride].copy()
     per_sample = rx.shape[0] / correlated_samples
@@ -297,15 +316,15 @@ def fit_kinds(points, P, N, x, y, z, sigma, perspective, kinds, correlated_sampl
         simple = np.min(score)
         if simple > n / correlated_samples * QUADRIC_PER_SAMPLE:
             th = quadric_of_sphere(starts[SPHERE])
-            m, share, cost = _robust(last, th, x, y, z, sigma, perspective, free, rounds[last], scratch)
+            m, share, cost = _robust(QUADRIC, th, x, y, z, sigma, perspective, free, rounds[QUADRIC], scratch)
             if is_ellipsoid(th):
                 ths[QUADRIC], mean2[QUADRIC], kept[QUADRIC] = th, m, share
                 score[QUADRIC] = cost / correlated_samples + 9 * price
     return ths, mean2, kept, score
 
 
-@njit(cache=True, error_model="numpy")
-def _start(kind, points, P, N, th):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _start(kind: int, points: Array, P: Array, N: Array, th: Array) -> bool:
     """Fill `th` with an algebraic start of a simple kind; whether there is one."""
     if kind == PLANE:
         th[:] = start_plane(points)
@@ -315,19 +334,19 @@ def _start(kind, points, P, N, th):  # type: ignore[no-untyped-def]  # numba typ
     if kind == SPHERE:
         start, exists = start_sphere(P, N)
     elif kind == CYLINDER:
-        start, exists = start_cylinder(P, N, normal_axis(N, False))
+        start, exists = start_cylinder(P, N, normal_axis(N, AROUND_ZERO))
     else:
-        start, exists = start_cone(P, N, normal_axis(N, True))
+        start, exists = start_cone(P, N, normal_axis(N, AROUND_MEAN))
     th[:] = start
     return exists
 
 
-@njit(cache=True, error_model="numpy")
-def _is_sane(kind, th):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _is_sane(kind: int, th: Array) -> bool:
     if kind == CYLINDER:
-        return th[6] < LARGEST_RADIUS_M
+        return bool(th[6] < LARGEST_RADIUS_M)
     if kind == SPHERE:
-        return th[3] < LARGEST_RADIUS_M
+        return bool(th[3] < LARGEST_RADIUS_M)
     if kind == CONE:
-        return 0.03 < th[6] < 1.45
+        return bool(0.03 < th[6] < 1.45)
     return True

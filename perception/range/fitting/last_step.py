@@ -6,20 +6,22 @@ Nothing but the image is read: what a region of a hundred thousand pixels holds 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from hal.arrays import Array, Labels, Mask
+from hal.jit import REORDERED, compiled
 from perception.range.fitting.fit import TRIM_SIGMAS, damped
-from perception.range.fitting.rays import CHUNK, LOOSE, SCRATCH, SIGMA, X, Y, Z, add_equations, fill_rows, mirror
-from perception.range.fitting.starts import solve_positive
-from perception.range.fitting.surfaces import FREEDOM, GRAZING_COSINE, LEAN, PLANE, SIZE, frame_of, step_into
+from perception.range.fitting.initialisation import solve_positive
+from perception.range.fitting.rays import CHUNK, SCRATCH, SIGMA, X, Y, Z, add_equations, fill_rows, mirror
+from perception.range.fitting.surfaces import FREEDOM, GRAZING_COSINE, PLANE, SIZE, frame_of, step_into
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def last_step(kind, th, depth, sen, noise, slack, runs, fixed):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def last_step(
+    kind: int, th: Array, depth: Array, sen: Array, noise: Array, runs: Labels, fixed: Mask,
+) -> tuple[Array, Array, float, int]:  # fmt: skip
     """One Gauss-Newton step on the pixels of runs (R, 3) from a start that is good already, in a single pass over them.
 
     The matrix and the trim are those of the start; the cost after the step follows from the quadratic model.
-    `slack`: how many times the noise is tolerated.
 
     Returns:
         parameters, information matrix (9, 9), squared residuals of the kept pixels, pixels kept.
@@ -27,7 +29,7 @@ def last_step(kind, th, depth, sen, noise, slack, runs, fixed):  # type: ignore[
     p = FREEDOM[kind]
     H, g, frame = np.zeros((9, 9)), np.zeros(9), np.empty(6)
     frame_of(kind, th, frame)
-    kept, used = _equations(kind, th, frame, depth, sen, noise, slack, runs, np.empty(SCRATCH), H, g)
+    kept, used = _equations(kind, th, frame, depth, sen, noise, runs, np.empty(SCRATCH), H, g)
     A, step = np.empty((p, p)), np.empty(p)
     damped(H, g, fixed, 0.0, p, A, step)
     if used <= p or not solve_positive(A, step, p):
@@ -39,21 +41,24 @@ def last_step(kind, th, depth, sen, noise, slack, runs, fixed):  # type: ignore[
     return moved, H, max(kept, 0.0), used
 
 
-@njit(cache=True, error_model="numpy", **LEAN, nogil=True)
-def _equations(kind, th, frame, depth, sen, noise, slack, runs, work, H, g):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _equations(
+    kind: int, th: Array, frame: Array, depth: Array, sen: Array, noise: Array, runs: Labels, work: Array,
+    H: Array, g: Array,
+) -> tuple[float, int]:  # fmt: skip
     """Gauss-Newton matrix and gradient of the pixels within the trim; their squared residuals, and how many they are."""
     perspective = sen[0] > 0
     cost, used, n, pixels = 0.0, 0.0, 0, 0
     last = runs.shape[0] - 1
     for i in range(runs.shape[0]):
-        v, first, end = runs[i, 0], runs[i, 1], runs[i, 2]
+        v, first, end = runs[i, 0], 0 + runs[i, 1], runs[i, 2]
         pixels += end - first
         while first < end:
             m = min(end - first, CHUNK - n)
             _load(depth[v, first : first + m], first, v, sen, work[n:])
             n, first = n + m, first + m
             if n == CHUNK or (i == last and first == end):
-                _fill_variances(n, noise, slack, work)
+                _fill_variances(n, noise, work)
                 if kind == PLANE:
                     more, hits = _add_plane(th, frame, n, perspective, work, H, g)
                 else:
@@ -65,8 +70,8 @@ def _equations(kind, th, frame, depth, sen, noise, slack, runs, work, H, g):  # 
     return max(cost - (pixels - used) * TRIM_SIGMAS * TRIM_SIGMAS, 0.0), int(used)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _load(depth, first, row, sen, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _load(depth: Array, first: int, row: int, sen: Array, work: Array) -> None:
     """The pixels of a run that begins at column `first` as samples."""
     per_x, y = 1.0 / sen[1], (row - sen[4]) / sen[2]
     n = depth.shape[0]
@@ -78,8 +83,10 @@ def _load(depth, first, row, sen, work):  # type: ignore[no-untyped-def]  # numb
         work[Z + k] = depth[k]
 
 
-@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _add_plane(th, frame, n, perspective, work, H, g):  # type: ignore[no-untyped-def]  # numba types it
+@compiled(fastmath=REORDERED)
+def _add_plane(
+    th: Array, frame: Array, n: int, perspective: bool, work: Array, H: Array, g: Array,
+) -> tuple[float, float]:  # fmt: skip
     """`fill_rows` and `add_equations` of a plane in one loop that takes no root: most pixels lie on planes.
 
     Row SIGMA holds variances. With the weight w, squared, min(1, (c / GRAZING_COSINE)^2) / sigma^2, sums of w^2 J'J, w^2 J'r.
@@ -122,18 +129,18 @@ def _add_plane(th, frame, n, perspective, work, H, g):  # type: ignore[no-untype
     return cost, used
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _take_roots(n, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _take_roots(n: int, work: Array) -> None:
     for k in range(n):
         work[SIGMA + k] = np.sqrt(work[SIGMA + k])
 
 
-@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _fill_variances(n, noise, slack, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled(fastmath=REORDERED)
+def _fill_variances(n: int, noise: Array, work: Array) -> None:
     """Squares of `sigma_at` of the loaded depths, without a branch, into row SIGMA."""
     a, b, c, d, e, f = noise[0], noise[1], noise[2], noise[3], noise[4], noise[5]
     for k in range(n):
         z = work[Z + k]
         z2 = z * z
         white, slow, step = a + b * z2, c + d * z2, e + f * z2
-        work[SIGMA + k] = slack * slack * (max(white * white, step * step * (1.0 / 12.0)) + slow * slow)
+        work[SIGMA + k] = max(white * white, step * step * (1.0 / 12.0)) + slow * slow

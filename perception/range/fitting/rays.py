@@ -8,9 +8,10 @@ compiler turns four or eight rays into one instruction: 6 ns a ray with its deri
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from perception.range.fitting.surfaces import CONE, CYLINDER, FREEDOM, GRAZING_COSINE, LEAN, PLANE, SPHERE, frame_of
+from hal.arrays import Array
+from hal.jit import REORDERED, compiled
+from perception.range.fitting.surfaces import CONE, CYLINDER, FREEDOM, GRAZING_COSINE, PLANE, SPHERE, frame_of
 
 CHUNK = 160  # what `merge` fits at once
 ROWS = [row * CHUNK for row in range(18)]  # where each row of the scratch array begins
@@ -26,11 +27,10 @@ CAUCHY_WIDTH = 2.0
 FARTHEST = 1e15  # sigmas; eight squares of it still multiply to a finite number
 # What `work` holds already: the samples, row ERROR of the surface, all of its rows.
 NOTHING, LOADED, ERRED, FILLED = range(4)
-LOOSE = {"reassoc", "contract", "nsz", "arcp"}  # sums may be reordered; NaN keeps its meaning
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def load_rows(x, y, z, sigma, first, n, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def load_rows(x: Array, y: Array, z: Array, sigma: Array, first: int, n: int, work: Array) -> None:
     """Samples first .. first + n into `work`.
 
     Loops that compute from several arrays ask at run time whether these may overlap, and round otherwise when they lie
@@ -47,8 +47,8 @@ def load_rows(x, y, z, sigma, first, n, work):  # type: ignore[no-untyped-def]  
         work[SIGMA + i] = sigma[i]
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def fill_rows(kind, th, frame, n, perspective, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def fill_rows(kind: int, th: Array, frame: Array, n: int, perspective: bool, work: Array) -> None:
     """Depth, cosine of incidence and derivatives (as `depth_and_jacobian`) of the `n` loaded samples into `work`.
 
     `work` (SCRATCH,) holds rows of CHUNK numbers; n <= CHUNK. Depth is NaN where a ray misses.
@@ -66,8 +66,8 @@ def fill_rows(kind, th, frame, n, perspective, work):  # type: ignore[no-untyped
         _quadric(th, n, p, work)
 
 
-@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _plane(th, frame, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled(fastmath=REORDERED)
+def _plane(th: Array, frame: Array, n: int, p: float, work: Array) -> None:
     nx, ny, nz, d = th[0], th[1], th[2], th[3]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
     for i in range(n):
@@ -85,8 +85,8 @@ def _plane(th, frame, n, p, work):  # type: ignore[no-untyped-def]  # numba type
         work[D2 + i] = -k
 
 
-@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _sphere(th, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled(fastmath=REORDERED)
+def _sphere(th: Array, n: int, p: float, work: Array) -> None:
     cx, cy, cz, r = th[0], th[1], th[2], th[3]
     side = 1.0 if th[4] > 0 else -1.0
     inverse_r = 1.0 / r
@@ -109,8 +109,8 @@ def _sphere(th, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
         work[D3 + i] = k
 
 
-@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _cylinder(th, frame, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled(fastmath=REORDERED)
+def _cylinder(th: Array, frame: Array, n: int, p: float, work: Array) -> None:
     cx, cy, cz, ax, ay, az, r = th[0], th[1], th[2], th[3], th[4], th[5], th[6]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
     side = 1.0 if th[7] > 0 else -1.0
@@ -143,8 +143,8 @@ def _cylinder(th, frame, n, p, work):  # type: ignore[no-untyped-def]  # numba t
         work[D4 + i] = k
 
 
-@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _cone(th, frame, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled(fastmath=REORDERED)
+def _cone(th: Array, frame: Array, n: int, p: float, work: Array) -> None:
     cx, cy, cz, ax, ay, az = th[0], th[1], th[2], th[3], th[4], th[5]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
     outside = th[7] > 0
@@ -186,8 +186,8 @@ def _cone(th, frame, n, p, work):  # type: ignore[no-untyped-def]  # numba types
         work[D5 + i] = -k * (rho * sa + h * ca)
 
 
-@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _quadric(th, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled(fastmath=REORDERED)
+def _quadric(th: Array, n: int, p: float, work: Array) -> None:
     s = 1.0 / th[3]
     cx, cy, cz = th[0] * s, th[1] * s, th[2] * s
     qxx, qyy, qzz, qxy, qxz, qyz, qx, qy, qz, q0 = (
@@ -233,16 +233,16 @@ def _quadric(th, n, p, work):  # type: ignore[no-untyped-def]  # numba types it
         work[D8 + i] = k
 
 
-@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def error_row(n, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled(fastmath=REORDERED)
+def error_row(n: int, work: Array) -> None:
     """Row ERROR of the filled rows: residuals in sigmas, lessened at grazing rays; NaN where the ray misses."""
     for i in range(n):
         w = min(1.0, work[COSINE + i] * (1.0 / GRAZING_COSINE)) / work[SIGMA + i]
         work[ERROR + i] = (work[Z + i] - work[DEPTH + i]) * w
 
 
-@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _cauchy_weights(n, c2, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled(fastmath=REORDERED)
+def _cauchy_weights(n: int, c2: float, work: Array) -> float:
     """Rows WEIGHT and RESIDUAL under Cauchy weights, 1 + ratio in row DEPTH; returns the number of samples that hit."""
     used = 0.0
     for i in range(n):
@@ -261,8 +261,8 @@ def _cauchy_weights(n, c2, work):  # type: ignore[no-untyped-def]  # numba types
     return used
 
 
-@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _sum_of_logarithms(values):  # type: ignore[no-untyped-def]  # numba types it
+@compiled(fastmath=REORDERED)
+def _sum_of_logarithms(values: Array) -> float:
     """Sum of ln(values): the logarithm of a product of eight is one logarithm in place of eight."""
     total = 0.0
     n = values.shape[0]
@@ -275,8 +275,8 @@ def _sum_of_logarithms(values):  # type: ignore[no-untyped-def]  # numba types i
     return total
 
 
-@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _trim_weights(n, trim, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled(fastmath=REORDERED)
+def _trim_weights(n: int, trim: float, work: Array) -> tuple[float, float]:
     """Rows WEIGHT and RESIDUAL under a trim; returns cost and number of samples kept."""
     used, cost = 0.0, 0.0
     for i in range(n):
@@ -292,22 +292,22 @@ def _trim_weights(n, trim, work):  # type: ignore[no-untyped-def]  # numba types
     return cost, used
 
 
-@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _dot(a, b):  # type: ignore[no-untyped-def]  # numba types it
+@compiled(fastmath=REORDERED)
+def _dot(a: Array, b: Array) -> float:
     total = 0.0
     for i in range(a.shape[0]):
         total += a[i] * b[i]
     return total
 
 
-@njit(cache=True, error_model="numpy", **LEAN, fastmath=LOOSE)
-def _weighted(row, weight):  # type: ignore[no-untyped-def]  # numba types it
+@compiled(fastmath=REORDERED)
+def _weighted(row: Array, weight: Array) -> None:
     for i in range(row.shape[0]):
         row[i] = row[i] * weight[i] if weight[i] > 0.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _add_products(p, n, work, H, g):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _add_products(p: int, n: int, work: Array, H: Array, g: Array) -> None:
     """Add J' W J to the lower triangle of `H` and J' W e to `g` from the rows of one chunk."""
     padded = (n + LANES - 1) // LANES * LANES
     work[WEIGHT + n : WEIGHT + padded] = 0.0
@@ -321,10 +321,11 @@ def _add_products(p, n, work, H, g):  # type: ignore[no-untyped-def]  # numba ty
             H[a, b] += _dot(mine, work[D0 + b * CHUNK : D0 + b * CHUNK + padded])
 
 
-@njit(cache=True, error_model="numpy", **LEAN, nogil=True)
-def normal_equations(  # type: ignore[no-untyped-def]  # numba types it
-    kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g, work, held, step_follows
-):
+@compiled
+def normal_equations(
+    kind: int, th: Array, frame: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, scale: float,
+    trim: float, H: Array, g: Array, work: Array, held: int, step_follows: bool,
+) -> tuple[float, int]:  # fmt: skip
     """Gauss-Newton matrix `H` (9, 9) and gradient `g` (9,) of the ray residuals of samples (N,); cost and used samples.
 
     `scale` > 0: Cauchy weights of that width in sigmas; 0: samples beyond `trim` sigmas are left out. `held`: what `work`
@@ -350,16 +351,16 @@ def normal_equations(  # type: ignore[no-untyped-def]  # numba types it
     return cost, int(used)
 
 
-@njit(cache=True, error_model="numpy", **LEAN, nogil=True)
-def add_equations(kind, n, scale, trim, work, H, g):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def add_equations(kind: int, n: int, scale: float, trim: float, work: Array, H: Array, g: Array) -> tuple[float, float]:
     """Add the `n` filled rays in `work` to the lower triangle of `H` and to `g`; returns their cost and how many count."""
     cost, used = _weigh(n, scale, trim, work)
     _add_products(FREEDOM[kind], n, work, H, g)
     return cost, used
 
 
-@njit(cache=True, error_model="numpy", **LEAN, nogil=True)
-def _weigh(n, scale, trim, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _weigh(n: int, scale: float, trim: float, work: Array) -> tuple[float, float]:
     """Rows WEIGHT and RESIDUAL of the `n` filled rays in `work`; returns their cost and how many count."""
     if scale > 0.0:
         c2 = scale * scale * CAUCHY_WIDTH * CAUCHY_WIDTH
@@ -368,22 +369,25 @@ def _weigh(n, scale, trim, work):  # type: ignore[no-untyped-def]  # numba types
     return _trim_weights(n, trim, work)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def mirror(p, H):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def mirror(p: int, H: Array) -> None:
     """Fill the upper triangle of the first p rows of `H` from the lower one."""
     for a in range(p):
         for b in range(a):
             H[b, a] = H[a, b]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def residuals(kind, th, x, y, z, sigma, perspective, out):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def residuals(kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, out: Array) -> None:
     """Fill `out` (N,) with residuals in sigmas, lessened at grazing rays; NaN where the ray misses."""
     residuals_by_chunks(kind, th, x, y, z, sigma, perspective, np.empty(6), np.empty(SCRATCH), out)
 
 
-@njit(cache=True, error_model="numpy", **LEAN, nogil=True)
-def residuals_by_chunks(kind, th, x, y, z, sigma, perspective, frame, work, out):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def residuals_by_chunks(
+    kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, frame: Array, work: Array,
+    out: Array,
+) -> None:  # fmt: skip
     """`residuals` that works in `frame` (6,) and `work` (SCRATCH,), and overwrites them."""
     frame_of(kind, th, frame)
     count = x.shape[0]

@@ -16,21 +16,19 @@ Steps live in a tangent space: shifts across the axis and tilts of unit vectors 
 # bodies and plain comparisons are what compiles fast.
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numba import njit
 
-PLANE, SPHERE, CYLINDER, CONE, QUADRIC = 0, 1, 2, 3, 4
+from hal.arrays import Array
+from hal.jit import as_numpy_scalar, compiled
+
+PLANE, SPHERE, CYLINDER, CONE, QUADRIC = (as_numpy_scalar(kind) for kind in range(5))
 SIZE = 16
 FREEDOM = np.array([3, 4, 5, 6, 9])
-# For functions that make no array, return none, and call no method of one: counting who holds which costs a tenth of a fit.
-LEAN: dict[str, Any] = {"_nrt": False}
 GRAZING_COSINE = 0.3  # below it a depth residual says little about the surface: pixels there lose weight
 
 
-@njit(cache=True, **LEAN)
-def tangent_frame(ax, ay, az):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def tangent_frame(ax: float, ay: float, az: float) -> tuple[float, float, float, float, float, float]:
     """Two unit vectors that complete (ax, ay, az) to a right-handed frame."""
     if abs(ax) < 0.8:
         ux, uy, uz = 0.0, az, -ay
@@ -41,8 +39,8 @@ def tangent_frame(ax, ay, az):  # type: ignore[no-untyped-def]  # numba types it
     return ux, uy, uz, ay * uz - az * uy, az * ux - ax * uz, ax * uy - ay * ux
 
 
-@njit(cache=True, **LEAN)
-def _roots(a, b, c, side):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _roots(a: float, b: float, c: float, side: float) -> float:
     """Root of a z^2 + 2 b z + c: the nearer for side +1, the farther for -1; NaN without a real root."""
     disc = b * b - a * c
     if disc < 0.0:
@@ -52,11 +50,11 @@ def _roots(a, b, c, side):  # type: ignore[no-untyped-def]  # numba types it
         return -0.5 * c / b
     if a < 0.0:
         root = -root
-    return (-b - root) / a if side > 0 else (-b + root) / a
+    return float((-b - root) / a if side > 0 else (-b + root) / a)
 
 
-@njit(cache=True, **LEAN)
-def depth_on(kind, th, x, y, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def depth_on(kind: int, th: Array, x: float, y: float, perspective: bool) -> float:
     """Depth z where the ray of (x, y) meets the surface; NaN where it does not."""
     if perspective:
         ox, oy, dx, dy = 0.0, 0.0, x, y
@@ -66,7 +64,7 @@ def depth_on(kind, th, x, y, perspective):  # type: ignore[no-untyped-def]  # nu
         facing = th[0] * dx + th[1] * dy + th[2]
         if abs(facing) < 1e-9:
             return np.nan
-        return (th[3] - th[0] * ox - th[1] * oy) / facing
+        return float((th[3] - th[0] * ox - th[1] * oy) / facing)
     wx, wy, wz = ox - th[0], oy - th[1], -th[2]
     if kind == SPHERE:
         a = dx * dx + dy * dy + 1.0
@@ -95,9 +93,9 @@ def depth_on(kind, th, x, y, perspective):  # type: ignore[no-untyped-def]  # nu
             near, far = far, near
         near_ok, far_ok = wa + near * da > 0.0, wa + far * da > 0.0
         if near_ok and far_ok:
-            return near if th[7] > 0 else far
+            return float(near if th[7] > 0 else far)
         if near_ok:
-            return near
+            return float(near)
         return far if far_ok else np.nan
     inverse = 1.0 / th[3]
     wx, wy, wz = wx * inverse, wy * inverse, wz * inverse
@@ -132,15 +130,15 @@ def depth_on(kind, th, x, y, perspective):  # type: ignore[no-untyped-def]  # nu
     return _roots(a, b, c, 1.0)
 
 
-@njit(cache=True, **LEAN)
-def depths_on(kind, th, x, y, perspective, out):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def depths_on(kind: int, th: Array, x: Array, y: Array, perspective: bool, out: Array) -> None:
     """`depth_on` for arrays x, y (N,) into `out` (N,)."""
     for i in range(x.shape[0]):
         out[i] = depth_on(kind, th, x[i], y[i], perspective)
 
 
-@njit(cache=True, **LEAN)
-def normal_on(kind, th, px, py, pz):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def normal_on(kind: int, th: Array, px: float, py: float, pz: float) -> tuple[float, float, float]:
     """Unit gradient of the surface at a point on it (not oriented)."""
     if kind == PLANE:
         return th[0], th[1], th[2]
@@ -164,8 +162,8 @@ def normal_on(kind, th, px, py, pz):  # type: ignore[no-untyped-def]  # numba ty
     return gx / n, gy / n, gz / n
 
 
-@njit(cache=True, **LEAN)
-def normals_on(kind, th, x, y, z, perspective, out):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def normals_on(kind: int, th: Array, x: Array, y: Array, z: Array, perspective: bool, out: Array) -> None:
     """Unit normals towards the sensor at the rays (x, y) and depths z (N,) into `out` (N, 3)."""
     for i in range(x.shape[0]):
         px, py = (x[i] * z[i], y[i] * z[i]) if perspective else (x[i], y[i])
@@ -175,8 +173,10 @@ def normals_on(kind, th, x, y, z, perspective, out):  # type: ignore[no-untyped-
         out[i, 0], out[i, 1], out[i, 2] = side * nx, side * ny, side * nz
 
 
-@njit(cache=True)
-def depth_and_jacobian(kind, th, frame, x, y, perspective, J):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def depth_and_jacobian(
+    kind: int, th: Array, frame: Array, x: float, y: float, perspective: bool, J: Array,
+) -> tuple[float, float]:  # fmt: skip
     """Depth, cosine of incidence, and J = dz / d(tangent parameters): dz = -(dF/dtheta) / (dF/dz) on F = 0."""
     z = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(z):
@@ -230,8 +230,8 @@ def depth_and_jacobian(kind, th, frame, x, y, perspective, J):  # type: ignore[n
     return z, cosine
 
 
-@njit(cache=True, **LEAN)
-def frame_of(kind, th, frame):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def frame_of(kind: int, th: Array, frame: Array) -> None:
     """Fill `frame` (6,) with the tangent frame that the steps of this surface refer to."""
     if kind == PLANE:
         f = tangent_frame(th[0], th[1], th[2])
@@ -243,8 +243,8 @@ def frame_of(kind, th, frame):  # type: ignore[no-untyped-def]  # numba types it
         frame[i] = f[i]
 
 
-@njit(cache=True, **LEAN)
-def step_into(kind, th, frame, step, out):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def step_into(kind: int, th: Array, frame: Array, step: Array, out: Array) -> None:
     """The surface after a tangent step, into `out`; unit vectors stay unit, quadrics keep the trace of their matrix."""
     for i in range(SIZE):
         out[i] = th[i]

@@ -18,9 +18,9 @@ Only nearest hits count, so that one surface of a solid hides another.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from hal.arrays import Array
+from hal.arrays import Array, Indices
+from hal.jit import as_numpy_scalar, compiled
 from perception.range.matching.models import ComponentModel, Form, ModelSurface, MotionKind
 
 DISC, RECTANGLE, CYLINDER, CONE, SPHERE, ELLIPSOID, TORUS = range(7)
@@ -29,6 +29,7 @@ MOVES = 15
 TRACE_STEPS = 24
 TRACE_END_M = 1e-5
 FREE_LENGTH = 4.0  # radii of a cylinder whose length the model does not tell
+MARGIN_PX = as_numpy_scalar(1)
 
 
 def solid_of(model: ComponentModel) -> Array:
@@ -100,8 +101,8 @@ def _row(s: ModelSurface) -> Array:
     return row
 
 
-@njit(cache=True, error_model="numpy")
-def hit(row, grow, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def hit(row: Array, grow: float, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> float:
     """Depth along the ray o + t d where it first meets the surface grown by `grow`; infinite where it does not."""
     form = int(row[0])
     wx, wy, wz = ox - row[1], oy - row[2], oz - row[3]
@@ -151,16 +152,19 @@ def hit(row, grow, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]  # n
         z = oz + t * dz
         if form == CYLINDER:
             if abs((wx + t * dx) * ax + (wy + t * dy) * ay + (wz + t * dz) * az) <= row[11]:
-                return t
+                return float(t)
         elif row[13] <= z <= row[14] and (
             form == SPHERE or (wx + t * dx) * ax + (wy + t * dy) * ay + (wz + t * dz) * az > 0.0
         ):
-            return t
+            return float(t)
     return np.inf
 
 
-@njit(cache=True, error_model="numpy")
-def _ring(R, r, ax, ay, az, wx, wy, wz, dx, dy, dz):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _ring(
+    R: float, r: float, ax: float, ay: float, az: float, wx: float, wy: float, wz: float, dx: float, dy: float,
+    dz: float,
+) -> float:  # fmt: skip
     """A torus met by steps of its distance (sphere tracing; Hart, The Visual Computer 12, 1996)."""
     A, B = dx * dx + dy * dy + dz * dz, dx * wx + dy * wy + dz * wz
     disc = B * B - A * (wx * wx + wy * wy + wz * wz - (R + r) * (R + r))
@@ -184,13 +188,15 @@ def _ring(R, r, ax, ay, az, wx, wy, wz, dx, dy, dz):  # type: ignore[no-untyped-
         q = np.sqrt(max(px * px + py * py + pz * pz - h * h, 0.0)) - R
         away = np.sqrt(q * q + h * h) - r
         if away < TRACE_END_M:
-            return t
+            return float(t)
         t += away * step
     return np.inf
 
 
-@njit(cache=True, error_model="numpy")
-def window_of(box, shift, R, p, sen, margin, limit, window):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def window_of(
+    box: Array, shift: Array, R: Array, p: Array, sen: Array, margin: int, limit: Indices, window: Indices,
+) -> None:  # fmt: skip
     """Fill `window` (u0, v0, u1, v1) with what a box (2, 3) of the object's frame covers, clipped to `limit`."""
     u0, v0, u1, v1 = 1e9, 1e9, -1e9, -1e9
     for corner in range(8):
@@ -210,8 +216,11 @@ def window_of(box, shift, R, p, sen, margin, limit, window):  # type: ignore[no-
     window[3] = int(min(max(np.ceil(v1) + margin + 1, window[1]), limit[3]))
 
 
-@njit(cache=True, error_model="numpy")
-def render(rows, boxes, grow, shift, R, p, sen, window, stride, depth, index):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def render(
+    rows: Array, boxes: Array, grow: Array, shift: Array, R: Array, p: Array, sen: Array, window: Indices, stride: int,
+    depth: Array, index: Indices,
+) -> None:  # fmt: skip
     """Fill `depth` (infinite where nothing is met) and `index` (row number or -1) over a window of the image.
 
     Args:
@@ -229,7 +238,7 @@ def render(rows, boxes, grow, shift, R, p, sen, window, stride, depth, index):  
     for s in range(rows.shape[0]):
         for a in range(3):
             away[a] = shift[a] * rows[s, MOVES]
-        window_of(boxes[s], away, R, p, sen, 1, window, part)
+        window_of(boxes[s], away, R, p, sen, MARGIN_PX, window, part)
         for j in range((part[1] - window[1] + stride - 1) // stride, (part[3] - window[1] + stride - 1) // stride):
             y = (window[1] + j * stride - sen[4]) / sen[2]
             for i in range((part[0] - window[0] + stride - 1) // stride, (part[2] - window[0] + stride - 1) // stride):

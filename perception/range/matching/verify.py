@@ -11,10 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from hal.arrays import Array
+from hal.arrays import Array, Indices, Mask
+from hal.jit import compiled
 from perception.range.matching.solids import MOVES, render, window_of
 
 HIT = 3.0  # log-likelihood of a pixel that agrees, over one of a gross error
@@ -65,8 +65,11 @@ class Solid:
     slide: Array
 
 
-@njit(cache=True, error_model="numpy")
-def _placed(boxes, slide, q, R0, p0, sen, limit, R, p, window):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _placed(
+    boxes: Array, slide: Array, q: Array, R0: Array, p0: Array, sen: Array, limit: Indices, R: Array, p: Array,
+    window: Indices,
+) -> None:  # fmt: skip
     """Pose of the hypothesis into `R`, `p`, and what of the image the solid covers into `window`, with a margin."""
     c, s = np.cos(q[2]), np.sin(q[2])
     for a in range(3):
@@ -82,8 +85,11 @@ def _placed(boxes, slide, q, R0, p0, sen, limit, R, p, window):  # type: ignore[
     window_of(box, np.zeros(3), R, p, sen, RING_PX + 1, limit, window)
 
 
-@njit(cache=True, error_model="numpy")
-def _lifts(m, k, window, stride, h, w, z, sigma, tolerance, is_free, lift):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _lifts(
+    m: Array, k: Indices, window: Indices, stride: int, h: int, w: int, z: Array, sigma: Array, tolerance: Array,
+    is_free: Mask, lift: Array,
+) -> None:  # fmt: skip
     """Mean residual of each row within its tolerance: how much higher or lower this component is than its model."""
     S = lift.shape[0]
     weight, total = np.zeros(S), np.zeros(S)
@@ -105,8 +111,12 @@ def _lifts(m, k, window, stride, h, w, z, sigma, tolerance, is_free, lift):  # t
         lift[s] = min(max(total[s] / (weight[s] + prior), -tolerance[s]), tolerance[s])
 
 
-@njit(cache=True, error_model="numpy")
-def judged(rows, boxes, tolerance, slide, q, z, panel, sigma, sen, R0, p0, stride, rim, m, k, lift, hits, counts):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def judged(
+    rows: Array, boxes: Array, tolerance: Array, slide: Array, q: Array, z: Array, panel: Array, sigma: Array,
+    sen: Array, R0: Array, p0: Array, stride: int, rim: bool, m: Array, k: Indices, lift: Array, hits: Indices,
+    counts: Array,
+) -> float:  # fmt: skip
     """Gain of the hypothesis q = (x, y, yaw, state, growth of each row) over the bare panel.
 
     Args:
@@ -162,8 +172,8 @@ def judged(rows, boxes, tolerance, slide, q, z, panel, sigma, sen, R0, p0, strid
     return score * stride * stride
 
 
-@njit(cache=True, error_model="numpy")
-def _priors(q, tolerance, is_free, lift):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _priors(q: Array, tolerance: Array, is_free: Mask, lift: Array) -> float:
     """Log-likelihood of heights and sizes that differ from the model's: a tolerance is two standard deviations."""
     out = 0.0
     for s in range(tolerance.shape[0]):
@@ -174,8 +184,8 @@ def _priors(q, tolerance, is_free, lift):  # type: ignore[no-untyped-def]  # num
     return out
 
 
-@njit(cache=True, error_model="numpy")
-def _slope(m, k, j, i, h, w):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _slope(m: Array, k: Indices, j: int, i: int, h: int, w: int) -> float:
     """Depth step to the next pixel of the same row of the solid, down or sideways, the larger."""
     out = 0.0
     if i > 0 and k[j, i - 1] == k[j, i]:
@@ -189,18 +199,21 @@ def _slope(m, k, j, i, h, w):  # type: ignore[no-untyped-def]  # numba types it
     return out
 
 
-@njit(cache=True, error_model="numpy")
-def _deepest_beside(m, k, j, i, h, w, panel):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _deepest_beside(m: Array, k: Indices, j: int, i: int, h: int, w: int, panel: float) -> float:
     """Depth of the deepest thing drawn in or beside a pixel: of what a beam there may have mixed with its own."""
     out = m[j, i]
     for b in range(max(j - 1, 0), min(j + 2, h)):
         for a in range(max(i - 1, 0), min(i + 2, w)):
             out = max(out, m[b, a] if k[b, a] >= 0 else panel)
-    return out
+    return float(out)
 
 
-@njit(cache=True, error_model="numpy")
-def _going_on(m, k, window, h, w, z, panel, sigma, hits, counts):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _going_on(
+    m: Array, k: Indices, window: Indices, h: int, w: int, z: Array, panel: Array, sigma: Array, hits: Indices,
+    counts: Array,
+) -> float:  # fmt: skip
     """Pixels beyond the outline, or before the model, whose depth goes on smoothly from explained ones.
 
     What hides a part stands off it: before the model without a jump there is a larger thing, and no occluder.
@@ -225,11 +238,14 @@ def _going_on(m, k, window, h, w, z, panel, sigma, hits, counts):  # type: ignor
                 if abs(depth - z[window[1] + a, window[0] + b]) < 3.0 * s + SLACK_M + min(step, STEEPEST_M):
                     counts[RING] += 1.0
                     break
-    return counts[RING]
+    return float(counts[RING])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def climbed(rows, boxes, tolerance, slide, q, ways, low, high, levels, z, panel, sigma, sen, R0, p0, stride, rim):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def climbed(
+    rows: Array, boxes: Array, tolerance: Array, slide: Array, q: Array, ways: Array, low: Array, high: Array,
+    levels: int, z: Array, panel: Array, sigma: Array, sen: Array, R0: Array, p0: Array, stride: int, rim: bool,
+) -> float:  # fmt: skip
     """Move `q` to the best hypothesis near by and give its gain: along one of the `ways` at a time, halved each level.
 
     Args:

@@ -9,11 +9,12 @@ Samples are (4, N) here and in `merge` and `join`: ray coordinates x and y, dept
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from hal.arrays import Array
+from hal.jit import as_numpy_scalar, compiled
 from perception.range.fitting import rays
 from perception.range.fitting.fit import fit_robust
-from perception.range.fitting.starts import start_plane
+from perception.range.fitting.initialisation import start_plane
 from perception.range.fitting.surfaces import CONE, CYLINDER, FREEDOM, PLANE, SIZE, normals_on
 from perception.range.segmentation.grid import slow_share_at
 
@@ -25,10 +26,11 @@ CUT_SIGMAS = 3.0
 SCRAP_AREA_PX = 600.0  # over which the slowest part of the noise, bands and waves of 30 pixels, keeps its sign
 LEAST_PRICE = 2.0  # of a parameter, Akaike's: Schwarz's is none where there is one value
 SLENDER_RAD = 0.15  # half-angle of a cone that may be a cylinder
+ROUNDS = as_numpy_scalar(2)  # of robust weights
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def simplest(kind, th, samples, perspective, patches):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def simplest(kind: int, th: Array, samples: Array, perspective: bool, patches: float) -> tuple[int, Array]:
     """The surface refined on its samples, or the simpler one that describes them more cheaply (Schwarz's criterion).
 
     `patches`: independent values of the noise among the samples. Returns kind and parameters.
@@ -48,8 +50,8 @@ def simplest(kind, th, samples, perspective, patches):  # type: ignore[no-untype
     return best_kind, best
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def straightened(kind, th, samples, noise, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def straightened(kind: int, th: Array, samples: Array, noise: Array, perspective: bool) -> tuple[int, Array]:
     """The plane, or the cylinder for a slender cone, that slow errors have bent into this surface, else itself.
 
     `noise` as `NoiseModel.packed`. Returns kind and parameters.
@@ -70,14 +72,16 @@ def straightened(kind, th, samples, noise, perspective):  # type: ignore[no-unty
     return kind, th
 
 
-@njit(cache=True, error_model="numpy")
-def schwarz_price(kind, patches):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def schwarz_price(kind: int, patches: float) -> float:
     """What Schwarz's criterion asks for the parameters of a surface: p ln n."""
-    return FREEDOM[kind] * np.log(max(patches, 2.0))
+    return float(FREEDOM[kind] * np.log(max(patches, 2.0)))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def scrap_gain(kind, th, own_kind, own, samples, pixels, noise, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def scrap_gain(
+    kind: int, th: Array, own_kind: int, own: Array, samples: Array, pixels: float, noise: Array, perspective: bool,
+) -> float:  # fmt: skip
     """How much cheaper a small piece is as part of a large surface than as a surface of its own; <= 0: it stays.
 
     Slow noise gives a scrap of a face one value or few, and any direction; so its direction and kind count for nothing.
@@ -90,34 +94,34 @@ def scrap_gain(kind, th, own_kind, own, samples, pixels, noise, perspective):  #
     values = max(pixels / (1.0 + slow * (SCRAP_AREA_PX - 1.0)), 1.0)
     price = FREEDOM[own_kind] * max(np.log(values), LEAST_PRICE)
     own_e = residual_sizes(own_kind, own, samples, perspective)
-    return price + values * (cut_mean_square(own_e, CUT_SIGMAS) - cut_mean_square(e, CUT_SIGMAS))
+    return float(price + values * (cut_mean_square(own_e, CUT_SIGMAS) - cut_mean_square(e, CUT_SIGMAS)))
 
 
-@njit(cache=True, error_model="numpy")
-def cut_mean_square(e, limit):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def cut_mean_square(e: Array, limit: float) -> float:
     """Mean of the squares of e (N,), each at most that of `limit`."""
     total = 0.0
     for i in range(e.shape[0]):
         cut = min(e[i], limit)
         total += cut * cut
-    return total / e.shape[0]
+    return float(total / e.shape[0])
 
 
-@njit(cache=True, error_model="numpy")
-def _is_near(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
-    return np.mean(residual_sizes(kind, th, samples, perspective) < NEAR_SIGMAS) > NEAR_SHARE
+@compiled
+def _is_near(kind: int, th: Array, samples: Array, perspective: bool) -> bool:
+    return bool(np.mean(residual_sizes(kind, th, samples, perspective) < NEAR_SIGMAS) > NEAR_SHARE)
 
 
-@njit(cache=True, error_model="numpy")
-def _refined(kind, th, s, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _refined(kind: int, th: Array, s: Array, perspective: bool) -> tuple[Array, float]:
     """Parameters after a robust fit, and the mean of the squared residuals, each at most the trim's."""
     free = np.zeros(9, np.bool_)
-    th, cost = fit_robust(kind, th, s[0], s[1], s[2], s[3], perspective, free, 2)
+    th, cost = fit_robust(kind, th, s[0], s[1], s[2], s[3], perspective, free, ROUNDS)
     return th, cost / s.shape[1]
 
 
-@njit(cache=True, error_model="numpy")
-def _simpler(simple, kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _simpler(simple: int, kind: int, th: Array, samples: Array, perspective: bool) -> tuple[Array, bool]:
     """Where the fit of a plane, or of a cylinder in place of a slender cone, starts; and whether there is one."""
     points = points_of(samples, perspective)
     if simple == PLANE:
@@ -134,8 +138,8 @@ def _simpler(simple, kind, th, samples, perspective):  # type: ignore[no-untyped
     return cylinder, True
 
 
-@njit(cache=True, error_model="numpy")
-def turn_of(normals):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def turn_of(normals: Array) -> float:
     """Angle in radians over which all but `ENDS` of the unit normals (N, 3) spread."""
     n = normals.shape[0]
     mx, my, mz = np.mean(normals[:, 0]), np.mean(normals[:, 1]), np.mean(normals[:, 2])
@@ -144,11 +148,11 @@ def turn_of(normals):  # type: ignore[no-untyped-def]  # numba types it
     for i in range(n):
         cosines[i] = (normals[i, 0] * mx + normals[i, 1] * my + normals[i, 2] * mz) / length
     cosines.sort()
-    return 2.0 * np.arccos(min(1.0, max(-1.0, cosines[int(ENDS * (n - 1) + 0.5)])))
+    return float(2.0 * np.arccos(min(1.0, max(-1.0, cosines[int(ENDS * (n - 1) + 0.5)]))))
 
 
-@njit(cache=True, error_model="numpy")
-def points_of(samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def points_of(samples: Array, perspective: bool) -> Array:
     """(N, 3) positions of the samples, metres."""
     out = np.empty((samples.shape[1], 3))
     for i in range(samples.shape[1]):
@@ -157,16 +161,16 @@ def points_of(samples, perspective):  # type: ignore[no-untyped-def]  # numba ty
     return out
 
 
-@njit(cache=True, error_model="numpy")
-def surface_normals(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def surface_normals(kind: int, th: Array, samples: Array, perspective: bool) -> Array:
     """(N, 3) unit normals of the surface towards the sensor, at the samples."""
     normals = np.empty((samples.shape[1], 3))
     normals_on(kind, th, samples[0], samples[1], samples[2], perspective, normals)
     return normals
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def residual_sizes(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def residual_sizes(kind: int, th: Array, samples: Array, perspective: bool) -> Array:
     """(N,) size of the residuals along the rays, in sigmas; a ray that misses counts as far off."""
     e = np.empty(samples.shape[1])
     rays.residuals(kind, th, samples[0], samples[1], samples[2], samples[3], perspective, e)

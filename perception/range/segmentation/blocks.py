@@ -6,9 +6,9 @@ A run of blocks is worked on in rows of one scratch array at fixed places, witho
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from perception.range.fitting.surfaces import LEAN
+from hal.arrays import Array, Labels
+from hal.jit import compiled
 
 JUMP_SLOPE = 2.5  # a surface seen steeper than 68 degrees counts as a jump between blocks
 BLOCK_SAMPLES = 4  # along a block; larger blocks are sampled
@@ -20,8 +20,11 @@ SAMPLES = 10 * RUN
 SCRATCH = SAMPLES + MOST_SAMPLES * RUN
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def mean_blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def mean_blocks(
+    depth: Array, sen: Array, noise: Array, b: int, x: Array, y: Array, z: Array, sigma: Array, count: Labels, top: int,
+    bottom: int,
+) -> None:  # fmt: skip
     """Blocks of b x b pixels of `depth` (H, W), rows [top, bottom) of them, into (h, w) arrays as in `Grid`.
 
     `count`: how many samples of a block lie within noise and slope of its median; where these are less than half, as
@@ -43,8 +46,8 @@ def mean_blocks(depth, sen, noise, b, x, y, z, sigma, count, top, bottom):  # ty
             _means(sen, side, z[r, start:end], sigma[r, start:end], count[r, start:end], work)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _load(depth, b, hop, side, r, start, n, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _load(depth: Array, b: int, hop: int, side: int, r: int, start: int, n: int, work: Array) -> None:
     """The samples of `n` blocks, one row for each place in a block; NaN beyond the image."""
     H, W = depth.shape
     for i in range(side):
@@ -59,8 +62,8 @@ def _load(depth, b, hop, side, r, start, n, work):  # type: ignore[no-untyped-de
                 out[c] = np.nan
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _medians(depth, b, hop, side, r, start, n, work, values):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _medians(depth: Array, b: int, hop: int, side: int, r: int, start: int, n: int, work: Array, values: Array) -> None:
     """Row MEDIAN: of four samples or less by a network, of the corners alone where the samples are nine or sixteen."""
     H, W = depth.shape
     if side == 1:
@@ -73,8 +76,8 @@ def _medians(depth, b, hop, side, r, start, n, work, values):  # type: ignore[no
         work[MEDIAN + c] = _median(side, c, work, values)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _medians_of_four(side, n, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _medians_of_four(side: int, n: int, work: Array) -> None:
     """Lower medians of the corners of `n` whole blocks, by a sorting network, missing readings last."""
     at_q, at_s = SAMPLES + (side - 1) * RUN, SAMPLES + side * (side - 1) * RUN
     at_t = SAMPLES + (side * side - 1) * RUN
@@ -89,8 +92,8 @@ def _medians_of_four(side, n, work):  # type: ignore[no-untyped-def]  # numba ty
         work[MEDIAN + c] = median if second < np.inf else np.nan
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _median(side, c, work, values):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _median(side: int, c: int, work: Array, values: Array) -> float:
     """Lower median of a block's samples, a real value and never the empty middle of a jump; NaN if most are missing."""
     n = 0
     for m in range(side * side):
@@ -105,8 +108,8 @@ def _median(side, c, work, values):  # type: ignore[no-untyped-def]  # numba typ
     return values[(n - 1) // 2] if n > 0 and 2 * n >= side * side else np.nan
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _is_any_known(n, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _is_any_known(n: int, work: Array) -> bool:
     """Whether any of the first `n` medians is a depth."""
     known = False
     for c in range(n):
@@ -114,16 +117,16 @@ def _is_any_known(n, work):  # type: ignore[no-untyped-def]  # numba types it
     return known
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _sums(sen, noise, b, hop, side, n, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _sums(sen: Array, noise: Array, b: int, hop: int, side: int, n: int, work: Array) -> None:
     perspective = sen[0] > 0
     _reach(noise, JUMP_SLOPE * 0.7 * b / sen[1], perspective, n, work)
     for k in range(side * side):
         _add(work[SAMPLES + k * RUN :], k // side * hop, k % side * hop, n, work)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _reach(noise, slope, perspective, n, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _reach(noise: Array, slope: float, perspective: bool, n: int, work: Array) -> None:
     """Variances of one pixel at the medians, and in row NEAR how far from it a sample of the same surface may lie."""
     for c in range(n):
         median = work[MEDIAN + c]
@@ -135,8 +138,8 @@ def _reach(noise, slope, perspective, n, work):  # type: ignore[no-untyped-def] 
         work[PER_Z + c] = 1.0 / median if perspective else 0.0
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _add(samples, row, column, n, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _add(samples: Array, row: int, column: int, n: int, work: Array) -> None:
     """One sample of each block, at that row and column of it, into the sums over those near the median.
 
     Planes are linear in 1 / z: with q = d / median, 1 / (1 + q) = 1 - q + q^2 - q^3 is summed less 1, over -q.
@@ -152,8 +155,8 @@ def _add(samples, row, column, n, work):  # type: ignore[no-untyped-def]  # numb
         work[M + c] += 1.0 if near else 0.0
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _place(sen, b, r, start, x, y, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _place(sen: Array, b: int, r: int, start: int, x: Array, y: Array, work: Array) -> None:
     """Where the samples near the median lie on average, or the middle of a block that has none."""
     middle = 0.5 * (b - 1)
     for c in range(x.shape[0]):
@@ -164,8 +167,8 @@ def _place(sen, b, r, start, x, y, work):  # type: ignore[no-untyped-def]  # num
         y[c] = (r * b + (work[SV + c] / m if m > 0.0 else middle) - sen[4]) / sen[2]
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _means(sen, side, z, sigma, count, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _means(sen: Array, side: int, z: Array, sigma: Array, count: Labels, work: Array) -> None:
     """Depth, its standard deviation, and how many samples they rest on."""
     perspective, full = sen[0] > 0, side * side
     for c in range(z.shape[0]):

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from perception.range.fitting.surfaces import LEAN, depth_on, normal_on
-from perception.range.segmentation.beside import WORD, flagged
-from perception.range.segmentation.claim import bucket
+from hal.arrays import Array, Indices, Labels, Mask
+from hal.jit import as_numpy_scalar, compiled
+from perception.range.fitting.surfaces import depth_on, normal_on
+from perception.range.segmentation.boundary_pixels import WORD, flagged
 from perception.range.segmentation.grid import sigma_at
+from perception.range.segmentation.pixel_assignment import bucket
 
 WIDEST_GAP_PX = 3  # unlabelled pixels that a border may hold: one block of pixels that no model claimed
 PAIR_POINTS = 24
+NONE_YET = as_numpy_scalar(0)
 
 
-@njit(cache=True)
-def touching(labels, sen):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def touching(labels: Labels, sen: Array) -> tuple[Labels, Indices, Array, Array]:
     """Pairs (P, 2) of labels a < b that touch, how many contacts each has, and ray coordinates x, y (P, PAIR_POINTS) of some.
 
     `labels` (H, W), `sen` as `packed` of a sensor. A pair with fewer contacts fills the first of its places only.
@@ -32,8 +34,8 @@ def touching(labels, sen):  # type: ignore[no-untyped-def]  # numba types it
     return pairs, lengths, x, y
 
 
-@njit(cache=True)
-def _contacts(labels, gap):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _contacts(labels: Labels, gap: int) -> tuple[Labels, Array, Array, Labels]:
     """Contacts along rows and columns, over at most `gap` zeros, in raster order.
 
     Returns the number of the pair (from 1) and the place of each, and the (P, 2) pairs, a < b, as they were met.
@@ -45,7 +47,7 @@ def _contacts(labels, gap):  # type: ignore[no-untyped-def]  # numba types it
     newest = np.zeros(labels.max() + 1, np.int32)
     pairs, older = np.empty((4 * W, 2), np.int32), np.empty(4 * W + 1, np.int32)
     words, columns = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
-    n, count = 0, 0
+    n, count = NONE_YET, NONE_YET
     for v in range(H):
         if n + 2 * W > ids.shape[0]:
             ids, us, vs = (
@@ -62,10 +64,11 @@ def _contacts(labels, gap):  # type: ignore[no-untyped-def]  # numba types it
     return ids[:n].copy(), us[:n].copy(), vs[:n].copy(), pairs[:count].copy()
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _add_contacts(  # type: ignore[no-untyped-def]  # numba types it
-    row, v, ends, gap, above, above_at, newest, pairs, older, count, ids, us, vs, n
-):
+@compiled
+def _add_contacts(
+    row: Labels, v: int, ends: Labels, gap: int, above: Labels, above_at: Labels, newest: Labels, pairs: Labels,
+    older: Labels, count: int, ids: Labels, us: Array, vs: Array, n: int,
+) -> tuple[int, int]:  # fmt: skip
     """The contacts of row v in the columns `ends` after the `n` and the `count` pairs so far; returns both numbers then."""
     for at in range(ends.shape[0]):
         u = ends[at]
@@ -94,16 +97,16 @@ def _add_contacts(  # type: ignore[no-untyped-def]  # numba types it
     return n, count
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _flag_ends(row, above, flags):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _flag_ends(row: Labels, above: Labels, flags: Mask) -> None:
     """Where a label is not that of the pixel to its left and of the last one above: nowhere inside of a region."""
     flags[0] = row[0] > 0
     for u in range(1, row.shape[0]):
         flags[u] = (row[u] > 0) & ((row[u] != row[u - 1]) | (row[u] != above[u]))
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _pass_row(row, v, above, above_at):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _pass_row(row: Labels, v: int, above: Labels, above_at: Labels) -> None:
     """Row v becomes the last one above, where it bears labels."""
     now = np.int32(v)
     for u in range(row.shape[0]):
@@ -112,8 +115,10 @@ def _pass_row(row, v, above, above_at):  # type: ignore[no-untyped-def]  # numba
         above[u] = row[u] if row[u] > 0 else above[u]
 
 
-@njit(cache=True)
-def step_and_turn(kind_a, a, kind_b, b, x, y, noise, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def step_and_turn(
+    kind_a: int, a: Array, kind_b: int, b: Array, x: Array, y: Array, noise: Array, perspective: bool,
+) -> tuple[float, float]:  # fmt: skip
     """Median step in sigmas and median turn in radians between two surfaces at the rays (x, y).
 
     A ray that misses one of the surfaces counts as an endless step; a turn is read where both are met.

@@ -8,16 +8,16 @@ quarter circle of radius r leaves two faces by 0.41 r and is 1.57 r wide. Each o
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from hal.arrays import Array
-from perception.range.fitting.surfaces import LEAN, PLANE, depth_on, normal_on
-from perception.range.segmentation.beside import WORD, flagged
+from hal.arrays import Array, Indices, Mask
+from hal.jit import compiled
+from perception.range.fitting.surfaces import PLANE, depth_on, normal_on
 from perception.range.segmentation.borders import step_and_turn, touching
+from perception.range.segmentation.boundary_pixels import WORD, flagged
 from perception.range.segmentation.grid import sigma_at
 from perception.range.segmentation.regions import regions_of
-from perception.range.segmentation.runs import pixels_of
+from perception.range.segmentation.run_length import pixels_of
 from perception.range.segmentation.seams import is_seam_grooved
 
 Labels = NDArray[np.int32]
@@ -86,8 +86,11 @@ def _strips(
     return {strip: faces for strip, faces in beside.items() if len(faces) > 1 or is_gentle[strip]}
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _continuations(depth, sen, noise, labels, kinds, table, half_width, length, pairs, lengths, x, y):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _continuations(
+    depth: Array, sen: Array, noise: Array, labels: Labels, kinds: Indices, table: Array, half_width: Array,
+    length: Array, pairs: Labels, lengths: Indices, x: Array, y: Array,
+) -> tuple[Mask, Mask]:  # fmt: skip
     """Of which pairs of labels that touch the narrower continues the wider as a strip; and which strips do so gently."""
     narrow_px = NARROW * min(labels.shape[0], labels.shape[1])
     out, is_gentle = np.zeros(pairs.shape[0], np.bool_), np.zeros(kinds.shape[0], np.bool_)
@@ -113,16 +116,16 @@ def _continuations(depth, sen, noise, labels, kinds, table, half_width, length, 
     return out, is_gentle
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _goes_on(step, turn, is_flat, is_narrow):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _goes_on(step: float, turn: float, is_flat: bool, is_narrow: bool) -> bool:
     """Whether a strip continues a face; `step` in sigmas, `turn` in rad. A flat one that is wide enough is a bevel."""
     if is_narrow:
         return step <= NARROW_SIGMAS and turn <= TURN_RAD
     return step <= STEP_SIGMAS and turn <= (FLAT_TURN_RAD if is_flat else TURN_RAD)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _shapes(labels, count):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _shapes(labels: Labels, count: int) -> Array:
     """(2, count) of each label: pixels over those at its rim, half the width of a strip; and its rim over that.
 
     A hole of one pixel, a gross error, has no rim. The latter is 12.6 for a disc, 16 for a square and four times the
@@ -145,8 +148,8 @@ def _shapes(labels, count):  # type: ignore[no-untyped-def]  # numba types it
     return out
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _flag_rims(above_2, above, own, below, below_2, flags):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _flag_rims(above_2: Labels, above: Labels, own: Labels, below: Labels, below_2: Labels, flags: Mask) -> None:
     """Labelled pixels with two in a row of another label above or below."""
     for u in range(own.shape[0]):
         k = own[u]
@@ -154,8 +157,8 @@ def _flag_rims(above_2, above, own, below, below_2, flags):  # type: ignore[no-u
         flags[u] = (k > 0) & (is_top | is_bottom)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _flag_sides(own, flags):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _flag_sides(own: Labels, flags: Mask) -> None:
     """And those with two in a row of another label to the left or right; beyond its ends the row goes on."""
     last = own.shape[0] - 1
     for u in range(last - 3):
@@ -169,8 +172,8 @@ def _flag_sides(own, flags):  # type: ignore[no-untyped-def]  # numba types it
         flags[u] |= (k > 0) & (is_left | is_right)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _off(kind, th, x, y, z, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _off(kind: int, th: Array, x: float, y: float, z: float, perspective: bool) -> float:
     """How far a pixel lies off a surface, across the surface, metres; infinite where its ray misses."""
     zm = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(zm):
@@ -179,8 +182,10 @@ def _off(kind, th, x, y, z, perspective):  # type: ignore[no-untyped-def]  # num
     return abs(z - zm) * (abs(nx * x + ny * y + nz) if perspective else abs(nz))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _nearer(depth, sen, indices, half_width, faces, kinds, table):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _nearer(
+    depth: Array, sen: Array, indices: Labels, half_width: float, faces: Indices, kinds: Indices, table: Array,
+) -> Labels:  # fmt: skip
     """Of each pixel the face that it lies nearest to, 0 where it is farther than the strip allows."""
     W = depth.shape[1]
     perspective = sen[0] > 0
@@ -197,8 +202,10 @@ def _nearer(depth, sen, indices, half_width, faces, kinds, table):  # type: igno
     return owner
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def spread_outwards(depth, sen, noise, labels, kinds, table, reach):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def spread_outwards(
+    depth: Array, sen: Array, noise: Array, labels: Labels, kinds: Indices, table: Array, reach: int,
+) -> None:  # fmt: skip
     """Give unlabelled pixels, ring by ring up to `reach`, to the surface beside them that they leave slowly; in place."""
     flat, fd, W = labels.ravel(), depth.ravel(), depth.shape[1]
     ring = _first_ring(labels, depth)
@@ -214,8 +221,8 @@ def spread_outwards(depth, sen, noise, labels, kinds, table, reach):  # type: ig
         flat[i] = max(flat[i], 0)
 
 
-@njit(cache=True, nogil=True)
-def _first_ring(labels, depth):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _first_ring(labels: Labels, depth: Array) -> Labels:
     """Flat indices of the unlabelled pixels with a reading beside labelled ones."""
     H, W = labels.shape
     words, columns = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
@@ -231,15 +238,15 @@ def _first_ring(labels, depth):  # type: ignore[no-untyped-def]  # numba types i
     return ring[:count].copy()
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _flag_outlines(above, own, below, flags):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _flag_outlines(above: Labels, own: Labels, below: Labels, flags: Mask) -> None:
     """Unlabelled pixels beside labelled ones, but for the ends of the row."""
     for u in range(1, own.shape[0] - 1):
         flags[u] = (own[u] == 0) & ((own[u - 1] | own[u + 1] | above[u] | below[u]) != 0)
 
 
-@njit(cache=True, nogil=True)
-def _next_ring(ring, shape, fd, flat):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _next_ring(ring: Labels, shape: tuple[int, int], fd: Array, flat: Labels) -> Labels:
     """The free pixels with a reading beside those of a ring, marked -1 in `flat` so that each comes once."""
     H, W = shape
     new, count = np.empty(4 * ring.shape[0], np.int32), 0
@@ -254,8 +261,10 @@ def _next_ring(ring, shape, fd, flat):  # type: ignore[no-untyped-def]  # numba 
     return new[:count].copy()
 
 
-@njit(cache=True, error_model="numpy", **LEAN, nogil=True)
-def _slowest_left(i, W, fd, sen, noise, flat, kinds, table, slope):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _slowest_left(
+    i: int, W: int, fd: Array, sen: Array, noise: Array, flat: Labels, kinds: Indices, table: Array, slope: float,
+) -> int:  # fmt: skip
     """The label beside pixel i whose surface it lies nearest to, 0 where all are farther than noise and `slope` allow."""
     perspective = sen[0] > 0
     x, y, z = (i % W - sen[3]) / sen[1], (i // W - sen[4]) / sen[2], fd[i]

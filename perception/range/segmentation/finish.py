@@ -7,14 +7,14 @@ from math import isnan, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from hal.arrays import Array
+from hal.arrays import Array, Mask
+from hal.jit import as_numpy_scalar, compiled
 from perception.range.fitting.fit import fit_robust
+from perception.range.fitting.initialisation import solve_positive
 from perception.range.fitting.last_step import last_step
-from perception.range.fitting.starts import solve_positive
-from perception.range.fitting.surfaces import FREEDOM, PLANE, SIZE, depth_on, frame_of
+from perception.range.fitting.surfaces import FREEDOM, PLANE, SIZE, depth_on
 from perception.range.noise import NoiseModel
 from perception.range.primitives import (
     COVARIANCE_OVER,
@@ -26,7 +26,7 @@ from perception.range.primitives import (
 )
 from perception.range.segmentation.bend import straightened
 from perception.range.segmentation.regions import Regions, spread
-from perception.range.segmentation.runs import pixels_of
+from perception.range.segmentation.run_length import pixels_of
 
 Labels = NDArray[np.int32]
 
@@ -37,6 +37,7 @@ SLOW_NOISE_AREA_PX = 150.0  # pixels that share one value of the slow noise; set
 STEP_AREA_PX = 16.0
 NO_SHIFT = 1e-9  # pixels: rounds up what is whole but for the last bit
 FARTHEST_SIGMAS = 50.0  # that the last step may move a surface where it was fitted already
+ROUNDS = as_numpy_scalar(1)  # of robust weights
 FREE = np.zeros(9, np.bool_)
 
 
@@ -64,26 +65,25 @@ def refine_surface(
     own: int,
     *,
     noise: NoiseModel,
-    slack: float = 1.0,
     fixed: NDArray[np.bool_] = FREE,
 ) -> tuple[Surface, Array]:
     """The surface after the ray-depth fit to all its pixels, and its parameters.
 
     Args:
         own: the label of those pixels in `regions`.
-        slack: how many times the noise is tolerated.
         fixed: (9,) tangent parameters that a prior holds.
     """
-    image = (regions.depth_m, regions.packed, regions.law)
     n = int(regions.sizes[own])
-    th, *figures = refined(kind, th, *image, slack, regions.runs_of(own), n, fixed)
-    refinement = Refinement(frame_vectors(kind, th), th, *figures)
+    th, H, inverse, middles, squares, kept = refined(
+        kind, th, regions.depth_m, regions.packed, regions.law, regions.runs_of(own), n, fixed
+    )
+    refinement = Refinement(frame_vectors(kind, th), th, H, inverse, middles, squares, kept)
     perspective = bool(regions.packed[0] > 0)
     return _surface(label, kind, refinement, n, noise=noise, perspective=perspective, fixed=fixed), th
 
 
 def refine_surfaces(
-    owns: list[int], kinds: list[int], parameters: list[Array], slack: list[float], regions: Regions, noise: NoiseModel
+    owns: list[int], kinds: list[int], parameters: list[Array], regions: Regions, noise: NoiseModel
 ) -> tuple[list[Surface], list[int], Array]:
     """`refine_surface` of the regions with labels `owns`, which become labels 1 to M.
 
@@ -92,21 +92,27 @@ def refine_surfaces(
     """
     if not owns:
         return [], [], np.zeros((0, SIZE))
-    mine = np.array(owns)
-    at = mine - 1
-    surface_of_each = (np.array(kinds)[at], np.array(parameters)[at], np.array(slack)[at])
-    image = (regions.depth_m, regions.packed, regions.law, regions.starts, regions.runs, regions.sizes)
-    claiming, ths, names, *figures = _refined_regions(mine, *surface_of_each, *image)
-    perspective = bool(regions.packed[0] > 0)
-    surfaces = []
-    rows = zip(owns, names.tolist(), *figures[:-2], *(f.tolist() for f in figures[-2:]), strict=True)
-    for label, (own, kind, *rest) in enumerate(rows, 1):
-        p = int(FREEDOM[kind])
-        frame, th, H, inverse, *more = rest
-        refinement = Refinement(frame, th, H, inverse[:p, :p], *more)
-        pixels = int(regions.sizes[own])
-        surfaces.append(_surface(label, kind, refinement, pixels, noise=noise, perspective=perspective, fixed=FREE))
-    return surfaces, claiming.tolist(), ths
+    kinds_before, ths_before, surfaces = [], np.empty((len(owns), SIZE)), []
+    for i, own in enumerate(owns):
+        kind, th = kinds[own - 1], parameters[own - 1]
+        surface, th = refine_surface(i + 1, kind, th, regions, own, noise=noise)
+        kinds_before.append(kind)
+        ths_before[i] = th
+        name, start = _straight(kind, th, regions, own)
+        if name != kind:
+            surface, _ = refine_surface(i + 1, name, start, regions, own, noise=noise)
+        surfaces.append(surface)
+    return surfaces, kinds_before, ths_before
+
+
+def _straight(kind: int, th: Array, regions: Regions, own: int) -> tuple[int, Array]:
+    """The simpler kind that slow errors of the sensor have bent into this one, with a start for it, or the kind itself."""
+    if kind == PLANE:
+        return kind, th
+    pixels = int(regions.sizes[own])
+    few = np.empty((4, min(pixels, NAMING_SAMPLES)))
+    spread(regions.depth_m, regions.packed, regions.law, regions.runs_of(own), pixels, 0.5, few)
+    return straightened(kind, th, few, regions.law, bool(regions.packed[0] > 0))
 
 
 def _surface(
@@ -140,43 +146,10 @@ def _surface(
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _refined_regions(mine, kinds, ths, slack, depth, sen, noise, starts, runs, sizes):  # type: ignore[no-untyped-def]  # numba types it
-    """`refined` of the regions `mine` (M,), and again under a simpler name where slow errors have bent a surface.
-
-    Returns kinds (M,) and parameters (M, 16) before that; after it kinds (M,), and what `Refinement` holds, M of each.
-    """
-    count, perspective, free = mine.shape[0], sen[0] > 0, np.zeros(9, np.bool_)
-    names, first, last, frames = kinds.copy(), np.empty((count, SIZE)), np.empty((count, SIZE)), np.empty((count, 6))
-    H, inverse, middles = np.empty((count, 9, 9)), np.empty((count, 9, 9)), np.empty((count, 4))
-    squares, kept = np.empty(count), np.empty(count, np.int64)
-    for i in range(count):
-        pixels, own = sizes[mine[i]], runs[starts[mine[i]] : starts[mine[i] + 1]]
-        kind, start = kinds[i], ths[i]
-        for is_again in (False, True):
-            th, H[i], inv, middles[i], squares[i], kept[i] = refined(
-                kind, start, depth, sen, noise, slack[i], own, pixels, free
-            )
-            p = FREEDOM[kind]
-            inverse[i, :p, :p] = inv
-            names[i], last[i] = kind, th
-            frame_of(kind, th, frames[i])
-            if is_again:
-                break
-            first[i] = th
-            if kind == PLANE:
-                break
-            few = np.empty((4, min(pixels, NAMING_SAMPLES)))
-            spread(depth, sen, noise, own, pixels, 0.5, few)
-            few[3] *= slack[i]
-            kind, start = straightened(kind, th, few, noise, perspective)
-            if kind == names[i]:
-                break
-    return kinds, first, names, frames.reshape((count, 2, 3)), last, H, inverse, middles, squares, kept
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def refined(kind, th, depth, sen, noise, slack, runs, pixels, fixed):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def refined(
+    kind: int, th: Array, depth: Array, sen: Array, noise: Array, runs: Labels, pixels: int, fixed: Mask,
+) -> tuple[Array, Array, Array, Array, float, int]:  # fmt: skip
     """The fit to the `pixels` of runs (R, 3): robust on a few that are evenly spread, then one step on all.
 
     Returns:
@@ -186,13 +159,12 @@ def refined(kind, th, depth, sen, noise, slack, runs, pixels, fixed):  # type: i
         return th, np.zeros((9, 9)), np.full((FREEDOM[kind], FREEDOM[kind]), np.nan), np.full(4, np.nan), 0.0, 0
     few = np.empty((4, min(pixels, COARSE_SAMPLES)))
     spread(depth, sen, noise, runs, pixels, NO_SHIFT, few)
-    few[3] *= slack
-    th, _ = fit_robust(kind, th, few[0], few[1], few[2], few[3], sen[0] > 0, fixed, 1)
+    th, _ = fit_robust(kind, th, few[0], few[1], few[2], few[3], sen[0] > 0, fixed, ROUNDS)
     middles = np.empty(4)
     for a in range(4):
         middles[a] = np.median(few[a, ::MIDDLE_STRIDE].copy())
     start = th
-    th, H, kept, used = last_step(kind, start, depth, sen, noise, slack, runs, fixed)
+    th, H, kept, used = last_step(kind, start, depth, sen, noise, runs, fixed)
     # Over a face that hardly bends, a step straight ahead may pass through flat and end on the far side of the sensor.
     before = depth_on(kind, start, middles[0], middles[1], sen[0] > 0)
     after = depth_on(kind, th, middles[0], middles[1], sen[0] > 0)
@@ -201,8 +173,8 @@ def refined(kind, th, depth, sen, noise, slack, runs, pixels, fixed):  # type: i
     return th, H, _inverse(H, FREEDOM[kind], fixed), middles, kept, used
 
 
-@njit(cache=True, error_model="numpy")
-def _inverse(H, p, fixed):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _inverse(H: Array, p: int, fixed: Mask) -> Array:
     """(p, p) inverse over the free parameters, zero elsewhere; NaN when they are not all determined."""
     A, b, out, scale = np.empty((p, p)), np.empty(p), np.zeros((p, p)), np.empty(p)
     for i in range(p):

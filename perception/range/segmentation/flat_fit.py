@@ -6,14 +6,15 @@ All are linear in g = 1 / z (pinhole) or g = z (parallel rays): a plane is g = a
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from perception.range.fitting.starts import solve_positive
-from perception.range.fitting.surfaces import LEAN
+from hal.arrays import Array, Labels
+from hal.jit import as_numpy_scalar, compiled
+from perception.range.fitting.initialisation import solve_positive
 
 BEND_RMS = 0.4  # in sigmas: how much a quadratic may gain over a plane before the plane is a strip of something bent
 BEND_F = 4.0  # and how significant that gain must be (F ratio)
 WORST_MEAN_SQUARE = 3.0  # in sigmas: what leaves more over its plane is no plane
+OF_PLANE, OF_BENT = as_numpy_scalar(3), as_numpy_scalar(6)  # coefficients of g over x and y
 # Where the products of 1, p, q, pp, pq, qq stand among 1, p, q, pp, pq, qq, ppp, ppq, pqq, qqq, pppp, pppq, ppqq, pqqq, qqqq.
 MOMENTS = np.array(
     [
@@ -27,8 +28,8 @@ MOMENTS = np.array(
 )
 
 
-@njit(cache=True, **LEAN)
-def solve3(S, out):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def solve3(S: Array, out: Array) -> bool:
     """Coefficients (a, b, c) of g = a x + b y + c from sums (n, x, y, xx, xy, yy, g, xg, yg); False if degenerate."""
     n = S[0]
     if n <= 0.0:
@@ -45,8 +46,8 @@ def solve3(S, out):  # type: ignore[no-untyped-def]  # numba types it
     return True
 
 
-@njit(cache=True, **LEAN)
-def plane_from_coefficients(m, perspective, th):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def plane_from_coefficients(m: Array, perspective: bool, th: Array) -> None:
     """PLANE parameters, normal towards the sensor, from g = a x + b y + c."""
     if perspective:
         nx, ny, nz, d = m[0], m[1], m[2], 1.0  # (a, b, c) . X = 1 and z > 0: this normal points away
@@ -56,17 +57,17 @@ def plane_from_coefficients(m, perspective, th):  # type: ignore[no-untyped-def]
     th[0], th[1], th[2], th[3] = nx / length, ny / length, nz / length, d / length
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def moved_rms(a, b, c, S, count):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def moved_rms(a: float, b: float, c: float, S: Array, count: int) -> float:
     """Root mean square of a x + b y + c over `count` blocks of sums `S`, in sigmas."""
     n, x, y = S[0], S[1] / S[0], S[2] / S[0]
     xx, xy, yy = S[3] / n - x * x, S[4] / n - x * y, S[5] / n - y * y
     square = (a * x + b * y + c) ** 2 + a * a * xx + 2.0 * a * b * xy + b * b * yy
-    return np.sqrt(max(square, 0.0) * n / count)
+    return float(np.sqrt(max(square, 0.0) * n / count))
 
 
-@njit(cache=True, error_model="numpy")
-def squares_left(idx, count, table, x0, y0, scale):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def squares_left(idx: Labels, count: int, table: Array, x0: float, y0: float, scale: float) -> tuple[float, float]:
     """Sum of squares (in sigmas) left by a plane and by a quadratic over the blocks idx[:count] of a padded table."""
     M, b, total = np.zeros(15), np.zeros(6), 0.0
     g0, per = table[idx[0], 2], 1.0 / scale
@@ -88,16 +89,16 @@ def squares_left(idx, count, table, x0, y0, scale):  # type: ignore[no-untyped-d
         for e in range(6):
             A[a, e] = M[row[e]] * (1.0 + 1e-9 if a == e else 1.0)
     plane, full = b[:3].copy(), b.copy()
-    if not solve_positive(A[:3, :3].copy(), plane, 3):
-        return max(total, 0.0), max(total, 0.0)
-    left = max(total - plane @ b[:3], 0.0)
-    if not solve_positive(A, full, 6):
+    if not solve_positive(A[:3, :3].copy(), plane, OF_PLANE):
+        return float(max(total, 0.0)), float(max(total, 0.0))
+    left = max(float(total - plane @ b[:3]), 0.0)
+    if not solve_positive(A, full, OF_BENT):
         return left, left
-    return left, max(total - full @ b, 0.0)
+    return left, max(float(total - full @ b), 0.0)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def is_bent(flat, quadratic, count):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def is_bent(flat: float, quadratic: float, count: int) -> bool:
     """Whether `count` blocks are no plane, from the sums of squares that a plane and a quadratic leave over them."""
     ratio = (flat - quadratic) / 3.0 / max(quadratic / max(count - 6, 1), 0.3)
     is_better = flat - quadratic > BEND_RMS * BEND_RMS * count and ratio > BEND_F

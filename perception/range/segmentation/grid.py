@@ -11,23 +11,22 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hal.arrays import Array
-from perception.range.components import for_each_tile
-from perception.range.fitting.surfaces import LEAN
+from hal.jit import as_numpy_scalar, compiled
 from perception.range.noise import NoiseModel, valid_sample
 from perception.range.segmentation.blocks import JUMP_SLOPE, mean_blocks
 from perception.range.segmentation.tangents import tangent_planes
 from perception.range.sensor import RangeSensorModel
+from perception.range.tiles import for_each_tile
 
 Ints = NDArray[np.int32]
 
 NORMAL_SIGMA_GOAL_RAD = 0.06  # tangent planes noisier than this are fitted over a wider window
 WIDEST_RADIUS = 3
 LARGE_SIDE_PX = 1024
-MIDDLE_SAMPLES = 1024
+MIDDLE_SAMPLES = as_numpy_scalar(1024)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -147,25 +146,25 @@ def _radius(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float, size_px
     return WIDEST_RADIUS, sigma
 
 
-@njit(cache=True)
-def _middle_depth(z):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _middle_depth(z: Array) -> float:
     """Median of a sample of the known depths, 1 without any."""
     known = valid_sample(z, MIDDLE_SAMPLES)
     return np.median(known) if known.shape[0] > 0 else 1.0
 
 
-@njit(cache=True, **LEAN)
-def sigma_at(noise, z):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def sigma_at(noise: Array, z: float) -> float:
     """Standard deviation of one pixel at depth z, metres; `noise` as `NoiseModel.packed`."""
     z2 = z * z
     white = noise[0] + noise[1] * z2
     slow = noise[2] + noise[3] * z2
     step = noise[4] + noise[5] * z2
-    return np.sqrt(max(white * white, step * step / 12.0) + slow * slow)
+    return float(np.sqrt(max(white * white, step * step / 12.0) + slow * slow))
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def slow_share_at(noise, z):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def slow_share_at(noise: Array, z: float) -> float:
     """Part of the variance at depth z that neighbouring pixels share; `noise` as `NoiseModel.packed`."""
     slow, sigma = noise[2] + noise[3] * z * z, sigma_at(noise, z)
-    return slow * slow / max(sigma * sigma, 1e-30)
+    return float(slow * slow / max(sigma * sigma, 1e-30))

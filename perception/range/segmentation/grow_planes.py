@@ -7,9 +7,9 @@ there. One that grew on a curved surface betrays itself: a quadratic explains it
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from perception.range.fitting.surfaces import LEAN
+from hal.arrays import Array, Indices, Labels, Mask
+from hal.jit import as_numpy_scalar, compiled
 from perception.range.segmentation.flat_fit import is_bent, moved_rms, plane_from_coefficients, solve3, squares_left
 from perception.range.segmentation.grow_surface import GROW_SIGMAS
 from perception.range.segmentation.tangents import STEADY_RMS
@@ -19,14 +19,16 @@ SAME_BLOCKS = 200  # of which no more than one may come or go in a sweep that is
 SAME_PLANE = 0.1  # sigmas: a plane that moves less explains the same blocks
 MOST_PLANES = 512
 LOOSE_NORMAL = 0.5  # length of a normal that seeds a plane but does not count
+EMPTY = as_numpy_scalar(0)
 TAKEN = np.int32(2**31 - 1)
 BENT = np.int32(-1)  # a block whose support is no plane
 
 
-@njit(cache=True, error_model="numpy")
-def grow_planes(  # type: ignore[no-untyped-def]  # numba types it
-    x, y, z, sigma, normal, rms, free, label, first_label, perspective, order, least, cos_limit, tried
-):
+@compiled
+def grow_planes(
+    x: Array, y: Array, z: Array, sigma: Array, normal: Array, rms: Array, free: Mask, label: Labels, first_label: int,
+    perspective: bool, order: Labels, least: int, cos_limit: float, tried: Mask,
+) -> tuple[Array, Indices, Array]:  # fmt: skip
     """Planes over the free blocks; writes labels and returns parameters (M, 16), block counts (M,), mean squares (M,).
 
     Blocks of supports that turned out curved are marked in `tried` so that they seed nothing again.
@@ -82,8 +84,8 @@ def grow_planes(  # type: ignore[no-untyped-def]  # numba types it
     return ths[:found].copy(), counts[:found].copy(), mean2[:found].copy()
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _hand_over(owner, place, free, label, tried):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _hand_over(owner: Labels, place: Labels, free: Mask, label: Labels, tried: Mask) -> None:
     for i in range(place.shape[0]):
         mine = owner[place[i]]
         if mine > 0:
@@ -92,8 +94,10 @@ def _hand_over(owner, place, free, label, tried):  # type: ignore[no-untyped-def
             tried[i] = True
 
 
-@njit(cache=True, error_model="numpy")
-def _padded(x, y, z, sigma, normal, rms, free, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _padded(
+    x: Array, y: Array, z: Array, sigma: Array, normal: Array, rms: Array, free: Mask, perspective: bool,
+) -> tuple[Array, Labels, Labels]:  # fmt: skip
     """Blocks with a frame of taken ones around, one row of numbers each, so that growing needs no look at the rim.
 
     Returns (N, 8) x, y, g, its weight, normal (0 where it says nothing), z; marks (N,), `TAKEN` where a block is not
@@ -122,8 +126,8 @@ def _padded(x, y, z, sigma, normal, rms, free, perspective):  # type: ignore[no-
     return table, mark, place
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _tangent(block, perspective, m):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _tangent(block: Array, perspective: bool, m: Array) -> bool:
     """Coefficients of the tangent plane of one row of the table into `m`; False where its ray grazes it."""
     x, y, nx, ny, nz = block[0], block[1], block[4], block[5], block[6]
     if perspective:
@@ -137,8 +141,8 @@ def _tangent(block, perspective, m):  # type: ignore[no-untyped-def]  # numba ty
     return True
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _add_block(block, S):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _add_block(block: Array, S: Array) -> None:
     """One more row of the table into the sums that `solve3` reads."""
     x, y, g, weight = block[0], block[1], block[2], block[3]
     wx, wy = weight * x, weight * y
@@ -153,17 +157,20 @@ def _add_block(block, S):  # type: ignore[no-untyped-def]  # numba types it
     S[8] += wy * g
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _fits(block, a, b, c, th, limit, cos_limit):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _fits(block: Array, a: float, b: float, c: float, th: Array, limit: float, cos_limit: float) -> bool:
     """Whether the plane g = a x + b y + c, `th`, explains a row of the table, and its normal does not speak against it."""
     e = block[2] - a * block[0] - b * block[1] - c
     nx, ny, nz = block[4], block[5], block[6]
     turn = th[0] * nx + th[1] * ny + th[2] * nz
-    return e * e * block[3] <= limit and (turn >= cos_limit or nx * nx + ny * ny + nz * nz <= 0.5)
+    return bool(e * e * block[3] <= limit and (turn >= cos_limit or nx * nx + ny * ny + nz * nz <= 0.5))
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _grown(table, mark, across, seed, stamp, m, th, perspective, cos_limit, queue, S):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _grown(
+    table: Array, mark: Labels, across: int, seed: int, stamp: int, m: Array, th: Array, perspective: bool,
+    cos_limit: float, queue: Labels, S: Array,
+) -> int:  # fmt: skip
     """Blocks connected to `seed` that the plane explains, nearest first, into `queue`; returns how many.
 
     The plane g = m . (x, y, 1) follows the blocks as they come: they must come from all sides.
@@ -193,15 +200,18 @@ def _grown(table, mark, across, seed, stamp, m, th, perspective, cos_limit, queu
     return count
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _filled(table, mark, across, seed, stamp, m, th, cos_limit, queue, spans, S):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _filled(
+    table: Array, mark: Labels, across: int, seed: int, stamp: int, m: Array, th: Array, cos_limit: float,
+    queue: Labels, spans: Labels, S: Array,
+) -> int:  # fmt: skip
     """All blocks connected to `seed` that the plane g = m . (x, y, 1) explains, a span of a row at a time.
 
     As `_grown`, with the plane held. Blocks that it does not explain are marked `stamp` - 1, so that none is asked twice.
     """
     S[:] = 0.0
     mark[seed] = stamp
-    count = _span(table, mark, seed, stamp, m, th, cos_limit, queue, 0, spans[0], S)
+    count = _span(table, mark, seed, stamp, m, th, cos_limit, queue, EMPTY, spans[0], S)
     found, head = 1, 0
     while head < found:
         left, right = spans[head]
@@ -221,8 +231,11 @@ def _filled(table, mark, across, seed, stamp, m, th, cos_limit, queue, spans, S)
     return count
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _span(table, mark, at, stamp, m, th, cos_limit, queue, count, span, S):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _span(
+    table: Array, mark: Labels, at: int, stamp: int, m: Array, th: Array, cos_limit: float, queue: Labels, count: int,
+    span: Labels, S: Array,
+) -> int:  # fmt: skip
     """The blocks of one row that join the one at `at` on both sides, into `queue`, their ends [first, last) into `span`."""
     a, b, c, limit = m[0], m[1], m[2], GROW_SIGMAS * GROW_SIGMAS
     for step in (-1, 1):

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from perception.range.fitting.surfaces import LEAN, PLANE, depth_on, normal_on
+from hal.arrays import Array, Image, Indices, Mask
+from hal.jit import compiled
+from perception.range.fitting.surfaces import PLANE, depth_on, normal_on
 from perception.range.segmentation.tangents import STEADY_RMS
 
 GROW_SIGMAS = 3.0  # what a block may leave its surface by
 
 
-@njit(cache=True)
-def grow_surface(  # type: ignore[no-untyped-def]  # numba types it
-    kind, th, x, y, z, sigma, normal, rms, free, seeds, perspective, cos_limit, mark, stamp, queue
-):
+@compiled
+def grow_surface(
+    kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, normal: Array, rms: Array, free: Mask,
+    seeds: Indices, perspective: bool, cos_limit: float, mark: Image, stamp: int, queue: Indices,
+) -> tuple[int, float]:  # fmt: skip
     """Blocks connected to `seeds` that the surface explains; returns their number, indices in queue[:number].
 
     Also returns the sum of squared residuals. `mark` receives `stamp` where a block belongs.
@@ -54,8 +56,11 @@ def grow_surface(  # type: ignore[no-untyped-def]  # numba types it
     return count, total
 
 
-@njit(cache=True, **LEAN)
-def _explained(kind, th, x, y, z, sigma, normals, j, rms, perspective, cos_limit):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _explained(
+    kind: int, th: Array, x: float, y: float, z: float, sigma: float, normals: Array, j: int, rms: float,
+    perspective: bool, cos_limit: float,
+) -> float:  # fmt: skip
     """Squared residual in sigmas (eased where grazing) if the surface explains the block, whose normal is the j-th, else -1."""
     zm = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(zm):

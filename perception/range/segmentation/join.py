@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from hal.arrays import Array
+from hal.arrays import Array, Indices, Labels, Mask
+from hal.jit import as_numpy_scalar, compiled
 from perception.range.fitting import fit
-from perception.range.fitting.surfaces import LEAN, PLANE, depth_on
+from perception.range.fitting.surfaces import PLANE, depth_on
 from perception.range.segmentation import bend
 from perception.range.segmentation.grid import slow_share_at
 from perception.range.segmentation.regions import Regions
 from perception.range.segmentation.seams import crosses_groove, is_grooved_at
 
 PAIR_SAMPLES = 150
+ROUGH_ROUNDS, ROUNDS = as_numpy_scalar(1), as_numpy_scalar(3)  # of robust weights
 JOINED_SHARE = 0.85
 JOINED_MEAN_SQUARE = 1.6
 ROUGH_STRIDE = 5  # of the samples of a first fit
@@ -51,8 +52,11 @@ def join_pieces(regions: Regions, kinds: list[int], parameters: list[Array]) -> 
     return joined
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _joined(kinds, ths, samples, starts, pixels, order, depth, sen, noise, labels):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _joined(
+    kinds: Indices, ths: Array, samples: Array, starts: Indices, pixels: Indices, order: Indices, depth: Array,
+    sen: Array, noise: Array, labels: Labels,
+) -> Indices:  # fmt: skip
     """`join_pieces` of samples (4, N), piece k's from `starts[k]` on; the largest come first. Updates `ths`."""
     perspective = sen[0] > 0
     owner, before = np.arange(1, kinds.shape[0] + 1), ths.copy()
@@ -81,10 +85,11 @@ def _joined(kinds, ths, samples, starts, pixels, order, depth, sen, noise, label
     return owner
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def related(  # type: ignore[no-untyped-def]  # numba types it
-    kind, th, samples, pixels, other_kind, other, others, other_pixels, noise, perspective
-):
+@compiled
+def related(
+    kind: int, th: Array, samples: Array, pixels: int, other_kind: int, other: Array, others: Array, other_pixels: int,
+    noise: Array, perspective: bool,
+) -> tuple[int, Array]:  # fmt: skip
     """What a smaller piece is to a larger one: nothing, a scrap of it, or a piece of one surface, whose parameters follow.
 
     Samples are (4, N) as in `bend`.
@@ -98,11 +103,11 @@ def related(  # type: ignore[no-untyped-def]  # numba types it
         if turn < np.cos(LARGEST_TURN_RAD):
             return APART, th
     both = np.concatenate((samples, others), 1)
-    rough = _fitted(kind, th, np.ascontiguousarray(both[:, ::ROUGH_STRIDE]), perspective, 1)
+    rough = _fitted(kind, th, np.ascontiguousarray(both[:, ::ROUGH_STRIDE]), perspective, ROUGH_ROUNDS)
     for s in (others, samples):  # the smaller piece refuses more often
         if _trimmed(kind, rough, s, perspective)[0] < ROUGH_SHARE:
             return APART, th
-    joint = _fitted(kind, th, both, perspective, 3)
+    joint = _fitted(kind, th, both, perspective, ROUNDS)
     # What a piece leaves over by itself is bend, where noise is slow, and it is no less in the joint surface.
     own = max(_trimmed(kind, th, samples, perspective)[1], _trimmed(other_kind, other, others, perspective)[1])
     limit = JOINED_MEAN_SQUARE * (1.0 + slow_share_at(noise, np.median(both[2])) * max(own - 1.0, 0.0))
@@ -113,10 +118,12 @@ def related(  # type: ignore[no-untyped-def]  # numba types it
     return JOINED, joint
 
 
-@njit(cache=True, error_model="numpy")
-def _is_scrap(kind, th, own_kind, own, samples, pixels, noise, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _is_scrap(
+    kind: int, th: Array, own_kind: int, own: Array, samples: Array, pixels: int, noise: Array, perspective: bool,
+) -> bool:  # fmt: skip
     """Whether a small piece lies so close along a large surface that it is only a dent in it, or a bit of its rim."""
-    if bend.scrap_gain(kind, th, own_kind, own, samples, pixels, noise, perspective) > 0.0:
+    if bend.scrap_gain(kind, th, own_kind, own, samples, float(pixels), noise, perspective) > 0.0:
         return True
     if kind == PLANE and own_kind != PLANE:
         return False
@@ -132,15 +139,15 @@ def _is_scrap(kind, th, own_kind, own, samples, pixels, noise, perspective):  # 
     return 2 * hit > samples.shape[1] and near > JOINED_SHARE * hit
 
 
-@njit(cache=True, error_model="numpy")
-def _fitted(kind, th, s, perspective, rounds):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _fitted(kind: int, th: Array, s: Array, perspective: bool, rounds: int) -> Array:
     free = np.zeros(9, np.bool_)
     th, _ = fit.fit_robust(kind, th, s[0], s[1], s[2], s[3], perspective, free, rounds)
     return th
 
 
-@njit(cache=True, error_model="numpy")
-def _trimmed(kind, th, s, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _trimmed(kind: int, th: Array, s: Array, perspective: bool) -> tuple[float, float]:
     """Share of the samples within the trim, and their mean squared residual in squared sigmas."""
     e = bend.residual_sizes(kind, th, s, perspective)
     kept, total = 0, 0.0
@@ -151,8 +158,8 @@ def _trimmed(kind, th, s, perspective):  # type: ignore[no-untyped-def]  # numba
     return kept / max(e.shape[0], 1), total / kept if kept else np.inf
 
 
-@njit(cache=True, error_model="numpy")
-def _passes_near(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _passes_near(kind: int, th: Array, samples: Array, perspective: bool) -> bool:
     """Whether the surface, extended, passes near most of a piece: a cheap refusal before the joint fits."""
     n, step = samples.shape[1], max(1, samples.shape[1] // NEAR_SAMPLES)
     count, far = (n + step - 1) // step, 0
@@ -161,11 +168,13 @@ def _passes_near(kind, th, samples, perspective):  # type: ignore[no-untyped-def
         far += not abs(samples[2, k] - z) < NEAR_SIGMAS * samples[3, k]
         if 2 * far >= count:
             return False  # most pairs are: half of the samples tell
-    return count >= LEAST_NEAR
+    return bool(count >= LEAST_NEAR)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def gap_between(depth, sen, noise, labels, own, kind, th, a, b):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def gap_between(
+    depth: Array, sen: Array, noise: Array, labels: Labels, own: Mask, kind: int, th: Array, a: Array, b: Array,
+) -> bool:  # fmt: skip
     """Whether the sensor sees past the surface on most of the shortest lines between two pieces of samples (4, N).
 
     `own` says which `labels` (H, W) belong to the pieces: what lies between them shows a groove, however narrow.
@@ -179,11 +188,11 @@ def gap_between(depth, sen, noise, labels, own, kind, th, a, b):  # type: ignore
     for m in lines:
         n = _first_at(distance[m], b[0], b[1], a[0, m], a[1, m])
         gaps += _is_gap(depth, sen, noise, labels, own, kind, th, a[0, m], a[1, m], b[0, n], b[1, n], slack)
-    return 2 * gaps > lines.shape[0]
+    return bool(2 * gaps > lines.shape[0])
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _lessen(x, y, x0, y0, distance):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _lessen(x: Array, y: Array, x0: float, y0: float, distance: Array) -> None:
     """Lessen the squared distances of rays (x, y) to the nearest of others by that to one more, (x0, y0)."""
     for m in range(x.shape[0]):
         dx, dy = x[m] - x0, y[m] - y0
@@ -191,8 +200,8 @@ def _lessen(x, y, x0, y0, distance):  # type: ignore[no-untyped-def]  # numba ty
         distance[m] = d2 if d2 < distance[m] else distance[m]
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _first_at(distance, x, y, x0, y0):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _first_at(distance: float, x: Array, y: Array, x0: float, y0: float) -> int:
     """The first of the rays (x, y) that is at most at that squared distance from (x0, y0)."""
     for n in range(x.shape[0]):
         dx, dy = x0 - x[n], y0 - y[n]
@@ -201,8 +210,11 @@ def _first_at(distance, x, y, x0, y0):  # type: ignore[no-untyped-def]  # numba 
     return 0
 
 
-@njit(cache=True, error_model="numpy")
-def _is_gap(depth, sen, noise, labels, own, kind, th, ax, ay, bx, by, slack):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _is_gap(
+    depth: Array, sen: Array, noise: Array, labels: Labels, own: Mask, kind: int, th: Array, ax: float, ay: float,
+    bx: float, by: float, slack: float,
+) -> bool:  # fmt: skip
     """Whether much of the line from ray a to ray b lies behind the surface, or `GROOVE_PX` in a row of neither piece."""
     H, W = depth.shape
     perspective = sen[0] > 0

@@ -6,15 +6,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from perception.range.components import find, unite
-from perception.range.fitting.surfaces import LEAN
+from hal.arrays import Array, Indices, Mask
+from hal.jit import compiled
 from perception.range.segmentation.tangents import STEADY_RMS
+from perception.range.segmentation.union_find import find, unite
 
 
-@njit(cache=True)
-def smooth_links(z, sigma, free, slope, inverse_f, perspective, normal, rms, cos_limit):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def smooth_links(
+    z: Array, sigma: Array, free: Mask, slope: float, inverse_f: float, perspective: bool, normal: Array, rms: Array,
+    cos_limit: float,
+) -> tuple[Mask, Mask]:  # fmt: skip
     """Which free blocks belong with their right and lower neighbour: a small depth step and a small turn between."""
     h, w = z.shape
     right, down = np.zeros((h, w), np.bool_), np.zeros((h, w), np.bool_)
@@ -32,8 +35,11 @@ def smooth_links(z, sigma, free, slope, inverse_f, perspective, normal, rms, cos
     return right, down
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def smooth_components(blocks, z, sigma, free, slope, inverse_f, perspective, normal, rms, cos_limit, least, most):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def smooth_components(
+    blocks: Indices, z: Array, sigma: Array, free: Mask, slope: float, inverse_f: float, perspective: bool,
+    normal: Array, rms: Array, cos_limit: float, least: int, most: int,
+) -> tuple[Indices, Indices]:  # fmt: skip
     """Components of at least `least` free blocks over `smooth_links`, the `most` largest, those first.
 
     `blocks` (B,): the free ones, flat, ascending. Returns starts (n + 1,) and flat indices (N,) in raster order: component
@@ -67,8 +73,10 @@ def smooth_components(blocks, z, sigma, free, slope, inverse_f, perspective, nor
     return starts, indices
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _is_smooth(z, normal, rms, r, c, i, j, limit, cos_limit):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _is_smooth(
+    z: Array, normal: Array, rms: Array, r: int, c: int, i: int, j: int, limit: float, cos_limit: float,
+) -> bool:  # fmt: skip
     """Whether two blocks differ by at most `limit` in depth, and their normals, where both are steady, by a small turn."""
     if not abs(z[i, j] - z[r, c]) <= limit:
         return False

@@ -9,12 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from hal.arrays import Array
-from perception.range.fitting.rays import LOOSE
-from perception.range.segmentation.runs import painted, places_of, runs_of
+from hal.arrays import Array, Indices
+from hal.jit import REORDERED, compiled
+from perception.range.segmentation.run_length import painted, places_of, runs_of
 
 Labels = NDArray[np.int32]
 
@@ -79,21 +78,23 @@ def regions_of(depth_m: Array, packed: Array, law: Array, labels: Labels, count:
     return Regions(depth_m=depth_m, packed=packed, law=law, labels=labels, starts=starts, runs=runs, sizes=sizes)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _spread_samples(depth, sen, noise, starts, runs, sizes, most):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _spread_samples(
+    depth: Array, sen: Array, noise: Array, starts: Indices, runs: Labels, sizes: Indices, most: int,
+) -> Array:  # fmt: skip
     """(count, 4, most) samples of each label, as many as it has at most."""
     count = sizes.shape[0] - 1
     out = np.empty((count, 4, most))
     for k in range(1, count + 1):
         mine = runs[starts[k] : starts[k + 1]]
-        spread(depth, sen, noise, mine, sizes[k], 0.5, out[k - 1, :, : min(sizes[k], most)])
+        spread(depth, sen, noise, mine, sizes[k], 0.5, out[k - 1])
     return out
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def spread(depth, sen, noise, runs, pixels, shift, out):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def spread(depth: Array, sen: Array, noise: Array, runs: Labels, pixels: int, shift: float, out: Array) -> None:
     """Fill `out` (4, n) with samples that are evenly spread over the `pixels` of runs (R, 3), `shift` 0 to 1 of a pixel on."""
-    n = out.shape[1]
+    n = min(out.shape[1], pixels)
     step = (pixels - 1) / max(n - 1, 1)
     run, passed = 0, 0
     for j in range(n):
@@ -103,11 +104,11 @@ def spread(depth, sen, noise, runs, pixels, shift, out):  # type: ignore[no-unty
             run += 1
         v, u = runs[run, 0], runs[run, 1] + at - passed
         out[0, j], out[1, j], out[2, j] = (u - sen[3]) / sen[1], (v - sen[4]) / sen[2], depth[v, u]
-    _fill_sigmas(out[2], noise, out[3])
+    _fill_sigmas(out[2, :n], noise, out[3, :n])
 
 
-@njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def _fill_sigmas(z, noise, out):  # type: ignore[no-untyped-def]  # numba types it
+@compiled(fastmath=REORDERED)
+def _fill_sigmas(z: Array, noise: Array, out: Array) -> None:
     """`sigma_at` of many depths, without a branch."""
     a, b, c, d, e, f = noise[0], noise[1], noise[2], noise[3], noise[4], noise[5]
     for i in range(z.shape[0]):

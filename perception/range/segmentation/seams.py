@@ -8,8 +8,9 @@ So lines across a seam go on well beyond it, and what lies in front, or gives no
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from hal.arrays import Array, Labels, Mask
+from hal.jit import compiled
 from perception.range.fitting.surfaces import PLANE, depth_on
 from perception.range.segmentation.grid import sigma_at
 
@@ -21,8 +22,10 @@ FLANK_PX = 3  # on the surface, on either side
 SHARE = 0.33  # of the places on a seam
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def is_seam_grooved(depth, sen, noise, labels, own, th, x, y):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def is_seam_grooved(
+    depth: Array, sen: Array, noise: Array, labels: Labels, own: Mask, th: Array, x: Array, y: Array,
+) -> bool:  # fmt: skip
     """Whether at more than `SHARE` of the rays (x, y) on a seam a groove crosses the row or the column of the image there.
 
     `own` says which of `labels` (H, W) belong to the two that meet at the seam: a groove lies between their pixels, and
@@ -32,18 +35,23 @@ def is_seam_grooved(depth, sen, noise, labels, own, th, x, y):  # type: ignore[n
     for k in range(x.shape[0]):
         u, v = x[k] * sen[1] + sen[3], y[k] * sen[2] + sen[4]
         grooves += is_grooved_at(depth, sen, noise, labels, own, th, u, v)
-    return grooves > SHARE * x.shape[0]
+    return bool(grooves > SHARE * x.shape[0])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def is_grooved_at(depth, sen, noise, labels, own, th, u, v):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def is_grooved_at(
+    depth: Array, sen: Array, noise: Array, labels: Labels, own: Mask, th: Array, u: float, v: float,
+) -> bool:  # fmt: skip
     """Whether a groove crosses the row or the column of the image at pixel (u, v)."""
     image = (depth, sen, noise, labels, own, th, u, v)
     return crosses_groove(*image, 0.0, 1.0, 0) or crosses_groove(*image, 1.0, 0.0, 0)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def crosses_groove(depth, sen, noise, labels, own, th, u0, v0, du, dv, count):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def crosses_groove(
+    depth: Array, sen: Array, noise: Array, labels: Labels, own: Mask, th: Array, u0: float, v0: float, du: float,
+    dv: float, count: int,
+) -> bool:  # fmt: skip
     """Whether the line from pixel (u0, v0), `count` times (du, dv) long, or its ends prolonged, pass a groove in the plane `th`."""
     H, W = depth.shape
     perspective = sen[0] > 0

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from perception.range.fitting.surfaces import LEAN
+from hal.arrays import Array, Labels, Mask
+from hal.jit import compiled
 
 LEVELS = 64  # of flatness, told apart by a counting sort
 LONE_BEND = 0.02  # what a neighbour without a normal counts as
 
 
-@njit(cache=True, error_model="numpy")
-def seed_order(normal, rms, free, reach):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def seed_order(normal: Array, rms: Array, free: Mask, reach: int) -> Labels:
     """Free blocks with a tangent plane, flattest neighbourhood first (counting sort), as flat indices."""
     h, w = rms.shape
     normals, known = _framed_normals(normal, rms, free, reach)
@@ -43,8 +43,8 @@ def seed_order(normal, rms, free, reach):  # type: ignore[no-untyped-def]  # num
     return out
 
 
-@njit(cache=True, error_model="numpy")
-def _framed_normals(normal, rms, free, reach):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _framed_normals(normal: Array, rms: Array, free: Mask, reach: int) -> tuple[Array, Mask]:
     """(3, h + 2 reach, w + 2 reach) components, NaN where a block has no normal, as all around; and which rows have any."""
     h, w = rms.shape
     out, known = np.full((3, h + 2 * reach, w + 2 * reach), np.nan), np.zeros(h, np.bool_)
@@ -57,21 +57,21 @@ def _framed_normals(normal, rms, free, reach):  # type: ignore[no-untyped-def]  
     return out, known
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _add_product(a, b, out):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _add_product(a: Array, b: Array, out: Array) -> None:
     for c in range(out.shape[0]):
         out[c] += a[c] * b[c]
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _add_bend(cosine, bend):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _add_bend(cosine: Array, bend: Array) -> None:
     """How far a normal turns to a neighbour: 1 less the cosine; a neighbour that is missing (NaN) says little."""
     for c in range(bend.shape[0]):
         bend[c] += 1.0 - cosine[c] if cosine[c] == cosine[c] else LONE_BEND
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _fill_levels(bend, rms, known, levels):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _fill_levels(bend: Array, rms: Array, known: Array, levels: Labels) -> None:
     """Level of each block, from 0 for a flat and quiet neighbourhood; -1 for a block without a normal."""
     for c in range(bend.shape[0]):
         level = min(LEVELS - 1.0, 12.0 * np.sqrt(max(25.0 * bend[c], 0.0)) + 4.0 * max(rms[c] - 1.0, 0.0))

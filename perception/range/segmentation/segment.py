@@ -19,18 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.arrays import Array
-from perception.range.components import for_each_tile
 from perception.range.fitting.surfaces import PLANE
 from perception.range.noise import WORST_SHARE, NoiseModel
-from perception.range.segmentation.beside import contested_pixels, pixels_around, renamed_pixels
-from perception.range.segmentation.claim import claim_again, claim_pixels
-from perception.range.segmentation.compete import Candidates, explain
+from perception.range.segmentation.boundary_pixels import contested_pixels, pixels_around, renamed_pixels
 from perception.range.segmentation.grid import Grid, block_size, build_grid, seen_from
 from perception.range.segmentation.grow_planes import grow_planes
-from perception.range.segmentation.left_over import unexplained
+from perception.range.segmentation.icm import REACH_PX, icm_sweep
+from perception.range.segmentation.model_selection import Candidates, select_models
+from perception.range.segmentation.pixel_assignment import assign_pixels, reassign_pixels
 from perception.range.segmentation.seeds import seed_order
-from perception.range.segmentation.settle import REACH_PX, settle
+from perception.range.segmentation.unlabelled import unlabelled_patches
 from perception.range.sensor import RangeSensorModel
+from perception.range.tiles import for_each_tile
 
 Labels = NDArray[np.int32]
 
@@ -75,21 +75,21 @@ class Task:
         )
 
 
-def segment(task: Task, noise: NoiseModel) -> tuple[Labels, Candidates, NoiseModel, Grid]:
+def segment(task: Task, noise: NoiseModel) -> tuple[Labels, Candidates, NoiseModel]:
     """Segment a depth image.
 
     Returns:
         labels (H, W), 0 = none; the surfaces behind them; and the noise model, widened where the planes of the image
-        themselves scatter more than the given one says; and the grid of blocks.
+        themselves scatter more than the given one says.
     """
     found, grid, blocks, noise = _settled_planes(task, noise)
     size = grid.size_px
     least = max(LEAST_CURVED_BLOCKS if size > 1 else 6, round(task.least_pixels / size**2))
-    explain(grid, blocks, found=found, least=least, slope=STEEP_SLOPE, focal_px=float(task.packed[1]))
+    select_models(grid, blocks, found=found, least=least, slope=STEEP_SLOPE, focal_px=float(task.packed[1]))
     labels = _claimed(task, noise, blocks, found, size=size)
     if size > 1:
         labels = _finer(task, noise, labels, found, size=(size + 1) // 2)
-    return labels, found, noise, grid
+    return labels, found, noise
 
 
 def _settled_planes(task: Task, noise: NoiseModel) -> tuple[Candidates, Grid, Labels, NoiseModel]:
@@ -115,7 +115,7 @@ def _finer(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, 
     Only patches that can hold the smallest surface are looked at, and only the part of the image that holds them.
     """
     least = max(8, round(task.least_pixels / size**2))
-    patches = unexplained(task.depth_m, labels, least if size == 1 else least * size**2 // 2, align_px=size)
+    patches = unlabelled_patches(task.depth_m, labels, least if size == 1 else least * size**2 // 2, align_px=size)
     if patches is None:
         return labels
     (top, left), left_over = patches
@@ -124,7 +124,7 @@ def _finer(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, 
     blocks = np.zeros(grid.z.shape, np.int32)
     before = len(found.kinds)
     _recover_planes(part, grid, blocks, found)
-    explain(grid, blocks, found=found, least=least, slope=STEEP_SLOPE, focal_px=float(task.packed[1]))
+    select_models(grid, blocks, found=found, least=least, slope=STEEP_SLOPE, focal_px=float(task.packed[1]))
     if len(found.kinds) == before:
         return labels
     inside = labels[top : top + left_over.shape[0], left : left + left_over.shape[1]]
@@ -137,7 +137,7 @@ def _claimed(task: Task, noise: NoiseModel, blocks: Labels, found: Candidates, *
     kinds, table = found.arrays()
     packed, law = task.packed, noise.packed()
     for_each_tile(
-        lambda top, bottom: claim_pixels(task.depth_m, packed, law, blocks, size, kinds, table, labels, top, bottom),
+        lambda top, bottom: assign_pixels(task.depth_m, packed, law, blocks, size, kinds, table, labels, top, bottom),
         blocks.shape[0],
         task.tiles,
         pool=task.pool,
@@ -148,15 +148,15 @@ def _claimed(task: Task, noise: NoiseModel, blocks: Labels, found: Candidates, *
 def _reclaimed(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, newest: int) -> Labels:
     """`labels`, changed in place: the pixels beside surfaces of label `newest` and later are judged again."""
     rows, columns = _contested(task, labels, newest)
-    judge = partial(claim_again, task.depth_m, task.packed, noise.packed(), labels, *found.arrays())
+    judge = partial(reassign_pixels, task.depth_m, task.packed, noise.packed(), labels, *found.arrays())
     _judged(task, judge, labels, rows, columns)
     return labels
 
 
-def settled(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, sweeps: int) -> Labels:
+def icm_labels(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, sweeps: int) -> Labels:
     """`labels`, changed in place by `sweeps` in which pixels between two equally good surfaces follow their neighbours."""
     slow = noise.slow_share(float(task.depths_m[2]))
-    judge = partial(settle, task.depth_m, task.packed, noise.packed(), slow, labels, *found.arrays())
+    judge = partial(icm_sweep, task.depth_m, task.packed, noise.packed(), slow, labels, *found.arrays())
     rows, columns = _contested(task, labels, 1)
     for _ in range(sweeps):
         moved = _judged(task, judge, labels, rows, columns)

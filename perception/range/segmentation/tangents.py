@@ -8,9 +8,9 @@ by the window, so that each row of blocks is fetched once for all shifts.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from perception.range.fitting.surfaces import LEAN
+from hal.arrays import Array, Labels
+from hal.jit import as_numpy_scalar, compiled
 
 JUMP_SIGMAS = 4.0
 LEAST_SHARE = 0.4  # of the window's blocks must lie on the surface
@@ -19,6 +19,7 @@ WINDOW_BEND = 0.0745 * TURN_RAD  # rms of a parabola that turns so far over twic
 LEAST_FACING = 0.15  # beyond, normals are not known well enough
 STEADY_RMS = 1.8  # what a tangent plane leaves over in sigmas, beyond which the block holds a crease or noise
 GAP = 8  # empty blocks that end a run
+FIRST = as_numpy_scalar(0)
 RUN = 128  # blocks at most
 X0, Y0, Z0, G0, BASE, SLOPE = (row * RUN for row in range(6))  # where the rows of the run's own blocks begin
 N, S, SX, SY, SG, SXX, SXY, SYY, SXG, SYG, SGG = (row * RUN for row in range(6, 17))  # sums over its neighbours
@@ -28,10 +29,11 @@ WIDE = RUN + 16  # a row of neighbours: room for a radius of eight blocks
 X, Y, Z, G, K = (row * WIDE for row in range(5))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def tangent_planes(  # type: ignore[no-untyped-def]  # numba types it
-    x, y, z, count, sigma, perspective, radius, slope_per_block, normal, rms, top, bottom
-):
+@compiled
+def tangent_planes(
+    x: Array, y: Array, z: Array, count: Labels, sigma: Array, perspective: bool, radius: int, slope_per_block: float,
+    normal: Array, rms: Array, top: int, bottom: int,
+) -> None:  # fmt: skip
     """Plane of least squares through the blocks around each block, within a jump of it; writes rows [top, bottom).
 
     Args:
@@ -44,7 +46,7 @@ def tangent_planes(  # type: ignore[no-untyped-def]  # numba types it
     least = max(5.0, np.floor((2 * radius + 1) ** 2 * LEAST_SHARE))
     work, wide = np.zeros(SCRATCH), np.empty(5 * WIDE)
     for r in range(top, bottom):
-        start, end = _next_run(z[r], 0)
+        start, end = _next_run(z[r], FIRST)
         while start < w:
             n = end - start
             work[N:NX] = 0.0
@@ -60,8 +62,8 @@ def tangent_planes(  # type: ignore[no-untyped-def]  # numba types it
             start, end = _next_run(z[r], end)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _next_run(z, start):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _next_run(z: Array, start: int) -> tuple[int, int]:
     """[start, end) of the next run of known depths that no gap of `GAP` empty blocks parts; (w, w) when there is none."""
     w = z.shape[0]
     while start < w and not np.isfinite(z[start]):
@@ -74,8 +76,8 @@ def _next_run(z, start):  # type: ignore[no-untyped-def]  # numba types it
     return start, min(last + 1, w)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _load_own(x, y, z, sigma, perspective, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _load_own(x: Array, y: Array, z: Array, sigma: Array, perspective: bool, work: Array) -> None:
     n = x.shape[0]
     for c in range(n):
         work[X0 + c], work[Y0 + c], work[Z0 + c] = x[c], y[c], z[c]
@@ -84,8 +86,8 @@ def _load_own(x, y, z, sigma, perspective, work):  # type: ignore[no-untyped-def
         work[SLOPE + c] = z[c] if perspective else 1.0
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _load(x, y, z, count, perspective, at, wide):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _load(x: Array, y: Array, z: Array, count: Labels, perspective: bool, at: int, wide: Array) -> None:
     """One row of neighbours into `wide`, the first at `at`."""
     n = x.shape[0]
     to_x, to_y, to_z, to_g, to_k = wide[X + at :], wide[Y + at :], wide[Z + at :], wide[G + at :], wide[K + at :]
@@ -105,8 +107,8 @@ def _load(x, y, z, count, perspective, at, wide):  # type: ignore[no-untyped-def
             to_g[c] = z[c]
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _add(reach, n, at, wide, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _add(reach: float, n: int, at: int, wide: Array, work: Array) -> None:
     """Sums of 1, k, and k times x, y, g, xx, xy, yy, xg, yg, gg over one neighbour of every block, if it is near.
 
     The neighbour of the first block is the one at `at` of the rows of `wide`.
@@ -132,8 +134,8 @@ def _add(reach, n, at, wide, work):  # type: ignore[no-untyped-def]  # numba typ
         work[SGG + c] += kg * dg
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _solve(n, least, perspective, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _solve(n: int, least: float, perspective: bool, work: Array) -> None:
     """Rows of the plane's normal towards the sensor and of what it leaves over in sigmas; NaN where it is not determined.
 
     The window's sums, centred, give the slopes (p, q) of g.
@@ -162,76 +164,9 @@ def _solve(n, least, perspective, work):  # type: ignore[no-untyped-def]  # numb
         work[RMS + c] = np.sqrt(left) * scale * JUMP_SIGMAS / work[BASE + c]
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _store(normal, rms, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _store(normal: Array, rms: Array, work: Array) -> None:
     for c in range(rms.shape[0]):
         if np.isfinite(work[NX + c]):
             normal[c, 0], normal[c, 1], normal[c, 2] = work[NX + c], work[NY + c], work[NZ + c]
             rms[c] = work[RMS + c]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def bent_planes(x, y, z, count, sigma, perspective, radius, slope_per_block, normal, rms):  # type: ignore[no-untyped-def]  # numba types it
-    """Tangent planes as a face's may be that bends or is steeper than a jump; changes `normal` and `rms` in place.
-
-    What planes leave over is told in units of what a face may bend within their window, where that is more than steady
-    noise. Where `tangent_planes` found none, steeper neighbours count too: what lies on both sides of a jump is no
-    plane, so only one that leaves no more over than noise and bend is kept. Arguments as there.
-    """
-    h, w = z.shape
-    half = (radius + 0.5) * abs(x[0, 1] - x[0, 0])
-    work = np.zeros(SCRATCH)
-    for r in range(h):
-        for c in range(w):
-            if rms[r, c] < STEADY_RMS or not np.isfinite(z[r, c]):
-                continue
-            length = half * z[r, c] if perspective else half
-            if np.isfinite(rms[r, c]):
-                rms[r, c] = _beyond_bend(rms[r, c], normal[r, c], x[r, c], y[r, c], sigma[r, c], perspective, length)
-                continue
-            _fit_steep(x, y, z, count, sigma, perspective, radius, slope_per_block, r, c, work)
-            work[RMS] = _beyond_bend(work[RMS], work[NX:RMS:RUN], x[r, c], y[r, c], sigma[r, c], perspective, length)
-            if work[RMS] < STEADY_RMS:
-                _store(normal[r, c : c + 1], rms[r, c : c + 1], work)
-
-
-@njit(cache=True, error_model="numpy", **LEAN)
-def _beyond_bend(rms, n, x, y, sigma, perspective, length):  # type: ignore[no-untyped-def]  # numba types it
-    """`rms` in units of the bend that a face with normal `n` may have within a window that is twice `length` metres wide.
-
-    A slanted face bends more for the same curvature: the window is longer on it, and depth runs along the ray.
-    """
-    facing = n[0] * x + n[1] * y + n[2] if perspective else n[2]
-    bend = WINDOW_BEND * length / max(facing * facing, LEAST_FACING**2)
-    return rms / max(1.0, bend / (STEADY_RMS * sigma))
-
-
-@njit(cache=True, error_model="numpy")
-def _fit_steep(x, y, z, count, sigma, perspective, radius, slope_per_block, r, c, work):  # type: ignore[no-untyped-def]  # numba types it
-    """The plane of one block, into the first places of `work`."""
-    h, w = z.shape
-    work[N:NX] = 0.0
-    _load_own(x[r, c : c + 1], y[r, c : c + 1], z[r, c : c + 1], sigma[r, c : c + 1], perspective, work)
-    for i in range(max(0, r - radius), min(h, r + radius + 1)):
-        for j in range(max(0, c - radius), min(w, c + radius + 1)):
-            reach = work[BASE] + work[SLOPE] * slope_per_block * max(abs(i - r), abs(j - c))
-            if abs(z[i, j] - z[r, c]) <= reach:
-                g = 1.0 / z[i, j] if perspective else z[i, j]
-                _add_one(count[i, j], x[i, j] - x[r, c], y[i, j] - y[r, c], g - work[G0], work)
-    _solve(1, max(5.0, np.floor((2 * radius + 1) ** 2 * LEAST_SHARE)), perspective, work)
-
-
-@njit(cache=True, error_model="numpy", **LEAN)
-def _add_one(k, dx, dy, dg, work):  # type: ignore[no-untyped-def]  # numba types it
-    """One neighbour into the sums of the first block."""
-    work[N] += 1.0
-    work[S] += k
-    work[SX] += k * dx
-    work[SY] += k * dy
-    work[SG] += k * dg
-    work[SXX] += k * dx * dx
-    work[SXY] += k * dx * dy
-    work[SYY] += k * dy * dy
-    work[SXG] += k * dx * dg
-    work[SYG] += k * dy * dg
-    work[SGG] += k * dg * dg

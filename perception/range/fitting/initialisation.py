@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from perception.range.fitting.surfaces import LEAN, SIZE, tangent_frame
+from hal.arrays import Array
+from hal.jit import compiled
+from perception.range.fitting.surfaces import SIZE, tangent_frame
 
 MOST_SWEEPS = 12  # of Jacobi rotations; a 3x3 matrix settles in four or five
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def solve_positive(A, b, p):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def solve_positive(A: Array, b: Array, p: int) -> bool:
     """Solve A x = b by Cholesky, overwriting both; False when A is not positive definite."""
     for i in range(p):
         top = A[i, i]
@@ -38,8 +39,8 @@ def solve_positive(A, b, p):  # type: ignore[no-untyped-def]  # numba types it
     return True
 
 
-@njit(cache=True, error_model="numpy")
-def principal_axes(S):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def principal_axes(S: Array) -> tuple[Array, Array]:
     """Eigenvalues (3,), smallest first, and eigenvectors (3, 3) in columns, of a symmetric matrix.
 
     Cyclic Jacobi rotations (Golub and Van Loan, 8.5): a tenth of what a call of LAPACK costs at this size.
@@ -75,8 +76,8 @@ def principal_axes(S):  # type: ignore[no-untyped-def]  # numba types it
     return values, V
 
 
-@njit(cache=True, error_model="numpy")
-def centroid(P):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def centroid(P: Array) -> Array:
     """Mean of points (N, 3)."""
     c = np.zeros(3)
     n = P.shape[0]
@@ -88,8 +89,8 @@ def centroid(P):  # type: ignore[no-untyped-def]  # numba types it
     return c
 
 
-@njit(cache=True, error_model="numpy")
-def scatter(P, c):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def scatter(P: Array, c: Array) -> Array:
     """(3, 3) sum of (P_i - c)(P_i - c)'."""
     S = np.zeros((3, 3))
     for i in range(P.shape[0]):
@@ -104,8 +105,8 @@ def scatter(P, c):  # type: ignore[no-untyped-def]  # numba types it
     return S
 
 
-@njit(cache=True, error_model="numpy")
-def start_plane(P):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def start_plane(P: Array) -> Array:
     """Plane through points (N, 3) by principal axes."""
     th = np.zeros(SIZE)
     c = centroid(P)
@@ -117,8 +118,8 @@ def start_plane(P):  # type: ignore[no-untyped-def]  # numba types it
     return th
 
 
-@njit(cache=True, error_model="numpy")
-def _least_squares(rows, values):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _least_squares(rows: Array, values: Array) -> tuple[Array, bool]:
     """Solve rows (N, m) x = values (N,) by normal equations; (x, solved)."""
     n, m = rows.shape
     A, b = np.zeros((m, m)), np.zeros(m)
@@ -135,8 +136,8 @@ def _least_squares(rows, values):  # type: ignore[no-untyped-def]  # numba types
     return b, solve_positive(A, b, m)
 
 
-@njit(cache=True, error_model="numpy")
-def _side(P, N, th, axis):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _side(P: Array, N: Array, th: Array, axis: Array) -> float:
     """+1 when the normals point away from the centre or axis of `th`, -1 when towards it."""
     outward = 0.0
     for i in range(P.shape[0]):
@@ -146,8 +147,8 @@ def _side(P, N, th, axis):  # type: ignore[no-untyped-def]  # numba types it
     return 1.0 if outward >= 0 else -1.0
 
 
-@njit(cache=True, error_model="numpy")
-def start_sphere(P, N):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def start_sphere(P: Array, N: Array) -> tuple[Array, bool]:
     """Algebraic sphere |X|^2 = 2 c . X + k about the centroid; side from the normals."""
     th = np.zeros(SIZE)
     c = centroid(P)
@@ -170,15 +171,15 @@ def start_sphere(P, N):  # type: ignore[no-untyped-def]  # numba types it
     return th, True
 
 
-@njit(cache=True, error_model="numpy")
-def normal_axis(N, centred):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def normal_axis(N: Array, centred: bool) -> Array:
     """Direction that the normals avoid (cylinder), or along which they are constant (cone, centred)."""
     _, V = principal_axes(scatter(N, centroid(N) if centred else np.zeros(3)))
     return V[:, 0].copy()
 
 
-@njit(cache=True, error_model="numpy")
-def start_cylinder(P, N, axis):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def start_cylinder(P: Array, N: Array, axis: Array) -> tuple[Array, bool]:
     """Circle (algebraic) of the points seen along `axis`."""
     th = np.zeros(SIZE)
     e = tangent_frame(axis[0], axis[1], axis[2])
@@ -201,8 +202,8 @@ def start_cylinder(P, N, axis):  # type: ignore[no-untyped-def]  # numba types i
     return th, True
 
 
-@njit(cache=True, error_model="numpy")
-def start_cone(P, N, axis):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def start_cone(P: Array, N: Array, axis: Array) -> tuple[Array, bool]:
     """Apex from n . X = n . apex; the angle from n . axis = -sin(angle)."""
     th = np.zeros(SIZE)
     c = centroid(P)
@@ -225,8 +226,8 @@ def start_cone(P, N, axis):  # type: ignore[no-untyped-def]  # numba types it
     return th, True
 
 
-@njit(cache=True, error_model="numpy")
-def quadric_of_sphere(th):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def quadric_of_sphere(th: Array) -> Array:
     """The sphere as a quadric centred on it: the start of an ellipsoid fit."""
     out = np.zeros(SIZE)
     out[:3] = th[:3]
@@ -235,8 +236,8 @@ def quadric_of_sphere(th):  # type: ignore[no-untyped-def]  # numba types it
     return out
 
 
-@njit(cache=True, error_model="numpy")
-def is_ellipsoid(th):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def is_ellipsoid(th: Array) -> bool:
     """Whether the quadric is a real ellipsoid of sane proportions (longest radius at most 8 times the shortest)."""
     A = np.array(
         [[th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]]
@@ -249,4 +250,4 @@ def is_ellipsoid(th):  # type: ignore[no-untyped-def]  # numba types it
     for k in range(3):
         t[k] = V[0, k] * b[0] + V[1, k] * b[1] + V[2, k] * b[2]
     rest = t[0] * t[0] / w[0] + t[1] * t[1] / w[1] + t[2] * t[2] / w[2] - th[13]
-    return rest > 0 and w[2] < 64.0 * w[0]
+    return bool(rest > 0 and w[2] < 64.0 * w[0])

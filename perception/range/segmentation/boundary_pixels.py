@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from numpy.typing import NDArray
 
-from perception.range.fitting.surfaces import LEAN
+from hal.arrays import Labels, Mask
+from hal.jit import compiled
 
 WORD = 8  # flags that are looked at together
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def contested_pixels(labels, newest, top, bottom):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def contested_pixels(labels: Labels, newest: int, top: int, bottom: int) -> tuple[Labels, Labels]:
     """Pixels whose 3x3 neighbourhood holds another surface than theirs, and one of label `newest` or later.
 
     Looks at the rows [top, bottom) of `labels` (H, W) int32; returns rows and columns (N,) int32, in raster order.
@@ -25,21 +26,21 @@ def contested_pixels(labels, newest, top, bottom):  # type: ignore[no-untyped-de
         if n + W >= rows.shape[0]:
             rows, columns = np.concatenate((rows, rows)), np.concatenate((columns, columns))
         column_range(labels, v, least, most)
-        _flag_contested(labels[v], least, most, np.int32(newest), words.view(np.bool_))
+        _flag_contested(labels[v], least, most, newest, words.view(np.bool_))
         count = flagged(words, columns[n:])
         rows[n : n + count] = v
         n += count
     return rows[:n].copy(), columns[:n].copy()
 
 
-@njit(cache=True, error_model="numpy")
-def new_columns(width):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def new_columns(width: int) -> tuple[NDArray[np.uint32], Labels]:
     """What `column_range` fills, (width + 2,) each: no surface lies before the first column and after the last."""
     return np.full(width + 2, np.uint32(0xFFFFFFFF)), np.zeros(width + 2, np.int32)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def column_range(labels, v, least, most):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def column_range(labels: Labels, v: int, least: NDArray[np.uint32], most: Labels) -> None:
     """Of each column of the three rows around row v: the least label, less one so that none counts as most; the largest."""
     one, last = np.int32(1), labels.shape[0] - 1
     above, own, below = labels[max(v - 1, 0)], labels[v], labels[min(v + 1, last)]
@@ -49,8 +50,8 @@ def column_range(labels, v, least, most):  # type: ignore[no-untyped-def]  # num
         low[u] = min(np.uint32(above[u] - one), np.uint32(own[u] - one), np.uint32(below[u] - one))
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _flag_contested(own, least, most, newest, flags):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _flag_contested(own: Labels, least: NDArray[np.uint32], most: Labels, newest: int, flags: Mask) -> None:
     """Where the three columns around hold another surface than the pixel's own, and one of label `newest` or later."""
     one = np.int32(1)
     for u in range(own.shape[0]):
@@ -59,8 +60,8 @@ def _flag_contested(own, least, most, newest, flags):  # type: ignore[no-untyped
         flags[u] = ((high != k) | ((k > 0) & (low != np.uint32(k - one)))) & (high >= newest)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def flagged(words, places):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def flagged(words: NDArray[np.uint64], places: Labels) -> int:
     """Where the flags in `words` are set, ascending, into `places`, which has room for one more; returns how many.
 
     Few are, so eight are passed at once where none of them is.
@@ -76,15 +77,15 @@ def flagged(words, places):  # type: ignore[no-untyped-def]  # numba types it
     return n
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def flag_free(labels, flags):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def flag_free(labels: Labels, flags: Mask) -> None:
     """Where a row of labels has none."""
     for u in range(labels.shape[0]):
         flags[u] = labels[u] == 0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def pixels_around(rows, columns, reach, shape):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def pixels_around(rows: Labels, columns: Labels, reach: int, shape: tuple[int, int]) -> tuple[Labels, Labels]:
     """Every pixel of an image of that shape that is at most `reach` rows and columns from one of those given, once."""
     H, W = shape
     seen = np.zeros((H, W), np.bool_)
@@ -104,8 +105,8 @@ def pixels_around(rows, columns, reach, shape):  # type: ignore[no-untyped-def] 
     return out_rows[:n].copy(), out_columns[:n].copy()
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def renamed_pixels(labels, rows, columns, names):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def renamed_pixels(labels: Labels, rows: Labels, columns: Labels, names: Labels) -> tuple[Labels, Labels]:
     """Give the pixels their new names, in place; returns rows and columns of those that had another one."""
     moved_rows, moved_columns = np.empty_like(rows), np.empty_like(columns)
     n = 0

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from numpy.typing import NDArray
 
-from perception.range.fitting.rays import LOOSE
-from perception.range.fitting.surfaces import LEAN, PLANE, depth_on, normal_on
-from perception.range.segmentation.beside import WORD, column_range, flag_free, flagged, new_columns
+from hal.arrays import Array, Indices, Labels
+from hal.jit import REORDERED, compiled
+from perception.range.fitting.surfaces import PLANE, depth_on, normal_on
+from perception.range.segmentation.boundary_pixels import WORD, column_range, flag_free, flagged, new_columns
 from perception.range.segmentation.grid import sigma_at
 
-CLAIM_SIGMAS = 3.5
+ASSIGNMENT_SIGMAS = 3.5
 PLAIN_SIGMAS = 1.0  # a pixel that its own block's surface explains so well is not offered to the others
 MAX_CANDIDATES = 8
 SEVERAL = np.int32(-1)  # surfaces compete
 EASED = 0.4  # the least part of a misfit that a grazing ray leaves
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def claim_pixels(depth, sen, noise, blocks, size, kinds, ths, out, top, bottom):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def assign_pixels(
+    depth: Array, sen: Array, noise: Array, blocks: Labels, size: int, kinds: Indices, ths: Array, out: Labels,
+    top: int, bottom: int,
+) -> None:  # fmt: skip
     """Label each pixel of `depth` (H, W) with the best surface among those of the 3x3 blocks around it.
 
-    Writes the rows of blocks [top, bottom) of `out` (H, W) int32: label, or 0 beyond `CLAIM_SIGMAS`. Labels index
+    Writes the rows of blocks [top, bottom) of `out` (H, W) int32: label, or 0 beyond `ASSIGNMENT_SIGMAS`. Labels index
     `kinds` and `ths` from 1.
     """
     w = blocks.shape[1]
@@ -31,15 +35,15 @@ def claim_pixels(depth, sen, noise, blocks, size, kinds, ths, out, top, bottom):
     for r in range(top, bottom):
         column_range(blocks, r, least, most)
         _only_labels(least, most, only)
-        _claim_first(depth, sen, noise, blocks[r], only, size, r, kinds, ths, out)
+        _assign_first(depth, sen, noise, blocks[r], only, size, r, kinds, ths, out)
         for c in range(w):
             if only[c] == SEVERAL:
                 n = _labels_around(blocks, r, c, near)
-                _claim_rest(depth, sen, noise, size, r, c, near, n, kinds, ths, perspective, out)
+                _assign_rest(depth, sen, noise, size, r, c, near, n, kinds, ths, perspective, out)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _only_labels(least, most, only):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _only_labels(least: NDArray[np.uint32], most: Labels, only: Labels) -> None:
     """The one label that the 3x3 blocks around each block hold, 0 where they hold none, from `column_range`."""
     one = np.int32(1)
     for c in range(only.shape[0]):
@@ -47,8 +51,11 @@ def _only_labels(least, most, only):  # type: ignore[no-untyped-def]  # numba ty
         only[c] = high if (high == 0) | (low == np.uint32(high - one)) else SEVERAL
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _claim_first(depth, sen, noise, own, only, size, r, kinds, ths, out):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _assign_first(
+    depth: Array, sen: Array, noise: Array, own: Labels, only: Labels, size: int, r: int, kinds: Indices, ths: Array,
+    out: Labels,
+) -> None:  # fmt: skip
     """Offer the pixels of the r-th row of blocks to the only surface there is, or to their `own` block's.
 
     Among several surfaces a pixel that its own one does not explain plainly is left `SEVERAL`.
@@ -62,12 +69,12 @@ def _claim_first(depth, sen, noise, own, only, size, r, kinds, ths, out):  # typ
         while c < w and only[c] == label and (label != SEVERAL or own[c] == mine):
             c += 1
         first, end = start * size, min(c * size, W)
-        k, limit, otherwise = (mine, PLAIN_SIGMAS, SEVERAL) if label == SEVERAL else (label, CLAIM_SIGMAS, 0)
+        k, limit, otherwise = (mine, PLAIN_SIGMAS, SEVERAL) if label == SEVERAL else (label, ASSIGNMENT_SIGMAS, 0)
         for v in range(r * size, min(r * size + size, H)):
             if k == 0:
                 out[v, first:end] = otherwise
             elif kinds[k] == PLANE:
-                _claim_run(
+                _assign_run(
                     depth[v, first:end],
                     ths[k],
                     k,
@@ -88,8 +95,11 @@ def _claim_first(depth, sen, noise, own, only, size, r, kinds, ths, out):  # typ
                     out[v, u] = k if e < limit else otherwise
 
 
-@njit(cache=True, error_model="numpy", fastmath=LOOSE, **LEAN)
-def _claim_run(depth, th, label, first, v, sen, noise, perspective, limit, otherwise, out):  # type: ignore[no-untyped-def]  # numba types it
+@compiled(fastmath=REORDERED)
+def _assign_run(
+    depth: Array, th: Array, label: int, first: int, v: int, sen: Array, noise: Array, perspective: bool, limit: float,
+    otherwise: int | np.int32, out: Labels,
+) -> None:  # fmt: skip
     """Pixels first, first + 1, ... of row v that a plane explains within `limit` sigmas, without branch or root."""
     p = 1.0 if perspective else 0.0
     y = (v - sen[4]) / sen[2]
@@ -111,8 +121,11 @@ def _claim_run(depth, th, label, first, v, sen, noise, perspective, limit, other
         out[i] = mine if e * e < square * variance * (facing * facing) else other
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _claim_rest(depth, sen, noise, size, r, c, near, n, kinds, ths, perspective, out):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _assign_rest(
+    depth: Array, sen: Array, noise: Array, size: int, r: int, c: int, near: Labels, n: int, kinds: Indices, ths: Array,
+    perspective: bool, out: Labels,
+) -> None:  # fmt: skip
     """The pixels of one block that are left to compete for, among the surfaces near[:n]."""
     H, W = depth.shape
     for v in range(r * size, min(r * size + size, H)):
@@ -122,10 +135,12 @@ def _claim_rest(depth, sen, noise, size, r, c, near, n, kinds, ths, perspective,
                 out[v, u] = _best_of(depth[v, u], x, y, noise, near, n, kinds, ths, perspective)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _best_of(z, x, y, noise, near, n, kinds, ths, perspective):  # type: ignore[no-untyped-def]  # numba types it
-    """The label among near[:n] whose surface explains the depth best, 0 when none does within `CLAIM_SIGMAS`."""
-    best, label = CLAIM_SIGMAS, 0
+@compiled
+def _best_of(
+    z: float, x: float, y: float, noise: Array, near: Labels, n: int, kinds: Indices, ths: Array, perspective: bool,
+) -> int:  # fmt: skip
+    """The label among near[:n] whose surface explains the depth best, 0 when none does within `ASSIGNMENT_SIGMAS`."""
+    best, label = ASSIGNMENT_SIGMAS, 0
     if not np.isfinite(z):
         return label
     sigma = sigma_at(noise, z)
@@ -136,23 +151,26 @@ def _best_of(z, x, y, noise, near, n, kinds, ths, perspective):  # type: ignore[
     return label
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def claim_again(depth, sen, noise, labels, kinds, ths, rows, columns, out, first, last):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def reassign_pixels(
+    depth: Array, sen: Array, noise: Array, labels: Labels, kinds: Indices, ths: Array, rows: Labels, columns: Labels,
+    out: Labels, first: int, last: int,
+) -> None:  # fmt: skip
     """Judge again the pixels at `rows`, `columns` (N,) among the surfaces of their 3x3 pixels; writes out[first:last].
 
-    Where earlier surfaces meet they have competed for every pixel already (`claim_pixels`): this is for new ones.
+    Where earlier surfaces meet they have competed for every pixel already (`assign_pixels`): this is for new ones.
     """
     perspective = sen[0] > 0
     near = np.empty(9, np.int32)
     for k in range(first, last):
-        v, u = rows[k], columns[k]
+        v, u = 0 + rows[k], 0 + columns[k]
         x, y = (u - sen[3]) / sen[1], (v - sen[4]) / sen[2]
         n = _labels_around(labels, v, u, near)
         out[k] = _best_of(depth[v, u], x, y, noise, near, n, kinds, ths, perspective)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _labels_around(labels, v, u, near):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _labels_around(labels: Labels, v: int, u: int, near: Labels) -> int:
     """The labels of a 3x3 neighbourhood into `near`, each once, in raster order; returns how many."""
     h, w = labels.shape
     n = 0
@@ -169,8 +187,10 @@ def _labels_around(labels, v, u, near):  # type: ignore[no-untyped-def]  # numba
     return n
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def misfit_of(k, kinds, ths, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def misfit_of(
+    k: np.int32, kinds: Indices, ths: Array, x: float, y: float, z: float, sigma: float, perspective: bool,
+) -> float:  # fmt: skip
     """`misfit` of surface k of a table: planes, which most are, in a line."""
     if kinds[k] != PLANE:
         return misfit(kinds[k], ths[k], x, y, z, sigma, perspective)
@@ -178,17 +198,17 @@ def misfit_of(k, kinds, ths, x, y, z, sigma, perspective):  # type: ignore[no-un
     facing = p * (ths[k, 0] * x + ths[k, 1] * y) + ths[k, 2]
     if not abs(facing) >= 1e-9:
         return np.inf
-    return abs(z - (ths[k, 3] - (1.0 - p) * (ths[k, 0] * x + ths[k, 1] * y)) / facing) / sigma
+    return float(abs(z - (ths[k, 3] - (1.0 - p) * (ths[k, 0] * x + ths[k, 1] * y)) / facing) / sigma)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def misfit(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def misfit(kind: int, th: Array, x: float, y: float, z: float, sigma: float, perspective: bool) -> float:
     """|z - surface| in sigmas, eased at grazing rays where half a pixel moves the depth far; infinite on a miss."""
     zm = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(zm):
         return np.inf
     e = abs(z - zm) / sigma
-    if e < CLAIM_SIGMAS or kind == PLANE or e * EASED >= CLAIM_SIGMAS:
+    if e < ASSIGNMENT_SIGMAS or kind == PLANE or e * EASED >= ASSIGNMENT_SIGMAS:
         return e
     px, py = (x * zm, y * zm) if perspective else (x, y)
     nx, ny, nz = normal_on(kind, th, px, py, zm)
@@ -196,8 +216,8 @@ def misfit(kind, th, x, y, z, sigma, perspective):  # type: ignore[no-untyped-de
     return e * max(EASED, min(1.0, 2.0 * facing))
 
 
-@njit(cache=True, error_model="numpy")
-def fill_small_gaps(label, depth, sweeps):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def fill_small_gaps(label: Labels, depth: Array, sweeps: int) -> None:
     """Give each unlabelled valid pixel the label that at least 5 of its 8 neighbours agree on; `sweeps` times."""
     H, W = label.shape
     words, columns = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
@@ -210,8 +230,8 @@ def fill_small_gaps(label, depth, sweeps):  # type: ignore[no-untyped-def]  # nu
                     label[v, columns[k]] = _agreed(before, v, columns[k])
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _agreed(label, v, u):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _agreed(label: Labels, v: int, u: int) -> int:
     """The label that at least 5 of 8 neighbours bear, 0 without one."""
     for i in range(4):  # five of eight miss no four of them
         k = label[v - 1 + i // 3, u - 1 + i % 3]
@@ -221,12 +241,12 @@ def _agreed(label, v, u):  # type: ignore[no-untyped-def]  # numba types it
         for j in range(9):
             n += label[v - 1 + j // 3, u - 1 + j % 3] == k
         if n >= 5:
-            return k
+            return int(k)
     return 0
 
 
-@njit(cache=True)
-def bucket(label, count):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def bucket(label: Labels, count: int) -> tuple[Indices, Labels]:
     """Flat pixel indices grouped by label: label k owns indices[starts[k] : starts[k + 1]]; starts is (count + 2,).
 
     Label 0 owns nothing: unlabelled pixels are left out.

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from perception.range.segmentation.borders import PAIR_POINTS, WIDEST_GAP_PX, touching
-from perception.range.segmentation.claim import bucket
-from perception.range.segmentation.left_over import unexplained
+from perception.range.segmentation.pixel_assignment import bucket
+from perception.range.segmentation.unlabelled import unlabelled_patches
 
 PACKED = np.array([1.0, 100.0, 120.0, 7.5, 4.0])
 
@@ -78,7 +78,7 @@ def test_unexplained_patches_are_the_large_components_of_what_is_free(seed):
     large[0] = False
     assert large.any()
     wanted = np.where(large[patch], depth, np.nan)
-    (top, left), part = unexplained(depth, labels, 20, align_px=2)
+    (top, left), part = unlabelled_patches(depth, labels, 20, align_px=2)
     assert top % 2 == left % 2 == 0
     found = np.full(depth.shape, np.nan)
     found[top : top + part.shape[0], left : left + part.shape[1]] = part
@@ -93,5 +93,5 @@ def test_nothing_is_unexplained_where_all_is_labelled_or_missing():
     depth[2] = np.nan
     labels = np.ones((6, 6), np.int32)
     labels[2:4] = 0
-    assert unexplained(depth, labels, 7, align_px=1) is None
-    assert unexplained(depth, labels, 6, align_px=1) is not None
+    assert unlabelled_patches(depth, labels, 7, align_px=1) is None
+    assert unlabelled_patches(depth, labels, 6, align_px=1) is not None

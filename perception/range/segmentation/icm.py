@@ -8,11 +8,11 @@ apart, least of all under slow noise, which pixels share. So a pixel's residual 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from perception.range.fitting.surfaces import LEAN
-from perception.range.segmentation.claim import CLAIM_SIGMAS, PLAIN_SIGMAS, misfit_of
+from hal.arrays import Array, Indices, Labels
+from hal.jit import compiled
 from perception.range.segmentation.grid import sigma_at
+from perception.range.segmentation.pixel_assignment import ASSIGNMENT_SIGMAS, PLAIN_SIGMAS, misfit_of
 
 REACH_PX = 2  # neighbours of 5 x 5
 SIDE_PX = 2 * REACH_PX + 1
@@ -24,8 +24,11 @@ TOP_LABEL = np.int32(2**31 - 1)
 SAFE_NEIGHBOURS = 5  # of eight: as many as a pixel beside a straight border has; with them, one that fits well stays
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def settle(depth, sen, noise, slow_share, labels, kinds, ths, rows, columns, out, first, last):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def icm_sweep(
+    depth: Array, sen: Array, noise: Array, slow_share: float, labels: Labels, kinds: Indices, ths: Array, rows: Labels,
+    columns: Labels, out: Labels, first: int, last: int,
+) -> None:  # fmt: skip
     """Judge again the pixels at `rows`, `columns` (N,) of `labels` (H, W); writes labels out[first:last].
 
     A pixel that no other label touches keeps its own.
@@ -49,7 +52,7 @@ def settle(depth, sen, noise, slow_share, labels, kinds, ths, rows, columns, out
         voters, mine = PATCH - _count(patch, np.int32(0)), _count(patch, own) if own > 0 else 0
         per_vote = NEIGHBOUR_WEIGHT / voters
         best = np.inf
-        if e < CLAIM_SIGMAS and mine > 0:
+        if e < ASSIGNMENT_SIGMAS and mine > 0:
             best = evidence * e * e + NEIGHBOUR_WEIGHT - per_vote * mine
         left, rival = voters - mine, TOP_LABEL
         while left > 0:
@@ -61,12 +64,12 @@ def settle(depth, sen, noise, slow_share, labels, kinds, ths, rows, columns, out
                 continue  # not even a perfect fit would win
             e = misfit_of(rival, kinds, ths, x, y, z, sigma, perspective)
             cost = evidence * e * e + least_cost
-            if e < CLAIM_SIGMAS and cost < best:
+            if e < ASSIGNMENT_SIGMAS and cost < best:
                 best, out[n] = cost, rival
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _copy_patch(labels, v, u, patch):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _copy_patch(labels: Labels, v: int, u: int, patch: Labels) -> None:
     """The labels around one pixel into `patch`, 0 beyond the image."""
     H, W = labels.shape
     inside = REACH_PX <= v < H - REACH_PX and REACH_PX <= u < W - REACH_PX
@@ -77,8 +80,8 @@ def _copy_patch(labels, v, u, patch):  # type: ignore[no-untyped-def]  # numba t
             patch[SIDE_PX * i + j] = labels[top + i, left + j] if is_there else 0
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _beside(labels, v, u, own):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _beside(labels: Labels, v: int, u: int, own: np.int32) -> tuple[int, int]:
     """How many of the eight nearest neighbours bear the pixel's own label, and how many another one."""
     H, W = labels.shape
     inside = 0 < v < H - 1 and 0 < u < W - 1
@@ -91,17 +94,17 @@ def _beside(labels, v, u, own):  # type: ignore[no-untyped-def]  # numba types i
     return same, other
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _count(patch, label):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _count(patch: Labels, label: np.int32) -> int:
     """How many places bear the label."""
     n = np.int32(0)
     for i in range(PATCH):
         n += np.int32(patch[i] == label)
-    return n
+    return int(n)
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _largest_below(patch, own, bound):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _largest_below(patch: Labels, own: np.int32, bound: np.int32) -> np.int32:
     """The largest label below `bound` that is not the pixel's own; 0 without one."""
     most = np.int32(0)
     for i in range(PATCH):

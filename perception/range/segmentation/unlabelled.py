@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from hal.arrays import Array
-from perception.range.components import find, unite
-from perception.range.segmentation.beside import WORD
-from perception.range.segmentation.runs import row_ends
+from hal.arrays import Array, Indices
+from hal.jit import compiled
+from perception.range.segmentation.boundary_pixels import WORD
+from perception.range.segmentation.run_length import row_ends
+from perception.range.segmentation.union_find import find, unite
 
 Labels = NDArray[np.int32]
 
 
-def unexplained(
+def unlabelled_patches(
     depth_m: Array, labels: Labels, least_pixels: int, *, align_px: int
 ) -> tuple[tuple[int, int], Array] | None:
     """The least part of the image that holds every unlabelled patch of at least `least_pixels`, None without any.
@@ -26,8 +26,8 @@ def unexplained(
     return ((top, left), part) if part.size else None
 
 
-@njit(cache=True, nogil=True)
-def _patches(depth, labels, least, align):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _patches(depth: Array, labels: Labels, least: int, align: int) -> tuple[int, int, Array]:
     H, W = depth.shape
     runs, begins = _free_runs(depth, labels)
     parent = _connected(runs, begins)
@@ -51,8 +51,8 @@ def _patches(depth, labels, least, align):  # type: ignore[no-untyped-def]  # nu
     return top, left, part
 
 
-@njit(cache=True, error_model="numpy")
-def _free_runs(depth, labels):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _free_runs(depth: Array, labels: Labels) -> tuple[Labels, Indices]:
     """Runs of unlabelled pixels with a reading (R, 3): row, first column, the one after the last; where each row's begin."""
     H, W = depth.shape
     words, ends = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 2, np.int32)
@@ -76,8 +76,8 @@ def _free_runs(depth, labels):  # type: ignore[no-untyped-def]  # numba types it
     return runs[:n].copy(), begins
 
 
-@njit(cache=True)
-def _connected(runs, begins):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _connected(runs: Labels, begins: Indices) -> Indices:
     """(R,) the parent of each run: those of neighbouring rows that touch, be it at a corner, have one root."""
     parent = np.arange(runs.shape[0])
     for v in range(1, begins.shape[0] - 1):

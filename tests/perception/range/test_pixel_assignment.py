@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perception.range.fitting.fit import PER_MEDIAN, SCALE_PRECISION, TRIM_SIGMAS, middle_scale
+from perception.range.fitting.initialisation import principal_axes
 from perception.range.fitting.last_step import last_step
 from perception.range.fitting.rays import MISS_SIGMAS
-from perception.range.fitting.starts import principal_axes
 from perception.range.fitting.surfaces import (
     CYLINDER,
     FREEDOM,
@@ -28,7 +28,7 @@ from perception.range.fitting.surfaces import (
 )
 from perception.range.noise import NoiseModel
 from perception.range.primitives import centre_and_radii, ellipsoid_of, named_covariance
-from perception.range.segmentation import beside, claim, finish
+from perception.range.segmentation import boundary_pixels, finish, pixel_assignment
 from perception.range.segmentation.regions import regions_of
 from perception.range.sensor import OrthographicSensor
 from tests.perception.range.scenes import PARALLEL, PINHOLE
@@ -61,9 +61,9 @@ def random_case(sensor, seed, size=2):
 def best_label(sensor, depth, v, u, near, table, own=0):
     """First label of least misfit among `near`, by the definition; `own` wins when it fits well."""
     packed, z = sensor.packed(), depth[v, u]
-    best, label = claim.CLAIM_SIGMAS, 0
+    best, label = pixel_assignment.ASSIGNMENT_SIGMAS, 0
     for k in near:
-        e = claim.misfit(
+        e = pixel_assignment.misfit(
             KINDS[k],
             table[k],
             (u - packed[3]) / packed[1],
@@ -72,7 +72,7 @@ def best_label(sensor, depth, v, u, near, table, own=0):
             float(NOISE.sigma_m(z)),
             bool(packed[0] > 0),
         )
-        if k == own and e < claim.PLAIN_SIGMAS:
+        if k == own and e < pixel_assignment.PLAIN_SIGMAS:
             return k
         if e < best:
             best, label = e, k
@@ -92,7 +92,9 @@ def test_pixels_go_to_the_best_surface_of_the_blocks_around(sensor, tiles):
     table, out = competing_surfaces(), np.full(depth.shape, -1, np.int32)
     cuts = np.linspace(0, blocks.shape[0], tiles + 1).astype(int).tolist()
     for top, bottom in pairwise(cuts):
-        claim.claim_pixels(depth, sensor.packed(), NOISE.packed(), blocks, 2, KINDS, table, out, top, bottom)
+        pixel_assignment.assign_pixels(
+            depth, sensor.packed(), NOISE.packed(), blocks, 2, KINDS, table, out, top, bottom
+        )
     assert (out >= 0).all() and len(np.unique(out)) == 5
     rng = np.random.default_rng(0)
     for v, u in zip(rng.integers(0, 120, 3000), rng.integers(0, 160, 3000), strict=True):
@@ -105,11 +107,13 @@ def test_pixels_go_to_the_best_surface_of_the_blocks_around(sensor, tiles):
 def test_only_pixels_beside_a_new_surface_are_judged_again(sensor):
     depth, blocks = random_case(sensor, 2, size=1)
     table, out, newest = competing_surfaces(), blocks.copy(), 3
-    rows, columns = beside.contested_pixels(blocks, newest, 0, 120)
+    rows, columns = boundary_pixels.contested_pixels(blocks, newest, 0, 120)
     names = np.full_like(rows, -1)
     for ends in ((0, 50), (50, rows.size)):
-        claim.claim_again(depth, sensor.packed(), NOISE.packed(), blocks, KINDS, table, rows, columns, names, *ends)
-    beside.renamed_pixels(out, rows, columns, names)
+        pixel_assignment.reassign_pixels(
+            depth, sensor.packed(), NOISE.packed(), blocks, KINDS, table, rows, columns, names, *ends
+        )
+    boundary_pixels.renamed_pixels(out, rows, columns, names)
     for v in range(120):
         for u in range(160):
             near = around(blocks, v, u)
@@ -138,25 +142,25 @@ def test_samples_of_each_label_come_in_raster_order(sensor):
 @pytest.mark.parametrize("sensor", [PINHOLE, PARALLEL], ids=["pinhole", "orthographic"])
 @pytest.mark.parametrize("kind", [PLANE, SPHERE])
 def test_the_last_step_over_runs_is_that_of_the_normal_equations_of_all_pixels(sensor, kind):
-    th, free, slack, rng = competing_surfaces()[kind + 1], np.zeros(9, bool), 1.5, np.random.default_rng(5)
+    th, free, rng = competing_surfaces()[kind + 1], np.zeros(9, bool), np.random.default_rng(5)
     packed, (v, u) = sensor.packed(), np.mgrid[:120, :160]
     x, y, depth = (u - packed[3]) / packed[1], (v - packed[4]) / packed[2], np.empty(u.shape)
     depths_on(kind, th, x.ravel(), y.ravel(), bool(packed[0] > 0), depth.ravel())
     labels = (np.isfinite(depth) & (rng.random(depth.shape) < 0.9)).astype(np.int32)
-    depth += 2.0 * NOISE.sigma_m(0.6) * rng.normal(size=depth.shape)
+    depth += 1.4 * NOISE.sigma_m(0.6) * rng.normal(size=depth.shape)
     inside = labels == 1
     x, y, z = x[inside], y[inside], depth[inside]
     p, J, e = int(FREEDOM[kind]), [], []
     frame, row = np.zeros(6), np.zeros(9)
     frame_of(kind, th, frame)
-    for k, sigma in enumerate(slack * NOISE.sigma_m(z)):
+    for k, sigma in enumerate(NOISE.sigma_m(z)):
         zm, cosine = depth_and_jacobian(kind, th, frame, x[k], y[k], bool(packed[0] > 0), row)
         weight = min(1.0, cosine / GRAZING_COSINE) / sigma
         if abs((z[k] - zm) * weight) <= TRIM_SIGMAS:
             J.append(row[:p] * weight)
             e.append((z[k] - zm) * weight)
     regions = regions_of(depth, packed, NOISE.packed(), labels, 1)
-    moved, H, kept, used = last_step(kind, th, depth, packed, NOISE.packed(), slack, regions.runs_of(1), free)
+    moved, H, kept, used = last_step(kind, th, depth, packed, NOISE.packed(), regions.runs_of(1), free)
     J, e = np.array(J), np.array(e)
     step, left, *_ = np.linalg.lstsq(J, e, rcond=None)
     expected = np.zeros(SIZE)
@@ -231,7 +235,7 @@ def test_a_sphere_is_refined_to_its_bound_and_its_covariance_is_the_inverse_info
         start[:5] = [0.002, -0.001, 0.601, 0.1, 1.0]
         z = surface + 1e-3 * rng.normal(size=x.shape)
         own = regions_of(z, sensor.packed(), noise.packed(), labels, 1)
-        image = (z, own.packed, own.law, 1.0, own.runs_of(1), own.pixels[0])
+        image = (z, own.packed, own.law, own.runs_of(1), own.pixels[0])
         th, H, covariance, middles, kept, used = finish.refined(SPHERE, start, *image, free)
         np.testing.assert_allclose(covariance @ H[:4, :4], np.eye(4), atol=1e-8)
         assert kept / used == pytest.approx(0.97, abs=0.1)

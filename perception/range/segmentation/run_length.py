@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from numpy.typing import NDArray
 
-from perception.range.fitting.surfaces import LEAN
-from perception.range.segmentation.beside import WORD, flagged
+from hal.arrays import Indices, Labels, Mask
+from hal.jit import compiled
+from perception.range.segmentation.boundary_pixels import WORD, flagged
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def _flag_changes(own, flags):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _flag_changes(own: Labels, flags: Mask) -> None:
     """Where a pixel's label is not that of the one to its left."""
     flags[0] = False
     for u in range(1, own.shape[0]):
         flags[u] = own[u] != own[u - 1]
 
 
-@njit(cache=True, error_model="numpy", **LEAN)
-def row_ends(own, words, ends):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def row_ends(own: Labels, words: NDArray[np.uint64], ends: Labels) -> int:
     """Where the runs of equal labels in a row (W,) end, into `ends` (W + 2,); returns how many there are.
 
     `words`: flags (W // 8 + 1,) to work in, zeros at first.
@@ -29,8 +30,8 @@ def row_ends(own, words, ends):  # type: ignore[no-untyped-def]  # numba types i
     return count + 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def runs_of(labels, count):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def runs_of(labels: Labels, count: int) -> tuple[Indices, Labels, Indices]:
     """The runs of labels 1 to `count` in the rows of (H, W) `labels`, grouped by label, in raster order.
 
     Returns `starts` (count + 2,): label k owns runs[starts[k] : starts[k + 1]]; the runs (R, 3): row, first column and
@@ -63,8 +64,8 @@ def runs_of(labels, count):  # type: ignore[no-untyped-def]  # numba types it
     return starts, runs, pixels
 
 
-@njit(cache=True, error_model="numpy", nogil=True, **LEAN)
-def painted(starts, runs, names, labels):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def painted(starts: Indices, runs: Labels, names: Labels, labels: Labels) -> None:
     """Write label `names[k]` over the runs of each k into `labels` (H, W), which is zero."""
     for k in range(1, names.shape[0]):
         for i in range(starts[k], starts[k + 1]):
@@ -73,8 +74,8 @@ def painted(starts, runs, names, labels):  # type: ignore[no-untyped-def]  # num
                 row[u] = names[k]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def places_of(runs, width):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def places_of(runs: Labels, width: int) -> Labels:
     """Flat pixel indices (N,) of runs (R, 3) in an image of that width."""
     out, n = np.empty(np.sum(runs[:, 2] - runs[:, 1]), np.int32), 0
     for i in range(runs.shape[0]):
@@ -84,8 +85,8 @@ def places_of(runs, width):  # type: ignore[no-untyped-def]  # numba types it
     return out
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def pixels_of(labels, count):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def pixels_of(labels: Labels, count: int) -> Indices:
     """How many pixels each of the labels 1 to `count` has, (count + 1,); entry 0: the unlabelled ones."""
     W = labels.shape[1]
     words, ends = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 2, np.int32)

@@ -1,48 +1,25 @@
-"""Connected components in horizontal tiles, and other work that tiles share.
+"""Connected components in horizontal tiles, as the paper labels them on a cube (Section III, Fig. 9).
 
-The paper's five steps (Section III): tiles, a raster scan in each, exchange of border rows by cube doubling, merging,
-relabelling. Here the exchange is a union-find over the seam rows, neighbours first, then pairs of pairs: log2(tiles)
-rounds. Labels follow the raster order of each component's first pixel, so they are the same for any number of tiles.
+The paper's five steps: tiles, a raster scan in each, exchange of border rows by cube doubling, merging, relabelling. Here
+the exchange is a union-find over the seam rows, neighbours first, then pairs of pairs: log2(tiles) rounds. Labels follow
+the raster order of each component's first pixel, so they are the same for any number of tiles.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
 
-Ints = NDArray[np.int32]
-Flags = NDArray[np.bool_]
-
-
-def tile_rows(rows: int, tiles: int) -> list[tuple[int, int]]:
-    """Row ranges [top, bottom) of at most `tiles` horizontal tiles, none empty."""
-    count = min(max(tiles, 1), max(rows, 1))
-    return [(rows * k // count, rows * (k + 1) // count) for k in range(count)]
-
-
-def for_each_tile(
-    work: Callable[[int, int], object], rows: int, tiles: int, *, pool: ThreadPoolExecutor | None
-) -> None:
-    """Call `work(top, bottom)` for every tile, on the pool's threads when one is given."""
-    if tiles == 1:
-        work(0, rows)
-        return
-    ranges = tile_rows(rows, tiles)
-    if pool is None or len(ranges) == 1:
-        for top, bottom in ranges:
-            work(top, bottom)
-        return
-    for done in [pool.submit(work, top, bottom) for top, bottom in ranges]:
-        done.result()
+from hal.arrays import Indices, Labels, Mask
+from hal.jit import compiled
+from perception.range.segmentation.union_find import unite
+from perception.range.tiles import for_each_tile, tile_rows
 
 
 def label_components(
-    mask: Flags, link_right: Flags, link_down: Flags, *, tiles: int = 1, pool: ThreadPoolExecutor | None = None
-) -> tuple[Ints, Ints]:
+    mask: Mask, link_right: Mask, link_down: Mask, *, tiles: int = 1, pool: ThreadPoolExecutor | None = None
+) -> tuple[Labels, Labels]:
     """Components of linked pixels.
 
     Args:
@@ -54,7 +31,7 @@ def label_components(
         labels (H, W) int32, 0 outside the mask, from 1 in raster order of first pixels; sizes (n + 1,), entry 0 unused.
     """
     H, W = mask.shape
-    parent = np.arange(H * W, dtype=np.int32)
+    parent = np.arange(H * W)
     for_each_tile(lambda top, bottom: _scan(mask, link_right, link_down, parent, top, bottom), H, tiles, pool=pool)
     seams = [top for top, _ in tile_rows(H, tiles)][1:]
     for round_seams in merge_rounds(seams):
@@ -76,26 +53,8 @@ def merge_rounds(seams: list[int]) -> list[list[int]]:
     return rounds
 
 
-@njit(cache=True, nogil=True)
-def find(parent, i):  # type: ignore[no-untyped-def]  # numba types it
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
-
-
-@njit(cache=True, nogil=True)
-def unite(parent, i, j):  # type: ignore[no-untyped-def]  # numba types it
-    """The smaller index becomes the root: roots are first pixels in raster order."""
-    a, b = find(parent, i), find(parent, j)
-    if a < b:
-        parent[b] = a
-    elif b < a:
-        parent[a] = b
-
-
-@njit(cache=True, nogil=True)
-def _scan(mask, link_right, link_down, parent, top, bottom):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _scan(mask: Mask, link_right: Mask, link_down: Mask, parent: Indices, top: int, bottom: int) -> None:
     W = mask.shape[1]
     for v in range(top, bottom):
         for u in range(W):
@@ -108,16 +67,16 @@ def _scan(mask, link_right, link_down, parent, top, bottom):  # type: ignore[no-
                 unite(parent, i - W, i)
 
 
-@njit(cache=True, nogil=True)
-def _merge_seam(mask, link_down, parent, seam):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _merge_seam(mask: Mask, link_down: Mask, parent: Indices, seam: int) -> None:
     W = mask.shape[1]
     for u in range(W):
         if mask[seam - 1, u] and mask[seam, u] and link_down[seam - 1, u]:
             unite(parent, (seam - 1) * W + u, seam * W + u)
 
 
-@njit(cache=True, nogil=True)
-def _relabel(mask, parent):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _relabel(mask: Mask, parent: Indices) -> tuple[Labels, Labels]:
     H, W = mask.shape
     label = np.zeros((H, W), np.int32)
     sizes = np.zeros(H * W + 1, np.int32)

@@ -8,10 +8,11 @@ turned it, radians, and the side of a square of its size, metres.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from hal.arrays import Array, Mask
+from hal.jit import as_numpy_scalar, compiled
 from perception.range.fitting import fit
-from perception.range.fitting.starts import solve_positive, start_plane
+from perception.range.fitting.initialisation import solve_positive, start_plane
 from perception.range.fitting.surfaces import PLANE, QUADRIC, SPHERE
 from perception.range.segmentation import bend
 from perception.range.segmentation.borders import step_and_turn
@@ -20,6 +21,8 @@ from perception.range.segmentation.grid import slow_share_at
 
 PIXELS, PATCHES, MEAN_SQUARE, TILT, SIZE_M = range(5)
 FIGURES = 5
+ROUNDS = as_numpy_scalar(3)  # of robust weights
+COEFFICIENTS = as_numpy_scalar(6)  # of a quadratic over x and y
 STEP_SIGMAS = 3.0
 SHARPEST_TURN_RAD = 1.2  # between facets of one narrow cylinder; an edge of a box turns by 1.57
 SMOOTH_TURN_RAD = 0.05
@@ -43,8 +46,10 @@ GIVE_UP = 10.0
 SLACK = 3.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def described(kind, th, samples, pixels, pitch, noise, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def described(
+    kind: int, th: Array, samples: Array, pixels: float, pitch: float, noise: Array, perspective: bool,
+) -> tuple[int, Array, Array, Array]:  # fmt: skip
     """A region by itself, as the simplest surface that describes it: kind, parameters, normals and figures.
 
     `pitch`: between pixels, in ray coordinates.
@@ -55,8 +60,10 @@ def described(kind, th, samples, pixels, pitch, noise, perspective):  # type: ig
     return kind, th, normals, figures_of(kind, th, samples, pixels, patches, pitch, perspective)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def figures_of(kind, th, samples, pixels, patches, pitch, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def figures_of(
+    kind: int, th: Array, samples: Array, pixels: float, patches: float, pitch: float, perspective: bool,
+) -> Array:  # fmt: skip
     """(FIGURES,) of a region; its tilt is sigma / (spread sqrt(patches)), the slope of a plane through noisy values."""
     out = np.empty(FIGURES)
     out[PIXELS], out[PATCHES] = pixels, patches
@@ -75,10 +82,11 @@ def figures_of(kind, th, samples, pixels, patches, pitch, perspective):  # type:
     return out
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def united(  # type: ignore[no-untyped-def]  # numba types it
-    kind, th, samples_a, normals_a, figures_a, samples_b, normals_b, figures_b, most, pitch, perspective
-):
+@compiled
+def united(
+    kind: int, th: Array, samples_a: Array, normals_a: Array, figures_a: Array, samples_b: Array, normals_b: Array,
+    figures_b: Array, most: int, pitch: float, perspective: bool,
+) -> tuple[Array, Array, Array]:  # fmt: skip
     """Samples, normals and figures of two regions that are one surface now.
 
     Each gives samples by its share of the pixels, a fifth of `most` at least, evenly spread over those that it has.
@@ -93,8 +101,8 @@ def united(  # type: ignore[no-untyped-def]  # numba types it
     return samples, normals, figures_of(kind, th, samples, pixels, patches, pitch, perspective)
 
 
-@njit(cache=True, error_model="numpy")
-def _spread(samples, normals, few, few_normals):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _spread(samples: Array, normals: Array, few: Array, few_normals: Array) -> None:
     """Fill `few` (4, n) and `few_normals` (n, 3) from samples and normals, evenly spread."""
     n, last = few.shape[1], samples.shape[1] - 1
     step = last / max(n - 1, 1)
@@ -106,24 +114,12 @@ def _spread(samples, normals, few, few_normals):  # type: ignore[no-untyped-def]
             few_normals[k, a] = normals[i, a]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def judged(  # type: ignore[no-untyped-def]  # numba types it
-    kind_a,
-    a,
-    samples_a,
-    normals_a,
-    figures_a,
-    kind_b,
-    b,
-    samples_b,
-    normals_b,
-    figures_b,
-    x,
-    y,
-    length_px,
-    noise,
-    perspective,
-):
+@compiled
+def judged(
+    kind_a: int, a: Array, samples_a: Array, normals_a: Array, figures_a: Array, kind_b: int, b: Array,
+    samples_b: Array, normals_b: Array, figures_b: Array, x: Array, y: Array, length_px: int, noise: Array,
+    perspective: bool,
+) -> tuple[float, int, Array]:  # fmt: skip
     """Gain of the best joint description of two regions that touch at the rays (x, y), its kind and parameters.
 
     A gain of 0 or less: they stay two.
@@ -184,17 +180,19 @@ def judged(  # type: ignore[no-untyped-def]  # numba types it
     return _swallowed(is_rounding, kind_b, b, figures_b, kind_a, a, samples_a, figures_a, noise, perspective)
 
 
-@njit(cache=True, error_model="numpy")
-def _continued(kind, th, samples, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _continued(kind: int, th: Array, samples: Array, perspective: bool) -> Array:
     """The surface refined on the samples of both regions."""
     free = np.zeros(9, np.bool_)
     x, y, z, sigma = samples[0], samples[1], samples[2], samples[3]
-    th, _ = fit.fit_robust(kind, th, x, y, z, sigma, perspective, free, 3)
+    th, _ = fit.fit_robust(kind, th, x, y, z, sigma, perspective, free, ROUNDS)
     return th
 
 
-@njit(cache=True, error_model="numpy")
-def _joint_fits(samples, normals, perspective, kinds, correlated, give_up):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _joint_fits(
+    samples: Array, normals: Array, perspective: bool, kinds: Mask, correlated: float, give_up: float,
+) -> tuple[Array, Mask]:  # fmt: skip
     """Parameters (5, SIZE) of each of `kinds` on the samples of both regions, and which of them fit at all."""
     points = bend.points_of(samples, perspective)
     x, y, z, sigma = samples[0], samples[1], samples[2], samples[3]
@@ -204,10 +202,11 @@ def _joint_fits(samples, normals, perspective, kinds, correlated, give_up):  # t
     return ths, np.isfinite(score) & (kept > 0.5)
 
 
-@njit(cache=True, error_model="numpy")
-def _gain(  # type: ignore[no-untyped-def]  # numba types it
-    kind, th, kind_a, samples_a, figures_a, kind_b, samples_b, figures_b, is_smooth, perspective
-):
+@compiled
+def _gain(
+    kind: int, th: Array, kind_a: int, samples_a: Array, figures_a: Array, kind_b: int, samples_b: Array,
+    figures_b: Array, is_smooth: bool, perspective: bool,
+) -> tuple[float, bool]:  # fmt: skip
     """How much cheaper the joint surface is than the two, minus infinity where it does not describe both.
 
     And whether both meet without a crease and lie near it: then they are one, however dear.
@@ -221,22 +220,24 @@ def _gain(  # type: ignore[no-untyped-def]  # numba types it
         samples, figures = (samples_a, figures_a) if side == 0 else (samples_b, figures_b)
         e = bend.residual_sizes(kind, th, samples, perspective)
         mean2 = bend.cut_mean_square(e, fit.TRIM_SIGMAS)
-        fits &= mean2 <= shown * mean_square_limit(figures[PATCHES]) and np.mean(e < fit.TRIM_SIGMAS) >= LEAST_SHARE
-        near &= np.mean(e < SMOOTH_LIMIT) > SMOOTH_SHARE
+        fits &= mean2 <= shown * mean_square_limit(figures[PATCHES]) and bool(
+            np.mean(e < fit.TRIM_SIGMAS) >= LEAST_SHARE
+        )
+        near &= bool(np.mean(e < SMOOTH_LIMIT) > SMOOTH_SHARE)
         apart += figures[MEAN_SQUARE] * figures[PATCHES] / shown
         together += mean2 * figures[PATCHES] / shown
     return apart - together if fits or near else -np.inf, near
 
 
-@njit(cache=True, error_model="numpy")
-def _is_strip(pixels_a, pixels_b, length_px):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _is_strip(pixels_a: float, pixels_b: float, length_px: int) -> bool:
     """Whether the smaller region is a narrow strip along its border with a much larger one."""
     less = min(pixels_a, pixels_b)
     return less < ROUNDING_PX * length_px and less < SCRAP_SHARE * max(pixels_a, pixels_b)
 
 
-@njit(cache=True, error_model="numpy")
-def _is_uneven(th, samples_a, samples_b, tolerance_m, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _is_uneven(th: Array, samples_a: Array, samples_b: Array, tolerance_m: float, perspective: bool) -> bool:
     """Whether two facets leave the plane `th` by less than things that are called flat do: upholstery, cardboard."""
     for side in range(2):
         samples = samples_a if side == 0 else samples_b
@@ -246,8 +247,11 @@ def _is_uneven(th, samples_a, samples_b, tolerance_m, perspective):  # type: ign
     return True
 
 
-@njit(cache=True, error_model="numpy")
-def _swallowed(is_rounding, kind, th, figures, own_kind, own, samples, own_figures, noise, perspective):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _swallowed(
+    is_rounding: bool, kind: int, th: Array, figures: Array, own_kind: int, own: Array, samples: Array,
+    own_figures: Array, noise: Array, perspective: bool,
+) -> tuple[float, int, Array]:  # fmt: skip
     if is_rounding:
         return LEAST_GAIN, kind, th
     if own_figures[PIXELS] > SCRAP_SHARE * figures[PIXELS]:
@@ -255,8 +259,8 @@ def _swallowed(is_rounding, kind, th, figures, own_kind, own, samples, own_figur
     return bend.scrap_gain(kind, th, own_kind, own, samples, own_figures[PIXELS], noise, perspective), kind, th
 
 
-@njit(cache=True, error_model="numpy")
-def _is_creased(samples, perspective, limit):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _is_creased(samples: Array, perspective: bool, limit: float) -> bool:
     """Whether even a quadratic in x and y leaves more than `limit` squared sigmas a sample over.
 
     It follows whatever is smooth and turns by no more than `SHARPEST_TURN_RAD`, so it spares the fits of surfaces.
@@ -283,22 +287,22 @@ def _is_creased(samples, perspective, limit):  # type: ignore[no-untyped-def]  #
         for k in range(j):
             A[k, j] = A[j, k]
     x = b.copy()
-    if not solve_positive(A, x, 6):
+    if not solve_positive(A, x, COEFFICIENTS):
         return False
     for j in range(6):
         total -= x[j] * b[j]
-    return total > limit * max(n - 6, 1)
+    return bool(total > limit * max(n - 6, 1))
 
 
-@njit(cache=True, error_model="numpy")
-def shown_noise(figures_a, figures_b):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def shown_noise(figures_a: Array, figures_b: Array) -> float:
     """How many times the noise model's variance two regions show by themselves; slanted faces scatter more."""
     na, nb = figures_a[PATCHES], figures_b[PATCHES]
     shown = (figures_a[MEAN_SQUARE] * na + figures_b[MEAN_SQUARE] * nb) / (na + nb)
-    return min(max(1.0, shown), MOST_NOISE)
+    return float(min(max(1.0, shown), MOST_NOISE))
 
 
-@njit(cache=True, error_model="numpy")
-def mean_square_limit(patches):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def mean_square_limit(patches: float) -> float:
     """What a right surface stays below in 97 of 100 cases: 1 + 2 sqrt(2 / n) of a mean of n squares, and a floor."""
-    return max(PLAIN_MEAN_SQUARE, 1.0 + 2.0 * np.sqrt(2.0 / patches))
+    return float(max(PLAIN_MEAN_SQUARE, 1.0 + 2.0 * np.sqrt(2.0 / patches)))

@@ -1,7 +1,6 @@
-"""Local geometry of a range image: derivatives, normals, orientation, mean and gaussian curvature.
+"""Normals, mean and gaussian curvature of a range image in single precision: with a median and a gaussian, a unit of times.
 
-The paper's formulas hold for a graph surface g(u, v) of parallel rays; a pinhole image needs the fundamental forms of
-the surface X(u, v) = O + z D, of which the graph is a special case. Both are here, the second by default:
+The fundamental forms of the surface X(u, v) = O + z D of the image's rays, of which the paper's graph g(u, v) is a special case:
 
     n = X_u x X_v / |X_u x X_v|;  H = (e G - 2 f F + g E) / (2 (E G - F^2));  K = (e g - f^2) / (E G - F^2)
 
@@ -10,25 +9,24 @@ Curvature is positive for a surface that bulges towards the sensor.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hal.arrays import Array
-from perception.range.filters import gaussian, remove_gross_errors
-from perception.range.fitting.rays import LOOSE
-from perception.range.noise import NoiseModel, estimate_noise
-from perception.range.sensor import RangeSensorModel
+from hal.jit import REORDERED, compiled
+from perception.range import RangeSensorModel
 
-CURVATURE_GOAL_PER_M = 4.0  # noise of H that still tells a ball of 0.1 m radius from a plane
+Single = NDArray[np.float32]
+
 CHUNK, ROW = 128, 144  # pixels worked on at a time; a row of the scratch array holds them and a neighbour on each side
 ABOVE, HERE, BELOW = 0, ROW, 2 * ROW  # rows of depth, each from one pixel before the chunk
 ACROSS = 3 * ROW  # x of each pixel's ray at depth 1
 GU, GV, NORMAL, MEAN, GAUSS = 4 * ROW, 5 * ROW, 6 * ROW, 9 * ROW, 10 * ROW  # the normal takes three rows
 SCRATCH = 11 * ROW
-SCALES_PX = (1.0, 1.5, 2.0, 3.0, 4.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -36,86 +34,46 @@ class LocalGeometry:
     """(H, W) maps; NaN beside holes and at the image border.
 
     `gu`, `gv`: metres of depth per pixel. `normal` (H, W, 3) towards the sensor. `mean_curvature_per_m`,
-    `gaussian_curvature_per_m2`: H and K. `scale_px`: sigma of the gaussian that regularised the derivatives.
+    `gaussian_curvature_per_m2`: H and K.
     """
 
-    gu: Array
-    gv: Array
-    normal: Array
-    mean_curvature_per_m: Array
-    gaussian_curvature_per_m2: Array
-    scale_px: float
-
-    @property
-    def orientation_rad(self) -> Array:
-        """atan2(gu, gv), the paper's orientation feature, (H, W)."""
-        return np.asarray(np.arctan2(self.gu, self.gv))
+    gu: Single
+    gv: Single
+    normal: Single
+    mean_curvature_per_m: Single
+    gaussian_curvature_per_m2: Single
 
 
-def local_geometry(
-    depth_m: Array, sensor: RangeSensorModel, *, noise: NoiseModel | None = None, scale_px: float | None = None
-) -> LocalGeometry:
-    """Geometry of an (H, W) depth image in metres, after removal of gross errors and an edge-keeping gaussian.
-
-    Args:
-        noise: estimated from the image when not given.
-        scale_px: sigma of the gaussian; chosen from the noise when not given.
-    """
-    law = noise or estimate_noise(depth_m, sensor)
-    scale = scale_px if scale_px is not None else choose_scale(depth_m, sensor, law)
-    clean = gaussian(remove_gross_errors(depth_m, sensor, law), sensor, law, sigma_px=scale)
-    return geometry_of(clean, sensor, scale_px=scale)
-
-
-def choose_scale(depth_m: Array, sensor: RangeSensorModel, noise: NoiseModel) -> float:
-    """Smallest gaussian whose second derivatives are steady enough: sigma(g_uu) = sigma sqrt(3 / (4 pi)) / (2 s^3)."""
-    middle = float(np.nanmedian(depth_m)) if np.isfinite(depth_m).any() else 1.0
-    sigma, pitch = float(noise.sigma_m(middle)), sensor.pitch_m(middle)
-    for scale in SCALES_PX:
-        curvature = sigma * np.sqrt(3.0 / (4.0 * np.pi)) / (2.0 * scale**3) / pitch**2
-        if curvature <= CURVATURE_GOAL_PER_M:
-            return scale
-    return SCALES_PX[-1]
-
-
-def geometry_of(depth_m: Array | NDArray[np.float32], sensor: RangeSensorModel, *, scale_px: float) -> LocalGeometry:
-    """Geometry by central differences of an already smoothed (H, W) depth image; float32 stays float32, and is faster."""
-    z = np.ascontiguousarray(depth_m)
+def geometry_of(depth_m: Array | Single, sensor: RangeSensorModel) -> LocalGeometry:
+    """Geometry by central differences of an already smoothed (H, W) depth image."""
+    z = np.ascontiguousarray(depth_m, np.float32)
     gu, gv, mean, gauss = (np.empty_like(z) for _ in range(4))
     normal = np.empty((*z.shape, 3), z.dtype)
     _fused(z, sensor.packed(), np.empty(SCRATCH, z.dtype), gu, gv, normal, mean, gauss)
-    return LocalGeometry(
-        gu=gu, gv=gv, normal=normal, mean_curvature_per_m=mean, gaussian_curvature_per_m2=gauss, scale_px=scale_px
-    )
+    return LocalGeometry(gu=gu, gv=gv, normal=normal, mean_curvature_per_m=mean, gaussian_curvature_per_m2=gauss)
 
 
-def curvature_class(geometry: LocalGeometry, *, flat_per_m: float) -> NDArray[np.int8]:
-    """(H, W) sign class 3 (sign H) + sign K of Besl and Jain (1986), -4 to 4; 0 is flat, 99 unknown.
+def filter_pass(depth_m: Array, sensor: RangeSensorModel) -> Callable[[], object]:
+    """Median 5x5, gaussian, derivatives, normals, H and K of one image, ready to be timed.
 
-    `flat_per_m`: principal curvatures smaller than this count as zero.
+    The fastest that we have: OpenCV's median and gaussian on one thread, and our fused, vectorised derivatives.
     """
-    H, K = geometry.mean_curvature_per_m, geometry.gaussian_curvature_per_m2
-    sign_h = np.where(np.abs(H) < flat_per_m, 0, np.sign(H))
-    sign_k = np.where(np.abs(K) < flat_per_m**2, 0, np.sign(K))
-    return np.where(np.isfinite(H), 3 * np.nan_to_num(sign_h) + np.nan_to_num(sign_k), 99).astype(np.int8)
+    cv2.setNumThreads(1)
+    single = depth_m.astype(np.float32)
+
+    def run() -> object:
+        smooth = cv2.GaussianBlur(cv2.medianBlur(single, 5), (0, 0), 1.5)
+        return geometry_of(np.asarray(smooth, np.float32), sensor)
+
+    run()
+    return run
 
 
-def graph_curvature(g: Array) -> tuple[Array, Array]:
-    """H and K of a graph surface g(u, v) with unit pixel pitch, exactly as printed in the paper (interior pixels).
-
-    H = ((1 + gv^2) guu + (1 + gu^2) gvv - 2 gu gv guv) / (2 (1 + gu^2 + gv^2)^(3/2))
-    K = (guu gvv - guv^2) / (1 + gu^2 + gv^2)^2
-    """
-    gu, gv = (g[1:-1, 2:] - g[1:-1, :-2]) / 2, (g[2:, 1:-1] - g[:-2, 1:-1]) / 2
-    guu = g[1:-1, 2:] - 2 * g[1:-1, 1:-1] + g[1:-1, :-2]
-    gvv = g[2:, 1:-1] - 2 * g[1:-1, 1:-1] + g[:-2, 1:-1]
-    guv = (g[2:, 2:] - g[2:, :-2] - g[:-2, 2:] + g[:-2, :-2]) / 4
-    q = 1 + gu**2 + gv**2
-    return ((1 + gv**2) * guu + (1 + gu**2) * gvv - 2 * gu * gv * guv) / (2 * q**1.5), (guu * gvv - guv**2) / q**2
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _fused(z, sen, work, gu, gv, normal, mean, gauss):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _fused(
+    z: Single, sen: Array, work: Single, gu: Single, gv: Single, normal: Single,
+    mean: Single, gauss: Single,
+) -> None:  # fmt: skip
     """Fill the maps from `z` (H, W), a chunk of a row at a time; all in the type of `z`, `work` (SCRATCH,) too."""
     H, W = z.shape
     for v in range(H):
@@ -139,8 +97,8 @@ def _fused(z, sen, work, gu, gv, normal, mean, gauss):  # type: ignore[no-untype
             gauss[v, first : first + n] = work[GAUSS : GAUSS + n]
 
 
-@njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def _forms(n, y, sen, work):  # type: ignore[no-untyped-def]  # numba types it
+@compiled(fastmath=REORDERED)
+def _forms(n: int, y: float | np.float32, sen: Array, work: Single) -> None:
     """Derivatives, normal, H and K of one chunk, without a branch: rows 4 to 10 of `work` from rows 0 to 3."""
     as_type = work.dtype.type
     half, quarter, two, one = as_type(0.5), as_type(0.25), as_type(2.0), as_type(1.0)

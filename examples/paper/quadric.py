@@ -10,11 +10,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from hal.arrays import Array
 from hal.errors import NotObservable
-from perception.range.primitives import SurfaceType
+from hal.jit import compiled
+from perception.range import SurfaceType
 
 TERMS = 10
 FLAT_RATIO = 1e-6  # residual ratio below which a second quadric fits as well: the points do not determine one
@@ -141,8 +141,8 @@ def _named(s: Array, q: Array, centre: Array, scale: float, count: int) -> Quadr
     return Quadric(coefficients=q, centre_m=centre, scale_m=scale, rms=float(s[-1] / np.sqrt(count)))
 
 
-@njit(cache=True, nogil=True)
-def _triangle(rows):  # type: ignore[no-untyped-def]  # numba types it
+@compiled
+def _triangle(rows: Array) -> Array:
     """(10, 10) upper triangle R of rows (N, 10) by Givens rotations, one row at a time."""
     n = rows.shape[1]
     R = np.zeros((n, n))

@@ -1,0 +1,172 @@
+"""Models compete for one smooth component: every primitive is offered, the cheapest that explains it wins."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.arrays import Array, Indices
+from hal.jit import compiled
+from perception.range.fitting import fit
+from perception.range.fitting.surfaces import QUADRIC, SIZE
+from perception.range.segmentation.finish import SLOW_NOISE_AREA_PX
+from perception.range.segmentation.grid import Grid
+from perception.range.segmentation.grow_surface import GROW_SIGMAS, grow_surface
+from perception.range.segmentation.links import smooth_components
+
+Labels = NDArray[np.int32]
+Flags = NDArray[np.bool_]
+
+ROUNDS = 6
+MOST_COMPONENTS = 48  # a round
+MOST_ATTEMPTS = 120  # on one grid: bounds the time that rubble can cost
+FIT_SAMPLES = 90
+GOOD_MEAN_SQUARE = 2.0
+GOOD_SHARE = 0.75
+WHOLE_SHARE = 0.85  # a fit to the whole component that explains less has rivals grown from parts of it
+LOCAL_BLOCKS = 45
+LOCAL_TRIES = 5
+FEW_BLOCKS_FOR_QUADRIC = 60
+GIVE_UP = 14.0  # a fit that keeps three quarters within three sigmas leaves 8 at most, once it has converged
+
+
+@dataclass(slots=True, eq=False)
+class Candidates:
+    """Surfaces found so far; label k is `kinds[k - 1]`, `parameters[k - 1]`. Grows while segmentation runs."""
+
+    kinds: list[int] = field(default_factory=list)
+    parameters: list[Array] = field(default_factory=list)
+
+    def add(self, kind: int, parameters: Array) -> int:
+        """Append a surface and return its label."""
+        self.kinds.append(kind)
+        self.parameters.append(parameters)
+        return len(self.kinds)
+
+    def arrays(self) -> tuple[NDArray[np.int64], Array]:
+        """Kinds (n + 1,) and parameters (n + 1, 16), entry 0 unused, for compiled loops."""
+        kinds = np.array([0, *self.kinds], np.int64)
+        table = np.array([np.zeros(SIZE), *self.parameters])
+        return kinds, table
+
+
+def select_models(grid: Grid, blocks: Labels, *, found: Candidates, least: int, slope: float, focal_px: float) -> None:
+    """Offer each smooth component of unlabelled blocks to all primitives until no round adds a surface.
+
+    The surface that explains most of a component takes its blocks, if they are at least `least`. Extends `blocks` (h, w)
+    and `found`. `slope`: metres of depth per metre across that are no jump yet.
+    """
+    free: Flags = np.isfinite(grid.z) & (blocks == 0)
+    turn_limit = float(np.cos(max(0.7, 5.0 * grid.normal_sigma_rad)))
+    cos_limit = float(np.cos(max(0.5, 4.0 * grid.normal_sigma_rad)))
+    flat_free, flat_blocks = free.ravel(), blocks.ravel()
+    attempts, left = 0, np.flatnonzero(flat_free)
+    for _ in range(ROUNDS):
+        starts, indices = smooth_components(
+            left, grid.z, grid.sigma, free, slope * grid.size_px, 1.0 / focal_px, grid.perspective, grid.normal, grid.rms,
+            turn_limit, least, MOST_COMPONENTS,
+        )  # fmt: skip
+        count = len(starts) - 1
+        if count == 0 or attempts >= MOST_ATTEMPTS:
+            break
+        attempts += count
+        for k in range(count):
+            members = indices[starts[k] : starts[k + 1]]
+            members = members[flat_free[members]]
+            best = _best_model(grid, cos_limit, free, members, least) if len(members) >= least else None
+            if best is None:
+                # What nothing explains now, nothing will: it must not be offered again.
+                flat_free[members] = False
+            else:
+                kind, th, mine = best
+                flat_blocks[mine] = found.add(kind, th)
+                flat_free[mine] = False
+        left = left[flat_free[left]]
+
+
+def _best_model(
+    grid: Grid, cos_limit: float, free: Flags, members: Indices, least: int
+) -> tuple[int, Array, Indices] | None:
+    """Kind, parameters and blocks (flat) of the surface that explains most of `members`, None when there is none."""
+    kind, th, share = _fitted(grid, members)
+    fits = [(kind, th)]
+    if kind < 0 or share < WHOLE_SHARE:
+        fits += [_fitted(grid, part)[:2] for part in _parts(grid, members)]
+    queue, mark = np.empty(grid.z.size, np.int64), np.zeros(grid.z.size, np.uint8)
+    best, best_gain, mine = -1, 0.0, queue[:0]
+    for k, (kind, th) in enumerate(fits):
+        if kind < 0:
+            continue
+        count, total = grow_surface(
+            kind, th, grid.x, grid.y, grid.z, grid.sigma, grid.normal, grid.rms, free, members, grid.perspective, cos_limit,
+            mark, k + 1, queue,
+        )  # fmt: skip
+        gain = GROW_SIGMAS**2 * count - total
+        if count >= least and total <= GOOD_MEAN_SQUARE * count and gain > best_gain:
+            best, best_gain, mine = k, gain, queue[:count].copy()
+    if best < 0:
+        return None
+    if best > 0 or len(mine) < 0.9 * len(members):
+        kind, th, _ = _fitted(grid, mine)
+        if kind >= 0:
+            return kind, th, mine
+    return *fits[best], mine
+
+
+def _parts(grid: Grid, members: Indices) -> Iterator[Indices]:
+    """The blocks around seeds that are evenly spread over `members`."""
+    inside = members[np.isfinite(grid.rms.ravel()[members])]
+    width = grid.z.shape[1]
+    if len(inside) < LOCAL_TRIES + 2:
+        return
+    for t in range(LOCAL_TRIES):
+        seed = inside[((t + 1) * (len(inside) - 1)) // (LOCAL_TRIES + 1)]
+        rows, columns = members // width - seed // width, members % width - seed % width
+        yield members[rows * rows + columns * columns <= LOCAL_BLOCKS / np.pi]
+
+
+def _fitted(grid: Grid, members: Indices) -> tuple[int, Array, float]:
+    """`_fit_blocks` of some blocks of a grid."""
+    x, y, z, sigma = (a.ravel() for a in (grid.x, grid.y, grid.z, grid.sigma))
+    normal = grid.normal.reshape(-1, 3)
+    return _fit_blocks(x, y, z, sigma, normal, grid.perspective, grid.size_px**2, grid.slow_share, members)
+
+
+@compiled
+def _fit_blocks(
+    x: Array, y: Array, z: Array, sigma: Array, normal: Array, perspective: bool, pixels: int, slow_share: float,
+    members: Indices,
+) -> tuple[int, Array, float]:  # fmt: skip
+    """Kind (-1 when none explains them), parameters (16,) and explained share of the blocks `members` (flat)."""
+    count = members.shape[0]
+    if count < 5:
+        return -1, np.zeros(SIZE), 0.0
+    # Evenly spread over the region; a fixed choice keeps results equal from run to run.
+    n = min(count, FIT_SAMPLES)
+    points, P, N = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    few = np.empty((4, n))
+    known = 0
+    for k in range(n):
+        i = members[k if count == n else (k * (count - 1)) // (n - 1)]
+        scale = z[i] if perspective else 1.0
+        few[0, k], few[1, k], few[2, k], few[3, k] = x[i], y[i], z[i], sigma[i]
+        points[k, 0], points[k, 1], points[k, 2] = x[i] * scale, y[i] * scale, z[i]
+        if np.isfinite(normal[i, 0]):
+            P[known], N[known] = points[k], normal[i]
+            known += 1
+    kinds = np.ones(5, np.bool_)
+    kinds[QUADRIC] = count >= FEW_BLOCKS_FOR_QUADRIC
+    # Slow noise covers samples together: so many count as one.
+    patches = max(count * pixels / SLOW_NOISE_AREA_PX, 1.0)
+    correlated = 1.0 + slow_share * max(n / patches - 1.0, 0.0)
+    ths, mean2, kept, score = fit.fit_kinds(
+        points, P[:known], N[:known], few[0], few[1], few[2], few[3], perspective, kinds, correlated, GIVE_UP
+    )
+    best, least = -1, np.inf
+    for k in range(5):
+        if mean2[k] < GOOD_MEAN_SQUARE and kept[k] > GOOD_SHARE and score[k] < least:
+            best, least = k, score[k]
+    return best, ths[best].copy(), kept[best]

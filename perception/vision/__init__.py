@@ -1,4 +1,7 @@
-"""Images to facts: the panel's lights and pose, its objects and what they show, and teaching (paper II)."""
+"""Images to facts: the panel's lights and pose, its objects and what they show (paper II).
+
+The module `viewpoints` says where to look from, and `teaching` how kinds and panels are taught.
+"""
 
 from __future__ import annotations
 
@@ -21,31 +24,13 @@ if TYPE_CHECKING:
     from perception.vision.quadrangle import QuadranglePose, estimate
     from perception.vision.reading import ObjectReading, answer_at
     from perception.vision.registration.outline import contour_m
-    from perception.vision.teaching.from_panel import PanelLooks, teach_from_panel
-    from perception.vision.teaching.panel_lights import LightsFound, find_border_lights
-    from perception.vision.teaching.panel_questions import kind_question, questions
-    from perception.vision.teaching.panel_teach import PanelObjectDraft, object_row, panel_text
-    from perception.vision.teaching.teach import (
-        Example,
-        Overview,
-        check,
-        example_at,
-        likest,
-        overview_of,
-        teach_example,
-    )
     from perception.vision.warm import warm_up
 
 __all__ = [
     "AssignedLights",
     "CameraProjection",
-    "Example",
     "Knowledge",
-    "LightsFound",
     "ObjectReading",
-    "Overview",
-    "PanelLooks",
-    "PanelObjectDraft",
     "PanelPrior",
     "PanelProjection",
     "PhotographKind",
@@ -53,7 +38,6 @@ __all__ = [
     "TaughtKind",
     "answer_at",
     "as_gray",
-    "check",
     "check_image",
     "check_upright",
     "contour_m",
@@ -61,29 +45,19 @@ __all__ = [
     "draw_annotated",
     "draw_outlines",
     "estimate",
-    "example_at",
-    "find_border_lights",
     "find_panel",
     "find_panel_lights",
     "inspect",
     "inspect_view",
     "kind_files",
-    "kind_question",
     "kind_text",
-    "likest",
     "load_kind",
     "load_knowledge",
     "merge_views",
-    "object_row",
     "one_plate",
-    "overview_of",
-    "panel_text",
-    "questions",
     "read_photograph",
     "recognise",
     "said",
-    "teach_example",
-    "teach_from_panel",
     "warm_up",
     "write_kind",
 ]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 from hal.errors import CellError, InvalidRequest
 from hal.kinds import installed_kinds
 from hal.panel import Question
-from perception.vision import (
+from perception.vision.teaching import (
     Example,
     Overview,
     PanelObjectDraft,
@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from perception.vision import Knowledge, LightsFound
+    from perception.vision import Knowledge
+    from perception.vision.teaching import LightsFound
 
 T = TypeVar("T")
 MOST_TRIES = 5  # a script that goes on giving the same wrong answer must end

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import Field, model_validator
 
 from hal.errors import InvalidRequest
-from hal.panel import Panel
+from hal.panel import Panel, Question
 from hal.strict import Strict
 from service.knowledge.images import ImageStore
 from service.knowledge.store import KnowledgeStore, check_name
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from perception.vision import Example, Overview, PanelLooks, PanelProjection, Question
+    from perception.vision import PanelProjection
+    from perception.vision.teaching import Example, Overview, PanelLooks
 
 PixelNumber = Annotated[float, Field(ge=-1e5, le=1e5)]
 Click = tuple[PixelNumber, PixelNumber]
@@ -103,7 +104,7 @@ class TaughtView(Result):
 
 def questions_of(kind: str) -> tuple[Question, ...]:
     """What the dialogue asks about an object of this kind."""
-    from perception.vision import questions
+    from perception.vision.teaching import questions
 
     return questions(kind)
 
@@ -114,7 +115,7 @@ def find_outline(images: ImageStore, store: KnowledgeStore, request: OutlineRequ
     Raises:
         NoSuchImage, InvalidRequest, NotObservable, NotFound, Ambiguous: says what is wrong and what helps.
     """
-    from perception.vision import example_at, overview_of
+    from perception.vision.teaching import example_at, overview_of
 
     overview = overview_of(images.pixels(request.image), plate_m=request.plate_m)
     return described(overview, example_at(overview, request.clicks_px), store)
@@ -144,7 +145,7 @@ def teach_kind(
     size_m: tuple[float, float] | None = None,
 ) -> TaughtView:
     """Teach one example of a kind and keep it; see `teach`."""
-    from perception.vision import example_at, overview_of, teach_example
+    from perception.vision.teaching import example_at, overview_of, teach_example
 
     check_name(kind)
     overview = overview_of(pixels, plate_m=plate_m)
@@ -167,7 +168,7 @@ def teach_panel(
     store: KnowledgeStore, pixels: NDArray[np.uint8], plate_m: tuple[float, float], lesson: PanelLesson
 ) -> TaughtView:
     """Write a whole panel's file from clicks and answers; see `teach`."""
-    from perception.vision import PanelObjectDraft, example_at, find_border_lights, overview_of, panel_text
+    from perception.vision.teaching import PanelObjectDraft, example_at, find_border_lights, overview_of, panel_text
 
     check_name(lesson.name)
     overview = overview_of(pixels, plate_m=plate_m)
@@ -221,7 +222,7 @@ def learn_panel(store: KnowledgeStore, pixels: NDArray[np.uint8], view: PanelPro
     Raises:
         InvalidRequest, NotObservable, NotFound, Ambiguous: the overview teaches nothing; says why and what helps.
     """
-    from perception.vision import teach_from_panel
+    from perception.vision.teaching import teach_from_panel
 
     looks = teach_from_panel(pixels, view, panel, store.knowledge(), source="panelwright learn")
     return Learned(panel=panel.name, looks=looks, files=tuple(store.write_kind(kind) for kind in looks.kinds))
@@ -229,7 +230,7 @@ def learn_panel(store: KnowledgeStore, pixels: NDArray[np.uint8], view: PanelPro
 
 def described(overview: Overview, example: Example, store: KnowledgeStore) -> OutlineView:
     """An example for people and pages: its outline in the image, and what it is taken for now."""
-    from perception.vision import likest
+    from perception.vision.teaching import likest
 
     if example.outline is None:
         raise InvalidRequest("nothing was pointed at", hint="click on an object")

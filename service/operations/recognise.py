@@ -25,7 +25,8 @@ from service.schema.results import LearnResult, RecogniseResult, SurfaceResult, 
 
 if TYPE_CHECKING:
     from hal.panel import Panel
-    from perception.vision import PanelLooks, PanelProjection
+    from perception.vision import PanelProjection
+    from perception.vision.teaching import PanelLooks
 
 
 def run_recognise(session: Session, request: RecogniseRequest) -> RecogniseResult:

@@ -150,8 +150,8 @@ def warm_up() -> None:
 
 
 def _checked(points_object_m: ArrayLike, points_px: ArrayLike, covariance_px: ArrayLike) -> tuple[Array, Array, Array]:
-    points = np.ascontiguousarray(points_object_m, float)
-    pixels = np.ascontiguousarray(points_px, float)
+    points = np.require(points_object_m, float, ("C", "W"))  # compiled loops take no other layout
+    pixels = np.require(points_px, float, ("C", "W"))
     covariance = np.asarray(covariance_px, float)
     if points.shape != (4, 3) or pixels.shape != (4, 2):
         raise InvalidRequest(
@@ -164,7 +164,7 @@ def _checked(points_object_m: ArrayLike, points_px: ArrayLike, covariance_px: Ar
         raise InvalidRequest(
             f"covariance_px must be a variance, (2, 2) or (4, 2, 2), not {covariance.shape}", hint="in px squared"
         )
-    covariance = np.ascontiguousarray(np.broadcast_to(covariance, (4, 2, 2)))
+    covariance = np.array(np.broadcast_to(covariance, (4, 2, 2)))
     for name, array in (("points_object_m", points), ("points_px", pixels), ("covariance_px", covariance)):
         if not np.isfinite(array).all():
             index = int(np.argwhere(~np.isfinite(array))[0][0])

@@ -1,1 +1,42 @@
-"""From clicks and answers to what the system knows: a new kind, or the file of a whole panel."""
+"""Teaching by clicks and answers: kinds by examples, whole panels by a dialogue, and a known panel by itself."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hal.face import load_on_first_use
+
+if TYPE_CHECKING:
+    from perception.vision.teaching.from_panel import PanelLooks, teach_from_panel
+    from perception.vision.teaching.panel_lights import LightsFound, find_border_lights
+    from perception.vision.teaching.panel_questions import kind_question, questions
+    from perception.vision.teaching.panel_teach import PanelObjectDraft, object_row, panel_text
+    from perception.vision.teaching.teach import (
+        Example,
+        Overview,
+        check,
+        example_at,
+        likest,
+        overview_of,
+        teach_example,
+    )
+
+__all__ = [
+    "Example",
+    "LightsFound",
+    "Overview",
+    "PanelLooks",
+    "PanelObjectDraft",
+    "check",
+    "example_at",
+    "find_border_lights",
+    "kind_question",
+    "likest",
+    "object_row",
+    "overview_of",
+    "panel_text",
+    "questions",
+    "teach_example",
+    "teach_from_panel",
+]
+__getattr__ = load_on_first_use(__name__, __file__)

@@ -164,7 +164,7 @@ def _checked(points_object_m: ArrayLike, points_px: ArrayLike, covariance_px: Ar
         raise InvalidRequest(
             f"covariance_px must be a variance, (2, 2) or (4, 2, 2), not {covariance.shape}", hint="in px squared"
         )
-    covariance = np.array(np.broadcast_to(covariance, (4, 2, 2)))
+    covariance = np.array(np.broadcast_to(covariance, (4, 2, 2)), order="C")
     for name, array in (("points_object_m", points), ("points_px", pixels), ("covariance_px", covariance)):
         if not np.isfinite(array).all():
             index = int(np.argwhere(~np.isfinite(array))[0][0])

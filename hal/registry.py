@@ -6,11 +6,11 @@ import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar, get_args, get_type_hints, runtime_checkable
 
 from hal.clock import Clock, WallClock
 from hal.config import Cell
-from hal.devices import Device
+from hal.devices import PROTOCOLS, ArmCapabilities, Device, DeviceKind
 from hal.emulation import EmulatorFactory
 from hal.entry_points import load, registered
 from hal.errors import ConfigError
@@ -84,6 +84,34 @@ def takes(model: type[Strict]) -> Callable[[F], F]:
 def options_model(factory: Factory) -> type[Strict] | None:
     """The model that the entry point is marked with; None for one that is not."""
     return getattr(factory, OPTIONS, None)
+
+
+@runtime_checkable
+class KnowsItsArm(Protocol):
+    """Options of an arm's driver that tell the arm's kinematics before anything is connected."""
+
+    def known_arm(self) -> ArmCapabilities:
+        """Kinematics and limits of the arm with these options."""
+        ...
+
+
+def kinds_of(factory: Factory) -> tuple[DeviceKind, ...] | None:
+    """The device kinds whose interface the factory's declared return type has; None when it declares none."""
+    try:
+        declared = get_type_hints(factory).get("return")
+    except (NameError, TypeError):
+        return None
+    classes = [each for each in (get_args(declared) or (declared,)) if isinstance(each, type)]
+    kinds = [
+        kind
+        for kind, protocol in PROTOCOLS.items()
+        if classes and all(set(_methods(protocol)) <= set(dir(each)) for each in classes)
+    ]
+    return tuple(kinds) or None
+
+
+def _methods(protocol: type) -> list[str]:
+    return [name for name, member in vars(protocol).items() if callable(member) and not name.startswith("_")]
 
 
 def device_factory(driver: str) -> Factory:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -13,6 +14,27 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from hal.errors import ConfigError
 
 M = TypeVar("M", bound="Strict")
+REFERENCE = "see the file reference in docs/"
+IN_DOCS = "the reference is in docs/"
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One thing that is wrong in a file: the key path, what is wrong with its value, and the remedy."""
+
+    key: str
+    text: str
+    hint: str
+    is_unknown_key: bool = False
+
+    def __str__(self) -> str:
+        """In one line, with its remedy unless that is a page for all of them."""
+        said = _said(self.key, self.text)
+        return said if self.hint.startswith("see ") or self.hint.endswith(IN_DOCS) else f"{said}; {self.hint}"
+
+    def below(self, key: str) -> Fault:
+        """The same fault of a table that stands under `key` of the file."""
+        return replace(self, key=f"{key}.{self.key}".rstrip("."))
 
 
 class Strict(BaseModel):
@@ -67,45 +89,61 @@ def validate(data: dict[str, Any], model: type[M], *, source: str) -> M:
     TOML has no tuples, so lists stand for them; nothing else is converted.
     """
     try:
-        # JSON mode is strict about types, but takes a list for a tuple and a string for an enum.
-        return model.model_validate_json(json.dumps(data, default=str), strict=True)
+        return _parsed(data, model)
     except ValidationError as error:
-        # A misspelt key leaves its right one missing: the misspelling is what to mend, so it comes first.
-        found = error.errors()
-        known = {(item["loc"], item["msg"]) for item in found}
-        found += [item for item in model.further_faults(data) if (item["loc"], item["msg"]) not in known]
-        items = sorted(found, key=lambda item: item["type"] != "extra_forbidden")
-        faults = [_fault(item, model) for item in items]
-        first_key, first_text, first_hint = faults[0]
-        more = f" (and {len(faults) - 1} more {'fault' if len(faults) == 2 else 'faults'})" if len(faults) > 1 else ""
-        raise ConfigError(
-            f"{_said(source, first_key, first_text)}{more}",
-            hint=first_hint,
-            file=source,
-            key=first_key,
-            faults=[_with_remedy(*fault) for fault in faults],
-        ) from error
+        raise refusal(_faults(error, data, model), source=source) from error
 
 
-def _with_remedy(key: str, text: str, hint: str) -> str:
-    """A fault in one line, with its remedy unless that is a page for all of them."""
-    return _said(key, text) if hint.startswith(("add ", "see ")) else f"{_said(key, text)}; {hint}"
+def faults_in(data: dict[str, Any], model: type[Strict]) -> list[Fault]:
+    """Everything that is wrong with plain data for `model`; empty when it is in order."""
+    try:
+        _parsed(data, model)
+    except ValidationError as error:
+        return _faults(error, data, model)
+    return []
 
 
-def _fault(item: Any, model: type[BaseModel]) -> tuple[str, str, str]:
+def refusal(faults: list[Fault], *, source: str) -> ConfigError:
+    """One error that names all faults of a file; its remedy is the first one's."""
+    more = f" (and {len(faults) - 1} more {'fault' if len(faults) == 2 else 'faults'})" if len(faults) > 1 else ""
+    first = faults[0]
+    return ConfigError(
+        f"{_said(source, first.key, first.text)}{more}",
+        hint=first.hint,
+        file=source,
+        key=first.key,
+        faults=[str(fault) for fault in faults],
+    )
+
+
+def _parsed(data: dict[str, Any], model: type[M]) -> M:
+    # JSON mode is strict about types, but takes a list for a tuple and a string for an enum.
+    return model.model_validate_json(json.dumps(data, default=str), strict=True)
+
+
+def _faults(error: ValidationError, data: dict[str, Any], model: type[Strict]) -> list[Fault]:
+    found = error.errors()
+    known = {(item["loc"], item["msg"]) for item in found}
+    found += [item for item in model.further_faults(data) if (item["loc"], item["msg"]) not in known]
+    # A misspelt key leaves its right one missing: the misspelling is what to mend, so it comes first.
+    return [_fault(item, model) for item in sorted(found, key=lambda item: item["type"] != "extra_forbidden")]
+
+
+def _fault(item: Any, model: type[BaseModel]) -> Fault:
     path = _path_in_file(item["loc"], model)
     key = ".".join(str(part) for part in path)
     if item["type"] == "extra_forbidden":
         hint = item.get("ctx", {}).get("hint") or unknown_key_hint(model, item["loc"])
-        return key, f"unknown key {path[-1]!r}", hint
+        return Fault(key, f"unknown key {path[-1]!r}", hint, is_unknown_key=True)
     if item["type"] == "missing":
-        return key, "is missing", f"add {key}; the reference is in docs/"
+        return Fault(key, "is missing", f"add {key}; {IN_DOCS}")
     given, hint = repr(item.get("input")), item.get("ctx", {}).get("hint")
     if hint is not None:  # the model knows what helps
-        return key, item["msg"], hint
+        return Fault(key, item["msg"], hint)
     if item["type"] == "value_error":
-        return key, item["msg"].removeprefix("Value error, "), "see the file reference in docs/"
-    return key, f"{item['msg']} (given: {given[:60]})", "see the file reference in docs/ for type, unit and range"
+        return Fault(key, item["msg"].removeprefix("Value error, "), REFERENCE)
+    said = f"{item['msg']} (given: {given[:60]})"
+    return Fault(key, said, f"{REFERENCE} for type, unit and range")
 
 
 def _said(*parts: str) -> str:

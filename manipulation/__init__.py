@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from manipulation.planning.transfer import QUICK, THOROUGH, Effort
     from manipulation.planning.visiting_order import visiting_order
     from manipulation.skills.attempt import Attempt
-    from manipulation.skills.context import SkillContext
+    from manipulation.skills.context import SkillContext, is_in_reach
     from manipulation.skills.operate import operate
     from manipulation.skills.outcome import ObjectState, SkillFailure, SkillReport, Verify
     from manipulation.skills.probe import proximity_probe, touch_probe
@@ -40,6 +40,7 @@ __all__ = [
     "SkillReport",
     "SpeedLimits",
     "Verify",
+    "is_in_reach",
     "operate",
     "park",
     "plan_sweep",

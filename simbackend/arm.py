@@ -14,7 +14,7 @@ from hal.clock import Deadline
 from hal.devices import ArmCapabilities, DeviceKind, JointState
 from hal.errors import InvalidRequest, MotionRefused
 from hal.readings import Cause, Quality, Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 from hal.simulated import Truth
 from simbackend import kernels
 from simbackend.arm_model import MODELS
@@ -30,6 +30,10 @@ class ArmOptions(SimOptions):
 
     model: Literal["t3", "ur10e"] = "t3"
     lookahead_s: Annotated[float, Field(ge=0, le=0.2)] = 0.0
+
+    def known_arm(self) -> ArmCapabilities:
+        """Kinematics and limits of the model."""
+        return MODELS[self.model]().capabilities
 
 
 class SimArm(SimDevice[JointState]):
@@ -100,6 +104,7 @@ class SimArm(SimDevice[JointState]):
         return state, *VALID
 
 
+@takes(ArmOptions)
 def connect(context: Context, options: dict[str, Any]) -> SimArm:
     """Entry point `sim:arm`."""
     return SimArm(context, parse(options, ArmOptions, context))

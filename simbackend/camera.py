@@ -11,7 +11,7 @@ from hal.calibration import CameraIntrinsics
 from hal.clock import Deadline
 from hal.devices import CameraCapabilities, DeviceKind, Image
 from hal.readings import Cause, Quality, Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 from simbackend.camera_sensor import CameraSensor, SensorOptions
 from simbackend.client import CameraView, Frame, true_mount
 from simbackend.device import VALID, SimDevice, SimOptions, parse
@@ -122,6 +122,7 @@ def scaled(lens: CameraIntrinsics, width_px: int, height_px: int) -> CameraIntri
     )
 
 
+@takes(CameraOptions)
 def connect(context: Context, options: dict[str, Any]) -> SimCamera:
     """Entry point `sim:camera`."""
     return SimCamera(context, parse(options, CameraOptions, context))

@@ -12,7 +12,7 @@ from hal.calibration import ToolLoad
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ForceTorqueCapabilities, Wrench
 from hal.readings import Cause, Quality, Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 from simbackend import kernels
 from simbackend.client import Frame
 from simbackend.device import VALID, SimDevice, SimOptions, parse
@@ -84,6 +84,7 @@ class SimForceTorque(SimDevice[Wrench]):
         return Wrench(force_n=raw[:3], torque_nm=raw[3:]), Quality.DEGRADED, Cause.SATURATED
 
 
+@takes(ForceTorqueOptions)
 def connect(context: Context, options: dict[str, Any]) -> SimForceTorque:
     """Entry point `sim:force_torque`."""
     return SimForceTorque(context, parse(options, ForceTorqueOptions, context))

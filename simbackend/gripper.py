@@ -9,7 +9,7 @@ from hal.clock import Deadline
 from hal.devices import DeviceKind, GripperCapabilities, GripperState
 from hal.errors import InvalidRequest
 from hal.readings import Cause, Quality, Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 from simbackend.client import Frame
 from simbackend.device import VALID, SimDevice, SimOptions, parse
 from simbackend.tool_model import MAX_FORCE_N, MAX_SPEED_M_PER_S, MAX_WIDTH_M
@@ -65,6 +65,7 @@ class SimGripper(SimDevice[GripperState]):
         return state, *VALID
 
 
+@takes(SimOptions)
 def connect(context: Context, options: dict[str, Any]) -> SimGripper:
     """Entry point `sim:gripper`."""
     return SimGripper(context, parse(options, SimOptions, context))

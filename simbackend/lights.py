@@ -9,7 +9,7 @@ from hal.clock import Deadline
 from hal.devices import DeviceKind, LightsCapabilities
 from hal.errors import InvalidRequest
 from hal.readings import Cause, Quality, Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 from simbackend.client import Frame
 from simbackend.device import VALID, SimDevice, SimOptions, parse
 
@@ -53,6 +53,7 @@ class SimLights(SimDevice[tuple[bool, ...]]):
         return tuple(bool(x) != bool(bias) for x in frame.snapshot.lights_on[: len(self._channels)]), *VALID
 
 
+@takes(SimOptions)
 def connect(context: Context, options: dict[str, Any]) -> SimLights:
     """Entry point `sim:lights`."""
     return SimLights(context, parse(options, SimOptions, context))

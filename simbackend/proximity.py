@@ -11,7 +11,7 @@ from hal.clock import Deadline
 from hal.devices import DeviceKind, ProximityCapabilities
 from hal.errors import ConfigError
 from hal.readings import Cause, Quality, Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 from simbackend.client import PROXIMITY_RANGE_M, Frame
 from simbackend.device import VALID, SimDevice, SimOptions, parse
 from simbackend.wire import PROXIMITY_TICKS, Snapshot
@@ -65,6 +65,7 @@ class SimProximity(SimDevice[float]):
         return round(distance_m / step_m) * step_m, *VALID
 
 
+@takes(ProximityOptions)
 def connect(context: Context, options: dict[str, Any]) -> SimProximity:
     """Entry point `sim:proximity`."""
     return SimProximity(context, parse(options, ProximityOptions, context))

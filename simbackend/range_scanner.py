@@ -10,7 +10,7 @@ import numpy as np
 from hal.clock import Deadline
 from hal.devices import DeviceKind, RangeImage, RangeScannerCapabilities
 from hal.readings import Cause, Quality, Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 from simbackend.client import CameraView, Frame, true_mount
 from simbackend.device import VALID, SimDevice, parse
 from simbackend.line_scanner import SimLineScanner
@@ -70,6 +70,7 @@ class SimRangeScanner(SimDevice[RangeImage]):
         return newest[2], *VALID
 
 
+@takes(RangeOptions)
 def connect(context: Context, options: dict[str, Any]) -> SimRangeScanner | SimLineScanner:
     """Entry point `sim:range_scanner`: a range camera or, with `model = "polar"`, a line scanner."""
     parsed = parse(options, RangeOptions, context)

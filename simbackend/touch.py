@@ -9,7 +9,7 @@ from pydantic import Field
 from hal.clock import Deadline
 from hal.devices import DeviceKind, TouchCapabilities
 from hal.readings import Cause, Quality, Stamped
-from hal.registry import Context
+from hal.registry import Context, takes
 from simbackend.client import Frame
 from simbackend.device import VALID, SimDevice, SimOptions, parse
 
@@ -41,6 +41,7 @@ class SimTouch(SimDevice[Contacts]):
         return tuple(force + bias >= self._threshold_n for force in frame.snapshot.pad_force_n.tolist()), *VALID
 
 
+@takes(TouchOptions)
 def connect(context: Context, options: dict[str, Any]) -> SimTouch:
     """Entry point `sim:touch`."""
     return SimTouch(context, parse(options, TouchOptions, context))

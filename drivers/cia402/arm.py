@@ -57,6 +57,10 @@ class Cia402Options(CanOptions):
     degrees_per_increment: Annotated[float, Field(gt=0)] = 0.001
     kinematics: KinematicsOptions
 
+    def known_arm(self) -> ArmCapabilities:
+        """Kinematics and limits as `kinematics` has them."""
+        return capabilities(self.kinematics, command_rate_hz=self.rate_hz, watchdog_s=self.heartbeat_s)
+
     @model_validator(mode="after")
     def _one_node_a_joint(self) -> Self:
         require_stations("nodes", self.nodes, self.kinematics)

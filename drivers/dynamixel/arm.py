@@ -61,6 +61,10 @@ class DynamixelOptions(BusOptions):
     is_fast: bool = True
     kinematics: KinematicsOptions
 
+    def known_arm(self) -> ArmCapabilities:
+        """Kinematics and limits as `kinematics` has them."""
+        return capabilities(self.kinematics, command_rate_hz=self.rate_hz, watchdog_s=self.watchdog_s)
+
     @model_validator(mode="after")
     def _one_servo_a_joint(self) -> Self:
         require_stations("ids", self.ids, self.kinematics)

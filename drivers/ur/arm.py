@@ -54,6 +54,10 @@ class UrOptions(rtde.RtdeOptions):
     lookahead_s: Annotated[float, Field(ge=0.03, le=0.2)] = 0.05
     watchdog_s: Annotated[float, Field(ge=0.02, le=2)] = 0.1
 
+    def known_arm(self) -> ArmCapabilities:
+        """Kinematics and limits as `kinematics` has them."""
+        return capabilities(self.kinematics, command_rate_hz=self.rate_hz, watchdog_s=self.watchdog_s)
+
     @model_validator(mode="after")
     def _has_six_joints(self) -> Self:
         if len(self.kinematics.links) != JOINTS:

@@ -21,6 +21,7 @@ from manipulation.planning.time_parameterization import SpeedLimits
 from manipulation.planning.transfer import THOROUGH, Effort, TransferPlanner
 
 STROKE_MARGIN_M = 0.001
+REACH_TURNS_RAD = np.linspace(-np.pi, np.pi, 12, endpoint=False)
 FINGERS = ("finger_left", "finger_right")
 
 
@@ -140,3 +141,14 @@ def panel_from_grip(point_m: Sequence[float], turn_rad: float) -> RigidTransform
     """
     c, s = np.cos(turn_rad), np.sin(turn_rad)
     return transform([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]], point_m)
+
+
+def is_in_reach(
+    kinematics: Kinematics, base_from_panel: RigidTransform, flange_from_grip: RigidTransform, point_m: Sequence[float]
+) -> bool:
+    """Can the fingertips stand on a point of the panel (panel frame, m), straight at the plate in any turn?
+
+    Only joint limits count: nothing is said of collisions or of the way there.
+    """
+    grips = (base_from_panel * panel_from_grip(point_m, float(turn)) for turn in REACH_TURNS_RAD)
+    return any(len(kinematics.inverse(grip * flange_from_grip.inv())) > 0 for grip in grips)

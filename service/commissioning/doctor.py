@@ -15,6 +15,7 @@ from hal.config import Cell, load_cell
 from hal.errors import REINSTALL, CellError, ConfigError, detail_lines
 from hal.registry import installed_drivers
 from service.client import Client
+from service.commissioning.cell_check import objects_in_reach
 from service.commissioning.preflight import check_machine, check_python, check_simulator
 from service.processes.stop_host import bound_socket
 from service.terminal import console, find_cell
@@ -115,7 +116,9 @@ def _ports(port: int, served: str | None) -> str:
 def _cell_file(path: Path) -> str:
     cell = load_cell(find_cell(path))
     check_machine(cell)
-    return f"{cell.name}: {len(cell.file.devices)} devices, panel {cell.panel.name} ({len(cell.panel.objects)} objects)"
+    objects, reached = len(cell.panel.objects), objects_in_reach(cell)
+    reach = "" if reached is None else f", {sum(reached.values())} in reach"
+    return f"{cell.name}: {len(cell.file.devices)} devices, panel {cell.panel.name} ({objects} objects{reach})"
 
 
 def _writable() -> str:

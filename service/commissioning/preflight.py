@@ -12,14 +12,14 @@ from scipy.spatial.transform import RigidTransform
 from hal.config import Cell, DeviceSection
 from hal.errors import REINSTALL, ConfigError
 from hal.frames import frame_tree
-from hal.registry import device_factory
 from hal.wires import claims_of, clash
+from service.commissioning.cell_check import check_cell
 
 PYTHON = (3, 11)
 
 
 def check_machine(cell: Cell) -> None:
-    """Python's version, the simulator's engine, that every driver and frame exists, and that no two want one wire.
+    """Python's version, the simulator's engine, that the cell file can be meant, and that no two devices want one wire.
 
     Raises:
         ConfigError: names what is missing and how to get it.
@@ -29,13 +29,7 @@ def check_machine(cell: Cell) -> None:
     for name, section in cell.file.devices.items():
         if section.driver.startswith("sim:"):
             check_simulator(f"devices.{name}")
-        try:
-            device_factory(section.driver)
-        except ConfigError as error:
-            key = f"devices.{name}.driver"
-            raise ConfigError(
-                f"{cell.path}: {key}: {error.what}", hint=error.hint, file=str(cell.path), key=key
-            ) from None
+    check_cell(cell)
     check_wires(cell)
 
 

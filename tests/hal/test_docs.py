@@ -11,7 +11,7 @@ from hal import panel
 from hal.calibration import CalibrationRecord, IntrinsicsRecord, LoadRecord, MountRecord
 from hal.config import CellSection, DeviceSection, EmulatorSection, SafetySection, WorkspaceSection
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).parents[2] / "docs" / "reference"
 PANEL_MODELS = (
     panel.Panel, panel.Light, panel.Scale, panel.State, panel.Tolerances, panel.Gauge, panel.PanelMeter, panel.Display,
     panel.Lamp, panel.Button, panel.Toggle, panel.Rotary, panel.Slider, panel.Lever, panel.Handwheel, panel.Mushroom,

@@ -45,14 +45,14 @@ def _assert_refused(done: subprocess.CompletedProcess[str], *words: str) -> None
 
 
 def test_an_unknown_driver_is_one_clear_message(write_cell: WriteCell) -> None:
-    path = write_cell()
+    path = write_cell(robot=True)
     path.write_text(path.read_text().replace("fake:lights", "fake:lihgts"))
     done = _run("serve", "--cell", str(path), "--port", "0")
     _assert_refused(done, str(path), "devices.panel_lights", "did you mean 'fake:lights'?")
 
 
 def test_a_misspelt_key_is_one_clear_message(write_cell: WriteCell) -> None:
-    path = write_cell()
+    path = write_cell(robot=True)
     path.write_text(path.read_text().replace("seed = 3", "sead = 3"))
     _assert_refused(_run("serve", "--cell", str(path)), str(path), "cell.sead", "did you mean 'seed'?")
 
@@ -69,7 +69,7 @@ def test_a_mistyped_name_of_a_shipped_cell_is_told_the_right_one_from_any_folder
 def test_a_missing_device_is_one_clear_message_of_a_command_that_wants_them_all(
     write_cell: WriteCell, tmp_path: Path
 ) -> None:
-    path = write_cell(options={"panel_lights": {"fail": "no answer from 10.0.0.9"}})
+    path = write_cell(robot=True, options={"panel_lights": {"fail": "no answer from 10.0.0.9"}})
     done = _run("demo", "--cell", str(path), "--runs", str(tmp_path / "runs"))
     _assert_refused(done, "panel_lights", "no answer from 10.0.0.9", "plug it in")
 
@@ -77,7 +77,7 @@ def test_a_missing_device_is_one_clear_message_of_a_command_that_wants_them_all(
 def test_a_missing_device_does_not_end_the_service(write_cell: WriteCell, tmp_path: Path) -> None:
     away = {"fail": "no answer from [10.0.0.9]"}
     world = {"child_pid_file": str(tmp_path / "world.pid")}
-    served = Served(write_cell(options={"finger_proximity": away, "panel_lights": world}), tmp_path)
+    served = Served(write_cell(robot=True, options={"finger_proximity": away, "panel_lights": world}), tmp_path)
     try:
         eventually(lambda: "devices connect finger_proximity" in served.log.read_text())
         assert "no answer from [10.0.0.9]\n  try    plug it in; then" in served.log.read_text()
@@ -92,15 +92,17 @@ def test_a_port_in_use_is_one_clear_message(write_cell: WriteCell, tmp_path: Pat
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = str(taken.getsockname()[1])
-        done = _run("serve", "--cell", str(write_cell()), "--port", port, "--runs", str(tmp_path / "runs"))
-        clash = _run("serve", "--cell", str(write_cell()), "--port", "0", "--stop-port", port)
+        done = _run("serve", "--cell", str(write_cell(robot=True)), "--port", port, "--runs", str(tmp_path / "runs"))
+        clash = _run("serve", "--cell", str(write_cell(robot=True)), "--port", "0", "--stop-port", port)
     _assert_refused(done, f"port {port}", "--port")
     _assert_refused(clash, f"port {port}", "--stop-port")
-    _assert_refused(_run("serve", "--cell", str(write_cell()), "--port", port, "--stop-port", port), "the stop process")
+    _assert_refused(
+        _run("serve", "--cell", str(write_cell(robot=True)), "--port", port, "--stop-port", port), "the stop process"
+    )
 
 
 def test_a_public_address_is_refused_while_there_are_no_keys(write_cell: WriteCell) -> None:
-    _assert_refused(_run("serve", "--cell", str(write_cell()), "--host", "0.0.0.0"), "0.0.0.0", "ssh -L")  # noqa: S104 - what is refused
+    _assert_refused(_run("serve", "--cell", str(write_cell(robot=True)), "--host", "0.0.0.0"), "0.0.0.0", "ssh -L")  # noqa: S104 - what is refused
 
 
 def test_no_service_to_talk_to_is_one_clear_message() -> None:
@@ -126,7 +128,7 @@ def test_a_missing_simulator_is_one_clear_message() -> None:
 def test_files_of_the_user_that_are_called_like_ours_break_nothing(write_cell: WriteCell, tmp_path: Path) -> None:
     for name in OURS:
         (tmp_path / f"{name}.py").write_text("raise SystemExit('a file of the user was taken for ours')\n")
-    command = [str(SCRIPT), "doctor", "--cell", str(write_cell()), "--port", str(_free_port())]
+    command = [str(SCRIPT), "doctor", "--cell", str(write_cell(robot=True)), "--port", str(_free_port())]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "cell process" in done.stdout  # a child has started, and its driver was found

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from perception.range.batch_results import BatchResult, KeptResults
     from perception.range.features import FeatureKind, RangeFeature
     from perception.range.matching.match import Match, match_models
-    from perception.range.matching.models import ComponentModel, load_models, models_from, shipped_models
+    from perception.range.matching.models import load_models, shipped_models
+    from perception.range.matching.panel_objects import PanelView, Sighting, find_objects
     from perception.range.noise import NoiseModel, estimate_noise
     from perception.range.plane import PlaneFit, fit_plane_near
     from perception.range.primitives import Cone, Cylinder, Ellipsoid, Plane, Sphere, Surface, SurfaceType
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 __all__ = [
     "MARK",
     "BatchResult",
-    "ComponentModel",
     "Cone",
     "Cylinder",
     "Ellipsoid",
@@ -34,6 +34,7 @@ __all__ = [
     "Match",
     "NoiseModel",
     "OrthographicSensor",
+    "PanelView",
     "PinholeSensor",
     "Plane",
     "PlaneFit",
@@ -41,6 +42,7 @@ __all__ = [
     "RangeScene",
     "RangeSensorModel",
     "Reading",
+    "Sighting",
     "Sphere",
     "Surface",
     "SurfaceType",
@@ -48,13 +50,13 @@ __all__ = [
     "assumptions",
     "batch_range",
     "estimate_noise",
+    "find_objects",
     "fit_plane_near",
     "image_from_sweep",
     "load_models",
     "load_recording",
     "match_json",
     "match_models",
-    "models_from",
     "picture",
     "recordings_in",
     "scene_json",

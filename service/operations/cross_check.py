@@ -16,11 +16,11 @@ from hal.devices import DeviceKind
 from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import UncertainPose, compose
 from hal.panel import PanelObject
-from perception.range import RangeScene
+from perception.range import RangeScene, Sighting
 from perception.vision import ObjectReading, viewpoints
 from service.operations.acquisition import Scan, settle
 from service.operations.locate import ScannedPlane, scan_plate
-from service.operations.range_detection import Sighting, find_by_surfaces, mark_of, surfaces_in
+from service.operations.range_detection import find_by_surfaces, mark_of, surfaces_in
 from service.operations.session import Session
 from service.operations.travel import go_to_first
 from service.report.plots import png_of

@@ -8,14 +8,14 @@ import numpy as np
 
 from hal.errors import NotFound
 from hal.geometry import compose
-from perception.range import Surface
+from perception.range import Sighting, Surface
 from service.jsonable import jsonable
 from service.knowledge.store import KnowledgeStore
 from service.knowledge.teach import learn_panel
 from service.operations.acquisition import look, scan, settle
 from service.operations.inspect import ensure_located, run_recognise_taught
 from service.operations.locate import go_to_overview, plate_in
-from service.operations.range_detection import Sighting, find_by_surfaces, mark_of, surfaces_in
+from service.operations.range_detection import find_by_surfaces, mark_of, surfaces_in
 from service.operations.session import Session
 from service.operations.stored import Pixels, blind_answer, blind_in_stored, panel_of, read_stored, shown, stored_view
 from service.report.plots import png_of

@@ -11,9 +11,11 @@ from hal.devices import RangeScannerCapabilities
 from hal.errors import Unsupported
 from hal.geometry import UncertainPose
 from hal.panel import Button, Handwheel, Light, Mushroom, Panel
+from perception.range import Sighting
+from perception.range.matching.panel_objects import models_of
 from perception.range.matching.solids import boxes_of, render, solid_of
 from service.operations.acquisition import Scan
-from service.operations.range_detection import Sighting, find_by_surfaces, mark_of, models_of, surfaces_in
+from service.operations.range_detection import find_by_surfaces, mark_of, surfaces_in
 from service.operations.recognise import _sighting_result
 from service.report.surfaces import FOUND, LOST, surfaces_picture
 

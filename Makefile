@@ -27,9 +27,9 @@ setup: .venv/ready  ## Make .venv with everything in it
 	    echo "  try    make PYTHON=/path/to/python3.11"; exit 2; }
 	@echo "setup: making .venv (about 120 packages, 2 GB; then the kernels are compiled, once per installation)"
 	@$(PYTHON) -m venv .venv
-	@$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt uv || true
+	@$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt uv 2>/dev/null || true
 	@$(call install,-e .)
-	@$(BIN)/python -c 'import hal, numpy, cv2, pybullet' || { echo "error: the installation is not complete; the lines above say why"; exit 2; }
+	@$(BIN)/python -c 'import hal, numpy, cv2, pybullet' >/dev/null || { echo "error: the installation is not complete; the lines above say why"; exit 2; }
 	@$(MAKE) --no-print-directory -j 2 warm test-packages
 	@touch $@
 	@echo "setup: ready"

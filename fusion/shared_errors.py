@@ -124,7 +124,7 @@ def error_budget(
         **_lens_errors(observations, mounts, lenses or {}),
     }
     changes = [*own, *(change for errors in shared.values() for change in errors)]
-    informations, gradients = _linearised(
+    informations, gradients = linearised(
         [*nominal, *(m for change in changes for m in change.values())], base_from_panel
     )
     concerned = [(k, i) for k, change in enumerate(changes) for i in change]
@@ -187,8 +187,8 @@ def _lens_errors(
     }
 
 
-def _linearised(measurements: Sequence[Measurement], pose: RigidTransform) -> tuple[Array, Array]:
-    """J^T J (N, 6, 6) and J^T r (N, 6) of each measurement at a pose."""
+def linearised(measurements: Sequence[Measurement], pose: RigidTransform) -> tuple[Array, Array]:
+    """Return J^T J (N, 6, 6) and J^T r (N, 6) of each measurement at a pose."""
     R, t = np.array(matrix_of(pose), order="C"), np.array(pose.translation, order="C")
     r, J = np.zeros((len(measurements), 6)), np.zeros((len(measurements), 6, 6))
     whitened_all(pack(measurements), R, t, r, J)

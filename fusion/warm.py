@@ -10,6 +10,7 @@ from fusion.certify.proof import quadratic_forms
 from fusion.features import Kind, box_features
 from fusion.measurement import Measurement, measurement
 from fusion.robust import fuse, used_entries
+from fusion.shared_errors import linearised
 from fusion.solve import solve
 from hal.geometry import UncertainPose
 
@@ -20,6 +21,7 @@ def warm_up() -> None:
     """Run one small problem of every class. Minutes after a change of the code, milliseconds when the cache is there."""
     made, pose = one_of_each_class(), RigidTransform.identity()
     solve(made, pose)
+    linearised(made, pose)
     prior = UncertainPose(parent_from_child=pose, covariance=1e-4 * np.eye(6))
     fuse(made, prior=prior)
     fuse([min(made, key=lambda one: one.dof)], prior=prior)  # where many poses fit, all are looked for

@@ -7,9 +7,10 @@ import sys
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-from fusion import fuse, warm_up
+from fusion import fuse, fuse_observations, warm_up
 from hal.geometry import UncertainPose
 from tests.fusion.mixtures import mixture
+from tests.fusion.test_shared_errors import MOUNTS, draw
 
 
 def variants() -> dict[str, int]:
@@ -28,4 +29,6 @@ def test_after_warming_up_no_fusion_waits_for_a_compiler() -> None:
     fuse(p.measurements)
     fuse(p.measurements, prior=prior, certify=True)
     fuse([min(p.measurements, key=lambda one: one.dof)], prior=prior)
+    fuse_observations(draw(np.random.default_rng(1)), MOUNTS)
     assert variants() == warm
+    assert max(warm.values()) == 1, "another set of argument types would be compiled as a kernel of its own"

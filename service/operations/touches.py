@@ -33,7 +33,7 @@ from service.schema.fuse_results import TouchingResult, TouchResult
 HOVER_M = 0.05  # of the fingertips above the plate while the proximity sensors look
 HOVER_SAMPLES = 5
 LEAST_TOUCHES = 3
-LEAST_GAIN = 0.03  # of the pose's mean square error: a touch that is expected to bring less is not made
+LEAST_GAIN = 0.01  # of the pose's mean square error: a touch that is expected to bring less is not made
 REST_S = 0.02  # two readings of a proximity sensor
 SPARE_SPOTS = 2  # more places than touches: to choose from, and to replace those that the arm cannot reach
 TOUCH_S = 2.0  # hovering, approaching and leaving, without the way there

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from hal.panel.gauge import Gauge
     from hal.panel.goals import GAUGE_SHARE, Goal, NumberGoal, Shown, StateGoal
     from hal.panel.handwheel import Handwheel
+    from hal.panel.knob import Knob
     from hal.panel.lamp import Lamp
     from hal.panel.layout import Panel, Tolerances, load_panel
     from hal.panel.lever import Lever
@@ -54,6 +55,7 @@ __all__ = [
     "Gauge",
     "Goal",
     "Handwheel",
+    "Knob",
     "Lamp",
     "Lever",
     "Light",

@@ -7,7 +7,7 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.errors import InvalidRequest
 from hal.motion import Compliance, Guard, Quantity
-from hal.panel import Rotary
+from hal.panel import Knob, Rotary
 from manipulation.planning.cartesian_path import arc
 from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import centre_between
@@ -63,7 +63,7 @@ def rotary(
     )
     return perform(
         context,
-        lambda attempt: _turn(attempt, selector, where.known, angles[target]),
+        lambda attempt: turn_bar(attempt, selector, where.known, angles[target], over_rad=PLAY_RAD),
         skill="rotary",
         object_name=name,
         target=target,
@@ -85,7 +85,10 @@ def _is_at(seen: ObjectState, target: str, angle_rad: float) -> bool:
     return seen.angle_rad is not None and abs(seen.angle_rad - angle_rad) <= TOLERANCE_RAD
 
 
-def _turn(attempt: Attempt, selector: Rotary, start_rad: float, goal_rad: float) -> float:
+def turn_bar(
+    attempt: Attempt, selector: Rotary | Knob, start_rad: float, goal_rad: float, *, over_rad: float = 0.0
+) -> float:
+    """Hold the bar on a knob and turn it, `over_rad` further than asked; returns the angle reached."""
     context = attempt.context
     bar_m = BAR_RATIO * selector.radius_m
     open_m = bar_m + 2.0 * SIDE_M
@@ -106,7 +109,7 @@ def _turn(attempt: Attempt, selector: Rotary, start_rad: float, goal_rad: float)
         raise SkillFailure(Outcome.MISSED, f"the fingers closed to {1e3 * width:.1f} mm; no bar between them")
     start = attempt.pose()
     axis = context.panel_pose.rotation.apply([0.0, 0.0, -1.0])
-    over = PLAY_RAD * float(np.sign(goal_rad - start_rad))  # the detent pulls the knob back into place
+    over = over_rad * float(np.sign(goal_rad - start_rad))  # the detent pulls the knob back into place
     poses = arc(start, centre_m=start.translation, axis=axis, angle_rad=goal_rad - start_rad + over)
     guard = Guard(name="effort", quantity=Quantity.FORCE, limit=STOP_N)
     report = attempt.along(poses, name="turn", speed_m_per_s=TURN_M_PER_S, guards=(guard,), compliance=YIELDING)
@@ -119,7 +122,9 @@ def _turn(attempt: Attempt, selector: Rotary, start_rad: float, goal_rad: float)
     return reached
 
 
-def _way(selector: Rotary, start_rad: float, goal_rad: float, seat_m: float, flip: float) -> list[RigidTransform]:
+def _way(
+    selector: Rotary | Knob, start_rad: float, goal_rad: float, seat_m: float, flip: float
+) -> list[RigidTransform]:
     x, y = selector.position_m
     steps = np.linspace(start_rad, goal_rad, max(3, int(abs(goal_rad - start_rad) / 0.1)))
     down = [panel_from_grip((x, y, seat_m + LIFT_M), flip - float(a)) for a in steps]

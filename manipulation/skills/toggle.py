@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Protocol
 
 import numpy as np
 
@@ -23,6 +24,40 @@ BEYOND_M = 0.013  # how far past the middle the fingertip's face goes if nothing
 SWEEP_M_PER_S = 0.03
 EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
 END_N = 4.0  # above what the detent needs: the bat stands on its stop
+
+
+class Handle(Protocol):
+    """A bat that leans up or down by `tilt_rad` about a pivot `PIVOT_M` above the plate."""
+
+    @property
+    def name(self) -> str:
+        """As in the panel file."""
+        ...
+
+    @property
+    def position_m(self) -> tuple[float, float]:
+        """Its pivot on the plate."""
+        ...
+
+    @property
+    def bat_length_m(self) -> float:
+        """From the plate to its tip."""
+        ...
+
+    @property
+    def bat_radius_m(self) -> float:
+        """Of its round end."""
+        ...
+
+    @property
+    def tilt_rad(self) -> float:
+        """How far it leans."""
+        ...
+
+    @property
+    def force_n(self) -> float:
+        """At its tip, to throw it."""
+        ...
 
 
 def toggle(
@@ -55,7 +90,7 @@ def toggle(
         is_said_there = current is not None and current.state == target and next(tries) == 0
         if is_said_there and verify is not None and (seen := verify()) is not None and seen.state == target:
             return None
-        return _throw(attempt, switch, up)
+        return throw(attempt, switch, up)
 
     return perform(
         context,
@@ -68,7 +103,7 @@ def toggle(
     )
 
 
-def _throw(attempt: Attempt, switch: Toggle, up: float) -> float:
+def throw(attempt: Attempt, switch: Handle, up: float) -> float:
     """Come down beside the bat and sweep it over, `up` 1 or -1; returns how far past the pivot the face came, m."""
     half = max(attempt.context.hand.closed_half_m)
     # The bat leans away from the target; come down beyond it.
@@ -85,12 +120,12 @@ def _throw(attempt: Attempt, switch: Toggle, up: float) -> float:
     return past
 
 
-def stop_force_n(switch: Toggle) -> float:
+def stop_force_n(switch: Handle) -> float:
     """Force that tells the bat stands on its stop, N: its own effort acts at its tip, the fingertip pushes lower down."""
     return EFFORT_SPREAD * switch.force_n / GRIP_RATIO + END_N
 
 
-def _come_down(attempt: Attempt, switch: Toggle, start_m: float, end_m: float) -> None:
+def _come_down(attempt: Attempt, switch: Handle, start_m: float, end_m: float) -> None:
     """The fingertip beside the bat, at panel height `start_m`, from where the sweep to `end_m` is free."""
     reach = PIVOT_M + GRIP_RATIO * switch.bat_length_m
     x, above = switch.position_m[0], reach + switch.bat_length_m + STANDOFF_M

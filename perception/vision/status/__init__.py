@@ -1,1 +1,19 @@
-"""One reader a kind: a rectified patch and the panel file's description in, a `PatchReading` out."""
+"""Readers, one file a kind: a rectified patch and the panel file's description in, a reading out.
+
+These names are what a package needs that brings a reader of its own.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hal.face import load_on_first_use
+
+if TYPE_CHECKING:
+    from perception.vision.patch import Patch
+    from perception.vision.reading import PatchReading
+    from perception.vision.status.choice import choose, contrast_noise
+    from perception.vision.status.reader import Reader
+
+__all__ = ["Patch", "PatchReading", "Reader", "choose", "contrast_noise"]
+__getattr__ = load_on_first_use(__name__, __file__)

@@ -1,0 +1,88 @@
+"""A breaker in the simulated world: a handle with a latch that lets it reach `on` only from `off`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from acme_breaker.model import Breaker
+from hal.simulated import ObjectTruth
+from simbackend.bodies import (
+    Body,
+    Canvas,
+    Detent,
+    Mechanism,
+    ObjectModel,
+    Start,
+    at,
+    cylinder,
+    moving,
+    place_of,
+    shape,
+    sphere,
+)
+
+PIVOT_M = 0.004
+WHITE, STEEL = (0.95, 0.95, 0.95), (0.80, 0.81, 0.83)
+HOUSING, WHITE_INK = (40, 41, 44), (235, 235, 235)
+
+
+@dataclass(slots=True, eq=False)
+class Latch(Detent):
+    """Rests at `on`, `off` or straight out; once straight out, it must come to `off` before `on` holds again."""
+
+    has_tripped: bool = False
+
+    def nearest(self, x: float) -> float:
+        """The resting place next to `x`."""
+        low, high = self.places
+        if self.has_tripped and x <= 0.8 * low:
+            self.has_tripped = False
+        places = (low, 0.0) if self.has_tripped else (low, high)
+        return min(places, key=lambda place: abs(place - x))
+
+
+class BreakerBody(Body[Breaker]):
+    """On, off or tripped."""
+
+    def start(self, panel_object: Breaker, u: float) -> Start:
+        """Each of the three in a third of all worlds."""
+        return Start(place=(panel_object.tilt_rad, -panel_object.tilt_rad, 0.0)[int(3 * u)])
+
+    def model(self, panel_object: Breaker, start: Start) -> ObjectModel:
+        """The handle with its bright tip."""
+        reach, r, tilt = panel_object.bat_length_m, panel_object.bat_radius_m, panel_object.tilt_rad
+        parts = [
+            shape(at(0, 0, reach / 2), cylinder(0.7 * r, reach), STEEL),
+            shape(at(0, 0, reach - r), sphere(r), WHITE),
+        ]
+        urdf = moving(
+            parts, kind="revolute", axis=(-1, 0, 0), limits=(-tilt, tilt), mass_kg=0.02, inertia_kg_m2=1e-4,
+            pivot_m=(0, 0, PIVOT_M),
+        )  # fmt: skip
+        return ObjectModel(urdf=urdf, place=start.place)
+
+    def mechanism(self, engine: Any, body: int, panel_object: Breaker, start: Start, effort_ratio: float) -> Latch:
+        """Snaps to where it may rest."""
+        effort = panel_object.force_n * panel_object.bat_length_m * effort_ratio
+        ends = (-panel_object.tilt_rad, panel_object.tilt_rad)
+        return Latch(
+            engine=engine, body=body, places=ends, effort=effort, max_speed=8.0, has_tripped=start.place == 0.0
+        )
+
+    def print_on(self, canvas: Canvas, panel_object: Breaker) -> None:
+        """The dark housing, I and O, and the label."""
+        (x, y), half = panel_object.position_m, panel_object.height_m / 2
+        canvas.box((x, y), (panel_object.width_m, panel_object.height_m), HOUSING, round_m=0.001)
+        canvas.text((x, y + 0.8 * half), "I", 0.004, WHITE_INK)
+        canvas.text((x, y - 0.8 * half), "O", 0.004, WHITE_INK)
+        canvas.label((x, y), half, panel_object.label)
+
+    def truth(self, panel_object: Breaker, start: Start, mechanism: Mechanism | None, *, is_lit: bool) -> ObjectTruth:
+        """Where the handle rests."""
+        place = place_of(mechanism)
+        states = {"on": panel_object.tilt_rad, "off": -panel_object.tilt_rad, "tripped": 0.0}
+        return ObjectTruth(name=panel_object.name, state=min(states, key=lambda s: abs(states[s] - place)), value=place)
+
+
+BODY = BreakerBody()

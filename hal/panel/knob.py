@@ -1,0 +1,65 @@
+"""Knobs that turn continuously over a scale."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from hal.panel.angles import PointerScale
+from hal.panel.base import PanelObject
+from hal.panel.form import Envelope, Face, Rim, circle
+from hal.panel.goals import GAUGE_SHARE, NumberGoal
+from hal.panel.parts import Positive, Vector2
+from hal.panel.questions import Question, Taught, about_a_pointer, pointer_scale, radius_of
+
+
+class Knob(PanelObject):
+    """Knob without detents: a bar on it to take hold of, with a mark that points at a value of the scale around it."""
+
+    kind: Literal["knob"] = "knob"
+    radius_m: Positive = 0.016
+    height_m: Positive = 0.018
+    scale: PointerScale
+    torque_nm: Positive = 0.1
+
+    asked: ClassVar[tuple[Question, ...]] = about_a_pointer("-135", "135")
+
+    @property
+    def face(self) -> Face:
+        """The knob, in the plane of its front."""
+        return Face(half_width_m=self.radius_m, half_height_m=self.radius_m, height_m=self.height_m)
+
+    @property
+    def half_footprint_m(self) -> Vector2:
+        """Its radius."""
+        return self.radius_m, self.radius_m
+
+    def envelope(self, angle_rad: float | None = None) -> Envelope:
+        """A box about the knob."""
+        return Envelope(half_m=self.half_footprint_m, height_m=self.height_m)
+
+    @property
+    def rim(self) -> Rim:
+        """The knob's shoulder, at half its height."""
+        return circle(self.radius_m, above_plate_m=self.height_m / 2)
+
+    @property
+    def goal(self) -> NumberGoal:
+        """A value of its scale."""
+        scale = self.scale
+        tolerance = GAUGE_SHARE * scale.span
+        return NumberGoal(key="value", low=scale.minimum, high=scale.maximum, unit=scale.unit, tolerance=tolerance)
+
+    @property
+    def mission_rank(self) -> float:
+        """After levers, sliders, buttons and toggles."""
+        return 5.0
+
+    @property
+    def full_scale(self) -> float:
+        """The span of its scale."""
+        return self.scale.span
+
+    @classmethod
+    def keys_of(cls, taught: Taught) -> dict[str, Any]:
+        """Radius and scale."""
+        return {**radius_of(taught), "scale": pointer_scale(taught)}

@@ -8,7 +8,7 @@ wall clock the thread always ticks and holds the arm.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
@@ -18,15 +18,12 @@ from hal.arrays import Array
 from hal.calibration import ToolLoad
 from hal.clock import Clock, SimClock
 from hal.config import SafetySection
-from hal.devices import Arm, ForceTorque, Gripper, Proximity, Touch
 from hal.errors import CellError, DeviceFault, MotionRefused, Stopped
 from hal.geometry import identity
 from hal.motion import (
     CartesianPath,
     DeclaredMotion,
     GripperMotion,
-    Hold,
-    JointTrajectory,
     MotionOutcome,
     MotionReport,
     RobotState,
@@ -43,6 +40,7 @@ from manipulation.control.sensing import (
     ContactWrench,
     DeviceFailure,
     Devices,
+    MotionDevices,
     RangeReader,
     Sample,
     ToolReading,
@@ -50,15 +48,10 @@ from manipulation.control.sensing import (
     refuse,
 )
 from manipulation.control.setpoint import SetPointLimiter, check, flange_matrix
-from manipulation.control.termination import Termination, TerminationMonitor
+from manipulation.control.termination import Termination, TerminationMonitor, cause_of_end, has_settled
 from manipulation.plausibility.hand import TouchMonitor
 from manipulation.plausibility.repetition import RepeatedWrench
 
-RAN = "ran to its declared end"
-SETTLE_S = 0.3
-CATCH_UP_S = 2.0  # for a set-point that speed limits hold back
-SETTLED_RAD = 2e-4
-SETTLED_RAD_PER_S = 0.02
 TARE_S = 0.1
 LATE_TICKS = 2  # a tick that comes later makes the motion late: caught up, 50 ms made 0.25 m/s of an approach at 0.06
 SLOW_TICKS = 4  # gripper and proximity are read every so many ticks
@@ -77,11 +70,7 @@ class Controller:
 
     def __init__(
         self,
-        arm: Arm,
-        gripper: Gripper,
-        force_torque: ForceTorque | None,
-        touch: Touch | None,
-        proximities: Sequence[Proximity] = (),
+        devices: MotionDevices,
         *,
         clock: Clock,
         safety: SafetySection,
@@ -94,20 +83,20 @@ class Controller:
         # In lockstep no reading is late by chance.
         patience_s = (1.0 if isinstance(clock, SimClock) else 3.0) * safety.max_reading_age_s
         self._devices = Devices(
-            arm=arm,
-            gripper=gripper,
-            force_torque=force_torque,
-            touch=touch,
+            arm=devices.arm,
+            gripper=devices.gripper,
+            force_torque=devices.force_torque,
+            touch=devices.touch,
             proximities=tuple(
                 RangeReader(sensor, clock, max_age_s=safety.max_reading_age_s, patience_s=patience_s)
-                for sensor in proximities
+                for sensor in devices.proximities
             ),
             clock=clock,
             max_age_s=safety.max_reading_age_s,
         )
-        self._repeated_wrench = RepeatedWrench(force_torque)
-        self._touch_monitor = TouchMonitor(touch, force_torque)
-        capabilities = arm.capabilities()
+        self._repeated_wrench = RepeatedWrench(devices.force_torque)
+        self._touch_monitor = TouchMonitor(devices.touch, devices.force_torque)
+        capabilities = devices.arm.capabilities()
         self.kinematics = Kinematics.of(capabilities)
         self._clock = clock
         self._safety = safety
@@ -116,8 +105,8 @@ class Controller:
         self._grip = flange_matrix(identity() if flange_from_grip is None else flange_from_grip)
         self._dt_s = 1.0 / (rate_hz or capabilities.command_rate_hz)
         self._filter = SetPointLimiter(self.kinematics, self._grip, safety.speed_limit_m_per_s, self._dt_s)
-        self._drives = Drives(arm, clock, self._dt_s)
-        self._standing = FollowingErrorMonitor(arm.name, self.kinematics, self._grip, self._drives)
+        self._drives = Drives(devices.arm, clock, self._dt_s)
+        self._standing = FollowingErrorMonitor(devices.arm.name, self.kinematics, self._grip, self._drives)
         self._is_lockstep = isinstance(clock, SimClock)
         self._thread = ControlThread(beat=None if self._is_lockstep else self._hold, at_end=self._drives.stop)
         self._busy = threading.Lock()
@@ -277,11 +266,12 @@ class Controller:
                     wanted = run.wanted(tick)
                     if run.is_over(tick):
                         over_since_s = elapsed_s if over_since_s is None else over_since_s
-                        if self._has_settled(motion, wanted, sample, elapsed_s - over_since_s):
+                        left_rad = np.abs(wanted - self._filter.last_rad)
+                        if has_settled(motion, left_rad, sample.velocity_rad_per_s, elapsed_s - over_since_s):
                             if isinstance(run, GripperExecutor):
                                 run.check_end(sample)
                                 self._touch_monitor.pads_moved(run.begun_m, sample.pads)
-                            return Termination(outcome=MotionOutcome.COMPLETED, cause=self._end_of(motion, wanted))
+                            return Termination(outcome=MotionOutcome.COMPLETED, cause=cause_of_end(motion, left_rad))
                     self._send(self._filter.apply(wanted))
                     self._drives.pass_tick()
                     ticks += 1
@@ -296,23 +286,6 @@ class Controller:
                 run.halt(sample, elapsed_s)
             self._come_to_rest(end)
             return end
-
-    def _has_settled(self, motion: DeclaredMotion, wanted: Array, sample: Sample, over_s: float) -> bool:
-        if isinstance(motion, Hold | GripperMotion):
-            return True
-        is_behind = np.abs(wanted - self._filter.last_rad).max() >= SETTLED_RAD
-        if not is_behind and np.abs(sample.velocity_rad_per_s).max() < SETTLED_RAD_PER_S:
-            return True
-        # A path may be far from its joints for good, where it yields; a trajectory's set-point is only on its way.
-        return over_s >= (CATCH_UP_S if is_behind and isinstance(motion, JointTrajectory) else SETTLE_S)
-
-    def _end_of(self, motion: DeclaredMotion, wanted: Array) -> str:
-        """The cause of a completed motion; tells when the limits have kept a trajectory's set-point from its end."""
-        left_rad = np.abs(wanted - self._filter.last_rad)
-        k = int(np.argmax(left_rad))
-        if left_rad[k] < SETTLED_RAD or not isinstance(motion, JointTrajectory):
-            return RAN
-        return f"{RAN}, but joint {k + 1} is still {1e3 * left_rad[k]:.1f} mrad away from it"
 
     def _come_to_rest(self, end: Termination) -> None:
         """Decelerate at the limit, then hold; only the arm is listened to, since another device may be what failed."""

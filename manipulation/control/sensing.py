@@ -52,6 +52,17 @@ class Sample:
         return Pads(width_m=self.gripper_width_m, is_moving=self.gripper_is_moving, is_holding=self.gripper_is_holding)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MotionDevices:
+    """The devices of a cell that the control loop works with. All but the arm and its gripper may be absent."""
+
+    arm: Arm
+    gripper: Gripper
+    force_torque: ForceTorque | None = None
+    touch: Touch | None = None
+    proximities: Sequence[Proximity] = ()
+
+
 class DeviceFailure(Exception):
     """A device could not be used in this tick; `device` names it."""
 

@@ -8,13 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from hal.arrays import Array
-from hal.motion import Guard, MotionOutcome, Quantity, Reaction
+from hal.motion import DeclaredMotion, GripperMotion, Guard, Hold, JointTrajectory, MotionOutcome, Quantity, Reaction
 from manipulation.control.guards import GuardSet, Measured
 from manipulation.control.sensing import Sample, ToolReading
 from manipulation.plausibility.arm import FOLLOWING_LIMIT_M
 
 TRACKING_TICKS = 5
 LOADED_START_RATIO = 1.2  # otherwise a jammed hand could never be taken away
+RAN = "ran to its declared end"
+SETTLE_S = 0.3
+CATCH_UP_S = 2.0  # for a set-point that speed limits hold back
+SETTLED_RAD = 2e-4
+SETTLED_RAD_PER_S = 0.02
 UNITS = {
     Quantity.FORCE: "N",
     Quantity.TORQUE: "N m",
@@ -111,3 +116,28 @@ def _standing_guards(force_limit_n: float, wrench: Array) -> tuple[Guard, ...]:
             reaction=Reaction.FAULT,
         ),
     )
+
+
+def has_settled(motion: DeclaredMotion, left_rad: Array, velocity_rad_per_s: Array, over_s: float) -> bool:
+    """Return whether a motion that has run its course is at its end.
+
+    Args:
+        left_rad: (n,) how far the set-point is from where the motion wants it, not negative.
+        velocity_rad_per_s: (n,) of the arm.
+        over_s: time since the course was run.
+    """
+    if isinstance(motion, Hold | GripperMotion):
+        return True
+    is_behind = left_rad.max() >= SETTLED_RAD
+    if not is_behind and np.abs(velocity_rad_per_s).max() < SETTLED_RAD_PER_S:
+        return True
+    # A path may be far from its joints for good, where it yields; a trajectory's set-point is only on its way.
+    return over_s >= (CATCH_UP_S if is_behind and isinstance(motion, JointTrajectory) else SETTLE_S)
+
+
+def cause_of_end(motion: DeclaredMotion, left_rad: Array) -> str:
+    """Say that a motion is completed, and when limits have kept a trajectory's set-point from its end."""
+    k = int(np.argmax(left_rad))
+    if left_rad[k] < SETTLED_RAD or not isinstance(motion, JointTrajectory):
+        return RAN
+    return f"{RAN}, but joint {k + 1} is still {1e3 * left_rad[k]:.1f} mrad away from it"

@@ -66,19 +66,11 @@ def perform(
         if outcome is Outcome.STIFF:
             break
     return SkillReport(
-        skill=skill,
-        object=object_name,
-        target=target,
-        outcome=outcome,
-        cause=cause,
-        reached=reached,
-        seen=seen,
-        attempts=tries,
-        started_s=started_s,
-        ended_s=context.mover.state().stamp_s,
+        skill=skill, object=object_name, target=target, outcome=outcome, cause=cause, reached=reached, seen=seen,
+        attempts=tries, started_s=started_s, ended_s=context.mover.state().stamp_s,
         peak_force_n=max((report.peak_force_n for report in attempt.reports), default=0.0),
         motions=tuple(attempt.reports),
-    )
+    )  # fmt: skip
 
 
 def _try(attempt: Attempt, stroke: Stroke) -> tuple[Outcome, str, float | None]:

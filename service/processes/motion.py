@@ -196,7 +196,7 @@ def controller_of(
     Raises:
         ConfigError: a part that motion needs is missing from the cell file.
     """
-    from manipulation import Controller
+    from manipulation import Controller, MotionDevices
 
     arm, gripper = _first(cell, devices, DeviceKind.ARM), _first(cell, devices, DeviceKind.GRIPPER)
     if gripper is None:
@@ -209,11 +209,13 @@ def controller_of(
     wrist = _first(cell, devices, DeviceKind.FORCE_TORQUE)
     _check_joints(cell, arm)
     controller = Controller(
-        arm,
-        gripper,
-        wrist,
-        _first(cell, devices, DeviceKind.TOUCH),
-        tuple(devices[name] for name in cell.names_of(DeviceKind.PROXIMITY)),
+        MotionDevices(
+            arm=arm,
+            gripper=gripper,
+            force_torque=wrist,
+            touch=_first(cell, devices, DeviceKind.TOUCH),
+            proximities=tuple(devices[name] for name in cell.names_of(DeviceKind.PROXIMITY)),
+        ),
         clock=clock,
         safety=cell.file.safety,
         load=_load(cell, wrist),

@@ -28,6 +28,7 @@ from hal.geometry import transform_rpy
 from hal.readings import Cause, Quality, Stamped
 from manipulation.arm.kinematics import Kinematics
 from manipulation.control.controller import Controller
+from manipulation.control.sensing import MotionDevices
 from tests.manipulation.arms import T3
 
 GRIP = transform_rpy((0.0, 0.0, 0.2), (0.0, 0.0, 0.0))
@@ -226,11 +227,13 @@ def make_rig(*, force_limit_n: float = 100.0, speed_limit_m_per_s: float = 0.25)
     """A started controller; close `rig.controller` at the end."""
     world, latched = World(), [False]
     controller = Controller(
-        FakeArm("arm", world),
-        FakeGripper("gripper", world),
-        FakeForceTorque("wrist_ft", world),
-        FakeTouch("finger_touch", world),
-        (FakeProximity("proximity_left", world),),
+        MotionDevices(
+            arm=FakeArm("arm", world),
+            gripper=FakeGripper("gripper", world),
+            force_torque=FakeForceTorque("wrist_ft", world),
+            touch=FakeTouch("finger_touch", world),
+            proximities=(FakeProximity("proximity_left", world),),
+        ),
         clock=world.clock,
         safety=SafetySection(force_limit_n=force_limit_n, speed_limit_m_per_s=speed_limit_m_per_s),
         load=LOAD,

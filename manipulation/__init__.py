@@ -10,43 +10,42 @@ if TYPE_CHECKING:
     from manipulation import plausibility
     from manipulation.arm.kinematics import Kinematics
     from manipulation.control.controller import Controller
-    from manipulation.planning.collision import CollisionModel
+    from manipulation.control.sensing import MotionDevices
     from manipulation.planning.shapes import CollisionBox
     from manipulation.planning.time_parameterization import SpeedLimits
     from manipulation.planning.touch_points import touch_points
-    from manipulation.planning.transfer import QUICK, THOROUGH, Effort
     from manipulation.planning.visiting_order import visiting_order
-    from manipulation.skills.attempt import Attempt
     from manipulation.skills.context import SkillContext, is_in_reach
     from manipulation.skills.operate import operate
     from manipulation.skills.outcome import ObjectState, SkillFailure, SkillReport, Verify
     from manipulation.skills.probe import proximity_probe, touch_probe
-    from manipulation.skills.retreat import park, retreat
+    from manipulation.skills.retreat import park
     from manipulation.skills.sweep import plan_sweep
+    from manipulation.skills.travel import back_out_of, plan_to_first, plan_to_joints, reachable, stands_clear
     from manipulation.warm import warm_up
 
 __all__ = [
-    "QUICK",
-    "THOROUGH",
-    "Attempt",
     "CollisionBox",
-    "CollisionModel",
     "Controller",
-    "Effort",
     "Kinematics",
+    "MotionDevices",
     "ObjectState",
     "SkillContext",
     "SkillFailure",
     "SkillReport",
     "SpeedLimits",
     "Verify",
+    "back_out_of",
     "is_in_reach",
     "operate",
     "park",
     "plan_sweep",
+    "plan_to_first",
+    "plan_to_joints",
     "plausibility",
     "proximity_probe",
-    "retreat",
+    "reachable",
+    "stands_clear",
     "touch_points",
     "touch_probe",
     "visiting_order",

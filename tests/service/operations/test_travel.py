@@ -14,9 +14,10 @@ from hal.config import load_cell
 from hal.errors import Unreachable
 from manipulation.planning.transfer import QUICK, THOROUGH, Effort
 from manipulation.skills.context import SkillContext
+from manipulation.skills.travel import MOST_THOROUGH, MOST_TRIES, NEAR_RAD, near_first
 from perception.vision.viewpoints import close_up_poses
 from service.operations.session import Session
-from service.operations.travel import MOST_THOROUGH, MOST_TRIES, NEAR_RAD, go_to_camera_view, near_first
+from service.operations.travel import go_to_camera_view
 
 ROOT = Path(__file__).parents[3]
 pytestmark = pytest.mark.timeout(300)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from hal.errors import Cancelled, DeviceFault, InvalidRequest, Stopped
+from hal.errors import Cancelled, DeviceFault, InvalidRequest, Stopped, Unsupported
 from hal.geometry import certain, transform_rpy
 from hal.motion import DeclaredMotion, Hold, MotionLog, MotionOutcome, MotionReport, RobotState
 from hal.panel import Lamp
@@ -195,7 +195,7 @@ def test_a_deed_without_knowledge_of_the_object_is_refused_before_anything_moves
         operate(work, work.panel.object("valve"), "ajar")
     with pytest.raises(InvalidRequest, match="off the scale"):
         operate(work, work.panel.object("fader"), 7.0)
-    with pytest.raises(InvalidRequest, match="cannot be worked"):
+    with pytest.raises(Unsupported, match="no skill"):
         operate(work, Lamp(name="lit", position_m=(0.0, 0.0), radius_m=0.01), "on")
     assert work.mover.asked == []
 

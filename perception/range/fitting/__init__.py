@@ -1,1 +1,1 @@
-"""Surfaces fitted to depths along rays: one surface at a time, compiled."""
+"""Fits of single primitives to depths measured along rays (compiled)."""

@@ -1,8 +1,9 @@
-"""Fits of primitives on depth residuals along each ray.
+"""Robust fits of primitives to depth residuals along each ray.
 
-Orthogonal distances bias a radius by about sigma^2 / (2 r) and more at grazing rays; the sensor errs along its ray, so
-the residual is `(z_measured - z_surface) / sigma(z)`. Robust start (Cauchy weights under a falling scale), then a trim
-at `TRIM_SIGMAS` and plain least squares (Levenberg's damping, Marquardt's scaling).
+The error of the sensor lies along its ray, so the residual is `(z_measured - z_surface) / sigma(z)`. Orthogonal
+distances would bias a radius by about sigma^2 / (2 r), and by more at grazing rays. A fit starts robustly, with Cauchy
+weights whose scale falls from round to round; it ends with least squares on the residuals below `TRIM_SIGMAS`
+(Levenberg's damping, Marquardt's scaling).
 """
 
 from __future__ import annotations
@@ -49,25 +50,30 @@ from perception.range.fitting.surfaces import (
 )
 
 TRIM_SIGMAS = 3.0
-PER_MEDIAN = 1.4826  # standard deviations of a normal law per median of its absolute value
+PER_MEDIAN = 1.4826  # standard deviation of a normal distribution per median of its absolute value
 SCALE_PRECISION = 0.004
-FALLS = 0.95  # of the scale before: so much at least it must fall for another round under Cauchy weights
+FALLS = 0.95  # another round with Cauchy weights follows only if the scale falls below this share of the previous one
 ROUGH_SAMPLES = 36
 ROUGH_LIMIT = 5.0
 ROUGH_STEPS = as_numpy_scalar(2)
-ELLIPSOID_GIVE_UP = 14.0  # the mean square of what is simpler beyond which none is tried; a sphere is no close start
+# No ellipsoid is tried if the mean square of the simpler kinds exceeds this: a sphere is then no good initial guess.
+ELLIPSOID_GIVE_UP = 14.0
 LARGEST_RADIUS_M = 10.0
-LEAST_NORMALS = 10  # that tell where anything but a plane starts
-QUADRIC_PER_SAMPLE = 1.15  # a simple surface under white noise costs about 0.95 a sample, and its price
-STEP_GOAL = 1e-3  # of a standard deviation of each parameter: a step that small changes nothing that matters
+LEAST_NORMALS = 10  # normals needed to start any kind but a plane
+QUADRIC_PER_SAMPLE = 1.15  # a simple surface under white noise costs about 0.95 per sample plus its parameter penalty
+STEP_GOAL = 1e-3  # in standard deviations of each parameter: smaller steps are negligible
 FIRST = as_numpy_scalar(0)
-AROUND_ZERO, AROUND_MEAN = as_numpy_scalar(False), as_numpy_scalar(True)  # what normals are scattered about
+AROUND_ZERO, AROUND_MEAN = as_numpy_scalar(False), as_numpy_scalar(True)  # centre of the scatter matrix of the normals
 
 
 @compiled
 def new_scratch(samples: int) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]:
-    """What a fit works in: rows of `rays`, two systems (9, 9) and (9,), that of a step, two frames, a trial, residuals."""
-    small = np.empty(3 * 81 + 3 * 9 + 2 * 6 + SIZE)  # one allocation in place of nine
+    """Allocate the work arrays of a fit to at most `samples` samples.
+
+    In order: rows of `rays`, matrix (9, 9) and gradient (9,) of the current and of the trial parameters, matrix and
+    vector of a step, tangent frames of the current and of the trial parameters, trial parameters, residuals.
+    """
+    small = np.empty(3 * 81 + 3 * 9 + 2 * 6 + SIZE)  # one allocation instead of nine
     H, H2, A = small[:81].reshape((9, 9)), small[81:162].reshape((9, 9)), small[162:243].reshape((9, 9))
     g, g2, step = small[243:252], small[252:261], small[261:270]
     frame, new_frame, trial = small[270:276], small[276:282], small[282:]
@@ -80,17 +86,17 @@ def refine(
     trim: float, fixed: Mask,
     scratch: tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array], held: int,
 ) -> tuple[float, int, int]:  # fmt: skip
-    """Minimise the ray residuals from `th`, which is moved.
+    """Minimise the ray residuals with at most `steps` damped Gauss-Newton steps; updates the parameters `th` in place.
 
     Args:
         x, y, z, sigma: (N,) samples; coordinates as in `Grid`.
         scale: > 0: width of the Cauchy weights in sigmas; 0: trim at `trim` and plain least squares.
-        fixed: (9,) bool, tangent parameters that a prior holds.
-        scratch: as `new_scratch`.
-        held: of the samples and `th` what `scratch` holds, as `normal_equations`.
+        fixed: (9,) bool, tangent parameters that stay at their prior value.
+        scratch: work arrays of `new_scratch`.
+        held: which rows for these samples and `th` are valid in `scratch` (NOTHING, LOADED, ERRED or FILLED).
 
     Returns:
-        cost, samples used, and what `scratch` holds of the samples and the parameters found.
+        cost, number of samples used, and which rows for the samples and the final `th` are valid in `scratch`.
     """
     work, H, g, H2, g2, A, step, frame, new_frame, trial, _ = scratch
     p = FREEDOM[kind]
@@ -138,7 +144,7 @@ def refine(
 
 @compiled
 def damped(H: Array, g: Array, fixed: Mask, damping: float, p: int, A: Array, step: Array) -> None:
-    """The system of one step into `A` (p, p) and `step` (p,): fixed parameters stay where they are."""
+    """Write the damped linear system of one step into `A` (p, p) and `step` (p,); fixed parameters get a zero step."""
     for a in range(p):
         for b in range(p):
             A[a, b] = 0.0 if fixed[a] or fixed[b] else H[a, b]
@@ -148,7 +154,7 @@ def damped(H: Array, g: Array, fixed: Mask, damping: float, p: int, A: Array, st
 
 @compiled
 def _load(x: Array, y: Array, z: Array, sigma: Array, work: Array) -> int:
-    """Loads the samples into `work` if they have room there; returns what it holds then."""
+    """Load the samples into `work` if there are at most CHUNK of them; returns LOADED or NOTHING."""
     if x.shape[0] > CHUNK:
         return NOTHING
     load_rows(x, y, z, sigma, FIRST, x.shape[0], work)
@@ -160,7 +166,10 @@ def _fill_errors(
     kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool,
     scratch: tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array], held: int,
 ) -> int:  # fmt: skip
-    """Residuals (N,) in sigmas into row ERROR if `scratch` holds the samples, else into its last array; and what it holds then."""
+    """Compute the residuals (N,) in sigmas; returns which rows of `scratch` are valid afterwards.
+
+    They go into row ERROR if `scratch` holds the samples, and otherwise into its last array.
+    """
     work, frame, n = scratch[0], scratch[7], x.shape[0]
     if held == NOTHING:
         residuals_by_chunks(kind, th, x, y, z, sigma, perspective, frame, work, scratch[10])
@@ -174,10 +183,10 @@ def _fill_errors(
 
 @compiled
 def middle_scale(e: Array) -> float:
-    """Robust residual scale, 1.48 times the (upper) median of |e|, at least 1; NaN is a ray that misses. Overwrites e (N,).
+    """Return the robust scale of the residuals e (N,): 1.48 times the upper median of |e|, at least 1. Overwrites e.
 
-    Good to `SCALE_PRECISION`: the value that halves the samples is closed in on by counting, which needs no branch;
-    sorting them out by a pivot costs ten times as much.
+    NaN marks a ray that misses. The median is found by bisection to the relative precision `SCALE_PRECISION`: counting
+    the smaller values needs no branch, and selection with a pivot takes ten times as long.
     """
     n = e.shape[0]
     most = 0.0
@@ -202,9 +211,9 @@ def middle_scale(e: Array) -> float:
 def fit_robust(
     kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, fixed: Mask, rounds: int,
 ) -> tuple[Array, float]:  # fmt: skip
-    """Refine under Cauchy weights whose scale falls with the residuals; ends with the trimmed fit.
+    """Fit with Cauchy weights whose scale falls with the residuals, then with trimmed least squares.
 
-    Returns parameters and the trimmed cost.
+    Returns the parameters and the trimmed cost.
     """
     th, scratch = th.copy(), new_scratch(x.shape[0])
     _, _, cost = _robust(kind, th, x, y, z, sigma, perspective, fixed, rounds, scratch)
@@ -216,7 +225,10 @@ def _robust(
     kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, fixed: Mask, rounds: int,
     scratch: tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array],
 ) -> tuple[float, float, float]:  # fmt: skip
-    """`fit_robust` that moves `th`; mean squared residual of the kept samples, share kept, and trimmed cost."""
+    """Fit as `fit_robust`, but update `th` in place.
+
+    Returns the mean squared residual of the kept samples, the share kept, and the trimmed cost.
+    """
     n = x.shape[0]
     e = scratch[0][ERROR : ERROR + n] if n <= CHUNK else scratch[10][:n]
     held, is_last, before, cost, used = _load(x, y, z, sigma, scratch[0]), rounds == 0, np.inf, 0.0, 0
@@ -225,7 +237,7 @@ def _robust(
         if not is_last:
             held = _fill_errors(kind, th, x, y, z, sigma, perspective, scratch, held)
             middle = middle_scale(e)
-            is_last = middle > FALLS * before  # the same weights once more would find the same surface
+            is_last = middle > FALLS * before  # nearly the same weights would give the same surface again
             if not is_last:
                 scale, steps, before = middle, 4, middle
         cost, used, held = refine(
@@ -243,7 +255,7 @@ def _rough(
     kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, fixed: Mask,
     scratch: tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array],
 ) -> float:  # fmt: skip
-    """Moves `th` by a few robust steps; the sum of squared residuals then, each at most `ROUGH_LIMIT` squared."""
+    """Update `th` by a few robust steps; returns the sum of squared residuals, each capped at `ROUGH_LIMIT` squared."""
     n = x.shape[0]
     e = scratch[0][ERROR : ERROR + n] if n <= CHUNK else scratch[10][:n]
     held, steps = _load(x, y, z, sigma, scratch[0]), ROUGH_STEPS
@@ -262,7 +274,10 @@ def _rough(
 
 @compiled
 def rough_mean_square(kind: int, th: Array, samples: Array, perspective: bool) -> float:
-    """Mean square in sigmas, each at most `ROUGH_LIMIT` squared, that a rough fit from `th` leaves of samples (4, N)."""
+    """Return the mean squared residual of a rough fit that starts at `th`, each capped at `ROUGH_LIMIT` squared.
+
+    `samples` (4, N) are x, y, z, sigma; about `ROUGH_SAMPLES` of them are used. Residuals are in sigmas.
+    """
     few = np.ascontiguousarray(samples[:, :: max(1, samples.shape[1] // ROUGH_SAMPLES)])
     free, scratch = np.zeros(9, np.bool_), new_scratch(few.shape[1])
     cost = _rough(kind, th.copy(), few[0], few[1], few[2], few[3], perspective, free, scratch)
@@ -276,12 +291,13 @@ def fit_kinds(
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Fit every kind in the (5,) mask `kinds` to one set of samples, `points` (N, 3).
 
-    `P` and `N` (M, 3) are those points that have a tangent plane, and its normal; only starts use them. All starts
-    run a few robust steps on a quarter of the samples; those that may still win are fitted to the end, and none whose
-    squared residuals, each at most `ROUGH_LIMIT` squared, still have a mean beyond `give_up`.
+    `P` and `N` (M, 3) are the points that have a tangent plane, and its normals; only the initialisation uses them.
+    Every kind first takes a few robust steps on a subset of about `ROUGH_SAMPLES` samples. A kind is fitted fully only
+    if its rough cost is close to the best one and its mean squared residual (each capped at `ROUGH_LIMIT` squared) is
+    at most `give_up`.
 
-    Returns per kind: parameters (5, SIZE), mean squared residual, share kept, and the criterion
-    `trimmed cost / correlated_samples + p ln n` by which kinds compete (Schwarz), infinite where a kind does not fit.
+    Returns for each kind: parameters (5, SIZE), mean squared residual, share of samples kept, and Schwarz's criterion
+    `trimmed cost / correlated_samples + p ln n` for comparing kinds; it is infinite where a kind does not fit.
     """
     ths = np.zeros((5, SIZE))
     mean2, kept, score = np.full(5, np.inf), np.zeros(5), np.full(5, np.inf)
@@ -294,12 +310,12 @@ def fit_kinds(
     starts, rough, best_rough = np.zeros((QUADRIC, SIZE)), np.full(QUADRIC, np.inf), np.inf
     for kind in range(QUADRIC):
         if kind == CONE and best_rough < 1.3 * per_sample:
-            break  # cones are for components that nothing simpler explains
+            break  # a cone is tried only if no simpler kind fits
         if kinds[kind] and _start(kind, points, P, N, starts[kind]):
             cost = _rough(kind, starts[kind], rx, ry, rz, rs, perspective, free, scratch)
             rough[kind] = cost / correlated_samples
             best_rough = min(best_rough, rough[kind])
-    # A start that is clearly behind after the rough fit is not going to win.
+    # A kind whose rough cost is clearly above the best one cannot win.
     behind = 2.0 * best_rough + 0.5 * per_sample
     give_up = give_up * per_sample
     for kind in range(QUADRIC):
@@ -312,7 +328,7 @@ def fit_kinds(
             ths[kind], mean2[kind], kept[kind], score[kind] = th, m, share, s
     is_near = rough[SPHERE] <= behind and best_rough <= ELLIPSOID_GIVE_UP * per_sample
     if kinds[QUADRIC] and is_near and starts[SPHERE, 3] < LARGEST_RADIUS_M:
-        # Nine parameters explain most things: they are tried when nothing simpler does.
+        # A quadric has nine parameters and fits almost anything, so it is tried only if no simpler kind fits.
         simple = np.min(score)
         if simple > n / correlated_samples * QUADRIC_PER_SAMPLE:
             th = quadric_of_sphere(starts[SPHERE])
@@ -325,7 +341,7 @@ def fit_kinds(
 
 @compiled
 def _start(kind: int, points: Array, P: Array, N: Array, th: Array) -> bool:
-    """Fill `th` with an algebraic start of a simple kind; whether there is one."""
+    """Fill `th` with the algebraic initial parameters of a kind other than QUADRIC; returns whether they exist."""
     if kind == PLANE:
         th[:] = start_plane(points)
         return True
@@ -343,6 +359,7 @@ def _start(kind: int, points: Array, P: Array, N: Array, th: Array) -> bool:
 
 @compiled
 def _is_sane(kind: int, th: Array) -> bool:
+    """Whether the radius, or the half angle of a cone, is within the accepted range."""
     if kind == CYLINDER:
         return bool(th[6] < LARGEST_RADIUS_M)
     if kind == SPHERE:

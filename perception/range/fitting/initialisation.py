@@ -1,4 +1,4 @@
-"""Where fits start: algebraic surfaces through points and normals, and the small linear algebra that they need."""
+"""Initial parameters of fits by algebraic fits to points and normals, with the small linear algebra they need."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hal.arrays import Array
 from hal.jit import compiled
 from perception.range.fitting.surfaces import SIZE, tangent_frame
 
-MOST_SWEEPS = 12  # of Jacobi rotations; a 3x3 matrix settles in four or five
+MOST_SWEEPS = 12  # of Jacobi rotations; a 3x3 matrix converges in four or five
 
 
 @compiled
@@ -43,7 +43,7 @@ def solve_positive(A: Array, b: Array, p: int) -> bool:
 def principal_axes(S: Array) -> tuple[Array, Array]:
     """Eigenvalues (3,), smallest first, and eigenvectors (3, 3) in columns, of a symmetric matrix.
 
-    Cyclic Jacobi rotations (Golub and Van Loan, 8.5): a tenth of what a call of LAPACK costs at this size.
+    Uses cyclic Jacobi rotations (Golub and Van Loan, 8.5), ten times as fast as a LAPACK call at this size.
     """
     A, V, values = S.copy(), np.eye(3), np.empty(3)
     size = abs(A[0, 0]) + abs(A[1, 1]) + abs(A[2, 2])
@@ -68,7 +68,7 @@ def principal_axes(S: Array) -> tuple[Array, Array]:
                     V[k, i], V[k, j] = c * V[k, i] - s * V[k, j], s * V[k, i] + c * V[k, j]
     for k in range(3):
         values[k] = A[k, k]
-    for j in (1, 2, 1):  # neighbours that stand the wrong way round change places
+    for j in (1, 2, 1):  # bubble sort: swap neighbours that are in the wrong order
         if values[j] < values[j - 1]:
             values[j - 1], values[j] = values[j], values[j - 1]
             for k in range(3):
@@ -91,7 +91,7 @@ def centroid(P: Array) -> Array:
 
 @compiled
 def scatter(P: Array, c: Array) -> Array:
-    """(3, 3) sum of (P_i - c)(P_i - c)'."""
+    """Scatter matrix (3, 3) of points (N, 3) about c: the sum of (P_i - c)(P_i - c)'."""
     S = np.zeros((3, 3))
     for i in range(P.shape[0]):
         x, y, z = P[i, 0] - c[0], P[i, 1] - c[1], P[i, 2] - c[2]
@@ -107,11 +107,11 @@ def scatter(P: Array, c: Array) -> Array:
 
 @compiled
 def start_plane(P: Array) -> Array:
-    """Plane through points (N, 3) by principal axes."""
+    """Fit a plane to points (N, 3): its normal is the principal axis of least scatter."""
     th = np.zeros(SIZE)
     c = centroid(P)
     _, V = principal_axes(scatter(P, c))
-    side = -1.0 if V[2, 0] > 0 else 1.0  # towards the sensor, but for planes that the ray only grazes
+    side = -1.0 if V[2, 0] > 0 else 1.0  # towards the sensor, except for planes nearly parallel to the rays
     for a in range(3):
         th[a] = side * V[a, 0]
         th[3] += th[a] * c[a]
@@ -120,7 +120,7 @@ def start_plane(P: Array) -> Array:
 
 @compiled
 def _least_squares(rows: Array, values: Array) -> tuple[Array, bool]:
-    """Solve rows (N, m) x = values (N,) by normal equations; (x, solved)."""
+    """Solve rows (N, m) x = values (N,) by normal equations; returns x and whether there is a solution."""
     n, m = rows.shape
     A, b = np.zeros((m, m)), np.zeros(m)
     for i in range(n):
@@ -138,7 +138,7 @@ def _least_squares(rows: Array, values: Array) -> tuple[Array, bool]:
 
 @compiled
 def _side(P: Array, N: Array, th: Array, axis: Array) -> float:
-    """+1 when the normals point away from the centre or axis of `th`, -1 when towards it."""
+    """Return +1 if the normals point away from the centre or axis of `th`, and -1 if they point towards it."""
     outward = 0.0
     for i in range(P.shape[0]):
         x, y, z = P[i, 0] - th[0], P[i, 1] - th[1], P[i, 2] - th[2]
@@ -149,7 +149,7 @@ def _side(P: Array, N: Array, th: Array, axis: Array) -> float:
 
 @compiled
 def start_sphere(P: Array, N: Array) -> tuple[Array, bool]:
-    """Algebraic sphere |X|^2 = 2 c . X + k about the centroid; side from the normals."""
+    """Fit a sphere algebraically, |X|^2 = 2 c . X + k about the centroid; the normals give the side."""
     th = np.zeros(SIZE)
     c = centroid(P)
     n = P.shape[0]
@@ -173,14 +173,17 @@ def start_sphere(P: Array, N: Array) -> tuple[Array, bool]:
 
 @compiled
 def normal_axis(N: Array, centred: bool) -> Array:
-    """Direction that the normals avoid (cylinder), or along which they are constant (cone, centred)."""
+    """Return the direction of least scatter of the normals: the axis of a cylinder, or (`centred`) of a cone.
+
+    Normals of a cylinder are perpendicular to its axis; those of a cone have a constant component along it.
+    """
     _, V = principal_axes(scatter(N, centroid(N) if centred else np.zeros(3)))
     return V[:, 0].copy()
 
 
 @compiled
 def start_cylinder(P: Array, N: Array, axis: Array) -> tuple[Array, bool]:
-    """Circle (algebraic) of the points seen along `axis`."""
+    """Fit a cylinder of known axis: an algebraic circle through the points projected along `axis`."""
     th = np.zeros(SIZE)
     e = tangent_frame(axis[0], axis[1], axis[2])
     c = centroid(P)
@@ -204,7 +207,7 @@ def start_cylinder(P: Array, N: Array, axis: Array) -> tuple[Array, bool]:
 
 @compiled
 def start_cone(P: Array, N: Array, axis: Array) -> tuple[Array, bool]:
-    """Apex from n . X = n . apex; the angle from n . axis = -sin(angle)."""
+    """Fit a cone algebraically: the apex from n . X = n . apex, the angle from n . axis = -sin(angle)."""
     th = np.zeros(SIZE)
     c = centroid(P)
     n = P.shape[0]
@@ -228,7 +231,7 @@ def start_cone(P: Array, N: Array, axis: Array) -> tuple[Array, bool]:
 
 @compiled
 def quadric_of_sphere(th: Array) -> Array:
-    """The sphere as a quadric centred on it: the start of an ellipsoid fit."""
+    """Return a sphere as a quadric about its centre: the initial parameters of an ellipsoid fit."""
     out = np.zeros(SIZE)
     out[:3] = th[:3]
     out[3] = max(th[3], 1e-6)
@@ -238,7 +241,7 @@ def quadric_of_sphere(th: Array) -> Array:
 
 @compiled
 def is_ellipsoid(th: Array) -> bool:
-    """Whether the quadric is a real ellipsoid of sane proportions (longest radius at most 8 times the shortest)."""
+    """Whether the quadric is a real ellipsoid whose longest radius is less than 8 times the shortest."""
     A = np.array(
         [[th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]]
     )

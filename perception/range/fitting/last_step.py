@@ -1,6 +1,6 @@
-"""The last step of a fit, on all pixels of a region: read from the image run by run, a chunk of rays at a time.
+"""The last step of a fit, on all pixels of a region, read from the image run by run in chunks of rays.
 
-Nothing but the image is read: what a region of a hundred thousand pixels holds is never written down.
+The pixels of a region are never copied into one array, because a region may have a hundred thousand of them.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from perception.range.fitting.surfaces import FREEDOM, GRAZING_COSINE, PLANE, SI
 def last_step(
     kind: int, th: Array, depth: Array, sen: Array, noise: Array, runs: Labels, fixed: Mask,
 ) -> tuple[Array, Array, float, int]:  # fmt: skip
-    """One Gauss-Newton step on the pixels of runs (R, 3) from a start that is good already, in a single pass over them.
+    """Take one Gauss-Newton step on the pixels of runs (R, 3), in one pass, from parameters that are already close.
 
-    The matrix and the trim are those of the start; the cost after the step follows from the quadratic model.
+    The matrix and the trim are evaluated at the initial parameters; the cost after the step is that of the quadratic
+    model.
 
     Returns:
-        parameters, information matrix (9, 9), squared residuals of the kept pixels, pixels kept.
+        parameters, information matrix (9, 9), sum of squared residuals of the kept pixels, number of pixels kept.
     """
     p = FREEDOM[kind]
     H, g, frame = np.zeros((9, 9)), np.zeros(9), np.empty(6)
@@ -46,7 +47,10 @@ def _equations(
     kind: int, th: Array, frame: Array, depth: Array, sen: Array, noise: Array, runs: Labels, work: Array,
     H: Array, g: Array,
 ) -> tuple[float, int]:  # fmt: skip
-    """Gauss-Newton matrix and gradient of the pixels within the trim; their squared residuals, and how many they are."""
+    """Add up the Gauss-Newton matrix `H` and gradient `g` of the pixels within the trim.
+
+    Returns the sum of the squared residuals of these pixels, and their number.
+    """
     perspective = sen[0] > 0
     cost, used, n, pixels = 0.0, 0.0, 0, 0
     last = runs.shape[0] - 1
@@ -72,7 +76,7 @@ def _equations(
 
 @compiled
 def _load(depth: Array, first: int, row: int, sen: Array, work: Array) -> None:
-    """The pixels of a run that begins at column `first` as samples."""
+    """Write the pixels of a run that begins at column `first` into the rows X, Y and Z of `work`."""
     per_x, y = 1.0 / sen[1], (row - sen[4]) / sen[2]
     n = depth.shape[0]
     for k in range(n):
@@ -87,9 +91,10 @@ def _load(depth: Array, first: int, row: int, sen: Array, work: Array) -> None:
 def _add_plane(
     th: Array, frame: Array, n: int, perspective: bool, work: Array, H: Array, g: Array,
 ) -> tuple[float, float]:  # fmt: skip
-    """`fill_rows` and `add_equations` of a plane in one loop that takes no root: most pixels lie on planes.
+    """Do `fill_rows` and `add_equations` for a plane in one loop without a square root, because most pixels lie on planes.
 
-    Row SIGMA holds variances. With the weight w, squared, min(1, (c / GRAZING_COSINE)^2) / sigma^2, sums of w^2 J'J, w^2 J'r.
+    Row SIGMA holds variances here. Adds w^2 J'J to `H` and w^2 J'r to `g`, with the squared weight
+    w^2 = min(1, (c / GRAZING_COSINE)^2) / sigma^2 and c the cosine of incidence.
     """
     p, limit = 1.0 if perspective else 0.0, TRIM_SIGMAS * TRIM_SIGMAS
     nx, ny, nz, d = th[0], th[1], th[2], th[3]
@@ -131,13 +136,14 @@ def _add_plane(
 
 @compiled
 def _take_roots(n: int, work: Array) -> None:
+    """Replace the variances in row SIGMA by standard deviations."""
     for k in range(n):
         work[SIGMA + k] = np.sqrt(work[SIGMA + k])
 
 
 @compiled(fastmath=REORDERED)
 def _fill_variances(n: int, noise: Array, work: Array) -> None:
-    """Squares of `sigma_at` of the loaded depths, without a branch, into row SIGMA."""
+    """Write the variance (`sigma_at` squared) of each loaded depth into row SIGMA, without a branch."""
     a, b, c, d, e, f = noise[0], noise[1], noise[2], noise[3], noise[4], noise[5]
     for k in range(n):
         z = work[Z + k]

@@ -1,8 +1,8 @@
-"""Many rays against one surface: the loops of `surfaces.depth_and_jacobian` with every constant taken out.
+"""Vectorised intersection of many rays with one surface, and the normal equations of their residuals.
 
-Samples are worked on in chunks whose rows stay in the first-level cache, and the bodies hold no branch, so that the
-compiler turns four or eight rays into one instruction: 6 ns a ray with its derivatives, 80 ns for the plain function.
-`surfaces` stays the reference; a test holds the two together.
+Computes the same as `surfaces.depth_and_jacobian`, which is the reference; a test compares the two. Samples are
+processed in chunks whose rows fit the first-level cache, and the loop bodies have no branch, so that the compiler
+handles four or eight rays with one instruction: 6 ns per ray with its derivatives, against 80 ns for the reference.
 """
 
 from __future__ import annotations
@@ -13,28 +13,28 @@ from hal.arrays import Array
 from hal.jit import REORDERED, compiled
 from perception.range.fitting.surfaces import CONE, CYLINDER, FREEDOM, GRAZING_COSINE, PLANE, SPHERE, frame_of
 
-CHUNK = 160  # what `merge` fits at once
+CHUNK = 160  # samples; `merge` fits this many at once
 ROWS = [row * CHUNK for row in range(18)]  # where each row of the scratch array begins
 DEPTH, COSINE = ROWS[:2]
-D0, D1, D2, D3, D4, D5, D6, D7, D8 = ROWS[2:11]  # derivatives of depth by the surface's free directions
+D0, D1, D2, D3, D4, D5, D6, D7, D8 = ROWS[2:11]  # derivatives of depth with respect to the tangent parameters
 WEIGHT, RESIDUAL = ROWS[11:13]
 X, Y, Z, SIGMA = ROWS[13:17]  # the samples
-ERROR = ROWS[17]  # residuals before they are weighed; NaN where a ray misses
+ERROR = ROWS[17]  # residuals before the robust weights; NaN where a ray misses
 SCRATCH = len(ROWS) * CHUNK
-LANES = 16  # rows are padded with zeros to this many samples: sums then need no remainder loop
+LANES = 16  # rows are padded with zeros to a multiple of this, so that sums need no remainder loop
 MISS_SIGMAS = 6.0  # a ray that misses the surface costs as much as a residual of this size
 CAUCHY_WIDTH = 2.0
-FARTHEST = 1e15  # sigmas; eight squares of it still multiply to a finite number
-# What `work` holds already: the samples, row ERROR of the surface, all of its rows.
+FARTHEST = 1e15  # sigmas; the product of eight of its squares is still finite
+# Which rows of `work` are valid: none; the samples; also row ERROR of the surface; all rows of the surface.
 NOTHING, LOADED, ERRED, FILLED = range(4)
 
 
 @compiled
 def load_rows(x: Array, y: Array, z: Array, sigma: Array, first: int, n: int, work: Array) -> None:
-    """Samples first .. first + n into `work`.
+    """Copy samples first .. first + n into `work`.
 
-    Loops that compute from several arrays ask at run time whether these may overlap, and round otherwise when they lie
-    side by side in memory. Within one array at fixed places there is nothing to ask: the same input, the same bits.
+    Compiled loops over several arrays test at run time whether these overlap in memory, and their rounding depends on
+    the outcome. Loops within one array at fixed offsets need no such test, so equal input gives bit-identical results.
     """
     x, y, z, sigma = x[first:], y[first:], z[first:], sigma[first:]
     for i in range(n):
@@ -49,7 +49,7 @@ def load_rows(x: Array, y: Array, z: Array, sigma: Array, first: int, n: int, wo
 
 @compiled
 def fill_rows(kind: int, th: Array, frame: Array, n: int, perspective: bool, work: Array) -> None:
-    """Depth, cosine of incidence and derivatives (as `depth_and_jacobian`) of the `n` loaded samples into `work`.
+    """Write depth, cosine of incidence and derivatives of the `n` loaded samples into `work`, as `depth_and_jacobian`.
 
     `work` (SCRATCH,) holds rows of CHUNK numbers; n <= CHUNK. Depth is NaN where a ray misses.
     """
@@ -68,6 +68,7 @@ def fill_rows(kind: int, th: Array, frame: Array, n: int, perspective: bool, wor
 
 @compiled(fastmath=REORDERED)
 def _plane(th: Array, frame: Array, n: int, p: float, work: Array) -> None:
+    """Fill the rows for a plane; `p` is 1 for perspective rays and 0 for parallel ones, here and below."""
     nx, ny, nz, d = th[0], th[1], th[2], th[3]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
     for i in range(n):
@@ -87,6 +88,7 @@ def _plane(th: Array, frame: Array, n: int, p: float, work: Array) -> None:
 
 @compiled(fastmath=REORDERED)
 def _sphere(th: Array, n: int, p: float, work: Array) -> None:
+    """Fill the rows for a sphere."""
     cx, cy, cz, r = th[0], th[1], th[2], th[3]
     side = 1.0 if th[4] > 0 else -1.0
     inverse_r = 1.0 / r
@@ -111,6 +113,7 @@ def _sphere(th: Array, n: int, p: float, work: Array) -> None:
 
 @compiled(fastmath=REORDERED)
 def _cylinder(th: Array, frame: Array, n: int, p: float, work: Array) -> None:
+    """Fill the rows for a cylinder."""
     cx, cy, cz, ax, ay, az, r = th[0], th[1], th[2], th[3], th[4], th[5], th[6]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
     side = 1.0 if th[7] > 0 else -1.0
@@ -127,7 +130,7 @@ def _cylinder(th: Array, frame: Array, n: int, p: float, work: Array) -> None:
         c = wx * wx + wy * wy + cz * cz - wa * wa - r * r
         z = (-b - side * np.sqrt(b * b - a * c)) / a
         h = wa + z * da
-        # The normal of a point on the surface needs no root: its distance from the axis is the radius.
+        # The normal needs no square root, because the distance of a surface point from the axis is the radius.
         nx = (wx + z * dx - h * ax) * inverse_r
         ny = (wy + z * dy - h * ay) * inverse_r
         nz = (z - cz - h * az) * inverse_r
@@ -145,6 +148,7 @@ def _cylinder(th: Array, frame: Array, n: int, p: float, work: Array) -> None:
 
 @compiled(fastmath=REORDERED)
 def _cone(th: Array, frame: Array, n: int, p: float, work: Array) -> None:
+    """Fill the rows for a cone; intersections with the other half of the double cone are discarded."""
     cx, cy, cz, ax, ay, az = th[0], th[1], th[2], th[3], th[4], th[5]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
     outside = th[7] > 0
@@ -163,7 +167,7 @@ def _cone(th: Array, frame: Array, n: int, p: float, work: Array) -> None:
         root = np.sqrt(b * b - a * c)
         one, two = (-b - root) / a, (-b + root) / a
         near, far = min(one, two), max(one, two)
-        near = near if wa + near * da > 0.0 else np.nan  # the other sheet of the double cone
+        near = near if wa + near * da > 0.0 else np.nan  # NaN on the other half of the double cone
         far = far if wa + far * da > 0.0 else np.nan
         wanted, other = (near, far) if outside else (far, near)
         z = other if np.isnan(wanted) else wanted
@@ -188,6 +192,7 @@ def _cone(th: Array, frame: Array, n: int, p: float, work: Array) -> None:
 
 @compiled(fastmath=REORDERED)
 def _quadric(th: Array, n: int, p: float, work: Array) -> None:
+    """Fill the rows for a quadric."""
     s = 1.0 / th[3]
     cx, cy, cz = th[0] * s, th[1] * s, th[2] * s
     qxx, qyy, qzz, qxy, qxz, qyz, qx, qy, qz, q0 = (
@@ -197,7 +202,7 @@ def _quadric(th: Array, n: int, p: float, work: Array) -> None:
         xi, yi = work[X + i], work[Y + i]
         dx, dy, dz = p * xi * s, p * yi * s, s
         wx, wy, wz = xi * s - dx - cx, yi * s - dy - cy, -cz
-        # Gradients at the origin of the ray and along it; the quadric is c + 2 b z + a z^2 there.
+        # Along the ray the quadric is a z^2 + 2 b z + c; u is the gradient of its quadratic part at the ray direction.
         ux, uy, uz = 2.0 * qxx * dx + qxy * dy + qxz * dz, 2.0 * qyy * dy + qxy * dx + qyz * dz, 0.0
         uz = 2.0 * qzz * dz + qxz * dx + qyz * dy
         a = 0.5 * (ux * dx + uy * dy + uz * dz)
@@ -235,7 +240,7 @@ def _quadric(th: Array, n: int, p: float, work: Array) -> None:
 
 @compiled(fastmath=REORDERED)
 def error_row(n: int, work: Array) -> None:
-    """Row ERROR of the filled rows: residuals in sigmas, lessened at grazing rays; NaN where the ray misses."""
+    """Fill row ERROR from the filled rows: residuals in sigmas, reduced at grazing rays; NaN where a ray misses."""
     for i in range(n):
         w = min(1.0, work[COSINE + i] * (1.0 / GRAZING_COSINE)) / work[SIGMA + i]
         work[ERROR + i] = (work[Z + i] - work[DEPTH + i]) * w
@@ -243,7 +248,10 @@ def error_row(n: int, work: Array) -> None:
 
 @compiled(fastmath=REORDERED)
 def _cauchy_weights(n: int, c2: float, work: Array) -> float:
-    """Rows WEIGHT and RESIDUAL under Cauchy weights, 1 + ratio in row DEPTH; returns the number of samples that hit."""
+    """Fill rows WEIGHT and RESIDUAL for Cauchy weights of squared width `c2`; returns the number of rays that hit.
+
+    Row DEPTH becomes 1 + e^2 / c2, whose logarithm is the cost of the sample.
+    """
     used = 0.0
     for i in range(n):
         zm = work[DEPTH + i]
@@ -263,7 +271,7 @@ def _cauchy_weights(n: int, c2: float, work: Array) -> float:
 
 @compiled(fastmath=REORDERED)
 def _sum_of_logarithms(values: Array) -> float:
-    """Sum of ln(values): the logarithm of a product of eight is one logarithm in place of eight."""
+    """Sum of ln(values), with one logarithm per product of eight values because logarithms are slow."""
     total = 0.0
     n = values.shape[0]
     whole = n // 8 * 8
@@ -277,7 +285,7 @@ def _sum_of_logarithms(values: Array) -> float:
 
 @compiled(fastmath=REORDERED)
 def _trim_weights(n: int, trim: float, work: Array) -> tuple[float, float]:
-    """Rows WEIGHT and RESIDUAL under a trim; returns cost and number of samples kept."""
+    """Fill rows WEIGHT and RESIDUAL with samples beyond `trim` sigmas left out; returns cost and number kept."""
     used, cost = 0.0, 0.0
     for i in range(n):
         zm = work[DEPTH + i]
@@ -294,6 +302,7 @@ def _trim_weights(n: int, trim: float, work: Array) -> tuple[float, float]:
 
 @compiled(fastmath=REORDERED)
 def _dot(a: Array, b: Array) -> float:
+    """Dot product whose order of summation the compiler may change."""
     total = 0.0
     for i in range(a.shape[0]):
         total += a[i] * b[i]
@@ -302,13 +311,17 @@ def _dot(a: Array, b: Array) -> float:
 
 @compiled(fastmath=REORDERED)
 def _weighted(row: Array, weight: Array) -> None:
+    """Multiply `row` by `weight` in place; samples without weight become 0, even if they are NaN."""
     for i in range(row.shape[0]):
         row[i] = row[i] * weight[i] if weight[i] > 0.0 else 0.0
 
 
 @compiled
 def _add_products(p: int, n: int, work: Array, H: Array, g: Array) -> None:
-    """Add J' W J to the lower triangle of `H` and J' W e to `g` from the rows of one chunk."""
+    """Add J'W^2 J to the lower triangle of `H` and J'W e to `g` from the rows of one chunk.
+
+    J: derivatives of depth, W: row WEIGHT, e: row RESIDUAL, which is already weighted.
+    """
     padded = (n + LANES - 1) // LANES * LANES
     work[WEIGHT + n : WEIGHT + padded] = 0.0
     work[RESIDUAL + n : RESIDUAL + padded] = 0.0
@@ -326,11 +339,14 @@ def normal_equations(
     kind: int, th: Array, frame: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, scale: float,
     trim: float, H: Array, g: Array, work: Array, held: int, step_follows: bool,
 ) -> tuple[float, int]:  # fmt: skip
-    """Gauss-Newton matrix `H` (9, 9) and gradient `g` (9,) of the ray residuals of samples (N,); cost and used samples.
+    """Compute Gauss-Newton matrix `H` (9, 9) and gradient `g` (9,) of the ray residuals; returns cost and samples used.
 
-    `scale` > 0: Cauchy weights of that width in sigmas; 0: samples beyond `trim` sigmas are left out. `held`: what `work`
-    holds already of at most CHUNK samples; afterwards it holds the samples and row ERROR. Without `step_follows` only cost
-    and used samples are found: `H` and `g` are zero.
+    Args:
+        x, y, z, sigma: (N,) samples; coordinates as in `Grid`.
+        scale: > 0: width of the Cauchy weights in sigmas; 0: samples beyond `trim` sigmas are left out.
+        held: which rows of `work` are already valid, for at most CHUNK samples (NOTHING, LOADED, ERRED or FILLED);
+            afterwards the samples and row ERROR are.
+        step_follows: whether `H` and `g` are needed; without it they are zero.
     """
     H[:] = 0.0
     g[:] = 0.0
@@ -353,7 +369,7 @@ def normal_equations(
 
 @compiled
 def add_equations(kind: int, n: int, scale: float, trim: float, work: Array, H: Array, g: Array) -> tuple[float, float]:
-    """Add the `n` filled rays in `work` to the lower triangle of `H` and to `g`; returns their cost and how many count."""
+    """Add the `n` filled rays in `work` to the lower triangle of `H` and to `g`; returns cost and number of rays used."""
     cost, used = _weigh(n, scale, trim, work)
     _add_products(FREEDOM[kind], n, work, H, g)
     return cost, used
@@ -361,7 +377,7 @@ def add_equations(kind: int, n: int, scale: float, trim: float, work: Array, H: 
 
 @compiled
 def _weigh(n: int, scale: float, trim: float, work: Array) -> tuple[float, float]:
-    """Rows WEIGHT and RESIDUAL of the `n` filled rays in `work`; returns their cost and how many count."""
+    """Fill rows WEIGHT and RESIDUAL of the `n` filled rays in `work`; returns cost and number of rays used."""
     if scale > 0.0:
         c2 = scale * scale * CAUCHY_WIDTH * CAUCHY_WIDTH
         used = _cauchy_weights(n, c2, work)
@@ -379,7 +395,7 @@ def mirror(p: int, H: Array) -> None:
 
 @compiled
 def residuals(kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, out: Array) -> None:
-    """Fill `out` (N,) with residuals in sigmas, lessened at grazing rays; NaN where the ray misses."""
+    """Fill `out` (N,) with residuals in sigmas, reduced at grazing rays; NaN where the ray misses."""
     residuals_by_chunks(kind, th, x, y, z, sigma, perspective, np.empty(6), np.empty(SCRATCH), out)
 
 
@@ -388,7 +404,7 @@ def residuals_by_chunks(
     kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, frame: Array, work: Array,
     out: Array,
 ) -> None:  # fmt: skip
-    """`residuals` that works in `frame` (6,) and `work` (SCRATCH,), and overwrites them."""
+    """Do the same as `residuals`, with `frame` (6,) and `work` (SCRATCH,) as work arrays, which are overwritten."""
     frame_of(kind, th, frame)
     count = x.shape[0]
     for first in range(0, count, CHUNK):

@@ -1,4 +1,4 @@
-"""Primitives met along a ray: depth and its derivatives, compiled.
+"""Intersection of rays with primitives: depth and its derivatives (compiled).
 
 A surface is a kind and a parameter vector of 16 numbers:
 
@@ -9,7 +9,7 @@ A surface is a kind and a parameter vector of 16 numbers:
     QUADRIC    centre (3), scale, then 10 coefficients over (xx, yy, zz, xy, xz, yz, x, y, z, 1) of (X - centre) / scale
 
 `side` is +1 for a surface seen from outside (the nearer root along the ray) and -1 from inside.
-Steps live in a tangent space: shifts across the axis and tilts of unit vectors in the frame of `tangent_frame`.
+Fits take steps in a tangent space: shifts across the axis, and tilts of unit vectors in the frame of `tangent_frame`.
 """
 
 # ruff: noqa: PLR0912, PLR1714, SIM109 - compiled loops take plain arrays, and long
@@ -24,7 +24,7 @@ from hal.jit import as_numpy_scalar, compiled
 PLANE, SPHERE, CYLINDER, CONE, QUADRIC = (as_numpy_scalar(kind) for kind in range(5))
 SIZE = 16
 FREEDOM = np.array([3, 4, 5, 6, 9])
-GRAZING_COSINE = 0.3  # below it a depth residual says little about the surface: pixels there lose weight
+GRAZING_COSINE = 0.3  # below it pixels lose weight, because a depth residual there says little about the surface
 
 
 @compiled
@@ -41,7 +41,7 @@ def tangent_frame(ax: float, ay: float, az: float) -> tuple[float, float, float,
 
 @compiled
 def _roots(a: float, b: float, c: float, side: float) -> float:
-    """Root of a z^2 + 2 b z + c: the nearer for side +1, the farther for -1; NaN without a real root."""
+    """Return the nearer (side +1) or farther (side -1) root of a z^2 + 2 b z + c; NaN without a real root."""
     disc = b * b - a * c
     if disc < 0.0:
         return np.nan
@@ -132,7 +132,7 @@ def depth_on(kind: int, th: Array, x: float, y: float, perspective: bool) -> flo
 
 @compiled
 def depths_on(kind: int, th: Array, x: Array, y: Array, perspective: bool, out: Array) -> None:
-    """`depth_on` for arrays x, y (N,) into `out` (N,)."""
+    """Write `depth_on` of arrays x, y (N,) into `out` (N,)."""
     for i in range(x.shape[0]):
         out[i] = depth_on(kind, th, x[i], y[i], perspective)
 
@@ -164,7 +164,7 @@ def normal_on(kind: int, th: Array, px: float, py: float, pz: float) -> tuple[fl
 
 @compiled
 def normals_on(kind: int, th: Array, x: Array, y: Array, z: Array, perspective: bool, out: Array) -> None:
-    """Unit normals towards the sensor at the rays (x, y) and depths z (N,) into `out` (N, 3)."""
+    """Write the unit normals at the rays (x, y) and depths z (N,), turned towards the sensor, into `out` (N, 3)."""
     for i in range(x.shape[0]):
         px, py = (x[i] * z[i], y[i] * z[i]) if perspective else (x[i], y[i])
         nx, ny, nz = normal_on(kind, th, px, py, z[i])
@@ -177,7 +177,10 @@ def normals_on(kind: int, th: Array, x: Array, y: Array, z: Array, perspective: 
 def depth_and_jacobian(
     kind: int, th: Array, frame: Array, x: float, y: float, perspective: bool, J: Array,
 ) -> tuple[float, float]:  # fmt: skip
-    """Depth, cosine of incidence, and J = dz / d(tangent parameters): dz = -(dF/dtheta) / (dF/dz) on F = 0."""
+    """Return depth and cosine of incidence of a ray; fill J with dz / d(tangent parameters).
+
+    On the surface F = 0 the derivative is dz / dtheta = -(dF/dtheta) / (dF/dz). Depth is NaN where the ray misses.
+    """
     z = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(z):
         return z, 0.0
@@ -232,7 +235,7 @@ def depth_and_jacobian(
 
 @compiled
 def frame_of(kind: int, th: Array, frame: Array) -> None:
-    """Fill `frame` (6,) with the tangent frame that the steps of this surface refer to."""
+    """Fill `frame` (6,) with the two tangent vectors in which steps of this surface are expressed."""
     if kind == PLANE:
         f = tangent_frame(th[0], th[1], th[2])
     elif kind == CYLINDER or kind == CONE:
@@ -245,7 +248,10 @@ def frame_of(kind: int, th: Array, frame: Array) -> None:
 
 @compiled
 def step_into(kind: int, th: Array, frame: Array, step: Array, out: Array) -> None:
-    """The surface after a tangent step, into `out`; unit vectors stay unit, quadrics keep the trace of their matrix."""
+    """Write the parameters after a tangent step into `out`.
+
+    Unit vectors stay unit vectors, and a quadric keeps the trace of its matrix.
+    """
     for i in range(SIZE):
         out[i] = th[i]
     if kind == PLANE or kind == CYLINDER or kind == CONE:

@@ -1,1 +1,1 @@
-"""Models of components, and where a library of them stands in an analysed scene."""
+"""Component models, and the search for their poses in an analysed scene."""

@@ -1,4 +1,4 @@
-"""Poses of models worth trying: what stands out of the panel, set beside what each surface of a model would look like."""
+"""Initial pose hypotheses: each piece of the scene that stands out of the panel is paired with each model surface."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Flags = NDArray[np.bool_]
 
 LEAST_HEIGHT_M = 0.002
 LEAST_PIXELS = 12
-LEAST_SHARE = 0.3  # of a surface; less than that of the panel itself stands out by noise and relief
+LEAST_SHARE = 0.3  # of a surface's pixels; of the panel itself a smaller share stands out, by noise and relief
 HEIGHT_SLACK_M = 0.004
-LYING = 0.15  # sine of the tilt from which a direction has a heading
+LYING = 0.15  # a direction has a heading if its projection on the panel is longer than this
 ELONGATED = 1.5
 SAME_TURN_RAD = 0.09
-BLIND_TURNS = 8  # of a period, when nothing tells the heading
+BLIND_TURNS = 8  # headings tried per period of symmetry if the data do not give one
 STATES = 7
 NORMAL_SLACK_RAD = 0.35
 LEAST_FACING = 0.3
@@ -35,11 +35,11 @@ class Piece:
     """Something that stands out of the panel, in the panel's frame: a region of the segmentation or of the relief.
 
     Attributes:
-        middle_m: (3,) median of its points; for balls the centre across the panel.
+        middle_m: (3,) centre along the panel (for a sphere, the sphere's), and median height.
         axis: (3,) normal of a plane, axis of a cylinder; zeros otherwise.
-        is_plane: whether the segmentation took it for a plane.
-        heading_rad: of its longer side along the panel; `half_m` (2,) half its extent along and across that.
-        label: of its surface in the scene, 0 for what no surface explains.
+        is_plane: whether the segmentation classified it as a plane.
+        heading_rad: direction of its longer side in the panel; `half_m` (2,) is half its extent along and across that.
+        label: label of its surface in the scene, 0 for pixels that no surface explains.
     """
 
     middle_m: Array
@@ -52,7 +52,7 @@ class Piece:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Candidate:
-    """A model ready to be judged; `travel` (S, 2, 3) boxes that hold its surfaces in every state."""
+    """A model prepared for matching; `travel` (S, 2, 3) are boxes that hold its surfaces in every state."""
 
     model: ComponentModel
     travel: Array
@@ -60,7 +60,7 @@ class Candidate:
 
 
 def candidate_of(model: ComponentModel) -> Candidate:
-    """The model with its rows, bounds and tolerances."""
+    """Prepare a model for matching: its rows, bounding boxes and tolerances."""
     slide = model.motion_axis if model.motion == MotionKind.SLIDE else np.zeros(3)
     tolerance = np.array([s.tolerance_m for s in model.surfaces])
     return Candidate(
@@ -71,7 +71,7 @@ def candidate_of(model: ComponentModel) -> Candidate:
 
 
 def pieces_of(scene: RangeScene, view: View) -> list[Piece]:
-    """Every surface that stands out of the panel, and every patch of relief that no surface explains."""
+    """Return every surface that stands out of the panel, and every patch above it that no surface explains."""
     points = scene.sensor.points(view.depth_m) - view.p
     in_panel = points @ view.R
     stands_out = np.isfinite(view.depth_m) & (in_panel[..., 2] > LEAST_HEIGHT_M + 3.0 * view.sigma_m)
@@ -86,17 +86,22 @@ def pieces_of(scene: RangeScene, view: View) -> list[Piece]:
 
 
 def _and_its_patches(mine: Flags) -> list[Flags]:
-    """All pixels of a surface, and each patch by itself: caps of two buttons at one height count as one surface."""
+    """Return the mask of a surface and, if it is not connected, of each of its patches.
+
+    The caps of two buttons at the same height are one surface, so each of them must be tried on its own.
+    """
     patches = _patches(mine)
     return [mine, *patches] if len(patches) > 1 else [mine]
 
 
 def _patches(mask: Flags) -> list[Flags]:
+    """Return the 4-connected patches of a mask that have at least `LEAST_PIXELS` pixels."""
     count, patch, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     return [patch == k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= LEAST_PIXELS]
 
 
 def _piece(points: Array, view: View, surface: Surface | None) -> Piece:
+    """Measure a piece from its points (N, 3) in the panel's frame and the surface that explains them, if any."""
     axis, centre, is_plane = np.zeros(3), None, False
     match None if surface is None else surface.primitive:
         case Plane(normal=normal):
@@ -128,12 +133,12 @@ def _piece(points: Array, view: View, surface: Surface | None) -> Piece:
 
 
 def hypotheses(candidate: Candidate, piece: Piece) -> list[Array]:
-    """Hypotheses (x, y, yaw, state) in the panel's frame that put some surface of the model where the piece is."""
+    """Return hypotheses (x, y, yaw, state) in the panel's frame that place a surface of the model on the piece."""
     model = candidate.model
     out: list[Array] = []
     for surface, box in zip(model.surfaces, candidate.travel, strict=True):
         if surface.type == Form.PLANE and surface.direction[2] < LEAST_FACING:
-            continue  # walls are seen at a slant, and something of their height tells the place better
+            continue  # walls are seen at grazing angles; other surfaces of the same height give a better position
         if not box[0, 2] - HEIGHT_SLACK_M <= piece.middle_m[2] <= box[1, 2] + HEIGHT_SLACK_M:
             continue
         for yaw in _yaws(model, surface, piece):
@@ -152,6 +157,7 @@ def hypotheses(candidate: Candidate, piece: Piece) -> list[Array]:
 
 
 def _faces_alike(surface: ModelSurface, piece: Piece, yaw: float) -> bool:
+    """Whether the normals of two planes agree after a rotation by `yaw`; True if either is not a plane."""
     if surface.type != Form.PLANE or not piece.is_plane:
         return True
     c, s = np.cos(yaw), np.sin(yaw)
@@ -161,7 +167,7 @@ def _faces_alike(surface: ModelSurface, piece: Piece, yaw: float) -> bool:
 
 
 def _long_side(surface: ModelSurface) -> tuple[Array, float, float]:
-    """Direction (2,) of a surface's longer side along the panel, and its half lengths along and across."""
+    """Return the direction (2,) of a surface's longer side in the panel, and its half lengths along and across it."""
     if surface.sides_m is not None:
         a, b = 0.5 * surface.sides_m[0], 0.5 * surface.sides_m[1]
         if a >= b:
@@ -173,7 +179,7 @@ def _long_side(surface: ModelSurface) -> tuple[Array, float, float]:
 
 
 def _yaws(model: ComponentModel, surface: ModelSurface, piece: Piece) -> list[float]:
-    """Turns about the panel's normal, each once in the period of the model's symmetry."""
+    """Return the rotations about the panel's normal to try, reduced to one period of the model's symmetry."""
     if model.turns == 0:
         return [0.0]
     out: list[float] = []
@@ -194,7 +200,7 @@ def _yaws(model: ComponentModel, surface: ModelSurface, piece: Piece) -> list[fl
 
 
 def _different(turns: list[float], period_rad: float) -> list[float]:
-    """The turns within a period, each once."""
+    """Reduce angles to one period and drop those closer than `SAME_TURN_RAD` to an earlier one."""
     kept: list[float] = []
     for turn in turns:
         if all(abs((turn - t + 0.5 * period_rad) % period_rad - 0.5 * period_rad) > SAME_TURN_RAD for t in kept):
@@ -203,6 +209,7 @@ def _different(turns: list[float], period_rad: float) -> list[float]:
 
 
 def _states(model: ComponentModel) -> list[float]:
+    """Return the states to try: several for a part that slides along the panel, else one."""
     if model.motion != MotionKind.SLIDE:
         return [0.0]
     if abs(model.motion_axis[2]) > 0.5:
@@ -211,7 +218,7 @@ def _states(model: ComponentModel) -> list[float]:
 
 
 def _shifts(surface: ModelSurface, piece: Piece, turn: Array) -> list[Array]:
-    """Of a long surface seen in part, either end or the middle may be what is seen."""
+    """Return shifts (2,) to try: if only part of a long surface is visible, that may be either end or the middle."""
     side, a, b = _long_side(surface)
     spare = a - piece.half_m[0]
     if np.hypot(*side) < 0.5 or a < ELONGATED * b or spare < 0.15 * a:

@@ -1,7 +1,8 @@
 """Finding the components of a model library in an analysed scene.
 
-Pieces of the scene suggest poses of models (`hypotheses`), each is moved to where it explains most of the depth image
-(`search`, `verify`), the best ones share the pixels out among themselves, and `placing` says how well each is placed.
+Pieces of the scene suggest poses of models (`hypotheses`). Each pose is refined until it explains as much of the depth
+image as possible (`search`, `verify`). Matches are then accepted best first, each taking the pixels that it explains,
+and `placing` computes their covariances.
 """
 
 from __future__ import annotations
@@ -25,22 +26,22 @@ from perception.range.primitives import Plane, Surface
 
 LEAST_SCORE = 45.0  # of a match; a pixel that agrees counts 3
 LEAST_PIXELS = 20
-LEAST_SEEN = 0.3  # of the pixels that the model covers
-LEAST_AGREEING = 0.78  # of those that nothing hides
+LEAST_SEEN = 0.3  # least share of the pixels that the model covers that agree with it
+LEAST_AGREEING = 0.78  # least share of agreement among the pixels that agree or contradict
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Match:
-    """A component found.
+    """A component found in a scene.
 
     Attributes:
         model: name of the model.
-        sensor_from_object: pose and covariance; where `free` names a direction its variance is what one turn allows.
-        labels: model surface name to surface label of the scene, for those that the segmentation has, too.
+        sensor_from_object: pose and covariance; an angle named in `free` has the variance of a uniform full turn.
+        labels: model surface name to surface label of the scene, for surfaces that the segmentation also found.
         state: position of the moving part along or about `motion_axis` (m or rad); None without one.
         state_sigma: its standard deviation.
         free: directions that the data do not fix, e.g. "turn about z".
-        score: log-likelihood over that of the bare panel; higher is surer.
+        score: log-likelihood minus that of the bare panel; higher means more certain.
         seen: share of the pixels that the model covers where the image agrees with it.
     """
 
@@ -89,7 +90,7 @@ def match_models(
 
 
 def view_of(scene: RangeScene, depth_m: Array, base: Surface) -> View:
-    """The image as hypotheses are held against it, with the panel's frame: z its outward normal, x the sensor's x."""
+    """Prepare the image for comparison with hypotheses, in the panel's frame: z outward, x the sensor's x in the panel."""
     plane = base.primitive
     if not isinstance(plane, Plane):
         raise TypeError(f"surface {base.label} is a {base.type}, not a plane")
@@ -113,6 +114,7 @@ def view_of(scene: RangeScene, depth_m: Array, base: Surface) -> View:
 
 
 def _holds(counts: Array) -> bool:
+    """Whether enough pixels agree with a hypothesis, in number and as a share, to accept it as a match."""
     against = counts[BEHIND] + counts[RING]
     return bool(
         counts[HITS] >= LEAST_PIXELS
@@ -122,6 +124,7 @@ def _holds(counts: Array) -> bool:
 
 
 def _finished(t: Try, scene: RangeScene, base: Surface, view: View) -> Match:
+    """Build the match of an accepted hypothesis, with its covariance and surface labels."""
     model = t.candidate.model
     evidence = explained(t.candidate.solid, t.q, view)
     x, y, yaw, state = t.q[:4]
@@ -147,7 +150,7 @@ def _finished(t: Try, scene: RangeScene, base: Surface, view: View) -> Match:
 def _labels(
     model: ComponentModel, scene: RangeScene, rows: NDArray[np.int64], pixels: NDArray[np.bool_]
 ) -> dict[str, int]:
-    """For each surface of the model the scene's surface that most of its explained pixels belong to."""
+    """Return for each surface of the model the label that most of its explained pixels have in the scene."""
     out: dict[str, int] = {}
     for k, surface in enumerate(model.surfaces):
         votes = np.bincount(scene.labels[pixels & (rows == k)], minlength=1)

@@ -1,6 +1,7 @@
-"""Models of components: bounded primitives with tolerances in the object's own frame, read from TOML.
+"""Component models: bounded primitives with tolerances in the object's own frame, read from TOML.
 
-Components stand on a panel: the origin lies on its plane under the middle of the component, z is the outward normal.
+Components are mounted on a panel: the origin lies on its plane below the centre of the component, and z is the outward
+normal.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from hal.errors import ConfigError
 
 
 class Form(StrEnum):
-    """What a surface of a model is: the types of `SurfaceType`, and rings, which no segmentation names."""
+    """Shape of a model surface: the types of `SurfaceType`, and the torus, which the segmentation does not fit."""
 
     PLANE = "plane"
     SPHERE = "sphere"
@@ -44,18 +45,18 @@ class ModelSurface:
 
     Attributes:
         name: unique in its model.
-        point_m: (3,) middle of a face, cylinder, ball or ring; the apex of a cone.
-        direction: (3,) outward normal of a plane, axis of a cylinder or ring, of a cone from the apex into it.
+        point_m: (3,) centre of a face, cylinder, sphere or torus; the apex of a cone.
+        direction: (3,) outward normal of a plane, axis of a cylinder or torus; for a cone, from the apex into it.
         along: (3,) direction of a rectangular face's first side; zeros for others.
-        size_m: radius of a sphere, cylinder or disc, of the ring that a torus is bent to; 0 for cones, ellipsoids and
+        size_m: radius of a sphere, cylinder or disc, or of a torus's centre line; 0 for cones, ellipsoids and
             rectangles.
         half_angle_rad: of a cone, else 0.
         sides_m: lengths of a rectangular face's sides, None for a disc.
         length_m: of a cylinder; 0 = unknown.
         radii_m: (3,) of an ellipsoid along the object's axes.
         tube_m: radius of a torus's tube.
-        between_m: least and greatest z of what there is of a sphere or cone.
-        tolerance_m: by which sizes and heights of one component may differ from another's.
+        between_m: least and greatest z of the part of a sphere or cone that exists.
+        tolerance_m: by how much sizes and heights may differ between components of this model.
         moves: whether it belongs to the moving part.
     """
 
@@ -77,11 +78,11 @@ class ModelSurface:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ComponentModel:
-    """A kind of component: its surfaces, how its part moves, and about which axis it looks the same.
+    """A kind of component: its surfaces, the motion of its moving part, and its rotational symmetry.
 
     Attributes:
-        turns: how many turns about the z axis look the same; 0 when every one does, and the pose leaves it free.
-        motion: slide along `motion_axis` or turn about it, between `low` and `high` (metres or radians).
+        turns: order of the rotational symmetry about z; 0 for full symmetry, where the angle cannot be determined.
+        motion: of the moving part: slide along `motion_axis` or turn about it, from `low` to `high` (m or rad).
     """
 
     name: str
@@ -131,10 +132,10 @@ def shipped_models() -> tuple[ComponentModel, ...]:
 
 
 def load_models(path: Path) -> tuple[ComponentModel, ...]:
-    """The component models of a TOML file.
+    """Read the component models of a TOML file.
 
     Raises:
-        ConfigError: the file cannot be read or breaks the format; names the key.
+        ConfigError: the file cannot be read or violates the format; the message names the key.
     """
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -219,7 +220,7 @@ def _surface(row: Mapping[str, Any], *, where: str) -> ModelSurface:
 
 
 def _along(row: Mapping[str, Any], normal: Array, where: str) -> Array:
-    """Direction of the first side, laid into the face."""
+    """Return the unit direction of a rectangle's first side, projected into the face."""
     side = _vector(row, "along", (1.0, 0.0, 0.0), where)
     return _unit(side - normal * float(normal @ side), f"{where}.along")
 

@@ -1,4 +1,4 @@
-"""Objects of a panel file found by their surfaces in a range image, each near its place."""
+"""Finding the objects of a panel file by their surfaces in a range image, each near its expected position."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from perception.range.matching.match import Match, match_models
 from perception.range.matching.models import ComponentModel, models_from
 from perception.range.primitives import Surface
 
-NEAR_M = 0.02  # a match further from where the file has its object is another thing; three sigmas of the belief beside
-LEAST_PIXELS = 20  # over an object's footprint; with fewer it is not in view
+NEAR_M = 0.02  # largest accepted distance from the expected position; three sigmas of the panel pose are added
+LEAST_PIXELS = 20  # over an object's footprint; with fewer the object is not in view
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -24,8 +24,8 @@ class Sighting:
     """What one range image shows of an object of the panel file.
 
     Attributes:
-        match, base_from_object: None when it was not found; `why` says so then.
-        off_m: distance between where it was found and where the panel file and the believed pose have it.
+        match, base_from_object: None if the object was not found; `why` then gives the reason.
+        off_m: distance of the found position from the one that the panel file and the estimated panel pose predict.
         state: how far a mushroom is pressed in (m, 0 to -travel), or a wheel's angle clockwise (rad, modulo one spoke).
     """
 
@@ -38,7 +38,7 @@ class Sighting:
 
 
 def models_of(panel: Panel) -> dict[str, ComponentModel]:
-    """A model for each object of the panel file that range images are searched for, by the object's name."""
+    """Return the component model of each object of the panel file that has a relief, by the object's name."""
     tables = {one.name: one.relief.table() for one in panel.objects if one.relief is not None}
     models = models_from({"model": tables}, where=f"panel {panel.name}") if tables else ()
     return {model.name: model for model in models}
@@ -46,12 +46,12 @@ def models_of(panel: Panel) -> dict[str, ComponentModel]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PanelView:
-    """A range image of a panel, analysed.
+    """An analysed range image of a panel.
 
     Attributes:
         depth_m: (H, W) the image.
         plate: the plane that the panel's objects stand on, in the sensor's frame.
-        base_from_panel: where the panel is believed to be; it tells two of a kind apart.
+        base_from_panel: estimated pose of the panel; it tells two objects of the same kind apart.
     """
 
     scene: RangeScene
@@ -62,7 +62,7 @@ class PanelView:
 
 
 def find_objects(panel: Panel, view: PanelView) -> list[Sighting]:
-    """Where a range image shows the objects of a panel file that have a relief, each looked for near its place."""
+    """Search a range image for each object of a panel file that has a relief, near its expected position."""
     reliefs = {one.name: one.relief for one in panel.objects if one.relief is not None}
     if not reliefs:
         return []
@@ -76,7 +76,7 @@ def find_objects(panel: Panel, view: PanelView) -> list[Sighting]:
 def _sighting(
     panel_object: PanelObject, relief: Relief, model: ComponentModel, view: PanelView, points: Array
 ) -> Sighting:
-    """Of `points` (H, W, 3), in the panel's frame, only those about the object are looked at: that is what keeps it quick."""
+    """Search for one object. For speed, only those of `points` (H, W, 3; panel frame) that lie near it are matched."""
     away = np.abs(points[..., :2] - panel_object.position_m).max(axis=-1)
     half = max(panel_object.half_footprint_m)
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(point_covariance(view.base_from_panel, panel_object.point_m))[-1]))
@@ -101,6 +101,7 @@ def _sighting(
 
 
 def _state(relief: Relief, match: Match, panel_from_object: RigidTransform) -> float | None:
+    """Return the state of the object's moving part as `Sighting.state` defines it."""
     if relief.motion == "slide":
         return match.state
     x, y, _ = panel_from_object.rotation.apply([1.0, 0.0, 0.0])

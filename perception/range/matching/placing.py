@@ -1,7 +1,8 @@
-"""How well a match is placed: the covariance of its pose and of its part's state, from what the image showed of it.
+"""Covariance of the pose of a match, and the standard deviation of its moving part's state.
 
-Outlines make the likelihood a staircase without curvature at its top, so the deviations are read off its flanks: the
-shift at which the best gain over all sizes has dropped by 2 is two standard deviations (profile likelihood).
+Outlines make the likelihood piecewise constant, so it has no curvature at its maximum. The standard deviations are
+therefore found by profile likelihood: the shift at which the log-likelihood, maximised over the surface sizes, has
+dropped by 2 is two standard deviations.
 """
 
 from __future__ import annotations
@@ -15,17 +16,18 @@ from perception.range.matching.search import FINE_M, FINE_RAD, Try, climb, growt
 from perception.range.matching.verify import View
 from perception.range.primitives import Surface
 
-FREE_TURN_RAD = np.pi / np.sqrt(3.0)  # of a turn of which nothing is known
+FREE_TURN_RAD = np.pi / np.sqrt(3.0)  # standard deviation of an unknown angle: uniform over a full turn
 DROP = 2.0
 SHARES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of a fine step
 GROWTH_LEVELS = 2
-LEAST_PITCHES = 0.1  # nothing is placed, or turned at its rim, better than a tenth of a pixel, as outlines are known
+LEAST_PITCHES = 0.1  # pixels; lower bound of the standard deviation of a position, because outlines are no sharper
 
 
 def placed_covariance(t: Try, view: View, base: Surface) -> tuple[Array, float]:
-    """(6, 6) covariance in sensor axes, translation then rotation, and the standard deviation of the state.
+    """Return the covariance (6, 6), translation then rotation in sensor axes, and the state's standard deviation.
 
-    Shifts along and across the object and its turn count as independent; height and tilt are the panel's.
+    The two shifts in the panel and the rotation about its normal are treated as independent; the covariance of height
+    and tilt is that of the panel's plane.
     """
     model = t.candidate.model
     steps = ways_of(model, t.q, FINE_M, FINE_RAD)
@@ -40,18 +42,18 @@ def placed_covariance(t: Try, view: View, base: Surface) -> tuple[Array, float]:
     axes = np.stack([view.R @ [c, s, 0.0], view.R @ [-s, c, 0.0]])
     C = np.zeros((6, 6))
     C[:3, :3] = axes.T @ np.diag([along**2, across**2]) @ axes + feature.point_covariance
-    # A tilt of the normal d = w x n is a turn w across it.
+    # A change of the normal d = w x n is a rotation w about an axis in the panel.
     C[3:, 3:] = np.cross(np.cross(n, feature.direction_covariance, axisb=0).T, n, axisa=1) * -1.0
     C[3:, 3:] = 0.5 * (C[3:, 3:] + C[3:, 3:].T) + turn**2 * np.outer(n, n)
     if model.motion != MotionKind.SLIDE:
         return C, turn
-    # In and out the depth tells, along the panel an outline.
+    # Depth measures a motion along the normal; an outline measures a motion along the panel.
     floor = feature.sigma_point_m if abs(model.motion_axis[2]) > 0.5 else LEAST_PITCHES * pitch
     return C, float(np.hypot(deviations[2 + (model.turns > 0)] * FINE_M, floor))
 
 
 def _deviation(t: Try, way: Array, view: View) -> float:
-    """Standard deviation along `way`, in units of it; the larger of both sides."""
+    """Return the standard deviation along `way`, in units of its length; the larger of both directions."""
     growths = growths_of(t.candidate, t.q.size)
     out = 0.0
     for sign in (1.0, -1.0):

@@ -1,4 +1,4 @@
-"""From poses worth trying to the few where a model explains most of the image near by."""
+"""Local search: refine the hypotheses of a model and keep the few poses that explain the image best."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from perception.range.matching.hypotheses import Candidate, Piece, hypotheses
 from perception.range.matching.models import ComponentModel, MotionKind
 from perception.range.matching.verify import View, climbed
 
-FEW_PIXELS, MANY_PIXELS = 400, 4000  # of a model: below the one every pixel is looked at, above the other a ninth
-STARTS = 24  # of a model, and a quarter of the pieces
-SMALL_STARTS = 120  # of a model of few pixels: cheap to try, and easily outranked by poses behind occluders
-FINE_STARTS = 6  # and an eighth of the pieces
-WORST_START = -45.0  # sizes that fit better may make up for so much
+FEW_PIXELS, MANY_PIXELS = 400, 4000  # pixels of a model: every one is used below the first, one in nine from the second
+STARTS = 24  # hypotheses refined per model, plus a quarter of the number of pieces
+SMALL_STARTS = 120  # for a model of few pixels, which is cheap to try and easily outranked by poses behind occluders
+FINE_STARTS = 6  # plus an eighth of the number of pieces
+WORST_START = -45.0  # a lower score is dropped; adapting the sizes can gain about this much
 APART_M, APART_RAD = 0.008, 0.1
 SAME_PLACE_M = 0.005
 COARSE_M, COARSE_RAD, COARSE_LEVELS = 0.006, 0.12, 3
 FINE_M, FINE_RAD, FINE_LEVELS = 0.0012, 0.03, 4
 GROWTH_STEP = 0.4  # of the tolerance
-GROWING_FROM_M = 0.0015  # what differs less is not told apart
+GROWING_FROM_M = 0.0015  # sizes with a smaller tolerance are not adapted, because the data cannot resolve them
 UPRIGHT = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Try:
-    """A model in a pose: `q` = (x, y, yaw, state, growth of each surface) in the panel's frame, and its gain."""
+    """A hypothesis with its score: a model at `q` = (x, y, yaw, state, size change of each surface), panel frame."""
 
     candidate: Candidate
     q: Array
@@ -35,7 +35,7 @@ class Try:
 
 
 def tries_of(candidate: Candidate, pieces: list[Piece], view: View) -> list[Try]:
-    """The best poses of one model, moved to where they explain most on every second pixel."""
+    """Return the best poses of one model, refined with coarse steps on a subset of the pixels (see `_stride`)."""
     growth = np.zeros(len(candidate.solid.rows))
     stride = _stride(candidate, view)
     quick = [
@@ -53,7 +53,7 @@ def tries_of(candidate: Candidate, pieces: list[Piece], view: View) -> list[Try]
 
 
 def _stride(candidate: Candidate, view: View) -> int:
-    """Every how manieth pixel is enough to tell good starts from bad ones."""
+    """Return the pixel stride that is fine enough to tell good hypotheses from bad ones."""
     size = candidate.travel[:, 1].max(axis=0) - candidate.travel[:, 0].min(axis=0)
     depth = float(view.p[2]) if view.packed[0] > 0 else 1.0
     pixels = float(size[0] * size[1]) * (view.packed[1] / depth) * (view.packed[2] / depth)
@@ -61,7 +61,7 @@ def _stride(candidate: Candidate, view: View) -> int:
 
 
 def _apart(tries: list[Try], apart_m: float, apart_rad: float, most: int) -> list[Try]:
-    """The best ones first, at most so many, without those that stand where a better one stands."""
+    """Return at most `most` tries, best first, without those whose pose is close to that of a better one."""
     ranked = sorted(tries, key=lambda t: -t.score)
     q = np.array([t.q[:4] for t in ranked]).reshape(-1, 4)
     is_open = np.ones(len(ranked), np.bool_)
@@ -75,13 +75,13 @@ def _apart(tries: list[Try], apart_m: float, apart_rad: float, most: int) -> lis
 
 
 def refined(t: Try, view: View) -> Try:
-    """The try moved to the best pose and sizes near by, on every pixel."""
+    """Refine pose and surface sizes with fine steps, on every pixel."""
     ways = np.concatenate([ways_of(t.candidate.model, t.q, FINE_M, FINE_RAD), growths_of(t.candidate, t.q.size)])
     return climb(t.candidate, t.q, view, ways=ways, levels=FINE_LEVELS)
 
 
 def growths_of(candidate: Candidate, size: int) -> Array:
-    """(M, `size`) steps of the sizes that one component may differ from another in."""
+    """Return search steps (M, `size`), one for each surface size that may differ between components of a model."""
     tolerance = candidate.solid.tolerance_m
     growing = np.flatnonzero(tolerance >= GROWING_FROM_M)
     out = np.zeros((len(growing), size))
@@ -90,7 +90,10 @@ def growths_of(candidate: Candidate, size: int) -> Array:
 
 
 def ways_of(model: ComponentModel, q: Array, step_m: float, step_rad: float) -> Array:
-    """(M, 4 + S) steps of a hypothesis: along and across the object, its turn, its state, and all but the state."""
+    """Return search steps (M, 4 + S) of a hypothesis: shifts along and across the object, rotation, and state.
+
+    The last step, for a part that slides along the panel, moves the body and leaves that part where it is.
+    """
     c, s = np.cos(q[2]), np.sin(q[2])
     ways = [[step_m * c, step_m * s, 0.0, 0.0], [-step_m * s, step_m * c, 0.0, 0.0]]
     if model.turns:
@@ -108,7 +111,7 @@ def ways_of(model: ComponentModel, q: Array, step_m: float, step_rad: float) -> 
 def climb(
     candidate: Candidate, q: Array, view: View, *, ways: Array | None = None, levels: int = 0, stride: int = 0
 ) -> Try:
-    """The best hypothesis near by; with `stride` only every so manieth pixel is looked at, and no rim."""
+    """Return the best hypothesis near `q`; with a `stride` only every `stride`-th pixel counts, and the rim does not."""
     model, solid = candidate.model, candidate.solid
     low, high = np.full(q.size, -np.inf), np.full(q.size, np.inf)
     if model.motion == MotionKind.SLIDE:

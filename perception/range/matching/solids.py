@@ -1,20 +1,20 @@
-"""Models of components as rays see them: bounded primitives in the object's frame, compiled.
+"""Ray casting of component models: bounded primitives in the object's frame (compiled).
 
-A solid is a table of rows, one a surface:
+A solid is a table with one row per surface. Its columns:
 
-    0       form, as `FORMS` counts them
-    1-3     a point of it: middle of a face, cylinder, ball or ring, apex of a cone
+    0       form: DISC, RECTANGLE, CYLINDER, CONE, SPHERE, ELLIPSOID or TORUS
+    1-3     reference point: centre of a face, cylinder, sphere or torus, or the apex of a cone
     4-6     unit axis or normal          7-9     unit direction of a rectangle's first side
     10, 11  radius and half length (cylinder), half sides (rectangle), tangent of the half angle (cone),
             radius (disc, sphere), radius of the ring and of its tube (torus)
     10-12   radii along the object's axes (ellipsoid)
-    13, 14  least and greatest z of what is kept of a sphere or cone
-    15      1 when it belongs to the part that slides
+    13, 14  least and greatest z of the part of a sphere or cone that exists
+    15      1 if the surface belongs to the sliding part
 
-Only nearest hits count, so that one surface of a solid hides another.
+Only the nearest hit along a ray counts, so that one surface of a solid can hide another.
 """
 
-# ruff: noqa: PLR0912 - compiled loops take plain arrays, and one branch a form is clearest.
+# ruff: noqa: PLR0912 - compiled loops take plain arrays, and one branch per form is clearest.
 from __future__ import annotations
 
 import numpy as np
@@ -28,19 +28,19 @@ WIDTH = 16
 MOVES = 15
 TRACE_STEPS = 24
 TRACE_END_M = 1e-5
-FREE_LENGTH = 4.0  # radii of a cylinder whose length the model does not tell
+FREE_LENGTH = 4.0  # half length, in radii, of a cylinder whose length the model does not give
 MARGIN_PX = as_numpy_scalar(1)
 
 
 def solid_of(model: ComponentModel) -> Array:
-    """(S, 16) rows of the model's surfaces in their order."""
+    """Return the table (S, 16) with one row per surface of the model, in the model's order."""
     return np.stack([_row(s) for s in model.surfaces])
 
 
 def boxes_of(model: ComponentModel, *, with_travel: bool = False) -> Array:
-    """(S, 2, 3) corners of a box in the object's frame that holds each surface, its size at its largest.
+    """Return the corners (S, 2, 3) of a bounding box of each surface in the object's frame, enlarged by its tolerance.
 
-    `with_travel` takes in every state of the sliding part; without it the part stands at 0.
+    `with_travel`: the box covers every state of the sliding part; without it the part is at state 0.
     """
     rows = solid_of(model)
     out = np.empty((len(rows), 2, 3))
@@ -55,13 +55,14 @@ def boxes_of(model: ComponentModel, *, with_travel: bool = False) -> Array:
 
 
 def _shifts(model: ComponentModel, surface: ModelSurface) -> list[Array]:
+    """Displacements (3,) of a surface at both ends of its travel; a single zero if it does not slide."""
     if model.motion != MotionKind.SLIDE or not surface.moves:
         return [np.zeros(3)]
     return [model.motion_axis * model.low, model.motion_axis * model.high]
 
 
 def _reach(row: Array) -> Array:
-    """(3,) half extent of a surface about its point along the object's axes."""
+    """Return the half extent (3,) of a surface about its reference point, along the object's axes."""
     form, axis = int(row[0]), row[4:7]
     across = np.sqrt(np.maximum(1.0 - axis**2, 0.0))
     if form == RECTANGLE:
@@ -80,6 +81,7 @@ def _reach(row: Array) -> Array:
 
 
 def _row(s: ModelSurface) -> Array:
+    """Return the table row (16,) of a surface."""
     row = np.zeros(WIDTH)
     row[1:4], row[4:7], row[7:10] = s.point_m, s.direction, s.along
     row[13], row[14] = s.between_m
@@ -103,7 +105,7 @@ def _row(s: ModelSurface) -> Array:
 
 @compiled
 def hit(row: Array, grow: float, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> float:
-    """Depth along the ray o + t d where it first meets the surface grown by `grow`; infinite where it does not."""
+    """Return the smallest t at which the ray o + t d hits the surface enlarged by `grow` metres; infinite on a miss."""
     form = int(row[0])
     wx, wy, wz = ox - row[1], oy - row[2], oz - row[3]
     ax, ay, az = row[4], row[5], row[6]
@@ -133,7 +135,7 @@ def hit(row: Array, grow: float, ox: float, oy: float, oz: float, dx: float, dy:
         C -= r * r
     else:
         if form == CONE:
-            # A cone grown by g is the same cone with its apex g / tan(angle) back.
+            # Enlarging a cone by g moves its apex back along the axis by g / tan(angle).
             back = grow / row[10]
             wx, wy, wz = wx + back * ax, wy + back * ay, wz + back * az
             B, C = dx * wx + dy * wy + dz * wz, wx * wx + wy * wy + wz * wz
@@ -165,14 +167,14 @@ def _ring(
     R: float, r: float, ax: float, ay: float, az: float, wx: float, wy: float, wz: float, dx: float, dy: float,
     dz: float,
 ) -> float:  # fmt: skip
-    """A torus met by steps of its distance (sphere tracing; Hart, The Visual Computer 12, 1996)."""
+    """Intersect a ray with a torus by sphere tracing (Hart, The Visual Computer 12, 1996); infinite on a miss."""
     A, B = dx * dx + dy * dy + dz * dz, dx * wx + dy * wy + dz * wz
     disc = B * B - A * (wx * wx + wy * wy + wz * wz - (R + r) * (R + r))
     if disc < 0.0:
         return np.inf
     root = np.sqrt(disc)
     t, end = (-B - root) / A, (-B + root) / A
-    # The tube lies between two planes: from where the ray enters that slab to where it leaves.
+    # The tube lies between two parallel planes, so the search is limited to the ray's path between them.
     da, wa = dx * ax + dy * ay + dz * az, wx * ax + wy * ay + wz * az
     if abs(da) > 1e-6:
         first, last = (-r - wa) / da, (r - wa) / da
@@ -197,7 +199,7 @@ def _ring(
 def window_of(
     box: Array, shift: Array, R: Array, p: Array, sen: Array, margin: int, limit: Indices, window: Indices,
 ) -> None:  # fmt: skip
-    """Fill `window` (u0, v0, u1, v1) with what a box (2, 3) of the object's frame covers, clipped to `limit`."""
+    """Fill `window` (u0, v0, u1, v1) with the pixels covered by a box (2, 3) of the object's frame, clipped to `limit`."""
     u0, v0, u1, v1 = 1e9, 1e9, -1e9, -1e9
     for corner in range(8):
         x = box[corner & 1, 0] + shift[0]
@@ -221,12 +223,12 @@ def render(
     rows: Array, boxes: Array, grow: Array, shift: Array, R: Array, p: Array, sen: Array, window: Indices, stride: int,
     depth: Array, index: Indices,
 ) -> None:  # fmt: skip
-    """Fill `depth` (infinite where nothing is met) and `index` (row number or -1) over a window of the image.
+    """Fill `depth` (infinite where no surface is hit) and `index` (row number or -1) over a window of the image.
 
     Args:
-        rows, grow: the solid, and what to add to the size of each row, m.
-        boxes: (S, 2, 3) corners of a box that holds each row, object frame.
-        shift: (3,) where the sliding part stands, object frame.
+        rows, grow: the solid, and the length (m) added to the size of each row.
+        boxes: (S, 2, 3) corners of the bounding box of each row, object frame.
+        shift: (3,) displacement of the sliding part, object frame, m.
         R, p: sensor_from_object.
         sen: `RangeSensorModel.packed()`.
         window: u0, v0, u1, v1 (exclusive); every `stride`-th pixel is drawn, packed densely into the outputs.

@@ -1,9 +1,10 @@
-"""How well a model in a pose explains a depth image, pixel by pixel, and the pose near by that explains it best.
+"""Score of a model in a given pose against a depth image, pixel by pixel, and the search for the best pose nearby.
 
-A pixel that the model covers is explained (measured and drawn depth agree), hidden (something nearer is measured) or
-contradicted (the sensor sees through the model). Its gain is the log-likelihood under the model, floored as gross
-errors are, less the one under the bare panel; hidden pixels cost little, because anything may stand in front. Beyond
-the outline, depth that goes on smoothly from an explained pixel contradicts too: the thing is larger than the model.
+A pixel that the model covers is explained (measured and rendered depth agree), hidden (the measured depth is nearer) or
+contradicted (the sensor sees through the model). Its gain is the log-likelihood under the model, with a lower bound for
+gross errors, minus the log-likelihood under the bare panel. Hidden pixels cost little, because anything may stand in
+front. Beyond the outline, depth that continues smoothly from an explained pixel also contradicts, because the object is
+then larger than the model.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from hal.arrays import Array, Indices, Mask
 from hal.jit import compiled
 from perception.range.matching.solids import MOVES, render, window_of
 
-HIT = 3.0  # log-likelihood of a pixel that agrees, over one of a gross error
+HIT = 3.0  # log-likelihood of a pixel that agrees, relative to a gross error
 HIDDEN = -0.4
-MIXED = -0.4  # half of the beams at a jump say anything between its sides: as likely there as a gross error
+MIXED = -0.4  # at a depth jump half of the beams measure some depth between its sides, so this costs little
 SEEN_THROUGH = -3.0
 GOES_ON = -2.0
 RING_PX = 2
-SLACK_M = 0.0002  # by which real components differ from their models beside sizes and heights
-SLOPE_SHARE = 0.3  # of the depth step to the next pixel: nobody places an outline better
+SLACK_M = 0.0002  # deviation of real components from their models, apart from sizes and heights
+SLOPE_SHARE = 0.3  # of the depth step to the next pixel: the accuracy of an outline's position
 STEEPEST_M = 0.004
 TRIES = 4
 HITS, BEHIND, RING, FRONT, COVERED, BETWEEN = range(6)
@@ -32,13 +33,13 @@ HITS, BEHIND, RING, FRONT, COVERED, BETWEEN = range(6)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """What hypotheses are held against.
+    """The image data that hypotheses are compared with.
 
     Attributes:
-        depth_m: (H, W), NaN where nothing is known or a better match owns the pixel.
+        depth_m: (H, W), NaN where there is no reading or a better match owns the pixel.
         panel_m: (H, W) depth of the bare panel.
-        sigma_m: (H, W) noise.
-        packed: of the sensor.
+        sigma_m: (H, W) standard deviation of the depth.
+        packed: `RangeSensorModel.packed()`.
         R, p: (3, 3) and (3,) sensor_from_panel.
     """
 
@@ -57,7 +58,14 @@ class View:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Solid:
-    """A model ready to be held against a view: rows of `solids`, boxes about them, tolerances, how its part slides."""
+    """A model in the form that the kernels use.
+
+    Attributes:
+        rows: (S, 16) table as in `solids`.
+        boxes: (S, 2, 3) bounding box of each row, object frame.
+        tolerance_m: (S,) of each surface.
+        slide: (3,) direction in which the sliding part moves, object frame; zeros without one.
+    """
 
     rows: Array
     boxes: Array
@@ -70,7 +78,7 @@ def _placed(
     boxes: Array, slide: Array, q: Array, R0: Array, p0: Array, sen: Array, limit: Indices, R: Array, p: Array,
     window: Indices,
 ) -> None:  # fmt: skip
-    """Pose of the hypothesis into `R`, `p`, and what of the image the solid covers into `window`, with a margin."""
+    """Write the pose of the hypothesis into `R`, `p`, and the pixels that the solid covers, with a margin, into `window`."""
     c, s = np.cos(q[2]), np.sin(q[2])
     for a in range(3):
         R[a, 0] = c * R0[a, 0] + s * R0[a, 1]
@@ -79,7 +87,7 @@ def _placed(
         p[a] = p0[a] + q[0] * R0[a, 0] + q[1] * R0[a, 1]
     box = np.empty((2, 3))
     for a in range(3):
-        # Rows that do not slide are held by the wider box, too: one box keeps this quick.
+        # For speed one box is used for all rows; it also holds those that do not slide.
         box[0, a] = boxes[:, 0, a].min() + min(slide[a] * q[3], 0.0)
         box[1, a] = boxes[:, 1, a].max() + max(slide[a] * q[3], 0.0)
     window_of(box, np.zeros(3), R, p, sen, RING_PX + 1, limit, window)
@@ -90,7 +98,7 @@ def _lifts(
     m: Array, k: Indices, window: Indices, stride: int, h: int, w: int, z: Array, sigma: Array, tolerance: Array,
     is_free: Mask, lift: Array,
 ) -> None:  # fmt: skip
-    """Mean residual of each row within its tolerance: how much higher or lower this component is than its model."""
+    """Estimate how much deeper each row of this component lies than in its model, within its tolerance, into `lift` (S,)."""
     S = lift.shape[0]
     weight, total = np.zeros(S), np.zeros(S)
     for j in range(h):
@@ -117,15 +125,16 @@ def judged(
     sen: Array, R0: Array, p0: Array, stride: int, rim: bool, m: Array, k: Indices, lift: Array, hits: Indices,
     counts: Array,
 ) -> float:  # fmt: skip
-    """Gain of the hypothesis q = (x, y, yaw, state, growth of each row) over the bare panel.
+    """Return the log-likelihood gain of the hypothesis q = (x, y, yaw, state, size change of each row) over the panel.
 
     Args:
         z, panel, sigma: images of `View`.
-        stride: every how manieth pixel is looked at; with 1, `rim` may ask for what goes on beyond the outline, too.
-        m, k, hits: scratch of the image's size: drawn depth, row and whether explained, packed as `render` does.
-        lift: (S,) filled with how much deeper than drawn each row was found.
-        counts: (6,) filled with pixels explained, seen through, going on, hidden, covered at all, and mixed with what
-            is beside.
+        stride: every `stride`-th pixel is used.
+        rim: whether to count pixels beyond the outline whose depth continues smoothly; only with `stride` 1.
+        m, k, hits: scratch: rendered depth, row, and whether the pixel is explained, packed as by `render`.
+        lift: (S,) filled with how much deeper than rendered each row was found.
+        counts: (6,) filled with the number of pixels that are explained (HITS), seen through (BEHIND), continuing
+            beyond the outline (RING), hidden (FRONT), covered (COVERED), and mixed with a neighbour (BETWEEN).
     """
     H, W = z.shape
     S = rows.shape[0]
@@ -174,7 +183,7 @@ def judged(
 
 @compiled
 def _priors(q: Array, tolerance: Array, is_free: Mask, lift: Array) -> float:
-    """Log-likelihood of heights and sizes that differ from the model's: a tolerance is two standard deviations."""
+    """Return the log prior of deviations from the model's heights and sizes; a tolerance is two standard deviations."""
     out = 0.0
     for s in range(tolerance.shape[0]):
         if not is_free[s]:
@@ -186,7 +195,7 @@ def _priors(q: Array, tolerance: Array, is_free: Mask, lift: Array) -> float:
 
 @compiled
 def _slope(m: Array, k: Indices, j: int, i: int, h: int, w: int) -> float:
-    """Depth step to the next pixel of the same row of the solid, down or sideways, the larger."""
+    """Return the larger of the horizontal and vertical depth steps to a neighbouring pixel of the same row of the solid."""
     out = 0.0
     if i > 0 and k[j, i - 1] == k[j, i]:
         out = abs(m[j, i] - m[j, i - 1])
@@ -201,7 +210,7 @@ def _slope(m: Array, k: Indices, j: int, i: int, h: int, w: int) -> float:
 
 @compiled
 def _deepest_beside(m: Array, k: Indices, j: int, i: int, h: int, w: int, panel: float) -> float:
-    """Depth of the deepest thing drawn in or beside a pixel: of what a beam there may have mixed with its own."""
+    """Return the greatest rendered depth in the 3x3 pixels around one: a beam there may mix it with its own depth."""
     out = m[j, i]
     for b in range(max(j - 1, 0), min(j + 2, h)):
         for a in range(max(i - 1, 0), min(i + 2, w)):
@@ -214,9 +223,10 @@ def _going_on(
     m: Array, k: Indices, window: Indices, h: int, w: int, z: Array, panel: Array, sigma: Array, hits: Indices,
     counts: Array,
 ) -> float:  # fmt: skip
-    """Pixels beyond the outline, or before the model, whose depth goes on smoothly from explained ones.
+    """Count pixels beyond the outline, or in front of the model, whose depth continues smoothly from explained pixels.
 
-    What hides a part stands off it: before the model without a jump there is a larger thing, and no occluder.
+    An occluder is separated from the model by a depth jump. Depth in front of the model without a jump therefore means
+    that the object is larger than the model.
     """
     for j in range(h):
         for i in range(w):
@@ -246,12 +256,12 @@ def climbed(
     rows: Array, boxes: Array, tolerance: Array, slide: Array, q: Array, ways: Array, low: Array, high: Array,
     levels: int, z: Array, panel: Array, sigma: Array, sen: Array, R0: Array, p0: Array, stride: int, rim: bool,
 ) -> float:  # fmt: skip
-    """Move `q` to the best hypothesis near by and give its gain: along one of the `ways` at a time, halved each level.
+    """Move `q` to a local maximum of the gain by coordinate search along `ways`; returns its gain.
 
     Args:
-        ways: (M, 4 + S) steps tried forwards and backwards.
+        ways: (M, 4 + S) steps, tried forwards and backwards one at a time.
         low, high: (4 + S,) bounds of the hypothesis.
-        levels: how often the steps are halved; 0 only judges.
+        levels: number of step sizes, each half the previous one; 0 only computes the gain.
     """
     H, W = z.shape
     n = (2 * H + stride) // stride, (2 * W + stride) // stride
@@ -297,7 +307,7 @@ def climbed(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Explained:
-    """What a hypothesis explains: (6,) `counts` as in `judged`, (H, W) row drawn or -1, and the pixels that agree."""
+    """The pixels of a hypothesis: (6,) `counts` as in `judged`, (H, W) row rendered or -1, and whether each agrees."""
 
     counts: Array
     rows: NDArray[np.int64]
@@ -305,7 +315,7 @@ class Explained:
 
 
 def explained(solid: Solid, q: Array, view: View) -> Explained:
-    """The pixels of the image that the hypothesis q = (x, y, yaw, state, growth of each row) covers and explains."""
+    """Return the pixels that the hypothesis q = (x, y, yaw, state, size change of each row) covers and explains."""
     H, W = view.depth_m.shape
     n = 2 * H + 1, 2 * W + 1
     m, k, hits = np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)

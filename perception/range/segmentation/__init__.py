@@ -1,1 +1,1 @@
-"""From a grid of blocks to the regions of surfaces: planes first, then models compete, then borders and pieces."""
+"""Segmentation of a depth image: grow planes from a grid of blocks, select surface kinds, then assign border pixels."""

@@ -1,5 +1,6 @@
-"""The processes of a running cell: `cell` and `stop`, who starts and watches them, and what joins them.
+"""The processes of a running cell, `cell` and `stop`: how they are started, watched and connected.
 
-`supervisor` starts, watches and restarts; `child` is one process that cannot outlive its parent; `latch` is the stop's byte of
-shared memory; `connection` is the service's hold on the cell, `seats` where its devices sit, `motion` its control thread.
+`supervisor` starts, watches and restarts them; `child` is one process that cannot outlive its parent; `latch` is the byte of
+shared memory that holds the software stop; `connection` is the service's access to the cell; `device_slots` holds the cell's
+devices and replaces them; `motion` connects the devices to the control thread.
 """

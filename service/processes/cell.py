@@ -1,4 +1,4 @@
-"""The cell: devices, emulators, clock and control thread. A process of its own, or inline for tests."""
+"""Runs the cell (devices, emulators, clock and control thread) in a process of its own, or inline for tests."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ from service.processes.motion import MotionPort, start_controller
 
 BEAT_S = 0.05
 CLOSE_TIMEOUT_S = 4.0
-NOTE = "note "  # begins a line for the journal
-MISSING = "device-missing"  # a note: the cell goes on without this device
-SWITCH_S = 0.0005  # the control thread waits no longer than this for a thread that answers the service
+NOTE = "note "  # prefix of a line that goes into the journal
+MISSING = "device-missing"  # kind of the note that says that the cell runs without this device
+SWITCH_S = 0.0005  # interpreter switch interval: the longest that the control thread waits for another thread
 log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class CellRuntime:
-    """A running cell. `objects` maps names to what is served: devices, the mover and the clock."""
+    """A running cell; `objects` maps names to the objects that are served: devices, the mover and the clock."""
 
     cell: Cell
     clock: Clock
@@ -71,17 +71,18 @@ class CellRuntime:
         partial: bool = False,
         report: Report = lambda _kind, _data: None,
     ) -> CellRuntime:
-        """Start emulators, connect all devices at once, then start the control thread.
+        """Start the emulators, connect all devices in parallel, then start the control thread.
 
         Args:
-            is_latched: read by the control thread each tick.
-            swapped: what takes the place of sections of the cell file, as an earlier run had it.
-            runs_dir: where `panelwright calibrate` keeps records; motion uses those, devices the cell file's own.
-            partial: go on without devices that do not connect; a wrong file is refused all the same.
-            report: told what becomes of drivers in processes of their own, and of devices that are `MISSING`.
+            is_latched: whether the software stop is latched; called by the control thread at each tick.
+            swapped: device sections that replace those of the cell file, for example from before a restart.
+            runs_dir: folder in which `panelwright calibrate` keeps its records. Motion uses these; the devices use the
+                records of the cell file.
+            partial: whether to go on without devices that do not connect; an invalid cell file is refused in any case.
+            report: called when an isolated driver stops or restarts, and for each device that is `MISSING`.
 
         Raises:
-            CellError: what could not be connected, all of it in one error; everything else is closed again.
+            CellError: lists everything that could not be connected; what had been started is closed again.
         """
         emulated = {name: cell.file.devices[name] for name in cell.file.emulators}
         cell.file.devices.update(swapped or {})
@@ -120,32 +121,32 @@ class CellRuntime:
         return cls(cell=cell, clock=clock, objects=objects, _closers=closers)
 
     def close(self) -> None:
-        """Stop the arm, then close devices, emulators and world; one that fails holds up nobody. Idempotent."""
+        """Stop the arm, then close devices, emulators and world even if some of them fail. Idempotent."""
         closers, self._closers = self._closers, []
         _close_all(closers)
 
 
 def _import_drivers(cell: Cell) -> None:
-    """Import every driver now, in one thread.
+    """Import every driver in one thread, before any device is connected.
 
-    Some libraries (OpenCV) bend `sys.path` while they are imported; a process that a driver starts meanwhile in another
-    thread would inherit the bent path and not even find `typing`.
+    Some libraries (OpenCV) change `sys.path` while they are imported. A process that a driver starts in another thread
+    at that time would inherit the changed path and fail to import even the standard library.
     """
     drivers = [section.driver for section in cell.file.devices.values()]
     for driver in [*drivers, *(section.driver for section in cell.file.emulators.values())]:
-        with contextlib.suppress(ConfigError):  # it comes again, with its key, when the device is connected
+        with contextlib.suppress(ConfigError):  # raised again, with its key, when the device is connected
             device_factory(driver)
 
 
 def clock_for(cell: Cell) -> Clock:
-    """The clock of the cell's mode: simulated, wall, or wall beside a simulated world."""
+    """Return the clock for the cell's mode: simulated, wall, or paced for a simulated world behind emulated wires."""
     clocks: dict[str, Callable[[], Clock]] = {"sim": SimClock, "mixed": PacedClock, "real": WallClock}
     return clocks[cell.file.cell.mode]()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FarSide:
-    """An emulated wire: the options that make a driver find it, the device that answers behind it, and what breaks it."""
+    """An emulated wire: the options with which a driver finds it, the device behind it, and its fault injection."""
 
     address: dict[str, Any]
     backing: Any
@@ -153,7 +154,7 @@ class FarSide:
 
 
 def start_emulators(cell: Cell, clock: Clock, shared: Shared, closers: list[Callable[[], None]]) -> dict[str, FarSide]:
-    """Start the far side of each emulated wire."""
+    """Start the emulator of each emulated wire; returns the far sides by device name."""
     far_sides: dict[str, FarSide] = {}
     for name, section in cell.file.emulators.items():
         key = f"emulators.{name}"
@@ -177,7 +178,10 @@ def _connect_all(
     *,
     report: Report | None,
 ) -> dict[str, DeviceSlot]:
-    """Every device in its slot; with a `report`, devices that did not connect leave an `UnavailableDevice` there."""
+    """Connect every device and put it into a slot.
+
+    With a `report`, the slot of a device that did not connect gets an `UnavailableDevice`; without one, it is an error.
+    """
     with ThreadPoolExecutor(len(sections), thread_name_prefix="connect") as pool:
         waiting = {name: pool.submit(connect, name, section) for name, section in sections.items()}
     failed: dict[str, CellError] = {}
@@ -193,19 +197,19 @@ def _connect_all(
     if failed and (report is None or not all(isinstance(error, DeviceError) for error in failed.values())):
         raise gathered(failed, total=len(sections), cell=cell)
     for name, error in failed.items():
-        assert report is not None  # noqa: S101 - narrowing: else it was raised
+        assert report is not None  # noqa: S101 - narrowing: without a report the error was raised above
         report(MISSING, {"device": name, "why": error.what, "hint": error.hint})
     return slots
 
 
 def gathered(failed: Mapping[str, CellError], *, total: int, cell: Cell) -> CellError:
-    """One error for all devices that did not connect; a single one stays itself."""
+    """Return one error for all devices that did not connect; the error of a single device is returned unchanged."""
     errors = list(failed.values())
     if len(errors) == 1:
         return errors[0]
     is_config = all(isinstance(error, ConfigError) for error in errors)
     same = {error.what.replace(f"devices.{name}: ", "") for name, error in failed.items()}
-    if is_config and len(same) == 1:  # a fault of what they share: the simulated world
+    if is_config and len(same) == 1:  # a fault of something that they share, such as the simulated world
         return ConfigError(same.pop(), hint=errors[0].hint)
     kind: type[CellError] = ConfigError if is_config else DevicesUnavailable
     return kind(
@@ -219,13 +223,13 @@ def _close_all(closers: Iterable[Callable[[], None]]) -> None:
     for close in list(closers)[::-1]:
         try:
             close()
-        except Exception:  # each thing gets its turn, whatever the one before did
+        except Exception:  # close the others even if this one fails
             log.exception("closing the cell")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CellOrder:
-    """What the supervisor tells a new cell process, over a pipe that nobody else reads."""
+    """The start parameters that the supervisor sends to a new cell process over a private pipe."""
 
     cell_path: str
     seed: int | None
@@ -238,33 +242,33 @@ class CellOrder:
     swapped: dict[str, dict[str, Any]]
 
     def to_line(self) -> str:
-        """One line of JSON."""
+        """Return the order as one line of JSON."""
         return json.dumps({name: getattr(self, name) for name in self.__slots__})
 
     @classmethod
     def from_line(cls, line: str) -> CellOrder:
-        """The inverse of `to_line`."""
+        """Read an order from one line of JSON, the inverse of `to_line`."""
         return cls(**json.loads(line))
 
 
 def error_to_line(error: CellError) -> str:
-    """An error on its way to the supervisor."""
+    """Encode an error as one line for the supervisor."""
     return "error " + base64.b64encode(pickle.dumps(error)).decode()
 
 
 def error_from_line(line: str) -> CellError:
-    """The inverse of `error_to_line`; only for lines of our own child."""
+    """Decode a line of `error_to_line`. It is unpickled, so it must come from our own child process."""
     error: CellError = pickle.loads(base64.b64decode(line.removeprefix("error ")))  # noqa: S301 - our own child
     return error
 
 
 def note_to_line(kind: str, data: dict[str, Any]) -> str:
-    """Something for the journal, on its way to the supervisor."""
+    """Encode an entry for the journal as one line for the supervisor."""
     return NOTE + json.dumps([kind, data])
 
 
 def note_from_line(line: str) -> tuple[str, dict[str, Any]] | None:
-    """The inverse of `note_to_line`; None for any other line."""
+    """Decode a line of `note_to_line`; None for any other line."""
     if not line.startswith(NOTE):
         return None
     kind, data = json.loads(line.removeprefix(NOTE))
@@ -272,8 +276,8 @@ def note_from_line(line: str) -> tuple[str, dict[str, Any]] | None:
 
 
 def main() -> None:
-    """Entry point of the cell process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the supervisor's business; the pipe tells when it ends
+    """Run the cell process; this is its entry point."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor handles Ctrl-C and closes the pipe when it ends
     sys.setswitchinterval(SWITCH_S)
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="cell: %(levelname)s %(name)s: %(message)s")
     lifeline = Lifeline()
@@ -315,9 +319,9 @@ def _run(order: CellOrder, lifeline: Lifeline, is_latched: Callable[[], bool], e
 
 def _end_with_parent(lifeline: Lifeline, is_orphan: threading.Event) -> None:
     lifeline.wait_for_end()
-    is_orphan.set()  # the control thread sees it at its next tick and stops the arm
+    is_orphan.set()  # the control thread reads this at its next tick and stops the arm
     threading.Event().wait(CLOSE_TIMEOUT_S)
-    kill_own_group()  # a driver that hangs in `close` must not keep the process
+    kill_own_group()  # a driver that hangs in `close` must not keep the process alive
 
 
 def _beat(beat: Beat) -> None:

@@ -21,14 +21,14 @@ LAST_WORDS_S = 1.0
 class Child:
     """A Python module in a process and a session of its own.
 
-    Being a session leader it does not get the terminal's Ctrl-C, and killing its group takes its own children along.
+    As a session leader it does not receive the terminal's Ctrl-C, and killing its process group also ends its children.
 
     Args:
-        module: run as by `python -m`, without the current folder on its import path.
-        arguments: its command line; never secrets.
-        pass_fds: descriptors that it inherits.
-        on_line: called with each line that it prints, from a thread of this object.
-        on_exit: called once with its exit code, from another.
+        module: name of the module, run as by `python -m` without the current folder on the import path.
+        arguments: command-line arguments. They must not hold secrets, because other users can read them.
+        pass_fds: file descriptors that it inherits.
+        on_line: called with each line that it prints, from a reader thread.
+        on_exit: called once with its exit code, from another thread.
     """
 
     def __init__(
@@ -58,15 +58,15 @@ class Child:
 
     @property
     def pid(self) -> int:
-        """Process id."""
+        """Process id of the child."""
         return self._process.pid
 
     def is_alive(self) -> bool:
-        """Does it run?"""
+        """Whether the child is running."""
         return self._process.poll() is None
 
     def write_line(self, line: str) -> bool:
-        """Send a line to its standard input; False when it is gone."""
+        """Send a line to its standard input; returns False when the child has ended."""
         with self._lock:
             try:
                 stdin = _opened(self._process.stdin)
@@ -77,7 +77,7 @@ class Child:
         return True
 
     def end(self, *, grace_s: float = GRACE_S) -> None:
-        """Close its lifeline, wait a bounded time, then kill it with all its children. A second call does nothing."""
+        """Close its standard input, wait at most `grace_s`, then kill it and its children. A second call does nothing."""
         with self._lock, contextlib.suppress(OSError):
             _opened(self._process.stdin).close()
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -85,9 +85,9 @@ class Child:
         self.kill()
 
     def kill(self) -> None:
-        """Kill it and everything it started, at once. What it started is killed even when it is dead already."""
+        """Kill it and all its children at once; the children are killed even when it has ended already."""
         if self._is_killed:
-            return  # its number may belong to somebody else by now
+            return  # its process id may belong to another process by now
         self._is_killed = True
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
@@ -100,7 +100,7 @@ class Child:
 
     def _wait(self, on_exit: Callable[[int], None]) -> None:
         code = self._process.wait()
-        self._reader.join(LAST_WORDS_S)  # what it said before it died comes first
+        self._reader.join(LAST_WORDS_S)  # deliver its last lines before the exit code
         on_exit(code)
 
 
@@ -110,9 +110,9 @@ def _opened(stream: IO[bytes] | None) -> IO[bytes]:
 
 
 class Lifeline:
-    """The child's side: lines from the parent, and an end when the parent is gone.
+    """The child's side of the connection: reads lines from the parent and notices when the parent ends.
 
-    Standard output is moved away, so that a library that prints cannot garble the line to the parent; prints go to
+    Standard output is redirected so that a library that prints cannot corrupt the messages to the parent; prints go to
     standard error.
     """
 
@@ -122,12 +122,12 @@ class Lifeline:
         self._lock = threading.Lock()
 
     def read_line(self) -> str | None:
-        """The next line from the parent; None when the parent is gone."""
+        """Return the next line from the parent; None when the parent has ended."""
         line = sys.stdin.readline()
         return line.rstrip("\n") if line else None
 
     def write_line(self, line: str) -> None:
-        """Tell the parent; a parent that is gone does not matter here."""
+        """Send a line to the parent; does nothing when the parent has ended."""
         with self._lock, contextlib.suppress(OSError, ValueError):
             self._out.write(line + "\n")
 
@@ -138,7 +138,7 @@ class Lifeline:
 
 
 def kill_own_group() -> None:
-    """End this process and everything it started, now. Only for a session leader."""
+    """Kill this process and all its children at once. The process must be a session leader."""
     if os.getpgrp() == os.getpid():
         os.killpg(os.getpid(), signal.SIGKILL)
     os._exit(1)

@@ -1,4 +1,4 @@
-"""What the service holds of a cell: its devices, its mover and its clock, the same inline and across processes."""
+"""The service's access to a cell (devices, mover and clock), the same inline and across processes."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from hal.devices import DeviceKind
 from hal.errors import DeviceUnavailable, InvalidRequest, Unsupported
 from hal.motion import Mover
 
-CLOCK = "clock"  # names of the served objects that are no devices; `Name` in the cell file cannot contain a dot
+CLOCK = "clock"  # served objects that are not devices; device names in a cell file cannot contain a dot
 MOVER = "mover"
 PREFIX = "cell."
 SWAPPER = "swapper"
-BEHIND = "behind."  # the device behind the emulated wire of the device with this name
+BEHIND = "behind."  # prefix of the device behind the emulated wire of the named device
 
-SWAP_TIMEOUT_S = 20.0  # the most patient driver tries for six seconds, and the old one may have to be connected again
+SWAP_TIMEOUT_S = 20.0  # the slowest driver tries for 6 s, and the old device may have to be connected again
 
 
 class CellConnection(Protocol):
-    """A started cell. Safe to share between threads."""
+    """A started cell; threads may share it."""
 
     @property
     def cell(self) -> Cell:
@@ -33,12 +33,12 @@ class CellConnection(Protocol):
 
     @property
     def clock(self) -> Clock:
-        """The cell's clock: simulated seconds in a simulated cell. Use `now_s`; time passes by declared motions."""
+        """The cell's clock: simulated seconds in a simulated cell. Use `now_s` only: declared motions advance the time."""
         ...
 
     @property
     def mover(self) -> Mover:
-        """The motion port.
+        """The port that executes declared motions.
 
         Raises:
             Unsupported: the cell has no arm.
@@ -46,24 +46,24 @@ class CellConnection(Protocol):
         ...
 
     def device(self, name: str) -> Any:
-        """The device called `name` in the cell file, behind its HAL interface.
+        """Return the device called `name` in the cell file, with its HAL interface.
 
         Raises:
-            InvalidRequest: no such device; says which name is near.
+            InvalidRequest: there is no such device; the hint gives the nearest name.
             DeviceUnavailable: the cell process is down.
         """
         ...
 
     def devices_of(self, kind: DeviceKind) -> dict[str, Any]:
-        """All devices of a kind by name, in the order of the cell file."""
+        """Return all devices of a kind by name, in the order of the cell file."""
         ...
 
     def behind_wires_of(self, kind: DeviceKind) -> dict[str, Any]:
-        """What answers behind the emulated wires of the devices of a kind; only the judge may look there."""
+        """Return the devices behind the emulated wires of a kind's devices. Only the evaluation of a mission may use them."""
         ...
 
     def close(self) -> None:
-        """Let go of the cell; a second call does nothing."""
+        """Release the cell; a second call does nothing."""
         ...
 
 
@@ -80,12 +80,12 @@ def check_name(cell: Cell, name: str) -> None:
 
 
 def emulated(cell: Cell, kind: DeviceKind) -> list[str]:
-    """Names of the devices of a kind whose wires the cell emulates."""
+    """Return the names of the devices of a kind whose wires the cell emulates."""
     return [name for name in cell.names_of(kind) if name in cell.file.emulators]
 
 
 class LocalConnection:
-    """A cell in this very process (`inline`)."""
+    """A cell in this process (`inline`)."""
 
     def __init__(self, cell: Cell, objects: Mapping[str, Any], *, close: Callable[[], None]) -> None:
         self.cell = cell
@@ -99,24 +99,24 @@ class LocalConnection:
 
     @property
     def mover(self) -> Mover:
-        """The motion port."""
+        """The port that executes declared motions."""
         return _mover_or_raise(self.cell, self._objects.get(PREFIX + MOVER))
 
     def device(self, name: str) -> Any:
-        """The device itself."""
+        """Return the device itself."""
         check_name(self.cell, name)
         return self._objects[name]
 
     def devices_of(self, kind: DeviceKind) -> dict[str, Any]:
-        """The devices themselves."""
+        """Return the devices themselves."""
         return {name: self._objects[name] for name in self.cell.names_of(kind)}
 
     def behind_wires_of(self, kind: DeviceKind) -> dict[str, Any]:
-        """The backing devices themselves."""
+        """Return the devices behind emulated wires."""
         return {name: self._objects[PREFIX + BEHIND + name] for name in emulated(self.cell, kind)}
 
     def swap(self, name: str, section: DeviceSection) -> None:
-        """Another device for `name`; see `service.processes.device_slots.Swapper`."""
+        """Replace the device called `name`; see `service.processes.device_slots.Swapper`."""
         deadline = Deadline.after(WallClock(), SWAP_TIMEOUT_S)
         self._objects[PREFIX + SWAPPER].swap(name, section.driver, section.options, deadline=deadline)
 
@@ -130,23 +130,23 @@ Connect = Callable[[str], Any]
 
 
 class RemoteConnection:
-    """A cell in another process. Each thread has proxies of its own, so that one slow read delays nobody else."""
+    """A cell in another process. Each thread has its own proxies, so that a slow read does not delay other threads."""
 
     def __init__(self, cell: Cell) -> None:
         self.cell = cell
         self._lock = threading.Lock()
         self._connect: Connect | None = None
         self._generation = 0
-        self._proxies: list[tuple[str, weakref.ref[Any]]] = []  # each lives as long as its thread
+        self._proxies: list[tuple[str, weakref.ref[Any]]] = []  # each proxy lives as long as its thread
         self._mine = threading.local()
         self._swaps: dict[str, int] = {}
 
     def attach(self, connect: Connect) -> None:
-        """A cell process is ready; proxies of an earlier one are dropped."""
+        """Use a new cell process and drop the proxies of an earlier one."""
         self._switch(connect)
 
     def detach(self) -> None:
-        """The cell process is gone."""
+        """Note that the cell process has ended."""
         self._switch(None)
 
     @property
@@ -156,25 +156,25 @@ class RemoteConnection:
 
     @property
     def mover(self) -> Mover:
-        """The motion port."""
+        """The port that executes declared motions."""
         has_arm = bool(self.cell.names_of(DeviceKind.ARM))
         return _mover_or_raise(self.cell, self._proxy(PREFIX + MOVER) if has_arm else None)
 
     def device(self, name: str) -> Any:
-        """A proxy of the device."""
+        """Return a proxy of the device."""
         check_name(self.cell, name)
         return self._proxy(name)
 
     def devices_of(self, kind: DeviceKind) -> dict[str, Any]:
-        """Proxies of the devices."""
+        """Return proxies of the devices."""
         return {name: self._proxy(name) for name in self.cell.names_of(kind)}
 
     def behind_wires_of(self, kind: DeviceKind) -> dict[str, Any]:
-        """Proxies of the backing devices."""
+        """Return proxies of the devices behind emulated wires."""
         return {name: self._proxy(PREFIX + BEHIND + name) for name in emulated(self.cell, kind)}
 
     def swap(self, name: str, section: DeviceSection) -> None:
-        """Another device for `name`; see `service.processes.device_slots.Swapper`. Proxies of the old one are dropped."""
+        """Replace the device called `name` and drop its proxies; see `service.processes.device_slots.Swapper`."""
         deadline = Deadline.after(WallClock(), SWAP_TIMEOUT_S)
         self._proxy(PREFIX + SWAPPER).swap(name, section.driver, section.options, deadline=deadline)
         self.cell.file.devices[name] = section
@@ -219,7 +219,7 @@ class RemoteConnection:
 
 
 def _close_link(proxy: Any) -> None:
-    """Close the wire of a proxy, not the device behind it."""
+    """Close the connection of a proxy, not the device that it stands for."""
     link = getattr(type(proxy), "disconnect", None)
     if link is not None:
         link(proxy)

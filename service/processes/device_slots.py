@@ -1,4 +1,4 @@
-"""Slots of a running cell: whoever holds a slot keeps talking to the device that is installed there now."""
+"""Slots for the devices of a running cell; calls to a slot reach the device that is installed at that time."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from hal.errors import CellError, ConfigError, DeviceUnavailable, MotionRefused
 from hal.readings import Cause, Quality
 from service.errors import Busy, NotConnected
 
-WIRE_KEYS = ("host", "port", "channel", "device")  # options that name a port which takes one driver at a time
-HAS_MEMORY = {DeviceKind.ARM, DeviceKind.FORCE_TORQUE}  # the control thread keeps kinematics and bias of these
+WIRE_KEYS = ("host", "port", "channel", "device")  # options that name a port which only one driver can use at a time
+HAS_MEMORY = {DeviceKind.ARM, DeviceKind.FORCE_TORQUE}  # the control thread stores the kinematics and the bias of these
 IN_MOTION = HAS_MEMORY | {DeviceKind.GRIPPER, DeviceKind.TOUCH, DeviceKind.PROXIMITY}
 log = logging.getLogger(__name__)
 
 
 class DeviceSlot:
-    """Passes every call on to the installed device."""
+    """Forwards every call to the installed device."""
 
     def __init__(self, device: Any) -> None:
         self._device = device
@@ -33,25 +33,25 @@ class DeviceSlot:
         return getattr(self._device, name)
 
     def __dir__(self) -> list[str]:
-        return dir(self._device)  # what a host offers to other processes
+        return dir(self._device)  # a host serves these names to other processes
 
     def close(self) -> None:
         """Close the installed device."""
         self._device.close()
 
     def installed(self) -> Any:
-        """The device itself."""
+        """Return the installed device."""
         return self._device
 
     def install(self, device: Any) -> None:
-        """Install another device; the caller closes the one before."""
+        """Install another device; the caller closes the previous one."""
         self._device = device
 
 
 class UnavailableDevice:
-    """Stands in the slot of a device that did not connect, so that the rest of the cell can be used meanwhile.
+    """Placeholder for a device that did not connect, so that the rest of the cell can be used.
 
-    It has the interface of its kind; every call raises why there is no device, with how to try again.
+    It has the interface of its kind; every call raises an error with the cause and how to connect again.
 
     Args:
         error: why connecting failed.
@@ -66,7 +66,7 @@ class UnavailableDevice:
         )
 
     def __dir__(self) -> list[str]:
-        return ["name", *dir(PROTOCOLS[self.kind])]  # what a host offers to other processes
+        return ["name", *dir(PROTOCOLS[self.kind])]  # a host serves these names to other processes
 
     def __getattr__(self, attribute: str) -> Any:
         if attribute.startswith("_") or attribute not in dir(PROTOCOLS[self.kind]):
@@ -82,18 +82,18 @@ class UnavailableDevice:
         return self._why
 
     def health(self) -> Health:
-        """Not connected, and why."""
+        """Return the state "not connected" with its cause."""
         return Health(connected=False, quality=Quality.INVALID, cause=Cause.COMM, detail=self._why.what)
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing, because no device is open."""
 
 
 class MotionDesk(Protocol):
-    """The part of the motion port that a swap needs."""
+    """The methods of the motion port that a swap needs."""
 
     def at_rest(self, work: Callable[[], None]) -> None:
-        """Run `work` while no motion runs or begins.
+        """Run `work` while no motion runs and none can begin.
 
         Raises:
             MotionRefused: a motion runs.
@@ -101,7 +101,7 @@ class MotionDesk(Protocol):
         ...
 
     def restart(self, between: Callable[[], None]) -> None:
-        """End the control thread, which stops the arm; run `between`; start the thread anew, with the drives off.
+        """End the control thread (this stops the arm), run `between`, and start a new thread with the drives off.
 
         Raises:
             MotionRefused: a motion runs.
@@ -110,19 +110,19 @@ class MotionDesk(Protocol):
 
 
 Connect = Callable[[str, DeviceSection], Any]
-"""Connects the device of a name as a section says that `Complete` has made."""
+"""Connects a device by its name and its section; `Complete` has completed the section."""
 Complete = Callable[[str, DeviceSection], DeviceSection]
-"""A section with the address of the cell's emulator, where it means the device behind that and names no other wire."""
+"""Adds the emulator's address to a section whose device the cell emulates, unless the section names another wire."""
 
 
 class Swapper:
-    """Installs other devices in the slots while the cell runs, one at a time.
+    """Replaces devices in the slots while the cell runs, one at a time.
 
-    The new device is connected before the old one is closed, unless both are on one port. Motion power is off after a
+    The new device is connected before the old one is closed, unless both use the same port. Motion power is off after a
     swap of the arm until the next declared motion asks for it, and a device that moves is not swapped during a motion.
 
     Args:
-        connect, complete: what the start of the cell used.
+        connect, complete: the functions that the start of the cell used.
         motion: the motion port; None in a cell without an arm.
     """
 
@@ -146,11 +146,12 @@ class Swapper:
         """Install another driver, or the same one with other options, for the device `name`.
 
         Args:
-            deadline: of the caller's wait for the answer; a connection that fails takes as long as its driver tries.
+            deadline: when the caller stops waiting for the answer; a failing connection takes as long as its driver tries.
 
         Raises:
-            DeviceError, ConfigError: the new one did not connect; the old one is kept, and the error says so.
-            MotionRefused: a motion runs. Busy: another device is being swapped.
+            DeviceError, ConfigError: the new device did not connect; the old one is kept, and the error says so.
+            MotionRefused: a motion runs.
+            Busy: another device is being swapped.
         """
         if not self._busy.acquire(blocking=False):
             raise Busy("another device is being swapped", hint="send it again in a moment", device=name)
@@ -163,12 +164,12 @@ class Swapper:
                 self._swap_on_one_port(name, old, new)
             else:
                 self._swap_side_by_side(name, new)
-            self._sections[name] = section  # everybody who looks into the cell file sees what is connected
+            self._sections[name] = section  # readers of the cell's sections see the connected device
         finally:
             self._busy.release()
 
     def _fill(self, name: str, new: DeviceSection) -> None:
-        """Install a device where there was none."""
+        """Install a device in a slot that holds an `UnavailableDevice`."""
         slot = self._slots[name]
         try:
             fresh = self._connect(name, new)
@@ -178,7 +179,7 @@ class Swapper:
             raise failure from error
         try:
             self._at_rest(new.kind, lambda: slot.install(fresh))
-        except CellError as error:  # the control thread does not take it
+        except CellError as error:  # the control thread refuses the new device
             slot.install(UnavailableDevice(name, new.kind, error))
             fresh.close()
             raise
@@ -191,7 +192,7 @@ class Swapper:
             with self._kept(name):
                 self._at_rest(new.kind, lambda: slot.install(fresh))
         except CellError:
-            if slot.installed() is fresh:  # the control thread does not take it
+            if slot.installed() is fresh:  # the control thread refuses the new device
                 self._at_rest(new.kind, lambda: slot.install(old))
             fresh.close()
             raise
@@ -202,7 +203,7 @@ class Swapper:
             with self._kept(name):
                 self._at_rest(new.kind, lambda: self._replace(name, new))
         except MotionRefused:
-            raise  # nothing was touched
+            raise  # the old device is still installed
         except CellError:
             self._at_rest(new.kind, lambda: self._return(name, old))
             raise
@@ -213,7 +214,7 @@ class Swapper:
         slot.install(self._connect(name, section))
 
     def _return(self, name: str, old: DeviceSection) -> None:
-        """The old device again, after its port was given to one that did not connect."""
+        """Connect the old device again after the new device on the same port did not connect."""
         try:
             self._replace(name, old)
         except CellError as error:
@@ -233,7 +234,7 @@ class Swapper:
 
     @contextmanager
     def _kept(self, name: str) -> Iterator[None]:
-        """Let errors inside say that the old device stays."""
+        """Add to errors raised inside that the old device is kept."""
         driver = self._sections[name].driver
         kept = f"{name} keeps {driver}, as the new driver"
         try:
@@ -254,7 +255,7 @@ class Swapper:
 
 
 def failure_of(name: str, error: BaseException) -> CellError:
-    """The error that connecting a device raised; a defect of its driver is logged and reported as `DeviceUnavailable`."""
+    """Return the error of a failed connection; a defect of the driver is logged and returned as `DeviceUnavailable`."""
     if isinstance(error, CellError):
         return error
     log.error("devices.%s", name, exc_info=error)
@@ -263,10 +264,10 @@ def failure_of(name: str, error: BaseException) -> CellError:
 
 
 def checked(name: str, device: Any, section: DeviceSection) -> Any:
-    """The device, if it is of the kind that its section says.
+    """Return the device if it has the kind that its section names.
 
     Raises:
-        ConfigError: it is not; it has been closed.
+        ConfigError: it has another kind; it has been closed.
     """
     if device.kind is section.kind:
         return device
@@ -280,7 +281,7 @@ def checked(name: str, device: Any, section: DeviceSection) -> Any:
 
 
 def names_another_wire(section: DeviceSection, own: DeviceSection) -> bool:
-    """Do the options say themselves where the device is, and not as the cell file does?"""
+    """Return whether the options name a wire that differs from the one in the cell file."""
     keys = (*WIRE_KEYS, "replay")
     return any(key in section.options and section.options[key] != own.options.get(key) for key in keys)
 

@@ -1,6 +1,6 @@
 """The stop latch: one byte of shared memory that the control thread reads each tick and the stop process writes.
 
-Nothing here imports more than the standard library: the stop process must start fast and stay small.
+This module imports only the standard library, because the stop process must start fast and stay small.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, Literal
 
 SIZE = 128
-CLEAR = 0x5A  # every other byte, zeroed memory too, means latched: damage must not start an arm
+CLEAR = 0x5A  # any other byte, including zero, means latched, so damaged memory cannot release the arm
 LATCHED = 0x01
 WORD = 8  # bytes
 BODY = struct.Struct("<BQd80s")  # flag, count, wall time, source
@@ -25,7 +25,7 @@ TRIES = 100
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LatchState:
-    """What the latch says. `count` rises with each change; `time_s` is wall time, for people."""
+    """The state of the latch. `count` rises with each change; `time_s` is wall time, for display only."""
 
     is_latched: bool
     count: int
@@ -37,10 +37,10 @@ UNREADABLE = LatchState(is_latched=True, count=0, time_s=0.0, source="latch not 
 
 
 class Latch:
-    """A mapped latch file. One process writes, its threads one after the other; any number reads without a lock.
+    """A memory-mapped latch file, written by one process (one thread at a time) and read by any number without a lock.
 
-    A sequence counter guards the record (a seqlock): odd while it is being written, different when it changed
-    meanwhile. The flag alone is one byte, so `is_set` needs no retry.
+    A sequence counter guards the record (a seqlock): it is odd during a write, and it differs if the record changed
+    during a read. The flag is a single byte, so `is_set` needs no retry.
     """
 
     def __init__(self, path: Path) -> None:
@@ -51,7 +51,7 @@ class Latch:
 
     @classmethod
     def create(cls, path: Path) -> Latch:
-        """Make the file; it starts latched."""
+        """Create the file with the stop latched."""
         path.write_bytes(b"\0" * SIZE)
         latch = cls(path)
         latch.set("start: latched until an explicit reset")
@@ -64,14 +64,14 @@ class Latch:
         self.close()
 
     def is_set(self) -> bool:
-        """Is the stop latched? A closed or damaged latch counts as latched."""
+        """Return whether the stop is latched; a closed or damaged latch counts as latched."""
         try:
             return self._memory[BODY_AT] != CLEAR
         except ValueError:
             return True
 
     def state(self) -> LatchState:
-        """The whole record; latched when no consistent one can be read."""
+        """Return the whole record; its state is latched when no consistent record can be read."""
         for _ in range(TRIES):
             try:
                 before = self._sequence[0]
@@ -85,12 +85,12 @@ class Latch:
         return UNREADABLE
 
     def set(self, source: str) -> LatchState:
-        """Latch the stop. Always succeeds, also when it is latched already."""
+        """Latch the stop; always succeeds, also when it is latched already."""
         with self._writing:
             return self._write(LATCHED, source)
 
     def reset(self, source: str, *, seen_count: int) -> bool:
-        """Clear the latch, if nobody stopped again since the caller saw `seen_count`; tells whether it is clear."""
+        """Clear the latch unless it was set again after `seen_count`; returns whether it is clear."""
         with self._writing:
             if self.state().count != seen_count:
                 return False
@@ -98,16 +98,16 @@ class Latch:
             return True
 
     def close(self) -> None:
-        """Unmap; a second call does nothing."""
+        """Unmap the file; a second call does nothing."""
         self._sequence.release()
         self._memory.close()
 
     def _write(self, flag: int, source: str) -> LatchState:
         sequence = self._sequence[0]
-        sequence += 1 + sequence % 2  # odd, also after a writer died in the middle
+        sequence += 1 + sequence % 2  # odd, also when an earlier writer died during its write
         self._sequence[0] = sequence
         if flag == LATCHED:
-            self._memory[BODY_AT] = LATCHED  # before the rest: the control thread may look right now
+            self._memory[BODY_AT] = LATCHED  # written first, because the control thread may read it at any time
         _, count, _, _ = BODY.unpack_from(self._memory, BODY_AT)
         text = source.encode("utf-8", "replace")[:80]
         BODY.pack_into(self._memory, BODY_AT, flag, count + 1, time.time(), text)
@@ -116,7 +116,7 @@ class Latch:
 
 
 class Beat:
-    """A sign of life in shared memory: one process writes its monotonic time, another looks how old it is."""
+    """A heartbeat in shared memory: one process writes its monotonic time, another reads its age."""
 
     def __init__(self, path: Path) -> None:
         if not path.exists():
@@ -126,22 +126,22 @@ class Beat:
         self._at_s = _word(self._memory, "d")
 
     def beat(self) -> None:
-        """I live."""
+        """Write the current time."""
         self._at_s[0] = time.monotonic()
 
     def age_s(self) -> float:
-        """Seconds since the last beat; both processes share the machine's monotonic clock."""
+        """Return the seconds since the last beat; both processes share the machine's monotonic clock."""
         return time.monotonic() - float(self._at_s[0])
 
     def close(self) -> None:
-        """Unmap; a second call does nothing."""
+        """Unmap the file; a second call does nothing."""
         self._at_s.release()
         self._memory.close()
 
 
 def _word(memory: mmap.mmap, kind: Literal["Q", "d"]) -> memoryview[Any]:
-    """The first eight bytes as one number, read and written in one piece.
+    """Return the first eight bytes as one number that is read and written atomically.
 
-    `struct.pack_into` clears its bytes before it fills them: another process then sees a zero, now and then.
+    `struct.pack_into` is not suitable: it clears its bytes before it fills them, so another process may read a zero.
     """
     return memoryview(memory)[:WORD].cast(kind)

@@ -1,4 +1,4 @@
-"""Joins the cell's devices to the control thread of `manipulation`."""
+"""Connects the cell's devices to the control thread of `manipulation`."""
 
 from __future__ import annotations
 
@@ -28,39 +28,39 @@ T = TypeVar("T")
 
 
 class Standstill:
-    """Stands for the control thread while a device that it needs is not connected: no motion, and no state, but why."""
+    """Replaces the control thread while a device that it needs is not connected; every request raises the cause."""
 
     def __init__(self, why: CellError) -> None:
         self._why = why
 
     def execute(self, motion: DeclaredMotion) -> MotionReport:  # noqa: ARG002 - an interface
-        """Raise."""
+        """Raise the error that says which device is not connected."""
         raise self._why
 
     def tare(self) -> Array:
-        """Raise."""
+        """Raise the error that says which device is not connected."""
         raise self._why
 
     def state(self) -> RobotState:
-        """Raise."""
+        """Raise the error that says which device is not connected."""
         raise self._why
 
     def cancel(self) -> None:
-        """Nothing moves."""
+        """Do nothing, because no motion runs."""
 
     def close(self) -> None:
-        """Nothing to end."""
+        """Do nothing, because there is no control thread."""
 
 
 class MotionPort:
-    """The mover as many clients see it: watching the state never gets in the way of a motion.
+    """The mover for several clients; reading the state never interrupts or refuses a motion.
 
     Args:
-        start: starts the control thread, or says why there can be none yet.
-        failing: which of its devices do not answer, and why.
+        start: starts the control thread, or raises why it cannot be started yet.
+        failing: returns which of its devices do not answer, and why.
 
-    A state that reads the devices and a motion exclude each other in the controller; here the motion waits the moment
-    that a read takes, and the readers get the newest snapshot while a motion runs.
+    In the controller, reading the state from the devices and a motion exclude each other. Here a motion waits for such a
+    read to end, and readers get the newest snapshot while a motion runs.
     """
 
     def __init__(
@@ -87,17 +87,17 @@ class MotionPort:
 
     def tare(self) -> Array:
         """Zero the contact wrench; see `hal.motion.Mover`."""
-        return self._alone("tare", lambda: self._controller.tare())  # noqa: PLW0108  # the one of the moment
+        return self._alone("tare", lambda: self._controller.tare())  # noqa: PLW0108  # looked up at the time of the call
 
     def cancel(self) -> None:
         """End the running motion."""
         self._controller.cancel()
 
     def state(self) -> RobotState:
-        """Newest snapshot.
+        """Return the newest snapshot of the robot's state.
 
-        While a simulated world stands still there is nothing new to read: a watcher who read again would only draw
-        from the sensors' noise, and the same seed would no longer give the same mission.
+        While the simulated time stands still, the last snapshot is returned again: another read would draw numbers from
+        the sensors' noise generators, and the same seed would no longer give the same mission.
         """
         newest = self._newest
         is_still = isinstance(self._clock, SimClock) and newest is not None and newest.stamp_s == self._clock.now_s()
@@ -115,7 +115,7 @@ class MotionPort:
                 self._devices_in_use.release()
 
     def at_rest(self, work: Callable[[], None]) -> None:
-        """Run `work` while no motion runs or begins; without a control thread, try to start one afterwards.
+        """Run `work` while no motion runs and none can begin; without a control thread, try to start one afterwards.
 
         Raises:
             MotionRefused: a motion runs.
@@ -126,7 +126,7 @@ class MotionPort:
             self._alone("exchange of a device", work)
 
     def restart(self, between: Callable[[], None]) -> None:
-        """End the control thread, which stops the arm; run `between`; start the thread anew, with the drives off.
+        """End the control thread (this stops the arm), run `between`, and start a new thread with the drives off.
 
         Raises:
             MotionRefused: a motion runs.
@@ -168,7 +168,7 @@ class MotionPort:
 def start_controller(
     cell: Cell, devices: Mapping[str, DeviceSlot], *, clock: Clock, is_latched: Callable[[], bool]
 ) -> MotionPort:
-    """The control thread over the cell's devices, as many clients see it; errors are those of `controller_of`."""
+    """Start the control thread for the cell's devices and return its port; errors as for `controller_of`."""
     used = {name: devices[name] for name, section in cell.file.devices.items() if section.kind in IN_MOTION}
 
     def start() -> Controller | Standstill:
@@ -191,7 +191,7 @@ def start_controller(
 def controller_of(
     cell: Cell, devices: Mapping[str, Any], *, clock: Clock, is_latched: Callable[[], bool]
 ) -> Controller:
-    """A running control thread over the first arm, gripper, force/torque and touch sensor and all proximity sensors.
+    """Start a control thread for the first arm, gripper, force/torque and touch sensor and for all proximity sensors.
 
     Raises:
         ConfigError: a part that motion needs is missing from the cell file.
@@ -248,7 +248,7 @@ def _first(cell: Cell, devices: Mapping[str, Any], kind: DeviceKind) -> Any:
 
 
 def flange_from(cell: Cell, device: Any) -> RigidTransform:
-    """Pose of a device on the flange by its calibration record; the flange itself when it has no mount."""
+    """Return `flange_from_device` from the calibration record; the identity for a device without a mount."""
     if device is None or cell.file.devices[device.name].mount is None:
         return identity()
     mount = cell.calibration_of(device.name).mount
@@ -256,10 +256,10 @@ def flange_from(cell: Cell, device: Any) -> RigidTransform:
 
 
 def _load(cell: Cell, wrist: Any) -> ToolLoad:
-    """What hangs below the force/torque sensor.
+    """Return the tool load below the force/torque sensor.
 
     Raises:
-        ConfigError: the sensor's record does not say.
+        ConfigError: the sensor's calibration record has no load.
     """
     if wrist is None:
         return ToolLoad(mass_kg=0.0, centre_of_mass_m=(0.0, 0.0, 0.0), bias=(0.0,) * 6)

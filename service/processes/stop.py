@@ -1,9 +1,9 @@
-"""The stop process: one tiny port that latches the software stop. It does nothing else, so nothing delays it.
+"""The stop process: a small HTTP port that latches the software stop and does nothing else, so nothing delays it.
 
-This is no safety function: a machine that can hurt people needs a hardware stop.
+This is not a safety function: a machine that can hurt people needs a hardware stop.
 
-Anyone may stop: no key, no lease, no body. Only the supervisor can reset, over this process's standard input. When the
-supervisor is gone, the latch is set and the process ends.
+Anyone may stop, without a key, a lease or a request body. Only the supervisor can reset, over this process's standard
+input. When the supervisor ends, the process sets the latch and ends.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ REASONS = {200: "OK", 204: "No Content", 400: "Bad Request", 404: "Not Found", 4
 
 
 class StopServer:
-    """Answers `POST /v1/stop` and `GET /v1/stop` in raw HTTP/1.1, one request a connection.
+    """Answers `POST /v1/stop` and `GET /v1/stop` in raw HTTP/1.1, one request per connection.
 
     Args:
-        latch: written by this object only.
-        origins: web origins that may read the answers (any may stop).
+        latch: the stop latch; only this object writes it.
+        origins: web origins that may read the answers (every origin may stop).
     """
 
     def __init__(self, latch: Latch, origins: tuple[str, ...] = ()) -> None:
@@ -38,7 +38,7 @@ class StopServer:
         self._origins = origins
 
     async def start(self, listener: socket.socket) -> asyncio.Server:
-        """Serve on a bound socket."""
+        """Start to serve on a bound socket."""
         return await asyncio.start_server(self._serve, sock=listener, limit=MAX_HEAD_BYTES, backlog=512)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -48,14 +48,14 @@ class StopServer:
             writer.write(self.answer(head, str(peer[0]) if isinstance(peer, tuple) else "local"))
             await asyncio.wait_for(writer.drain(), HEAD_TIMEOUT_S)
         except (TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            pass  # a slow or broken client gets nothing and holds nothing up
+            pass  # a slow or broken client gets no answer and does not delay others
         finally:
             writer.close()
             with contextlib.suppress(OSError):
                 await writer.wait_closed()
 
     def answer(self, head: bytes, peer: str) -> bytes:
-        """The whole response to a request head. A stop is latched before anything else is looked at."""
+        """Return the whole response to a request head; a stop is latched before the rest of the request is checked."""
         lines = head.decode("latin-1").split("\r\n")
         method, _, rest = lines[0].partition(" ")
         path = rest.partition(" ")[0].partition("?")[0].rstrip("/")
@@ -89,7 +89,7 @@ class StopServer:
 
 
 def as_dict(state: LatchState) -> dict[str, object]:
-    """The latch as the API shows it."""
+    """Return the latch's state as the API shows it."""
     return {
         "is_latched": state.is_latched,
         "count": state.count,
@@ -122,15 +122,15 @@ async def _run(listener: socket.socket, latch: Latch, origins: tuple[str, ...]) 
 
 
 def main() -> None:
-    """Entry point of the stop process."""
+    """Run the stop process; this is its entry point."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--fd", type=int, required=True, help="bound listening socket")
     parser.add_argument("--latch", type=Path, required=True)
     parser.add_argument("--origin", action="append", default=[])
     options = parser.parse_args()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the supervisor's business; the pipe tells when it ends
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor handles Ctrl-C and closes the pipe when it ends
     with contextlib.suppress(OSError):
-        os.nice(-10)  # only root may; without it the process is still the smallest of all
+        os.nice(-10)  # only root may raise the priority; the process works without it
     with Latch(options.latch) as latch, socket.socket(fileno=options.fd) as listener:
         asyncio.run(_run(listener, latch, tuple(options.origin)))
 

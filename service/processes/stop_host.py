@@ -1,4 +1,4 @@
-"""The service's hold on the stop port: in a process of its own, or in a thread of this one."""
+"""Runs the stop port for the service, in its own process or in a thread of this process."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from service.processes.child import Child
 from service.processes.latch import Latch, LatchState
 from service.processes.stop import StopServer
 
-STOP_ANSWER_S = 0.5  # then the latch is set from here
-RESET_ANSWER_S = 5.0  # a busy machine may take its time over this
+STOP_ANSWER_S = 0.5  # after this, the latch is set from this process
+RESET_ANSWER_S = 5.0  # generous, because a busy machine answers late
 READY_S = 20.0
 MAX_RESTARTS = 3
 log = logging.getLogger(__name__)
 
 
 class InlineStop:
-    """The stop port in a thread of this process; for tests and debugging."""
+    """Runs the stop port in a thread of this process, for tests and debugging."""
 
     def __init__(self, latch: Latch, listener: socket.socket | None, origins: tuple[str, ...]) -> None:
         self._latch = latch
@@ -38,20 +38,20 @@ class InlineStop:
             self._server = asyncio.run_coroutine_threadsafe(start, self._loop).result(READY_S)
 
     def stop(self, source: str) -> LatchState:
-        """Latch."""
+        """Latch the stop."""
         return self._latch.set(source)
 
     def reset(self, source: str, *, seen_count: int) -> bool:
-        """Clear, unless stopped again."""
+        """Clear the latch unless it was set again after `seen_count`."""
         return self._latch.reset(source, seen_count=seen_count)
 
     def is_alive(self) -> bool:
-        """Does its thread run?"""
+        """Whether its thread is running."""
         return self._thread.is_alive()
 
     @property
     def pid(self) -> int | None:
-        """No process of its own."""
+        """None, because it has no process of its own."""
         return None
 
     def close(self) -> None:
@@ -74,7 +74,7 @@ class InlineStop:
 
 
 class ProcessStop:
-    """The stop process, restarted when it dies. While it is down the latch stays set: no stop, no motion."""
+    """Runs the stop process and restarts it when it dies; the latch stays set meanwhile, so nothing can move."""
 
     def __init__(
         self,
@@ -96,7 +96,7 @@ class ProcessStop:
         self._child = self._begin()
 
     def stop(self, source: str) -> LatchState:
-        """Latch, by the stop process when it answers, else directly."""
+        """Latch the stop through the stop process, or directly when that does not answer."""
         count = self._latch.state().count
         is_told = self._child.is_alive() and self._child.write_line(f"stop {_line(source)}")
         if not (is_told and self._has_changed(count, STOP_ANSWER_S)):
@@ -104,15 +104,15 @@ class ProcessStop:
         return self._latch.state()
 
     def reset(self, source: str, *, seen_count: int) -> bool:
-        """Ask the stop process to clear the latch; it refuses when somebody stopped after `seen_count`.
+        """Ask the stop process to clear the latch; it refuses if the latch was set again after `seen_count`.
 
         Raises:
-            MotionRefused: it did not answer; an answer that comes later clears nothing.
+            MotionRefused: it did not answer in time; a late answer clears nothing.
         """
         self._is_ready.wait(READY_S)
         is_told = self._child.write_line(f"reset {seen_count} {_line(source)}")
         if not (is_told and self._has_changed(seen_count, RESET_ANSWER_S)):
-            self._latch.set("a reset without an answer")  # raises the count, so that the late one is refused
+            self._latch.set("a reset without an answer")  # raises the count, so that a late reset is refused
             raise MotionRefused(
                 f"the stop process did not answer within {RESET_ANSWER_S:.0f} s, so the stop stays latched",
                 hint="look at the cell, then reset again; is the machine overloaded?",
@@ -120,16 +120,16 @@ class ProcessStop:
         return not self._latch.is_set()
 
     def is_alive(self) -> bool:
-        """Does the process run?"""
+        """Whether the process is running."""
         return self._child.is_alive()
 
     @property
     def pid(self) -> int | None:
-        """Its process id."""
+        """Process id of the stop process."""
         return self._child.pid
 
     def close(self) -> None:
-        """End the process; it latches the stop when it goes."""
+        """End the process; it latches the stop before it ends."""
         self._is_closing = True
         self._child.end(grace_s=1.0)
         self._listener.close()
@@ -176,7 +176,7 @@ def _any_port() -> socket.socket:
 
 
 def bound_socket(host: str, port: int, *, option: str = "--port") -> socket.socket:
-    """A bound TCP socket; `port` 0 takes any free one. `option` is what chooses another.
+    """Return a bound TCP socket; `port` 0 takes any free port. `option` is the command-line option to name in errors.
 
     Raises:
         ConfigError: the port is taken or may not be used.
@@ -185,7 +185,7 @@ def bound_socket(host: str, port: int, *, option: str = "--port") -> socket.sock
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
-        listener.listen(512)  # at once: with SO_REUSEADDR only listening sockets exclude each other
+        listener.listen(512)  # listen at once, because with SO_REUSEADDR only listening sockets exclude each other
     except OSError as error:
         listener.close()
         raise ConfigError(

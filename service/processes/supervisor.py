@@ -1,4 +1,4 @@
-"""Starts the stop process and the cell process, watches them, restarts them and never leaves one behind."""
+"""Starts, watches and restarts the stop process and the cell process, and ends both when it ends."""
 
 from __future__ import annotations
 
@@ -24,45 +24,45 @@ from service.processes.connection import CellConnection, LocalConnection, Remote
 from service.processes.latch import Beat, Latch, LatchState
 from service.processes.stop_host import InlineStop, ProcessStop
 
-START_TIMEOUT_S = 400.0  # the very first start compiles the control kernels beside much else, minutes on a busy machine
+START_TIMEOUT_S = 400.0  # the first start compiles the control kernels, which takes minutes on a busy machine
 MAX_RESTARTS = 3
-BEAT_TIMEOUT_S = 10.0  # the beat thread shares its interpreter with numba's compiler, which holds the lock for seconds
+BEAT_TIMEOUT_S = 10.0  # numba's compiler can hold the interpreter lock for seconds, which delays the beat thread
 WATCH_S = 0.1
 log = logging.getLogger(__name__)
 
 
 class StopHost(Protocol):
-    """Whoever writes the latch."""
+    """The interface of the object that writes the latch."""
 
     def stop(self, source: str) -> LatchState:
-        """Latch; never fails."""
+        """Latch the stop; never fails."""
         ...
 
     def reset(self, source: str, *, seen_count: int) -> bool:
-        """Clear unless somebody stopped again after `seen_count`.
+        """Clear the latch unless it was set again after `seen_count`; returns whether it is clear.
 
         Raises:
-            MotionRefused: nobody answered.
+            MotionRefused: the stop process did not answer.
         """
         ...
 
     @property
     def pid(self) -> int | None:
-        """Its process, when it has one of its own."""
+        """Process id, or None when it has no process of its own."""
         ...
 
     def is_alive(self) -> bool:
-        """Would a POST to the stop port be answered?"""
+        """Whether the stop port answers requests."""
         ...
 
     def close(self) -> None:
-        """End; the latch stays set."""
+        """End the stop port; the latch stays set."""
         ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProcessHealth:
-    """State of one process."""
+    """The state of one supervised process."""
 
     name: str
     pid: int | None
@@ -73,7 +73,7 @@ class ProcessHealth:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MissingDevice:
-    """A device that the cell goes on without, why, and what may help."""
+    """A device that is not connected while the cell runs, with the cause and a remedy."""
 
     device: str
     why: str
@@ -81,16 +81,16 @@ class MissingDevice:
 
 
 class Supervisor:
-    """Owner of a cell's processes.
+    """Starts and owns the processes of a cell.
 
     Args:
-        cell: what to start.
-        stop_listener: bound socket of the stop port; None for no port (tests).
+        cell: the cell to start.
+        stop_listener: bound socket of the stop port; None for no port (in tests).
         origins: web origins that may read answers of the stop port.
-        inline: cell and stop port in this process.
-        runs_dir: where calibrations are kept; None: only the cell file's own count.
-        partial: a cell whose devices do not all connect goes on without them; see `missing`.
-        report: told about starts, deaths, stops and resets.
+        inline: whether to run the cell and the stop port in this process.
+        runs_dir: folder of the calibration records found here; None to use only those of the cell file.
+        partial: whether to go on without devices that do not connect; see `missing`.
+        report: called for each start, unexpected end, stop and reset.
     """
 
     def __init__(
@@ -132,34 +132,34 @@ class Supervisor:
 
     @property
     def connection(self) -> CellConnection:
-        """The cell, wherever it runs. Its devices are unavailable while the cell process is down."""
+        """The connection to the cell; its devices are unavailable while the cell process is down."""
         return self._local or self._remote
 
     @property
     def folder(self) -> Path:
-        """Runtime folder: latch, beat and sockets; only this user can enter."""
+        """Runtime folder with latch, heartbeat and sockets; only this user has access."""
         return self._folder
 
     @property
     def is_ready(self) -> bool:
-        """Is the cell up?"""
+        """Whether the cell is running and ready."""
         return self._is_ready.is_set()
 
     @property
     def problem(self) -> CellError | None:
-        """Why the cell is not up, if it is known."""
+        """The error that keeps the cell from running, if it is known."""
         return self._problem
 
     @property
     def missing(self) -> tuple[MissingDevice, ...]:
-        """What did not connect when the cell started, nor later."""
+        """Devices that have not connected, neither at the cell's start nor later."""
         return tuple(self._missing.values())
 
     def start(self) -> None:
-        """Start the cell and wait until it is ready. In a simulated cell the latch is then reset, explicitly.
+        """Start the cell and wait until it is ready; in a simulated cell, reset the latch afterwards.
 
         Raises:
-            CellError: it could not start; says why.
+            CellError: the cell could not start.
         """
         begun = self.latch.state().count
         try:
@@ -179,9 +179,9 @@ class Supervisor:
         return state
 
     def note_stop(self) -> None:
-        """Report the newest stop, once: the stop port writes the latch and tells nobody.
+        """Report the newest stop once, because the stop port writes the latch without reporting.
 
-        To be called again and again; of stops that come faster than the calls only the last one is told.
+        Call it periodically; of several stops between two calls only the last one is reported.
         """
         with self._noting:
             state = self.latch.state()
@@ -192,12 +192,12 @@ class Supervisor:
             self._report("stop", {"source": state.source, "count": state.count})
 
     def reset(self, source: str, *, seen_count: int) -> LatchState:
-        """Clear the latch. This alone moves nothing.
+        """Clear the latch; this alone moves nothing.
 
         Raises:
-            MotionRefused: somebody stopped again meanwhile, or the stop process is down or silent (no stop, no motion).
+            MotionRefused: the stop was latched again meanwhile, or the stop process is down or does not answer.
         """
-        self.note_stop()  # before its traces are gone
+        self.note_stop()  # before the reset overwrites the latch's record
         if not self._stop.is_alive():
             raise MotionRefused("the stop process is down, so nothing may move", hint="restart `panelwright serve`")
         if not self._stop.reset(source, seen_count=seen_count):
@@ -208,13 +208,13 @@ class Supervisor:
         return self.latch.state()
 
     def swap(self, name: str, section: DeviceSection) -> None:
-        """Another device for `name`, also after a restart of the cell process; see `service.processes.device_slots.Swapper`."""
+        """Replace the device called `name`, also for later restarts of the cell process; see `device_slots.Swapper`."""
         (self._local or self._remote).swap(name, section)
         self._swapped[name] = section
         self._missing.pop(name, None)
 
     def processes(self) -> tuple[ProcessHealth, ...]:
-        """State of the supervised processes."""
+        """Return the state of the supervised processes."""
         child = self._child
         alive = self._local is not None or (child is not None and child.is_alive())
         detail = self._problem.what if self._problem is not None else ""
@@ -230,7 +230,7 @@ class Supervisor:
         )
 
     def close(self) -> None:
-        """Stop first, then end everything; bounded, idempotent."""
+        """Latch the stop, then end all processes; takes a bounded time and is idempotent."""
         if self._is_closing.is_set():
             return
         self._is_closing.set()
@@ -297,13 +297,13 @@ class Supervisor:
         self._report("cell-ready", {"pid": child.pid, "seconds": round(time.monotonic() - child.started_s, 3)})
 
     def _note(self, kind: str, data: dict[str, Any]) -> None:
-        """What the cell tells."""
+        """Handle a note that the cell process sends."""
         if kind == MISSING:
             self._missing[data["device"]] = MissingDevice(**data)
         self._report(kind, data)
 
     def _order(self) -> CellOrder:
-        """What the next cell process has to do; address and key are its own, so that nobody talks to one that died."""
+        """Return the order for the next cell process, with a new address and key so that old connections cannot reach it."""
         return CellOrder(
             cell_path=str(self.cell.path),
             seed=self.cell.file.cell.seed,
@@ -324,7 +324,7 @@ class Supervisor:
             return self._child
 
     def _watch(self) -> None:
-        """Until the end: notice a dead or hung cell process, latch the stop, clear up after it, restart it."""
+        """Watch the cell process until the end; when it dies or hangs, latch the stop, clean up and restart it."""
         while not self._is_closing.wait(WATCH_S):
             child = self._child
             assert child is not None  # noqa: S101 - narrowing: the watch begins after the start
@@ -342,7 +342,7 @@ class Supervisor:
         why = "died" if not child.is_alive() else f"hung: no sign of life for {self._beat.age_s():.1f} s"
         self._is_ready.clear()
         self._stop.stop(f"the cell process {why}")
-        child.kill()  # its world too
+        child.kill()  # also ends the process of its simulated world
         self._remote.detach()
         self._problem = DeviceUnavailable(
             f"the cell process {why}",

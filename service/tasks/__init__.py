@@ -1,1 +1,1 @@
-"""Who may do what, and what was done: tasks, the lease on motion, the gate between them and the cell, the journal."""
+"""Tasks, the lease on motion, the gate between tasks and the cell, and the journal of what was done."""

@@ -1,6 +1,6 @@
-"""A task's view of the cell: as the cell, but a task that was cancelled or stopped can start no further motion.
+"""Gives a task access to the cell, in which a task that was cancelled or stopped can start no further motion.
 
-An arm that failed latches the stop: neither this task nor a later one moves it before somebody has looked at it.
+When an arm fails, the stop is latched, so that no task moves the arm before a person has checked it.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from service.processes.connection import CellConnection
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GatedMover:
-    """Checks before each motion whether the task still has the right to move.
+    """Executes motions after a check that the task may still move.
 
     Attributes:
-        check: raises when it has not.
+        check: raises when the task may not move any more.
         arms: names of devices whose failure stops the cell.
-        stop: latches the stop, with the reason.
+        stop: latches the stop; takes the reason.
     """
 
     mover: Mover
@@ -37,7 +37,7 @@ class GatedMover:
         """Run the motion.
 
         Raises:
-            Cancelled, Stopped: the task was, perhaps between two motions; nothing moved.
+            Cancelled, Stopped: the task was cancelled or stopped, perhaps between two motions; nothing moved.
         """
         self.check()
         report = self.mover.execute(motion)
@@ -50,7 +50,7 @@ class GatedMover:
         self.mover.cancel()
 
     def tare(self) -> Array:
-        """Zero the contact wrench; refused as a motion is."""
+        """Zero the contact wrench; refused under the same conditions as a motion."""
         self.check()
         try:
             return self.mover.tare()
@@ -60,12 +60,12 @@ class GatedMover:
             raise
 
     def state(self) -> RobotState:
-        """Newest snapshot."""
+        """Return the newest snapshot of the robot's state."""
         return self.mover.state()
 
 
 class GatedConnection:
-    """The cell's connection with a gated mover, and with the calibrations of the moment the task began."""
+    """The cell's connection with a gated mover and the calibrations that were in use when the task began."""
 
     def __init__(
         self,
@@ -82,7 +82,7 @@ class GatedConnection:
 
     @property
     def cell(self) -> Cell:
-        """The cell file, with what was calibrated here in place of its records."""
+        """The cell file, with records that were calibrated here in place of its own."""
         return self._cell or self._connection.cell
 
     @property
@@ -101,16 +101,16 @@ class GatedConnection:
         )
 
     def device(self, name: str) -> Any:
-        """A device."""
+        """Return the device called `name`."""
         return self._connection.device(name)
 
     def devices_of(self, kind: DeviceKind) -> dict[str, Any]:
-        """Devices of a kind."""
+        """Return all devices of a kind by name."""
         return self._connection.devices_of(kind)
 
     def behind_wires_of(self, kind: DeviceKind) -> dict[str, Any]:
-        """What answers behind emulated wires."""
+        """Return the devices behind the emulated wires of a kind's devices."""
         return self._connection.behind_wires_of(kind)
 
     def close(self) -> None:
-        """Nothing: the connection belongs to the service, not to the task."""
+        """Do nothing, because the connection belongs to the service and not to the task."""

@@ -1,12 +1,12 @@
-"""The journal: what was asked, started, stopped and ended, in SQLite, each row chained to the one before by its hash.
+"""The journal of requests, starts, stops and ends in SQLite; the hash of each row covers the hash of the row before.
 
-One thread writes. `append` returns when the row is on disk; rows that wait together share one commit, so that a burst
-of events costs one flush of the disk. Two services on one folder (a demo beside `serve`) keep one chain.
+One thread writes. `append` returns when the row is on disk; rows that wait at the same time share one commit, so a burst
+of events costs one disk flush. Two services on one folder (a demo beside `serve`) write one chain.
 
-The disk that it takes is bounded: a file that has grown too big hands its rows over to an older part
-(`journal-<first>-<last>.sqlite`), and the oldest part goes when there are too many. Rows are copied first and deleted
-afterwards, so that each is in one place at least; readers read all parts as one journal. A row of the chain says what
-went, so that `verify_chain` can tell it from a theft.
+The disk space is bounded: the rows of a file that has grown too large are moved to an older part
+(`journal-<first>-<last>.sqlite`), and the oldest part is deleted when there are too many. Rows are copied first and deleted
+afterwards, so each row always exists in at least one file; readers read all parts as one journal. A row of the chain
+records which rows were deleted, so that `verify_chain` can distinguish this from tampering.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from service.tasks.journal_parts import INSERT_ROW, SCHEMA, parts_of, snapshot, 
 from service.tasks.journal_reader import DROPPED, FIRST_HASH, Record, chain_hash, read_records, verify_chain
 
 MAX_GROUP = 200
-MAX_KEPT = 1000  # notes that wait for room on the disk
+MAX_KEPT = 1000  # notes kept in memory while the disk is full
 PART_BYTES = 16_000_000  # some ten thousand rows
-KEEP_PARTS = 8  # with the live file some 150 MB
+KEEP_PARTS = 8  # together with the live file about 150 MB
 log = logging.getLogger(__name__)
 APPEND_TIMEOUT_S = 10.0
 
@@ -41,19 +41,19 @@ class _Entry:
     text: str
     wall_time_s: float
     monotonic_s: float
-    done: Future[None] | None  # None: nobody waits for it
+    done: Future[None] | None  # None for a note, which nobody waits for
 
 
 class Journal:
-    """An append-only record of the cell.
+    """An append-only record of what happened in the cell.
 
     Args:
-        path: SQLite file; made when missing. Older parts lie beside it.
-        part_bytes: a file with more than this hands its rows over to a new part.
-        keep_parts: so many older parts are kept.
+        path: SQLite file, created if missing. Older parts are in the same folder.
+        part_bytes: size from which the rows of the file are moved to a new part.
+        keep_parts: number of older parts that are kept.
 
     Raises:
-        JournalError: it cannot be opened for writing.
+        JournalError: the file cannot be opened for writing.
     """
 
     def __init__(self, path: Path, *, part_bytes: int = PART_BYTES, keep_parts: int = KEEP_PARTS) -> None:
@@ -68,7 +68,7 @@ class Journal:
         ready.result()
 
     def append(self, kind: str, data: dict[str, Any]) -> None:
-        """Record durably; returns after the commit.
+        """Record durably and return after the commit.
 
         Raises:
             JournalError: the disk is full or read-only, or the journal is closed.
@@ -84,20 +84,20 @@ class Journal:
             ) from error
 
     def note(self, kind: str, data: dict[str, Any]) -> None:
-        """Record soon, without waiting; for what nobody's permission hangs on. On a full disk it waits for room."""
+        """Record without waiting, for events that no permission depends on; kept in memory while the disk is full."""
         if not self._is_closed:
             self._put(kind, data, None)
 
     def records(self, *, kinds: tuple[str, ...] = (), limit: int = 1000) -> list[Record]:
-        """The newest records of the given kinds (all when empty), oldest first."""
+        """Return the newest records of the given kinds (of all kinds when empty), oldest first."""
         return read_records(self.path, kinds=kinds, limit=limit)
 
     def verify(self) -> int:
-        """Walk the whole chain, see `verify_chain`."""
+        """Check the whole chain; see `verify_chain`."""
         return verify_chain(self.path)
 
     def close(self) -> None:
-        """Write what waits and close; a second call does nothing."""
+        """Write all waiting entries and close; a second call does nothing."""
         if self._is_closed:
             return
         self._is_closed = True
@@ -131,7 +131,7 @@ class Journal:
         db.close()
 
     def _hand_over(self, db: sqlite3.Connection) -> None:
-        """Keep the live file small. What goes wrong here loses nothing and is tried again when it has grown further."""
+        """Move rows to an older part when the live file is too large; a failure loses no row and is tried again later."""
         size = _size_bytes(db)
         if size <= self._hand_over_at:
             return
@@ -145,7 +145,7 @@ class Journal:
             log.error("%s has %.0f MB and cannot be divided: %s", self.path, size / 1e6, error)
 
     def _next_group(self) -> tuple[list[_Entry], bool]:
-        """All entries that wait now (at least one, unless the journal ends), and whether they are the last."""
+        """Wait for entries; returns all that wait (none only when the journal ends) and whether they are the last."""
         group: list[_Entry] = []
         entry = self._waiting.get()
         while entry is not None:
@@ -175,7 +175,7 @@ def _last_hash(db: sqlite3.Connection) -> str:
 
 
 def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry]) -> list[_Entry]:
-    """Write a group in one transaction and tell its callers; returns the notes that found no room."""
+    """Write a group in one transaction and notify its callers; returns the notes that did not fit on the disk."""
     if not group:
         return []
     try:
@@ -184,7 +184,7 @@ def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry]) -> list[_En
             _insert(db, entry)
         db.execute("COMMIT")
     except sqlite3.Error as error:
-        with contextlib.suppress(sqlite3.Error):  # a disk that takes no commit may take no rollback; callers are told
+        with contextlib.suppress(sqlite3.Error):  # when the commit failed the rollback may fail too; callers get the error
             db.execute("ROLLBACK")
         notes = [entry for entry in group if entry.done is None]
         if notes:
@@ -200,20 +200,20 @@ def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry]) -> list[_En
 
 
 def _insert(db: sqlite3.Connection, entry: _Entry) -> None:
-    newest = _last_hash(db)  # under the lock, for another service may have written since
+    newest = _last_hash(db)  # read under the lock, because another service may have written meanwhile
     digest = chain_hash(newest, entry.wall_time_s, entry.monotonic_s, entry.kind, entry.text)
     row = (None, entry.wall_time_s, entry.monotonic_s, entry.kind, entry.text, newest, digest)
     db.execute(INSERT_ROW, row)
 
 
 def hand_over(db: sqlite3.Connection, path: Path, *, part_bytes: int, keep_parts: int) -> None:
-    """Move all rows but the newest, which the chain goes on from, to a new part; drop the oldest parts.
+    """Move all rows except the newest, which the chain continues from, to a new part; delete the oldest parts.
 
     Raises:
-        sqlite3.Error, OSError: it could not be done; every row is still in one place at least.
+        sqlite3.Error, OSError: the move failed; every row still exists in at least one file.
     """
     db.execute("BEGIN IMMEDIATE")
-    if _size_bytes(db) <= part_bytes:  # another service did it meanwhile
+    if _size_bytes(db) <= part_bytes:  # another service has done it meanwhile
         db.execute("ROLLBACK")
         return
     first_id, last_id = db.execute("SELECT MIN(id), MAX(id) - 1 FROM journal").fetchone()
@@ -230,7 +230,7 @@ def hand_over(db: sqlite3.Connection, path: Path, *, part_bytes: int, keep_parts
 
 
 def _dropped(parts: list[Path]) -> _Entry:
-    """The row that says which rows are gone."""
+    """Return the row that records which rows were deleted."""
     with snapshot(parts[-1]) as db:
         number, digest = db.execute("SELECT id, hash FROM journal ORDER BY id DESC LIMIT 1").fetchone()
     told = {"id": number, "hash": digest, "files": [part.name for part in parts]}
@@ -244,7 +244,7 @@ def _dropped(parts: list[Path]) -> _Entry:
 
 
 def _size_bytes(db: sqlite3.Connection) -> int:
-    """What the rows take; pages that are free do not count."""
+    """Return the bytes that the rows occupy; free pages do not count."""
     pages, free, size = (
         int(db.execute(f"PRAGMA {what}").fetchone()[0]) for what in ("page_count", "freelist_count", "page_size")
     )

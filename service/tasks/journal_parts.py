@@ -1,6 +1,6 @@
-"""The older parts of a journal: files beside the live one that took over its rows, oldest first.
+"""The older parts of a journal: files beside the live one to which rows were moved.
 
-A part is written whole under another name and renamed, so it is there with all its rows or not at all.
+A part is written completely under a temporary name and then renamed, so it exists with all its rows or not at all.
 """
 
 from __future__ import annotations
@@ -31,32 +31,35 @@ Row = tuple[Any, ...]
 
 
 def parts_of(live: Path) -> list[Path]:
-    """The parts of the journal whose newest rows are in `live`, oldest first."""
+    """Return the older parts of the journal whose live file is `live`, oldest first."""
     name = re.compile(rf"{re.escape(live.stem)}-\d{{12}}-\d{{12}}{re.escape(live.suffix)}")
     return sorted(path for path in live.parent.iterdir() if name.fullmatch(path.name))
 
 
 def newest_first(live: Path) -> Iterator[Path]:
-    """All files of a journal. The parts are looked up after the live file was read: what left it is in one by then."""
+    """Yield all files of a journal, the live one first.
+
+    The parts are listed after the live file was read, so rows that were moved out of it are found in a part.
+    """
     yield live
     yield from reversed(parts_of(live))
 
 
 @contextmanager
 def snapshot(path: Path) -> Iterator[sqlite3.Connection]:
-    """A file of a journal as it is now, for reading; rows that go meanwhile stay visible."""
-    uri = path.absolute().as_uri()  # a folder may be called "50% off?"
+    """Open a journal file for reading at its present state; rows that are moved meanwhile stay visible."""
+    uri = path.absolute().as_uri()  # escapes characters such as % and ? in folder names
     with closing(sqlite3.connect(f"{uri}?mode=ro", uri=True, isolation_level=None)) as db:
         db.execute("BEGIN")
-        db.execute("SELECT 1 FROM journal LIMIT 1").fetchone()  # the snapshot begins with the first read
+        db.execute("SELECT 1 FROM journal LIMIT 1").fetchone()  # the first read fixes the snapshot
         yield db
 
 
 def write_part(live: Path, rows: Iterable[Row], *, first_id: int, last_id: int) -> Path:
-    """Write the rows with these ids beside `live`; on the disk when it returns.
+    """Write the rows with these ids as a part beside `live`; returns its path when it is on the disk.
 
     Raises:
-        OSError, sqlite3.Error: it cannot be written; nothing is left of it.
+        OSError, sqlite3.Error: the part cannot be written; no incomplete file remains.
     """
     path = live.with_name(f"{live.stem}-{first_id:012d}-{last_id:012d}{live.suffix}")
     fresh = path.with_name(path.name + NEW)
@@ -72,7 +75,7 @@ def write_part(live: Path, rows: Iterable[Row], *, first_id: int, last_id: int) 
         fresh.replace(path)
     finally:
         fresh.unlink(missing_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY)  # the new name is on the disk once its folder is
+    folder = os.open(path.parent, os.O_RDONLY)  # the new name is durable only after its folder is flushed
     try:
         os.fsync(folder)
     finally:

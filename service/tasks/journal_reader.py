@@ -1,4 +1,4 @@
-"""Reads a journal, all its parts as one, and walks its chain; needs no service and disturbs none."""
+"""Reads a journal with all its parts and checks its chain, without a service and without disturbing one."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from service.errors import JournalError
 from service.tasks.journal_parts import newest_first, parts_of, snapshot
 
 FIRST_HASH = "0" * 64
-DROPPED = "journal-dropped"  # the kind of row that says up to where the oldest rows have gone
+DROPPED = "journal-dropped"  # kind of the row that records which of the oldest rows were deleted
 MAX_ID = 2**62
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Record:
-    """One row. `wall_time_s` is for people; `monotonic_s` orders what happened within one run."""
+    """One row of the journal. `wall_time_s` is for display; `monotonic_s` gives the order within one run."""
 
     id: int
     wall_time_s: float
@@ -33,10 +33,10 @@ class Record:
 
 
 def read_records(path: Path, *, kinds: tuple[str, ...] = (), limit: int = 1000) -> list[Record]:
-    """The newest records of the given kinds (all when empty), oldest first.
+    """Return the newest records of the given kinds (of all kinds when empty), oldest first.
 
     Raises:
-        JournalError: it cannot be read.
+        JournalError: the journal cannot be read.
     """
     where = f"AND kind IN ({','.join('?' * len(kinds))})" if kinds else ""
     sql = f"SELECT * FROM journal WHERE id < ? {where} ORDER BY id DESC LIMIT ?"  # noqa: S608 - only ?s
@@ -52,15 +52,15 @@ def read_records(path: Path, *, kinds: tuple[str, ...] = (), limit: int = 1000) 
 
 
 def verify_chain(path: Path) -> int:
-    """Walk the whole chain, as far back as it is kept; returns the number of rows.
+    """Check the whole chain as far back as it is kept; returns the number of rows.
 
     Raises:
-        JournalError: a row was changed, removed or inserted (names it), or the journal cannot be read.
+        JournalError: a row was changed, removed or inserted (the error names it), or the journal cannot be read.
     """
     dropped = read_records(path, kinds=(DROPPED,), limit=1)
     previous, last_id = (dropped[0].data["hash"], dropped[0].data["id"]) if dropped else (FIRST_HASH, 0)
     count = 0
-    with _readable(path), snapshot(path) as live, ExitStack() as files:  # before the parts are looked up
+    with _readable(path), snapshot(path) as live, ExitStack() as files:  # open the live file before the parts are listed
         parts = [(part, files.enter_context(snapshot(part))) for part in parts_of(path)]
         for part, db in (*parts, (path, live)):
             for row in db.execute("SELECT * FROM journal WHERE id > ? ORDER BY id", (last_id,)):
@@ -77,7 +77,7 @@ def verify_chain(path: Path) -> int:
 
 
 def chain_hash(previous: str, wall_time_s: float, monotonic_s: float, kind: str, text: str) -> str:
-    """The hash of a row, over its content and the hash of the row before."""
+    """Return the hash of a row, computed over its content and the hash of the row before."""
     parts = json.dumps([previous, wall_time_s, monotonic_s, kind, text], separators=(",", ":"))
     return hashlib.sha256(parts.encode()).hexdigest()
 

@@ -1,4 +1,4 @@
-"""The lease: who may move the arm. One holder, an epoch that rises with each grant, a time to live."""
+"""The lease, which gives one client the right to move the arm; it has an epoch that rises with each grant, and it expires."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from service.errors import StaleEpoch
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grant:
-    """A lease as its holder got it. Only the holder knows `token`."""
+    """A lease as it was granted to its holder; only the holder knows `token`."""
 
     holder: str
     epoch: int
@@ -25,13 +25,13 @@ class Grant:
 
 
 class LeaseDesk:
-    """Grants, renews, checks and ends the lease. Time is monotonic; the wall clock decides nothing.
+    """Grants, renews, checks and ends the lease, on the monotonic clock.
 
     Args:
-        ttl_s: without a heartbeat for so long, the lease lapses.
-        on_loss: called with a reason when a holder lost the lease by lapse or take-over; stops what it started.
-        others: what moves, or waits to, and was not started by this holder (one sentence); None when nothing does.
-        report: told about each grant, take-over, release and lapse.
+        ttl_s: the lease lapses after this time without a heartbeat.
+        on_loss: called with a reason when a holder loses the lease by lapse or take-over; stops the holder's tasks.
+        others: returns a sentence about a motion task (running or queued) that this holder did not start, or None.
+        report: called for each grant, take-over, release and lapse.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class LeaseDesk:
         """Take the free lease.
 
         Raises:
-            LeaseError: somebody holds it, `details["holder"]` says who; or another one's task moves without it.
+            LeaseError: another client holds it (`details["holder"]`), or a task of another client moves without a lease.
         """
         self.expire()
         with self._lock:
@@ -78,7 +78,7 @@ class LeaseDesk:
             return self._grant(holder, "lease-acquired")
 
     def take_over(self, holder: str) -> Grant:
-        """Take the lease from whoever holds it; what that one started, or anybody without a lease, is stopped."""
+        """Take the lease from its holder; tasks of that holder, and of clients without a lease, are stopped."""
         self.expire()
         with self._lock:
             before, moving = self._holder, self._others(holder)
@@ -88,10 +88,10 @@ class LeaseDesk:
         return grant
 
     def heartbeat(self, token: str) -> Grant:
-        """Renew.
+        """Renew the lease.
 
         Raises:
-            StaleEpoch: the lease is somebody else's now, or nobody's.
+            StaleEpoch: another client holds the lease now, or nobody does.
         """
         self.expire()
         with self._lock:
@@ -100,10 +100,10 @@ class LeaseDesk:
             return self._shown()
 
     def release(self, token: str) -> None:
-        """Give it back.
+        """Give the lease back.
 
         Raises:
-            StaleEpoch: it was not yours any more.
+            StaleEpoch: the caller does not hold the lease any more.
         """
         self.expire()
         with self._lock:
@@ -112,11 +112,11 @@ class LeaseDesk:
             self._holder, self._token = None, ""
 
     def check(self, token: str | None) -> str | None:
-        """May the bearer of `token` move? Returns the holder's name; None when nobody holds the lease.
+        """Check that the bearer of `token` may move; returns the holder's name, or None when nobody holds the lease.
 
         Raises:
-            LeaseError: another one holds it.
-            StaleEpoch: the token is of an earlier epoch.
+            LeaseError: another client holds the lease.
+            StaleEpoch: the token belongs to an earlier epoch.
         """
         self.expire()
         with self._lock:
@@ -135,14 +135,14 @@ class LeaseDesk:
             return self._holder
 
     def holder(self) -> tuple[str | None, int, float]:
-        """Who holds it (or None), the epoch, and the seconds that are left."""
+        """Return the holder (or None), the epoch and the seconds that are left."""
         self.expire()
         with self._lock:
             left_s = max(0.0, self._ends_s - self._clock.now_s()) if self._holder is not None else 0.0
             return self._holder, self._epoch, left_s
 
     def expire(self) -> None:
-        """End a lease whose heartbeat stayed out; called before every decision and by a timer."""
+        """End the lease if its heartbeat is overdue; called before every decision and by a timer."""
         with self._lock:
             if self._holder is None or self._clock.now_s() < self._ends_s:
                 return
@@ -159,7 +159,7 @@ class LeaseDesk:
         return self._shown()
 
     def _shown(self) -> Grant:
-        assert self._holder is not None  # noqa: S101 - narrowing: only called for a holder
+        assert self._holder is not None  # noqa: S101 - narrowing: only called while there is a holder
         return Grant(
             holder=self._holder,
             epoch=self._epoch,

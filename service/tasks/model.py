@@ -1,4 +1,4 @@
-"""What a task is: its states, its events, its artefacts."""
+"""The data of a task: its states, events and artefacts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class TaskState(StrEnum):
 
     @property
     def is_final(self) -> bool:
-        """Does nothing happen any more?"""
+        """Whether the task has ended."""
         return not ALLOWED[self]
 
 
@@ -34,7 +34,7 @@ ALLOWED: dict[TaskState, frozenset[TaskState]] = {
     # from           to
     _S.QUEUED: frozenset({_S.RUNNING, _S.CANCELLED, _S.FAILED}),
     _S.RUNNING: frozenset({_S.CANCELLING, _S.SUCCEEDED, _S.FAILED}),
-    _S.CANCELLING: frozenset({_S.CANCELLED, _S.SUCCEEDED, _S.FAILED}),  # it may end by itself first
+    _S.CANCELLING: frozenset({_S.CANCELLED, _S.SUCCEEDED, _S.FAILED}),  # it may end by itself before the cancellation takes effect
     _S.SUCCEEDED: frozenset(),
     _S.FAILED: frozenset(),
     _S.CANCELLED: frozenset(),
@@ -56,7 +56,7 @@ class TaskEvent:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Artefact:
-    """A file that a task left."""
+    """A file that a task produced."""
 
     name: str
     media_type: str
@@ -64,7 +64,7 @@ class Artefact:
 
     @staticmethod
     def is_name(text: str) -> bool:
-        """Is this a plain file name, which cannot leave its folder?"""
+        """Return whether the text is a plain file name, which cannot lead out of its folder."""
         return re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", text) is not None
 
 
@@ -73,11 +73,11 @@ class Task:
     """One task. Its methods may be called from any thread.
 
     Attributes:
-        moves: may move the arm.
+        moves: whether it may move the arm.
         holder: who held the lease when it was started.
         key: the caller's idempotency key.
         problem: why it failed, as plain values.
-        created_s, started_s, ended_s: wall time, for people; nothing is decided by it.
+        created_s, started_s, ended_s: wall time, for display only.
     """
 
     id: str
@@ -102,16 +102,16 @@ class Task:
 
     @property
     def fraction(self) -> float:
-        """How far the work is, 0 to 1."""
+        """Progress of the work, from 0 to 1."""
         return self.events[-1].fraction if self.events else 0.0
 
     @property
     def step(self) -> str:
-        """What is being done."""
+        """Description of the present step."""
         return self.events[-1].step if self.events else ""
 
     def move_to(self, state: TaskState) -> bool:
-        """Change the state if the table allows it; tells whether it did."""
+        """Change the state if `ALLOWED` permits it; returns whether it changed."""
         with self._condition:
             if state not in ALLOWED[self.state]:
                 return False
@@ -127,7 +127,7 @@ class Task:
         return True
 
     def ask_cancel(self, reason: str) -> bool:
-        """Ask for the end; False when it has ended already. A queued task ends at once. Asking twice is no error."""
+        """Request cancellation; False when the task has ended already. A queued task ends at once; a repeat is no error."""
         with self._condition:
             if self.state.is_final:
                 return False
@@ -135,14 +135,14 @@ class Task:
                 self.cancel_reason = reason
                 self.cancel_asked.set()
             is_waiting = self.state is TaskState.QUEUED
-        # Between lock and move a queued task may have begun to run; the second move then catches it.
+        # A queued task may have begun to run before the first `move_to`; the second one handles that case.
         if is_waiting and self.move_to(TaskState.CANCELLED):
             return True
         self.move_to(TaskState.CANCELLING)
         return True
 
     def add_event(self, kind: str, *, fraction: float | None = None, step: str | None = None, detail: str = "") -> None:
-        """Append an event; what is not given stays as it was."""
+        """Append an event; a fraction or step that is not given stays unchanged."""
         with self._condition:
             self._append(
                 kind,
@@ -153,18 +153,18 @@ class Task:
         self._tell()
 
     def add_artefact(self, artefact: Artefact) -> None:
-        """Note a file that was written."""
+        """Record a file that was written."""
         with self._condition:
             self.artefacts[:] = [item for item in self.artefacts if item.name != artefact.name] + [artefact]
         self.add_event("artefact", detail=artefact.name)
 
     def events_after(self, sequence: int) -> list[TaskEvent]:
-        """Events with a higher sequence number."""
+        """Return the events with a higher sequence number."""
         with self._condition:
             return [event for event in self.events if event.sequence > sequence]
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until the task has ended; tells whether it has."""
+        """Wait until the task has ended; returns whether it has."""
         with self._condition:
             return self._condition.wait_for(lambda: self.state.is_final, timeout_s)
 

@@ -1,4 +1,4 @@
-"""Tasks: long work that a caller starts, watches and may cancel. One motion task at a time."""
+"""Runs tasks, which are long operations that a caller starts, watches and may cancel; one motion task at a time."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from service.tasks.model import Artefact, Task, TaskEvent, TaskState
 
 __all__ = ["Artefact", "Recorder", "Task", "TaskContext", "TaskEvent", "TaskState", "TaskStore"]
 
-CANCEL_REPEAT_S = 0.05  # a cancel that falls between two motions must still meet the second
+CANCEL_REPEAT_S = 0.05  # repeated, because a cancel between two motions must also end the second one
 MAX_ARTEFACT_BYTES = 64_000_000
 log = logging.getLogger(__name__)
 
 
 class Recorder(Protocol):
-    """Where tasks leave their traces (the journal)."""
+    """The interface through which tasks are recorded (the journal)."""
 
     def append(self, kind: str, data: dict[str, Any]) -> None:
         """Record durably before returning; raises `JournalError`."""
@@ -35,7 +35,7 @@ class Recorder(Protocol):
 
 
 class TaskContext:
-    """The side of a task that its operation sees."""
+    """The interface of a task for the operation that it runs."""
 
     def __init__(self, task: Task, folder: Path) -> None:
         self._task = task
@@ -48,11 +48,11 @@ class TaskContext:
 
     @property
     def is_cancelled(self) -> bool:
-        """Has somebody asked for the end of this task?"""
+        """Whether cancellation of this task was requested."""
         return self._task.cancel_asked.is_set()
 
     def progress(self, fraction: float, step: str, detail: str = "") -> None:
-        """Tell watchers how far the work is (0 to 1) and what is being done.
+        """Report the progress (0 to 1) and the present step.
 
         Raises:
             Cancelled: the task was cancelled.
@@ -61,7 +61,7 @@ class TaskContext:
         self._task.add_event("progress", fraction=min(1.0, max(0.0, fraction)), step=step, detail=detail)
 
     def check_cancelled(self) -> None:
-        """Raise `Cancelled` when somebody asked for the end of this task."""
+        """Raise `Cancelled` when cancellation of this task was requested."""
         if self.is_cancelled:
             raise Cancelled(
                 f"task {self._task.id} was cancelled: {self._task.cancel_reason}",
@@ -70,10 +70,10 @@ class TaskContext:
             )
 
     def artefact(self, name: str, data: bytes, media_type: str) -> str:
-        """Keep a file with the task; returns its URL path.
+        """Store a file with the task; returns its URL path.
 
         Raises:
-            InvalidRequest: the name is no plain file name, or the file is too big.
+            InvalidRequest: the name is not a plain file name, or the file is too large.
         """
         if not Artefact.is_name(name) or len(data) > MAX_ARTEFACT_BYTES:
             raise InvalidRequest(
@@ -95,9 +95,9 @@ class TaskStore:
     Args:
         folder: artefacts go to `folder/<task id>/`.
         recorder: the journal; a task is acknowledged after its record is on disk.
-        stop_motion: ends the running motion; called at once, and again until a cancelled task has ended.
+        stop_motion: ends the running motion; called at a cancellation and repeatedly until the task has ended.
         max_queued: more waiting tasks than this are refused with `Busy`.
-        keep: so many finished tasks stay in memory; the artefacts of older ones are removed.
+        keep: number of finished tasks that are kept; the artefacts of older ones are removed.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class TaskStore:
         self._tasks: OrderedDict[str, Task] = OrderedDict()
         self._listeners: set[Callable[[Task], None]] = set()
         self._is_closed = False
-        # Moving tasks queue for one thread, so that two never command the arm; reading tasks do not wait for them.
+        # Motion tasks share one thread, so that two never command the arm; reading tasks do not wait for them.
         self._lanes = {
             True: ThreadPoolExecutor(1, thread_name_prefix="task-motion"),
             False: ThreadPoolExecutor(2, thread_name_prefix="task-read"),
@@ -134,12 +134,12 @@ class TaskStore:
         holder: str | None = None,
         key: str | None = None,
     ) -> Task:
-        """Queue a task. The same idempotency `key` with the same request gives the same task again.
+        """Queue a task; the same idempotency `key` with the same request returns the same task again.
 
         Raises:
             Busy: too many tasks wait.
             InvalidRequest: the key was used for another request.
-            JournalError: the start cannot be recorded, so it does not happen.
+            JournalError: the start cannot be recorded, so the task does not start.
         """
         with self._lock:
             earlier = self._with_key(key, verb, request)
@@ -163,7 +163,7 @@ class TaskStore:
         return task
 
     def restore(self, task: Task) -> None:
-        """Take up a task of an earlier service run, for reading only; one that never ended counts as aborted."""
+        """Add a task of an earlier service run, for reading only; one that had not ended counts as aborted."""
         if not task.state.is_final:
             error = Aborted(
                 f"the service ended while task {task.id} was {task.state}", hint="look at the cell, then start it again"
@@ -177,15 +177,15 @@ class TaskStore:
         self._remove_artefacts(forgotten)
 
     def sweep(self) -> None:
-        """Remove artefacts of tasks that nobody can ask for any more; called when those of earlier runs are restored."""
+        """Remove artefacts of tasks that are not kept any more; called after the tasks of earlier runs were restored."""
         if self._folder.is_dir():
             self._remove_artefacts([path.name for path in self._folder.iterdir() if path.name not in self._tasks])
 
     def get(self, task_id: str) -> Task:
-        """The task called `task_id`.
+        """Return the task with the id `task_id`.
 
         Raises:
-            NoSuchTask: never heard of it, or forgotten.
+            NoSuchTask: there is no such task, or it is not kept any more.
         """
         task = self._tasks.get(task_id)
         if task is None:
@@ -193,27 +193,27 @@ class TaskStore:
         return task
 
     def all(self) -> list[Task]:
-        """All kept tasks, newest first."""
+        """Return all kept tasks, newest first."""
         with self._lock:
             return list(self._tasks.values())[::-1]
 
     def moving(self) -> Task | None:
-        """The task that may move the arm now, or None."""
+        """Return the task that may move the arm now, or None."""
         return next((t for t in self.all() if t.moves and t.state in (TaskState.RUNNING, TaskState.CANCELLING)), None)
 
     def moving_for_others(self, holder: str) -> str | None:
-        """The task that moves, or waits to, and was not started by this holder of the lease, in words; None without."""
-        for task in reversed(self.all()):  # the one that moves before those that wait
+        """Describe a motion task (running or queued) that this holder of the lease did not start; None without one."""
+        for task in reversed(self.all()):  # the running task comes before the queued ones
             if task.moves and not task.state.is_final and task.holder != holder:
                 who = task.holder or "somebody without a lease"
                 return f"{task.verb} (task {task.id}) of {who} is {task.state}"
         return None
 
     def artefact_path(self, task_id: str, name: str) -> tuple[Path, Artefact]:
-        """File and description of an artefact.
+        """Return the file and the description of an artefact.
 
         Raises:
-            NoSuchTask: no such task or artefact.
+            NoSuchTask: there is no such task or artefact.
         """
         task = self.get(task_id)
         found = next((item for item in task.artefacts if item.name == name), None)
@@ -223,11 +223,11 @@ class TaskStore:
         return path, found
 
     def cancel(self, task_id: str, *, reason: str = "asked for") -> Task:
-        """End a task: it is told, so that it begins no further motion, and the arm is stopped until it has ended.
+        """Cancel a task: it can begin no further motion, and running motions are stopped until it has ended.
 
         Raises:
-            NoSuchTask: never heard of it.
-            NotPossibleNow: it has ended already.
+            NoSuchTask: there is no such task.
+            NotPossibleNow: the task has ended already.
         """
         task = self.get(task_id)
         if not task.ask_cancel(reason):
@@ -239,19 +239,19 @@ class TaskStore:
         return task
 
     def cancel_moving(self, reason: str) -> None:
-        """Cancel every task that moves or waits to move."""
+        """Cancel every motion task, running or queued."""
         for task in self.all():
             if task.moves and task.ask_cancel(reason) and task.state is TaskState.CANCELLING:
                 self._stop_until_ended(task)
 
     def subscribe(self, listener: Callable[[Task], None]) -> Callable[[], None]:
-        """Call `listener` after each change of any task, from any thread; returns what ends that."""
+        """Call `listener` after each change of any task, from any thread; returns a function that ends this."""
         with self._lock:
             self._listeners.add(listener)
         return lambda: self._listeners.discard(listener)
 
     def close(self, *, timeout_s: float = 3.0) -> None:
-        """Cancel everything and wait a bounded time; a second call does nothing."""
+        """Cancel all tasks and wait at most `timeout_s`; a second call does nothing."""
         if self._is_closed:
             return
         self._is_closed = True
@@ -285,10 +285,10 @@ class TaskStore:
 
     def _end(self, task: Task, state: TaskState, *, error: CellError | None = None, result: Any = None) -> None:
         if state is TaskState.CANCELLED and not task.cancel_asked.is_set():
-            state = TaskState.FAILED  # somebody below cancelled the motion, nobody the task
+            state = TaskState.FAILED  # the motion was cancelled, but not by a cancellation of the task
         task.result = result
         task.problem = problem_of(error) if error is not None else None
-        # Recorded before it shows: who sees the end may rely on finding it after a power cut.
+        # Recorded before it becomes visible, so that an end that a client has seen survives a power failure.
         self._record_end(task, state)
         task.move_to(state)
 
@@ -298,7 +298,7 @@ class TaskStore:
         try:
             self._recorder.append("task-ended", {**ended, "artefacts": jsonable(task.artefacts)})
         except CellError as error:
-            level = logging.INFO if self._is_closed else logging.ERROR  # after the end the next start tells of it
+            level = logging.INFO if self._is_closed else logging.ERROR  # after closing, the next start reports it
             log.log(level, "the end of task %s was not recorded: %s", task.id, error)
 
     def _stop_until_ended(self, task: Task) -> None:
@@ -315,7 +315,7 @@ class TaskStore:
             self._stop_motion()
         except CellError as error:
             log.warning("stopping the motion of a cancelled task: %s", error)
-        except Exception:  # a defect below must not end the attempts: the arm may still move
+        except Exception:  # repeat after any defect, because the arm may still move
             log.exception("stopping the motion of a cancelled task")
 
     def _with_key(self, key: str | None, verb: str, request: dict[str, Any]) -> Task | None:

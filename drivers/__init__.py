@@ -1,3 +1,5 @@
-"""Real devices: one file or folder a device, `kinds/` for what those of a kind share, `transport/` for the wires,
-`emulators/` for the far side of each wire.
+"""Drivers for real devices: one file or folder per device.
+
+`kinds/` holds what devices of one kind share, `transport/` the communication links, and `emulators/` the
+emulated device at the other end of each link.
 """

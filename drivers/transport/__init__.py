@@ -1,1 +1,1 @@
-"""Wires: links, framing, request and answer, owner threads, mailboxes. Devices are built from these."""
+"""Communication layer that drivers are built on: links, framing, requests and answers, owner threads, mailboxes."""

@@ -1,4 +1,4 @@
-"""A bus of devices that answer when asked: one lock, one owner thread, health per station."""
+"""Bus of devices that answer requests: one lock, one owner thread, and a separate health state per station."""
 
 from __future__ import annotations
 
@@ -23,34 +23,34 @@ C_contra = TypeVar("C_contra", contravariant=True)
 R = TypeVar("R")
 T = TypeVar("T")
 IDLE_S = 0.02
-SET_UP_AGAIN_AFTER = 5  # polls without an answer: it may have been switched off and on
-YIELD_S, LONGEST_YIELD_S = 0.0005, 0.02  # a caller gets the bus between two polls, and a poll between its many calls
-SLOWEST_POLL_S = 0.5  # a dead station may cost a live one at most one time-out in this time
+SET_UP_AGAIN_AFTER = 5  # polls without an answer: the device may have been power-cycled
+YIELD_S, LONGEST_YIELD_S = 0.0005, 0.02  # callers get the bus between two polls, and polls get it between many calls
+SLOWEST_POLL_S = 0.5  # an unresponsive station may cost the others at most one time-out per this interval
 
 
 class Station(Protocol[C_contra]):
-    """One device of a bus, as the owner thread sees it."""
+    """Device on a bus, as seen by the owner thread."""
 
     @property
     def period_s(self) -> float:
-        """Time between polls."""
+        """Return the time between two polls, in seconds."""
         ...
 
     def set_up(self, client: C_contra) -> None:
-        """Identify and configure the device; repeated after each loss."""
+        """Identify and configure the device; called again after each loss of the bus."""
         ...
 
     def poll(self, client: C_contra) -> None:
-        """Ask for the newest values and publish them."""
+        """Request the newest values and publish them."""
         ...
 
     def fail(self, error: Exception) -> None:
-        """A poll or set-up went wrong, or the bus was lost."""
+        """Record that a poll or set-up failed, or that the bus was lost."""
         ...
 
 
 class _Slot(Generic[C]):
-    """A station with its schedule."""
+    """Station together with its polling schedule."""
 
     def __init__(self, station: Station[C]) -> None:
         self.station = station
@@ -60,10 +60,10 @@ class _Slot(Generic[C]):
 
 
 class Bus(Generic[C]):
-    """Polls its stations and lets callers talk in between.
+    """Polls its stations in turn and lets callers send requests between polls.
 
     Args:
-        client: makes the protocol's client over a fresh link.
+        client: creates the protocol client on a newly opened link.
     """
 
     def __init__(self, name: str, *, open_link: Callable[[], Link], client: Callable[[Link], C]) -> None:
@@ -72,15 +72,15 @@ class Bus(Generic[C]):
         self._client: C | None = None
         self._slots: list[_Slot[C]] = []
         self._lock = threading.Lock()
-        self._callers: deque[None] = deque()  # one for each that waits for the bus
+        self._callers: deque[None] = deque()  # one entry per caller that is waiting for the bus
         self._open_link = open_link
-        self._rest = threading.Event()  # never set: a rest that needs no other clock
+        self._rest = threading.Event()  # never set: waiting on it is a sleep
         self._port: Port[Link] | None = None
         self._members = threading.Lock()
         self._line: FdLink | None = None
 
     def attach(self, station: Station[C]) -> None:
-        """Take a station in; the first one starts the owner thread."""
+        """Add a station; the first one starts the owner thread."""
         with self._members:
             self._slots = [*self._slots, _Slot(station)]
             if self._port is None:
@@ -88,7 +88,7 @@ class Bus(Generic[C]):
                 self._port.start()
 
     def detach(self, station: Station[C]) -> None:
-        """Let a station go; the last one ends the thread and frees the port, which a later one may open again."""
+        """Remove a station; the last one ends the thread and closes the port, which a later `attach` opens again."""
         with self._members:
             self._slots = [slot for slot in self._slots if slot.station is not station]
             port = self._port
@@ -99,25 +99,25 @@ class Bus(Generic[C]):
 
     @property
     def is_up(self) -> bool:
-        """Is the port open?"""
+        """Return whether the port is open."""
         return self._client is not None
 
     @property
     def reconnects(self) -> int:
-        """How often the port was opened again."""
+        """Return how many times the port was reopened."""
         return self._port.reconnects if self._port is not None else 0
 
     @property
     def heard_bytes(self) -> int | None:
-        """Bytes that the open port has brought; None where nobody counts them."""
+        """Return the number of bytes received on the open port, or None where the link does not count them."""
         line = self._line
         return None if line is None else line.received
 
     def call(self, work: Callable[[C, float], R], until_s: float) -> R:
-        """Run `work(client, until_s)` alone on the bus, in the caller's thread.
+        """Run `work(client, until_s)` with exclusive use of the bus, in the caller's thread.
 
         Raises:
-            NoAnswer: the bus stayed busy until `until_s`. LinkLost: the bus is down. What `work` raises.
+            NoAnswer: the bus was busy until `until_s`. LinkLost: the bus is down. Also whatever `work` raises.
         """
         self._callers.append(None)
         try:
@@ -134,7 +134,7 @@ class Bus(Generic[C]):
             self._lock.release()
 
     def rest(self, duration_s: float) -> None:
-        """Let a caller wait between two talks."""
+        """Sleep for `duration_s` between two requests of a caller."""
         self._rest.wait(duration_s)
 
     def close(self) -> None:
@@ -145,7 +145,7 @@ class Bus(Generic[C]):
             port.close()
 
     def set_up(self, link: Link) -> None:
-        """A fresh link: every station needs its set-up again (owner thread)."""
+        """Create a client on the new link and mark every station for set-up (owner thread)."""
         self._line = inside(link, FdLink)
         with self._lock:
             self._client = self._make_client(link)
@@ -153,7 +153,7 @@ class Bus(Generic[C]):
             slot.needs_set_up, slot.failures, slot.due_s = True, 0, 0.0
 
     def serve(self, link: Link) -> None:
-        """Serve the station that is due, or rest (owner thread)."""
+        """Poll the station that is due, or sleep until one is (owner thread)."""
         slot = min(self._slots, key=lambda s: s.due_s, default=None)
         wait_s = IDLE_S if slot is None else slot.due_s - now_s()
         if slot is None or wait_s > 0.0:
@@ -169,7 +169,7 @@ class Bus(Generic[C]):
             self._note_failure(slot, error, link)
 
     def _let_callers_pass(self) -> None:
-        """A lock goes to whoever is there: a bus that is polled without a pause would never be a caller's."""
+        """Wait briefly while callers are waiting: without a pause the polling thread would take the lock again every time."""
         until_s = now_s() + LONGEST_YIELD_S
         while self._callers and now_s() < until_s:
             self._rest.wait(YIELD_S)
@@ -195,7 +195,7 @@ class Bus(Generic[C]):
             raise LinkLost(f"{link.name}: its name has vanished or leads to another port")
 
     def lost(self, error: Exception) -> None:
-        """Tell every station (owner thread)."""
+        """Report the loss to every station (owner thread)."""
         with self._lock:
             self._client = None
         for slot in self._slots:
@@ -203,7 +203,7 @@ class Bus(Generic[C]):
 
 
 class PolledDevice(WireDevice[T], Generic[T, C]):
-    """A device on a bus. The subclass says how to set it up and what a poll brings."""
+    """Device polled on a bus; the subclass defines its set-up and its poll."""
 
     def __init__(self, context: Context, bus: Bus[C], *, rate_hz: float, max_age_s: float) -> None:
         super().__init__(context, max_age_s=max_age_s)
@@ -213,19 +213,19 @@ class PolledDevice(WireDevice[T], Generic[T, C]):
 
     @property
     def period_s(self) -> float:
-        """Time between polls."""
+        """Return the time between two polls, in seconds."""
         return 1.0 / self.rate_hz
 
     @abstractmethod
     def set_up(self, client: C) -> None:
-        """Identify and configure the device; repeated after each loss."""
+        """Identify and configure the device; called again after each loss of the bus."""
 
     @abstractmethod
     def poll(self, client: C) -> None:
-        """Ask for the newest values and publish them."""
+        """Request the newest values and publish them."""
 
     def fail(self, error: Exception) -> None:
-        """A lost answer leaves a gap in the sequence and readers wait for the next; anything worse reaches them."""
+        """Count a lost or bad answer as a gap in the sequence; report any other error to the readers."""
         if isinstance(error, NoAnswer | BadAnswer):
             self.errors += 1
             self._sequence += 1
@@ -234,10 +234,10 @@ class PolledDevice(WireDevice[T], Generic[T, C]):
         super().fail(error)
 
     def call(self, work: Callable[[C, float], R], deadline: Deadline) -> R:
-        """Talk with the device in the caller's thread.
+        """Run `work` on the bus in the caller's thread, with errors translated for this device.
 
         Raises:
-            DeviceTimeout, DeviceFault, DeviceUnavailable: with the device's name.
+            DeviceTimeout, DeviceFault, DeviceUnavailable: each names the device.
         """
         self.require_open()
         try:
@@ -247,30 +247,30 @@ class PolledDevice(WireDevice[T], Generic[T, C]):
             raise self.translate(error) from error
 
     def join(self, timeout_s: float = CONNECT_S) -> None:
-        """Enter the bus and wait for the first sample.
+        """Attach to the bus and wait for the first sample.
 
         Raises:
-            DeviceUnavailable: none came.
+            DeviceUnavailable: no sample arrived.
         """
         self.bus.attach(self)
         self.await_first(timeout_s)
 
     def release(self) -> None:
-        """Leave the bus."""
+        """Detach from the bus."""
         self.bus.detach(self)
 
     def is_up(self) -> bool:
-        """Is the link open and set up?"""
+        """Return whether the link is open and set up."""
         return self.bus.is_up
 
     def reconnects(self) -> int:
-        """How often the link was set up again."""
+        """Return how many times the link was set up again."""
         return self.bus.reconnects
 
     def heard_bytes(self) -> int | None:
-        """As the bus counts them, for all its stations."""
+        """Return the bus's count of received bytes, which covers all its stations."""
         return self.bus.heard_bytes
 
     def link_name(self) -> str:
-        """Port and speed, or address."""
+        """Return the link's name: port and baud rate, or network address."""
         return self.bus.name

@@ -1,4 +1,4 @@
-"""CAN frames over an slcan adapter (serial or TCP) or Linux SocketCAN, as bytes on a link, which captures and re-opens."""
+"""CAN frames over an slcan adapter (serial or TCP) or Linux SocketCAN, as a byte link that can be captured and reopened."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SLCAN_RATES = {rate: code for code, rate in enumerate((10, 20, 50, 100, 125, 250
 RAW = struct.Struct("<IB3x8s")
 NO_DATA = 0xE0000000  # flags of extended identifiers, remote requests and error frames (linux/can.h)
 LONGEST_LINE = 32
-STAMP_CHARS = 4  # milliseconds, where the adapter was told once to add them
+STAMP_CHARS = 4  # milliseconds, if time stamps were once enabled in the adapter
 TCP = "tcp://"
 
 
@@ -40,17 +40,17 @@ class CanOptions(Captured):
     @property
     @abstractmethod
     def stations(self) -> tuple[str, ...]:
-        """What of the bus is this device's alone."""
+        """Return the identifiers on the bus that belong to this device alone."""
 
     def claim(self) -> ResourceClaim:
-        """Its stations; an adapter on a serial port is opened for one device, whatever hangs on its bus."""
+        """Claim the device's stations; a serial adapter is claimed whole, because only one device can open it."""
         if self.is_slcan and tcp_address(self.channel) is None:
             return ResourceClaim(wire=f"serial {self.channel}")
         return ResourceClaim(wire=f"CAN {self.channel}", bus=f"CAN at {self.bitrate} bit/s", stations=self.stations)
 
     @property
     def is_slcan(self) -> bool:
-        """Adapter or SocketCAN?"""
+        """Return whether the channel is an slcan adapter (True) or SocketCAN (False)."""
         return "/" in self.channel
 
     @model_validator(mode="after")
@@ -62,32 +62,32 @@ class CanOptions(Captured):
 
 @dataclass(frozen=True, slots=True)
 class CanFrame:
-    """Identifier and up to eight bytes."""
+    """CAN frame: identifier and up to eight data bytes."""
 
     id: int
     data: bytes
 
 
 class CanCodec(Protocol):
-    """Frames in and out of a link's bytes."""
+    """Converts CAN frames to and from the bytes of a link."""
 
     def opening(self, bitrate: int) -> bytes:
-        """What opens the channel."""
+        """Return the bytes that open the channel at this bit rate."""
         ...
 
     def encode(self, frame: CanFrame) -> bytes:
-        """One frame."""
+        """Return one frame as bytes."""
         ...
 
     def feed(self, chunk: bytes) -> list[CanFrame]:
-        """The frames that are complete now; damaged ones are counted in `bad`."""
+        """Return the frames completed by this chunk; damaged ones are counted in `bad`."""
         ...
 
 
 class Slcan:
-    """`tIIILDD..` and a carriage return a frame, maybe with a time stamp (Lawicel CAN232 manual).
+    """slcan codec: each frame is `tIIILDD..`, an optional time stamp and a carriage return (Lawicel CAN232 manual).
 
-    `z`, a bare return and BEL acknowledge.
+    `z`, a bare carriage return and BEL are acknowledgements and carry no frame.
     """
 
     def __init__(self) -> None:
@@ -95,18 +95,18 @@ class Slcan:
         self.bad = 0
 
     def opening(self, bitrate: int) -> bytes:
-        """Close, set the rate, open."""
+        """Return the commands that close the channel, set the bit rate and open it."""
         return b"\rC\rS%d\rO\r" % SLCAN_RATES[bitrate // 1000]
 
     def encode(self, frame: CanFrame) -> bytes:
-        """One line."""
+        """Return the frame as one slcan line."""
         return b"t%03X%d%s\r" % (frame.id, len(frame.data), frame.data.hex().upper().encode())
 
     def feed(self, chunk: bytes) -> list[CanFrame]:
-        """Lines to frames."""
+        """Return the frames in the lines completed by this chunk."""
         *lines, self._buffer = (self._buffer + chunk).replace(b"\x07", b"\r").split(b"\r")
         self._buffer = self._buffer[-LONGEST_LINE:]
-        # No hex digit is a `t`: the last one begins the frame, whatever noise stands before it.
+        # `t` is not a hex digit, so the last `t` begins the frame, whatever noise precedes it.
         frames = [self._line(line[line.rindex(b"t") :]) for line in lines if b"t" in line]
         return [frame for frame in frames if frame is not None]
 
@@ -129,31 +129,31 @@ class Slcan:
 
 
 class RawCan:
-    """The kernel's 16-byte frames."""
+    """Codec for the 16-byte frames of Linux SocketCAN."""
 
     def opening(self, bitrate: int) -> bytes:  # noqa: ARG002  # the system sets the rate: ip link set can0 ...
-        """Nothing."""
+        """Return nothing: the interface is already configured."""
         return b""
 
     def encode(self, frame: CanFrame) -> bytes:
-        """One frame."""
+        """Return the frame in the kernel's format."""
         return RAW.pack(frame.id, len(frame.data), frame.data)
 
     def feed(self, chunk: bytes) -> list[CanFrame]:
-        """The socket gives whole frames; those that are no data of an 11-bit identifier are others' business."""
+        """Return the data frames with 11-bit identifiers; the socket delivers whole frames, and other types are ignored."""
         whole = chunk[: len(chunk) // RAW.size * RAW.size]
         return [CanFrame(id_, data[:length]) for id_, length, data in RAW.iter_unpack(whole) if not id_ & NO_DATA]
 
 
 def tcp_address(channel: str) -> tuple[str, int] | None:
-    """Host and port of `tcp://HOST:PORT`; None for other channels."""
+    """Return host and port of `tcp://HOST:PORT`, or None for other channels."""
     host, _, port = channel.removeprefix(TCP).rpartition(":")
     is_address = channel.startswith(TCP) and host and port.isascii() and port.isdigit() and int(port) < 65_536
     return (host, int(port)) if is_address else None
 
 
 def can_opener(options: CanOptions, device: str) -> tuple[Callable[[], Link], Callable[[], CanCodec], str]:
-    """What opens the channel, what makes its codec, and its name."""
+    """Return a function that opens the channel, one that creates its codec, and the channel's name."""
     address = tcp_address(options.channel)
     if address is not None:
         opener = opener_with_files(
@@ -170,10 +170,10 @@ def can_opener(options: CanOptions, device: str) -> tuple[Callable[[], Link], Ca
 
 
 def open_socketcan(interface: str, *, device: str) -> Link:
-    """A raw CAN socket.
+    """Open a raw CAN socket on `interface`.
 
     Raises:
-        DeviceUnavailable: no such interface, or it is down.
+        DeviceUnavailable: the interface does not exist or is down.
     """
     try:
         sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)

@@ -1,7 +1,8 @@
-"""Traffic of a wire in a file, and such a file in the place of the wire.
+"""Record the traffic of a link in a file, and replay such a file in place of the link.
 
-One JSON object a line. `{"t": s, "dir": "rx", "hex": "5959.."}` is what one read brought (nothing, too: a driver acts on
-silence as on bytes), `"tx"` what was written, `"open"` an opening of the port, with its name and the time of a byte.
+The file holds one JSON object per line. `{"t": s, "dir": "rx", "hex": "5959.."}` is the result of one read; empty reads
+are recorded too, because drivers react to silence. `"tx"` is one write. `"open"` is an opening of the port, with the
+link's name and the duration of one byte.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from typing import Any, TypeVar
 from drivers.transport.link import Cancellable, Link, RecordingEnded, now_s
 from hal.errors import ConfigError, DeviceUnavailable
 
-EARLY_S = 0.01  # a replay is never quite in step; what is due so soon was there when the recorded driver looked
-WRITE_IN_S = 0.5  # a request that comes later than that will not be made
-AHEAD_S = 0.2  # a request is looked for so far ahead; a later one of the same bytes is another
+EARLY_S = 0.01  # a replay is never exactly in step: data due this soon counts as having arrived already
+WRITE_IN_S = 0.5  # a request that is this late is taken as one that will not be written
+AHEAD_S = 0.2  # search window for a recorded request; an equal request further ahead is a different one
 L = TypeVar("L")
 
 
 class CaptureLink:
-    """A link that writes all traffic to a file."""
+    """Link that writes all traffic to a file."""
 
     def __init__(self, inner: Link, path: Path) -> None:
         self.inner = inner
@@ -35,36 +36,36 @@ class CaptureLink:
 
     @property
     def name(self) -> str:
-        """Name of the link inside."""
+        """Return the name of the wrapped link."""
         return self.inner.name
 
     @property
     def byte_s(self) -> float:
-        """As the link inside."""
+        """Return the byte duration of the wrapped link, in seconds."""
         return self.inner.byte_s
 
     def read(self, until_s: float) -> bytes:
-        """As the link inside."""
+        """Read from the wrapped link and record the result, also when it is empty."""
         chunk = self.inner.read(until_s)
         self._note("rx", chunk)
         return chunk
 
     def write(self, data: bytes, until_s: float) -> None:
-        """As the link inside."""
+        """Write to the wrapped link and record the data."""
         self._note("tx", data)
         self.inner.write(data, until_s)
 
     def is_present(self) -> bool:
-        """As the link inside."""
+        """Return whether the wrapped link's port is present."""
         return self.inner.is_present()
 
     def cancel(self) -> None:
-        """As the link inside, where it can."""
+        """Cancel reads of the wrapped link, if it supports that."""
         if isinstance(self.inner, Cancellable):
             self.inner.cancel()
 
     def close(self) -> None:
-        """Close link and file."""
+        """Close the link and the file."""
         self.inner.close()
         self._file.close()
 
@@ -72,21 +73,21 @@ class CaptureLink:
         self._write_line({"t": round(now_s() - self._start_s, 6), "dir": direction, "hex": data.hex()})
 
     def _write_line(self, line: dict[str, Any]) -> None:
-        with suppress(ValueError):  # closed by the owner thread meanwhile: the link inside says so
+        with suppress(ValueError):  # the owner thread closed the file meanwhile; the wrapped link reports the loss
             self._file.write(json.dumps(line) + "\n")
 
 
 def inside(link: Link, kind: type[L]) -> L | None:
-    """The link itself, or the one that is captured, if it is of that kind: for what only some links can do."""
+    """Return `link`, or the link that it captures, if that is of type `kind`; else None."""
     found = link.inner if isinstance(link, CaptureLink) else link
     return found if isinstance(found, kind) else None
 
 
 def captured(opener: Callable[[], Link], path: Path, device: str) -> Callable[[], Link]:
-    """What opens the link and the file that its traffic goes to.
+    """Return a function that opens the link together with its capture file.
 
-    Raises (what is returned):
-        DeviceUnavailable: the link cannot be opened, or the file not be written.
+    Raises (by the returned function):
+        DeviceUnavailable: the link cannot be opened, or the file cannot be written.
     """
 
     def opened() -> Link:
@@ -94,7 +95,7 @@ def captured(opener: Callable[[], Link], path: Path, device: str) -> Callable[[]
         try:
             return CaptureLink(link, path)
         except OSError as error:
-            link.close()  # or the next attempt would find the port taken, by us
+            link.close()  # otherwise the next attempt would find the port held by this process
             what = f"{device}: the capture {path} cannot be written: {error.strerror or error}"
             hint = "name a file in a folder that exists and may be written to"
             raise DeviceUnavailable(what, hint=hint, device=device) from error
@@ -104,7 +105,7 @@ def captured(opener: Callable[[], Link], path: Path, device: str) -> Callable[[]
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One read or write of a recording, `t_s` after the port was opened."""
+    """One recorded read or write, `t_s` seconds after the port was opened."""
 
     t_s: float
     is_read: bool
@@ -113,7 +114,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """From one opening of the port to its loss."""
+    """Recording from one opening of the port to its loss."""
 
     name: str
     byte_s: float
@@ -121,10 +122,10 @@ class Session:
 
 
 def read_capture(path: Path) -> list[Session]:
-    """The sessions of a capture file.
+    """Return the sessions of a capture file.
 
     Raises:
-        ConfigError: no such file, or not a capture; names file and line.
+        ConfigError: the file does not exist or is not a capture; the message names file and line.
     """
     try:
         lines = path.read_text(encoding="ascii").splitlines()
@@ -143,7 +144,7 @@ def read_capture(path: Path) -> list[Session]:
                     is_read = entry["dir"] == "rx"
                     sessions[-1][2].append(Event(float(entry["t"]), is_read, bytes.fromhex(entry["hex"])))
                 case _:
-                    continue  # what a program has noted about the capture
+                    continue  # notes that a program has added to the capture
         except (ValueError, KeyError, TypeError) as error:
             if number == len(lines):
                 break  # the writer was killed in the middle of a line
@@ -153,14 +154,14 @@ def read_capture(path: Path) -> list[Session]:
 
 
 class ReplayLink:
-    """Gives what the recorded driver read, when it read it, provided that it is asked what the recorded driver asked.
+    """Link that replays a session: recorded data comes at its recorded time, if the recorded requests are written.
 
-    What was read after a request is held back until the request is written, or its time is over; each request sets the
-    pace anew, so that a replay on a busy machine is later and not another. The end of the recording is the loss of the link.
+    Data read after a request is held back until that request is written or its time is over. Each request restarts the
+    time base, so on a busy machine a replay runs later but stays the same. The end of the recording is a lost link.
     """
 
     def __init__(self, session: Session) -> None:
-        self._events = list(session.events[::-1])  # the next one is the last
+        self._events = list(session.events[::-1])  # reversed: the next event is the last element
         self._name = f"replay of {session.name}"
         self._byte_s = session.byte_s
         self._start_s = now_s()
@@ -168,16 +169,16 @@ class ReplayLink:
 
     @property
     def name(self) -> str:
-        """`replay of LINK`."""
+        """Return `replay of LINK`."""
         return self._name
 
     @property
     def byte_s(self) -> float:
-        """As recorded."""
+        """Return the recorded byte duration, in seconds."""
         return self._byte_s
 
     def read(self, until_s: float) -> bytes:
-        """What the next recorded read brought."""
+        """Return the data of the next recorded read, or `b""` when none is due before `until_s`."""
         until_s = max(until_s, now_s())
         with self._written:
             while self._events:
@@ -195,8 +196,8 @@ class ReplayLink:
                         return event.data
             raise RecordingEnded(f"{self._name} is at its end")
 
-    def write(self, data: bytes, until_s: float) -> None:  # noqa: ARG002  # a file takes anything at once
-        """Let go what was read after the same bytes had been written."""
+    def write(self, data: bytes, until_s: float) -> None:  # noqa: ARG002  # a file accepts any data at once
+        """Release the data that was read after the same bytes were written in the recording."""
         with self._written:
             latest_s, is_next = now_s() - self._start_s + AHEAD_S, True
             for i in range(len(self._events) - 1, -1, -1):
@@ -206,25 +207,25 @@ class ReplayLink:
                 if not event.is_read and event.data == data:
                     if is_next:
                         self._start_s = now_s() - event.t_s
-                    # Silence that was heard before it is over: how often a driver looks depends on how busy it is.
+                    # Skip recorded silence before this request: how often a driver reads depends on how busy it is.
                     self._events[i:] = [e for e in self._events[i + 1 :] if e.data or not e.is_read]
                     self._written.notify_all()
                     return
                 is_next &= event.is_read
 
     def is_present(self) -> bool:
-        """A recording stays."""
+        """Return True: a recording cannot be unplugged."""
         return True
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing: there is nothing to release."""
 
 
 def replay_opener(path: Path, device: str) -> Callable[[], Link]:
-    """Opens one session of a capture after the other, as the recorded driver opened its port.
+    """Return a function that opens the sessions of a capture one after another, as the recorded driver opened its port.
 
     Raises:
-        ConfigError: the file is no capture.
+        ConfigError: the file is not a capture.
     """
     sessions = deque(read_capture(path))
 

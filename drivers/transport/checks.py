@@ -1,4 +1,4 @@
-"""Checksums of the wires; each docstring gives the check value, the result for ASCII `123456789`."""
+"""Checksums of the protocols; each docstring gives the check value, the result for ASCII `123456789`."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def crc_x25(data: bytes) -> int:
 
 
 def crc_sick(data: bytes) -> int:
-    """Check word of the SICK LMS 2xx family: one shift a byte, over the byte and its predecessor. Check A656."""
+    """Check word of the SICK LMS 2xx family: one shift per byte, over the byte and its predecessor. Check A656."""
     crc = previous = 0
     for byte in data:
         crc = (crc & 0x7FFF) << 1 ^ (0x8005 if crc & 0x8000 else 0)
@@ -62,7 +62,7 @@ def crc_sick(data: bytes) -> int:
 
 
 def sum_scip(data: bytes) -> int:
-    """Check character of a SCIP 2.0 line: low six bits of the sum, moved to printable characters."""
+    """Check character of a SCIP 2.0 line: the low six bits of the sum, mapped to printable characters."""
     return (sum(data) & 0x3F) + 0x30
 
 

@@ -1,4 +1,4 @@
-"""What every wired device shares: mailbox, health, stamps, errors with the device's name."""
+"""Base of all drivers: mailbox, health, time stamps, and errors that name the device."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ BYTES_WITHOUT_SENSE = (
     "bytes come but none that fit: another device or address, or on a serial line another baud rate, which "
     "`panelwright doctor` finds"
 )
-SLICE_S = 0.02  # a stream reader looks up this often, so that close() is quick
+SLICE_S = 0.02  # longest wait of a stream reader, so that close() returns soon
 CONNECT_S = 3.0  # a set-up whose first answers are lost needs several attempts
-REFUSED_S = 1.0  # a port that cannot be opened for so long is not there
-PATIENCE = 6.0  # with an emulator beside us: it is as late as we are when the machine is busy, and not broken
+REFUSED_S = 1.0  # a port that cannot be opened for this long counts as absent
+PATIENCE = 6.0  # factor on time limits beside an emulator, which a busy machine delays as much as us
 
 
 def wall_until(deadline: Deadline, cap_s: float = 3600.0) -> float:
-    """The moment of a deadline on the links' clock: a wire waits in wall time whatever clock the cell has."""
+    """Return the deadline on the links' clock, because links wait in wall time whatever the cell's clock."""
     return now_s() + min(deadline.remaining_s(), cap_s)
 
 
 class WireDevice(Generic[T]):
-    """Base of all drivers: the newest sample, its health and its errors.
+    """Base of all drivers: holds the newest sample, the device's health and its errors.
 
     Args:
-        max_age_s: samples older than this are never given out; three periods are usual. In a real cell whose safety
-            section allows older readings, that limit holds: a busy host is no broken device. Beside a simulated world
-            it does not, as the world waits for a late sample: an arm whose set-points hang in a wire must not be
-            moved on by a controller that looks at an old state.
+        max_age_s: samples older than this are never returned; three periods are usual. In a real cell whose safety
+            section allows older readings, the cell's limit applies, because a busy host is not a device fault. With a
+            simulated world this limit is kept, because the world waits for a late sample: a controller must not keep
+            moving an arm, whose set-points may be delayed on the link, from an old state.
     """
 
     kind: ClassVar[DeviceKind]
@@ -55,7 +55,7 @@ class WireDevice(Generic[T]):
         if cell is not None and not is_mixed:
             self.max_age_s = max(max_age_s, cell.file.safety.max_reading_age_s)
         if self.is_emulated and self.kind is DeviceKind.ARM:
-            # How far the world may be ahead of the wire is way that the tracking guard sees: 5 mm at 0.25 m/s.
+            # While the world runs ahead of the link the arm moves unseen by the tracking guard: 5 mm at 0.25 m/s.
             self.max_age_s = max_age_s / 2.0
         self.mailbox: Mailbox[T] = Mailbox()
         self.errors = 0
@@ -66,7 +66,7 @@ class WireDevice(Generic[T]):
 
     @property
     def name(self) -> str:
-        """Name in the cell file."""
+        """Return the device's name in the cell file."""
         return self.context.name
 
     def publish(
@@ -79,11 +79,11 @@ class WireDevice(Generic[T]):
         cause: Cause = Cause.NONE,
         missed: int = 0,
     ) -> None:
-        """Put a new sample for all readers.
+        """Publish a new sample to all readers.
 
         Args:
-            valid_s: when it was valid, on the links' clock.
-            missed: samples known to be lost just before this one; the sequence skips them.
+            valid_s: when the value was valid, on the links' clock.
+            missed: samples known to be lost just before this one; the sequence number skips them.
         """
         self._sequence += 1 + missed
         self.errors += missed
@@ -105,13 +105,13 @@ class WireDevice(Generic[T]):
         return clock.now_s() - (now_s() - valid_s)
 
     def newest(self, deadline: Deadline, *, not_before_s: float | None = None) -> Stamped[T]:
-        """The newest sample, at most `max_age_s` old; waits for one until the deadline.
+        """Return the newest sample, at most `max_age_s` old; wait for one until the deadline.
 
         Args:
-            not_before_s: on the cell's clock; only a sample that was valid then or later will do, whatever its age.
+            not_before_s: on the cell's clock; only a sample valid at or after this time is returned, whatever its age.
 
         Raises:
-            DeviceTimeout: none came in time. DeviceUnavailable: the link is down. DeviceFault: the device says so.
+            DeviceTimeout: no sample in time. DeviceUnavailable: the link is down. DeviceFault: the device reports a fault.
         """
         self.require_open()
         clock, started_s, until_s = self.context.clock, now_s(), wall_until(deadline)
@@ -121,17 +121,17 @@ class WireDevice(Generic[T]):
             sample = self.mailbox.wait(oldest_host_s=oldest_s, until_s=until_s, errors_since_s=errors_since_s)
             if sample is None:
                 raise self.timeout(now_s() - started_s)
-            # One that was held up on the wire may have been young enough when the wait began, and be too old by now.
+            # A sample delayed on the link may have been young enough when the wait began and be too old now.
             if not_before_s is not None or sample.age_s(clock.now_s()) <= self.max_age_s:
                 return sample
 
     def require_open(self) -> None:
-        """Refuse to work after `close`."""
+        """Raise an error if the device has been closed."""
         if self._is_closed:
             raise DeviceUnavailable(f"{self.name} is closed", hint="connect it again", device=self.name)
 
     def timeout(self, waited_s: float) -> DeviceTimeout:
-        """The error for silence, with what is known about it."""
+        """Return the error for a silent device, with what is known about the silence."""
         self.errors += 1
         newest = self.mailbox.peek()
         age = "no good reading so far"
@@ -146,14 +146,14 @@ class WireDevice(Generic[T]):
         )
 
     def fail(self, error: Exception) -> None:
-        """Readers get this error until the next sample."""
+        """Make readers raise this error until the next sample arrives."""
         self.errors += 1
         as_cell_error = self.translate(error)
         self._last_error = str(as_cell_error)
         self.mailbox.fail(as_cell_error)
 
     def translate(self, error: Exception) -> CellError:
-        """A wire's error as one of `hal`, with the device's name."""
+        """Return the `hal` error that corresponds to a link error, with the device's name."""
         if isinstance(error, CellError):
             return error
         where = {"device": self.name, "link": self.link_name()}
@@ -167,7 +167,7 @@ class WireDevice(Generic[T]):
         return DeviceTimeout(f"{self.name}: {error}", hint=self._silence_hint(), counts=self.wire_counts(), **where)
 
     def heard_bytes(self) -> int | None:
-        """Bytes that the wire has brought so far; None where nobody counts them."""
+        """Return the number of bytes received so far, or None where the link does not count them."""
         return None
 
     def _silence_hint(self) -> str:
@@ -177,7 +177,7 @@ class WireDevice(Generic[T]):
         return BYTES_WITHOUT_SENSE if heard else NOT_A_BYTE
 
     def health(self) -> Health:
-        """State of link and newest sample; returns at once."""
+        """Return the state of the link and of the newest sample, without waiting."""
         newest, error = self.mailbox.peek(), self.mailbox.error()
         quality, cause = self._condition(newest, error)
         return Health(
@@ -201,10 +201,10 @@ class WireDevice(Generic[T]):
         return newest.quality, newest.cause
 
     def await_first(self, timeout_s: float = CONNECT_S) -> None:
-        """Wait until the first sample is there, or close and say why none came.
+        """Wait for the first sample; if none comes, close the device and raise the reason.
 
         Raises:
-            DeviceUnavailable: with the last error as its cause.
+            DeviceUnavailable: the last error is its cause.
         """
         started_s = now_s()
         until_s = started_s + self.patience * timeout_s
@@ -214,7 +214,7 @@ class WireDevice(Generic[T]):
             except DeviceUnavailable:
                 if now_s() > started_s + REFUSED_S:
                     break
-                threading.Event().wait(SLICE_S)  # the port is being tried again
+                threading.Event().wait(SLICE_S)  # another attempt to open the port follows
             except CellError:
                 threading.Event().wait(SLICE_S)
         if self.mailbox.peek() is not None:
@@ -240,32 +240,32 @@ class WireDevice(Generic[T]):
 
     @abstractmethod
     def release(self) -> None:
-        """Give up thread and port; called once."""
+        """Release thread and port; called once."""
 
     @abstractmethod
     def is_up(self) -> bool:
-        """Is the link open and set up?"""
+        """Return whether the link is open and set up."""
 
     @abstractmethod
     def reconnects(self) -> int:
-        """How often the link was set up again."""
+        """Return how many times the link was set up again."""
 
     @abstractmethod
     def link_name(self) -> str:
-        """Port and speed, or address."""
+        """Return the link's name: port and baud rate, or network address."""
 
     def wire_counts(self) -> str:
-        """Counters that tell a wrong baud rate from a dead device."""
+        """Return the counters that distinguish a wrong baud rate from a dead device, as text."""
         return f"{self.mailbox.published} samples, {self.errors} errors"
 
 
 class PortDevice(WireDevice[T]):
-    """A device with a port, and so an owner thread, of its own. The subclass makes the `port`."""
+    """Device with its own port and therefore its own owner thread; the subclass creates `port`."""
 
     port: Port[Any]
 
     def lost(self, error: Exception) -> None:
-        """Tell all readers (owner thread)."""
+        """Report the loss to all readers (owner thread)."""
         self.fail(error)
 
     def release(self) -> None:
@@ -273,9 +273,9 @@ class PortDevice(WireDevice[T]):
         self.port.close()
 
     def is_up(self) -> bool:
-        """Is the link open and set up?"""
+        """Return whether the link is open and set up."""
         return self.port.link is not None
 
     def reconnects(self) -> int:
-        """How often the link was set up again."""
+        """Return how many times the link was set up again."""
         return self.port.reconnects

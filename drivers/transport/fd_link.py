@@ -1,4 +1,4 @@
-"""Deadline-bound bytes over a non-blocking file descriptor: what serial ports and sockets share."""
+"""Bytes with deadlines over a non-blocking file descriptor: the part that serial ports and sockets share."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import threading
 from drivers.transport.link import LinkLost, NoAnswer, now_s
 
 CHUNK_BYTES = 65_536
-LOOK_UP_S = 0.02  # how long a read that is cancelled may go on
-SELECT_MOST = 1024  # descriptors that `select` knows
+LOOK_UP_S = 0.02  # longest time that a cancelled read may continue
+SELECT_MOST = 1024  # `select` accepts descriptors below this number only
 
 
 class FdLink:
-    """A link over an open, non-blocking descriptor that this object owns."""
+    """Link over an open, non-blocking descriptor that this object owns."""
 
     def __init__(self, fd: int, name: str) -> None:
         self._fd = fd
         self._name = name
-        self.received = 0  # bytes so far: tells a dead line from one whose bytes nobody understands
+        self.received = 0  # bytes so far: distinguishes a dead line from bytes that no parser accepts
         self._is_cancelled = False
         self._write_lock = threading.Lock()
         self._close_lock = threading.Lock()
@@ -30,16 +30,16 @@ class FdLink:
 
     @property
     def name(self) -> str:
-        """What a person would call it."""
+        """Return the name shown to people."""
         return self._name
 
     @property
     def byte_s(self) -> float:
-        """Networks bring whole messages."""
+        """Return 0: a network delivers whole messages."""
         return 0.0
 
     def read(self, until_s: float) -> bytes:
-        """At least one byte, or `b""` at `until_s`."""
+        """Return at least one byte, or `b""` at `until_s`."""
         try:
             if not self._has_bytes(until_s):
                 return b""
@@ -63,11 +63,14 @@ class FdLink:
         raise LinkLost(f"{self._name} is being closed")
 
     def cancel(self) -> None:
-        """End a read that waits, and all later ones, with `LinkLost`; from any thread. The owner closes the link."""
+        """Make a waiting read and all later ones raise `LinkLost`; any thread may call this.
+
+        The owner closes the link.
+        """
         self._is_cancelled = True
 
     def _is_readable(self, wait_s: float) -> bool:
-        # `poll` waits whole milliseconds, rounded up: a SYNC that is due meanwhile would leave up to 1 ms late.
+        # `poll` waits in whole milliseconds, rounded up, which would send a due SYNC up to 1 ms late.
         if self._fd < SELECT_MOST:
             return bool(select.select([self._fd], [], [], wait_s)[0])
         return bool(self._poll_in.poll(wait_s * 1e3))
@@ -94,7 +97,7 @@ class FdLink:
                     raise NoAnswer(f"{self._name}: the port takes no more bytes") from None
 
     def is_present(self) -> bool:
-        """Sockets have no name that could vanish; serial ports override this."""
+        """Return True: a socket has no path that could vanish; serial ports override this."""
         return True
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Incremental framing: bytes in any chunks to checked frames; the output does not depend on the chunking."""
+"""Incremental framing: turns bytes, in chunks of any size, into checked frames; the result does not depend on the chunks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(slots=True)
 class FramingCounts:
-    """What a framer has seen: good frames, frames that failed their check, bytes that belonged to no frame."""
+    """Counters of a framer: good frames, frames that failed their check, bytes outside any frame."""
 
     frames: int = 0
     bad: int = 0
@@ -18,13 +18,13 @@ class FramingCounts:
 class Framer:
     """Finds frames that start with `header`, have a known length and pass `check`.
 
-    A candidate that fails gives up only its first byte, so a false header inside noise never hides a true frame.
+    After a failed candidate only its first byte is dropped, so a false header inside noise never hides a true frame.
 
     Args:
         header: first bytes of every frame (at least one).
-        length: total length of the frame that begins at the start of its argument; None asks for more bytes, 0 says
-            that no frame begins here. A constant for frames of one size.
-        check: is this complete frame right?
+        length: returns the total length of the frame at the start of its argument; None asks for more bytes, 0 says that
+            no frame begins here. An integer for frames of one size.
+        check: returns whether a complete frame is valid.
     """
 
     def __init__(
@@ -41,15 +41,15 @@ class Framer:
 
     @property
     def pending(self) -> int:
-        """Bytes kept because they may begin a frame."""
+        """Return the number of bytes kept because they may begin a frame."""
         return len(self._buffer)
 
     def reset(self) -> None:
-        """Forget what has been kept: the wire was opened anew."""
+        """Discard the kept bytes, because the link was reopened."""
         self._buffer = b""
 
     def feed(self, chunk: bytes) -> list[bytes]:
-        """The frames that are complete now."""
+        """Return the frames completed by this chunk."""
         data = self._buffer + chunk
         frames: list[bytes] = []
         at = 0
@@ -78,7 +78,7 @@ class Framer:
         return self._length if isinstance(self._length, int) else self._length(data[at:])
 
     def _next_header(self, data: bytes, at: int) -> int:
-        """Where the next header or the beginning of one at the very end stands; `len(data)` when there is none."""
+        """Return where the next header, or a partial one at the very end, begins; `len(data)` if there is none."""
         found = data.find(self._header, at)
         if found >= 0:
             return found

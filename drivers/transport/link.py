@@ -1,7 +1,7 @@
-"""A link carries bytes under a deadline.
+"""Link: sends and receives bytes under a deadline.
 
-Times here are `time.monotonic` seconds: a wire does not know the cell's clock. These errors stay inside `drivers`;
-`drivers.transport.device` turns them into the errors of `hal` with the device's name.
+Times here are `time.monotonic` seconds, because a link does not know the cell's clock. The errors defined here stay
+inside `drivers`; `drivers.transport.device` converts them to the errors of `hal` with the device's name.
 """
 
 from __future__ import annotations
@@ -9,35 +9,35 @@ from __future__ import annotations
 import time
 from typing import Protocol, runtime_checkable
 
-FLOOD_BYTES = 1 << 20  # more than any buffer between a device and us holds
+FLOOD_BYTES = 1 << 20  # more than any buffer between the device and this process holds
 
 
 class WireError(Exception):
-    """Something went wrong on a wire."""
+    """Base of all communication errors on a link."""
 
 
 class LinkLost(WireError):
-    """The port has gone: end of file, I/O error, its name vanished or names another device."""
+    """The port is gone: end of file, I/O error, or its path vanished or leads to another device."""
 
 
 class RecordingEnded(LinkLost):
-    """A recording that is read in the place of a wire holds no more."""
+    """The recording that is replayed in place of the link has ended."""
 
 
 class NoAnswer(WireError):
-    """Nothing valid came in time."""
+    """No valid answer arrived in time."""
 
 
 class BadAnswer(WireError):
-    """The far side answered, but not what was asked."""
+    """An answer arrived, but not to what was asked."""
 
 
 class Refused(WireError):
     """The device answered with an error report.
 
     Attributes:
-        code: as the device's manual numbers it.
-        hint: what to do about it.
+        code: number of the error in the device's manual.
+        hint: what the user can do about it.
     """
 
     def __init__(self, what: str, *, code: int, hint: str = "look the code up in the device's manual") -> None:
@@ -47,23 +47,23 @@ class Refused(WireError):
 
 
 class Link(Protocol):
-    """Bytes both ways. One thread reads; any thread may write."""
+    """Byte link in both directions. One thread reads; any thread may write."""
 
     @property
     def name(self) -> str:
-        """What a person would call it: `serial /dev/ttyUSB0, 115200 baud`."""
+        """Return the name shown to people: `serial /dev/ttyUSB0, 115200 baud`."""
         ...
 
     @property
     def byte_s(self) -> float:
-        """Seconds a byte takes on the line; 0 where bytes arrive at once."""
+        """Return the seconds one byte takes on the line; 0 where data arrive in whole messages."""
         ...
 
     def read(self, until_s: float) -> bytes:
-        """What has arrived: at least one byte, or `b""` when `until_s` passes without one.
+        """Return the bytes that have arrived: at least one, or `b""` when `until_s` passes without any.
 
         Raises:
-            LinkLost: the port has gone.
+            LinkLost: the port is gone.
         """
         ...
 
@@ -71,13 +71,13 @@ class Link(Protocol):
         """Send all of `data`.
 
         Raises:
-            NoAnswer: the far side did not take it before `until_s`.
-            LinkLost: the port has gone.
+            NoAnswer: the data could not be sent before `until_s`.
+            LinkLost: the port is gone.
         """
         ...
 
     def is_present(self) -> bool:
-        """Does the port's name still lead to the port that is open? Asked after silence."""
+        """Return whether the port's path still leads to the open port; called after silence."""
         ...
 
     def close(self) -> None:
@@ -87,20 +87,20 @@ class Link(Protocol):
 
 @runtime_checkable
 class Cancellable(Protocol):
-    """A link whose reads another thread can end: a set-up may wait for answers for seconds, `close` must not."""
+    """Link whose reads another thread can end, so that `close` need not wait while a set-up waits seconds for answers."""
 
     def cancel(self) -> None:
-        """End a read that waits, and all later ones, with `LinkLost`."""
+        """Make a waiting read and all later ones raise `LinkLost`."""
         ...
 
 
 def now_s() -> float:
-    """The time that links count in."""
+    """Return the time on the links' clock (`time.monotonic`), in seconds."""
     return time.monotonic()
 
 
 def drain(link: Link) -> bytes:
-    """Everything that lies ready; whatever came before a request cannot be its answer. A flood does not hold it up."""
+    """Read and return everything already received, up to a limit; bytes from before a request cannot be its answer."""
     late = b""
     while len(late) < FLOOD_BYTES and (chunk := link.read(0.0)):
         late += chunk
@@ -108,7 +108,7 @@ def drain(link: Link) -> bytes:
 
 
 def drain_until_quiet(link: Link, *, quiet_s: float, until_s: float) -> int:
-    """Throw bytes away until none has come for `quiet_s`; returns how many. Ends at `until_s` in any case."""
+    """Discard bytes until none has arrived for `quiet_s`, or until `until_s`; return how many were discarded."""
     dropped = 0
     while now_s() < until_s:
         chunk = link.read(min(now_s() + quiet_s, until_s))

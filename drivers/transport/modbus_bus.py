@@ -1,4 +1,4 @@
-"""Modbus buses from options: RTU when `port` is a path, TCP when it is a number; one bus for all devices on a wire."""
+"""Create Modbus buses from options: RTU when `port` is a path, TCP when it is a number; one shared bus per link."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class ModbusOptions(EitherOptions):
         return self
 
     def claim(self) -> ResourceClaim:
-        """The unit, on a bus for many."""
+        """Claim the unit on a shared bus."""
         bus = "Modbus TCP" if self.transport == "tcp" else f"Modbus RTU at {self.baud} baud"
         return ResourceClaim(wire=self.wire, bus=bus, stations=(f"unit {self.unit}",), shared_as=self.shared_as)
 
 
 def modbus_bus(context: Context, options: ModbusOptions) -> Bus[ModbusMaster]:
-    """The bus of this wire; devices that name the same wire get the same one."""
+    """Return the bus for these options; devices that name the same link share one bus."""
     opener, name = either_opener(options, context.name)
 
     def client(link: Link) -> ModbusMaster:

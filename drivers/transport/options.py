@@ -1,4 +1,4 @@
-"""Option models that drivers share, and how a link is opened from them."""
+"""Option models that drivers share, and the functions that open a link from them."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class Captured(WireOptions):
     replay: Path | None = None
 
     def claims(self) -> tuple[ResourceClaim, ...]:
-        """The wire, unless its traffic comes from a file."""
+        """Return the claim on the link, or none when its traffic comes from a file."""
         return () if self.replay is not None else (self.claim(),)
 
     @abstractmethod
     def claim(self) -> ResourceClaim:
-        """What the device takes of its wire."""
+        """Return what the device claims of its link."""
 
 
 class SerialOptions(Captured):
@@ -47,7 +47,7 @@ class SerialOptions(Captured):
     baud: Annotated[int, Field(ge=300, le=4_500_000)] = 115_200
 
     def claim(self) -> ResourceClaim:
-        """The port."""
+        """Claim the serial port."""
         return ResourceClaim(wire=f"serial {self.port}")
 
 
@@ -58,7 +58,7 @@ class TcpOptions(Captured):
     port: PortNumber
 
     def claim(self) -> ResourceClaim:
-        """The connection."""
+        """Claim the TCP connection."""
         return ResourceClaim(wire=f"tcp {self.host}:{self.port}")
 
 
@@ -69,7 +69,7 @@ class UdpOptions(Captured):
     port: PortNumber
 
     def claim(self) -> ResourceClaim:
-        """The far side: it answers one."""
+        """Claim the remote address, which answers one client only."""
         return ResourceClaim(wire=f"udp {self.host}:{self.port}")
 
 
@@ -82,32 +82,32 @@ class EitherOptions(Captured):
 
     @property
     def transport(self) -> Literal["tcp", "serial"]:
-        """Which of the two the options mean."""
+        """Return which of the two the options select."""
         return "tcp" if isinstance(self.port, int) else "serial"
 
     @property
     def wire(self) -> str:
-        """The wire in words."""
+        """Return the link in words."""
         return f"tcp {self.host or LOOPBACK}:{self.port}" if self.transport == "tcp" else f"serial {self.port}"
 
     def claim(self) -> ResourceClaim:
-        """Port or connection."""
+        """Claim the serial port or the TCP connection."""
         return ResourceClaim(wire=self.wire)
 
 
 def read_options(context: Context, options: dict[str, Any], model: type[M]) -> M:
-    """Validate a driver's options; a fault names `devices.NAME.options.KEY` (`ConfigError`)."""
+    """Validate a driver's options; an error names `devices.NAME.options.KEY` (`ConfigError`)."""
     return validate(options, model, source=f"devices.{context.name}.options")
 
 
 def serial_opener(options: SerialOptions, device: str) -> tuple[Callable[[], Link], str]:
-    """What opens the port, and the link's name."""
+    """Return a function that opens the port, and the link's name."""
     opener = opener_with_files(options, device, lambda: open_serial(options.port, baud=options.baud, device=device))
     return opener, f"serial {options.port}, {options.baud} baud"
 
 
 def tcp_opener(options: TcpOptions, device: str) -> tuple[Callable[[], Link], str]:
-    """What connects, and the link's name."""
+    """Return a function that connects, and the link's name."""
     opener = opener_with_files(
         options, device, lambda: open_tcp(options.host, options.port, timeout_s=CONNECT_TIMEOUT_S, device=device)
     )
@@ -115,13 +115,13 @@ def tcp_opener(options: TcpOptions, device: str) -> tuple[Callable[[], Link], st
 
 
 def udp_opener(options: UdpOptions, device: str) -> tuple[Callable[[], Link], str]:
-    """What makes the socket, and the link's name."""
+    """Return a function that creates the socket, and the link's name."""
     opener = opener_with_files(options, device, lambda: open_udp(options.host, options.port, device=device))
     return opener, f"udp {options.host}:{options.port}"
 
 
 def either_opener(options: EitherOptions, device: str) -> tuple[Callable[[], Link], str]:
-    """Serial or TCP."""
+    """Return a function that opens the serial port or TCP connection, and the link's name."""
     if isinstance(options.port, int):
         host, number = options.host or LOOPBACK, options.port
         opener = opener_with_files(
@@ -134,10 +134,10 @@ def either_opener(options: EitherOptions, device: str) -> tuple[Callable[[], Lin
 
 
 def opener_with_files(options: Captured, device: str, opener: Callable[[], Link]) -> Callable[[], Link]:
-    """The opener itself, or one that captures or replays.
+    """Return `opener` itself, or one that captures to or replays from a file.
 
     Raises:
-        ConfigError: the file to replay is no capture.
+        ConfigError: the file to replay is not a capture.
     """
     capture, replay = options.capture, options.replay
     if replay is not None:

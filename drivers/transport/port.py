@@ -1,4 +1,4 @@
-"""The owner thread of one port: opens it, lets its tenant set up and serve, and opens it again after every loss."""
+"""Owner thread of one port: opens it, runs its tenant's `set_up` and `serve`, and reopens it after every loss."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from hal.errors import CellError
 log = logging.getLogger(__name__)
 
 FIRST_RETRY_S = 0.02
-LAST_RETRY_S = 0.15  # a port that returns is in use again within 0.5 s
+LAST_RETRY_S = 0.15  # a port that comes back is in use again within 0.5 s
 JOIN_S = 1.0
 
 
 class Closable(Protocol):
-    """Anything that a port can hold: a link, a camera."""
+    """Anything that a port can hold: a link or a camera."""
 
     def close(self) -> None:
-        """Release it."""
+        """Release the resource."""
         ...
 
 
@@ -31,18 +31,18 @@ L_contra = TypeVar("L_contra", bound=Closable, contravariant=True)
 
 
 class Tenant(Protocol[L_contra]):
-    """What lives on a port. All three are called by the owner thread alone."""
+    """User of a port; only the owner thread calls these three methods."""
 
     def set_up(self, link: L_contra) -> None:
-        """Bring the far side to the state that `serve` needs; repeated after each loss.
+        """Bring the device to the state that `serve` needs; called again after each loss.
 
         Raises:
-            WireError, CellError: it did not work; the port is closed and tried again.
+            WireError, CellError: set-up failed; the port is closed and opened again.
         """
         ...
 
     def serve(self, link: L_contra) -> None:
-        """One piece of work of at most some 50 ms.
+        """Do one piece of work of at most about 50 ms.
 
         Raises:
             WireError, CellError: the port is closed and opened again.
@@ -50,17 +50,17 @@ class Tenant(Protocol[L_contra]):
         ...
 
     def lost(self, error: Exception) -> None:
-        """The port could not be opened, could not be set up, or was lost while serving."""
+        """Handle that the port could not be opened or set up, or was lost while serving."""
         ...
 
 
 class Port(Generic[L]):
-    """Keeps a tenant on its wire.
+    """Keeps a tenant connected to its link.
 
     Args:
-        name: of the device or bus; the thread carries it.
+        name: name of the device or bus; used as the thread's name.
         open_link: opens the port; raises `DeviceUnavailable`.
-        realtime_priority: of the owner thread, 1 to 99, where the system allows it; 0 asks for none.
+        realtime_priority: priority of the owner thread, 1 to 99, where the system allows it; 0 requests none.
     """
 
     def __init__(self, name: str, *, open_link: Callable[[], L], tenant: Tenant[L], realtime_priority: int = 0) -> None:
@@ -68,28 +68,28 @@ class Port(Generic[L]):
         self._tenant = tenant
         self._closing = threading.Event()
         self._link: L | None = None
-        self._held: L | None = None  # also while it is being set up
+        self._held: L | None = None  # set during set-up too
         self._sessions = 0
         self._realtime_priority = realtime_priority
         self.is_realtime = False
         self._thread = threading.Thread(target=self._run, name=f"port {name}", daemon=True)
 
     def start(self) -> None:
-        """Begin to open the port."""
+        """Start the owner thread, which opens the port."""
         self._thread.start()
 
     @property
     def link(self) -> L | None:
-        """The link while it is open and set up, else None."""
+        """Return the link while it is open and set up, else None."""
         return self._link
 
     @property
     def reconnects(self) -> int:
-        """How often the port was set up again after the first time."""
+        """Return how many times the port was set up again after the first time."""
         return max(0, self._sessions - 1)
 
     def close(self) -> None:
-        """End the thread and release the port; bounded, idempotent."""
+        """End the thread and release the port, in bounded time; a second call does nothing."""
         self._closing.set()
         held = self._held
         if isinstance(held, Cancellable):
@@ -106,16 +106,16 @@ class Port(Generic[L]):
                 self._session()
             except (WireError, CellError) as error:
                 retry_s = self._rest(error, retry_s)
-            except Exception as error:  # a defect in a driver must not leave a device silent for ever
+            except Exception as error:  # a driver bug must not silence a device for good
                 log.exception("%s failed", self._thread.name)
                 retry_s = self._rest(LinkLost(f"its driver failed: {error!r}"), retry_s)
 
     def _rest(self, error: Exception, retry_s: float) -> float:
-        """Tell the tenant, wait, and say how long the next wait is."""
+        """Report the error to the tenant, wait, and return the next waiting time in seconds."""
         retry_s = FIRST_RETRY_S if self._link is not None else min(2.0 * retry_s, LAST_RETRY_S)
         self._link = None
         if self._closing.is_set():
-            return retry_s  # it was let go
+            return retry_s  # the port was closed
         self._tenant.lost(error)
         self._closing.wait(retry_s)
         return retry_s
@@ -124,7 +124,7 @@ class Port(Generic[L]):
         link = self._held = self._open_link()
         try:
             if self._closing.is_set():
-                return  # it was closed while the link was opened, and not cancelled
+                return  # closed while the link was being opened, so nobody cancelled it
             self._tenant.set_up(link)
             self._link = link
             self._sessions += 1
@@ -136,9 +136,9 @@ class Port(Generic[L]):
 
 
 def ask_for_realtime(priority: int) -> bool:
-    """Let the calling thread go before all ordinary ones of the machine; tells whether the system allows it.
+    """Request real-time scheduling for the calling thread; return whether the system allowed it.
 
-    Linux wants CAP_SYS_NICE or an rtprio limit for that. Threads and processes that it starts do not inherit it.
+    Linux requires CAP_SYS_NICE or an rtprio limit. Threads and processes started by this thread do not inherit it.
     """
     try:
         os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(priority))

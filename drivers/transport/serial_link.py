@@ -1,4 +1,4 @@
-"""Serial ports: exclusive, by stable name, low latency, with errors that name port, owner and remedy."""
+"""Serial ports: exclusive access, stable names, low latency, and errors that name the port, its owner and a remedy."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from hal.errors import DeviceUnavailable
 
 PTY_MAJORS = range(136, 144)  # Linux devices.txt
 BITS_PER_BYTE = 10
-USUAL_PORTS = ("ttyUSB*", "ttyACM*", "ttyAMA*")  # a look at /sys by pyserial costs a millisecond at every attempt
+USUAL_PORTS = ("ttyUSB*", "ttyACM*", "ttyAMA*")  # pyserial's scan of /sys would cost 1 ms per attempt
 STABLE_NAMES = Path("/dev/serial/by-id")
 SYSFS = Path("/sys/class/tty")
-SHORT_TIMER_MS = 1  # an FTDI adapter's shortest; 16 is what it has from the factory
+SHORT_TIMER_MS = 1  # shortest setting of an FTDI adapter; its default is 16
 
 
 class SerialLink(FdLink):
-    """An open serial port."""
+    """Link over an open serial port."""
 
     def __init__(self, port: serial.Serial, *, path: str, baud: int) -> None:
         super().__init__(port.fileno(), f"serial {path}, {baud} baud")
@@ -37,20 +37,20 @@ class SerialLink(FdLink):
         self._name += self.latency
 
     def is_present(self) -> bool:
-        """Does the name still lead to the character device that is open? A re-plugged adapter is another one."""
+        """Return whether the path still leads to the open character device; a re-plugged adapter is a different one."""
         try:
-            return os.stat(self._path).st_rdev == self._device_id  # noqa: PTH116  # st_rdev of the link's end
+            return os.stat(self._path).st_rdev == self._device_id  # noqa: PTH116  # st_rdev of the symbolic link's target
         except OSError:
             return False
 
     @property
     def byte_s(self) -> float:
-        """Start bit, eight data bits, stop bit; a pseudo terminal has no line."""
+        """Return the duration of start bit, eight data bits and stop bit, in seconds; 0 for a pseudo terminal."""
         is_pseudo = os.major(self._device_id) in PTY_MAJORS
         return 0.0 if is_pseudo else BITS_PER_BYTE / float(self._port.baudrate)
 
     def set_baud(self, baud: int) -> None:
-        """Change the speed of the open port."""
+        """Change the baud rate of the open port."""
         try:
             self._port.baudrate = baud
         except (serial.SerialException, OSError, termios.error) as error:
@@ -58,37 +58,37 @@ class SerialLink(FdLink):
         self._name = f"serial {self._path}, {baud} baud{self.latency}"
 
     def set_dtr(self, is_on: bool) -> None:
-        """Work the DTR line; a pseudo terminal and some adapters have none, which is no error."""
+        """Set the DTR line; a pseudo terminal and some adapters have none, which is not an error."""
         with suppress(serial.SerialException, OSError):
             self._port.dtr = is_on
 
     def _release(self, fd: int) -> None:  # noqa: ARG002  # pyserial closes it
         try:
             self._port.close()
-        except OSError as error:  # an unplugged port may refuse even to close
+        except OSError as error:  # closing an unplugged port may fail
             if error.errno not in (errno.EIO, errno.EBADF, errno.ENODEV):
                 raise
 
 
 def open_serial(path: str, *, baud: int, device: str, parity: str = "N", stop_bits: int = 1) -> SerialLink:
-    """Open a port for this process alone.
+    """Open a serial port for exclusive use by this process.
 
     Args:
-        path: give a name that survives re-plugging, from `/dev/serial/by-id`.
+        path: preferably a name that survives re-plugging, from `/dev/serial/by-id`.
         device: name of the device in the cell file, for errors.
 
     Raises:
-        DeviceUnavailable: no such port, no right to open it, or another program has it.
+        DeviceUnavailable: no such port, no permission, or another program holds it.
     """
     try:
         port = serial.Serial(path, baud, parity=parity, stopbits=stop_bits, timeout=0, write_timeout=0, exclusive=True)
-    except (serial.SerialException, OSError, ValueError, termios.error) as error:  # termios.error is no OSError
+    except (serial.SerialException, OSError, ValueError, termios.error) as error:  # termios.error is not an OSError
         raise _unavailable(path, device, error) from error
     return SerialLink(port, path=path, baud=baud)
 
 
 def _ask_for_low_latency(port: serial.Serial) -> bool:
-    """FTDI adapters hold bytes back for 16 ms unless told otherwise (pyserial PR 290). Does the driver comply?"""
+    """Request low latency, because FTDI adapters buffer for 16 ms otherwise (pyserial PR 290); return if it was accepted."""
     try:
         port.set_low_latency_mode(True)
     except (OSError, ValueError, NotImplementedError):
@@ -97,7 +97,7 @@ def _ask_for_low_latency(port: serial.Serial) -> bool:
 
 
 def latency_timer_ms(path: str, *, sysfs: Path = SYSFS) -> int | None:
-    """How long the USB adapter behind `path` holds bytes back, in ms; None when its driver does not say."""
+    """Return how long the USB adapter behind `path` buffers bytes, in ms; None when its driver does not report it."""
     try:
         return int(_timer_file(path, sysfs).read_text())
     except (OSError, ValueError):
@@ -105,9 +105,9 @@ def latency_timer_ms(path: str, *, sysfs: Path = SYSFS) -> int | None:
 
 
 def shorten_latency_timer(path: str, *, sysfs: Path = SYSFS) -> int | None:
-    """Set the adapter's timer to its shortest where this user may; what it is then, in ms, or None when it has none.
+    """Set the adapter's latency timer to its minimum if permitted; return its value in ms, or None if it has none.
 
-    Drivers that obey the low-latency request of an open port have done it already.
+    Drivers that accept the low-latency request on an open port have done this already.
     """
     timer_ms = latency_timer_ms(path, sysfs=sysfs)
     if timer_ms is None or timer_ms <= SHORT_TIMER_MS:
@@ -144,7 +144,7 @@ def _ports_now() -> str:
 
 
 def serial_ports() -> list[str]:
-    """Every serial port of this machine: by its stable name, or as pyserial finds it where there are none."""
+    """Return every serial port of this machine: by stable name, or as pyserial finds them where there are none."""
     return _stable_names() or sorted(port.device for port in serial.tools.list_ports.comports())
 
 
@@ -153,11 +153,11 @@ def _stable_names() -> list[str]:
 
 
 def port_owner(path: str) -> str | None:
-    """`name (pid N)` of a process that has `path` open, or None when it cannot be seen."""
+    """Return `name (pid N)` of a process that has `path` open, or None when none is visible."""
     try:
         wanted = os.path.realpath(path)
     except OSError:
-        return None  # it has vanished meanwhile
+        return None  # the process has ended meanwhile
     for folder in Path("/proc").glob("[0-9]*/fd"):
         try:
             if any(os.path.realpath(fd) == wanted for fd in folder.iterdir()):

@@ -1,4 +1,4 @@
-"""TCP and UDP links. A UDP link is connected, so datagrams of strangers never reach the driver."""
+"""TCP and UDP links. A UDP link is connected, so datagrams from other senders never reach the driver."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hal.errors import DeviceUnavailable
 
 
 class SocketLink(FdLink):
-    """An open, connected socket."""
+    """Link over an open, connected socket."""
 
     def __init__(self, sock: socket.socket, name: str) -> None:
         super().__init__(sock.fileno(), name)
@@ -23,10 +23,10 @@ class SocketLink(FdLink):
 
 
 class DatagramLink(SocketLink):
-    """A connected UDP socket: each read is one datagram."""
+    """Connected UDP socket: each read returns one datagram."""
 
     def read(self, until_s: float) -> bytes:
-        """One datagram; a far side that is not there yet counts as silence, not as loss."""
+        """Return one datagram; a remote device that is not up yet counts as silence, not as a lost link."""
         try:
             if self._has_bytes(until_s):
                 data = self._sock.recv(CHUNK_BYTES)
@@ -42,14 +42,14 @@ class DatagramLink(SocketLink):
         try:
             super()._write_all(data, until_s)
         except ConnectionRefusedError:
-            os.write(self._fd, data)  # the refusal belonged to an earlier datagram
+            os.write(self._fd, data)  # the error belonged to an earlier datagram
 
 
 def open_tcp(host: str, port: int, *, timeout_s: float, device: str) -> SocketLink:
-    """Connect within `timeout_s`.
+    """Open a TCP connection within `timeout_s`.
 
     Raises:
-        DeviceUnavailable: nobody answers there.
+        DeviceUnavailable: the connection could not be made.
     """
     try:
         sock = socket.create_connection((host, port), timeout=timeout_s)
@@ -62,10 +62,10 @@ def open_tcp(host: str, port: int, *, timeout_s: float, device: str) -> SocketLi
 
 
 def open_udp(host: str, port: int, *, device: str) -> DatagramLink:
-    """A UDP socket that talks with `host:port` alone.
+    """Open a UDP socket that exchanges datagrams with `host:port` only.
 
     Raises:
-        DeviceUnavailable: the host's name cannot be resolved or no network leads there.
+        DeviceUnavailable: the host's name cannot be resolved, or there is no route to it.
     """
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:

@@ -1,4 +1,4 @@
-"""A device that talks by itself: its owner thread reads the link, parses and publishes, and starts anew after silence."""
+"""Device that streams without being asked: its owner thread reads, parses and publishes, and reopens after silence."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ T = TypeVar("T")
 
 
 class StreamDevice(PortDevice[T]):
-    """A device that talks by itself. The subclass says how to start it and what its bytes mean.
+    """Device that streams without being asked; the subclass starts the stream and parses its bytes.
 
     Args:
         open_link: opens the port.
-        silence_s: after this long without a sample (and not before the last one is too old to be given out) the link is
-            opened and set up anew.
-        realtime_priority: of the owner thread (see `Port`).
+        silence_s: after this long without a sample, but not before the last one exceeds `max_age_s`, the link is reopened
+            and set up again.
+        realtime_priority: priority of the owner thread (see `Port`).
     """
 
     def __init__(
@@ -48,17 +48,17 @@ class StreamDevice(PortDevice[T]):
 
     @abstractmethod
     def start(self, link: Link) -> None:
-        """Stop a running stream, flush, identify, configure, start: as if the device had been left in any state."""
+        """Stop any running stream, flush, identify, configure and start, whatever state the device was left in."""
 
     @abstractmethod
     def receive(self, chunk: bytes, arrived_s: float) -> None:
-        """Parse bytes and `publish` what is complete; never raises on bad data, may raise `WireError` to start anew."""
+        """Parse bytes and `publish` complete samples; bad data is no error, but `WireError` may be raised to restart."""
 
     def join(self, timeout_s: float = CONNECT_S) -> None:
         """Start the owner thread and wait for the first sample.
 
         Raises:
-            DeviceUnavailable: none came.
+            DeviceUnavailable: no sample arrived.
         """
         self.port.start()
         self.await_first(timeout_s)
@@ -71,8 +71,8 @@ class StreamDevice(PortDevice[T]):
         self.start(link)
         self._heard_s = now_s()
 
-    def keep_going(self, link: Link) -> float:  # noqa: ARG002  # for those that need it
-        """Send what the device must hear regularly; returns how long the next read may wait, in seconds."""
+    def keep_going(self, link: Link) -> float:  # noqa: ARG002  # for subclasses that need it
+        """Send what the device must receive regularly; return how long the next read may wait, in seconds."""
         return SLICE_S
 
     def serve(self, link: Link) -> None:
@@ -85,7 +85,7 @@ class StreamDevice(PortDevice[T]):
             raise NoAnswer(f"no valid data for {silent_s:.2f} s; {self.wire_counts()}")
 
     def take_in(self, link: Link, until_s: float) -> None:
-        """Wait for a chunk until then and parse it (owner thread)."""
+        """Wait for a chunk until `until_s` and parse it (owner thread)."""
         chunk = link.read(until_s)
         if not chunk:
             return
@@ -97,16 +97,16 @@ class StreamDevice(PortDevice[T]):
             self._heard_s = arrived_s
 
     def link_name(self) -> str:
-        """Port and speed, or address."""
+        """Return the link's name: port and baud rate, or network address."""
         return self._link_name
 
     def wire_counts(self) -> str:
-        """Bytes without frames mean a wrong baud rate or a wrong device."""
+        """Return the counters as text; bytes without frames mean a wrong baud rate or a wrong device."""
         heard = self.heard_bytes()
         heard = self.bytes_in if heard is None else heard
         return f"{heard} bytes, {self.mailbox.published} samples, {self.errors} errors"
 
     def heard_bytes(self) -> int | None:
-        """What the link counts, since the device was connected; a replay counts nothing."""
+        """Return the bytes counted by the link since the device was connected; None for a replay."""
         line = self._line
         return None if line is None else self._heard_before + line.received

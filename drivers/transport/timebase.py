@@ -1,29 +1,29 @@
-"""Device clocks on the host's: unwrapping counters, estimating the offset, stamping frames of devices without a clock."""
+"""Converts device clocks to host time: unwraps counters, estimates the offset, stamps frames of devices without a clock."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
 
-WINDOW_S = 0.5  # long enough to hold some frames that were not late, short enough to follow a clock that runs badly
-MAX_DRIFT = 0.05  # of a device's clock against the host's; quartz has 1e-4, a clock counted in software some percent
-QUARTZ_DRIFT = 5e-4  # below this no slope is drawn: it costs 0.4 ms at most
+WINDOW_S = 0.5  # long enough to contain frames that were not late, short enough to follow an inaccurate clock
+MAX_DRIFT = 0.05  # device clock against the host's; quartz has 1e-4, a software counter a few percent
+QUARTZ_DRIFT = 5e-4  # below this drift no slope is estimated; the error is at most 0.4 ms
 EXCHANGES = 64
-REPEATED = 0.3  # of a period: nearer together than a device can send
-LATELY = 8  # frames: one of so many was not late; a talker that has shifted is followed after so many
-ALMOST = 0.1  # of a period: the jitter of a gap that a lost frame has left
+REPEATED = 0.3  # fraction of a period: frames closer together than a device can send
+LATELY = 8  # frames; at least one of this many was not late, and a shift of the sender is followed after this many
+ALMOST = 0.1  # fraction of a period: jitter of the gap that a lost frame leaves
 LATE_S, SELDOM = 5e-4, 0.2
 PERIOD_OVER_S = 1.0
-PAUSE_S, PAUSE_RATIO = 0.1, 3.0  # a pause lasts longer, and as many times longer than the shortest gap lately
-RESTART_S = 1.0  # a device clock this far behind itself, or off what is expected, has been restarted
-LONGEST_AWAY_S = 60.0  # quartz clocks part by 30 ms in that time
+PAUSE_S, PAUSE_RATIO = 0.1, 3.0  # a pause is longer than this, and than this multiple of the shortest recent gap
+RESTART_S = 1.0  # a device clock that jumps back or differs from the expected time by this much has been restarted
+LONGEST_AWAY_S = 60.0  # quartz clocks drift apart by 30 ms in that time
 
 
 class Unwrapper:
-    """A counter of `bits` bits to steadily growing seconds.
+    """Unwraps a counter of `bits` bits into monotonic seconds.
 
     Args:
-        tick_s: seconds a count.
+        tick_s: seconds per count.
     """
 
     def __init__(self, *, bits: int, tick_s: float) -> None:
@@ -33,7 +33,7 @@ class Unwrapper:
         self._ticks = 0
 
     def seconds(self, count: int) -> float:
-        """Seconds since the counter's zero before it was first seen; steps back of less than half a turn stay so."""
+        """Return seconds since the last zero before the first count; steps back of less than half a turn are kept."""
         if self._last is None:
             self._ticks = count
         else:
@@ -44,29 +44,31 @@ class Unwrapper:
 
 
 class HostTime:
-    """Host time of device stamps. A frame can arrive late but never early, so the smallest difference is the truest:
+    """Estimates the host time of device time stamps.
 
-    offset(t) = the line through the smallest `arrived - device` of the last two whole windows, and never more than the
-    difference of the frame at hand or of the window that runs. The line's slope is the drift of the two clocks.
+    A frame can arrive late but never early, so the smallest difference is the most accurate one:
+
+    offset(t) = the line through the smallest `arrived - device` of the last two complete windows, limited to the
+    difference of the current frame and of the current window. The slope of the line is the drift between the clocks.
     """
 
     def __init__(self) -> None:
         self._forget()
 
     def reset(self) -> None:
-        """The device was opened anew: its clock may have started again, or go on, and the first frame may be late."""
+        """Prepare for a reopened device: its clock may have restarted or continued, and the first frame may be late."""
         self._is_reopened = True
 
     def _forget(self) -> None:
         self._is_reopened = False
         self._arrived_s = -math.inf
-        self._truest: list[tuple[float, float]] = []  # (arrived, difference) of the last two whole windows
+        self._truest: list[tuple[float, float]] = []  # (arrived, difference) of the last two complete windows
         self._running = (0.0, math.inf)
         self._window_end_s = -math.inf
         self._device_s = -math.inf
 
     def host_s(self, *, device_s: float, arrived_s: float) -> float:
-        """When a sample stamped `device_s` was taken, on the clock of `arrived_s`."""
+        """Return when a sample stamped `device_s` was taken, on the clock of `arrived_s`."""
         if device_s < self._device_s - RESTART_S or (self._is_reopened and not self._goes_on(device_s, arrived_s)):
             self._forget()
         self._is_reopened = False
@@ -82,7 +84,7 @@ class HostTime:
         return device_s + min(difference_s, self._line_s(arrived_s))
 
     def _goes_on(self, device_s: float, arrived_s: float) -> bool:
-        """Does the clock still say what the last offset lets expect?"""
+        """Return whether the device clock agrees with the last offset."""
         beyond_s = arrived_s - device_s - self._line_s(self._arrived_s)
         return arrived_s - self._arrived_s < LONGEST_AWAY_S and -RESTART_S < beyond_s < RESTART_S
 
@@ -94,15 +96,15 @@ class HostTime:
             before_s, before_offset_s = self._truest[0]
             drift = (offset_s - before_offset_s) / max(then_s - before_s, 1e-3)
         if abs(drift) < QUARTZ_DRIFT:
-            drift = 0.0  # what such a slope shows is the jitter of the two differences
+            drift = 0.0  # a slope this small is jitter of the two differences
         return offset_s + min(max(drift, -MAX_DRIFT), MAX_DRIFT) * min(at_s - then_s, 2.0 * WINDOW_S)
 
 
 class ExchangeTime:
-    """When a device that is asked has taken what it answers: somewhere between request and answer.
+    """Estimates when a device took the value that it returned: at some time between request and answer.
 
-    The shortest exchange lately is what wire and device need, and the middle of that is taken. One that lasted longer has
-    waited, maybe after the value was taken, so that of the later part nothing is claimed:
+    The shortest recent exchange is the time that link and device need, and the middle of it is used. A longer exchange
+    contains waiting, possibly after the value was taken, so the value is not dated later than that:
 
         taken = asked + min_i (answered_i - asked_i) / 2.
     """
@@ -111,25 +113,25 @@ class ExchangeTime:
         self._lasted_s: deque[float] = deque(maxlen=EXCHANGES)
 
     def taken_s(self, asked_s: float, answered_s: float) -> float:
-        """When the value of this exchange was taken, on the clock of both."""
+        """Return when the value of this exchange was taken, on the clock of both arguments."""
         self._lasted_s.append(answered_s - asked_s)
         return asked_s + 0.5 * min(self._lasted_s)
 
 
 class FrameTimes:
-    """Stamps for the frames of a talker without a clock, and none for repeated frames.
+    """Stamps the frames of a device that streams without a clock, and drops repeated frames.
 
-    Its count of frames is the clock. A frame can arrive late but never early, so of the last few arrivals a_i, frame
-    number n_i, with the period p measured over the last second:
+    The frame count serves as the clock. A frame can arrive late but never early, so from the last few arrivals a_i with
+    frame numbers n_i, and the period p measured over the last second:
 
         stamp(n) = min_i a_i + (n - n_i) p,  at most one period before its own arrival.
 
-    This host is late seldom. Where many frames come late, the talker itself is irregular and its arrivals are the truth.
-    The frame that ends a pause may be as old as that, and nothing tells: it is left out, and the next one counts.
+    The host is rarely late. If many frames come late, the sender itself is irregular and the arrival times are used.
+    The frame that ends a pause may be as old as the pause, which cannot be detected, so it is dropped.
 
     Args:
         period_s: nominal time between two frames.
-        frame_bytes: length of a frame; it began that much line time before it was complete.
+        frame_bytes: length of a frame; a frame began this many byte durations before it was complete.
     """
 
     def __init__(self, *, period_s: float, frame_bytes: int) -> None:
@@ -142,14 +144,14 @@ class FrameTimes:
         self._gaps_s: deque[float] = deque(maxlen=LATELY)
 
     def reset(self) -> None:
-        """The wire was opened anew."""
+        """Start again, because the link was reopened."""
         self._arrivals.clear()
         self._late.clear()
         self._last = (b"", -math.inf)
         self._gaps_s.clear()
 
     def stamped(self, frames: list[bytes], *, arrived_s: float, byte_s: float) -> list[tuple[bytes, float]]:
-        """Each new frame with its time; the same bytes at the same moment are one frame that was repeated."""
+        """Return each new frame with its time; equal frames at the same moment are one repeated frame."""
         fresh = []
         for frame in frames:
             if frame == self._last[0] and arrived_s - self._last[1] < REPEATED * self._nominal_s:
@@ -169,7 +171,7 @@ class FrameTimes:
     def _stamp_s(self, arrived_s: float) -> float:
         period_s, count = self._period_s(), 0
         if self._arrivals:
-            gaps = (arrived_s - self._stamped_s) / period_s  # whole ones beyond the first are lost frames
+            gaps = (arrived_s - self._stamped_s) / period_s  # whole periods beyond the first are lost frames
             count = self._arrivals[-1][0] + max(1, math.floor(gaps + ALMOST))
         self._arrivals.append((count, arrived_s))
         lately = list(self._arrivals)[-LATELY:]

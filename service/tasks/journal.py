@@ -184,7 +184,7 @@ def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry]) -> list[_En
             _insert(db, entry)
         db.execute("COMMIT")
     except sqlite3.Error as error:
-        with contextlib.suppress(sqlite3.Error):  # when the commit failed the rollback may fail too; callers get the error
+        with contextlib.suppress(sqlite3.Error):  # after a failed commit this may fail too
             db.execute("ROLLBACK")
         notes = [entry for entry in group if entry.done is None]
         if notes:

@@ -60,7 +60,7 @@ def verify_chain(path: Path) -> int:
     dropped = read_records(path, kinds=(DROPPED,), limit=1)
     previous, last_id = (dropped[0].data["hash"], dropped[0].data["id"]) if dropped else (FIRST_HASH, 0)
     count = 0
-    with _readable(path), snapshot(path) as live, ExitStack() as files:  # open the live file before the parts are listed
+    with _readable(path), snapshot(path) as live, ExitStack() as files:  # before the parts are listed
         parts = [(part, files.enter_context(snapshot(part))) for part in parts_of(path)]
         for part, db in (*parts, (path, live)):
             for row in db.execute("SELECT * FROM journal WHERE id > ? ORDER BY id", (last_id,)):

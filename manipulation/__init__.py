@@ -1,4 +1,4 @@
-"""A pose to a deed: collision-free motion, a guarded skill for each kind of control, and the control loop (paper V)."""
+"""Manipulation (paper V): collision-free motion, a guarded skill for each kind of control, and the control loop."""
 
 from __future__ import annotations
 

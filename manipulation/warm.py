@@ -1,4 +1,4 @@
-"""Compiles, or loads from the cache, what control and planning compute with, so that the first plan is as fast as any."""
+"""Compiles, or loads from the cache, the kernels of control and planning, so that the first plan is not slower."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The arm as geometry: its chain of joints, forwards and backwards."""
+"""Geometry of the arm: forward and inverse kinematics of its chain of joints."""

@@ -1,7 +1,7 @@
-"""Compiled kinematics of the arm: plain arrays in, plain arrays out.
+"""Compiled kinematics of the arm, on plain arrays.
 
 `dh`: (n, 4) rows (d, a, alpha, offset) of a standard Denavit-Hartenberg chain, m and rad. Matrices are 4x4 homogeneous.
-The tests hold a numpy oracle beside each.
+The tests compare each kernel with a numpy implementation.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from hal.jit import compiled, inlined
 
 @compiled
 def frames(dh: Array, q: Array) -> Array:
-    """Frames of the chain, (n + 1, 4, 4): the base, then the frame after each joint; the last is the flange."""
+    """Return the frames of the chain, (n + 1, 4, 4): the base, then one after each joint; the last is the flange."""
     n = dh.shape[0]
     out = np.zeros((n + 1, 4, 4))
     for k in range(4):
@@ -40,7 +40,7 @@ def frames(dh: Array, q: Array) -> Array:
 
 @compiled
 def tool_and_jacobian(dh: Array, q: Array, flange_from_tool: Array) -> tuple[Array, Array]:
-    """`base_from_tool` (4, 4) and the Jacobian (6, n) of the tool's origin: rows v then omega, base axes."""
+    """Return `base_from_tool` (4, 4) and the Jacobian (6, n) of the tool's origin: rows v then omega, base axes."""
     n = dh.shape[0]
     chain = frames(dh, q)
     tool = np.ascontiguousarray(chain[n]) @ flange_from_tool
@@ -57,7 +57,7 @@ def tool_and_jacobian(dh: Array, q: Array, flange_from_tool: Array) -> tuple[Arr
 
 @inlined
 def rotation_exp(w: Array) -> Array:
-    """Rodrigues: the (3, 3) rotation of a rotation vector (3,) rad."""
+    """Return the (3, 3) rotation of a rotation vector (3,) rad, by Rodrigues' formula."""
     angle = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
     if angle < 1e-12:
         a, b = 1.0, 0.5
@@ -73,7 +73,7 @@ def rotation_exp(w: Array) -> Array:
 
 @compiled
 def rotation_log(r: Array) -> Array:
-    """The rotation vector (3,) rad of a rotation matrix whose angle is below pi."""
+    """Return the rotation vector (3,) rad of a rotation matrix whose angle is below pi."""
     v = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
     sine = 0.5 * np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     cosine = 0.5 * (r[0, 0] + r[1, 1] + r[2, 2] - 1.0)
@@ -85,7 +85,7 @@ def rotation_log(r: Array) -> Array:
 
 @inlined
 def pose_error(goal: Array, pose: Array) -> Array:
-    """The twist (6,) in base axes that carries `pose` onto `goal`: translation, then rotation vector."""
+    """Return the twist (6,) in base axes that carries `pose` onto `goal`: translation, then rotation vector."""
     out = np.empty(6)
     for k in range(3):
         out[k] = goal[k, 3] - pose[k, 3]
@@ -95,10 +95,12 @@ def pose_error(goal: Array, pose: Array) -> Array:
 
 @inlined
 def follow_pose(dh: Array, flange_from_tool: Array, q: Array, goal: Array, damping: float, steps: int) -> Array:
-    """Joints (n,) near `q` whose tool pose is `goal`: damped least squares, dq = J^T (J J^T + damping^2 I)^-1 e.
+    """Return the joints (n,) near `q` whose tool pose is `goal`, by damped least squares.
 
-    Source: Wampler, IEEE SMC 16(1), 1986. One or two steps do, since a control tick moves the goal by under a
-    millimetre.
+    dq = J^T (J J^T + damping^2 I)^-1 e. One or two steps are enough, because a control tick moves the goal by less than
+    a millimetre.
+
+    Source: Wampler, IEEE SMC 16(1), 1986.
     """
     q = q.copy()
     for _ in range(steps):

@@ -16,10 +16,10 @@ from hal.devices import ArmCapabilities
 from hal.errors import Unreachable
 from manipulation.arm import kernels
 
-RESIDUAL = 1e-6  # EAIK answers an unreachable pose in the least-squares sense; a round trip through FK tells
+RESIDUAL = 1e-6  # EAIK answers an unreachable pose by least squares; forward kinematics shows the difference
 LARGEST_STEP_RAD = 0.35  # between neighbouring samples of a stroke; a larger step is another branch
 TURN_RAD = 2.0 * np.pi
-SINGULAR_RATIO = 0.02  # smallest singular value of the scaled Jacobian; the notes' strokes fail below
+SINGULAR_RATIO = 0.02  # smallest singular value of the scaled Jacobian; strokes fail below this
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,7 +42,7 @@ class Kinematics:
 
     @classmethod
     def of(cls, capabilities: ArmCapabilities) -> Kinematics:
-        """Build from what the arm says about itself."""
+        """Build the kinematics from the arm's capabilities."""
         dh = np.array([[link.d_m, link.a_m, link.alpha_rad, link.offset_rad] for link in capabilities.links])
         return cls(
             capabilities=capabilities,
@@ -55,29 +55,28 @@ class Kinematics:
         )
 
     def flange(self, q_rad: Array) -> RigidTransform:
-        """`base_from_flange` for joints (n,) rad."""
+        """Return `base_from_flange` for joints (n,) rad."""
         return RigidTransform.from_matrix(kernels.frames(self.dh, q_rad)[-1])
 
     def tool(self, q_rad: Array, flange_from_tool: RigidTransform) -> RigidTransform:
-        """`base_from_tool` for joints (n,) rad."""
+        """Return `base_from_tool` for joints (n,) rad."""
         return self.flange(q_rad) * flange_from_tool
 
     def jacobian(self, q_rad: Array, flange_from_tool: RigidTransform) -> Array:
-        """(6, n) Jacobian of the tool's origin in base axes: velocity, then angular velocity."""
+        """Return the (6, n) Jacobian of the tool's origin in base axes: velocity, then angular velocity."""
         matrix = np.ascontiguousarray(flange_from_tool.as_matrix())
         return np.asarray(kernels.tool_and_jacobian(self.dh, q_rad, matrix)[1])
 
     def inverse(self, base_from_flange: RigidTransform) -> Array:
-        """All joint vectors (k, n) rad inside the limits that reach the pose; whole turns count as branches of their
-        own.
+        """Return all joint vectors (k, n) rad inside the limits that reach the pose, with all whole turns of joints.
 
-        Source: Elsner et al., EAIK, 2025 (subproblem decomposition); each answer is checked by forward kinematics.
+        Source: Elsner et al., EAIK, 2025 (subproblem decomposition); each solution is checked by forward kinematics.
         """
         turned = [_turned(q[None], self.lower_rad, self.upper_rad)[:, 0] for q in self._branches(base_from_flange)]
         return np.concatenate([np.empty((0, len(self.dh))), *turned])
 
     def _branches(self, base_from_flange: RigidTransform) -> Array:
-        """(k, n) the joint vectors that reach the pose, each joint up to whole turns."""
+        """Return the joint vectors (k, n) that reach the pose, each joint up to whole turns."""
         goal = base_from_flange.as_matrix()
         found = np.atleast_2d(np.asarray(self.solver.IK(goal).Q, float))
         if found.size == 0:
@@ -86,17 +85,17 @@ class Kinematics:
         return found[[np.abs(kernels.frames(self.dh, q)[-1] - goal).max() < RESIDUAL for q in found]]
 
     def follow(self, base_from_flange: Sequence[RigidTransform], *, near_rad: Array) -> tuple[Array, ...]:
-        """Joint paths (N, n), one for each branch that follows *all* poses without a jump, limit or singularity;
-        best first.
+        """Return the joint paths (N, n) that follow *all* poses without a jump, limit or singularity; best first.
 
-        The branch is chosen over the whole stroke: one lever arc in five met a wrist limit when chosen by its first
-        pose. Whole turns of single joints are branches of their own, but of one path: it is followed once.
+        The branch is chosen over the whole stroke: chosen by the first pose alone, one lever arc in five meets a wrist
+        limit. Paths that differ by whole turns of single joints are all returned, but their branch is followed only
+        once.
 
         Args:
-            near_rad: branches are ranked by how far the arm must move from here.
+            near_rad: paths are ranked by how far the arm must move from these joints.
 
         Raises:
-            Unreachable: no branch does; says which pose stops the longest one.
+            Unreachable: no branch follows all poses; names the pose at which the longest one stops.
         """
         branches = [self._branches(pose) for pose in base_from_flange]
         ranked: list[tuple[float, Array]] = []
@@ -122,20 +121,20 @@ class Kinematics:
         return min(self.conditioning(q) for q in path[:: max(1, len(path) // 8)]) >= SINGULAR_RATIO
 
     def conditioning(self, q_rad: Array) -> float:
-        """Smallest singular value of the flange Jacobian with lengths scaled by 0.5 m; 0 at a singularity."""
+        """Return the smallest singular value of the flange Jacobian, lengths scaled by 0.5 m; 0 at a singularity."""
         scale = np.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])[:, None]
         _, jacobian = kernels.tool_and_jacobian(self.dh, q_rad, np.eye(4))
         return float(np.linalg.svd(scale * jacobian, compute_uv=False)[-1])
 
     def _effort(self, path: Array, near_rad: Array, poor: float) -> float:
-        # Seconds to get there, plus a price for ending near a limit or a singularity.
+        # Seconds to get there, plus a penalty for ending near a limit or a singularity.
         travel = np.max(np.abs(path[0] - near_rad) / self.velocity_rad_per_s)
         margin = np.min(np.minimum(path - self.lower_rad, self.upper_rad - path))
         return float(travel + 0.05 / (margin + 0.02) + 0.05 / (poor + 0.02))
 
 
 def _unwound(start: Array, branches: Sequence[Array]) -> Array:
-    """(m, n) from `start` on, the nearest joint vector for each pose without whole turns in between; ends before a jump."""
+    """Return the path (m, n) from `start` through the nearest solution of each pose, up to the first jump."""
     path = [start]
     for options in branches:
         steps = (options - path[-1] + np.pi) % TURN_RAD - np.pi
@@ -147,13 +146,13 @@ def _unwound(start: Array, branches: Sequence[Array]) -> Array:
 
 
 def _fits(path: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
-    """(m,) for each place of a path: do whole turns bring all of the path up to there inside the limits?"""
+    """Return (m,) for each point of a path whether whole turns can bring the path up to there inside the limits."""
     low, high = np.minimum.accumulate(path), np.maximum.accumulate(path)
     return np.asarray((high + _least_turns(low, lower) <= upper + 1e-12).all(axis=1))
 
 
 def _turned(path: Array, lower: Array, upper: Array) -> Array:
-    """(k, m, n) all paths that are equal to this one (m, n) up to whole turns of single joints and inside the limits."""
+    """Return all paths (k, m, n) inside the limits that equal this one (m, n) up to whole turns of single joints."""
     first = _least_turns(path.min(axis=0), lower)
     choices = [
         np.arange(least, limit - highest + 1e-12, TURN_RAD)

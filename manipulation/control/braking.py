@@ -1,6 +1,6 @@
 """The last filter before the drive: joint range, speed and acceleration, braking ahead, and the speed of the tip.
 
-Ways and speeds are of one tick, `most` is the change of speed in a tick.
+Distances and speeds are per tick; `most` is the largest change of speed per tick.
 """
 
 from __future__ import annotations
@@ -14,27 +14,27 @@ from manipulation.arm.kernels import tool_and_jacobian
 
 @inlined
 def rest_way(speed: float, most: float) -> float:
-    """Way that is still covered after a tick at `speed` when each further tick is slower by `most`."""
+    """Return the distance still covered after a tick at `speed` when every further tick is slower by `most`."""
     ticks = np.floor(speed / most)
     return float(ticks * speed - 0.5 * ticks * (ticks + 1.0) * most)
 
 
 @inlined
 def fastest_to_rest(way: float, most: float) -> float:
-    """Speed per tick that comes to rest exactly after `way`: v + rest_way(v, most) = way."""
+    """Return the speed per tick that comes to rest exactly after the distance `way`: v + rest_way(v, most) = way."""
     ticks = max(1.0, np.ceil(0.5 * (np.sqrt(1.0 + 8.0 * way / most) - 1.0)))
     return float(way / ticks + 0.5 * (ticks - 1.0) * most)
 
 
 @inlined
 def rest_place(place: float, speed: float, most: float) -> float:
-    """Place of rest of what has just reached `place` at `speed` per tick."""
+    """Return where a joint that has just reached `place` at `speed` per tick can come to rest."""
     return float(place + np.sign(speed) * rest_way(abs(speed), most))
 
 
 @inlined
 def step_to_rest(way: float, most: float) -> float:
-    """`fastest_to_rest` with the sign of `way`."""
+    """Return `fastest_to_rest` with the sign of `way`."""
     return float(np.sign(way) * fastest_to_rest(abs(way), most))
 
 
@@ -50,12 +50,12 @@ def limited_step(
     upper: Array,
     dt_s: float,
 ) -> Array:
-    """The set-point (n,) nearest to `wanted` that respects range, speed and acceleration limits per joint.
+    """Return the set-point (n,) nearest to `wanted` within the range, speed and acceleration limits of each joint.
 
-    It goes no faster than it can brake ahead of where the wanted one would come to rest if that braked from now on:
-    what it can follow it follows exactly, behind a leap it arrives without running past. `wanted_before` (k, n), newest
-    first: of the speeds between them the fastest one each way counts, since ticks that come late and early make a
-    steady course jerk.
+    The step is never too fast to brake before the place where the wanted set-point would come to rest if it began to
+    brake now. A motion within the limits is therefore followed exactly, and after a jump the goal is reached without
+    overshoot. `wanted_before` (k, n) holds the previous wanted set-points, newest first. In each direction the fastest
+    of the speeds between them counts, because ticks that come late or early make a steady motion look jerky.
     """
     out = np.empty_like(wanted)
     for i in range(wanted.shape[0]):
@@ -66,7 +66,7 @@ def limited_step(
             before = min(max(wanted_before[k, i], lower[i]), upper[i])
             slow, fast = min(slow, after - before), max(fast, after - before)
             after = before
-        slow, fast = max(slow, -fastest), min(fast, fastest)  # faster than that nobody follows
+        slow, fast = max(slow, -fastest), min(fast, fastest)  # the joint cannot follow faster than that
         below = min(max(rest_place(goal, slow, most), lower[i]), upper[i])
         above = min(max(rest_place(goal, fast, most), lower[i]), upper[i])
         step = min(max(goal - last[i], step_to_rest(below - last[i], most)), step_to_rest(above - last[i], most))
@@ -80,11 +80,12 @@ def limited_step(
 def slowed_step(
     jacobian: Array, step: Array, last_step: Array, most: Array, below: Array, above: Array, tip_m: float
 ) -> Array:
-    """The joint step (n,) nearest to `step` that moves the tip by `tip_m` at most.
+    """Return the joint step (n,) nearest to `step` that moves the tip by at most `tip_m`.
 
-    On the way from `step` to the one that keeps its direction and brakes as hard as acceleration allows (`most` (n,) a
-    tick): both respect acceleration and range (`below`, `above` (n,): what is left of it), so all between do. Where
-    even that is too fast for the tip, it is scaled: of the limits that of the tip comes first.
+    It is sought between `step` and the step that keeps the present direction and brakes as hard as the acceleration
+    limit allows (`most` (n,), per tick). Both respect acceleration and the range that is left (`below`, `above` (n,)),
+    so every step between them does. If even full braking moves the tip too fast, that step is scaled down: the limit of
+    the tip takes precedence over the others.
     """
     share = 1.0
     for i in range(step.shape[0]):
@@ -94,7 +95,7 @@ def slowed_step(
     for i in range(step.shape[0]):
         brake[i] = max(-fastest_to_rest(below[i], most[i]), min(brake[i], fastest_to_rest(above[i], most[i])))
     harder = brake.copy()
-    for i in range(step.shape[0]):  # a joint near its goal brakes harder than that, and may if the tip allows it
+    for i in range(step.shape[0]):  # a joint near its goal may brake harder if the tip limit allows it
         if (last_step[i] - brake[i]) * (brake[i] - step[i]) > 0.0:
             harder[i] = step[i]
     slow = jacobian[:3] @ harder
@@ -122,7 +123,7 @@ def safe_step(
     tip_limit_m_per_s: float,
     dt_s: float,
 ) -> Array:
-    """The last filter before the drive: joint range, speed and acceleration, and the speed of the tool's tip."""
+    """Apply the last filter before the drive: joint range, speed and acceleration, and the speed of the tool's tip."""
     out = limited_step(wanted, wanted_before, last, last_velocity, velocity, acceleration, lower, upper, dt_s)
     out = np.minimum(np.maximum(out, lower), upper)
     _, jacobian = tool_and_jacobian(dh, last, flange_from_tool)
@@ -135,7 +136,7 @@ def safe_step(
 
 
 def warm(dh: Array) -> None:
-    """Compile (or load from the cache) the filter, so that no tick waits for a compiler."""
+    """Compile the filter (or load it from the cache), so that no tick waits for a compiler."""
     n = dh.shape[0]
     q, ones = np.full(n, 0.1), np.ones(n)
     safe_step(dh, np.eye(4), q, np.zeros((2, n)), q, np.zeros(n), ones, ones, -ones, ones, 1e-9, 0.01)

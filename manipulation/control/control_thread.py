@@ -1,4 +1,4 @@
-"""The one thread that moves the arm: does what callers hand over, a call at a time, and beats in between."""
+"""The one thread that moves the arm: it runs the callers' jobs one at a time, and a periodic task between them."""
 
 from __future__ import annotations
 
@@ -27,30 +27,30 @@ class _Job:
 
 
 class ControlThread:
-    """Jobs in the order in which they come; errors go to the caller, the thread lives on.
+    """Runs jobs in the order in which they arrive; an error goes to the caller and the thread goes on.
 
     Args:
-        beat: called again and again while there is no job; one that raises ends the thread. None lets the thread sleep
-            until a job comes (in lockstep with a simulated world, where nothing happens between motions).
-        at_end: called by the thread as its last act.
+        beat: called repeatedly while there is no job; if it raises, the thread ends. None lets the thread sleep until a
+            job comes (in lockstep with a simulated world, where nothing happens between motions).
+        at_end: called by the thread just before it ends.
     """
 
     def __init__(self, *, beat: Callable[[], None] | None, at_end: Callable[[], None]) -> None:
         self._beat = beat
         self._at_end = at_end
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
-        self._gate = threading.Lock()  # a job enters before closing, and is answered, or not at all
+        self._gate = threading.Lock()  # a job is either queued before closing and answered, or refused
         self._is_closing = False
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Begin; a second call does nothing."""
+        """Start the thread; a second call does nothing."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._loop, name="control", daemon=True)
             self._thread.start()
 
     def close(self) -> None:
-        """Refuse new jobs, finish the one that runs, end; a second call does nothing."""
+        """Refuse new jobs, finish the running one and end the thread; a second call does nothing."""
         with self._gate:
             self._is_closing = True
         self._jobs.put(None)
@@ -58,7 +58,7 @@ class ControlThread:
             self._thread.join(timeout=JOIN_S)
 
     def do(self, call: Callable[[], T]) -> T:
-        """What `call` returns or raises, called on the thread.
+        """Run `call` on the thread and return its result; what it raises is raised here.
 
         Raises:
             MotionRefused: the thread does not run.
@@ -76,7 +76,7 @@ class ControlThread:
         try:
             while not self._is_closing:
                 self._turn()
-        except Exception:  # of a beat: nobody knows any more what holds the arm
+        except Exception:  # raised by `beat`: it is no longer known what holds the arm
             log.exception("the control thread ends")
         with self._gate:
             self._is_closing = True
@@ -94,7 +94,7 @@ class ControlThread:
             self._beat()
 
     def _refuse_rest(self) -> None:
-        # Callers that asked while the thread closed get an answer too.
+        # Callers whose jobs arrived while the thread closed get an answer too.
         while True:
             try:
                 job = self._jobs.get(block=False)

@@ -1,8 +1,8 @@
-"""The control thread: executes declared motions, one at a time, and reports what really happened.
+"""The controller: executes declared motions on the control thread, one at a time, and reports what really happened.
 
-Every tick: read all devices, look at stop latch, cancel and guards, compute the set-point, filter it, send it, let one
-period pass. On a simulated clock the period steps the world in lockstep, and nothing ticks between motions; on a
-wall clock the thread always ticks and holds the arm.
+Every tick it reads all devices, checks the stop latch, cancellation and guards, computes the set-point, filters it,
+sends it, and lets one period pass. On a simulated clock the period steps the world in lockstep, and nothing runs
+between motions. On a wall clock the thread ticks all the time and holds the arm.
 """
 
 from __future__ import annotations
@@ -53,16 +53,16 @@ from manipulation.plausibility.hand import TouchMonitor
 from manipulation.plausibility.repetition import RepeatedWrench
 
 TARE_S = 0.1
-LATE_TICKS = 2  # a tick that comes later makes the motion late: caught up, 50 ms made 0.25 m/s of an approach at 0.06
-SLOW_TICKS = 4  # gripper and proximity are read every so many ticks
+LATE_TICKS = 2  # a longer tick delays the motion; catching up 50 ms turned an approach at 0.06 m/s into 0.25 m/s
+SLOW_TICKS = 4  # gripper and proximity sensors are read once per this many ticks
 
 
 class Controller:
-    """Implements `hal.motion.Mover` over the devices of one cell.
+    """Implements `hal.motion.Mover` with the devices of one cell.
 
     Args:
         safety: force and speed limits that hold in every motion.
-        load: what hangs below the sensor; `tare` corrects its bias.
+        load: mass and centre of mass of what hangs below the sensor, and the sensor's bias, which `tare` corrects.
         is_latched: reads the stop latch; called every tick.
         flange_from_grip: the tool of motions that name none.
         rate_hz: control rate; None takes the arm's.
@@ -80,7 +80,7 @@ class Controller:
         flange_from_grip: RigidTransform | None = None,
         rate_hz: float | None = None,
     ) -> None:
-        # In lockstep no reading is late by chance.
+        # In lockstep a late reading is never an accident of timing.
         patience_s = (1.0 if isinstance(clock, SimClock) else 3.0) * safety.max_reading_age_s
         self._devices = Devices(
             arm=devices.arm,
@@ -119,13 +119,13 @@ class Controller:
     # -- life ------------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Warm the compiled kernels, then start the control thread; a second call does nothing."""
+        """Compile or load the kernels, then start the control thread; a second call does nothing."""
         kernels.warm(self.kinematics.dh)
         braking.warm(self.kinematics.dh)
         self._thread.start()
 
     def close(self) -> None:
-        """Cancel what runs, stop the arm, end the thread; a second call does nothing."""
+        """Cancel the running motion, stop the arm and end the thread; a second call does nothing."""
         self._is_closing = True  # a motion that begins at this moment clears `_cancel`
         self._cancel.set()
         self._thread.close()
@@ -133,10 +133,10 @@ class Controller:
     # -- the Mover port --------------------------------------------------------------------------------------------
 
     def execute(self, motion: DeclaredMotion) -> MotionReport:
-        """Executor the motion on the control thread and wait for its end.
+        """Execute the motion on the control thread and wait for its end.
 
         Raises:
-            MotionRefused: not finite, outside limits, start too far away, or another motion runs.
+            MotionRefused: the motion is not finite, exceeds limits or starts too far away, or another motion runs.
             Stopped: the stop latch is set.
         """
         if not self._busy.acquire(blocking=False):
@@ -152,12 +152,12 @@ class Controller:
         self._cancel.set()
 
     def tare(self) -> Array:
-        """Take the present wrench, averaged over 0.1 s at rest, as zero contact; returns the bias (6,), sensor axes.
+        """Take the present wrench, averaged over 0.1 s at rest, as zero contact; returns the bias (6,) in sensor axes.
 
         Raises:
             MotionRefused: a motion runs.
             Stopped: the stop latch is set.
-            DeviceFault: a device failed meanwhile; names it.
+            DeviceFault: a device failed meanwhile; the error names it.
         """
         if not self._busy.acquire(blocking=False):
             raise MotionRefused("tare refused: a motion runs", hint="tare when the arm rests")
@@ -167,7 +167,7 @@ class Controller:
             self._busy.release()
 
     def state(self) -> RobotState:
-        """Newest snapshot; between motions on a simulated clock the devices are read for it.
+        """Return the newest snapshot; between motions on a simulated clock the devices are read for it.
 
         Raises:
             DeviceFault: there is no snapshot, and a device fails.
@@ -185,8 +185,8 @@ class Controller:
     # -- between motions -------------------------------------------------------------------------------------------
 
     def _hold(self) -> None:
-        """One tick between motions on a wall clock: the arm stays, its watchdog quiet, the state fresh."""
-        if self._is_latched():  # before the devices: one of them may be dead, and the drives must go off all the same
+        """Run one tick between motions on a wall clock: hold the arm, serve its watchdog and refresh the state."""
+        if self._is_latched():  # checked before reading: the drives must go off even if a device is dead
             self._drives.switch_off()
         with suppress(DeviceFailure):
             sample = self._read()
@@ -288,7 +288,7 @@ class Controller:
             return end
 
     def _come_to_rest(self, end: Termination) -> None:
-        """Decelerate at the limit, then hold; only the arm is listened to, since another device may be what failed."""
+        """Decelerate at the limit, then hold; only the arm is used, because another device may have failed."""
         if end.device is not None:
             self._faults = (end.cause,)
         try:
@@ -333,7 +333,7 @@ class Controller:
             sample = self._devices.read(before)
             refuse(self._repeated_wrench.note(sample.raw_wrench, stamp_s=sample.stamp_s))
         except DeviceFailure as failure:
-            self._faults = self._faults or (str(failure),)  # who looks at the state sees that it is old
+            self._faults = self._faults or (str(failure),)  # a reader of the state sees that it is old
             raise
         self._faults = ()
         return sample

@@ -1,4 +1,4 @@
-"""The arm's drives as the control thread uses them: on, held by set-points in an even rhythm, off."""
+"""The arm's drives as the control thread uses them: switched on and off, and held by set-points at an even rate."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 
 
 class Drives:
-    """Switches the drives and sends set-points, one a period of `dt_s`."""
+    """Switches the drives and sends set-points, one per period of `dt_s`."""
 
     def __init__(self, arm: Arm, clock: Clock, dt_s: float) -> None:
         self.dt_s = dt_s
@@ -24,7 +24,7 @@ class Drives:
         self._next_tick_s = clock.now_s()
 
     def switch_on(self) -> None:
-        """Take the arm under power.
+        """Switch the drives on.
 
         Raises:
             DeviceFailure: the arm refuses or does not answer.
@@ -36,22 +36,22 @@ class Drives:
         self.are_on = True
 
     def switch_off(self) -> None:
-        """Drives off, when they are on: stop latched, or the arm does not answer."""
+        """Switch the drives off if they are on, because the stop is latched or the arm does not answer."""
         if self.are_on:
             self.stop()
         self.are_on = False
 
     def stop(self) -> None:
-        """Ask the arm to stop, whatever is known of it; an arm that does not hear stops by its own watchdog."""
+        """Ask the arm to stop in any state; an arm that does not receive this stops by its own watchdog."""
         try:
             self._arm.stop(deadline=Deadline.after(self._clock, command_wait_s(self._clock)))
         except CellError:
             pass
-        except Exception:  # a defect of its driver: whoever stops goes on with what else there is to end
+        except Exception:  # a defect of the driver must not keep the caller from stopping the rest
             log.exception("stopping %s", self._arm.name)
 
     def send(self, position_rad: Array) -> Array:
-        """Send a set-point (n,), rad; returns what the arm took.
+        """Send a set-point (n,), rad, and return the one that the arm accepted.
 
         Raises:
             DeviceFailure: the arm refuses or does not answer.
@@ -63,15 +63,15 @@ class Drives:
             raise failure_of(self._arm.name, error) from error
 
     def begin_rhythm(self) -> None:
-        """Count periods from now."""
+        """Start counting periods from now."""
         self._next_tick_s = self._clock.now_s()
 
     def pass_tick(self) -> None:
-        """Let one period pass; a simulated world makes its steps meanwhile."""
+        """Wait until the next period begins; a simulated world makes its steps meanwhile."""
         if not isinstance(self._clock, WallClock):
             self._clock.sleep(self.dt_s)
             return
         now_s = self._clock.now_s()
-        # After a late tick the rhythm starts anew: catching up would bunch set-points.
+        # After a late tick the periods are counted anew, because catching up would bunch set-points.
         self._next_tick_s = max(self._next_tick_s + self.dt_s, now_s)
         self._clock.sleep(self._next_tick_s - now_s)

@@ -1,4 +1,4 @@
-"""One run per kind of declared motion: where the arm should be in this tick, and whether the motion is over."""
+"""One executor per kind of declared motion: it computes the set-point of each tick and says when the motion is over."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from manipulation.control.sensing import Sample, command_wait_s, refuse
 from manipulation.plausibility.hand import wrong_width
 
 BLEND_S = 0.25  # the gap between the declared and the measured start is closed over this time
-TURN_ARM_M = 0.1  # a turn of 1 rad counts as this much way
-DAMPING = 1e-3  # of the damped least squares; strokes are chosen clear of singularities beforehand
+TURN_ARM_M = 0.1  # a turn of 1 rad counts as this much distance
+DAMPING = 1e-3  # of the damped least squares; strokes are planned clear of singularities
 GRIP_START_S = 0.08  # a gripper needs this long to report that it moves
 GRIP_REST_S = 0.05
 log = logging.getLogger(__name__)
@@ -30,9 +30,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tick:
-    """What a run may look at: time since its start, the sample, the contact wrench (6,) in tool axes, the last
-    set-point.
-    """
+    """Inputs of an executor: time since its start, sample, contact wrench (6,) in tool axes, last set-point."""
 
     elapsed_s: float
     sample: Sample
@@ -45,16 +43,16 @@ class Executor(Protocol):
     """A motion in execution."""
 
     def wanted(self, tick: Tick) -> Array:
-        """Joint set-point (n,) for this tick."""
+        """Return the joint set-point (n,) for this tick."""
         ...
 
     def is_over(self, tick: Tick) -> bool:
-        """Has the declared course been run?"""
+        """Return whether the declared motion has run to its end."""
         ...
 
 
 class TrajectoryExecutor:
-    """Cubic Hermite between the declared joint states, blended from the measured start."""
+    """Interpolates the declared joint states by cubic Hermite polynomials, blended from the measured start."""
 
     def __init__(self, motion: JointTrajectory, start_rad: Array) -> None:
         self._t = motion.times_s
@@ -62,17 +60,17 @@ class TrajectoryExecutor:
         self._gap = start_rad - motion.positions_rad[0]
 
     def wanted(self, tick: Tick) -> Array:
-        """The point of the trajectory at this time."""
+        """Return the point of the trajectory at this time."""
         q: Array = kernels.hermite(self._t, self._q, self._v, tick.elapsed_s)
         return np.asarray(q + self._gap * _fade(tick.elapsed_s))
 
     def is_over(self, tick: Tick) -> bool:
-        """The declared time is over."""
+        """Return whether the declared time has passed."""
         return bool(tick.elapsed_s >= self._t[-1])
 
 
 class PathExecutor:
-    """Tool poses in time; with compliance the tool yields about them by an admittance in tool axes."""
+    """Follows tool poses in time; with compliance, an admittance in tool axes lets the tool yield about them."""
 
     def __init__(self, motion: CartesianPath, kinematics: Kinematics, start_rad: Array) -> None:
         poses = motion.base_from_tool
@@ -90,7 +88,7 @@ class PathExecutor:
         self._admittance = None if motion.compliance is None else Admittance(motion.compliance)
 
     def wanted(self, tick: Tick) -> Array:
-        """Joints whose tool pose is the path's, displaced by the admittance."""
+        """Return the joints whose tool pose is the path's, displaced by the admittance."""
         offset = np.zeros(6) if self._admittance is None else self._admittance.step(tick.wrench, tick.dt_s)
         shift = self._gap * _fade(tick.elapsed_s)
         q: Array = kernels.path_joints(
@@ -111,14 +109,15 @@ class PathExecutor:
         return q
 
     def is_over(self, tick: Tick) -> bool:
-        """The declared time is over."""
+        """Return whether the declared time has passed."""
         return bool(tick.elapsed_s >= self._t[-1])
 
 
 def smooth_ways(times_s: Array, points: Array, turns: Array) -> tuple[Array, Array]:
-    """Way (N,) along a path of points (N, 3) and turns (N - 1, 3), and its speed (N,) at each point: rest at both ends.
+    """Return the distance (N,) along a path of points (N, 3) and turns (N - 1, 3), and the speed (N,) at each point.
 
-    Between, the harmonic mean of the neighbouring speeds, which keeps the cubic from running backwards.
+    The path begins and ends at rest. At inner points the speed is the harmonic mean of the neighbouring speeds, which
+    keeps the cubic from running backwards.
 
     Source: Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5(2), 1984.
     """
@@ -148,22 +147,22 @@ class Admittance:
 
 
 class HoldExecutor:
-    """Stand still."""
+    """Keeps the arm where it is."""
 
     def __init__(self, motion: Hold) -> None:
         self._duration_s = motion.duration_s
 
     def wanted(self, tick: Tick) -> Array:
-        """Where it is."""
+        """Return the last set-point."""
         return tick.last_rad
 
     def is_over(self, tick: Tick) -> bool:
-        """The time is over."""
+        """Return whether the declared time has passed."""
         return tick.elapsed_s >= self._duration_s
 
 
 class GripperExecutor:
-    """The arm holds while the pads move; over when they rest."""
+    """Holds the arm while the pads move; it is over when they rest."""
 
     def __init__(self, motion: GripperMotion, gripper: Gripper, sample: Sample, clock: Clock) -> None:
         self._motion, self._gripper, self._clock = motion, gripper, clock
@@ -179,31 +178,31 @@ class GripperExecutor:
         )
 
     def halt(self, sample: Sample, elapsed_s: float) -> None:
-        """Let the pads stay where they are, unless they rest already: what ends a motion early is meant for them too."""
+        """Stop the pads where they are, unless they rest already: an early end of the motion applies to them too."""
         if not sample.gripper_is_moving and elapsed_s >= GRIP_START_S:
             return
         try:
             self._move_to(sample.gripper_width_m)
         except CellError:
-            pass  # it may be what has failed
-        except Exception:  # a defect of its driver: the arm must come to rest all the same
+            pass  # the gripper may be the device that failed
+        except Exception:  # a defect of the driver must not keep the arm from coming to rest
             log.exception("halting %s", self._gripper.name)
 
     def check_end(self, sample: Sample) -> None:
-        """Is the width what the pads were sent to, where they hold nothing?
+        """Check that pads which hold nothing have reached the width that they were sent to.
 
         Raises:
-            DeviceFailure: it cannot be.
+            DeviceFailure: the reported width contradicts the command.
         """
         if self._motion.must_arrive:
             refuse(wrong_width(self._gripper.name, sample.pads, sent_m=self._sent_m, begun_m=self.begun_m))
 
     def wanted(self, tick: Tick) -> Array:
-        """Where it is."""
+        """Return the last set-point."""
         return tick.last_rad
 
     def is_over(self, tick: Tick) -> bool:
-        """The pads have rested for a moment, or the time is over."""
+        """Return whether the pads have rested for a moment, or the time is over."""
         if tick.sample.gripper_is_moving or tick.elapsed_s < GRIP_START_S:
             self._resting_since_s = None
         elif self._resting_since_s is None:
@@ -219,7 +218,7 @@ def begin(
     sample: Sample,
     clock: Clock,
 ) -> Executor:
-    """The run of a motion that starts at the measured joints of `sample`."""
+    """Return the executor of a motion that starts at the measured joints of `sample`."""
     match motion:
         case JointTrajectory():
             return TrajectoryExecutor(motion, sample.position_rad)
@@ -232,6 +231,6 @@ def begin(
 
 
 def _fade(elapsed_s: float) -> float:
-    """1 at the start, 0 after BLEND_S, level at both ends."""
+    """Return a weight that falls smoothly from 1 at the start to 0 after BLEND_S."""
     u = min(1.0, elapsed_s / BLEND_S)
     return 1.0 - u * u * (3.0 - 2.0 * u)

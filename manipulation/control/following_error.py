@@ -1,4 +1,4 @@
-"""Does the arm stand where it says? An arm that is believed wrongly leaps there with its next set-point."""
+"""Checks that the arm stands where it reports: a wrong position would make it jump with its next set-point."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from manipulation.plausibility.arm import does_not_follow
 
 
 class FollowingErrorMonitor:
-    """Compares where an arm says that it stands with where its drives have it, before anything moves.
+    """Compares the position that an arm reports with the one that its drives hold, before anything moves.
 
     Args:
         arm: its name in the cell file.
-        flange_from_grip: (4, 4) the tips, where a difference of joints is measured in metres.
+        flange_from_grip: (4, 4) pose of the finger tips, where a difference of joints is measured in metres.
     """
 
     def __init__(self, arm: str, kinematics: Kinematics, flange_from_grip: Array, drives: Drives) -> None:
@@ -26,26 +26,27 @@ class FollowingErrorMonitor:
         self._kinematics = kinematics
         self._grip = flange_from_grip
         self._drives = drives
-        self._is_doubted = False  # since it failed, until it takes a set-point where it says that it stands
+        self._is_doubted = False  # from a failure until the arm accepts a set-point at its reported position
 
     def check_held(self, measured_rad: Array, held: SetPointLimiter) -> None:
-        """Refuse to begin where readings put an arm that is held elsewhere: it would leap there.
+        """Refuse to begin when the arm reports a position far from where its drives hold it: it would jump there.
 
         Args:
-            measured_rad: (n,) what the arm says.
-            held: what was sent last.
+            measured_rad: (n,) joints that the arm reports.
+            held: the limiter that keeps the last set-point sent.
 
         Raises:
-            DeviceFailure: the drives are on, and the arm says that it is far from where they hold it.
+            DeviceFailure: the drives are on, and the arm reports a position far from where they hold it.
         """
         if self._drives.are_on:
             self._check_near(measured_rad, held.last_rad, "{} from where it was sent")
 
     def resume(self, measured_rad: Array, filter_: SetPointLimiter) -> None:
-        """Drives on, the set-point where the arm says that it is.
+        """Switch the drives on, with the set-point where the arm reports that it is.
 
         Raises:
-            DeviceFailure: the drives refuse, or an arm that has failed takes a set-point far from there.
+            DeviceFailure: the drives refuse, or after a failure the arm accepts a set-point far from its reported
+                position.
         """
         filter_.begin_at(measured_rad)
         self._drives.switch_on()
@@ -55,7 +56,10 @@ class FollowingErrorMonitor:
             self._is_doubted = False
 
     def give_up(self, failed: str | None) -> None:
-        """If it is the arm that failed, its own brake holds it: no set-point can be trusted to be where it is."""
+        """Switch the drives off if it was the arm that failed, so that its brake holds it.
+
+        Its reported position is not trusted, so no set-point is known to be where the arm is.
+        """
         if failed == self._arm:
             self._is_doubted = True
             self._drives.switch_off()

@@ -1,4 +1,4 @@
-"""Guards: what ends a motion. Quantities are computed once a tick, and only when a guard asks for them."""
+"""Guards, the conditions that end a motion; a quantity is computed once per tick, if a guard needs it."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from hal.motion import Guard, Quantity
 from manipulation.arm import kernels as arm_kernels
 
 RISE_WINDOW_S = 0.4
-RISE_AFTER_S = 0.15  # a motion that begins under load takes it up again first; an arm behind a wire is 50 ms later
+RISE_AFTER_S = 0.15  # a motion that begins under load first builds that load up again; a networked arm is 50 ms later
 RISE_SAMPLE_S = 0.016  # the running median is refreshed at 62 Hz; a contact rises within a few of these
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Measured:
-    """What guards may ask for in one tick: contact wrench (6,) and tool pose (4, 4) measured, tip commanded (3,)."""
+    """The inputs of guards in one tick: contact wrench (6,) and tool pose (4, 4) measured, tip commanded (3,) m."""
 
     elapsed_s: float
     wrench: Array
@@ -31,13 +31,13 @@ class Measured:
 
 
 class GuardSet:
-    """The guards of one motion, with their memories."""
+    """The guards of one motion, with their state."""
 
     def __init__(self, guards: Sequence[Guard], start_tool: Array) -> None:
         self._watches = [_GuardMonitor(guard, start_tool) for guard in guards]
 
     def tripped(self, now: Measured) -> Guard | None:
-        """The first guard that has held for its ticks, or None."""
+        """Return the first guard whose condition has held for its number of ticks, or None."""
         for watch in self._watches:
             if watch.holds(now):
                 return watch.guard
@@ -45,7 +45,7 @@ class GuardSet:
 
 
 class _GuardMonitor:
-    """One guard: how many ticks it has held, and the running median when it watches a rise."""
+    """One guard, the number of ticks for which it has held, and the running median if it watches a rise."""
 
     def __init__(self, guard: Guard, start_tool: Array) -> None:
         self.guard = guard
@@ -59,7 +59,8 @@ class _GuardMonitor:
     def holds(self, now: Measured) -> bool:
         value = self._value(now)
         beyond = value <= self.guard.limit if self.guard.below else value >= self.guard.limit
-        self._held = self._held + 1 if beyond else 0  # NaN compares false, so "nothing in range" never trips
+        # NaN compares false, so "nothing in range" never trips a guard.
+        self._held = self._held + 1 if beyond else 0
         return self._held >= self.guard.ticks
 
     def _value(self, now: Measured) -> float:

@@ -1,6 +1,6 @@
-"""Compiled inner loops of the control tick: where a motion wants the joints, and what the tool measures.
+"""Compiled inner loops of the control tick: the joints that a motion wants, and what the tool measures.
 
-Arrays as in `manipulation.arm.kernels`; the tests hold a numpy oracle beside each.
+Arrays are as in `manipulation.arm.kernels`; the tests compare each kernel with a numpy implementation.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from manipulation.arm.kernels import follow_pose, frames, rotation_exp
 def pose_on_path(
     times_s: Array, ways: Array, speeds: Array, points: Array, rotations: Array, turns: Array, t_s: float
 ) -> Array:
-    """The pose (4, 4) at `t_s` on a path: points (N, 3), rotations (N, 3, 3), turns (N - 1, 3) from one to the next.
+    """Return the pose (4, 4) at `t_s` on a path of points (N, 3), rotations (N, 3, 3) and turns (N - 1, 3).
 
-    Straight and with constant turn between neighbours, R(f) = Exp(f w) R_i, as `hal.geometry.interpolate`. The way
-    along the path (ways (N,), speeds (N,)) is a cubic Hermite in time, so that the speed has no steps: with constant
-    speed between samples 20 ms apart the tool's inertia made 6 N at every start.
+    Between neighbours the path is straight with a constant turn w, R(f) = Exp(f w) R_i, as in
+    `hal.geometry.interpolate`. The distance along the path (ways (N,), speeds (N,)) is a cubic Hermite polynomial in
+    time. It makes the speed continuous, because a constant speed between samples 20 ms apart causes 6 N of tool inertia
+    at every start.
     """
     out = np.eye(4)
     last = times_s.shape[0] - 1
@@ -56,8 +57,9 @@ def path_joints(
     q: Array,
     damping: float,
 ) -> Array:
-    """Joints (n,) near `q` for the path's pose at `t_s`, moved by `shift` (6,) in base axes and by `offset` (6,) in
-    tool axes.
+    """Return the joints (n,) near `q` for the path's pose at `t_s`, displaced by `shift` and `offset`.
+
+    `shift` (6,) is in base axes, `offset` (6,) in tool axes; translation first, then rotation vector.
     """
     pose = pose_on_path(times_s, ways, speeds, points, rotations, turns, t_s)
     rotation = rotation_exp(shift[3:]) @ np.ascontiguousarray(pose[:3, :3])
@@ -68,7 +70,7 @@ def path_joints(
 
 @compiled
 def hermite(times_s: Array, positions: Array, velocities: Array, t_s: float) -> Array:
-    """The cubic Hermite interpolant (n,) through (N, n) positions and velocities; constant beyond the ends."""
+    """Return the cubic Hermite interpolant (n,) through (N, n) positions and velocities; constant beyond the ends."""
     last = times_s.shape[0] - 1
     if t_s <= times_s[0]:
         return np.copy(positions[0])
@@ -87,10 +89,10 @@ def hermite(times_s: Array, positions: Array, velocities: Array, t_s: float) -> 
 def admittance_step(
     state: Array, wrench: Array, stiffness: Array, damping: Array, mass: Array, bound: Array, dt_s: float
 ) -> None:
-    """One semi-implicit Euler step of m a + d v + k x = f per axis, in place; `state`: (2, 6) offset and velocity.
+    """Make one semi-implicit Euler step of m a + d v + k x = f per axis, in place; `state` (2, 6): offset, velocity.
 
     Damping and spring act implicitly, so that the step is stable for any gain. An axis with infinite stiffness stays
-    at 0. Beyond `bound` (6,) the offset stops.
+    at 0. The offset stops at `bound` (6,).
     """
     for k in range(6):
         if np.isinf(stiffness[k]):
@@ -108,7 +110,7 @@ def admittance_step(
 
 @inlined
 def wrench_at(wrench: Array, child_from_parent: Array) -> Array:
-    """A wrench (6,) given in the parent about its origin, seen in the child about the child's origin.
+    """Return a wrench (6,), given in the parent about its origin, in child axes about the child's origin.
 
     f' = R f,  t' = R t + p x R f  with child_from_parent = (R, p).
     """
@@ -124,7 +126,10 @@ def wrench_at(wrench: Array, child_from_parent: Array) -> Array:
 
 @inlined
 def weight_at(up_m_per_s2: Array, mass_kg: float, centre_m: Array) -> Array:
-    """Wrench (6,) of gravity about the sensor: f = -m g up, t = c x f. `up_m_per_s2`: g times "up" in sensor axes."""
+    """Return the wrench (6,) of gravity about the sensor: f = -m g up, t = c x f.
+
+    `up_m_per_s2` (3,) is g times the upward unit vector in sensor axes.
+    """
     out = np.empty(6)
     for k in range(3):
         out[k] = -mass_kg * up_m_per_s2[k]
@@ -148,9 +153,9 @@ def tick_view(
     centre_m: Array,
     gravity_m_per_s2: float,
 ) -> tuple[Array, Array, Array]:
-    """All that a tick looks at: base_from_tool (4, 4), commanded tip (3,), contact wrench (6,) in tool axes.
+    """Return all that a tick needs: base_from_tool (4, 4), commanded tip (3,), contact wrench (6,) in tool axes.
 
-    contact = raw - bias - weight in sensor axes, carried over to the tool.
+    The contact wrench is raw - bias - weight in sensor axes, transformed to the tool.
     """
     n = dh.shape[0]
     flange = np.ascontiguousarray(frames(dh, q)[n])
@@ -171,7 +176,7 @@ def tick_view(
 
 
 def warm(dh: Array) -> None:
-    """Compile (or load from the cache) every kernel of the control tick, so that no tick waits for a compiler."""
+    """Compile every kernel of the control tick (or load it from the cache), so that no tick waits for a compiler."""
     n, eye = dh.shape[0], np.eye(4)
     q = np.full(n, 0.1)
     times, points, rotations = np.array([0.0, 1.0]), np.zeros((2, 3)), np.array([np.eye(3), np.eye(3)])

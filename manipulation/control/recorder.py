@@ -1,4 +1,4 @@
-"""What a motion did, sampled for its report."""
+"""Samples what a motion did, for its report."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class Recorder:
         self._ticks = 0
         self._rows: list[tuple[float, Array, Array, Array]] = []
         self.peak_force_n = 0.0
-        self.started_s = 0.0  # cell clock, of the first sample
+        self.started_s = 0.0  # time of the first sample on the cell clock
 
     def note(self, elapsed_s: float, q_rad: Array, wrench: Array, tip_m: Array) -> None:
-        """Take one tick in."""
+        """Record one tick."""
         force = math.sqrt(float(wrench[:3] @ wrench[:3]))
         self.peak_force_n = max(self.peak_force_n, force)
         if self._ticks % self._stride == 0:
@@ -31,7 +31,7 @@ class Recorder:
         self._ticks += 1
 
     def log(self, joints: int) -> MotionLog:
-        """The samples so far; empty arrays of the right shape when nothing ran."""
+        """Return the samples so far; empty arrays of the right shape when nothing ran."""
         if not self._rows:
             return MotionLog(
                 times_s=np.empty(0),

@@ -1,4 +1,4 @@
-"""One look at all motion devices per control tick, and the contact wrench behind the raw one."""
+"""Reads all motion devices once per control tick, and computes the contact wrench from the raw one."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ log = logging.getLogger(__name__)
 
 GRAVITY_M_PER_S2 = 9.80665
 RANGE_WAIT_S = 0.004
-READ_WAIT_S = 0.02  # longest that one tick waits for a device; a tick itself lasts 2 to 8 ms
-PACED_WAIT_S = 1.0  # the same where the world stands still so long: a busy machine is no broken device
+READ_WAIT_S = 0.02  # longest wait of one tick for a device; a tick itself lasts 2 to 8 ms
+PACED_WAIT_S = 1.0  # the same on a clock that stops while waiting: a busy computer is not a broken device
 STALE_WAIT_S, STALE_STEP_S = 0.1, 0.002
-COMMAND_WAIT_S = 0.25  # for what crosses a slow bus once a motion, not every tick
+COMMAND_WAIT_S = 0.25  # for commands sent over a slow bus once per motion, not every tick
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sample:
-    """What the devices said in one tick; `raw_wrench` (6,) in sensor axes with bias and weight inside."""
+    """The readings of one tick; `raw_wrench` (6,) is in sensor axes and still contains bias and weight."""
 
     stamp_s: float
     position_rad: Array
@@ -48,7 +48,7 @@ class Sample:
 
     @property
     def pads(self) -> Pads:
-        """What the gripper said of its pads."""
+        """State of the pads as the gripper reported it."""
         return Pads(width_m=self.gripper_width_m, is_moving=self.gripper_is_moving, is_holding=self.gripper_is_holding)
 
 
@@ -67,25 +67,27 @@ class DeviceFailure(Exception):
     """A device could not be used in this tick; `device` names it."""
 
     def __init__(self, device: str, cause: str) -> None:
-        super().__init__(cause if cause.startswith(device) else f"{device}: {cause}")  # drivers name themselves
+        # Some drivers begin with their name.
+        super().__init__(cause if cause.startswith(device) else f"{device}: {cause}")
         self.device = device
         self.cause = cause
 
 
 def refuse(finding: Finding | None) -> None:
-    """End the motion if a device is not believed.
+    """End the motion if there is a finding, that is, if a device is not to be believed.
 
     Raises:
-        DeviceFailure: there is a finding; with its cause.
+        DeviceFailure: there is a finding; carries its cause.
     """
     if finding is not None:
         raise DeviceFailure(finding.device, finding.cause)
 
 
 class RangeReader:
-    """A proximity sensor in the control loop: its newest distance, NaN when nothing is within range.
+    """Reads the newest distance of a proximity sensor in the control loop; NaN when nothing is within range.
 
-    A range sensor on a slow wire misses a beat now and then. It stops the arm only when nothing has come for `patience_s`.
+    A range sensor on a slow bus misses a reading now and then, so it is a failure only when nothing has come for
+    `patience_s`.
     """
 
     def __init__(self, sensor: Proximity, clock: Clock, *, max_age_s: float, patience_s: float) -> None:
@@ -102,10 +104,10 @@ class RangeReader:
         return self._sensor.name
 
     def read(self, now_s: float) -> float:
-        """The distance, m.
+        """Return the distance, m.
 
         Raises:
-            CellError: silent or stale for longer than the patience, or broken.
+            CellError: the sensor has been silent or stale for longer than `patience_s`, or is broken.
         """
         try:
             self._value_m = self._fresh(now_s)
@@ -124,12 +126,12 @@ class RangeReader:
 
 
 def read_wait_s(clock: Clock) -> float:
-    """How long one tick may wait for a device."""
+    """Return how long one tick may wait for a device."""
     return PACED_WAIT_S if isinstance(clock, PacedClock) else READ_WAIT_S
 
 
 def command_wait_s(clock: Clock) -> float:
-    """How long a motion may wait at its begin or end for a command to be taken."""
+    """Return how long a motion may wait, at its begin or end, for a device to accept a command."""
     return 2.0 * PACED_WAIT_S if isinstance(clock, PacedClock) else COMMAND_WAIT_S
 
 
@@ -148,11 +150,12 @@ class Devices:
     def read(self, before: Sample | None = None) -> Sample:
         """Read the devices once; with the sample `before`, gripper and proximity are taken over from it.
 
-        Those two are slow by nature: reading them every fourth tick leaves time for the others.
+        Gripper and proximity sensors are slow: the caller reads them every fourth tick, which leaves time for the
+        others.
 
         Raises:
-            DeviceFailure: the first device that is silent, broken, stale or invalid. "Nothing in range" is a
-            proximity reading.
+            DeviceFailure: the first device that is silent, broken, stale or invalid. "Nothing in range" is a valid
+                proximity reading.
         """
         joints = self._joints()
         now_s = self.clock.now_s()
@@ -186,10 +189,10 @@ class Devices:
         )
 
     def _joints(self) -> JointState:
-        """The arm's newest state; an old one is waited out for a moment on a wall clock.
+        """Return the arm's newest state; on a wall clock, wait a moment if it is old.
 
-        No set-point goes out meanwhile, so nothing moves on unseen. An arm that fails latches the stop: a machine that stood still
-        for a tenth of a second is no reason for that.
+        No set-point goes out while waiting, so nothing moves unobserved. A failed arm latches the stop, which would be
+        too strict for a computer that only paused for a tenth of a second.
         """
         began_s = self.clock.now_s()
         while True:
@@ -205,7 +208,7 @@ class Devices:
             self.clock.sleep(STALE_STEP_S)
 
     def _may_wait(self, waited_s: float) -> bool:
-        """In lockstep a reading is never old by chance, and waiting would move the world."""
+        """Return whether to wait for a newer reading; never in lockstep, where waiting would move the world."""
         return not isinstance(self.clock, SimClock) and waited_s < STALE_WAIT_S
 
     def _ask(self, device: str, read: Callable[..., Stamped[T]], now_s: float, deadline: Deadline) -> T:
@@ -225,9 +228,10 @@ class Devices:
 
 
 def failure_of(device: str, error: Exception) -> DeviceFailure:
-    """By the name that the error itself gives, if it does: a device may stand for others.
+    """Return the failure that stands for an error, named after the device in the error if it gives one.
 
-    A defect of a driver is a failure of its device: it must end a motion as gently as a loose cable does.
+    A device may stand for others, so the error's own name goes first. A defect of a driver counts as a failure of its
+    device, because it must end a motion as gently as a loose cable does.
     """
     if not isinstance(error, CellError):
         log.error("%s: its driver failed", device, exc_info=error)
@@ -237,12 +241,12 @@ def failure_of(device: str, error: Exception) -> DeviceFailure:
 
 
 def _check_finite(device: str, values: Array) -> None:
-    if not math.isfinite(values @ values):  # a sum hides neither NaN nor infinity
+    if not math.isfinite(values @ values):  # a sum of squares keeps NaN and infinity
         raise DeviceFailure(device, "a reading is not finite")
 
 
 class ContactWrench:
-    """Takes bias and tool weight off the raw wrench: contact = raw - bias - weight, sensor axes.
+    """Removes bias and tool weight from the raw wrench: contact = raw - bias - weight, sensor axes.
 
     weight: f = m R^T g, t = c x f, with R the rotation base_from_sensor and c the centre of mass in sensor axes.
     """
@@ -254,13 +258,13 @@ class ContactWrench:
         self.bias = np.asarray(load.bias, float)
 
     def weight(self, base_from_flange: Array) -> Array:
-        """(6,) what gravity alone makes the sensor read."""
-        # The third row of base_from_sensor is "up" seen by the sensor.
+        """Return the wrench (6,) that gravity alone causes at the sensor."""
+        # The third row of base_from_sensor is the "up" direction in sensor axes.
         up = base_from_flange[2, :3] @ self.flange_from_sensor[:3, :3]
         return np.asarray(kernels.weight_at(GRAVITY_M_PER_S2 * up, self.mass_kg, self.centre_m))
 
     def in_flange(self, raw_wrench: Array, base_from_flange: Array) -> Array:
-        """(6,) the contact wrench in flange axes about the flange."""
+        """Return the contact wrench (6,) in flange axes about the flange."""
         contact = raw_wrench - self.bias - self.weight(base_from_flange)
         return np.asarray(kernels.wrench_at(contact, self.flange_from_sensor))
 
@@ -275,10 +279,10 @@ class ToolReading:
 
 
 class ToolView:
-    """Carries samples over to one tool, with the wrench as the mean of two ticks.
+    """Computes what samples mean for one tool, with the wrench as the mean of two ticks.
 
-    Rubbing contacts change the sign of their friction from tick to tick, in the engine by 30 N and in a stiff wrist by
-    ringing; the mean of two ticks cancels that at the price of half a tick of delay.
+    In sliding contact the friction changes its sign from tick to tick, by 30 N in the physics engine and by ringing in
+    a stiff wrist. The mean of two ticks cancels that and costs half a tick of delay.
     """
 
     def __init__(self, dh: Array, contact: ContactWrench, flange_from_tool: Array) -> None:
@@ -289,7 +293,7 @@ class ToolView:
         self._before: Array | None = None
 
     def look(self, sample: Sample, commanded_rad: Array) -> ToolReading:
-        """What the tool is and feels in this tick."""
+        """Return the pose and the contact wrench of the tool in this tick."""
         contact = self._contact
         pose, tip, now = kernels.tick_view(
             self._dh,

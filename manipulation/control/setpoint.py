@@ -19,11 +19,11 @@ START_RAD = 0.05
 START_M = 0.005
 SPEED_SLACK = 1.05
 RESTING_RAD_PER_S = 1e-4
-LOOK_BACK_TICKS = 3  # with one, 10 % of jitter in the ticks tripled the error behind a steady course
+LOOK_BACK_TICKS = 3  # with one, 10 % of jitter in the ticks triples the following error of a steady motion
 
 
 class SetPointLimiter:
-    """Finite, within joint range, speed and acceleration, and tip speed; remembers what was really sent."""
+    """Keeps set-points finite and within joint range, speed, acceleration and tip speed; keeps the one sent last."""
 
     def __init__(self, kinematics: Kinematics, flange_from_tool: Array, tip_limit_m_per_s: float, dt_s: float) -> None:
         self._kinematics = kinematics
@@ -35,16 +35,16 @@ class SetPointLimiter:
         self.velocity_rad_per_s = np.zeros(len(kinematics.dh))
 
     def begin_at(self, measured_rad: Array) -> None:
-        """The first set-point after any resume is the measured position."""
+        """Start from the measured position, which is the first set-point after every resume."""
         self.last_rad = np.clip(measured_rad, self._kinematics.lower_rad, self._kinematics.upper_rad)
         self.velocity_rad_per_s = np.zeros_like(measured_rad)
         self._wanted_rad[:] = self.last_rad
 
     def apply(self, wanted_rad: Array) -> Array:
-        """The set-point that may be sent.
+        """Return the set-point that may be sent.
 
         Raises:
-            DeviceFailure: the wanted one is not finite.
+            DeviceFailure: the wanted set-point is not finite.
         """
         if not math.isfinite(wanted_rad @ wanted_rad):
             raise DeviceFailure("controller", "a set-point was not finite")
@@ -59,26 +59,26 @@ class SetPointLimiter:
         return out
 
     def brake(self) -> Array:
-        """The set-point of a tick that only slows down, each joint as fast as it may."""
+        """Return the set-point of a tick that only slows down, each joint as fast as its limit allows."""
         self._wanted_rad[:] = self.last_rad
         return self.apply(self.last_rad)
 
     def sent(self, position_rad: Array) -> None:
-        """What the arm says that it sent to its drives."""
+        """Note the set-point that the arm reports as sent to its drives."""
         self.velocity_rad_per_s = (position_rad - self.last_rad) / self._dt_s
         self.last_rad = position_rad
 
     @property
     def is_at_rest(self) -> bool:
-        """Does the set-point stand still?"""
+        """Whether the set-point stands still."""
         return bool(np.abs(self.velocity_rad_per_s).max() < RESTING_RAD_PER_S)
 
 
 def check(motion: DeclaredMotion, kinematics: Kinematics, measured_rad: Array) -> None:
-    """Refuse a motion that cannot be meant.
+    """Refuse a motion that cannot be intended.
 
     Raises:
-        MotionRefused: not finite, times that do not rise, outside joint range or speed, or a start that is far away.
+        MotionRefused: values not finite, times that do not rise, outside joint range or speed, or a start too far away.
     """
     match motion:
         case JointTrajectory():
@@ -142,5 +142,5 @@ def _refused(motion: DeclaredMotion, what: str, hint: str) -> MotionRefused:
 
 
 def flange_matrix(pose: RigidTransform) -> Array:
-    """A pose as the contiguous (4, 4) array that the kernels take."""
+    """Return a pose as the contiguous (4, 4) array that the kernels take."""
     return np.ascontiguousarray(pose.as_matrix())

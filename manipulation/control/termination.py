@@ -1,4 +1,4 @@
-"""What ends a motion early: the stop latch, its caller, its guards, and those that hold in every motion."""
+"""Ends a motion early: by the stop latch, by its caller, by its own guards, and by the guards of every motion."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from manipulation.control.sensing import Sample, ToolReading
 from manipulation.plausibility.arm import FOLLOWING_LIMIT_M
 
 TRACKING_TICKS = 5
-LOADED_START_RATIO = 1.2  # otherwise a jammed hand could never be taken away
+LOADED_START_RATIO = 1.2  # without this, a jammed hand could never be freed
 RAN = "ran to its declared end"
 SETTLE_S = 0.3
 CATCH_UP_S = 2.0  # for a set-point that speed limits hold back
@@ -43,14 +43,14 @@ class Termination:
 
 
 class TerminationMonitor:
-    """Looks every tick whether the motion must end.
+    """Checks every tick whether the motion must end.
 
     Args:
-        declared: the guards that the motion brings.
-        force_limit_n: holds in every motion.
-        look: what is measured at its start.
+        declared: the motion's own guards.
+        force_limit_n: limit of the contact force, which holds in every motion.
+        look: the measurement at the start of the motion.
         arm: name of the device that is at fault when the arm does not follow.
-        is_latched, is_cancelled: asked every tick.
+        is_latched, is_cancelled: called every tick.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class TerminationMonitor:
         self._is_cancelled = is_cancelled
 
     def ending(self, elapsed_s: float, sample: Sample, look: ToolReading) -> Termination | None:
-        """Why the motion must end now, or None."""
+        """Return why the motion must end now, or None."""
         if self._is_latched():
             return Termination(outcome=MotionOutcome.STOPPED, cause="the stop latch was set")
         if self._is_cancelled():
@@ -103,7 +103,10 @@ class TerminationMonitor:
 
 
 def _standing_guards(force_limit_n: float, wrench: Array) -> tuple[Guard, ...]:
-    """Force and tracking hold in every motion; one that begins under load may go on while that does not grow."""
+    """Return the guards of every motion: force and tracking.
+
+    A motion that begins under load gets a higher force limit, so that it may go on while the load does not grow.
+    """
     loaded_n = LOADED_START_RATIO * float(np.linalg.norm(wrench[:3]))
     force_n = max(force_limit_n, loaded_n)
     return (
@@ -119,24 +122,24 @@ def _standing_guards(force_limit_n: float, wrench: Array) -> tuple[Guard, ...]:
 
 
 def has_settled(motion: DeclaredMotion, left_rad: Array, velocity_rad_per_s: Array, over_s: float) -> bool:
-    """Return whether a motion that has run its course is at its end.
+    """Return whether a motion that has run to its end has also come to rest there.
 
     Args:
-        left_rad: (n,) how far the set-point is from where the motion wants it, not negative.
+        left_rad: (n,) distance from the set-point to the wanted one, not negative.
         velocity_rad_per_s: (n,) of the arm.
-        over_s: time since the course was run.
+        over_s: time since the motion has run to its end.
     """
     if isinstance(motion, Hold | GripperMotion):
         return True
     is_behind = left_rad.max() >= SETTLED_RAD
     if not is_behind and np.abs(velocity_rad_per_s).max() < SETTLED_RAD_PER_S:
         return True
-    # A path may be far from its joints for good, where it yields; a trajectory's set-point is only on its way.
+    # A compliant path may stay away from its joints; the set-point of a trajectory is only late.
     return over_s >= (CATCH_UP_S if is_behind and isinstance(motion, JointTrajectory) else SETTLE_S)
 
 
 def cause_of_end(motion: DeclaredMotion, left_rad: Array) -> str:
-    """Say that a motion is completed, and when limits have kept a trajectory's set-point from its end."""
+    """Say that a motion is completed, and whether limits have kept a trajectory's set-point from its end."""
     k = int(np.argmax(left_rad))
     if left_rad[k] < SETTLED_RAD or not isinstance(motion, JointTrajectory):
         return RAN

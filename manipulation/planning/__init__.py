@@ -1,1 +1,1 @@
-"""Where the arm may go: shapes and gaps, collision-free transfers, straight and curved paths, and their timing."""
+"""Planning: collision shapes and distances, collision-free transfers, straight and curved paths, and their timing."""

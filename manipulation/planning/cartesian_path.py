@@ -1,6 +1,6 @@
 """Cartesian paths: lines, arcs and sequences of poses, each from rest to rest with ramped speed.
 
-A step of the speed alone makes more than 8 N of tool inertia at 60 mm/s, which looks like contact; so every path
+A step of the speed causes more than 8 N of tool inertia at 60 mm/s, which looks like contact. Therefore every path
 begins and ends with a ramp.
 """
 
@@ -18,7 +18,7 @@ from hal.geometry import difference, interpolate
 from hal.motion import CartesianPath, Compliance, Guard
 
 RAMP_M_PER_S2 = 0.5  # a 0.9 kg tool pushes 0.5 N at this acceleration, far below any contact threshold
-TURN_ARM_M = 0.10  # a turn of 1 rad counts as this much way when a path is timed
+TURN_ARM_M = 0.10  # a turn of 1 rad counts as this much distance when a path is timed
 SAMPLE_S = 0.02
 
 
@@ -33,7 +33,7 @@ def line(
     compliance: Compliance | None = None,
     ramp_m_per_s2: float = RAMP_M_PER_S2,
 ) -> CartesianPath:
-    """A straight move with constant turn between two tool poses in the base frame."""
+    """Return a straight move with constant turn between two tool poses in the base frame."""
     way = _way(start, end)
     return along(
         lambda s: interpolate(start, end, s / way if way > 0 else 1.0),
@@ -58,7 +58,7 @@ def through(
     slow_last_m: float = 0.0,
     slow_ratio: float = 0.3,
 ) -> CartesianPath:
-    """A path through dense poses; over the last `slow_last_m` the speed is `slow_ratio` of the rest."""
+    """Return a path through closely spaced poses; over the last `slow_last_m` the speed is `slow_ratio` of the rest."""
     marks = np.concatenate([[0.0], np.cumsum([_way(a, b) for a, b in itertools.pairwise(poses)])])
 
     def pose_at(s: float) -> RigidTransform:
@@ -92,7 +92,7 @@ def along(
     slow_last_m: float = 0.0,
     slow_ratio: float = 0.3,
 ) -> CartesianPath:
-    """Sample `pose_at(s)`, s from 0 to `way_m`, in time with a trapezoid of speed."""
+    """Sample `pose_at(s)`, s from 0 to `way_m`, in time with a trapezoidal speed profile."""
     times, places = ramped(
         way_m, speed_m_per_s, ramp_m_per_s2=ramp_m_per_s2, slow_last_m=slow_last_m, slow_ratio=slow_ratio
     )
@@ -114,7 +114,7 @@ def ramped(
     slow_last_m: float = 0.0,
     slow_ratio: float = 0.3,
 ) -> tuple[Array, Array]:
-    """Times (N,) s and places (N,) m of a move from rest to rest: ramp, cruise, an optional slow end, ramp.
+    """Return times (N,) s and distances (N,) m of a move from rest to rest: ramp, cruise, an optional slow end, ramp.
 
     v(s) = min(v_max, sqrt(2 a s), sqrt(2 a (way - s))), and near the slow part sqrt(v_slow^2 + 2 a (s_slow - s)).
     """
@@ -135,7 +135,7 @@ def ramped(
 def arc(
     start: RigidTransform, *, centre_m: ArrayLike, axis: ArrayLike, angle_rad: float, step_rad: float = 0.03
 ) -> tuple[RigidTransform, ...]:
-    """Poses from `start` turned rigidly about a line in the base frame, in even steps; both ends included."""
+    """Return the poses of `start` turned rigidly about a line in the base frame, in even steps; both ends included."""
     centre = np.asarray(centre_m, float)
     unit = np.asarray(axis, float) / np.linalg.norm(axis)
     count = max(2, int(np.ceil(abs(angle_rad) / step_rad)) + 1)
@@ -143,13 +143,13 @@ def arc(
 
 
 def turned_about(pose: RigidTransform, centre_m: Array, unit_axis: Array, angle_rad: float) -> RigidTransform:
-    """The pose turned by `angle_rad` about the line through `centre_m`, all in the base frame."""
+    """Return the pose turned by `angle_rad` about the line through `centre_m`, all in the base frame."""
     turn = Rotation.from_rotvec(angle_rad * unit_axis)
     return RigidTransform.from_components(centre_m + turn.apply(pose.translation - centre_m), turn * pose.rotation)
 
 
 def shifted(pose: RigidTransform, offset_m: ArrayLike) -> RigidTransform:
-    """The pose moved by an offset given in its own axes."""
+    """Return the pose moved by an offset given in its own axes."""
     return pose * RigidTransform.from_translation(np.asarray(offset_m, float))
 
 

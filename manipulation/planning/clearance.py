@@ -1,4 +1,4 @@
-"""Compiled distances: capsules of the arm against boxes, and against one another."""
+"""Compiled distances between the capsules of the arm and boxes, and between two capsules."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SEARCH_STEPS = 16  # 0.618^16 of a 0.5 m link: 0.2 mm of arc, far less in distan
 
 @inlined
 def point_box(x: float, y: float, z: float, half: Array) -> float:
-    """Signed distance from a point in box axes to the box: negative inside."""
+    """Return the signed distance from a point in box axes to the box, negative inside."""
     dx, dy, dz = abs(x) - half[0], abs(y) - half[1], abs(z) - half[2]
     ox, oy, oz = max(dx, 0.0), max(dy, 0.0), max(dz, 0.0)
     return float(np.sqrt(ox * ox + oy * oy + oz * oz) + min(max(dx, dy, dz), 0.0))
@@ -25,7 +25,7 @@ def point_box(x: float, y: float, z: float, half: Array) -> float:
 
 @compiled
 def segment_box(start: Array, end: Array, rotation: Array, middle: Array, half: Array) -> float:
-    """Least signed distance between the segment and the box (rotation: base_from_box)."""
+    """Return the least signed distance between the segment and the box (rotation: base_from_box)."""
     a, b = np.empty(3), np.empty(3)
     for k in range(3):
         a[k] = b[k] = 0.0
@@ -54,7 +54,7 @@ def segment_box(start: Array, end: Array, rotation: Array, middle: Array, half: 
 
 @compiled
 def segment_segment(p1: Array, q1: Array, p2: Array, q2: Array) -> float:
-    """Least distance between two segments.
+    """Return the least distance between two segments.
 
     Source: Ericson, Real-Time Collision Detection, 2005, section 5.1.9.
     """
@@ -84,9 +84,7 @@ def segment_segment(p1: Array, q1: Array, p2: Array, q2: Array) -> float:
 
 @compiled
 def capsule_ends(dh: Array, q: Array, tool_ends: Array) -> Array:
-    """Ends (n + m, 2, 3) in the base of all capsules: n links from joint to joint, then the m of the tool on the
-    flange.
-    """
+    """Return the ends (n + m, 2, 3) in the base of all capsules: the n links, then the m of the tool on the flange."""
     n, m = dh.shape[0], tool_ends.shape[0]
     chain = frames(dh, q)
     out = np.empty((n + m, 2, 3))
@@ -116,17 +114,17 @@ def least_clearance(
     pairs: Index,
     enough: float,
 ) -> float:
-    """Least gap (m, negative when overlapping) over all watched capsule-box pairs and self pairs.
+    """Return the least gap (m, negative when overlapping) over all watched capsule-box pairs and self pairs.
 
-    `watched`: (capsules, boxes) of bool. Gaps above `enough` may be answered by a lower bound of theirs, and the
-    first gap below it ends the search, so a validity check is cheap; with `enough` infinite the answer is exact.
+    `watched`: (capsules, boxes) of bool. For gaps above `enough` a lower bound may be returned, and the first gap below
+    it ends the search, so a validity check is cheap. With `enough` infinite the result is exact.
     """
     ends = capsule_ends(dh, q, tool_ends)
     least = np.inf
     for i in range(ends.shape[0]):
         for j in range(halves.shape[0]):
             if watched[i, j]:
-                # The sphere round the box rules most pairs out before the search.
+                # The bounding sphere of the box rules out most pairs before the search.
                 reach = np.sqrt(np.dot(halves[j], halves[j]))
                 centre = 0.5 * (ends[i, 0] + ends[i, 1])
                 span = ends[i, 1] - ends[i, 0]
@@ -163,8 +161,9 @@ def first_hit(
     pairs: Index,
     margin: float,
 ) -> float:
-    """Fraction of the straight joint segment that is free: 1 when all of it is, checked every `step_rad` of the
-    fastest joint.
+    """Return the free fraction of the straight joint segment, 1 when all of it is free.
+
+    It is checked every `step_rad` of the fastest joint.
     """
     longest = np.max(np.abs(end - start))
     count = max(1, int(np.ceil(longest / step_rad)))
@@ -177,7 +176,7 @@ def first_hit(
 
 @compiled
 def overlap_counts(dh: Array, configurations: Array, tool_ends: Array, radii: Array, pairs: Index) -> Array:
-    """How many of the configurations (m, n) make each pair of capsules overlap, (k,)."""
+    """Return for each pair of capsules (k,) in how many of the configurations (m, n) it overlaps."""
     out = np.zeros(pairs.shape[0])
     for c in range(configurations.shape[0]):
         ends = capsule_ends(dh, configurations[c], tool_ends)

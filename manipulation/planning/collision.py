@@ -1,4 +1,4 @@
-"""Is the arm clear of the panel, of the floor and of itself?"""
+"""Collision checks of the arm against the panel, the floor and itself."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from manipulation.arm.kinematics import Kinematics
 from manipulation.planning import clearance
 from manipulation.planning.shapes import Capsule, CollisionBox
 
-RECHECK_RAD = 0.005  # the notes' goal: no collision when re-checked every 5 mrad
-SELF_SAMPLES = 400  # random joint vectors that tell which pairs of links always touch
+RECHECK_RAD = 0.005  # the requirement: no collision when re-checked every 5 mrad
+SELF_SAMPLES = 400  # random joint vectors that show which pairs of links always touch
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -45,7 +45,7 @@ class CollisionModel:
     def build(
         cls, kinematics: Kinematics, tool: Sequence[Capsule], boxes: Sequence[CollisionBox] = ()
     ) -> CollisionModel:
-        """A model with all pairs watched but those that always touch (neighbouring links, the foot and the floor)."""
+        """Build a model that watches all pairs but those that always touch (neighbouring links, foot and floor)."""
         radii = np.array([*kinematics.capabilities.link_radius_m, *(c.radius_m for c in tool)])
         ends = np.array([[c.start_m, c.end_m] for c in tool]).reshape(-1, 2, 3)
         bare = cls(
@@ -63,7 +63,7 @@ class CollisionModel:
         return replace(bare, self_pairs=bare._separable_pairs()).with_boxes(boxes)
 
     def with_boxes(self, boxes: Iterable[CollisionBox], *, ignored: Iterable[tuple[str, str]] = ()) -> CollisionModel:
-        """The same arm among other boxes; `ignored` pairs of (capsule or "", box) may touch."""
+        """Return the same arm among other boxes; `ignored` pairs of (capsule or "", box) may touch."""
         boxes = tuple(boxes)
         names = self.capsule_names
         watched = np.ones((len(names), len(boxes)), bool)
@@ -87,12 +87,12 @@ class CollisionModel:
 
     @property
     def capsule_names(self) -> tuple[str, ...]:
-        """`link1`... then the names of the tool's capsules."""
+        """`link1` and so on, then the names of the tool's capsules."""
         links = tuple(f"link{i + 1}" for i in range(len(self.kinematics.dh)))
         return links + tuple(c.name for c in self.tool)
 
     def clearance_m(self, q_rad: Array, *, enough_m: float = np.inf) -> float:
-        """Least gap over all watched pairs, negative when something overlaps."""
+        """Return the least gap over all watched pairs, m, negative when something overlaps."""
         return float(
             clearance.least_clearance(
                 self.kinematics.dh, q_rad, self.tool_ends, self.radii, self.rotations, self.middles, self.halves,
@@ -101,13 +101,13 @@ class CollisionModel:
         )  # fmt: skip
 
     def is_clear(self, q_rad: Array, *, margin_m: float) -> bool:
-        """Is every watched gap at least the margin?"""
+        """Return whether every watched gap is at least the margin."""
         return self.clearance_m(q_rad, enough_m=margin_m) >= margin_m
 
     def free_fraction(
         self, start_rad: Array, end_rad: Array, *, margin_m: float, step_rad: float = RECHECK_RAD
     ) -> float:
-        """How much of the straight joint segment is free, from its start: 1 when all of it is."""
+        """Return the fraction of the straight joint segment that is free, from its start: 1 when all of it is."""
         return float(
             clearance.first_hit(
                 self.kinematics.dh, start_rad, end_rad, step_rad, self.tool_ends, self.radii, self.rotations,
@@ -116,7 +116,7 @@ class CollisionModel:
         )  # fmt: skip
 
     def nearest(self, q_rad: Array) -> str:
-        """Names of the two things that are nearest to each other at `q_rad`, for error messages."""
+        """Return the names of the two things that are nearest to each other at `q_rad`, for error messages."""
         ends = clearance.capsule_ends(self.kinematics.dh, q_rad, self.tool_ends)
         names = self.capsule_names
         gaps = {
@@ -134,9 +134,9 @@ class CollisionModel:
         return min(gaps, key=lambda pair: gaps[pair]) if gaps else "nothing"
 
     def _separable_pairs(self) -> NDArray[np.int64]:
-        """Pairs of capsules, not neighbours, that are apart in at least half of all configurations."""
+        """Return the pairs of capsules, not neighbours, that are apart in at least half of all configurations."""
         kin = self.kinematics
-        rng = np.random.default_rng(0)  # which pairs can part is geometry; the seed only fixes the samples
+        rng = np.random.default_rng(0)  # the result depends on the geometry; the seed only fixes the samples
         count, links = len(self.radii), len(kin.dh)
         pairs = np.array(
             [(i, j) for i in range(count) for j in range(i + 2, count) if i < links - 1], np.int64
@@ -147,5 +147,5 @@ class CollisionModel:
 
 
 def placed(boxes: Iterable[CollisionBox], base_from_panel: RigidTransform) -> tuple[CollisionBox, ...]:
-    """Boxes of the panel frame in the base frame."""
+    """Return boxes of the panel frame in the base frame."""
     return tuple(box.moved(base_from_panel) for box in boxes)

@@ -1,4 +1,4 @@
-"""The shape of the hand: what collision checks and skills need to know about gripper and fingers."""
+"""The shape of the hand, as collision checks and skills need it."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Hand:
         finger_thickness_m: along x; two closed fingers are twice as thick.
         finger_width_m: along y.
         finger_length_m: from the tips back to the body.
-        body_half_m, body_back_m: the body as a box, half its edges, its middle this far behind the tips.
-        pad_stiffness_n_per_m: how much the pads give under load; a push of F leaves the finger F/k past the surface.
+        body_half_m, body_back_m: the body as a box: half its edges, and how far its middle is behind the tips.
+        pad_stiffness_n_per_m: stiffness of the pads; under a push of F the finger goes F/k past the surface.
     """
 
     finger_thickness_m: float = 0.007
@@ -36,7 +36,7 @@ class Hand:
         return self.finger_thickness_m, self.finger_width_m / 2
 
     def capsules(self, flange_from_grip: RigidTransform, width_m: float) -> tuple[Capsule, ...]:
-        """Fingers at an opening, body and wrist as capsules in flange axes."""
+        """Return the fingers at an opening, the body and the wrist as capsules in flange axes."""
         radius = float(np.hypot(self.finger_thickness_m, self.finger_width_m)) / 2
         across = width_m / 2 + self.finger_thickness_m / 2
         fingers = [
@@ -45,7 +45,7 @@ class Hand:
         ]
         half_x, half_y, half_z = self.body_half_m
         back = -self.body_back_m
-        # The body is wider than deep: two parallel capsules hold it with little waste.
+        # The body is wider than deep, so two parallel capsules enclose it tightly.
         x = half_x - half_y
         body = [
             _capsule(

@@ -1,7 +1,7 @@
 """RRT-Connect in joint space.
 
-Written here rather than taken from ompl: a seed per plan instead of one for the whole process, and no call back into
-Python for every state (a check costs microseconds, so the whole search stays in a few compiled calls).
+It is not taken from ompl, because it needs a seed per plan instead of one per process, and no call back into Python for
+every state (a check takes microseconds, so the whole search is a few compiled calls).
 
 Source: Kuffner and LaValle, ICRA 2000; shortcuts after Geraerts and Overmars, IJRR 26(8), 2007.
 """
@@ -19,7 +19,7 @@ Free = Callable[[Array, Array], float]
 
 
 class _Tree:
-    """Configurations with their parents, in growing arrays."""
+    """Configurations and their parents, in growing arrays."""
 
     def __init__(self, root: Array, weights: Array) -> None:
         self._q = np.empty((256, len(root)))
@@ -61,9 +61,9 @@ def connect(
     step_rad: float = 0.5,
     max_nodes: int = 4000,
 ) -> Array | None:
-    """A path (N, n) of free straight segments from start to goal, or None when the search ran out of nodes."""
+    """Return a path (N, n) of free straight segments from start to goal, or None when the search ran out of nodes."""
     rng = np.random.default_rng(seed)
-    weights = np.linspace(1.0, 0.4, len(start))  # the big joints sweep the big volumes
+    weights = np.linspace(1.0, 0.4, len(start))  # the first joints sweep the largest volumes
     trees = [_Tree(start, weights), _Tree(goal, weights)]
     active = 0
     for _ in range(max_nodes):
@@ -79,7 +79,7 @@ def connect(
 
 
 def _extend(tree: _Tree, target: Array, free: Free, step_rad: float) -> int | None:
-    """One step towards the target, cut at the first obstacle; None when it cannot move."""
+    """Make one step towards the target, cut at the first obstacle; None when it cannot move."""
     near = tree.nearest(target)
     q = tree.configuration(near)
     ahead = target - q
@@ -94,7 +94,7 @@ def _extend(tree: _Tree, target: Array, free: Free, step_rad: float) -> int | No
 
 
 def _connect(tree: _Tree, target: Array, free: Free, step_rad: float) -> int | None:
-    """Steps towards the target until it is reached (its index) or an obstacle stops them (None)."""
+    """Step towards the target until it is reached (returns its index) or an obstacle stops the steps (None)."""
     while True:
         new = _extend(tree, target, free, step_rad)
         if new is None:
@@ -107,7 +107,7 @@ def _connect(tree: _Tree, target: Array, free: Free, step_rad: float) -> int | N
 
 
 def shortcut(path: Array, *, free: Free, seed: int, rounds: int = 80) -> Array:
-    """The path with free straight cuts between random points of it, and without needless corners."""
+    """Return the path with free straight cuts between random points of it, and without needless corners."""
     rng = np.random.default_rng(seed)
     points = [q for q in path]
     for _ in range(rounds):

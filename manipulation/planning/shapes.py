@@ -1,7 +1,7 @@
-"""What can touch what: arm and tool as capsules, panel and surroundings as boxes.
+"""Collision shapes: arm and tool as capsules, panel and surroundings as boxes.
 
-A capsule is a segment with a radius. The distance from a point to a box is convex, so along a segment its minimum is
-found by a golden-section search; that makes a whole check of arm against panel a matter of microseconds.
+A capsule is a segment with a radius. The distance from a point to a box is convex, so its minimum along a segment is
+found by a golden-section search, and a check of the whole arm against the panel takes microseconds.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from hal.panel import Panel, PanelObject
 Vector3 = tuple[float, float, float]
 
 
-# A panel is set in a wall or a cabinet that nobody has measured: no way leads round its edge, where a hand would hook on.
+# A panel is set in a wall or cabinet of unknown size, so no path may lead round its edge: the hand could get caught.
 WALL_BEYOND_M = 0.3
 WALL_DEPTH_M = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Capsule:
-    """A capsule fixed to the flange: both ends in flange axes, m."""
+    """A capsule fixed to the flange; both ends in flange axes, m."""
 
     name: str
     start_m: Vector3
@@ -41,18 +41,18 @@ class CollisionBox:
     half_m: Vector3
 
     def moved(self, grand_from_parent: RigidTransform) -> CollisionBox:
-        """The same box seen from the parent's parent."""
+        """Return the same box seen from the parent's parent."""
         return CollisionBox(
             name=self.name, parent_from_box=grand_from_parent * self.parent_from_box, half_m=self.half_m
         )
 
 
 def panel_boxes(panel: Panel, angles_rad: Mapping[str, float] | None = None) -> tuple[CollisionBox, ...]:
-    """Plate and objects of a panel as boxes in the panel frame; the plate with the wall that it is set in.
+    """Return the plate and the objects of a panel as boxes in the panel frame; the plate includes the wall around it.
 
     Args:
-        angles_rad: present angle (clockwise from up) of levers by name; one whose angle is unknown gets the box of its
-            whole sweep.
+        angles_rad: present angle (clockwise from up) of levers by name; a lever whose angle is unknown gets the box of
+            its whole sweep.
     """
     half_depth_m = max(panel.thickness_m, WALL_DEPTH_M) / 2
     plate = CollisionBox(
@@ -65,7 +65,7 @@ def panel_boxes(panel: Panel, angles_rad: Mapping[str, float] | None = None) -> 
 
 
 def envelope(panel_object: PanelObject, *, angle_rad: float | None = None) -> CollisionBox:
-    """A box in the panel frame that holds the object in any state, or, if that is smaller, at `angle_rad`."""
+    """Return a box in the panel frame that holds the object in any state, or a smaller one for `angle_rad`."""
     room = panel_object.envelope(angle_rad)
     foot = transform_rpy((*panel_object.position_m, 0.0), (0.0, 0.0, room.turn_rad))
     return CollisionBox(
@@ -76,7 +76,7 @@ def envelope(panel_object: PanelObject, *, angle_rad: float | None = None) -> Co
 
 
 def floor_box(z_m: float) -> CollisionBox:
-    """The floor as a box whose top lies at `z_m` of the base; it leaves a hole for the arm's own foot to the caller."""
+    """Return the floor as a box whose top lies at `z_m` of the base; the caller must exempt the arm's own foot."""
     return CollisionBox(
         name="floor",
         parent_from_box=identity() * transform_rpy((0.0, 0.0, z_m - 0.5), (0.0, 0.0, 0.0)),

@@ -1,7 +1,7 @@
-"""When to be where: a joint path becomes a trajectory that keeps to the limits of joints and tip.
+"""Time parameterization: a joint path becomes a trajectory within the limits of joints and tip.
 
-The path q(s) is re-sampled with rounded corners; then the speed ds/dt is made as high as the limits allow by one pass
-forwards and one backwards over the samples.
+The path q(s) is sampled on a grid with rounded corners. Then the speed ds/dt is made as high as the limits allow by one
+pass forwards and one backwards over the samples.
 
 Source: Bobrow, Dubowsky and Gibson, IJRR 4(3), 1985, in the grid form of Pham and Pham, IEEE T-RO 34(3), 2018, with the
 acceleration limit split in half between the two terms of q'' = q_s s'' + q_ss s'^2.
@@ -25,7 +25,7 @@ SAMPLE_RAD = 0.02  # spacing of the timing grid along the path
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpeedLimits:
-    """How fast a transfer may be: a fraction of the joint limits, and the speed of the tool's tip."""
+    """Speed limits of a transfer: fractions of the joint limits, and the speed of the tool's tip."""
 
     tip_m_per_s: float
     joint_ratio: float = 0.5
@@ -41,7 +41,7 @@ def timed(
     name: str,
     guards: tuple[Guard, ...] = (),
 ) -> JointTrajectory:
-    """The trajectory along a smooth dense path (N, n), N >= 2, from rest to rest."""
+    """Return the trajectory along a smooth dense path (N, n), N >= 2, from rest to rest."""
     s = np.concatenate([[0.0], np.cumsum(np.maximum(np.linalg.norm(np.diff(path_rad, axis=0), axis=1), 1e-9))])
     spline = CubicSpline(s, path_rad) if len(s) > 2 else CubicSpline(s, path_rad, bc_type="clamped")
     if len(s) == 2:
@@ -70,7 +70,7 @@ def _speed_profile(
     flange_from_tool: RigidTransform,
     limits: SpeedLimits,
 ) -> Array:
-    """Highest ds/dt (N,) on the grid, zero at both ends."""
+    """Return the highest ds/dt (N,) on the grid, zero at both ends."""
     v_max = limits.joint_ratio * kinematics.velocity_rad_per_s
     a_max = 0.5 * limits.acceleration_ratio * kinematics.acceleration_rad_per_s2
     tool = np.ascontiguousarray(flange_from_tool.as_matrix())

@@ -1,4 +1,4 @@
-"""Bare places of the plate where a finger may touch."""
+"""Free places of the plate where a finger may touch."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from hal.errors import NotFound
 from hal.panel import Panel, PanelObject
 
 GRID_M = 0.005
-EDGE_M = 0.025  # a finger that misses the plate finds nothing
+EDGE_M = 0.025  # distance from the edge, so that the finger does not miss the plate
 
 
 def touch_points(panel: Panel, count: int, *, clearance_m: float = 0.030) -> Array:
     """Choose (count, 2) panel points far from every object and light, and far from each other.
 
-    Greedy farthest points, which for a plate with instruments are its bare corners and the gaps between rows: their
-    spread makes the normal of the touched plane as well known as it can be.
+    The farthest point is added repeatedly. On a plate with instruments this gives its free corners and the gaps between
+    rows, and their large spread makes the normal of the touched plane as certain as possible.
 
     Raises:
-        NotFound: the panel has too few bare places.
+        NotFound: the panel has too few free places.
     """
     candidates = _candidates(panel, clearance_m)
     if len(candidates) == 0:
@@ -47,13 +47,13 @@ def _candidates(panel: Panel, clearance_m: float) -> Array:
 
 
 def room_m(panel: Panel, points: Array) -> Array:
-    """(N,) how far points (N, 2) of the panel are from the nearest object or light, m; negative where one is."""
+    """Return (N,) the distance of points (N, 2) of the panel to the nearest object or light, m; negative inside one."""
     gaps = [np.linalg.norm(points - light.position_m[:2], axis=1) - light.radius_m for light in panel.lights]
     return np.asarray(np.min([*gaps, *(_distance_to(points, panel_object) for panel_object in panel.objects)], axis=0))
 
 
 def _distance_to(points: Array, panel_object: PanelObject) -> Array:
-    """From (N, 2) panel points to the footprint of an object, in any of its states; negative inside."""
+    """Return the distance of (N, 2) panel points to the footprint of an object in any state, m; negative inside."""
     half = np.array(panel_object.half_footprint_m)
     outside = np.abs(points - np.array(panel_object.position_m)) - half
     return np.asarray(np.linalg.norm(np.maximum(outside, 0.0), axis=1) + np.minimum(outside.max(axis=1), 0.0))

@@ -1,4 +1,4 @@
-"""Collision-free transfers: the straight segment when it is free, else a search, then shortcuts and timing."""
+"""Collision-free transfers: the straight segment if it is free, else a search, shortcuts and timing."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from manipulation.planning.collision import CollisionModel
 from manipulation.planning.rrt import connect, shortcut
 from manipulation.planning.time_parameterization import SpeedLimits, timed
 
-SEARCH_STEP_RAD = 0.02  # edges of the search; the answer is checked again at RECHECK_RAD
-DETOUR_RAD = 0.8  # how far a joint may leave the range between its two ends, as long as that finds a way
-END_SHARE = 0.9  # of the room that an end has: with all of it the end itself would touch the margin
+SEARCH_STEP_RAD = 0.02  # checking step of the search; the result is checked again at RECHECK_RAD
+DETOUR_RAD = 0.8  # how far a joint may leave the range between its two ends in the first search
+END_SHARE = 0.9  # of the gap at an end: with all of it the end itself would violate the margin
 CORNER_RAD = 0.25  # how far before a corner its rounding begins
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effort:
-    """How long to look for a way: so many searches of so many nodes at most."""
+    """How long to search for a path: the largest number of searches, and of nodes per search."""
 
     searches: int
     nodes: int
 
 
-THOROUGH = Effort(searches=4, nodes=4000)  # ten seconds where there is no way
-QUICK = Effort(searches=2, nodes=400)  # the searches of four missions took 24 nodes at most
+THOROUGH = Effort(searches=4, nodes=4000)  # ten seconds where there is no path
+QUICK = Effort(searches=2, nodes=400)  # the searches of four missions took at most 24 nodes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,7 +40,7 @@ class TransferPlanner:
     Attributes:
         margin_m: least gap on the way.
         end_margin_m: least gap at both ends, where the tool may be near its object.
-        seed: same seed, same path.
+        seed: random seed; the same seed gives the same path.
     """
 
     model: CollisionModel
@@ -59,7 +59,7 @@ class TransferPlanner:
         guards: tuple[Guard, ...] = (),
         effort: Effort = THOROUGH,
     ) -> JointTrajectory:
-        """A timed free trajectory from rest at `start_rad` to rest at `goal_rad`, (n,) each.
+        """Plan a timed collision-free trajectory from rest at `start_rad` to rest at `goal_rad`, (n,) each.
 
         Raises:
             Unreachable: start or goal touches something, or no free path was found; names what is in the way.
@@ -88,7 +88,7 @@ class TransferPlanner:
         )
 
     def _margin(self, start: Array, goal: Array) -> float:
-        """The wished margin, or what both ends leave of it."""
+        """Return the wanted margin, or a smaller one if the gaps at both ends require it."""
         gaps = [self.model.clearance_m(q, enough_m=self.margin_m) for q in (start, goal)]
         for which, q, gap in zip(("start", "goal"), (start, goal), gaps, strict=True):
             if gap < self.end_margin_m:
@@ -99,14 +99,14 @@ class TransferPlanner:
         return min(self.margin_m, *(END_SHARE * gap for gap in gaps))
 
     def _search_range(self, start: Array, goal: Array) -> tuple[Array, Array]:
-        """A little beyond the two ends: whole turns of the wrist are never the short way."""
+        """Return joint limits a little beyond the two ends: whole turns of the wrist are never the short way."""
         kin = self.model.kinematics
         lower = np.maximum(kin.lower_rad, np.minimum(start, goal) - DETOUR_RAD)
         upper = np.minimum(kin.upper_rad, np.maximum(start, goal) + DETOUR_RAD)
         return lower, upper
 
     def _rounded(self, path: Array, margin: float) -> Array | None:
-        """The path densely sampled with parabolic corners; corners are made tighter until all of it is free."""
+        """Sample the path densely with parabolic corners, made tighter until all of it is free; None if none is."""
         for corner in (CORNER_RAD, CORNER_RAD / 3, CORNER_RAD / 10, CORNER_RAD / 30):
             dense = round_corners(path, corner)
             steps = itertools.pairwise(dense)
@@ -131,7 +131,7 @@ class TransferPlanner:
 
 
 def round_corners(path_rad: Array, corner_rad: float, *, spacing_rad: float = 0.05) -> Array:
-    """A dense path (M, n) along the polyline (N, n) whose corners are parabolas that begin `corner_rad` before them."""
+    """Return a dense path (M, n) along the polyline (N, n) whose parabolic corners begin `corner_rad` before each."""
     out = [path_rad[0]]
     for before, at, after in zip(path_rad, path_rad[1:], path_rad[2:], strict=False):
         back, ahead = before - at, after - at

@@ -1,4 +1,4 @@
-"""In which order to visit places, so that the way is short: the arm's tip may not be faster than the cell file says."""
+"""The order in which to visit places so that the path is short, because the speed of the arm's tip is limited."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ MOST_TRIED = 6  # 720 orders; more places are visited nearest first
 
 
 def visiting_order(start_m: ArrayLike, places_m: ArrayLike) -> list[int]:
-    """Indices of the places (N, k) in the order of a short way from `start_m` (k,) through them all, m.
+    """Return the indices of the places (N, k) in the order of a short path from `start_m` (k,) through them all, m.
 
-    The shortest of all orders for at most `MOST_TRIED` places, each time the nearest for more.
+    It is the shortest of all orders for at most `MOST_TRIED` places, and always the nearest next place for more.
     """
     start, places = np.asarray(start_m, float), np.asarray(places_m, float)
     points = np.vstack([start, places.reshape(-1, len(start))])

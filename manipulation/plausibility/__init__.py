@@ -1,6 +1,6 @@
-"""Is this device lying? Readings held against each other, against commands and against geometry.
+"""Plausibility checks: readings of devices compared with each other, with commands and with geometry.
 
-Nothing here reads a device or raises: readings go in, a `Finding` or None comes out, and callers say it in their own way.
+Nothing here reads a device or raises. Readings go in, a `Finding` or None comes out, and the caller reports it.
 """
 
 from __future__ import annotations

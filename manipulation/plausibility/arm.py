@@ -1,18 +1,18 @@
-"""An arm against where its drives hold it: one that is believed wrongly leaps there with its next set-point."""
+"""Compares the arm's reported position with the one its drives hold: a wrong one would make the arm jump."""
 
 from __future__ import annotations
 
 from manipulation.plausibility.finding import Finding, Symptom
 
-FOLLOWING_LIMIT_M = 0.02  # of the tips; tracking in a motion is held to the same
+FOLLOWING_LIMIT_M = 0.02  # of the tips; the tracking guard of a motion has the same limit
 
 
 def does_not_follow(arm: str, apart_m: float, how: str) -> Finding | None:
     """Find an arm whose tips are too far from where they should be.
 
     Args:
-        apart_m: distance of the tips.
-        how: what the distance is, with `{}` where its millimetres go.
+        apart_m: distance between reported and expected tips.
+        how: a description of that distance, with `{}` in place of its millimetres.
     """
     if apart_m < FOLLOWING_LIMIT_M:
         return None

@@ -1,6 +1,6 @@
-"""Gripper and fingers against what was asked of them and what the wrist feels.
+"""Compares gripper and fingers with their commands and with the force at the wrist.
 
-A finding needs two witnesses, and tells only what no healthy device could say; the rest is believed.
+A finding needs two independent pieces of evidence and states only what no healthy device could report.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from hal.arrays import Array
 from hal.devices import ForceTorque, Touch
 from manipulation.plausibility.finding import Finding, Symptom
 
-WIDTH_OFF_M = 0.003  # pads that rest and hold nothing are nearer than this to where they were sent
-FELT_N = 8.0  # twice what the hand's own inertia makes of a transfer, and far above what closes a switch
-NEAR_TIPS_M = 0.03  # lever arm of a force about the tips: what pushes further up is not for the fingers to feel
+WIDTH_OFF_M = 0.003  # pads at rest that hold nothing are nearer than this to the commanded width
+FELT_N = 8.0  # twice the hand's inertial force in a transfer, and far above the threshold of a touch switch
+NEAR_TIPS_M = 0.03  # lever arm of a force about the tips: the fingers do not feel a force that acts further up
 UNFELT_S = 0.05
-QUIET_S = 20.0  # after it was told: the hand must be able to leave what it pushes on
+QUIET_S = 20.0  # after a finding: the hand must be able to leave what it pushes on
 FREE_N = 5.0
-FREE_WAY_M = 0.15  # longer than any retreat: a finger that leaves something behind has left it by then
+FREE_WAY_M = 0.15  # longer than any retreat, after which a finger has left whatever it touched
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pads:
-    """What a gripper says of its pads."""
+    """State of the pads as the gripper reports it."""
 
     width_m: float
     is_moving: bool = False
@@ -32,12 +32,12 @@ class Pads:
 
 
 def wrong_width(gripper: str, now: Pads, *, sent_m: float, begun_m: float) -> Finding | None:
-    """Find pads that hold nothing and say that they stand elsewhere, or open ones that say they did not move.
+    """Find pads that hold nothing but report another width than commanded, or opening pads that report no motion.
 
     Args:
-        now: what the gripper says after it was sent to a width and has come to rest.
-        sent_m: the width that the gripper took.
-        begun_m: what it said before.
+        now: the gripper's report after it was sent to a width and has come to rest.
+        sent_m: the width that the gripper accepted.
+        begun_m: the width that it reported before.
     """
     is_off = abs(now.width_m - sent_m) > WIDTH_OFF_M
     is_still = abs(now.width_m - begun_m) <= 0.5 * WIDTH_OFF_M
@@ -54,9 +54,10 @@ def wrong_width(gripper: str, now: Pads, *, sent_m: float, begun_m: float) -> Fi
 
 
 class TouchMonitor:
-    """Watches for fingers that feel nothing while the wrist does, and for such that feel something where nothing is.
+    """Finds touch sensors that feel nothing while the wrist does, or feel something where nothing can be.
 
-    A force counts only if it acts near the tips; a free hand is one that has opened and travels with an idle wrist.
+    A force counts only if it acts near the tips. A free hand is one that has opened and travels with no force at the
+    wrist.
     """
 
     def __init__(self, sensor: Touch | None, force_torque: ForceTorque | None) -> None:
@@ -76,18 +77,18 @@ class TouchMonitor:
         self._is_empty = now.width_m > begun_m + WIDTH_OFF_M and not now.is_holding
 
     def begin(self, *, moves_pads: bool) -> None:
-        """Note that a motion begins: its tips may be others than those of the one before."""
+        """Note that a motion begins, because its tips may differ from those of the previous motion."""
         self._before_s = None
         self._free_from_m = None
         if moves_pads:
             self._is_empty = False
 
     def note(self, contacts: tuple[bool, ...], wrench: Array, tip_m: Array, *, stamp_s: float) -> Finding | None:
-        """Take one tick; what it finds is told once, then not for a while.
+        """Check one tick; a finding is returned once and then suppressed for a while.
 
         Args:
             wrench: (6,) contact wrench in tool axes about the tips.
-            tip_m: (3,) where the tips are.
+            tip_m: (3,) position of the tips.
         """
         if not self._is_watched or stamp_s < self._quiet_until_s:
             return None

@@ -1,4 +1,4 @@
-"""Proximity sensors against the plate that the fingers touch where the sensors looked."""
+"""Compares proximity sensors with the plate that the fingers touched at the same place."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from hal.panel import Panel
 from manipulation.planning.touch_points import room_m
 from manipulation.plausibility.finding import Finding, Symptom
 
-BARE_M = 0.010  # of plate round the beam's foot: no part of it sees an edge
-LEAST_OFF_M = 0.005  # mounts and plates are known better
-OFF_SIGMA = 6.0  # of one reading
+BARE_M = 0.010  # radius of free plate around the beam's foot, so that no part of the beam sees an edge
+LEAST_OFF_M = 0.005  # mounts and plates are known better than this
+OFF_SIGMA = 6.0  # standard deviations of one reading
 
 
 class ProximityMonitor:
-    """Watches for a sensor whose readings over the touched plate are off by the same at two places in a row.
+    """Finds a sensor whose readings over the touched plate are off by the same amount at two places in a row.
 
-    One place alone proves nothing: a cable may hang before the plate there.
+    One place alone proves nothing, because a cable may hang before the plate there.
     """
 
     def __init__(self, panel: Panel) -> None:
@@ -37,11 +37,11 @@ class ProximityMonitor:
         base_from_panel: RigidTransform,
         touched_m: Array,
     ) -> Finding | None:
-        """Take one place of the plate; finds that the sensor is off there as at the place before.
+        """Check one place of the plate; there is a finding if the sensor is off there as at the place before.
 
         Args:
-            of: its range and noise.
-            readings: `base_from_sensor` and what it said from there, m; NaN where it saw nothing.
+            of: range and noise of the sensor.
+            readings: `base_from_sensor` and the distance measured from there, m; NaN where nothing was seen.
             touched_m: (3,) where the fingers met the plate, base frame.
         """
         expected_m: list[float] = []
@@ -53,7 +53,7 @@ class ProximityMonitor:
         said_m = np.array([distance_m for _, distance_m in readings])
         off_m = said_m - np.array(expected_m)
         limit_m = max(LEAST_OFF_M, OFF_SIGMA * of.sigma_m)
-        if np.all(np.abs(off_m) <= limit_m):  # NaN is not
+        if np.all(np.abs(off_m) <= limit_m):  # false for NaN
             self._off_before_m.pop(sensor, None)
             return None
         before_m, self._off_before_m[sensor] = self._off_before_m.get(sensor), off_m
@@ -76,7 +76,7 @@ class ProximityMonitor:
         base_from_panel: RigidTransform,
         touched_m: Array,
     ) -> float | None:
-        """How far the bare plate is along the beam, m; None where the beam meets something else, or maybe."""
+        """Return the distance of the free plate along the beam, m; None where the beam may meet something else."""
         panel_from_sensor = base_from_panel.inv() * base_from_sensor
         start, beam = panel_from_sensor.translation, panel_from_sensor.rotation.apply([0.0, 0.0, 1.0])
         if beam[2] > -0.9:

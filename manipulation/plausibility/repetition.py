@@ -1,4 +1,4 @@
-"""Sensors that repeat one reading under new stamps: the noise of a live one makes every reading different."""
+"""Finds sensors that repeat one reading under new time stamps, which the noise of a working sensor rules out."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hal.arrays import Array
 from hal.devices import ForceTorque
 from manipulation.plausibility.finding import Finding, Symptom
 
-# A touch grows by 6 N in that time; noise has never repeated so long.
+# A contact force grows by 6 N in this time; sensor noise has never repeated for so long.
 FROZEN_S, FROZEN_TICKS, FROZEN_PERIODS = 0.1, 10, 4
 
 
@@ -25,13 +25,13 @@ class Frame:
 
     @classmethod
     def of(cls, array: NDArray[np.generic], *, stamp_s: float) -> Frame:
-        """The frame of an array."""
+        """Return the frame of an array."""
         digest = hashlib.blake2b(np.ascontiguousarray(array).tobytes(), digest_size=16).digest()
         return cls(stamp_s=stamp_s, digest=digest)
 
 
 def repeated_frame(device: str, before: Frame | None, newest: Frame) -> Finding | None:
-    """Find a device that sent the same frame again under another stamp."""
+    """Find a device that sent the same frame again under another time stamp."""
     if before is None or before.digest != newest.digest or before.stamp_s == newest.stamp_s:
         return None
     return Finding(
@@ -43,7 +43,7 @@ def repeated_frame(device: str, before: Frame | None, newest: Frame) -> Finding 
 
 
 class RepeatedWrench:
-    """Watches a force/torque sensor for one reading that repeats: no guard would ever see a contact.
+    """Finds a force/torque sensor that repeats one reading, with which no guard would ever see a contact.
 
     A sensor that states no noise is believed, because it may well repeat itself.
     """
@@ -59,7 +59,7 @@ class RepeatedWrench:
         self._ticks = 0
 
     def note(self, raw_wrench: Array, *, stamp_s: float) -> Finding | None:
-        """Take the newest reading (6,); finds that all six numbers have been the same for too long."""
+        """Check the newest reading (6,); there is a finding if all six numbers have been the same for too long."""
         if not self._is_noisy:
             return None
         newest = raw_wrench.tobytes()

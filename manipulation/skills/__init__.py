@@ -1,6 +1,6 @@
-"""What the hand can do to a panel: one file per kind of control, with typed outcomes; nothing is done without a second look.
+"""Skills that operate a panel: one file per kind of control, with typed outcomes; only a read-back makes one `done`.
 
-These names are what a package needs that brings a skill of its own.
+The names below are what a package needs that adds a skill of its own.
 """
 
 from __future__ import annotations

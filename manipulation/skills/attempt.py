@@ -1,4 +1,4 @@
-"""One attempt of a skill: it runs declared motions, goes to a standoff and touches down, and keeps the reports."""
+"""One attempt of a skill: runs declared motions, goes to a standoff, approaches, and keeps the reports."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ from manipulation.skills.outcome import Outcome, SkillFailure
 
 APPROACH_M_PER_S = 0.06
 CONTACT_N = 8.0
-STANDOFF_M = 0.030  # of the tips above the object's highest place
+STANDOFF_M = 0.030  # of the tips above the object's highest point
 RETREAT_M = 0.050
 RETREAT_M_PER_S = 0.15
 PADS_M_PER_S = 0.1
 LET_GO_N = 15.0
 CLOSED_M = 0.0005
 GRASP_M_PER_S = 0.03
-FREE_N = 40.0  # more than this in a move that should be free is a collision
+FREE_N = 40.0  # a larger force in a move that should be free is a collision
 
 
 class Attempt:
-    """Runs declared motions for one skill and keeps their reports."""
+    """Runs the declared motions of one skill and keeps their reports."""
 
     def __init__(self, context: SkillContext) -> None:
         self.context = context
         self.reports: list[MotionReport] = []
 
     def run(self, motion: DeclaredMotion) -> MotionReport:
-        """Execute; returns when the motion completed or one of its own guards ended it.
+        """Execute a motion; returns when it completed or one of its own guards ended it.
 
         Raises:
             SkillFailure: a protective guard tripped.
-            DeviceFault, Stopped, Cancelled: what the cell met; these end the task, not only the attempt.
+            DeviceFault, Stopped, Cancelled: the cell failed or was stopped; these end the task, not only the attempt.
         """
         report = self.context.mover.execute(motion)
         self.reports.append(report)
@@ -63,30 +63,30 @@ class Attempt:
                 raise DeviceFault(f"{motion.name}: {report.cause}", hint=hint, device=report.device)
 
     def joints(self) -> Array:
-        """Measured joints (n,)."""
+        """Return the measured joints (n,), rad."""
         return self.context.mover.state().position_rad
 
     def pose(self) -> RigidTransform:
-        """Measured base_from_grip."""
+        """Return the measured base_from_grip."""
         return self.context.kinematics.tool(self.joints(), self.context.flange_from_grip)
 
     def open_to(self, width_m: float, *, force_n: float = LET_GO_N, name: str = "set opening") -> None:
-        """Move the pads to an opening while the arm holds; closed pads that shall be closed are left alone."""
+        """Move the pads to an opening while the arm holds; does nothing when they are closed and shall be closed."""
         width = min(width_m, self.context.hand.max_width_m)
         if max(width, self.context.mover.state().gripper_width_m) <= CLOSED_M:
             return
         self.run(GripperMotion(name=name, width_m=width, force_n=force_n, speed_m_per_s=PADS_M_PER_S))
 
     def grasp(self, force_n: float, *, name: str) -> float:
-        """Close slowly until the pads press with `force_n`; returns the opening left, m.
+        """Close slowly until the pads press with `force_n`; returns the opening that is left, m.
 
-        Fast pads stop on the peak of their own impact and hold nothing.
+        Fast pads would stop at the peak force of their own impact and then hold nothing.
         """
         self.run(GripperMotion(name=name, width_m=0.0, force_n=force_n, speed_m_per_s=GRASP_M_PER_S))
         return self.context.mover.state().gripper_width_m
 
     def go_to(self, goal_rad: Array, *, width_m: float, name: str) -> None:
-        """A collision-free transfer; any strong contact on the way ends the attempt."""
+        """Make a collision-free transfer; a strong contact on the way ends the attempt."""
         motion = self.context.transfer(self.joints(), goal_rad, width_m=width_m, name=name)
         self.run(motion)
 
@@ -99,7 +99,7 @@ class Attempt:
         guards: tuple[Guard, ...] = (),
         compliance: Compliance | None = None,
     ) -> MotionReport:
-        """A straight move of the tips from where they are to `goal` (base_from_grip)."""
+        """Move the tips in a straight line from where they are to `goal` (base_from_grip)."""
         motion = line(
             self.pose(), goal, name=name, speed_m_per_s=speed_m_per_s, flange_from_tool=self.context.flange_from_grip,
             guards=guards, compliance=compliance,
@@ -116,7 +116,7 @@ class Attempt:
         compliance: Compliance | None = None,
         slow_last_m: float = 0.0,
     ) -> MotionReport:
-        """A move through dense poses (base_from_grip), the first where the tool is."""
+        """Move through closely spaced poses (base_from_grip), the first of which is where the tool is."""
         motion = through(
             poses, name=name, speed_m_per_s=speed_m_per_s, flange_from_tool=self.context.flange_from_grip, guards=guards,
             compliance=compliance, slow_last_m=slow_last_m,
@@ -126,14 +126,14 @@ class Attempt:
     def advance(
         self, distance_m: float, *, name: str, speed_m_per_s: float = APPROACH_M_PER_S, stop_n: float = CONTACT_N
     ) -> MotionReport:
-        """Move along the fingers (negative: back) until a contact of `stop_n` against the motion."""
+        """Move along the fingers (negative: back) until a contact force of `stop_n` against the motion."""
         sign = -1.0 if distance_m > 0 else 1.0
         guard = Guard(name="contact", quantity=Quantity.FORCE, limit=stop_n, axis=(0.0, 0.0, sign))
         goal = shifted(self.pose(), (0.0, 0.0, distance_m))
         return self.straight(goal, name=name, speed_m_per_s=speed_m_per_s, guards=(guard,))
 
     def leave(self, distance_m: float = RETREAT_M) -> None:
-        """Back off along the fingers."""
+        """Move back along the fingers."""
         self.advance(-distance_m, name="retreat", speed_m_per_s=RETREAT_M_PER_S, stop_n=FREE_N)
 
     def begin(
@@ -144,9 +144,10 @@ class Attempt:
         width_m: float,
         name: str,
     ) -> int:
-        """Set the opening, go to the standoff of the best way, and tare there; returns which way it is.
+        """Choose the best of several strokes, set the opening, go to its standoff and tare there; returns its index.
 
-        `options`: for each way its panel_from_grip poses, the first at the standoff.
+        Args:
+            options: for each stroke its panel_from_grip poses, the first at the standoff.
         """
         index, path = self.context.choose(options, near_rad=self.joints(), width_m=width_m, may_touch=may_touch)
         self.open_to(width_m)

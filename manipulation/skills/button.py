@@ -18,15 +18,15 @@ def button(
     current: ObjectState | None = None,
     verify: Verify | None = None,
 ) -> SkillReport:
-    """Press the button once; not at all when what is expected is there already, since a press would undo it.
+    """Press the button once, but not if the expected state was already seen, because a press would undo it.
 
-    One that springs back and works no lamp shows nothing afterwards: its outcome is `unverified`.
+    A button that springs back and works no lamp shows nothing afterwards, so its outcome is `unverified`.
 
     Args:
         expected: the state that the read-back must show afterwards: `pressed` or `released` of a latching button, or
-            the state of the lamp that it works. None accepts any read-back that gives an answer.
-        current: what the last look showed of what the button works.
-        verify: the caller's second look.
+            the state of the lamp that the button works. None accepts any conclusive read-back.
+        current: what the last observation showed of the button or its lamp.
+        verify: the caller's read-back.
 
     Raises:
         DeviceFault, Stopped, Cancelled: the cell cannot go on.

@@ -1,5 +1,6 @@
-"""Where a guarded move met something: the pads give way, so the place of first contact is read from the rise of the
-force.
+"""Guarded moves until contact.
+
+The pads give way under load, so the place of first contact is computed from the rise of the force.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from manipulation.skills.attempt import Attempt
 from manipulation.skills.outcome import Outcome, SkillFailure
 
 INF = float("inf")
-FEEL_N = 3.0  # moves no lever, and no knob by its own side
+FEEL_N = 3.0  # too little to move a lever, or a knob pushed from its side
 FEEL_M_PER_S = 0.03
-# Onto a hard stop the force overshoots by stiffness x speed x reaction time; a soft push along the fingers or across
-# them makes the stiffness 4 kN/m, whatever is touched.
+# At a hard stop the force overshoots by stiffness x speed x reaction time; a soft push along or across the fingers
+# limits the stiffness to 4 kN/m, whatever is touched.
 SOFT_PUSH = Compliance(
     stiffness=(4000.0, 4000.0, 4000.0, INF, INF, INF),
     damping=(500.0, 500.0, 500.0, 10.0, 10.0, 10.0),
@@ -27,21 +28,21 @@ SOFT_PUSH = Compliance(
     max_offset_m=0.015,
 )
 ONSET_N = 1.0  # above noise, drift and inertia in a slow move
-COARSE_RAD = 5e-4  # an arm whose joints move in such steps, or larger ones, shakes its hand by more than it feels
-REST_S = 0.12  # what shook has come to rest, and the mean of the second half knows 0.1 N
-REST_RATIO = 0.4  # of the force that stopped the move; creeping pads and friction may take the rest away
+COARSE_RAD = 5e-4  # joint steps of this size or more cause larger inertial forces than a light contact
+REST_S = 0.12  # vibration has decayed by then, and the mean over the second half resolves 0.1 N
+REST_RATIO = 0.4  # of the force that stopped the move; creeping pads and friction may reduce it this far
 LEAST_M = 0.0005
-MOST_TRIES = 24  # something that gives way at once leaves no force at rest either, but the hand gets no further
+MOST_TRIES = 24  # an object that yields at once leaves no force at rest either, so the number of tries is limited
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Meeting:
-    """A guarded move that was to meet something.
+    """Result of a guarded move that should make contact.
 
     Attributes:
-        way_m: from the start of the move to the place of first contact, along the move.
-        give_n_per_m: rise of the force per metre beyond it; 0 when too few samples tell.
-        is_met: did the guard trip?
+        way_m: distance from the start of the move to the place of first contact, along the move.
+        give_n_per_m: rise of the force per metre beyond it; 0 when there are too few samples.
+        is_met: whether the guard tripped.
     """
 
     way_m: float
@@ -55,8 +56,8 @@ def meet(
 ) -> Meeting:
     """Move straight to `goal` (base_from_grip, same rotation) until a force of `stop_n` against the motion.
 
-    The hand's own inertia passes for a contact when the arm moves in jerks: the steps of servos that resolve 1.5 mrad
-    are several newtons. On such an arm a force that is gone at rest was no contact, and the move goes on.
+    If the arm moves in jerks, the hand's own inertia can look like a contact: a servo resolution of 1.5 mrad causes
+    several newtons. On such an arm a force that is gone at rest was no contact, and the move goes on.
     """
     start = attempt.pose()
     ahead = goal.translation - start.translation
@@ -83,19 +84,19 @@ def _shakes(attempt: Attempt) -> bool:
 
 
 def force_at_rest_n(attempt: Attempt, in_tool: Array) -> float:
-    """Force along a unit vector in tool axes while the arm stands still, N: the mean, once what shook is at rest."""
+    """Return the mean force along a unit vector in tool axes while the arm stands still and does not vibrate, N."""
     wrench = attempt.run(Hold(name="feel at rest", duration_s=REST_S)).log.wrench
     return float(np.mean(wrench[len(wrench) // 2 :, :3] @ in_tool))
 
 
 def onset(depth_m: Array, force_n: Array, deepest_m: float) -> tuple[float, float]:
-    """Depth (m) at which the straight line through the rising force is zero, and its slope (N/m).
+    """Return the depth (m) at which the straight line fitted to the rising force is zero, and its slope (N/m).
 
     Args:
         depth_m, force_n: (N,) in the order of time.
-        deepest_m: the answer when no sample shows a force.
+        deepest_m: the depth to return when no sample shows a force.
     """
-    # Only the last unbroken rise: while the arm speeds up, its own inertia can pass for a newton.
+    # Only the last unbroken rise counts, because the arm's inertia can look like 1 N of contact while it speeds up.
     below = np.flatnonzero(force_n < ONSET_N)
     first = 0 if len(below) == 0 else int(below[-1]) + 1
     if first >= len(force_n):
@@ -110,10 +111,10 @@ def onset(depth_m: Array, force_n: Array, deepest_m: float) -> tuple[float, floa
 
 
 def against_turn(start: RigidTransform, hub_m: Array, axis: Array) -> tuple[float, float, float]:
-    """Unit vector in tool axes against a turn of the tool about `axis` through `hub_m` (base frame).
+    """Return the unit vector in tool axes against a turn of the tool about `axis` through `hub_m` (base frame).
 
-    The tool turns with the object, so the direction stays the same in its axes; friction along the others, which has
-    nothing to do with the effort, does not count.
+    The tool turns with the object, so this direction is constant in tool axes. Friction in other directions is not part
+    of the effort of the object and does not count.
     """
     ahead = start.rotation.inv().apply(np.cross(axis, start.translation - hub_m))
     against = -ahead / np.linalg.norm(ahead)
@@ -121,15 +122,14 @@ def against_turn(start: RigidTransform, hub_m: Array, axis: Array) -> tuple[floa
 
 
 def centre_between(attempt: Attempt, *, room_m: float, what: str) -> None:
-    """Local refinement before a cage or a grasp: feel the object between the open fingers on both sides, go to the
-    middle.
+    """Feel the object between the open fingers on both sides and go to the middle, before a cage or a grasp.
 
     Args:
-        room_m: how far each side may be.
+        room_m: largest distance to the object on each side.
         what: its name, for the cause.
 
     Raises:
-        SkillFailure: nothing on one of the sides (`missed`).
+        SkillFailure: there is no contact on one of the sides (`missed`).
     """
     start = attempt.pose()
     across = start.rotation.apply([1.0, 0.0, 0.0])

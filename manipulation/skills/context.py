@@ -1,4 +1,4 @@
-"""What a skill works with: the mover, the arm's kinematics, the panel where it is believed to be, and the limits."""
+"""The inputs of a skill: the mover, the arm's kinematics, the panel and its estimated pose, and the limits."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ def _no_progress(_fraction: float, _text: str) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SkillContext:
-    """The frozen context of a skill.
+    """The fixed inputs of a skill.
 
     Attributes:
         mover: runs declared motions.
         base_from_panel: the panel's estimated pose with its covariance.
-        flange_from_grip: finger tips on the flange, z along the fingers, x the closing direction.
+        flange_from_grip: pose of the finger tips on the flange, z along the fingers, x the closing direction.
         limits: speed of transfers.
-        angles_rad: present angles of levers, by name, for collision checks; others get their whole sweep.
-        park_rad: where the arm rests.
+        angles_rad: present angles of levers, by name, for collision checks; the others block their whole sweep.
+        park_rad: joints of the parking position.
         floor_z_m: height of the floor in the base frame.
         obstacles: further boxes in the base frame.
         progress: called with a fraction and a sentence.
-        seed: of the transfer planner.
+        seed: random seed of the transfer planner.
     """
 
     mover: Mover
@@ -66,11 +66,11 @@ class SkillContext:
         return self.base_from_panel.parent_from_child
 
     def collision(self, *, width_m: float, may_touch: Sequence[str] = (), near_plate: bool = False) -> CollisionModel:
-        """Arm, hand at an opening, panel, floor and obstacles.
+        """Return the collision model of arm, hand at an opening, panel, floor and obstacles.
 
         Args:
             may_touch: names of objects that the hand may touch.
-            near_plate: the fingers may come down to the plate.
+            near_plate: whether the fingers may come down to the plate.
         """
         hand = self.hand.capsules(self.flange_from_grip, width_m)
         boxes = (
@@ -86,7 +86,7 @@ class SkillContext:
     def transfer(
         self, start_rad: Array, goal_rad: Array, *, width_m: float, name: str, effort: Effort = THOROUGH
     ) -> JointTrajectory:
-        """A collision-free trajectory between two joint vectors.
+        """Plan a collision-free trajectory between two joint vectors.
 
         Raises:
             Unreachable: none found.
@@ -102,13 +102,13 @@ class SkillContext:
     def choose(
         self, options: Sequence[Sequence[RigidTransform]], *, near_rad: Array, width_m: float, may_touch: Sequence[str]
     ) -> tuple[int, Array]:
-        """Which of several ways to do a stroke the arm can do best, and its joints (N, n) along it.
+        """Return which of several strokes the arm can begin soonest, and its joints (N, n) along it.
 
         Args:
-            options: each a sequence of panel_from_grip poses, the first at the standoff.
+            options: for each stroke its panel_from_grip poses, the first at the standoff.
 
         Raises:
-            Unreachable: none can be followed on one branch without touching something else.
+            Unreachable: none can be followed on one branch of the arm without touching anything else.
         """
         model = self.collision(width_m=width_m, may_touch=may_touch, near_plate=True)
         failures, best = [], None
@@ -135,9 +135,10 @@ class SkillContext:
 
 
 def panel_from_grip(point_m: Sequence[float], turn_rad: float) -> RigidTransform:
-    """Grip pose in the panel frame: fingers straight at the plate, closing direction at `turn_rad` from the panel's x.
+    """Return a grip pose in the panel frame, with the fingers perpendicular to the plate.
 
-    Columns: x = (cos, sin, 0), z = (0, 0, -1), y = z cross x.
+    The closing direction is at `turn_rad` from the panel's x axis. Columns: x = (cos, sin, 0), z = (0, 0, -1), y = z
+    cross x.
     """
     c, s = np.cos(turn_rad), np.sin(turn_rad)
     return transform([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]], point_m)
@@ -146,9 +147,9 @@ def panel_from_grip(point_m: Sequence[float], turn_rad: float) -> RigidTransform
 def is_in_reach(
     kinematics: Kinematics, base_from_panel: RigidTransform, flange_from_grip: RigidTransform, point_m: Sequence[float]
 ) -> bool:
-    """Can the fingertips stand on a point of the panel (panel frame, m), straight at the plate in any turn?
+    """Return whether the fingertips can be at a point of the panel (panel frame, m), perpendicular to it, at any turn.
 
-    Only joint limits count: nothing is said of collisions or of the way there.
+    Only joint limits count; collisions and the path to the point are not checked.
     """
     grips = (base_from_panel * panel_from_grip(point_m, float(turn)) for turn in REACH_TURNS_RAD)
     return any(len(kinematics.inverse(grip * flange_from_grip.inv())) > 0 for grip in grips)

@@ -20,22 +20,22 @@ from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, Skil
 from manipulation.skills.perform import perform
 
 HUB_M = 0.009  # the panel file does not say how thick the hub is; this is generous
-SIDE_M = 0.009  # most room between each finger and the rim when coming down
+SIDE_M = 0.009  # largest free space between each finger and the rim when approaching
 SPARE_M = 0.001
 TIP_DEPTH_M = 0.008  # of the tips below the middle of the rim
-FRICTION = 0.6  # of pads on paint, low on purpose
-FIRMER_RATIO = 1.4  # a light grasp first: a firm one made 97 N of friction along the fingers
+FRICTION = 0.6  # of pads on paint; a low value is the safe side
+FIRMER_RATIO = 1.4  # the first grasp is light, because a firm one caused 97 N of friction along the fingers
 GRIP_FLOOR_N = 12.0
 LARGEST_GRIP_N = 45.0
 TURN_M_PER_S = 0.08
-LONGEST_RAD = 1.7  # of one hold; then the hand goes back for the next
+LONGEST_RAD = 1.7  # largest turn of one grasp; then the hand goes back for the next
 EFFORT_SPREAD = 1.6
 EFFORT_FLOOR_N = 30.0
 LARGEST_STOP_N = 92.0
 TOLERANCE_RAD = np.radians(6.0)
 INF = float("inf")
-# Hub and plate are known to a few millimetres: the hand yields along the radius and the axis, so that the rim leads
-# it round.
+# Hub and plate are known to a few millimetres only, so the hand yields along the radius and the axis, and the rim
+# guides it round.
 RADIAL = Compliance(
     stiffness=(50.0, INF, 400.0, INF, INF, INF),
     damping=(1000.0, 1000.0, 1500.0, 10.0, 10.0, 10.0),
@@ -58,11 +58,11 @@ def handwheel(
     reached.
 
     Args:
-        current: what the last look showed (angle); without it `verify` is asked.
-        verify: the caller's second look.
+        current: what the last observation showed (angle); without it `verify` is asked.
+        verify: the caller's read-back.
 
     Raises:
-        InvalidRequest: the target is beyond the wheel's stops, or nobody knows its angle.
+        InvalidRequest: the target is beyond the wheel's stops, or its present angle is not known.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
     name = wheel.name
@@ -94,22 +94,23 @@ def handwheel(
 
 
 def grip_force_n(wheel: Handwheel, *, tries: int = 0) -> float:
-    """Force of each pad so that friction carries the wheel, 2 mu F r = torque; firmer after each try that slipped."""
+    """Return the force of each pad with which friction carries the wheel, 2 mu F r = torque; firmer after each slip."""
     needed = wheel.torque_nm / (2.0 * FRICTION * wheel.radius_m)
     return float(np.clip(needed * FIRMER_RATIO**tries, GRIP_FLOOR_N, LARGEST_GRIP_N))
 
 
 def free_side_m(wheel: Handwheel, finger_m: float) -> float:
-    """Room on each side of the rim, such that a hand moved inwards meets the rim before its inner finger meets the hub.
+    """Return the free space on each side of the rim with which the rim is met before the hub.
 
-    The outer finger meets the rim at radius R - side, the inner one the hub at hub + finger + rim + side.
+    Moving inwards, the outer finger meets the rim at radius R - side, the inner one the hub at hub + finger + rim +
+    side.
     """
     most = 0.5 * (wheel.radius_m - wheel.rim_m - HUB_M - finger_m - SPARE_M)
     return float(np.clip(most, 0.003, SIDE_M))
 
 
 def _carry(attempt: Attempt, wheel: Handwheel, angle_rad: float, span_rad: float, grip_n: float) -> float:
-    """One hold and turn; returns the signed angle by which the wheel turned."""
+    """Hold the rim once and turn it; returns the signed angle by which the wheel turned."""
     context, sign = attempt.context, float(np.sign(span_rad))
     side_m = free_side_m(wheel, context.hand.finger_thickness_m)
     open_m = 2.0 * (wheel.rim_m + side_m)
@@ -130,7 +131,8 @@ def _carry(attempt: Attempt, wheel: Handwheel, angle_rad: float, span_rad: float
     stop_n = min(LARGEST_STOP_N, EFFORT_SPREAD * wheel.torque_nm / wheel.radius_m + EFFORT_FLOOR_N)
     against = against_turn(start, hub, sign * axis)
     guard = Guard(name="effort", quantity=Quantity.FORCE, limit=stop_n, axis=against)
-    lag = wheel.torque_nm / (2.0 * context.hand.pad_stiffness_n_per_m * wheel.radius_m**2)  # what both pads give
+    # Angle lost because both pads yield.
+    lag = wheel.torque_nm / (2.0 * context.hand.pad_stiffness_n_per_m * wheel.radius_m**2)
     poses = arc(start, centre_m=hub, axis=axis, angle_rad=span_rad + sign * lag)
     report = attempt.along(poses, name="turn", speed_m_per_s=TURN_M_PER_S, guards=(guard,), compliance=RADIAL)
     turned = sign * float(np.linalg.norm((report.base_from_tool.rotation * start.rotation.inv()).as_rotvec()))
@@ -143,7 +145,7 @@ def _carry(attempt: Attempt, wheel: Handwheel, angle_rad: float, span_rad: float
 
 
 def _hub(attempt: Attempt, wheel: Handwheel, place_rad: float) -> Array:
-    """The hub in the base frame: the panel's pose, moved along the radius by what the fingers found of the rim."""
+    """Return the hub in the base frame: its place by the panel's pose, corrected radially by where the rim was felt."""
     panel = attempt.context.panel_pose
     tool = (panel.inv() * attempt.pose()).translation
     radial = np.array([np.sin(place_rad), np.cos(place_rad), 0.0])
@@ -152,7 +154,7 @@ def _hub(attempt: Attempt, wheel: Handwheel, place_rad: float) -> Array:
 
 
 def _way(wheel: Handwheel, start_rad: float, span_rad: float, flip: float) -> list[RigidTransform]:
-    """Grip poses with the closing direction along the radius, from the standoff round the turn."""
+    """Return grip poses with the closing direction along the radius, from the standoff to the end of the turn."""
 
     def at(angle: float, z: float) -> RigidTransform:
         x, y = wheel.position_m

@@ -1,4 +1,4 @@
-"""Where a control stood when it was last seen; a stroke begins there."""
+"""The place where a control was last seen, from which a stroke begins."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from manipulation.skills.outcome import ObjectState, Verify
 
 
 class InitialState:
-    """Keeps an angle, or a value of a scale, by the newest look that showed it.
+    """Keeps the angle or scale value of a control from the newest observation that showed it.
 
     Args:
-        place_of: takes angle or value from a look; None when it shows neither.
-        what: names the place to people.
-        current: what the last look showed; without it `verify` is asked.
-        verify: the caller's second look.
+        place_of: takes the angle or value from an observation; None when it shows neither.
+        what: name of the quantity, for people.
+        current: what the last observation showed; without it `verify` is asked.
+        verify: the caller's read-back.
     """
 
     def __init__(
@@ -37,23 +37,23 @@ class InitialState:
 
     @property
     def known(self) -> float:
-        """Angle or value where the control stands.
+        """Angle or value of the control.
 
         Raises:
-            InvalidRequest: no look has shown it.
+            InvalidRequest: no observation has shown it.
         """
         if self._place is None:
             raise InvalidRequest(f"{self._what} is not known", hint="read it first, or give `current`")
         return self._place
 
     def moved_to(self, place: float) -> float:
-        """Keep where the control was moved to as the tool measured it; returns that."""
+        """Keep the place that the control was moved to, as measured by the tool, and return it."""
         self._place = place
         return place
 
     @property
     def verify(self) -> Verify | None:
-        """The caller's second look, whose angle or value is kept; None when nobody looks."""
+        """The caller's read-back, which also updates the kept angle or value; None when there is no read-back."""
         return self._look if self._verify is not None else None
 
     def _look(self) -> ObjectState | None:

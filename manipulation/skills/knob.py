@@ -16,7 +16,7 @@ from manipulation.skills.rotary import turn_bar
 TOLERANCE_RATIO = 0.02
 GIVE_RAD = np.radians(
     3.5
-)  # what the pads give against friction: two missions ended 2.6 and 4.6 degrees short without it
+)  # the pads yield under friction by this much: without it two missions ended 2.6 and 4.6 degrees short
 
 
 def knob(
@@ -32,11 +32,11 @@ def knob(
     The mechanical estimate in the report is the value reached.
 
     Args:
-        current: what the last look showed; without it `verify` is asked.
-        verify: the caller's second look.
+        current: what the last observation showed; without it `verify` is asked.
+        verify: the caller's read-back.
 
     Raises:
-        InvalidRequest: a value off its scale, or nobody knows where it points.
+        InvalidRequest: the value is off the scale, or the present value is not known.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
     name, scale = panel_object.name, panel_object.scale

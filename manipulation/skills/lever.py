@@ -1,4 +1,4 @@
-"""Turn a lever valve: cage the bar between the fingers and carry it round its hub."""
+"""Turn a lever valve: enclose the bar between the fingers without squeezing it, and carry it round its hub."""
 
 from __future__ import annotations
 
@@ -20,24 +20,25 @@ from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, Skil
 from manipulation.skills.perform import perform
 
 OVERLAP_M = 0.013  # how far the tips reach below the top of the bar
-FROM_END_M = 0.008  # the fingers hold the bar this far before its end: a long lever arm spares the soft pads
-APPROACH_SIDE_M = 0.010  # free space on each side when coming down; more than the pose error
-CAGE_SIDE_M = 0.002  # free space on each side in the stroke: caged, not squeezed
+FROM_END_M = 0.008  # the fingers hold the bar this far before its end: a long lever arm keeps the load on the pads low
+APPROACH_SIDE_M = 0.010  # free space on each side when approaching; more than the pose error
+CAGE_SIDE_M = 0.002  # free space on each side in the stroke: the bar is enclosed, not squeezed
 STROKE_M_PER_S = 0.08
-LAST_RAD = np.radians(9.0)  # the prototype met the end stop at more than 300 N before it slowed down
+LAST_RAD = np.radians(9.0)  # slow over this angle: at full speed the end stop was met with more than 300 N
 OVERTRAVEL_RAD = np.radians(12.0)  # play of the cage and give of the pads
 LAST_M_PER_S = 0.018
 END_RISE_N = 8.0
-SHORT_RAD = np.radians(1.0)  # a tool that stands so far before the state has met no end stop: the bar stuck and slipped
+# If the tool stops further before the state than this, it was friction and not the end stop.
+SHORT_RAD = np.radians(1.0)
 STOP_TRIES = 3
 EFFORT_SPREAD = 1.6
 EFFORT_FLOOR_N = 35.0
-LARGEST_STOP_N = 92.0  # below the cell's protective limit, so that a stiff valve is told from a collision
+LARGEST_STOP_N = 92.0  # below the cell's protective limit, to tell a stiff valve from a collision
 MOVED_RAD = np.radians(12.0)
 TOLERANCE_RAD = np.radians(8.0)
 INF = float("inf")
-# Stiff across the bar, where the work is done. Along the bar and along the fingers the hand yields, or a pose error
-# would build up friction there (25 N of 60) that lets go in jumps.
+# Stiff across the bar, where the work is done. Along the bar and the fingers the hand yields, because a pose error
+# would build up friction there (25 N of 60) that releases in jumps.
 YIELDING = Compliance(
     stiffness=(INF, 1000.0, 2000.0, INF, INF, INF),
     damping=(1500.0, 1500.0, 1500.0, 10.0, 10.0, 10.0),
@@ -48,7 +49,7 @@ YIELDING = Compliance(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Turn:
-    """From where to where, clockwise seen from the front."""
+    """A turn from one angle to another, clockwise seen from the front."""
 
     start_rad: float
     goal_rad: float
@@ -71,12 +72,12 @@ def lever(
     The mechanical estimate in the report is the angle reached, rad clockwise from up.
 
     Args:
-        current: what the last look showed; the fingers come down where its angle has the bar. Without it `verify` is
+        current: what the last observation showed; its angle tells where the fingers come down. Without it `verify` is
             asked.
-        verify: the caller's second look.
+        verify: the caller's read-back.
 
     Raises:
-        InvalidRequest: the lever has no such state, or nobody knows where the bar is.
+        InvalidRequest: the lever has no such state, or its present angle is not known.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
     name = valve.name
@@ -118,7 +119,7 @@ def _is_at(seen: ObjectState, target: str, goal_rad: float) -> bool:
 
 
 def _turn_lever(attempt: Attempt, valve: Lever, turn: _Turn) -> float:
-    """One stroke; returns the angle reached by the bar, as the tool tells it."""
+    """Make one stroke; returns the angle that the bar reached, as measured by the tool."""
     open_m = valve.width_m + 2.0 * APPROACH_SIDE_M
     radius = valve.length_m - FROM_END_M
     ways = [_way(valve, turn, radius, flip) for flip in (0.0, np.pi)]
@@ -136,7 +137,7 @@ def _turn_lever(attempt: Attempt, valve: Lever, turn: _Turn) -> float:
 
 
 def _way(valve: Lever, turn: _Turn, radius: float, flip: float) -> list[RigidTransform]:
-    """Standoff, down, and round: grip poses in the panel frame with the closing direction across the bar."""
+    """Return grip poses in the panel frame from the standoff to the end, with the closing direction across the bar."""
 
     def at(angle: float, z: float) -> RigidTransform:
         x, y = valve.position_m
@@ -149,7 +150,7 @@ def _way(valve: Lever, turn: _Turn, radius: float, flip: float) -> list[RigidTra
 
 
 def _hub(attempt: Attempt, valve: Lever, angle_rad: float) -> Array:
-    """The hub in the base frame: where the panel's pose says, moved across the bar by what the fingers found."""
+    """Return the hub in the base frame: its place by the panel's pose, corrected across the bar by touch."""
     panel = attempt.context.panel_pose
     tool = (panel.inv() * attempt.pose()).translation
     across = np.array([np.cos(angle_rad), -np.sin(angle_rad), 0.0])
@@ -158,9 +159,9 @@ def _hub(attempt: Attempt, valve: Lever, angle_rad: float) -> Array:
 
 
 def _carry(attempt: Attempt, valve: Lever, turn: _Turn, hub: Array) -> float:
-    """The stroke in two parts: fast to 9 degrees before the end, then slowly onto the end stop.
+    """Make the stroke in two parts: fast to 9 degrees before the end, then slowly onto the end stop.
 
-    Returns the signed angle by which the bar turned: that of the tool less the play of the cage and the give of the
+    Returns the signed angle by which the bar turned: the turn of the tool less the play of the cage and the give of the
     pads.
     """
     context, span_rad = attempt.context, turn.span_rad
@@ -187,7 +188,7 @@ def _carry(attempt: Attempt, valve: Lever, turn: _Turn, hub: Array) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Arc:
-    """Where the bar turns: hub (3,) m and axis (3,) in the base frame, positive in the sense of the stroke."""
+    """The rotation of the bar: hub (3,) m and axis (3,) in the base frame, positive in the sense of the stroke."""
 
     hub: Array
     axis: Array
@@ -197,7 +198,7 @@ class _Arc:
 
 
 def _to_the_stop(attempt: Attempt, way: _Arc, start: RigidTransform, strong: Guard) -> float:
-    """Slowly on until the force rises where the end stop can be; a rise before that was the bar's own friction.
+    """Move on slowly until the force rises where the end stop can be; an earlier rise is the bar's own friction.
 
     Returns the angle by which the bar turned since `start`.
     """
@@ -214,7 +215,7 @@ def _to_the_stop(attempt: Attempt, way: _Arc, start: RigidTransform, strong: Gua
         force = float(np.linalg.norm(report.wrench[:3]))
         tool_rad = _between(start, report.base_from_tool)
         lag_rad = (CAGE_SIDE_M + force / attempt.context.hand.pad_stiffness_n_per_m) / way.radius_m
-        # The tool is ahead of the bar by a lag that is known badly, so at the stop it has always passed the state.
+        # The tool is ahead of the bar by a lag that is known poorly, so at the stop it is always past the state.
         if report.tripped != rise.name or tool_rad > way.span_rad - SHORT_RAD or tries == STOP_TRIES:
             return max(0.0, tool_rad - lag_rad)
 

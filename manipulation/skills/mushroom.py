@@ -1,4 +1,4 @@
-"""Press an emergency mushroom; it latches."""
+"""Press an emergency mushroom button, which latches."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def mushroom(
     cap: Mushroom,
     target: str = "pressed",
     *,
-    current: ObjectState | None = None,  # noqa: ARG001 - pressed again, a latched cap stays latched
+    current: ObjectState | None = None,  # noqa: ARG001 - a second press leaves a latched cap latched
     verify: Verify | None = None,
 ) -> SkillReport:
     """Press the mushroom until it latches.

@@ -1,4 +1,4 @@
-"""The one door to the skills: the skill is found by the kind of the object."""
+"""The single entry point of the skills: finds the skill by the kind of the object."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from manipulation.skills.outcome import ObjectState, SkillReport, Verify
 
 
 class Skill(Protocol):
-    """A function that works one kind of control.
+    """A function that operates one kind of control.
 
-    Its panel object is of its kind. Its goal is one of that kind's states, or a number in the unit of its scale (an angle
-    in rad where the kind has no scale).
+    The panel object is of that kind. The goal is one of the kind's states, or a number in the unit of its scale (an
+    angle in rad where the kind has no scale).
     """
 
     def __call__(
@@ -27,7 +27,7 @@ class Skill(Protocol):
         current: ObjectState | None = None,
         verify: Verify | None = None,
     ) -> SkillReport:
-        """Work the object until `goal` is reached, as far as `verify` shows it; `current` is the last look before."""
+        """Operate the object until `goal` is reached, as confirmed by `verify`; `current` is the last observation."""
         ...
 
 
@@ -39,15 +39,15 @@ def operate(
     current: ObjectState | None = None,
     verify: Verify | None = None,
 ) -> SkillReport:
-    """Work a control of the panel by the skill of its kind.
+    """Operate a control of the panel with the skill of its kind.
 
     Args:
         goal: a state of the object, or a number: a value of its scale, or an angle in rad, clockwise from up.
-        current: what the last look showed of it; without it `verify` is asked where the skill must know.
-        verify: the caller's second look. Without it nothing is confirmed, and a finished stroke is `unverified`.
+        current: what the last observation showed of it; without it `verify` is asked where the skill must know.
+        verify: the caller's read-back. Without it nothing is confirmed, and a finished stroke is `unverified`.
 
     Raises:
-        Unsupported: the kind has no skill: it is read only.
+        Unsupported: the kind has no skill, because it can only be read.
         InvalidRequest: the object has no such state or value.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """

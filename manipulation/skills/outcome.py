@@ -1,4 +1,4 @@
-"""How a skill ended. Nothing is `done` without a read-back."""
+"""Outcomes and reports of skills. Nothing is `done` without a read-back."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from hal.motion import MotionReport
 
 
 class Outcome(StrEnum):
-    """Typed ends of a skill."""
+    """How a skill ended."""
 
     DONE = "done"  # the read-back confirms it
-    STIFF = "stiff"  # it did not give way within the force that the panel file leads to expect
+    STIFF = "stiff"  # it did not move within the force expected from the panel file
     STALLED = "stalled"  # it moved, and stopped before the target
-    SLIPPED = "slipped"  # the hand went all the way, the object did not
-    MISSED = "missed"  # the object was not where the hand went
+    SLIPPED = "slipped"  # the hand completed the stroke, the object did not
+    MISSED = "missed"  # the object was not where it was expected
     FORCE_LIMIT = "force_limit"  # the protective force limit ended it
-    UNREACHABLE = "unreachable"  # no collision-free way
+    UNREACHABLE = "unreachable"  # no collision-free path
     UNVERIFIED = "unverified"  # mechanically finished; no read-back confirms it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObjectState:
-    """What a look says about an object: a named state, a value of its scale, or an angle clockwise from up.
+    """What an observation says about an object: a named state, a value of its scale, or an angle clockwise from up.
 
-    `sigma` is the look's own one sigma of value or angle.
+    `sigma` is one standard deviation of the value or angle.
     """
 
     name: str
@@ -38,26 +38,26 @@ class ObjectState:
     sigma: float = 0.0
 
 
-SURE = 2.0  # sigmas of the look; a cap 2.36 % off was once read as 1.9 and called done within 2
+SURE = 2.0  # sigmas added to the error, because a cap that is 2.36 % off may be read as 1.9 % with 2 % allowed
 
 
 def surely_within(measured: float | None, goal: float, allowed: float, *, sigma: float) -> bool:
-    """Is what was measured within `allowed` of the goal even if the look erred by as much as it does now and then?"""
+    """Return whether a measurement is within `allowed` of the goal even if it errs by `SURE` sigmas."""
     return measured is not None and abs(measured - goal) + SURE * sigma <= allowed
 
 
 Verify = Callable[[], ObjectState | None]
-"""The caller's second look; None when it cannot tell."""
+"""The caller's read-back; it returns None when it is inconclusive."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SkillReport:
-    """What a skill did.
+    """Report of one run of a skill.
 
     Attributes:
         target: what was asked for, e.g. "open" or "62.0 %".
-        reached: the mechanical estimate from measured tool motion, in the object's own terms; None when it tells
-        nothing. seen: the last read-back.
+        reached: the mechanical estimate from measured tool motion, in the object's own terms; None when there is none.
+        seen: the last read-back.
         attempts: how often the stroke was tried.
         peak_force_n: over all motions.
     """
@@ -77,7 +77,7 @@ class SkillReport:
 
     @property
     def is_done(self) -> bool:
-        """Confirmed by a read-back?"""
+        """Whether a read-back confirmed the target."""
         return self.outcome is Outcome.DONE
 
     @property
@@ -87,7 +87,7 @@ class SkillReport:
 
 
 class SkillFailure(Exception):
-    """Ends an attempt with an outcome; never leaves the skills."""
+    """Ends an attempt with an outcome; it is caught within the skills."""
 
     def __init__(self, outcome: Outcome, cause: str, *, reached: float | None = None) -> None:
         super().__init__(cause)
@@ -97,5 +97,5 @@ class SkillFailure(Exception):
 
 
 def wrapped(angle_rad: float) -> float:
-    """The angle in (-pi, pi]."""
+    """Return the angle in (-pi, pi]."""
     return float(-((-angle_rad + np.pi) % (2.0 * np.pi) - np.pi))

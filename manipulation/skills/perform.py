@@ -1,4 +1,4 @@
-"""The frame of every skill: a stroke, a second look, and at most two more tries while the look disagrees."""
+"""The frame of every skill: a stroke, a read-back, and at most two more tries while they disagree."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from manipulation.skills.retreat import retreat
 MAX_ATTEMPTS = 3
 
 Stroke = Callable[[Attempt], float | None]
-"""One try of the deed; returns the mechanical estimate; raises `SkillFailure`."""
+"""One try of the stroke; returns the mechanical estimate or raises `SkillFailure`."""
 
 
 def perform(
@@ -28,11 +28,11 @@ def perform(
     attempts: int = MAX_ATTEMPTS,
     repeats: bool = True,
 ) -> SkillReport:
-    """Try a stroke, retreat, look again, and try at most twice more while the look disagrees.
+    """Try a stroke, retreat, read back, and try at most twice more while the read-back does not show the target.
 
     Args:
-        repeats: may a stroke that ended as declared be tried again when the look disagrees? Not for a button, whose
-            second press undoes the first.
+        repeats: whether a stroke that ended as declared may be tried again when the read-back disagrees. Not for a
+            button, whose second press undoes the first.
 
     Raises:
         DeviceFault, Stopped, Cancelled: the cell cannot go on; the caller parks when that is possible.

@@ -1,4 +1,4 @@
-"""Pressing a cap with the closed fingertip: what button and mushroom share."""
+"""Pressing a cap with the closed fingertip: the part that button and mushroom share."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ SEEK_ABOVE_M = 0.004
 PRESS_M_PER_S = 0.020
 STOP_FLOOR_N = 15.0
 EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
-BOTTOM_N = 6.0  # above the spring at full travel: the cap stands on its stop
+BOTTOM_N = 6.0  # beyond the spring force at full travel, where the cap is at its stop
 DEEP_ENOUGH_RATIO = 0.3  # a latched cap has only this much travel left
-LOST_M = 0.018  # how far behind its expected place the cap may be met, and what the soft push yields
+LOST_M = 0.018  # how far behind its expected place the cap may be, plus the give of the soft push
 
 
 def press(
@@ -39,10 +39,10 @@ def press(
 ) -> SkillReport:
     """Press a cap down to its stop and let go.
 
-    Args:
-        is_there: the target was shown before: it is only pressed if the look does not show it any more.
-
     The mechanical estimate is the travel of the cap in metres.
+
+    Args:
+        is_there: the target has been seen already, so the cap is pressed only if the read-back no longer shows it.
     """
 
     tries = itertools.count()
@@ -79,7 +79,7 @@ def press(
 
 
 def stop_force_n(cap: Button | Mushroom) -> float:
-    """Force that tells the cap stands on its stop, N."""
+    """Return the force at which the cap must have reached its stop, N."""
     full = cap.preload_n + cap.spring_n_per_m * cap.travel_m
     return max(STOP_FLOOR_N, EFFORT_SPREAD * full + BOTTOM_N)
 
@@ -91,7 +91,7 @@ def _push(attempt: Attempt, cap: Button | Mushroom) -> MotionReport:
 
 
 def travelled_m(report: MotionReport, pad_stiffness_n_per_m: float) -> float:
-    """How far the cap moved: tip travel under force, less what the pads gave."""
+    """Return how far the cap moved, m: tip travel under force, less the give of the pads."""
     axis = report.base_from_tool.rotation.apply([0.0, 0.0, 1.0])
     depth, force = report.log.tip_m @ axis, -report.log.wrench[:, 2]
     loaded = np.flatnonzero(force > 1.0)

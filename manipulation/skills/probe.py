@@ -1,4 +1,4 @@
-"""Feeling for the panel: touch points with the closed fingers, and proximity points with the sensors beside them."""
+"""Probing the panel: touch points with the closed fingers, and proximity points with the sensors beside them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from manipulation.skills.contact import onset
 from manipulation.skills.context import SkillContext, panel_from_grip
 from manipulation.skills.outcome import Outcome, SkillFailure
 
-SLOW_FROM_M = 0.010  # slow from here before the expected surface; covers a pose error of 3 mm and 1 degree with room
+SLOW_FROM_M = 0.010  # slow from this distance before the expected surface; more than a pose error of 3 mm and 1 degree
 BEYOND_M = 0.012
 TOUCH_M_PER_S = 0.012
 TOUCH_N = 4.0
@@ -28,7 +28,7 @@ TURNS_RAD = tuple(np.linspace(-np.pi, np.pi, 8, endpoint=False))
 class TouchPoint:
     """Where the fingers met a surface: base frame, m, with a (3, 3) covariance in base axes.
 
-    `normal`: from the surface to the fingers. Across the fingers the covariance is that of the fingertip's face.
+    `normal` points from the surface to the fingers. Across the fingers, the covariance is that of the fingertip's face.
     """
 
     point_m: Array
@@ -41,7 +41,7 @@ class TouchPoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ProximityPoint:
-    """One averaged distance of one sensor: its beam leaves `base_from_sensor` along +z."""
+    """One averaged distance of one sensor, whose beam leaves `base_from_sensor` along +z."""
 
     base_from_sensor: RigidTransform
     distance_m: float
@@ -53,15 +53,15 @@ class ProximityPoint:
 def touch_probe(
     context: SkillContext, point_m: Sequence[float], *, object_name: str | None = None, retreat_m: float = 0.03
 ) -> TouchPoint:
-    """Touch the panel (or an object's top) at a point of the panel frame, straight along the panel's normal.
+    """Touch the panel (or the top of an object) at a point of the panel frame, along the panel's normal.
 
     Args:
         point_m: expected surface point in the panel frame, m.
         object_name: the object that will be touched; None means the plate.
 
     Raises:
-        SkillFailure: nothing was met within 12 mm behind the expected surface (`missed`), or the force limit.
-        Unreachable: no free way.
+        SkillFailure: no contact up to 12 mm behind the expected surface (`missed`), or the force limit was reached.
+        Unreachable: there is no collision-free path.
     """
     attempt = Attempt(context)
     x, y, z = (float(v) for v in point_m)
@@ -78,10 +78,10 @@ def touch_probe(
 
 
 def contact_of(report: MotionReport, *, finger_half_m: tuple[float, float]) -> TouchPoint:
-    """The point of first contact in a guarded approach along the fingers.
+    """Return the point of first contact of a guarded approach along the fingers.
 
-    The pads give way, so the tip is past the surface when the guard trips; the force rises linearly with the depth,
-    and the straight line through the samples above the sensor's noise meets zero force at the surface.
+    The pads give way, so the tip is past the surface when the guard trips. The force rises linearly with the depth, and
+    the straight line through the samples above the sensor's noise is zero at the surface.
     """
     axis = report.base_from_tool.rotation.apply([0.0, 0.0, 1.0])
     depth = report.log.tip_m @ axis
@@ -91,7 +91,7 @@ def contact_of(report: MotionReport, *, finger_half_m: tuple[float, float]) -> T
     point = tip + (surface - tip @ axis) * axis
     R = report.base_from_tool.rotation.as_matrix()
     half_x, half_y = finger_half_m
-    # Anywhere on the rectangular face with equal chance: variance of a uniform spread is half^2 / 3.
+    # The contact is anywhere on the rectangular face with equal probability: the variance is half^2 / 3.
     local = np.diag([half_x**2 / 3, half_y**2 / 3, NORMAL_SIGMA_M**2])
     return TouchPoint(
         point_m=point,
@@ -112,15 +112,15 @@ def proximity_probe(
     samples: int = 10,
     sigma_m: float = 0.001,
 ) -> tuple[ProximityPoint, ...]:
-    """Hold the fingers `distance_m` above a point of the panel frame and average what every proximity sensor says.
+    """Hold the fingers `distance_m` above a point of the panel frame and average the readings of each proximity sensor.
 
     Args:
         flange_from_sensors: mounts in the order of the mover's `proximity_m`.
-        sigma_m: one sigma of a single reading; the answer's is that of the mean, but not below a third of it.
+        sigma_m: one sigma of a single reading; the result has that of the mean, but at least a third of it.
 
     Raises:
         SkillFailure: no sensor saw a surface (`missed`).
-        Unreachable: no free way.
+        Unreachable: there is no collision-free path.
     """
     attempt = Attempt(context)
     x, y, z = (float(v) for v in point_m)

@@ -1,4 +1,4 @@
-"""The way out: open the hand, back off along the fingers, and go to the parking joints."""
+"""Retreat: open the hand, move back along the fingers, and go to the parking joints."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ PULL_N = 90.0  # after a failure the hand may be jammed; just below the cell's p
 
 
 def retreat(context: SkillContext, attempt: Attempt | None = None, *, distance_m: float = RETREAT_M) -> None:
-    """Open the hand and back off along the fingers; for the way out after any error.
+    """Open the hand and move back along the fingers, for example after an error.
 
     Raises:
-        DeviceFault, Stopped, Cancelled: the cell does not obey.
+        DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
     attempt = attempt or Attempt(context)
     width = min(context.hand.max_width_m, context.mover.state().gripper_width_m + 0.02)
     with suppress(SkillFailure, MotionRefused):
-        # The way out does not wait for a gripper that says nonsense: it has let go, or the pull will tell.
+        # A gripper with an implausible reading does not end the retreat: the pull shows whether it has let go.
         attempt.run(
             GripperMotion(name="let go", width_m=width, force_n=LET_GO_N, speed_m_per_s=PADS_M_PER_S, must_arrive=False)
         )
-    # Something may hold the hand: it is pulled several times, and `park` sees whether it came free.
+    # Something may hold the hand, so it is pulled several times; `park` checks whether it came free.
     for _ in range(PULLS):
         with suppress(SkillFailure, MotionRefused):
             pulled = attempt.advance(-distance_m, name="retreat", speed_m_per_s=RETREAT_M_PER_S, stop_n=PULL_N)
@@ -36,12 +36,12 @@ def retreat(context: SkillContext, attempt: Attempt | None = None, *, distance_m
 
 
 def park(context: SkillContext) -> None:
-    """Back off from the panel if near it, then go to the parking joints.
+    """Move back from the panel if near it, then go to the parking joints.
 
     Raises:
-        Unreachable: no free way, even after backing off.
-        MotionError: something held the arm up on the way.
-        DeviceFault, Stopped, Cancelled: the cell does not obey.
+        Unreachable: there is no collision-free path, even after moving back.
+        MotionError: a contact stopped the arm on the way.
+        DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
     try:
         _park(context)

@@ -17,15 +17,15 @@ from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, Skil
 from manipulation.skills.perform import perform
 
 SIDE_M = 0.009
-BAR_RATIO = 0.45  # width of the bar over the knob's radius
+BAR_RATIO = 0.45  # width of the bar divided by the knob's radius
 SEAT_N = 5.0
 LIFT_M = 0.0015
-GRIP_N = 12.0  # a low grip force: 40 N doubled the peaks of the prototype
+GRIP_N = 12.0  # low, because 40 N doubles the force peaks
 TURN_M_PER_S = 0.05
 PLAY_RAD = 0.08
 STOP_N = 40.0
 TOLERANCE_RAD = np.radians(12.0)
-# Heavy virtual mass against chatter (15 to 28 N tick to tick with 8 kg, 4 to 6 N with 200 kg).
+# A heavy virtual mass prevents chatter (15 to 28 N from tick to tick with 8 kg, 4 to 6 N with 200 kg).
 YIELDING = Compliance(
     stiffness=(400.0, 400.0, float("inf"), float("inf"), float("inf"), float("inf")),
     damping=(1500.0, 1500.0, 1500.0, 10.0, 10.0, 10.0),
@@ -47,11 +47,11 @@ def rotary(
     The mechanical estimate in the report is the angle reached, rad clockwise from up.
 
     Args:
-        current: what the last look showed (angle or state); without it `verify` is asked.
-        verify: the caller's second look.
+        current: what the last observation showed (angle or state); without it `verify` is asked.
+        verify: the caller's read-back.
 
     Raises:
-        InvalidRequest: the selector has no such state, or nobody knows where it points.
+        InvalidRequest: the selector has no such state, or its present position is not known.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
     name = selector.name
@@ -73,7 +73,7 @@ def rotary(
 
 
 def _resting_angle(seen: ObjectState, angles: dict[str, float]) -> float | None:
-    """A selector rests in a detent: the state's own angle is better than a measured one."""
+    """Return the angle of the observed state if there is one: a selector rests in a detent, so it is the most exact."""
     if seen.state in angles:
         return angles[str(seen.state)]
     return seen.angle_rad
@@ -88,7 +88,7 @@ def _is_at(seen: ObjectState, target: str, angle_rad: float) -> bool:
 def turn_bar(
     attempt: Attempt, selector: Rotary | Knob, start_rad: float, goal_rad: float, *, over_rad: float = 0.0
 ) -> float:
-    """Hold the bar on a knob and turn it, `over_rad` further than asked; returns the angle reached."""
+    """Hold the bar of a knob and turn it `over_rad` further than asked; returns the angle reached."""
     context = attempt.context
     bar_m = BAR_RATIO * selector.radius_m
     open_m = bar_m + 2.0 * SIDE_M

@@ -1,4 +1,4 @@
-"""Move a slider: push its cap by a face that the finger has felt, by the distance that is missing."""
+"""Move a slider: feel a face of its cap with the finger and push it by the missing distance."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from manipulation.skills.initial_state import InitialState
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
 from manipulation.skills.perform import perform
 
-TIP_HEIGHT_M = 0.007  # of the fingertip over the plate: low on the cap, yet a pose error does not scrape
-SIDE_M = 0.009  # room between fingertip and cap when coming down
+TIP_HEIGHT_M = 0.007  # of the fingertip over the plate: low on the cap, but a pose error does not make it scrape
+SIDE_M = 0.009  # free space between fingertip and cap when approaching
 SEEK_M = 0.022
 SEEK_M_PER_S = 0.02
 SEEK_N = 1.3  # below the friction of a light slider, above noise and inertia
 PUSH_M_PER_S = 0.05
-SHORT_M = 0.003  # the push pauses this far before the end to learn how far the pads give
+SHORT_M = 0.003  # the push pauses this far before the end to measure the give of the pads
 TOLERANCE_RATIO = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Push:
-    """Places along the track from its middle, m."""
+    """Start and goal of a push along the track, measured from its middle, m."""
 
     start_m: float
     goal_m: float
@@ -50,17 +50,15 @@ def slider(
 ) -> SkillReport:
     """Push the slider to a value of its scale.
 
-    The distance to push is the difference of two values and the cap's face is found by touch, so an error of the
-    panel's pose does not enter the result.
-
-    The mechanical estimate in the report is the value reached.
+    The distance to push is the difference of two values, and the cap's face is found by touch, so an error of the
+    panel's pose does not affect the result. The mechanical estimate in the report is the value reached.
 
     Args:
-        current: what the last look showed; without it `verify` is asked first.
-        verify: the caller's second look.
+        current: what the last observation showed; without it `verify` is asked first.
+        verify: the caller's read-back.
 
     Raises:
-        InvalidRequest: the value is off the scale, or nobody knows where the cap is.
+        InvalidRequest: the value is off the scale, or the present value is not known.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
     name = fader.name
@@ -88,7 +86,7 @@ def slider(
 
 
 def _push(attempt: Attempt, fader: Slider, push: _Push) -> float:
-    """One push; returns how far the cap moved along the track, m, signed."""
+    """Push once; returns how far the cap moved along the track, m, signed."""
     context = attempt.context
     half_x, half_y = context.hand.closed_half_m
     turns = ((0.0, half_x), (np.pi, half_x), (np.pi / 2, half_y), (-np.pi / 2, half_y))
@@ -113,7 +111,8 @@ def _push(attempt: Attempt, fader: Slider, push: _Push) -> float:
     )
     if not met.is_met:
         raise SkillFailure(Outcome.MISSED, "no cap was met")
-    face = float(met.way_m - (attempt.pose().translation - begun) @ ahead)  # from here back to the face, not positive
+    # From the present place back to the face, not positive.
+    face = float(met.way_m - (attempt.pose().translation - begun) @ ahead)
     length = abs(push.goal_m - push.start_m)
     start = attempt.pose().translation
     _go(attempt, fader, ahead, max(0.0, length + face - SHORT_M), "push")
@@ -160,6 +159,6 @@ def _go(attempt: Attempt, fader: Slider, ahead: np.ndarray, distance_m: float, n
 
 
 def _give_m(attempt: Attempt, ahead: np.ndarray) -> float:
-    """How far the pads give under the push that friction holds now."""
+    """Return how far the pads yield under the force that friction holds at rest, m."""
     force = max(0.0, force_at_rest_n(attempt, attempt.pose().rotation.inv().apply(-ahead)))
     return force / attempt.context.hand.pad_stiffness_n_per_m

@@ -1,4 +1,4 @@
-"""Sweep a line scanner on the wrist: nod it about its own x axis, so that its lines become an image."""
+"""Sweep a line scanner on the wrist: turn it about its own x axis, so that its lines become an image."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from hal.motion import CartesianPath
 from manipulation.planning.cartesian_path import TURN_ARM_M, arc, through
 from manipulation.skills.context import STROKE_MARGIN_M, SkillContext
 
-HALVES_RAD = (0.48, 0.40, 0.32, 0.24)  # tried in this order: near a joint limit a smaller image is better than none
+# Tried in this order, because near a joint limit a smaller image is better than none.
+HALVES_RAD = (0.48, 0.40, 0.32, 0.24)
 QUICK_RAD_PER_S = 0.4  # to the first line and back from the last
 SAME_BRANCH_RAD = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sweep:
-    """Three declared motions, each from rest to rest; after the last the arm stands where it stood before.
+    """Three declared motions, each from rest to rest; after the last one the arm is back where it began.
 
     Attributes:
         out: to the first line.
         across: over all lines, at the rate of the sweep.
-        back: to the pose before.
-        half_rad: the lines lie up to this angle on both sides of that pose.
+        back: to the initial pose.
+        half_rad: the lines lie up to this angle on both sides of the initial pose.
     """
 
     out: CartesianPath
@@ -43,17 +44,17 @@ def plan_sweep(
     start_rad: Array,
     width_m: float,
 ) -> Sweep:
-    """The widest sweep that the arm can make from where it stands without touching anything.
+    """Plan the widest sweep that the arm can make from where it stands without touching anything.
 
-    The scanner turns about its x axis through its own origin, so that the image is what a range camera would have seen from
-    the pose `start_rad`.
+    The scanner turns about its x axis through its own origin, so that the image is the one that a range camera would
+    see from the pose `start_rad`.
 
     Args:
         flange_from_scanner: mount of the scanner; its beams lie in its x-z plane.
         width_m: opening of the gripper.
 
     Raises:
-        Unreachable: not even the smallest sweep.
+        Unreachable: not even the smallest sweep is possible.
     """
     base_from_scanner = context.kinematics.tool(start_rad, flange_from_scanner)
     axis = base_from_scanner.rotation.apply([1.0, 0.0, 0.0])
@@ -87,7 +88,7 @@ def _is_free(
     start_rad: Array,
     width_m: float,
 ) -> bool:
-    """Can the arm follow these poses on the branch that it is on, without touching anything?"""
+    """Return whether the arm can follow these poses on its present branch without touching anything."""
     flange = [pose * flange_from_scanner.inv() for pose in base_from_scanner]
     try:
         paths = context.kinematics.follow(flange, near_rad=start_rad)

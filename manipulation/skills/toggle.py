@@ -19,11 +19,11 @@ from manipulation.skills.perform import perform
 
 PIVOT_M = 0.004  # the bat turns a little above the plate
 GRIP_RATIO = 0.55  # how far up the bat the fingertip pushes: high enough for a lever arm, low enough not to slip off
-SIDE_M = 0.008  # room between fingertip and bat when coming down; more than the pose error
+SIDE_M = 0.008  # free space between fingertip and bat when approaching; more than the pose error
 BEYOND_M = 0.013  # how far past the middle the fingertip's face goes if nothing stops it
 SWEEP_M_PER_S = 0.03
 EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
-END_N = 4.0  # above what the detent needs: the bat stands on its stop
+END_N = 4.0  # beyond the force of the detent, where the bat is at its stop
 
 
 class Handle(Protocol):
@@ -31,32 +31,32 @@ class Handle(Protocol):
 
     @property
     def name(self) -> str:
-        """As in the panel file."""
+        """Name in the panel file."""
         ...
 
     @property
     def position_m(self) -> tuple[float, float]:
-        """Its pivot on the plate."""
+        """Position of the pivot on the plate."""
         ...
 
     @property
     def bat_length_m(self) -> float:
-        """From the plate to its tip."""
+        """Length from the plate to the tip."""
         ...
 
     @property
     def bat_radius_m(self) -> float:
-        """Of its round end."""
+        """Radius of the round end."""
         ...
 
     @property
     def tilt_rad(self) -> float:
-        """How far it leans."""
+        """Angle by which the bat leans to either side."""
         ...
 
     @property
     def force_n(self) -> float:
-        """At its tip, to throw it."""
+        """Force at the tip that throws it."""
         ...
 
 
@@ -68,14 +68,14 @@ def toggle(
     current: ObjectState | None = None,
     verify: Verify | None = None,
 ) -> SkillReport:
-    """Throw the toggle to `on` (up) or `off` (down); one that stands there already is only looked at.
+    """Throw the toggle to `on` (up) or `off` (down); one that is there already is only read.
 
-    The mechanical estimate in the report is how far past the pivot the fingertip's face came, m; more than 0 has thrown
-    the toggle.
+    The mechanical estimate in the report is how far past the pivot the fingertip's face came, m; more than 0 means that
+    the toggle was thrown.
 
     Args:
-        current: what the last look showed.
-        verify: the caller's second look.
+        current: what the last observation showed.
+        verify: the caller's read-back.
 
     Raises:
         InvalidRequest: a toggle has no such state.
@@ -104,7 +104,7 @@ def toggle(
 
 
 def throw(attempt: Attempt, switch: Handle, up: float) -> float:
-    """Come down beside the bat and sweep it over, `up` 1 or -1; returns how far past the pivot the face came, m."""
+    """Approach beside the bat and sweep it over, `up` 1 or -1; returns how far past the pivot the face came, m."""
     half = max(attempt.context.hand.closed_half_m)
     # The bat leans away from the target; come down beyond it.
     lean = switch.bat_length_m * np.sin(switch.tilt_rad) + switch.bat_radius_m
@@ -121,12 +121,15 @@ def throw(attempt: Attempt, switch: Handle, up: float) -> float:
 
 
 def stop_force_n(switch: Handle) -> float:
-    """Force that tells the bat stands on its stop, N: its own effort acts at its tip, the fingertip pushes lower down."""
+    """Return the force at which the bat must have reached its stop, N.
+
+    The effort in the panel file acts at the tip of the bat; the fingertip pushes lower down.
+    """
     return EFFORT_SPREAD * switch.force_n / GRIP_RATIO + END_N
 
 
 def _come_down(attempt: Attempt, switch: Handle, start_m: float, end_m: float) -> None:
-    """The fingertip beside the bat, at panel height `start_m`, from where the sweep to `end_m` is free."""
+    """Bring the fingertip beside the bat, at panel height `start_m`, where the sweep to `end_m` is free."""
     reach = PIVOT_M + GRIP_RATIO * switch.bat_length_m
     x, above = switch.position_m[0], reach + switch.bat_length_m + STANDOFF_M
     ways = [
@@ -144,11 +147,11 @@ def _come_down(attempt: Attempt, switch: Handle, start_m: float, end_m: float) -
 
 
 def _sweep(attempt: Attempt, way_m: float, stop_n: float) -> float:
-    """Push along the panel's y axis until the bat stands on its stop; returns how far the fingertip came, m."""
+    """Push along the panel's y axis until the bat reaches its stop; returns how far the fingertip moved, m."""
     here = attempt.pose()
     sweep = attempt.context.panel_pose.rotation.apply([0.0, way_m, 0.0])
     unit = sweep / np.linalg.norm(sweep)
-    # Only against the sweep: what wedges the finger up along the leaning bat is no effort of the bat.
+    # Only the force against the sweep counts; the force that pushes the finger up along the leaning bat does not.
     x, y, z = here.rotation.inv().apply(-unit)
     against = (float(x), float(y), float(z))
     guard = Guard(name="end stop", quantity=Quantity.FORCE, limit=stop_n, axis=against, ticks=1)

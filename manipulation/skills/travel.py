@@ -1,4 +1,4 @@
-"""Travel through free space: which arm configuration to take, and along which collision-free way."""
+"""Travel through free space: chooses the arm configuration and a collision-free path to it."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from manipulation.skills.retreat import retreat
 ENOUGH_CONDITIONING = 0.06  # smallest singular value over the largest: below it, small moves need fast wrists
 CLEAR_M = 0.004
 MOST_TRIES, MOST_THOROUGH = 24, 3  # goals that are searched for quickly, and then thoroughly
-# The largest turn of a joint between neighbouring views; 3.9 s to another branch of the arm, 1.1 s without.
+# Largest turn of a joint that counts as near; a move to another branch of the arm takes 3.9 s instead of 1.1 s.
 NEAR_RAD = 1.5
-MOST_STEPS_BACK = 6  # of 50 mm: further than the room of an unlocated panel reaches
+MOST_STEPS_BACK = 6  # of 50 mm each: more than the depth of the space that an unlocated panel may occupy
 
 
 def _nothing() -> None:
@@ -41,17 +41,17 @@ def plan_to_first(
     thorough: bool = True,
     between: Callable[[], None] = _nothing,
 ) -> JointTrajectory:
-    """Plan a way for the flange to the first of the poses that is reachable without collision.
+    """Plan a path for the flange to the first of the poses that is reachable without collision.
 
-    A pose that is near by goes before one that another branch of the arm must be taken for, and one that a quick search
-    finds a way to before one that needs a long search: where there is no way, a long one takes ten seconds.
+    Near goals are tried before those that need another branch of the arm, and every goal gets a quick search before any
+    gets a long one, because a long search that finds no path takes ten seconds.
 
     Args:
         thorough: False where other poses would do as well, and only quick searches are worth their time.
         between: called before each search; may raise to give up.
 
     Raises:
-        Unreachable: none of them; says what is in the way of the last one.
+        Unreachable: there is no path to any of them; names the obstacle of the last one.
     """
     state = context.mover.state()
     model = context.collision(width_m=state.gripper_width_m)
@@ -76,7 +76,7 @@ def plan_to_first(
 
 
 def plan_to_joints(context: SkillContext, goal_rad: Array, *, name: str) -> JointTrajectory | None:
-    """Plan a way to a joint vector (n,); None when something is in the way."""
+    """Plan a path to a joint vector (n,); None when there is none."""
     state = context.mover.state()
     if not context.collision(width_m=state.gripper_width_m).is_clear(goal_rad, margin_m=CLEAR_M):
         return None
@@ -87,7 +87,7 @@ def plan_to_joints(context: SkillContext, goal_rad: Array, *, name: str) -> Join
 
 
 def reachable(context: SkillContext, base_from_flange: Sequence[RigidTransform]) -> list[int]:
-    """Return the indices of the poses in which the arm touches nothing; says nothing about the way there."""
+    """Return the indices of the poses in which the arm touches nothing; the path there is not checked."""
     state = context.mover.state()
     model = context.collision(width_m=state.gripper_width_m)
     return [k for k, pose in enumerate(base_from_flange) if _goals(model, pose, state.position_rad)]
@@ -101,18 +101,18 @@ def stands_clear(context: SkillContext, room: CollisionBox) -> bool:
 
 
 def back_out_of(context: SkillContext, room: CollisionBox) -> None:
-    """Back off along the fingers until the arm stands outside of `room`, in which no way can be planned.
+    """Move back along the fingers until the arm is outside `room`, where no path can be planned.
 
     Raises:
-        Unreachable: it did not get out.
-        DeviceFault, Stopped, Cancelled: the cell does not obey.
+        Unreachable: the arm did not get out.
+        DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
     retreat(context)
     attempt = Attempt(context)
     for _ in range(MOST_STEPS_BACK):
         if stands_clear(context, room):
             return
-        with suppress(SkillFailure):  # something strong in the way: the next look tells
+        with suppress(SkillFailure):  # stopped by a strong contact; the next check shows whether the arm is clear
             attempt.leave()
     raise Unreachable(
         f"the arm stands where the panel may be, and {MOST_STEPS_BACK} steps back along its fingers did not free it",
@@ -132,7 +132,7 @@ def near_first(goals: Iterable[Array], here: Array) -> Iterator[Array]:
 
 
 def _goals(model: CollisionModel, base_from_flange: RigidTransform, here: Array) -> list[Array]:
-    """Arm configurations for a flange pose, well-conditioned and free ones, nearest first."""
+    """Return up to three well-conditioned, collision-free arm configurations for a flange pose, nearest first."""
     found = [
         q
         for q in model.kinematics.inverse(base_from_flange)

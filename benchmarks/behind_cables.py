@@ -24,11 +24,11 @@ from service.operations.evaluate import shown_of
 from service.operations.inspect import close_ups, look_past
 from service.operations.locate import go_to_overview, locate
 from service.operations.session import OperationContext, Session
-from service.operations.world_model import WorldModel
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection
 from service.tasks.model import Task
 from service.tasks.store import TaskContext
+from service.world_model import WorldModel
 
 BENCH = Path(__file__).resolve().parents[1] / "cells" / "bench.toml"
 FIRST, COUNT = 1000, 10

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         ProximityObservation,
         TouchObservation,
     )
-    from fusion.planning import CandidateSensing, PoseTolerance, SensingChoice, next_measurement
+    from fusion.planning import PoseTolerance, SensingChoice, TouchPlan, next_measurement
     from fusion.robust import FusedPose, ShapeEstimate, fuse
     from fusion.shapes import Box, Cylinder, FeatureSet, MovingPart, Shape
     from fusion.shared_errors import ErrorBudget, FusedObservations, error_budget, fuse_observations
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Box",
-    "CandidateSensing",
     "Contradiction",
     "Cylinder",
     "ErrorBudget",
@@ -54,6 +53,7 @@ __all__ = [
     "Shape",
     "ShapeEstimate",
     "TouchObservation",
+    "TouchPlan",
     "error_budget",
     "fuse",
     "fuse_observations",

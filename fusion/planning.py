@@ -10,7 +10,8 @@ Source: V. V. Fedorov, Theory of Optimal Experiments, Academic Press 1972, ch. 2
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -19,6 +20,9 @@ from fusion.shared_errors import ErrorBudget
 from hal.arrays import Array
 from hal.errors import InvalidRequest
 from hal.geometry import matrix_of, skew
+
+LEAST_GAIN = 0.01  # of the pose's mean square error: a touch that is expected to bring less is not made
+TOUCH_S = 2.0  # hovering, approaching and leaving, without the way there
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,3 +105,61 @@ def next_measurement(
     gains = [np.log(before / error) / c.cost_s for error, c in zip(after, candidates, strict=True)]
     best = int(np.argmax(gains))
     return SensingChoice(index=best, error_before=before, error_after=after[best], gain_per_s=float(gains[best]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TouchPlan:
+    """What is known of the pose, and the places that could be touched next.
+
+    Attributes:
+        base_from_panel: the pose believed.
+        budget: of all observations so far.
+        tolerance: how well the pose is wanted.
+        spots_m: (N, 2) places left, panel frame.
+        offers: what a touch at each of them would tell.
+        tip_m: (2,) where the fingertips are, panel frame.
+        speed_m_per_s: of the tips on the way.
+    """
+
+    base_from_panel: RigidTransform
+    budget: ErrorBudget
+    tolerance: PoseTolerance
+    spots_m: Array
+    offers: tuple[ErrorBudget, ...]
+    tip_m: Array
+    speed_m_per_s: float
+
+    @property
+    def error(self) -> float:
+        """Mean square error of the pose in units of the tolerance."""
+        return self.tolerance.error_of(self.budget.covariance, self.base_from_panel)
+
+    def choice(self) -> SensingChoice | None:
+        """Return the place to touch next, or None when no place is left."""
+        if not self.offers:
+            return None
+        ways_m = np.linalg.norm(self.spots_m - self.tip_m, axis=1)
+        candidates = [
+            CandidateSensing(budget=offer, cost_s=TOUCH_S + float(way_m) / self.speed_m_per_s)
+            for offer, way_m in zip(self.offers, ways_m, strict=True)
+        ]
+        return next_measurement(self.budget, self.base_from_panel, candidates, tolerance=self.tolerance)
+
+    def without(self, index: int) -> Self:
+        """Return the plan without a place."""
+        left = [k for k in range(len(self.offers)) if k != index]
+        return replace(self, spots_m=self.spots_m[left], offers=tuple(self.offers[k] for k in left))
+
+    def after(self, index: int, told: ErrorBudget) -> Self:
+        """Return the plan after a place was touched and its readings told so much."""
+        return replace(self.without(index), budget=self.budget.plus(told), tip_m=self.spots_m[index])
+
+    def reason_to_stop(self, choice: SensingChoice | None) -> str:
+        """Why no further place needs to be touched; empty when one does."""
+        if self.error <= 1.0:
+            return "the pose is as good as wanted"
+        if choice is None:
+            return "no place is left"
+        if choice.error_after > (1.0 - LEAST_GAIN) * choice.error_before:
+            return f"no further touch is expected to lower the pose's mean square error by {100 * LEAST_GAIN:.0f} %"
+        return ""

@@ -20,13 +20,13 @@ from service.commissioning.preflight import check_wires
 from service.errors import NotPossibleNow
 from service.knowledge.calibrations import Calibrations
 from service.operations import Operation, OperationContext
-from service.operations.world_model import WorldModel
 from service.processes.supervisor import Supervisor
 from service.tasks.gate import GatedConnection
 from service.tasks.journal import Journal
 from service.tasks.lease import LeaseDesk
 from service.tasks.model import Artefact, Task, TaskState
 from service.tasks.store import TaskContext, TaskStore
+from service.world_model import WorldModel
 
 RESTORED_TASKS = 100
 LOOK_S = 0.05

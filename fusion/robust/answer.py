@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
+from scipy.special import chdtr
 
 from fusion.batch import Batch
 from fusion.certify.proof import Certificate, certificate
@@ -24,6 +25,8 @@ from hal.geometry import UncertainPose
 
 EVIDENCE_NEEDED = math.log(1000.0)  # for agreement against chance, once something was rejected
 EVIDENCE_PER_MISMATCH = 0.5  # each rejected measurement is a surprise: fewer are bad than good
+ONE_IN = 1e5
+NO_NOISE = 1e-9  # a chi-square per degree of freedom that no sensor's noise gives, in whatever unit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,6 +130,17 @@ class FusedPose:
     certificate: Certificate | None = None
     proven_set: ProvenSet | None = None
     shape: ShapeEstimate | None = None
+
+    @property
+    def agrees_too_well(self) -> bool:
+        """Do the measurements agree better than noise of the stated size lets them, but for once in `ONE_IN` times?
+
+        Variances in mm^2 that are taken for m^2 make the chi-square a million times too small. Examples drawn by hand agree
+        exactly and are not meant.
+        """
+        if self.dof < 1 or self.chi_square < NO_NOISE * self.dof:
+            return False
+        return bool(chdtr(self.dof, self.chi_square) * ONE_IN <= 1.0)
 
     @property
     def base_from_object(self) -> UncertainPose:

@@ -9,8 +9,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from hal.config import Cell
-from service.operations import targets
-from service.operations.session import OperationContext, Session
+from service.operations.session import OperationContext, Session, check_looked_for
 from service.schema import fuse_request, fuse_results, mission_results, requests, results
 
 __all__ = ["OPERATIONS", "Operation", "OperationContext"]
@@ -71,6 +70,17 @@ def _in_session(module: str, function: str) -> Callable[[OperationContext, Any],
     return run
 
 
+def _checked_by(function: str) -> Callable[[Cell, Any], None]:
+    """`service.operations.manipulate.<function>(cell, request)`, imported when first used, as in `_in_session`."""
+
+    def check(cell: Cell, request: Any) -> None:
+        from service.operations import manipulate
+
+        getattr(manipulate, function)(cell, request)
+
+    return check
+
+
 def _mission(context: OperationContext, request: requests.MissionRequest) -> mission_results.MissionResult:
     from service.operations.mission import run_mission
 
@@ -105,7 +115,7 @@ OPERATIONS: dict[str, Operation] = {
             run=_in_session("recognise", "run_recognise"),
             summary="Find the panel's objects in the camera's image or surfaces in the range image",
             example={"use": ["vision"], "mode": "taught"},
-            check=targets.check_looked_for,
+            check=check_looked_for,
             is_still=_is_stored,
         ),
         Operation(
@@ -124,7 +134,7 @@ OPERATIONS: dict[str, Operation] = {
             run=_in_session("inspect", "run_inspect"),
             summary="Read instruments, lamps, switches and valves from close up",
             example={"objects": ["pressure", "main_valve"], "least_confidence": 0.5},
-            check=targets.check_looked_for,
+            check=check_looked_for,
             is_still=_is_stored,
         ),
         Operation(
@@ -142,7 +152,7 @@ OPERATIONS: dict[str, Operation] = {
             run=_in_session("manipulate", "run_manipulate"),
             summary="Work one control and look whether it worked",
             example={"object": "main_valve", "state": "open"},
-            check=targets.check_manipulate,
+            check=_checked_by("check_manipulate"),
         ),
         Operation(
             name="missions",
@@ -151,7 +161,7 @@ OPERATIONS: dict[str, Operation] = {
             run=_mission,
             summary="Run the whole mission and write its report",
             example={"touches": 4},
-            check=targets.check_mission,
+            check=_checked_by("check_mission"),
         ),
         Operation(
             name="calibrations",

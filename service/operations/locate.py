@@ -15,9 +15,9 @@ from perception.vision import AssignedLights, PanelPrior, QuadranglePose, find_p
 from service.operations.acquisition import LightPair, Look, Scan, look_with_lights, scan
 from service.operations.session import Session
 from service.operations.travel import go_to_camera_view, leave_the_panel
-from service.operations.world_model import expected_panel
 from service.schema.requests import PanelPoseRequest
 from service.schema.results import PanelPoseResult, PlateInScanner, estimated
+from service.world_model import expected_panel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

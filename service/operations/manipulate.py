@@ -1,21 +1,23 @@
-"""Working one control: the skill for its kind, a second look, and what both say."""
+"""The verb `manipulate`: what a deed shall reach, the skill for its kind, a second look, and what both say."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hal.errors import PerceptionError, Unreachable
+from hal.config import Cell
+from hal.entry_points import registered
+from hal.errors import InvalidRequest, PerceptionError, Unreachable
+from hal.kinds import SKILLS, has_part
 from hal.panel import PanelObject
 from manipulation import ObjectState, SkillReport, Verify, operate
 from perception.vision import ObjectReading, said
 from service.operations.inspect import ensure_located, look_close, look_past
 from service.operations.session import Session
-from service.operations.targets import target_of, text_of
 from service.operations.travel import skill_context
 from service.report.plots import png_of
 from service.report.record import Picture
 from service.schema.mission_results import ActionResult, ManipulateResult
-from service.schema.requests import ActionBody, ManipulateRequest
+from service.schema.requests import ActionBody, ManipulateRequest, MissionRequest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,6 +64,42 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
         after=eye.last,
         picture=eye.picture,
     )
+
+
+def target_of(panel_object: PanelObject, body: ActionBody) -> str | float:
+    """What a deed shall reach; the usual deed of its kind when nothing is asked.
+
+    Raises:
+        InvalidRequest: the object cannot be worked, or has no such state or value.
+    """
+    goal = panel_object.goal
+    if goal is None or not has_part(SKILLS, panel_object.kind):
+        raise InvalidRequest(
+            f"{panel_object.name} is a {panel_object.kind}, which cannot be worked: it is read only",
+            hint=f"kinds that can be: {', '.join(registered(SKILLS))}",
+        )
+    for other in sorted({"state", "value", "angle_rad"} - {goal.key}):  # what is meant must not be guessed
+        if getattr(body, other) is not None:
+            hint = f"send {{'object': '{panel_object.name}', '{goal.key}': ...}}"
+            what = f"{panel_object.name} is a {panel_object.kind}: it takes {goal.key}, not {other}"
+            raise InvalidRequest(what, hint=hint)
+    return goal.checked(panel_object.name, getattr(body, goal.key))
+
+
+def text_of(panel_object: PanelObject, target: str | float) -> str:
+    """A target as a report has it."""
+    return str(target) if panel_object.goal is None else panel_object.goal.text(target)
+
+
+def check_manipulate(cell: Cell, request: ManipulateRequest) -> None:
+    """Raise `InvalidRequest` for a deed that makes no sense on the cell's panel."""
+    target_of(cell.panel.object(request.object), request)
+
+
+def check_mission(cell: Cell, request: MissionRequest) -> None:
+    """Raise `InvalidRequest` when one of the deeds makes no sense on the cell's panel."""
+    for body in request.actions or ():
+        target_of(cell.panel.object(body.object), body)
 
 
 def run_manipulate(session: Session, request: ManipulateRequest) -> ManipulateResult:

@@ -17,14 +17,13 @@ from hal.geometry import compose
 from hal.panel import PanelObject, Shown
 from perception.vision import ObjectReading
 from service.operations.acquisition import settle
-from service.operations.cross_check import OVERVIEW, check_surfaces, need_its_place, view_surfaces
 from service.operations.evaluate import AFTER
 from service.operations.inspect import Inspection, inspect_close, inspect_here, need_all_present, reading_result
 from service.operations.locate import Located, ScannedPlane, go_to_overview, locate, scan_plate
 from service.operations.manipulate import work
-from service.operations.sense import fuse_and_remember, fused_result, light_observations
+from service.operations.range_detection import OVERVIEW, check_surfaces, need_its_place, view_surfaces
+from service.operations.sense import feel, fuse_and_remember, fused_result, light_observations
 from service.operations.session import OperationContext, Session
-from service.operations.touches import feel
 from service.operations.travel import leave_the_panel, park
 from service.problem import problem_of
 from service.report.drawing import panel_drawing

@@ -1,26 +1,37 @@
-"""Objects of the panel file found by their surfaces in a range image: the emergency mushroom and the valve wheel."""
+"""Objects of the panel file by their surfaces in a range image, and whether they stand where layout and vision have them.
+
+These are the kinds with a relief, such as mushroom buttons and handwheels. What is not found, or found elsewhere, is looked
+at again from near by and stated. Nothing is overridden: what still stands elsewhere after the second look is not worked.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial.transform import RigidTransform
+from scipy.special import chdtri
 
-from hal.errors import Unsupported
-from hal.geometry import UncertainPose
-from hal.panel import Panel
-from perception.range import (
-    PanelView,
-    PinholeSensor,
-    RangeScene,
-    Sighting,
-    Surface,
-    analyse,
-    find_objects,
-)
-from service.operations.acquisition import Scan
-from service.report.surfaces import Mark
+from hal.devices import DeviceKind
+from hal.errors import NotFound, PerceptionError, Unreachable, Unsupported
+from hal.geometry import UncertainPose, compose
+from hal.panel import Panel, PanelObject
+from perception.range import PanelView, PinholeSensor, RangeScene, Sighting, Surface, analyse, find_objects
+from perception.vision import ObjectReading, viewpoints
+from service.operations.acquisition import Scan, settle
+from service.operations.locate import ScannedPlane, scan_plate
+from service.operations.session import Session
+from service.operations.travel import go_to_first
+from service.report.plots import png_of
+from service.report.record import Picture
+from service.report.surfaces import Mark, surfaces_picture
+from service.schema.mission_results import SurfaceCheck
 
-OUTLINE_POINTS = 48
+OUTLINE_POINTS = 48  # of the circle that is drawn around an object
+ELSEWHERE_P = 1e-3  # one object in a thousand that stands in its place is looked at twice
+TURN_SLACK_RAD = 0.1  # a wheel's angle by its spokes and by its mark, beside three sigmas
+OVERVIEW, CLOSER = "the overview", "a closer look"
 
 
 def surfaces_in(image: Scan) -> RangeScene:
@@ -72,3 +83,158 @@ def mark_of(sighting: Sighting, image: Scan, base_from_panel: UncertainPose) -> 
         text=panel_object.name if sighting.match is not None else f"{panel_object.name}: {sighting.why}",
         is_found=sighting.match is not None,
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SurfaceView:
+    """One scan, its surfaces, and what of the panel file was found in it; `place`: where the arm looked from."""
+
+    place: str
+    scan: Scan
+    scene: RangeScene
+    sightings: tuple[Sighting, ...]
+
+
+def view_surfaces(session: Session, plane: ScannedPlane, place: str) -> SurfaceView:
+    """The mushrooms and handwheels in a scan whose plate is known."""
+    scene = surfaces_in(plane.scan)
+    found = find_by_surfaces(scene, plane.scan, session.panel, session.believed_panel(), plane.fit.surface)
+    return SurfaceView(place=place, scan=plane.scan, scene=scene, sightings=tuple(found))
+
+
+def check_surfaces(session: Session, first: SurfaceView) -> tuple[list[SurfaceCheck], list[Picture]]:
+    """Judge what was seen from the overview, and look closer where that disagrees or shows nothing.
+
+    Raises:
+        NotFound: the panel has not been located.
+        Stopped, DeviceFault, MotionError, Cancelled: the cell cannot go on.
+    """
+    base_from_panel, shown = session.known_panel(), session.world.readings
+    checks: list[SurfaceCheck] = []
+    pictures = [_picture(session, first, "surfaces")]
+    for sighting in first.sightings:
+        name = sighting.panel_object.name
+        check = compared(sighting, base_from_panel, session.panel.tolerances.position_m, shown.get(name), first.place)
+        if not check.agrees:
+            again = _look_closer(session, sighting.panel_object)
+            if isinstance(again, SurfaceView):
+                pictures.append(_picture(session, again, f"surfaces-{name}"))
+                (second,) = [s for s in again.sightings if s.panel_object.name == name]
+                closer = compared(second, base_from_panel, session.panel.tolerances.position_m, shown.get(name), CLOSER)
+                check = after_both(check, closer)
+            else:
+                check = check.model_copy(update={"finding": f"{check.finding}; no closer look: {again}"})
+        checks.append(check)
+    return checks, pictures
+
+
+def compared(
+    sighting: Sighting, base_from_panel: UncertainPose, position_m: float, reading: ObjectReading | None, place: str
+) -> SurfaceCheck:
+    """A sighting held against the panel file and against what vision says.
+
+    Args:
+        position_m: how far an object of a built panel stands from its place in the file, one sigma.
+    """
+    panel_object, match = sighting.panel_object, sighting.match
+    if match is None or sighting.base_from_object is None:
+        return SurfaceCheck(
+            name=panel_object.name, kind=panel_object.kind, seen_from=place, found=False, agrees=None, centre_in_base_m=None,
+            off_m=None, sigma_m=None, chi_square=None, off_vision_m=None, shows=None, vision_shows=_said(panel_object, reading),
+            stands_elsewhere=False,
+            finding=f"not found by its surfaces: {sighting.why}",
+        )  # fmt: skip
+    panel_from_object = compose(base_from_panel.inverse(), sighting.base_from_object)
+    x, y, z = sighting.base_from_object.parent_from_child.translation
+    at_m = panel_from_object.parent_from_child.translation[:2]
+    off = at_m - panel_object.position_m
+    C = panel_from_object.covariance[:2, :2] + position_m**2 * np.eye(2)
+    chi_square = float(off @ np.linalg.solve(C, off))
+    is_elsewhere = bool(chi_square > chdtri(2, ELSEWHERE_P))
+    shows_alike = _shows_alike(sighting, reading)
+    off_m, sigma_m = float(np.linalg.norm(off)), float(np.sqrt(0.5 * np.trace(C)))
+    seen = None if reading is None or reading.centre_m is None else reading.centre_m[:2]
+    shows, vision_shows = _shown(sighting), _said(panel_object, reading)
+    finding = f"stands {1e3 * off_m:.1f} mm from its place in the panel file (1 sigma {1e3 * sigma_m:.1f} mm)"
+    if not shows_alike:
+        finding += f"; shows {shows} by its surfaces and {vision_shows} by vision"
+    return SurfaceCheck(
+        name=panel_object.name, kind=panel_object.kind, seen_from=place, found=True, agrees=shows_alike and not is_elsewhere,
+        centre_in_base_m=(float(x), float(y), float(z)), off_m=off_m, sigma_m=sigma_m, chi_square=chi_square,
+        off_vision_m=None if seen is None else float(np.linalg.norm(at_m - seen)),
+        shows=shows, vision_shows=vision_shows, stands_elsewhere=is_elsewhere, finding=finding,
+    )  # fmt: skip
+
+
+def after_both(first: SurfaceCheck, second: SurfaceCheck) -> SurfaceCheck:
+    """What two looks say together: the closer one where it found the object, and both are told."""
+    newest = second if second.found else first
+    both = f"from {first.seen_from} {first.finding}; from {second.seen_from} {second.finding}"
+    return newest.model_copy(update={"finding": both})
+
+
+def need_its_place(checks: Iterable[SurfaceCheck], name: str) -> None:
+    """Refuse to work an object that stands elsewhere by its surfaces: the fingers would go to where the file has it.
+
+    Raises:
+        NotFound: the object was found elsewhere, twice if it could be looked at twice.
+    """
+    for check in checks:
+        if check.name == name and check.stands_elsewhere:
+            raise NotFound(
+                f"{name} is not worked: {check.finding}",
+                hint="correct its position_m in the panel file, or measure the scanner's mount (`panelwright calibrate scanner`)",
+            )
+
+
+def _shown(sighting: Sighting) -> str | None:
+    """The state by surfaces in the words of vision; a wheel's spokes look the same after each."""
+    relief, state = sighting.panel_object.relief, sighting.state
+    if state is None or relief is None:
+        return None
+    if relief.motion == "slide":
+        return relief.state_name(state)
+    return f"{np.degrees(state):.0f} deg (modulo {360 / relief.turns:.0f})"
+
+
+def _said(panel_object: PanelObject, reading: ObjectReading | None) -> str | None:
+    if reading is None or not reading.answered:
+        return None
+    if not panel_object.value_is_angle or reading.value is None:
+        return reading.state
+    return f"{np.degrees(reading.value):.0f} deg"
+
+
+def _shows_alike(sighting: Sighting, reading: ObjectReading | None) -> bool:
+    """Do surfaces and vision give the same state? Where one of them gives none, nothing contradicts."""
+    relief, match, state = sighting.panel_object.relief, sighting.match, sighting.state
+    if relief is None or match is None or state is None or reading is None or not reading.answered:
+        return True
+    if relief.motion == "slide":
+        return reading.state is None or _shown(sighting) == reading.state
+    if reading.value is None:
+        return True
+    spoke = 2.0 * np.pi / relief.turns
+    apart = abs((state - reading.value + 0.5 * spoke) % spoke - 0.5 * spoke)
+    sigma = np.hypot(match.state_sigma or 0.0, reading.uncertainty or 0.0)
+    return bool(apart <= TURN_SLACK_RAD + 3.0 * sigma)
+
+
+def _look_closer(session: Session, panel_object: PanelObject) -> SurfaceView | str:
+    """The scanner square before the object; text says why not."""
+    flange_from_scanner = session.mount(session.first(DeviceKind.RANGE_SCANNER)).parent_from_child
+    views = viewpoints.close_up_poses(session.known_panel().parent_from_child, panel_object.point_m)
+    try:
+        go_to_first(
+            session, (v * flange_from_scanner.inv() for v in views), name=f"closer look at {panel_object.name}"[:60]
+        )
+        settle(session)
+        return view_surfaces(session, scan_plate(session), CLOSER)
+    except (PerceptionError, Unreachable) as error:
+        return error.what
+
+
+def _picture(session: Session, view: SurfaceView, name: str) -> Picture:
+    marks = [mark_of(s, view.scan, session.believed_panel()) for s in view.sightings]
+    title = f"surfaces in the range image from {view.place}, and what the panel file has of them"
+    return Picture(name=name, title=title, png=png_of(surfaces_picture(view.scene, marks)))

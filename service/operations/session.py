@@ -15,10 +15,11 @@ from hal.frames import frame_tree
 from hal.geometry import UncertainPose, identity
 from hal.motion import DeclaredMotion, MotionOutcome, MotionReport, Mover, RobotState
 from hal.panel import Panel
-from service.operations.world_model import WorldModel, expected_panel
 from service.processes.connection import CellConnection
 from service.report.record import MissionRecord
+from service.schema.requests import InspectRequest, RecogniseRequest
 from service.tasks.store import TaskContext
+from service.world_model import WorldModel, expected_panel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -233,3 +234,10 @@ def panel_object_or_all(panel: Panel, names: Collection[str] | None) -> tuple[st
     if not names:
         raise InvalidRequest("no objects were named", hint="leave `objects` out to mean all of them")
     return tuple(panel_object.name for panel_object in panel.objects if panel_object.name in names)
+
+
+def check_looked_for(cell: Cell, request: InspectRequest | RecogniseRequest) -> None:
+    """Raise `InvalidRequest` for an object that the cell's panel does not have, unless a stored image is asked about."""
+    if request.image is None:
+        for name in request.objects or ():
+            cell.panel.object(name)

@@ -1,14 +1,21 @@
-"""The body of `fuse`: measurements of nine kinds, and objects whose own measures are unknown."""
+"""The body of `fuse`: measurements of nine kinds, and objects whose own measures are unknown.
+
+Each body turns itself into what `fusion` takes, which is imported only then: the service is up fast.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
+import numpy as np
 from pydantic import ConfigDict, Field, model_validator
 
 from hal.strict import Strict
 from service.schema.examples import FUSE_EXAMPLES
 from service.schema.requests import Length, ObjectName, Point, PoseBody, Row3, Touches, Vector3, WantedPose
+
+if TYPE_CHECKING:
+    from fusion import Box, Cylinder, FeatureSet, Measurement, MovingPart
 
 SENSING = Literal[
     "point-point", "point-line", "point-plane", "line-point", "line-line", "line-plane", "plane-point", "plane-line",
@@ -35,6 +42,29 @@ class MeasurementBody(Strict):
         str, Field(max_length=41, description="part of `shape` that was sensed; then x_m and u are ignored")
     ] = ""
 
+    def measurement(self) -> Measurement:
+        """The same as fusion takes it.
+
+        Raises:
+            InvalidRequest: see `fusion.Measurement`.
+        """
+        from fusion import Feature, Kind, Measurement, SensingClass
+
+        cls = SensingClass.named(self.sensing)
+        kind = list(Kind)[(cls - 1) % 3]
+        feature = Feature(kind=kind, point_m=np.array(self.x_m), direction=np.array(self.u), name="")
+        return Measurement(
+            cls=cls,
+            x_m=feature.point_m,
+            u=feature.direction,
+            mu_m=np.array(self.mu_m),
+            C_m2=np.array(self.c_m2),
+            M=np.array(self.m_per_rad2),
+            label=self.label,
+            sensor=self.sensor,
+            part=self.part,
+        )
+
 
 Sigma = Annotated[float, Field(gt=0.0, le=10.0, description="standard deviation of what is believed beforehand, m")]
 Size = Annotated[float, Field(gt=0.0, le=100.0)]
@@ -48,6 +78,12 @@ class CylinderBody(Strict):
     length_m: Size
     sigma_m: Sigma = 0.02
 
+    def shape(self) -> Cylinder:
+        """The same as fusion takes it."""
+        from fusion import Cylinder
+
+        return Cylinder(radius_m=self.radius_m, length_m=self.length_m, sigma_m=self.sigma_m)
+
 
 class BoxBody(Strict):
     """A box about its origin; parts are the faces `+x` to `-z` and edges such as `+x+z`. Its three sizes are estimated, m."""
@@ -55,6 +91,12 @@ class BoxBody(Strict):
     kind: Literal["box"]
     size_m: tuple[Size, Size, Size]
     sigma_m: Sigma = 0.02
+
+    def shape(self) -> Box:
+        """The same as fusion takes it."""
+        from fusion import Box
+
+        return Box(size_m=self.size_m, sigma_m=self.sigma_m)
 
 
 class ParameterBody(Strict):
@@ -74,6 +116,24 @@ class MovingPartBody(Strict):
     direction: Vector3 = (0.0, 0.0, 1.0)
     slopes: Annotated[dict[str, Vector3], Field(max_length=20)] = {}
 
+    def moving(self, parameters: tuple[str, ...]) -> MovingPart:
+        """The same as fusion takes it, with a slope for each of the parameters.
+
+        Raises:
+            InvalidRequest: a line or plane without direction.
+        """
+        from fusion import Feature, Kind, MovingPart, unit
+
+        return MovingPart(
+            feature=Feature(
+                kind=Kind(self.feature),
+                point_m=np.array(self.point_m),
+                direction=unit(self.direction),
+                name=self.name,
+            ),
+            slopes=np.array([self.slopes.get(name, (0.0, 0.0, 0.0)) for name in parameters]),
+        )
+
 
 class FeatureSetBody(Strict):
     """Any points, lines and planes whose places depend linearly on parameters, all of which are estimated."""
@@ -89,6 +149,22 @@ class FeatureSetBody(Strict):
             if unknown := set(part.slopes) - known:
                 raise ValueError(f"part {part.name!r} depends on {sorted(unknown)}, which is no parameter")
         return self
+
+    def shape(self) -> FeatureSet:
+        """The same as fusion takes it.
+
+        Raises:
+            InvalidRequest: a line or plane without direction.
+        """
+        from fusion import FeatureSet
+
+        names = tuple(p.name for p in self.parameters)
+        return FeatureSet(
+            names=names,
+            start=np.array([p.start_m for p in self.parameters]),
+            sigma=np.array([p.sigma_m for p in self.parameters]),
+            moving={part.name: part.moving(names) for part in self.parts},
+        )
 
 
 ShapeBody = Annotated[CylinderBody | BoxBody | FeatureSetBody, Field(discriminator="kind")]

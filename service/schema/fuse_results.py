@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 from pydantic import BeforeValidator, Field
 from scipy.spatial.transform import RigidTransform
 
-from hal.geometry import to_json
-from service.schema.results import EstimatedPose, Numbers, Placement, Result, Rows
+from hal.geometry import UncertainPose, to_json
+from service.schema.results import EstimatedPose, Numbers, Placement, Result, Rows, estimated, fields_of
+
+if TYPE_CHECKING:
+    from fusion import FusedPose, Measurement, ShapeEstimate
 
 
 def _placed(value: Any) -> Any:
@@ -120,4 +125,60 @@ class FuseResult(EstimatedPose):
     shape: ShapeResult | None
     touching: Annotated[TouchingResult | None, Field(description="when the cell collected the measurements itself")] = (
         None
+    )
+
+
+def answer_of(pose: UncertainPose, fused: FusedPose, measurements: Sequence[Measurement]) -> FuseResult:
+    """The fused pose as reports and the API give it; `pose` is the same pose in the frames that the caller means."""
+    rejected = {r.index: r for r in fused.rejected}
+    return FuseResult(
+        **fields_of(estimated(pose)),
+        chi_square=fused.chi_square,
+        dof=fused.dof,
+        warnings=_warnings(fused),
+        ambiguous=fused.is_ambiguous,
+        unobservable=[direction.words for direction in fused.unobservable],
+        measurements=[
+            MeasurementResult(
+                label=m.label,
+                sensor=m.sensor,
+                sensing=m.cls.words,
+                value=float(fused.values[i]),
+                dof=m.dof,
+                rejected=i in rejected,
+                reason=rejected[i].reason if i in rejected else None,
+            )
+            for i, m in enumerate(measurements)
+        ],
+        rejected=[RejectedMeasurement.model_validate(r) for r in fused.rejected],
+        alternatives=[
+            AlternativePose(
+                **fields_of(estimated(UncertainPose(parent_from_child=a.pose, covariance=a.covariance))),
+                odds=a.odds,
+                rejected=list(a.rejected),
+            )
+            for a in fused.alternatives
+        ],
+        certificate=None if fused.certificate is None else CertificateResult.model_validate(fused.certificate),
+        proven_set=None if fused.proven_set is None else ProvenSetResult.model_validate(fused.proven_set),
+        shape=None if fused.shape is None else _shape_result(fused.shape),
+    )
+
+
+def _warnings(fused: FusedPose) -> list[str]:
+    """What a caller should look at although there is an answer."""
+    if not fused.agrees_too_well:
+        return []
+    return [
+        f"the measurements agree far better than their covariances say (chi-square {fused.chi_square:.2g} with {fused.dof} "
+        "degrees of freedom): are these in m^2, not in mm^2, and of one reading?"
+    ]
+
+
+def _shape_result(shape: ShapeEstimate) -> ShapeResult:
+    return ShapeResult(
+        names=list(shape.names),
+        values=shape.values.tolist(),
+        sigma=np.sqrt(np.diag(shape.covariance)).tolist(),
+        covariance=shape.covariance.tolist(),
     )

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusion import CandidateSensing, ErrorBudget, Observation, PoseTolerance, TouchObservation, error_budget
-from fusion.planning import next_measurement
+from fusion import ErrorBudget, Observation, PoseTolerance, TouchObservation, error_budget
+from fusion.planning import CandidateSensing, next_measurement
 from fusion.shared_errors import fuse_observations
 from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose, point_covariance

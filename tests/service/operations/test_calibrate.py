@@ -19,7 +19,6 @@ from service.operations.acquisition import settle
 from service.operations.calibrate import run_calibrations
 from service.operations.session import OperationContext, Session
 from service.operations.travel import kinematics
-from service.operations.world_model import WorldModel
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection
 from service.schema.requests import CalibrationRequest
@@ -27,6 +26,7 @@ from service.schema.results import CalibrationResult
 from service.tasks.gate import GatedConnection
 from service.tasks.model import Task
 from service.tasks.store import TaskContext
+from service.world_model import WorldModel
 from simbackend.draws import Draws
 
 ROOT = Path(__file__).parents[3]

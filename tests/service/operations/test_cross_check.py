@@ -12,7 +12,7 @@ from hal.panel import Handwheel, Mushroom
 from perception.range import Sighting
 from perception.range.matching.match import Match
 from perception.vision.reading import ObjectReading
-from service.operations.cross_check import CLOSER, OVERVIEW, SurfaceCheck, after_both, compared, need_its_place
+from service.operations.range_detection import CLOSER, OVERVIEW, SurfaceCheck, after_both, compared, need_its_place
 
 BASE_FROM_PANEL = RigidTransform.from_components([0.9, 0.1, 0.5], Rotation.from_euler("xyz", [1.5, 0.1, -1.6]))
 MUSHROOM = Mushroom(name="stop", position_m=(0.19, 0.0))

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fusion import ErrorBudget, PoseTolerance
+from fusion import ErrorBudget, PoseTolerance, TouchPlan
 from hal.errors import NotFound, Stopped, Unreachable
 from hal.panel import load_panel
-from service.operations import touches
-from service.operations.touches import TouchPlan
+from service.operations import sense
 from tests.fusion.test_shared_errors import BASE_FROM_PANEL
 
 PANEL = load_panel(Path(__file__).parents[3] / "panels" / "bench.toml")
@@ -56,12 +55,12 @@ class Toucher:
         return [np.asarray(spot)]
 
 
-def follow(monkeypatch: pytest.MonkeyPatch, toucher: Toucher, made: TouchPlan, most: int = 4) -> touches.Felt:
-    monkeypatch.setattr(touches, "_feel_at", toucher)
-    monkeypatch.setattr(touches, "mounts_of", lambda *_: {})
-    monkeypatch.setattr(touches, "error_budget", lambda spots, *_: touch_at(spots[0]))
+def follow(monkeypatch: pytest.MonkeyPatch, toucher: Toucher, made: TouchPlan, most: int = 4) -> sense.Felt:
+    monkeypatch.setattr(sense, "_feel_at", toucher)
+    monkeypatch.setattr(sense, "mounts_of", lambda *_: {})
+    monkeypatch.setattr(sense, "error_budget", lambda spots, *_: touch_at(spots[0]))
     session: Any = SimpleNamespace(panel=PANEL, progress=lambda *_: None)
-    return touches.follow(session, made, most)
+    return sense.follow(session, made, most)
 
 
 def test_each_touch_brings_what_it_was_expected_to(monkeypatch: pytest.MonkeyPatch) -> None:

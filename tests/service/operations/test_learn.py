@@ -13,12 +13,12 @@ from hal.config import Cell, load_cell
 from hal.errors import NotFound
 from service.operations.recognise import run_learn, run_recognise
 from service.operations.session import OperationContext, Session
-from service.operations.world_model import WorldModel
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection
 from service.schema.requests import LearnRequest, RecogniseRequest
 from service.tasks.model import Task
 from service.tasks.store import TaskContext
+from service.world_model import WorldModel
 
 ROOT = Path(__file__).parents[3]
 SEED = 31

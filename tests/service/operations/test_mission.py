@@ -16,19 +16,19 @@ from hal.config import load_cell
 from hal.errors import CellError, DeviceFault, NotFound
 from hal.motion import DeclaredMotion, MotionReport
 from hal.simulated import Fault, ObjectTruth, Truth
-from service.operations.cross_check import CLOSER, OVERVIEW, check_surfaces, need_its_place, view_surfaces
 from service.operations.evaluate import evaluate
 from service.operations.inspect import look_close
 from service.operations.locate import go_to_overview, locate, scan_plate
 from service.operations.mission import run_mission
+from service.operations.range_detection import CLOSER, OVERVIEW, check_surfaces, need_its_place, view_surfaces
 from service.operations.session import OperationContext, Session
 from service.operations.travel import go_to_joints
-from service.operations.world_model import WorldModel
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection
 from service.schema.requests import ActionBody, MissionRequest
 from service.tasks.model import Task
 from service.tasks.store import TaskContext
+from service.world_model import WorldModel
 
 ROOT = Path(__file__).parents[3]
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]

@@ -15,16 +15,15 @@ from hal.config import Cell, load_cell
 from hal.devices import RangeScannerCapabilities
 from hal.errors import DeviceError, StaleReading, Unsupported
 from hal.simulated import Fault
-from service.operations.acquisition import scan
+from service.operations.acquisition import scan, sweep_rate_rad_per_s, sweep_scanner
 from service.operations.locate import ScannedPlane, go_to_overview, locate, plate_in
 from service.operations.range_detection import Sighting, find_by_surfaces, surfaces_in
 from service.operations.session import OperationContext, Session
-from service.operations.sweep import sweep_rate_rad_per_s, sweep_scanner
-from service.operations.world_model import WorldModel
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection
 from service.tasks.model import Task
 from service.tasks.store import TaskContext
+from service.world_model import WorldModel
 
 ROOT = Path(__file__).parents[3]
 

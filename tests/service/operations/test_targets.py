@@ -11,10 +11,10 @@ import pytest
 from hal.config import load_cell
 from hal.errors import InvalidRequest
 from service.operations import OPERATIONS
+from service.operations.manipulate import target_of
 from service.operations.mission import usual_actions
-from service.operations.targets import target_of
-from service.operations.world_model import WorldModel
 from service.schema.requests import ActionBody
+from service.world_model import WorldModel
 
 CELL = load_cell(Path(__file__).parents[3] / "cells/bench.toml")
 

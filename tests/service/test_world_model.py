@@ -14,10 +14,10 @@ from hal.config import load_cell
 from hal.geometry import UncertainPose
 from manipulation.plausibility import Frame
 from perception.vision import ObjectReading
-from service.operations.world_model import Facts, WorldModel, expected_panel
+from service.world_model import Facts, WorldModel, expected_panel
 
 POSE = UncertainPose(parent_from_child=RigidTransform.from_translation([0.7, 0.0, 0.4]), covariance=1e-6 * np.eye(6))
-CELL = load_cell(Path(__file__).parents[3] / "cells" / "bench.toml")
+CELL = load_cell(Path(__file__).parents[2] / "cells" / "bench.toml")
 
 
 def reading(name: str, *, state: str | None) -> ObjectReading:

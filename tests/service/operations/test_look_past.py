@@ -14,6 +14,7 @@ from benchmarks.behind_cables import drawn_cable, open_session, with_cables
 from hal.config import CableSection, load_cell
 from hal.errors import StaleReading, Unreachable
 from hal.simulated import Fault
+from perception.vision import viewpoints
 from perception.vision.reading import ANSWER_AT, ObjectReading
 from service.operations import inspect
 from service.operations.inspect import Inspection, close_ups, inspect_close
@@ -48,7 +49,7 @@ def straight_look(session: Session) -> Inspection:
 def test_a_display_behind_a_cable_is_read_from_the_side(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     session.world.forget_reading("temperature")
     with monkeypatch.context() as patch:
-        patch.setattr(inspect, "SIDES", {})
+        patch.setattr(viewpoints, "SIDES", {})
         straight = inspect_close(session, ("temperature", "flow"))
     assert not straight.readings["temperature"].answered and straight.readings["flow"].answered
     found = inspect_close(session, ("temperature", "flow"))
@@ -77,7 +78,7 @@ def test_a_cap_that_looks_alike_from_afar_is_read_from_close_by(session: Session
     assert not straight.readings["hold"].answered
     found = inspect.look_past(session, straight)
     assert found.readings["hold"].state == truth_of(session, "hold").state == "pressed"
-    assert 1 <= len(found.pictures) - len(straight.pictures) <= len(inspect.FOR_ALIKE)
+    assert 1 <= len(found.pictures) - len(straight.pictures) <= len(viewpoints.CLOSE_SIDES)
     assert "close by" in found.pictures[len(straight.pictures)].title
 
 

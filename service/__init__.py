@@ -1,1 +1,1 @@
-"""The front of the cell: processes, tasks, HTTP, stop, journal, reports, command line."""
+"""The service that runs a cell: processes, tasks, HTTP, stop, journal, reports and command line."""

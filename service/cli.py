@@ -8,16 +8,16 @@ from collections.abc import Callable
 
 
 def main() -> None:
-    """Entry point: an error that we know ends with one clear message and exit code 2, never with a traceback."""
-    if sys.version_info[:2] != (3, 11):  # before any import that would fail with something less clear
+    """Run the command line; a known error ends with one message and exit code 2, not with a traceback."""
+    if sys.version_info[:2] != (3, 11):  # before any import that would fail with a less clear error
         found = f"{sys.version_info[0]}.{sys.version_info[1]}"
         sys.stderr.write(
             f"panelwright needs Python 3.11, this is {found}\n"
             "  try    install it with Python 3.11 (`make setup` in a checkout)\n"
         )
         raise SystemExit(2)
-    os.environ["PYTHONSAFEPATH"] = "1"  # no child process takes a `drivers.py` of the current folder for ours
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # what it warns of comes as an error of ours, with a remedy
+    os.environ["PYTHONSAFEPATH"] = "1"  # no child process imports a `drivers.py` of the current folder
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # our own errors report these faults, with a remedy
     from hal.errors import REINSTALL, CellError
     from service.commands.shutdown import leave
     from service.errors import of_file
@@ -27,7 +27,7 @@ def main() -> None:
     except CellError as error:
         sys.stderr.write(error.for_people() + "\n")
         leave(2)
-    except OSError as error:  # a folder that is not there, a right that is missing, a disk that is full
+    except OSError as error:  # missing folder, missing permission or full disk
         known = of_file(error)
         if known is None:
             raise

@@ -1,4 +1,4 @@
-"""A small client of the HTTP API over httpx: the command line uses it, and others may copy it."""
+"""A small client of the HTTP API; the command line uses it, and other programs may copy it."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from hal.errors import CellError, ConfigError, DeviceUnavailable, Retry, detail_
 
 DEFAULT_URL = "http://127.0.0.1:8460"
 FINAL = ("succeeded", "failed", "cancelled")
-STOP_WAIT_S = 1.0  # then the stop process is asked, which no work of the service delays
+STOP_WAIT_S = 1.0  # after this, the stop process is asked, which other work cannot delay
 
 
 class ApiError(CellError):
-    """A problem that the service answered with; `problem` holds the whole document."""
+    """An error that the service returned as a problem document, which `problem` holds whole."""
 
     def __init__(self, problem: dict[str, Any]) -> None:
         super().__init__(
@@ -29,7 +29,7 @@ class ApiError(CellError):
         self.problem = problem
 
     def for_people(self) -> str:
-        """Several lines for a terminal."""
+        """Return the error as several lines for a terminal."""
         lines = [f"{self.problem.get('title', 'Problem')}: {self.what}"]
         return "\n".join(
             [
@@ -43,39 +43,39 @@ class ApiError(CellError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Client:
-    """Talks to one service.
+    """A client of one service.
 
     Args:
-        url: where it answers, e.g. `http://127.0.0.1:8460`.
-        timeout_s: for one answer.
+        url: address of the service, e.g. `http://127.0.0.1:8460`.
+        timeout_s: the longest wait for one answer.
     """
 
     url: str = DEFAULT_URL
     timeout_s: float = 40.0
 
     def get(self, path: str) -> Any:
-        """The JSON answer to a GET.
+        """Return the JSON answer to a GET request.
 
         Raises:
             ApiError: the service answered with a problem.
-            ConfigError: the address is none, or something else answers there.
-            DeviceUnavailable: nobody answers there.
+            ConfigError: the address is not valid, or another program answers there.
+            DeviceUnavailable: nothing answers there.
         """
         return _json(self.fetch("GET", path))
 
     def post(self, path: str, body: Any = None, *, headers: dict[str, str] | None = None) -> Any:
-        """The JSON answer to a POST; errors as for `get`."""
+        """Return the JSON answer to a POST request; errors as for `get`."""
         return _json(self.fetch("POST", path, body, headers=headers))
 
     def stop(self) -> Any:
-        """Latch the software stop: by the service or, when it does not answer at once, by its stop process.
+        """Latch the software stop through the service or, when that does not answer at once, through its stop process.
 
-        The stop process is looked for on the next port, where `serve` puts it; where `--stop-port` put it elsewhere, make a
-        client of that address.
+        The stop process is expected on the next port, which is the default of `serve`; if `--stop-port` chose another, make a
+        client for that address.
 
         Raises:
             ApiError: the service answered with a problem.
-            DeviceUnavailable: neither of them answers.
+            DeviceUnavailable: neither the service nor the stop process answers.
         """
         url = self._address()
         try:
@@ -91,16 +91,16 @@ class Client:
                 ) from error
 
     def put(self, path: str, body: Any) -> Any:
-        """The JSON answer to a PUT; errors as for `get`."""
+        """Return the JSON answer to a PUT request; errors as for `get`."""
         return _json(self.fetch("PUT", path, body))
 
     def fetch(self, method: str, path: str, body: Any = None, *, headers: dict[str, str] | None = None) -> bytes:
-        """The raw answer; errors as for `get`."""
+        """Return the raw bytes of an answer; errors as for `get`."""
         with self._stream(method, path, body, headers or {}) as answer:
             return answer.read()
 
     def events(self, task_id: str) -> Iterator[dict[str, Any]]:
-        """The events of a task as they come, until it ends. A lost connection is taken up where it broke."""
+        """Yield the events of a task as they come until it ends; a lost connection is resumed after the last event."""
         seen = 0
         while True:
             for event in self._events(f"/v1/tasks/{task_id}/events", seen):
@@ -115,13 +115,13 @@ class Client:
                 for event in httpx2.EventSource(answer):
                     yield json.loads(event.data)
             except httpx2.RequestError:
-                return  # the caller looks whether the task has ended, and comes back if not
+                return  # the caller checks whether the task has ended, and calls again if not
 
     @contextmanager
     def _stream(self, method: str, path: str, body: Any, headers: dict[str, str]) -> Iterator[httpx2.Response]:
-        """An answer that is no problem, while it is being read; a connection that breaks then is a service that is gone."""
+        """Open a successful answer for reading; a connection that breaks meanwhile raises `DeviceUnavailable`."""
         url = self._address().join(path)
-        # A proxy of the environment is for the world outside: a cell is reached directly.
+        # Ignore proxies of the environment, because a cell is reached directly.
         with httpx2.Client(timeout=self.timeout_s, trust_env=False) as connection:
             try:
                 with connection.stream(method, url, json=body, headers=headers) as answer:
@@ -133,7 +133,7 @@ class Client:
 
     def _address(self) -> httpx2.URL:
         try:
-            url = httpx2.URL(self.url if "//" in self.url else f"http://{self.url}")  # as curl takes it
+            url = httpx2.URL(self.url if "//" in self.url else f"http://{self.url}")  # http is the default, as for curl
         except httpx2.InvalidURL:
             url = httpx2.URL("")
         if not url.host or url.scheme != "http":
@@ -141,7 +141,7 @@ class Client:
         return url
 
     def _lost(self, error: Exception) -> DeviceUnavailable:
-        why = str(error).partition("] ")[2] or str(error) or type(error).__name__  # without the number of the error
+        why = str(error).partition("] ")[2] or str(error) or type(error).__name__  # without the error number
         return DeviceUnavailable(
             f"no panelwright answers at {self.url}: {why}",
             hint="start one with `panelwright serve`, or name its address with --url",

@@ -1,4 +1,4 @@
-"""Compiles all kernels once per installation, on all cores, and tells how far it is."""
+"""Compiles all kernels once per installation on all cores, and reports the progress."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from service.warm import STAGES, SURVEY, hash_of_sources
 LOOK_S = 0.25
 WORKER = "service.warm"
 Tell = Callable[[int, int], None]
-"""Told how many kernels of how many are compiled, several times a second."""
+"""Called several times per second with the number of compiled kernels and the number of all kernels."""
 
 
 def is_compiled() -> bool:
-    """Say whether everything was compiled before, from the same sources. Takes a few hundredths of a second."""
+    """Return whether all kernels were compiled from the present sources; takes a few hundredths of a second."""
     return _marker().is_file()
 
 
 def compile_kernels(tell: Tell, *, stages: Iterable[str] = STAGES, cores: int | None = None) -> None:
-    """Compile what is not compiled yet; returns within seconds when there is nothing to do.
+    """Compile the kernels that are not compiled yet; returns within seconds when there are none.
 
     Args:
-        stages: what is run for it; each in a process of its own.
-        cores: how many run at a time; those of this machine when not given.
+        stages: stages of `service.warm` to run, each in its own process.
+        cores: number of stages that run at a time; the number of cores of this machine when not given.
 
     Raises:
         Defect: a stage failed.
@@ -51,7 +51,7 @@ def _marker() -> Path:
 
 
 def _run(stages: list[str], cores: int, *, on_line: Callable[[str], None], on_look: Callable[[], None]) -> None:
-    """Run stages in child processes, some at a time, until all have ended; all are ended with an error."""
+    """Run the stages in child processes, `cores` at a time, until all have ended; an error ends all of them."""
     waiting, running = stages[::-1], dict[str, Child]()
     ended: SimpleQueue[tuple[str, int]] = SimpleQueue()
 

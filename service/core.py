@@ -1,4 +1,4 @@
-"""The service without its front: processes, journal, lease, tasks and memory of one cell, joined."""
+"""The service without HTTP: connects the processes, journal, lease, tasks and stored data of one cell."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class Service:
 
     Args:
         cell: the cell to run.
-        operations: the verbs.
-        runs_dir: missions leave their reports here; tasks and journal live in `runs_dir/.service`.
+        operations: the operations by verb.
+        runs_dir: folder for the reports of missions; tasks and journal are kept in `runs_dir/.service`.
         stop_listener, origins, inline, partial: see `Supervisor`.
     """
 
@@ -79,17 +79,17 @@ class Service:
             report=self.note,
         )
         self._is_closing = threading.Event()
-        self._folder_lock = (state_dir / "lock").open("w")  # held until the process ends, however it does
+        self._folder_lock = (state_dir / "lock").open("w")  # held until the process ends, even if it is killed
         if _is_alone(self._folder_lock):
             self._restore_tasks()
-        else:  # their tasks are none of ours, and those that run have not been aborted
+        else:  # tasks of the other service; those that run were not aborted
             log.warning("another panelwright writes to %s too: tasks of earlier runs are not shown", runs_dir)
 
     def start(self) -> None:
         """Start the cell and wait until it is ready.
 
         Raises:
-            CellError: it could not start.
+            CellError: the cell could not start.
         """
         self.note("service-start", {"cell": self.cell.name, "mode": self.cell.file.cell.mode})
         threading.Thread(target=self._watch, name="watch", daemon=True).start()
@@ -99,11 +99,11 @@ class Service:
         """Start the operation `verb` as a task.
 
         Raises:
-            InvalidRequest: no such verb, or a request that makes no sense in this cell.
+            InvalidRequest: there is no such verb, or the request is not valid for this cell.
             LeaseError: another client holds the cell.
-            Stopped: it would move, and the stop is latched.
-            DeviceUnavailable: the cell is not up.
-            Busy, JournalError: it could not be accepted.
+            Stopped: the operation moves the arm, and the stop is latched.
+            DeviceUnavailable: the cell is not running.
+            Busy, JournalError: the task could not be accepted.
         """
         operation = self.operations.get(verb)
         if operation is None:
@@ -143,7 +143,7 @@ class Service:
         return task
 
     def _confirm(self, task: Task, lease_token: str | None) -> None:
-        """Look at the lease again: who took it over before the task was listed could not cancel it."""
+        """Check the lease again, because a client that took it over before the task was listed could not cancel the task."""
         try:
             self.lease.check(lease_token)
         except LeaseError as error:
@@ -152,12 +152,12 @@ class Service:
             raise
 
     def swap_device(self, name: str, section: DeviceSection) -> None:
-        """Another driver or other options for a device, until the service ends; see `service.processes.device_slots.Swapper`.
+        """Use another driver or other options for a device until the service ends; see `service.processes.device_slots`.
 
         Raises:
-            DeviceUnavailable: the cell is not up.
-            DeviceError, ConfigError: the new one did not connect; the old one is kept.
-            MotionRefused, Busy: not now.
+            DeviceUnavailable: the cell is not running.
+            DeviceError, ConfigError: the new device did not connect; the old one is kept.
+            MotionRefused, Busy: a motion or another swap is running.
         """
         self._check_cell()
         check_wires(self.cell, {name: section})
@@ -171,7 +171,7 @@ class Service:
         self.note("device-swapped", {**told, "seconds": round(time.monotonic() - started_s, 3)})
 
     def close(self) -> None:
-        """Stop the arm, end tasks and processes, close the journal. Bounded and idempotent."""
+        """Stop the arm, end tasks and processes, close the journal; takes a bounded time and is idempotent."""
         if self._is_closing.is_set():
             return
         self._is_closing.set()
@@ -183,10 +183,10 @@ class Service:
         self._folder_lock.close()
 
     def stop_quietly(self, source: str) -> None:
-        """Latch the stop and never fail; for the way out."""
+        """Latch the stop without raising, for use while the service closes."""
         try:
             self.supervisor.stop(source)
-        except Exception:  # whatever it was, the way out goes on
+        except Exception:  # closing goes on after any error
             log.exception("latching the stop")
 
     def _check_cell(self) -> None:
@@ -197,7 +197,7 @@ class Service:
         raise DeviceUnavailable("the cell is starting", hint="GET /readyz tells when it is up", device="cell")
 
     def _check_not_stopped_since(self, count: int) -> None:
-        """A stop that came while the arm stood, and its reset, leave nothing in the latch but a higher count."""
+        """Raise `Stopped` when the latch's count has risen: a stop that was reset since leaves no other trace."""
         if self.supervisor.latch.state().count != count:
             raise Stopped(
                 "the software stop was pressed after this task was asked for",
@@ -214,14 +214,14 @@ class Service:
             self.supervisor.note_stop()
 
     def note(self, kind: str, data: dict[str, Any]) -> None:
-        """Record something without waiting for it."""
+        """Write an entry to the journal without waiting for the disk."""
         try:
             self.journal.note(kind, data)
         except CellError as error:
             log.error("not recorded: %s %s: %s", kind, data, error)
 
     def _restore_tasks(self) -> None:
-        """Take up the tasks of earlier runs from the journal."""
+        """Restore the tasks of earlier runs from the journal."""
         tasks: dict[str, Task] = {}
         kinds = ("task-queued", "task-started", "task-ended")
         records = self.journal.records(kinds=kinds, limit=len(kinds) * RESTORED_TASKS)
@@ -249,7 +249,7 @@ class Service:
 
 
 def _is_alone(lock: IO[str]) -> bool:
-    """Take the lock of a folder; False when another service has it."""
+    """Take the lock of a folder; returns False when another service holds it."""
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
@@ -258,7 +258,7 @@ def _is_alone(lock: IO[str]) -> bool:
 
 
 def _bring_to_end(task: Task, data: dict[str, Any], ended_s: float) -> None:
-    """Give a restored task what its last record says."""
+    """Set state and result of a restored task from its last record."""
     task.result, task.problem = data["result"], data["problem"]
     task.artefacts = [Artefact(**item) for item in data["artefacts"]]
     task.started_s, task.ended_s = data.get("started_s"), ended_s
@@ -268,7 +268,7 @@ def _bring_to_end(task: Task, data: dict[str, Any], ended_s: float) -> None:
 
 
 def stopped(source: str) -> Stopped:
-    """The refusal of a motion while the stop is latched."""
+    """Return the error for a motion while the stop is latched."""
     return Stopped(
         f"the software stop is latched ({source})", hint="look at the cell, then POST /v1/stop/reset and command again"
     )

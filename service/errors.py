@@ -1,4 +1,4 @@
-"""Errors that only the service knows, in the same tree."""
+"""Errors of the service, subclasses of `hal.errors.CellError`."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
 class Busy(CellError):
-    """A queue is full; nothing was accepted."""
+    """A queue is full, so the request was not accepted."""
 
     retry = Retry.SAFE
 
 
 class NoSuchTask(InvalidRequest):
-    """No task or artefact has that name."""
+    """There is no task or artefact with that name."""
 
 
 class NoSuchMission(NoSuchTask):
-    """No mission has left a file of that name."""
+    """There is no file of a mission with that name."""
 
 
 class NoSuchDevice(NoSuchTask):
@@ -28,53 +28,53 @@ class NoSuchDevice(NoSuchTask):
 
 
 class DevicesUnavailable(DeviceUnavailable):
-    """Several devices did not connect; the details say why each, and what to do."""
+    """Several devices did not connect; the details give cause and remedy for each."""
 
     retry = Retry.AFTER_FIX
 
 
 class NotConnected(DeviceUnavailable):
-    """The device did not connect when the cell started, nor when somebody tried again; the rest of the cell works."""
+    """The device did not connect, neither at the cell's start nor later; the rest of the cell works."""
 
     retry = Retry.AFTER_FIX
 
 
 class NotPossibleNow(CellError):
-    """The thing exists, but its state does not allow this."""
+    """The requested object exists, but its state does not allow the request."""
 
     retry = Retry.AFTER_FIX
 
 
 class StaleEpoch(LeaseError):
-    """The lease that came with the command is not the present one."""
+    """The lease that came with the command is not valid any more."""
 
 
 class Aborted(CellError):
     """The service ended while the task ran; the arm was stopped. The task was not taken up again."""
 
-    retry = Retry.AFTER_FIX  # the arm may stand in the middle of a deed: a person looks first
+    retry = Retry.AFTER_FIX  # the arm may have stopped in the middle of an action, so a person must check first
 
 
 class JournalError(CellError):
-    """The journal cannot be written, so nothing may start (no audit, no motion); or it cannot be read or trusted."""
+    """The journal cannot be written, so no task may start; or it cannot be read, or its chain is broken."""
 
     retry = Retry.AFTER_FIX
 
 
 class FileFault(CellError):
-    """A file or folder cannot be written or read: not there, no right, no room."""
+    """A file or folder cannot be written or read: it is missing, permission is missing, or the disk is full."""
 
     retry = Retry.AFTER_FIX
 
 
 class Defect(CellError):
-    """A fault in our own program; the text names what failed, the log has the rest."""
+    """A defect of this program; the text names what failed, and the log has the details."""
 
 
 def of_file(error: Exception) -> CellError | None:
-    """What an error of the file system says to a person; None when it is about something else.
+    """Return the `CellError` for an error of the file system; None for any other error.
 
-    A write to a full disk names no file, an open or a `mkdir` does.
+    The error of a write to a full disk names no file; that of an open or a `mkdir` does.
     """
     if not isinstance(error, OSError) or (error.filename is None and error.errno not in FULL):
         return None

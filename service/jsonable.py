@@ -1,4 +1,4 @@
-"""Anything of ours as plain JSON values: finite numbers, strings, lists, objects."""
+"""Converts the project's values to plain JSON values: finite numbers, strings, lists and objects."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.geometry import to_json
 
-MAX_ARRAY = 4096  # longer arrays belong into artefacts; JSON gets their shape
+MAX_ARRAY = 4096  # elements; longer arrays belong in artefacts, and JSON gives only their shape
 
 
 def jsonable(value: Any) -> Any:
-    """Plain JSON for dataclasses, models, enums, arrays and poses; NaN and infinity become null."""
+    """Return plain JSON values for dataclasses, models, enums, arrays and poses; NaN and infinity become null."""
     if value is None or isinstance(value, str | bool | int):
         return value.value if isinstance(value, Enum) else value
     if isinstance(value, float | np.floating):

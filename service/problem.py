@@ -1,4 +1,4 @@
-"""Errors as RFC 9457 problems: plain values, the same in HTTP answers, in tasks and in the journal."""
+"""Converts errors to RFC 9457 problems, as plain values for HTTP answers, tasks and the journal."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from service import errors
 from service.jsonable import jsonable
 
 STATUS: dict[type[CellError], HTTPStatus] = {
-    # The nearest class up the tree decides.
+    # The first base class found here determines the status.
     CellError: HTTPStatus.INTERNAL_SERVER_ERROR,
     hal_errors.ConfigError: HTTPStatus.UNPROCESSABLE_ENTITY,
     hal_errors.InvalidRequest: HTTPStatus.UNPROCESSABLE_ENTITY,
@@ -33,12 +33,12 @@ STATUS: dict[type[CellError], HTTPStatus] = {
 
 
 def status_of(error: CellError) -> int:
-    """The HTTP status that tells the kind of an error."""
+    """Return the HTTP status for an error."""
     return int(next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS))
 
 
 def problem_of(error: CellError) -> dict[str, Any]:
-    """`type`, `title`, `status`, `detail`, `hint`, `retry` and `details` of an error, as plain JSON values."""
+    """Return `type`, `title`, `status`, `detail`, `hint`, `retry` and `details` of an error as plain JSON values."""
     return {
         "type": f"urn:panelwright:{error.type_name}",
         "title": error.type_name.replace("-", " ").capitalize(),

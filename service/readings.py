@@ -1,4 +1,4 @@
-"""Newest readings of devices, read once for all who ask, as JSON, PNG or npz."""
+"""Gives the newest readings of devices as JSON, PNG or npz; one read serves all callers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ READS: dict[DeviceKind, str] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Snapshot:
-    """A reading, and when this process got it (monotonic seconds)."""
+    """A reading and the monotonic time in seconds at which this process got it."""
 
     stamped: Stamped[Any]
     age_s: float
@@ -42,10 +42,10 @@ class Snapshot:
 
 
 class ReadingDesk:
-    """Reads a device when the newest snapshot is too old; a lock a device keeps several askers to one read.
+    """Reads a device when its newest snapshot is too old; a lock per device lets several callers share one read.
 
     Args:
-        connection: gives the cell, which may change when it is restarted.
+        connection: returns the cell's connection, which may change when the cell is restarted.
     """
 
     def __init__(self, connection: Callable[[], CellConnection]) -> None:
@@ -56,11 +56,11 @@ class ReadingDesk:
         self._pictures: dict[str, tuple[Snapshot, bytes]] = {}
 
     def read(self, name: str, *, max_age_s: float) -> Snapshot:
-        """The device's reading, at most `max_age_s` old.
+        """Return a reading of the device that is at most `max_age_s` old.
 
         Raises:
-            InvalidRequest: no such device.
-            DeviceError: it gives nothing; says why.
+            InvalidRequest: there is no such device.
+            DeviceError: the device gives no reading.
         """
         connection = self._connection()
         device = connection.device(name)
@@ -78,12 +78,12 @@ class ReadingDesk:
             return snapshot
 
     def forget(self, name: str) -> None:
-        """Another device sits there now."""
+        """Drop the readings of the device called `name`, because another device was installed."""
         self._snapshots.pop(name, None)
         self._pictures.pop(name, None)
 
     def png(self, name: str, *, max_age_s: float) -> bytes:
-        """The reading as a PNG picture; encoded once a snapshot."""
+        """Return the reading as a PNG picture, encoded once per snapshot."""
         snapshot = self.read(name, max_age_s=max_age_s)
         cached = self._pictures.get(name)
         if cached is not None and cached[0] is snapshot:
@@ -93,9 +93,9 @@ class ReadingDesk:
         return data
 
     def npz(self, name: str, *, max_age_s: float) -> bytes:
-        """The reading's array in numpy's npz format: `pixels` or `depth_m`, with its stamps.
+        """Return the reading's array (`pixels` or `depth_m`) with its stamps in numpy's npz format.
 
-        A range image says which sensor took it (`meta`, as in `perception.range.recordings`), so that it can be analysed.
+        A range image also has `meta`, which describes the sensor as in `perception.range.recordings`, so it can be analysed.
         """
         stamped = self.read(name, max_age_s=max_age_s).stamped
         arrays = _arrays(name, stamped.value)
@@ -107,7 +107,7 @@ class ReadingDesk:
 
 
 def as_json(name: str, kind: DeviceKind, snapshot: Snapshot) -> dict[str, Any]:
-    """A reading with its stamps as plain values; pictures are described, not listed."""
+    """Return a reading with its stamps as plain values; pictures are described, not listed."""
     stamped = snapshot.stamped
     return {
         "device": name,
@@ -123,7 +123,7 @@ def as_json(name: str, kind: DeviceKind, snapshot: Snapshot) -> dict[str, Any]:
 
 
 def described(value: Any) -> Any:
-    """A value as JSON; pictures are described, not listed."""
+    """Return a value as plain JSON values; pictures are described, not listed."""
     if isinstance(value, Image):
         height, width = value.pixels.shape[:2]
         mean = float(value.pixels.mean())
@@ -145,7 +145,7 @@ def _arrays(name: str, value: Any) -> dict[str, Any]:
 
 
 def _sensor_of(scanner: RangeScannerCapabilities) -> dict[str, str]:
-    """`meta` of a recording: unit and sensor. A sweep of beams is no image, and has none."""
+    """Return the `meta` of a recording (unit and sensor); empty for a line of beams, which is not an image."""
     sensor: dict[str, Any]
     if scanner.projection == "pinhole":
         sensor = {"kind": "pinhole", "f": scanner.fx, "fy": scanner.fy, "cx": scanner.cx, "cy": scanner.cy}
@@ -169,7 +169,7 @@ def _encode_png(name: str, value: Any) -> bytes:
 
 
 def _depth_picture(depth_m: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """Near is bright, unseen is black."""
+    """Return a gray picture of a range image: near is bright, pixels without a range are black."""
     seen = np.isfinite(depth_m)
     if not seen.any():
         return np.zeros(depth_m.shape, np.uint8)

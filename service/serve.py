@@ -1,4 +1,4 @@
-"""A whole panelwright: service, HTTP server, stop port. `panelwright serve` and `panelwright demo` run this."""
+"""Runs service, HTTP server and stop port together, for `panelwright serve` and `panelwright demo`."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ if TYPE_CHECKING:
     from service.http.server import HttpServer
 
 log = logging.getLogger(__name__)
-SWITCH_S = 0.001  # a computing thread yields to the event loop five times sooner than by default
+SWITCH_S = 0.001  # Python's default is 5 ms; a computing thread yields to the event loop sooner
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """How to serve.
+    """Options of `serve`.
 
     Attributes:
-        stop_port: None for the port after `port`, or any free one.
-        partial: go on without devices that do not connect.
-        warm: load hot loops early.
+        stop_port: None for the port after `port`, or for any free port.
+        partial: whether to go on without devices that do not connect.
+        warm: whether to load the compiled kernels at the start.
     """
 
     host: str = "127.0.0.1"
@@ -49,7 +49,7 @@ class Options:
 
 
 class Panelwright:
-    """Everything that `serve` starts, with one way up and one way down.
+    """Starts and closes everything that `serve` runs.
 
     Raises:
         ConfigError: a port is in use, or given twice.
@@ -93,26 +93,26 @@ class Panelwright:
 
     @property
     def url(self) -> str:
-        """Where it answers."""
+        """Address of the HTTP server."""
         return f"http://{self.host}:{self.port}"
 
     @property
     def stop_url(self) -> str:
-        """Where the stop process answers."""
+        """Address of the stop process."""
         return f"http://{self.host}:{self.stop_port}/v1/stop"
 
     @property
     def error(self) -> CellError | None:
-        """Why the cell could not start."""
+        """The error with which the cell could not start, or None."""
         return self._error
 
     @property
     def is_ending(self) -> bool:
-        """Whether it was told to end, perhaps before it was up."""
+        """Whether it was told to end, perhaps before the start was complete."""
         return self._is_ending.is_set()
 
     def start(self) -> None:
-        """Start the server in a thread and the cell, and wait until both are up.
+        """Start the server in a thread and the cell, and wait until both are ready.
 
         Raises:
             CellError: the cell could not start; everything is closed again.
@@ -128,7 +128,8 @@ class Panelwright:
     def run(self) -> None:
         """Serve in the main thread until Ctrl-C or SIGTERM, then close.
 
-        The front is up before the hardware; a cell that cannot start, as its file is wrong, ends it.
+        The HTTP server is ready before the hardware. A cell that cannot start, for example because its file is wrong, ends
+        the server.
 
         Raises:
             CellError: the cell could not start.
@@ -144,7 +145,7 @@ class Panelwright:
             raise self._error
 
     def close(self) -> None:
-        """Stop the arm, end server and processes; bounded, idempotent."""
+        """Stop the arm, end server and processes; takes a bounded time and is idempotent."""
         self._is_ending.set()
         if self._server is not None:
             self._server.stop()
@@ -152,13 +153,13 @@ class Panelwright:
         self._listener.close()
 
     def wait_until_settled(self, timeout_s: float) -> bool:
-        """Wait until the cell is up or has failed; tells whether that happened."""
+        """Wait until the cell is ready or has failed; returns whether that happened in time."""
         return self._is_settled.wait(timeout_s)
 
     def _begin(self) -> None:
-        """Start the cell in the background: it needs seconds, while this process imports its web framework."""
+        """Start the cell in the background, because it takes seconds in which this process imports its web framework."""
         sys.setswitchinterval(SWITCH_S)
-        # FastAPI silences this one within `catch_warnings` only, which imports in the cell's thread meanwhile undo.
+        # FastAPI hides this warning with `catch_warnings`, which imports in the cell's thread can undo meanwhile.
         warnings.simplefilter("ignore", UnsupportedFieldAttributeWarning)
         threading.Thread(target=self._start_service, name="start-cell", daemon=True).start()
         from service.http.app import create_app, state_of_app
@@ -170,7 +171,7 @@ class Panelwright:
         )
 
         def on_exit(why: str) -> None:
-            # The latch first, by the stop process: then every stream is told to end.
+            # Latch the stop first, through the stop process; then tell every stream to end.
             self._is_ending.set()
             self.service.stop_quietly(why)
             state_of_app(app).hub.close()
@@ -179,15 +180,15 @@ class Panelwright:
         freeze_loaded()
         if self._error is not None:
             self._server.stop()  # the cell failed before there was a server to end
-        if self._wants_warmth:  # beside the cell's start, which waits for another process
+        if self._wants_warmth:  # at the same time as the cell's start, which waits for another process
             threading.Thread(target=_warm, name="warm", daemon=True).start()
 
     def _start_service(self) -> None:
         try:
             self.service.start()
         except CellError as error:
-            self._error = None if self._is_ending.is_set() else error  # Ctrl-C while it starts is no fault
-        except Exception as error:  # a defect must end the program with a message, not hang it
+            self._error = None if self._is_ending.is_set() else error  # Ctrl-C during the start is not an error
+        except Exception as error:  # a defect must end the program with a message
             log.exception("starting the cell")
             from service.errors import Defect
 
@@ -198,20 +199,21 @@ class Panelwright:
 
 
 def _warm() -> None:
-    """Load the hot loops while nobody waits; a fault here will show when they are used."""
+    """Load the compiled kernels before they are needed; an error here is logged and shows again when they are used."""
     from service.warm import warm
 
     try:
         warm()
-    except Exception:  # the first user gets it with its context
+    except Exception:  # raised again, with its context, at the first use
         log.warning("warming up failed", exc_info=True)
     freeze_loaded()
 
 
 def exit_on_sigterm() -> None:
-    """Let SIGTERM unwind like Ctrl-C: its default would skip all cleaning up, also when uvicorn raises it again.
+    """Make SIGTERM raise an exception as Ctrl-C does, because its default action would skip all clean-up.
 
-    The end of a terminal counts as SIGTERM, unless `nohup` wants it ignored.
+    This also covers uvicorn, which raises the signal again. The end of the terminal (SIGHUP) is handled in the same way,
+    unless `nohup` made the process ignore it.
     """
 
     def leave(_signal: int, _frame: FrameType | None) -> None:

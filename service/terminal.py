@@ -1,4 +1,4 @@
-"""The terminal that commands print to, and how they find a cell file that a person names."""
+"""Prints to the terminal, and finds the cell file that a person names."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 from rich.console import Console
 
 ROOT = Path(__file__).parents[1]
-LOG_WIDTH = 160  # where there is no terminal: a table cut at 80 columns loses the names of the devices
+LOG_WIDTH = 160  # width without a terminal; at 80 columns tables lose the device names
 console = Console(
     highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else LOG_WIDTH
 )
 
 
 def find_cell(path: Path) -> Path:
-    """`path` as given, or the shipped file of that name when there is none here."""
+    """Return `path` as given if it exists, else the shipped file of that name."""
     shipped = ROOT / path
     is_elsewhere = not path.exists() and not path.is_absolute() and shipped.parent.is_dir()
     return shipped if is_elsewhere and (shipped.exists() or not path.parent.is_dir()) else path

@@ -1,6 +1,6 @@
-"""Compiles or loads the compiled kernels before somebody waits for them.
+"""Compiles or loads the kernels before they are needed.
 
-Run as a module it is one worker of `service.compiling`: `python -m service.warm STAGE`, or `survey`.
+`service.compiling` runs this module as a worker process: `python -m service.warm STAGE`, or `survey`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SURVEY = "survey"
 
 
 def _imports() -> None:
-    # Everything that a mission computes, plans and draws with.
+    # All kernels with which a mission computes, plans and draws.
     for name in ("service.operations.mission", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         import_module(name)
 
@@ -69,9 +69,9 @@ STAGES: Mapping[str, Callable[[], None]] = {
     "cell": _cell,
     "imports": _imports,
 }
-"""What can be compiled side by side, longest first."""
+"""The stages that can be compiled in parallel, the longest first."""
 OF_SERVICE = ("imports", "range", "vision", "fusion", "planning")
-"""What the service process computes with. The cell and world processes load their own kernels when they start."""
+"""The stages of the service process. The cell and world processes load their own kernels when they start."""
 
 
 def warm() -> None:
@@ -81,13 +81,13 @@ def warm() -> None:
 
 
 def sources() -> list[Path]:
-    """Return the files that hold compiled kernels, or say how kernels are compiled."""
+    """Return the files that hold compiled kernels or determine how kernels are compiled."""
     files = sorted(file for room in ROOMS for file in (ROOT / room).rglob("*.py"))
     return [file for file in files if b"numba" in (text := file.read_bytes()) or b"hal.jit" in text]
 
 
 def hash_of_sources() -> str:
-    """Hash the files that hold kernels and Python's version, to tell whether all was compiled before."""
+    """Return a hash of the kernels' files and Python's version, which tells whether everything was compiled before."""
     digest = hashlib.sha256(sys.version.encode())
     for file in sources():
         digest.update(file.relative_to(ROOT).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")

@@ -1,6 +1,6 @@
-"""Readers, one file a kind: a rectified patch and the panel file's description in, a reading out.
+"""Readers, one file per kind: each turns a rectified patch and the panel file's description into a reading.
 
-These names are what a package needs that brings a reader of its own.
+The names exported here are those that a package with a reader of its own needs.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Bars that stick out of a hub: knob marks, lever handles, toggle bats. They differ from what lies on both sides."""
+"""Contrast of bars that stick out of a hub (knob marks, lever handles, toggle bats) against both of their sides."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 from hal.arrays import Array
 from perception.vision.patch import Patch, sample_at
 
-CORE = (-0.5, 0.0, 0.5)  # of the half width
+CORE = (-0.5, 0.0, 0.5)  # places across the bar, in half widths
 FLANK = (1.7, 2.1)
-LEAST_KNOWN = 0.35  # of a bar's stations
+LEAST_KNOWN = 0.35  # share of a bar's stations that must be visible
 
 
 def bar_contrast(
@@ -27,14 +27,15 @@ def bar_contrast(
 ) -> Array:
     """(N,) signed contrast (gray levels) of a bar from the object's middle towards each angle, clockwise from up.
 
-    At every station along the bar the core is compared with both flanks; the station counts with the smaller of the two
-    differences, and with nothing when their signs disagree (an edge, not a bar). The result is a low quantile over the
-    stations, of the sign that the bar has: positive for bars brighter than their surroundings.
+    At every station along the bar the core is compared with both flanks. The station counts with the smaller of the two
+    differences, and with 0 when their signs disagree (an edge, not a bar). The result is a low quantile over the
+    stations, with the sign of the bar: positive for bars brighter than their surroundings.
 
     Args:
         height_m: height above the plate of the bar's ends (inner, outer), or one height, or None for the patch's plane.
-        hidden: (H, W) what something lies across: such stations say nothing, and a bar that is mostly hidden has no contrast.
-        beside_m: how far to the right of the line from the middle the bar lies, parallel to it.
+        hidden: (H, W) mask of occluded pixels. Occluded stations are ignored; a bar that is mostly occluded has no
+            contrast.
+        beside_m: offset of the bar to the right of the line from the middle, parallel to it.
     """
     angle = np.atleast_1d(np.asarray(angles_rad, float))
     ends_z = [None, None] if height_m is None else list(np.broadcast_to(np.asarray(height_m, float), (2,)))
@@ -42,7 +43,8 @@ def bar_contrast(
             for r, z in zip(along_m, ends_z, strict=True)]  # fmt: skip
     along = ends[1] - ends[0]
     length = np.linalg.norm(along, axis=1, keepdims=True)
-    across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(length, 1e-9)  # as it appears: bars may lean
+    # Direction across the bar as it appears, because bars may lean
+    across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(length, 1e-9)
     count = max(6, round(float(length.max())))
     share = np.linspace(0.0, 1.0, count)[None, :, None, None]
     offsets = np.array([*CORE, -flank[0], -flank[1], flank[0], flank[1]]) * half_width_m
@@ -59,7 +61,8 @@ def bar_contrast(
         lost = sample_at(hidden.astype(np.uint8), place[..., 0].reshape(shape), place[..., 1].reshape(shape)) > 0.2
         lost = lost.reshape(len(angle), count, len(offsets))
         no_core, no_left, no_right = (lost[:, :, part].any(axis=2) for part in (slice(3), slice(3, 5), slice(5, 7)))
-        left, right = np.where(no_left, right, left), np.where(no_right, left, right)  # one flank tells alone
+        # If one flank is hidden, the other is used alone
+        left, right = np.where(no_left, right, left), np.where(no_right, left, right)
         left = np.where(no_core | no_left & no_right, np.nan, left)
     bright = np.maximum(np.minimum(left, right), 0.0)
     dark = np.maximum(np.minimum(-left, -right), 0.0)
@@ -68,8 +71,8 @@ def bar_contrast(
 
 
 def _low(stations: Array, quantile: float) -> Array:
-    """Mean of the lower half around a quantile of the known stations: smoother than the quantile itself."""
-    ordered = np.sort(stations, axis=1)  # what is not known comes last
+    """Mean of the lower half around a quantile of the known stations; it is smoother than the quantile itself."""
+    ordered = np.sort(stations, axis=1)  # NaN (unknown) sorts last
     if not np.isnan(ordered[:, -1]).any():
         top = max(2, round(stations.shape[1] * 2 * quantile))
         return np.asarray(ordered[:, :top].mean(axis=1))

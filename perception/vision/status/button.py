@@ -13,16 +13,16 @@ from perception.vision.status.shade import cap_shades
 
 SHADE_HALF, SHADE_SCALE = 0.06, 0.03  # .95 of 179 drawn flush caps stay below 0.062, half of the others exceed 0.068
 SPOT_HALF, SPOT_SCALE = 1.12, 0.1  # .95 of flush caps stay below 0.96, .95 of the others exceed 1.28
-SHADE_ODDS, SPOT_ODDS = (-1.5, 3.0), (-2.5, 6.0)  # a cap a pixel beside its place has a shade too
-#: Of 230 flush caps none has more than 0.002 below, but for glare beside some drawn ones (0.004 to 0.014).
+SHADE_ODDS, SPOT_ODDS = (-1.5, 3.0), (-2.5, 6.0)  # a cap whose place is off by a pixel has a shade too
+# Of 230 flush caps none exceeds 0.002 below, except for glare beside some drawn ones (0.004 to 0.014).
 BELOW_FROM, BELOW_SCALE, BELOW_ODDS = 0.0075, 0.0015, 4.5
-ALONE = 1.3  # log odds at most, of a shade without a face, and of no shine without a ring
+ALONE = 1.3  # largest log odds of a shade without a visible face, or of missing shine without a visible ring
 MODEL_SHARE = 0.25
 UNSEEN = "the button cannot be seen (glare, shadow or cover): change the angle or the light"
 
 
 def read_button(patch: Patch, spec: Button) -> PatchReading:
-    """State of a push button. `patch` shows any plane near the cap."""
+    """State of a push button. `patch` may show any plane near the cap."""
     return read_cap(patch, spec, foot_m=0.0)
 
 
@@ -36,7 +36,7 @@ def read_cap(patch: Patch, spec: Button | Mushroom, *, foot_m: float | None) -> 
     a = np.linspace(0, 2 * np.pi, 24)
     seen = patch.seen(np.outer([0.5, 0.8, 1.0], np.sin(a)) * R, np.outer([0.5, 0.8, 1.0], np.cos(a)) * R)
     by_height = patch.growth_per_m > 0
-    if seen < 0.4 and not by_height:  # edges show beside saturation, shades do not
+    if seen < 0.4 and not by_height:  # edges remain measurable beside saturation, shades do not
         return refused(UNSEEN)
     evidence = _by_height(patch, spec, foot_m) if by_height else _by_shade(patch, R)
     if evidence is None:
@@ -49,13 +49,13 @@ def read_cap(patch: Patch, spec: Button | Mushroom, *, foot_m: float | None) -> 
 
 
 def _by_height(patch: Patch, spec: Button | Mushroom, foot_m: float | None) -> float | None:
-    """Log odds of `released` from the measured height."""
+    """Log odds of `released` from the measured height; None if the height cannot be measured."""
     lowest, high = spec.height_m - spec.travel_m, spec.height_m
     cap = cap_height(patch, radius_m=spec.radius_m, low_m=lowest, high_m=high, foot_m=foot_m)
     if cap is None:
         return None
     depth = spec.pressed_depth_m
-    sigma_m = np.hypot(cap.sigma_m, MODEL_SHARE * depth)  # neither cap nor travel is known better than that
+    sigma_m = np.hypot(cap.sigma_m, MODEL_SHARE * depth)  # cap height and travel are not known better than this share
     return float((cap.height_m - (high - depth / 2)) * depth / sigma_m**2)
 
 

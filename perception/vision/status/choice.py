@@ -1,4 +1,4 @@
-"""Choosing one of several named states by rival evidence."""
+"""Choice of one of several named states by comparing their evidence."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from perception.vision.reading import PatchReading, doubted, gated, probability,
 
 
 def choose(names: Sequence[str], evidence: Array, *, noise: float, seen: float, what: str) -> PatchReading:
-    """The state with the most evidence, unless a state of another name comes near.
+    """Return the state with the most evidence, or refuse if a state with another name comes close.
 
     Args:
         names: (N,) state names; one name may have several places.
         evidence: (N,) non-negative contrast, gray levels.
-        noise: what such a contrast reaches by chance, gray levels.
-        seen: share of the object that is visible, 0 to 1.
-        what: the moving part, for the refusal.
+        noise: contrast that occurs by chance, gray levels.
+        seen: visible share of the object, 0 to 1.
+        what: name of the moving part, for the refusal's text.
     """
     if seen < 0.4:
         return refused(f"the {what} cannot be seen (glare, shadow or cover): change the angle or the light")
@@ -42,7 +42,7 @@ def choose(names: Sequence[str], evidence: Array, *, noise: float, seen: float, 
 
 
 def contrast_noise(patch: Patch) -> float:
-    """Gray levels that a contrast between small means reaches by chance in this patch."""
+    """Contrast (gray levels) that the means of small areas of this patch reach by chance."""
     below = np.cumsum(step_counts(np.ascontiguousarray(patch.gray), 1))
     middle = np.searchsorted(below, [(below[-1] + 1) // 2, below[-1] // 2 + 1])
     return float(max(1.5, 1.2 * middle.mean()))

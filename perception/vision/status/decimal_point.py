@@ -1,4 +1,4 @@
-"""The decimal point: what is left at the foot of a gap between digits when the lit segments have been taken away."""
+"""Search for the decimal point: ink that remains at the foot of a gap after the lit segments have been subtracted."""
 
 from __future__ import annotations
 
@@ -17,35 +17,36 @@ from perception.vision.status.digit_grid_worth import Float32
 RADIUS = 0.075  # of the digit height
 LEVEL = 0.47  # of a lit segment: dots blurred by motion have .4 to .6, gaps without one up to .37 (of 1400 drawn ones)
 LEVEL_SPREAD = 0.07
-MOST_TYPICAL = 0.37  # where the gaps without a point seem to have more, the strokes are not known
-MOST_ODDS = 6.0  # logarithm: a dot that is brighter is no surer, and two gaps with one each stay in doubt
-HIDDEN_ODDS = -0.7  # logarithm, of a point in a gap that is hidden against no point at all
-STRIP = (0.55, 1.25)  # rows that are looked at, over the digit height from its top
-HALF_STROKES = np.array([0.045, 0.065])  # of the digit height: tried, with every blur
+MOST_TYPICAL = 0.37  # if gaps without a point exceed this, the stroke model is wrong
+MOST_ODDS = 6.0  # log odds at most: a brighter dot is not more certain, and two gaps with a dot each stay ambiguous
+HIDDEN_ODDS = -0.7  # log odds of a point in a hidden gap against no point at all
+STRIP = (0.55, 1.25)  # rows that are searched, in digit heights from the digit's top
+HALF_STROKES = np.array([0.045, 0.065])  # candidate half stroke widths, in digit heights; each is tried with every blur
 BLURS = np.array([0.02, 0.05, 0.09])
-INSETS = (0.2, 0.08, 0.32)  # of a segment's axis, at either end, by which its stroke is shorter
-PLACES_X = np.linspace(0.25, 0.75, 6)  # of the gap
-MORE_PLACES_X = np.linspace(0.25, 1.05, 9)  # of one hidden in part: no stroke beside it says where the grid lies
-PLACES_Y = np.linspace(-0.12, 0.06, 7)  # of the digit height, from the bottom segments' axis
+INSETS = (0.2, 0.08, 0.32)  # shares of a segment's axis by which its stroke is shorter at either end
+PLACES_X = np.linspace(0.25, 0.75, 6)  # candidate places across the gap, as shares of it
+# Candidate places in a partly hidden gap: no stroke beside it confirms where the grid lies
+MORE_PLACES_X = np.linspace(0.25, 1.05, 9)
+PLACES_Y = np.linspace(-0.12, 0.06, 7)  # in digit heights, from the bottom segments' axis
 COLON_STRIP, COLON_LEVEL = (
     (0.0, 1.0),
     0.8,
 )  # colons of 36 drawn clocks have 1.1 or more, gaps of 75 sure numbers up to .6
 COLON_Y = (np.linspace(-0.80, -0.58, 7), np.linspace(-0.42, -0.20, 7))
-LEAST_OF_DOT = 0.4  # of a dot's picture that must be seen to tell its height
-STEPS = 8  # places a px at which a stroke's profile is tabled
+LEAST_OF_DOT = 0.4  # visible share of a dot's template that is needed to estimate its height
+STEPS = 8  # samples per px of the tabulated stroke profiles
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DecimalPoint:
-    """Number of cells before the decimal point (None without one), and the probability that this is so."""
+    """Number of cells before the decimal point (None without one), and the probability that this is correct."""
 
     place: int | None
     probability: float
 
 
 def find_decimal_point(ink: Float32, seen: Float32, grid: DigitGrid, lit_levels: Array) -> DecimalPoint:
-    """Where the decimal point is.
+    """Find the decimal point.
 
     A dot template must reach a share of a lit segment's level and stand out from the other gaps.
 
@@ -60,7 +61,7 @@ def find_decimal_point(ink: Float32, seen: Float32, grid: DigitGrid, lit_levels:
     order = np.sort(levels[clear])
     typical = float(np.clip(np.median(order[:-1]), 0.0, MOST_TYPICAL)) if len(order) > 1 else 0.0
     odds = (levels - typical - LEVEL) / LEVEL_SPREAD
-    # A gap that is hidden in part may show a dot; that it shows none says nothing. The last: no point.
+    # A partly hidden gap can show a dot, but the absence of one proves nothing. The last entry means no point.
     odds = np.append(np.clip(odds, np.where(clear, -30.0, HIDDEN_ODDS), MOST_ODDS), 0.0)
     share = np.exp(odds - odds.max())
     k = int(share.argmax())
@@ -68,7 +69,7 @@ def find_decimal_point(ink: Float32, seen: Float32, grid: DigitGrid, lit_levels:
 
 
 def find_colon(ink: Float32, seen: Float32, grid: DigitGrid, lit_levels: Array) -> int | None:
-    """Number of cells before a clock's colon: a gap with one dot in its upper half and one in its lower; None without one."""
+    """Number of cells before a clock's colon, which is one dot in the upper and one in the lower half of a gap; or None."""
     if grid.count < 2:
         return None
     dots = [dot_levels(ink, seen, grid, lit_levels, strip=COLON_STRIP, places_y=ys)[0] for ys in COLON_Y]
@@ -86,11 +87,11 @@ def dot_levels(
     strip: tuple[float, float] = STRIP,
     places_y: Array = PLACES_Y,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """(cells - 1,) level of the best dot in every gap over that of lit segments beside it, and whether the gap is seen.
+    """(cells - 1,) level of the best dot in every gap relative to lit segments beside it, and whether the gap is visible.
 
     Args:
-        strip: rows that are looked at, over the digit height from its top.
-        places_y: of the dot, over the digit height, from the bottom segments' axis.
+        strip: rows that are searched, in digit heights from the digit's top.
+        places_y: candidate heights of the dot, in digit heights from the bottom segments' axis.
     """
     first, last = (round(grid.top_px + share * grid.height_px) for share in strip)
     first, last = max(0, first), min(len(ink), last)
@@ -109,7 +110,7 @@ def dot_levels(
 
 
 def _beside(lit_levels: Array) -> Array:
-    """(cells - 1,) level of lit segments beside every gap: behind glare a dot is dimmer, as its neighbours are."""
+    """(cells - 1,) level of lit segments beside every gap. Behind glare a dot is as dim as its neighbours."""
     lit = lit_levels > 0
     cells = np.where(lit.any(axis=1), (lit_levels * lit).sum(axis=1) / np.maximum(lit.sum(axis=1), 1), np.nan)
     if not np.isfinite(cells).any():
@@ -120,7 +121,7 @@ def _beside(lit_levels: Array) -> Array:
 
 
 def _dot(radius_px: float, sigma_px: float) -> Float32:
-    """A blurred disc of unit height before the blur."""
+    """Template of a disc that has unit height before it is blurred."""
     half = int(np.ceil(radius_px + 2.5 * sigma_px))
     y, x = np.mgrid[-half : half + 1, -half : half + 1]
     disc = np.clip(radius_px + 0.5 - np.hypot(x, y), 0.0, 1.0).astype(np.float32)
@@ -128,7 +129,7 @@ def _dot(radius_px: float, sigma_px: float) -> Float32:
 
 
 def _drawn(strip: Float32, clear: Float32, grid: DigitGrid, lit_levels: Array, first: int) -> tuple[Float32, float]:
-    """The lit segments as drawn strokes with the width and blur that leave the least, and that blur in px."""
+    """The lit segments drawn with the stroke width and blur that minimise the residual, and that blur in px."""
     h = grid.height_px
     shapes = [(half * h, max(blur * h, 0.3)) for half in HALF_STROKES for blur in BLURS]
     distance = np.arange(0.0, (HALF_STROKES[-1] + 2.5 * BLURS[-1]) * h + 1.0, 1.0 / STEPS)
@@ -143,7 +144,7 @@ def _drawn(strip: Float32, clear: Float32, grid: DigitGrid, lit_levels: Array, f
 
 
 def _closest(canvases: Float32, strip: Float32, clear: Float32) -> tuple[int, Float32, float]:
-    """Which of (rows, columns, shapes) pictures fits the strip best, that picture at its best strength, what it leaves."""
+    """Index of the (rows, columns, shapes) picture that fits the strip best, that picture scaled to fit, and the residual."""
     seen = (canvases * clear[..., None]).reshape(strip.size, -1)
     along = strip.ravel() @ seen
     square = np.maximum(np.einsum("pk,pk->k", seen, seen), 1e-6)
@@ -153,7 +154,7 @@ def _closest(canvases: Float32, strip: Float32, clear: Float32) -> tuple[int, Fl
 
 
 def _profile(distance: Array, half_px: float, sigma_px: float) -> Array:
-    """Height of a blurred stroke of unit height at a distance from its axis."""
+    """Profile of a blurred stroke of unit height against the distance from its axis."""
     scale = np.sqrt(2.0) * sigma_px
     return np.asarray(0.5 * (erf((half_px - distance) / scale) + erf((half_px + distance) / scale)))
 
@@ -165,7 +166,7 @@ def _strokes(
     """(rows, columns, shapes) sum of the lit segments' strokes on a strip that begins at row strip[0].
 
     Args:
-        tables: (N, shapes) height of a stroke at every 1 / STEPS px from its axis.
+        tables: (N, shapes) stroke profiles, sampled every 1 / STEPS px from the axis.
     """
     first, rows, columns = strip
     left, pitch, width, top, bottom, slant = grid
@@ -200,11 +201,12 @@ def _strokes(
 def _best_dots(
     rest: Float32, seen: Float32, dot: Float32, grid: Array, count: int, first: int, xs: Array, ys: Array
 ) -> tuple[Array, Array]:
-    """(count - 1,) least-squares height of the best dot over an even ground in every gap, and 1 where the gap is seen."""
+    """(count - 1,) least-squares height of the best dot on a constant background per gap, and 1 where the gap is visible."""
     left, pitch, width, top, bottom, slant = grid
     rows, columns = rest.shape
     half = dot.shape[0] // 2
-    # What a dot's picture varies by, seen whole: a place that shows less of one cannot tell its height.
+    # Variance of a fully visible dot template: a place that shows much less of it cannot determine the dot's
+    # height.
     least = LEAST_OF_DOT * ((dot * dot).sum() - dot.sum() ** 2 / dot.size)
     best, clear = np.full(count - 1, -np.inf), np.zeros(count - 1)
     for gap in range(count - 1):

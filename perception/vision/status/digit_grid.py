@@ -1,8 +1,9 @@
-"""Where the digit cells of a seven-segment display are: slant, rows, pitch and width whose cells make the best characters.
+"""Search for the digit cells of a seven-segment display: the slant, rows, pitch and width that fit characters best.
 
-The slant is the one whose sheared picture has the sharpest columns. For every likely row pair and width, the worth of a cell
-is then known along the picture (see `digit_grid_worth`); a grid is the pitch and phase that collect the most. The best few are
-refined continuously. How many cells there are need not be known: blank ones are worth nothing.
+The slant is the one whose sheared picture has the sharpest columns. For every likely pair of rows and every width, the
+worth of a cell is computed along the picture (see `digit_grid_worth`); a grid is the pitch and phase with the largest
+total. The best few grids are refined continuously. The number of cells need not be known, because blank cells are worth
+nothing.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ AXES = np.array([
     [[0, 0.5], [1, 0.5]],
 ])  # fmt: skip
 SLANTS = np.tan(np.deg2rad(np.arange(-2.0, 16.1, 2.0)))
-WIDTHS = np.array([0.40, 0.49, 0.60])  # between the uprights' axes, over the digit height
-PITCHES = np.geomspace(1.25, 2.6, 16)  # over that width
-HEIGHTS = np.geomspace(0.34, 0.94, 10)  # of a digit over the picture's
+WIDTHS = np.array([0.40, 0.49, 0.60])  # candidate distances between the uprights' axes, in digit heights
+PITCHES = np.geomspace(1.25, 2.6, 16)  # candidate pitches, in cell widths
+HEIGHTS = np.geomspace(0.34, 0.94, 10)  # candidate digit heights, as shares of the picture's height
 ROWS_TRIED = 4
 REFINED = 2
 REFINE_STEPS = np.array([0.05, 0.025, 0.012])  # of the digit height
-EVEN_OUT = 0.45  # dimmer parts of the picture are raised until their ink reaches this share of the strongest
+EVEN_OUT = 0.45  # dimmer parts of the picture are amplified until their ink reaches this share of the strongest
 LIT_SHARES = LIT.astype(float)
 
 
@@ -60,34 +61,34 @@ class DigitGrid:
 
     @property
     def gap(self) -> float:
-        """Between neighbours' uprights, over the digit height."""
+        """Gap between the uprights of neighbouring cells, in digit heights."""
         return (self.pitch_px - self.width_px) / self.height_px
 
     @property
     def height_px(self) -> float:
-        """Between the axes of the top and the bottom segments."""
+        """Distance between the axes of the top and bottom segments."""
         return self.bottom_px - self.top_px
 
     @property
     def numbers(self) -> Array:
-        """(6,) left, pitch, width, top, bottom, slant, as the compiled routines take them."""
+        """(6,) left, pitch, width, top, bottom, slant, in the order that the compiled routines expect."""
         return np.array([self.left_px, self.pitch_px, self.width_px, self.top_px, self.bottom_px, self.slant])
 
     def place(self, x: Array, y: Array, cell: Array) -> tuple[Array, Array]:
-        """Pixel of cell coordinates: x from 0 (left upright) to 1, y from 0 (top) to 1."""
+        """Pixel coordinates of a place in a cell: x from 0 (left upright) to 1, y from 0 (top) to 1."""
         v = self.top_px + y * (self.bottom_px - self.top_px)
         lean = self.slant * ((self.top_px + self.bottom_px) / 2 - v)
         return self.left_px + cell * self.pitch_px + x * self.width_px + lean, v
 
 
 def find_digit_grids(ink: Float32, seen: Float32, *, most: int = 8, free: float = 0.5) -> list[tuple[float, DigitGrid]]:
-    """(worth, grid) of the most promising grids, best first; none where no ink stands out.
+    """(worth, grid) of the most promising grids, best first; an empty list where no ink stands out.
 
     Args:
-        ink: (H, W) how much every pixel differs from the background, as segments do; 0 where nothing is seen.
-        seen: (H, W) 1 where the display is seen, 0 where something hides it.
-        most: number of cells at most.
-        free: how far the grid's middle may lie from the picture's, over its width.
+        ink: (H, W) how much every pixel differs from the background in the way segments do; 0 where nothing is visible.
+        seen: (H, W) 1 where the display is visible, 0 where something hides it.
+        most: maximum number of cells.
+        free: largest distance of the grid's middle from the picture's, as a share of the picture's width.
     """
     even = _evened(ink)
     flat = _flat_ink(even)
@@ -95,7 +96,7 @@ def find_digit_grids(ink: Float32, seen: Float32, *, most: int = 8, free: float 
     if len(rows) == 0:
         return []
     slant = _slant(even, flat)
-    whole = bool(seen.min() > 0)  # then nobody looks at what is seen
+    whole = bool(seen.min() > 0)  # if nothing is hidden, `seen` need not be evaluated
     upright, clear = _upright(even, slant), seen if whole else _upright(seen, slant)
     sums = np.asarray(cv2.integral(upright, sdepth=cv2.CV_64F), float)
     shares = sums if whole else np.asarray(cv2.integral(clear, sdepth=cv2.CV_64F), float)
@@ -109,13 +110,13 @@ def find_digit_grids(ink: Float32, seen: Float32, *, most: int = 8, free: float 
 
 
 def _refined(upright: Float32, clear: Float32, whole: bool, guess: Array, slant: float) -> tuple[float, DigitGrid]:
-    """(worth, grid) near a guess, sought continuously."""
+    """(worth, grid) after continuous refinement of a guess."""
     _, left, pitch, width, top, height, count = (float(value) for value in guess)
     place = np.array([left, pitch, width, top, top + height, 0.0])
     means, shares = segment_means(upright, clear, whole, width, height)
     worth = refine_grid(means, shares, whole, place, int(count), LIT_SHARES, REFINE_STEPS, slant)
     left, pitch, width, top, bottom, rest = (float(value) for value in place)
-    left += slant * ((len(upright) - 1) / 2 - (top + bottom) / 2)  # the shear left the picture's middle row in place
+    left += slant * ((len(upright) - 1) / 2 - (top + bottom) / 2)  # shearing keeps the picture's middle row in place
     return float(worth), DigitGrid(
         left_px=left, pitch_px=pitch, width_px=width, top_px=top, bottom_px=bottom, slant=slant + rest, count=int(count)
     )
@@ -124,7 +125,7 @@ def _refined(upright: Float32, clear: Float32, whole: bool, guess: Array, slant:
 def segment_means(
     upright: Float32, clear: Float32, whole: bool, width_px: float, height_px: float
 ) -> tuple[Float32, Float32]:
-    """What `digit_grid_fit.grid_worth` looks up: means over boxes of the size of a segment of such cells, around every pixel."""
+    """Box means that `digit_grid_fit.grid_worth` looks up; the boxes have the size of a segment of such cells."""
     stroke = round(2 * STROKE * height_px) | 1
     boxes = (
         (round((1 - 2 * INNER) * width_px) | 1, stroke),
@@ -139,7 +140,7 @@ def segment_means(
 
 
 def _evened(ink: Float32) -> Float32:
-    """The ink with dim stretches raised: behind glare and at grazing light, segments are as sure but weaker."""
+    """Ink with dim stretches amplified: segments behind glare or in grazing light are as certain, only weaker."""
     high = column_levels(ink, 0.92)[None]
     reach = max(3, len(ink) // 2) | 1
     wide = cv2.GaussianBlur(cv2.dilate(high, np.ones((1, reach), np.uint8)), (0, 0), reach / 4)
@@ -148,12 +149,12 @@ def _evened(ink: Float32) -> Float32:
 
 
 def _flat_ink(even: Float32) -> Float32:
-    """What is left of the ink where it is wider than an upright."""
+    """The part of the ink that is wider than an upright."""
     return np.asarray(cv2.erode(even, np.ones((1, max(3, len(even) // 9) | 1), np.uint8)), np.float32)
 
 
 def _slant(even: Float32, flat: Float32) -> float:
-    """Tangent of the lean to the right under which the uprights' columns are sharpest."""
+    """Tangent of the lean to the right at which the uprights' columns are sharpest."""
     uprights = cv2.subtract(even, cv2.dilate(flat, np.ones((1, max(3, len(even) // 9) | 1), np.uint8)))
     energies = slant_energies(np.asarray(cv2.GaussianBlur(uprights, (3, 1), 0), np.float32), SLANTS)
     k = int(energies.argmax())
@@ -161,7 +162,7 @@ def _slant(even: Float32, flat: Float32) -> float:
 
 
 def _upright(image: Float32, slant: float) -> Float32:
-    """The picture sheared about its middle row, so that leaning uprights stand."""
+    """The picture sheared about its middle row so that leaning uprights become vertical."""
     if slant == 0.0:
         return image
     middle = (len(image) - 1) / 2
@@ -171,13 +172,14 @@ def _upright(image: Float32, slant: float) -> Float32:
 
 
 def _row_pairs(ink: Float32, even: Float32, flat: Float32) -> Array:
-    """(N, 2) top and height of likely digits: three rows of flat segments at equal distances, or where ink begins and ends."""
+    """(N, 2) top and height of likely digits: three equidistant rows of flat segments, or the rows where ink begins and ends."""
     rows = len(ink)
     profile = (cv2.GaussianBlur(flat, (1, 3), 0) ** 2).sum(axis=1, dtype=float)
     if profile.max() <= 0:
         return np.zeros((0, 2))
     found = _extent(ink)
-    found += [(top, 1.12 * height) for top, height in found if top + 1.12 * height < rows - 1]  # a dim bottom
+    # The bottom segment may be too dim to show
+    found += [(top, 1.12 * height) for top, height in found if top + 1.12 * height < rows - 1]
     found += [
         pair for pair in _extent(even) if all(abs(pair[0] - t) + abs(pair[1] - h) > 0.06 * rows for t, h in found)
     ]
@@ -191,7 +193,7 @@ def _row_pairs(ink: Float32, even: Float32, flat: Float32) -> Array:
 
 
 def _extent(ink: Float32) -> list[tuple[float, float]]:
-    """Rows of the top and bottom segments' axes, by where the ink begins and ends."""
+    """Rows of the top and bottom segments' axes, estimated from where the ink begins and ends."""
     strong = level_at(ink, 0.99)
     profile = np.count_nonzero(ink > 0.45 * strong, axis=1)
     there = np.flatnonzero(profile >= max(2.0, 0.15 * profile.max()))

@@ -1,4 +1,4 @@
-"""Compiled continuous search around a rough grid: what it is worth by box means, and the steps that make it worth more."""
+"""Compiled continuous refinement of a rough digit grid: its worth from box means, and the steps that increase it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from perception.vision.status.digit_grid_worth import (
 
 @inlined
 def _at(image: Float32, u: float, v: float) -> float:
-    """Bilinear value, 0 outside."""
+    """Bilinear interpolation; 0 outside the image."""
     height, width = image.shape
     if u < 0.0 or v < 0.0 or u > width - 1 or v > height - 1:
         return 0.0
@@ -37,8 +37,8 @@ def grid_worth(means: Float32, shares: Float32, whole: bool, grid: Array, count:
     """Worth of a grid (left, pitch, width, top, bottom, slant) of `count` cells.
 
     Args:
-        means: (3, H, W) mean ink of a flat segment, an upright one, and mean square in a loop, around every pixel.
-        shares: (2, H, W) seen share of a flat and an upright segment around every pixel; not looked at when `whole`.
+        means: (3, H, W) around every pixel: mean ink of a flat segment, of an upright one, and mean square in a loop.
+        shares: (2, H, W) visible share of a flat and an upright segment around every pixel; ignored when `whole`.
     """
     left, pitch, width, top, bottom, slant = grid
     height = bottom - top
@@ -65,13 +65,13 @@ def grid_worth(means: Float32, shares: Float32, whole: bool, grid: Array, count:
 def refine_grid(
     means: Float32, shares: Float32, whole: bool, grid: Array, count: int, lit: Array, steps: Array, lean: float
 ) -> float:
-    """Coordinate search around a grid, which is changed in place; its worth.
+    """Refine a grid in place by coordinate search and return its worth.
 
     Args:
-        means, shares, whole: as `grid_worth`.
+        means, shares, whole: as for `grid_worth`.
         grid: (6,) left, pitch, width, top, bottom, slant.
-        steps: search steps over the digit height, one round each.
-        lean: slant that was taken out of the picture.
+        steps: step sizes in digit heights, one round of search per step.
+        lean: slant that has already been removed from the picture.
     """
     score = grid_worth(means, shares, whole, grid, count, lit)
     moves = np.array([
@@ -105,7 +105,7 @@ def refine_grid(
 
 @inlined
 def is_sound(grid: Array, count: int, rows: int, columns: int, lean: float) -> bool:
-    """Whether cells keep apart (else neighbours would share an upright), stay in the picture and look like digits."""
+    """Whether the cells do not overlap (neighbours would share an upright), stay in the picture and are shaped like digits."""
     left, pitch, width, top, bottom, slant = grid
     height = bottom - top
     right = left + (count - 1) * pitch + width

@@ -1,8 +1,9 @@
-"""Compiled sums behind the grid search: what cells of seven segments make a character, along rows of places and in one grid.
+"""Compiled sums for the grid search: the worth of seven-segment cells along rows of places and in one grid.
 
-A cell's worth is the ink energy that its best character explains by segments of one level, less what it leaves:
-P - k (T - P) with T = sum(area * level^2) over segments and loops, P = (sum of area * level over the lit ones)^2 / their
-area, the projection on the character's flat template. Straddling two digits or holding noise is worth nothing.
+A cell's worth is the ink energy that its best character explains by segments of one level, minus the weighted residual:
+P - k (T - P) with T = sum(area * level^2) over segments and loops, P = (sum of area * level over the lit ones)^2 /
+their area, the projection on the character's flat template. A cell that straddles two digits or holds noise is worth
+nothing.
 """
 
 from __future__ import annotations
@@ -15,17 +16,17 @@ from hal.jit import compiled, inlined
 
 Float32 = NDArray[np.float32]
 
-LEFT_OVER = 0.7  # k: what unexplained ink costs
-STROKE = 0.05  # half of a stroke's width over the digit height
-INNER = 0.22  # of an axis, left out at either end: there other segments meet it
-LOOP = 0.2  # half size of the probed middle of a loop, over the cell's width; half of that over its height
+LEFT_OVER = 0.7  # k: weight of unexplained ink
+STROKE = 0.05  # half of a stroke's width, in digit heights
+INNER = 0.22  # share of an axis that is skipped at either end, because other segments meet it there
+LOOP = 0.2  # half size of the probed middle of a loop, as a share of the cell's width and of half its height
 FREE_GAP = 0.13
-LEAST_GAP = 0.08  # between neighbours' uprights over the digit height: closer ones would be one upright shared
-COARSE = 15.0  # a digit is this many places high in the coarse search
-LEAST_WEIGHT = 0.15  # share of a segment seen below which it says nothing
+LEAST_GAP = 0.08  # between neighbours' uprights, in digit heights: below this they would be one shared upright
+COARSE = 15.0  # height of a digit in the coarse search, in places
+LEAST_WEIGHT = 0.15  # visible share of a segment below which it is ignored
 MOST_CELLS = 64
 NEGLIGIBLE = 0.02  # of the best cell's worth
-BEYOND = (0.14, 0.34)  # of the digit height, above and below it: an upright that goes on there belongs to a frame
+BEYOND = (0.14, 0.34)  # in digit heights, above and below the digit: an upright that continues there belongs to a frame
 
 #: Middle of every segment's axis in a cell of unit width and height, y down; the first row is x, the second y.
 MIDDLES = np.array([[0.5, 1.0, 1.0, 0.5, 0.0, 0.0, 0.5], [0.0, 0.25, 0.75, 1.0, 0.75, 0.25, 0.5]])
@@ -34,11 +35,17 @@ FLAT = np.array([True, False, False, True, False, False, True])
 
 @inlined
 def cell_worth(levels: Array, areas: Array, loops: float, lit: Array) -> float:
-    """Worth of one cell: (7,) levels and seen areas, energy in its loops, (characters, 7) 1 where a segment is lit."""
+    """Worth of one cell.
+
+    Args:
+        levels, areas: (7,) mean level and visible area of the segments.
+        loops: energy in the cell's loops.
+        lit: (characters, 7) 1 where a segment is lit.
+    """
     total = loops
     for s in range(7):
         total += areas[s] * levels[s] * levels[s]
-    square, over = 0.0, 1.0  # P of the best character is square / over: compared crosswise, a division takes long
+    square, over = 0.0, 1.0  # P of the best character is square / over; comparing products avoids slow divisions
     for g in range(lit.shape[0]):
         area = product = 0.0
         for s in range(7):
@@ -53,8 +60,10 @@ def cell_worth(levels: Array, areas: Array, loops: float, lit: Array) -> float:
 
 @compiled
 def cell_boxes(top: float, height: float, width: float) -> Array:
-    """(13, 4) left, top, right, bottom of parts of a cell whose left upright is at column 0: its seven segments, its two
-    loops, and what is above and below the left and the right uprights."""
+    """(13, 4) boxes (left, top, right, bottom) of a cell whose left upright is at column 0.
+
+    The boxes are its seven segments, its two loops, and the areas above and below the left and the right uprights.
+    """
     boxes = np.empty((13, 4))
     s, half = STROKE * height, height / 2
     for k in range(7):
@@ -73,7 +82,7 @@ def cell_boxes(top: float, height: float, width: float) -> Array:
 
 @inlined
 def _at_most(value: float, most: int) -> int:
-    """The nearest integer from 0 to `most`."""
+    """The nearest integer, clipped to 0 .. `most`."""
     return max(0, min(most, int(value + 0.5)))
 
 
@@ -86,11 +95,12 @@ def worth_along(
     Args:
         whole: nothing is hidden, so that areas need not be looked up.
         place: row of the top segment's axis, height from there to the bottom's, width between the uprights' axes, px.
-        out: filled.
+        out: receives the result.
     """
     rows, columns = ink.shape[0] - 1, ink.shape[1] - 1
     boxes = cell_boxes(place[0], place[1], place[2])
-    energy, clear = np.empty((13, columns + 1)), np.empty((13, columns + 1))  # of a box's rows, left of every column
+    # Cumulative over the columns, for the rows of each box
+    energy, clear = np.empty((13, columns + 1)), np.empty((13, columns + 1))
     for b in range(13):
         top, bottom = _at_most(boxes[b, 1], rows), _at_most(boxes[b, 3], rows)
         for x in range(columns + 1):
@@ -110,11 +120,11 @@ def worth_along(
         segments = 0.0
         for b in range(7):
             segments += areas[b] * levels[b] * levels[b]
-        if segments < NEGLIGIBLE * most:  # it cannot be worth more than that
+        if segments < NEGLIGIBLE * most:  # an upper bound of the worth is already negligible
             out[k] = 0.0
             continue
         rest = areas[7] * levels[7] * levels[7] + areas[8] * levels[8] * levels[8]
-        for b in (9, 11):  # as much as its upright is worth
+        for b in (9, 11):  # subtract the frame's share, at most the upright's own worth
             rest += 2.0 * areas[1] * min(levels[b], levels[b + 1]) ** 2 / LEFT_OVER
         out[k] = cell_worth(levels, areas, rest, lit)
         most = max(most, out[k])
@@ -122,8 +132,10 @@ def worth_along(
 
 @inlined
 def apartness(gap: float) -> float:
-    """What a grid's worth is multiplied by for its gaps (over the digit height): neighbours that all but share their
-    uprights count the same ink twice."""
+    """Factor on a grid's worth for its gap (in digit heights).
+
+    Neighbouring cells that nearly share their uprights would count the same ink twice.
+    """
     return min(1.0, max(0.3, 0.3 + 0.7 * (gap - LEAST_GAP) / (FREE_GAP - LEAST_GAP)))
 
 
@@ -131,11 +143,14 @@ def apartness(gap: float) -> float:
 def best_pitch(
     worth: Array, stride: int, pitches: Array, size: tuple[float, float], columns: int, most: int, free: float
 ) -> tuple[float, float, float, int]:
-    """(worth, left column, pitch, cells) of the best grid of at most `most` cells over worths of cells `stride` apart.
+    """(worth, left column, pitch, cells) of the best grid of at most `most` cells.
 
     Args:
-        pitches: to try, over the width; size: width and height of a cell, px.
-        free: how far the grid's middle may lie from the middle column, over `columns`; off the middle counts less.
+        worth: worth of cells at places `stride` px apart.
+        pitches: candidates, in cell widths.
+        size: width and height of a cell, px.
+        free: largest distance of the grid's middle from the middle column, as a share of `columns`; distance lowers the
+            worth.
     """
     width, height = size
     best, left, pitch, count = 0.0, 0.0, 0.0, 0
@@ -178,7 +193,9 @@ def guesses(
 
     Args:
         ink, seen: integral images of the upright picture.
-        rows: (R, 2) top and height, px; widths: over the height; pitches: over the width.
+        rows: (R, 2) top and height, px.
+        widths: in digit heights.
+        pitches: in cell widths.
     """
     found = np.zeros((len(rows) * len(widths), 7))
     columns = ink.shape[1] - 1
@@ -196,8 +213,10 @@ def guesses(
 
 @compiled
 def slant_energies(uprights: Float32, slants: Array) -> Array:
-    """(slants,) sum of the squared column sums (of every second row) of the picture sheared by every slant: most when
-    uprights stand."""
+    """(slants,) sum of squared column sums of the picture sheared by every slant; largest when the uprights are vertical.
+
+    Only every second row is used.
+    """
     rows, columns = uprights.shape
     middle = (rows - 1) / 2
     energies = np.zeros(len(slants))
@@ -217,7 +236,7 @@ def slant_energies(uprights: Float32, slants: Array) -> Array:
 
 @compiled
 def row_scores(profile: Array, heights: Array, step: float) -> Array:
-    """(N, 3) score, top and height of digits whose flat segments would lie in rows of much flat ink and the loops' not."""
+    """(N, 3) score, top and height of digits with much flat ink in the segments' rows and little in the loops' rows."""
     rows = len(profile)
     found = np.zeros((len(heights) * (int(rows / step) + 1), 3))
     n = 0

@@ -1,8 +1,8 @@
-"""Seven-segment displays by geometry: ink, grid of digit cells, level of every segment, the likeliest number.
+"""Geometric reader of seven-segment displays: ink, grid of digit cells, level of every segment, the likeliest number.
 
-What hides a part (a cable, saturation) is found first and says nothing about the segments behind it. The numbers that what
-is left allows are weighed by their likelihood, by the display's range and by the previous reading; when two stay about
-equally likely there is no answer.
+Whatever hides a part (a cable, saturation) is found first, and the segments behind it count as unknown. The numbers
+that remain possible are weighed by their likelihood, by the display's range and by the previous reading; if two are
+about equally likely, the reading is refused.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from perception.vision.status.occluder_bands import hidden_by_bands
 from perception.vision.status.reader import Hints, Reader
 from perception.vision.status.stray import leaves_out, stray_ink
 
-MARGIN = 0.09  # share of the smaller side that a frame may take
-WORK_ROWS = 64  # a window is read with so many rows: a stroke is 4 px wide then
-MOST_CELLS = 8  # of a display that nobody has counted
-CELL_COST = 0.008  # a grid with one more cell must explain that much more
-FITS = 12.0  # nats a character whose segments' levels agree: nothing fits better
-SAME_COMB = 0.05  # of the digit height
-WORTH_WEIGHT = 8.0  # nats a character that a grid of e times the worth may fit worse
-TEMPERATURE = 2.0  # what is wrong with one segment is wrong with its neighbours too: they count half
-KNOWN_FREE, FREE = 0.35, 0.5  # how far the digits may sit from the middle, over the width
+MARGIN = 0.09  # share of the smaller side that a frame may cover
+WORK_ROWS = 64  # height in px to which a window is scaled for reading; a stroke is then 4 px wide
+MOST_CELLS = 8  # for a display whose number of digits is not known
+CELL_COST = 0.008  # share by which a grid with one more cell must explain more ink
+FITS = 12.0  # cap on the log-likelihood (nats) per character: no fit counts as better
+SAME_COMB = 0.05  # in digit heights
+WORTH_WEIGHT = 8.0  # nats per character that a grid with e times the worth may fit worse
+TEMPERATURE = 2.0  # neighbouring segments share their errors, so log-likelihoods count half
+KNOWN_FREE, FREE = 0.35, 0.5  # largest distance of the digits from the window's middle, over its width
 
-STRAY, STRAY_SCALE = 0.045, 0.003  # ink off the strokes, see `stray_ink`
-# Level of the weakest digit over the typical one: of 355 drawn hard displays read right all have more than .52, of 9 read wrong
-# two less than .36: a digit behind a cable that nobody saw, and one in glare.
+STRAY, STRAY_SCALE = 0.045, 0.003  # half and scale for ink off the strokes, see `stray_ink`
+# Level of the weakest digit relative to the typical one. Of 355 hard drawn displays read correctly all exceed 0.52;
+# of 9 misread ones two are below 0.36: a digit behind an undetected cable, and one in glare.
 WEAK, WEAK_SCALE = 0.44, 0.025
-LEFT_OUT = 0.7  # of the trust, where a digit or a sign may stand beside those that were read
-SURE = 0.732  # the most that one piece of evidence gives
+LEFT_OUT = 0.7  # factor on the trust where a digit or a sign may stand beside those that were read
+SURE = 0.732  # largest probability that a single piece of evidence gives
 
-MOST_NAMED, NAMED = 4, 0.1  # numbers that a refusal names: at most; the share of the likelihood that each has
-MOST_POSSIBLE = 10  # numbers that a refusal lists for programs
+MOST_NAMED, NAMED = 4, 0.1  # maximum number of candidates in a refusal's text, and the least probability of each
+MOST_POSSIBLE = 10  # maximum number of candidates in a refusal's data
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -54,10 +54,10 @@ class Decoded:
     """The numbers that one grid may show, best first.
 
     Attributes:
-        ink, seen: (H, W) what the grid was laid on.
-        explained: share of the ink.
+        ink, seen: (H, W) ink and visibility of the picture on which the grid lies.
+        explained: share of the ink that the lit segments explain.
         lit_levels: (cells, 7) level of the best number's lit segments, 0 for the others.
-        weakest: level of its weakest digit over the typical one.
+        weakest: level of its weakest digit relative to the typical one.
         fit: mean log-likelihood of its characters.
     """
 
@@ -77,8 +77,8 @@ def read_display(
     """Text and value of a display. `patch` shows its window and the plate round it, origin at the middle.
 
     Args:
-        digits_taught: False: number of digits and decimals are to be found in the picture.
-        before: the previous reading, which tells between numbers that are about equally likely.
+        digits_taught: if False, the number of digits and decimals is determined from the picture.
+        before: the previous reading, which decides between numbers that are about equally likely.
     """
     rows, columns = _window(patch, spec)
     gray, inside = patch.gray[rows, columns], patch.inside[rows, columns]
@@ -104,15 +104,15 @@ def read_window(
     limits: tuple[float, float] | None = None, hidden: NDArray[np.bool_] | None = None, before: float | None = None,
     framed: bool = False, bare: bool = False,
 ) -> PatchReading:  # fmt: skip
-    """Text of an upright window of digits.
+    """Read the text in an upright window of digits.
 
     Args:
-        digits, decimals, dark: what is known; None lets the picture decide.
-        limits: smallest and largest value possible.
-        hidden: (H, W) True where something lies across the window.
+        digits, decimals, dark: what is known; None means that the picture decides.
+        limits: smallest and largest possible value.
+        hidden: (H, W) True where something occludes the window.
         before: the previous reading.
         framed: the picture shows a frame all round.
-        bare: nothing but digits is in the window: what their number leaves over of the ink speaks against it.
+        bare: the window contains nothing but digits, so that unexplained ink counts against the reading.
     """
     gray, hidden = _working_size(gray, hidden)
     polarities = (True, False) if dark is None else (dark,)
@@ -133,7 +133,7 @@ def read_window(
 
 
 def _as_time(number: PatchReading, found: Decoded, place: int) -> PatchReading:
-    """What a clock shows, which is text and no value: a colon, and as digits stand beside one; else doubted."""
+    """Reading of a clock, which has text but no value; in doubt unless one or two digits precede its colon and two follow it."""
     characters = found.listed[0].characters
     before, after = characters[:place].strip(), characters[place:]
     text = f"{before}:{after}"
@@ -166,7 +166,7 @@ def _decoded(
         if decoded is None:
             continue
         most_worth = most_worth or worth
-        # A grid that is too high claims ink by its size that it has not: its segments' levels do not agree.
+        # A grid that is too high claims ink by its size that does not exist: its segments' levels disagree.
         this = decoded.fit + WORTH_WEIGHT * float(np.log(worth / most_worth))
         if best is None or this > score:
             best, score = decoded, this
@@ -174,16 +174,16 @@ def _decoded(
 
 
 def _same(a: DigitGrid, b: DigitGrid) -> bool:
-    """Whether two grids lie on the same digits, so that one of them needs to be read."""
+    """Whether two grids lie on the same digits, so that only one of them needs to be read."""
     off = np.abs(a.numbers - b.numbers)  # left, pitch, width, top, bottom
     return a.count == b.count and bool(off[:5].max() < SAME_COMB * a.height_px)
 
 
 def decode(ink: Float32, seen: Float32, grid: DigitGrid, *, all_cells: bool = False) -> Decoded | None:
-    """What a grid may show; None when lit and unlit do not separate.
+    """Decode the numbers that a grid may show; None when lit and unlit segments do not separate.
 
     Args:
-        all_cells: the grid's last cell is the display's; else blank ones at its end are no part of it.
+        all_cells: the grid's last cell is the display's last; otherwise blank cells at its end are not counted.
     """
     segments, shares = segment_levels(ink, seen, grid)
     levels = separate(without_frames(ink, grid, segments), shares, *loop_levels(ink, seen, grid))
@@ -205,7 +205,7 @@ def decode(ink: Float32, seen: Float32, grid: DigitGrid, *, all_cells: bool = Fa
 
 
 def _weakest(ink: Array, lit: NDArray[np.bool_], characters: str) -> float:
-    """Mean level of the lit segments that are seen of the weakest digit over that of the typical one."""
+    """Mean level of the visible lit segments of the weakest digit, relative to the typical digit."""
     is_digit = lit.any(axis=1) & np.array([character.isdigit() for character in characters])
     if not is_digit.any():
         return 1.0
@@ -214,8 +214,8 @@ def _weakest(ink: Array, lit: NDArray[np.bool_], characters: str) -> float:
 
 
 def _of_any_length(characters: Array, blank: Array) -> list[Number]:
-    """The likely numbers of a display whose last cells may be no part of it, best first."""
-    tail = np.append(np.cumsum(blank[::-1])[::-1], 0.0)  # log-likelihood that all cells from one on are blank
+    """The likely numbers of a display whose last cells may not belong to it, best first."""
+    tail = np.append(np.cumsum(blank[::-1])[::-1], 0.0)  # log-likelihood that all cells from each one on are blank
     listed = [
         replace(number, log_likelihood=number.log_likelihood + float(tail[count]))
         for count in range(1, len(blank) + 1)
@@ -230,7 +230,7 @@ def _lit(character: str) -> NDArray[np.bool_]:
 
 
 def _explained(ink: Float32, grid: DigitGrid, lit_levels: Array) -> float:
-    """How much of the picture's ink the lit segments are, 0 to 1: squared level times area over the sum of squares."""
+    """Share (0 to 1) of the picture's ink energy, squared level times area, that the lit segments explain."""
     h = grid.height_px
     area = np.where([True, False, False, True, False, False, True], grid.width_px, h / 2) * 0.08 * h
     total = float((ink.astype(float) ** 2).sum())
@@ -248,7 +248,7 @@ def _answer(
     covered: bool,
     bare: bool,
 ) -> PatchReading:
-    """The likeliest number within the range, or why there is none."""
+    """The likeliest number within the range, or a refusal with its reason."""
     texts = [(_with_point(n.characters, point, decimals), n.log_likelihood) for n in found.listed]
     valued = [(text, value, score) for text, score in texts if (value := _value(text)) is not None]
     if not valued:
@@ -285,28 +285,29 @@ def _answer(
 
 
 def _ranked(numbers: Sequence[tuple[str, float]], share: Array, trust: float) -> tuple[Possible, ...]:
-    """Texts and values with their probabilities, likeliest first; of equally likely ones the one furthest from zero.
+    """Texts and values with their probabilities, likeliest first; among equally likely ones the one furthest from zero first.
 
-    A cable makes equals often. Whoever acts on the first of them then errs towards the alarm.
+    A cable often makes several numbers equally likely. A caller that acts on the first of them then errs towards the
+    alarm.
     """
     order = sorted(range(len(numbers)), key=lambda i: (-round(float(share[i]), 6), -abs(numbers[i][1])))
     return tuple(Possible(text=numbers[i][0], value=numbers[i][1], probability=float(share[i]) * trust) for i in order)
 
 
 def _expected(value: float, before: float | None, span: float) -> float:
-    """Log-probability of a value after the previous one: most readings move little, some jump anywhere."""
+    """Log-probability of a value given the previous one: most readings change little, a few jump to any value."""
     if before is None or not np.isfinite(span) or span <= 0:
         return 0.0
     return float(np.log(0.05 + 0.95 * np.exp(-abs(value - before) / (0.05 * span))))
 
 
 def _with_point(characters: str, point: DecimalPoint | None, decimals: int | None) -> str:
-    """Text with its decimal point: where the panel file says, else where a dot is lit at the foot of a gap."""
+    """Text with its decimal point, from the panel file or else from the dot that is lit in a gap."""
     place = (len(characters) - decimals if decimals else None) if point is None else point.place
     if place is not None and place >= len(characters):
-        place = None  # of a shorter number
+        place = None  # place for a number with fewer digits
     if place and not characters[place - 1].isdigit():
-        return ""  # a point stands behind a digit
+        return ""  # a point needs a digit before it
     text = characters if place is None else f"{characters[:place]}.{characters[place:]}"
     return text.replace(" ", "")
 
@@ -338,7 +339,7 @@ def _working_size(gray: Image, hidden: NDArray[np.bool_] | None) -> tuple[Image,
 
 
 class _DisplayReader(Reader[Display]):
-    """Tells a display's reader how many digits were taught, and what it showed before."""
+    """Reader that passes on the number of digits taught and the previous reading."""
 
     def status(self, patch: Patch, spec: Display, hints: Hints) -> PatchReading:
         """Text and value of a display."""

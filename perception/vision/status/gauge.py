@@ -1,4 +1,4 @@
-"""Round pointer gauges: linear or taught non-linear scale, any polarity."""
+"""Reader of round pointer gauges with a linear or taught non-linear scale and any polarity."""
 
 from __future__ import annotations
 
@@ -11,18 +11,20 @@ from perception.vision.status.occluder_bands import MOST_COVERED, lying_across
 from perception.vision.status.pointer import PointerFit, find_pointer, wrapped
 from perception.vision.status.reader import Reader
 
-POINTER_FROM, POINTER_TO = 0.25, 0.60  # share of the radius over which every gauge pointer has ink and no numeral is
-FINE_TO = 0.48  # numerals begin at half of the radius: blurred, they pulled pointers beside them by up to 6 degrees
-STOP_RAD = np.deg2rad(6.0)  # a pointer rests that far beyond its scale at most
-LEAST_SEEN = 0.25  # share of a face
+# Share of the radius over which every gauge pointer has ink and there are no numerals
+POINTER_FROM, POINTER_TO = 0.25, 0.60
+FINE_TO = 0.48  # numerals begin at half of the radius: blurred, they pull nearby pointers by up to 6 degrees
+STOP_RAD = np.deg2rad(6.0)  # a pointer rests at most this far beyond its scale
+LEAST_SEEN = 0.25  # share of the face that must be visible
 MOST_SIGMA_RAD = 0.03
-#: Of the score of a pointer that its best rival has, half and scale; numerals stand where a gauge's pointer is looked for.
+# Score of the best rival over that of the pointer: half and scale. Numerals may lie where a gauge's pointer is
+# searched.
 RIVAL = (
     0.50,
     0.03,
 )  # of 330 pointers on drawn panels read right .98 have less than 0.45; half of those read wrong have more than 0.6
 SIGMA_RAD = (0.026, 0.003)  # .99 of them have less than 0.026
-LEAST_SHOWN = 0.52  # of the pointer's radii: beside a cable, a numeral alone would have as much
+LEAST_SHOWN = 0.52  # visible share of the pointer's radii: beside a cable, a numeral alone could reach less than this
 
 
 def read_gauge(patch: Patch, spec: Gauge) -> PatchReading:
@@ -44,7 +46,7 @@ def read_gauge(patch: Patch, spec: Gauge) -> PatchReading:
 
 
 def no_pointer(seen: float, unit: str) -> PatchReading:
-    """The refusal of a face without a pointer, by the share of it that can be seen."""
+    """Refusal for a face without a pointer, worded by the share of the face that is visible."""
     if seen < LEAST_SEEN:
         return refused("the face cannot be seen (glare, shadow or cover): change the angle or the light", unit=unit)
     return refused("no pointer stands out on the face: come closer or add light", unit=unit)
@@ -53,7 +55,7 @@ def no_pointer(seen: float, unit: str) -> PatchReading:
 def status_of_pointer(
     fit: PointerFit, scale: Scale, seen: float, *, rival: tuple[float, float] = RIVAL, sigma_rad: tuple[float, float] = SIGMA_RAD
 ) -> PatchReading:  # fmt: skip
-    """Value and confidence of a pointer on a scale, or the refusal of a pointer that is off the scale.
+    """Value and confidence of a pointer on a scale, or a refusal when the pointer is off the scale.
 
     Args:
         rival, sigma_rad: see `pointer_confidence`.
@@ -87,11 +89,13 @@ def pointer_confidence(
 ) -> float:
     """Confidence of a pointer from contrast, rival, support, straightness and visibility.
 
-    A dark pointer shows on a saturated face as well: what saturation hides is missing from its support.
+    A dark pointer is visible on a saturated face as well; parts that saturation hides are missing from its support.
 
     Args:
-        rival: share of the score that its best rival has: where half of the readings are wrong, and how soon that changes.
-        sigma_rad: the same of one sigma of its direction: what is no pointer is not straight.
+        rival: (half, scale) of a logistic in the best rival's share of the score; at `half`, half of the readings are
+            wrong.
+        sigma_rad: (half, scale) in the standard deviation of the direction, which is large for anything but a straight
+            pointer.
     """
     return probability(
         [

@@ -1,8 +1,8 @@
-"""What seven segments say: characters by likelihood, numbers as blanks, perhaps a sign, then digits.
+"""Decoding of seven-segment levels: likelihoods of characters, and numbers as blanks, an optional sign, then digits.
 
-A segment's level is normal around the level of lit segments of its cell, or around that of unlit ones; a hidden segment says
-nothing, so that what it would have decided stays undecided. Every number that is about as likely as the best is listed:
-a range or a previous reading may tell between them.
+A segment's level is normally distributed around the level of the lit segments of its cell, or around that of the unlit
+ones. A hidden segment carries no information, so whatever it would have decided stays undecided. Every number that is
+about as likely as the best is listed; a range or a previous reading may decide between them.
 """
 
 from __future__ import annotations
@@ -20,26 +20,27 @@ GLYPHS = (
     ("0", "abcdef"), ("1", "bc"), ("2", "abged"), ("3", "abgcd"), ("4", "fgbc"), ("5", "afgcd"), ("6", "afgedc"),
     ("7", "abc"), ("8", "abcdefg"), ("9", "abcdfg"), ("7", "abcf"), ("6", "fgedc"), ("9", "abcfg"), ("-", "g"),
 )  # fmt: skip
-#: (characters, 7) which segments a character lights.
+# (characters, 7) which segments each character lights.
 LIT = np.array([[s in lit for s in SEGMENTS] for _, lit in GLYPHS])
 NAMES = [name for name, _ in GLYPHS]
 OTHER_FORMS = [(int(name), k) for k, name in enumerate(NAMES) if k >= 10 and name.isdigit()]
-RARE = {10: 1.5, 11: 1.5, 12: 1.5}  # nats: other ways to draw 7, 6 and 9
+RARE = {10: 1.5, 11: 1.5, 12: 1.5}  # nats of penalty: other ways to draw 7, 6 and 9
 
 LEAST_NOISE = 1.0  # levels
-LEVEL_NOISE = 0.8  # of the ink's spread: a level is the median of five places, each the best of three
-LEAST_SEEN = 0.19  # share of a segment below which it says nothing
-SPREAD = 0.16  # one sigma of a lit segment's level over that level: uneven light, blur, pixels
-LEAK = 0.15  # the same for an unlit one: its lit neighbours' blur
-CELL_SPREAD = 0.4  # one sigma of the logarithm of a cell's lit level over the display's
-MOST_LOSS = 9.0  # nats that one segment may cost: something else than noise has happened to it
-GHOST, MOST_GHOST = 0.12, 0.3  # unlit segments that show: one sigma of their level over the lit one; at most
-CLOSE = 7.0  # nats: characters listed beside the best of their cell
+LEVEL_NOISE = 0.8  # as a share of the ink's spread: a level is the median of five places, each the best of three
+LEAST_SEEN = 0.19  # visible share of a segment below which it is ignored
+SPREAD = 0.16  # standard deviation of a lit segment's level over that level: uneven light, blur, pixels
+LEAK = 0.15  # the same for an unlit segment, which receives blur from its lit neighbours
+CELL_SPREAD = 0.4  # standard deviation of the logarithm of a cell's lit level over the display's
+MOST_LOSS = 9.0  # largest penalty (nats) per segment: larger deviations are not due to noise
+# Faintly visible unlit segments: standard deviation of their level over the lit one, and its maximum
+GHOST, MOST_GHOST = 0.12, 0.3
+CLOSE = 7.0  # nats within which further characters of a cell are listed
 MOST_LISTED = 300
 
 
 def lit_segments(text: str) -> int:
-    """How many segments a text lights."""
+    """Number of segments that a text lights."""
     return sum(int(LIT[NAMES.index(character)].sum()) for character in text if character in NAMES)
 
 
@@ -48,8 +49,8 @@ class Levels:
     """Levels of a display's segments.
 
     Attributes:
-        ink, seen: (cells, 7) level and seen share of every segment.
-        unlit, noise: (cells,) level of what is not lit, and one sigma of a level's noise, in every cell.
+        ink, seen: (cells, 7) level and visible share of every segment.
+        unlit, noise: (cells,) level of unlit segments, and standard deviation of a level's noise, in every cell.
         lit: level of lit segments.
     """
 
@@ -69,14 +70,15 @@ class Number:
 
 
 def separate(ink: Array, seen: Array, loops: Array, loop_noise: Array) -> Levels | None:
-    """Levels with lit and unlit told apart (N. Otsu, IEEE SMC 9(1), 1979); None where they do not separate.
+    """Separate lit from unlit levels (N. Otsu, IEEE SMC 9(1), 1979); None where they do not separate.
 
     Args:
-        ink, seen: (cells, 7) level and seen share of every segment.
+        ink, seen: (cells, 7) level and visible share of every segment.
         loops, loop_noise: (cells,) mean and spread inside the loops; NaN where they are hidden.
     """
     clear = ink[seen >= LEAST_SEEN]
-    values = np.sort(np.concatenate([clear, loops[np.isfinite(loops)]]))  # with the loops: "888" has nothing unlit
+    # Loops are included because "888" has no unlit segment
+    values = np.sort(np.concatenate([clear, loops[np.isfinite(loops)]]))
     if len(clear) < 2 or len(values) < 4:
         return None
     n = np.arange(1, len(values))
@@ -87,7 +89,7 @@ def separate(ink: Array, seen: Array, loops: Array, loop_noise: Array) -> Levels
     known = loop_noise[np.isfinite(loop_noise)]
     spread = np.where(np.isfinite(loop_noise), loop_noise, np.median(known) if len(known) else LEAST_NOISE)
     noise = np.maximum(LEAST_NOISE, LEVEL_NOISE * spread)
-    # The best across a stroke lies above the mean: unlit segments look brighter than loops by about a sigma.
+    # The best value across a stroke exceeds the mean, so unlit segments appear about one sigma brighter than loops.
     local = np.where(np.isfinite(loops), loops + noise, low[k])
     return Levels(
         ink=ink, seen=seen, unlit=0.5 * (local + np.minimum(low[k], local + 2 * noise)), lit=float(high[k]), noise=noise
@@ -100,7 +102,7 @@ def likelihoods(levels: Levels) -> tuple[Array, Array]:
     w, ink = weight[:, None, :], levels.ink[:, None, :]
     there = w * LIT
     total = there.sum(axis=2, keepdims=True)
-    # The lit level of the cell, drawn to the display's as by one more segment.
+    # Lit level of each cell, shrunk towards the display's level with the weight of one segment.
     own = ((there * ink).sum(axis=2, keepdims=True) + 0.5 * levels.lit) / (total + 0.5)
     unlit, noise = levels.unlit[:, None, None], levels.noise[:, None, None]
     own = np.clip(own, unlit + 0.15 * np.maximum(levels.lit - unlit, 1.0), 2.5 * levels.lit)
@@ -114,7 +116,7 @@ def likelihoods(levels: Levels) -> tuple[Array, Array]:
 
 
 def _blank(levels: Levels, weight: Array) -> Array:
-    """(cells,) log-likelihood of a blank cell: its segments show alike, as ghosts do, and hardly more than its loops."""
+    """(cells,) log-likelihood of a blank cell: its segments have similar levels that hardly exceed those of its loops."""
     unlit, noise = levels.unlit[:, None], levels.noise[:, None]
     ghost = np.sort(np.where(weight > 0, levels.ink, unlit), axis=1)[:, 3:4]  # the median
     ghost = np.clip(ghost, unlit, unlit + MOST_GHOST * levels.lit)
@@ -124,7 +126,7 @@ def _blank(levels: Levels, weight: Array) -> Array:
 
 
 def numbers(characters: Array, blank: Array) -> list[Number]:
-    """Every likely number, best first: blanks, perhaps a sign (and blanks behind it), then digits.
+    """List every likely number, best first: blanks, an optional sign (and blanks after it), then digits.
 
     Args:
         characters, blank: from `likelihoods`.
@@ -153,7 +155,7 @@ def numbers(characters: Array, blank: Array) -> list[Number]:
 
 
 def _digits(characters: Array) -> Array:
-    """(cells, 10) log-likelihood of every digit, by its best form."""
+    """(cells, 10) log-likelihood of every digit, using its best form."""
     digits = characters[:, :10].copy()
     for digit, k in OTHER_FORMS:
         np.maximum(digits[:, digit], characters[:, k], out=digits[:, digit])
@@ -167,7 +169,7 @@ def _alternatives(digits: Array) -> list[tuple[str, float]]:
         sorted(((str(k), loss) for k, loss in enumerate(row) if loss <= CLOSE), key=lambda c: c[1])
         for row in losses.tolist()
     ]
-    while prod(len(c) for c in close) > MOST_LISTED:  # drop the least likely of all
+    while prod(len(c) for c in close) > MOST_LISTED:  # drop the least likely character of all
         worst = max(range(len(close)), key=lambda i: close[i][-1][1] if len(close[i]) > 1 else -1.0)
         close[worst].pop()
     texts = [("".join(c for c, _ in choice), sum(loss for _, loss in choice)) for choice in product(*close)]

@@ -1,4 +1,4 @@
-"""The ink of a display: how much every pixel differs from the background as segments do, and what can be seen of it."""
+"""Ink of a display: how much every pixel differs from the background in the way segments do, and where it is visible."""
 
 from __future__ import annotations
 
@@ -10,30 +10,33 @@ from hal.arrays import Image
 from hal.jit import compiled
 from perception.vision.status.digit_grid_worth import Float32
 
-HEADROOM = 0.5  # of a lit segment: where less is left below white, nothing can be told
-SHOWS = 0.3  # of a lit segment: so much stands out that it is no noise
-KERNEL = 0.30  # of the picture's height: wider than any stroke, narrower than what light does
+HEADROOM = 0.5  # share of a lit segment's level: with less room below white, the pixel counts as unknown
+SHOWS = 0.3  # share of a lit segment's level that exceeds noise
+KERNEL = 0.30  # share of the picture's height: wider than any stroke, narrower than the variation of light
 SATURATED = 252
-GLARE = 80.0  # gray levels that the background varies by: more is glare, which adds light, and no slope of light
-#: Light of every gray level as cameras code it: under glare strokes stand out by less gray but by as much light.
+GLARE = 80.0  # range of the background in gray levels: more indicates glare, which adds light, and not a gradient
+# Light per gray level as cameras encode it: under glare, strokes have less gray contrast but the same light
+# contrast.
 LIGHT = np.round(255.0 * (np.arange(256) / 255.0) ** 2.2).astype(np.uint8)
 BORDER_ROUNDS = 4
 STROKE_SHOWS = 18.0  # gray levels
-NEAR_STROKE = 0.12  # of the picture's height
-DEEP, LEAST_DEEP = 0.22, 0.3  # of the picture's height: from its border, and px there that no frame seen aslant has
-WIDEST_STROKE = 0.17  # of the picture's height
+NEAR_STROKE = 0.12  # share of the picture's height
+# Share of the picture's height from its border; least px there that no frame seen obliquely reaches
+DEEP, LEAST_DEEP = 0.22, 0.3
+WIDEST_STROKE = 0.17  # share of the picture's height
 
 
 def segment_ink(gray: Image, is_dark: bool, hidden: NDArray[np.bool_] | None = None) -> tuple[Float32, Float32]:
     """(ink, seen), both (H, W): hat transform with a kernel wider than a segment's stroke, 0 at the typical background.
 
-    White-hat for glowing segments, black-hat for dark ones, so gradients and glare vanish: of light instead of gray levels
-    where glare makes the background uneven. Hidden and drowned pixels are taken as background and as not seen.
+    White-hat for glowing segments and black-hat for dark ones, so that gradients and glare vanish; computed on light
+    instead of gray levels where glare makes the background uneven. Hidden and saturated pixels count as background and
+    as not visible.
     """
     smooth = np.asarray(cv2.GaussianBlur(gray, (0, 0), max(0.6, 0.012 * gray.shape[0])), np.uint8)
     lost = _drowned(gray, is_dark) if hidden is None else hidden | _drowned(gray, is_dark)
     white = SATURATED
-    covered = lost if is_dark else hidden  # glare is its own background: filled, its flanks would stand out from that
+    covered = lost if is_dark else hidden  # glare is its own background: if it were filled, its flanks would stand out
     ink, background = _hat(smooth, is_dark, covered)
     if _is_uneven(background, lost):
         ink, background = _hat(LIGHT[smooth], is_dark, covered)
@@ -41,20 +44,20 @@ def segment_ink(gray: Image, is_dark: bool, hidden: NDArray[np.bool_] | None = N
     seen = (~lost).astype(np.float32)
     if not is_dark:
         lit = level_at(ink, 0.98)
-        # Where glare leaves little room below white, a stroke that shows is one; that none shows says nothing.
+        # Where glare leaves little room below white, a visible stroke is evidence, but a missing one is not.
         seen = seen * ((background < white - HEADROOM * lit) | (ink > SHOWS * lit)).astype(np.float32)
     ink = np.maximum(ink - level_at(ink[seen > 0] if lost.any() else ink, 0.35), 0.0) * seen
     return np.asarray(ink, np.float32), seen
 
 
 def _is_uneven(background: Image, lost: NDArray[np.bool_]) -> bool:
-    """Whether the background varies by as much as only glare makes it."""
+    """Whether the background varies so much that only glare explains it."""
     shown = background[::3, ::3][~lost[::3, ::3]].astype(np.float32)
     return shown.size > 0 and level_at(shown, 0.95) - level_at(shown, 0.05) > GLARE
 
 
 def _hat(smooth: Image, is_dark: bool, covered: NDArray[np.bool_] | None) -> tuple[Float32, Image]:
-    """(H, W) how far strokes stand out, and the background that they stand out from; what is covered is background."""
+    """(H, W) contrast of strokes, and the background relative to which it is measured; covered pixels are background."""
     size = max(5, round(KERNEL * smooth.shape[0])) | 1
     kernel = np.ones((size, size), np.uint8)
     filled = cv2.bitwise_not(smooth) if is_dark else smooth
@@ -66,9 +69,9 @@ def _hat(smooth: Image, is_dark: bool, covered: NDArray[np.bool_] | None) -> tup
 
 
 def _drowned(gray: Image, is_dark: bool) -> NDArray[np.bool_]:
-    """Where glare hides segments: saturated, and wider than a stroke, which may glow into saturation itself.
+    """Mask of the glare that hides segments: saturated areas wider than a stroke, because a stroke may itself saturate.
 
-    Dark segments in a saturated ground are seen, and so is their absence beside others.
+    Dark segments on a saturated background remain visible, and so does their absence beside others.
     """
     white = (gray >= SATURATED).astype(np.uint8)
     if not white.any():
@@ -79,7 +82,7 @@ def _drowned(gray: Image, is_dark: bool) -> NDArray[np.bool_]:
 
 
 def _near_strokes(gray: Image) -> NDArray[np.bool_]:
-    """Where a dark stroke would show, as one nearby does: light changes little over so short a way."""
+    """Mask of the places where a dark stroke would be visible because a nearby one is; light varies little over that distance."""
     rows = gray.shape[0]
     size = max(5, round(KERNEL * rows)) | 1
     smooth = cv2.GaussianBlur(gray, (0, 0), max(0.6, 0.012 * rows))
@@ -90,15 +93,18 @@ def _near_strokes(gray: Image) -> NDArray[np.bool_]:
 
 
 def without_border(ink: Float32, *, framed: bool = False) -> tuple[Float32, NDArray[np.bool_] | None]:
-    """The ink less what hangs together with the picture's border over a long stretch, a frame and not a segment; and what
-    of it reaches in among the digits, which it may hide or take along: that is not known to be background.
+    """Remove ink that is connected with the picture's border over a long stretch, because it is a frame and not a segment.
+
+    Ink of that frame that reaches in among the digits may hide them or be removed with them, so it is returned as
+    unknown.
 
     Args:
-        framed: a frame surely surrounds the digits: what touches the border anywhere is not theirs. It is taken away level
-            by level, since a frame may stand out far more than the digits do.
+        framed: a frame certainly surrounds the digits, so that anything touching the border is not a digit. It is
+            removed level by level, because a frame may have far more contrast than the digits.
 
     Returns:
-        (H, W) the ink left, and a mask of what may hide digits; None where nothing does, and of what is surely a frame.
+        (H, W) the remaining ink, and a mask of what may hide digits. The mask is None where nothing does, and where the
+        removed ink is certainly a frame.
     """
     lost: NDArray[np.bool_] | None = None
     for _ in range(BORDER_ROUNDS if framed else 1):
@@ -112,8 +118,10 @@ def without_border(ink: Float32, *, framed: bool = False) -> tuple[Float32, NDAr
 
 
 def _at_border(ink: Float32, least: float, framed: bool) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
-    """(H, W) where ink above a level hangs together with the border, a little widened, and the parts of it that reach deep
-    into the picture; None where none does."""
+    """(H, W) ink above a level that is connected with the border, slightly dilated, and its parts that reach deep inside.
+
+    None where no ink reaches deep into the picture.
+    """
     mask = (ink > least).astype(np.uint8)
     if not (mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()):
         return None
@@ -135,7 +143,7 @@ def _at_border(ink: Float32, least: float, framed: bool) -> tuple[NDArray[np.boo
 
 
 def level_at(ink: Float32, share: float) -> float:
-    """The level that this share of the ink (from 0 to 255) does not exceed, to a level."""
+    """Quantile of the ink (0 to 255), to one gray level: the level that this share of it does not exceed."""
     return _level_at(ink.ravel(), share)
 
 
@@ -153,7 +161,7 @@ def _level_at(ink: Float32, share: float) -> float:
 
 @compiled
 def column_levels(ink: Float32, share: float) -> Float32:
-    """(W,) the level that this share of every column of the ink (from 0 to 255) does not exceed, to a level."""
+    """(W,) quantile of every column of the ink (0 to 255): the level that this share of the column does not exceed."""
     rows, columns = ink.shape
     out = np.zeros(columns, np.float32)
     counts = np.zeros(256, np.int64)

@@ -1,4 +1,4 @@
-"""Knobs over a scale: the angle of the mark on the knob, and the value that it points at."""
+"""Reader of knobs over a scale: the angle of the mark on the knob, and the value at which it points."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from perception.vision.status.reader import Reader
 MARK_FROM, MARK_TO = 0.35, 0.80  # share of the knob's radius over which the mark runs
 MARK_HALF_WIDTH = 0.06
 STEP_RAD = np.deg2rad(1.0)
-BEYOND_RAD = np.deg2rad(6.0)  # a mark rests that far beyond its scale at most
-RIVAL_RAD = np.deg2rad(25.0)  # what is further off is another mark
+BEYOND_RAD = np.deg2rad(6.0)  # a mark rests at most this far beyond its scale
+RIVAL_RAD = np.deg2rad(25.0)  # anything further off is a different mark
 SIGMA_RAD = np.deg2rad(0.8)
 
 
@@ -42,7 +42,8 @@ def read_knob(patch: Patch, spec: Knob) -> PatchReading:
     rival = float(evidence[np.abs(angles - angles[best]) > RIVAL_RAD].max(initial=0.0))
     near = np.abs(angles - angles[best]) <= np.deg2rad(6.0)
     weights = np.maximum(evidence[near] - 0.5 * peak, 0.0)
-    angle = float((weights @ angles[near]) / weights.sum())  # the mark's middle: both of its flanks count alike
+    # The mark's middle, to which both flanks contribute equally
+    angle = float((weights @ angles[near]) / weights.sum())
     confidence = probability(
         [
             (np.log(peak / noise), np.log(2.5), 0.3),

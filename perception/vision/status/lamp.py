@@ -1,4 +1,4 @@
-"""Indicator lamps: a lit one is brighter than the plate around it and brightest in the middle."""
+"""Reader of indicator lamps: a lit lamp is brighter than the plate around it and brightest in the middle."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from perception.vision.reading import PatchReading, gated, refused
 from perception.vision.status.occluder_bands import cables_across
 from perception.vision.status.reader import LAMP_MARGIN, Reader
 
-CORE, RIM, PLATE = (0.0, 0.15, 0.3), (0.5, 0.6, 0.7), (1.45, 1.6, 1.75)  # of the radius
-RING_PLACES, LEAST_SEEN = 108, 0.3  # places looked at in each; share that must not be hidden
-CLEAR_OF_BEZEL = 1.4  # of the radius
+CORE, RIM, PLATE = (0.0, 0.15, 0.3), (0.5, 0.6, 0.7), (1.45, 1.6, 1.75)  # in radii
+RING_PLACES, LEAST_SEEN = 108, 0.3  # samples per ring; share that must be visible
+CLEAR_OF_BEZEL = 1.4  # in radii
 LIT_RATIO = 0.95  # between an unlit lens (0.2 to 0.9 of the plate) and a lit one (above 1.1)
-MOST_WHITE = 0.2  # of the plate around
+MOST_WHITE = 0.2  # share of the surrounding plate
 FLAT_RATIO = 1.1  # middle over rim: of unlit lenses .95 have less than 1.1, of lit ones that do not saturate .97 more
 
 
@@ -31,15 +31,14 @@ def read_lamp(patch: Patch, spec: Lamp) -> PatchReading:
         return refused("something lies across the lamp: move it or look past it")
     around = float(np.median(plate))
     if around >= WHITE_LEVEL - 2 and core.mean() >= LIT_RATIO * WHITE_LEVEL:
-        return refused("glare covers the lamp: change the angle or the light")  # a darker lens is unlit all the more
+        # A lens darker than the plate is certainly unlit
+        return refused("glare covers the lamp: change the angle or the light")
     level = max(around, 8.0)
-    middle = float(np.median(core))  # an unlit lens may have a shine
+    middle = float(np.median(core))  # an unlit lens may show a reflection
     brightness = np.log(max(middle, 2.0) / level / LIT_RATIO)
     peaked = np.log((middle + 8.0) / (float(np.median(rim)) + 8.0) / FLAT_RATIO)
     peak = 1.5 * np.clip(peaked / 0.1, -1.0, 1.0)
-    if (
-        middle >= WHITE_LEVEL - 2
-    ):  # brighter than shows, and its peak is cut off; what is white beyond it too may be glare
+    if middle >= WHITE_LEVEL - 2:  # the peak is clipped; if the surroundings are white too, this may be glare
         peak = 0.5 if (plate >= WHITE_LEVEL - 2).mean() > MOST_WHITE else 1.5
     evidence = brightness / 0.12 + peak
     inside = patch.inside.mean()
@@ -54,7 +53,7 @@ def read_lamp(patch: Patch, spec: Lamp) -> PatchReading:
 def _ring(
     patch: Patch, light: Image, radius_m: float, radii: tuple[float, ...], hidden: NDArray[np.bool_] | None
 ) -> Array:
-    """(N,) brightness at places about the middle that nothing lies across."""
+    """(N,) brightness at the unoccluded places of rings about the middle."""
     a = np.linspace(0, 2 * np.pi, RING_PLACES // len(radii), endpoint=False)
     r = np.array(radii)[:, None] * radius_m
     u, v = patch.pixel_of(r * np.sin(a), r * np.cos(a))

@@ -1,4 +1,4 @@
-"""Levels of the segments of a grid, and of its loops, from the ink."""
+"""Levels of the segments and of the loops of a digit grid, computed from the ink."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from hal.jit import compiled, inlined
 from perception.vision.status.digit_grid import AXES, DigitGrid
 from perception.vision.status.digit_grid_worth import BEYOND, INNER, STROKE, Float32
 
-PARTS = 5  # places along a segment's axis
-CLEAR = 0.6  # of a pixel seen
-WHOLLY_SEEN = 0.5  # share of the least seen segment
-FRAME_LEVEL = 0.5  # of an upright's level, above and below it: it is a frame's side
+PARTS = 5  # samples along a segment's axis
+CLEAR = 0.6  # visibility of a pixel that counts as visible
+WHOLLY_SEEN = 0.5  # least visible share over all segments of a cell that counts as wholly visible
+FRAME_LEVEL = 0.5  # share of an upright's level: ink above and below it that exceeds this makes it a frame's side
 LEAST_LOOP_PLACES = 6
 LOOP_X = np.linspace(0.36, 0.64, 3)
 LOOP_Y = np.array([0.2, 0.25, 0.3, 0.7, 0.75, 0.8])
 
 
 def segment_levels(ink: Float32, seen: Float32, grid: DigitGrid) -> tuple[Array, Array]:
-    """(cells, 7) ink of every segment, the median along its axis of the best across its stroke, and its seen share."""
+    """(cells, 7) level of every segment (the median along its axis of the maximum across its stroke), and its visible share."""
     return _segments(ink, seen, grid.numbers, grid.count, AXES)
 
 
 def loop_levels(ink: Float32, seen: Float32, grid: DigitGrid) -> tuple[Array, Array]:
-    """(cells,) mean and standard deviation of the ink inside the loops of every cell, where no segment is; NaN unseen."""
+    """(cells,) mean and standard deviation of the ink inside the loops of every cell, where there is no segment; NaN if hidden."""
     return _loops(ink, seen, grid.numbers, grid.count, LOOP_X, LOOP_Y)
 
 
 def without_frames(ink: Float32, grid: DigitGrid, levels: Array) -> Array:
-    """(cells, 7) levels with those uprights taken away that go on above and below the digit: a frame's side, no segment."""
+    """(cells, 7) levels without the uprights that continue above and below the digit, because these are a frame's sides."""
     beyond = _beyond(ink, grid.numbers, grid.count)
     out = levels.copy()
     for side, (upper, lower) in enumerate(((5, 4), (1, 2))):
@@ -41,12 +41,13 @@ def without_frames(ink: Float32, grid: DigitGrid, levels: Array) -> Array:
 
 
 def with_hidden_ends(seen: Float32, grid: DigitGrid, most: int) -> DigitGrid:
-    """The grid with the cells beside its ends that are hidden in part: a digit that a cable crosses makes no character and
-    so no cell, and without it the number would be another one.
+    """Extend the grid by partly hidden cells at its ends.
+
+    A digit that a cable crosses matches no character and gets no cell; without it the number would be a different one.
 
     Args:
-        seen: (H, W) 1 where the display is seen.
-        most: number of cells at most.
+        seen: (H, W) 1 where the display is visible.
+        most: maximum number of cells.
     """
     for step_px in (grid.pitch_px, -grid.pitch_px):
         while grid.count < most:
@@ -62,7 +63,7 @@ def with_hidden_ends(seen: Float32, grid: DigitGrid, most: int) -> DigitGrid:
 
 
 def _fits(cell: DigitGrid, columns: int) -> bool:
-    """Whether a cell of its own lies inside the picture with its strokes."""
+    """Whether a further cell lies inside the picture with its strokes."""
     u, _ = cell.place(np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.0, 1.0, 0.0, 1.0]), np.zeros(4))
     half = STROKE * cell.height_px
     return bool(u.min() >= half and u.max() <= columns - 1 - half)
@@ -70,7 +71,7 @@ def _fits(cell: DigitGrid, columns: int) -> bool:
 
 @inlined
 def _value(image: Float32, u: float, v: float) -> float:
-    """Bilinear value; outside is 0, and fades in over a pixel."""
+    """Bilinear interpolation; 0 outside, with a linear transition over one pixel at the border."""
     height, width = image.shape
     if u <= -1.0 or v <= -1.0 or u >= width or v >= height:
         return 0.0
@@ -107,7 +108,8 @@ def _segments(ink: Float32, seen: Float32, grid: Array, count: int, axes: Array)
                         clear += 1
                         axis_clear = axis_clear or j == 0
                         strongest = max(strongest, _value(ink, u + du, v + dv))
-                if axis_clear and clear >= 2:  # the outer part alone is no witness: a stroke may be narrower
+                # The outer sample alone proves nothing, because the stroke may be narrower
+                if axis_clear and clear >= 2:
                     best[n] = strongest
                     n += 1
             levels[cell, k] = np.median(best[:n]) if n else 0.0
@@ -139,7 +141,7 @@ def _loops(ink: Float32, seen: Float32, grid: Array, count: int, xs: Array, ys: 
 
 @compiled
 def _beyond(ink: Float32, grid: Array, count: int) -> Array:
-    """(cells, 2) least ink of the places above and below the left and the right uprights, each the best across."""
+    """(cells, 2) least ink over the places above and below the left and right uprights, each the maximum across the stroke."""
     left, pitch, width, top, bottom, slant = grid
     height = bottom - top
     found = np.zeros((count, 2))

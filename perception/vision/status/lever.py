@@ -1,4 +1,4 @@
-"""Quarter-turn levers: a bar from the hub towards one of the taught angles."""
+"""Reader of quarter-turn levers: a bar that points from the hub towards one of the taught angles."""
 
 from __future__ import annotations
 
@@ -18,25 +18,26 @@ from perception.vision.status.occluder_bands import cables_across
 from perception.vision.status.reader import Reader
 
 BAR_FROM, BAR_TO = 0.40, 0.92  # share of the length: outside the hub, inside the tip
-FLANK = (1.35, 1.6)  # of the half width: pipes and flanges lie close by
-BESIDE = np.linspace(-1.5, 1.5, 13)  # of the half width: a shadow falls to one side
-SHADOW_SHARE = 0.4  # of the bar's width that its shadow has
-CLEAR_OF_TIP = 1.25  # of the length: pipes end there too, as a rule
-BEYOND = (1.12, 1.30)  # of the length: clear of the tip, and still in the patch
-ASIDE = (-0.5, 0.0, 0.5)  # of the width: where it may go on
-GOES_ON = 2.0  # how much what goes on counts: a flange or a pipe's end lies there at times
+FLANK = (1.35, 1.6)  # in half widths; pipes and flanges are close by
+BESIDE = np.linspace(-1.5, 1.5, 13)  # in half widths; a shadow falls to one side
+SHADOW_SHARE = 0.4  # width of the bar's shadow, as a share of the bar's width
+CLEAR_OF_TIP = 1.25  # in lengths; pipes usually end within this radius too
+BEYOND = (1.12, 1.30)  # in lengths: clear of the tip, and still in the patch
+ASIDE = (-0.5, 0.0, 0.5)  # in widths: places where the bar may continue
+GOES_ON = 2.0  # weight of the contrast beyond the tip; a flange or a pipe's end sometimes lies there
 SWEEP_RAD = np.deg2rad(np.arange(-30.0, 30.5, 1.0))
 BETWEEN_RAD = 0.16  # a quarter-turn valve that is 9 degrees off its stop is neither open nor closed
 ANGLE_SIGMA_RAD = 0.02
 LIGHT_SIGMA, MIDDLE_GRAY = 1.4, 128.0  # of the bar's width; gray levels
-MOST_IN_GLARE = 0.79  # of some thirty that the second look answered one was wrong: it stays a doubt
+MOST_IN_GLARE = 0.79  # of about thirty second-pass answers one was wrong, so their confidence stays below an answer's
 WOBBLE_RAD = np.deg2rad(np.linspace(-10, 10, 9))
 
 
 def read_lever(patch: Patch, spec: Lever) -> PatchReading:
     """State of a lever valve. `patch` shows the plane of the bar; several states may share a name.
 
-    Beside a glare one of the bar's sides hardly differs from it: what does not stand out is looked at without the light's slopes.
+    Beside glare one side of the bar has little contrast. If no bar stands out, the patch is read again without its
+    gradients.
     """
     angles = np.array([state.angle_rad for state in spec.states])
     r = np.linspace(BAR_FROM, BAR_TO, 8)[:, None] * spec.length_m
@@ -49,7 +50,7 @@ def read_lever(patch: Patch, spec: Lever) -> PatchReading:
             return status
         status = replace(again, confidence=min(again.confidence, MOST_IN_GLARE))
     angle = _bar_angle(patch, spec, nominal, hidden)
-    # Seen aslant, the bar's walls turn its image by up to the lean of its height over its length.
+    # Seen obliquely, the bar's walls turn its image by up to the lean of its height over its length.
     lean_m = float(np.linalg.norm(patch.parallax_px_per_m)) * spec.height_m / patch.px_per_m
     if abs(angle - nominal) <= BETWEEN_RAD + lean_m / spec.length_m:
         return replace(status, value=angle, unit="rad", uncertainty=ANGLE_SIGMA_RAD)
@@ -60,7 +61,7 @@ def read_lever(patch: Patch, spec: Lever) -> PatchReading:
 
 
 def _direction(patch: Patch, spec: Lever, seen: float) -> tuple[PatchReading, float, NDArray[np.bool_] | None]:
-    """The state whose bar stands out most, its direction, and what lies across."""
+    """The state whose bar has the most contrast, its direction, and the mask of occluders."""
     L = spec.length_m
     angles = np.array([state.angle_rad for state in spec.states])
     tried = (angles[:, None] + WOBBLE_RAD).ravel()
@@ -75,7 +76,7 @@ def _direction(patch: Patch, spec: Lever, seen: float) -> tuple[PatchReading, fl
 
 
 def _flattened(patch: Patch, spec: Lever) -> Patch:
-    """The patch less what changes over more than a bar's width, about middle gray."""
+    """The patch without variations wider than the bar, about middle gray."""
     gray = patch.gray.astype(np.float32)
     light = cv2.GaussianBlur(gray, (0, 0), LIGHT_SIGMA * spec.width_m * patch.px_per_m)
     return replace(patch, gray=np.clip(np.round(gray - light + MIDDLE_GRAY), 0, 255).astype(np.uint8))
@@ -84,12 +85,12 @@ def _flattened(patch: Patch, spec: Lever) -> Patch:
 def _that_ends(
     patch: Patch, spec: Lever, angles_rad: Array, contrast: Array, hidden: NDArray[np.bool_] | None
 ) -> Array:
-    """(N,) contrasts of bars less what goes on beyond their tips: a handle ends there, a cable does not."""
+    """(N,) contrasts of bars minus that of their continuation beyond the tips: a handle ends there, a cable does not."""
     L, noise = spec.length_m, contrast_noise(patch)
-    shows = np.abs(contrast) > 1.5 * noise  # the others are no evidence anyway
+    shows = np.abs(contrast) > 1.5 * noise  # the others are too weak to be evidence
     if not shows.any():
         return contrast
-    lost = ~patch.inside if hidden is None else hidden | ~patch.inside  # beyond the image its border repeats
+    lost = ~patch.inside if hidden is None else hidden | ~patch.inside  # outside the image, its border is repeated
     goes_on = np.stack([
         bar_contrast(
             patch, angles_rad[shows], along_m=(BEYOND[0] * L, BEYOND[1] * L), half_width_m=half_width_m, quantile=0.5,
@@ -106,9 +107,9 @@ def _that_ends(
 
 
 def _is_parallel(patch: Patch, spec: Lever, nominal: float) -> bool:
-    """Is what stands out a line beside the state's direction and parallel to it, rather than a bar turned off it?
+    """Whether the visible line is parallel to the state's direction and beside it, rather than a bar turned off it.
 
-    A handle of the plate's own gray shows by the shadow along its side alone; a handle between its states lies across.
+    A handle as gray as the plate shows only by the shadow along its side; a handle between two states is not parallel.
     """
     along_m = (BAR_FROM * spec.length_m, BAR_TO * spec.length_m)
     turned = parallel = 0.0
@@ -124,7 +125,7 @@ def _is_parallel(patch: Patch, spec: Lever, nominal: float) -> bool:
 
 
 def _bar_angle(patch: Patch, spec: Lever, nominal: float, hidden: NDArray[np.bool_] | None) -> float:
-    """Where the bar really points, near a state: the direction that shows it best."""
+    """Direction of the bar near a state's nominal angle: the one with the most contrast."""
     L = spec.length_m
     tried = nominal + SWEEP_RAD
     contrast = np.abs(

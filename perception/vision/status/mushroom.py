@@ -1,4 +1,4 @@
-"""Emergency mushrooms: pressed ones stay in."""
+"""Reader of emergency-stop mushroom buttons, which stay in when pressed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from perception.vision.status.reader import Reader
 
 
 def read_mushroom(patch: Patch, spec: Mushroom) -> PatchReading:
-    """State of an emergency mushroom. `patch` shows any plane near the cap."""
+    """State of an emergency-stop button. `patch` may show any plane near the cap."""
     return read_cap(patch, spec, foot_m=None)  # the head moves as a whole
 
 

@@ -1,9 +1,9 @@
-"""Cables in front of an object: bands that come in over its border at one place and leave at another.
+"""Detection of cables in front of an object: bands that enter over its border at one place and leave at another.
 
-Where a cable crosses a dark window its gray may be the window's, on the plate just outside it is plain; where its gray is
-the plate's it is plain in the window. So a closed path around the object and one just inside its border are searched for
-places that stand out, and every two of them on one path that match in gray and width are joined by a band, which must have
-one gray all along, straight or with one bend.
+Where a cable crosses a dark window it may be as gray as the window, but it stands out on the plate just outside; where
+it is as gray as the plate, it stands out in the window. So a closed path around the object and one just inside its
+border are searched for contrasting places. Every two places on one path that match in gray and width are joined by a
+band, which must have one gray throughout and be straight or have one bend.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from hal.arrays import Array
 from perception.vision.patch import Patch, sample_at
 from perception.vision.status.occluders import OUTSIDE, Crossing, border_crossings, followed_in, smoothed
 
-SAME_GRAY = 16.0  # levels along a band; real cables shine a little
-GROUND_SHARE = 0.5  # of what a band within the window stands out by
-WHOLLY = 0.97  # of it: nothing is left to refine
-ALONG_SHARE = 0.72  # of the band's axis that must have its gray
-INSET = 0.09  # of the smaller side, from the border to the path within: clear of a frame, and no digits yet
-MOST_WIDTH = 0.5  # of the object's smaller side: wider things are not looked past
+SAME_GRAY = 16.0  # gray levels of variation along a band; real cables are slightly glossy
+GROUND_SHARE = 0.5  # share of the contrast of a band within the window
+WHOLLY = 0.97  # share of the band's axis above which no refinement is needed
+ALONG_SHARE = 0.72  # share of the band's axis that must have its gray
+INSET = 0.09  # share of the smaller side, from the border to the inner path: clear of a frame, and outside the digits
+MOST_WIDTH = 0.5  # share of the object's smaller side: wider occluders are not handled here
 BENDS = (
     0.0,
     -0.3,
@@ -44,24 +44,25 @@ BENDS = (
     4.5,
 )  # of the band's width, sideways
 INK_EDGE_PX = 4.0
-MOST_COVERED = 0.3  # of a face: what was followed over more of it is the face itself, or a glare on it
-WITHIN = np.linspace(-0.9, 0.9, 48)  # of the half width and height
-OWN_ASIDE, OWN_RAD = 0.6, np.deg2rad(12.0)  # of a band's width from the object's middle; from one of its directions
-BENT_AT = (0.5, 0.3, 0.7)  # of its length
-CORE = 0.2  # of the width, to either side of the axis: where a band's gray is looked at
+MOST_COVERED = 0.3  # share of a face: a larger followed region is the face itself, or a glare on it
+WITHIN = np.linspace(-0.9, 0.9, 48)  # in half widths and heights
+# In band widths from the object's middle; angle from one of its own directions
+OWN_ASIDE, OWN_RAD = 0.6, np.deg2rad(12.0)
+BENT_AT = (0.5, 0.3, 0.7)  # share of its length
+CORE = 0.2  # half width of the strip about the axis in which a band's gray is measured, in band widths
 CENTRED = ((0.1, 0.3), (0.1, 0.15), (0.05, 0.08), (0.05, 0.04))
 FINER = ((0.14, 0.3), (0.07, 0.15))  # steps of place and size about the best bend
-MERGED = 1.7  # times the other end's width: something lies beside the cable there
+MERGED = 1.7  # ratio of the widths of the two ends: something beside the cable has merged with it
 
 
 def hidden_by_bands(
     patch: Patch, *, half_width_m: float, half_height_m: float, dark_ink: bool
 ) -> NDArray[np.bool_] | None:
-    """(H, W) mask of the cables that cross a display in the patch; None when none does.
+    """(H, W) mask of the cables that cross a display in the patch; None when there is none.
 
     Args:
-        dark_ink: whether segments are darker than their ground. The blurred edge of a cable that differs from the ground as
-            segments do would pass for ink, so it is hidden too; any other edge shows what lies beside it.
+        dark_ink: whether segments are darker than their background. The blurred edge of a cable with the polarity of
+            the segments could pass for ink, so it is hidden too; the other edges are left visible.
     """
     smooth = smoothed(patch)
     inset = INSET * 2 * min(half_width_m, half_height_m)
@@ -80,7 +81,7 @@ def hidden_by_bands(
     for (a, b), within in (
         (pair, within) for ends, within in zip(paths, (False, True), strict=True) for pair in combinations(ends, 2)
     ):
-        # Within the window its ground is what the band must not be taken for.
+        # Within the window the band must differ from the window's background.
         tolerance = min(SAME_GRAY, GROUND_SHARE * min(a.by, b.by)) if within else SAME_GRAY
         line = None if a.side == b.side else _joined(smooth, a, b, least_side, tolerance)
         if line is not None:
@@ -96,14 +97,15 @@ def hidden_by_bands(
 def lying_across(
     patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool, through: bool = False, most: float = 1.0
 ) -> NDArray[np.bool_] | None:
-    """(H, W) mask of what lies across an object in the patch; None when nothing does.
+    """(H, W) mask of the occluders of an object in the patch; None when there are none.
 
-    Cables first, as bands of one gray; what else comes in over the border is followed by its gray (`covered`), which leaks
-    into a frame or a pointer of the same gray where a band does not.
+    Cables are searched first, as bands of one gray. Anything else that enters over the border is followed by its gray
+    (`covered`); unlike the band search, this leaks into a frame or a pointer of the same gray.
 
     Args:
-        half_width_m, half_height_m, is_round, through: as `followed_in`.
-        most: share of the object that what is followed covers at most; else it is a part of the object (see `MOST_COVERED`).
+        half_width_m, half_height_m, is_round, through: as for `followed_in`.
+        most: largest share of the object that a followed region may cover; a larger one is part of the object
+            (see `MOST_COVERED`).
     """
     smooth = smoothed(patch)
     ends = border_crossings(
@@ -126,7 +128,7 @@ def lying_across(
 def _share(
     patch: Patch, mask: NDArray[np.bool_], half_width_m: float, half_height_m: float, *, is_round: bool
 ) -> float:
-    """Share of an object's face, its frame left out, that a mask covers."""
+    """Share of an object's face, without its frame, that a mask covers."""
     x, y = np.meshgrid(WITHIN, WITHIN)
     face = np.hypot(x, y) < WITHIN[-1] + 1e-9 if is_round else np.ones(x.shape, bool)
     u, v = patch.pixel_of(x[face] * half_width_m, y[face] * half_height_m)
@@ -134,10 +136,10 @@ def _share(
 
 
 def cables_across(patch: Patch, *, radius_m: float, own_rad: Array) -> NDArray[np.bool_] | None:
-    """(H, W) mask of the cables that cross a disc about the object's middle; None when none does.
+    """(H, W) mask of the cables that cross a disc about the object's middle; None when there are none.
 
     Args:
-        radius_m: of the disc, clear of the object's ends.
+        radius_m: radius of the disc, clear of the object's ends.
         own_rad: (N,) directions, clockwise from up, in which the object itself has bands through its middle.
     """
     smooth = smoothed(patch)

@@ -1,4 +1,4 @@
-"""What a kind needs to be read: a function from a rectified patch to a status, and the patch that it wants."""
+"""Registration of readers: per kind, a function from a rectified patch to a status, and the patch that it needs."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from perception.vision.patch import Patch, rectify
 from perception.vision.projection import PanelProjection
 from perception.vision.reading import PatchReading, as_often_right
 
-MARGIN = 1.25  # of the face: readers look at the plate around the object too
+MARGIN = 1.25  # times the face: readers need the plate around the object too
 LAMP_MARGIN = 2.0
 K = TypeVar("K", bound=PanelObject)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hints:
-    """What is known beside the image.
+    """Knowledge beside the image.
 
     Attributes:
-        before: the previous reading, which tells between numbers that are about equally likely.
-        digits_taught: whether the panel file knows how many digits and decimals its displays have.
+        before: the previous reading, which decides between numbers that are about equally likely.
+        digits_taught: whether the panel file states the number of digits and decimals of its displays.
     """
 
     before: float | None = None
@@ -38,13 +38,14 @@ class Reader(Generic[K]):
     """The reader of one kind.
 
     Attributes:
-        read: status of an object by a patch that shows the plane of its face, origin at its middle.
-        guesses_right: share of its guesses that are right however weak the evidence, but no more than a guess may claim.
-        is_telling: whether its reading, when sure, proves that the object is there although its outline has the
-            plate's gray.
-        margin, side_m: the patch is so many times the object's face, and so much wider on every side: what stands out
-            appears beside its foot, and the patch must hold both.
-        leans: the object stands out like a bat: the patch shows the plane of the plate, and as far as its tip appears.
+        read: status of an object from a patch that shows the plane of its face, origin at its middle.
+        guesses_right: share of its guesses that are right even with weak evidence, at most what a guess may claim.
+        is_telling: whether a confident reading proves that the object is present even if its outline has the plate's
+            gray.
+        margin, side_m: the patch is `margin` times the object's face plus `side_m` on every side, because a raised part
+            appears displaced from its foot and the patch must contain both.
+        leans: the object stands out like a bat: the patch shows the plane of the plate and extends to where its tip
+            appears.
     """
 
     read: Callable[[Patch, K], PatchReading]
@@ -55,7 +56,7 @@ class Reader(Generic[K]):
     leans: bool = False
 
     def status(self, patch: Patch, spec: K, hints: Hints) -> PatchReading:  # noqa: ARG002 - of use to some
-        """The status of an object; `hints` help only kinds whose reader overrides this."""
+        """Status of an object; `hints` only matter to kinds whose reader overrides this."""
         return self.read(patch, spec)
 
 
@@ -72,17 +73,17 @@ def reader_of(kind: str) -> Reader[Any]:
 def read_patch(
     patch: Patch, spec: PanelObject, *, digits_taught: bool = True, before: float | None = None
 ) -> PatchReading:
-    """The status of one object by the reader of its kind; the value `before` tells between a display's likely numbers."""
+    """Status of one object by the reader of its kind; `before` helps to decide between a display's likely numbers."""
     reader = reader_of(spec.kind)
     status = reader.status(patch, spec, Hints(before=before, digits_taught=digits_taught))
     return as_often_right(status, reader.guesses_right)
 
 
 def patch_of(image: Image, gray: Image, view: PanelProjection, spec: PanelObject, shift_px: Array) -> Patch:
-    """The rectified patch that the reader of this object wants."""
+    """The rectified patch that the reader of this object needs."""
     face, reader = spec.face, reader_of(spec.kind)
     side = reader.side_m
-    if reader.leans:  # and the plate beyond its tip, where it must have ended
+    if reader.leans:  # and the plate beyond its tip, to check that it ends there
         side += _lean_m(view, spec, face.height_m) + spec.envelope().half_m[0]
     return rectify(
         image,
@@ -97,7 +98,7 @@ def patch_of(image: Image, gray: Image, view: PanelProjection, spec: PanelObject
 
 
 def _lean_m(view: PanelProjection, spec: PanelObject, height_m: float) -> float:
-    """How far beside its foot a point at that height appears, in metres on the plate."""
+    """Distance on the plate, m, by which a point at that height appears displaced from its foot."""
     x, y = spec.position_m
     px = view.project([[x, y, 0.0], [x, y, height_m], [x + 0.01, y, 0.0], [x, y + 0.01, 0.0]])
     scale = min(float(np.linalg.norm(px[2] - px[0])), float(np.linalg.norm(px[3] - px[0]))) / 0.01

@@ -1,4 +1,4 @@
-"""Selector knobs: the mark on the knob points at one of the taught places."""
+"""Reader of selector knobs: the mark on the knob points at one of the taught places."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from perception.vision.status.reader import Reader
 
 MARK_FROM, MARK_TO = 0.35, 0.80  # share of the knob's radius over which the mark runs
 MARK_HALF_WIDTH = 0.06
-WOBBLE_RAD = np.deg2rad(np.linspace(-9, 9, 7))  # a detent may stand off its place by that much
+WOBBLE_RAD = np.deg2rad(np.linspace(-9, 9, 7))  # a detent may deviate from its nominal angle by this much
 
 
 def read_rotary(patch: Patch, spec: Rotary) -> PatchReading:

@@ -1,7 +1,7 @@
-"""What a round cap that stands out shows from straight ahead: its shadow or side on one side, and a spot of shine on its face.
+"""Shading of a raised round cap seen from the front: its shadow or side on one side, and a highlight on its face.
 
-Both are looked for round the cap by angle and radius. What something lies across, what is saturated and what is outside of the
-image says nothing; the light's own slope over face and plate is taken off first.
+Both are measured round the cap by angle and radius. Occluded or saturated pixels and those outside the image are
+ignored; the illumination gradient over face and plate is removed first.
 """
 
 from __future__ import annotations
@@ -19,33 +19,35 @@ from perception.vision.status.occluder_bands import cables_across
 
 ANGLES = np.linspace(0, 2 * np.pi, 72, endpoint=False)
 WAVES = np.column_stack([np.ones(len(ANGLES)), np.cos(ANGLES), np.sin(ANGLES)])
-FACE, RIM, RING, PLATE = (0.10, 0.62), (0.46, 0.62), (0.86, 1.06), (1.12, 1.32)  # of the cap's radius
+FACE, RIM, RING, PLATE = (0.10, 0.62), (0.46, 0.62), (0.86, 1.06), (1.12, 1.32)  # in cap radii
 FACE_RADII = np.linspace(*FACE, 11)
-GAP, INNER = np.linspace(0.5, 1.12, 32), (0.35, 0.50)  # radii over which a gap round the cap is; of the face within
-GAP_DARK = 0.85  # of face and plate: a gap is darker than both
-LEAST_GAP = 0.6  # share of it that must be known
-SPOT_TO = 0.46  # of the radius: a glare from beside the cap is brightest further out
-CLEAR_OF_RING = 1.4  # of the radius: what crosses a circle of that size is no part of the button
-BLUR_PX = 2.0  # of what lies across, beyond its mask
-LEAST_RING, LEAST_FACE = 0.4, 0.5  # share that must be known
-ODD_SIGMAS, ODD_SHARE = 4.0, 0.12  # the plate beside a cap is even but for what lies across it: noise, and of its gray
-HEADROOM = 0.2  # of the plate's gray, above a face: with less no shine shows
-SMOOTH = 0.01  # of the plate's gray: so far a face's light may be off the smooth one
+# Radii at which a gap round the cap is searched; inner part of the face
+GAP, INNER = np.linspace(0.5, 1.12, 32), (0.35, 0.50)
+GAP_DARK = 0.85  # share of the gray of face and plate: a gap is darker than both
+LEAST_GAP = 0.6  # share of it that must be visible
+SPOT_TO = 0.46  # in radii: glare from beside the cap is brightest further out
+CLEAR_OF_RING = 1.4  # in radii: anything that crosses a circle of this size does not belong to the button
+BLUR_PX = 2.0  # px by which an occluder's blur extends beyond its mask
+LEAST_RING, LEAST_FACE = 0.4, 0.5  # share that must be visible
+# The plate beside a cap is uniform except for occluders: limits in noise sigmas and as a share of its gray
+ODD_SIGMAS, ODD_SHARE = 4.0, 0.12
+HEADROOM = 0.2  # share of the plate's gray left above a face: with less, no highlight can show
+SMOOTH = 0.01  # share of the plate's gray by which a face may deviate from the smooth model
 ROUNDS = 4
-BLOB = (9, 3)  # angles and radii that a spot fills
+BLOB = (9, 3)  # angles and radii that a highlight fills
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shades:
-    """Of a cap; NaN where too little can be seen.
+    """Shading of a cap; NaN where too little is visible.
 
     Attributes:
-        shade: first harmonic of the ring round the cap, beyond what face and plate have of it, over the plate's gray.
-        spot: how far the brightest spot of the face stands out from the face's smooth light, over what the rest of the face
-            does (its noise, and a hundredth of the plate's gray).
-        below: how much more darkness a gap round the cap has below than above, over the gray beside it and the radius; 0 where
-            there is no gap, or too little of it shows. A cap's side and shadow are below as light comes from above; in a cap that
-            is pushed in, the collar's shadow is above.
+        shade: first harmonic of the ring round the cap, minus that of face and plate, over the plate's gray.
+        spot: excess of the face's brightest spot over its smooth illumination, relative to the residual of the rest of
+            the face (its noise plus a hundredth of the plate's gray).
+        below: darkness of a gap round the cap below minus above, over the gray beside it and the radius; 0 where there
+            is no gap, or too little of it is visible. Light comes from above, so a cap's side and shadow are below; in
+            a cap that is pushed in, the collar's shadow is above.
     """
 
     shade: float
@@ -54,7 +56,7 @@ class Shades:
 
 
 def cap_shades(patch: Patch, radius_m: float) -> Shades:
-    """Shadow and shine of a round cap of that radius about the patch's middle."""
+    """Shadow and highlight of a round cap of that radius about the patch's middle."""
     hidden = cables_across(patch, radius_m=CLEAR_OF_RING * radius_m, own_rad=np.empty(0))
     lost = ~patch.inside | (patch.gray >= WHITE_LEVEL)
     if hidden is not None:
@@ -84,7 +86,7 @@ def cap_shades(patch: Patch, radius_m: float) -> Shades:
 
 
 def _spot(patch: Patch, unknown: NDArray[np.uint8], radius_m: float, level: float) -> float:
-    """`Shades.spot`: the light of a face without one changes smoothly over it."""
+    """`Shades.spot`; the illumination of a face without a highlight varies smoothly."""
     x, y = np.outer(FACE_RADII, np.sin(ANGLES)), np.outer(FACE_RADII, np.cos(ANGLES))
     u, v = patch.pixel_of(radius_m * x, radius_m * y)
     gray = np.asarray(sample_at(patch.gray, u, v), float)
@@ -113,7 +115,7 @@ def _spot(patch: Patch, unknown: NDArray[np.uint8], radius_m: float, level: floa
 
 
 def _below(patch: Patch, unknown: NDArray[np.uint8], radius_m: float) -> float:
-    """`Shades.below`: a registration a pixel off moves both edges of a gap alike, so how thick it is on either side stays."""
+    """`Shades.below`; a registration error moves both edges of a gap alike, so its thickness on either side is unaffected."""
     u, v = patch.pixel_of(radius_m * np.outer(GAP, np.sin(ANGLES)), radius_m * np.outer(GAP, np.cos(ANGLES)))
     gray = np.asarray(sample_at(patch.gray, u, v), float)
     known = (sample_at(unknown, u, v) > 0.5).mean(axis=0) < 0.2
@@ -129,13 +131,13 @@ def _below(patch: Patch, unknown: NDArray[np.uint8], radius_m: float) -> float:
 
 
 def _mean_round(patch: Patch, unknown: NDArray[np.uint8], radii_m: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """(angles,) mean gray over some radii, and where most of them are not known."""
+    """(angles,) mean gray over some radii, and the angles at which most of them are unknown."""
     u, v = patch.pixel_of(np.outer(radii_m, np.sin(ANGLES)), np.outer(radii_m, np.cos(ANGLES)))
     return np.asarray(sample_at(patch.gray, u, v).mean(axis=0), float), sample_at(unknown, u, v).mean(axis=0) > 0.4
 
 
 def _wave(values: Array, known: NDArray[np.bool_]) -> Array:
-    """(3,) mean, cosine and sine of what is known of values round the cap, by reweighted least squares."""
+    """(3,) mean, cosine and sine of the known values round the cap, by iteratively reweighted least squares."""
     base, y = WAVES[known], values[known]
     weight, found = np.ones(len(y)), np.zeros(3)
     for _ in range(ROUNDS):

@@ -1,4 +1,4 @@
-"""Sliders: the cap covers what lies to both sides of the slot."""
+"""Reader of sliders: the cap is found where it covers both sides of the slot."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ from perception.vision.status.choice import contrast_noise
 from perception.vision.status.occluder_bands import lying_across
 from perception.vision.status.reader import Reader
 
-SLOT = 0.2  # of the cap's width: half of the slot and what blurs it
-EDGE_BOX = 0.22  # of the cap's length: a line across its middle is further from its edges
-LEAST_OPEN = 0.4  # of a box that must not be covered
-SLACK = 0.12  # of the cap's length: by how much a cap may differ from its drawing
-NEXT_TO = 0.4  # of the cap's length: how exactly two caps share an edge
-SAME_EDGE = 1.25  # times the weaker edge of the cap
+SLOT = 0.2  # share of the cap's width: half of the slot plus its blur
+EDGE_BOX = 0.22  # share of the cap's length: a line across its middle is further than this from its edges
+LEAST_OPEN = 0.4  # share of a box that must not be occluded
+SLACK = 0.12  # share of the cap's length by which a cap may differ from its nominal length
+NEXT_TO = 0.4  # share of the cap's length: tolerance for two caps sharing an edge
+SAME_EDGE = 1.25  # times the cap's weaker edge
 #: Of the cap's length: half of what is averaged for a line across its middle, and how far beside it and how wide its flanks are.
 LINE, LINE_FLANK, LINE_WIDTH = 0.05, 0.15, 0.10
-LINE_NEAR = 0.17  # of the cap's length: how far from the middle of its edges, one of which its shadow may pull
-LINE_NOISES, LINE_SHARE = 2.0, 0.15  # of the contrast's noise and of the cap's edge: what a line stands out by at least
-NO_LINE = 0.75  # of 12 caps in bad light whose line does not show 8 were right: cables and glare are taken for caps
-BEYOND, MOST_BEYOND = 0.8, 0.4  # of the cap's width from the track; share that may be as dark there
-SIDES = np.linspace(-0.40, 0.40, 17)  # of the cap's width: inside the cap
+LINE_NEAR = 0.17  # share of the cap's length: distance from the middle of its edges, one of which its shadow may shift
+# Least contrast of a line: in sigmas of the contrast's noise, and as a share of the cap's edge
+LINE_NOISES, LINE_SHARE = 2.0, 0.15
+NO_LINE = 0.75  # of 12 caps in bad light without a visible line 8 were right: cables and glare are taken for caps
+BEYOND, MOST_BEYOND = 0.8, 0.4  # in cap widths from the track; share that may be as dark there
+SIDES = np.linspace(-0.40, 0.40, 17)  # in cap widths: inside the cap
 
 
 def read_slider(patch: Patch, spec: Slider) -> PatchReading:
@@ -43,7 +44,7 @@ def read_slider(patch: Patch, spec: Slider) -> PatchReading:
     u, v = patch.pixel_of(*_place(spec.angle_rad, s, np.zeros(1)))
     if float(np.mean(sample_at(patch.inside.astype(np.uint8), u, v))) < 0.97:
         return refused("part of the track is outside the image: move the camera", unit=spec.scale.unit)
-    lean_m = _base_shift_m(patch, spec, s)  # the foot of a cap there shows on that side of its top
+    lean_m = _base_shift_m(patch, spec, s)  # where the foot of a cap appears relative to its top
     open_ = _uncovered(patch, spec, s, np.minimum(left, right), float(np.median(lean_m)))
     found = _best_pair(left, right, s, open_, along_m=along, lean_m=lean_m, limits_m=(lo, hi))
     noise = contrast_noise(patch)
@@ -77,7 +78,7 @@ def read_slider(patch: Patch, spec: Slider) -> PatchReading:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Cap:
-    """Where the middle of the cap's top is, m along the track, and the contrast of its weaker edge and of its best rival."""
+    """Middle of the cap's top, m along the track, and the contrasts of its weaker edge and of its best rival."""
 
     place_m: float
     peak: float
@@ -87,7 +88,7 @@ class _Cap:
 def _best_pair(
     left: Array, right: Array, s: Array, open_: Array, *, along_m: float, lean_m: Array, limits_m: tuple[float, float]
 ) -> _Cap:
-    """The pair of opposite edges as far apart as the cap is long; what lies between them (a line, a shine) is free.
+    """Find the pair of opposite edges that are one cap length apart; what lies between them (a line, a highlight) is ignored.
 
     Every edge counts with the weaker of the two sides of the slot, and the pair with its weaker edge: a tick or a label
     is on one side, glare and shadow have one edge.
@@ -107,7 +108,7 @@ def _best_pair(
         )
         no_low, no_high = (np.interp(s + shift, s, hidden) > 0.5 for shift in (-low_shift, high_shift))
         score = np.where(off | no_low | no_high, 0.0, np.minimum(at_low, at_high))
-        # What has one of its edges under a cable may be the cap as well: it is a rival with all that can be seen of it.
+        # A candidate with one edge under a cable may be the cap as well: it is a rival with its visible edge alone.
         perhaps = np.where(no_low, np.where(no_high, 0.0, at_high), np.where(no_high, at_low, score))
         sides.append((score, np.where(off, 0.0, perhaps), into, out))
     (score, perhaps, into, out), other = sorted(sides, key=lambda side: -float(side[0].max()))
@@ -119,11 +120,11 @@ def _best_pair(
     high = _crest(s, out, float(s[top] + high_shift[top]), SLACK * along_m)
     lean = float(lean_m[top])
     place = (low + high - lean) / 2
-    if abs(lean) >= 0.1 * along_m:  # only one edge is the top's, the other is the foot's
+    if abs(lean) >= 0.1 * along_m:  # only one edge belongs to the top, the other to the foot
         place = low + along_m / 2 if lean > 0 else high - along_m / 2
-    beside = np.abs(s - s[top]) > along_m  # the line across a whole cap's middle is no edge of another one
+    beside = np.abs(s - s[top]) > along_m  # the line across a cap's middle must not count as an edge of another cap
     whole = max(float(score[apart].max(initial=0.0)), float(other[0].max()))
-    # An edge of the cap that is found whole would do for one of another gray beside it whose far edge is hidden.
+    # One edge of a complete cap could also bound a neighbour of another gray whose far edge is hidden.
     next_to_it = np.abs(np.abs(s - s[top]) - along_m) < NEXT_TO * along_m
     elsewhere = np.where(next_to_it & (other[1] <= SAME_EDGE * score[top]), 0.0, other[1])
     rival = max(whole, *(float(partly[beside].max(initial=0.0)) for partly in (perhaps, elsewhere)))
@@ -133,9 +134,9 @@ def _best_pair(
 def _line(
     left: Array, right: Array, s: Array, open_: Array, *, near_m: float, along_m: float, least: float
 ) -> float | None:
-    """Where the line across the cap's middle is, m along the track; None where none stands out on both sides of the slot.
+    """Place of the line across the cap's middle, m along the track; None where no line shows on both sides of the slot.
 
-    A cap throws a shadow of nearly its own gray to one side, which pulls that edge; the line on top of it is not moved.
+    A cap casts a shadow of nearly its own gray to one side, which shifts that edge; the line on its top is not shifted.
     """
     step = float(s[1] - s[0])
     thin, far, wide = (max(1, round(k * along_m / step)) for k in (LINE, LINE_FLANK, LINE_WIDTH / 2))
@@ -155,7 +156,7 @@ def _line(
 
 
 def _fall(profile: Array, open_: Array, box: float) -> Array:
-    """By how much the gray falls at every place: mean over a box before less mean over a box behind, NaN if covered."""
+    """Decrease of gray at every place: mean over a box before it minus mean over a box behind it; NaN if occluded."""
     n = max(2, round(box))
     weight, gray = np.pad(open_, n, mode="edge"), np.pad(profile, n, mode="edge")
     count, total = (np.concatenate([[0.0], np.cumsum(x)]) for x in (weight, weight * gray))
@@ -170,20 +171,20 @@ def _fall(profile: Array, open_: Array, box: float) -> Array:
 
 
 def _near(profile: Array, reach: float) -> Array:
-    """Largest value within `reach` samples."""
+    """Running maximum within `reach` samples."""
     kernel = np.ones((1, 2 * max(1, round(reach)) + 1), np.uint8)
     return np.asarray(cv2.dilate(np.asarray(profile, np.float32)[None], kernel)[0], float)
 
 
 def _both_sides(edges: Array, white: Array) -> Array:
-    """(N,) the weaker of the two sides' edges; beside saturation an edge is weaker than it is, and the other side tells."""
+    """(N,) the weaker of the two sides' edges; where one side is saturated, its edge is too weak and the other side is used."""
     weaker = edges.min(axis=0)
     blind = white > 0
     return np.asarray(np.where(blind[0] != blind[1], np.where(blind[0], edges[1], edges[0]), weaker))
 
 
 def _crest(s: Array, edge: Array, at_m: float, reach_m: float) -> float:
-    """Where an edge signal has its crest within reach of a place, m."""
+    """Place of an edge signal's maximum within reach of a place, m."""
     near = np.flatnonzero(np.abs(s - at_m) <= reach_m + (s[1] - s[0]))
     k = int(near[edge[near].argmax()])
     if not 0 < k < len(s) - 1:
@@ -194,8 +195,8 @@ def _crest(s: Array, edge: Array, at_m: float, reach_m: float) -> float:
 
 
 def _uncovered(patch: Patch, spec: Slider, s: Array, profile: Array, lean_m: float) -> Array:
-    """1 where nothing lies across the track, else 0."""
-    # The cap stands out and may lean over the footprint: look for what comes in from further away.
+    """1 where nothing occludes the track, else 0."""
+    # The cap stands out and may lean over the footprint, so search for what enters from further away.
     lean_px = float(np.linalg.norm(patch.parallax_px_per_m)) * spec.cap_size_m[2]
     room_m = 0.004 + lean_px / patch.px_per_m
     width, height = spec.half_footprint_m
@@ -211,12 +212,13 @@ def _uncovered(patch: Patch, spec: Slider, s: Array, profile: Array, lean_m: flo
 
 
 def _is_cap(profile: Array, beyond: Array, s: Array, open_: Array, width_m: float) -> bool:
-    """Is what seems to lie across the track the cap itself? A dark cap runs into printed ticks of the same gray.
+    """Whether the apparent occluder of the track is the cap itself; a dark cap merges with printed ticks of the same gray.
 
-    The cap is as long as the panel file says, it is the only thing that stands out there, and it ends on both sides.
+    The cap has the length that the panel file states, it is the only thing that stands out there, and it ends on both
+    sides.
 
     Args:
-        profile, beyond: (N,) gray along the track on the cap's sides, and the brighter of what lies beyond them.
+        profile, beyond: (N,) gray along the track on the cap's sides, and the brighter of the two strips beyond them.
     """
     shut = open_ < 0.5
     if not shut.any():
@@ -241,16 +243,16 @@ def _closed(profile: Array, width: float) -> Array:
 
 
 def _open(patch: Patch, cover: NDArray[np.bool_], angle_rad: float, s: Array, across_m: float) -> Array:
-    """1 where nothing lies across the track, else 0."""
+    """1 where nothing occludes the track, else 0."""
     u, v = patch.pixel_of(*_place(angle_rad, s, np.linspace(-1.0, 1.0, 5) * across_m))
     return np.asarray(sample_at(cover.astype(np.uint8), u, v).max(axis=1) < 0.3, float)
 
 
 def _base_shift_m(patch: Patch, spec: Slider, s: Array) -> Array:
-    """How far along the track the foot of a cap at the places `s` (N,) appears beside its top in the patch, (N,) m.
+    """(N,) distance along the track, m, by which the foot of a cap at each place `s` (N,) appears displaced from its top.
 
-    The foot is further off than the top, so it appears nearer to where the camera looks: from before the track's middle
-    a cap at its end leans over by a millimetre.
+    The foot is further from the camera than the top, so it appears nearer to the camera's foot point: seen from before
+    the track's middle, a cap at its end leans by a millimetre.
     """
     u, v = -patch.parallax_px_per_m * spec.cap_size_m[2] / patch.px_per_m
     at_middle_m = float(u * np.cos(spec.angle_rad) - v * np.sin(spec.angle_rad))
@@ -258,9 +260,9 @@ def _base_shift_m(patch: Patch, spec: Slider, s: Array) -> Array:
 
 
 def _beside_slot(patch: Patch, spec: Slider) -> tuple[Array, Array]:
-    """Distances across the track, m, at which the cap is looked for: inside the cap, not on the slot as it appears.
+    """Distances across the track, m, at which the cap is searched: inside the cap, and off the slot as it appears.
 
-    The slot lies deeper than the cap's top, so from aside it shows beside the track's middle.
+    The slot lies deeper than the cap's top, so in an oblique view it appears displaced from the track's middle.
     """
     across = spec.cap_size_m[1]
     u, v = -patch.parallax_px_per_m * spec.cap_size_m[2] / patch.px_per_m

@@ -1,4 +1,4 @@
-"""Toggle switches: a bat that leans up (`on`) or down (`off`) and stands out of the plate."""
+"""Reader of toggle switches: a bat that leans up (`on`) or down (`off`) and stands out of the plate."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from perception.vision.status.choice import choose, contrast_noise
 from perception.vision.status.reader import Reader
 
 STATES, LEANS = ("on", "off"), (0.0, np.pi)  # clockwise from up
-BAT_FROM, BAT_TO = 0.62, 0.95  # of the length: the nut around the foot looks like a bar too
-BRIGHT_ODDS = 2.0  # bats are metal or white far more often than darker than their base
-BEYOND = (1.5, 3.0)  # of the bat's radius past its tip: clear of its round end
-BEHIND = (0.8, 1.7)  # of it behind the foot: still before the nut
-GOES_ON = 3.0  # how much what goes on counts: it may stand out less there
-PIVOT_M = 0.004  # a bat turns about a point that far above the plate
+BAT_FROM, BAT_TO = 0.62, 0.95  # share of the length: the nut around the foot looks like a bar too
+BRIGHT_ODDS = 2.0  # prior for a bright bat: bats are usually metal or white, rarely darker than their base
+BEYOND = (1.5, 3.0)  # in bat radii past its tip: clear of its round end
+BEHIND = (0.8, 1.7)  # in bat radii behind the foot: still before the nut
+GOES_ON = 3.0  # weight of the contrast beyond the ends, which may be weaker there
+PIVOT_M = 0.004  # height above the plate of the point about which a bat turns
 FLANK, WIDE_FLANK = (
     (1.6, 1.9),
     (2.3, 2.6),
 )  # of 0.8 of the bat's radius: what is compared with it lies that far beside its axis
-AT_FOOT = (0.15, 0.5)  # of the length: there a bat of the plate's gray stands out from the nut about its foot
-AT_FOOT_NOISE = 3.0  # of the noise of a contrast: less tells nothing there
+AT_FOOT = (0.15, 0.5)  # share of the length: there a bat as gray as the plate contrasts with the nut about its foot
+AT_FOOT_NOISE = 3.0  # times the noise of a contrast: less is no evidence there
 
 
 def read_toggle(patch: Patch, spec: Toggle) -> PatchReading:
-    """State of a toggle switch. `patch` shows the plate (or any plane: heights are followed)."""
+    """State of a toggle switch. `patch` shows the plate (or any plane, because heights are taken into account)."""
     reach = spec.bat_length_m * np.sin(spec.tilt_rad)
     y = np.linspace(-1, 1, 12)[:, None] * reach
     seen = patch.seen(np.array([-1.0, 0.0, 1.0]) * spec.bat_radius_m + 0 * y, y + np.zeros(3))
@@ -46,13 +46,13 @@ def read_toggle(patch: Patch, spec: Toggle) -> PatchReading:
 
 
 def _of_one_colour(contrast: Array) -> Array:
-    """(2,) evidence: what is dark on one side and bright on the other is the rest of the switch."""
+    """(2,) evidence per state: if one side is dark and the other bright, the dark one is the rest of the switch."""
     rivals = (np.maximum(contrast, 0.0), BRIGHT_ODDS), (np.maximum(-contrast, 0.0), 1.0)
     return np.asarray(max(rivals, key=lambda e: e[0].max() * e[1])[0])
 
 
 def _at_foot(patch: Patch, spec: Toggle, noise: float) -> Array:
-    """(2,) signed contrast of the bat before its nut, towards `LEANS`; zeros where it does not stand out on one side."""
+    """(2,) signed contrast of the bat before its nut, towards `LEANS`; zeros where it does not stand out on one side only."""
     contrast = np.array([_stretch(patch, spec, angle, AT_FOOT, FLANK) for angle in LEANS])
     size = np.abs(contrast)
     stands_out = size.max() > AT_FOOT_NOISE * noise and size.min() < 0.5 * size.max()
@@ -73,7 +73,7 @@ def _stretch(
 
 
 def _bat(patch: Patch, spec: Toggle, angle_rad: float, flank: tuple[float, float]) -> float:
-    """Signed contrast of a bat that leans towards an angle, less what goes on beyond its tip or behind its foot.
+    """Signed contrast of a bat that leans towards an angle, minus its continuation beyond the tip or behind the foot.
 
     A bat ends there. A cable does not, nor does the bat in its other position where the view runs along both.
     """
@@ -88,12 +88,12 @@ def _bat(patch: Patch, spec: Toggle, angle_rad: float, flank: tuple[float, float
         spec.bat_radius_m * patch.px_per_m / max(float(np.linalg.norm(tip - foot)), 1e-9)
     )  # of the bat as it appears
     if radii > 1.0:
-        return bat  # seen from its tip: it has no length
+        return bat  # seen end-on, it has no length
     beyond, behind = (
         _stretch(patch, spec, angle_rad, along, flank)
         for along in ((1.0 + BEYOND[0] * radii, 1.0 + BEYOND[1] * radii), (-BEHIND[1] * radii, -BEHIND[0] * radii))
     )
-    goes_on = max(beyond, 0.0) if bat > 0 else max(-beyond, -behind, 0.0)  # behind a bright bat its nut may shine
+    goes_on = max(beyond, 0.0) if bat > 0 else max(-beyond, -behind, 0.0)  # behind a bright bat its nut may reflect
     return float(np.sign(bat) * max(abs(bat) - GOES_ON * goes_on, 0.0))
 
 

@@ -1,1 +1,1 @@
-"""What stands where in an image: the plate, the outlines on it, and the kinds that they look like."""
+"""Find the plate in an image, the outlines on it, and the kinds of object that they resemble."""

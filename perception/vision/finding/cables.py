@@ -1,9 +1,9 @@
-"""Cables that hang before a plate: where they run, and the picture as it would be without them.
+"""Detection of cables that hang before a plate, and removal of them from the picture.
 
-A cable is a dark band of one width that goes on from the top of the plate to the bottom, or to a side; nothing on a panel
-is so long. Its course is the path with the most darkness against both of its sides (dynamic programming, R. Bellman,
-1957; for lines in pictures U. Montanari, Comm. ACM 14(5), 1971). What it covers is bridged from side to side, row by row:
-not what is there, but nothing that an edge or a look would stumble over.
+A cable is a dark band of constant width that runs from the top of the plate to the bottom or to a side; nothing on a
+panel is that long. Its course is the path with the largest darkness relative to both of its sides (dynamic programming,
+R. Bellman, 1957; for lines in pictures U. Montanari, Comm. ACM 14(5), 1971). The covered pixels are interpolated from
+side to side, row by row, which does not restore the picture but leaves no false edges.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ STEADY = 13  # rows agree on where the cable is
 
 
 def without_cables(picture: Image, plate_gray: Float32) -> Image:
-    """The (H, W) picture of a plate with its cables bridged; the picture itself where none hangs."""
+    """The (H, W) picture of a plate with its cables interpolated away; the same picture if there is none."""
     height, width = picture.shape
     cells = (width // ACROSS, height // ALONG)
     small, level = (cv2.resize(p, cells, interpolation=cv2.INTER_AREA) for p in (picture, plate_gray))
@@ -78,7 +78,7 @@ def _middle(
 
 
 def _strip(picture: Image, rows: NDArray[np.int64], at: Array) -> Array:
-    """(N, 2 * REACH_PX + 1) grays beside a course."""
+    """(N, 2 * REACH_PX + 1) gray values across a course."""
     u = np.clip(np.round(at[:, None] + np.arange(-REACH_PX, REACH_PX + 1)), 0, picture.shape[1] - 1).astype(int)
     return np.asarray(picture[rows[:, None], u], float)
 
@@ -97,7 +97,7 @@ def _extent(profile: Array) -> tuple[int, int]:
 
 
 def _shift(strip: Array, middle: float, half: float) -> Array:
-    """(N,) by how much each row's darkest band lies beside the middle, as its neighbours along the cable agree."""
+    """(N,) offset of each row's darkest band from the middle, smoothed over neighbouring rows."""
     reach = max(1, round(half) - 1)
     sums = np.pad(np.cumsum(strip, axis=1), ((0, 0), (1, 0)))
     tried = np.clip(round(middle) + np.arange(-SHIFTS_PX, SHIFTS_PX + 1), reach + 4, strip.shape[1] - reach - 5)
@@ -125,7 +125,7 @@ def _steady(at: Array) -> Array:
 
 
 def _bridged(picture: Image, rows: NDArray[np.int64], at: Array, half: float) -> Image:
-    """The picture with a straight slope of gray from one side of the band to the other, in every row."""
+    """The picture with the band replaced by a linear interpolation between its two sides, in every row."""
     out = picture.copy()
     _bridge(out, rows, np.floor(at - half).astype(np.int64) - 1, np.ceil(at + half).astype(np.int64) + 1)
     return out
@@ -133,7 +133,7 @@ def _bridged(picture: Image, rows: NDArray[np.int64], at: Array, half: float) ->
 
 @compiled
 def _bridge(picture: Image, rows: NDArray[np.int64], left: NDArray[np.int64], right: NDArray[np.int64]) -> None:
-    """In place. Beyond the picture's border a side has the gray of the other."""
+    """Interpolate one row in place. A side outside the picture takes the gray of the other side."""
     width = picture.shape[1]
     for k in range(len(rows)):
         row = picture[rows[k]]
@@ -150,7 +150,7 @@ def _bridge(picture: Image, rows: NDArray[np.int64], left: NDArray[np.int64], ri
 
 @compiled
 def _darkness(small: Float32, level: Float32, halves: NDArray[np.int64]) -> Float32:
-    """(H, W) by how much a band about each cell is darker than both of its sides, the best of several widths."""
+    """(H, W) darkness of a band about each cell relative to both of its sides, the maximum over several widths."""
     height, width = small.shape
     out = np.full((height, width), np.float32(-0.5))
     sums = np.zeros(width + 1, np.float32)
@@ -170,7 +170,7 @@ def _darkness(small: Float32, level: Float32, halves: NDArray[np.int64]) -> Floa
 
 @compiled
 def _course(gain: Float32, bend: float) -> tuple[NDArray[np.int64], float]:
-    """(H,) cell in every row of the path from top to bottom with the most gain, and that; slopes of up to two cells."""
+    """(H,) cell per row of the top-to-bottom path with the largest gain, and that gain; slopes are at most two cells per row."""
     height, width = gain.shape
     slopes = 5
     price = np.float32(bend)

@@ -1,7 +1,7 @@
-"""Circles in the plate's rectified picture, by votes.
+"""Hough detection of circles in the plate's rectified picture.
 
-Every edge pixel names the centres that its gradient points at, for every radius (D. H. Ballard, Pattern Recognition
-13(2), 1981). A candidate is then verified on the outline itself: the share of it that has an edge along the normal.
+Every edge pixel votes for the centres at which its gradient points, for every radius (D. H. Ballard, Pattern
+Recognition 13(2), 1981). A candidate is then verified by the share of its outline that has an edge along the normal.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def find_circles(edges: Edges, *, least_px: float, most_px: float) -> list[Circl
 
 
 def _pool(votes: Float32, radii: Array) -> None:
-    """In place: votes summed over neighbouring places and radii, over the circumference."""
+    """Sum the votes in place over neighbouring places and radii, and divide by the circumference."""
     for plane in votes:
         cv2.GaussianBlur(plane, (0, 0), 0.9, dst=plane)
     _average(votes, radii.astype(np.float32))
@@ -118,7 +118,7 @@ def _distinct(circles: list[Circle]) -> list[Circle]:
 
 @compiled
 def _average(planes: Float32, radii: Float32) -> None:
-    """In place: mean of every plane and its two neighbours, the outermost as they are, over the radius."""
+    """Average every plane in place with its two neighbours along the radius; the outermost planes stay unchanged."""
     count, height, width = planes.shape
     before, here = planes[0].copy(), planes[0].copy()
     for k in range(count):
@@ -135,7 +135,7 @@ def _average(planes: Float32, radii: Float32) -> None:
 
 @compiled
 def _vote(votes: Float32, u: Array, v: Array, nx: Array, ny: Array, radii: Array, cell: int) -> None:
-    """One vote a radius on either side of every edge pixel; radius by radius, so that one plane stays in the cache."""
+    """Add one vote per radius on either side of every edge pixel, radius by radius, so that one plane stays in the cache."""
     _, height, width = votes.shape
     share = 1.0 / cell  # cells are powers of two: exactly as dividing, and quicker
     for k in range(len(radii)):
@@ -170,7 +170,7 @@ def _climbed(
     gx: Float32, gy: Float32, strength: Float32, strong: NDArray[np.bool_], normals: Array, steps: Array,
     u: float, v: float, r: float,
 ) -> tuple[float, float, float, float]:  # fmt: skip
-    """(u, v, r, coverage) of the best of 27 neighbours a step, in ever smaller steps, until nothing is better."""
+    """(u, v, r, coverage) after hill climbing: the best of 27 neighbours per step, with shrinking steps."""
     score = -1.0
     for step in steps:
         best, best_u, best_v, best_r = -1.0, u, v, r

@@ -1,4 +1,4 @@
-"""Connected parts of a sparse mask, by runs: boxes and middles only, a tenth of the price of a labelled picture."""
+"""Connected components of a sparse mask by runs; only boxes and middles, which is ten times faster than labelling."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def components(mask: NDArray[np.uint8], *, diagonal: bool) -> Array:
 
 @compiled
 def _components(mask: NDArray[np.uint8], reach: int) -> Array:
-    """Runs of a row join the runs of the row above that they overlap (union-find); sums are kept a run."""
+    """Join the runs of a row to the overlapping runs of the row above (union-find), with sums per run."""
     height, width = mask.shape
     most = height * (width + 1) // 2 + 1
     parent, first, last, row = np.empty((4, most), np.int32)
@@ -86,7 +86,7 @@ def _root(parent: NDArray[np.int32], k: int) -> int:
 
 @inlined
 def _join(parent: NDArray[np.int32], a: int, b: int) -> None:
-    """The older root stays."""
+    """Join two sets of runs; the older root is kept."""
     ra, rb = _root(parent, a), _root(parent, b)
     if ra < rb:
         parent[rb] = ra

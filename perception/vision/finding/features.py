@@ -1,11 +1,11 @@
-"""What a place on the plate looks like, told in numbers that a person can check.
+"""Features that describe the appearance of a place on the plate.
 
-Around a middle, on circles of growing radius, whichever way the object is turned: relative gray (median), unevenness
+On circles of growing radius around a middle, independent of the object's rotation: relative gray (median), unevenness
 (inner 70 % range), and edge strength (median and strong). Then, towards eight directions of the upright plate, relative
-gray and edges on rings: a toggle's plate is taller than wide, a display wider than high. Logarithms of ratios to the
-plate's own gray, so exposure and light cancel; medians and directions, so a cable or a highlight spoils a few numbers and
-not all. For closed regions: the paper's size, height, width, aspect and Fourier shape
-descriptors (C. T. Zahn and R. Z. Roskies, IEEE Trans. Computers 21(3), 1972, in the complex form of G. H. Granlund, 1972).
+gray and edges on rings: a toggle's plate is taller than wide, a display wider than high. They are logarithms of ratios
+to the plate's own gray, so exposure and light cancel; medians and directions confine the effect of a cable or a
+highlight to a few features. For closed regions: the paper's size, height, width, aspect and Fourier shape descriptors
+(C. T. Zahn and R. Z. Roskies, IEEE Trans. Computers 21(3), 1972, in the complex form of G. H. Granlund, 1972).
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ DESCRIPTORS = 12
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Ground:
-    """The rectified plate, its edges and the gray that it would have without objects; `noisy`: the image that it is of."""
+    """The rectified plate, its edges, the gray it would have without objects, and whether the image is `noisy`."""
 
     picture: NDArray[np.float32]
     edges: Edges
@@ -85,7 +85,7 @@ class RegionShape:
 
 
 def plate_gray(picture: Image) -> NDArray[np.float32]:
-    """(H, W) gray of the plate itself: a median wide enough to overlook every object."""
+    """(H, W) gray of the plate itself, by a median filter wide enough to suppress every object."""
     small = cv2.resize(picture, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
     framed = cv2.copyMakeBorder(small, 24, 24, 24, 24, cv2.BORDER_REFLECT)
     median = cv2.GaussianBlur(cv2.medianBlur(framed, 49)[24:-24, 24:-24], (0, 0), 3.0)
@@ -93,7 +93,7 @@ def plate_gray(picture: Image) -> NDArray[np.float32]:
 
 
 def look_at(ground: Ground, places_px: ArrayLike) -> Array:
-    """(N, LENGTH) looks of (N, 2) places (u, v) of the rectified plate: `GROUPS`, then `AROUND_GROUPS`."""
+    """(N, LENGTH) features of (N, 2) places (u, v) of the rectified plate: `GROUPS`, then `AROUND_GROUPS`."""
     places = np.asarray(places_px, float).reshape(-1, 2)
     parts = [_looks(ground, places[k : k + AT_ONCE]) for k in range(0, len(places), AT_ONCE)]
     return np.concatenate(parts).astype(float) if parts else np.zeros((0, LENGTH))
@@ -118,7 +118,7 @@ def _looks(ground: Ground, places: Array) -> NDArray[np.float32]:
 
 
 def half_turned(looks: Array) -> Array:
-    """(N, LENGTH) what `look_at` gives of the same places when the picture is turned by half a turn."""
+    """(N, LENGTH) features of the same places when the picture is turned by half a turn."""
     plain = len(GROUPS) * len(RADII_M)
     tables = looks[:, plain:].reshape(len(looks), len(AROUND_GROUPS), DIRECTIONS, RINGS)
     return np.concatenate([looks[:, :plain], np.roll(tables, DIRECTIONS // 2, axis=2).reshape(len(looks), -1)], axis=1)

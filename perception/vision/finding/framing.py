@@ -1,4 +1,4 @@
-"""Is there one panel in the image, and is it the right way up? What cannot be answered for is refused before reading."""
+"""Check that the image shows exactly one panel, the right way up; otherwise the reading is refused."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def check_upright(gray: Image, view: PanelProjection, panel: Panel) -> None:
 
 
 def _righted_share(gray: Image, panel: Panel) -> float:
-    """As `_objects_share` of an image whose plate is looked for anew; 0 where there is none."""
+    """`_objects_share` of an image in which the plate is searched again; 0 where there is none."""
     plate = find_plate(gray, panel.width_m, panel.height_m)
     return 0.0 if plate is None else float(np.nan_to_num(_objects_share(gray, plate.view, panel)))
 
@@ -97,7 +97,7 @@ def upside_down(view: PanelProjection) -> PanelProjection:
 
 
 def _objects_share(gray: Image, view: PanelProjection, panel: Panel) -> float:
-    """Share of the edges of the panel's objects that the image shows; NaN, which compares as no, where none has any."""
+    """Share of the edges of the panel's objects that the image shows; NaN (all comparisons false) if no object has edges."""
     shares = np.array(list(register(gray, view, panel).edge_share.values()))
     shares = shares[np.isfinite(shares)]
     return float(shares.mean()) if len(shares) else float("nan")
@@ -113,7 +113,7 @@ def _panels_in(gray: Image, aspect: float) -> int:
 
 
 def _plates_among(mask: NDArray[np.uint8], aspect: float) -> int:
-    """Of the outer contours, those of a size with the largest that are plates; objects on a plate are holes in it."""
+    """Number of outer contours of similar size that are plates; objects on a plate are holes in it."""
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     outlines = [np.asarray(contour, np.int32) for contour in contours]
     areas = np.array([cv2.contourArea(outline) for outline in outlines])

@@ -1,4 +1,4 @@
-"""Likeness of places to taught looks: the nearest looks of every kind, and what follows for the place."""
+"""Distances between the features of places and taught features: the nearest taught examples of every kind."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Prepared:
 
 @lru_cache(maxsize=4)
 def prepared(knowledge: Knowledge) -> Prepared:
-    """The looks of all kinds as `nearest` wants them, made once for a knowledge."""
+    """Prepare the taught features of all kinds for `nearest`; done once per knowledge."""
     counts = [len(kind.looks) for kind in knowledge.kinds]
     gain = knowledge.weights / knowledge.spread
     scaled = np.vstack([kind.looks for kind in knowledge.kinds]) * gain
@@ -48,7 +48,7 @@ def prepared(knowledge: Knowledge) -> Prepared:
 
 
 def distances(looks: Array, knowledge: Knowledge) -> Array:
-    """(N, kinds) distance of (N, LENGTH) looks to the nearest look of every kind, in spreads a number.
+    """(N, kinds) distance of (N, LENGTH) features to the nearest taught example of every kind, in spreads per feature.
 
     The distance is the weighted mean of the absolute differences over the spread, each limited to `CLIP`.
     """
@@ -56,10 +56,10 @@ def distances(looks: Array, knowledge: Knowledge) -> Array:
 
 
 def nearest(looks: Array, known: Prepared, *, kind: int | None = None, mean_of: int = 1) -> Array:
-    """`distances` to looks that are prepared; with `kind`, (N, 1) to the looks of that column only.
+    """`distances` to prepared examples; with `kind`, (N, 1) distances to the examples of that column only.
 
-    `mean_of`: to that many nearest looks of every kind, in the mean. One that a kind does not have counts as further
-    than the last by `NEXT_FURTHER`: a kind of one look is neither preferred nor out of the question.
+    `mean_of`: number of nearest examples of every kind over which the distance is averaged. A missing example counts as
+    `NEXT_FURTHER` more distant than the last, so that a kind with one example is neither preferred nor excluded.
     """
     first = known.first if kind is None else known.first[kind : kind + 2]
     scaled = (looks * known.gain).astype(np.float32)
@@ -100,8 +100,10 @@ def _nearest(
     mean_of: int,
     step: float,
 ) -> NDArray[np.float32]:
-    """One look against all taught ones at once, number by number: the inner loop runs in vector registers, in an order
-    of sums that no processor changes."""
+    """Compare one place with all taught examples, feature by feature.
+
+    The inner loop is vectorised with an order of summation that does not depend on the processor.
+    """
     n, length = looks.shape
     begin, end = first[0], first[-1]
     total = np.empty(end - begin, np.float32)
@@ -121,7 +123,7 @@ def _nearest(
 
 @inlined
 def _mean_of_least(values: NDArray[np.float32], count: int, step: float) -> float:
-    """Mean of the `count` least values; those that lack follow the last in steps."""
+    """Mean of the `count` least values; missing ones are extrapolated from the last by `step`."""
     least = np.full(count, np.inf)
     for value in values:
         if value < least[-1]:

@@ -1,9 +1,10 @@
-"""The plate in an overview: four robust lines around what differs from the room, and the view straight onto it.
+"""Detection of the plate in an overview: four robust lines around the region that differs from the room.
 
-A rigid plate before a typical camera is laid through the lines and follows the image's edges, so a side that the image
-cuts off is where the others put it; where they do not say, it begins at the image's border. Where the edges do not confirm a
-visible side (glare or shadow misled its line), the plate is laid again without that line, each also from further off, and
-freely, as a steep tilt before a wider lens wants it; what is confirmed best stands.
+A rigid plate before a typical camera is fitted to the lines and then to the image's edges, so that a side outside the
+image follows from the others; where they do not determine it, it is placed at the image's border. If edges do not
+confirm a visible side (glare or shadow misled its line), the fit is repeated without that line. Each fit is also tried
+with wider search windows, and as a free homography for steep tilts and wide lenses. The fit with the most confirmed
+edges is returned.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ _Attempt = tuple[list[Array | None], tuple[float, ...], float]  # lines, windows
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Search:
-    """What every attempt to lay the plate through coarse lines needs."""
+    """Data that every attempt to fit the plate to coarse lines needs."""
 
     image: EdgeImage
     outline: Outline
@@ -107,7 +108,7 @@ class _Search:
         return best if best is not None and self._is_plate(best) else None
 
     def _is_plate(self, view: PlateProjection) -> bool:
-        """Whether edges confirm enough of the border, and a camera could see a plate of these proportions so."""
+        """Whether edges confirm enough of the border, and the plate's proportions are possible for the camera."""
         visible, near = (int(mask.sum()) for mask in confirmed(self.image, view, self.outline))
         is_confirmed = near >= max(LEAST_CONFIRMED, LEAST_SHARE_CONFIRMED * visible)
         return is_confirmed and self._stretch(view) < MOST_STRETCHED
@@ -132,7 +133,7 @@ class _Search:
     def _laid(
         self, lines: list[Array | None], windows_px: tuple[float, ...], sigma_px: float
     ) -> PlateProjection | None:
-        """The plate through the lines, moved onto the image's edges: first as a rigid one, then freely."""
+        """Fit the plate to the lines and then to the image's edges: first as a rigid plate, then freely."""
         corners_px = self._corners_px(lines)
         if corners_px is None:
             return None
@@ -146,7 +147,7 @@ class _Search:
         return follow_edges(self.image, free, self.outline, FREE_WINDOWS_PX)
 
     def _free(self, lines: list[Array | None]) -> PlateProjection | None:
-        """The plate through four lines, as no rigid one: a lens that is not typical shows at a steep tilt."""
+        """Fit the plate to four lines as a free homography, because an atypical lens matters at a steep tilt."""
         corners_px = self._corners_px(lines) if all(line is not None for line in lines) else None
         if corners_px is None:
             return None
@@ -161,7 +162,7 @@ class _Search:
         return None if corners is None else (corners + 0.5) * self.shrink - 0.5
 
     def _score(self, view: PlateProjection) -> int:
-        """Samples of the border that an edge confirms, less visible ones that none does."""
+        """Number of border samples that an edge confirms, minus the visible ones that none confirms."""
         visible, near = confirmed(self.image, view, self.outline)
         return 2 * int(near.sum()) - int(visible.sum())
 

@@ -1,7 +1,7 @@
-"""A plate of known size before a camera of known or typical focal length: six numbers instead of a homography's eight.
+"""Pose of a plate of known size before a camera of known or typical focal length: six parameters instead of eight.
 
-Two of a homography's freedoms are no motion of a rigid plate. Without them a side that the image does not show, or that a
-cable or a glare hides, follows from the others.
+Two of a homography's eight degrees of freedom are no motion of a rigid plate. Without them a side that is outside the
+image, or hidden by a cable or glare, follows from the others.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""Region growing on mean and variance (the paper's segmentation), one raster pass with region sums, deterministic.
+"""Region growing on mean and variance (the paper's segmentation) in one deterministic raster pass.
 
-A pixel joins the region above or to its left whose mean it does not leave by more than the tolerance and the region's own
-spread; two regions that meet in a pixel and agree become one (union-find, R. E. Tarjan, J. ACM 22(2), 1975). Sums are kept
-at the roots, so every region's size, mean, variance, middle and box are there when the pass ends.
+A pixel joins the region above or to its left if it deviates from that region's mean by at most the tolerance or the
+region's own spread; two regions that meet in a pixel and agree are merged (union-find, R. E. Tarjan, J. ACM 22(2),
+1975). Sums are kept at the roots, so every region's size, mean, variance, middle and box are available when the pass
+ends.
 """
 
 from __future__ import annotations
@@ -89,7 +90,7 @@ def _moments(region: Array) -> Moments:
 
 @inlined
 def _begin(sums: Array, parent: NDArray[np.int32], k: int, u: int, v: int) -> None:
-    """A region without pixels yet, from this place on."""
+    """Start an empty region at this place."""
     parent[k] = k
     sums[k] = 0.0
     sums[k, 5], sums[k, 6], sums[k, 7] = u, u, v
@@ -97,7 +98,7 @@ def _begin(sums: Array, parent: NDArray[np.int32], k: int, u: int, v: int) -> No
 
 @inlined
 def _joined(sums: Array, parent: NDArray[np.int32], a: int, b: int) -> int:
-    """One region of two roots; the older one's number stays."""
+    """Merge the regions of two roots; the older root's number is kept."""
     low, high = (a, b) if a < b else (b, a)
     parent[high] = low
     for j in range(5):

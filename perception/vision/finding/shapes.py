@@ -1,7 +1,7 @@
-"""Edges of the plate's rectified picture, and the sub-objects with straight outlines: rectangles and slots by runs.
+"""Edges of the plate's rectified picture, and its rectangles and slots, found by runs of edge pixels.
 
-A candidate is verified on the outline itself: the share of it that has an edge of the right direction. That is
-insensitive to what a region method fails on: glare, shadow, cables, low contrast inside.
+A candidate is verified by the share of its outline that has an edge of the right direction. Unlike region methods, this
+is insensitive to glare, shadow, cables and low contrast inside.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def find_rectangles(maps: DirectionMaps, *, least_px: float, most_px: float) -> 
 
 
 def find_slots(maps: DirectionMaps, *, least_px: float, most_px: float) -> list[tuple[float, float]]:
-    """Middles of long thin things, flat or upright: slots and tracks, whatever covers part of them."""
+    """Middles of long thin horizontal or vertical shapes: slots and tracks, even if partly covered."""
     found = []
     flat, upright = maps
     for mask, is_flat in ((flat, True), (upright.T, False)):
@@ -130,7 +130,7 @@ def _runs(flat: NDArray[np.bool_], least_px: float) -> list[tuple[float, float, 
 def _pairs(
     runs: list[tuple[float, float, float]], least_px: float, most_px: float
 ) -> list[tuple[tuple[float, float, float], tuple[float, float, float]]]:
-    """Runs that face each other."""
+    """Pairs of runs that face each other."""
     out = []
     for i, a in enumerate(runs):
         for b in runs[i + 1 :]:
@@ -154,7 +154,7 @@ def _sums(mask: NDArray[np.bool_], axis: int) -> NDArray[np.int32]:
 def _judged(
     flat: NDArray[np.int32], upright: NDArray[np.int32], x0: float, y0: float, x1: float, y1: float
 ) -> Rectangle:
-    """Coverage of the four sides: the mean, held down by the worst side."""
+    """Coverage of the four sides: the mean, limited by the worst side."""
     a, b = round(max(x0, 0)), round(min(x1, flat.shape[1] - 2))
     c, d = round(max(y0, 0)), round(min(y1, upright.shape[0] - 2))
     if b - a < 4 or d - c < 4:

@@ -1,7 +1,7 @@
-"""The panel's four lights in a pair of images, off and on, and the pose that they give.
+"""Detection of the panel's four lights in a pair of images, off and on, and the pose that follows from them.
 
-`alignment` lays the two images onto each other, `find` grows the blobs of the difference, `core` finds the lamp in
-each, `assign` picks the four that the taught quadrangle allows (`search`), `panel_finder` joins them.
+`alignment` registers the two images, `find` extracts the blobs of the difference, `core` finds the lamp in each,
+`assign` selects the four that match the taught quadrangle (`search`), `panel_finder` combines these steps.
 """
 
 from perception.vision.lights.alignment import CameraMoved

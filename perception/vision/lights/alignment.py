@@ -1,4 +1,4 @@
-"""Two images of one scene onto each other, although lights, glare and exposure changed in between."""
+"""Registration of two images of one scene between which lights, glare and exposure changed."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class CameraMoved(PerceptionError):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ImageAlignment:
-    """How the first image lies on the second, and what remains of it there.
+    """Registration of the first image to the second.
 
     Attributes:
-        second_from_first: (2, 3) map of pixels (shift, turn and growth).
+        second_from_first: (2, 3) affine map of pixels (shift, turn and growth).
         gain, offset: grey levels, second = gain * first + offset.
         shift_px: (2,) motion of the image centre.
-        warped: (H, W) the first image as the second camera would have seen it, in the second's grey levels.
+        warped: (H, W) the first image resampled to the second's view, in the second's grey levels.
         inside: (H, W) True where `warped` is known.
         agreement: correlation of the gradients, 0..1; 1 also when the scene has no edges to compare.
     """
@@ -83,7 +83,7 @@ def register(first: Image, second: Image, *, noise: float) -> ImageAlignment:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Edges:
-    """Pixels of the second image that can tell motion, and its gradient images."""
+    """Pixels of the second image whose gradients constrain the motion, and its gradient images."""
 
     rows: NDArray[np.intp]
     columns: NDArray[np.intp]
@@ -161,7 +161,7 @@ def _tones(first: NDArray[Any], second: NDArray[Any]) -> tuple[float, float]:
 
 
 def _robust_correlation(a: NDArray[Any], b: NDArray[Any]) -> float:
-    """Correlation without the tenth that differs most: lights and glare may change without harm."""
+    """Correlation without the tenth that differs most, because lights and glare may change."""
     rest = np.abs(a - b)
     keep = rest <= np.quantile(rest, 0.9)
     a, b = a[keep], b[keep]

@@ -1,7 +1,7 @@
-"""Which of the bright blobs are the panel's four lights: the taught quadrangle picks (paper, Section II-B).
+"""Selection of the panel's four lights among the bright blobs by the taught quadrangle (paper, Section II-B).
 
-A hypothesis names up to four blobs. It is scored by how lamp-like they are, how equal in true size and contrast, how
-plainly the camera would have to stand, and how well the fourth light falls where the other three predict it.
+A hypothesis names up to four blobs. Its score rates how lamp-like they are, how equal in true size and contrast, how
+plausible the camera's attitude is, and how well the fourth light agrees with the place that the other three predict.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def _cameras(
 
 
 def _pairs(centres: Array, traits: Array, model: Array, frame: Array, into: tuple[Array, NDArray[np.int64]]) -> None:
-    """Hypotheses with two lights only: nearly frontal, so a similarity of the plane predicts the other two."""
+    """Add hypotheses with only two lights: a similarity of the plane (near-frontal view) predicts the other two."""
     reward, log_size, log_contrast, _ = traits
     flat = model[:, :2]
     for a, b in permutations(range(4), 2):
@@ -200,7 +200,7 @@ def _pairs(centres: Array, traits: Array, model: Array, frame: Array, into: tupl
 
 
 def _missing(place_px: Array, frame: Array) -> float:
-    """What it costs that a light is not seen at this place."""
+    """Score penalty for a light that is not seen at this place."""
     beyond = float(np.maximum(np.maximum(-place_px, place_px - frame), 0.0).sum())
     return MISSING_OUTSIDE + OUTSIDE_PER_WIDTH * beyond / float(frame[0]) if beyond > 0.0 else MISSING_INSIDE
 

@@ -1,4 +1,4 @@
-"""The lamp inside its own glow: a lit lamp throws light on the plate round it, which the difference shows too."""
+"""Separation of a lit lamp from its own glow on the plate, which the difference image shows too."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From two images of the panel, lights off and on, to the panel's pose (paper, Section II-B, Fig. 5)."""
+"""The panel's pose from two images of it, with lights off and on (paper, Section II-B, Fig. 5)."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def warm_up() -> None:
 
 
 def _plausible(pose: QuadranglePose, prior: PanelPrior) -> UncertainPose:
-    """The pose that the prior allows; of several, the only one."""
+    """The pose that the prior allows, provided that there is exactly one."""
     candidates = [(pose.camera_from_object, pose.covariance)]
     if pose.ambiguous and prior.camera_from_expected is not None:
         candidates += [(a.camera_from_object, a.covariance) for a in pose.alternatives if a.covariance is not None]

@@ -1,4 +1,4 @@
-"""Compiled search for the taught quadrangle among blobs: every ordered triple, its poses, the fourth light."""
+"""Compiled search for the taught quadrangle among blobs: every ordered triple, its poses, and the fourth light."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def turns(centres: Array, i: int, j: int, k: int) -> float:
 
 @compiled
 def pose_score(R: Array, upright: Array, roundness: float, prior: Array) -> float:
-    """What a rotation costs that is tilted or rolled, or under which round lamps would look flatter than they do."""
+    """Score penalty of a rotation for tilt and roll, and for lamps that look rounder than it predicts."""
     Q = R @ upright.T
     tilt = np.arccos(min(1.0, max(-1.0, Q[2, 2])))
     roll = np.arctan2(Q[1, 0] - Q[0, 1], Q[0, 0] + Q[1, 1])
@@ -64,13 +64,13 @@ def pose_score(R: Array, upright: Array, roundness: float, prior: Array) -> floa
 
 @inlined
 def alike(sizes: Array, contrasts: Array, n: int) -> float:
-    """What it costs that the first n lamps differ in size and contrast."""
+    """Score penalty for differences in size and contrast among the first n lamps."""
     return -0.5 * (spread(sizes, n) / SIZE_SPREAD**2 + spread(contrasts, n) / CONTRAST_SPREAD**2)
 
 
 @inlined
 def unseen(u: float, v: float, frame: Array) -> float:
-    """What a fourth light costs that is at a place and not seen there."""
+    """Score penalty for a fourth light that is not seen at its predicted place."""
     beyond = max(-u, u - frame[0], 0.0) + max(-v, v - frame[1], 0.0)
     missing = MISSING_OUTSIDE + OUTSIDE_PER_WIDTH * beyond / frame[0] if beyond > 0.0 else MISSING_INSIDE
     return -UNCHECKED - missing
@@ -206,7 +206,7 @@ def try_triple(
 
 @compiled
 def insert(score: float, order: NDArray[np.int64], best: Array, chosen: NDArray[np.int64]) -> None:
-    """Put a hypothesis into the list of the best ones, each set of blobs once."""
+    """Insert a hypothesis into the list of the best ones, where each set of blobs occurs once."""
     m = best.shape[0]
     if score <= best[m - 1]:
         return

@@ -1,1 +1,1 @@
-"""Photographs of devices that no panel file describes: one dial, one display."""
+"""Readers of photographs of single devices (a dial or a display) without a panel file."""

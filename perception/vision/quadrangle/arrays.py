@@ -1,4 +1,4 @@
-"""Compiled odds and ends round the four-light pose: pixels to ideal coordinates, the object's plane, covariances."""
+"""Compiled array routines of the four-light pose: pixels to ideal coordinates, the object's plane, covariances."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pose of four lights in one image, with covariance, every other pose that the image allows, and an honest flag.
+"""Pose of four lights in one image, with covariance, all alternative poses, and an ambiguity flag.
 
 Maximum likelihood on the reprojection error, from three-point and mirrored starts (paper, Section II-B, refined).
 """
@@ -91,10 +91,10 @@ class QuadranglePose:
 def estimate(
     points_object_m: ArrayLike, points_px: ArrayLike, covariance_px: ArrayLike, intrinsics: CameraIntrinsics
 ) -> QuadranglePose:
-    """The pose of four points from their pixels, with everything that the data leave open.
+    """Estimate the pose of four points from their pixels, with all alternatives that the data allow.
 
     Minimises sum e_i^T S_i^-1 e_i over SE(3), e_i the reprojection error; every local minimum is found and weighed by
-    exp(-chi2 / 2) sqrt(det covariance). Near fronto-parallel, where the mirror need not be a minimum of its own, the
+    exp(-chi2 / 2) sqrt(det covariance). Near fronto-parallel, where the mirror pose need not be a minimum, the
     posterior over the object's normal is summed instead.
 
     Args:

@@ -48,7 +48,7 @@ class Crossing:
 
 
 def covered(patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool) -> NDArray[np.bool_] | None:
-    """(H, W) mask of what lies across the object in the patch; None when nothing does.
+    """(H, W) mask of the occluders of the object in the patch; None when there are none.
 
     Args:
         half_width_m, half_height_m: of the object; the patch must reach beyond it.
@@ -72,9 +72,9 @@ def followed_in(
     """(H, W) mask of what can be followed by its gray from crossings deep into the object; None when nothing can.
 
     Args:
-        smooth: what `smoothed` makes of the patch.
-        half_width_m, half_height_m, is_round: as `covered`.
-        through: only what comes out at another side of a rectangle counts: labels lead into a slot and its ticks, and end there.
+        smooth: result of `smoothed` for the patch.
+        half_width_m, half_height_m, is_round: as for `covered`.
+        through: count only what leaves at another side of a rectangle, because labels lead into a slot and end there.
     """
     if not found:
         return None
@@ -102,11 +102,11 @@ def border_crossings(
     patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool, beyond: float = OUTSIDE,
     smooth: Image | None = None,
 ) -> list[Crossing]:  # fmt: skip
-    """The places just outside of an object's border that stand out from the plate round them; arguments as `covered`.
+    """Places just outside an object's border that contrast with the plate round them; arguments as for `covered`.
 
     Args:
         beyond: distance of the path from the border, over the larger half size.
-        smooth: what `smoothed` makes of the patch, to save its making.
+        smooth: result of `smoothed` for the patch, if it is already computed.
     """
     path_u, path_v = _path(patch, half_width_m, half_height_m, is_round, 1.0 + beyond)
     inside = (path_u > 1) & (path_v > 1) & (path_u < patch.gray.shape[1] - 2) & (path_v < patch.gray.shape[0] - 2)
@@ -147,12 +147,12 @@ def border_crossings(
 
 
 def smoothed(patch: Patch) -> Image:
-    """The patch's gray as crossings are looked for in it."""
+    """The smoothed gray image in which crossings are searched."""
     return np.asarray(cv2.GaussianBlur(patch.gray, (0, 0), 1.0), np.uint8)
 
 
 def _sides(patch: Patch, points: Array, w: float, h: float) -> NDArray[np.int64]:
-    """(N,) which side of the rectangle every point of its path lies at: 0 to 3 from the top clockwise."""
+    """(N,) side of the rectangle at which every point of its path lies: 0 to 3 from the top clockwise."""
     x, y = ((points[:, k] - patch.pixel_of(0.0, 0.0, 0.0)[k]) / patch.px_per_m for k in (0, 1))
     flat = np.abs(y) - h > np.abs(x) - w
     return np.asarray(np.where(flat, np.where(y < 0, 0, 2), np.where(x > 0, 1, 3)), np.int64)
@@ -207,7 +207,7 @@ def _noise(patch: Patch) -> float:
 
 @compiled
 def ring_medians(values: NDArray[np.uint8], size: int) -> Array:
-    """(N,) median of the `size` (odd, at most N) values around every one of a closed path: a histogram that slides along."""
+    """(N,) sliding median of `size` values (odd, at most N) along a closed path, by a sliding histogram."""
     n, half = len(values), size // 2
     counts = np.zeros(256, np.int64)
     for k in range(-half, half + 1):

@@ -1,9 +1,9 @@
-"""A pointer about a known pivot, found without outliers.
+"""Robust search for a pointer about a known pivot.
 
-The face is unrolled to (angle, radius). Along the angle, a morphological closing or opening paints the face without
-thin structures, so glare, gradients and shadow borders vanish and what is left is ink (black-hat, white-hat). A
-pointer has ink at *every* radius between hub and numerals; a numeral, a tick or a cable has it at some. The score of an
-angle is therefore a low quantile over the radii, not their mean. The opposite end is shorter and fails the same test.
+The face is unrolled to (angle, radius). A morphological closing or opening along the angle estimates the face without
+thin structures; the difference (black-hat, white-hat) is the ink, free of glare, gradients and shadow borders. A
+pointer has ink at *every* radius between hub and numerals; a numeral, a tick or a cable has it only at some. The score
+of an angle is therefore a low quantile over the radii, not their mean. The opposite, shorter end fails the same test.
 """
 
 from __future__ import annotations
@@ -126,8 +126,10 @@ def find_pointer(
 
 
 def _off_face(fit: PointerFit, polar: Float32, ink: Float32, angles: Array) -> float:
-    """How far a pointer's gray lies from that of the face about it, over its ink: a gap between two bright things has ink
-    that is dark, and the face's gray."""
+    """Difference between a pointer's gray and the face's, relative to its ink.
+
+    A gap between two bright things has dark ink, but the face's gray.
+    """
     top = int(np.abs(wrapped(angles - fit.angle_rad)).argmin())
     column = slice(max(0, top - 1), top + 2)
     face = np.median(polar[:, np.abs(wrapped(angles - fit.angle_rad)) < ABOUT_RAD], axis=1)
@@ -168,7 +170,7 @@ def ink_along_angle(polar: Float32, width: float, is_dark: bool, *, wraps: bool)
 def _hidden(
     patch: Patch, cover: NDArray[np.bool_] | None, pivot_m: tuple[float, float], radii_m: Array, angles_rad: Array
 ) -> NDArray[np.bool_]:
-    """(radii, angles) what something lies across, or what is outside the image."""
+    """(radii, angles) mask of the samples that are occluded or outside the image."""
     lost = ~patch.inside if cover is None else cover | ~patch.inside
     if not lost.any():
         return np.zeros((len(radii_m), len(angles_rad)), bool)
@@ -176,7 +178,7 @@ def _hidden(
 
 
 def _low_mean(columns: Float32, hidden: NDArray[np.bool_], low: float, high: float) -> Array:
-    """Mean of every column between two quantiles of what is not hidden; a column half hidden scores 0."""
+    """Mean of every column between two quantiles of the visible values; a column that is half hidden scores 0."""
     if not hidden.any():
         first, last = _between(np.array(len(columns)), low, high)
         return np.asarray(np.sort(columns, axis=0)[int(first) : int(last)].mean(axis=0), float)
@@ -192,7 +194,7 @@ def _low_mean(columns: Float32, hidden: NDArray[np.bool_], low: float, high: flo
 
 
 def _between(count: NDArray[np.int64], low: float, high: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First and last rank between two quantiles of so many values, two ranks at least."""
+    """First and last rank between two quantiles of `count` values, at least two ranks."""
     first = (low * count).astype(int)
     return first, np.maximum(first + 2, np.round(high * count).astype(int))
 
@@ -209,7 +211,7 @@ def _angles(patch: Patch, outer_m: float, limits_rad: tuple[float, float] | None
 def _rough(
     ink: Float32, hidden: NDArray[np.bool_], angles: Array, *, wraps: bool, quantile: float, is_dark: bool, from_hub: bool
 ) -> PointerFit | None:  # fmt: skip
-    """The direction with most ink at every one of the radii, to a column; None when nothing stands out."""
+    """Find the direction with the most ink at all radii, to one column; None when nothing stands out."""
     everywhere = _ink_of_columns(ink, hidden, quantile)
     noise = 1.4826 * float(np.median(everywhere)) + 0.5
     score = _from_hub(everywhere, ink, hidden, quantile) if from_hub else everywhere
@@ -238,13 +240,13 @@ def _rough(
 
 
 def _ink_of_columns(ink: Float32, hidden: NDArray[np.bool_], quantile: float) -> Float32:
-    """(angles,) ink that a direction has at most of its radii."""
+    """(angles,) ink that a direction reaches at most of its radii."""
     mean = _low_mean(ink, hidden, 0.5 * quantile, quantile + 0.25).astype(np.float32)
     return np.asarray(cv2.GaussianBlur(mean[None], (0, 0), 1.0, borderType=cv2.BORDER_REPLICATE)[0], np.float32)
 
 
 def _from_hub(score: Float32, ink: Float32, hidden: NDArray[np.bool_], quantile: float) -> Float32:
-    """(angles,) the score, that much less where the inner radii have little ink: numerals and words begin further out."""
+    """(angles,) score, reduced where the inner radii have little ink, because numerals and words begin further out."""
     inner = max(2, round(INNER_SHARE * len(ink)))
     limit = INNER_TIMES * _ink_of_columns(ink[:inner], hidden[:inner], quantile)
     is_hidden = hidden[:inner].mean(axis=0) >= 0.5

@@ -23,8 +23,8 @@ def row_centres(
 ) -> tuple[Array, Array, Array]:
     """(rows,) centre of the ink (rad), its mass and its width (rad), within `half` of `middle` in every row.
 
-    A pointer is of one gray: rows where something stands out much more belong to a numeral or a tick beside it. Where ink
-    goes on under what lies across, its centre is not the pointer's.
+    A pointer has one gray: rows with much stronger ink belong to a numeral or a tick beside it. Where the ink continues
+    under an occluder, its visible centre is not the pointer's centre and the row is dropped.
 
     Args:
         ink, hidden: (rows, angles); offset: (angles,) rad.
@@ -57,7 +57,7 @@ def row_centres(
 def _goes_under(
     ink: NDArray[np.float32], hidden: NDArray[np.bool_], offset: Array, middle: float, half: float, top: float
 ) -> bool:
-    """Whether the ink of a row that counts has something hidden beside it."""
+    """Whether the relevant ink of a row is adjacent to hidden samples."""
     columns = len(ink)
     for j in range(columns):
         if abs(offset[j] - middle) < half and ink[j] > HALF_LEVEL * top:

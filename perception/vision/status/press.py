@@ -1,6 +1,6 @@
-"""How far out a round cap stands, by parallax: needs a camera that knows heights (without: `shade`).
+"""Height of a round cap by parallax; needs a camera whose model includes heights (otherwise see `shade`).
 
-A cap at height z looks larger by z over the camera's distance and shifted by the parallax; its edge measures both.
+A cap at height z appears larger by z over the camera's distance and displaced by the parallax; its edge measures both.
 """
 
 from __future__ import annotations
@@ -94,9 +94,9 @@ def _at(patch: Patch, r_m: Array, a: Array, z_m: float) -> tuple[Array, Array]:
 
 
 def _on_ring(patch: Patch, radius_m: float, a: Array, outward: Array, at_plate_m: Array) -> NDArray[np.bool_]:
-    """(N,) which edges of the face are those of a ring round the cap, printed or flat: of the cap's gray, it hides the cap's.
+    """(N,) mask of the face's edges that belong to a ring round the cap, printed or flat, which is as gray as the cap.
 
-    The ring's outer edge shows all along the side where height does not move the cap over it.
+    The ring's outer edge is visible all along the side where height does not move the cap over it.
 
     Args:
         outward: (N,) how far height moves the face's edge outward, m per m.

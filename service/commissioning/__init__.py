@@ -1,1 +1,1 @@
-"""What brings a machine and single devices of a cell into service: checks, conformance, reading, recording, new drivers."""
+"""Commissioning of a machine and of single devices: checks, conformance tests, reading, recording, new drivers."""

@@ -1,4 +1,4 @@
-"""What a cell file says that cannot be meant, found before anything is connected: all of it at once."""
+"""Finds all implausible values of a cell file before anything is connected, and reports them together."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from hal.strict import Fault, faults_in, refusal, validate
 from manipulation import Kinematics, is_in_reach
 
 FULL_TURN_RAD = math.tau + 1e-3
-LARGEST_M = 20.0  # of a cell; more is millimetres
-JOINT_LIMITS = ("lower_rad", "upper_rad")  # a joint may turn more than once
+LARGEST_M = 20.0  # largest plausible length in a cell; more was probably given in millimetres
+JOINT_LIMITS = ("lower_rad", "upper_rad")  # excluded from the check of angles, because a joint may turn more than once
 LOOKING = (DeviceKind.CAMERA, DeviceKind.RANGE_SCANNER)
 
 
 def check_cell(cell: Cell) -> None:
-    """Refuse a cell file with everything in it that cannot be meant.
+    """Raise an error that lists everything implausible in a cell file.
 
     Raises:
-        ConfigError: names key, value and remedy of the first fault, and of each further one.
+        ConfigError: names key, value and remedy of each fault.
     """
     faults = [*unit_faults(cell.file.model_dump(mode="json", by_alias=True)), *device_faults(cell)]
     if not faults:
-        faults = reach_faults(cell)  # with degrees for radians nothing could be reached anyway
+        faults = reach_faults(cell)  # only with plausible units, because otherwise nothing would be in reach
     if faults:
         raise refusal(faults, source=str(cell.path))
 
 
 def unit_faults(data: Any, key: str = "") -> list[Fault]:
-    """Angles beyond a full turn and lengths beyond any cell, in data of nested tables."""
+    """Return faults for angles beyond a full turn and for lengths beyond any cell, in nested tables."""
     if isinstance(data, dict):
         below = [unit_faults(value, f"{key}.{name}".lstrip(".")) for name, value in data.items()]
         return [fault for faults in below for fault in faults]
@@ -54,7 +54,7 @@ def unit_faults(data: Any, key: str = "") -> list[Fault]:
 
 
 def device_faults(cell: Cell) -> list[Fault]:
-    """No arm; drivers that are not there or of another kind; options that a driver refuses; no mount."""
+    """Return faults for a missing arm, unknown or wrong drivers, options that a driver refuses, and missing mounts."""
     faults = []
     if not cell.names_of(DeviceKind.ARM):
         hint = 'add [devices.arm] with kind = "arm" and its driver; `panelwright drivers` lists them'
@@ -65,7 +65,7 @@ def device_faults(cell: Cell) -> list[Fault]:
 
 
 def reach_faults(cell: Cell) -> list[Fault]:
-    """The panel is nowhere near the arm, as far as the arm's driver tells its kinematics unconnected."""
+    """Return a fault if the panel is out of the arm's reach; needs a driver that knows its kinematics unconnected."""
     reached = objects_in_reach(cell)
     if reached is None or any(reached.values()) or not reached:
         return []
@@ -81,7 +81,7 @@ def reach_faults(cell: Cell) -> list[Fault]:
 
 
 def objects_in_reach(cell: Cell) -> dict[str, bool] | None:
-    """Which objects of the panel the gripper can touch where the cell file has the panel; None when that is not known."""
+    """Return for each object whether the gripper can touch it at the panel's nominal pose; None when that is unknown."""
     arm = _known_arm(cell)
     grippers = cell.names_of(DeviceKind.GRIPPER)
     if arm is None or not grippers or cell.file.devices[grippers[0]].mount is None:
@@ -100,7 +100,7 @@ def objects_in_reach(cell: Cell) -> dict[str, bool] | None:
 
 
 def _faults_of(cell: Cell, name: str, section: DeviceSection) -> Iterator[Fault]:
-    """Of one device, with keys below its table."""
+    """Yield the faults of one device, with keys relative to its table."""
     try:
         factory = device_factory(section.driver)
     except ConfigError as error:
@@ -115,7 +115,7 @@ def _faults_of(cell: Cell, name: str, section: DeviceSection) -> Iterator[Fault]
     model = options_model(factory)
     if model is not None:
         of_options = faults_in(section.options, model)
-        if name in cell.file.emulators:  # which fills in what is missing
+        if name in cell.file.emulators:  # the emulator adds the missing options
             of_options = [fault for fault in of_options if fault.is_unknown_key]
         yield from (fault.below("options") for fault in of_options)
     if section.kind in LOOKING and section.mount is None:

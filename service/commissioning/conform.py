@@ -1,4 +1,4 @@
-"""Runs the conformance kit over the devices of a cell file, real ones too: one generated test class a device."""
+"""Runs the conformance tests on the devices of a cell file, also real ones, with one generated test class per device."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from hal.registry import connect as connect_device
 from hal.simulated import Fault, FaultInjection
 from service.processes.cell import clock_for, start_emulators
 
-LINK = "link"  # property of a test: what the device says about its wire
+LINK = "link"  # test property that holds what the device reports about its connection
 SAMPLE_PERIOD_S = {DeviceKind.ARM: 0.02, DeviceKind.CAMERA: 0.2, DeviceKind.RANGE_SCANNER: 0.2}
 
 
 class Bench:
-    """What the devices of a cell share while they are tried one after another."""
+    """The clock, the world and the emulators that the devices of a cell share while they are tested one by one."""
 
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
@@ -32,7 +32,7 @@ class Bench:
         self._far_sides = start_emulators(cell, self.clock, self._shared, self._closers)
 
     def connect(self, name: str) -> Any:
-        """The device, connected anew."""
+        """Connect the device again and return it."""
         section = self._cell.file.devices[name]
         context = Context(name=name, clock=self.clock, cell=self._cell, shared=self._shared)
         far_side = self._far_sides.get(name)
@@ -40,24 +40,24 @@ class Bench:
         return connect_device(context, section.driver, {**section.options, **address})
 
     def fault_injection(self, name: str, device: Any) -> Callable[[Fault | None], None] | None:
-        """What breaks the device or its wire; None for a real device on a real wire."""
+        """Return the function that injects faults; None for a real device on a real wire."""
         if isinstance(device, FaultInjection):
             return device.inject_fault
         far_side = self._far_sides.get(name)
         return None if far_side is None else far_side.inject
 
     def close(self) -> None:
-        """End emulators and world."""
+        """Close the emulators and the world."""
         for close in self._closers[::-1]:
             close()
         self._closers.clear()
 
 
 def run(cell: Cell, *, devices: Sequence[str], level: str, report: Path | None = None) -> int:
-    """Try the named devices (all when empty) up to a level; returns pytest's exit code, 130 after Ctrl-C.
+    """Test the named devices (all when empty) up to a level; returns pytest's exit code, or 130 after Ctrl-C.
 
     Args:
-        report: where to write what was found, as `report.md` and `report.json`: the path without the ending.
+        report: path without suffix under which the results are written as `.md` and `.json`.
 
     Raises:
         ConfigError: pytest is not installed, or the report cannot be written.
@@ -71,7 +71,7 @@ def run(cell: Cell, *, devices: Sequence[str], level: str, report: Path | None =
     names = tuple(devices) or tuple(cell.file.devices)
     notebook = Notebook(level)
     with tempfile.TemporaryDirectory(prefix="panelwright-conform-") as folder:
-        # A file and a root of its own keep pytest from collecting the project's tests.
+        # A separate file and root directory keep pytest from collecting the project's tests.
         path = Path(folder) / f"test_{cell.name}.py"
         call = f"classes_for({str(cell.path.resolve())!r}, {cell.file.cell.seed}, {names!r}, {level!r})"
         path.write_text(f"from service.commissioning.conform import classes_for\n\nglobals().update({call})\n")
@@ -79,11 +79,11 @@ def run(cell: Cell, *, devices: Sequence[str], level: str, report: Path | None =
         code = int(pytest.main([str(path), *options], plugins=[notebook]))
     if report is not None:
         write_report(report, cell, names, notebook)
-    return 128 + signal.SIGINT if notebook.is_stopped else code  # pytest's 2 may also be a file that it cannot load
+    return 128 + signal.SIGINT if notebook.is_stopped else code  # pytest's 2 may also mean a file that it cannot load
 
 
 def classes_for(cell_path: str, seed: int, names: Sequence[str], level: str) -> dict[str, Any]:
-    """What the generated test file holds: one class a device, and the bench that they share."""
+    """Return the contents of the generated test module: one class per device, and the bench that they share."""
     import pytest
 
     cell = load_cell(Path(cell_path), seed=seed)
@@ -98,7 +98,7 @@ def classes_for(cell_path: str, seed: int, names: Sequence[str], level: str) -> 
 
 
 def class_name(device: str) -> str:
-    """Name of a device's test class."""
+    """Return the name of a device's test class."""
     return f"Test_{device}"
 
 
@@ -116,7 +116,7 @@ def _class(cell: Cell, name: str, *, may_move: bool) -> type:
         inject, period_s = bench.fault_injection(name, device), SAMPLE_PERIOD_S.get(kind, 0.05)
         yield Rig(device=device, clock=bench.clock, sample_period_s=period_s, inject=inject, may_move=may_move)
         if inject is not None:
-            inject(None)  # a test that failed may have left it broken
+            inject(None)  # a failed test may have left a fault injected
         device.close()
 
     return type(class_name(name), (CONTRACTS[kind],), {"rig": rig})

@@ -1,4 +1,4 @@
-"""What the conformance kit has found, device by device and promise by promise, for people (Markdown) and programs (JSON)."""
+"""Reports the results of the conformance tests per device and promise, as Markdown and as JSON."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ WORST_FIRST = ("failed", "skipped", "not tried", "passed")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """One promise of one device.
+    """The result of one promise of one device.
 
     Attributes:
-        outcome: passed, failed, skipped (it could not be tried here) or not tried (not asked for, or stopped before).
-        why: of everything but a pass.
-        link: what the device said about its wire.
+        outcome: passed, failed, skipped (could not be tested here) or not tried (not requested, or interrupted before).
+        why: the reason of every outcome except passed.
+        link: what the device reported about its connection.
     """
 
     device: str
@@ -39,7 +39,7 @@ class Finding:
 
 
 class Notebook:
-    """A pytest plugin that leaves out the promises above a level and writes down how the others went."""
+    """A pytest plugin that skips the promises above a level and records the results of the others."""
 
     def __init__(self, level: str) -> None:
         self.level = level
@@ -49,11 +49,11 @@ class Notebook:
         self._open: list[str] = []
 
     def pytest_configure(self, config: Any) -> None:
-        """Make the marker known."""
+        """Register the marker."""
         config.addinivalue_line("markers", "conformance(level): level of a promise")
 
     def pytest_collection_modifyitems(self, config: Any, items: list[Any]) -> None:
-        """Leave out what is above the level."""
+        """Deselect the tests above the level."""
         from hal.conformance import LEVELS
 
         order = [str(level) for level in LEVELS]
@@ -70,14 +70,14 @@ class Notebook:
         self._open = [item.nodeid for item in items]
 
     def pytest_runtest_logreport(self, report: Any) -> None:
-        """One phase of one test: its call, or a set-up or an end that did not work."""
+        """Record one phase of a test: its call, or a set-up or tear-down that failed."""
         if report.when != "call" and report.outcome == "passed":
             return
         link = str(dict(report.user_properties).get("link", ""))
         self._note(report.nodeid, report.outcome, report.duration, _why(report), link)
 
     def pytest_keyboard_interrupt(self) -> None:
-        """Ctrl-C: what was not reached is not tried, and the report must say so."""
+        """Note Ctrl-C, so that the report lists the remaining tests as not tried."""
         self.is_stopped = True
         for node in self._open:
             self._note(node, "not tried", 0.0, "Ctrl-C came before", "")
@@ -99,7 +99,7 @@ class Notebook:
 
 
 def _why(report: Any) -> str:
-    """In one line: the reason of a skip, or the last line of a failure."""
+    """Return one line: the reason of a skip, or the last line of a failure."""
     if report.outcome == "passed":
         return ""
     if report.outcome == "skipped":
@@ -113,7 +113,7 @@ def write_report(stem: Path, cell: Cell, devices: Sequence[str], notebook: Noteb
     """Write `STEM.md` and `STEM.json`; returns their paths.
 
     Raises:
-        ConfigError: they cannot be written.
+        ConfigError: the files cannot be written.
     """
     found = as_data(cell, devices, notebook)
     paths = stem.with_name(f"{stem.name}.md"), stem.with_name(f"{stem.name}.json")
@@ -127,7 +127,7 @@ def write_report(stem: Path, cell: Cell, devices: Sequence[str], notebook: Noteb
 
 
 def as_data(cell: Cell, devices: Sequence[str], notebook: Notebook) -> dict[str, Any]:
-    """Everything, as plain JSON."""
+    """Return all results as plain JSON values."""
     by_device = {name: [f for f in notebook.findings if f.device == name] for name in devices}
     return {
         "schema": 1,
@@ -161,7 +161,7 @@ def _device(cell: Cell, name: str, findings: list[Finding]) -> dict[str, Any]:
 
 
 def as_markdown(found: dict[str, Any]) -> str:
-    """The same for people: a table of devices, then for each what did not pass, and last what did."""
+    """Return the results as Markdown: a table of devices, then per device what did not pass, and last what passed."""
     lines = [
         f"# Conformance of cell {found['cell']}",
         "",

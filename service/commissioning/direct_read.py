@@ -1,6 +1,6 @@
-"""Reads one device of a cell in this process, without a service: for whoever wires it up or judges it.
+"""Reads one device of a cell in this process, without a service, while it is being wired or tested.
 
-Only this device is connected, and of the cell's emulators only its own, so a cell whose other devices are absent will do.
+Only this device is connected, and only its own emulator is started, so the other devices of the cell may be absent.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from service.jsonable import jsonable
 from service.processes.cell import clock_for, start_emulators
 from service.readings import READS, described
 
-CONNECT_ATTEMPTS = 3  # a device that gives nothing three times in a row is not there
+CONNECT_ATTEMPTS = 3  # after three connections without a sample the device counts as absent
 LOOK_AGAIN_S = 0.0005
-ERROR_REST_S = 0.02  # a device that is not there says so at once, again and again
+ERROR_REST_S = 0.02  # limits the rate of errors from an absent device
 
 
 @contextmanager
 def only_device(
     cell: Cell, name: str, more_options: Mapping[str, Any] = MappingProxyType({})
 ) -> Iterator[tuple[Callable[[], Any], Clock, dict[str, Any]]]:
-    """What connects the device `name` anew, its clock and its options; its emulator runs meanwhile if the cell has one.
+    """Yield a function that connects the device `name`, its clock and its options; its emulator runs meanwhile, if any.
 
     Args:
-        more_options: beside those of the cell file.
+        more_options: options in addition to those of the cell file.
 
     Raises:
         ConfigError: the cell has no such device, or its options are wrong.
@@ -64,10 +64,10 @@ def only_device(
 
 
 def read_lines(cell: Cell, name: str, *, samples: int, timeout_s: float) -> Iterator[dict[str, Any]]:
-    """One JSON object for each new sample, and one for each call or connection that ended in an error.
+    """Yield one JSON object per new sample, and one per call or connection that failed.
 
     A sample has `value`, `sequence`, `host_time_s` (monotonic), `host_unix_s`, `device_time_s`, `age_s`, `quality`,
-    `cause` and `took_s`, the length of the call. An error has `error` with `type`, `what`, `hint` and `details`.
+    `cause` and `took_s`, the duration of the call. An error has `error` with `type`, `what`, `hint` and `details`.
 
     Args:
         timeout_s: deadline of each call.
@@ -95,7 +95,7 @@ def read_lines(cell: Cell, name: str, *, samples: int, timeout_s: float) -> Iter
 
 
 def samples_of(device: Any, name: str, kind: DeviceKind, clock: Clock, timeout_s: float) -> Iterator[dict[str, Any]]:
-    """New samples and errors of a connected device without end, in the form of `read_lines`."""
+    """Yield new samples and errors of a connected device endlessly, in the format of `read_lines`."""
     read, last = getattr(device, READS[kind]), -1
     for started_s in iter(time.monotonic, None):
         deadline = Deadline.after(clock, timeout_s)
@@ -134,5 +134,5 @@ def _error(name: str, kind: DeviceKind, error: CellError, took_s: float) -> dict
 
 
 def as_line(item: dict[str, Any]) -> str:
-    """One line of JSON."""
+    """Return the item as one line of JSON."""
     return json.dumps(item, allow_nan=False) + "\n"

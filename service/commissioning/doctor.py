@@ -1,4 +1,4 @@
-"""What works on this machine, and what to do about the rest: the checks of `panelwright doctor`."""
+"""Checks what works on this machine and says what to do about the rest, for `panelwright doctor`."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from service.terminal import console, find_cell
 
 PINNED = {"pybullet": "3.2.7", "numpy": "2.", "opencv-python-headless": "4."}
 READS = 20
-ANSWER_S = 1.0  # in which a service that runs has answered
+ANSWER_S = 1.0  # a running service answers within this time
 
 
 def examine(cell: Path, port: int, *, connect: bool) -> bool:
-    """Run all checks and print what they find; tells whether everything is in order.
+    """Run all checks and print their results; returns whether everything is in order.
 
     Args:
-        connect: try the devices too, unless a service on `port` has them.
+        connect: whether to connect the devices too, unless a service on `port` uses them.
     """
     served = _served_cell(port)
     checks: list[tuple[str, Callable[[], str]]] = [
@@ -43,7 +43,7 @@ def examine(cell: Path, port: int, *, connect: bool) -> bool:
         ("timer", _timer),
     ]
     results = [_check(name, check) for name, check in checks]
-    may_connect = connect and served is None  # two programs on one arm are worse than an examination less
+    may_connect = connect and served is None  # two programs must not control one arm
     if may_connect and all(results):
         results.append(_wires(load_cell(find_cell(cell))))
     if may_connect and all(results):
@@ -64,7 +64,7 @@ def _check(name: str, check: Callable[[], str]) -> bool:
 
 
 def _wires(cell: Cell) -> bool:
-    """What the installed drivers find out about ports and wires; they are found by name, as the drivers are."""
+    """Run the checks of ports and wires that installed packages register as entry points."""
     is_good = True
     for point in entry_points(group="panelwright.doctor"):
         for finding in point.load()(cell):
@@ -97,10 +97,10 @@ def _simulator() -> str:
 
 
 def _served_cell(port: int) -> str | None:
-    """Name of the cell that a panelwright on this machine serves at `port`, if one does."""
+    """Return the name of the cell that a service on this machine runs at `port`; None without one."""
     try:
         info = Client(url=f"http://127.0.0.1:{port}", timeout_s=ANSWER_S).get("/v1/info")
-    except CellError:  # nobody, or something else
+    except CellError:  # nothing answers, or another program does
         return None
     return str(info["cell"]) if isinstance(info, dict) and "cell" in info else None
 
@@ -136,7 +136,7 @@ def _writable() -> str:
 
 
 def _timer() -> str:
-    """How late 2 ms sleeps return: the floor under every control period."""
+    """Measure how late sleeps of 2 ms return, which limits the accuracy of every control period."""
     lates_s = []
     for _ in range(200):
         due_s = time.monotonic() + 0.002

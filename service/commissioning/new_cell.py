@@ -1,4 +1,4 @@
-"""Copies a cell with all the files that it names into a folder, where it can be edited."""
+"""Copies a cell file with all files that it names into a folder for editing."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from service.terminal import find_cell
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CopiedCell:
-    """Where the copies are: the cell file, its panel file, and all files together."""
+    """The paths of the copies: the cell file, its panel file, and all files."""
 
     cell: Path
     panel: Path
@@ -21,13 +21,13 @@ class CopiedCell:
 
 
 def copy_cell(path: Path, folder: Path) -> CopiedCell:
-    """Copy a cell file and what it names to the places below `folder` that its keys give; all files, or none.
+    """Copy a cell file and the files that it names to the same relative paths below `folder`; all files or none.
 
     Args:
         path: a cell file, or the name of a shipped one.
 
     Raises:
-        ConfigError: the cell is not in order, names a file by an absolute path, or a file is in `folder` already.
+        ConfigError: the cell is not valid or names a file by an absolute path, or a file exists in `folder` already.
     """
     source = find_cell(path)
     cell = load_cell(source)
@@ -56,7 +56,7 @@ def copy_cell(path: Path, folder: Path) -> CopiedCell:
 
 
 def _relative(text: str, key: str, cell_path: Path) -> Path:
-    """A path of the cell file, which must lead to the copy as it led to the original."""
+    """Return a path from the cell file, which must be relative so that it also leads to the copy."""
     path = Path(text)
     if path.is_absolute() or ".." in path.parts:
         raise ConfigError(

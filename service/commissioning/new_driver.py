@@ -1,4 +1,4 @@
-"""Writes a new driver into a project: the texts come from whatever package offers templates (`panelwright.scaffold`)."""
+"""Writes the files of a new driver from templates of the entry-point group `panelwright.scaffold`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SHORT = {"scanner": DeviceKind.RANGE_SCANNER, "ft": DeviceKind.FORCE_TORQUE, "fo
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Written:
-    """What was written, which project files were changed, how the tests are run and how the driver is installed."""
+    """The files that were written and changed, and the commands that run the tests and install the driver."""
 
     files: tuple[Path, ...]
     registered: tuple[Path, ...]
@@ -24,10 +24,10 @@ class Written:
 
 
 def parse_kind(what: str) -> tuple[DeviceKind, str]:
-    """`scanner:foo` as kind and name.
+    """Split text such as `scanner:foo` into kind and name.
 
     Raises:
-        ConfigError: it is not of that form, or there is no such kind.
+        ConfigError: the text does not have that form, or there is no such kind.
     """
     word, _, name = what.partition(":")
     kinds = [*DeviceKind, *SHORT]
@@ -39,11 +39,11 @@ def parse_kind(what: str) -> tuple[DeviceKind, str]:
 
 
 def write_driver(kind: DeviceKind, name: str, *, transport: str, folder: Path, package: str | None) -> Written:
-    """Write all files, or none.
+    """Write all files of a new driver, or none.
 
     Args:
         folder: panelwright's own tree, whose `pyproject.toml` then gets the entry points, or any other folder, which
-            becomes a package of its own.
+            becomes a separate package.
 
     Raises:
         ConfigError: name, kind or transport is not possible, a file exists, or there are no templates.
@@ -74,7 +74,7 @@ def write_driver(kind: DeviceKind, name: str, *, transport: str, folder: Path, p
 
 
 def with_lines(text: str, lines: dict[str, str], path: Path) -> str:
-    """`text` with each line put at the top of its table.
+    """Return the TOML `text` with each line inserted at the top of its table.
 
     Raises:
         ConfigError: there is no such table.

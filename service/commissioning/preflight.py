@@ -1,4 +1,4 @@
-"""What a cell needs of machine and wires, checked before anything starts, so that the message is about the cause."""
+"""Checks what a cell needs from the machine and the wires before anything starts, so that errors name the cause."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ PYTHON = (3, 11)
 
 
 def check_machine(cell: Cell) -> None:
-    """Python's version, the simulator's engine, that the cell file can be meant, and that no two devices want one wire.
+    """Check Python's version, the simulator's engine, the cell file's plausibility, and that no two devices use one wire.
 
     Raises:
         ConfigError: names what is missing and how to get it.
     """
     check_python()
-    frame_tree(cell, RigidTransform.identity())  # a mount on a frame that is not there would show at the first look
+    frame_tree(cell, RigidTransform.identity())  # finds mounts on frames that do not exist
     for name, section in cell.file.devices.items():
         if section.driver.startswith("sim:"):
             check_simulator(f"devices.{name}")
@@ -34,13 +34,13 @@ def check_machine(cell: Cell) -> None:
 
 
 def check_wires(cell: Cell, others: Mapping[str, DeviceSection] | None = None) -> None:
-    """Raise `ConfigError` when two devices want the same port or connection, or the same address on a bus they share.
+    """Raise `ConfigError` when two devices use the same port or connection, or the same address on a shared bus.
 
     Args:
-        others: sections to be in the place of the cell file's.
+        others: sections that replace those of the cell file.
     """
     others = others or {}
-    emulated = cell.file.emulators.keys() - others.keys()  # their wires are made later
+    emulated = cell.file.emulators.keys() - others.keys()  # their wires are created later
     sections = {**cell.file.devices, **others}
     isolated = {name: section.isolate for name, section in sections.items()}
     takes = [
@@ -62,7 +62,7 @@ def check_wires(cell: Cell, others: Mapping[str, DeviceSection] | None = None) -
 
 
 def check_python() -> None:
-    """Raise `ConfigError` unless this is the Python that all our wheels exist for."""
+    """Raise `ConfigError` unless this is the Python version for which all required wheels exist."""
     if sys.version_info[:2] != PYTHON:
         raise ConfigError(
             f"this is Python {sys.version_info[0]}.{sys.version_info[1]}; panelwright needs {PYTHON[0]}.{PYTHON[1]}",
@@ -71,7 +71,7 @@ def check_python() -> None:
 
 
 def check_simulator(key: str) -> None:
-    """Raise `ConfigError` unless PyBullet is installed; it is looked for, not imported."""
+    """Raise `ConfigError` unless PyBullet is installed, without importing it."""
     if find_spec("pybullet") is None:
         raise ConfigError(
             f"{key} is simulated, but PyBullet is not installed",

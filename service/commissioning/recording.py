@@ -1,4 +1,4 @@
-"""Records the wire of one device of a cell, and plays such a recording back: without a service, without the device."""
+"""Records the traffic of one device of a cell, and replays a recording without a service and without the device."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from hal.registry import Context, connect
 from service.commissioning.direct_read import only_device, samples_of
 from service.jsonable import jsonable
 
-ABOUT = "about"  # kind of the line that says whose traffic it is; the drivers pass over it
+ABOUT = "about"  # kind of the line that describes the device; the drivers ignore it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class About:
-    """Whose traffic a recording holds: what makes the same driver read it again."""
+    """The device of a recording: the data with which the same driver can read the recording again."""
 
     device: str
     kind: DeviceKind
@@ -32,14 +32,14 @@ class About:
 def record(
     cell: Cell, name: str, path: Path, *, duration_s: float, timeout_s: float
 ) -> Generator[dict[str, Any], None, None]:
-    """Write all traffic of the device `name` into `path` for some time; yields its samples and errors meanwhile.
+    """Write all traffic of the device `name` to `path` for `duration_s`; yields its samples and errors meanwhile.
 
     Args:
         timeout_s: deadline of each reading.
 
     Raises:
-        ConfigError: the cell has no such device, the device no wire, or the file exists or cannot be written.
-        DeviceError: it did not connect.
+        ConfigError: the cell has no such device, the device has no wire, or the file exists or cannot be written.
+        DeviceError: the device did not connect.
     """
     if path.exists():
         raise ConfigError(f"{path} exists already", hint="choose another name, or remove it; nothing was written")
@@ -54,7 +54,7 @@ def record(
         try:
             device = connect_it()
         except CellError as error:
-            if path.stat().st_size == len(header):  # no traffic to keep: the next attempt finds the name free
+            if path.stat().st_size == len(header):  # no traffic was recorded; the next attempt can use the name
                 path.unlink()
             if not isinstance(error, ConfigError) or "capture" not in error.what:
                 raise
@@ -68,11 +68,11 @@ def record(
 
 
 def replay(path: Path, *, timeout_s: float) -> Iterator[dict[str, Any]]:
-    """The samples and errors that the recorded driver makes of the recorded traffic, at its pace, to the end.
+    """Yield the samples and errors that the recorded device's driver reads from the recording, at its original pace.
 
     Raises:
-        ConfigError: the file is no recording of a device.
-        DeviceError: the driver finds nothing in it.
+        ConfigError: the file is not a recording of a device.
+        DeviceError: the driver finds no samples in it.
     """
     about, clock = read_about(path), WallClock()
     device = connect(Context(name=about.device, clock=clock), about.driver, {**about.options, "replay": str(path)})
@@ -86,10 +86,10 @@ def replay(path: Path, *, timeout_s: float) -> Iterator[dict[str, Any]]:
 
 
 def read_about(path: Path) -> About:
-    """Whose traffic a file holds.
+    """Read which device a recording belongs to.
 
     Raises:
-        ConfigError: it does not say.
+        ConfigError: the file does not name a device.
     """
     hint = "give a file that `panelwright devices record` has written"
     try:
@@ -111,7 +111,7 @@ def read_about(path: Path) -> About:
 
 
 def _until(items: Iterator[dict[str, Any]], duration_s: float) -> Iterator[dict[str, Any]]:
-    """So many seconds on the wall, by which the wire runs: the clock of a mixed cell may go slower."""
+    """Yield items for `duration_s` of wall time, because the clock of a mixed cell may run slower than its wires."""
     clock = WallClock()
     end_s = clock.now_s() + duration_s
     for item in items:

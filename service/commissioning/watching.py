@@ -1,4 +1,4 @@
-"""What `panelwright devices watch` shows of a running service: values, rates, ages and error counters, line by line."""
+"""Collects what `panelwright devices watch` shows of a running service: values, rates, ages and error counters."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ SHOWN: dict[DeviceKind, tuple[str, str, int]] = {  # key of the value, unit, dec
 
 
 class Asks(Protocol):
-    """The part of a client that watching needs."""
+    """The part of a client that `Watch` needs."""
 
     def get(self, path: str) -> Any:
-        """The JSON answer to a GET."""
+        """Return the JSON answer to a GET request."""
         ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """One device at one moment; None where it is not known.
+    """The state of one device at one time; None where a value is not known.
 
     Attributes:
         health: `valid`, `degraded (cause)`, `disconnected`, and so on.
-        rate_hz: samples a second since the row before.
-        errors_since: errors since the row before.
+        rate_hz: samples per second since the previous row.
+        errors_since: errors since the previous row.
     """
 
     name: str
@@ -56,11 +56,11 @@ class Row:
 
 
 class Watch:
-    """Looks at all devices again and again.
+    """Reads the state of all devices repeatedly.
 
     Args:
-        with_pictures: also read cameras and range scanners; each look then costs a picture.
-        now_s: a clock in seconds; rates are counted on it.
+        with_pictures: whether to read cameras and range scanners too, which takes one picture each time.
+        now_s: clock in seconds, from which rates are computed.
     """
 
     def __init__(
@@ -69,10 +69,10 @@ class Watch:
         self._client = client
         self._with_pictures = with_pictures
         self._now_s = now_s
-        self._before: dict[str, tuple[float, int, int]] = {}  # when, samples, errors
+        self._before: dict[str, tuple[float, int, int]] = {}  # time, samples, errors
 
     def look(self) -> list[Row]:
-        """Every device now.
+        """Return the present state of every device.
 
         Raises:
             ApiError, DeviceUnavailable: the service does not answer.
@@ -84,7 +84,7 @@ class Watch:
         now, samples, errors = self._now_s(), int(health["samples"]), int(health["errors"])
         before_s, samples_before, errors_before = self._before.get(name, (now, samples, errors))
         self._before[name] = now, samples, errors
-        is_later = now > before_s and samples >= samples_before  # a device opened anew counts from zero
+        is_later = now > before_s and samples >= samples_before  # a device that was opened again counts from zero
         value, age_s = self._value(view, kind)
         return Row(
             name=name,
@@ -101,7 +101,7 @@ class Watch:
         )
 
     def _value(self, view: dict[str, Any], kind: DeviceKind) -> tuple[str, float | None]:
-        """The newest value in few characters and its age; what went wrong in place of the value."""
+        """Return the newest value as short text and its age; after an error, the error in place of the value."""
         if kind in PICTURES and not self._with_pictures:
             return "", None
         try:
@@ -121,7 +121,7 @@ def _health_word(health: dict[str, Any]) -> str:
 
 
 def brief(kind: DeviceKind, value: Any) -> str:
-    """A reading's value in few characters, with its unit."""
+    """Return a reading's value as short text with its unit."""
     key, unit, decimals = SHOWN[kind]
     told = value[key] if key else value
     numbers = told if isinstance(told, list) else [told]

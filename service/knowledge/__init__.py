@@ -1,1 +1,1 @@
-"""What a cell remembers: stored images, calibrations, and the kinds and panels that users taught."""
+"""The stored data of a cell: images, calibrations, and the kinds and panels that users taught."""

@@ -1,7 +1,7 @@
-"""What was calibrated on this machine: records over those of the cell file, one folder a cell, older versions kept.
+"""Calibration records measured on this machine, which replace those of the cell file; one folder per cell.
 
-The cell file's own records say what the cell was built to (a simulated cell draws its truth about them). What the arm
-found out later lies over them, in `RUNS/calibrations/<cell>/`, and is what tasks compute with.
+The cell file's own records are the nominal values (a simulated cell draws its true values around them). The measured
+records, in `RUNS/calibrations/<cell>/`, are those that tasks use; older versions are kept.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class NoSuchCalibration(NoSuchTask):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibrated:
-    """A device's record in use. `is_measured`: found by calibrating here; else it is the cell file's own."""
+    """The record of a device that is in use. `is_measured`: measured here; otherwise it is from the cell file."""
 
     device: str
     parent: str
@@ -37,9 +37,9 @@ class Calibrated:
 
 
 class Calibrations:
-    """The records of one cell."""
+    """The calibration records of one cell."""
 
-    _lock = threading.Lock()  # of all of this process
+    _lock = threading.Lock()  # shared by all instances of this process
 
     def __init__(self, folder: Path, cell: Cell) -> None:
         self.folder = folder
@@ -47,16 +47,16 @@ class Calibrations:
 
     @classmethod
     def of_runs(cls, runs_dir: Path, cell: Cell) -> Calibrations:
-        """Where a service keeps them. A simulated cell of another seed is another cell: its sensors sit elsewhere."""
+        """Return the records of a service's cell; each seed of a simulated cell has its own, because the sensors differ."""
         section = cell.file.cell
         name = section.name if section.mode == "real" else f"{section.name}-seed{section.seed}"
         return cls(runs_dir / FOLDER / name, cell)
 
     def applied(self) -> Cell:
-        """The cell with what was measured in place of the cell file's records.
+        """Return the cell with the measured records in place of the cell file's.
 
         Raises:
-            ConfigError: a measured record is malformed; names it.
+            ConfigError: a measured record is malformed; the error names it.
         """
         measured = {name: load_calibration(path) for name, path in self._measured().items()}
         if not measured:
@@ -69,7 +69,7 @@ class Calibrations:
         )
 
     def all(self) -> list[Calibrated]:
-        """One entry a mounted device, in the order of the cell file."""
+        """Return one entry per mounted device, in the order of the cell file."""
         cell, measured = self.applied(), self._measured()
         found = []
         for device, section in cell.file.devices.items():
@@ -91,10 +91,10 @@ class Calibrations:
         return found
 
     def of(self, device: str) -> Calibrated:
-        """The record of one device.
+        """Return the record of one device.
 
         Raises:
-            NoSuchCalibration: no such device, or it has no mount.
+            NoSuchCalibration: there is no such device, or it has no mount.
         """
         for entry in self.all():
             if entry.device == device:
@@ -105,7 +105,7 @@ class Calibrations:
         )
 
     def write(self, record: CalibrationRecord) -> Path:
-        """Keep a record as the one in use; the one before moves to `older/`. Whole or not at all.
+        """Store a record as the one in use, atomically; the previous one moves to `older/`.
 
         Raises:
             ConfigError: the device has no mount, so nothing would read the record.
@@ -132,10 +132,10 @@ class Calibrations:
         return path
 
     def forget(self, device: str) -> None:
-        """Go back to the cell file's own record; what was measured moves to `older/`.
+        """Return to the cell file's own record; the measured one moves to `older/`.
 
         Raises:
-            NoSuchCalibration: nothing was measured for it.
+            NoSuchCalibration: nothing was measured for the device.
         """
         entry = self.of(device)
         if not entry.is_measured:
@@ -148,12 +148,12 @@ class Calibrations:
             entry.path.rename(_unused(older))
 
     def _measured(self) -> dict[str, Path]:
-        """Files of this folder that stand for a record of the cell, by the record's name."""
+        """Return the files of this folder that replace a record of the cell, by the record's name."""
         return {name: path for name in self._cell.calibrations if (path := self.folder / f"{name}.toml").exists()}
 
 
 def _unused(path: Path) -> Path:
-    """The path, or one beside it that does not exist yet: an older record is never overwritten."""
+    """Return the path, or a numbered one if it exists, because an older record is never overwritten."""
     count, free = 1, path
     while free.exists():
         count += 1

@@ -1,7 +1,7 @@
-"""The paper's question-and-answer sequence: a person is led through teaching a kind or a whole panel.
+"""The paper's question-and-answer sequence, which guides a person through teaching a kind or a whole panel.
 
-What is asked and what is made of it is all here; `Talk` is a terminal, or a script in tests. An answer that makes no sense
-is explained and asked again; nothing is written before the last answer.
+The questions and the use of the answers are all here; `Talk` is a terminal, or a script in tests. An invalid answer
+is explained and the question repeated; nothing is written before the last answer.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from perception.vision.teaching import LightsFound
 
 T = TypeVar("T")
-MOST_TRIES = 5  # a script that goes on giving the same wrong answer must end
+MOST_TRIES = 5  # ends a script that repeats the same wrong answer
 WHAT = Question(key="what", text="What do you teach?", choices=("kind", "panel"), default="kind")
 WHERE = Question(key="where", text="Where is it (pixels: x,y of its middle, or of two opposite corners: x,y x,y)?")
 MORE = Question(key="more", text="Is there another object?", choices=("no", "yes"), default="no")
@@ -49,24 +49,24 @@ LIGHTS = Question(key="lights", text="Where are the four border lights (x,y x,y 
 
 
 class Talk(Protocol):
-    """Somebody who answers."""
+    """The interface to the person or script that answers."""
 
     def ask(self, question: Question) -> str:
-        """The answer, stripped; empty for none.
+        """Ask a question; returns the answer, stripped, or an empty text for none.
 
         Raises:
-            InvalidRequest: nobody answers any more.
+            InvalidRequest: there are no more answers.
         """
         ...
 
     def say(self, text: str) -> None:
-        """Tell something."""
+        """Show a text."""
         ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Dialogue:
-    """One session over one image."""
+    """One teaching session about one image."""
 
     talk: Talk
     store: KnowledgeStore
@@ -77,7 +77,7 @@ class Dialogue:
     def about(
         cls, talk: Talk, store: KnowledgeStore, pixels: NDArray[np.uint8], plate_m: tuple[float, float]
     ) -> Dialogue:
-        """A dialogue about an image.
+        """Start a dialogue about an image.
 
         Raises:
             InvalidRequest, NotObservable, NotFound, Ambiguous: the image shows no panel to teach from.
@@ -86,7 +86,7 @@ class Dialogue:
         return cls(talk=talk, store=store, pixels=pixels, overview=overview)
 
     def run(self) -> None:
-        """Ask, teach, and show what is found now."""
+        """Ask the questions, teach, and show what is found afterwards."""
         what = self._until_good(lambda: self._answer(WHAT))
         if what == "kind":
             self._teach_kinds()
@@ -141,7 +141,7 @@ class Dialogue:
     def _object_answer(
         self, question: Question, kind: str, name: str, example: Example, answers: dict[str, str]
     ) -> str:
-        """An answer that makes sense together with those before it."""
+        """Ask until the answer is valid together with the earlier ones."""
         given = self._answer(question)
         tried = {**answers, question.key: given}
         object_row(PanelObjectDraft(kind=kind, name=name, example=example, answers=tried), self.overview)
@@ -169,7 +169,7 @@ class Dialogue:
 
     def _name(self, question: Question) -> str:
         name = self._answer(question)
-        if name in IS_IT.choices:  # one question too late: it would become a kind
+        if name in IS_IT.choices:  # an answer to the previous question, which must not become a kind
             raise InvalidRequest(f"{name!r} is no answer to what it is called", hint="give a name")
         check_name(name)
         return name
@@ -181,7 +181,7 @@ class Dialogue:
         return given
 
     def _until_good(self, step: Callable[[], T]) -> T:
-        """Repeat a step until its answer makes sense."""
+        """Repeat a step until its answer is valid."""
         for _ in range(MOST_TRIES - 1):
             try:
                 return step()
@@ -192,13 +192,13 @@ class Dialogue:
         return step()
 
     def show_found(self) -> None:
-        """What is found in the image with what is known now."""
+        """Show what is found in the image with the present knowledge."""
         lines = []
         for found in check(self.pixels, self.store.knowledge(), plate_m=self.overview.plate_m):
             x, y = found.centre_px
             verdict = f"refused: {found.reason}" if found.reason else f"confidence {found.confidence:.2f}"
             lines.append(f"{found.kind} at {x:.0f},{y:.0f} px  {verdict}")
-        for line in dict.fromkeys(lines):  # two refused candidates may differ in nothing that a person sees
+        for line in dict.fromkeys(lines):  # two rejected candidates may give the same text
             self.talk.say(line)
 
     def _show_read(self, name: str) -> None:
@@ -214,7 +214,7 @@ class NobodyAnswers(InvalidRequest):
 
 
 def describe(overview: Overview, example: Example, knowledge: Knowledge) -> str:
-    """What was found at the clicks, in one sentence."""
+    """Describe in one sentence what was found at the clicks."""
     shape = example.outline.shape if example.outline is not None else "place"
     width, height = (1e3 * side for side in example.size_m)
     x, y = overview.in_image(example.centre_m[None])[0]
@@ -227,10 +227,10 @@ def describe(overview: Overview, example: Example, knowledge: Knowledge) -> str:
 
 
 def points_of(text: str, *, least: int = 1) -> tuple[tuple[float, float], ...]:
-    """Pixels from "x,y x,y".
+    """Read pixel coordinates from text such as "x,y x,y".
 
     Raises:
-        InvalidRequest: no numbers, or too few.
+        InvalidRequest: the text has no numbers, or too few.
     """
     try:
         pairs = [tuple(float(part) for part in item.split(",")) for item in text.split()]

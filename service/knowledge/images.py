@@ -1,4 +1,4 @@
-"""Stored images: uploaded once, checked once, and then named in requests."""
+"""Stores images that are uploaded and checked once and then named in requests."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ MEDIA = {".png": "image/png", ".jpg": "image/jpeg", ".bmp": "image/bmp"}
 
 
 class NoSuchImage(NoSuchTask):
-    """No stored image has that id."""
+    """There is no stored image with that id."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredImage:
-    """A stored image; its id says what is in it, so the same image has the same id again."""
+    """A stored image; its id is derived from its content, so the same image always has the same id."""
 
     id: str
     path: Path
@@ -42,23 +42,23 @@ class StoredImage:
 
     @property
     def media_type(self) -> str:
-        """For HTTP."""
+        """The media type for HTTP."""
         return MEDIA[self.path.suffix]
 
 
 class ImageStore:
-    """Images in `runs_dir/images`, one file each."""
+    """Stores images in `runs_dir/images`, one file each."""
 
-    _lock = threading.Lock()  # of all stores of this process: they may share a folder
+    _lock = threading.Lock()  # shared by all stores of this process, which may use one folder
 
     def __init__(self, runs_dir: Path) -> None:
         self._folder = runs_dir / FOLDER
 
     def add(self, data: bytes) -> StoredImage:
-        """Check and keep an image.
+        """Check and store an image.
 
         Raises:
-            InvalidRequest: no image, damaged, deeper than 8 bits, too small, too large.
+            InvalidRequest: the data are not an image, or it is damaged, deeper than 8 bits, too small or too large.
             NotPossibleNow: the store is full.
         """
         from perception.vision import check_image, decode
@@ -81,11 +81,11 @@ class ImageStore:
                     partial.write_bytes(data)
                     partial.rename(self._folder / f"{image_id}{suffix}")
                 finally:
-                    partial.unlink(missing_ok=True)  # half an image of a full disk
+                    partial.unlink(missing_ok=True)  # incomplete file after a full disk
         return self.get(image_id)
 
     def get(self, image_id: str) -> StoredImage:
-        """The stored image of that id.
+        """Return the stored image with that id.
 
         Raises:
             NoSuchImage: there is none.
@@ -97,7 +97,7 @@ class ImageStore:
         raise NoSuchImage("there is no stored image of that id", hint="POST /v1/images stores one, GET lists them")
 
     def pixels(self, image_id: str) -> NDArray[np.uint8]:
-        """Its pixels, gray (H, W) or RGB (H, W, 3).
+        """Return an image's pixels, gray (H, W) or RGB (H, W, 3).
 
         Raises:
             NoSuchImage: there is none.
@@ -107,11 +107,11 @@ class ImageStore:
         return decode(self.get(image_id).path.read_bytes())
 
     def all(self) -> list[StoredImage]:
-        """Every stored image, newest first."""
+        """Return all stored images, newest first."""
         return sorted((_stored(path) for path in self._files()), key=lambda image: image.stored_s, reverse=True)
 
     def remove(self, image_id: str) -> None:
-        """Delete one.
+        """Delete an image.
 
         Raises:
             NoSuchImage: there is none.
@@ -130,7 +130,7 @@ def _stored(path: Path) -> StoredImage:
     status = path.stat()
     with Pillow.open(path) as picture:  # reads the header only
         width, height = picture.size
-        if picture.getexif().get(0x0112, 1) >= 5:  # the camera was held on its side: the picture is shown turned
+        if picture.getexif().get(0x0112, 1) >= 5:  # EXIF orientations 5 to 8 swap width and height
             width, height = height, width
     return StoredImage(
         id=path.stem, path=path, width_px=width, height_px=height, size_bytes=status.st_size, stored_s=status.st_mtime

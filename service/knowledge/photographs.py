@@ -1,4 +1,4 @@
-"""Instruments in photographs that users bring: read by kind and scale, with nothing taught."""
+"""Reads instruments in users' photographs from their kind and scale, without teaching."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 
 def read_stored_photograph(images: ImageStore, request: ReadPhotographRequest) -> PhotographReading:
-    """What a stored photograph shows.
+    """Read the instrument in a stored photograph.
 
     Raises:
         NoSuchImage: there is no such image.
-        InvalidRequest: the scale does not go with the kind.
-        NotObservable: the image shows nothing.
+        InvalidRequest: the scale does not fit the kind.
+        NotObservable: no instrument can be read in the image.
     """
     return read_pixels(
         images.pixels(request.image), request.kind, scale=request.scale, ends_rad=request.ends_rad, unit=request.unit,
@@ -39,7 +39,7 @@ def read_pixels(
     is_scene: bool,
     least_confidence: float,
 ) -> PhotographReading:
-    """What a photograph shows; errors as `read_stored_photograph`."""
+    """Read the instrument in a photograph; errors as for `read_stored_photograph`."""
     from perception.vision import read_photograph
 
     found = read_photograph(

@@ -1,4 +1,4 @@
-"""What users taught: kinds and panels as readable TOML in one folder, before the shipped ones and those of the cell."""
+"""Stores kinds and panels that users taught as TOML in one folder; they take precedence over the shipped ones."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ PLAIN_NAME = re.compile(r"[a-z][a-z0-9_]{0,40}")
 
 
 class NoSuchKnowledge(NoSuchTask):
-    """Nothing of that name was taught or shipped."""
+    """There is no taught or shipped kind or panel with that name."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KindSummary:
-    """Size on the plate of a typical one, and how many examples taught it."""
+    """Typical size of a kind on the plate, and the number of its examples."""
 
     width_m: float
     height_m: float
@@ -38,9 +38,9 @@ class KindSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KnowledgeFile:
-    """One file of the knowledge; `is_taught` False: shipped with the system.
+    """One file of the knowledge; it is shipped with the system unless `is_taught`.
 
-    `of_cell`: the file with the looks that the cell's own panel adds to it.
+    `of_cell`: the file with the appearance examples that the cell's own panel adds to it.
     """
 
     name: str
@@ -49,16 +49,16 @@ class KnowledgeFile:
     of_cell: Path | None = None
 
     def text(self) -> str:
-        """Its TOML, with the looks of the cell's own panel at its end."""
+        """Return its TOML, with the examples of the cell's own panel at the end."""
         if self.path.suffix == ".toml" and self.of_cell is None:
             return self.path.read_text(encoding="utf-8")
         return _text_of(*(_stamped(path) for path in (self.path, self.of_cell) if path is not None))
 
     def summary(self) -> KindSummary:
-        """What a kind's file says, without the numbers of its looks.
+        """Return a summary of a kind's file, without its feature values.
 
         Raises:
-            ConfigError: it is malformed.
+            ConfigError: the file is malformed.
         """
         own, *added = (_kind_in(_stamped(path)) for path in (self.path, self.of_cell) if path is not None)
         width_m, height_m = own.size_m
@@ -66,9 +66,9 @@ class KnowledgeFile:
 
 
 class KnowledgeStore:
-    """Kinds in `folder/*.toml`, panels in `folder/panels/*.toml`; `of_cell` holds looks that add to the shipped kinds."""
+    """Stores kinds in `folder/*.toml` and panels in `folder/panels/*.toml`; `of_cell` adds examples to shipped kinds."""
 
-    _lock = threading.Lock()  # of all of this process: two lessons at once must not lose one
+    _lock = threading.Lock()  # shared by all instances of this process, so that no concurrent lesson is lost
 
     def __init__(self, folder: Path, *, of_cell: Path | None = None) -> None:
         self.folder = folder
@@ -76,14 +76,14 @@ class KnowledgeStore:
 
     @classmethod
     def of_runs(cls, runs_dir: Path, cell: Cell) -> KnowledgeStore:
-        """Where a service keeps them, over what its cell file names."""
+        """Return the store of a service, in addition to the folder that its cell file names."""
         return cls(runs_dir / FOLDER, of_cell=cell.knowledge_path)
 
     def knowledge(self) -> Knowledge:
-        """The shipped kinds with the looks of the cell's own panel, each replaced by the folder's own of that name.
+        """Return the shipped kinds with the examples of the cell's own panel; taught kinds replace those of the same name.
 
         Raises:
-            ConfigError: a file of a folder is malformed; names it.
+            ConfigError: a file of a folder is malformed; the error names it.
         """
         from perception.vision import Knowledge
 
@@ -93,10 +93,10 @@ class KnowledgeStore:
         taught = _kinds_in(self.folder, _stamps(self.folder)).kinds
         names = {kind.name for kind in taught}
         kinds = (*(kind for kind in shipped.kinds if kind.name not in names), *taught)
-        return Knowledge(kinds=kinds, spread=shipped.spread)  # the unit of likeness stays what the shipped looks gave
+        return Knowledge(kinds=kinds, spread=shipped.spread)  # of the shipped examples
 
     def kinds(self) -> list[KnowledgeFile]:
-        """Files of all kinds in use, by name."""
+        """Return the files of all kinds in use, ordered by name."""
         files = {path.stem: KnowledgeFile(name=path.stem, path=path, is_taught=False) for path in _kinds_of(None)}
         for path in () if self.of_cell is None else _kinds_of(self.of_cell):
             known = files.get(path.stem)
@@ -110,15 +110,15 @@ class KnowledgeStore:
         return [files[name] for name in sorted(files)]
 
     def panels(self) -> list[KnowledgeFile]:
-        """Files of the taught panels, by name."""
+        """Return the files of the taught panels, ordered by name."""
         folder = self.folder / "panels"
         return [KnowledgeFile(name=path.stem, path=path, is_taught=True) for path in _toml(folder)]
 
     def panel(self, name: str) -> Panel:
-        """A taught panel.
+        """Return a taught panel.
 
         Raises:
-            NoSuchKnowledge: nobody taught it.
+            NoSuchKnowledge: it was not taught.
             ConfigError: its file is malformed.
         """
         for file in self.panels():
@@ -127,7 +127,7 @@ class KnowledgeStore:
         raise NoSuchKnowledge("no panel of that name was taught", hint="GET /v1/knowledge lists what is known")
 
     def write_kind(self, kind: TaughtKind) -> Path:
-        """Keep a taught kind, in place of the one of that name."""
+        """Store a taught kind and replace one of the same name."""
         from perception.vision import write_kind
 
         check_name(kind.name)
@@ -136,7 +136,7 @@ class KnowledgeStore:
             return write_kind(kind, self.folder)
 
     def write_panel(self, name: str, text: str) -> Path:
-        """Keep a taught panel, in place of the one of that name."""
+        """Store a taught panel and replace one of the same name."""
         check_name(name)
         folder = self.folder / "panels"
         with self._lock:
@@ -147,7 +147,7 @@ class KnowledgeStore:
         """Delete a taught kind or panel; a shipped kind of that name is in use again.
 
         Raises:
-            NoSuchKnowledge: nobody taught it.
+            NoSuchKnowledge: it was not taught.
         """
         files = {"kinds": self.kinds, "panels": self.panels}[group]()
         file = next((file for file in files if file.name == name and file.is_taught), None)
@@ -157,7 +157,7 @@ class KnowledgeStore:
 
 
 def check_name(name: str) -> None:
-    """Raise `InvalidRequest` for what cannot be a file's and an object's name."""
+    """Raise `InvalidRequest` for a name that cannot be used for files and objects."""
     if not PLAIN_NAME.fullmatch(name):
         raise InvalidRequest(f"{name[:40]!r} is no name of a kind or panel", hint="small letters, digits, underscores")
 
@@ -167,20 +167,20 @@ def _toml(folder: Path) -> Iterator[Path]:
 
 
 def _kinds_of(folder: Path | None) -> list[Path]:
-    """The files of a folder's kinds, or of the shipped ones; none where there is no such folder."""
+    """Return the files of the kinds in a folder (None: the shipped ones); none if the folder does not exist."""
     from perception.vision import kind_files
 
     return [path for path in kind_files(folder) if PLAIN_NAME.fullmatch(path.stem)]
 
 
 def _stamps(folder: Path) -> tuple[tuple[str, int, int], ...]:
-    """What tells that a folder's files are as they were when they were read."""
+    """Return stamps of a folder's files, which show whether a file has changed since it was read."""
     return tuple((path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in _kinds_of(folder))
 
 
 @lru_cache(maxsize=8)
 def _kinds_in(folder: Path, stamps: tuple[tuple[str, int, int], ...]) -> Knowledge:
-    """The kinds of a folder, read once."""
+    """Read the kinds of a folder; cached by the stamps of its files."""
     del stamps
     from perception.vision import load_knowledge
 
@@ -196,12 +196,12 @@ def _shipped() -> Knowledge:
 
 @lru_cache(maxsize=8)
 def _with_looks_in(folder: Path, stamps: tuple[tuple[str, int, int], ...]) -> Knowledge:
-    """The shipped kinds with the looks of a cell's folder."""
+    """Return the shipped kinds with the examples of a cell's folder; cached by the stamps of its files."""
     return _shipped().with_looks_of(_kinds_in(folder, stamps).kinds)
 
 
 def _stamped(path: Path) -> tuple[Path, int]:
-    """A file, and what tells that it is as it was when it was read."""
+    """Return a file with its stamp, which shows whether it has changed since it was read."""
     return path, path.stat().st_mtime_ns
 
 
@@ -214,7 +214,7 @@ def _kind_in(stamped: tuple[Path, int]) -> TaughtKind:
 
 @lru_cache(maxsize=256)
 def _text_of(*stamped: tuple[Path, int]) -> str:
-    """The TOML of a kind that is no TOML, or whose looks are in two files."""
+    """Return as TOML a kind that is not stored as TOML, or whose examples are in two files."""
     from perception.vision import kind_text
 
     own, *added = (_kind_in(each) for each in stamped)

@@ -1,4 +1,4 @@
-"""Teaching from an image: a kind by clicks, or a whole panel by clicks and answers; requests, answers and the work."""
+"""Teaches from an image: a kind by clicks, or a whole panel by clicks and answers."""
 
 from __future__ import annotations
 
@@ -103,17 +103,17 @@ class TaughtView(Result):
 
 
 def questions_of(kind: str) -> tuple[Question, ...]:
-    """What the dialogue asks about an object of this kind."""
+    """Return the questions of the dialogue about an object of this kind."""
     from perception.vision.teaching import questions
 
     return questions(kind)
 
 
 def find_outline(images: ImageStore, store: KnowledgeStore, request: OutlineRequest) -> OutlineView:
-    """The outline at the clicks and what it is taken for; writes nothing.
+    """Find the outline at the clicks and classify it; writes nothing.
 
     Raises:
-        NoSuchImage, InvalidRequest, NotObservable, NotFound, Ambiguous: says what is wrong and what helps.
+        NoSuchImage, InvalidRequest, NotObservable, NotFound, Ambiguous: there is no usable outline.
     """
     from perception.vision.teaching import example_at, overview_of
 
@@ -122,10 +122,11 @@ def find_outline(images: ImageStore, store: KnowledgeStore, request: OutlineRequ
 
 
 def teach(images: ImageStore, store: KnowledgeStore, request: TeachRequest) -> TaughtView:
-    """Learn what the request says and write it down.
+    """Teach what the request describes and store it.
 
     Raises:
-        as `find_outline`; Ambiguous also when the lesson would make another kind worse; ConfigError: no panel comes out.
+        PerceptionError: as for `find_outline`; `Ambiguous` also when the lesson would make another kind worse.
+        ConfigError: the answers do not make a valid panel.
     """
     pixels = images.pixels(request.image)
     if request.panel is not None:
@@ -144,7 +145,7 @@ def teach_kind(
     clicks_px: tuple[Click, ...],
     size_m: tuple[float, float] | None = None,
 ) -> TaughtView:
-    """Teach one example of a kind and keep it; see `teach`."""
+    """Teach one example of a kind and store it; see `teach`."""
     from perception.vision.teaching import example_at, overview_of, teach_example
 
     check_name(kind)
@@ -197,14 +198,14 @@ def teach_panel(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Learned:
-    """What an overview of a known panel taught, and the files of the kinds that learned something."""
+    """The examples learned from an overview of a known panel, and the files of the kinds that were changed."""
 
     panel: str
     looks: PanelLooks
     files: tuple[Path, ...]
 
     def result(self) -> LearnResult:
-        """The same as an answer: objects by name, looks by kind."""
+        """Return the result as an API answer: objects by name, examples by kind."""
         return LearnResult(
             panel=self.panel,
             added=self.looks.added,
@@ -217,10 +218,10 @@ class Learned:
 
 
 def learn_panel(store: KnowledgeStore, pixels: NDArray[np.uint8], view: PanelProjection, panel: Panel) -> Learned:
-    """Let a known panel teach its own looks from one overview, and keep them.
+    """Learn the appearance of a known panel's objects from one overview and store it.
 
     Raises:
-        InvalidRequest, NotObservable, NotFound, Ambiguous: the overview teaches nothing; says why and what helps.
+        InvalidRequest, NotObservable, NotFound, Ambiguous: nothing can be learned from the overview.
     """
     from perception.vision.teaching import teach_from_panel
 
@@ -229,7 +230,7 @@ def learn_panel(store: KnowledgeStore, pixels: NDArray[np.uint8], view: PanelPro
 
 
 def described(overview: Overview, example: Example, store: KnowledgeStore) -> OutlineView:
-    """An example for people and pages: its outline in the image, and what it is taken for now."""
+    """Return an example's outline in the image and its present classification, for display."""
     from perception.vision.teaching import likest
 
     if example.outline is None:

@@ -1,1 +1,1 @@
-"""What a mission leaves behind: `report.json` for programs, `report.html` with pictures for people."""
+"""The report of a mission: `report.json` for programs, and `report.html` with pictures for people."""

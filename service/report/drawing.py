@@ -1,4 +1,4 @@
-"""Line drawing of the panel in an estimated pose over the camera's image, as in the paper's Fig. 13."""
+"""Draws the panel's outlines in an estimated pose over the camera's image, as in the paper's Fig. 13."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PLATE, OBJECT, LIGHT = "#2ec4b6", "#ff9f1c", "#ffe066"
 def panel_drawing(
     panel: Panel, camera_from_panel: RigidTransform, intrinsics: CameraIntrinsics, pixels: NDArray[np.uint8]
 ) -> bytes:
-    """PNG of the image with plate, objects, lights and the panel's axes drawn where the pose puts them."""
+    """Return a PNG of the image with plate, objects, lights and the panel's axes projected by the pose."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.0, 8.0 * intrinsics.height_px / intrinsics.width_px), dpi=100)
@@ -50,6 +50,6 @@ def panel_drawing(
 
 
 def _edges(corners: Array) -> Array:
-    """A polyline fine enough to follow the lens's distortion."""
+    """Subdivide a polyline so finely that its edges follow the lens distortion."""
     pieces = [a + (b - a) * f for a, b in pairwise(corners) for f in np.linspace(0, 1, 20)]
     return np.array(pieces)

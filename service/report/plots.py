@@ -1,4 +1,4 @@
-"""The report's drawings: differences, ranges, wrenches and joints as PNG bytes."""
+"""Draws the report's pictures (lights, ranges, stations, wrenches and joints) as PNG bytes."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ MAX_PLOT_POINTS = 4000
 
 
 def png_of(pixels: Pixels) -> bytes:
-    """(H, W) gray or (H, W, 3) RGB, uint8, as PNG."""
+    """Encode pixels, uint8 (H, W) gray or (H, W, 3) RGB, as PNG."""
     stream = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(stream, "PNG")
     return stream.getvalue()
 
 
 def lights_picture(image_off: Pixels, image_on: Pixels, centres_px: NDArray[Any], names: Sequence[str]) -> bytes:
-    """On, off, and their difference with the four lights ringed."""
+    """Draw the images with lights on and off, and their difference with the four lights circled."""
     figure = _sheet(3.1)
     panes = figure.subplots(1, 3)
     difference = image_on.astype(int) - image_off.astype(int)
@@ -52,7 +52,7 @@ def lights_picture(image_off: Pixels, image_on: Pixels, centres_px: NDArray[Any]
 
 
 def range_picture(depth_m: NDArray[Any], residual_m: NDArray[Any]) -> bytes:
-    """The range image and its distance from the fitted plane."""
+    """Draw the range image and its residuals from the fitted plane."""
     figure = _sheet(4.2)
     left, right = figure.subplots(1, 2)
     shown = left.imshow(depth_m, cmap="viridis")
@@ -69,7 +69,7 @@ def range_picture(depth_m: NDArray[Any], residual_m: NDArray[Any]) -> bytes:
 def stations_picture(
     panel_from_camera: Sequence[NDArray[Any]], size_m: tuple[float, float], residuals_px: NDArray[Any]
 ) -> bytes:
-    """Where a camera looked from, before the plate (4x4 each, panel frame), and what its pixels miss the fit by."""
+    """Draw the camera's stations before the plate (4x4 poses `panel_from_camera`) and the residuals in pixels."""
     figure = _sheet(4.6)
     room = figure.add_subplot(1, 2, 1, projection="3d")
     x, y = size_m[0] / 2, size_m[1] / 2
@@ -104,7 +104,7 @@ def stations_picture(
 
 
 def wrench_picture(motions: Sequence[MotionReport]) -> bytes:
-    """Contact force and torque over the whole mission, with the names of the motions that pushed."""
+    """Plot contact force and torque over the whole mission, with the names of the motions that pushed hard."""
     figure = _sheet(4.2)
     force, torque = figure.subplots(2, 1, sharex=True)
     times, wrench = _joined(motions, lambda m: m.log.wrench)
@@ -122,7 +122,7 @@ def wrench_picture(motions: Sequence[MotionReport]) -> bytes:
 
 
 def joints_picture(motions: Sequence[MotionReport]) -> bytes:
-    """Joint angles over the whole mission."""
+    """Plot the joint angles over the whole mission."""
     figure = _sheet(3.4)
     pane = figure.subplots()
     times, joints = _joined(motions, lambda m: m.log.positions_rad)
@@ -145,7 +145,7 @@ def _joined(motions: Sequence[MotionReport], pick: Any) -> tuple[NDArray[Any], N
 
 
 def _sheet(height_in: float) -> Figure:
-    from matplotlib.figure import Figure  # half a second that a start need not wait for
+    from matplotlib.figure import Figure  # takes half a second to import, so not at the start
 
     return Figure(figsize=(10.5, height_in), dpi=100, layout="constrained")
 
@@ -159,9 +159,9 @@ def _finished(figure: Figure, panes: Sequence[Any]) -> bytes:
 
 
 def figure_png(figure: Figure) -> bytes:
-    """A finished figure as PNG bytes."""
+    """Return a finished figure as PNG bytes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     stream = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(stream)  # type: ignore[no-untyped-call]  # matplotlib types it not
+    FigureCanvasAgg(figure).print_png(stream)  # type: ignore[no-untyped-call]  # matplotlib has no annotation here
     return stream.getvalue()

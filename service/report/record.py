@@ -1,4 +1,4 @@
-"""The record of a mission while it runs: facts only, in the order in which they became known."""
+"""Records the facts of a mission while it runs, in the order in which they become known."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from service.schema.fuse_results import FuseResult
 from service.schema.mission_results import ActionResult, ObjectPlace, ReadingResult, SurfaceCheck
 from service.schema.results import EstimatedPose, FittedPlate
 
-# Fields of a record that a report has once they are known.
+# Fields of a record that appear in a report once they are known.
 FINDINGS = ("plate_in_scanner", "objects", "fused", "by_lights", "by_surfaces", "not_parked")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
-    """One step of the mission with its times: on the wall and on the cell's clock."""
+    """One step of the mission, with its wall time and its time on the cell's clock."""
 
     name: str
     wall_s: float
@@ -31,7 +31,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Picture:
-    """An image of the report, PNG."""
+    """A PNG picture of the report."""
 
     name: str
     title: str
@@ -40,15 +40,15 @@ class Picture:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class MissionRecord:
-    """Grows while the mission runs; one thread writes it.
+    """The record of a mission, written by one thread while the mission runs.
 
     Attributes:
         now_s: the cell's clock.
-        plate_in_scanner: the plate's plane as the first scan has it.
-        objects: where each object is in 3-D.
-        fused, by_lights: the panel's pose by all senses, and by its lights alone.
-        by_surfaces: what the surfaces of objects say beside layout and vision.
-        not_parked: why the arm was left where it stands after an error.
+        plate_in_scanner: the plate's plane in the first scan.
+        objects: the position of each object in 3-D.
+        fused, by_lights: the panel's pose from all sensors, and from its lights alone.
+        by_surfaces: results from the objects' surfaces, in addition to layout and vision.
+        not_parked: why the arm was not parked after an error.
     """
 
     mission: str
@@ -77,7 +77,7 @@ class MissionRecord:
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Time one step; a step that fails is recorded too."""
+        """Record one step and its duration, also when it fails."""
         wall_s, cell_s = time.monotonic(), self.now_s()
         ok, detail = False, ""
         try:
@@ -99,11 +99,11 @@ class MissionRecord:
 
     @property
     def succeeded(self) -> bool:
-        """Every action confirmed and nothing failed."""
+        """Whether every action was confirmed and nothing failed."""
         return self.problem is None and bool(self.actions) and all(action.confirmed for action in self.actions)
 
     def summary(self) -> dict[str, Any]:
-        """The contents of `report.json`, without the pictures."""
+        """Return the contents of `report.json`, without the pictures."""
         return {
             "schema": 1,
             "mission": self.mission,
@@ -129,4 +129,4 @@ class MissionRecord:
         try:
             return self.now_s()
         except CellError:
-            return fallback_s  # the cell died in this step; the step's own error tells
+            return fallback_s  # the cell's process ended in this step, which the step's error reports

@@ -1,4 +1,4 @@
-"""A range image in colours, one a surface, with what was found in it for people."""
+"""Draws a range image with one colour per surface and with the objects that were found in it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TEXT_SCALE = 0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Mark:
-    """An object drawn over the image: `outline_px` (N, 2) in pixels of the range image."""
+    """An object to draw over the image; `outline_px` is (N, 2) in pixels of the range image."""
 
     outline_px: Array
     text: str
@@ -27,12 +27,12 @@ class Mark:
 
 
 def surfaces_picture(scene: RangeScene, marks: Sequence[Mark]) -> Pixels:
-    """(sH, sW, 3) RGB: the surfaces, and over them the marks; green where found, red where looked for in vain."""
+    """Return a picture (sH, sW, 3) RGB of the surfaces with the marks: green for found objects, red for missing ones."""
     image = np.ascontiguousarray(picture(scene))
     scale = image.shape[0] / scene.labels.shape[0]
     for mark in marks:
         colour = FOUND if mark.is_found else LOST
-        # The middle of pixel 0 of the range image is the middle of the block that shows it.
+        # The centre of a pixel of the range image maps to the centre of its block in the picture.
         outline = np.round(scale * (mark.outline_px + 0.5) - 0.5).astype(np.int32)
         cv2.polylines(image, [outline.reshape(-1, 1, 2)], True, colour, 2, cv2.LINE_AA)
         _write(image, mark.text, outline, colour)
@@ -40,7 +40,7 @@ def surfaces_picture(scene: RangeScene, marks: Sequence[Mark]) -> Pixels:
 
 
 def _write(image: Pixels, text: str, outline: NDArray[np.int32], colour: tuple[int, int, int]) -> None:
-    """Below the outline, or above it where there is no room, inside the image."""
+    """Write text below the outline, or above it when there is no room below, inside the image."""
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SCALE, 1)
     low, high = outline.min(axis=0), outline.max(axis=0)
     x = int(np.clip(low[0], 2, max(2, image.shape[1] - width - 2)))

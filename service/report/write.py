@@ -1,4 +1,4 @@
-"""Writes a mission's folder: `report.json`, `report.html` and the pictures."""
+"""Writes a mission's report folder: `report.json`, `report.html` and the pictures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TEMPLATES = Path(__file__).parent
 
 
 def write_report(record: MissionRecord, folder: Path) -> Path:
-    """Write everything into `folder` (made if need be); returns the path of `report.html`."""
+    """Write the report into `folder`, created if missing; returns the path of `report.html`."""
     folder.mkdir(parents=True, exist_ok=True)
     for picture in record.pictures:
         (folder / f"{picture.name}.png").write_bytes(picture.png)
@@ -28,12 +28,12 @@ def write_report(record: MissionRecord, folder: Path) -> Path:
 
 
 def write_json(folder: Path, summary: dict[str, Any]) -> None:
-    """Replace `report.json` in one step, so that a reader never sees half of it."""
+    """Replace `report.json` atomically, so that a reader never sees an incomplete file."""
     write_atomically(folder / "report.json", json.dumps(summary, indent=1, allow_nan=False))
 
 
 def render(folder: Path) -> Path:
-    """Make `report.html` from the folder's `report.json` (again, after the judge has added to it)."""
+    """Write `report.html` from the folder's `report.json`; called again after the evaluation has been added."""
     summary = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     titles = json.loads((folder / "titles.json").read_text(encoding="utf-8"))
     environment = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined)

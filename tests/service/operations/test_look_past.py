@@ -85,7 +85,7 @@ def test_a_cap_that_looks_alike_from_afar_is_read_from_close_by(session: Session
 def test_a_cap_that_no_side_shows_says_how_often_it_was_looked_at(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(inspect, "FOR_ALIKE", ("the left", "above"))  # from further off this one looks alike
+    monkeypatch.setattr(viewpoints, "CLOSE_SIDES", ("the left", "above"))  # from further off this one looks alike
     session.world.forget_reading("hold")
     reading = inspect_close(session, ("hold",)).readings["hold"]
     assert not reading.answered and "(2 looks from the sides did not tell either)" in (reading.reason or "")
@@ -98,14 +98,14 @@ def test_neighbours_that_cannot_be_read_are_looked_at_together(session: Session)
     titles = [picture.title for picture in found.pictures[len(first.pictures) :]]
     assert found.readings["start"].state == truth_of(session, "start").state
     assert titles[0] in ("hold, start from the right", "start, hold from the right")
-    assert len(titles) <= len(inspect.SIDES), "each side once"
+    assert len(titles) <= len(viewpoints.SIDES), "each side once"
     assert titles[-1].startswith("hold from "), "what has been told is not asked for again"
 
 
 def test_a_guess_is_answered_to_who_asks_for_it_and_not_remembered(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(inspect, "FOR_ALIKE", ())
+    monkeypatch.setattr(viewpoints, "CLOSE_SIDES", ())
     session.world.forget_reading("hold")
     (refusal,) = inspect.run_inspect(session, InspectRequest(objects=("hold",))).objects
     (guess,) = inspect.run_inspect(session, InspectRequest(objects=("hold",), least_confidence=0.0)).objects

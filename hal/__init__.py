@@ -1,1 +1,1 @@
-"""The words everyone speaks: devices, values with units, frames, time, errors, cell and panel files."""
+"""The hardware abstraction layer: devices, values with units, frames, time, errors, cell and panel files."""

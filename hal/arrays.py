@@ -1,4 +1,4 @@
-"""The array types that everyone speaks, by what they hold."""
+"""The array types that all packages share, named by their content."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-"""Numbers: coordinates, matrices, covariances, depths. Shape and unit stand in the docstring of whoever gives it."""
+"""Numbers: coordinates, matrices, covariances, depths. Shape and unit are given in the docstring of the function."""
 
 Image = NDArray[np.uint8]
 """Pixels: (H, W) gray or (H, W, 3) RGB."""
 
 Labels = NDArray[np.int32]
-"""One label a pixel, (H, W); 0 belongs to nothing."""
+"""One label per pixel, (H, W); 0 means no label."""
 
 Mask = NDArray[np.bool_]
-"""One truth value an element."""
+"""One Boolean value per element."""
 
 Indices = NDArray[np.int64]
-"""Whole numbers: positions in another array, counts, kinds."""
+"""Integers: indices into another array, counts, kinds."""

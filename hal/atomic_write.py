@@ -1,4 +1,4 @@
-"""Replace a file in one step: after a crash or on a full disk the old or the new one is there, never half of one."""
+"""Replaces a file atomically: after a crash or on a full disk, either the old or the new file is complete."""
 
 from __future__ import annotations
 

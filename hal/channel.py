@@ -1,7 +1,7 @@
-"""Messages between two processes on one machine: pickles over a Unix socket, big arrays through shared memory.
+"""Sends messages between two processes on one machine: pickles over a Unix socket, large arrays in shared memory.
 
-Arrays travel out of band (pickle protocol 5) in a memory file that both sides map. The kernel frees it with its last
-user, so even `kill -9` leaves nothing behind. A channel carries one call at a time; it is not for several threads.
+Arrays are sent out of band (pickle protocol 5) in a memory file that both sides map. The kernel frees it with its last
+user, so even `kill -9` leaves nothing behind. A channel carries one call at a time and must not be shared by threads.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ INLINE_BYTES = 16_384  # below this a pipe is as fast as shared memory
 
 class _Pickler(pickle.Pickler):
     def persistent_id(self, obj: Any) -> Any:
-        # The two sides have different clocks, so what travels is the time that is left.
+        # The two sides have different clocks, so the remaining time is sent.
         return obj.remaining_s() if isinstance(obj, Deadline) else None
 
 
@@ -39,7 +39,7 @@ class Channel:
 
     Args:
         connection: a connected Unix-socket connection of `multiprocessing`; the channel owns it.
-        clock: whose time received deadlines count in.
+        clock: the clock of received deadlines.
     """
 
     def __init__(self, connection: Connection, clock: Clock) -> None:
@@ -49,7 +49,7 @@ class Channel:
         self._incoming: mmap.mmap | None = None
 
     def send(self, message: Any) -> None:
-        """Send one message; the peer must have taken the one before (calls alternate)."""
+        """Send one message; the peer must have received the previous one (calls alternate)."""
         big: list[pickle.PickleBuffer] = []
         stream = io.BytesIO()
 
@@ -77,7 +77,7 @@ class Channel:
             self._connection.send_bytes(b"filled")
 
     def receive(self) -> Any:
-        """The next message; blocks.
+        """Wait for the next message and return it.
 
         Raises:
             EOFError: the peer is gone.
@@ -98,7 +98,7 @@ class Channel:
         return _Unpickler(data, buffers, self._clock).load()
 
     def poll(self, timeout_s: float) -> bool:
-        """Is a message there within `timeout_s`?"""
+        """Return whether a message arrives within `timeout_s`."""
         return self._connection.poll(timeout_s)
 
     def close(self) -> None:
@@ -106,7 +106,7 @@ class Channel:
         self._connection.close()
 
     def _reserve(self, size: int) -> int | None:
-        """Make the outgoing memory at least `size` long; the descriptor of a new one, or None."""
+        """Make the outgoing memory at least `size` bytes long; returns the descriptor if it is new, else None."""
         if size == 0 or (self._outgoing is not None and len(self._outgoing) >= size):
             return None
         handle = os.memfd_create("panelwright")

@@ -1,4 +1,4 @@
-"""Clocks and deadlines. Nothing in the cell asks the wall for the time of day."""
+"""Clocks and deadlines; the cell's decisions never depend on the time of day."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-IDLE_S = 5.0  # a paced world that nobody has ticked for this long stands still; time passes without it
+IDLE_S = 5.0  # after this long without a tick the world stands still, and the clock follows the wall clock
 TICKS_KEPT = 512
 
 
 class Clock(Protocol):
-    """Monotonic seconds. `sleep` returns when that much of *this* clock's time has passed."""
+    """A monotonic clock; `sleep` returns when that much of *this* clock's time has passed."""
 
     def now_s(self) -> float:
-        """Seconds since an arbitrary start; never goes back."""
+        """Return the seconds since an arbitrary start; never decreases."""
         ...
 
     def sleep(self, duration_s: float) -> None:
@@ -29,17 +29,17 @@ class WallClock:
     """The machine's monotonic clock."""
 
     def now_s(self) -> float:
-        """Seconds of `time.monotonic`."""
+        """Return the seconds of `time.monotonic`."""
         return time.monotonic()
 
     def sleep(self, duration_s: float) -> None:
-        """Block the calling thread."""
+        """Block the calling thread for `duration_s`."""
         if duration_s > 0.0:
             time.sleep(duration_s)
 
 
 class SimClock:
-    """A clock that a simulator owns: `advance` steps the world and moves the time.
+    """A clock that a simulator controls: `advance` steps the world and moves the time.
 
     Args:
         advance: called with the seconds to pass; returns the new time in seconds. None makes a free-running test clock.
@@ -51,15 +51,15 @@ class SimClock:
         self._lock = threading.Lock()
 
     def now_s(self) -> float:
-        """Simulated seconds since the world began."""
+        """Return the simulated seconds since the start of the world."""
         return self._now_s
 
     def attach(self, advance: Callable[[float], float]) -> None:
-        """Let a world drive this clock; called once, when the first simulated device connects."""
+        """Connect this clock to a world; called once, when the first simulated device connects."""
         self._advance = advance
 
     def set_now_s(self, now_s: float) -> None:
-        """Follow the world's time; it never goes back."""
+        """Set the clock to the world's time; it never decreases."""
         self._now_s = max(self._now_s, now_s)
 
     def sleep(self, duration_s: float) -> None:
@@ -72,31 +72,31 @@ class SimClock:
 
 
 class PacedClock:
-    """The time of a simulated world that never runs ahead of the wall (mode `mixed`).
+    """The time of a simulated world that never runs ahead of the wall clock (mode `mixed`).
 
-    While somebody ticks, this is the world's time: a machine that is too slow makes time slow, and does not make set-points
-    run away from a world that lags behind. When nobody ticks, time passes with the wall, so that deadlines end.
+    While the world is stepped, this is the world's time: on a slow machine the time slows down, so that set-points do not
+    run ahead of a world that lags behind. Without steps, it follows the wall clock, so that deadlines still expire.
     """
 
     def __init__(self, advance: Callable[[float], float] | None = None) -> None:
         self._advance = advance
         self._lock = threading.Lock()
         self._now_s = time.monotonic()
-        self._ticked_at_s = self._now_s - IDLE_S  # on the wall; until the first tick time passes with it
+        self._ticked_at_s = self._now_s - IDLE_S  # wall clock; until the first tick the time follows it
         self._ticking = 0
         self._ticks: deque[tuple[float, float]] = deque(maxlen=TICKS_KEPT)  # (wall, this clock) at the end of each
 
     def attach(self, advance: Callable[[float], float]) -> None:
-        """Let this clock drive a world."""
+        """Connect this clock to a world."""
         self._advance = advance
 
     def now_s(self) -> float:
-        """Seconds; never goes back."""
+        """Return the time in seconds; never decreases."""
         with self._lock:
             return self._present_s()
 
     def sleep(self, duration_s: float) -> None:
-        """Step the world by `duration_s`, then wait for the wall to catch up."""
+        """Step the world by `duration_s`, then wait until the wall clock has caught up."""
         if duration_s <= 0.0:
             return
         with self._lock:
@@ -115,10 +115,10 @@ class PacedClock:
                 self._ticks.append((self._ticked_at_s, self._now_s))
 
     def at_s(self, wall_s: float) -> float:
-        """What this clock showed when `time.monotonic` showed `wall_s`; beyond its memory it went with the wall.
+        """Return this clock's time when `time.monotonic` was `wall_s`; before its stored ticks it follows the wall clock.
 
-        What a wire between a cell and its simulated world carries ages in this time: a machine that is too slow makes
-        its frames late, and its world as late as they are.
+        The age of data on a wire between a cell and its simulated world is measured in this time, because a slow machine
+        delays the frames and the world equally.
         """
         with self._lock:
             if wall_s >= self._ticked_at_s:
@@ -137,40 +137,40 @@ class PacedClock:
 
 
 class ReplayClock:
-    """Follows the stamps of a recording: `now_s` is the time of the newest record given out."""
+    """A clock that follows a recording: `now_s` is the stamp of the newest record that was replayed."""
 
     def __init__(self, *, start_s: float = 0.0) -> None:
         self._now_s = start_s
 
     def now_s(self) -> float:
-        """Recorded seconds."""
+        """Return the recorded time in seconds."""
         return self._now_s
 
     def seek(self, stamp_s: float) -> None:
-        """Move on to the stamp of the record that is given out now."""
+        """Advance to the stamp of the record that is replayed now."""
         self._now_s = max(self._now_s, stamp_s)
 
     def sleep(self, duration_s: float) -> None:
-        """Time passes at once: a recording has no present."""
+        """Return at once, because the time of a recording does not depend on waiting."""
         self._now_s += max(0.0, duration_s)
 
 
 @dataclass(frozen=True, slots=True)
 class Deadline:
-    """A moment on a clock after which a call must have returned. One deadline owns a call and its retries."""
+    """A time on a clock by which a call must have returned, including its retries."""
 
     at_s: float
     clock: Clock
 
     @classmethod
     def after(cls, clock: Clock, duration_s: float) -> Deadline:
-        """The moment `duration_s` from now."""
+        """Return the deadline `duration_s` from now."""
         return cls(clock.now_s() + duration_s, clock)
 
     def remaining_s(self) -> float:
-        """Seconds left, never negative."""
+        """Return the seconds left, never negative."""
         return max(0.0, self.at_s - self.clock.now_s())
 
     def is_past(self) -> bool:
-        """Has the moment passed?"""
+        """Return whether the deadline has passed."""
         return self.clock.now_s() >= self.at_s

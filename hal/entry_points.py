@@ -1,4 +1,4 @@
-"""Entry points by name: loaded only when they are asked for, and a typo gets an answer."""
+"""Loads entry points by name at their first use; an unknown name is answered with the nearest known one."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from hal.errors import REINSTALL, ConfigError
 
 
 def registered(group: str) -> tuple[str, ...]:
-    """The names that installed packages have registered in a group, in alphabetical order."""
+    """Return the names that installed packages have registered in a group, in alphabetical order."""
     return tuple(sorted(_points(group)))
 
 
 def load(group: str, name: str, what: str) -> Any:
-    """The object registered under `name`; `what` says to people what it is.
+    """Return the object registered under `name`; `what` describes it in errors.
 
     Raises:
         ConfigError: unknown name (with the nearest known one), or its package does not import.
@@ -37,7 +37,7 @@ def load(group: str, name: str, what: str) -> Any:
 
 
 def near_or_all(name: str, known: Iterable[str]) -> str:
-    """What helps against an unknown name: the nearest known one, or all of them."""
+    """Return a hint for an unknown name: the nearest known one, or all of them."""
     known = sorted(known)
     near = get_close_matches(name, known, n=1)
     return f"did you mean {near[0]!r}?" if near else f"installed: {', '.join(known) or 'none'}"
@@ -49,5 +49,5 @@ def _points(group: str) -> dict[str, EntryPoint]:
 
 @cache
 def _points_on(group: str, _path: tuple[str, ...]) -> dict[str, EntryPoint]:
-    """Reading them takes milliseconds, so they are kept as long as the path on which packages are looked for stays."""
+    """Read a group's entry points; this takes milliseconds, so they are cached until the import path changes."""
     return {point.name: point for point in entry_points(group=group)}

@@ -1,4 +1,4 @@
-"""One tree of errors. Each names the thing, the cause and the remedy, and says whether to try again."""
+"""The tree of errors; each names the object, the cause and the remedy, and says whether to try again."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class CellError(Exception):
         self.details = details
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Errors cross process borders; the default would lose the keyword arguments.
+        # Errors are sent between processes; the default would lose the keyword arguments.
         return _rebuild, (type(self), self.what, self.hint, self.details)
 
     @property
@@ -51,7 +51,7 @@ class CellError(Exception):
 
 
 def detail_lines(details: dict[str, Any]) -> list[str]:
-    """The facts of an error for a terminal, one a line; of the `faults` of a file those that the first line has not."""
+    """Return an error's details for a terminal, one per line, without the fault that the first line already has."""
     lines: list[str] = []
     for key, value in details.items():
         if key == "faults":

@@ -1,4 +1,4 @@
-"""The face of a package: the names that it gives to other rooms, each loaded when it is first used (PEP 562).
+"""Loads the public names of a package when they are first used (PEP 562).
 
 A package lists its names once as imports that only type checkers run, and once in `__all__`:
 
@@ -22,7 +22,7 @@ from typing import Any
 
 
 def load_on_first_use(package: str, file: str) -> Callable[[str], Any]:
-    """A module's `__getattr__`, which imports a name from where the `if TYPE_CHECKING:` block of `file` has it from.
+    """Return a module's `__getattr__` that imports names from the modules in the `if TYPE_CHECKING:` block of `file`.
 
     Args:
         package: `__name__` of the package.
@@ -36,14 +36,14 @@ def load_on_first_use(package: str, file: str) -> Callable[[str], Any]:
         module, original = homes[name]
         is_submodule = module == package  # `from manipulation import plausibility`, in manipulation itself
         value = import_module(f"{package}.{original}") if is_submodule else getattr(import_module(module), original)
-        setattr(sys.modules[package], name, value)  # the next use finds it without coming here
+        setattr(sys.modules[package], name, value)  # the next use does not call `__getattr__`
         return value
 
     return load
 
 
 def _homes(source: str) -> Iterator[tuple[str, tuple[str, str]]]:
-    """Name, and the module and name that it stands for, of every import under `if TYPE_CHECKING:`."""
+    """Yield each name imported under `if TYPE_CHECKING:`, with its module and its name there."""
     for block in ast.parse(source).body:
         if isinstance(block, ast.If) and isinstance(block.test, ast.Name) and block.test.id == "TYPE_CHECKING":
             for line in block.body:

@@ -1,4 +1,4 @@
-"""The tree of frames: who sits on whom, with covariance. Base is the root."""
+"""The tree of frames with the base as its root; every pose between child and parent has a covariance."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class FrameTree:
     links: Mapping[str, tuple[str, UncertainPose]]
 
     def names(self) -> tuple[str, ...]:
-        """All frames, the root first."""
+        """Names of all frames, the root first."""
         return (BASE, *self.links)
 
     def parent_of(self, name: str) -> str | None:
-        """Name of the parent; None for the root.
+        """Return the name of the parent; None for the root.
 
         Raises:
             InvalidRequest: no such frame.
@@ -38,7 +38,7 @@ class FrameTree:
         return self.links[name][0]
 
     def base_from(self, name: str) -> UncertainPose:
-        """`base_from_<name>`: the chain from the root, covariances carried along (the links are independent)."""
+        """Return `base_from_<name>`, composed from the root; the covariances are propagated as if links are independent."""
         chain: list[UncertainPose] = []
         while (parent := self.parent_of(name)) is not None:
             chain.append(self.links[name][1])
@@ -49,16 +49,16 @@ class FrameTree:
         return pose
 
     def pose(self, parent: str, child: str) -> UncertainPose:
-        """`<parent>_from_<child>` for any two frames. Links that both share count twice."""
+        """Return `<parent>_from_<child>` for any two frames; the covariance of links that both share counts twice."""
         if parent == BASE:
             return self.base_from(child)
         return compose(self.base_from(parent).inverse(), self.base_from(child))
 
     def with_frame(self, name: str, parent: str, parent_from_child: UncertainPose) -> FrameTree:
-        """The same tree with one frame added or moved.
+        """Return the same tree with one frame added or moved.
 
         Raises:
-            InvalidRequest: unknown parent, or the frame would hang on itself.
+            InvalidRequest: the parent is unknown, or the frame would be its own ancestor.
         """
         ancestor: str | None = parent
         while ancestor is not None:
@@ -69,10 +69,10 @@ class FrameTree:
 
 
 def frame_tree(cell: Cell, base_from_flange: RigidTransform) -> FrameTree:
-    """The frames of a cell: base, flange, and every mounted device.
+    """Return the frames of a cell: base, flange and every mounted device.
 
     Raises:
-        ConfigError: a mount hangs on a frame that does not exist.
+        ConfigError: a mount refers to a frame that does not exist.
     """
     tree = FrameTree(links={FLANGE: (BASE, certain(base_from_flange))})
     waiting = {name: device for name, device in cell.file.devices.items() if device.mount is not None}

@@ -1,6 +1,6 @@
-"""Objects of another process behind proxies with the same methods.
+"""Gives access to objects of another process through proxies with the same methods.
 
-The service reaches the cell's devices this way, and `hal.host_process` those of a child: a server with one thread a
+The service uses it for the cell's devices, and `hal.host_process` for those of a child: a server with one thread per
 connection, one call at a time.
 """
 
@@ -22,7 +22,7 @@ from hal.channel import Channel
 from hal.clock import Clock, Deadline, WallClock
 from hal.errors import CellError, DeviceTimeout, DeviceUnavailable
 
-ANSWER_MARGIN_S = 0.5  # what an answer may take beyond the deadline that went with the call
+ANSWER_MARGIN_S = 0.5  # extra time for an answer after the deadline of the call
 CONNECT_TIMEOUT_S = 20.0
 SUPERVISED = "the supervisor restarts it; see `panelwright doctor` and the log"
 
@@ -33,8 +33,8 @@ class HostServer:
     Args:
         objects: by name; their public methods can be called and their plain public attributes read.
         address: path of a Unix socket.
-        authkey: both sides must know it.
-        clock: whose time deadlines count in on this side.
+        authkey: secret that both sides must know.
+        clock: the clock of deadlines on this side.
     """
 
     def __init__(self, objects: Mapping[str, object], address: str, authkey: bytes, clock: Clock) -> None:
@@ -57,7 +57,7 @@ class HostServer:
             return
         self._is_closed.set()
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as bell:
-            bell.connect(self.address)  # wakes `accept`; a `Client` would wait for ever for one that has ended
+            bell.connect(self.address)  # wakes `accept`; a `Client` would wait for ever if the thread has ended
         self._thread.join(timeout=1.0)
         self._listener.close()
         for connection in list(self._connections):
@@ -81,23 +81,23 @@ class HostServer:
                 method, args, kwargs = channel.receive()
                 _send(channel, _answer(target, method, args, kwargs))
         except (EOFError, OSError):
-            pass  # the client went away; its calls go with it
+            pass  # the client has disconnected, so its calls end
         finally:
             self._connections.discard(connection)
             channel.close()
 
 
 def _hang_up(connection: Connection) -> None:
-    """End a connection that another thread reads from; that one sees the end and closes it.
+    """Shut down a connection that another thread reads from; that thread notices the end and closes it.
 
-    Closed under the reader, it would sleep on, and fail with a TypeError at the next byte.
+    If it were closed here, the reader would go on waiting and fail with a TypeError at the next byte.
     """
     with contextlib.suppress(OSError), socket.socket(fileno=os.dup(connection.fileno())) as end:
         end.shutdown(socket.SHUT_RDWR)
 
 
 def _describe(target: object) -> tuple[frozenset[str], dict[str, Any]]:
-    """Names of the public methods, and values of the public attributes that never change (`name`, `kind`)."""
+    """Return the names of the public methods and the values of constant public attributes (`name`, `kind`)."""
     names = [name for name in dir(target) if not name.startswith("_")]
     methods = frozenset(name for name in names if callable(getattr(target, name)))
     constants: dict[str, Any] = {name: getattr(target, name) for name in ("name", "kind") if name in names}
@@ -118,12 +118,12 @@ def _send(channel: Channel, answer: tuple[str, Any]) -> None:
         channel.send(answer)
     except (EOFError, OSError):
         raise
-    except Exception as error:  # it cannot be pickled, so nothing of it is on its way yet
+    except Exception as error:  # it cannot be pickled, so nothing was sent yet
         channel.send(("defect", f"its answer cannot leave the process: {type(error).__name__}: {error}"))
 
 
 class Proxy:
-    """Stands for an object of another process. Threads may share it; their calls queue."""
+    """A proxy for an object of another process; threads may share it, and their calls queue."""
 
     def __init__(self, address: str, authkey: bytes, name: str, clock: Clock, *, gone_hint: str = SUPERVISED) -> None:
         self._gone_hint = gone_hint
@@ -145,10 +145,10 @@ class Proxy:
         raise AttributeError(f"{self._name} has no {attribute!r}")
 
     def __dir__(self) -> list[str]:
-        return sorted({*self._methods, *self._constants})  # what a host offers to other processes
+        return sorted({*self._methods, *self._constants})  # a host serves these names to other processes
 
     def disconnect(self) -> None:
-        """Close this proxy's own connection; the far object lives on."""
+        """Close this proxy's connection; the remote object stays open."""
         with self._lock:
             self._drop()
 
@@ -200,7 +200,7 @@ class Proxy:
         except (OSError, EOFError) as error:
             self._drop()
             raise self._lost(error) from error
-        except BaseException:  # late, or interrupted by Ctrl-C: what comes yet must never be taken for the next answer
+        except BaseException:  # late, or Ctrl-C: a late answer must not be taken for the next one
             self._drop()
             raise
         return outcome, value
@@ -239,16 +239,16 @@ def serve(
 def connect(
     address: str, authkey: bytes | None, name: str, *, clock: Clock | None = None, gone_hint: str = SUPERVISED
 ) -> Any:
-    """A proxy for the object called `name` behind `address`; `gone_hint` says what helps when its process has died.
+    """Return a proxy for the object `name` at `address`; `gone_hint` is the remedy when its process has died.
 
     Raises:
-        DeviceUnavailable: nobody serves there, or has no such object.
+        DeviceUnavailable: nothing serves there, or there is no such object.
     """
     return Proxy(address, authkey or _inherited_key(), name, clock or WallClock(), gone_hint=gone_hint)
 
 
 def new_address() -> str:
-    """A fresh path for a Unix socket in a folder that only this user can enter."""
+    """Return a new path for a Unix socket in a folder that only this user can access."""
     return str(Path(tempfile.mkdtemp(prefix="panelwright-")) / f"{secrets.token_hex(4)}.sock")
 
 

@@ -1,4 +1,4 @@
-"""Child processes that hold objects; `hal.isolated` keeps a device in one."""
+"""Runs child processes that serve objects; `hal.isolated` keeps a device in one."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from typing import Any
 from hal.errors import CellError, DeviceTimeout, DeviceUnavailable
 from hal.host import CONNECT_TIMEOUT_S, connect, new_address, serve
 
-LOOK_S = 0.1  # a start that is given up is noticed within this
-EXIT = "exit"  # detail of an error about a process that died: how it did
+LOOK_S = 0.1  # a request to end the start is noticed within this time
+EXIT = "exit"  # key of the error detail that says how a process died
 
 
 class HostProcess:
-    """A child process that makes objects and serves them; ends with its parent, however that ends.
+    """A child process that makes objects and serves them; it ends with its parent, even if that is killed.
 
     Args:
         make: importable function that makes the objects in the child; raises CellError when it cannot.
@@ -59,7 +59,7 @@ class HostProcess:
         return self._process.pid
 
     def is_alive(self) -> bool:
-        """Does the child run?"""
+        """Whether the child is running."""
         return self._process.is_alive()
 
     def await_end(self) -> str:
@@ -69,7 +69,7 @@ class HostProcess:
         return self._how_it_ended()
 
     def proxy(self, name: str) -> Any:
-        """A proxy for the child's object called `name`."""
+        """Return a proxy for the child's object called `name`."""
         return connect(self.address, None, name)
 
     def close(self) -> None:
@@ -96,7 +96,7 @@ class HostProcess:
             raise error
 
     def _first_word(self, name: str, give_up: threading.Event) -> CellError | None:
-        """What the child says once it is ready, or the error that it could not be."""
+        """Wait until the child is ready; returns the error with which it failed, or None."""
         until_s = time.monotonic() + CONNECT_TIMEOUT_S
         while not self._lifeline.poll(LOOK_S):
             if give_up.is_set():
@@ -115,7 +115,7 @@ class HostProcess:
 def _run_host(
     make: Callable[..., Mapping[str, object]], args: tuple[Any, ...], address: str, lifeline: Connection
 ) -> None:
-    faulthandler.enable()  # a crash inside a vendor's library then says in the log which call it was
+    faulthandler.enable()  # a crash inside a vendor's library then logs the call
     try:
         objects = make(*args)
         server = serve(objects, address)
@@ -129,6 +129,6 @@ def _run_host(
     for panel_object in objects.values():
         close = getattr(panel_object, "close", None)
         if close is not None:
-            with contextlib.suppress(Exception):  # the process ends anyway, and every object gets its turn
+            with contextlib.suppress(Exception):  # close the others even if this one fails
                 close()
-    os._exit(0)  # a driver's stuck thread must not keep the process
+    os._exit(0)  # a driver's stuck thread must not keep the process alive

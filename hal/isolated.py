@@ -1,4 +1,4 @@
-"""A device in a process of its own (`isolate = true`), which is started again when its driver crashes."""
+"""Runs a device in its own process (`isolate = true`) and starts it again when its driver crashes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CLEAR_THE_HAND = "when nothing is between the jaws connect it again: PUT /v1/dev
 log = logging.getLogger(__name__)
 
 Report = Callable[[str, dict[str, Any]], None]
-"""Called with each thing worth recording: a kind and plain data."""
+"""Called for each event to record, with its kind and plain data."""
 
 
 class IsolatedDevice:
@@ -68,7 +68,7 @@ class IsolatedDevice:
         self._crashes_s: list[float] = []
         self._restarts = 0
         self._process = self._begin()
-        self._constants = self._proxy()  # knows the names also while the process is down
+        self._constants = self._proxy()  # keeps the names while the process is down
         self._watcher = threading.Thread(target=self._watch, name=f"watch-{self._name}", daemon=True)
         self._watcher.start()
 
@@ -82,7 +82,7 @@ class IsolatedDevice:
         return dir(self._constants)
 
     def health(self) -> Health:
-        """State of the device, or of its driver while that is down; returns at once."""
+        """Return the state of the device, or of its driver while that is down; returns at once."""
         try:
             health: Health = self._call("health")
         except DeviceUnavailable as gone:
@@ -94,7 +94,7 @@ class IsolatedDevice:
         """Close the device and end its process; a second call does nothing."""
         self._is_closed.set()
         self._process.close()
-        self._watcher.join()  # a start that is under way is given up
+        self._watcher.join()  # ends a restart that is in progress
         self._process.close()
         self._down = (f"{self._name} is closed", "connect it again")
 
@@ -105,7 +105,7 @@ class IsolatedDevice:
         return getattr(self._proxy(), method)(*args, **kwargs)
 
     def _proxy(self) -> Any:
-        """A connection of the calling thread's own, so that one slow read delays nobody else, `health` least of all."""
+        """Return the calling thread's own connection, so that a slow read does not delay other threads or `health`."""
         process = self._process
         if getattr(self._mine, "process", None) is not process:
             self._mine.proxy = connect(process.address, None, self._name, gone_hint=SOON)
@@ -122,7 +122,7 @@ class IsolatedDevice:
                 return
 
     def _comes_back(self, how: str) -> bool:
-        """Bury the process and start another one; False when it is not to be."""
+        """Clean up after the process and start another one; returns False when it must stay down."""
         crashed = f"the driver of {self._name}, {self._driver}, has crashed ({how})"
         log.error("%s", crashed)
         self._report("driver-down", {"device": self._name, "driver": self._driver, "exit": how})

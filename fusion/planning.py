@@ -115,8 +115,9 @@ class TouchPlan:
         base_from_panel: the pose believed.
         budget: of all observations so far.
         tolerance: how well the pose is wanted.
-        spots_m: (N, 2) places left, panel frame.
+        spots_m: (N, 2) places left, panel frame, those that are farthest apart first.
         offers: what a touch at each of them would tell.
+        places: how many of the first ones may be chosen; the others replace those that cannot be touched.
         tip_m: (2,) where the fingertips are, panel frame.
         speed_m_per_s: of the tips on the way.
     """
@@ -126,6 +127,7 @@ class TouchPlan:
     tolerance: PoseTolerance
     spots_m: Array
     offers: tuple[ErrorBudget, ...]
+    places: int
     tip_m: Array
     speed_m_per_s: float
 
@@ -136,12 +138,13 @@ class TouchPlan:
 
     def choice(self) -> SensingChoice | None:
         """Return the place to touch next, or None when no place is left."""
-        if not self.offers:
+        offers, spots_m = self.offers[: self.places], self.spots_m[: self.places]
+        if not offers:
             return None
-        ways_m = np.linalg.norm(self.spots_m - self.tip_m, axis=1)
+        ways_m = np.linalg.norm(spots_m - self.tip_m, axis=1)
         candidates = [
             CandidateSensing(budget=offer, cost_s=TOUCH_S + float(way_m) / self.speed_m_per_s)
-            for offer, way_m in zip(self.offers, ways_m, strict=True)
+            for offer, way_m in zip(offers, ways_m, strict=True)
         ]
         return next_measurement(self.budget, self.base_from_panel, candidates, tolerance=self.tolerance)
 
@@ -152,7 +155,8 @@ class TouchPlan:
 
     def after(self, index: int, told: ErrorBudget) -> Self:
         """Return the plan after a place was touched and its readings told so much."""
-        return replace(self.without(index), budget=self.budget.plus(told), tip_m=self.spots_m[index])
+        budget, tip_m = self.budget.plus(told), self.spots_m[index]
+        return replace(self.without(index), budget=budget, places=self.places - 1, tip_m=tip_m)
 
     def reason_to_stop(self, choice: SensingChoice | None) -> str:
         """Why no further place needs to be touched; empty when one does."""

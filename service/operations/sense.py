@@ -42,7 +42,7 @@ HOVER_M = 0.05  # of the fingertips above the plate while the proximity sensors 
 HOVER_SAMPLES = 5
 LEAST_TOUCHES = 3
 REST_S = 0.02  # two readings of a proximity sensor
-SPARE_SPOTS = 2  # more places than touches: to choose from, and to replace those that the arm cannot reach
+SPARE_SPOTS = 2  # more places than touches, to replace those that the arm cannot reach
 TOUCH_SIGMA_M = 0.0003  # what `touch_probe` states
 
 
@@ -191,6 +191,7 @@ def touch_plan(session: Session, touches: int, known: Sequence[Observation], tol
         tolerance=tolerance,
         spots_m=spots_m,
         offers=tuple(error_budget(each, mounts_of(session, each), base_from_panel) for each in expected),
+        places=touches,
         tip_m=_fingers_over_panel(session),
         speed_m_per_s=session.cell.file.safety.speed_limit_m_per_s,
     )

@@ -35,6 +35,7 @@ def plan(**changes: Any) -> TouchPlan:
         tolerance=PoseTolerance(position_m=1e-4, angle_rad=3e-4),
         spots_m=SPOTS_M,
         offers=tuple(touch_at(spot) for spot in SPOTS_M),
+        places=4,
         tip_m=np.zeros(2),
         speed_m_per_s=0.25,
     )
@@ -101,6 +102,7 @@ def test_a_place_out_of_reach_is_replaced(monkeypatch: pytest.MonkeyPatch) -> No
     felt = follow(monkeypatch, Toucher(Unreachable("no way to it", hint="another place")), plan())
     assert len(felt.account.touches) == len(felt.observations) == 4
     assert "no way to it" in felt.account.skipped[0]
+    assert list(SPOTS_M[4]) in [touch.spot_m for touch in felt.account.touches], "the first spare place stands in"
 
 
 def test_too_few_places_say_why(monkeypatch: pytest.MonkeyPatch) -> None:

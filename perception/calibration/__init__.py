@@ -1,6 +1,6 @@
-"""Where camera and scanner sit, what the lens does and what the tool weighs, found from the cell's own views.
+"""Calibration of camera mount, scanner mount, lens and tool load from the cell's own measurements.
 
-The module `calibration_poses` says where to measure from.
+The module `calibration_poses` proposes the poses to measure from.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Calibration boards: what they look like and where their points are in an image."""
+"""Calibration boards: their appearance and the positions of their points in an image."""
 
 from __future__ import annotations
 

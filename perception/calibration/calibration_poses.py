@@ -1,4 +1,4 @@
-"""Where to measure from when a sensor on the hand is calibrated: the poses that tell most."""
+"""Selection of the most informative poses for calibrating a sensor on the hand."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def in_view(
     flange: RigidTransform, flange_from_camera: RigidTransform, base_from_points: RigidTransform, points_m: Array,
     lens: CameraIntrinsics,
 ) -> bool:  # fmt: skip
-    """Are all points in the image, clear of its edge?"""
+    """Whether all points are in the image, clear of its edge."""
     seen = ((flange * flange_from_camera).inv() * base_from_points).apply(points_m)
     if (seen[:, 2] < 0.1).any():
         return False
@@ -54,13 +54,13 @@ def in_view(
 
 
 def plate_view(target: RigidTransform) -> Array:
-    """What a scan of the plate is worth: its height and tilts only."""
+    """Information of a scan of the plate: it constrains height and tilts only."""
     turn = np.kron(np.eye(2), matrix_of(target))
     return np.asarray(turn @ np.diag(np.square(PLATE_SIGMA)) @ turn.T)
 
 
 def by_plate(flange_from_sensor: RigidTransform, base_from_plate: RigidTransform) -> Propose:
-    """Chooses what tells most of a sensor that sees a plate."""
+    """Return a function that proposes the most informative pose for a sensor that sees a plate."""
 
     def propose(done: Sequence[RigidTransform], candidates: Sequence[RigidTransform]) -> int:
         views = [

@@ -24,7 +24,7 @@ class CubicLens:
     Attributes:
         coefficients: (10, 2), one column per axis, over the monomials of `cubic_monomials`.
         centre_px, scale_px: the monomials are taken of `(pixel - centre_px) / scale_px`, for conditioning.
-        bias_px: root mean square of what the cubic cannot follow over the frame. It is bias: data do not shrink it.
+        bias_px: root mean square model error of the cubic over the frame; more data do not reduce this bias.
     """
 
     coefficients: Array

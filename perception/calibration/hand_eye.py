@@ -1,8 +1,8 @@
-"""Where the camera sits in the hand, and the target in the world, from views of one target: A_i X B_i = Z.
+"""Hand-eye calibration of the camera mount and the target's pose from views of one target: A_i X B_i = Z.
 
 A_i = base_from_flange, X = flange_from_camera, B_i = camera_from_target, Z = base_from_target. The closed form of the
-rotations starts a maximum-likelihood fit of X and Z together, weighted by the covariance of every B_i (and of the arm).
-Covariances are over translation then rotation in the parent's axes, as everywhere.
+rotations initialises a maximum-likelihood fit of X and Z together, weighted by the covariance of every B_i (and of the
+arm). Covariances are over translation then rotation in the parent's axes.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def check_turns(views: Sequence[HandEyeView]) -> None:
 
 
 def _axis_spread(flanges: Sequence[RigidTransform]) -> tuple[float, Array]:
-    """How far the turns' axes differ (mean sin^2 in the second direction, 0..0.5) and their main axis, flange frame."""
+    """Spread of the turns' axes (mean sin^2 in the second direction, 0..0.5) and their main axis, flange frame."""
     R = np.array([matrix_of(flange) for flange in flanges])
     turns, _ = _relative_turns(R)
     angles = np.linalg.norm(turns, axis=1)
@@ -135,7 +135,7 @@ def _relative_turns(R: Array) -> tuple[Array, Array]:
 
 
 def _closed_form(stack: _Stack) -> tuple[RigidTransform, RigidTransform]:
-    """Park and Martin: rotation vectors of A_ij and B_ij are turned onto each other; the translations are linear."""
+    """Closed form (Park and Martin): align the rotation vectors of A_ij and B_ij, then solve linearly for the translations."""
     turns_a, pairs = _relative_turns(stack.Ra)
     turns_b, _ = _relative_turns(stack.Rb.swapaxes(1, 2))
     rx = Rotation.align_vectors(turns_a, turns_b)[0]
@@ -174,7 +174,7 @@ class _Stack:
 
 
 def _residuals(stack: _Stack, x: RigidTransform, z: RigidTransform) -> Array:
-    """(N, 6) translation and rotation by which A X B misses Z, base axes."""
+    """(N, 6) residuals: translation and rotation between A X B and Z, base axes."""
     Rx, Rz = matrix_of(x), matrix_of(z)
     shift = np.einsum("nij,nj->ni", stack.Ra, stack.tb @ Rx.T + x.translation) + stack.ta - z.translation
     turn = Rotation.from_matrix(stack.Ra @ Rx @ stack.Rb @ Rz.T).as_rotvec()
@@ -252,13 +252,13 @@ def propose_next(
     done: Sequence[HandEyeView], result: tuple[RigidTransform, RigidTransform], candidates: Sequence[RigidTransform],
     *, view_covariance: Callable[[RigidTransform], Array], arm_sigma_m: float = 1e-4, arm_sigma_rad: float = 1e-4,
 ) -> tuple[int, float]:  # fmt: skip
-    """Which flange pose to go to next: the one that shrinks the covariance of X most.
+    """Choose the flange pose to go to next: the one that reduces the covariance of X most.
 
     Args:
         done: the stations so far (one or more).
-        result: X and Z as far as known (nominal values will do).
+        result: X and Z as far as known (nominal values suffice).
         candidates: base_from_flange poses from which the target is in view.
-        view_covariance: the 6x6 covariance that a view of a camera_from_target is expected to have.
+        view_covariance: the expected 6x6 covariance of a view's camera_from_target.
 
     Returns: index into `candidates`, and log det of X's covariance after it (lower is better).
 

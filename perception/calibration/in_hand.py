@@ -1,10 +1,10 @@
-"""Camera on the hand, from known points seen from many poses of the arm: mount, target and lens in one fit.
+"""Joint calibration of a camera on the hand from known points seen from many poses: mount, target and lens in one fit.
 
 Pixel: u = lens((A X)^-1 Z (p + e)) + s with A = base_from_flange, X = flange_from_camera, Z = base_from_target. X, Z,
-the lens, the errors e of the points and two numbers of s (`InHandState.offset`) are estimated together; what is known
-beforehand of lens, e and s (one sigma each) enters as measurements, and the arm's own repeatability is marginalised
-into the noise of every view. So the covariance of X tells all of it. Covariances are over translation then rotation in
-the parent's axes.
+the lens, the errors e of the points and two parameters of s (`InHandState.offset`) are estimated together. Prior
+knowledge of lens, e and s (one sigma each) enters as measurements, and the arm's own repeatability is marginalised into
+the noise of every view, so the covariance of X includes all these contributions. Covariances are over translation then
+rotation in the parent's axes.
 """
 
 from __future__ import annotations
@@ -65,14 +65,14 @@ class InHandState:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Beforehand:
-    """One sigma of what is known before any view, and of the arm.
+    """Standard deviations of the prior knowledge, and of the arm.
 
     Attributes:
         focal_ratio, centre_px, k1: of the lens.
         point_m: of each coordinate of the target's points.
         disc_m: radius of a flat disc that a point is the middle of; 0 for a corner or a cross. Not a sigma.
-        offset: of both numbers of `InHandState.offset`.
-        arm_m, arm_rad: repeatability of the arm, drawn anew at every station.
+        offset: of both parameters of `InHandState.offset`.
+        arm_m, arm_rad: repeatability of the arm, independent at every station.
     """
 
     focal_ratio: float
@@ -198,7 +198,7 @@ def propose_view(
 def _information(
     flange: RigidTransform, points_m: Array, state: InHandState, known: Beforehand, sigma_px: float
 ) -> Array:
-    """What one view tells of the state's step."""
+    """Information matrix that one view contributes to the state's step."""
     nothing = np.zeros((len(points_m), 2))
     covariance = np.tile(sigma_px**2 * np.eye(2), (len(points_m), 1, 1))
     view = InHandView(base_from_flange=flange, pixels_px=nothing, covariance_px=covariance)
@@ -241,7 +241,7 @@ def _fit(
 
 
 def _priors(lens: CameraIntrinsics, known: Beforehand, count: int) -> Array:
-    """One sigma of the lens, of the points' coordinates and of their offset, as they stand in the state's step."""
+    """Standard deviations of the lens, of the points' coordinates and of their offset, in the order of the state's step."""
     of_lens = [
         known.focal_ratio * lens.fx_px,
         known.focal_ratio * lens.fy_px,
@@ -265,7 +265,7 @@ def _moved(state: InHandState, step: Array) -> InHandState:
 
 
 def _residual(view: InHandView, points_m: Array, state: InHandState, disc_m: float) -> tuple[Array, Array]:
-    """(2N,) pixels that the state predicts less the measured ones, and their derivatives by the state's step."""
+    """(2N,) residuals, predicted minus measured pixels, and their derivatives with respect to the state's step."""
     Rx, Rz = matrix_of(state.flange_from_camera), matrix_of(state.base_from_target)
     Ra = matrix_of(view.base_from_flange)
     turned = (points_m + state.point_errors_m) @ Rz.T
@@ -292,7 +292,7 @@ def _residual(view: InHandView, points_m: Array, state: InHandState, disc_m: flo
 
 
 def _noise(view: InHandView, points_m: Array, state: InHandState, known: Beforehand) -> Array:
-    """(2N, 2N) covariance of a view's residuals: of the pixels, and what the arm's repeatability does to all of them."""
+    """(2N, 2N) covariance of a view's residuals: noise of the pixels, and the common effect of the arm's repeatability."""
     Rx, Rz = matrix_of(state.flange_from_camera), matrix_of(state.base_from_target)
     Ra = matrix_of(view.base_from_flange)
     world = (points_m + state.point_errors_m) @ Rz.T + state.base_from_target.translation

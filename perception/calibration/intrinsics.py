@@ -110,7 +110,7 @@ def calibrate_camera(
 
 
 def _cleaned(view: BoardView, pose: RigidTransform, intrinsics: CameraIntrinsics) -> BoardView:
-    """The view without points that lie far from where the others want them, and with the middles of its discs."""
+    """The view without outlying points, and with the true middles of its discs."""
     errors_px = np.linalg.norm(view.pixels_px - project(pose.apply(view.points_m), intrinsics), axis=1)
     near = errors_px <= STRAY * max(view.sigma_px, float(np.median(errors_px)))
     if near.sum() < FEWEST_POINTS:
@@ -218,7 +218,7 @@ def with_parameters(intrinsics: CameraIntrinsics, values: Array) -> CameraIntrin
 
 
 def lens_jacobian(normalised: Array, intrinsics: CameraIntrinsics) -> Array:
-    """(N, 2, 9) derivatives of the pixels of (N, 2) undistorted normalised points by `NAMES`."""
+    """(N, 2, 9) derivatives of the pixels of (N, 2) undistorted normalised points with respect to `NAMES`."""
     x, y = normalised.T
     r2 = x * x + y * y
     d = distort(normalised, intrinsics)
@@ -235,7 +235,7 @@ def lens_jacobian(normalised: Array, intrinsics: CameraIntrinsics) -> Array:
 
 
 def _projection(view: BoardView, pose: RigidTransform, intrinsics: CameraIntrinsics) -> tuple[Array, Array, Array]:
-    """Pixels (N, 2), and derivatives (2N, 9) by the intrinsics and (2N, 6) by the pose."""
+    """Pixels (N, 2), and derivatives (2N, 9) with respect to the intrinsics and (2N, 6) to the pose."""
     turned = view.points_m @ matrix_of(pose).T
     q = turned + pose.translation
     z = np.maximum(q[:, 2], 1e-6)

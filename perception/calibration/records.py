@@ -15,7 +15,7 @@ from perception.calibration.wrench import WrenchCalibration
 
 
 def mount_of(parent_from_device: UncertainPose) -> MountRecord:
-    """Position, fixed-axis roll pitch yaw, one sigma an axis and how the axes' errors go together."""
+    """Position, fixed-axis roll pitch yaw, one sigma per axis and the correlations of the axes' errors."""
     pose, covariance = parent_from_device.parent_from_child, parent_from_device.covariance
     sigma = np.sqrt(np.diag(covariance))
     correlations = (covariance / np.outer(sigma, sigma))[np.tril_indices(6, -1)] if np.all(sigma > 0) else np.empty(0)
@@ -62,7 +62,7 @@ def record_of(
 
 
 def renewed(current: CalibrationRecord, found: CalibrationRecord) -> CalibrationRecord:
-    """What was found, over what the present record says of the rest; one version further."""
+    """The present record updated with the new results, with its version incremented."""
     parts = {name: getattr(found, name) for name in ("mount", "intrinsics", "load")}
     update = {name: part for name, part in parts.items() if part is not None}
     about = {"date": found.date, "method": found.method, "quality": found.quality, "version": current.version + 1}

@@ -1,6 +1,6 @@
-"""Where the range scanner sits in the hand: its points on one flat plate, from several poses, must lie in one plane.
+"""Calibration of the range scanner's mount: its points on one flat plate, seen from several poses, must be coplanar.
 
-Works for a scanner that sweeps a line and for one that gives an image: only points are used.
+It works for line scanners and for range cameras, because only points are used.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class _Scan:
         return self.rows(state, index, plate)[0]
 
     def within(self, sigmas: float, state: State, index: int, plate: UncertainPose) -> _Scan:
-        """The scan without what is no part of the plate."""
+        """The scan without points that do not belong to the plate."""
         near = np.abs(self.heights(state, index, plate)) < sigmas * self.sigma_m
         if near.sum() < LEAST_POINTS:
             return self
@@ -167,7 +167,7 @@ def _checked(index: int, view: ScannerView) -> Array:
 
 
 def _across(view: ScannerView, points: Array, R: Array, normal: Array) -> Array:
-    """(N,) noise of the points across the plate: along the ray it is sigma, across it sigma times the cosine."""
+    """(N,) standard deviation of the points normal to the plate: that along the ray times the cosine of incidence."""
     world = points @ (matrix_of(view.base_from_flange) @ R).T
     cosine = np.abs(world @ normal) / np.maximum(np.linalg.norm(points, axis=1), 1e-9)
     return np.asarray(view.sigma_m * np.maximum(cosine, 0.1))

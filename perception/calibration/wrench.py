@@ -1,4 +1,4 @@
-"""Force/torque bias and tool weight from readings in several poses of the hand, nothing touched."""
+"""Force/torque bias and tool weight from readings without contact in several poses of the hand."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def calibrate_wrench(
 
 
 def unload(wrench: ArrayLike, base_from_sensor: ArrayLike, load: ToolLoad) -> Array:
-    """(6,) what the world does to the tool: the reading without bias and weight."""
+    """(6,) external wrench on the tool: the reading without bias and weight."""
     g = np.asarray(base_from_sensor, float).T @ np.array([0.0, 0.0, -GRAVITY_M_PER_S2])
     weight = load.mass_kg * g
     own = np.concatenate([weight, np.cross(load.centre_of_mass_m, weight)]) + load.bias

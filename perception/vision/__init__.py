@@ -1,6 +1,6 @@
-"""Images to facts: the panel's lights and pose, its objects and what they show (paper II).
+"""Vision: the panel's lights and pose, its objects, and their states, from images (paper II).
 
-The module `viewpoints` says where to look from, and `teaching` how kinds and panels are taught.
+The module `viewpoints` proposes camera poses, and `teaching` adds kinds and panels.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ def draw_outlines(
 def _draw(
     image: NDArray[Any], outlines_px: Sequence[NDArray[Any]], texts: Sequence[str], colours: Sequence[Colour]
 ) -> Image:
-    """No text covers another."""
+    """Draw outlines and texts so that no text covers another."""
     check_image(image)
     rgb = np.repeat(image[:, :, None], 3, axis=2) if image.ndim == 2 else image[:, :, :3].copy()
     picture: Image = np.ascontiguousarray(rgb)
@@ -61,7 +61,7 @@ def _draw(
 
 
 def said(reading: ObjectReading) -> str:
-    """What the object says, in a few words."""
+    """Short text of an object's reading."""
     if not reading.present:
         return "not seen"
     if reading.reason is not None:

@@ -27,7 +27,7 @@ def value_at(image: NDArray[Any], u: float, v: float) -> float:
 def polar_values(
     image: Image, centre_px: tuple[float, float], radii_px: Array, directions: Array
 ) -> NDArray[np.float32]:
-    """(radii, directions) values about a centre; `directions` is (2, N), what a pixel of radius adds to u and to v."""
+    """(radii, directions) values about a centre; `directions` is (2, N), the change of u and of v per pixel of radius."""
     out = np.empty((len(radii_px), directions.shape[1]), np.float32)
     for i in range(len(radii_px)):
         for j in range(directions.shape[1]):
@@ -39,7 +39,7 @@ def polar_values(
 
 @compiled
 def step_counts(gray: Image, every: int) -> NDArray[np.int64]:
-    """(1021,) how often every magnitude of the second difference along `every`-th row occurs."""
+    """(1021,) histogram of the second difference's magnitude along every `every`-th row."""
     counts = np.zeros(4 * 255 + 1, np.int64)
     for v in range(0, gray.shape[0], every):
         for u in range(1, gray.shape[1] - 1):

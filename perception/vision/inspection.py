@@ -1,4 +1,4 @@
-"""The taught panel: register the model to the image, check that every object is there, read each one."""
+"""Inspection of a taught panel: register the model to the image, check that every object is present, read each one."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""What the system knows of kinds of objects (files: `knowledge_files`).
+"""Taught knowledge about kinds of objects (files: `knowledge_files`).
 
-A kind has a size and looks. A look is what one taught example looked like (see `features`): four rows of numbers over the
-distance from the middle, and two tables with such a row per direction. The kind `nothing` holds looks of what is *not* an
-object: screws, labels, parts of objects. Adding a look to one kind changes no other kind's looks.
+A kind has a size and looks. A look is the feature vector of one taught example (see `features`): four rows of numbers
+over the distance from the middle, and two tables with such a row per direction. The kind `nothing` holds looks of what
+is *not* an object: screws, labels, parts of objects. Adding a look to one kind changes no other kind's looks.
 
-Some looks are of noisy images, as a camera takes them in bad light, and only noisy images are compared with these: there a
-blurred, half shaded thing is worth knowing, and in a good image it would be taken for others.
+Some looks were taught from noisy images, such as a camera takes in bad light, and only noisy images are compared with
+them; in a good image, other objects would resemble these blurred, half shaded examples.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ def _at_reading_size(image: NDArray[Any]) -> tuple[Image, tuple[float, float, fl
 
 
 def _ends(gray: Image, u: float, v: float, radius: float) -> tuple[tuple[float, float], float]:
-    """Pointer angles at minimum and maximum, and the most confidence that they deserve."""
+    """Pointer angles at minimum and maximum, and the largest confidence that they justify."""
     usual = (-SCALE_END_RAD, SCALE_END_RAD)
     by_ticks = scale_ends(gray, u, v, radius)
     if by_ticks is None:
@@ -100,7 +100,7 @@ def _ends(gray: Image, u: float, v: float, radius: float) -> tuple[tuple[float, 
 
 
 def _pointer(picture: Image, u: float, v: float, radius: float) -> tuple[PointerFit, float] | None:
-    """The pointer and the most confidence that it deserves; None where nothing stands out."""
+    """The pointer and the largest confidence that it justifies; None where nothing stands out."""
     drop, by_sides = find_drop(picture, u, v, radius)
     if drop is not None:
         return drop.fit, drop.most
@@ -118,7 +118,7 @@ def _pointer(picture: Image, u: float, v: float, radius: float) -> tuple[Pointer
 
 
 def _lines(picture: Image, u: float, v: float, radius: float) -> tuple[list[PointerFit], list[PointerFit]]:
-    """What looks like a needle in lightness, and in the other channels, of either polarity."""
+    """Needle candidates in lightness, and in the other channels, of either polarity."""
     gray = as_gray(picture)
     glare = _glare(gray, u, v, radius)
     fits: list[list[PointerFit]] = []
@@ -142,7 +142,7 @@ def _lines(picture: Image, u: float, v: float, radius: float) -> tuple[list[Poin
 def _believed(in_gray: list[PointerFit], in_colour: list[PointerFit]) -> tuple[PointerFit, PointerFit | None]:
     """The pointer that is read, and the clearest other one.
 
-    Lightness is sharper than colour: where it shows the clearest pointer well, it says where that points.
+    Lightness is sharper than colour: where it shows the clearest pointer well, its direction is used.
     """
     fits = in_gray + in_colour
     best, same_rad = max(fits, key=_clearness), SAME_RAD
@@ -154,7 +154,7 @@ def _believed(in_gray: list[PointerFit], in_colour: list[PointerFit]) -> tuple[P
 
 
 def _agreement(best: PointerFit, rival: PointerFit | None) -> float:
-    """Most confidence that the channels leave: less than an answer needs where a clear one points elsewhere."""
+    """Largest confidence given the other channels: too low for an answer if a clear one points elsewhere."""
     if rival is None:
         return 1.0
     return float(1.0 / (1.0 + np.exp(-(_clearness(best) - _clearness(rival) - CLEARER_BY) / 0.3)))
@@ -190,7 +190,7 @@ def _glare(gray: Image, u: float, v: float, radius: float) -> NDArray[np.bool_] 
 
 
 def _reaches_hub(patch: Patch, angle_rad: float, radius: float) -> float:
-    """Share of the way from the hub to the numerals that looks like the pointer further out rather than like the face."""
+    """Share of the way from the hub to the numerals that resembles the outer pointer rather than the face."""
     turn = np.linspace(-np.pi, np.pi, 180)
     outer = np.linspace(NUMERALS_FROM, TIP_AT, 12) * radius
     inner = np.linspace(0.15, NUMERALS_FROM, 12) * radius

@@ -1,7 +1,7 @@
-"""A drop as a dial's pointer: a wide hub with one tip, in a colour or gray of its own.
+"""Detection of drop-shaped dial pointers: a wide hub with one tip, in a colour or gray of its own.
 
-Its outline gives its axis where nothing of its gray touches it. Numerals that do (a gray picture of a coloured pointer, a
-black pointer) are told from it by its sides: two straight edges from the hub to the tip, the same to the left and right.
+The outline gives the axis if nothing of the same gray touches it. If numerals do (a gray picture of a coloured pointer,
+a black pointer), the sides give it: two straight edges from the hub to the tip, symmetric to the left and right.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def find_drop(image: Image, u: float, v: float, radius: float) -> tuple[Drop | N
 
 
 def _agreed(fit: PointerFit, own: Sides | None, others: list[Sides]) -> Drop:
-    """The outline's axis, corrected by sides that run near it in any plane; or what its own plane's say where they contradict."""
+    """The outline's axis, corrected by nearby sides in any plane, or replaced by its own plane's sides if they contradict it."""
     clear = [sides for sides in (own, *others) if sides is not None and sides.score > SCORE[0]]
     near = [sides for sides in clear if _off(sides, fit) < NEAR_RAD]
     if near:
@@ -117,7 +117,7 @@ def _off(sides: Sides, fit: PointerFit) -> float:
 
 
 def _fit_of(sides: Sides) -> PointerFit:
-    """A pointer of which nothing else is known: how sure it is, its sides say."""
+    """A `PointerFit` of which only the direction is known; its confidence comes from the sides."""
     return PointerFit(
         angle_rad=sides.angle_rad, sigma_rad=SIDES_SIGMA_RAD, strength=20.0, contrast=20.0, rival_ratio=0.3,
         rival_rad=sides.angle_rad + np.pi, supported=1.0, shown=1.0, is_dark=True, unknown=0.0,
@@ -125,7 +125,7 @@ def _fit_of(sides: Sides) -> PointerFit:
 
 
 def _worth(sides: Sides) -> float:
-    """Confidence of what only its sides tell: never sure, since two marks beside a needle may have both."""
+    """Confidence of a direction known from its sides alone; never high, because marks on both sides of a needle look alike."""
     return MOST_BY_SIDES * probability([(sides.score, *SCORE), (sides.lead, *LEAD)])
 
 

@@ -47,7 +47,7 @@ def read_photographed_display(image: NDArray[Any], *, scene: bool, least_confide
 
 
 def _read(place: tuple[Image, bool | None, float]) -> list[tuple[float, PatchReading]]:
-    """What a window says, with the weight of its place: with and without what touches its border."""
+    """Readings of a window with and without what touches its border, each with the weight of its place."""
     window, dark, share = place
     straight = _straight(_scaled(window))
     return [
@@ -60,20 +60,21 @@ def _with_rows(
 ) -> list[tuple[float, PatchReading]]:
     """The readings of a crop, and those of rows of digits found in it.
 
-    A row may lack digits, but has no frame and no words beside it: what it says counts in full where the crop at least guesses the
-    same.
+    A row may lack digits, but has no frame and no words beside it: its reading counts in full where the crop has the
+    same text, even as a guess.
     """
     supposed = {said.text for _, answer in whole if (said := answer.guess or answer).text is not None}
     return whole + [(1.0 if answer.text in supposed else ROW * share, answer) for share, answer in rows]
 
 
 def _agreed(answers: list[tuple[float, PatchReading]], few: float = FEW) -> PatchReading:
-    """The answer that says most, less sure for every rival, in a doubtful place, and of few segments, as any bar makes a 1;
-    the likeliest refusal where nothing was read.
+    """The reading with the most weight, or the likeliest refusal if nothing was read.
+
+    Rivals, a doubtful place and few segments (any bar resembles a 1) lower its confidence.
 
     Args:
         answers: with the weight of the place where each was read.
-        few: segments that are worth 1 - 1/e.
+        few: number of segments that is worth 1 - 1/e.
     """
     weighed = [
         (share * answer.confidence * float(np.sqrt(lit_segments(answer.text))), share, answer)
@@ -122,9 +123,9 @@ def _scaled(window: Image) -> Image:
 
 
 def _straight(window: Image) -> Image:
-    """The window sheared so that its flat edges, of the digits and of the frame, are level.
+    """The window sheared so that the flat edges of the digits and of the frame are level.
 
-    The shear stands for a turn: what it leaves of that, a lean of the uprights, the reader looks for itself.
+    The shear approximates a rotation; the reader itself finds the remaining lean of the uprights.
     """
     edges = np.abs(cv2.Sobel(cv2.GaussianBlur(window, (0, 0), 1.0), cv2.CV_32F, 0, 1))
     energies = slant_energies(np.ascontiguousarray(edges.T), TURNS)

@@ -1,6 +1,6 @@
-"""Where a round gauge's scale begins and ends, by its ticks.
+"""Ends of a round gauge's scale, found by its ticks.
 
-On every ring of the face one goes from tick to tick as far as they follow one another. Ticks of one scale show on several
+On every ring of the face, ticks are followed as long as they are evenly spaced. The ticks of one scale show on several
 rings, and all of them end at the same two places; numerals, words and shadows do not.
 """
 
@@ -30,7 +30,7 @@ LEAST_RINGS, LEAST_SHARE = 2, 0.4  # that agree, and of all rings' weight
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TickRun:
-    """Ticks that follow one another on a ring: where the first and the last stand (rad, clockwise from up), how many."""
+    """A run of evenly spaced ticks on a ring: angles of the first and the last (rad, clockwise from up), and their number."""
 
     ends_rad: tuple[float, float]
     ticks: int
@@ -38,7 +38,7 @@ class TickRun:
 
     @property
     def weight(self) -> float:
-        """What its ends count."""
+        """Weight of its ends in the vote."""
         return self.ticks * float(np.log1p(self.contrast))
 
 
@@ -92,7 +92,7 @@ def _longest(profile: Array) -> TickRun | None:
 
 
 def _follow(profile: Array, step: int) -> TickRun | None:
-    """From where five ticks show best, both ways to the last one; None for a run that is none of a scale."""
+    """Follow the ticks both ways from the five clearest ones; None for a run that does not belong to a scale."""
     grid = sum(np.roll(profile, -k * step) - np.roll(profile, -k * step - step // 2) for k in range(-2, 3))
     start, contrast = _tick(profile, int(np.argmax(grid)), step)
     contrasts, ends, most_missing = [contrast], [], max(1, HIDDEN_SAMPLES // step)
@@ -113,7 +113,7 @@ def _follow(profile: Array, step: int) -> TickRun | None:
 
 
 def _tick(profile: Array, near: int, step: int) -> tuple[int, float]:
-    """Where the tick near a place is, and how far it stands out of the gaps beside it."""
+    """Position of the tick near a place, and its contrast against the gaps beside it."""
     reach = max(1, int(SEARCHED * step))
     places = np.arange(near - reach, near + reach + 1)
     at = int(places[np.argmax(profile[places % SAMPLES])])
@@ -126,10 +126,10 @@ def _weight(runs: Sequence[TickRun]) -> float:
 
 
 def _apart(run: TickRun, ends_rad: tuple[float, float]) -> float:
-    """How far that end is off which is further off."""
+    """The larger of the angular distances between the ends."""
     return max(abs(_off(one, other)) for one, other in zip(run.ends_rad, ends_rad, strict=True))
 
 
 def _off(angle_rad: float, other_rad: float) -> float:
-    """The difference, from minus half a turn to half a turn."""
+    """Angular difference, wrapped to half a turn either way."""
     return float((angle_rad - other_rad + np.pi) % (2 * np.pi) - np.pi)

@@ -1,4 +1,4 @@
-"""Where names stand in a picture: beside their objects, over no other name, and over objects only for want of room."""
+"""Placement of names in a picture: beside their objects, never over another name, over objects only if space is short."""
 
 from __future__ import annotations
 

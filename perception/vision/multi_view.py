@@ -1,4 +1,4 @@
-"""One reading from several looks at an object: what hides it from one side seldom does from another."""
+"""Merging of several views of one object: what occludes it from one side rarely does from another."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ SIGMAS = 5.0  # two values may lie so far apart
 
 
 def merge_views(looks: Sequence[ObjectReading]) -> ObjectReading:
-    """What the looks say together.
+    """Merge the readings of several views into one.
 
-    The surest answer holds unless another look contradicts it. Without an answer, numbers that each look of a display leaves
-    open are weighed together: what one allows and the others do not is out.
+    The most confident answer holds unless another view contradicts it. Without an answer, the numbers that each view of
+    a display leaves possible are weighed together; a number that one view excludes is dropped.
 
     Args:
-        looks: of one object, the straightest first; at least one.
+        looks: of one object, the most frontal first; at least one.
     """
     answers = [look for look in looks if look.answered]
     if not answers:
@@ -38,7 +38,7 @@ def merge_views(looks: Sequence[ObjectReading]) -> ObjectReading:
 
 
 def _allows(look: ObjectReading, answer: ObjectReading) -> bool:
-    """Whether what a look says can be true when `answer` is."""
+    """Whether a view's reading is compatible with `answer`."""
     if look.answered:
         if look.text is not None or look.state is not None:
             return (look.text, look.state) == (answer.text, answer.state)
@@ -51,7 +51,7 @@ def _allows(look: ObjectReading, answer: ObjectReading) -> bool:
 
 
 def _from_what_is_left(looks: Sequence[ObjectReading]) -> ObjectReading:
-    """The number that all looks of a display leave, or the refusal of the first look at which the object showed."""
+    """The number that all views of a display leave possible, or the refusal of the first view in which the object showed."""
     first = next((look for look in looks if look.present), looks[0])
     lists = [{number.text: number.probability for number in look.possible} for look in looks if look.possible]
     if len(lists) < 2:

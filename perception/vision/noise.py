@@ -1,4 +1,4 @@
-"""How much noise the pixels of a gray image have."""
+"""Estimation of the pixel noise of a gray image."""
 
 from __future__ import annotations
 

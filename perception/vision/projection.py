@@ -1,4 +1,4 @@
-"""How panel points come to pixels: through a calibrated camera with a pose, or through a homography of the plate.
+"""Projection of panel points to pixels: through a calibrated camera with a pose, or through a homography of the plate.
 
 Both views can be moved by a small parameter vector with a prior, so that registration is the same for both.
 """
@@ -18,7 +18,7 @@ from hal.geometry import UncertainPose, perturbed
 
 
 class PanelProjection(Protocol):
-    """Panel points (m, panel frame, z towards the viewer) to pixels, with small uncertain motion."""
+    """Projection of panel points (m, panel frame, z towards the viewer) to pixels, with small uncertain motion."""
 
     @property
     def prior_sigma(self) -> Array:

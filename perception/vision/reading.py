@@ -1,4 +1,4 @@
-"""What an object says: value, state or text with uncertainty and confidence, or the reason why it cannot be told."""
+"""Readings: value, state or text with uncertainty and confidence, or the reason for a refusal."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Possible:
 
     @property
     def half_digit(self) -> float:
-        """Half of what the last digit counts: the number's own uncertainty."""
+        """Half a unit of the last digit: the uncertainty of the number as displayed."""
         return 0.5 * 10.0 ** -len(self.text.partition(".")[2])
 
 

@@ -1,4 +1,4 @@
-"""Where to put the camera: square in front of what it shall see, near enough to read, far enough to see all.
+"""Camera poses for viewing the panel: square in front, near enough to read, far enough to see everything.
 
 Every function gives `base_from_camera` poses, best first; the caller takes the first that its arm can reach.
 """

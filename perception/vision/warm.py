@@ -1,4 +1,4 @@
-"""Compiles, or loads from the cache, what displays and pointers are read with, so that the first is read as fast as any."""
+"""Compile, or load from the cache, the functions of displays and pointers, so that the first reading is as fast as later ones."""
 
 from __future__ import annotations
 

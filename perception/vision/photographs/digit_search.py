@@ -90,7 +90,7 @@ def _cells(gray: Image) -> Iterator[DigitCell]:
 
 
 def _ink(small: Image, is_dark: bool) -> Float32:
-    """White or black hat less the noise."""
+    """White or black hat minus the noise."""
     smooth = cv2.GaussianBlur(small, (3, 3), 0)
     operation = cv2.MORPH_BLACKHAT if is_dark else cv2.MORPH_TOPHAT
     hat = cv2.morphologyEx(smooth, operation, np.ones((KERNEL_PX, KERNEL_PX), np.uint8)).astype(np.float32)
@@ -116,7 +116,7 @@ def _cells_of_height(ink: Float32, is_dark: bool, scale: float) -> Iterator[Digi
 
 
 def _peaks(scores: Float32) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of what is good and not less than anything near."""
+    """Rows and columns of the local maxima above the threshold."""
     near = cv2.dilate(scores, np.ones((5, 5), np.uint8))
     rows, columns = np.nonzero((scores >= near) & (scores > LEAST_SHARE * PLAIN))
     return rows, columns

@@ -106,7 +106,7 @@ def normal_spread(R: Array, t: Array, C: Array, normal: Array) -> tuple[float, f
 
 @inlined
 def opposite(normal_camera: Array, best: Array, far: float) -> bool:
-    """Is this normal nearer to the mirror of the best one than to itself, and more than `far` (cosine) off it?
+    """Whether this normal is nearer to the mirror of the best one than to itself, and more than `far` (cosine) off it.
 
     Both face the camera (n . k > 0), in axes whose third is the line of sight k. The mirror of n is 2 (n.k) k - n.
     """

@@ -1,1 +1,1 @@
-"""A taught panel laid onto the image: the edges that its file promises, looked for along their normals."""
+"""Registration of a taught panel to the image: its edges are searched along their normals."""

@@ -1,4 +1,4 @@
-"""What edges every kind of object shows, whatever its state: contour points of the panel file in the panel frame."""
+"""Edges that every kind of object shows in any state: contour points of the panel file in the panel frame."""
 
 from __future__ import annotations
 

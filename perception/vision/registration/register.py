@@ -1,7 +1,7 @@
-"""Panel model to image: every model edge looks along its normal for an image edge, and the view follows them all.
+"""Registration of the panel model to the image: image edges are searched along the normals of the model's edges.
 
 The scheme is that of C. Harris and C. Stennett, RAPID, BMVC 1990, with a shrinking search window, a prior from the
-known pose, and Cauchy weights (Huber, Robust Statistics, 1981) so that labels, shadows and cables do not pull.
+known pose, and Cauchy weights (Huber, Robust Statistics, 1981) that limit the influence of labels, shadows and cables.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def _look(
 
 
 def _ahead(view: PanelProjection, edges: Outline) -> Array:
-    """(N, 2) what a step along every normal is in the image, px."""
+    """(N, 2) displacement in the image, px, for a step along every normal."""
     step = NORMAL_STEP_M * np.column_stack([edges.normals, np.zeros(len(edges.normals))])
     return view.project(edges.points_m + step) - view.project(edges.points_m)
 
@@ -178,7 +178,7 @@ def _step(
 
 
 def _motion(reference: PanelProjection, delta: Array, points_m: Array) -> Array:
-    """(N, 2, P) what the projected points do per unit of every motion parameter, by differences."""
+    """(N, 2, P) derivatives of the projected points with respect to every motion parameter, by differences."""
     base = reference.moved(delta).project(points_m)
     out = np.empty((len(points_m), 2, len(delta)))
     for k, sigma in enumerate(reference.prior_sigma):

@@ -1,4 +1,4 @@
-"""Which of many examples are worth keeping: those that the ones kept so far do not tell.
+"""Selection of the taught examples worth keeping: those that the examples kept so far would misclassify.
 
 P. E. Hart, the condensed nearest neighbour rule, IEEE Trans. Inf. Theory 14(3), 1968, with a margin.
 """

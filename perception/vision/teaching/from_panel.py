@@ -1,8 +1,9 @@
-"""A known panel teaches its own looks: its file and a view of it say what is where, so nobody has to click.
+"""Teaching of looks from a known panel: its file and a view of it determine where every object is, without clicks.
 
-Every object that is there teaches one look, at the sub-object nearest to its middle, which is where blind recognition will
-look. Where none lies at the middle, as with a lever, the look says how the middle lies from the sub-object: the paper's
-relations. Sub-objects that belong to no object teach what is none. Only looks that others do not tell are kept (`condense`).
+Every object that is present teaches one look, at the sub-object nearest to its middle, where blind recognition will
+search. If none lies at the middle, as for a lever, the look includes the middle's offset from the sub-object: the
+paper's relations. Sub-objects that belong to no object teach the kind `nothing`. Only looks that the others do not
+imply are kept (`condense`).
 """
 
 from __future__ import annotations

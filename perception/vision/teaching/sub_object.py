@@ -1,4 +1,4 @@
-"""The outline under a click: the circle, the rectangle or the closed group of edges that a person would point at."""
+"""The outline under a click: the circle, the rectangle or the closed group of edges at which a person would point."""
 
 from __future__ import annotations
 

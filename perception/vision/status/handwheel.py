@@ -165,7 +165,7 @@ def _at(mark: NDArray[np.float32], angle: float) -> Array:
 
 
 def _mark_evidence(profile: Array, k: int) -> float:
-    """Least difference (gray levels) of spoke `k` from the others over at least two neighbouring radii."""
+    """Largest difference (gray levels) of spoke `k` from the others that holds at two neighbouring radii."""
     rest = np.delete(profile, k, axis=0)
     known = np.isfinite(rest).any(axis=0) & np.isfinite(profile[k])
     others = _median(np.where(known, rest, 0.0), axis=0)
@@ -174,7 +174,7 @@ def _mark_evidence(profile: Array, k: int) -> float:
 
 
 def _beyond(profile: Array, k: int) -> float:
-    """Least amount (gray levels) by which spoke `k` exceeds both gaps and other spokes over two or more neighbouring radii."""
+    """Largest amount (gray levels) by which spoke `k` lies outside gaps and other spokes at two neighbouring radii."""
     rest = np.nan_to_num(np.delete(profile, k, axis=0))
     over, under = profile[k] - rest.max(axis=0, initial=0.0), rest.min(axis=0, initial=0.0) - profile[k]
     beyond = np.nan_to_num(np.maximum(over, under)).clip(min=0.0)

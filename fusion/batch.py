@@ -1,4 +1,4 @@
-"""Measurements checked and laid out as arrays for the compiled loops."""
+"""Checks measurements and lays them out as arrays for the compiled loops."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from hal.geometry import UncertainPose
 
 GATE_PROBABILITY = 0.999  # a good measurement passes its gate with this probability (notes/fusion.md, "Robust")
 GATES = np.array([np.inf, *(2.0 * gammaincinv(0.5 * np.arange(1, 7), GATE_PROBABILITY))])  # quantiles of chi-square
-FAR_M = 100.0  # no panel is this far away: such a number is in millimetres
-WIDE_M = 10.0  # no sensor is this poor
-SHARP_M = 1e-9  # and none this good
+FAR_M = 100.0  # no panel is this far away, so such a number is in millimetres
+WIDE_M = 10.0  # no sensor has such a large standard deviation
+SHARP_M = 1e-9  # and none such a small one
 SHARP_RAD = 1e-9
 _DOF = np.array([[6] * 4] + [[constraints_of(c, rank) for rank in range(4)] for c in range(1, 10)])
 _FIELDS: tuple[tuple[str, tuple[int, ...]], ...] = (
@@ -37,10 +37,10 @@ class Batch(NamedTuple):
     """Measurements as arrays; symmetric matrices as (xx, xy, xz, yy, yz, zz).
 
     cls, dof: (N,) integers; m, w: (N, 3) object point and direction; mu: (N, 3); C: (N, 6) covariance; variance, axes:
-    (N, 3), (N, 3, 3) its eigenvalues, rising, and unit eigenvectors as rows; d, a1, a2: (N, 3) unit eigenvectors of M, its null
-    direction first; p: (N, 2) information of the others, 1/rad^2, 0 where rounding; tilt: (N, 3) all eigenvalues as they are
-    (a null one of 1e-4 is rounding, but it is part of f); gate: (N,) chi-square limits; prior_*: pose (3, 3), (3,),
-    whitening (6, 6) so that |W delta|^2 is chi-square.
+    (N, 3), (N, 3, 3) its eigenvalues, rising, and unit eigenvectors as rows; d, a1, a2: (N, 3) unit eigenvectors of M,
+    its null direction first; p: (N, 2) information of the other two, 1/rad^2, 0 where it is rounding error; tilt: (N,
+    3) all eigenvalues unchanged (a null one of 1e-4 is rounding error, but it is part of f); gate: (N,) chi-square
+    limits; prior_*: pose (3, 3), (3,), and whitening (6, 6) such that |W delta|^2 is chi-square.
 
     A prior pose is one more entry with cls 0 at the end.
     """
@@ -64,7 +64,7 @@ class Batch(NamedTuple):
     prior_w: Array
 
     def part(self, chosen: NDArray[Any]) -> Batch:
-        """The entries at the indices (or mask) `chosen`, with the same prior pose."""
+        """Return the entries at the indices (or mask) `chosen`, with the same prior pose."""
         return self._replace(**{k: getattr(self, k)[chosen] for k in self._fields if not k.startswith("prior")})
 
 
@@ -72,8 +72,8 @@ def pack(measurements: Sequence[Measurement], prior: UncertainPose | None = None
     """Check measurements and lay them out; the prior, if any, becomes the last entry.
 
     Raises:
-        InvalidRequest: wrong shape, NaN, zero direction, C not positive definite, M indefinite, or numbers that can only
-            be in another unit; `details` holds `index` and `reason`. Or the prior's covariance makes no sense.
+        InvalidRequest: wrong shape, NaN, zero direction, C not positive definite, M indefinite, or numbers that must be
+            in another unit; `details` holds `index` and `reason`. Or the prior's covariance is invalid.
     """
     n, extra = len(measurements), int(prior is not None)
     cls = np.array([m.cls for m in measurements] + [0] * extra, np.int64)
@@ -83,7 +83,7 @@ def pack(measurements: Sequence[Measurement], prior: UncertainPose | None = None
         C, M = (C + C.transpose(0, 2, 1)) / 2, (M + M.transpose(0, 2, 1)) / 2
     if extra:
         C[n] = np.eye(3)
-    length = np.where(_AIMLESS[cls], 1.0, np.sqrt(np.einsum("ik,ik->i", u, u)))  # a point's direction means nothing
+    length = np.where(_AIMLESS[cls], 1.0, np.sqrt(np.einsum("ik,ik->i", u, u)))  # a point has no direction
     w = np.where(_AIMLESS[cls][:, None], _UP, u / np.maximum(length, 1e-300)[:, None])
     values, vectors = np.linalg.eigh(np.concatenate([C, M]))
     columns = np.ascontiguousarray(vectors.transpose(0, 2, 1))  # eigenvectors as rows
@@ -101,16 +101,16 @@ def pack(measurements: Sequence[Measurement], prior: UncertainPose | None = None
 
 
 def _prior_arrays(prior: UncertainPose | None) -> tuple[Array, Array, Array]:
-    """Rotation, translation and whitening of a prior pose; fillers when there is none."""
+    """Return rotation, translation and whitening of a prior pose; placeholders when there is none."""
     if prior is None:
         return np.eye(3), np.zeros(3), np.zeros((6, 6))
-    # C order and writable like the arrays of the measurements: numba compiles everything anew for any other layout.
+    # C order and writable like the arrays of the measurements: numba compiles everything again for any other layout.
     pose, white = prior.parent_from_child.as_matrix(), _whitening(prior.covariance)
     return np.array(pose[:3, :3], order="C"), np.array(pose[:3, 3]), np.array(white, order="C")
 
 
 def duplicates(measurements: Sequence[Measurement]) -> dict[int, int]:
-    """Index of each measurement that repeats an earlier one number by number, and which one it repeats."""
+    """Return the index of each measurement that exactly repeats an earlier one, with the index of that one."""
     seen: dict[tuple[object, ...], int] = {}
     found: dict[int, int] = {}
     for i, m in enumerate(measurements):
@@ -128,7 +128,7 @@ def _bad(measurements: Sequence[Measurement], i: int, what: str, hint: str) -> I
 
 
 def _stacked(measurements: Sequence[Measurement], name: str, shape: tuple[int, ...], extra: int) -> Array:
-    """One field of all measurements, (N + extra, *shape); zero for the prior.
+    """Return one field of all measurements, (N + extra, *shape); zero for the prior.
 
     Raises:
         InvalidRequest: one has another shape.
@@ -148,7 +148,7 @@ def _stacked(measurements: Sequence[Measurement], name: str, shape: tuple[int, .
 
 
 def _plain(m: Array, u: Array, mu: Array, C: Array, M: Array) -> bool:
-    """Is every number finite, every place near and every matrix exactly symmetric? The rule, and quick to see."""
+    """Return whether all numbers are finite, all points near and all matrices exactly symmetric; a quick check."""
     sizes = (np.abs(m).max(initial=0.0), np.abs(mu).max(initial=0.0), np.abs(u).max(initial=0.0))
     near = sizes[0] <= FAR_M and sizes[1] <= FAR_M and sizes[2] < np.inf  # no comparison holds for NaN
     sums = np.sum(C) + np.sum(M)
@@ -156,7 +156,7 @@ def _plain(m: Array, u: Array, mu: Array, C: Array, M: Array) -> bool:
 
 
 def _check_numbers(given: Sequence[Measurement], m: Array, u: Array, mu: Array, C: Array, M: Array) -> None:
-    """Refuse what is not finite, not symmetric or not in metres."""
+    """Refuse numbers that are not finite, not symmetric or not in metres."""
     for (name, _), value in zip(_FIELDS, (m, u, mu, C, M), strict=True):
         _refuse(given, ~_each(np.isfinite(value)), f"{name} holds a number that is not finite",
                 "leave out readings that the sensor did not make")  # fmt: skip
@@ -201,11 +201,11 @@ def _sym6(S: NDArray[Any]) -> Array:
 
 
 def _whitening(covariance: Array) -> Array:
-    """W with W^T W = covariance^-1."""
+    """Return W with W^T W = covariance^-1."""
     if not np.isfinite(covariance).all():
         raise InvalidRequest("the prior pose has a covariance that is not finite", hint="leave the prior out")
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
     if values[0] < -1e-9 * max(values[5], 1e-12):
         raise InvalidRequest("the prior pose's covariance is indefinite", hint="check its order and sign")
-    # A pose known better than 1 um or 1 urad is a claim, not knowledge; it would freeze the solution.
+    # A standard deviation below 1 um or 1 urad is not realistic and would fix the solution.
     return np.asarray(vectors.T / np.sqrt(np.maximum(values, 1e-12))[:, None])

@@ -1,4 +1,4 @@
-"""What fusion refuses to answer."""
+"""Errors of fusion."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Contradiction(Ambiguous):
 
     @classmethod
     def among(cls, agreeing: int, total: int, outside: Sequence[tuple[int, str, float]]) -> Self:
-        """The error when the best set holds `agreeing` of `total`, and `outside` lists (index, label, value) of the rest."""
+        """Return the error when `agreeing` of `total` agree; `outside` lists (index, label, value) of the rest."""
         return cls(
             f"only {agreeing} of {total} measurements agree, which chance explains",
             hint="check which feature was sensed where, and the units; or add measurements",

@@ -1,4 +1,4 @@
-"""Points, lines and planes: what an object offers to a sensor, and what a sensor reports (paper section IV-B-1)."""
+"""Points, lines and planes: the features of an object, and what a sensor reports (paper section IV-B-1)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hal.errors import InvalidRequest
 
 
 class Kind(StrEnum):
-    """A feature's dimension: a point has none, a line has one, a plane has two."""
+    """Kind of a feature by its dimension: a point has none, a line has one, a plane has two."""
 
     POINT = "point"
     LINE = "line"
@@ -28,7 +28,7 @@ class Feature:
         kind: point, line or plane.
         point_m: (3,) the point itself, or any point on the line or plane, metres.
         direction: (3,) unit vector along the line or normal to the plane (either sense); without meaning for a point.
-        name: how reports call it.
+        name: its name in reports.
     """
 
     kind: Kind
@@ -38,7 +38,7 @@ class Feature:
 
 
 def unit(direction: ArrayLike, what: str = "direction") -> Array:
-    """`direction` (3,) scaled to length one.
+    """Return `direction` (3,) scaled to length one.
 
     Raises:
         InvalidRequest: not three finite numbers, or (almost) zero.
@@ -60,22 +60,22 @@ def _place(point_m: ArrayLike) -> Array:
 
 
 def point(point_m: ArrayLike, *, name: str = "") -> Feature:
-    """A point feature: a vertex, a small hole, a light. `point_m`: (3,) in the object frame."""
+    """Return a point feature: a vertex, a small hole, a light. `point_m`: (3,) in the object frame."""
     return Feature(kind=Kind.POINT, point_m=_place(point_m), direction=np.array([0.0, 0.0, 1.0]), name=name)
 
 
 def line(point_m: ArrayLike, direction: ArrayLike, *, name: str = "") -> Feature:
-    """A line feature: an edge through `point_m` (3,) along `direction` (3,), object frame."""
+    """Return a line feature: an edge through `point_m` (3,) along `direction` (3,), object frame."""
     return Feature(kind=Kind.LINE, point_m=_place(point_m), direction=unit(direction), name=name)
 
 
 def plane(point_m: ArrayLike, normal: ArrayLike, *, name: str = "") -> Feature:
-    """A plane feature: a face through `point_m` (3,) with `normal` (3,), object frame."""
+    """Return a plane feature: a face through `point_m` (3,) with `normal` (3,), object frame."""
     return Feature(kind=Kind.PLANE, point_m=_place(point_m), direction=unit(normal), name=name)
 
 
 def box_features(low_m: ArrayLike, high_m: ArrayLike, *, name: str = "box") -> tuple[Feature, ...]:
-    """The 8 vertices, 12 edges and 6 faces of an axis-aligned box from corner `low_m` to corner `high_m`, (3,) each."""
+    """Return the 8 vertices, 12 edges and 6 faces of an axis-aligned box from `low_m` to `high_m`, (3,) each."""
     low, high = _place(low_m), _place(high_m)
     middle, axes = (low + high) / 2, np.eye(3)
     found = [

@@ -1,4 +1,4 @@
-"""A sensor's report as eq 13 has it: a squared distance from every candidate feature, tied to one object feature."""
+"""A measurement (eq 13): a squared distance to every possible sensed feature, tied to one object feature."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from fusion.features import Feature, Kind
 from hal.arrays import Array
 from hal.errors import InvalidRequest
 
-NULL_RATIO = 1e-9  # an eigenvalue of M below this share of the largest one is rounding
+NULL_RATIO = 1e-9  # an eigenvalue of M below this share of the largest one is rounding error
 
 
 class SensingClass(IntEnum):
-    """What the sensor reports, then what it belongs to on the object (paper, Fig. 11)."""
+    """Class of a measurement: the kind of the sensed feature, then that of the object feature (paper, Fig. 11)."""
 
     POINT_POINT = 1
     POINT_LINE = 2
@@ -35,13 +35,13 @@ class SensingClass(IntEnum):
 
     @classmethod
     def of(cls, sensed: Kind, on_object: Kind) -> SensingClass:
-        """The class of a sensed `point`, `line` or `plane` that belongs to a feature of the object."""
+        """Return the class of a sensed `point`, `line` or `plane` that belongs to a feature of the object."""
         order = list(Kind)
         return cls(3 * order.index(sensed) + order.index(on_object) + 1)
 
     @classmethod
     def named(cls, words: str) -> SensingClass:
-        """The class with that descriptor; the inverse of `words`.
+        """Return the class with that descriptor; the inverse of `words`.
 
         Raises:
             InvalidRequest: no such class.
@@ -81,7 +81,7 @@ class Measurement:
 
     @property
     def dof(self) -> int:
-        """Degrees of freedom of the chi-square that the local pose function follows at the true pose."""
+        """Degrees of freedom of the chi-square distribution of the local pose function at the true pose."""
         values = np.linalg.eigvalsh(self.M)
         return constraints_of(self.cls, int(np.sum(values[1:] > NULL_RATIO * values[2])))
 
@@ -96,7 +96,7 @@ def measurement(
     label: str = "",
     sensor: str = "",
 ) -> Measurement:
-    """A measurement of `feature` by something that senses points, lines or planes; shapes and units as `Measurement`."""
+    """Return a measurement of `feature` by a sensor of points, lines or planes; shapes and units as `Measurement`."""
     return Measurement(
         cls=SensingClass.of(sensed, feature.kind),
         x_m=feature.point_m,
@@ -110,7 +110,10 @@ def measurement(
 
 
 def constraints_of(cls: int, rank: int) -> int:
-    """Constraints that a class makes when `rank` of the two direction errors are known (notes/fusion.md, table)."""
+    """Return the number of constraints of a class when `rank` of the two direction errors are known.
+
+    Source: notes/fusion.md, table.
+    """
     rank = min(rank, 2)
     return {1: 3, 2: 2, 3: 1, 4: rank, 5: 2 + rank, 6: 1 + max(rank - 1, 0), 7: max(rank - 1, 0), 8: rank, 9: 1 + rank}[
         cls

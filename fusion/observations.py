@@ -1,7 +1,7 @@
-"""Readings of mounted sensors, and the measurements that fusion takes of them.
+"""Readings of mounted sensors, and the measurements that fusion makes from them.
 
-An observation keeps a reading apart from the pose of its sensor, so that an error of the mounting, which all readings of
-one sensor share, can be put in afterwards (`fusion.shared_errors`).
+An observation keeps a reading apart from the pose of its sensor. So an error of the mounting, which all readings of one
+sensor share, can be added afterwards (`fusion.shared_errors`).
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ class PixelObservation:
 
     Attributes:
         sensor, base_from_flange: as `Observation`.
-        name: what the point is called.
+        name: name of the point.
         point_m: (3,) panel frame.
         pixel_px: (2,) its image, not undistorted.
-        covariance_px: (2, 2) px^2, noise, lens and the tolerance of the point's own place together.
+        covariance_px: (2, 2) px^2, of noise, lens and the tolerance of the point's own position together.
         intrinsics: the camera's calibration.
     """
 
@@ -73,7 +73,7 @@ class PixelObservation:
         return np.full(2, float(np.sqrt(np.trace(self.covariance_px) / 2.0)))
 
     def measurement(self, base_from_sensor: UncertainPose, errors: Array) -> Measurement:
-        """Return the ray through the point: line-point."""
+        """Return the ray through the point, of class line-point."""
         lens = self.intrinsics
         return sensing.pixel(
             point(self.point_m, name=self.name),
@@ -88,13 +88,13 @@ class PixelObservation:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PlaneObservation:
-    """The plate's plane, fitted to a range image.
+    """The plane of the plate, fitted to a range image.
 
     Attributes:
         sensor, base_from_flange: as `Observation`.
-        point_m, normal: (3,) middle of the fitted points and unit normal, sensor frame.
+        point_m, normal: (3,) centroid of the fitted points and unit normal, sensor frame.
         point_covariance, normal_covariance: (3, 3) of both, m^2 and rad^2.
-        systematic_offset_m, systematic_angle_rad: what the scanner's maker allows beyond noise, one sigma.
+        systematic_offset_m, systematic_angle_rad: the scanner's specified systematic errors beyond noise, one sigma.
     """
 
     sensor: str
@@ -115,7 +115,7 @@ class PlaneObservation:
         return np.array([float(np.hypot(offset, self.systematic_offset_m)), angle, angle])
 
     def measurement(self, base_from_sensor: UncertainPose, errors: Array) -> Measurement:
-        """Return the fitted plane: plane-plane."""
+        """Return the fitted plane, of class plane-plane."""
         across = np.linalg.svd(self.normal[None])[2][1:]
         turn = Rotation.from_rotvec(errors[1] * across[0] + errors[2] * across[1])
         return sensing.range_plane(
@@ -132,7 +132,7 @@ class PlaneObservation:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TouchObservation:
-    """The fingertip on the bare plate: `tip_m` (3,) in the frame of the gripper."""
+    """A contact of the fingertip with the plate: `tip_m` (3,) in the frame of the gripper."""
 
     sensor: str
     base_from_flange: RigidTransform
@@ -142,11 +142,11 @@ class TouchObservation:
 
     @property
     def sigmas(self) -> Array:
-        """(1,) along the finger, m; across it nothing is measured."""
+        """(1,) along the finger, m; nothing is measured across it."""
         return np.array([self.sigma_m])
 
     def measurement(self, base_from_sensor: UncertainPose, errors: Array) -> Measurement:
-        """Return a point of the plate: point-plane."""
+        """Return a point of the plate, of class point-plane."""
         tip = self.tip_m + np.array([0.0, 0.0, errors[0]])
         return sensing.touch(
             PLATE, base_from_sensor, sigma_m=self.sigma_m, tip_m=tip, label=self.label, sensor=self.sensor
@@ -155,7 +155,7 @@ class TouchObservation:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ProximityObservation:
-    """A distance to the bare plate along the sensor's z axis, m."""
+    """A distance to the plate along the sensor's z axis, m."""
 
     sensor: str
     base_from_flange: RigidTransform
@@ -169,7 +169,7 @@ class ProximityObservation:
         return np.array([self.sigma_m])
 
     def measurement(self, base_from_sensor: UncertainPose, errors: Array) -> Measurement:
-        """Return a point of the plate: point-plane."""
+        """Return a point of the plate, of class point-plane."""
         return sensing.proximity(
             PLATE,
             base_from_sensor,

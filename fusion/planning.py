@@ -1,8 +1,8 @@
-"""Choose what to sense next: of the sensings that could be made, the one that tells most about the pose per second.
+"""Chooses the next sensing: the possible one that reduces the uncertainty of the pose most per second.
 
-What a sensing at the believed pose will tell is known before it is made: its information depends on the geometry and not on
-the reading, and so do the errors that it shares with what was sensed before (`fusion.shared_errors`). The measure is the mean
-square error of the pose in units of what the task tolerates: 1 is "on average just tolerable".
+The information of a sensing at the estimated pose is known before it is made, because it depends on the geometry and
+not on the reading; so do the errors that it shares with earlier readings (`fusion.shared_errors`). The criterion is the
+mean square error of the pose in units of the task's tolerance: 1 is "on average just tolerable".
 
 Source: V. V. Fedorov, Theory of Optimal Experiments, Academic Press 1972, ch. 2: sequential design, A-optimality.
 """
@@ -27,7 +27,7 @@ TOUCH_S = 2.0  # hovering, approaching and leaving, without the way there
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseTolerance:
-    """How well a pose is wanted: position and angle, one standard deviation over all axes, and where on the object."""
+    """Tolerance of a pose: standard deviations of position and angle over all axes, and the point where it applies."""
 
     position_m: float = 0.001
     angle_rad: float = 0.0012  # a third of a millimetre over half the width of a panel
@@ -41,7 +41,7 @@ class PoseTolerance:
             base_from_object: the pose itself.
         """
         lever = matrix_of(base_from_object) @ np.asarray(self.at_m, float)
-        J = np.hstack([np.eye(3), -skew(lever)])  # moves the place that matters
+        J = np.hstack([np.eye(3), -skew(lever)])  # error of the point at which the tolerance applies
         at_place = float(np.trace(J @ covariance @ J.T))
         turned = float(np.trace(covariance[3:, 3:]))
         return 0.5 * (at_place / self.position_m**2 + turned / self.angle_rad**2)
@@ -52,8 +52,8 @@ class CandidateSensing:
     """A sensing that could be made.
 
     Attributes:
-        budget: what its observations would tell, with the errors that they share with others.
-        cost_s: time that it takes, s.
+        budget: the information of its observations, with the errors that they share with others.
+        cost_s: its duration, s.
     """
 
     budget: ErrorBudget
@@ -83,13 +83,13 @@ def next_measurement(
     *,
     tolerance: PoseTolerance | None = None,
 ) -> SensingChoice:
-    """Return the candidate that shrinks the pose's error most per second.
+    """Return the candidate that reduces the pose's error most per second.
 
     Args:
-        budget: of what has been observed so far.
-        base_from_object: the pose now.
-        candidates: what could be sensed.
-        tolerance: how well the pose is wanted.
+        budget: of the observations so far.
+        base_from_object: the present estimate of the pose.
+        candidates: the possible sensings.
+        tolerance: the accuracy wanted.
 
     Raises:
         InvalidRequest: no candidate, or a cost that is not positive.

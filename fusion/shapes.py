@@ -1,7 +1,7 @@
-"""Objects with unknown measures: their features depend on parameters, and on where they were touched.
+"""Objects with unknown dimensions: their features depend on parameters, and on where they were touched.
 
-A curved surface is no point, line or plane, but near a sensed place it is as good as its tangent plane there, and that is a
-feature like any other. So a cylinder's radius or a box's size come out of the same measurements as the pose.
+A curved surface is not a point, line or plane, but near a sensed point it is approximated by its tangent plane, which
+is a feature like any other. So a cylinder's radius or a box's size is estimated from the same measurements as the pose.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ class Shape(Protocol):
 
     Attributes:
         names: of the parameters, with units.
-        start: (P,) values believed beforehand.
-        sigma: (P,) standard deviations of that belief; make them wide to let the measurements speak.
+        start: (P,) prior values.
+        sigma: (P,) standard deviations of the prior values; make them large to let the measurements decide.
         parts: names of its surfaces and edges.
     """
 
@@ -39,7 +39,7 @@ class Shape(Protocol):
     def parts(self) -> tuple[str, ...]: ...
 
     def feature(self, part: str, values: Array, place_m: Array) -> Feature:
-        """The feature that `part` is near `place_m` (3,), object frame, when the parameters are `values` (P,)."""
+        """Return the feature of `part` near `place_m` (3,), object frame, when the parameters are `values` (P,)."""
         ...
 
 
@@ -53,17 +53,17 @@ class Cylinder:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Radius and length."""
+        """Names of radius and length."""
         return ("radius_m", "length_m")
 
     @property
     def start(self) -> Array:
-        """(2,) believed beforehand, m."""
+        """(2,) prior values, m."""
         return np.array([self.radius_m, self.length_m])
 
     @property
     def sigma(self) -> Array:
-        """(2,) of that belief, m."""
+        """(2,) standard deviations of the prior values, m."""
         return np.full(2, self.sigma_m)
 
     @property
@@ -72,7 +72,7 @@ class Cylinder:
         return ("wall", "top")
 
     def feature(self, part: str, values: Array, place_m: Array) -> Feature:
-        """Tangent plane of the wall next to `place_m`, or the plane of the top.
+        """Return the tangent plane of the wall next to `place_m`, or the plane of the top.
 
         Raises:
             InvalidRequest: no such part.
@@ -97,17 +97,17 @@ class Box:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Length along each axis."""
+        """Names of the lengths along each axis."""
         return ("size_x_m", "size_y_m", "size_z_m")
 
     @property
     def start(self) -> Array:
-        """(3,) believed beforehand, m."""
+        """(3,) prior values, m."""
         return np.array(self.size_m)
 
     @property
     def sigma(self) -> Array:
-        """(3,) of that belief, m."""
+        """(3,) standard deviations of the prior values, m."""
         return np.full(3, self.sigma_m)
 
     @property
@@ -117,7 +117,7 @@ class Box:
         return (*faces, *(a + b for a in faces for b in faces if a[1] < b[1]))
 
     def feature(self, part: str, values: Array, place_m: Array) -> Feature:  # noqa: ARG002 - flat faces are flat everywhere
-        """A face's plane or an edge's line.
+        """Return a face's plane or an edge's line.
 
         Raises:
             InvalidRequest: no such part.
@@ -134,11 +134,11 @@ class Box:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MovingPart:
-    """A feature whose place depends on the parameters: point_m + slopes^T values.
+    """A feature whose position depends on the parameters: point_m + slopes^T values.
 
     Attributes:
-        feature: where it is when all parameters are zero.
-        slopes: (P, 3) by how much its point moves for each unit of each parameter, object frame.
+        feature: the feature when all parameters are zero.
+        slopes: (P, 3) displacement of its point per unit of each parameter, object frame.
     """
 
     feature: Feature
@@ -147,7 +147,7 @@ class MovingPart:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FeatureSet:
-    """Any points, lines and planes whose places depend linearly on parameters: a hinge's gap, a slider's travel, a pitch.
+    """Points, lines and planes whose positions are linear in parameters: a hinge's gap, a slider's travel, a pitch.
 
     Attributes:
         names, start, sigma: as `Shape`.
@@ -165,7 +165,7 @@ class FeatureSet:
         return tuple(self.moving)
 
     def feature(self, part: str, values: Array, place_m: Array) -> Feature:  # noqa: ARG002 - these features are flat everywhere
-        """The part's feature at these parameters.
+        """Return the part's feature at these parameters.
 
         Raises:
             InvalidRequest: no such part.

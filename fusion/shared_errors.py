@@ -1,8 +1,8 @@
 """Covariance of a pose whose measurements share the errors of their sensors' mountings.
 
-All readings of one sensor share the error of its mounting, and all rays of one camera those of its lens. Each measurement
-carries the mounting's error in its weight, as if it were its own; the covariance of the answer is then summed over the
-errors that are really independent. An error that is one sigma large changes the whitened residuals r by dr, and so moves the
+All readings of one sensor share the error of its mounting, and all rays of one camera that of its lens. In the weights,
+each measurement carries the error of the mounting as if it were its own. The covariance of the pose is then summed over
+the errors that are really independent. An error of one sigma changes the whitened residuals r by dr, and so moves the
 estimate by A^-1 g with g = J^T dr and A = J^T J (linear error propagation):
 
     covariance = A^-1 (sum_k g_k g_k^T) A^-1
@@ -29,7 +29,7 @@ from hal.geometry import UncertainPose, certain, compose, difference, matrix_of,
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ErrorBudget:
-    """What a set of observations tells about a pose, and every independent error in it.
+    """The information of a set of observations about a pose, and every independent error in it.
 
     Attributes:
         information: (6, 6) A = sum of J^T J, translation then rotation, base axes.
@@ -53,7 +53,7 @@ class ErrorBudget:
     @property
     def covariance(self) -> Array:
         """(6, 6) of the pose: the true one has translation t + d and rotation Exp(r) R, base axes."""
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(self.information), 1e-300))  # metres beside radians
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(self.information), 1e-300))  # scales metres and radians alike
         inverse = np.linalg.inv(self.information * np.outer(scale, scale)) * np.outer(scale, scale)
         spread = self.own + sum((G @ G.T for G in self.shared.values()), np.zeros((6, 6)))
         return np.asarray(inverse @ spread @ inverse)
@@ -61,9 +61,10 @@ class ErrorBudget:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FusedObservations:
-    """The panel's pose with its covariance, the measurements in the order of the observations, and the fusion's answer.
+    """The panel's pose with its covariance, the measurements in the order of observations, and the result of `fuse`.
 
-    The covariance of `base_from_panel` counts shared errors once; that of `fused` takes all measurements as independent.
+    The covariance of `base_from_panel` counts shared errors once; that of `fused` takes all measurements as
+    independent.
     """
 
     base_from_panel: UncertainPose
@@ -84,8 +85,8 @@ def fuse_observations(
     Args:
         observations: readings of any sensors.
         mounts: `flange_from_sensor` of every sensor in `observations`.
-        lenses: for each camera, its lens with one independent error one sigma large at a time.
-        prior: a pose believed beforehand; it only chooses between mirror images and is not part of the answer's covariance.
+        lenses: for each camera, its calibrations, each with one independent error of one sigma.
+        prior: a prior pose; it only chooses between mirror images and does not enter the resulting covariance.
 
     Raises:
         InvalidRequest, Contradiction: see `fusion.fuse`.
@@ -113,9 +114,9 @@ def error_budget(
     *,
     lenses: Mapping[str, Sequence[CameraIntrinsics]] | None = None,
 ) -> ErrorBudget:
-    """Return what observations tell about a pose and which errors they share; arguments as `fuse_observations`.
+    """Return the information of observations and the errors that they share; arguments as `fuse_observations`.
 
-    It depends on where the sensors stand and hardly on what they read, so it also holds for readings that are only expected.
+    It depends on the poses of the sensors and hardly on their readings, so it also holds for expected readings.
     """
     nominal = [_measure(o, mounts[o.sensor], np.zeros(len(o.sigmas))) for o in observations]
     own = [{i: _measure(o, mounts[o.sensor], error)} for i, o in enumerate(observations) for error in np.diag(o.sigmas)]
@@ -144,13 +145,13 @@ def _measure(o: Observation, mount: UncertainPose, errors: Array) -> Measurement
 
 
 Change = dict[int, Measurement]
-"""What an error makes of the measurements that it concerns, by their index."""
+"""The measurements that an error affects, changed by it, by their index."""
 
 
 def _mounting_errors(
     observations: Sequence[Observation], mounts: Mapping[str, UncertainPose], nominal: Sequence[Measurement]
 ) -> dict[str, list[Change]]:
-    """For each sensor, its measurements when one independent error of its mounting is one sigma large."""
+    """Return for each sensor its measurements when one independent error of its mounting is one sigma."""
     errors: dict[str, list[Change]] = {}
     for sensor in sorted({o.sensor for o in observations}):
         mount = mounts[sensor]
@@ -173,7 +174,7 @@ def _lens_errors(
     mounts: Mapping[str, UncertainPose],
     lenses: Mapping[str, Sequence[CameraIntrinsics]],
 ) -> dict[str, list[Change]]:
-    """For each camera, its rays when one independent error of its lens is one sigma large."""
+    """Return for each camera its rays when one independent error of its lens is one sigma."""
     return {
         f"lens of {camera}": [
             {
@@ -196,13 +197,13 @@ def linearised(measurements: Sequence[Measurement], pose: RigidTransform) -> tup
 
 
 def _carried(m: Measurement, motion: RigidTransform) -> Measurement:
-    """The measurement that a sensor would give if it stood moved by `motion` (base frame)."""
+    """Return the measurement that a sensor would give if it were moved by `motion` (base frame)."""
     R = matrix_of(motion)
     return replace(m, mu_m=motion.apply(m.mu_m), C_m2=R @ m.C_m2 @ R.T, M=R @ m.M @ R.T)
 
 
 def _one_sigma(covariance: Array) -> Array:
-    """Rows are independent errors of one sigma whose outer products sum to the covariance."""
+    """Return rows that are independent errors of one sigma, whose outer products sum to the covariance."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T)
 
@@ -215,7 +216,7 @@ def _solve(measurements: Sequence[Measurement], start: RigidTransform) -> RigidT
 
 
 def _mirror_resolved(fused: FusedPose, prior: UncertainPose | None) -> RigidTransform:
-    """Of the answer and the alternatives that fit as well, the one nearest to the prior."""
+    """Return the pose nearest to the prior, of the answer and the alternatives that fit as well."""
     if prior is None or not fused.is_ambiguous:
         return fused.pose
     poses = [fused.pose, *(a.pose for a in fused.alternatives if a.odds > 0.01)]

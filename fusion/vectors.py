@@ -1,6 +1,6 @@
-"""Three-vectors as tuples and small dense algebra for the compiled loops: no allocation, no library call.
+"""Three-vectors as tuples and small dense algebra for the compiled loops, without allocation or library calls.
 
-Tuples of three floats live in registers; a call to LAPACK for a 6x6 system costs more than the system itself.
+Tuples of three floats stay in registers, and a call to LAPACK for a 6x6 system takes longer than its solution.
 Symmetric 3x3 matrices are (xx, xy, xz, yy, yz, zz).
 """
 
@@ -17,37 +17,37 @@ Sym = tuple[float, float, float, float, float, float]
 
 @inlined
 def vec(a: Array, i: int) -> Vec:
-    """Row i of an (N, 3) array."""
+    """Return row i of an (N, 3) array."""
     return (a[i, 0], a[i, 1], a[i, 2])
 
 
 @inlined
 def sym(a: Array, i: int) -> Sym:
-    """Row i of an (N, 6) array of symmetric matrices."""
+    """Return row i of an (N, 6) array of symmetric matrices."""
     return (a[i, 0], a[i, 1], a[i, 2], a[i, 3], a[i, 4], a[i, 5])
 
 
 @inlined
 def dot(a: Vec, b: Vec) -> float:
-    """a . b"""
+    """Return a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @inlined
 def cross(a: Vec, b: Vec) -> Vec:
-    """a x b"""
+    """Return a x b."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @inlined
 def blend(s: float, a: Vec, t: float, b: Vec) -> Vec:
-    """s a + t b"""
+    """Return s a + t b."""
     return (s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2])
 
 
 @inlined
 def normalised(a: Vec) -> Vec:
-    """a / |a|, or the z axis when a vanishes."""
+    """Return a / |a|, or the z axis when a vanishes."""
     n = math.sqrt(dot(a, a))
     if n < 1e-300:
         return (0.0, 0.0, 1.0)
@@ -56,7 +56,7 @@ def normalised(a: Vec) -> Vec:
 
 @inlined
 def across(a: Vec) -> Vec:
-    """Some unit vector across the unit vector a."""
+    """Return a unit vector perpendicular to the unit vector a."""
     if abs(a[0]) < 0.6:
         return normalised((0.0, -a[2], a[1]))
     return normalised((a[2], 0.0, -a[0]))
@@ -64,7 +64,7 @@ def across(a: Vec) -> Vec:
 
 @inlined
 def times(S: Sym, a: Vec) -> Vec:
-    """S a"""
+    """Return S a."""
     return (
         S[0] * a[0] + S[1] * a[1] + S[2] * a[2],
         S[1] * a[0] + S[3] * a[1] + S[4] * a[2],
@@ -74,13 +74,13 @@ def times(S: Sym, a: Vec) -> Vec:
 
 @inlined
 def form(a: Vec, S: Sym, b: Vec) -> float:
-    """a . S b"""
+    """Return a . S b."""
     return dot(a, times(S, b))
 
 
 @inlined
 def turned(R: Array, a: Vec) -> Vec:
-    """R a"""
+    """Return R a."""
     return (
         R[0, 0] * a[0] + R[0, 1] * a[1] + R[0, 2] * a[2],
         R[1, 0] * a[0] + R[1, 1] * a[1] + R[1, 2] * a[2],
@@ -90,7 +90,7 @@ def turned(R: Array, a: Vec) -> Vec:
 
 @inlined
 def cholesky(S: Array, n: int) -> bool:
-    """Lower factor of the leading n x n block in place; False when it is not positive definite."""
+    """Compute the lower factor of the leading n x n block in place; returns False when it is not positive definite."""
     for j in range(n):
         s = S[j, j]
         for k in range(j):
@@ -108,7 +108,7 @@ def cholesky(S: Array, n: int) -> bool:
 
 @inlined
 def solve_lower(L: Array, b: Array, n: int) -> None:
-    """b <- L^-1 b"""
+    """Replace b by L^-1 b."""
     for i in range(n):
         s = b[i]
         for k in range(i):
@@ -118,7 +118,7 @@ def solve_lower(L: Array, b: Array, n: int) -> None:
 
 @inlined
 def solve_upper(L: Array, b: Array, n: int) -> None:
-    """b <- L^-T b"""
+    """Replace b by L^-T b."""
     for i in range(n - 1, -1, -1):
         s = b[i]
         for k in range(i + 1, n):
@@ -128,7 +128,7 @@ def solve_upper(L: Array, b: Array, n: int) -> None:
 
 @inlined
 def move(R: Array, t: Array, delta: Array) -> None:
-    """In place: t <- t + d, R <- Exp(r) R for delta = (d, r), (6,)."""
+    """Move a pose in place: t <- t + d, R <- Exp(r) R for delta = (d, r), (6,)."""
     t[0] += delta[0]
     t[1] += delta[1]
     t[2] += delta[2]
@@ -150,7 +150,7 @@ def move(R: Array, t: Array, delta: Array) -> None:
 
 @inlined
 def rotation_vector(R: Array, Q: Array) -> Vec:
-    """log(R Q^T), the turn that takes Q to R, in base axes."""
+    """Return log(R Q^T), the rotation vector that takes Q to R, in base axes."""
     x = y = z = 0.0
     trace = 0.0
     for k in range(3):

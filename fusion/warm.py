@@ -1,4 +1,4 @@
-"""Compile or load the fast loops before the first caller waits for them."""
+"""Compiles or loads the fast loops before the first caller would wait for them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIGMA_M, SIGMA_RAD = 0.001, 0.002
 
 
 def warm_up() -> None:
-    """Run one small problem of every class. Minutes after a change of the code, milliseconds when the cache is there."""
+    """Run one small problem of every class: minutes after a change of the code, milliseconds from the cache."""
     made, pose = one_of_each_class(), RigidTransform.identity()
     solve(made, pose)
     linearised(made, pose)
@@ -31,7 +31,7 @@ def warm_up() -> None:
 
 
 def one_of_each_class() -> list[Measurement]:
-    """Measurements of a box that stands in the base frame, without noise: each thing sensed of each kind of feature."""
+    """Return noise-free measurements of a box in the base frame: each kind sensed of each kind of feature."""
     box = box_features((0.0, 0.0, 0.0), (0.3, 0.2, 0.1))
     made = []
     for sensed in Kind:

@@ -1,7 +1,7 @@
-"""A proof that no other pose fits better: `certificate`.
+"""Proof that no other pose fits better: `certificate`.
 
-`lifted` writes the error as one quadratic form, `dual` finds multipliers that prove its minimum from the pose itself, and where
-they do not, `relaxation` solves the semidefinite problem.
+`lifted` writes the error as one quadratic form, `dual` finds multipliers that prove its minimum from the pose itself,
+and if they do not exist, `relaxation` solves the semidefinite problem.
 """
 
 from fusion.certify.proof import Certificate, certificate

@@ -1,11 +1,11 @@
-"""Multipliers that prove a pose best, found from the pose itself: a certificate without a general solver.
+"""Multipliers that prove a pose optimal, found from the pose itself: a certificate without a general solver.
 
-The relaxation of `fusion.certify` has the dual: max b.y with S = Q - sum y_k A_k >= 0. If a pose z is best and the relaxation
-is tight, S z = 0 (complementary slackness). That fixes y up to the combinations of constraints that vanish at z, and only "is S
-positive definite across z?" is left, in 15 dimensions. Seen from the pose itself, z = (1, vec I, 0, 0), so those combinations
-are the same for every problem. Newton's method on -log det S moves among them until S is positive (Boyd and Vandenberghe,
-Convex Optimization, 2004, section 11.4: phase one by a barrier). With enough rows S is positive at once, since y is of the
-size of the misfit.
+The relaxation of `fusion.certify` has the dual: max b.y with S = Q - sum y_k A_k >= 0. If a pose z is optimal and the
+relaxation is tight, S z = 0 (complementary slackness). That fixes y up to the combinations of constraints that vanish
+at z, and it remains to make S positive definite across z, in 15 dimensions. In the frame of the pose itself, z = (1,
+vec I, 0, 0), so those combinations are the same for every problem. Newton's method on -log det S searches among them
+until S is positive (Boyd and Vandenberghe, Convex Optimization, 2004, section 11.4: phase one by a barrier). With
+enough rows S is positive at once, because y is as small as the residuals.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ class Minimiser:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Identity:
-    """What the constraints are at z = (1, vec I, 0, 0).
+    """The constraints at z = (1, vec I, 0, 0).
 
-    tangent (16, 6): dz of a step (translation, rotation); across (16, 15): basis of what is normal to z; normals (16, 29):
-    A_k z; normal_fit (29, 16): multipliers from Q z; restricted (29, 15, 15): the constraints across z; free (K, 15, 15):
-    their combinations that vanish at z.
+    tangent (16, 6): dz of a step (translation, rotation); across (16, 15): basis perpendicular to z; normals (16, 29):
+    A_k z; normal_fit (29, 16): multipliers from Q z; restricted (29, 15, 15): the constraints across z; free (K, 15,
+    15): their combinations that vanish at z.
     """
 
     z: Array
@@ -62,7 +62,7 @@ class _Identity:
 
 
 def minimiser(Q: Array, rotation: Array, translation: Array, *, prove: bool = True) -> Minimiser:
-    """The minimum of z^T Q z next to a pose, and whether it is proven to be the global one.
+    """Return the minimum of z^T Q z near a pose, and whether it is proven to be the global one.
 
     Args:
         Q: (16, 16) positive semidefinite, over z = (1, vec R, t, -R^T t).
@@ -75,7 +75,7 @@ def minimiser(Q: Array, rotation: Array, translation: Array, *, prove: bool = Tr
 
 
 def _descended(Q: Array, rotation: Array, translation: Array) -> tuple[Array, Array, Array]:
-    """Gauss-Newton on the pose (rows are linear in z); rotation, translation, and Q as seen from there."""
+    """Return rotation, translation, and Q in the frame of that pose, by Gauss-Newton (rows are linear in z)."""
     at = _identity()
     R, t = rotation, translation
     scale = float(np.trace(Q))
@@ -92,7 +92,7 @@ def _descended(Q: Array, rotation: Array, translation: Array) -> tuple[Array, Ar
 
 
 def seen_from(R: Array, t: Array) -> Array:
-    """T (16, 16) with z(X1 X) = T z(X) for X1 = (R, t): R1 R, R1 t + t1, s - R^T R1^T t1."""
+    """Return T (16, 16) with z(X1 X) = T z(X) for X1 = (R, t): R1 R, R1 t + t1, s - R^T R1^T t1."""
     T = np.zeros((SIZE, SIZE))
     T[0, 0] = 1.0
     T[ROTATION, ROTATION] = np.kron(R, np.eye(3))
@@ -102,7 +102,7 @@ def seen_from(R: Array, t: Array) -> Array:
 
 
 def _is_proven(seen: Array) -> bool:
-    """Are there multipliers that make S positive definite across z, and S z = 0?"""
+    """Return whether there are multipliers that make S positive definite across z, with S z = 0."""
     at = _identity()
     force = seen @ at.z
     y = at.normal_fit @ force
@@ -112,13 +112,16 @@ def _is_proven(seen: Array) -> bool:
     S = _made_positive(white.T @ (across - np.tensordot(y, at.restricted, 1)) @ white, white.T @ at.free @ white)
     if S is None:
         return False
-    # What is left of S z lowers the bound by this much; at a minimum it is rounding.
+    # The residual of S z = 0 lowers the bound; at a minimum it is rounding error.
     left = white.T @ at.across.T @ (force - at.normals @ y)
     return bool(left @ np.linalg.solve(S, left) < SLACK * (1.0 + at.z @ force))
 
 
 def _made_positive(S: Array, free: Array) -> Array | None:
-    """S (n, n) + sum x_j free_j (K, n, n) that is positive definite: Newton on -log det(S + lift I), the lift falling."""
+    """Return S (n, n) + sum x_j free_j (K, n, n) that is positive definite, or None.
+
+    Newton's method on -log det(S + lift I), with a decreasing lift.
+    """
     least = float(np.linalg.eigvalsh(S)[0])
     if least > POSITIVE:
         return S

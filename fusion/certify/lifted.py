@@ -1,6 +1,6 @@
-"""The error of frozen covariances as one quadratic form over z = (1, vec R, t, -R^T t), compiled (notes/fusion.md, "Certificate").
+"""The error at frozen covariances as one quadratic form over z = (1, vec R, t, -R^T t), compiled.
 
-With s = -R^T t the rows of `fusion.distance.rows` are linear in z,
+See notes/fusion.md, "Certificate". With s = -R^T t the rows of `fusion.distance.rows` are linear in z,
 
     A = a^T m - a^T s - a^T R^T mu      B = n^T (R m + t - mu)      D = n^T R w.
 """
@@ -20,7 +20,7 @@ SIZE = 16  # numbers in z: 1, R row by row at 1, t at 10, s at 13
 
 @inlined
 def _row_a(Z: Array, k: int, R: Array, n: Vec, m: Vec, mu: Vec, size: float) -> None:
-    """Row A of the object direction a = R^T n."""
+    """Fill row A of the object direction a = R^T n."""
     Z[k, :] = 0.0
     for j in range(3):
         a = R[0, j] * n[0] + R[1, j] * n[1] + R[2, j] * n[2]
@@ -50,7 +50,7 @@ def _row_d(Z: Array, k: int, n: Vec, w: Vec) -> None:
 
 @inlined
 def _rows_of(b: Batch, i: int, R: Array, about: Vec, middle: Vec, size: float, Z: Array) -> None:
-    """Rows Z of entry i over z, in the order of `distance.rows`."""
+    """Fill the rows Z of entry i over z, in the order of `distance.rows`."""
     c = b.cls[i]
     w, u = vec(b.w, i), turned(R, vec(b.w, i))
     m = (b.m[i, 0] - about[0], b.m[i, 1] - about[1], b.m[i, 2] - about[2])
@@ -80,7 +80,7 @@ def _rows_of(b: Batch, i: int, R: Array, about: Vec, middle: Vec, size: float, Z
 
 @inlined
 def _prior_rows(b: Batch, about: Vec, middle: Vec, size: float, Z: Array) -> None:
-    """Rows of a prior pose, white: t - t0 exactly, and the rotation error as the vector part of R R0^T (first order)."""
+    """Fill the whitened rows of a prior pose: t - t0 exactly, and the vector part of R R0^T (first order)."""
     plain = np.zeros((6, SIZE))
     m = (-about[0], -about[1], -about[2])
     t0 = (b.prior_t[0] - middle[0], b.prior_t[1] - middle[1], b.prior_t[2] - middle[2])
@@ -96,9 +96,10 @@ def _prior_rows(b: Batch, about: Vec, middle: Vec, size: float, Z: Array) -> Non
 
 @compiled
 def lift(b: Batch, R: Array, t: Array, about: Array, middle: Array, size: float, out: Array) -> None:
-    """out (N, 16, 16): z^T out_i z is the first-order local pose function of entry i, its covariance frozen at the pose R, t.
+    """Compute out (N, 16, 16) with z^T out_i z = first-order local pose function of entry i, covariance frozen at R, t.
 
-    Features are taken from `about` (3,), object frame, and places from `middle` (3,), base frame, in units of `size`.
+    Features are relative to `about` (3,), object frame, and sensed points to `middle` (3,), base frame, in units of
+    `size`.
     """
     r, J, V, Z = np.empty(6), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, SIZE))
     centre, origin = (about[0], about[1], about[2]), (middle[0], middle[1], middle[2])

@@ -1,9 +1,10 @@
-"""A proof that no other pose fits better: the semidefinite relaxation of the fused problem (notes/fusion.md, "Certificate").
+"""Proof that no other pose fits better, by semidefinite relaxation (notes/fusion.md, "Certificate").
 
-At frozen covariances E = z^T Q z with z = (1, vec R, t, -R^T t), 16 numbers, for any mixture of the nine classes and any number of
-measurements (`lifted`). Shor's relaxation replaces z z^T by a positive semidefinite Z under 29 quadratic constraints
-that every pose obeys. If the best Z has rank one, it is a pose, and no pose is better. Mostly the multipliers that prove this
-follow from the pose itself (`dual`); where they do not, clarabel (the `certify` extra) solves the relaxation.
+At frozen covariances E = z^T Q z with z = (1, vec R, t, -R^T t), 16 numbers, for any mixture of the nine classes and
+any number of measurements (`lifted`). Shor's relaxation replaces z z^T by a positive semidefinite Z under 29 quadratic
+constraints that every pose fulfils. If the optimal Z has rank one, it is a pose, and no pose is better. In most cases
+the multipliers that prove this follow from the pose itself (`dual`); otherwise clarabel (the `certify` extra) solves
+the relaxation.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ AGREES_SIGMAS = 1.0  # freezing the covariances moves the minimum by a small par
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Certificate:
-    """What the relaxation says about a pose.
+    """Result of the relaxation for a pose.
 
     Attributes:
-        tight: the relaxation is a pose, and it is the given one: nothing fits these measurements better.
+        tight: the relaxation is a pose, and it is the given one: no pose fits these measurements better.
         gap: ratio of the second to the first eigenvalue of Z; rank one when (almost) zero, 0 where multipliers prove it.
-        lower_bound: no pose has a smaller error over these measurements, at the covariances of the answer.
+        lower_bound: no pose has a smaller error over these measurements, at the covariances of the given pose.
         value: the error of the given pose, at the same covariances.
         distance_sigmas: Mahalanobis distance between the given pose and that of the relaxation.
         base_from_object: the pose of the relaxation.
@@ -81,12 +82,12 @@ def certificate(b: Batch, used: NDArray[np.bool_], local: LocalSolution) -> Cert
 
 
 def quadratic_forms(b: Batch, R: Array, t: Array, about: Array, middle: Array, size: float) -> Array:
-    """(N, 16, 16): z^T Q_i z is the error of each entry, its covariance frozen at the pose R, t; see `lifted.lift`."""
+    """Return (N, 16, 16) forms with z^T Q_i z = error of each entry, covariance frozen at R, t; see `lifted.lift`."""
     forms = np.empty((len(b.cls), SIZE, SIZE))
     lift(b, np.array(R, order="C"), np.array(t, order="C"), np.array(about), np.array(middle), size, forms)
     return forms
 
 
 def monomials(R: Array, t: Array) -> Array:
-    """z (16,) of a pose: 1, R row by row, t, -R^T t."""
+    """Return z (16,) of a pose: 1, R row by row, t, -R^T t."""
     return np.concatenate([[1.0], R.ravel(), t, -R.T @ t])

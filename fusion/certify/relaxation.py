@@ -1,4 +1,7 @@
-"""Shor's relaxation of min z^T Q z over poses, z = (1, vec R, t, -R^T t): the constraints, and Clarabel (the `certify` extra)."""
+"""Shor's relaxation of min z^T Q z over poses, z = (1, vec R, t, -R^T t): its constraints and its solution.
+
+Clarabel (the `certify` extra) solves it.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +23,10 @@ _WEIGHT = np.where(_ROWS == _COLUMNS, 1.0, np.sqrt(2.0))
 
 @cache
 def constraints() -> tuple[Array, Array]:
-    """The quadratic constraints z^T A_k z = b_k that every pose obeys: A (K, 16, 16) symmetric, b (K,).
+    """Return the quadratic constraints z^T A_k z = b_k that every pose fulfils: A (K, 16, 16) symmetric, b (K,).
 
-    1 homogenisation, 6 of R^T R = I, 6 of R R^T = I, 9 cross products of columns, 3 of s + R^T t = 0, 3 of t + R s = 0, 1 of
-    |t| = |s|. (The two orthogonality sets share their trace; one of it is left out.)
+    1 homogenisation, 6 of R^T R = I, 6 of R R^T = I, 9 cross products of columns, 3 of s + R^T t = 0, 3 of t + R s = 0,
+    1 of |t| = |s|. (The two orthogonality sets share their trace, so one row of it is left out.)
     """
     r = [[1 + 3 * i + j for j in range(3)] for i in range(3)]  # places of R_ij, t_i and s_i in z
     t, s = range(10, 13), range(13, 16)
@@ -53,7 +56,7 @@ def constraints() -> tuple[Array, Array]:
 
 @cache
 def _cone() -> tuple[Any, Any, Any]:
-    """What every problem shares: the constraint columns, the cone and the settings."""
+    """Return what every problem shares: the constraint columns, the cone and the settings."""
     clarabel = _clarabel()
     from scipy.sparse import csc_matrix
 
@@ -76,7 +79,10 @@ def _clarabel() -> Any:
 
 
 def relaxed(Q: Array) -> tuple[Array, float]:
-    """min <Q, Z> over Z >= 0 with <A_k, Z> = b_k, by its dual: max b.y with Q - sum y_k A_k >= 0. Returns Z and the minimum."""
+    """Return Z and the minimum of <Q, Z> over Z >= 0 with <A_k, Z> = b_k.
+
+    Solved by its dual: max b.y with Q - sum y_k A_k >= 0.
+    """
     from scipy.sparse import csc_matrix
 
     columns, cone, settings = _cone()
@@ -91,7 +97,7 @@ def relaxed(Q: Array) -> tuple[Array, float]:
 
 
 def nearest_pose(z: Array) -> tuple[Array, Array]:
-    """Rotation (3, 3) and (scaled) translation nearest to the leading eigenvector."""
+    """Return the rotation (3, 3) and (scaled) translation nearest to the leading eigenvector."""
     z = z / z[0]
     U, _, Vt = np.linalg.svd(z[ROTATION].reshape(3, 3))
     return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt, z[TRANSLATION]

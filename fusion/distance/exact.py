@@ -1,12 +1,13 @@
-"""The nine local pose functions without approximation, and their gradients, compiled (paper eq 10; notes/fusion.md table).
+"""The nine local pose functions without approximation, and their gradients, compiled (paper eq 10; notes/fusion.md).
 
-Classes 1, 2, 3, 5, 6 and 9 have closed forms. In 4, 7 and 8 the sensed point and direction are coupled, and what is left is
+Classes 1, 2, 3, 5, 6 and 9 have closed forms. In 4, 7 and 8 the sensed point and direction are coupled, and there
+remains
 
     F(v) = F0 + s (h.v)^2 / (v.A v) + v.M v,    |v| = 1
 
-with (s, h, A) = (-1, C^-1 e, C^-1) for line-point and (+1, e, C) for plane-point; plane-line is plane-point with v held
-across u. F has several minima; each is reached by Newton's method on the sphere from starts at the minima of either term, from
-the arcs between those, and from a coarse grid.
+with (s, h, A) = (-1, C^-1 e, C^-1) for line-point and (+1, e, C) for plane-point; plane-line is plane-point with v
+perpendicular to u. F has several minima. Each is reached by Newton's method on the sphere, started at the minima of
+either term, on the arcs between those, and on a coarse grid.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from fusion.vectors import Vec, across, blend, cross, dot, normalised, turned, v
 from hal.arrays import Array
 from hal.jit import compiled, inlined
 
-# A symmetric matrix by its eigenvalues and unit eigenvectors: v.S v then is a sum of squares, not a difference of large numbers.
+# A symmetric matrix by its eigenvalues and unit eigenvectors, so that v.S v is a sum of squares without cancellation.
 Spectral = tuple[float, float, float, Vec, Vec, Vec]
 REFINED = 8  # starts that Newton's method follows, best first
 LONGEST = 0.7  # step on the sphere, rad (as a tangent)
@@ -35,7 +36,7 @@ _GRID = np.array([
 
 @inlined
 def _place(b: Batch, i: int, inverse: bool) -> Spectral:
-    """C of entry i, or C^-1."""
+    """Return C of entry i, or C^-1."""
     X = b.axes[i]
     v1, v2, v3 = b.variance[i, 0], b.variance[i, 1], b.variance[i, 2]
     if inverse:
@@ -45,25 +46,28 @@ def _place(b: Batch, i: int, inverse: bool) -> Spectral:
 
 @inlined
 def _direction(b: Batch, i: int) -> Spectral:
-    """M of entry i."""
+    """Return M of entry i."""
     return (b.tilt[i, 0], b.tilt[i, 1], b.tilt[i, 2], vec(b.d, i), vec(b.a1, i), vec(b.a2, i))
 
 
 @inlined
 def weighted(a: Vec, M: Spectral, b: Vec) -> float:
-    """a . M b"""
+    """Return a . M b."""
     return M[0] * dot(a, M[3]) * dot(b, M[3]) + M[1] * dot(a, M[4]) * dot(b, M[4]) + M[2] * dot(a, M[5]) * dot(b, M[5])
 
 
 @inlined
 def pulled(M: Spectral, a: Vec) -> Vec:
-    """M a"""
+    """Return M a."""
     return blend(1.0, blend(M[0] * dot(a, M[3]), M[3], M[1] * dot(a, M[4]), M[4]), M[2] * dot(a, M[5]), M[5])
 
 
 @inlined
 def _line_value(e: Vec, A: Spectral, M: Spectral, v: Vec) -> float:
-    """Line-point: distance of the nearest point of the line plus the direction's share; subtracts before it squares."""
+    """Return F of line-point: distance of the nearest point of the line plus the term of the direction.
+
+    It subtracts before squaring, which avoids cancellation.
+    """
     k = weighted(v, A, e) / weighted(v, A, v)
     y = blend(1.0, e, -k, v)
     return weighted(y, A, y) + weighted(v, M, v)
@@ -82,10 +86,11 @@ def _value(line: bool, e: Vec, A: Spectral, M: Spectral, v: Vec) -> float:
 
 @inlined
 def _step_on_sphere(h11: float, h12: float, h22: float, g1: float, g2: float) -> tuple[float, float]:
-    """-|H|^-1 g for a 2x2 tangent Hessian H: Newton's step where F curves upwards, and downhill where it does not.
+    """Return -|H|^-1 g for a 2x2 tangent Hessian H: Newton's step where F curves upwards, downhill where it does not.
 
-    Each eigenvector goes its own way and at most LONGEST far. A common shift of an indefinite H would be as large as its
-    stiffest direction allows, and the other one would hardly move: in the long valleys of line-point that ends on a slope.
+    The step along each eigenvector is limited to LONGEST separately. A common shift of an indefinite H would be as
+    large as its stiffest direction requires and would stop the motion along the other one, in the long valleys of line-
+    point.
     """
     angle = 0.5 * math.atan2(2.0 * h12, h11 - h22)
     c, s = math.cos(angle), math.sin(angle)
@@ -99,7 +104,10 @@ def _step_on_sphere(h11: float, h12: float, h22: float, g1: float, g2: float) ->
 
 @inlined
 def _newton(line: bool, e: Vec, A: Spectral, M: Spectral, v: Vec, steps: int) -> Vec:
-    """A minimum of F near v. Written for v of any length, F is of degree 0, so its tangent Hessian is the plain one."""
+    """Return a minimum of F near v.
+
+    F is written for v of any length and has degree 0, so its tangent Hessian is the ordinary one.
+    """
     h = pulled(A, e) if line else e
     s = -1.0 if line else 1.0
     best = _value(line, e, A, M, v)
@@ -137,7 +145,7 @@ def _newton(line: bool, e: Vec, A: Spectral, M: Spectral, v: Vec, steps: int) ->
 def _sphere(  # noqa: PLR0912 - one flat loop, for the compiler
     line: bool, e: Vec, A: Spectral, M: Spectral, d: Vec, a1: Vec, a2: Vec
 ) -> Vec:
-    """Where F is least on the whole sphere: starts by value, the best ones refined."""
+    """Return where F is least on the whole sphere: starts are sorted by value, and the best ones refined."""
     starts, cost = np.empty((100, 3)), np.empty(100)
     n = 0
     for k in range(13):
@@ -150,8 +158,9 @@ def _sphere(  # noqa: PLR0912 - one flat loop, for the compiler
         n1 = across(toward)
         n2 = cross(toward, n1)
         if line:
-            # The minimum moves from d (direction known well) towards e (point known well) as |e| grows. Either share hardly
-            # grows along one great circle: the point's from e to the axis that C leaves widest, the direction's from d to a1.
+            # The minimum moves from d (direction known well) towards e (point known well) as |e| grows. Either term is
+            # nearly constant along one great circle: the point's from e to the longest axis of C, the direction's from
+            # d to a1.
             long = A[5]
             for k in range(1, 13):
                 n = _arc(starts, n, d, toward, k / 12.0)
@@ -159,7 +168,7 @@ def _sphere(  # noqa: PLR0912 - one flat loop, for the compiler
                 n = _arc(starts, n, d, a1, (k - 0.5) / 12.0)
             n = _start(starts, n, normalised(cross(cross(toward, long), a2)))
         else:
-            # e-perp is where the first term vanishes; the second is least there at one of two directions.
+            # The first term is 0 on the circle perpendicular to e; there the second is least at one of two directions.
             m11, m12, m22 = weighted(n1, M, n1), weighted(n1, M, n2), weighted(n2, M, n2)
             angle = 0.5 * math.atan2(2.0 * m12, m11 - m22)
             low = blend(-math.sin(angle), n1, math.cos(angle), n2)
@@ -178,7 +187,7 @@ def _sphere(  # noqa: PLR0912 - one flat loop, for the compiler
         value = _value(line, e, A, M, v)
         if value < least:
             best, least = v, value
-        for j in range(n):  # what lies close to this minimum, or to where it was reached from, would lead here again
+        for j in range(n):  # starts close to this minimum, or to its start, would lead here again
             if abs(dot(v, vec(starts, j))) > 0.995 or abs(dot(start, vec(starts, j))) > 0.98:
                 cost[j] = np.inf
         cost[k] = np.inf
@@ -193,14 +202,17 @@ def _start(starts: Array, n: int, v: Vec) -> int:
 
 @inlined
 def _arc(starts: Array, n: int, a: Vec, b: Vec, share: float) -> int:
-    """Two starts between a and b, and between a and -b."""
+    """Add two starts: between a and b, and between a and -b."""
     n = _start(starts, n, normalised(blend(1.0 - share, a, share, b)))
     return _start(starts, n, normalised(blend(1.0 - share, a, -share, b)))
 
 
 @inlined
 def _circle(e: Vec, C: Spectral, M: Spectral, u: Vec, d: Vec) -> Vec:
-    """Where F of plane-line is least: v across u, one angle; stationary points of degree 6, so at most 6 in half a turn."""
+    """Return where F of plane-line is least, with v perpendicular to u, that is, over one angle.
+
+    The stationary points are the roots of a polynomial of degree 6, so there are at most 6 in half a turn.
+    """
     n1 = across(u)
     n2 = cross(u, n1)
     h1, h2 = dot(n1, e), dot(n2, e)
@@ -248,7 +260,7 @@ def _circle(e: Vec, C: Spectral, M: Spectral, u: Vec, d: Vec) -> Vec:
 def _polish_angle(
     h1: float, h2: float, c11: float, c12: float, c22: float, m11: float, m12: float, m22: float, x: float
 ) -> float:
-    """Newton's method on the angle; keeps the old one where a step does not help."""
+    """Refine the angle by Newton's method; keeps the best one where a step does not help."""
     best = np.inf
     kept = x
     for _ in range(25):
@@ -275,7 +287,7 @@ def _polish_angle(
 
 @inlined
 def _least_across(M: Spectral, u: Vec) -> Vec:
-    """The unit v across u with least v.M v: class 6."""
+    """Return the unit v perpendicular to u with the least v.M v (class 6)."""
     n1 = across(u)
     n2 = cross(u, n1)
     m11, m12, m22 = weighted(n1, M, n1), weighted(n1, M, n2), weighted(n2, M, n2)
@@ -285,7 +297,10 @@ def _least_across(M: Spectral, u: Vec) -> Vec:
 
 @inlined
 def local(b: Batch, i: int, u: Vec, e: Vec, v: Vec, search: bool) -> tuple[float, Vec, Vec, Vec]:
-    """f, df/dx, df/du and v* of entry i. `search`: over the whole sphere; else by Newton's method from v (classes 4, 7)."""
+    """Return f, df/dx, df/du and v* of entry i.
+
+    With `search` v* is sought over the whole sphere, else by Newton's method from v (classes 4, 7 and 8).
+    """
     c = b.cls[i]
     C, A, M = _place(b, i, False), _place(b, i, True), _direction(b, i)
     zero = (0.0, 0.0, 0.0)
@@ -341,7 +356,7 @@ def local(b: Batch, i: int, u: Vec, e: Vec, v: Vec, search: bool) -> tuple[float
 
 @compiled
 def evaluate(b: Batch, R: Array, t: Array, search: bool, f: Array, grad: Array, direction: Array) -> None:
-    """Exact f (N,) and its gradients grad (N, 6) over (translation, rotation) at a pose; `direction` (N, 3) is v*.
+    """Compute the exact f (N,), gradients grad (N, 6) over (translation, rotation), and v* as `direction` (N, 3).
 
     With `search` the global minimum over v is sought; otherwise `direction` is where to start (and is updated).
     """

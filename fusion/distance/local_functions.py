@@ -1,7 +1,8 @@
-"""The nine local pose functions: how badly a pose fits each measurement, exactly (paper eqs 10-13, Fig. 12).
+"""The exact nine local pose functions: how badly a pose fits each measurement (paper eqs 10-13, Fig. 12).
 
-`f(X) = min over Y of g(Y)` under the class's constraint. Formulas: notes/fusion.md, table of section 2; the compiled code is in
-`exact`, a slow independent one in `reference`. At the true pose f follows chi-square with `Measurement.dof`.
+`f(X) = min over Y of g(Y)` under the class's constraint. The formulas are in notes/fusion.md, table of section 2; the
+compiled code is in `exact`, a slow independent one in `reference`. At the true pose f follows a chi-square distribution
+with `Measurement.dof`.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from hal.geometry import matrix_of
 
 
 def local_values(measurements: Sequence[Measurement], base_from_object: RigidTransform) -> Array:
-    """(N,) exact local pose functions f_i at a pose, without unit.
+    """Return (N,) exact local pose functions f_i at a pose, without unit.
 
     Raises:
-        InvalidRequest: a measurement makes no sense; see `fusion.batch.pack`.
+        InvalidRequest: a measurement is invalid; see `fusion.batch.pack`.
     """
     return local_values_and_gradients(measurements, base_from_object)[0]
 
@@ -30,12 +31,12 @@ def local_values(measurements: Sequence[Measurement], base_from_object: RigidTra
 def local_values_and_gradients(
     measurements: Sequence[Measurement], base_from_object: RigidTransform
 ) -> tuple[Array, Array]:
-    """f (N,) and its gradients (N, 6) over (translation, rotation) in base axes, 1/m and 1/rad.
+    """Return f (N,) and its gradients (N, 6) over (translation, rotation) in base axes, 1/m and 1/rad.
 
-    The gradients follow from the envelope theorem: the sensed feature is already at its best.
+    The gradients follow from the envelope theorem, because the sensed feature is already at its optimum.
 
     Raises:
-        InvalidRequest: a measurement makes no sense.
+        InvalidRequest: a measurement is invalid.
     """
     b = pack(measurements)
     f, gradients, _ = batch_values(b, matrix_of(base_from_object), np.array(base_from_object.translation))
@@ -43,7 +44,7 @@ def local_values_and_gradients(
 
 
 def batch_values(b: Batch, R: Array, t: Array) -> tuple[Array, Array, Array]:
-    """f (N,), gradients (N, 6) and best sensed directions (N, 3) of packed measurements; zero for a prior entry."""
+    """Return f (N,), gradients (N, 6) and best sensed directions (N, 3) of packed measurements; zero for a prior."""
     n = len(b.cls)
     f, gradients, directions = np.zeros(n), np.zeros((n, 6)), np.zeros((n, 3))
     evaluate(b, np.array(R, order="C"), np.array(t, order="C"), True, f, gradients, directions)
@@ -51,9 +52,9 @@ def batch_values(b: Batch, R: Array, t: Array) -> tuple[Array, Array, Array]:
 
 
 def local_value(measurement: Measurement, base_from_object: RigidTransform) -> float:
-    """`local_values` of one measurement.
+    """Return `local_values` of one measurement.
 
     Raises:
-        InvalidRequest: the measurement makes no sense.
+        InvalidRequest: the measurement is invalid.
     """
     return float(local_values([measurement], base_from_object)[0])

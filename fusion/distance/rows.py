@@ -24,7 +24,7 @@ HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 NEAR, FAR = (
     as_numpy_scalar(False),
     as_numpy_scalar(True),
-)  # what `far` says: first steps from anywhere, or the last ones at the solution
+)  # values of `far`: the last steps at the solution, or the first steps from anywhere
 FLOOR = 1e-6  # share of the direction variance that is kept where u^T S u vanishes far from the solution
 
 
@@ -55,7 +55,7 @@ def _row_d(r: Array, J: Array, k: int, n: Vec, g: Vec) -> None:
 
 @inlined
 def _variance(p: float) -> float:
-    """1/p, and a very large number where nothing is known."""
+    """Return 1/p, or a very large number where nothing is known."""
     return 1.0 / p if p > 1e-12 else 1e12
 
 
@@ -129,7 +129,7 @@ def rows(b: Batch, i: int, R: Array, t: Array, far: bool, r: Array, J: Array, V:
 
 @inlined
 def _direction_rows(r: Array, J: Array, V: Array, k: int, a1: Vec, a2: Vec, v1: float, v2: float, u: Vec) -> None:
-    """Rows D(a1), D(a2) at k and k + 1, independent of the rows before."""
+    """Fill rows D(a1), D(a2) at k and k + 1, independent of the rows before."""
     _row_d(r, J, k, a1, u)
     _row_d(r, J, k + 1, a2, u)
     for j in range(k):
@@ -139,7 +139,7 @@ def _direction_rows(r: Array, J: Array, V: Array, k: int, a1: Vec, a2: Vec, v1: 
 
 @inlined
 def _prior_rows(b: Batch, R: Array, t: Array, r: Array, J: Array, V: Array) -> int:
-    """A prior pose as six rows that are white already: W (delta), first order in the rotation."""
+    """Fill a prior pose as six whitened rows: W (delta), first order in the rotation."""
     x = rotation_vector(R, b.prior_r)
     for k in range(6):
         s = 0.0
@@ -154,7 +154,7 @@ def _prior_rows(b: Batch, R: Array, t: Array, r: Array, J: Array, V: Array) -> i
 
 @compiled
 def whitened(b: Batch, i: int, R: Array, t: Array, far: bool, r: Array, J: Array, V: Array) -> int:
-    """As `rows`, with r and J divided by the root of the covariance: f = |r|^2."""
+    """Fill the rows as `rows` does, with r and J divided by the root of the covariance, so that f = |r|^2."""
     k = rows(b, i, R, t, far, r, J, V)
     if b.cls[i] == 0:
         return k
@@ -172,7 +172,7 @@ def whitened(b: Batch, i: int, R: Array, t: Array, far: bool, r: Array, J: Array
 
 @compiled
 def values(b: Batch, R: Array, t: Array, far: bool, f: Array) -> None:
-    """First-order local pose functions f (N,) at a pose."""
+    """Compute first-order local pose functions f (N,) at a pose."""
     r, J, V = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     for i in range(b.cls.size):
         k = rows(b, i, R, t, far, r, J, V)
@@ -189,7 +189,7 @@ def values(b: Batch, R: Array, t: Array, far: bool, f: Array) -> None:
 
 @compiled
 def log_volumes(b: Batch, R: Array, t: Array, out: Array) -> None:
-    """out (N,) = log sqrt det(2 pi V_i): how much room (m, rad) a good measurement's residual has; 0 for a prior."""
+    """Compute out (N,) = log sqrt det(2 pi V_i), the log volume (m, rad) of an inlier's residual; 0 for a prior."""
     r, J, V = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     for i in range(b.cls.size):
         out[i] = 0.0
@@ -201,7 +201,7 @@ def log_volumes(b: Batch, R: Array, t: Array, out: Array) -> None:
 
 @compiled
 def whitened_all(b: Batch, R: Array, t: Array, r: Array, J: Array) -> None:
-    """Whitened residuals r (N, 6) and Jacobians J (N, 6, 6) of every entry, zero beyond its own rows."""
+    """Compute whitened residuals r (N, 6) and Jacobians J (N, 6, 6) of every entry, zero beyond its own rows."""
     own_r, own_j, V = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     r[:], J[:] = 0.0, 0.0
     for i in range(b.cls.size):

@@ -1,7 +1,7 @@
-"""From measurements, some of them wrong, to a pose that says what it knows (paper IV, issue 3): `fuse`.
+"""Robust fusion: `fuse` computes a pose from measurements, some of which may be wrong (paper IV).
 
-`search` draws subsets, `minima` ends what they find, `evidence` asks whether agreement may be chance, `answer` says it all;
-`inliers` proves a set best, `with_shape` estimates an object's measures too, `incremental` adds and takes single measurements.
+`search` draws subsets, `minima` refines what they find, `evidence` tests whether agreement may be chance, and `answer`
+reports the result; `inliers` proves a set optimal, `with_shape` also estimates an object's dimensions.
 """
 
 from fusion.robust.answer import Alternative, FusedPose, Rejected, ShapeEstimate

@@ -1,4 +1,4 @@
-"""What fusion answers: the pose, how well it is known, what was not believed, what else fits."""
+"""The result of fusion: the pose, its covariance, the rejected measurements, and alternative poses."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from fusion.solve.observability import FreeDirection
 from hal.arrays import Array
 from hal.geometry import UncertainPose
 
-EVIDENCE_NEEDED = math.log(1000.0)  # for agreement against chance, once something was rejected
-EVIDENCE_PER_MISMATCH = 0.5  # each rejected measurement is a surprise: fewer are bad than good
+EVIDENCE_NEEDED = math.log(1000.0)  # of agreement against chance, if a measurement was rejected
+EVIDENCE_PER_MISMATCH = 0.5  # for each rejected measurement, because bad ones are less frequent than good ones
 ONE_IN = 1e5
-NO_NOISE = 1e-9  # a chi-square per degree of freedom that no sensor's noise gives, in whatever unit
+NO_NOISE = 1e-9  # a chi-square per degree of freedom too small for any sensor's noise, in any unit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Proofs:
-    """What to prove beside the answer: the certificate, and the best set within so many seconds (None: not)."""
+    """The proofs wanted beside the pose: the certificate, and the best set within so many seconds (None: no proof)."""
 
     certificate: bool = False
     set_within_s: float | None = None
@@ -42,10 +42,10 @@ class Rejected:
     """A measurement that was not used.
 
     Attributes:
-        index: its place in the sequence given; -1 for the prior pose.
+        index: its index in the sequence given; -1 for the prior pose.
         label: its label.
-        value: its local pose function at the answer.
-        limit: what a good one stays below.
+        value: its local pose function at the estimated pose.
+        limit: upper limit of that value for a good measurement.
         reason: `mismatch`, or `duplicate of measurement 3`.
     """
 
@@ -63,9 +63,9 @@ class Alternative:
     Attributes:
         pose: base_from_object.
         covariance: 6x6, translation then rotation, base axes.
-        cost: its truncated error; the answer's is the least.
-        odds: how probable it is relative to the answer, 0 to 1.
-        rejected: indices that it calls mismatched.
+        cost: its truncated error; the estimate has the least.
+        odds: its probability relative to the estimate, 0 to 1.
+        rejected: indices of the measurements that it rejects.
     """
 
     pose: RigidTransform
@@ -77,12 +77,12 @@ class Alternative:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ShapeEstimate:
-    """Measures of an object that were estimated with its pose.
+    """Dimensions of an object that were estimated with its pose.
 
     Attributes:
-        names: of the measures, with their units.
+        names: of the dimensions, with their units.
         values: (P,) estimates.
-        covariance: (P, P) of them, the pose unknown.
+        covariance: (P, P) of the estimates, with the pose unknown.
     """
 
     names: tuple[str, ...]
@@ -90,22 +90,22 @@ class ShapeEstimate:
     covariance: Array
 
     def sigma_of(self, name: str) -> float:
-        """Standard deviation of one measure."""
+        """Return the standard deviation of one dimension."""
         k = self.names.index(name)
         return math.sqrt(self.covariance[k, k])
 
     def value_of(self, name: str) -> float:
-        """One measure."""
+        """Return one dimension."""
         return float(self.values[self.names.index(name)])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FusedPose:
-    """Where the object stands, and how well that is known.
+    """Estimated pose of the object, with its covariance.
 
     Attributes:
         pose: base_from_object.
-        covariance: 6x6 over (dx, dy, dz, rx, ry, rz), m and rad, base axes; free directions carry 10 object sizes or 10 rad.
+        covariance: 6x6 over (dx, dy, dz, rx, ry, rz), m and rad, base axes; free directions have 10 sizes or rad.
         chi_square: sum of the local pose functions of the measurements used.
         dof: its degrees of freedom.
         values: (N,) local pose function of every measurement given, at `pose`.
@@ -115,7 +115,7 @@ class FusedPose:
         evidence: log odds that the measurements used agree because of the pose, against chance.
         certificate: proof that no other pose fits those measurements better, when asked for.
         proven_set: the set of measurements with the least truncated error, with proof, when asked for.
-        shape: the object's own measures, when it was given as a shape with unknown ones.
+        shape: the estimated dimensions of the object, if it was given as a shape.
     """
 
     pose: RigidTransform
@@ -133,10 +133,10 @@ class FusedPose:
 
     @property
     def agrees_too_well(self) -> bool:
-        """Do the measurements agree better than noise of the stated size lets them, but for once in `ONE_IN` times?
+        """Whether the measurements agree better than their stated noise allows, except once in `ONE_IN` cases.
 
-        Variances in mm^2 that are taken for m^2 make the chi-square a million times too small. Examples drawn by hand agree
-        exactly and are not meant.
+        Variances in mm^2 that are taken for m^2 make the chi-square a million times too small. Constructed examples
+        agree exactly and are not reported.
         """
         if self.dof < 1 or self.chi_square < NO_NOISE * self.dof:
             return False
@@ -144,12 +144,12 @@ class FusedPose:
 
     @property
     def base_from_object(self) -> UncertainPose:
-        """The pose with its covariance, as the rest of the cell takes it."""
+        """The pose with its covariance, as the rest of the cell uses it."""
         return UncertainPose(parent_from_child=self.pose, covariance=self.covariance)
 
     @property
     def is_ambiguous(self) -> bool:
-        """True when another pose is at least a hundredth as probable."""
+        """Whether another pose is at least a hundredth as probable."""
         return any(a.odds > 0.01 for a in self.alternatives)
 
 
@@ -162,7 +162,7 @@ def judged(
     repeats: dict[int, int],
     proofs: Proofs,
 ) -> FusedPose:
-    """The answer that a best minimum and the `others` make.
+    """Return the result for a best minimum and the `others`.
 
     Args:
         b: packed measurements; `index` (N,) says which of `given` each entry is, -1 for the prior.
@@ -201,11 +201,11 @@ def weighed(
     given: Sequence[Measurement],
     repeats: dict[int, int],
 ) -> tuple[Array, tuple[Rejected, ...], float]:
-    """What an answer says of its measurements: value of each (N,), those not used, and the evidence for the others.
+    """Return the value of each measurement (N,), the rejected ones, and the evidence for the others.
 
     Args:
         b: packed measurements; `index` says which of `given` each entry is, -1 for the prior.
-        used: which entries the `local` solution stems from.
+        used: which entries the `local` solution is computed from.
         given: all measurements of the caller.
         repeats: index of each duplicate, and of the measurement that it repeats.
 
@@ -255,6 +255,6 @@ def _alternatives(best: Minimum, others: Sequence[Minimum], index: NDArray[np.in
 
 
 def _odds(m: Minimum, best: Minimum) -> float:
-    """exp(-delta/2) sqrt(det cov / det cov_best): share of the posterior around each (Laplace)."""
+    """Return exp(-delta/2) sqrt(det cov / det cov_best), the ratio of the posterior masses around both (Laplace)."""
     size = np.linalg.slogdet(m.local.covariance)[1] - np.linalg.slogdet(best.local.covariance)[1]
     return float(np.exp(min(0.5 * (best.cost - m.cost) + 0.5 * size, 0.0)))

@@ -1,4 +1,4 @@
-"""The one entry point: from measurements, some of them wrong, to a pose that says what it knows (paper IV, issue 3)."""
+"""The entry point of fusion: computes a pose from measurements, some of which may be wrong (paper IV)."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ def fuse(
     prove_set_within_s: float | None = None,
     seed: int = 0,
 ) -> FusedPose:
-    """The pose that the largest agreeing part of the measurements points to.
+    """Return the pose on which the largest part of the measurements agrees.
 
     Args:
         measurements: any mixture of the nine classes, in any order.
-        prior: a pose believed beforehand (say from the four lights) with its covariance; it can be outvoted, and is then
-            listed in `rejected` with index -1.
-        shape: the object's family when its own measures (a radius, a size) are to be estimated too; measurements with a
-            `part` follow it, and a prior pose is needed to start from.
+        prior: a prior pose (say from the four lights) with its covariance; it can be outvoted, and is then listed in
+            `rejected` with index -1.
+        shape: the object's family when its own dimensions (a radius, a size) are to be estimated too; measurements with a
+            `part` follow it, and a prior pose is needed as a start.
         certify: also bound the error from below by a semidefinite relaxation (needs clarabel).
-        prove_set_within_s: also prove which set of measurements is best, by branch and bound, for at most 16 of them; after
-            so many seconds the gap that is left is stated instead.
-        seed: of the random subsets; the same input and seed give the same answer.
+        prove_set_within_s: also prove which set of measurements is best, by branch and bound, for at most 16 of them;
+            after so many seconds the remaining gap is stated instead.
+        seed: of the random subsets; the same input and seed give the same result.
 
     Raises:
-        InvalidRequest: a measurement makes no sense (`details["index"]`, `details["reason"]`), there is none, there are too
+        InvalidRequest: a measurement is invalid (`details["index"]`, `details["reason"]`), there is none, there are too
             many for branch and bound, or a shape comes without a prior pose or with something to prove.
         Contradiction: no set of measurements agrees by more than chance; `details` names those outside the best set.
     """
@@ -73,10 +73,10 @@ def fuse(
 def used_entries(
     measurements: Sequence[Measurement], answer: FusedPose
 ) -> tuple[Batch, NDArray[np.bool_], LocalSolution]:
-    """An answer's measurements packed, which of them it used (N,), and the local solution there: for a certificate.
+    """Return the packed measurements of a result, which of them it used (N,), and the local solution there.
 
     Raises:
-        InvalidRequest: a measurement makes no sense.
+        InvalidRequest: a measurement is invalid.
     """
     b = pack(measurements)
     used = np.ones(len(measurements), bool)

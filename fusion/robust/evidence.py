@@ -1,4 +1,4 @@
-"""Do measurements agree because of the pose, or by chance?"""
+"""Tests whether measurements agree because of the pose or by chance."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ POSE_VOLUME = 8.0 * math.pi**2  # of all rotations (as rotation vectors spread e
 
 
 def log_evidence(b: Batch, used: NDArray[np.bool_], local: LocalSolution) -> float:
-    """Log odds of the used measurements stemming from one pose, against all N being strays; natural logarithm.
+    """Return the natural log odds that the used measurements stem from one pose, against all N being outliers.
 
-    A stray hits anywhere within a metre and any direction cosine; a good one falls near its place with its own covariance.
-    The pose pays for its freedom (posterior over prior volume, Laplace), and for the choice of this set among all of its size.
+    An outlier is uniform within a metre and over direction cosines; an inlier is near its predicted value with its own
+    covariance. Two penalties are subtracted: for the free parameters of the pose (posterior over prior volume,
+    Laplace), and for the choice of this set among all sets of its size.
 
     Args:
         b: packed measurements.

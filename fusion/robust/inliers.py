@@ -1,14 +1,15 @@
-"""The best set of measurements, proven: branch and bound over which of them to believe (notes/fusion.md, "Robust").
+"""The best set of measurements, proven by branch and bound over the inlier sets (notes/fusion.md, "Robust").
 
 The truncated error sum min(E_i, gate_i) of N measurements is the least, over all 2^N sets I, of
 
     min over poses of sum_{i in I} E_i  +  sum_{i not in I} gate_i.
 
-A node of the tree has decided some measurements: I believed, O not. Whatever the rest does, the error there is at least
-min sum_I E_i + sum_O gate_i, and the first term has the lower bound of `fusion.certify`. Nodes whose bound exceeds the best
-error known are cut off; when none is left, that error is proven to be the least. E_i is the local pose function with its
-covariance frozen at the answer, so the proof holds for that quadratic error; for classes 1, 2, 3, 5 and 9, whose residual has
-a constant covariance up to the object's own turn, this changes little, for 4, 6, 7 and 8 it is first order.
+A node of the tree has decided some measurements: I are inliers, O outliers. Whatever is decided for the rest, the error
+there is at least min sum_I E_i + sum_O gate_i, and `fusion.certify` gives a lower bound of the first term. Nodes whose
+bound exceeds the best error known are cut off; when none is left, that error is proven to be the least. E_i is the
+local pose function with its covariance frozen at the given solution, so the proof holds for that quadratic error. This
+changes little for classes 1, 2, 3, 5 and 9, whose residuals have a constant covariance up to the object's rotation; for
+4, 6, 7 and 8 it is first order.
 """
 
 from __future__ import annotations
@@ -41,16 +42,16 @@ IGNORED_DOF = 6  # fewer constraints than this fit some pose exactly, so their b
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ProvenSet:
-    """What branch and bound found.
+    """Result of branch and bound.
 
     Attributes:
-        believed: indices of the measurements that the best set believes; -1 for a prior pose.
-        cost: its truncated error, covariances frozen at the answer that was given.
+        believed: indices of the inliers of the best set; -1 for a prior pose.
+        cost: its truncated error, covariances frozen at the given solution.
         lower_bound: no pose has a smaller truncated error; equal to `cost` (to 1e-4) when proven.
-        gap: cost - lower_bound: what the deadline left undecided.
-        proven: the tree was searched to its end.
-        agrees: the best set is the one that the answer used.
-        nodes: sets looked at.
+        gap: cost - lower_bound, which is left at the deadline.
+        proven: whether the tree was searched to its end.
+        agrees: whether the best set is the one that the given solution used.
+        nodes: number of sets examined.
         base_from_object: the pose of the best set.
     """
 
@@ -66,7 +67,10 @@ class ProvenSet:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Node:
-    """Decided so far: `state` (N,) is 1 believed, 0 not, -1 open. A pose that fits the believed ones, and their error's bound."""
+    """A partial decision: `state` (N,) is 1 inlier, 0 outlier, -1 undecided.
+
+    `bound` is a lower bound of the truncated error; `R`, `t` is a pose that fits the inliers.
+    """
 
     state: NDArray[np.int64]
     bound: float
@@ -83,12 +87,12 @@ def best_set(
     deadline_s: float,
     clock: Callable[[], float] = time.monotonic,
 ) -> ProvenSet:
-    """The set of measurements with the least truncated error, with proof or with the gap that is left at the deadline.
+    """Return the set of measurements with the least truncated error, proven or with the gap left at the deadline.
 
     Args:
         b: at most 16 packed measurements (a prior pose counts as one).
-        used: (N,) those that the answer believes; `local` its solution.
-        index: (N,) what the caller calls each.
+        used: (N,) inliers of the given solution `local`.
+        index: (N,) the caller's index of each.
         deadline_s: how long to search; the best set so far is returned then.
         clock: seconds, for tests.
 
@@ -121,19 +125,19 @@ def best_set(
 
 
 def too_many(count: int) -> InvalidRequest:
-    """The refusal of a set that branch and bound would not finish."""
+    """Return the error for a set that is too large for branch and bound."""
     what = f"branch and bound takes at most {MOST} measurements, not {count}"
     return InvalidRequest(what, hint="leave out `prove_set_within_s`, or those that are beyond doubt")
 
 
 def errors(forms: Array, R: Array, t: Array) -> Array:
-    """(N,) E_i = z^T Q_i z at a pose, in the units of the forms (N, 16, 16)."""
+    """Return (N,) E_i = z^T Q_i z at a pose, in the units of the forms (N, 16, 16)."""
     z = monomials(R, t)
     return np.asarray(forms @ z @ z)
 
 
 class _Tree:
-    """Open nodes by bound, and the best truncated error so far with its pose."""
+    """Open nodes sorted by bound, and the best truncated error so far with its pose."""
 
     def __init__(self, forms: Array, gate: Array, dof: NDArray[np.int64], R: Array, t: Array) -> None:
         self.forms, self.gate, self.dof = forms, gate, dof
@@ -149,7 +153,7 @@ class _Tree:
         if not len(undecided) or self._is_hopeless(node.bound):
             return
         f = errors(self.forms, node.R, node.t)
-        # Decide first what tells most: little of it fits here, or, near the start, many constraints.
+        # Decide first the measurement that fits worst here or, near the start, has the most constraints.
         k = int(undecided[np.argmax(np.minimum(f, self.gate)[undecided] + 1e-3 * self.dof[undecided])])
         for believe in (1, 0):
             state = node.state.copy()
@@ -157,7 +161,7 @@ class _Tree:
             self._add(state, node)
 
     def _add(self, state: NDArray[np.int64], parent: _Node) -> None:
-        """Bound a node; keep it if it may hold something better than what is known."""
+        """Bound a node; keep it if it may hold a better set than the best known."""
         self.nodes += 1
         left_out = float(self.gate[state == 0].sum())
         believed = state == 1
@@ -170,7 +174,7 @@ class _Tree:
             heapq.heappush(self.open, (bound, self.nodes, _Node(state=state, bound=bound, R=R, t=t)))
 
     def _fitted(self, believed: NDArray[np.bool_], parent: _Node) -> tuple[Array, Array, float]:
-        """A pose that fits the believed ones, and a lower bound of their error over all poses."""
+        """Return a pose that fits the inliers, and a lower bound of their error over all poses."""
         Q = self.forms[believed].sum(axis=0)
         found = minimiser(Q, parent.R, parent.t)
         if found.proven:
@@ -181,7 +185,7 @@ class _Tree:
         return better.rotation, better.translation, max(bound - SOLVER_SLACK * (1.0 + abs(bound)), 0.0)
 
     def _improve(self, R: Array, t: Array) -> None:
-        """Descend on the truncated error from a pose: fit those inside their gates until the set stands."""
+        """Descend on the truncated error from a pose: fit the inliers of the gates until their set is stable."""
         inside = None
         for _ in range(RESCUES):
             f = errors(self.forms, R, t)

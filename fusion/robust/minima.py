@@ -1,4 +1,4 @@
-"""The minima of the truncated error sum min(f_i, gate_i): found from small subsets, finished on the exact functions.
+"""The minima of the truncated error sum min(f_i, gate_i), found from small subsets and refined on the exact functions.
 
 The gate passes 99.9 % of good measurements (notes/fusion.md, "Robust").
 """
@@ -35,20 +35,20 @@ MOST_MIRRORED = 16  # minima whose mirror images are looked for
 READMITTED = 3  # cheapest candidates whose rejected measurements are tried again
 ALTERNATIVE_COST = 18.0  # a minimum this much worse has odds below 1e-4
 SAME_SIGMAS = 6.0  # minima closer than this are one
-# Minima that leave a motion free are one within this turn: their information speaks of their surroundings only.
+# Minima with a free motion are the same within this angle, because their information is only local.
 FREE_COSINE = math.cos(0.5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Minimum:
-    """A minimum of the truncated error: `used` (N,) marks what lies inside its gate."""
+    """A minimum of the truncated error; `used` (N,) marks the measurements inside their gates."""
 
     cost: float
     used: Flags
     local: LocalSolution
 
     def near(self, other: Minimum) -> bool:
-        """Is `other` another pose, and good enough to be mentioned?"""
+        """Return whether `other` is another pose and good enough to be reported."""
         apart = not _same(other.local.rotation, other.local.translation_m, self.local)
         return apart and other.cost < self.cost + ALTERNATIVE_COST
 
@@ -63,7 +63,7 @@ class Candidates:
 
 
 def minima(b: Batch, rng: np.random.Generator) -> tuple[Minimum, list[Minimum]]:
-    """The best minimum and the other distinct ones within ALTERNATIVE_COST, best first."""
+    """Return the best minimum and the other distinct ones within ALTERNATIVE_COST, best first."""
     n = len(b.cls)
     small = b if n <= MOST_SEARCHED else b.part(np.sort(rng.choice(n, MOST_SEARCHED, replace=False)))
     found: list[Minimum] = []
@@ -74,7 +74,7 @@ def minima(b: Batch, rng: np.random.Generator) -> tuple[Minimum, list[Minimum]]:
     while waiting:
         poses = waiting.pop(0)
         for R, t in zip(poses.R, poses.t, strict=True):
-            # A pose from part of the measurements is only as exact as those are.
+            # A pose from a part of the measurements is only as exact as that part.
             if any(_same(R, t, m.local, share=len(small.cls) / n) for m in found):
                 continue
             if small is not b:
@@ -93,7 +93,7 @@ def minima(b: Batch, rng: np.random.Generator) -> tuple[Minimum, list[Minimum]]:
 
 
 def _search(b: Batch, rng: np.random.Generator) -> Candidates:
-    """Settled candidates from rounds of subsets, until a better pose is improbable; only those near the least cost."""
+    """Return settled candidates near the least cost, from rounds of subsets until a better pose is improbable."""
     n, done, size = len(b.cls), 0, FIRST_ROUND
     rounds: list[tuple[Array, Array, Array]] = []
     least, agreeing = np.inf, 0
@@ -110,7 +110,7 @@ def _search(b: Batch, rng: np.random.Generator) -> Candidates:
             break
         size = int(min(max(wanted - done, FIRST_ROUND), LARGEST_ROUND, 3 * size))
     R, t, cost = (np.concatenate(part) for part in zip(*rounds, strict=True))
-    if not len(cost):  # no subset fits any pose; one that is judged says what each measurement misses it by
+    if not len(cost):  # no subset fits any pose; the result for this one shows how badly each measurement fits
         R, t = np.eye(3)[np.newaxis], np.zeros((1, 3))
         place(b, np.ones(n), R[0], t[0])
         cost = np.array([search.settle(b, R[0], t[0], np.empty(n), True)])
@@ -121,14 +121,17 @@ def _search(b: Batch, rng: np.random.Generator) -> Candidates:
 
 
 def _nearby(found: Candidates, least: float) -> Candidates:
-    """The candidates that may become minima worth a mention, cheapest first."""
+    """Return the candidates that may become minima worth reporting, cheapest first."""
     order = np.argsort(found.cost, kind="stable")
     order = order[found.cost[order] < least + ALTERNATIVE_COST + 5.0]
     return Candidates(R=found.R[order], t=found.t[order], cost=found.cost[order])
 
 
 def _enough(b: Batch, agreeing: int) -> float:
-    """Subsets after which a clean, converging one has been missed with MISS_PROBABILITY, if `agreeing` dof are good."""
+    """Return the number of subsets after which a clean, converging one is missed with only MISS_PROBABILITY.
+
+    `agreeing`: degrees of freedom of the inliers.
+    """
     total = int(b.dof.sum())
     typical = float(b.dof @ b.dof) / max(total, 1)  # of an entry picked in proportion to its dof
     picks = min(math.ceil(search.SUBSET_DOF / max(typical, 1.0)), search.SUBSET_MOST, len(b.dof))
@@ -137,16 +140,16 @@ def _enough(b: Batch, agreeing: int) -> float:
 
 
 def _draws(rng: np.random.Generator, count: int) -> Array:
-    """The random numbers of `count` hypotheses, (count, DRAWS): picks, evenly in 0 to 1, then quaternions, normal."""
+    """Return the random numbers of `count` hypotheses, (count, DRAWS): uniform picks, then normal quaternions."""
     made = rng.random((count, search.DRAWS))
     made[:, search.SUBSET_MOST :] = rng.normal(size=(count, search.DRAWS - search.SUBSET_MOST))
     return made
 
 
 def _everywhere(b: Batch, rng: np.random.Generator) -> Candidates:
-    """Settled poses from many hypotheses, one each of those that are alike: three rays, for one, fit up to four poses.
+    """Return settled poses from many hypotheses, one per group of similar ones; three rays, say, fit up to four.
 
-    `_search` stops once it has a pose that cannot be bettered; where others fit as well, that says nothing of them.
+    `_search` stops once it has a pose that cannot be improved, which says nothing of other poses that fit as well.
     """
     draws = _draws(rng, EVERYWHERE)
     R, t, cost = np.empty((EVERYWHERE, 3, 3)), np.empty((EVERYWHERE, 3)), np.empty(EVERYWHERE)
@@ -164,9 +167,9 @@ def _everywhere(b: Batch, rng: np.random.Generator) -> Candidates:
 
 
 def _mirrored(b: Batch, R: Array, t: Array) -> Candidates:
-    """Settled poses from half a turn about each principal axis of the features' places, then of their directions.
+    """Return settled poses after half a turn about each principal axis of the features' points and directions.
 
-    Each stands where its turn fits best those that agree at R, t.
+    Each gets the translation that best fits the inliers of the pose R, t.
     """
     own, aimed = b.cls > 0, np.isin(b.cls, AIMED)
     if not own.any():
@@ -185,7 +188,7 @@ def _mirrored(b: Batch, R: Array, t: Array) -> Candidates:
 
 
 def finished(b: Batch, R: Array, t: Array) -> Minimum:
-    """The exact minimum near R, t with the set of used measurements brought into agreement with the exact gate."""
+    """Return the exact minimum near R, t, with the set of used measurements made consistent with the exact gate."""
     f = np.empty(len(b.cls))
     values(b, R, t, False, f)
     used = f < b.gate
@@ -199,7 +202,7 @@ def finished(b: Batch, R: Array, t: Array) -> Minimum:
 
 
 def _same(R: Array, t: Array, local: LocalSolution, *, share: float = 1.0) -> bool:
-    """Is R, t within a few standard deviations of a minimum, when it rests on a `share` of its information?"""
+    """Return whether R, t is within a few sigmas of a minimum, if it rests on a `share` of its information."""
     W = R @ local.rotation.T
     half = 0.5 * np.array([W[2, 1] - W[1, 2], W[0, 2] - W[2, 0], W[1, 0] - W[0, 1]])
     cosine, sine = 0.5 * (np.trace(W) - 1.0), math.sqrt(half @ half)

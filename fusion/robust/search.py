@@ -1,7 +1,7 @@
-"""Poses from small random subsets, and their refinement on everything that agrees, compiled (notes/fusion.md, "Robust").
+"""Poses from small random subsets, and their refinement on the inliers, compiled (notes/fusion.md, "Robust").
 
-Annealed truncation alone loses the right pose when a quarter of the measurements are bad; subsets that happen to be clean do
-not. A subset carries just enough freedom to be checked (8 degrees of freedom for 6 unknowns).
+Annealed truncation alone loses the right pose when a quarter of the measurements are bad; random subsets that happen to
+be free of outliers do not. A subset has one more degree of freedom than the 6 unknowns, so that it can be checked.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from fusion.solve.placement import place
 from hal.arrays import Array
 from hal.jit import as_numpy_scalar, compiled, inlined
 
-SUBSET_DOF = 7  # six unknowns and one to check them by; 8 finds clean subsets a third less often
+SUBSET_DOF = 7  # six unknowns and one for a check; 8 finds clean subsets a third less often
 SUBSET_MOST = 8  # measurements in a subset
 ROTATIONS = 3
 DRAWS = SUBSET_MOST + 4 * ROTATIONS  # random numbers a hypothesis uses: picks and quaternions
 STEPS, ANNEAL_STEPS = as_numpy_scalar(12), as_numpy_scalar(4)
 ANNEALED, AS_IT_IS = as_numpy_scalar(True), as_numpy_scalar(False)
-FIT_LIMIT = 60.0  # a subset that its own pose explains no better than this is not clean
+FIT_LIMIT = 60.0  # a subset with a larger error at its own pose contains outliers
 LEAST_GAIN = 1e-6  # of truncated error, below which two are equal
 ANNEAL = (8.0, 4.0, 2.0, 1.0)
-OTHERS = 2  # hypotheses of another attitude that are settled too: the cheapest are often all one pose, and its mirror image none
+OTHERS = 2  # hypotheses of another attitude that are settled too, because the cheapest are often all one pose
 OTHER_ATTITUDE = 2.86  # trace of the turn between two of one attitude: 0.38 rad
 OTHER_COST = 23.0  # of truncated error above the cheapest, up to which a hypothesis may become another answer
 
@@ -43,9 +43,9 @@ def _rotation(R: Array, x: float, y: float, z: float, w: float) -> None:
 
 @inlined
 def _pick(b: Batch, draws: Array, h: int, use: Array) -> None:
-    """Mark a random subset of SUBSET_DOF degrees of freedom, each entry as likely as it has degrees of freedom.
+    """Mark a random subset of SUBSET_DOF degrees of freedom; each entry's probability is proportional to its own.
 
-    The fewer entries it takes, the likelier all of them are good.
+    The fewer entries a subset has, the more likely all of them are good.
     """
     use[:] = 0.0
     total, dof = 0, 0
@@ -68,7 +68,7 @@ def _pick(b: Batch, draws: Array, h: int, use: Array) -> None:
 
 @inlined
 def _start(b: Batch, draws: Array, h: int, use: Array, R: Array, t: Array, work: Array) -> None:
-    """The best of ROTATIONS random rotations, each with its best translation."""
+    """Set R, t to the best of ROTATIONS random rotations, each with its best translation."""
     R1, t1 = np.empty((3, 3)), np.empty(3)
     least = np.inf
     for k in range(ROTATIONS):
@@ -83,7 +83,7 @@ def _start(b: Batch, draws: Array, h: int, use: Array, R: Array, t: Array, work:
 
 @compiled
 def hypotheses(b: Batch, draws: Array, Rs: Array, ts: Array, costs: Array) -> None:
-    """One pose per row of `draws` (H, DRAWS): Rs (H, 3, 3), ts (H, 3) and truncated costs (H,), infinite if unfit."""
+    """Compute a pose per row of `draws` (H, DRAWS): Rs (H, 3, 3), ts (H, 3), truncated costs (H,), infinite if bad."""
     n = b.cls.size
     use, f, work = np.empty(n), np.empty(n), np.empty((13, 6))
     for h in range(draws.shape[0]):
@@ -101,7 +101,7 @@ def hypotheses(b: Batch, draws: Array, Rs: Array, ts: Array, costs: Array) -> No
 
 @inlined
 def truncated(b: Batch, f: Array) -> float:
-    """sum min(f_i, gate_i) (TLS)"""
+    """Return the truncated error sum min(f_i, gate_i)."""
     cost = 0.0
     for i in range(f.size):
         cost += min(f[i], b.gate[i])
@@ -110,10 +110,10 @@ def truncated(b: Batch, f: Array) -> float:
 
 @compiled
 def candidates(b: Batch, draws: Array, most: int, Rs: Array, ts: Array, costs: Array, inside: NDArray[np.int64]) -> int:
-    """One round: hypotheses from `draws` (H, DRAWS), of which the best `most` are settled, and OTHERS of other attitudes.
+    """Make one round: hypotheses from `draws` (H, DRAWS); the best `most` are settled, and OTHERS of other attitudes.
 
-    The first so many rows of Rs (H, 3, 3), ts (H, 3), costs (H,) are the settled ones, cheapest first, with the degrees
-    of freedom inside their gates in `inside` (H,). Returns how many.
+    The first rows of Rs (H, 3, 3), ts (H, 3) and costs (H,) receive the settled ones, cheapest first, and `inside` (H,)
+    the degrees of freedom inside their gates. Returns their number.
     """
     n = b.cls.size
     hypotheses(b, draws, Rs, ts, costs)
@@ -143,7 +143,7 @@ def candidates(b: Batch, draws: Array, most: int, Rs: Array, ts: Array, costs: A
 
 @inlined
 def _is_other(R: Array, known: Array, count: int) -> bool:
-    """Is R (3, 3) of another attitude than the first `count` of `known`?"""
+    """Return whether R (3, 3) has another attitude than the first `count` of `known`."""
     for k in range(count):
         turn = 0.0
         for i in range(3):
@@ -156,7 +156,10 @@ def _is_other(R: Array, known: Array, count: int) -> bool:
 
 @compiled
 def settle(b: Batch, R: Array, t: Array, f: Array, annealed: bool) -> float:
-    """Refine R, t in place on the measurements inside a shrinking gate until the set stands; fills f (N,), returns TLS."""
+    """Refine R, t in place on the inliers of a shrinking gate until their set is stable; fills f (N,).
+
+    Returns the truncated error.
+    """
     n = b.cls.size
     use, before = np.ones(n), np.ones(n)
     if annealed:
@@ -181,10 +184,10 @@ def settle(b: Batch, R: Array, t: Array, f: Array, annealed: bool) -> float:
 
 @compiled
 def readmit(b: Batch, R: Array, t: Array, cost: float) -> float:
-    """Descend in place by believing one rejected measurement more, wherever that lowers the truncated error; returns it.
+    """Add one rejected measurement at a time, in place, wherever that lowers the truncated error; returns that error.
 
-    `settle` stops where each set suits its own pose. A set that is one measurement short can do so too: what it leaves
-    almost free is then some other noise's, and the good measurement that would hold it looks wrong.
+    `settle` stops where a set and its pose are consistent. That can also happen with one good measurement missing: the
+    direction that it would constrain is then fitted to noise, and the measurement looks wrong.
     """
     n = b.cls.size
     use, f, left_out = np.empty(n), np.empty(n), np.empty(n)

@@ -1,9 +1,9 @@
-"""Pose and measures of an object together: Gauss-Newton over 6 + P unknowns on the same rows (paper section IV: "applicable to
-problems in which parameterized information is required", such as feature size).
+"""Pose and dimensions of an object together: Gauss-Newton over 6 + P unknowns on the same residual rows.
 
-The features of a shape move with its parameters and with the place sensed. At each step they are set anew, the rows' derivatives
-over the pose are those of `distance.rows` (moving along a tangent changes a distance to second order only), and those over the
-parameters are differences.
+Paper section IV: "applicable to problems in which parameterized information is required", such as feature size. The
+features of a shape move with its parameters and with the sensed point, so they are computed again at each step. The
+derivatives over the pose are those of `distance.rows` (a motion along a tangent changes a distance to second order
+only), and those over the parameters are finite differences.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ DIFFERENCE = 1e-6  # share of a parameter's sigma
 
 
 def fuse_shape(given: Sequence[Measurement], shape: Shape, prior: UncertainPose) -> FusedPose:
-    """Pose and parameters of a shape from measurements of its parts, some of them perhaps wrong.
+    """Return the pose and the parameters of a shape from measurements of its parts, some of which may be wrong.
 
     Args:
         given: measurements; those with a `part` follow the shape, others keep their feature.
-        shape: the family, with what is believed of its parameters.
-        prior: a believed pose, good enough to say which side of the object was sensed.
+        shape: the family, with prior values of its parameters.
+        prior: a prior pose, good enough to say which side of the object was sensed.
 
     Raises:
-        InvalidRequest: a measurement makes no sense or names no part of the shape.
-        Contradiction: those that agree could do so by chance.
+        InvalidRequest: a measurement is invalid or names no part of the shape.
+        Contradiction: the inliers could agree by chance.
     """
     repeats = duplicates(given)
     distinct = [i for i in range(len(given)) if i not in repeats]
@@ -52,7 +52,7 @@ def fuse_shape(given: Sequence[Measurement], shape: Shape, prior: UncertainPose)
     everything = np.ones(len(measurements) + 1)
     found = [_descended(measurements, shape, prior, weigh, everything) for weigh in (_level, _forgiving)]
     if not all(made[2].all() for made in found):
-        # A precise mismatch can bend the measures until it fits; a random half of the measurements often is without it.
+        # A precise outlier can distort the dimensions until it fits; a random half of the data often excludes it.
         rng = np.random.default_rng(0)
         for _ in range(RESTARTS):
             half = np.asarray(rng.random(len(everything)) < 0.5, float)
@@ -77,12 +77,12 @@ def fuse_shape(given: Sequence[Measurement], shape: Shape, prior: UncertainPose)
 
 
 def _level(f: Array, gate: Array, scale: float) -> Array:
-    """Huber's weights: a large misfit counts by its size, not by its square; good where many misfits are the start's."""
+    """Return Huber's weights: a large residual counts linearly; good where the start causes many large residuals."""
     return np.asarray(np.minimum(1.0, np.sqrt(scale**0.5 * gate / np.maximum(f, 1e-9))))
 
 
 def _forgiving(f: Array, gate: Array, scale: float) -> Array:
-    """Geman and McClure's weights, narrowing: a misfit far beyond the others stops counting; good where few are wrong."""
+    """Return Geman and McClure's weights, narrowing: a far larger residual stops counting; good with few outliers."""
     return np.asarray((scale * gate / (scale * gate + f)) ** 2)
 
 
@@ -93,9 +93,9 @@ def _descended(
     weigh: Callable[[Array, Array, float], Array],
     start_with: Array,
 ) -> tuple[RigidTransform, Array, NDArray[np.bool_], float]:
-    """Pose, parameters, which measurements (N,) lie inside their gates, and the truncated error, by narrowing weights.
+    """Return pose, parameters, inliers (N,) and truncated error, by narrowing weights.
 
-    `start_with` (N,): 0 for those that count only at the end.
+    `start_with` (N,): 0 for the measurements that count only at the end.
     """
     pose, values = prior.parent_from_child, np.array(shape.start, float)
     b, f, _, _ = _system(measurements, shape, prior, pose, values, np.zeros(len(measurements) + 1))
@@ -113,7 +113,7 @@ def _descended(
             continue
         last = 0 if step @ H @ step < 1e-8 else last - 1
         weights = np.asarray(f < b.gate, float)
-        weights[-1] = 1.0  # the believed pose says which side was sensed; without it nothing holds
+        weights[-1] = 1.0  # the prior pose says which side was sensed, so it is always used
     return pose, values, weights > 0, float(np.minimum(f, b.gate).sum())
 
 
@@ -125,7 +125,7 @@ def _system(
     values: Array,
     weights: Array,
 ) -> tuple[Batch, Array, Array, Array]:
-    """The batch at these features, f (N,), and the weighted normal equations H (6 + P, 6 + P), g over pose and parameters."""
+    """Return the batch at these features, f (N,), and the weighted normal equations H (6 + P, 6 + P), g."""
     R, t = np.array(matrix_of(pose), order="C"), np.array(pose.translation, order="C")
     spread = np.asarray(shape.sigma, float)
     b = pack(_placed(measurements, shape, pose, values), prior)
@@ -148,7 +148,7 @@ def _system(
 def _placed(
     measurements: Sequence[Measurement], shape: Shape, pose: RigidTransform, values: Array
 ) -> list[Measurement]:
-    """The measurements with the features that the shape has at these parameters, next to where they were made."""
+    """Return the measurements with the features that the shape has at these parameters, near the sensed points."""
     object_from_base = pose.inv()
     made = []
     for i, m in enumerate(measurements):
@@ -166,7 +166,7 @@ def _placed(
 
 
 def _rows(b: Batch, R: Array, t: Array) -> tuple[Array, Array]:
-    """Whitened residuals (N, 6) and Jacobians (N, 6, 6) of a batch."""
+    """Return the whitened residuals (N, 6) and Jacobians (N, 6, 6) of a batch."""
     n = len(b.cls)
     r, J = np.zeros((n, 6)), np.zeros((n, 6, 6))
     whitened_all(b, R, t, r, J)
@@ -176,12 +176,12 @@ def _rows(b: Batch, R: Array, t: Array) -> tuple[Array, Array]:
 def _local(
     b: Batch, f: Array, H: Array, pose: RigidTransform, used: NDArray[np.bool_], sigma: Array
 ) -> tuple[LocalSolution, Array]:
-    """The solution as one of the pose alone, and the covariance (6 + P, 6 + P) of pose and parameters."""
+    """Return the solution for the pose alone, and the covariance (6 + P, 6 + P) of pose and parameters."""
     joint = np.asarray(np.linalg.inv(H), float)
     information = np.linalg.inv(joint[:6, :6])
     fitted = len(sigma) - float(
         np.diag(joint)[6:] @ sigma**-2.0
-    )  # parameters that the measurements tell, not the belief
+    )  # parameters determined by the measurements, not by the prior
     R = matrix_of(pose)
     covariance, free = covariance_and_freedom(information, *middle_and_size(b, used, R))
     local = LocalSolution(

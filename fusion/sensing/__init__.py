@@ -1,9 +1,9 @@
-"""From what a sensor says to a measurement with its distance function (paper section IV-B, eq 13).
+"""Turns sensor readings into measurements with their distance functions (paper section IV-B, eq 13).
 
-Every function takes the sensor's pose as an `UncertainPose`, so that what is not known about the arm or the mounting enters C
-and M, and propagates covariances to first order. Which of the nine classes comes out depends on the feature given: a touched
-point on an edge is point-line, on a face point-plane. Pixels are undistorted first (perception's camera model); camera axes are
-x right, y down, z forward. Measurements from one sensor pose share its error; the fusion takes them as independent.
+Every function takes the sensor's pose as an `UncertainPose`, so that the uncertainty of arm and mounting enters C and
+M, and propagates covariances to first order. The class depends on the feature given: a touched point on an edge is
+point-line, on a face point-plane. Pixels are undistorted first (perception's camera model); camera axes are x right, y
+down, z forward. Measurements from one sensor pose share its error; fusion takes them as independent.
 """
 
 from __future__ import annotations

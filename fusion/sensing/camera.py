@@ -1,4 +1,4 @@
-"""One camera: a pixel is a line through the lens, an edge in the image a plane through it."""
+"""Measurements of one camera: a pixel is a line through the lens, an edge in the image a plane through it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Pinhole:
     cy_px: float
 
     def ray(self, pixel_px: ArrayLike) -> Array:
-        """(3,) unit direction in the camera frame of an undistorted pixel (u, v)."""
+        """Return the (3,) unit direction in the camera frame of an undistorted pixel (u, v)."""
         u, v = np.asarray(pixel_px, float)
         ray = np.array([(u - self.cx_px) / self.fx_px, (v - self.cy_px) / self.fy_px, 1.0])
         return np.asarray(ray / np.linalg.norm(ray))
@@ -41,12 +41,12 @@ def pixel(
     label: str = "",
     sensor: str = "camera",
 ) -> Measurement:
-    """A point (a vertex, a light) seen by one camera: line-point, the line from the lens through the point.
+    """Return the measurement of a point (a vertex, a light) by one camera, of class line-point: a line from the lens.
 
     Args:
         feature: the point, object frame.
         base_from_camera: pose of the camera.
-        pixel_px: (2,) undistorted image place.
+        pixel_px: (2,) undistorted image point.
         sigma_px: its standard deviation per axis.
         camera: the camera.
     """
@@ -68,7 +68,7 @@ def image_line(
     label: str = "",
     sensor: str = "camera",
 ) -> Measurement:
-    """An edge seen by one camera: plane-line, the plane of the lens and the image line.
+    """Return the measurement of an edge by one camera, of class plane-line: the plane of lens and image line.
 
     Args:
         feature: the edge, object frame.
@@ -98,5 +98,5 @@ def _checked_ends(ends_px: ArrayLike) -> Array:
 
 
 def _image_plane(camera: Pinhole, ends: Array) -> Array:
-    """(3,) unit normal, camera frame, of the plane through the lens and two image points."""
+    """Return the (3,) unit normal, camera frame, of the plane through the lens and two image points."""
     return unit(np.cross(camera.ray(ends[0]), camera.ray(ends[1])))

@@ -1,4 +1,4 @@
-"""Touch, proximity and range: a point or a plane in the sensor's own frame becomes a measurement."""
+"""Measurements by touch, proximity and range: a point or a plane in the sensor's own frame."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def touch(
     label: str = "",
     sensor: str = "touch",
 ) -> Measurement:
-    """A fingertip felt `feature`: point-point, point-line or point-plane.
+    """Return the measurement of a fingertip contact with `feature`: point-point, point-line or point-plane.
 
     Args:
         feature: what was touched, object frame.
         base_from_finger: pose of the finger at contact.
-        sigma_m: standard deviation of the contact place, same in all directions.
+        sigma_m: standard deviation of the contact point, the same in all directions.
         tip_m: (3,) the tip in the finger frame.
     """
     return range_point(
@@ -45,7 +45,7 @@ def proximity(
     label: str = "",
     sensor: str = "proximity",
 ) -> Measurement:
-    """A distance along the sensor's z axis to `feature`: point-point, point-line or point-plane.
+    """Return the measurement of a distance along the sensor's z axis to `feature`: point-point, -line or -plane.
 
     Args:
         feature: what was sensed, object frame.
@@ -69,7 +69,7 @@ def range_point(
     label: str = "",
     sensor: str = "range",
 ) -> Measurement:
-    """A sensed point with any covariance: point-point, point-line or point-plane.
+    """Return the measurement of a sensed point with any covariance: point-point, point-line or point-plane.
 
     Args:
         feature: what the point lies on, object frame.
@@ -95,12 +95,12 @@ def range_plane(
     label: str = "",
     sensor: str = "range",
 ) -> Measurement:
-    """A plane fitted to a range image: plane-plane, or plane-line and plane-point for what lies in it.
+    """Return the measurement of a plane fitted to a range image: plane-plane, or -line and -point for features in it.
 
     Args:
         feature: what lies in the plane, object frame.
         base_from_sensor: pose of the scanner.
-        point_m: (3,) middle of the fitted patch, sensor frame: there offset and tilt are independent.
+        point_m: (3,) centroid of the fitted patch, sensor frame, where offset and tilt are independent.
         normal: (3,) of the plane, sensor frame, either sense.
         offset_sigma_m: standard deviation along the normal.
         normal_sigma_rad: standard deviation of the normal about any axis across it.

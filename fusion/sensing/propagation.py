@@ -1,4 +1,4 @@
-"""First-order propagation of everything uncertain into C and M of the distance function (paper eq 13)."""
+"""First-order propagation of all uncertainties into C and M of the distance function (paper eq 13)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fusion.measurement import Measurement, measurement
 from hal.arrays import Array
 from hal.geometry import UncertainPose, matrix_of, skew
 
-SMALLEST_SIGMA_M = 1e-6  # nothing is placed better than a micrometre
+SMALLEST_SIGMA_M = 1e-6  # no position is known better than a micrometre
 SMALLEST_SIGMA_RAD = 1e-6
 STEP = 1e-5  # of the central differences, in units of a parameter's standard deviation scale (m, rad, px alike)
 
@@ -25,7 +25,7 @@ def sensed_by(
     label: str,
     sensor: str,
 ) -> Measurement:
-    """Measurement from a place and direction in one sensor's frame that depend on errors x with covariance `own`."""
+    """Return a measurement from a point and direction in a sensor's frame that depend on errors of covariance `own`."""
     k = len(own)
 
     def in_base(x: Array) -> tuple[Array, Array]:
@@ -44,7 +44,7 @@ def from_joint(
     label: str,
     sensor: str,
 ) -> Measurement:
-    """Measurement from a place and direction in the base that depend on errors x with `covariance`."""
+    """Return a measurement from a point and direction in the base that depend on errors x with `covariance`."""
     place, direction = sensed(np.zeros(len(covariance)))
 
     def joined(x: Array) -> Array:
@@ -67,17 +67,17 @@ def from_joint(
 
 
 def _lever(shift: Array, direction: Array) -> Array:
-    """d(shift)/d(direction) when the shifted place stays on the line or plane: the shift turns with the direction."""
+    """Return d(shift)/d(direction) when the shifted point stays on the line or plane, so that both turn together."""
     along = float(shift @ direction)
     across = shift - along * direction
-    # along a line the place moves with the direction; in a plane it sinks when the normal leans towards it
+    # on a line the point moves with the direction; on a plane it moves against the normal's tilt
     return along * np.eye(3) - np.outer(direction, across)
 
 
 def _best_known(joint: Array, direction: Array, kind: Kind) -> Array:
-    """Shift along the line, or in the plane, to the place whose error is least coupled to the direction's.
+    """Return the shift along the line, or in the plane, to the point whose error is least coupled to the direction's.
 
-    eq 13 has no term between place and direction, so they had better be independent where it is evaluated.
+    eq 13 has no term between point and direction, so they should be independent where it is evaluated.
     """
     P = np.eye(3) - np.outer(direction, direction)
     spread, coupled = P @ joint[3:, 3:] @ P, joint[:3, 3:]
@@ -89,20 +89,20 @@ def _best_known(joint: Array, direction: Array, kind: Kind) -> Array:
 
 
 def _information(spread: Array, direction: Array) -> Array:
-    """M: the inverse of a direction's covariance (3, 3) across the direction, zero along it."""
+    """Return M: the inverse of a direction's covariance (3, 3) across the direction, zero along it."""
     T = np.linalg.svd(direction[None])[2][1:].T
     across = T.T @ spread @ T + SMALLEST_SIGMA_RAD**2 * np.eye(2)
     return np.asarray(T @ np.linalg.inv(across) @ T.T)
 
 
 def floored(C: Array) -> Array:
-    """A covariance that no direction escapes."""
+    """Return a covariance made symmetric, with a smallest variance in every direction."""
     C = (C + C.T) / 2
     return np.asarray(C + max(SMALLEST_SIGMA_M**2, 1e-9 * np.trace(C)) * np.eye(3))
 
 
 def jacobian(function: Callable[[Array], Array], n: int) -> Array:
-    """(len(function), n) central differences at zero."""
+    """Return (len(function), n) central differences at zero."""
     eye = STEP * np.eye(n)
     return np.column_stack([(function(e) - function(-e)) / (2 * STEP) for e in eye])
 
@@ -116,7 +116,7 @@ def block_diagonal(blocks: Sequence[Array]) -> Array:
 
 
 def moved(pose: UncertainPose, delta: Array) -> tuple[Array, Array]:
-    """Origin (3,) and axes (3, 3) of a pose with error `delta` (6,)."""
+    """Return origin (3,) and axes (3, 3) of a pose with error `delta` (6,)."""
     child = pose.parent_from_child
     W, angle = skew(delta[3:]), float(np.linalg.norm(delta[3:]))
     turn = np.eye(3) + np.sinc(angle / np.pi) * W + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * W @ W  # Rodrigues

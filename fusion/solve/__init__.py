@@ -1,7 +1,8 @@
-"""From a start to the nearest minimum of E, with covariance, fit and what stays free (paper eqs 11, 12).
+"""Local solve: the nearest minimum of E, with covariance, fit and unobservable motions (paper eqs 11, 12).
 
-`placement` finds a translation to start from, `descent` goes down the rows, `polish` ends on the exact functions, and
-`observability` says in words what the measurements leave free. All below `local` and `observability` is compiled.
+`placement` finds an initial translation, `descent` minimises the first-order residuals, `polish` the exact functions,
+and `observability` describes in words what the measurements leave free. All below `local` and `observability` is
+compiled.
 """
 
 from fusion.solve.local import LocalSolution, local_solution, solve, solve_from_many

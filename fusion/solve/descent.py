@@ -1,4 +1,4 @@
-"""Descent on the squared sum of the whitened rows, compiled: from anywhere, or the last steps (`fusion.distance.rows`)."""
+"""Descent on the sum of squares of the whitened rows, compiled: from anywhere, or the last steps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hal.jit import compiled
 
 @compiled
 def accumulate(b: Batch, use: Array, R: Array, t: Array, far: bool, H: Array, g: Array, work: Array) -> float:
-    """H (6, 6) lower = sum J^T J, g (6,) = sum J^T r over entries with use > 0; returns sum |r|^2.
+    """Compute H (6, 6) lower = sum J^T J, g (6,) = sum J^T r over entries with use > 0; returns sum |r|^2.
 
     work: (13, 6) scratch.
     """
@@ -38,7 +38,7 @@ def accumulate(b: Batch, use: Array, R: Array, t: Array, far: bool, H: Array, g:
 
 @compiled
 def cost_of(b: Batch, use: Array, R: Array, t: Array, far: bool, work: Array) -> float:
-    """sum |r|^2 over entries with use > 0."""
+    """Return sum |r|^2 over entries with use > 0."""
     r, J, V = work[0], work[1:7], work[7:13]
     cost = 0.0
     for i in range(b.cls.size):
@@ -56,10 +56,10 @@ def cost_of(b: Batch, use: Array, R: Array, t: Array, far: bool, work: Array) ->
 
 @compiled
 def descend(b: Batch, use: Array, R: Array, t: Array, far: bool, steps: int, tolerance: float) -> float:  # noqa: PLR0912 - one flat loop, for the compiler
-    """Levenberg-Marquardt on sum |r|^2 over entries with use > 0; moves R (3, 3) and t (3,) in place, returns the cost.
+    """Minimise sum |r|^2 over entries with use > 0 by Levenberg-Marquardt, moving R, t in place; returns the cost.
 
     The step is damped in proportion to the diagonal of J^T J (Marquardt), so metres and radians need no common scale.
-    Stops when the predicted fall is below `tolerance`.
+    It stops when the predicted decrease is below `tolerance`.
     """
     H, L, g, step = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty(6)
     H1, g1, work = np.empty((6, 6)), np.empty(6), np.empty((13, 6))
@@ -84,7 +84,7 @@ def descend(b: Batch, use: Array, R: Array, t: Array, far: bool, steps: int, tol
             fall += step[j] * step[j]
         solve_upper(L, step, 6)
         turn = step[3] ** 2 + step[4] ** 2 + step[5] ** 2
-        if turn > 1.0:  # beyond a radian the linearisation says nothing
+        if turn > 1.0:  # the linearisation is not valid beyond a radian
             for j in range(6):
                 step[j] /= turn**0.5
         for p in range(3):

@@ -1,4 +1,4 @@
-"""The local solve: from a start to the nearest minimum of E, with covariance, fit and what stays free (paper eqs 11, 12)."""
+"""The local solve: from a start to the nearest minimum of E, with covariance and unobservable motions (eqs 11, 12)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hal.arrays import Array
 from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose
 
-MIN_SIZE_M = 0.05  # features closer together than this still make an object of this size
+MIN_SIZE_M = 0.05  # smallest size of an object, even if its features are closer together
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,7 +28,7 @@ class LocalSolution:
 
     Attributes:
         rotation, translation_m: the pose, base_from_object, (3, 3) and (3,).
-        covariance: 6x6, translation then rotation, base axes, m and rad; free directions carry 10 object sizes or 10 rad.
+        covariance: 6x6, translation then rotation, base axes, m and rad; free directions have 10 object sizes or rad.
         information: 6x6 in the same order.
         values: (N,) exact local pose functions, the prior's share last if there was one.
         chi_square: their sum, E.
@@ -54,10 +54,10 @@ class LocalSolution:
 def solve(
     measurements: Sequence[Measurement], start: RigidTransform, *, prior: UncertainPose | None = None
 ) -> LocalSolution:
-    """The minimum of E = sum f_i near `start`; believes every measurement.
+    """Return the minimum of E = sum f_i near `start`; uses every measurement.
 
     Raises:
-        InvalidRequest: a measurement makes no sense, or there is none.
+        InvalidRequest: a measurement is invalid, or there is none.
     """
     if not len(measurements) and prior is None:
         raise InvalidRequest("no measurement to fuse", hint="give at least one measurement or a prior pose")
@@ -72,10 +72,10 @@ def solve_from_many(
     seed: int = 0,
     prior: UncertainPose | None = None,
 ) -> LocalSolution:
-    """The best of several local solves from random rotations: plain least squares over all measurements (paper, 1990).
+    """Return the best of several local solves from random rotations: least squares over all measurements (paper, 1990).
 
     Raises:
-        InvalidRequest: a measurement makes no sense, or there is none.
+        InvalidRequest: a measurement is invalid, or there is none.
     """
     if not len(measurements):
         raise InvalidRequest("no measurement to fuse", hint="give at least one measurement")
@@ -92,9 +92,9 @@ def _started(b: Batch, use: Array, rotation: Array) -> LocalSolution:
 
 
 def local_solution(b: Batch, use: Array, rotation: Array, translation_m: Array, *, far: bool = True) -> LocalSolution:
-    """As `solve`, on packed measurements of which `use` (N,) > 0 count; the arguments stay untouched."""
+    """Return the solution as `solve` does, for packed measurements with `use` (N,) > 0; arguments stay unchanged."""
     n = len(b.cls)
-    # C order: numba compiles everything anew for any other layout.
+    # C order, because numba compiles everything again for any other layout.
     R, t = np.array(rotation, float, order="C"), np.array(translation_m, float, order="C")
     H, f, gradient, direction = np.zeros((6, 6)), np.zeros(n), np.zeros((n, 6)), np.zeros((n, 3))
     solve_from(b, use, R, t, far, H, f, gradient, direction)
@@ -113,7 +113,7 @@ def local_solution(b: Batch, use: Array, rotation: Array, translation_m: Array, 
 
 
 def middle_and_size(b: Batch, chosen: NDArray[np.bool_], R: Array) -> tuple[Array, float]:
-    """Middle of the chosen features (3,), from the object's origin in base axes, and their spread, m."""
+    """Return the centroid of the chosen features (3,), from the object's origin in base axes, and their spread, m."""
     points = b.m[chosen & (b.cls > 0)]
     if not len(points):
         return np.zeros(3), 1.0

@@ -1,4 +1,4 @@
-"""Which motions of the object the measurements leave free, in words (issue 3; notes/fusion.md, "Mirrors, rank")."""
+"""Motions of the object that the measurements leave free, in words (notes/fusion.md, "Mirrors, rank")."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from hal.arrays import Array
 from hal.geometry import skew
 
-FREE_SIGMA = 1.0  # a share of the object's size, or a radian: past it the measurements say nothing
-PRIOR_SIGMA = 10.0  # what a free direction's standard deviation is given as, in the same unit
+FREE_SIGMA = 1.0  # in object sizes or radians: a larger standard deviation means that the motion is not observed
+PRIOR_SIGMA = 10.0  # the standard deviation reported for a free direction, in the same unit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FreeDirection:
-    """A motion that the measurements do not see.
+    """A motion that the measurements do not observe.
 
     Attributes:
         words: for people, with the direction in base axes.
@@ -29,14 +29,14 @@ class FreeDirection:
 def covariance_and_freedom(
     information: Array, centre_m: Array, size_m: float
 ) -> tuple[Array, tuple[FreeDirection, ...]]:
-    """6x6 covariance over (translation, rotation) of the object's origin, and the motions that are not observed.
+    """Return the 6x6 covariance over (translation, rotation) of the object's origin, and the unobservable motions.
 
     Free motions get a standard deviation of `PRIOR_SIGMA` radians or object sizes instead of infinity.
 
     Args:
         information: (6, 6) over translation and rotation in base axes.
-        centre_m: (3,) from the object's origin to the middle of its sensed features, base axes. Rotation is judged about it.
-        size_m: how far those features spread; it makes metres and radians comparable.
+        centre_m: (3,) from the object's origin to the centroid of its sensed features, base axes; rotation is about it.
+        size_m: spread of those features; it makes metres and radians comparable.
     """
     # A motion (c, r) of the middle moves the origin by c - r x centre = c + [centre]x r.
     origin_from_centre = np.diag([size_m, size_m, size_m, 1.0, 1.0, 1.0])
@@ -52,7 +52,7 @@ def covariance_and_freedom(
 
 
 def _simple_basis(vectors: Array) -> Array:
-    """Another basis of the same space in which pure shifts stand alone: reduced by the rotation part."""
+    """Return another basis of the same space in which pure translations are separate: reduced by the rotation part."""
     if vectors.shape[1] < 2:
         return vectors
     _, size, turn = np.linalg.svd(vectors[3:])

@@ -1,4 +1,4 @@
-"""Where an object of known rotation stands best: a linear problem, the start of every local solve, compiled."""
+"""The best translation at a known rotation: a linear problem, the start of every local solve, compiled."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from hal.jit import compiled
 
 @compiled
 def place(b: Batch, use: Array, R: Array, t: Array) -> None:  # noqa: PLR0912 - one flat loop, for the compiler
-    """t (3,) in place: the translation that fits the used entries best at rotation R, every row weighing the same.
+    """Set t (3,) in place to the translation that fits the used entries best at rotation R, all rows with equal weight.
 
-    At a fixed rotation all rows are linear in t. What they leave free is taken from the centroids; lines and planes that a
-    camera sees do not count there, since their mu is the camera.
+    At a fixed rotation all rows are linear in t. Directions that they leave free are taken from the centroids; there
+    lines and planes seen by a camera do not count, because their mu is the camera.
     """
     r, J, V = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     A, x = np.zeros((3, 3)), np.zeros(3)

@@ -1,7 +1,7 @@
 """The last steps to the minimum of the exact error E = sum f_i, and the information there, compiled (paper eq 11).
 
-The gradient is exact (envelope theorem), the Hessian first order, so each step shortens the error by the relative error of
-the Hessian, about a hundred times.
+The gradient is exact (envelope theorem) and the Hessian first order, so each step reduces the error by about a factor
+of a hundred, which is the relative accuracy of the Hessian.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ANYWHERE = as_numpy_scalar(True)
 def polish(  # noqa: PLR0912 - one flat loop, for the compiler
     b: Batch, use: Array, R: Array, t: Array, steps: int, H: Array, f: Array, grad: Array, direction: Array
 ) -> float:
-    """Move R, t in place to the minimum of the exact E over used entries; returns the last step's predicted fall.
+    """Move R, t in place to the minimum of the exact E over used entries; returns the last step's predicted decrease.
 
     Fills H (6, 6) with the information sum J^T J at the end, f (N,), grad (N, 6) and v* (N, 3) with exact values there.
     """
@@ -81,7 +81,7 @@ def polish(  # noqa: PLR0912 - one flat loop, for the compiler
 def solve_from(
     b: Batch, use: Array, R: Array, t: Array, far: bool, H: Array, f: Array, grad: Array, direction: Array
 ) -> float:
-    """Local solve from R, t (moved in place): coarse and fine Levenberg-Marquardt, then `polish`."""
+    """Solve locally from R, t (moved in place): coarse and fine Levenberg-Marquardt, then `polish`."""
     if far:
         descend(b, use, R, t, FAR, COARSE_STEPS, 1e-2)
     descend(b, use, R, t, NEAR, FINE_STEPS, 1e-9)

@@ -1,7 +1,7 @@
-"""Flat faces that the sensor has bent: slow errors and calibration turn a wall into a piece of a huge ball.
+"""Simplification of surfaces that sensor errors have bent: a wall may appear as a part of a very large sphere.
 
-Triangulating sensors are off by one or two hundredths of the depth, slowly over the image. A surface that turns by less
-than such errors can is called what it most likely is, a plane.
+Triangulating sensors have errors of one or two per cent of the depth that vary slowly over the image. A surface whose
+normals turn by less than such errors can cause is reported as a plane.
 
 Samples are (4, N) here and in `merge` and `join`: ray coordinates x and y, depth z and its standard deviation.
 """
@@ -20,20 +20,20 @@ from perception.range.segmentation.grid import slow_share_at
 
 BEND_TURN_RAD = 0.3  # walls, floors, screens and table tops of the real development frames turn by 0.07 to 0.27
 ENDS = 0.02  # share of the samples whose normals may turn farther
-NEAR_SIGMAS = 5.0  # the bend that a plane leaves over
+NEAR_SIGMAS = 5.0  # largest residual of a sample that counts as near the simpler surface
 NEAR_SHARE = 0.8
 CUT_SIGMAS = 3.0
-SCRAP_AREA_PX = 600.0  # over which the slowest part of the noise, bands and waves of 30 pixels, keeps its sign
-LEAST_PRICE = 2.0  # of a parameter, Akaike's: Schwarz's is none where there is one value
+SCRAP_AREA_PX = 600.0  # area over which the slowest noise, bands and waves of 30 pixels, keeps its sign
+LEAST_PRICE = 2.0  # cost per parameter (Akaike), because Schwarz's is zero for a single value
 SLENDER_RAD = 0.15  # half-angle of a cone that may be a cylinder
 ROUNDS = as_numpy_scalar(2)  # of robust weights
 
 
 @compiled
 def simplest(kind: int, th: Array, samples: Array, perspective: bool, patches: float) -> tuple[int, Array]:
-    """The surface refined on its samples, or the simpler one that describes them more cheaply (Schwarz's criterion).
+    """Refine a surface on its samples, and replace it by a simpler one of lower cost (Schwarz's criterion).
 
-    `patches`: independent values of the noise among the samples. Returns kind and parameters.
+    `patches`: number of independent noise values among the samples. Returns kind and parameters.
     """
     if kind == PLANE or samples.shape[1] == 0:
         return kind, th
@@ -52,9 +52,9 @@ def simplest(kind: int, th: Array, samples: Array, perspective: bool, patches: f
 
 @compiled
 def straightened(kind: int, th: Array, samples: Array, noise: Array, perspective: bool) -> tuple[int, Array]:
-    """The plane, or the cylinder for a slender cone, that slow errors have bent into this surface, else itself.
+    """Replace a surface by the plane, or a slender cone by the cylinder, that slow errors may have bent into it.
 
-    `noise` as `NoiseModel.packed`. Returns kind and parameters.
+    `noise` as `NoiseModel.packed`. Returns kind and parameters, unchanged if its curvature is real.
     """
     if kind == PLANE or samples.shape[1] == 0:
         return kind, th
@@ -74,7 +74,7 @@ def straightened(kind: int, th: Array, samples: Array, noise: Array, perspective
 
 @compiled
 def schwarz_price(kind: int, patches: float) -> float:
-    """What Schwarz's criterion asks for the parameters of a surface: p ln n."""
+    """Penalty p ln n for the parameters of a surface in Schwarz's criterion."""
     return float(FREEDOM[kind] * np.log(max(patches, 2.0)))
 
 
@@ -82,10 +82,10 @@ def schwarz_price(kind: int, patches: float) -> float:
 def scrap_gain(
     kind: int, th: Array, own_kind: int, own: Array, samples: Array, pixels: float, noise: Array, perspective: bool,
 ) -> float:  # fmt: skip
-    """How much cheaper a small piece is as part of a large surface than as a surface of its own; <= 0: it stays.
+    """Return how much lower the cost of a small piece is as part of a large surface; it stays separate if <= 0.
 
-    Slow noise gives a scrap of a face one value or few, and any direction; so its direction and kind count for nothing.
-    `samples`: of the small piece, which has so many `pixels`.
+    A small piece of a face has only one or a few independent values of the slow noise, which may tilt it anyhow.
+    Therefore its direction and kind are ignored. `samples` are those of the small piece, which has `pixels` pixels.
     """
     e = residual_sizes(kind, th, samples, perspective)
     if not np.mean(e < NEAR_SIGMAS) >= NEAR_SHARE:
@@ -99,7 +99,7 @@ def scrap_gain(
 
 @compiled
 def cut_mean_square(e: Array, limit: float) -> float:
-    """Mean of the squares of e (N,), each at most that of `limit`."""
+    """Mean of the squares of e (N,), each capped at the square of `limit`."""
     total = 0.0
     for i in range(e.shape[0]):
         cut = min(e[i], limit)
@@ -109,12 +109,13 @@ def cut_mean_square(e: Array, limit: float) -> float:
 
 @compiled
 def _is_near(kind: int, th: Array, samples: Array, perspective: bool) -> bool:
+    """Whether most samples lie within `NEAR_SIGMAS` of the surface."""
     return bool(np.mean(residual_sizes(kind, th, samples, perspective) < NEAR_SIGMAS) > NEAR_SHARE)
 
 
 @compiled
 def _refined(kind: int, th: Array, s: Array, perspective: bool) -> tuple[Array, float]:
-    """Parameters after a robust fit, and the mean of the squared residuals, each at most the trim's."""
+    """Return the parameters of a robust fit and the mean squared residual, each capped at the trim."""
     free = np.zeros(9, np.bool_)
     th, cost = fit_robust(kind, th, s[0], s[1], s[2], s[3], perspective, free, ROUNDS)
     return th, cost / s.shape[1]
@@ -122,7 +123,7 @@ def _refined(kind: int, th: Array, s: Array, perspective: bool) -> tuple[Array, 
 
 @compiled
 def _simpler(simple: int, kind: int, th: Array, samples: Array, perspective: bool) -> tuple[Array, bool]:
-    """Where the fit of a plane, or of a cylinder in place of a slender cone, starts; and whether there is one."""
+    """Return initial parameters of a plane, or of a cylinder in place of a slender cone, and whether they exist."""
     points = points_of(samples, perspective)
     if simple == PLANE:
         return start_plane(points), True
@@ -140,7 +141,7 @@ def _simpler(simple: int, kind: int, th: Array, samples: Array, perspective: boo
 
 @compiled
 def turn_of(normals: Array) -> float:
-    """Angle in radians over which all but `ENDS` of the unit normals (N, 3) spread."""
+    """Return the angle in radians over which all but the share `ENDS` of the unit normals (N, 3) spread."""
     n = normals.shape[0]
     mx, my, mz = np.mean(normals[:, 0]), np.mean(normals[:, 1]), np.mean(normals[:, 2])
     length = max(np.sqrt(mx * mx + my * my + mz * mz), 1e-12)
@@ -153,7 +154,7 @@ def turn_of(normals: Array) -> float:
 
 @compiled
 def points_of(samples: Array, perspective: bool) -> Array:
-    """(N, 3) positions of the samples, metres."""
+    """Return the positions (N, 3) of the samples, metres."""
     out = np.empty((samples.shape[1], 3))
     for i in range(samples.shape[1]):
         scale = samples[2, i] if perspective else 1.0
@@ -163,7 +164,7 @@ def points_of(samples: Array, perspective: bool) -> Array:
 
 @compiled
 def surface_normals(kind: int, th: Array, samples: Array, perspective: bool) -> Array:
-    """(N, 3) unit normals of the surface towards the sensor, at the samples."""
+    """Return the unit normals (N, 3) of the surface at the samples, turned towards the sensor."""
     normals = np.empty((samples.shape[1], 3))
     normals_on(kind, th, samples[0], samples[1], samples[2], perspective, normals)
     return normals
@@ -171,7 +172,7 @@ def surface_normals(kind: int, th: Array, samples: Array, perspective: bool) -> 
 
 @compiled
 def residual_sizes(kind: int, th: Array, samples: Array, perspective: bool) -> Array:
-    """(N,) size of the residuals along the rays, in sigmas; a ray that misses counts as far off."""
+    """Return the absolute residuals (N,) along the rays, in sigmas; `MISS_SIGMAS` for a ray that misses."""
     e = np.empty(samples.shape[1])
     rays.residuals(kind, th, samples[0], samples[1], samples[2], samples[3], perspective, e)
     for i in range(e.shape[0]):

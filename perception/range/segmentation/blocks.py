@@ -1,6 +1,6 @@
-"""Mean depth of small blocks of pixels, each on the side of a jump that holds its median.
+"""Mean depth of small blocks of pixels; of a block across a depth jump, only the side of its median counts.
 
-A run of blocks is worked on in rows of one scratch array at fixed places, without a branch (`tangents` says why).
+Blocks are processed in runs, in rows of one scratch array at fixed offsets and without a branch (`tangents` says why).
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ def mean_blocks(
     depth: Array, sen: Array, noise: Array, b: int, x: Array, y: Array, z: Array, sigma: Array, count: Labels, top: int,
     bottom: int,
 ) -> None:  # fmt: skip
-    """Blocks of b x b pixels of `depth` (H, W), rows [top, bottom) of them, into (h, w) arrays as in `Grid`.
+    """Average blocks of b x b pixels of `depth` (H, W); writes rows [top, bottom) of (h, w) arrays as in `Grid`.
 
-    `count`: how many samples of a block lie within noise and slope of its median; where these are less than half, as
-    where most readings are missing, `z` and `sigma` are NaN.
+    `count`: number of samples of a block whose distance from its median noise and slope allow. If that is less than
+    half, as where most readings are missing, `z` and `sigma` are NaN.
     """
     w = x.shape[1]
     hop = (b + BLOCK_SAMPLES - 1) // BLOCK_SAMPLES
@@ -48,7 +48,7 @@ def mean_blocks(
 
 @compiled
 def _load(depth: Array, b: int, hop: int, side: int, r: int, start: int, n: int, work: Array) -> None:
-    """The samples of `n` blocks, one row for each place in a block; NaN beyond the image."""
+    """Load the samples of `n` blocks, one row per position in the block; NaN beyond the image."""
     H, W = depth.shape
     for i in range(side):
         row = depth[min(r * b + i * hop, H - 1)]
@@ -64,7 +64,7 @@ def _load(depth: Array, b: int, hop: int, side: int, r: int, start: int, n: int,
 
 @compiled
 def _medians(depth: Array, b: int, hop: int, side: int, r: int, start: int, n: int, work: Array, values: Array) -> None:
-    """Row MEDIAN: of four samples or less by a network, of the corners alone where the samples are nine or sixteen."""
+    """Fill row MEDIAN: for whole blocks from the four corner samples, else from all samples of the block."""
     H, W = depth.shape
     if side == 1:
         for c in range(n):
@@ -78,7 +78,7 @@ def _medians(depth: Array, b: int, hop: int, side: int, r: int, start: int, n: i
 
 @compiled
 def _medians_of_four(side: int, n: int, work: Array) -> None:
-    """Lower medians of the corners of `n` whole blocks, by a sorting network, missing readings last."""
+    """Compute the lower medians of the corners of `n` whole blocks by a sorting network; missing readings sort last."""
     at_q, at_s = SAMPLES + (side - 1) * RUN, SAMPLES + side * (side - 1) * RUN
     at_t = SAMPLES + (side * side - 1) * RUN
     for c in range(n):
@@ -87,14 +87,17 @@ def _medians_of_four(side: int, n: int, work: Array) -> None:
         s, t = s if s == s else np.inf, t if t == t else np.inf  # noqa: PLR0124 - as above
         low_1, high_1, low_2, high_2 = min(p, q), max(p, q), min(s, t), max(s, t)
         second, third = min(max(low_1, low_2), high_1, high_2), max(low_1, low_2, min(high_1, high_2))
-        # Of three or four readings the second, of two the first; one alone is too few.
+        # The second of three or four readings, the first of two; NaN if there is only one.
         median = min(low_1, low_2) if third == np.inf else second
         work[MEDIAN + c] = median if second < np.inf else np.nan
 
 
 @compiled
 def _median(side: int, c: int, work: Array, values: Array) -> float:
-    """Lower median of a block's samples, a real value and never the empty middle of a jump; NaN if most are missing."""
+    """Lower median of a block's samples; NaN if most are missing.
+
+    It is always a measured value, and not a mean of two values on either side of a jump.
+    """
     n = 0
     for m in range(side * side):
         d = work[SAMPLES + m * RUN + c]
@@ -119,6 +122,7 @@ def _is_any_known(n: int, work: Array) -> bool:
 
 @compiled
 def _sums(sen: Array, noise: Array, b: int, hop: int, side: int, n: int, work: Array) -> None:
+    """Fill the rows of sums over the samples near the median of each block."""
     perspective = sen[0] > 0
     _reach(noise, JUMP_SLOPE * 0.7 * b / sen[1], perspective, n, work)
     for k in range(side * side):
@@ -127,7 +131,7 @@ def _sums(sen: Array, noise: Array, b: int, hop: int, side: int, n: int, work: A
 
 @compiled
 def _reach(noise: Array, slope: float, perspective: bool, n: int, work: Array) -> None:
-    """Variances of one pixel at the medians, and in row NEAR how far from it a sample of the same surface may lie."""
+    """Compute the variances of one pixel at the medians, and the largest distance of a near sample into row NEAR."""
     for c in range(n):
         median = work[MEDIAN + c]
         z2 = median * median
@@ -140,9 +144,10 @@ def _reach(noise: Array, slope: float, perspective: bool, n: int, work: Array) -
 
 @compiled
 def _add(samples: Array, row: int, column: int, n: int, work: Array) -> None:
-    """One sample of each block, at that row and column of it, into the sums over those near the median.
+    """Add one sample of each block, at this row and column of the block, to the sums over samples near the median.
 
-    Planes are linear in 1 / z: with q = d / median, 1 / (1 + q) = 1 - q + q^2 - q^3 is summed less 1, over -q.
+    Planes are linear in 1 / z, so 1 / z is averaged, by its series: with q = d / median the sum is of d (1 - q + q^2),
+    which is median (1 - 1 / (1 + q)) up to third order.
     """
     u, v = float(column), float(row)
     for c in range(n):
@@ -157,7 +162,7 @@ def _add(samples: Array, row: int, column: int, n: int, work: Array) -> None:
 
 @compiled
 def _place(sen: Array, b: int, r: int, start: int, x: Array, y: Array, work: Array) -> None:
-    """Where the samples near the median lie on average, or the middle of a block that has none."""
+    """Compute the mean ray coordinates of the samples near the median, or those of the block's centre without any."""
     middle = 0.5 * (b - 1)
     for c in range(x.shape[0]):
         m = work[M + c]
@@ -169,7 +174,7 @@ def _place(sen: Array, b: int, r: int, start: int, x: Array, y: Array, work: Arr
 
 @compiled
 def _means(sen: Array, side: int, z: Array, sigma: Array, count: Labels, work: Array) -> None:
-    """Depth, its standard deviation, and how many samples they rest on."""
+    """Compute the mean depth of each block, its standard deviation and the number of samples used."""
     perspective, full = sen[0] > 0, side * side
     for c in range(z.shape[0]):
         median, m = work[MEDIAN + c], work[M + c]
@@ -178,7 +183,7 @@ def _means(sen: Array, side: int, z: Array, sigma: Array, count: Labels, work: A
         z[c] = depth if 2.0 * m >= full else np.nan
     for c in range(sigma.shape[0]):
         m = work[M + c]
-        # Code steps are shared by neighbours, so averaging gains little on them.
+        # Neighbours share quantisation steps, so averaging reduces their error little.
         kept = max(work[FAST + c] / m, work[STEP + c] / 24.0)
         sigma[c] = np.sqrt(kept + work[SLOW + c]) if 2.0 * m >= full else np.nan
     for c in range(count.shape[0]):

@@ -1,4 +1,4 @@
-"""Where two regions touch, and what their models say there: a step, a crease, or one smooth surface cut in two."""
+"""Borders between touching regions, and the step and angle between their surfaces there."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from perception.range.segmentation.boundary_pixels import WORD, flagged
 from perception.range.segmentation.grid import sigma_at
 from perception.range.segmentation.pixel_assignment import bucket
 
-WIDEST_GAP_PX = 3  # unlabelled pixels that a border may hold: one block of pixels that no model claimed
+WIDEST_GAP_PX = 3  # most unlabelled pixels across a border: one block that no surface explained
 PAIR_POINTS = 24
 NONE_YET = as_numpy_scalar(0)
 
 
 @compiled
 def touching(labels: Labels, sen: Array) -> tuple[Labels, Indices, Array, Array]:
-    """Pairs (P, 2) of labels a < b that touch, how many contacts each has, and ray coordinates x, y (P, PAIR_POINTS) of some.
+    """Find the pairs of labels that touch.
 
-    `labels` (H, W), `sen` as `packed` of a sensor. A pair with fewer contacts fills the first of its places only.
+    `labels` (H, W), `sen` as `packed` of a sensor. Returns pairs (P, 2) of labels a < b, the number of contacts of each,
+    and ray coordinates x, y (P, PAIR_POINTS) of some contacts; the rest is unset for a pair with fewer contacts.
     """
     ids, us, vs, pairs = _contacts(labels, WIDEST_GAP_PX)
     starts, order = bucket(ids, pairs.shape[0])
@@ -36,14 +37,15 @@ def touching(labels: Labels, sen: Array) -> tuple[Labels, Indices, Array, Array]
 
 @compiled
 def _contacts(labels: Labels, gap: int) -> tuple[Labels, Array, Array, Labels]:
-    """Contacts along rows and columns, over at most `gap` zeros, in raster order.
+    """Find contacts of labels along rows and columns, across at most `gap` zeros, in raster order.
 
-    Returns the number of the pair (from 1) and the place of each, and the (P, 2) pairs, a < b, as they were met.
+    Returns for each contact the number of its pair (from 1) and its column and row; and the pairs (P, 2), a < b, in
+    order of their first contact.
     """
     H, W = labels.shape
     ids, us, vs = np.empty(8 * W, np.int32), np.empty(8 * W), np.empty(8 * W)
     above, above_at = np.zeros(W, np.int32), np.zeros(W, np.int32)
-    # Pairs of one smaller label are a linked list: no label has many neighbours.
+    # The pairs with the same smaller label form a linked list, which is short because no label has many neighbours.
     newest = np.zeros(labels.max() + 1, np.int32)
     pairs, older = np.empty((4 * W, 2), np.int32), np.empty(4 * W + 1, np.int32)
     words, columns = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
@@ -69,7 +71,7 @@ def _add_contacts(
     row: Labels, v: int, ends: Labels, gap: int, above: Labels, above_at: Labels, newest: Labels, pairs: Labels,
     older: Labels, count: int, ids: Labels, us: Array, vs: Array, n: int,
 ) -> tuple[int, int]:  # fmt: skip
-    """The contacts of row v in the columns `ends` after the `n` and the `count` pairs so far; returns both numbers then."""
+    """Append the contacts of row v in the columns `ends` to the `n` contacts and `count` pairs; returns both numbers."""
     for at in range(ends.shape[0]):
         u = ends[at]
         label, left_at = row[u], u - 1
@@ -99,7 +101,7 @@ def _add_contacts(
 
 @compiled
 def _flag_ends(row: Labels, above: Labels, flags: Mask) -> None:
-    """Where a label is not that of the pixel to its left and of the last one above: nowhere inside of a region."""
+    """Flag labelled pixels whose label differs from that of the pixel to the left or of the last labelled one above."""
     flags[0] = row[0] > 0
     for u in range(1, row.shape[0]):
         flags[u] = (row[u] > 0) & ((row[u] != row[u - 1]) | (row[u] != above[u]))
@@ -107,7 +109,7 @@ def _flag_ends(row: Labels, above: Labels, flags: Mask) -> None:
 
 @compiled
 def _pass_row(row: Labels, v: int, above: Labels, above_at: Labels) -> None:
-    """Row v becomes the last one above, where it bears labels."""
+    """Update the last label above each column, and its row, with the labelled pixels of row v."""
     now = np.int32(v)
     for u in range(row.shape[0]):
         above_at[u] = now if row[u] > 0 else above_at[u]
@@ -119,9 +121,9 @@ def _pass_row(row: Labels, v: int, above: Labels, above_at: Labels) -> None:
 def step_and_turn(
     kind_a: int, a: Array, kind_b: int, b: Array, x: Array, y: Array, noise: Array, perspective: bool,
 ) -> tuple[float, float]:  # fmt: skip
-    """Median step in sigmas and median turn in radians between two surfaces at the rays (x, y).
+    """Return the median step in sigmas and the median angle in radians between two surfaces at the rays (x, y).
 
-    A ray that misses one of the surfaces counts as an endless step; a turn is read where both are met.
+    A ray that misses one of the surfaces counts as an infinite step; the angle uses only rays that hit both.
     """
     n = x.shape[0]
     steps, turns = np.empty(n), np.empty(n)

@@ -1,4 +1,4 @@
-"""Pixels that lie beside another surface than their own: the few of an image whose label is worth a second look."""
+"""Search for the pixels beside another surface than their own; only their labels may need to change."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 from hal.arrays import Labels, Mask
 from hal.jit import compiled
 
-WORD = 8  # flags that are looked at together
+WORD = 8  # flags that are tested together
 
 
 @compiled
 def contested_pixels(labels: Labels, newest: int, top: int, bottom: int) -> tuple[Labels, Labels]:
-    """Pixels whose 3x3 neighbourhood holds another surface than theirs, and one of label `newest` or later.
+    """Find pixels whose 3x3 neighbourhood has a label other than theirs, and one that is at least `newest`.
 
-    Looks at the rows [top, bottom) of `labels` (H, W) int32; returns rows and columns (N,) int32, in raster order.
+    Searches the rows [top, bottom) of `labels` (H, W) int32; returns rows and columns (N,) int32, in raster order.
     """
     W = labels.shape[1]
     least, most = new_columns(W)
@@ -35,13 +35,16 @@ def contested_pixels(labels: Labels, newest: int, top: int, bottom: int) -> tupl
 
 @compiled
 def new_columns(width: int) -> tuple[NDArray[np.uint32], Labels]:
-    """What `column_range` fills, (width + 2,) each: no surface lies before the first column and after the last."""
+    """Allocate the arrays (width + 2,) that `column_range` fills; the first and last entries stand for no label."""
     return np.full(width + 2, np.uint32(0xFFFFFFFF)), np.zeros(width + 2, np.int32)
 
 
 @compiled
 def column_range(labels: Labels, v: int, least: NDArray[np.uint32], most: Labels) -> None:
-    """Of each column of the three rows around row v: the least label, less one so that none counts as most; the largest."""
+    """Compute the least and the largest label of each column of the three rows around row v.
+
+    `least` holds labels minus one as unsigned numbers, so that label 0 (none) becomes the largest.
+    """
     one, last = np.int32(1), labels.shape[0] - 1
     above, own, below = labels[max(v - 1, 0)], labels[v], labels[min(v + 1, last)]
     low, high = least[1:-1], most[1:-1]
@@ -52,7 +55,7 @@ def column_range(labels: Labels, v: int, least: NDArray[np.uint32], most: Labels
 
 @compiled
 def _flag_contested(own: Labels, least: NDArray[np.uint32], most: Labels, newest: int, flags: Mask) -> None:
-    """Where the three columns around hold another surface than the pixel's own, and one of label `newest` or later."""
+    """Flag pixels whose 3x3 neighbourhood has a label other than their own, and one that is at least `newest`."""
     one = np.int32(1)
     for u in range(own.shape[0]):
         k = own[u]
@@ -62,9 +65,9 @@ def _flag_contested(own: Labels, least: NDArray[np.uint32], most: Labels, newest
 
 @compiled
 def flagged(words: NDArray[np.uint64], places: Labels) -> int:
-    """Where the flags in `words` are set, ascending, into `places`, which has room for one more; returns how many.
+    """Write the indices of the flags set in `words`, ascending, into `places`; returns their number.
 
-    Few are, so eight are passed at once where none of them is.
+    `places` needs room for one more. Flags are tested eight at a time, because few are set.
     """
     flags = words.view(np.bool_)
     n = 0
@@ -79,14 +82,14 @@ def flagged(words: NDArray[np.uint64], places: Labels) -> int:
 
 @compiled
 def flag_free(labels: Labels, flags: Mask) -> None:
-    """Where a row of labels has none."""
+    """Flag the unlabelled pixels of a row."""
     for u in range(labels.shape[0]):
         flags[u] = labels[u] == 0
 
 
 @compiled
 def pixels_around(rows: Labels, columns: Labels, reach: int, shape: tuple[int, int]) -> tuple[Labels, Labels]:
-    """Every pixel of an image of that shape that is at most `reach` rows and columns from one of those given, once."""
+    """Return each pixel within `reach` rows and columns of a given one, once, for an image of the given shape."""
     H, W = shape
     seen = np.zeros((H, W), np.bool_)
     side = 2 * reach + 1
@@ -107,7 +110,7 @@ def pixels_around(rows: Labels, columns: Labels, reach: int, shape: tuple[int, i
 
 @compiled
 def renamed_pixels(labels: Labels, rows: Labels, columns: Labels, names: Labels) -> tuple[Labels, Labels]:
-    """Give the pixels their new names, in place; returns rows and columns of those that had another one."""
+    """Write the new labels `names` of the pixels, in place; returns rows and columns of those that changed."""
     moved_rows, moved_columns = np.empty_like(rows), np.empty_like(columns)
     n = 0
     for k in range(rows.shape[0]):

@@ -1,8 +1,8 @@
-"""Rounded edges belong to the faces that they join, as people outline them.
+"""Assignment of rounded edges (fillets) to the faces that they join, as in manual segmentations.
 
-A rounded edge is a surface of its own to a sensor that is fine enough, but nobody calls it one. It is a strip much
-narrower than its neighbours, which it continues without a step and without a crease, and it lies close to them: a
-quarter circle of radius r leaves two faces by 0.41 r and is 1.57 r wide. Each of its pixels goes to the nearer face.
+An accurate sensor resolves a rounded edge as a separate surface, but people do not outline it as one. It is a strip much
+narrower than its neighbours, which it continues without a step or a crease, and it lies close to them: a quarter circle
+of radius r deviates from two faces by at most 0.41 r and is 1.57 r wide. Each of its pixels goes to the nearer face.
 """
 
 from __future__ import annotations
@@ -22,28 +22,31 @@ from perception.range.segmentation.seams import is_seam_grooved
 
 Labels = NDArray[np.int32]
 
-NARROWER = 0.6  # than the faces beside it
-LONG = 22.0  # as `_shapes` says it: three times as long as wide
+NARROWER = 0.6  # largest ratio of a strip's width to that of the face beside it
+LONG = 22.0  # least elongation as `_shapes` measures it; about three times as long as wide
 STEP_SIGMAS = 3.0
-TURN_RAD = 1.0  # a surface through a net of rounded edges meets its faces at any angle below a right one
+TURN_RAD = 1.0  # a surface fitted to several rounded edges may meet its faces at any angle below a right angle
 FLAT_TURN_RAD = 0.5
-NARROW, NARROW_SIGMAS = 0.004, 4.0  # of the image's shorter side, half the width of what has no bend of its own to see
+NARROW, NARROW_SIGMAS = 0.004, 4.0  # half width, in shorter image sides, below which a strip's own shape is unknown
 GENTLE_RAD = 0.7
-NEAR_SHARE = 0.5  # of the strip's width, that it may lie off its faces
-LEAST_SHARE = 0.4  # of the pixels of a strip between faces that do so: nets of edges take thin faces along
-WHOLE_SHARE = 0.7  # of those of a strip beside one face
+NEAR_SHARE = 0.5  # of the strip's width; largest distance of its pixels from a face
+LEAST_SHARE = 0.4  # of a strip between faces must be so near; low, because connected edges may include thin faces
+WHOLE_SHARE = 0.7  # the same for a strip beside one face
 LEAST_BORDER_PX = 6
-ALONG_SHARE = 0.15  # of a strip's rim: one that has less of it at a face touches that by its end only
+ALONG_SHARE = 0.15  # of a strip's rim; if less borders a face, the strip touches it only with its end
 REACH = 0.025  # of the image's shorter side, over which unlabelled pixels beside a face may curve away from it
-LEAST_ROWS = 192  # in smaller images what is beside a face is mixed pixels of an outline, which models are matched by
-SLOPE = 0.5  # at which they may do so
+LEAST_ROWS = 192  # in smaller images the pixels beside a face are mixed pixels of an outline, which matching needs
+SLOPE = 0.5  # largest slope of that curve
 SIGMAS = 3.0
 
 
 def without_fillets(
     depth_m: Array, packed: Array, law: Array, labels: Labels, kinds: NDArray[np.int64], table: Array
 ) -> Labels:
-    """(H, W) `labels`, changed in place: rounded edges go to their faces; labels index `kinds` and `table` from 1."""
+    """Assign rounded edges to their faces; returns `labels` (H, W), changed in place.
+
+    Labels index `kinds` and `table` from 1.
+    """
     half_width, length = _shapes(labels, kinds.shape[0])
     beside = _strips(depth_m, packed, law, labels, kinds, table, half_width, length)
     if beside:
@@ -53,7 +56,7 @@ def without_fillets(
             owner = _nearer(depth_m, packed, mine, half_width[strip], np.array(faces), kinds, table)
             share = np.mean(owner > 0)
             if share >= (LEAST_SHARE if len(faces) > 1 else WHOLE_SHARE):
-                # What is left of a strip that has gone is no surface; of a net of edges it is a thin face.
+                # If most of a strip is assigned, the rest is no surface; otherwise it is a thin face among the edges.
                 labels.ravel()[mine] = np.where(owner > 0, owner, 0 if share >= WHOLE_SHARE else strip)
     if min(labels.shape) >= LEAST_ROWS:
         spread_outwards(depth_m, packed, law, labels, kinds, table, round(REACH * min(labels.shape)))
@@ -70,7 +73,7 @@ def _strips(
     half_width: Array,
     length: Array,
 ) -> dict[int, list[int]]:
-    """The faces beside each strip that continues them: two or more, or one that it leaves gently towards an outline."""
+    """Return the faces that each strip continues: two or more, or one with a gentle transition at an outline."""
     if not np.any((length >= LONG) & (half_width <= NARROWER * half_width.max())):
         return {}
     pairs, lengths, x, y = touching(labels, packed)
@@ -91,7 +94,7 @@ def _continuations(
     depth: Array, sen: Array, noise: Array, labels: Labels, kinds: Indices, table: Array, half_width: Array,
     length: Array, pairs: Labels, lengths: Indices, x: Array, y: Array,
 ) -> tuple[Mask, Mask]:  # fmt: skip
-    """Of which pairs of labels that touch the narrower continues the wider as a strip; and which strips do so gently."""
+    """Return in which touching pairs the narrower label continues the wider one as a strip, and which strips are gentle."""
     narrow_px = NARROW * min(labels.shape[0], labels.shape[1])
     out, is_gentle = np.zeros(pairs.shape[0], np.bool_), np.zeros(kinds.shape[0], np.bool_)
     for p in range(pairs.shape[0]):
@@ -118,7 +121,7 @@ def _continuations(
 
 @compiled
 def _goes_on(step: float, turn: float, is_flat: bool, is_narrow: bool) -> bool:
-    """Whether a strip continues a face; `step` in sigmas, `turn` in rad. A flat one that is wide enough is a bevel."""
+    """Whether a strip continues a face; `step` in sigmas, `turn` in rad. A flat strip at a larger angle is a bevel."""
     if is_narrow:
         return step <= NARROW_SIGMAS and turn <= TURN_RAD
     return step <= STEP_SIGMAS and turn <= (FLAT_TURN_RAD if is_flat else TURN_RAD)
@@ -126,10 +129,11 @@ def _goes_on(step: float, turn: float, is_flat: bool, is_narrow: bool) -> bool:
 
 @compiled
 def _shapes(labels: Labels, count: int) -> Array:
-    """(2, count) of each label: pixels over those at its rim, half the width of a strip; and its rim over that.
+    """Return half width and elongation (2, count) of each label.
 
-    A hole of one pixel, a gross error, has no rim. The latter is 12.6 for a disc, 16 for a square and four times the
-    length over the width for a long strip.
+    The half width of a strip is its number of pixels divided by the number of pixels on its rim. The elongation is the
+    rim divided by the half width: 12.6 for a disc, 16 for a square, and four times length / width for a long strip. A
+    hole of one pixel (a gross error) does not count as rim.
     """
     H, W = labels.shape
     pixels, rim = pixels_of(labels, count - 1), np.zeros(count)
@@ -150,7 +154,7 @@ def _shapes(labels: Labels, count: int) -> Array:
 
 @compiled
 def _flag_rims(above_2: Labels, above: Labels, own: Labels, below: Labels, below_2: Labels, flags: Mask) -> None:
-    """Labelled pixels with two in a row of another label above or below."""
+    """Flag labelled pixels with two successive pixels of another label above or below."""
     for u in range(own.shape[0]):
         k = own[u]
         is_top, is_bottom = (above[u] != k) & (above_2[u] != k), (below[u] != k) & (below_2[u] != k)
@@ -159,7 +163,7 @@ def _flag_rims(above_2: Labels, above: Labels, own: Labels, below: Labels, below
 
 @compiled
 def _flag_sides(own: Labels, flags: Mask) -> None:
-    """And those with two in a row of another label to the left or right; beyond its ends the row goes on."""
+    """Also flag those with two successive pixels of another label to the left or right; end pixels are repeated."""
     last = own.shape[0] - 1
     for u in range(last - 3):
         k = own[u + 2]
@@ -174,7 +178,7 @@ def _flag_sides(own: Labels, flags: Mask) -> None:
 
 @compiled
 def _off(kind: int, th: Array, x: float, y: float, z: float, perspective: bool) -> float:
-    """How far a pixel lies off a surface, across the surface, metres; infinite where its ray misses."""
+    """Distance of a pixel from a surface along the normal, metres; infinite if its ray misses."""
     zm = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(zm):
         return np.inf
@@ -186,7 +190,7 @@ def _off(kind: int, th: Array, x: float, y: float, z: float, perspective: bool) 
 def _nearer(
     depth: Array, sen: Array, indices: Labels, half_width: float, faces: Indices, kinds: Indices, table: Array,
 ) -> Labels:  # fmt: skip
-    """Of each pixel the face that it lies nearest to, 0 where it is farther than the strip allows."""
+    """Return the nearest face of each pixel; 0 if it is farther away than the width of the strip allows."""
     W = depth.shape[1]
     perspective = sen[0] > 0
     owner = np.zeros(indices.shape[0], np.int32)
@@ -206,7 +210,7 @@ def _nearer(
 def spread_outwards(
     depth: Array, sen: Array, noise: Array, labels: Labels, kinds: Indices, table: Array, reach: int,
 ) -> None:  # fmt: skip
-    """Give unlabelled pixels, ring by ring up to `reach`, to the surface beside them that they leave slowly; in place."""
+    """Assign unlabelled pixels beside a surface that curve slowly away from it, ring by ring up to `reach`; in place."""
     flat, fd, W = labels.ravel(), depth.ravel(), depth.shape[1]
     ring = _first_ring(labels, depth)
     for sweep in range(1, reach + 1):
@@ -214,7 +218,7 @@ def spread_outwards(
         for k in range(ring.shape[0]):
             chosen[k] = _slowest_left(ring[k], W, fd, sen, noise, flat, kinds, table, SLOPE * sweep / sen[1])
         for k in range(ring.shape[0]):
-            # What is refused is not asked again: farther out more would be allowed.
+            # A rejected pixel is marked, because the limit grows with the distance and would accept it later.
             flat[ring[k]] = chosen[k] if chosen[k] else -1
         ring = _next_ring(ring[chosen > 0], depth.shape, fd, flat)
     for i in range(flat.shape[0]):
@@ -223,7 +227,7 @@ def spread_outwards(
 
 @compiled
 def _first_ring(labels: Labels, depth: Array) -> Labels:
-    """Flat indices of the unlabelled pixels with a reading beside labelled ones."""
+    """Return the flat indices of the unlabelled pixels with a reading beside labelled ones."""
     H, W = labels.shape
     words, columns = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
     ring, count = np.empty(4 * W, np.int32), 0
@@ -240,14 +244,14 @@ def _first_ring(labels: Labels, depth: Array) -> Labels:
 
 @compiled
 def _flag_outlines(above: Labels, own: Labels, below: Labels, flags: Mask) -> None:
-    """Unlabelled pixels beside labelled ones, but for the ends of the row."""
+    """Flag unlabelled pixels beside labelled ones, except at the ends of the row."""
     for u in range(1, own.shape[0] - 1):
         flags[u] = (own[u] == 0) & ((own[u - 1] | own[u + 1] | above[u] | below[u]) != 0)
 
 
 @compiled
 def _next_ring(ring: Labels, shape: tuple[int, int], fd: Array, flat: Labels) -> Labels:
-    """The free pixels with a reading beside those of a ring, marked -1 in `flat` so that each comes once."""
+    """Return the free pixels with a reading beside those of a ring; marks them -1 in `flat`, so that each occurs once."""
     H, W = shape
     new, count = np.empty(4 * ring.shape[0], np.int32), 0
     for i in ring:
@@ -265,7 +269,7 @@ def _next_ring(ring: Labels, shape: tuple[int, int], fd: Array, flat: Labels) ->
 def _slowest_left(
     i: int, W: int, fd: Array, sen: Array, noise: Array, flat: Labels, kinds: Indices, table: Array, slope: float,
 ) -> int:  # fmt: skip
-    """The label beside pixel i whose surface it lies nearest to, 0 where all are farther than noise and `slope` allow."""
+    """Return the nearest of the surfaces beside pixel i; 0 if all are farther away than noise and `slope` allow."""
     perspective = sen[0] > 0
     x, y, z = (i % W - sen[3]) / sen[1], (i // W - sen[4]) / sen[2], fd[i]
     best, label = SIGMAS * sigma_at(noise, z) + slope * (z if perspective else 1.0), 0

@@ -1,4 +1,4 @@
-"""Last refinement of each region on its own pixels, with covariance and figures of fit; what is too small goes."""
+"""Final refinement of each region on all its pixels, with covariance and residuals; regions too small are dropped."""
 
 from __future__ import annotations
 
@@ -30,22 +30,23 @@ from perception.range.segmentation.run_length import pixels_of
 
 Labels = NDArray[np.int32]
 
-COARSE_SAMPLES = 300  # a refined start on these leaves the full fit one step
+COARSE_SAMPLES = 300  # after a fit to these, one step on all pixels is enough
 NAMING_SAMPLES = 150
-MIDDLE_STRIDE = 4  # of these, every fourth tells where a surface lies
-SLOW_NOISE_AREA_PX = 150.0  # pixels that share one value of the slow noise; sets how little averaging gains on it
+MIDDLE_STRIDE = 4  # every fourth of the coarse samples is used for the medians
+SLOW_NOISE_AREA_PX = 150.0  # pixels that share one value of the slow noise; limits the gain of averaging
 STEP_AREA_PX = 16.0
-NO_SHIFT = 1e-9  # pixels: rounds up what is whole but for the last bit
-FARTHEST_SIGMAS = 50.0  # that the last step may move a surface where it was fitted already
+NO_SHIFT = 1e-9  # pixels; makes positions robust to rounding just below a whole number
+FARTHEST_SIGMAS = 50.0  # largest displacement of a surface by the last step
 ROUNDS = as_numpy_scalar(1)  # of robust weights
 FREE = np.zeros(9, np.bool_)
 
 
 class Refinement(NamedTuple):
-    """What the last fit of one region says.
+    """Result of the final fit of one region.
 
-    Frame (2, 3) of tilts, parameters, information matrix (9, 9), its inverse (p, p) over the free parameters, NaN where
-    they are not all determined, medians (4,) of x, y, z and sigma, squared residuals of the kept pixels, pixels kept.
+    Frame (2, 3) of tilts; parameters; information matrix (9, 9); its inverse (p, p) over the free parameters, NaN if
+    they are not all determined; medians (4,) of x, y, z and sigma; sum of squared residuals of the kept pixels; number
+    of pixels kept.
     """
 
     frame: Array
@@ -67,11 +68,11 @@ def refine_surface(
     noise: NoiseModel,
     fixed: NDArray[np.bool_] = FREE,
 ) -> tuple[Surface, Array]:
-    """The surface after the ray-depth fit to all its pixels, and its parameters.
+    """Fit a surface to the depths of all its pixels; returns the surface and its parameters.
 
     Args:
         own: the label of those pixels in `regions`.
-        fixed: (9,) tangent parameters that a prior holds.
+        fixed: (9,) tangent parameters that stay at their prior value.
     """
     n = int(regions.sizes[own])
     th, H, inverse, middles, squares, kept = refined(
@@ -85,10 +86,10 @@ def refine_surface(
 def refine_surfaces(
     owns: list[int], kinds: list[int], parameters: list[Array], regions: Regions, noise: NoiseModel
 ) -> tuple[list[Surface], list[int], Array]:
-    """`refine_surface` of the regions with labels `owns`, which become labels 1 to M.
+    """Apply `refine_surface` to the regions with labels `owns`, which become labels 1 to M.
 
-    A surface that the sensor has bent is named straight. It keeps the bent surface's pixels: kinds (M,) and parameters
-    (M, 16) by which pixels are judged come second and third.
+    A surface that only sensor errors make curved is reported as the simpler kind. Pixels are still assigned by the
+    curved one, so its kinds (M,) and parameters (M, 16) are returned as well, second and third.
     """
     if not owns:
         return [], [], np.zeros((0, SIZE))
@@ -106,7 +107,7 @@ def refine_surfaces(
 
 
 def _straight(kind: int, th: Array, regions: Regions, own: int) -> tuple[int, Array]:
-    """The simpler kind that slow errors of the sensor have bent into this one, with a start for it, or the kind itself."""
+    """Return the simpler kind that slow sensor errors have bent into this one, with initial parameters; or the kind itself."""
     if kind == PLANE:
         return kind, th
     pixels = int(regions.sizes[own])
@@ -150,10 +151,10 @@ def _surface(
 def refined(
     kind: int, th: Array, depth: Array, sen: Array, noise: Array, runs: Labels, pixels: int, fixed: Mask,
 ) -> tuple[Array, Array, Array, Array, float, int]:  # fmt: skip
-    """The fit to the `pixels` of runs (R, 3): robust on a few that are evenly spread, then one step on all.
+    """Fit a surface to the `pixels` of runs (R, 3): robustly on an evenly spread sample, then one step on all.
 
     Returns:
-        what `Refinement` holds but for the frame.
+        the fields of `Refinement` except the frame.
     """
     if pixels == 0:
         return th, np.zeros((9, 9)), np.full((FREEDOM[kind], FREEDOM[kind]), np.nan), np.full(4, np.nan), 0.0, 0
@@ -165,7 +166,7 @@ def refined(
         middles[a] = np.median(few[a, ::MIDDLE_STRIDE].copy())
     start = th
     th, H, kept, used = last_step(kind, start, depth, sen, noise, runs, fixed)
-    # Over a face that hardly bends, a step straight ahead may pass through flat and end on the far side of the sensor.
+    # On a nearly flat face the step may pass through zero curvature and put the surface on the other side of the sensor.
     before = depth_on(kind, start, middles[0], middles[1], sen[0] > 0)
     after = depth_on(kind, th, middles[0], middles[1], sen[0] > 0)
     if np.isfinite(before) and not abs(after - before) < FARTHEST_SIGMAS * middles[3]:
@@ -175,7 +176,7 @@ def refined(
 
 @compiled
 def _inverse(H: Array, p: int, fixed: Mask) -> Array:
-    """(p, p) inverse over the free parameters, zero elsewhere; NaN when they are not all determined."""
+    """Return the inverse (p, p) over the free parameters, zero elsewhere; NaN if they are not all determined."""
     A, b, out, scale = np.empty((p, p)), np.empty(p), np.zeros((p, p)), np.empty(p)
     for i in range(p):
         scale[i] = 1.0 / np.sqrt(max(H[i, i], 1e-300))
@@ -194,7 +195,7 @@ def _inverse(H: Array, p: int, fixed: Mask) -> Array:
 
 
 def without_crumbs(labels: Labels, surfaces: list[Surface], least: float) -> tuple[Labels, list[Surface]]:
-    """Labels and surfaces, numbered anew, without those that their neighbours have left fewer than `least` pixels."""
+    """Drop surfaces that have kept fewer than `least` pixels; returns renumbered labels and surfaces."""
     pixels = pixels_of(labels, len(surfaces)).tolist()
     kept = [s for s in surfaces if pixels[s.label] >= least]
     if len(kept) == len(surfaces):
@@ -205,7 +206,7 @@ def without_crumbs(labels: Labels, surfaces: list[Surface], least: float) -> tup
 
 
 def averaging_loss(noise: NoiseModel, depth_m: float) -> float:
-    """How many times larger a parameter's variance is than for white noise of the same size (>= 1)."""
+    """Factor (>= 1) by which a parameter's variance exceeds that for white noise of the same size."""
     z2 = depth_m * depth_m
     white = (noise.white[0] + noise.white[1] * z2) ** 2
     slow = (noise.correlated[0] + noise.correlated[1] * z2) ** 2
@@ -216,7 +217,7 @@ def averaging_loss(noise: NoiseModel, depth_m: float) -> float:
 
 
 def _pseudo_inverse(H: Array, kind: int, fixed: NDArray[np.bool_]) -> Array:
-    """(p, p) inverse of an information matrix that leaves a direction free: what is determined keeps its variance."""
+    """Return the pseudo-inverse (p, p) of a singular information matrix: the variances of determined directions."""
     p = int(FREEDOM[kind])
     free = np.flatnonzero(~fixed[:p])
     out = np.zeros((p, p))

@@ -1,6 +1,6 @@
-"""Planes from sums over blocks, and whether a quadratic describes the same blocks clearly better.
+"""Planes from sums over blocks, and the test whether a quadratic describes the same blocks clearly better.
 
-All are linear in g = 1 / z (pinhole) or g = z (parallel rays): a plane is g = a x + b y + c over ray coordinates x, y.
+Fits are linear in g = 1 / z (pinhole) or g = z (parallel rays): a plane is g = a x + b y + c in ray coordinates x, y.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ from hal.arrays import Array, Labels
 from hal.jit import as_numpy_scalar, compiled
 from perception.range.fitting.initialisation import solve_positive
 
-BEND_RMS = 0.4  # in sigmas: how much a quadratic may gain over a plane before the plane is a strip of something bent
-BEND_F = 4.0  # and how significant that gain must be (F ratio)
-WORST_MEAN_SQUARE = 3.0  # in sigmas: what leaves more over its plane is no plane
+BEND_RMS = 0.4  # sigmas; a larger gain of a quadratic over a plane means that the blocks are curved
+BEND_F = 4.0  # F ratio that this gain must also exceed to be significant
+WORST_MEAN_SQUARE = 3.0  # squared sigmas; blocks with a larger mean square about their plane are not planar
 OF_PLANE, OF_BENT = as_numpy_scalar(3), as_numpy_scalar(6)  # coefficients of g over x and y
-# Where the products of 1, p, q, pp, pq, qq stand among 1, p, q, pp, pq, qq, ppp, ppq, pqq, qqq, pppp, pppq, ppqq, pqqq, qqqq.
+# Index of each product of two of 1, p, q, pp, pq, qq in the list of moments
+# 1, p, q, pp, pq, qq, ppp, ppq, pqq, qqq, pppp, pppq, ppqq, pqqq, qqqq.
 MOMENTS = np.array(
     [
         [0, 1, 2, 3, 4, 5],
@@ -30,7 +31,7 @@ MOMENTS = np.array(
 
 @compiled
 def solve3(S: Array, out: Array) -> bool:
-    """Coefficients (a, b, c) of g = a x + b y + c from sums (n, x, y, xx, xy, yy, g, xg, yg); False if degenerate."""
+    """Solve for (a, b, c) of g = a x + b y + c from sums (n, x, y, xx, xy, yy, g, xg, yg); False if degenerate."""
     n = S[0]
     if n <= 0.0:
         return False
@@ -48,7 +49,7 @@ def solve3(S: Array, out: Array) -> bool:
 
 @compiled
 def plane_from_coefficients(m: Array, perspective: bool, th: Array) -> None:
-    """PLANE parameters, normal towards the sensor, from g = a x + b y + c."""
+    """Write the PLANE parameters, normal towards the sensor, of g = a x + b y + c into `th`."""
     if perspective:
         nx, ny, nz, d = m[0], m[1], m[2], 1.0  # (a, b, c) . X = 1 and z > 0: this normal points away
     else:
@@ -59,7 +60,7 @@ def plane_from_coefficients(m: Array, perspective: bool, th: Array) -> None:
 
 @compiled
 def moved_rms(a: float, b: float, c: float, S: Array, count: int) -> float:
-    """Root mean square of a x + b y + c over `count` blocks of sums `S`, in sigmas."""
+    """Root mean square of a x + b y + c over `count` blocks with sums `S`, in sigmas."""
     n, x, y = S[0], S[1] / S[0], S[2] / S[0]
     xx, xy, yy = S[3] / n - x * x, S[4] / n - x * y, S[5] / n - y * y
     square = (a * x + b * y + c) ** 2 + a * a * xx + 2.0 * a * b * xy + b * b * yy
@@ -68,7 +69,10 @@ def moved_rms(a: float, b: float, c: float, S: Array, count: int) -> float:
 
 @compiled
 def squares_left(idx: Labels, count: int, table: Array, x0: float, y0: float, scale: float) -> tuple[float, float]:
-    """Sum of squares (in sigmas) left by a plane and by a quadratic over the blocks idx[:count] of a padded table."""
+    """Return the residual sums of squares (in sigmas) of a plane and of a quadratic fitted to the blocks idx[:count].
+
+    `table` is that of `grow_planes`.
+    """
     M, b, total = np.zeros(15), np.zeros(6), 0.0
     g0, per = table[idx[0], 2], 1.0 / scale
     for k in range(count):
@@ -84,7 +88,7 @@ def squares_left(idx: Labels, count: int, table: Array, x0: float, y0: float, sc
         for m, value in enumerate((wv, wv * p, wv * q, wv * pp, wv * pq, wv * qq)):
             b[m] += value
     A = np.empty((6, 6))
-    # Products of two of 1, p, q, pp, pq, qq, by where their moment stands.
+    # Normal matrix of the basis 1, p, q, pp, pq, qq, from the moments.
     for a, row in enumerate(MOMENTS):
         for e in range(6):
             A[a, e] = M[row[e]] * (1.0 + 1e-9 if a == e else 1.0)
@@ -99,7 +103,7 @@ def squares_left(idx: Labels, count: int, table: Array, x0: float, y0: float, sc
 
 @compiled
 def is_bent(flat: float, quadratic: float, count: int) -> bool:
-    """Whether `count` blocks are no plane, from the sums of squares that a plane and a quadratic leave over them."""
+    """Whether `count` blocks are not planar, from the residual sums of squares of a plane and of a quadratic."""
     ratio = (flat - quadratic) / 3.0 / max(quadratic / max(count - 6, 1), 0.3)
     is_better = flat - quadratic > BEND_RMS * BEND_RMS * count and ratio > BEND_F
     return is_better or flat > WORST_MEAN_SQUARE * count

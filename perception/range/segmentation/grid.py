@@ -1,7 +1,7 @@
-"""The image as a grid of small blocks with a tangent plane each.
+"""The image as a grid of small blocks, each with a tangent plane.
 
-Averaging b x b pixels and fitting a plane to the neighbouring blocks is the regularisation that the noise asks for;
-blocks that straddle a jump keep only the larger side. Planes are linear in the inverse depth of a pinhole and in the
+Averaging b x b pixels and fitting a plane to the neighbouring blocks suppresses the noise. A block across a depth jump
+uses only the pixels on the side of its median. Planes are linear in the inverse depth of a pinhole sensor and in the
 depth of an orthographic sensor, so one linear fit serves both.
 """
 
@@ -34,8 +34,8 @@ class Grid:
     """Blocks of an image, (h, w) arrays; NaN depth marks an empty block.
 
     `x`, `y` are coordinates on the plane z = 1 (pinhole) or metres (orthographic), `z` metres over `count` samples,
-    `sigma` the standard deviation of `z`, `normal` (h, w, 3) towards the sensor, `rms` what the tangent plane leaves
-    over in sigmas, `slow_share` the part of the variance that neighbours share.
+    `sigma` the standard deviation of `z`, `normal` (h, w, 3) towards the sensor, `rms` the residual of the tangent
+    plane in sigmas, `slow_share` the part of the variance that neighbours share.
     """
 
     size_px: int
@@ -53,9 +53,10 @@ class Grid:
 
 
 def block_size(shape: tuple[int, int], noise: NoiseModel, sensor: RangeSensorModel, depth_m: float) -> int:
-    """Pixels along a block: 1 below 192 rows, 2 below 384, then 3, or 4 where the noise asks for steadier tangent planes.
+    """Return the side of a block in pixels: 1 below 192 rows, 2 below 384, then 3, or 4 if the noise is large.
 
-    Above 1024 rows blocks grow with the image, so that the number of blocks, and with it memory, stays bounded.
+    Rows are those of the shorter side. Above 1024 blocks grow with the image, so that their number, and with it memory,
+    stays bounded.
     """
     if min(shape) < 192:
         return 1
@@ -68,12 +69,15 @@ def block_size(shape: tuple[int, int], noise: NoiseModel, sensor: RangeSensorMod
 
 
 def slope_sigma_rad(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float, *, side_px: int) -> float:
-    """Standard deviation of the slope of a plane fitted to a square window: sigma / (pitch sqrt(sum u^2)) and more."""
+    """Standard deviation of the slope of a plane fitted to a square window.
+
+    It is sigma / (pitch sqrt(sum u^2)) for white noise, plus a part for slow noise and quantisation steps.
+    """
     pitch = sensor.pitch_m(depth_m)
     slow = noise.correlated[0] + noise.correlated[1] * depth_m**2
     step = noise.step[0] + noise.step[1] * depth_m**2
     white = max(noise.sigma_of(depth_m) ** 2 - slow**2, 0.0) ** 0.5 * np.sqrt(12.0) / (pitch * side_px**2)
-    # White noise averages out; slow noise and steps do not, they tilt a short window as a whole.
+    # White noise averages out; slow noise and steps do not, because they tilt a short window as a whole.
     return float(np.hypot(white, np.hypot(0.7 * slow, 0.3 * step) / (pitch * side_px)))
 
 
@@ -88,10 +92,10 @@ def build_grid(
     tiles: int = 1,
     pool: ThreadPoolExecutor | None = None,
 ) -> Grid:
-    """Blocks of `size_px` pixels of an (H, W) depth image and their tangent planes; the window radius follows noise.
+    """Build blocks of `size_px` pixels of an (H, W) depth image and their tangent planes; noise sets the window radius.
 
-    Neighbours steeper than `jump_slope` (metres of depth per metre across) are apart. `corner_px`: row and column of
-    the sensor at which the image begins, for a part of a larger one.
+    Neighbours with a slope above `jump_slope` (metres of depth per metre across) are separate. `corner_px`: row and
+    column of the sensor at which the image begins, for a part of a larger one.
     """
     packed = seen_from(sensor, corner_px)
     law = noise.packed()
@@ -129,7 +133,7 @@ def build_grid(
 
 
 def seen_from(sensor: RangeSensorModel, corner_px: tuple[int, int]) -> Array:
-    """(5,) packed sensor of the part of its image that begins at row and column `corner_px`."""
+    """Return the packed sensor (5,) of the part of its image that begins at row and column `corner_px`."""
     packed = sensor.packed()
     packed[3] -= corner_px[1]
     packed[4] -= corner_px[0]
@@ -137,7 +141,7 @@ def seen_from(sensor: RangeSensorModel, corner_px: tuple[int, int]) -> Array:
 
 
 def _radius(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float, size_px: int) -> tuple[int, float]:
-    """Smallest window radius whose slope is known to the goal, and the slope's sigma there."""
+    """Return the smallest window radius at which the slope is accurate enough, and the slope's standard deviation."""
     sigma = np.inf
     for radius in range(1, WIDEST_RADIUS + 1):
         sigma = slope_sigma_rad(noise, sensor, depth_m, side_px=(2 * radius + 1) * size_px)
@@ -148,7 +152,7 @@ def _radius(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float, size_px
 
 @compiled
 def _middle_depth(z: Array) -> float:
-    """Median of a sample of the known depths, 1 without any."""
+    """Median of a sample of the known depths; 1 if there are none."""
     known = valid_sample(z, MIDDLE_SAMPLES)
     return np.median(known) if known.shape[0] > 0 else 1.0
 

@@ -1,7 +1,7 @@
 """Planes grown over the grid from flat seeds.
 
-A plane grows while its own model explains the next block, so it stops at a crease however gentle the normals change
-there. One that grew on a curved surface betrays itself: a quadratic explains its support clearly better.
+A plane grows as long as its own model explains the next block, so it stops at a crease however gradually the normals
+change there. A plane that grew on a curved surface is rejected, because a quadratic explains its blocks clearly better.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from perception.range.segmentation.flat_fit import is_bent, moved_rms, plane_fro
 from perception.range.segmentation.grow_surface import GROW_SIGMAS
 from perception.range.segmentation.tangents import STEADY_RMS
 
-SWEEPS = 3  # of growing a plane from one seed, each with the plane of the sweep before
-SAME_BLOCKS = 200  # of which no more than one may come or go in a sweep that is the last
-SAME_PLANE = 0.1  # sigmas: a plane that moves less explains the same blocks
+SWEEPS = 3  # times that a plane is grown from one seed, each time with the plane of the previous sweep
+SAME_BLOCKS = 200  # sweeps end when the number of blocks changes by less than one in this many
+SAME_PLANE = 0.1  # sigmas; sweeps end when the plane moves by less, as it then explains the same blocks
 MOST_PLANES = 512
-LOOSE_NORMAL = 0.5  # length of a normal that seeds a plane but does not count
+LOOSE_NORMAL = 0.5  # stored length of a normal that may seed a plane but is too noisy to be compared with one
 EMPTY = as_numpy_scalar(0)
 TAKEN = np.int32(2**31 - 1)
-BENT = np.int32(-1)  # a block whose support is no plane
+BENT = np.int32(-1)  # a block from which no plane grows
 
 
 @compiled
@@ -29,9 +29,10 @@ def grow_planes(
     x: Array, y: Array, z: Array, sigma: Array, normal: Array, rms: Array, free: Mask, label: Labels, first_label: int,
     perspective: bool, order: Labels, least: int, cos_limit: float, tried: Mask,
 ) -> tuple[Array, Indices, Array]:  # fmt: skip
-    """Planes over the free blocks; writes labels and returns parameters (M, 16), block counts (M,), mean squares (M,).
+    """Grow planes over the free blocks; writes their labels.
 
-    Blocks of supports that turned out curved are marked in `tried` so that they seed nothing again.
+    Returns parameters (M, 16), block counts (M,) and mean squared residuals (M,).
+    Blocks of planes that were rejected as curved are marked in `tried`, so that they are not used as seeds again.
     """
     h, w = z.shape
     table, mark, place = _padded(x, y, z, sigma, normal, rms, free, perspective)
@@ -86,6 +87,7 @@ def grow_planes(
 
 @compiled
 def _hand_over(owner: Labels, place: Labels, free: Mask, label: Labels, tried: Mask) -> None:
+    """Copy the owners from the padded table to the flat grid arrays `free`, `label` and `tried`."""
     for i in range(place.shape[0]):
         mine = owner[place[i]]
         if mine > 0:
@@ -98,10 +100,10 @@ def _hand_over(owner: Labels, place: Labels, free: Mask, label: Labels, tried: M
 def _padded(
     x: Array, y: Array, z: Array, sigma: Array, normal: Array, rms: Array, free: Mask, perspective: bool,
 ) -> tuple[Array, Labels, Labels]:  # fmt: skip
-    """Blocks with a frame of taken ones around, one row of numbers each, so that growing needs no look at the rim.
+    """Copy the blocks into a table with a margin of taken ones, so that growing needs no test for the image border.
 
-    Returns (N, 8) x, y, g, its weight, normal (0 where it says nothing), z; marks (N,), `TAKEN` where a block is not
-    free; and where among the N each block stands (h w,).
+    Returns (N, 8) x, y, g, weight of g, normal (0 if unknown), z; marks (N,), `TAKEN` where a block is not free; and
+    the row of the table for each block (h w,).
     """
     h, w = z.shape
     across = w + 2
@@ -119,7 +121,7 @@ def _padded(
             table[i, 0], table[i, 1], table[i, 2] = x[r, c], y[r, c], 1.0 / d if perspective else d
             table[i, 3], table[i, 7] = weight * weight, d
             if np.isfinite(rms[r, c]):
-                # The length of the normal says whether it counts: noisy ones do not hold a plane back.
+                # The length of the normal encodes whether `_fits` compares it: noisy normals do not limit growth.
                 size = 1.0 if rms[r, c] < STEADY_RMS else LOOSE_NORMAL
                 for k in range(3):
                     table[i, 4 + k] = size * normal[r, c, k]
@@ -128,7 +130,7 @@ def _padded(
 
 @compiled
 def _tangent(block: Array, perspective: bool, m: Array) -> bool:
-    """Coefficients of the tangent plane of one row of the table into `m`; False where its ray grazes it."""
+    """Write the coefficients of a block's tangent plane into `m`; False if the plane contains the ray."""
     x, y, nx, ny, nz = block[0], block[1], block[4], block[5], block[6]
     if perspective:
         d = (nx * x + ny * y + nz) * block[7]
@@ -143,7 +145,7 @@ def _tangent(block: Array, perspective: bool, m: Array) -> bool:
 
 @compiled
 def _add_block(block: Array, S: Array) -> None:
-    """One more row of the table into the sums that `solve3` reads."""
+    """Add one row of the table to the sums that `solve3` reads."""
     x, y, g, weight = block[0], block[1], block[2], block[3]
     wx, wy = weight * x, weight * y
     S[0] += weight
@@ -159,7 +161,7 @@ def _add_block(block: Array, S: Array) -> None:
 
 @compiled
 def _fits(block: Array, a: float, b: float, c: float, th: Array, limit: float, cos_limit: float) -> bool:
-    """Whether the plane g = a x + b y + c, `th`, explains a row of the table, and its normal does not speak against it."""
+    """Whether the plane g = a x + b y + c (`th`) explains a block, and the block's normal, if steady, agrees."""
     e = block[2] - a * block[0] - b * block[1] - c
     nx, ny, nz = block[4], block[5], block[6]
     turn = th[0] * nx + th[1] * ny + th[2] * nz
@@ -171,10 +173,10 @@ def _grown(
     table: Array, mark: Labels, across: int, seed: int, stamp: int, m: Array, th: Array, perspective: bool,
     cos_limit: float, queue: Labels, S: Array,
 ) -> int:  # fmt: skip
-    """Blocks connected to `seed` that the plane explains, nearest first, into `queue`; returns how many.
+    """Collect the blocks connected to `seed` that the plane explains into `queue`, nearest first; returns their number.
 
-    The plane g = m . (x, y, 1) follows the blocks as they come: they must come from all sides.
-    `S` receives their sums as `solve3` reads them.
+    The plane g = m . (x, y, 1) is refitted as blocks are added, so they are added breadth first, from all sides.
+    `S` receives their sums in the form that `solve3` reads.
     """
     S[:] = 0.0
     queue[0] = seed
@@ -205,9 +207,9 @@ def _filled(
     table: Array, mark: Labels, across: int, seed: int, stamp: int, m: Array, th: Array, cos_limit: float,
     queue: Labels, spans: Labels, S: Array,
 ) -> int:  # fmt: skip
-    """All blocks connected to `seed` that the plane g = m . (x, y, 1) explains, a span of a row at a time.
+    """Collect all blocks connected to `seed` that the fixed plane g = m . (x, y, 1) explains, by scan-line filling.
 
-    As `_grown`, with the plane held. Blocks that it does not explain are marked `stamp` - 1, so that none is asked twice.
+    Otherwise as `_grown`. Blocks that the plane does not explain are marked `stamp` - 1, so that each is tested once.
     """
     S[:] = 0.0
     mark[seed] = stamp
@@ -236,7 +238,7 @@ def _span(
     table: Array, mark: Labels, at: int, stamp: int, m: Array, th: Array, cos_limit: float, queue: Labels, count: int,
     span: Labels, S: Array,
 ) -> int:  # fmt: skip
-    """The blocks of one row that join the one at `at` on both sides, into `queue`, their ends [first, last) into `span`."""
+    """Append the explained blocks of one row around block `at` to `queue`; their range [first, end) goes to `span`."""
     a, b, c, limit = m[0], m[1], m[2], GROW_SIGMAS * GROW_SIGMAS
     for step in (-1, 1):
         j = at + step

@@ -1,4 +1,4 @@
-"""A surface of any kind grown over the grid: the blocks around given ones that it explains."""
+"""Growing a surface of any kind over the grid: the blocks connected to given ones that it explains."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hal.jit import compiled
 from perception.range.fitting.surfaces import PLANE, depth_on, normal_on
 from perception.range.segmentation.tangents import STEADY_RMS
 
-GROW_SIGMAS = 3.0  # what a block may leave its surface by
+GROW_SIGMAS = 3.0  # largest residual of a block
 
 
 @compiled
@@ -17,9 +17,9 @@ def grow_surface(
     kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, normal: Array, rms: Array, free: Mask,
     seeds: Indices, perspective: bool, cos_limit: float, mark: Image, stamp: int, queue: Indices,
 ) -> tuple[int, float]:  # fmt: skip
-    """Blocks connected to `seeds` that the surface explains; returns their number, indices in queue[:number].
+    """Collect the blocks connected to `seeds` that the surface explains into `queue`; returns their number.
 
-    Also returns the sum of squared residuals. `mark` receives `stamp` where a block belongs.
+    Also returns the sum of squared residuals. `mark` receives `stamp` for each of these blocks.
     """
     h, w = z.shape
     fx, fy, fz, fs = x.ravel(), y.ravel(), z.ravel(), sigma.ravel()
@@ -61,7 +61,7 @@ def _explained(
     kind: int, th: Array, x: float, y: float, z: float, sigma: float, normals: Array, j: int, rms: float,
     perspective: bool, cos_limit: float,
 ) -> float:  # fmt: skip
-    """Squared residual in sigmas (eased where grazing) if the surface explains the block, whose normal is the j-th, else -1."""
+    """Return the squared residual in sigmas, reduced at grazing rays, if the surface explains block j, else -1."""
     zm = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(zm):
         return -1.0
@@ -70,7 +70,7 @@ def _explained(
     nx, ny, nz = normal_on(kind, th, px, py, zm)
     facing = nx * x + ny * y + nz if perspective else nz
     reach = np.sqrt(x * x + y * y + 1.0) if perspective else 1.0
-    # The block's own sampling error grows with the slope; at the rim of a curved surface it rules.
+    # The sampling error of a block grows with the slope, and dominates at the rim of a curved surface.
     limit = GROW_SIGMAS * min(3.0, max(1.0, 0.5 * reach / max(abs(facing), 1e-3)))
     if abs(e) > limit:
         return -1.0

@@ -1,8 +1,8 @@
-"""Pixels that two surfaces explain about equally go where their neighbours are.
+"""Assignment of pixels that several surfaces explain about equally, by their neighbours' labels.
 
-Near a crease, and on the whole ring where a wrong plane cuts a ball, the depth of one pixel cannot tell two surfaces
-apart, least of all under slow noise, which pixels share. So a pixel's residual competes with the labels around it
-(iterated conditional modes; Besag, J. R. Stat. Soc. B 48(3), 1986).
+Near a crease, and on the ring where a wrong plane intersects a sphere, the depth of one pixel cannot tell two surfaces
+apart, least of all under slow noise, which neighbouring pixels share. Therefore the residual of a pixel is combined
+with the labels around it (iterated conditional modes; Besag, J. R. Stat. Soc. B 48(3), 1986).
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from perception.range.segmentation.pixel_assignment import ASSIGNMENT_SIGMAS, PL
 
 REACH_PX = 2  # neighbours of 5 x 5
 SIDE_PX = 2 * REACH_PX + 1
-OWN = SIDE_PX * SIDE_PX // 2  # the pixel itself among them
-PATCH = 32  # places for them in row order; zeros fill the last vector
-SHARED_PX = 25.0  # they share one value of the slow noise
-NEIGHBOUR_WEIGHT = 3.0  # in units of half a squared residual, for a pixel whose neighbours all bear the other label
+OWN = SIDE_PX * SIDE_PX // 2  # index of the pixel itself in the patch
+PATCH = 32  # size of the patch in row order, padded with zeros to whole vectors
+SHARED_PX = 25.0  # pixels that share one value of the slow noise
+NEIGHBOUR_WEIGHT = 3.0  # cost, as half a squared residual, of a label that no neighbour has
 TOP_LABEL = np.int32(2**31 - 1)
-SAFE_NEIGHBOURS = 5  # of eight: as many as a pixel beside a straight border has; with them, one that fits well stays
+SAFE_NEIGHBOURS = 5  # of eight, as at a straight border; a pixel with so many equal neighbours that fits well stays
 
 
 @compiled
@@ -29,9 +29,9 @@ def icm_sweep(
     depth: Array, sen: Array, noise: Array, slow_share: float, labels: Labels, kinds: Indices, ths: Array, rows: Labels,
     columns: Labels, out: Labels, first: int, last: int,
 ) -> None:  # fmt: skip
-    """Judge again the pixels at `rows`, `columns` (N,) of `labels` (H, W); writes labels out[first:last].
+    """Compute new labels of the pixels at `rows`, `columns` (N,) of `labels` (H, W); writes out[first:last].
 
-    A pixel that no other label touches keeps its own.
+    A pixel without a neighbour of another label keeps its own.
     """
     patch = np.zeros(PATCH, np.int32)
     perspective, per_x, per_y = sen[0] > 0, 1.0 / sen[1], 1.0 / sen[2]
@@ -61,7 +61,7 @@ def icm_sweep(
             left -= votes
             least_cost = NEIGHBOUR_WEIGHT - per_vote * votes
             if least_cost >= best:
-                continue  # not even a perfect fit would win
+                continue  # even a residual of zero would cost more
             e = misfit_of(rival, kinds, ths, x, y, z, sigma, perspective)
             cost = evidence * e * e + least_cost
             if e < ASSIGNMENT_SIGMAS and cost < best:
@@ -70,7 +70,7 @@ def icm_sweep(
 
 @compiled
 def _copy_patch(labels: Labels, v: int, u: int, patch: Labels) -> None:
-    """The labels around one pixel into `patch`, 0 beyond the image."""
+    """Copy the labels around one pixel into `patch`; 0 beyond the image."""
     H, W = labels.shape
     inside = REACH_PX <= v < H - REACH_PX and REACH_PX <= u < W - REACH_PX
     top, left = v - REACH_PX, u - REACH_PX
@@ -82,7 +82,7 @@ def _copy_patch(labels: Labels, v: int, u: int, patch: Labels) -> None:
 
 @compiled
 def _beside(labels: Labels, v: int, u: int, own: np.int32) -> tuple[int, int]:
-    """How many of the eight nearest neighbours bear the pixel's own label, and how many another one."""
+    """Count how many of the eight nearest neighbours have the pixel's own label, and how many another one."""
     H, W = labels.shape
     inside = 0 < v < H - 1 and 0 < u < W - 1
     same, other = -1, 0
@@ -96,7 +96,7 @@ def _beside(labels: Labels, v: int, u: int, own: np.int32) -> tuple[int, int]:
 
 @compiled
 def _count(patch: Labels, label: np.int32) -> int:
-    """How many places bear the label."""
+    """Count the entries of the patch that have the label."""
     n = np.int32(0)
     for i in range(PATCH):
         n += np.int32(patch[i] == label)
@@ -105,7 +105,7 @@ def _count(patch: Labels, label: np.int32) -> int:
 
 @compiled
 def _largest_below(patch: Labels, own: np.int32, bound: np.int32) -> np.int32:
-    """The largest label below `bound` that is not the pixel's own; 0 without one."""
+    """Return the largest label below `bound` that is not the pixel's own; 0 without one."""
     most = np.int32(0)
     for i in range(PATCH):
         k = patch[i]

@@ -1,4 +1,4 @@
-"""Joining pieces of one surface that something in front has parted."""
+"""Joining pieces of one surface that are separated by an object in front of it."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ PAIR_SAMPLES = 150
 ROUGH_ROUNDS, ROUNDS = as_numpy_scalar(1), as_numpy_scalar(3)  # of robust weights
 JOINED_SHARE = 0.85
 JOINED_MEAN_SQUARE = 1.6
-ROUGH_STRIDE = 5  # of the samples of a first fit
-ROUGH_SHARE = 0.7  # of them must lie near it before all are fitted
-NEAR_SAMPLES = 16  # at least (a small piece: all it has) decide whether a surface passes near a piece
+ROUGH_STRIDE = 5  # the first fit uses every fifth sample
+ROUGH_SHARE = 0.7  # of the samples must lie near the first fit before all samples are fitted
+NEAR_SAMPLES = 16  # samples, or all of a smaller piece, that decide whether a surface passes near a piece
 LEAST_NEAR = 4
 NEAR_SIGMAS = 20.0
 SCRAP_SHARE = 0.1
@@ -29,14 +29,14 @@ SIGHT_LINES = 5
 GAP_SIGMAS = 6.0
 TOUCHING_PX = 8
 GROOVE_PX = 2  # a single pixel may be a gross error
-BEHIND_SHARE = 0.15  # more of the sight line than this seen behind the surface: a gap, not an occluder
+BEHIND_SHARE = 0.15  # if a larger share of the line is measured behind the surface, there is a gap and no occluder
 APART, SCRAP, JOINED = 0, 1, 2
 
 
 def join_pieces(regions: Regions, kinds: list[int], parameters: list[Array]) -> list[int]:
-    """For each surface (label k at k - 1) the label that it belongs to after joining, itself when it stays alone.
+    """Join pieces of one surface; returns for each label (k at k - 1) the label that it belongs to afterwards.
 
-    Parameters of the surviving labels are updated in place.
+    A surface that is not joined keeps its label. Updates `parameters` of the labels that remain.
     """
     if len(kinds) < 2:
         return list(range(1, len(kinds) + 1))
@@ -57,7 +57,7 @@ def _joined(
     kinds: Indices, ths: Array, samples: Array, starts: Indices, pixels: Indices, order: Indices, depth: Array,
     sen: Array, noise: Array, labels: Labels,
 ) -> Indices:  # fmt: skip
-    """`join_pieces` of samples (4, N), piece k's from `starts[k]` on; the largest come first. Updates `ths`."""
+    """Kernel of `join_pieces`: samples (4, N), piece k's from `starts[k]` on; tried in `order`. Updates `ths`."""
     perspective = sen[0] > 0
     owner, before = np.arange(1, kinds.shape[0] + 1), ths.copy()
     thin = [np.ascontiguousarray(samples[:, starts[k] : starts[k + 1]]) for k in range(kinds.shape[0])]
@@ -90,9 +90,9 @@ def related(
     kind: int, th: Array, samples: Array, pixels: int, other_kind: int, other: Array, others: Array, other_pixels: int,
     noise: Array, perspective: bool,
 ) -> tuple[int, Array]:  # fmt: skip
-    """What a smaller piece is to a larger one: nothing, a scrap of it, or a piece of one surface, whose parameters follow.
+    """Classify the relation of a smaller piece to a larger one: APART, SCRAP (its fragment) or JOINED (one surface).
 
-    Samples are (4, N) as in `bend`.
+    Samples are (4, N) as in `bend`. Also returns the parameters of the larger or the joint surface.
     """
     if other_pixels <= SCRAP_SHARE * pixels and _is_scrap(
         kind, th, other_kind, other, others, other_pixels, noise, perspective
@@ -104,11 +104,11 @@ def related(
             return APART, th
     both = np.concatenate((samples, others), 1)
     rough = _fitted(kind, th, np.ascontiguousarray(both[:, ::ROUGH_STRIDE]), perspective, ROUGH_ROUNDS)
-    for s in (others, samples):  # the smaller piece refuses more often
+    for s in (others, samples):  # the smaller piece first, because it fails more often
         if _trimmed(kind, rough, s, perspective)[0] < ROUGH_SHARE:
             return APART, th
     joint = _fitted(kind, th, both, perspective, ROUNDS)
-    # What a piece leaves over by itself is bend, where noise is slow, and it is no less in the joint surface.
+    # Where noise is slow, residuals of a piece are distortions, which the joint surface cannot remove: widen the limit.
     own = max(_trimmed(kind, th, samples, perspective)[1], _trimmed(other_kind, other, others, perspective)[1])
     limit = JOINED_MEAN_SQUARE * (1.0 + slow_share_at(noise, np.median(both[2])) * max(own - 1.0, 0.0))
     for s in (samples, others):
@@ -122,7 +122,7 @@ def related(
 def _is_scrap(
     kind: int, th: Array, own_kind: int, own: Array, samples: Array, pixels: int, noise: Array, perspective: bool,
 ) -> bool:  # fmt: skip
-    """Whether a small piece lies so close along a large surface that it is only a dent in it, or a bit of its rim."""
+    """Whether a small piece lies so close to a large surface that it is only a dent in it or a part of its rim."""
     if bend.scrap_gain(kind, th, own_kind, own, samples, float(pixels), noise, perspective) > 0.0:
         return True
     if kind == PLANE and own_kind != PLANE:
@@ -135,12 +135,13 @@ def _is_scrap(
         if np.isfinite(z):
             hit += 1
             near += abs(samples[2, i] - z) < SCRAP_SIGMAS * samples[3, i]
-    # Rays just outside the outline miss; those that hit decide, when they are the larger part.
+    # Rays just outside the outline miss the surface; the rays that hit decide if they are the majority.
     return 2 * hit > samples.shape[1] and near > JOINED_SHARE * hit
 
 
 @compiled
 def _fitted(kind: int, th: Array, s: Array, perspective: bool, rounds: int) -> Array:
+    """Return the parameters of a robust fit to samples (4, N) that starts at `th`."""
     free = np.zeros(9, np.bool_)
     th, _ = fit.fit_robust(kind, th, s[0], s[1], s[2], s[3], perspective, free, rounds)
     return th
@@ -148,7 +149,7 @@ def _fitted(kind: int, th: Array, s: Array, perspective: bool, rounds: int) -> A
 
 @compiled
 def _trimmed(kind: int, th: Array, s: Array, perspective: bool) -> tuple[float, float]:
-    """Share of the samples within the trim, and their mean squared residual in squared sigmas."""
+    """Return the share of the samples within the trim, and their mean squared residual in squared sigmas."""
     e = bend.residual_sizes(kind, th, s, perspective)
     kept, total = 0, 0.0
     for i in range(e.shape[0]):
@@ -160,14 +161,14 @@ def _trimmed(kind: int, th: Array, s: Array, perspective: bool) -> tuple[float, 
 
 @compiled
 def _passes_near(kind: int, th: Array, samples: Array, perspective: bool) -> bool:
-    """Whether the surface, extended, passes near most of a piece: a cheap refusal before the joint fits."""
+    """Whether the extended surface passes near most of a piece: a cheap test before the joint fits."""
     n, step = samples.shape[1], max(1, samples.shape[1] // NEAR_SAMPLES)
     count, far = (n + step - 1) // step, 0
     for k in range(0, n, step):
         z = depth_on(kind, th, samples[0, k], samples[1, k], perspective)
         far += not abs(samples[2, k] - z) < NEAR_SIGMAS * samples[3, k]
         if 2 * far >= count:
-            return False  # most pairs are: half of the samples tell
+            return False  # decided early, because most pairs fail
     return bool(count >= LEAST_NEAR)
 
 
@@ -175,9 +176,9 @@ def _passes_near(kind: int, th: Array, samples: Array, perspective: bool) -> boo
 def gap_between(
     depth: Array, sen: Array, noise: Array, labels: Labels, own: Mask, kind: int, th: Array, a: Array, b: Array,
 ) -> bool:  # fmt: skip
-    """Whether the sensor sees past the surface on most of the shortest lines between two pieces of samples (4, N).
+    """Whether there is a gap in the surface on most of the shortest lines between two pieces, samples (4, N).
 
-    `own` says which `labels` (H, W) belong to the pieces: what lies between them shows a groove, however narrow.
+    `own` says which of `labels` (H, W) belong to the pieces; other pixels between them may belong to a narrow groove.
     """
     distance = np.full(a.shape[1], np.inf)
     for n in range(b.shape[1]):
@@ -193,7 +194,7 @@ def gap_between(
 
 @compiled
 def _lessen(x: Array, y: Array, x0: float, y0: float, distance: Array) -> None:
-    """Lessen the squared distances of rays (x, y) to the nearest of others by that to one more, (x0, y0)."""
+    """Update the squared distance from each ray (x, y) to its nearest ray in another set with one more ray (x0, y0)."""
     for m in range(x.shape[0]):
         dx, dy = x[m] - x0, y[m] - y0
         d2 = dx * dx + dy * dy
@@ -202,7 +203,7 @@ def _lessen(x: Array, y: Array, x0: float, y0: float, distance: Array) -> None:
 
 @compiled
 def _first_at(distance: float, x: Array, y: Array, x0: float, y0: float) -> int:
-    """The first of the rays (x, y) that is at most at that squared distance from (x0, y0)."""
+    """Return the index of the first ray (x, y) whose squared distance from (x0, y0) is at most `distance`."""
     for n in range(x.shape[0]):
         dx, dy = x0 - x[n], y0 - y[n]
         if dx * dx + dy * dy <= distance:
@@ -215,7 +216,11 @@ def _is_gap(
     depth: Array, sen: Array, noise: Array, labels: Labels, own: Mask, kind: int, th: Array, ax: float, ay: float,
     bx: float, by: float, slack: float,
 ) -> bool:  # fmt: skip
-    """Whether much of the line from ray a to ray b lies behind the surface, or `GROOVE_PX` in a row of neither piece."""
+    """Whether the depth on the line from ray a to ray b shows a gap in the surface.
+
+    That is: much of it lies behind the surface, or `GROOVE_PX` successive pixels of neither piece do, or a groove
+    crosses it.
+    """
     H, W = depth.shape
     perspective = sen[0] > 0
     du, dv = (bx - ax) * sen[1], (by - ay) * sen[2]
@@ -238,6 +243,6 @@ def _is_gap(
     u, v = ax * sen[1] + sen[3], ay * sen[2] + sen[4]
     if crosses_groove(depth, sen, noise, labels, own, th, u, v, du / count, dv / count, count):
         return True
-    # Where pieces touch, the line between them may lie along what parts them.
+    # If the pieces touch, the line between them may run along the groove that separates them.
     is_touching = count <= TOUCHING_PX
     return is_touching and is_grooved_at(depth, sen, noise, labels, own, th, u + 0.5 * du, v + 0.5 * dv)

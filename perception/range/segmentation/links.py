@@ -1,7 +1,4 @@
-"""Which neighbouring blocks belong together before any surface is known: depth without a step, normals without a crease.
-
-`components` labels whole images, in tiles; the blocks that are still free are few, and one pass over them tells theirs.
-"""
+"""Connected components of neighbouring blocks without a depth step or a crease, before any surface is known."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ def smooth_links(
     z: Array, sigma: Array, free: Mask, slope: float, inverse_f: float, perspective: bool, normal: Array, rms: Array,
     cos_limit: float,
 ) -> tuple[Mask, Mask]:  # fmt: skip
-    """Which free blocks belong with their right and lower neighbour: a small depth step and a small turn between."""
+    """Return which free blocks are linked to their right and lower neighbours by a small step in depth and normal."""
     h, w = z.shape
     right, down = np.zeros((h, w), np.bool_), np.zeros((h, w), np.bool_)
     for r in range(h):
@@ -40,10 +37,10 @@ def smooth_components(
     blocks: Indices, z: Array, sigma: Array, free: Mask, slope: float, inverse_f: float, perspective: bool,
     normal: Array, rms: Array, cos_limit: float, least: int, most: int,
 ) -> tuple[Indices, Indices]:  # fmt: skip
-    """Components of at least `least` free blocks over `smooth_links`, the `most` largest, those first.
+    """Return the components of at least `least` free blocks under the links of `smooth_links`, the `most` largest ones.
 
-    `blocks` (B,): the free ones, flat, ascending. Returns starts (n + 1,) and flat indices (N,) in raster order: component
-    k owns indices[starts[k] : starts[k + 1]].
+    `blocks` (B,): flat indices of the free blocks, ascending. Returns starts (n + 1,) and flat indices (N,): component
+    k, the largest first, owns indices[starts[k] : starts[k + 1]], in raster order.
     """
     h, w = z.shape
     parent, sizes = np.empty(h * w, np.int64), np.empty(h * w, np.int64)
@@ -58,7 +55,7 @@ def smooth_components(
                 unite(parent, at, i * w + j)
     for i in blocks:
         sizes[find(parent, i)] += 1
-    large = blocks[sizes[blocks] >= least]  # their first blocks: no other has a size
+    large = blocks[sizes[blocks] >= least]  # the first block of each component, because only roots have a size
     large = large[np.argsort(-sizes[large], kind="mergesort")][:most]
     starts = np.zeros(large.shape[0] + 1, np.int64)
     starts[1:] = np.cumsum(sizes[large])
@@ -77,7 +74,7 @@ def smooth_components(
 def _is_smooth(
     z: Array, normal: Array, rms: Array, r: int, c: int, i: int, j: int, limit: float, cos_limit: float,
 ) -> bool:  # fmt: skip
-    """Whether two blocks differ by at most `limit` in depth, and their normals, where both are steady, by a small turn."""
+    """Whether two blocks differ by at most `limit` in depth and, if both normals are reliable, little in direction."""
     if not abs(z[i, j] - z[r, c]) <= limit:
         return False
     if not (rms[r, c] < STEADY_RMS and rms[i, j] < STEADY_RMS):

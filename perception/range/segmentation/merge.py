@@ -1,10 +1,10 @@
-"""Touching regions that are one surface: agglomeration on the graph of neighbours, cheapest description first.
+"""Merging touching regions that belong to one surface: agglomeration on the graph of neighbours, largest gain first.
 
-Slow noise and bent calibration break one face into several, and planes that grow first leave a narrow cylinder as
-facets. Two regions that meet without a step are joined when one surface describes both more cheaply than two do
-(Schwarz's criterion over independent patches of noise), or when they meet without a crease either: then what parts them
-is the error of the sensor, whatever the models say. `pairs` judges, compiled; the graph is kept here, in plain
-Python, because an image has no more than some hundred pairs.
+Slow noise and calibration errors split one face into several regions, and growing planes first splits a narrow cylinder
+into facets. Two regions that meet without a step are merged if one surface describes both at a lower cost than two
+(Schwarz's criterion over independent patches of noise). They are also merged if they meet without a crease, because
+only sensor errors then separate them. `merge_criterion` decides (compiled); the graph is kept here in plain Python,
+because an image has at most some hundred pairs.
 """
 
 from __future__ import annotations
@@ -22,11 +22,14 @@ from perception.range.segmentation.seams import is_seam_grooved
 
 PART_SAMPLES = 80
 LEAST_BORDER_PX = 6
-TIP_SHARE = 0.35  # of the side of a square of the smaller region: two that touch by less may have anything between them
+TIP_SHARE = 0.35  # least length of a border, relative to the square root of the smaller region's area
 
 
 def merge_touching(regions: Regions, kinds: list[int], parameters: list[Array]) -> list[int]:
-    """For each label (k at k - 1) the label it belongs to afterwards; updates kinds and parameters of the survivors."""
+    """Merge touching regions; returns for each label (k at k - 1) the label that it belongs to afterwards.
+
+    Updates `kinds` and `parameters` of the labels that remain.
+    """
     if not kinds:
         return []
     names, ths = np.array(kinds), np.stack(parameters)
@@ -37,15 +40,17 @@ def merge_touching(regions: Regions, kinds: list[int], parameters: list[Array]) 
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class _Graph:
-    """Parts and the borders between them; label k is at k - 1 of `kinds` and `ths`, and at k of what else is told of parts.
+    """Regions and the borders between them.
+
+    Label k is at index k - 1 of `kinds` and `ths`, and at index k of the other attributes of regions.
 
     Attributes:
         kinds, ths: kinds (count,) and parameters (count, 16).
         few, normals, figures: samples (4, n) and normals (n, 3) of each, and figures (count + 1, FIGURES), entry 0 unused.
         owner: (count + 1,) the label that each belongs to.
-        pairs: (P, 2) labels a < b that touch; twice 0: no more.
-        lengths, x, y: pixels of each border, and the rays (n,) of some of them.
-        gains, is_old: (P,) how much cheaper each is as one, and whether that still holds.
+        pairs: (P, 2) labels a < b that touch; both are 0 for a pair that no longer exists.
+        lengths, x, y: number of pixels of each border, and the rays (n,) of some of them.
+        gains, is_old: (P,) gain of merging each pair, and whether it is up to date.
     """
 
     kinds: Indices
@@ -63,7 +68,7 @@ class _Graph:
 
 
 def _agglomerated(regions: Regions, graph: _Graph) -> Indices:
-    """Joins pairs of labels, the most gainful first, until none gains; the owner (count + 1,) of each label then."""
+    """Merge pairs of labels, the largest gain first, until no gain is positive; returns the owner (count + 1,)."""
     perspective, pitch = bool(regions.packed[0] > 0), 1.0 / float(regions.packed[1])
     joint_kinds, joint_ths = np.zeros(len(graph.pairs), np.int64), np.zeros((len(graph.pairs), SIZE))
     few, normals, figures = graph.few, graph.normals, graph.figures
@@ -85,13 +90,13 @@ def _agglomerated(regions: Regions, graph: _Graph) -> Indices:
         )  # fmt: skip
         graph.owner[graph.owner == lost] = kept
         _rewire(kept, lost, graph)
-        # A part that took in a scrap, and is the surface it was, is what it was to neighbours that the scrap did not touch.
+        # If the surface has not changed, the gains with neighbours that the merged region did not touch stay valid.
         if not is_same:
             graph.is_old &= (graph.pairs != kept).all(axis=1)
 
 
 def _described_graph(regions: Regions, kinds: Indices, ths: Array) -> _Graph:
-    """The graph of the regions; changes `kinds` and `ths` to the simplest that describe each."""
+    """Build the graph of the regions; replaces `kinds` and `ths` by the simplest surface that describes each region."""
     perspective, pitch = bool(regions.packed[0] > 0), 1.0 / float(regions.packed[1])
     samples = regions.samples(PART_SAMPLES)
     few, normals = [np.empty((4, 0))], [np.empty((0, 3))]
@@ -114,7 +119,7 @@ def _described_graph(regions: Regions, kinds: Indices, ths: Array) -> _Graph:
 
 
 def _gain_of(p: int, graph: _Graph, regions: Regions) -> tuple[float, int, Array]:
-    """How much cheaper pair p is as one surface (0 or less: it stays two), that surface's kind and its parameters."""
+    """Return the gain of merging pair p (not merged if 0 or less), and kind and parameters of the joint surface."""
     kinds, ths, few, normals, figures = graph.kinds, graph.ths, graph.few, graph.normals, graph.figures
     a, b = graph.pairs[p].tolist()
     length_px = int(graph.lengths[p])
@@ -135,7 +140,7 @@ def _gain_of(p: int, graph: _Graph, regions: Regions) -> tuple[float, int, Array
 
 
 def _most_gainful(gains: Array, pairs: Labels) -> int | None:
-    """The pair with the largest gain, of equal ones the last in the order of labels; None when none gains."""
+    """Return the pair with the largest gain, of equal ones the last in label order; None if no gain is positive."""
     most = gains.max(initial=0.0)
     if not most > 0.0:
         return None
@@ -144,9 +149,9 @@ def _most_gainful(gains: Array, pairs: Labels) -> int | None:
 
 
 def _rewire(kept: int, lost: int, graph: _Graph) -> None:
-    """The borders of the part that is lost go to the one that is kept; pairs that have got more are to be judged again.
+    """Transfer the borders of label `lost` to label `kept`; pairs whose border changed are marked for a new evaluation.
 
-    A pair that is no more has label 0 twice, and gains nothing.
+    A pair that no longer exists gets label 0 twice and gain 0.
     """
     pairs, x, y = graph.pairs, graph.x, graph.y
     for p in np.flatnonzero((pairs == lost).any(axis=1)).tolist():

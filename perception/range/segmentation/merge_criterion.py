@@ -1,8 +1,8 @@
-"""Two touching regions, compiled: whether one surface describes both more cheaply than two do.
+"""Merge criterion of two touching regions: whether one surface describes both at a lower cost than two (compiled).
 
-A region is its kind, parameters, (4, N) samples, their (N, 3) normals on its surface, and FIGURES: its pixels, how many
-independent values of the noise these hold, what the surface leaves over in squared sigmas, how far noise may have
-turned it, radians, and the side of a square of its size, metres.
+A region is given by its kind, parameters, (4, N) samples, their (N, 3) normals on its surface, and its figures: number
+of pixels (PIXELS), number of independent noise values among them (PATCHES), mean squared residual in squared sigmas
+(MEAN_SQUARE), standard deviation of its tilt in radians (TILT), and side of a square of its area in metres (SIZE_M).
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ STEP_SIGMAS = 3.0
 SHARPEST_TURN_RAD = 1.2  # between facets of one narrow cylinder; an edge of a box turns by 1.57
 SMOOTH_TURN_RAD = 0.05
 SMOOTH_SIGMAS = 3.0
-SMOOTH_SHARE = 0.8  # of both parts within `SMOOTH_LIMIT` of the joint surface, when no crease parts them
+SMOOTH_SHARE = 0.8  # of both parts must lie within `SMOOTH_LIMIT` of the joint surface if no crease separates them
 SMOOTH_LIMIT = 5.0
 LEAST_SHARE = 0.85
 UNEVEN_TURN_RAD = 0.25  # between facets of one face
-ROUNDING_PX = 4.0  # wide at most, by which an edge of a face is rounded
+ROUNDING_PX = 4.0  # largest width of a rounded edge
 ROUNDING_TURN_RAD = 0.6
 ROUNDING_SIGMAS = 2.0
 UNEVEN_SHARE = 0.02  # of the smaller facet's size
 LEAST_GAIN = 1e-3
 SCRAP_SHARE = 0.1  # of the larger part
 PLAIN_MEAN_SQUARE = 1.6
-MOST_NOISE = 2.5  # times the model's variance, that two parts may show and still be joined on its strength
-CREASE_MEAN_SQUARE = 2.0  # times the limit, that a quadratic leaves over: no surface follows such a crease
-# Mean square of a rough fit, cut at five sigmas, that no full fit brings below the limits: where the crease is smooth or
-# both are flat; and beyond the limit, for two that are known well enough to tell.
+MOST_NOISE = 2.5  # largest ratio of observed to modelled variance by which the limits are widened
+CREASE_MEAN_SQUARE = 2.0  # if the residual of a quadratic exceeds the limit this many times, no surface fits
+# Mean square of a rough fit, cut at five sigmas, above which a full fit cannot reach the limits. GIVE_UP holds for two
+# planes or a smooth border; otherwise it is the limit plus SLACK.
 GIVE_UP = 10.0
 SLACK = 3.0
 
@@ -50,9 +50,9 @@ SLACK = 3.0
 def described(
     kind: int, th: Array, samples: Array, pixels: float, pitch: float, noise: Array, perspective: bool,
 ) -> tuple[int, Array, Array, Array]:  # fmt: skip
-    """A region by itself, as the simplest surface that describes it: kind, parameters, normals and figures.
+    """Describe one region by the simplest suitable surface; returns kind, parameters, normals and figures.
 
-    `pitch`: between pixels, in ray coordinates.
+    `pitch`: distance between pixels, in ray coordinates.
     """
     patches = max(pixels / (1.0 + slow_share_at(noise, np.median(samples[2])) * (SLOW_NOISE_AREA_PX - 1.0)), 1.0)
     kind, th = bend.simplest(kind, th, samples, perspective, patches)
@@ -64,7 +64,10 @@ def described(
 def figures_of(
     kind: int, th: Array, samples: Array, pixels: float, patches: float, pitch: float, perspective: bool,
 ) -> Array:  # fmt: skip
-    """(FIGURES,) of a region; its tilt is sigma / (spread sqrt(patches)), the slope of a plane through noisy values."""
+    """Return the figures (FIGURES,) of a region.
+
+    Its tilt is sigma / (spread sqrt(patches)), the standard deviation of the slope of a plane fitted to noisy values.
+    """
     out = np.empty(FIGURES)
     out[PIXELS], out[PATCHES] = pixels, patches
     e = bend.residual_sizes(kind, th, samples, perspective)
@@ -87,9 +90,9 @@ def united(
     kind: int, th: Array, samples_a: Array, normals_a: Array, figures_a: Array, samples_b: Array, normals_b: Array,
     figures_b: Array, most: int, pitch: float, perspective: bool,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Samples, normals and figures of two regions that are one surface now.
+    """Return samples, normals and figures of two regions that have been merged.
 
-    Each gives samples by its share of the pixels, a fifth of `most` at least, evenly spread over those that it has.
+    Each contributes samples in proportion to its pixels, but at least a fifth of `most`, evenly spread over its own.
     """
     pixels, patches = figures_a[PIXELS] + figures_b[PIXELS], figures_a[PATCHES] + figures_b[PATCHES]
     share = min(max(figures_b[PIXELS] / pixels, 0.2), 0.8)
@@ -103,7 +106,7 @@ def united(
 
 @compiled
 def _spread(samples: Array, normals: Array, few: Array, few_normals: Array) -> None:
-    """Fill `few` (4, n) and `few_normals` (n, 3) from samples and normals, evenly spread."""
+    """Fill `few` (4, n) and `few_normals` (n, 3) with an evenly spread choice of samples and normals."""
     n, last = few.shape[1], samples.shape[1] - 1
     step = last / max(n - 1, 1)
     for k in range(n):
@@ -120,9 +123,9 @@ def judged(
     samples_b: Array, normals_b: Array, figures_b: Array, x: Array, y: Array, length_px: int, noise: Array,
     perspective: bool,
 ) -> tuple[float, int, Array]:  # fmt: skip
-    """Gain of the best joint description of two regions that touch at the rays (x, y), its kind and parameters.
+    """Find the best joint surface of two regions that touch at the rays (x, y); returns its gain, kind and parameters.
 
-    A gain of 0 or less: they stay two.
+    With a gain of 0 or less they stay separate.
     """
     shown = shown_noise(figures_a, figures_b)
     step, turn = step_and_turn(kind_a, a, kind_b, b, x, y, noise, perspective)
@@ -131,7 +134,7 @@ def judged(
     tolerated = max(SMOOTH_TURN_RAD, SMOOTH_SIGMAS * np.hypot(figures_a[TILT], figures_b[TILT]))
     is_smooth = turn < min(tolerated, 0.5 * SHARPEST_TURN_RAD)
     may_join = step <= STEP_SIGMAS * np.sqrt(shown) and turn <= SHARPEST_TURN_RAD
-    # A rounded edge goes to its face in any case, and what it is by itself is not worth fits.
+    # A rounded edge is merged with its face in any case, so no fits are needed.
     if may_join and (is_smooth or not is_rounding):
         samples, normals = np.concatenate((samples_a, samples_b), 1), np.concatenate((normals_a, normals_b))
         limit = shown * max(mean_square_limit(figures_a[PATCHES]), mean_square_limit(figures_b[PATCHES]))
@@ -145,7 +148,7 @@ def judged(
             own, continued = (kind_a, a) if figures_a[PIXELS] >= figures_b[PIXELS] else (kind_b, b)
             goes_on = own != PLANE and fit.rough_mean_square(own, continued, samples, perspective) <= give_up
             if goes_on:
-                # Pieces of one bent surface: the larger's goes on over the smaller, and no other need be tried.
+                # If the surface of the larger region also explains the smaller one, no other kind need be tried.
                 continued = _continued(own, continued, samples, perspective)
                 gain, _ = _gain(
                     own, continued, kind_a, samples_a, figures_a, kind_b, samples_b, figures_b, is_smooth, perspective
@@ -182,7 +185,7 @@ def judged(
 
 @compiled
 def _continued(kind: int, th: Array, samples: Array, perspective: bool) -> Array:
-    """The surface refined on the samples of both regions."""
+    """Refine the parameters of a surface on the samples of both regions."""
     free = np.zeros(9, np.bool_)
     x, y, z, sigma = samples[0], samples[1], samples[2], samples[3]
     th, _ = fit.fit_robust(kind, th, x, y, z, sigma, perspective, free, ROUNDS)
@@ -193,7 +196,7 @@ def _continued(kind: int, th: Array, samples: Array, perspective: bool) -> Array
 def _joint_fits(
     samples: Array, normals: Array, perspective: bool, kinds: Mask, correlated: float, give_up: float,
 ) -> tuple[Array, Mask]:  # fmt: skip
-    """Parameters (5, SIZE) of each of `kinds` on the samples of both regions, and which of them fit at all."""
+    """Fit each of `kinds` to the samples of both regions; returns parameters (5, SIZE) and which kinds fit."""
     points = bend.points_of(samples, perspective)
     x, y, z, sigma = samples[0], samples[1], samples[2], samples[3]
     ths, _, kept, score = fit.fit_kinds(
@@ -207,9 +210,10 @@ def _gain(
     kind: int, th: Array, kind_a: int, samples_a: Array, figures_a: Array, kind_b: int, samples_b: Array,
     figures_b: Array, is_smooth: bool, perspective: bool,
 ) -> tuple[float, bool]:  # fmt: skip
-    """How much cheaper the joint surface is than the two, minus infinity where it does not describe both.
+    """Return the cost of two surfaces minus that of the joint surface; minus infinity if it does not describe both.
 
-    And whether both meet without a crease and lie near it: then they are one, however dear.
+    Also returns whether the regions meet without a crease and lie near the joint surface; they are then merged whatever
+    the cost.
     """
     shown = shown_noise(figures_a, figures_b)
     patches_a, patches_b = figures_a[PATCHES], figures_b[PATCHES]
@@ -238,7 +242,7 @@ def _is_strip(pixels_a: float, pixels_b: float, length_px: int) -> bool:
 
 @compiled
 def _is_uneven(th: Array, samples_a: Array, samples_b: Array, tolerance_m: float, perspective: bool) -> bool:
-    """Whether two facets leave the plane `th` by less than things that are called flat do: upholstery, cardboard."""
+    """Whether two facets deviate from the plane `th` by at most the unevenness accepted for upholstery or cardboard."""
     for side in range(2):
         samples = samples_a if side == 0 else samples_b
         e = bend.residual_sizes(PLANE, th, samples, perspective) * samples[3]
@@ -252,6 +256,7 @@ def _swallowed(
     is_rounding: bool, kind: int, th: Array, figures: Array, own_kind: int, own: Array, samples: Array,
     own_figures: Array, noise: Array, perspective: bool,
 ) -> tuple[float, int, Array]:  # fmt: skip
+    """Return the gain of merging a rounded edge or scrap (`own`) into the larger region, and the latter's surface."""
     if is_rounding:
         return LEAST_GAIN, kind, th
     if own_figures[PIXELS] > SCRAP_SHARE * figures[PIXELS]:
@@ -261,9 +266,10 @@ def _swallowed(
 
 @compiled
 def _is_creased(samples: Array, perspective: bool, limit: float) -> bool:
-    """Whether even a quadratic in x and y leaves more than `limit` squared sigmas a sample over.
+    """Whether the mean squared residual of a quadratic in x and y exceeds `limit` squared sigmas per sample.
 
-    It follows whatever is smooth and turns by no more than `SHARPEST_TURN_RAD`, so it spares the fits of surfaces.
+    A quadratic follows any smooth surface that turns by at most `SHARPEST_TURN_RAD`. If it fails, no joint surface
+    needs to be fitted.
     """
     n = samples.shape[1]
     A, b, row = np.zeros((6, 6)), np.zeros(6), np.empty(6)
@@ -274,7 +280,7 @@ def _is_creased(samples: Array, perspective: bool, limit: float) -> bool:
     for i in range(n):
         u, v, z = (samples[0, i] - mx) * scale, (samples[1, i] - my) * scale, samples[2, i]
         row[0], row[1], row[2], row[3], row[4], row[5] = 1.0, u, v, u * u, u * v, v * v
-        # Planes are straight in 1 / z under perspective; sigma goes with it.
+        # Under perspective planes are linear in 1 / z, and sigma is converted accordingly.
         value = (1.0 / z if perspective else z) - g0
         sigma = samples[3, i] / (z * z) if perspective else samples[3, i]
         w = 1.0 / (sigma * sigma)
@@ -296,7 +302,7 @@ def _is_creased(samples: Array, perspective: bool, limit: float) -> bool:
 
 @compiled
 def shown_noise(figures_a: Array, figures_b: Array) -> float:
-    """How many times the noise model's variance two regions show by themselves; slanted faces scatter more."""
+    """Ratio of observed to modelled variance of two regions, from 1 to `MOST_NOISE`; slanted faces scatter more."""
     na, nb = figures_a[PATCHES], figures_b[PATCHES]
     shown = (figures_a[MEAN_SQUARE] * na + figures_b[MEAN_SQUARE] * nb) / (na + nb)
     return float(min(max(1.0, shown), MOST_NOISE))
@@ -304,5 +310,8 @@ def shown_noise(figures_a: Array, figures_b: Array) -> float:
 
 @compiled
 def mean_square_limit(patches: float) -> float:
-    """What a right surface stays below in 97 of 100 cases: 1 + 2 sqrt(2 / n) of a mean of n squares, and a floor."""
+    """Limit that the mean square of n residuals of a correct surface meets with probability 0.97: 1 + 2 sqrt(2 / n).
+
+    It is at least `PLAIN_MEAN_SQUARE`.
+    """
     return float(max(PLAIN_MEAN_SQUARE, 1.0 + 2.0 * np.sqrt(2.0 / patches)))

@@ -1,4 +1,4 @@
-"""Models compete for one smooth component: every primitive is offered, the cheapest that explains it wins."""
+"""Model selection for a smooth component: all kinds of primitives are fitted, and Schwarz's criterion selects one."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ Labels = NDArray[np.int32]
 Flags = NDArray[np.bool_]
 
 ROUNDS = 6
-MOST_COMPONENTS = 48  # a round
-MOST_ATTEMPTS = 120  # on one grid: bounds the time that rubble can cost
+MOST_COMPONENTS = 48  # per round
+MOST_ATTEMPTS = 120  # per grid; bounds the time spent on irregular scenes
 FIT_SAMPLES = 90
 GOOD_MEAN_SQUARE = 2.0
 GOOD_SHARE = 0.75
-WHOLE_SHARE = 0.85  # a fit to the whole component that explains less has rivals grown from parts of it
+WHOLE_SHARE = 0.85  # if a fit to the whole component explains less, fits to parts of it are tried as well
 LOCAL_BLOCKS = 45
 LOCAL_TRIES = 5
 FEW_BLOCKS_FOR_QUADRIC = 60
-GIVE_UP = 14.0  # a fit that keeps three quarters within three sigmas leaves 8 at most, once it has converged
+GIVE_UP = 14.0  # rough mean square; a converged fit with three quarters within three sigmas has 8 at most
 
 
 @dataclass(slots=True, eq=False)
@@ -54,10 +54,10 @@ class Candidates:
 
 
 def select_models(grid: Grid, blocks: Labels, *, found: Candidates, least: int, slope: float, focal_px: float) -> None:
-    """Offer each smooth component of unlabelled blocks to all primitives until no round adds a surface.
+    """Fit all kinds of primitives to each smooth component of unlabelled blocks, until a round finds no component.
 
-    The surface that explains most of a component takes its blocks, if they are at least `least`. Extends `blocks` (h, w)
-    and `found`. `slope`: metres of depth per metre across that are no jump yet.
+    The surface that explains most of a component is assigned the blocks it explains, if there are at least `least`.
+    Extends `blocks` (h, w) and `found`. `slope`: largest slope, metres of depth per metre across, that is not a jump.
     """
     free: Flags = np.isfinite(grid.z) & (blocks == 0)
     turn_limit = float(np.cos(max(0.7, 5.0 * grid.normal_sigma_rad)))
@@ -78,7 +78,7 @@ def select_models(grid: Grid, blocks: Labels, *, found: Candidates, least: int, 
             members = members[flat_free[members]]
             best = _best_model(grid, cos_limit, free, members, least) if len(members) >= least else None
             if best is None:
-                # What nothing explains now, nothing will: it must not be offered again.
+                # Blocks that no surface explains now are not tried again, because later rounds would fail as well.
                 flat_free[members] = False
             else:
                 kind, th, mine = best
@@ -90,7 +90,7 @@ def select_models(grid: Grid, blocks: Labels, *, found: Candidates, least: int, 
 def _best_model(
     grid: Grid, cos_limit: float, free: Flags, members: Indices, least: int
 ) -> tuple[int, Array, Indices] | None:
-    """Kind, parameters and blocks (flat) of the surface that explains most of `members`, None when there is none."""
+    """Return kind, parameters and blocks (flat) of the surface that explains most of `members`; None without one."""
     kind, th, share = _fitted(grid, members)
     fits = [(kind, th)]
     if kind < 0 or share < WHOLE_SHARE:
@@ -117,7 +117,7 @@ def _best_model(
 
 
 def _parts(grid: Grid, members: Indices) -> Iterator[Indices]:
-    """The blocks around seeds that are evenly spread over `members`."""
+    """Yield the blocks around each of some seeds that are evenly spread over `members`."""
     inside = members[np.isfinite(grid.rms.ravel()[members])]
     width = grid.z.shape[1]
     if len(inside) < LOCAL_TRIES + 2:
@@ -129,7 +129,7 @@ def _parts(grid: Grid, members: Indices) -> Iterator[Indices]:
 
 
 def _fitted(grid: Grid, members: Indices) -> tuple[int, Array, float]:
-    """`_fit_blocks` of some blocks of a grid."""
+    """Call `_fit_blocks` for the blocks `members` (flat indices) of a grid."""
     x, y, z, sigma = (a.ravel() for a in (grid.x, grid.y, grid.z, grid.sigma))
     normal = grid.normal.reshape(-1, 3)
     return _fit_blocks(x, y, z, sigma, normal, grid.perspective, grid.size_px**2, grid.slow_share, members)
@@ -140,11 +140,14 @@ def _fit_blocks(
     x: Array, y: Array, z: Array, sigma: Array, normal: Array, perspective: bool, pixels: int, slow_share: float,
     members: Indices,
 ) -> tuple[int, Array, float]:  # fmt: skip
-    """Kind (-1 when none explains them), parameters (16,) and explained share of the blocks `members` (flat)."""
+    """Fit all kinds to the blocks `members` (flat); returns the best kind, its parameters (16,) and share explained.
+
+    The kind is -1 if none explains them.
+    """
     count = members.shape[0]
     if count < 5:
         return -1, np.zeros(SIZE), 0.0
-    # Evenly spread over the region; a fixed choice keeps results equal from run to run.
+    # Samples are evenly spread over the region; a deterministic choice makes results repeatable.
     n = min(count, FIT_SAMPLES)
     points, P, N = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
     few = np.empty((4, n))
@@ -159,7 +162,7 @@ def _fit_blocks(
             known += 1
     kinds = np.ones(5, np.bool_)
     kinds[QUADRIC] = count >= FEW_BLOCKS_FOR_QUADRIC
-    # Slow noise covers samples together: so many count as one.
+    # Slow noise is common to neighbouring samples; this many samples count as one independent sample.
     patches = max(count * pixels / SLOW_NOISE_AREA_PX, 1.0)
     correlated = 1.0 + slow_share * max(n / patches - 1.0, 0.0)
     ths, mean2, kept, score = fit.fit_kinds(

@@ -1,4 +1,4 @@
-"""From blocks back to pixels: every pixel goes to the neighbouring surface that explains its depth best."""
+"""Assignment of pixels: each gets the label of the neighbouring surface that explains its depth best."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from perception.range.segmentation.boundary_pixels import WORD, column_range, fl
 from perception.range.segmentation.grid import sigma_at
 
 ASSIGNMENT_SIGMAS = 3.5
-PLAIN_SIGMAS = 1.0  # a pixel that its own block's surface explains so well is not offered to the others
+PLAIN_SIGMAS = 1.0  # a pixel whose residual from its own block's surface is smaller is not compared with others
 MAX_CANDIDATES = 8
-SEVERAL = np.int32(-1)  # surfaces compete
-EASED = 0.4  # the least part of a misfit that a grazing ray leaves
+SEVERAL = np.int32(-1)  # marks blocks and pixels for which several surfaces must be compared
+EASED = 0.4  # smallest factor by which a residual is reduced at a grazing ray
 
 
 @compiled
@@ -44,7 +44,10 @@ def assign_pixels(
 
 @compiled
 def _only_labels(least: NDArray[np.uint32], most: Labels, only: Labels) -> None:
-    """The one label that the 3x3 blocks around each block hold, 0 where they hold none, from `column_range`."""
+    """Write the only label of the 3x3 blocks around each block into `only`: 0 if there is none, SEVERAL if more than one.
+
+    `least` and `most` are those of `column_range`.
+    """
     one = np.int32(1)
     for c in range(only.shape[0]):
         low, high = min(least[c], least[c + 1], least[c + 2]), max(most[c], most[c + 1], most[c + 2])
@@ -56,9 +59,9 @@ def _assign_first(
     depth: Array, sen: Array, noise: Array, own: Labels, only: Labels, size: int, r: int, kinds: Indices, ths: Array,
     out: Labels,
 ) -> None:  # fmt: skip
-    """Offer the pixels of the r-th row of blocks to the only surface there is, or to their `own` block's.
+    """Compare the pixels of the r-th row of blocks with the only surface around, or else with that of their `own` block.
 
-    Among several surfaces a pixel that its own one does not explain plainly is left `SEVERAL`.
+    If there are several surfaces, a pixel that its own one does not explain within `PLAIN_SIGMAS` becomes `SEVERAL`.
     """
     H, W = depth.shape
     w = own.shape[0]
@@ -100,7 +103,10 @@ def _assign_run(
     depth: Array, th: Array, label: int, first: int, v: int, sen: Array, noise: Array, perspective: bool, limit: float,
     otherwise: int | np.int32, out: Labels,
 ) -> None:  # fmt: skip
-    """Pixels first, first + 1, ... of row v that a plane explains within `limit` sigmas, without branch or root."""
+    """Label the pixels first, first + 1, ... of row v that a plane explains within `limit` sigmas; others get `otherwise`.
+
+    The loop has neither a branch nor a square root.
+    """
     p = 1.0 if perspective else 0.0
     y = (v - sen[4]) / sen[2]
     per_x = 1.0 / sen[1]
@@ -114,7 +120,7 @@ def _assign_run(
         dx = p * x
         z = depth[i]
         facing = th[0] * dx + along
-        e = z * facing - (at - th[0] * (x - dx))  # times `facing`: no division
+        e = z * facing - (at - th[0] * (x - dx))  # residual times `facing`, which avoids a division
         z2 = z * z
         white, slow, step = noise[0] + noise[1] * z2, noise[2] + noise[3] * z2, noise[4] + noise[5] * z2
         variance = max(white * white, step * step * (1.0 / 12.0)) + slow * slow
@@ -126,7 +132,7 @@ def _assign_rest(
     depth: Array, sen: Array, noise: Array, size: int, r: int, c: int, near: Labels, n: int, kinds: Indices, ths: Array,
     perspective: bool, out: Labels,
 ) -> None:  # fmt: skip
-    """The pixels of one block that are left to compete for, among the surfaces near[:n]."""
+    """Assign the pixels of one block that are still `SEVERAL` to the best of the surfaces near[:n]."""
     H, W = depth.shape
     for v in range(r * size, min(r * size + size, H)):
         for u in range(c * size, min(c * size + size, W)):
@@ -139,7 +145,7 @@ def _assign_rest(
 def _best_of(
     z: float, x: float, y: float, noise: Array, near: Labels, n: int, kinds: Indices, ths: Array, perspective: bool,
 ) -> int:  # fmt: skip
-    """The label among near[:n] whose surface explains the depth best, 0 when none does within `ASSIGNMENT_SIGMAS`."""
+    """Return the label of near[:n] whose surface explains the depth best; 0 if none does within `ASSIGNMENT_SIGMAS`."""
     best, label = ASSIGNMENT_SIGMAS, 0
     if not np.isfinite(z):
         return label
@@ -156,9 +162,9 @@ def reassign_pixels(
     depth: Array, sen: Array, noise: Array, labels: Labels, kinds: Indices, ths: Array, rows: Labels, columns: Labels,
     out: Labels, first: int, last: int,
 ) -> None:  # fmt: skip
-    """Judge again the pixels at `rows`, `columns` (N,) among the surfaces of their 3x3 pixels; writes out[first:last].
+    """Find the best surface around each of the pixels at `rows`, `columns` (N,); writes its label into out[first:last].
 
-    Where earlier surfaces meet they have competed for every pixel already (`assign_pixels`): this is for new ones.
+    Only the pixels beside new surfaces need this, because `assign_pixels` has compared the earlier ones.
     """
     perspective = sen[0] > 0
     near = np.empty(9, np.int32)
@@ -171,7 +177,7 @@ def reassign_pixels(
 
 @compiled
 def _labels_around(labels: Labels, v: int, u: int, near: Labels) -> int:
-    """The labels of a 3x3 neighbourhood into `near`, each once, in raster order; returns how many."""
+    """Write the distinct labels of a 3x3 neighbourhood into `near`, in raster order; returns their number."""
     h, w = labels.shape
     n = 0
     for i in range(max(0, v - 1), min(h, v + 2)):
@@ -191,7 +197,7 @@ def _labels_around(labels: Labels, v: int, u: int, near: Labels) -> int:
 def misfit_of(
     k: np.int32, kinds: Indices, ths: Array, x: float, y: float, z: float, sigma: float, perspective: bool,
 ) -> float:  # fmt: skip
-    """`misfit` of surface k of a table: planes, which most are, in a line."""
+    """Return `misfit` of surface k of a table, with a short cut for planes, which are most frequent."""
     if kinds[k] != PLANE:
         return misfit(kinds[k], ths[k], x, y, z, sigma, perspective)
     p = 1.0 if perspective else 0.0
@@ -203,7 +209,10 @@ def misfit_of(
 
 @compiled
 def misfit(kind: int, th: Array, x: float, y: float, z: float, sigma: float, perspective: bool) -> float:
-    """|z - surface| in sigmas, eased at grazing rays where half a pixel moves the depth far; infinite on a miss."""
+    """Return |z - surface| in sigmas; infinite on a miss.
+
+    It is reduced at grazing rays, because half a pixel changes the depth much there.
+    """
     zm = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(zm):
         return np.inf
@@ -218,7 +227,7 @@ def misfit(kind: int, th: Array, x: float, y: float, z: float, sigma: float, per
 
 @compiled
 def fill_small_gaps(label: Labels, depth: Array, sweeps: int) -> None:
-    """Give each unlabelled valid pixel the label that at least 5 of its 8 neighbours agree on; `sweeps` times."""
+    """Give each unlabelled valid pixel the label that at least 5 of its 8 neighbours have; `sweeps` times."""
     H, W = label.shape
     words, columns = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 1, np.int32)
     for _ in range(sweeps):
@@ -232,8 +241,8 @@ def fill_small_gaps(label: Labels, depth: Array, sweeps: int) -> None:
 
 @compiled
 def _agreed(label: Labels, v: int, u: int) -> int:
-    """The label that at least 5 of 8 neighbours bear, 0 without one."""
-    for i in range(4):  # five of eight miss no four of them
+    """Return the label that at least 5 of 8 neighbours have; 0 without one."""
+    for i in range(4):  # a label of five neighbours is among any four
         k = label[v - 1 + i // 3, u - 1 + i % 3]
         if k == 0:
             continue
@@ -247,14 +256,14 @@ def _agreed(label: Labels, v: int, u: int) -> int:
 
 @compiled
 def bucket(label: Labels, count: int) -> tuple[Indices, Labels]:
-    """Flat pixel indices grouped by label: label k owns indices[starts[k] : starts[k + 1]]; starts is (count + 2,).
+    """Group flat pixel indices by label: label k owns indices[starts[k] : starts[k + 1]]; starts is (count + 2,).
 
-    Label 0 owns nothing: unlabelled pixels are left out.
+    Unlabelled pixels (label 0) are left out.
     """
     flat = label.ravel()
     n = flat.shape[0]
     starts = np.zeros(count + 2, np.int64)
-    # Neighbours mostly share their label: sums wait until it changes.
+    # Neighbours mostly have the same label, so counts are updated only where it changes.
     own, first = np.int64(0), 0
     for i in range(n):
         if flat[i] != own:

@@ -1,7 +1,7 @@
-"""The pixels of each region of a label image, as fits read them.
+"""The pixels of each region of a label image, and samples of them for fits.
 
-Samples are (4, N): ray coordinates x and y, depth z and its standard deviation, metres. Only the places of pixels are
-kept, as runs of rows; samples are made where they are wanted, for most steps need a few of a region.
+Samples are (4, N): ray coordinates x and y, depth z and its standard deviation, metres. Only the positions of pixels
+are stored, as runs in rows; samples are computed on demand, because most steps need only a few per region.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ Labels = NDArray[np.int32]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Regions:
-    """Labels 1 to `count` of a depth image (H, W) in metres; `packed` and `law` of its sensor and its noise.
+    """The regions with labels 1 to `count` of a depth image (H, W) in metres.
 
-    Label k owns `runs[starts[k] : starts[k + 1]]` and `sizes[k]` pixels, as `runs_of` tells them.
+    `packed` and `law` are the packed sensor and noise models. Label k owns `runs[starts[k] : starts[k + 1]]` and
+    `sizes[k]` pixels, as `runs_of` returns them.
     """
 
     depth_m: Array
@@ -35,17 +36,17 @@ class Regions:
 
     @property
     def pixels(self) -> list[int]:
-        """How many pixels each label has; entry 0 is label 1."""
+        """Number of pixels of each label; entry 0 is label 1."""
         sizes: list[int] = self.sizes[1:].tolist()
         return sizes
 
     def few(self, most: int) -> list[Array]:
-        """At most `most` samples of each label, evenly spread over its pixels; the same choice every time."""
+        """Return at most `most` samples of each label, spread evenly and deterministically over its pixels."""
         sizes = np.minimum(self.sizes[1:], most).tolist()
         return [np.ascontiguousarray(s[:, :n]) for s, n in zip(self.samples(most), sizes, strict=True)]
 
     def samples(self, most: int) -> Array:
-        """The same as one array (count, 4, most), of which a label with fewer pixels fills the first only."""
+        """Return the samples of `few` as one array (count, 4, most); unset beyond the pixels of a small label."""
         return np.asarray(
             _spread_samples(self.depth_m, self.packed, self.law, self.starts, self.runs, self.sizes, most)
         )
@@ -59,13 +60,13 @@ class Regions:
         return np.asarray(places_of(self.runs_of(label), self.labels.shape[1]))
 
     def renamed(self, names: Labels) -> Labels:
-        """(H, W) labels after k is called `names[k]`."""
+        """Return the labels (H, W) with each label k replaced by `names[k]`."""
         labels = np.zeros_like(self.labels)
         painted(self.starts, self.runs, names, labels)
         return labels
 
     def given_to(self, owner: list[int]) -> Regions:
-        """The regions after label k has gone to `owner[k - 1]`."""
+        """Return the regions with each label k merged into `owner[k - 1]`."""
         if owner == list(range(1, len(owner) + 1)):
             return self
         labels = self.renamed(np.array([0, *owner], np.int32))
@@ -73,7 +74,7 @@ class Regions:
 
 
 def regions_of(depth_m: Array, packed: Array, law: Array, labels: Labels, count: int) -> Regions:
-    """The pixels of labels 1 to `count`."""
+    """Build the regions of labels 1 to `count`."""
     starts, runs, sizes = runs_of(labels, count)
     return Regions(depth_m=depth_m, packed=packed, law=law, labels=labels, starts=starts, runs=runs, sizes=sizes)
 
@@ -82,7 +83,7 @@ def regions_of(depth_m: Array, packed: Array, law: Array, labels: Labels, count:
 def _spread_samples(
     depth: Array, sen: Array, noise: Array, starts: Indices, runs: Labels, sizes: Indices, most: int,
 ) -> Array:  # fmt: skip
-    """(count, 4, most) samples of each label, as many as it has at most."""
+    """Return samples (count, 4, most) of each label; a label with fewer pixels leaves the rest unset."""
     count = sizes.shape[0] - 1
     out = np.empty((count, 4, most))
     for k in range(1, count + 1):
@@ -93,7 +94,7 @@ def _spread_samples(
 
 @compiled
 def spread(depth: Array, sen: Array, noise: Array, runs: Labels, pixels: int, shift: float, out: Array) -> None:
-    """Fill `out` (4, n) with samples that are evenly spread over the `pixels` of runs (R, 3), `shift` 0 to 1 of a pixel on."""
+    """Fill `out` (4, n) with samples evenly spread over the `pixels` of runs (R, 3), offset by `shift` (0 to 1)."""
     n = min(out.shape[1], pixels)
     step = (pixels - 1) / max(n - 1, 1)
     run, passed = 0, 0
@@ -109,7 +110,7 @@ def spread(depth: Array, sen: Array, noise: Array, runs: Labels, pixels: int, sh
 
 @compiled(fastmath=REORDERED)
 def _fill_sigmas(z: Array, noise: Array, out: Array) -> None:
-    """`sigma_at` of many depths, without a branch."""
+    """Write `sigma_at` of the depths z (N,) into `out` (N,), without a branch."""
     a, b, c, d, e, f = noise[0], noise[1], noise[2], noise[3], noise[4], noise[5]
     for i in range(z.shape[0]):
         z2 = z[i] * z[i]

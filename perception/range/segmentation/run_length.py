@@ -1,4 +1,4 @@
-"""Label images as runs of rows: a region of a thousand pixels is a few dozen runs, and loops over one hold no branch."""
+"""Run-length encoding of label images, which makes loops over a region short and free of branches."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from perception.range.segmentation.boundary_pixels import WORD, flagged
 
 @compiled
 def _flag_changes(own: Labels, flags: Mask) -> None:
-    """Where a pixel's label is not that of the one to its left."""
+    """Flag the pixels whose label differs from that of the pixel to their left."""
     flags[0] = False
     for u in range(1, own.shape[0]):
         flags[u] = own[u] != own[u - 1]
@@ -20,9 +20,9 @@ def _flag_changes(own: Labels, flags: Mask) -> None:
 
 @compiled
 def row_ends(own: Labels, words: NDArray[np.uint64], ends: Labels) -> int:
-    """Where the runs of equal labels in a row (W,) end, into `ends` (W + 2,); returns how many there are.
+    """Write the ends of the runs of equal labels in a row (W,) into `ends` (W + 2,); returns the number of runs.
 
-    `words`: flags (W // 8 + 1,) to work in, zeros at first.
+    `words` (W // 8 + 1,): work array for flags, initially zero.
     """
     _flag_changes(own, words.view(np.bool_))
     count = flagged(words, ends)
@@ -32,10 +32,10 @@ def row_ends(own: Labels, words: NDArray[np.uint64], ends: Labels) -> int:
 
 @compiled
 def runs_of(labels: Labels, count: int) -> tuple[Indices, Labels, Indices]:
-    """The runs of labels 1 to `count` in the rows of (H, W) `labels`, grouped by label, in raster order.
+    """Return the runs of labels 1 to `count` in the rows of `labels` (H, W), grouped by label, in raster order.
 
     Returns `starts` (count + 2,): label k owns runs[starts[k] : starts[k + 1]]; the runs (R, 3): row, first column and
-    the one after the last; and how many pixels each label has (count + 1,), entry 0 unused.
+    the column after the last; and the number of pixels of each label (count + 1,), entry 0 unused.
     """
     H, W = labels.shape
     words, ends = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 2, np.int32)
@@ -76,7 +76,7 @@ def painted(starts: Indices, runs: Labels, names: Labels, labels: Labels) -> Non
 
 @compiled
 def places_of(runs: Labels, width: int) -> Labels:
-    """Flat pixel indices (N,) of runs (R, 3) in an image of that width."""
+    """Return the flat pixel indices (N,) of runs (R, 3) in an image of the given width."""
     out, n = np.empty(np.sum(runs[:, 2] - runs[:, 1]), np.int32), 0
     for i in range(runs.shape[0]):
         for u in range(runs[i, 1], runs[i, 2]):
@@ -87,7 +87,7 @@ def places_of(runs: Labels, width: int) -> Labels:
 
 @compiled
 def pixels_of(labels: Labels, count: int) -> Indices:
-    """How many pixels each of the labels 1 to `count` has, (count + 1,); entry 0: the unlabelled ones."""
+    """Count the pixels of each label 1 to `count`, (count + 1,); entry 0 counts the unlabelled pixels."""
     W = labels.shape[1]
     words, ends = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 2, np.int32)
     pixels = np.zeros(count + 1, np.int64)

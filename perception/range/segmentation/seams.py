@@ -1,8 +1,9 @@
-"""Grooves on the way from one region to another: what a sensor sees clearly behind a plane that goes on beyond.
+"""Detection of grooves between two regions: pixels clearly behind a plane that continues on both sides.
 
-Faces that lie in one plane, cushions or boxes side by side, are two when a groove parts them, be it two pixels wide.
-Labels need not end there: a rounded rim beyond the groove often lies as near to the other face's plane as to its own.
-So lines across a seam go on well beyond it, and what lies in front, or gives no reading, tells nothing.
+Faces in one plane, such as cushions or boxes side by side, are two faces if a groove separates them, even one of two
+pixels. The labels need not end at the groove, because a rounded rim beyond it is often as near to the plane of the other
+face as to its own. Therefore the lines tested across a seam extend well beyond it. Pixels in front of the plane, or
+without a reading, give no evidence.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from hal.jit import compiled
 from perception.range.fitting.surfaces import PLANE, depth_on
 from perception.range.segmentation.grid import sigma_at
 
-BEYOND = 0.05  # of the image's shorter side, that a line goes on beyond a seam: rims are rounded
+BEYOND = 0.05  # of the image's shorter side, by which a line extends beyond a seam, because rims are rounded
 DEEP_SIGMAS = 4.0
 DEEP_PX = 2  # in a row: one may be a gross error
 FLANK_SIGMAS = 3.0
@@ -26,10 +27,10 @@ SHARE = 0.33  # of the places on a seam
 def is_seam_grooved(
     depth: Array, sen: Array, noise: Array, labels: Labels, own: Mask, th: Array, x: Array, y: Array,
 ) -> bool:  # fmt: skip
-    """Whether at more than `SHARE` of the rays (x, y) on a seam a groove crosses the row or the column of the image there.
+    """Whether a groove crosses the image row or column at more than the share `SHARE` of the rays (x, y) on a seam.
 
-    `own` says which of `labels` (H, W) belong to the two that meet at the seam: a groove lies between their pixels, and
-    is neither's.
+    `own` says which of `labels` (H, W) belong to the two regions that meet at the seam; the pixels of a groove belong to
+    neither.
     """
     grooves = 0
     for k in range(x.shape[0]):
@@ -42,7 +43,7 @@ def is_seam_grooved(
 def is_grooved_at(
     depth: Array, sen: Array, noise: Array, labels: Labels, own: Mask, th: Array, u: float, v: float,
 ) -> bool:  # fmt: skip
-    """Whether a groove crosses the row or the column of the image at pixel (u, v)."""
+    """Whether a groove crosses the image row or column through pixel (u, v)."""
     image = (depth, sen, noise, labels, own, th, u, v)
     return crosses_groove(*image, 0.0, 1.0, 0) or crosses_groove(*image, 1.0, 0.0, 0)
 
@@ -52,7 +53,7 @@ def crosses_groove(
     depth: Array, sen: Array, noise: Array, labels: Labels, own: Mask, th: Array, u0: float, v0: float, du: float,
     dv: float, count: int,
 ) -> bool:  # fmt: skip
-    """Whether the line from pixel (u0, v0), `count` times (du, dv) long, or its ends prolonged, pass a groove in the plane `th`."""
+    """Whether the line from pixel (u0, v0), `count` steps (du, dv) long and extended at both ends, crosses a groove."""
     H, W = depth.shape
     perspective = sen[0] > 0
     reach = int(BEYOND * min(H, W) + 0.5)
@@ -64,7 +65,7 @@ def crosses_groove(
             continue
         x, y = (u - sen[3]) / sen[1], (v - sen[4]) / sen[2]
         zm = depth_on(PLANE, th, x, y, perspective)
-        # Across the plane: along a ray that grazes it, a fraction of a pixel is many sigmas.
+        # The distance along the normal is used, because at grazing rays a fraction of a pixel is many sigmas of depth.
         facing = abs(th[0] * x + th[1] * y + th[2]) if perspective else abs(th[2])
         e = (depth[v, u] - zm) * facing / sigma_at(noise, zm)
         run = run + 1 if e > DEEP_SIGMAS and not own[labels[v, u]] else 0

@@ -7,13 +7,13 @@ import numpy as np
 from hal.arrays import Array, Labels, Mask
 from hal.jit import compiled
 
-LEVELS = 64  # of flatness, told apart by a counting sort
-LONE_BEND = 0.02  # what a neighbour without a normal counts as
+LEVELS = 64  # of flatness in the counting sort
+LONE_BEND = 0.02  # bend assumed towards a neighbour without a normal
 
 
 @compiled
 def seed_order(normal: Array, rms: Array, free: Mask, reach: int) -> Labels:
-    """Free blocks with a tangent plane, flattest neighbourhood first (counting sort), as flat indices."""
+    """Return the flat indices of free blocks with a tangent plane, flattest neighbourhood first (counting sort)."""
     h, w = rms.shape
     normals, known = _framed_normals(normal, rms, free, reach)
     cosine, bend, levels = np.empty(w), np.empty(w), np.empty((h, w), np.int32)
@@ -45,7 +45,10 @@ def seed_order(normal: Array, rms: Array, free: Mask, reach: int) -> Labels:
 
 @compiled
 def _framed_normals(normal: Array, rms: Array, free: Mask, reach: int) -> tuple[Array, Mask]:
-    """(3, h + 2 reach, w + 2 reach) components, NaN where a block has no normal, as all around; and which rows have any."""
+    """Return the normals of free blocks as (3, h + 2 reach, w + 2 reach), and which rows have any.
+
+    They are NaN where a block has no normal, and in the margin.
+    """
     h, w = rms.shape
     out, known = np.full((3, h + 2 * reach, w + 2 * reach), np.nan), np.zeros(h, np.bool_)
     for r in range(h):
@@ -59,20 +62,21 @@ def _framed_normals(normal: Array, rms: Array, free: Mask, reach: int) -> tuple[
 
 @compiled
 def _add_product(a: Array, b: Array, out: Array) -> None:
+    """Add a * b to `out`, elementwise."""
     for c in range(out.shape[0]):
         out[c] += a[c] * b[c]
 
 
 @compiled
 def _add_bend(cosine: Array, bend: Array) -> None:
-    """How far a normal turns to a neighbour: 1 less the cosine; a neighbour that is missing (NaN) says little."""
+    """Add the bend towards a neighbour: 1 - cosine of the angle between normals, `LONE_BEND` if one is NaN."""
     for c in range(bend.shape[0]):
         bend[c] += 1.0 - cosine[c] if cosine[c] == cosine[c] else LONE_BEND
 
 
 @compiled
 def _fill_levels(bend: Array, rms: Array, known: Array, levels: Labels) -> None:
-    """Level of each block, from 0 for a flat and quiet neighbourhood; -1 for a block without a normal."""
+    """Fill `levels`: from 0 for a flat neighbourhood with small residuals upwards; -1 for a block without a normal."""
     for c in range(bend.shape[0]):
         level = min(LEVELS - 1.0, 12.0 * np.sqrt(max(25.0 * bend[c], 0.0)) + 4.0 * max(rms[c] - 1.0, 0.0))
         levels[c] = np.int32(level if known[c] == known[c] else -1.0)

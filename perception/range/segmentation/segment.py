@@ -1,11 +1,10 @@
-"""Segmentation: lowest order first, and models compete.
+"""Segmentation of a depth image: planes first, then model selection among all primitives.
 
-1. Planes grow from the flattest blocks while their own model explains the next block (range and orientation).
-2. What is left falls into components of smooth range; each is offered to every primitive, and the cheapest that
-   explains it wins (Schwarz's criterion). A component that no primitive explains is split by growing local fits.
-3. Pieces of one surface that an occluder parted are joined when one model explains both.
-4. Pixels are claimed by the surface that explains them best; what no block could hold is tried again pixel by pixel.
-Each round leaves fewer free blocks, and rounds end when no surface is added.
+1. Planes grow from the flattest blocks for as long as their model explains the next block in range and orientation.
+2. The remaining blocks form components of smooth range. Every kind of primitive is fitted to each component, and
+   Schwarz's criterion selects one. A component that no primitive explains is split by growing local fits.
+3. Each pixel is assigned to the neighbouring surface that explains it best.
+4. Steps 1 to 3 are repeated with smaller blocks on patches that are still unlabelled.
 """
 
 from __future__ import annotations
@@ -35,21 +34,21 @@ from perception.range.tiles import for_each_tile
 Labels = NDArray[np.int32]
 
 LEAST_PIXELS_AT_256 = 32  # per 256 x 256 pixels of image
-LEAST_FLAT_BLOCKS = 24  # a smaller flat patch may be a facet of something bent; whole components decide about it
-LEAST_CURVED_BLOCKS = 16  # smaller things wait for the pixels themselves
-STEEP_SLOPE = 14.0  # what is left once the large surfaces are named may be seen as steep as 86 degrees
+LEAST_FLAT_BLOCKS = 24  # a smaller flat patch may be a facet of a curved surface, so model selection decides about it
+LEAST_CURVED_BLOCKS = 16  # smaller surfaces are searched for with smaller blocks
+STEEP_SLOPE = 14.0  # blocks that remain after the large surfaces are found may be tilted by up to 86 degrees
 LARGE_PLANE_BLOCKS = 80
-SETTLED_MEAN_SQUARE = 1.25  # residuals cut at three sigmas; wider noise than modelled drives them to 1.5 and more
+SETTLED_MEAN_SQUARE = 1.25  # of residuals cut at three sigmas; noise wider than modelled gives 1.5 and more
 WIDER = 1.5
 WIDENINGS = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Task:
-    """What every step needs: the (H, W) depth in metres, the sensor, and how many tiles share the pixel work.
+    """Input of every step: the (H, W) depth in metres, the sensor, and the number of tiles for parallel pixel work.
 
-    The depth may be a part of the sensor's image, which begins at row and column `corner_px`. `depths_m` (5,): the
-    whole image's `typical_depths_m`. `packed` (5,): the sensor of this part of the image, as compiled loops read it.
+    The depth may be a part of the sensor's image that begins at row and column `corner_px`. `depths_m` (5,): the whole
+    image's `typical_depths_m`. `packed` (5,): the sensor of this part of the image, in the form that kernels read.
     """
 
     depth_m: Array
@@ -65,11 +64,11 @@ class Task:
 
     @property
     def least_pixels(self) -> float:
-        """Pixels of the smallest surface that is looked for."""
+        """Number of pixels of the smallest surface that is searched for."""
         return LEAST_PIXELS_AT_256 * self.sensor.width_px * self.sensor.height_px / 65536
 
     def grid(self, depth_m: Array, noise: NoiseModel, size: int, **slope: float) -> Grid:
-        """Blocks of `size` pixels of a depth image of this task's sensor."""
+        """Build the grid of blocks of `size` pixels of a depth image from this task's sensor."""
         return build_grid(
             depth_m, self.sensor, noise, size, corner_px=self.corner_px, tiles=self.tiles, pool=self.pool, **slope
         )
@@ -79,8 +78,8 @@ def segment(task: Task, noise: NoiseModel) -> tuple[Labels, Candidates, NoiseMod
     """Segment a depth image.
 
     Returns:
-        labels (H, W), 0 = none; the surfaces behind them; and the noise model, widened where the planes of the image
-        themselves scatter more than the given one says.
+        labels (H, W), 0 = none; the surfaces that they index; and the noise model, widened if the residuals of the
+        large planes are larger than the given one allows.
     """
     found, grid, blocks, noise = _settled_planes(task, noise)
     size = grid.size_px
@@ -93,7 +92,7 @@ def segment(task: Task, noise: NoiseModel) -> tuple[Labels, Candidates, NoiseMod
 
 
 def _settled_planes(task: Task, noise: NoiseModel) -> tuple[Candidates, Grid, Labels, NoiseModel]:
-    """Planes on the coarse grid, grown again under wider noise while large planes scatter more than it allows."""
+    """Grow planes on the coarse grid; repeat with wider noise while large planes scatter more than it allows."""
     depths = task.depths_m
     shape = (task.depth_m.shape[0], task.depth_m.shape[1])
     for attempt in range(WIDENINGS + 1):
@@ -110,9 +109,10 @@ def _settled_planes(task: Task, noise: NoiseModel) -> tuple[Candidates, Grid, La
 
 
 def _finer(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, size: int) -> Labels:
-    """Surfaces too small for the coarse blocks, from the pixels that nothing explains yet; returns new labels.
+    """Find surfaces that are too small for the coarse blocks among the unlabelled pixels; returns the new labels.
 
-    Only patches that can hold the smallest surface are looked at, and only the part of the image that holds them.
+    Only patches that are large enough for the smallest surface are processed, and only the part of the image around
+    them.
     """
     least = max(8, round(task.least_pixels / size**2))
     patches = unlabelled_patches(task.depth_m, labels, least if size == 1 else least * size**2 // 2, align_px=size)
@@ -133,6 +133,7 @@ def _finer(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, 
 
 
 def _claimed(task: Task, noise: NoiseModel, blocks: Labels, found: Candidates, *, size: int) -> Labels:
+    """Assign every pixel to the best surface of the blocks around it; returns labels (H, W)."""
     labels = np.zeros(task.depth_m.shape, np.int32)
     kinds, table = found.arrays()
     packed, law = task.packed, noise.packed()
@@ -146,7 +147,7 @@ def _claimed(task: Task, noise: NoiseModel, blocks: Labels, found: Candidates, *
 
 
 def _reclaimed(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, newest: int) -> Labels:
-    """`labels`, changed in place: the pixels beside surfaces of label `newest` and later are judged again."""
+    """Reassign the pixels beside surfaces of label `newest` and later; returns `labels`, changed in place."""
     rows, columns = _contested(task, labels, newest)
     judge = partial(reassign_pixels, task.depth_m, task.packed, noise.packed(), labels, *found.arrays())
     _judged(task, judge, labels, rows, columns)
@@ -154,19 +155,22 @@ def _reclaimed(task: Task, noise: NoiseModel, labels: Labels, found: Candidates,
 
 
 def icm_labels(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, sweeps: int) -> Labels:
-    """`labels`, changed in place by `sweeps` in which pixels between two equally good surfaces follow their neighbours."""
+    """Let pixels that several surfaces explain follow their neighbours, in `sweeps` of iterated conditional modes.
+
+    Returns `labels`, changed in place.
+    """
     slow = noise.slow_share(float(task.depths_m[2]))
     judge = partial(icm_sweep, task.depth_m, task.packed, noise.packed(), slow, labels, *found.arrays())
     rows, columns = _contested(task, labels, 1)
     for _ in range(sweeps):
         moved = _judged(task, judge, labels, rows, columns)
-        # Around what did not move, every pixel would be judged as it was.
+        # The decision for a pixel can change only if a label around it has changed.
         rows, columns = pixels_around(*moved, REACH_PX, labels.shape)
     return labels
 
 
 def _contested(task: Task, labels: Labels, newest: int) -> tuple[Labels, Labels]:
-    """`contested_pixels` of the whole image."""
+    """Return `contested_pixels` of the whole image, computed in tiles."""
     parts: dict[int, tuple[Labels, Labels]] = {}
 
     def look(top: int, bottom: int) -> None:
@@ -180,7 +184,7 @@ def _contested(task: Task, labels: Labels, newest: int) -> tuple[Labels, Labels]
 def _judged(
     task: Task, judge: Callable[..., object], labels: Labels, rows: Labels, columns: Labels
 ) -> tuple[Labels, Labels]:
-    """Have all the pixels judged by the labels as they are, then name them, in place; returns those that moved."""
+    """Compute new labels of all pixels from the current ones, then write them; returns the pixels that changed."""
     names = np.empty_like(rows)
     for_each_tile(partial(judge, rows, columns, names), rows.size, task.tiles, pool=task.pool)
     moved: tuple[Labels, Labels] = renamed_pixels(labels, rows, columns, names)

@@ -1,8 +1,8 @@
-"""Tangent planes of all blocks of a grid, a run of blocks at a time.
+"""Tangent planes of all blocks of a grid, computed in runs of blocks.
 
-A run is worked on in rows of one scratch array at fixed places, and the loops hold no branch: only so does the compiler
-prove that nothing overlaps, and turn four blocks into one instruction. The neighbours of a run lie in rows that are wider
-by the window, so that each row of blocks is fetched once for all shifts.
+The rows of a run are at fixed offsets in one scratch array, and the loops have no branch. Only then can the compiler
+prove that nothing overlaps, and handle four blocks with one instruction. The neighbours of a run are held in rows that
+are wider by the window, so that each row of blocks is loaded once for all shifts.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from hal.jit import as_numpy_scalar, compiled
 JUMP_SIGMAS = 4.0
 LEAST_SHARE = 0.4  # of the window's blocks must lie on the surface
 TURN_RAD = 0.15  # between neighbouring blocks of one face
-WINDOW_BEND = 0.0745 * TURN_RAD  # rms of a parabola that turns so far over twice a length, by that length
-LEAST_FACING = 0.15  # beyond, normals are not known well enough
-STEADY_RMS = 1.8  # what a tangent plane leaves over in sigmas, beyond which the block holds a crease or noise
+WINDOW_BEND = 0.0745 * TURN_RAD  # rms, per length, of a parabola that turns by TURN_RAD over twice that length
+LEAST_FACING = 0.15  # below this cosine of incidence normals are too inaccurate
+STEADY_RMS = 1.8  # sigmas; a tangent plane with larger residuals lies on a crease or in noise
 GAP = 8  # empty blocks that end a run
 FIRST = as_numpy_scalar(0)
 RUN = 128  # blocks at most
@@ -34,13 +34,13 @@ def tangent_planes(
     x: Array, y: Array, z: Array, count: Labels, sigma: Array, perspective: bool, radius: int, slope_per_block: float,
     normal: Array, rms: Array, top: int, bottom: int,
 ) -> None:  # fmt: skip
-    """Plane of least squares through the blocks around each block, within a jump of it; writes rows [top, bottom).
+    """Fit a plane to the blocks around each block that no depth jump separates from it; writes rows [top, bottom).
 
     Args:
-        x, y, z, count, sigma: (h, w) as in `Grid`, NaN depth where a block is empty; `count` weighs a block.
+        x, y, z, count, sigma: (h, w) as in `Grid`, NaN depth where a block is empty; `count` is the weight of a block.
         radius: of the window in blocks.
-        slope_per_block: metres of depth per block (and per metre of depth, if perspective) that are no jump yet.
-        normal, rms: (h, w, 3) and (h, w) outputs, filled with NaN; left so where no plane is determined.
+        slope_per_block: largest step that is not a jump, in metres per block (and per metre of depth, if perspective).
+        normal, rms: (h, w, 3) and (h, w) outputs, initially NaN; they stay NaN where no plane is determined.
     """
     h, w = z.shape
     least = max(5.0, np.floor((2 * radius + 1) ** 2 * LEAST_SHARE))
@@ -64,7 +64,7 @@ def tangent_planes(
 
 @compiled
 def _next_run(z: Array, start: int) -> tuple[int, int]:
-    """[start, end) of the next run of known depths that no gap of `GAP` empty blocks parts; (w, w) when there is none."""
+    """Return [start, end) of the next run of known depths without a gap of `GAP` empty blocks; (w, w) without one."""
     w = z.shape[0]
     while start < w and not np.isfinite(z[start]):
         start += 1
@@ -78,6 +78,7 @@ def _next_run(z: Array, start: int) -> tuple[int, int]:
 
 @compiled
 def _load_own(x: Array, y: Array, z: Array, sigma: Array, perspective: bool, work: Array) -> None:
+    """Load the blocks of the run, and the limits of a jump at each, into `work`."""
     n = x.shape[0]
     for c in range(n):
         work[X0 + c], work[Y0 + c], work[Z0 + c] = x[c], y[c], z[c]
@@ -88,7 +89,7 @@ def _load_own(x: Array, y: Array, z: Array, sigma: Array, perspective: bool, wor
 
 @compiled
 def _load(x: Array, y: Array, z: Array, count: Labels, perspective: bool, at: int, wide: Array) -> None:
-    """One row of neighbours into `wide`, the first at `at`."""
+    """Load one row of neighbours into `wide`, the first at offset `at`."""
     n = x.shape[0]
     to_x, to_y, to_z, to_g, to_k = wide[X + at :], wide[Y + at :], wide[Z + at :], wide[G + at :], wide[K + at :]
     for c in range(n):
@@ -109,9 +110,9 @@ def _load(x: Array, y: Array, z: Array, count: Labels, perspective: bool, at: in
 
 @compiled
 def _add(reach: float, n: int, at: int, wide: Array, work: Array) -> None:
-    """Sums of 1, k, and k times x, y, g, xx, xy, yy, xg, yg, gg over one neighbour of every block, if it is near.
+    """Add one neighbour of every block, if it is near, to the sums of 1, k, and k times x, y, g, xx, xy, yy, xg, yg, gg.
 
-    The neighbour of the first block is the one at `at` of the rows of `wide`.
+    k is the weight of the neighbour. That of the first block is at offset `at` in the rows of `wide`.
     """
     x, y, z, g, count = wide[X + at :], wide[Y + at :], wide[Z + at :], wide[G + at :], wide[K + at :]
     for c in range(n):
@@ -136,9 +137,9 @@ def _add(reach: float, n: int, at: int, wide: Array, work: Array) -> None:
 
 @compiled
 def _solve(n: int, least: float, perspective: bool, work: Array) -> None:
-    """Rows of the plane's normal towards the sensor and of what it leaves over in sigmas; NaN where it is not determined.
+    """Compute the planes' normals towards the sensor and rms residuals in sigmas; NaN where a plane is not determined.
 
-    The window's sums, centred, give the slopes (p, q) of g.
+    The centred sums of the window give the slopes (a, b) of g.
     """
     p = 1.0 if perspective else 0.0
     for c in range(n):
@@ -166,6 +167,7 @@ def _solve(n: int, least: float, perspective: bool, work: Array) -> None:
 
 @compiled
 def _store(normal: Array, rms: Array, work: Array) -> None:
+    """Copy the normals and residuals of the run into the outputs where a plane is determined."""
     for c in range(rms.shape[0]):
         if np.isfinite(work[NX + c]):
             normal[c, 0], normal[c, 1], normal[c, 2] = work[NX + c], work[NY + c], work[NZ + c]

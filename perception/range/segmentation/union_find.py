@@ -1,4 +1,4 @@
-"""Union-find over array indices: the smallest index of a set is its root."""
+"""Union-find over array indices; the root of a set is its smallest index."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hal.jit import compiled
 
 @compiled
 def find(parent: Indices, i: int) -> int:
-    """The root of index i; shortens the way there in place."""
+    """Return the root of index i; halves the path to it in place."""
     while parent[i] != i:
         parent[i] = parent[parent[i]]
         i = parent[i]
@@ -17,7 +17,7 @@ def find(parent: Indices, i: int) -> int:
 
 @compiled
 def unite(parent: Indices, i: int, j: int) -> None:
-    """Join the sets of two indices; the smaller root stays one, so roots are first pixels in raster order."""
+    """Join the sets of two indices; the smaller root remains the root, so it is the first pixel in raster order."""
     a, b = find(parent, i), find(parent, j)
     if a < b:
         parent[b] = a

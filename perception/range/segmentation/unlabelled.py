@@ -1,4 +1,4 @@
-"""What no surface explains yet: unlabelled patches that are large enough to hold one."""
+"""Search for unlabelled patches that are large enough to hold a surface."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Labels = NDArray[np.int32]
 def unlabelled_patches(
     depth_m: Array, labels: Labels, least_pixels: int, *, align_px: int
 ) -> tuple[tuple[int, int], Array] | None:
-    """The least part of the image that holds every unlabelled patch of at least `least_pixels`, None without any.
+    """Return the smallest part of the image that holds every unlabelled patch of at least `least_pixels`; None without.
 
     Patches are connected over sides and corners. Returns the part's first row and column, multiples of `align_px`, and
-    its depth, NaN outside of those patches.
+    its depth, which is NaN outside these patches.
     """
     top, left, part = _patches(depth_m, labels, least_pixels, align_px)
     return ((top, left), part) if part.size else None
@@ -28,6 +28,7 @@ def unlabelled_patches(
 
 @compiled
 def _patches(depth: Array, labels: Labels, least: int, align: int) -> tuple[int, int, Array]:
+    """Kernel of `unlabelled_patches`; the depth is empty if there are no patches."""
     H, W = depth.shape
     runs, begins = _free_runs(depth, labels)
     parent = _connected(runs, begins)
@@ -53,7 +54,10 @@ def _patches(depth: Array, labels: Labels, least: int, align: int) -> tuple[int,
 
 @compiled
 def _free_runs(depth: Array, labels: Labels) -> tuple[Labels, Indices]:
-    """Runs of unlabelled pixels with a reading (R, 3): row, first column, the one after the last; where each row's begin."""
+    """Return the runs (R, 3) of unlabelled pixels with a reading, and the index (H + 1,) of each row's first run.
+
+    A run is row, first column and the column after the last.
+    """
     H, W = depth.shape
     words, ends = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 2, np.int32)
     runs, begins, n = np.empty((4 * max(H, W), 3), np.int32), np.zeros(H + 1, np.int64), 0
@@ -78,7 +82,7 @@ def _free_runs(depth: Array, labels: Labels) -> tuple[Labels, Indices]:
 
 @compiled
 def _connected(runs: Labels, begins: Indices) -> Indices:
-    """(R,) the parent of each run: those of neighbouring rows that touch, be it at a corner, have one root."""
+    """Return the union-find parents (R,) of the runs; runs that touch, even at a corner, have the same root."""
     parent = np.arange(runs.shape[0])
     for v in range(1, begins.shape[0] - 1):
         above = begins[v - 1]

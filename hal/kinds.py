@@ -28,13 +28,13 @@ LACKS = {
 
 
 def installed_kinds() -> tuple[str, ...]:
-    """Names of all kinds that a panel file may have."""
+    """Return the names of all kinds that a panel file may have."""
     return registered(KINDS)
 
 
 @cache
 def kind_model(kind: str) -> type[PanelObject]:
-    """The model of a kind's objects.
+    """Return the model of a kind's objects.
 
     Raises:
         ConfigError: no such kind (with the nearest known one), its package does not import, or it says another name.
@@ -49,13 +49,13 @@ def kind_model(kind: str) -> type[PanelObject]:
 
 
 def has_part(group: str, kind: str) -> bool:
-    """Whether there is a reader, a skill or a body (by the group) for a kind."""
+    """Return whether a kind has a reader, a skill or a body, depending on the group."""
     return kind in registered(group)
 
 
 @cache
 def part_of(group: str, kind: str) -> Any:
-    """The reader, skill or body (by the group) of a kind.
+    """Return the reader, skill or body of a kind, depending on the group.
 
     Raises:
         Unsupported: the kind has none; says what that means.
@@ -71,5 +71,5 @@ def part_of(group: str, kind: str) -> Any:
 
 
 def hint_for(kind: str) -> str:
-    """What helps against the name of a kind that is not installed."""
+    """Return a hint for the name of a kind that is not installed."""
     return near_or_all(kind, installed_kinds())

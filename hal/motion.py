@@ -1,7 +1,7 @@
-"""Declared motions: a skill says what shall move, how hard it may push and what ends it; the cell executes it.
+"""Declared motions: a skill specifies the motion, its force limits and what ends it; the cell executes it.
 
 All poses are `base_from_tool`, where `flange_from_tool` comes with the motion. Wrenches are contact wrenches (bias and
-tool weight taken off) in tool axes about the tool's origin: what the world exerts on the tool.
+tool weight subtracted) in tool axes about the tool's origin: the wrench that the environment exerts on the tool.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hal.arrays import Array
 
 
 class Quantity(StrEnum):
-    """What a guard watches."""
+    """The quantity that a guard watches."""
 
     FORCE = "force"  # N, along `axis` of the tool, or the norm when the axis is None
     TORQUE = "torque"  # N m, likewise
@@ -29,7 +29,7 @@ class Quantity(StrEnum):
 
 
 class Reaction(StrEnum):
-    """What happens when a guard trips."""
+    """The reaction when a guard trips."""
 
     STOP = "stop"  # decelerate, hold, outcome `guard`
     FAULT = "fault"  # the same, but the motion counts as failed (protective)
@@ -91,7 +91,7 @@ class CartesianPath:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hold:
-    """Stand still for a while: lamps settle, frames arrive."""
+    """Stand still for a time, for example until lamps have settled."""
 
     name: str
     duration_s: float
@@ -100,9 +100,9 @@ class Hold:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GripperMotion:
-    """Move the pads while the arm holds; ends when they rest or `timeout_s` is over.
+    """Move the pads while the arm holds its pose; ends when they stand still or after `timeout_s`.
 
-    With `must_arrive`, pads that hold nothing and say that they rest elsewhere are a fault of the gripper.
+    With `must_arrive`, it is a gripper fault if the pads hold nothing and stand still at another width.
     """
 
     name: str
@@ -129,7 +129,7 @@ class MotionOutcome(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionLog:
-    """What happened, sampled every `1/rate_hz`: times (N,), joints (N, n), contact wrench in tool axes (N, 6),
+    """The course of a motion, sampled every `1/rate_hz`: times (N,), joints (N, n), contact wrench in tool axes (N, 6),
     tip (N, 3); `started_s` is the cell clock's time of the first sample."""
 
     times_s: Array
@@ -141,7 +141,7 @@ class MotionLog:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionReport:
-    """What really happened. `tripped` names the guard, `device` what failed; `cause` is a sentence for people."""
+    """The result of a motion. `tripped` names the guard, `device` the failed device; `cause` explains it in a sentence."""
 
     name: str
     outcome: MotionOutcome
@@ -159,7 +159,7 @@ class MotionReport:
 
     @property
     def duration_s(self) -> float:
-        """Seconds on the cell's clock."""
+        """Duration in seconds on the cell's clock."""
         return self.ended_s - self.started_s
 
 
@@ -184,7 +184,7 @@ class Mover(Protocol):
     """The cell's motion port: one motion at a time."""
 
     def execute(self, motion: DeclaredMotion) -> MotionReport:
-        """Run the motion to its end; blocks. Never raises for what the motion met: the report says it.
+        """Run the motion and wait for its end; events during the motion are not raised but given in the report.
 
         Raises:
             MotionRefused: not finite, outside limits, start pose too far away, or another motion runs.

@@ -1,4 +1,4 @@
-"""A reading: a value with its stamps, quality and cause. Age decides, not the success of a call."""
+"""Readings: values with stamps, quality and cause; the age decides whether a value may be used."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class Quality(StrEnum):
-    """May the value be used?"""
+    """Whether the value may be used."""
 
     VALID = "valid"
     DEGRADED = "degraded"
@@ -20,7 +20,7 @@ class Quality(StrEnum):
 
 
 class Cause(StrEnum):
-    """Why the quality is not `valid`."""
+    """The reason why the quality is not `valid`."""
 
     NONE = "none"
     TIMEOUT = "timeout"
@@ -40,7 +40,7 @@ class Stamped(Generic[T]):
         value: in SI units.
         host_time_s: when the value was valid, on the cell's clock (monotonic or simulated).
         device_time_s: the device's own stamp, or None when it has no clock.
-        sequence: counts up by one a sample; a gap is a lost sample.
+        sequence: rises by one per sample; a gap means a lost sample.
     """
 
     value: T
@@ -51,14 +51,14 @@ class Stamped(Generic[T]):
     cause: Cause = Cause.NONE
 
     def age_s(self, now_s: float) -> float:
-        """Seconds since the value was valid."""
+        """Return the seconds since the value was valid."""
         return now_s - self.host_time_s
 
     def usable(self, *, now_s: float, max_age_s: float, device: str) -> T:
-        """The value, if it may be used for motion or fusion.
+        """Return the value if it may be used for motion or fusion.
 
         Raises:
-            StaleReading: invalid or older than `max_age_s`.
+            StaleReading: the value is invalid or older than `max_age_s`.
         """
         if self.quality is Quality.INVALID:
             raise StaleReading(

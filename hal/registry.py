@@ -1,4 +1,4 @@
-"""Drivers by name: entry points, loaded only when a cell file asks for them."""
+"""Finds drivers by name among the entry points and loads them when a cell file needs them."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Shared:
-    """What several devices of one cell share: the world, a bus. Made once, closed last."""
+    """Resources that several devices of a cell share (a world, a bus); each is made once and closed last."""
 
     _resources: dict[str, Any] = field(default_factory=dict)
     _lock: threading.RLock = field(default_factory=threading.RLock)
 
     def get(self, key: str, make: Callable[[], R]) -> R:
-        """The resource under `key`; the first caller makes it."""
+        """Return the resource under `key`; the first call makes it."""
         with self._lock:
             if key not in self._resources:
                 self._resources[key] = make()
@@ -39,7 +39,7 @@ class Shared:
             return resource
 
     def peek(self, key: str) -> Any | None:
-        """The resource under `key`, or None."""
+        """Return the resource under `key`, or None."""
         return self._resources.get(key)
 
     def close(self) -> None:
@@ -47,14 +47,14 @@ class Shared:
         with self._lock:
             resources = list(self._resources.values())
             self._resources.clear()
-        with ExitStack() as stack:  # calls in reverse order, each whatever the one before did
+        with ExitStack() as stack:  # calls in reverse order, also after errors
             for resource in resources:
                 stack.callback(resource.close)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Context:
-    """What a driver's factory gets beside its options.
+    """The parameters that a driver's factory gets in addition to its options.
 
     `cell` is None when a driver is used on its own. A simulated driver replaces the time with its world's:
     it registers `advance` at the `SimClock` in `clock`.
@@ -72,7 +72,7 @@ Factory = Callable[[Context, dict[str, Any]], Device]
 
 
 def takes(model: type[Strict]) -> Callable[[F], F]:
-    """Marks a driver's entry point with the model of its options, so that they can be read without connecting."""
+    """Mark a driver's entry point with the model of its options, so that they can be checked without connecting."""
 
     def mark(factory: F) -> F:
         setattr(factory, OPTIONS, model)
@@ -82,7 +82,7 @@ def takes(model: type[Strict]) -> Callable[[F], F]:
 
 
 def options_model(factory: Factory) -> type[Strict] | None:
-    """The model that the entry point is marked with; None for one that is not."""
+    """Return the options model of a marked entry point; None without a mark."""
     return getattr(factory, OPTIONS, None)
 
 
@@ -91,12 +91,12 @@ class KnowsItsArm(Protocol):
     """Options of an arm's driver that tell the arm's kinematics before anything is connected."""
 
     def known_arm(self) -> ArmCapabilities:
-        """Kinematics and limits of the arm with these options."""
+        """Return the kinematics and limits of the arm with these options."""
         ...
 
 
 def kinds_of(factory: Factory) -> tuple[DeviceKind, ...] | None:
-    """The device kinds whose interface the factory's declared return type has; None when it declares none."""
+    """Return the device kinds whose interface the factory's declared return type has; None without a declaration."""
     try:
         declared = get_type_hints(factory).get("return")
     except (NameError, TypeError):
@@ -115,7 +115,7 @@ def _methods(protocol: type) -> list[str]:
 
 
 def device_factory(driver: str) -> Factory:
-    """The factory registered under `driver`, for example `serial:tfmini`.
+    """Return the factory registered under `driver`, for example `serial:tfmini`.
 
     Raises:
         ConfigError: unknown name (with the nearest known one), or its package does not import.
@@ -125,7 +125,7 @@ def device_factory(driver: str) -> Factory:
 
 
 def emulator_factory(name: str) -> EmulatorFactory:
-    """The emulator registered under `name`.
+    """Return the emulator factory registered under `name`.
 
     Raises:
         ConfigError: as `device_factory`.
@@ -135,15 +135,15 @@ def emulator_factory(name: str) -> EmulatorFactory:
 
 
 def installed_drivers() -> tuple[str, ...]:
-    """Names of all registered drivers."""
+    """Return the names of all registered drivers."""
     return registered(DEVICES)
 
 
 def _in_file(details: dict[str, Any], cell: Cell | None) -> dict[str, Any]:
-    """`file` and `key` of a fault in a driver's options, which know the table they stand in and not its file."""
+    """Return a fault's details with the cell file and the full key, because driver options know only their table."""
     if cell is None or "key" not in details or "file" not in details:
         return details
-    key = f"{details['file']}.{details['key']}".rstrip(".")  # of the options as a whole when they contradict each other
+    key = f"{details['file']}.{details['key']}".rstrip(".")  # empty key: the options contradict each other
     return {**details, "file": str(cell.path), "key": key}
 
 

@@ -1,4 +1,4 @@
-"""What a simulated device offers beyond its kind: faults on request, and the truth for the judge.
+"""Interfaces of simulated devices beyond their kind: fault injection, and the true state for the evaluation.
 
 Perception, fusion and manipulation may not import this module; import-linter sees to it.
 """
@@ -13,7 +13,7 @@ from hal.arrays import Array
 
 
 class Fault(StrEnum):
-    """What can be injected into a simulated device."""
+    """The faults that can be injected into a simulated device."""
 
     SILENT = "silent"
     STALE = "stale"
@@ -24,7 +24,7 @@ class Fault(StrEnum):
 
 @runtime_checkable
 class FaultInjection(Protocol):
-    """Extra of simulated devices."""
+    """The fault-injection interface of simulated devices."""
 
     def inject_fault(self, fault: Fault | None, *, magnitude: float = 0.0) -> None:
         """Begin a fault, or end it with None."""
@@ -33,7 +33,7 @@ class FaultInjection(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObjectTruth:
-    """What an object of the simulated panel really shows: only for judging a finished mission."""
+    """The true state of an object of the simulated panel, only for the evaluation of a finished mission."""
 
     name: str
     value: float | None = None
@@ -43,7 +43,7 @@ class ObjectTruth:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Truth:
-    """What the simulator knows. Never reachable from perception, fusion, manipulation or missions."""
+    """The simulator's true state, which perception, fusion, manipulation and missions cannot access."""
 
     base_from_panel_matrix: Array  # (4, 4)
     objects: tuple[ObjectTruth, ...]

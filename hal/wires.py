@@ -1,4 +1,4 @@
-"""What devices take of the wires they hang on, read from their options before anything is opened."""
+"""Determines from the options which wires and bus addresses devices use, before anything is opened."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from hal.strict import Strict, validate
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResourceClaim:
-    """What a device takes of a wire.
+    """The use of a wire by a device.
 
     Attributes:
         wire: the wire in words: `serial /dev/ttyUSB0`, `tcp 10.0.0.5:502`, `CAN can0`.
         bus: protocol and rate of a wire that several devices may share; None when it is this device's alone.
-        stations: the addresses on the bus that are this device's: `unit 9`, `node 3`.
-        shared_as: devices of the same word here may be on one station, as the functions of an I/O box are.
+        stations: the bus addresses of this device, such as `unit 9` or `node 3`.
+        shared_as: devices with the same word here may use one station, such as the functions of an I/O box.
     """
 
     wire: str
@@ -29,7 +29,7 @@ class ResourceClaim:
 
     @property
     def same_wire(self) -> str:
-        """Equal for names of the same wire: a serial port has its own and stable ones that link to it."""
+        """Return a key that is equal for all names of the same wire, because a serial port may also have linked names."""
         sort, _, place = self.wire.partition(" ")
         return f"{sort} {Path(place).resolve()}" if place.startswith("/") else self.wire.lower()
 
@@ -38,15 +38,15 @@ class WireOptions(Strict):
     """Base of the options of devices on wires."""
 
     def claims(self) -> tuple[ResourceClaim, ...]:
-        """What a device with these options takes; nothing, unless a model says more."""
+        """Return the wires that a device with these options uses; none unless a subclass overrides this."""
         return ()
 
 
 def claims_of(driver: str, options: dict[str, Any]) -> tuple[ResourceClaim, ...]:
-    """What a device of `driver` takes of wires.
+    """Return the wires that a device of `driver` uses.
 
-    Nothing for a driver whose entry point does not name its options (`hal.registry.takes`). Nothing either for one that
-    is not installed and for options that it refuses: connecting says what is wrong with them.
+    Empty for a driver whose entry point does not name its options (`hal.registry.takes`), for a driver that
+    is not installed, and for options that it refuses: connecting reports what is wrong with them.
     """
     try:
         model = options_model(device_factory(driver))
@@ -58,10 +58,10 @@ def claims_of(driver: str, options: dict[str, Any]) -> tuple[ResourceClaim, ...]
 
 
 def clash(one: ResourceClaim, other: ResourceClaim, *, apart: bool = False) -> tuple[str, str] | None:
-    """Why two devices cannot both have what they claim, and the remedy; None when they can.
+    """Return why two devices cannot both use what they claim, and the remedy; None when they can.
 
     Args:
-        apart: they live in two processes, and a serial port is opened for one.
+        apart: whether they are in two processes; a serial port can be opened by only one.
     """
     if one.same_wire != other.same_wire:
         return None

@@ -10,7 +10,7 @@ Vector2 = tuple[float, float]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Face:
-    """What a picture of the object must hold, in any state: an upright rectangle, and the height above the plate of the
+    """The part of a picture that shows the object in any state: an upright rectangle, and the height above the plate of the
     plane in which its reader looks at it."""
 
     half_width_m: float
@@ -34,7 +34,7 @@ class Rim:
 
 
 def circle(radius_m: float, *, above_plate_m: float = 0.0, reach_m: float = 0.0) -> Rim:
-    """A round rim."""
+    """Return a round rim."""
     size = 2.0 * radius_m
     return Rim(shape="circle", width_m=size, height_m=size, above_plate_m=above_plate_m, reach_m=reach_m)
 
@@ -77,11 +77,11 @@ class Relief:
     pressed_depth_m: float = 0.0
 
     def state_name(self, state: float) -> str:
-        """What sliding by `state` metres is called."""
+        """Return the name of the state after a slide by `state` metres."""
         return "pressed" if state < -0.5 * self.pressed_depth_m else "released"
 
     def table(self) -> dict[str, Any]:
-        """The model as `perception.range` takes it."""
+        """Return the model as a table for `perception.range`."""
         axis = {"motion_axis": [0.0, 0.0, 1.0]} if self.motion == "slide" else {}
         surfaces = list(self.surfaces)
         return {

@@ -1,4 +1,4 @@
-"""What may be asked of a control: one of several states, or a number within limits."""
+"""Goals that a control can be set to: one of several states, or a number within limits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ GAUGE_SHARE = 0.02
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shown:
-    """What an object shows, as far as somebody can tell: a value in the unit of its kind, a state, a text."""
+    """The reading of an object, as far as it is known: a value in the unit of its kind, a state, a text."""
 
     value: float | None = None
     state: str | None = None
@@ -34,7 +34,7 @@ class StateGoal:
     key = "state"
 
     def checked(self, name: str, asked: str | float | None) -> str:
-        """The state asked for.
+        """Return the requested state.
 
         Raises:
             InvalidRequest: no state is given, or the object called `name` has no such state.
@@ -48,15 +48,15 @@ class StateGoal:
         return str(state)
 
     def text(self, target: str | float) -> str:
-        """The target as a report has it."""
+        """Return the target as text for a report."""
         return str(target)
 
     def is_reached(self, target: str | float, truth: Shown) -> bool:
-        """Whether what the object truly shows is the target."""
+        """Return whether the object's true state is the target."""
         return truth.state == target
 
     def other_than(self, shown: Shown) -> str:
-        """The first state that is not shown now."""
+        """Return the first state that is not shown now."""
         return next(state for state in self.states if state != shown.state)
 
 
@@ -71,7 +71,7 @@ class NumberGoal:
     tolerance: float
 
     def checked(self, name: str, asked: str | float | None) -> float:
-        """The number asked for.
+        """Return the requested number.
 
         Raises:
             InvalidRequest: no number is given, or it is not within the limits of the object called `name`.
@@ -84,15 +84,15 @@ class NumberGoal:
         return float(asked)
 
     def text(self, target: str | float) -> str:
-        """The target as a report has it."""
+        """Return the target as text for a report."""
         return f"{float(target):g}"
 
     def is_reached(self, target: str | float, truth: Shown) -> bool:
-        """Whether what the object truly shows is within the tolerance of the target."""
+        """Return whether the object's true value is within the tolerance of the target."""
         return truth.value is not None and abs(truth.value - float(target)) <= self.tolerance
 
     def other_than(self, shown: Shown) -> float:
-        """Three or seven tenths of the range, whichever is further from what is shown now."""
+        """Return the value at 30 % or 70 % of the range, whichever is further from the present one."""
         span = self.high - self.low
         near, far = self.low + 0.3 * span, self.low + 0.7 * span
         value = self.low if shown.value is None else shown.value

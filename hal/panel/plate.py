@@ -1,4 +1,4 @@
-"""What cannot be meant about the places of a panel's parts: names given twice, parts off the plate or in one another."""
+"""Finds faults in the layout of a panel: names given twice, parts off the plate, parts that overlap."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Parts = Mapping[Location, Light | PanelObject]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Foot:
-    """What a part covers on the plate: a circle, or a rectangle turned counter-clockwise."""
+    """The area that a part covers on the plate: a circle, or a rectangle turned counter-clockwise."""
 
     centre_m: Vector2
     half_m: Vector2
@@ -28,7 +28,7 @@ class _Foot:
     is_round: bool = False
 
     def across(self, x: float, y: float) -> float:
-        """Half its extent along a unit direction."""
+        """Return half the extent along a unit direction."""
         if self.is_round:
             return self.half_m[0]
         c, s = math.cos(self.turn_rad), math.sin(self.turn_rad)
@@ -36,7 +36,7 @@ class _Foot:
 
 
 def faults_of(width_m: float, height_m: float, parts: Parts) -> list[InitErrorDetails]:
-    """Every fault of the places of lights and objects; `parts` are by their place in the file."""
+    """Return all faults of the positions of lights and objects; `parts` are keyed by their location in the file."""
     return [*_twice(parts), *_off_the_plate(width_m, height_m, parts), *_overlapping(parts), *_without_lamp(parts)]
 
 
@@ -101,7 +101,7 @@ def _foot(part: Light | PanelObject) -> _Foot:
 
 
 def _depth_m(a: _Foot, b: _Foot) -> float:
-    """How far two feet stand in one another, by the directions in which they could be apart; negative where they are."""
+    """Return the overlap of two areas in metres by the separating-axis test; negative when they are apart."""
     dx, dy = b.centre_m[0] - a.centre_m[0], b.centre_m[1] - a.centre_m[1]
     angles = [foot.turn_rad + quarter for foot in (a, b) if not foot.is_round for quarter in (0.0, math.pi / 2)]
     if a.is_round or b.is_round:

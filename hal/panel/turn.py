@@ -1,4 +1,4 @@
-"""Angles that can be meant: what is beyond a full turn was probably given in degrees."""
+"""Checks angles for plausibility; an angle beyond a full turn was probably given in degrees."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ MOST_TURNS = 10
 
 
 def meant_otherwise(what: str, hint: str) -> PydanticCustomError:
-    """The refusal of what cannot be meant, with what helps."""
+    """Return the error for an implausible value, with a hint."""
     return PydanticCustomError("cannot_be_meant", "{what}", {"what": what, "hint": hint})
 
 
 def beyond(key: str, angle_rad: float, most: str = "a full turn") -> PydanticCustomError:
-    """The refusal of an angle that is beyond what can be meant."""
+    """Return the error for an angle that is too large to be plausible."""
     stem = key.removesuffix("_rad")
     hint = f"angles are radians: if this is degrees, write {stem}_deg = {angle_rad:g}"
     return meant_otherwise(f"{angle_rad:g} rad is beyond {most}", hint)
@@ -37,7 +37,7 @@ def _within_turns(angle_rad: float, info: ValidationInfo) -> float:
 
 
 def below_a_quarter(angle_rad: float, info: ValidationInfo) -> float:
-    """The angle, if it is less than a quarter of a turn."""
+    """Return the angle if it is less than a quarter of a turn, else raise."""
     if angle_rad >= math.pi / 2:
         raise beyond(info.field_name or "angle_rad", angle_rad, "a quarter of a turn")
     return angle_rad
@@ -46,4 +46,4 @@ def below_a_quarter(angle_rad: float, info: ValidationInfo) -> float:
 Angle = Annotated[float, AfterValidator(_within_a_turn)]
 """An angle in radians of at most a full turn to either side."""
 Turns = Annotated[float, AfterValidator(_within_turns)]
-"""An angle in radians of what may turn several times."""
+"""An angle in radians of a part that may turn several times."""

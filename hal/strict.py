@@ -28,12 +28,12 @@ class Fault:
     is_unknown_key: bool = False
 
     def __str__(self) -> str:
-        """In one line, with its remedy unless that is a page for all of them."""
+        """Return the fault in one line, with its remedy unless that is a page that covers all faults."""
         said = _said(self.key, self.text)
         return said if self.hint.startswith("see ") or self.hint.endswith(IN_DOCS) else f"{said}; {self.hint}"
 
     def below(self, key: str) -> Fault:
-        """The same fault of a table that stands under `key` of the file."""
+        """Return the same fault for a table that is under `key` of the file."""
         return replace(self, key=f"{key}.{self.key}".rstrip("."))
 
 
@@ -58,9 +58,9 @@ def load_toml(path: Path, model: type[M], what: str) -> M:
 
 
 def read_text(path: Path, what: str) -> str:
-    """The text of a file that a user named."""
+    """Read the text of a file that a user named."""
     try:
-        return path.read_text(encoding="utf-8-sig")  # editors on Windows put a mark before the first key
+        return path.read_text(encoding="utf-8-sig")  # some editors write a byte-order mark before the first key
     except FileNotFoundError:
         # Their endings are alike and would make any two names look near.
         near = get_close_matches(path.stem, [p.stem for p in path.parent.glob("*.toml")], n=1, cutoff=0.5)
@@ -95,7 +95,7 @@ def validate(data: dict[str, Any], model: type[M], *, source: str) -> M:
 
 
 def faults_in(data: dict[str, Any], model: type[Strict]) -> list[Fault]:
-    """Everything that is wrong with plain data for `model`; empty when it is in order."""
+    """Return all faults of plain data for `model`; empty when the data are valid."""
     try:
         _parsed(data, model)
     except ValidationError as error:
@@ -104,7 +104,7 @@ def faults_in(data: dict[str, Any], model: type[Strict]) -> list[Fault]:
 
 
 def refusal(faults: list[Fault], *, source: str) -> ConfigError:
-    """One error that names all faults of a file; its remedy is the first one's."""
+    """Return one error that names all faults of a file; its remedy is that of the first fault."""
     more = f" (and {len(faults) - 1} more {'fault' if len(faults) == 2 else 'faults'})" if len(faults) > 1 else ""
     first = faults[0]
     return ConfigError(
@@ -147,12 +147,12 @@ def _fault(item: Any, model: type[BaseModel]) -> Fault:
 
 
 def _said(*parts: str) -> str:
-    """Where and what, colons between; a fault of the whole has no key."""
+    """Join the non-empty parts of a message with colons; a fault of the whole file has no key."""
     return ": ".join(part for part in parts if part)
 
 
 def unknown_key_hint(model: type[BaseModel], location: tuple[int | str, ...]) -> str:
-    """What helps against an unknown key at `location` of data for `model`: the nearest known key, or all of them."""
+    """Return a hint for an unknown key at `location` of data for `model`: the nearest known key, or all of them."""
     return _did_you_mean(str(location[-1]), _fields_at(model, list(location[:-1])))
 
 
@@ -165,7 +165,7 @@ def _path_in_file(location: tuple[Any, ...], model: type[BaseModel]) -> list[Any
 
 
 def reachable(model: type[BaseModel]) -> set[type[BaseModel]]:
-    """The model and all models that its fields are made of."""
+    """Return the model and all models that its fields use."""
     found: set[type[BaseModel]] = set()
     waiting = [model]
     while waiting:
@@ -184,7 +184,7 @@ def _did_you_mean(name: str, known: list[str]) -> str:
 
 
 def _fields_at(model: type[BaseModel], location: list[Any]) -> list[str]:
-    """Field names of the model that stands at `location` inside `model`."""
+    """Return the field names of the model at `location` inside `model`."""
     models: list[type[BaseModel]] = [model]
     for part in location:
         if isinstance(part, int):

@@ -1,4 +1,4 @@
-"""Angles of a panel file: radians, or degrees under keys that end in `_deg`."""
+"""Reads the angles of a panel file: radians, or degrees under keys that end in `_deg`."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Location = tuple[str | int, ...]
 
 
 def fault(at: Location, given: object, what: str, hint: str) -> InitErrorDetails:
-    """A fault of a file: where, the value that is given there, what is wrong with it, and what helps."""
+    """Return a fault of a file: the location, the value there, what is wrong with it, and a hint."""
     return InitErrorDetails(type=meant_otherwise(what, hint), loc=at, input=given)
 
 
 def again(item: Any, model: type[BaseModel]) -> InitErrorDetails:
-    """A fault that `model` has found, so that it can be raised together with others."""
+    """Return a fault that `model` has found, in a form that can be raised together with others."""
     context = dict(item.get("ctx", {}))
     if item["type"] == "extra_forbidden":
         context["hint"] = unknown_key_hint(model, item["loc"])
@@ -35,7 +35,7 @@ def again(item: Any, model: type[BaseModel]) -> InitErrorDetails:
 
 
 def in_radians(table: Any, known: frozenset[str], at: Location = ()) -> tuple[Any, list[InitErrorDetails]]:
-    """A table of a panel file with every angle in radians, and the faults of those that are given twice.
+    """Return a table of a panel file with every angle in radians, and the faults of angles that are given twice.
 
     Args:
         known: keys of the models that will read it: what would be none of them stays, and is refused under its own name.
@@ -62,7 +62,7 @@ def in_radians(table: Any, known: frozenset[str], at: Location = ()) -> tuple[An
 
 
 def _radians(value: Any, *, is_table: bool) -> Any:
-    """Degrees as radians; what is no number stays, for its model to refuse."""
+    """Convert degrees to radians; a value that is not a number stays unchanged, so that its model refuses it."""
     if is_table and isinstance(value, list):  # pairs of place and value
         return [[_radians(p[0], is_table=False), *p[1:]] if isinstance(p, list) and p else p for p in value]
     return math.radians(value) if isinstance(value, int | float) and not isinstance(value, bool) else value

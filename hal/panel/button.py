@@ -42,11 +42,11 @@ class Button(PanelObject):
 
     @property
     def half_footprint_m(self) -> Vector2:
-        """Its radius."""
+        """Half width and half height, which are its radius."""
         return self.radius_m, self.radius_m
 
     def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """A box about the cap."""
+        """Return a box around the cap."""
         return Envelope(half_m=self.half_footprint_m, height_m=self.height_m)
 
     @property
@@ -60,17 +60,17 @@ class Button(PanelObject):
 
     @property
     def shown_by(self) -> str:
-        """Its lamp, where it has one: a button springs back, and what it works is what counts."""
+        """The name of its lamp, if any, because a button springs back and its effect is what counts."""
         return self.name if self.lights_lamp is None else self.lights_lamp
 
     @property
     def mission_rank(self) -> float | None:
-        """One with a lamp first, then one that latches; any other shows nothing that could be confirmed."""
+        """Rank of buttons with a lamp, then of latching ones; None for others, whose state cannot be confirmed."""
         if self.lights_lamp is not None:
             return 3.0
         return 3.5 if self.latching else None
 
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
-        """Radius, colour, and whether it latches."""
+        """Return the keys for radius, colour and whether it latches."""
         return {**radius_of(taught), "colour": taught.text("colour"), "latching": taught.text("latching") == "yes"}

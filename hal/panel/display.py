@@ -49,11 +49,11 @@ class Display(PanelObject):
 
     @property
     def half_footprint_m(self) -> Vector2:
-        """Half its sides."""
+        """Half width and half height of its frame."""
         return self.width_m / 2, self.height_m / 2
 
     def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """A flat box."""
+        """Return a flat box around the instrument."""
         return Envelope(half_m=self.half_footprint_m, height_m=LEAST_HEIGHT_M)
 
     @property
@@ -63,16 +63,16 @@ class Display(PanelObject):
 
     @property
     def full_scale(self) -> float:
-        """From the least to the greatest that it may show."""
+        """The difference between the largest and the smallest value that it may show."""
         return self.maximum - self.minimum
 
     def is_right(self, said: Shown, truth: Shown) -> bool:
-        """Whether every character is right."""
+        """Return whether every character is right."""
         return said.text is not None and said.text.strip() == (truth.text or "").strip()
 
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
-        """Size, digits and range."""
+        """Return the keys for size, digits and range."""
         width, height = taught.size_m
         return {
             "width_m": round(width, 4),

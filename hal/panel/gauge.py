@@ -31,11 +31,11 @@ class Gauge(PanelObject):
 
     @property
     def half_footprint_m(self) -> Vector2:
-        """Its radius."""
+        """Half width and half height, which are its radius."""
         return self.radius_m, self.radius_m
 
     def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """A flat box."""
+        """Return a flat box around the instrument."""
         return Envelope(half_m=self.half_footprint_m, height_m=max(self.depth_m, LEAST_HEIGHT_M))
 
     @property
@@ -45,10 +45,10 @@ class Gauge(PanelObject):
 
     @property
     def full_scale(self) -> float:
-        """The span of its scale."""
+        """The difference between the highest and the lowest value of its scale."""
         return self.scale.span
 
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
-        """Radius and scale."""
+        """Return the keys for radius and scale."""
         return {**radius_of(taught), "scale": pointer_scale(taught)}

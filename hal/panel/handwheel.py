@@ -53,7 +53,7 @@ class Handwheel(PanelObject):
         return self.radius_m + self.rim_m, self.radius_m + self.rim_m
 
     def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """A box about the wheel."""
+        """Return a box around the wheel."""
         return Envelope(half_m=self.half_footprint_m, height_m=self.height_m + self.rim_m)
 
     @property
@@ -68,7 +68,7 @@ class Handwheel(PanelObject):
         return NumberGoal(key="angle_rad", low=low, high=high, unit="rad", tolerance=RIGHT_RAD)
 
     def is_right(self, said: Shown, truth: Shown) -> bool:
-        """Whether the marked spoke stands where it was said to, whole turns aside."""
+        """Return whether the marked spoke has the given angle, modulo whole turns."""
         if said.value is None or truth.value is None:
             return False
         return bool(abs((said.value - truth.value + math.pi) % (2 * math.pi) - math.pi) <= RIGHT_RAD)
@@ -102,5 +102,5 @@ class Handwheel(PanelObject):
 
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
-        """Radius and spokes."""
+        """Return the keys for radius and spokes."""
         return {**radius_of(taught), "spokes": round(taught.number("spokes"))}

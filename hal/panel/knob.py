@@ -30,11 +30,11 @@ class Knob(PanelObject):
 
     @property
     def half_footprint_m(self) -> Vector2:
-        """Its radius."""
+        """Half width and half height, which are its radius."""
         return self.radius_m, self.radius_m
 
     def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """A box about the knob."""
+        """Return a box around the knob."""
         return Envelope(half_m=self.half_footprint_m, height_m=self.height_m)
 
     @property
@@ -44,22 +44,22 @@ class Knob(PanelObject):
 
     @property
     def goal(self) -> NumberGoal:
-        """A value of its scale."""
+        """A number on its scale."""
         scale = self.scale
         tolerance = GAUGE_SHARE * scale.span
         return NumberGoal(key="value", low=scale.minimum, high=scale.maximum, unit=scale.unit, tolerance=tolerance)
 
     @property
     def mission_rank(self) -> float:
-        """After levers, sliders, buttons and toggles."""
+        """Rank after levers, sliders, buttons and toggles."""
         return 5.0
 
     @property
     def full_scale(self) -> float:
-        """The span of its scale."""
+        """The difference between the highest and the lowest value of its scale."""
         return self.scale.span
 
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
-        """Radius and scale."""
+        """Return the keys for radius and scale."""
         return {**radius_of(taught), "scale": pointer_scale(taught)}

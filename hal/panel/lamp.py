@@ -30,11 +30,11 @@ class Lamp(PanelObject):
 
     @property
     def half_footprint_m(self) -> Vector2:
-        """Its radius."""
+        """Half width and half height, which are its radius."""
         return self.radius_m, self.radius_m
 
     def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """A box about the lens."""
+        """Return a box around the lens."""
         return Envelope(half_m=self.half_footprint_m, height_m=max(self.height_m, LEAST_HEIGHT_M))
 
     @property
@@ -44,5 +44,5 @@ class Lamp(PanelObject):
 
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
-        """Radius and colour."""
+        """Return the keys for radius and colour."""
         return {**radius_of(taught), "colour": taught.text("colour")}

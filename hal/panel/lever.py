@@ -28,22 +28,22 @@ class Lever(PanelObject):
 
     @property
     def face(self) -> Face:
-        """All that its bar sweeps, in the plane of its top."""
+        """The area that its bar sweeps, in the plane of its top."""
         return Face(half_width_m=self.length_m, half_height_m=self.length_m, height_m=self.height_m)
 
     @property
     def half_footprint_m(self) -> Vector2:
-        """All that its bar sweeps, and its end."""
+        """Half the sides of the area that its bar sweeps, including its end."""
         reach = self.length_m + self.width_m
         return reach, reach
 
     @property
     def half_foot_m(self) -> Vector2:
-        """Its hub; the bar may pass over what is lower."""
+        """Half the sides of its hub; the bar may pass over lower parts."""
         return self.width_m / 2, self.width_m / 2
 
     def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """All that it sweeps; at a known angle hub and bar, from half a width behind the hub to the far end."""
+        """Return a box around all that it sweeps; at a known angle, around hub and bar only."""
         if angle_rad is None:
             return Envelope(half_m=self.half_footprint_m, height_m=self.height_m)
         along = self.length_m / 2
@@ -52,20 +52,20 @@ class Lever(PanelObject):
 
     @property
     def goal(self) -> StateGoal:
-        """One of its places."""
+        """One of its states."""
         return StateGoal(states=tuple(state.name for state in self.states))
 
     @property
     def resting_angles(self) -> Mapping[str, float]:
-        """The angles of its places."""
+        """Angle of each state."""
         return {state.name: state.angle_rad for state in self.states}
 
     @property
     def mission_rank(self) -> float:
-        """Before everything else."""
+        """Rank before all other kinds."""
         return 1.0
 
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
-        """Length and places."""
+        """Return the keys for length and states."""
         return {"length_m": round(taught.reach_m, 4), "states": taught.states("states")}

@@ -39,12 +39,12 @@ class Mushroom(PanelObject):
         return self.radius_m, self.radius_m
 
     def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """A box about the head."""
+        """Return a box around the head."""
         return Envelope(half_m=self.half_footprint_m, height_m=self.height_m)
 
     @property
     def goal(self) -> StateGoal:
-        """It can be pressed; only a person frees it."""
+        """The state `pressed`; only a person may release it."""
         return StateGoal(states=("pressed",), usual="pressed")
 
     @property
@@ -66,5 +66,5 @@ class Mushroom(PanelObject):
 
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
-        """The radius."""
+        """Return the key for the radius."""
         return radius_of(taught)

@@ -34,11 +34,11 @@ class PanelMeter(PanelObject):
 
     @property
     def half_footprint_m(self) -> Vector2:
-        """Half its sides."""
+        """Half width and half height of its frame."""
         return self.width_m / 2, self.height_m / 2
 
     def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """A flat box."""
+        """Return a flat box around the instrument."""
         return Envelope(half_m=self.half_footprint_m, height_m=max(self.depth_m, LEAST_HEIGHT_M))
 
     @property
@@ -48,12 +48,12 @@ class PanelMeter(PanelObject):
 
     @property
     def full_scale(self) -> float:
-        """The span of its scale."""
+        """The difference between the highest and the lowest value of its scale."""
         return self.scale.span
 
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
-        """Size, needle and scale; pivot and needle are where such meters have them."""
+        """Return the keys for size, needle and scale; pivot and needle have the usual proportions of such meters."""
         width, height = taught.size_m
         below = round(PIVOT_SHARE * height, 4)
         return {

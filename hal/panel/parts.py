@@ -66,7 +66,7 @@ class Scale(Strict):
         return self.maximum - self.minimum
 
     def value_at(self, place: float) -> float:
-        """The value shown at a place (rad or m), linear between taught pairs, going on straight beyond the ends."""
+        """Return the value at a place (rad or m), linear between the given pairs and extrapolated beyond the ends."""
         points = self._points()
         for (p0, v0), (p1, v1) in pairwise(points):
             if place <= p1 or (p1, v1) == points[-1]:
@@ -74,7 +74,7 @@ class Scale(Strict):
         raise AssertionError("a scale has two points")
 
     def place_of(self, value: float) -> float:
-        """The inverse of `value_at`."""
+        """Return the place (rad or m) of a value, the inverse of `value_at`."""
         points = sorted((v, p) for p, v in self._points())
         for (v0, p0), (v1, p1) in pairwise(points):
             if value <= v1 or (v1, p1) == points[-1]:

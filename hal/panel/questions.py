@@ -28,43 +28,43 @@ class Taught(Protocol):
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Width and height of the outline on the plate."""
+        """Width and height of the outline on the plate, in metres."""
         ...
 
     @property
     def reach_m(self) -> float:
-        """From the place that was clicked to the far end of the outline."""
+        """Distance in metres from the clicked place to the far end of the outline."""
         ...
 
     def text(self, key: str) -> str:
-        """The answer to a question.
+        """Return the answer to a question.
 
         Raises:
-            InvalidRequest: it is none of the question's choices.
+            InvalidRequest: the answer is not one of the question's choices.
         """
         ...
 
     def number(self, key: str) -> float:
-        """The answer to a question as a number.
+        """Return the answer to a question as a number.
 
         Raises:
-            InvalidRequest: it is none.
+            InvalidRequest: the answer is not a number.
         """
         ...
 
     def mark_deg(self, key: str, *, pivot_below_m: float = 0.0) -> float:
-        """The answer as an angle, clockwise from straight up, about a pivot below the object's middle.
+        """Return the answer as an angle in degrees, clockwise from straight up, about a pivot below the object's middle.
 
         Raises:
-            InvalidRequest: it is neither an angle nor a pixel.
+            InvalidRequest: the answer is neither an angle nor a pixel.
         """
         ...
 
     def states(self, key: str) -> list[dict[str, Any]]:
-        """The answer as named places: tables of the panel file with `name` and `angle_deg`.
+        """Return the answer as named states: tables of the panel file with `name` and `angle_deg`.
 
         Raises:
-            InvalidRequest: an angle is no number.
+            InvalidRequest: an angle is not a number.
         """
         ...
 
@@ -77,7 +77,7 @@ ENDS = (
 
 
 def about_a_pointer(low_deg: str, high_deg: str) -> tuple[Question, ...]:
-    """The questions about a scale whose places are angles."""
+    """Return the questions about a scale whose places are angles."""
     return (
         *ENDS,
         Question(key="at_min", text=f"Where is the low end ({MARKS})?", default=low_deg),
@@ -86,16 +86,16 @@ def about_a_pointer(low_deg: str, high_deg: str) -> tuple[Question, ...]:
 
 
 def ends_of(taught: Taught) -> dict[str, Any]:
-    """Least and greatest value of a scale, and its unit."""
+    """Return the smallest and the largest value of a scale, and its unit."""
     return {"minimum": taught.number("minimum"), "maximum": taught.number("maximum"), "unit": taught.text("unit")}
 
 
 def pointer_scale(taught: Taught, *, pivot_below_m: float = 0.0) -> dict[str, Any]:
-    """The answers about a scale whose places are angles, as a table of the panel file."""
+    """Return the answers about a scale whose places are angles, as a table of the panel file."""
     at_min, at_max = (taught.mark_deg(key, pivot_below_m=pivot_below_m) for key in ("at_min", "at_max"))
     return {**ends_of(taught), "at_min_deg": at_min, "at_max_deg": at_max}
 
 
 def radius_of(taught: Taught) -> dict[str, Any]:
-    """The radius of a round object's outline."""
+    """Return the key for the radius of a round object's outline."""
     return {"radius_m": round(sum(taught.size_m) / 4, 4)}

@@ -30,11 +30,11 @@ class Rotary(PanelObject):
 
     @property
     def half_footprint_m(self) -> Vector2:
-        """Its radius."""
+        """Half width and half height, which are its radius."""
         return self.radius_m, self.radius_m
 
     def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """A box about the knob."""
+        """Return a box around the knob."""
         return Envelope(half_m=self.half_footprint_m, height_m=self.height_m)
 
     @property
@@ -44,15 +44,15 @@ class Rotary(PanelObject):
 
     @property
     def goal(self) -> StateGoal:
-        """One of its places."""
+        """One of its states."""
         return StateGoal(states=tuple(state.name for state in self.states))
 
     @property
     def resting_angles(self) -> Mapping[str, float]:
-        """The angles of its detents."""
+        """Angle of each detent."""
         return {state.name: state.angle_rad for state in self.states}
 
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
-        """Radius and places."""
+        """Return the keys for radius and states."""
         return {**radius_of(taught), "states": taught.states("states")}

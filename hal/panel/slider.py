@@ -70,31 +70,31 @@ class Slider(PanelObject):
         return Face(half_width_m=half_width, half_height_m=half_height, height_m=self.cap_size_m[2])
 
     def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """A box along the track."""
+        """Return a box along the track."""
         along, across, out = self.cap_size_m
         half = ((self.travel_m + along) / 2, across / 2)
         return Envelope(half_m=half, height_m=out, turn_rad=self.angle_rad)
 
     @property
     def goal(self) -> NumberGoal:
-        """A value of its scale."""
+        """A number on its scale."""
         scale = self.scale
         tolerance = GAUGE_SHARE * scale.span
         return NumberGoal(key="value", low=scale.minimum, high=scale.maximum, unit=scale.unit, tolerance=tolerance)
 
     @property
     def mission_rank(self) -> float:
-        """After levers."""
+        """Rank after levers."""
         return 2.0
 
     @property
     def full_scale(self) -> float:
-        """The span of its scale."""
+        """The difference between the highest and the lowest value of its scale."""
         return self.scale.span
 
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
-        """Travel and scale, from the outline of track and cap."""
+        """Return the keys for travel and scale, from the outline of track and cap."""
         rises = taught.text("rises")
         is_flat = rises in ("right", "left")
         travel = round(max(taught.size_m[0 if is_flat else 1] - CAP_M, 0.01), 4)

@@ -34,16 +34,16 @@ class Toggle(PanelObject):
 
     @property
     def half_foot_m(self) -> Vector2:
-        """Its nut."""
+        """Half the sides of its nut."""
         return 1.8 * self.bat_radius_m, 1.8 * self.bat_radius_m
 
     @property
     def half_footprint_m(self) -> Vector2:
-        """The length of its bat: what a finger needs about it."""
+        """The length of its bat, which is the room that a finger needs around it."""
         return self.bat_length_m, self.bat_length_m
 
     def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """The bat swings in the vertical plane."""
+        """Return a box around the bat, which swings in the vertical plane."""
         half = self.bat_length_m * math.sin(self.tilt_rad) + 2 * self.bat_radius_m
         return Envelope(half_m=(2 * self.bat_radius_m, half), height_m=self.bat_length_m + self.bat_radius_m)
 
@@ -54,10 +54,10 @@ class Toggle(PanelObject):
 
     @property
     def mission_rank(self) -> float:
-        """After levers, sliders and buttons."""
+        """Rank after levers, sliders and buttons."""
         return 4.0
 
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
-        """Nothing: its outline tells little of a bat that stands out."""
+        """Return no keys, because the outline says little about a bat that stands out of the plate."""
         return {}

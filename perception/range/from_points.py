@@ -1,4 +1,4 @@
-"""Depth image of points, as a scanner that the wrist sweeps gives them."""
+"""Depth image from points, such as those of a scanner that the wrist sweeps."""
 
 from __future__ import annotations
 

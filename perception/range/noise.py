@@ -1,4 +1,4 @@
-"""How noisy a range image is, from the image itself.
+"""Estimation of the noise model of a range image from the image itself.
 
 Three causes are told apart, because a method tuned to one fails on the others: white noise, seen in small windows;
 correlated noise, which only larger windows see; and the step between codes, which hides noise smaller than itself.

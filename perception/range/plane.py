@@ -1,4 +1,4 @@
-"""The dominant plane near an expected one: the mission's "scan the panel and fit its plane"."""
+"""Fit of the dominant plane near an expected one, as in the mission step "scan the panel and fit its plane"."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LEAST_SHARE = 0.05  # of the valid blocks: a plane that holds less is not the pa
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PlaneFit:
-    """The plane found, as a surface and as a fusion feature, and how much of the image it holds.
+    """The plane found, as a surface and as a fusion feature, and the share of the image that lies on it.
 
     `sight_share` is the share of all valid pixels on the plane; `inliers` (H, W) says which.
     """
@@ -51,7 +51,7 @@ def fit_plane_near(
 ) -> PlaneFit:
     """The largest plane within three standard deviations of an expected one, fitted on depth residuals.
 
-    The expectation only selects; it does not pull the fit, so the result may be fused with where it came from.
+    The expectation only selects inliers and is no prior of the fit, so the result may be fused with its source.
 
     Args:
         depth_m: (H, W) depth in metres, NaN where missing.
@@ -119,7 +119,7 @@ def _near_expectation(
 def _most_supported(
     points: Array, sigma: Array, normals: Array, expected: Array, *, sigma_angle_rad: float, normal_sigma_rad: float
 ) -> Array | None:
-    """(4,) normal and offset of the plane through one block that most blocks agree with, after two refits."""
+    """Return normal and offset (4,) of the plane hypothesis with the most inlier blocks, refitted; None without one."""
     turn = np.arccos(np.clip(normals @ expected, -1.0, 1.0))
     facing = np.flatnonzero(turn <= 3.0 * np.hypot(sigma_angle_rad, normal_sigma_rad) + 0.05)
     if facing.size < LEAST_BLOCKS:
@@ -146,7 +146,7 @@ def _mean_normal(normals: Array, expected: Array) -> Array:
 
 
 def _refitted(points: Array, sigma: Array, plane: Array, sigma_angle_rad: float) -> tuple[Array, int]:
-    """Alternate inliers and weighted principal axes, the gate narrowing from the angle's slack to the noise."""
+    """Refit a plane by weighted principal axes to its inliers, with a gate that narrows; returns it and their number."""
     thin = max(1, len(points) // 1500)
     P, s = points[::thin], sigma[::thin]
     inside = np.zeros(len(P), bool)

@@ -1,4 +1,4 @@
-"""What people and other programs get of a scene: JSON, a coloured picture, a coloured point cloud."""
+"""Output of a scene as JSON, as a coloured picture and as a coloured point cloud."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ def refine_surfaces(
 
 
 def _straight(kind: int, th: Array, regions: Regions, own: int) -> tuple[int, Array]:
-    """Return the simpler kind that slow sensor errors have bent into this one, with initial parameters; or the kind itself."""
+    """Return the simpler kind that slow sensor errors may have bent into this one, with initial parameters."""
     if kind == PLANE:
         return kind, th
     pixels = int(regions.sizes[own])

@@ -44,7 +44,7 @@ def assign_pixels(
 
 @compiled
 def _only_labels(least: NDArray[np.uint32], most: Labels, only: Labels) -> None:
-    """Write the only label of the 3x3 blocks around each block into `only`: 0 if there is none, SEVERAL if more than one.
+    """Write the only label of the 3x3 blocks around each block into `only`: 0 if none, SEVERAL if more than one.
 
     `least` and `most` are those of `column_range`.
     """
@@ -103,7 +103,7 @@ def _assign_run(
     depth: Array, th: Array, label: int, first: int, v: int, sen: Array, noise: Array, perspective: bool, limit: float,
     otherwise: int | np.int32, out: Labels,
 ) -> None:  # fmt: skip
-    """Label the pixels first, first + 1, ... of row v that a plane explains within `limit` sigmas; others get `otherwise`.
+    """Label the pixels of row v from column `first` that a plane explains within `limit` sigmas; others get `otherwise`.
 
     The loop has neither a branch nor a square root.
     """
